@@ -28,13 +28,12 @@ from dynsim.studies.bench.programs import (
     DYNSIM_CONTACTS,
     DYNSIM_FREE,
     DYNSIM_RADAU5,
-    DYNSIM_RK4,
-    DYNSIM_RK43,
     LCABA,
     MUJOCO_CONTACTS,
     MUJOCO_EULER,
     MUJOCO_FREE,
     MUJOCO_IMPLICIT,
+    SAME_TASK,
 )  # fmt: skip
 from dynsim.system.terminal import Terminal
 
@@ -133,7 +132,7 @@ def held(scenario: str, show: Callable[[dict[str, Any]], str]) -> list[str]:
 def elbows_in_short() -> str:
     glued, real = contact()["elbow_comparison"], contact()["elbow_comparison_floor"]
     mean = held("elbow_comparison", lambda c: number(c["normal_force_mean_N"], 3))
-    times = {r["variant"]: r for r in bench()["variants"] if (r["contacts"], r["method"]) == ("glued", "radau5")}
+    times = {row["variant"]: row for row in bench()["variants"]}
     return lines(
         ["", *HEADS],
         [
@@ -347,22 +346,6 @@ def ledger() -> str:
     return ruled(heads, rules, rows)
 
 
-def against_rk43() -> str:
-    rows = []
-    for scenario, one in validation()["against_rk43"].items():
-        evaluations = [
-            " to ".join(grouped(n) for n in dict.fromkeys(one[key])) for key in ("evaluations_rk43", "evaluations")
-        ]
-        differences = [
-            small(one[key]) if key in one else ""
-            for key in ("joint", "electrical_energy_J", "hand_error_rms_m", "events_s")
-        ]
-        both = [small(one["ledger_rk43"]), small(one["ledger"])]
-        rows.append([f"`{scenario}`", f"`{one['method']}`", *differences, *both, *evaluations])
-    heads = ["scenario", "by", "joint", "energy", "hand's error", "events, s", "ledger `rk43`", "now"]
-    return lines([*heads, "right-hand sides `rk43`", "now"], rows, left=2)
-
-
 def time_stepping() -> str:
     rows = []
     for name, one in validation()["time_stepping"].items():
@@ -392,11 +375,20 @@ def right_hand_side() -> str:
         ("Pinocchio `constraintDynamics`, 2 × 3 rows", CONSTRAINT_DYNAMICS), ("Pinocchio `lcaba`, 2 × 3 rows", LCABA),
         ("MuJoCo `mj_step`, free", MUJOCO_FREE), ("MuJoCo `mj_step`, 2 frictional contacts", MUJOCO_CONTACTS),
     )  # fmt: skip
-    sizes = bench()["right_hand_side"]
+    sizes, times = by_links()
     return lines(
-        ["", *(f"{row['links']}{' links' if k == 0 else ''}" for k, row in enumerate(sizes))],
-        [[label, *(microseconds(row["median_us"].get(name)) for row in sizes)] for label, name in contenders],
+        heads_of(sizes), [[label, *(microseconds(times.get((n, name))) for n in sizes)] for label, name in contenders]
     )
+
+
+def by_links() -> tuple[list[int], dict[tuple[int, str], float]]:
+    """Numbers of links, and microseconds of a right-hand side by them and program."""
+    times = {(row["links"], row["program"]): row["median_us"] for row in bench()["right_hand_side"]}
+    return list(dict.fromkeys(n for n, _ in times)), times
+
+
+def heads_of(sizes: Sequence[int]) -> list[str]:
+    return ["", f"{sizes[0]} links", *map(str, sizes[1:])]
 
 
 def microseconds(value: float | None) -> str:
@@ -411,26 +403,21 @@ def ratios() -> str:
         ("Pinocchio ABA", ABA), ("Pinocchio `constraintDynamics`", CONSTRAINT_DYNAMICS), ("Pinocchio `lcaba`", LCABA),
         ("MuJoCo, free", MUJOCO_FREE), ("MuJoCo, contacts", MUJOCO_CONTACTS),
     )  # fmt: skip
-    rows = {one["peer"]: one["time_by_links"] for one in bench()["ratios"] if "time_by_links" in one}
-    sizes = [str(row["links"]) for row in bench()["right_hand_side"]]
-    heads = ["", *(f"{n}{' links' if k == 0 else ''}" for k, n in enumerate(sizes))]
-    cells = [
-        [
-            label,
-            *(
-                NONE if rows[peer][n] is None else f"{rows[peer][n]:.{1 if rows[peer][n] < 9.95 else 0}f}"
-                for n in sizes
-            ),
-        ]
-        for label, peer in labels
-    ]
-    return lines(heads, cells)
+    sizes, times = by_links()
+
+    def ratio(n: int, peer: str) -> str:
+        if (n, peer) not in times:
+            return NONE
+        value = times[n, peer] / times[n, SAME_TASK[peer]]
+        return f"{value:.{1 if value < 9.95 else 0}f}"
+
+    return lines(heads_of(sizes), [[label, *(ratio(n, peer) for n in sizes)] for label, peer in labels])
 
 
 def job() -> str:
     programs = (
-        ("dynsim, `rk43`", DYNSIM_RK43), ("dynsim, `radau5`", DYNSIM_RADAU5), ("dynsim, RK4 1 ms", DYNSIM_RK4),
-        ("MuJoCo, Euler 1 ms", MUJOCO_EULER), ("MuJoCo, implicitfast 1 ms", MUJOCO_IMPLICIT),
+        ("dynsim, `radau5`", DYNSIM_RADAU5), ("MuJoCo, Euler 1 ms", MUJOCO_EULER),
+        ("MuJoCo, implicitfast 1 ms", MUJOCO_IMPLICIT),
     )  # fmt: skip
     rows: list[list[str]] = []
     for case in dict.fromkeys(one["case"] for one in bench()["job"]):
@@ -492,7 +479,7 @@ TABLES: dict[str, Callable[[], str]] = {
     one.__name__: one
     for one in (
         elbows_in_short, elbows, glued_and_real, overturning_holds, overturning_drives, assumptions, ledger,
-        against_rk43, time_stepping, endings, right_hand_side, ratios, job, precision, sweeps, comparison, faults,
+        time_stepping, endings, right_hand_side, ratios, job, precision, sweeps, comparison, faults,
     )
 }  # fmt: skip
 
@@ -573,7 +560,7 @@ NUMBERS: dict[str, Callable[[], str]] = {
     "job_held_ratio_implicit": lambda: against_mujoco(HELD_CASE, MUJOCO_IMPLICIT),
     "job_free_ratio": lambda: against_mujoco("free arm", MUJOCO_EULER),
     "job_free_ratio_implicit": lambda: against_mujoco("free arm", MUJOCO_IMPLICIT),
-    "rhs_us": lambda: number(bench()["right_hand_side"][0]["median_us"][DYNSIM_CONTACTS], 2),
+    "rhs_us": lambda: number(by_links()[1][10, DYNSIM_CONTACTS], 2),
     "cold_wall_s": lambda: number(start_up()["radau5"]["cold"]["wall_s"], 2),
     "cold_cpu_s": lambda: number(start_up()["radau5"]["cold"]["cpu_s"], 2),
     "warm_wall_s": lambda: number(start_up()["radau5"]["warm"]["wall_s"], 2),

@@ -84,12 +84,16 @@ def dae() -> str:
     """The wedge as COLLADA: in centimetres, turned and moved by its node, with normals between the indices."""
     numbers = " ".join(f"{x:g}" for x in (100.0 * (CORNERS @ np.diag([-1.0, -1.0, 1.0]) - [0.0, 0.0, 0.05])).ravel())
     index = " ".join(f"{k} 0" for face in FACES for k in face)
+    parts = "".join(f'<param name="{name}" type="float"/>' for name in "XYZ")
+    accessor = (
+        '<technique_common><accessor source="#{}" count="{}" stride="3">' + parts + "</accessor></technique_common>"
+    )
     return f"""<?xml version="1.0"?>
 <COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
 <asset><unit name="centimeter" meter="0.01"/><up_axis>Y_UP</up_axis></asset>
 <library_geometries><geometry id="g"><mesh>
-<source id="p"><float_array id="pa" count="12">{numbers}</float_array></source>
-<source id="n"><float_array id="na" count="3">0 0 1</float_array></source>
+<source id="p"><float_array id="pa" count="12">{numbers}</float_array>{accessor.format("pa", 4)}</source>
+<source id="n"><float_array id="na" count="3">0 0 1</float_array>{accessor.format("na", 1)}</source>
 <vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
 <polylist count="4"><input semantic="VERTEX" source="#v" offset="0"/><input semantic="NORMAL" source="#n" offset="1"/>
 <vcount>3 3 3 3</vcount><p>{index}</p></polylist>

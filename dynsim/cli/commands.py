@@ -260,8 +260,8 @@ def bench(
     from dynsim.studies.bench.table import format_table
     from dynsim.system.files import write_json
 
-    with console.status("measuring"):
-        result = run_bench(quick)
+    with console.status("measuring") as status:
+        result = run_bench(quick, status.update)
     for table in format_table(result):
         console.print(table)
     if json_file is not None:

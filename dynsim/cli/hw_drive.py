@@ -91,8 +91,8 @@ def hw_drive(
         from dynsim.hardware.virtual.faults import load_fault_script
         from dynsim.scenario import load_scenario
         from dynsim.system.files import check_writable
-        from dynsim.teleop.driven import Pace
-        from dynsim.teleop.web.follower import Wanted
+        from dynsim.teleop.session import SpeedLimits
+        from dynsim.teleop.web.follower import DriveRequest
         from dynsim.teleop.web.servos import SimulationProcess
 
     if faults and port != VIRTUAL:
@@ -102,10 +102,11 @@ def hw_drive(
     script = load_fault_script(faults, servo_map.ids) if faults else None
     folder = out or new_folder(Path("results", loaded.name))
     check_writable(folder, RUN_FILES)
-    wanted = Wanted(loaded, servo_map, Pace(speed, turn, base_speed), longest, http_port, until_closed, folder)
+    limits = SpeedLimits(speed, turn, base_speed)
+    request = DriveRequest(loaded, servo_map, limits, longest, http_port, until_closed, folder)
     moves = live or port == VIRTUAL
     result: Any = None
-    with SimulationProcess(wanted) as process:
+    with SimulationProcess(request) as process:
         with console.status("loading the kernels; the first time they are compiled, which takes half a minute"):
             ready = process.ready()
         motion = check_drive(
@@ -161,7 +162,7 @@ def hw_drive(
     if done.saved:
         _tell_files(loaded.variant or loaded.name, folder, result, quiet=quiet)
         if not quiet:
-            tell_drive(done.account, done.driven, folder)
+            tell_drive(done.report, done.driven, folder)
     if error is None and not quiet:
         tell_replay(result, "driven", folder / SERVOS, folder / "record.h5")
     if error is not None:

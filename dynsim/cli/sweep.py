@@ -28,7 +28,7 @@ from dynsim.system.terminal import escaped
 
 if TYPE_CHECKING:
     from dynsim.studies.journal import Row
-    from dynsim.studies.plan import Plan
+    from dynsim.studies.sweep_plan import Plan
 
 # Reasons of failed runs that are printed.
 _SHOWN = 5
@@ -95,8 +95,8 @@ def sweep(
         raise ScenarioError("--plot says what is drawn, --no-figures that nothing is: give one of them")
     from dynsim.scenario import read_scenario
     from dynsim.studies.journal import OK
-    from dynsim.studies.plan import Axis, Law, Plan
     from dynsim.studies.sweep import TABLES, has_parquet, run_sweep
+    from dynsim.studies.sweep_plan import Axis, Law, Plan
 
     file = read_scenario(scenario)
     axes, laws = tuple(map(Axis.parse, grid or ())), tuple(map(Law.parse, sample or ()))

@@ -17,7 +17,7 @@ from dynsim.system import interruption
 from dynsim.system.terminal import escaped
 
 if TYPE_CHECKING:
-    from dynsim.teleop.web.session import Account
+    from dynsim.teleop.web.live import DriveReport
 
 VariantOption = Annotated[
     str | None,
@@ -64,39 +64,39 @@ def teleop(
     from dynsim.engine.results import RUN_FILES, save_drive
     from dynsim.scenario import load_scenario
     from dynsim.system.files import check_writable
-    from dynsim.teleop.drive import drive
-    from dynsim.teleop.driven import Pace
-    from dynsim.teleop.web.session import Session
+    from dynsim.teleop.begin import begin
+    from dynsim.teleop.session import SpeedLimits
+    from dynsim.teleop.web.live import LiveDrive
 
     loaded = load_scenario(scenario, variant, parsed_overrides(overrides))
     folder = out or new_folder(Path("results", loaded.name))
     check_writable(folder, RUN_FILES)
     with console.status("loading the kernels; the first time they are compiled, which takes half a minute"):
-        driven = drive(loaded, pace=Pace(speed, turn, base_speed), limit=longest)
-    session = Session(driven, loaded.variant or loaded.name)
+        session = begin(loaded, limits=SpeedLimits(speed, turn, base_speed), longest=longest)
+    drive = LiveDrive(session, loaded.variant or loaded.name)
     try:
-        address = session.open(http_port)
+        address = drive.open(http_port)
         tell_address(address, "Ctrl-C ends the drive and saves it", open_=open_)
-        account = session.run(until_closed=until_closed)
+        drive.run(until_closed=until_closed)
     except KeyboardInterrupt:
         # Before the first tick.
         interruption.answered()
-        account = session.account
-        account.ended = "interrupted"
+        drive.report.ended = "interrupted"
     finally:
-        session.close()
-    if driven.ticks == 0:
-        console.print(f"The drive is over ({escaped(account.ended)}) before it began; nothing is saved", soft_wrap=True)
+        drive.close()
+    report = drive.report
+    if session.ticks == 0:
+        console.print(f"The drive is over ({escaped(report.ended)}) before it began; nothing is saved", soft_wrap=True)
         return
-    record = driven.record() if account.stop is None or account.stop.record is None else account.stop.record
+    record = session.record() if report.stop is None or report.stop.record is None else report.stop.record
     save_drive(record, folder)
     interruption.heed()
     if not quiet:
-        tell_drive(account, driven.ticks * driven.period, folder)
+        tell_drive(report, session.ticks * session.period, folder)
     write_view({loaded.variant or loaded.name: record}, folder, quiet)
-    if account.stop is not None:
+    if report.stop is not None:
         errors.print(f"what was simulated until then is in {escaped(folder)}, marked incomplete")
-        raise account.stop
+        raise report.stop
 
 
 def require_websockets() -> None:
@@ -120,12 +120,12 @@ def new_folder(place: Path) -> Path:
     return next(folder for k in itertools.count(1) if not (folder := place / f"drive_{k}").exists())
 
 
-def tell_drive(account: Account, driven: float, folder: Path) -> None:
+def tell_drive(report: DriveReport, driven: float, folder: Path) -> None:
     """How a drive of so many seconds went, where it is, and how it is repeated."""
-    late = sorted(account.late)
+    late = sorted(report.late)
     middle, most = 1e3 * late[len(late) // 2], 1e3 * late[-1 - len(late) // 100]
-    text = f"Driven for {driven:.1f} s ({escaped(account.ended)}); ticks late by {middle:.1f} ms, 99 % by {most:.1f} ms"
-    behind = f"; {account.lost:.1f} s behind real time" if account.lost > LATE else ""
+    text = f"Driven for {driven:.1f} s ({escaped(report.ended)}); ticks late by {middle:.1f} ms, 99 % by {most:.1f} ms"
+    behind = f"; {report.lost:.1f} s behind real time" if report.lost > LATE else ""
     console.print(text + behind, highlight=False, soft_wrap=True)
     console.print(f"Written to {escaped(folder)}", highlight=False, soft_wrap=True)
     script = escaped(folder / "scenario.yaml")

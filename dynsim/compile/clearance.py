@@ -11,7 +11,7 @@ import numpy as np
 
 from dynsim.model.description import Array, Link, Quadric, Robot
 from dynsim.model.surfaces import Surface
-from dynsim.system.reuse import Reuse
+from dynsim.system.memo import recall
 
 # Depth beyond its radius that does not count as passing below a surface [m]: what a contact may be off at the start.
 SLACK = 1e-6
@@ -137,25 +137,23 @@ def is_plane(surface: Surface) -> TypeGuard[Quadric]:
     return isinstance(surface, Quadric) and not surface.Q.any()
 
 
-def sinking(robot: Robot, surfaces: Mapping[str, Surface], q: Array, reuse: Reuse | None = None) -> list[Sinking]:
+def sinking(robot: Robot, surfaces: Mapping[str, Surface], q: Array) -> list[Sinking]:
     """Bodies whose axes lie below a surface by more than their radius, at samples q, (T, nq).
 
-    The axes of a body are those of :func:`axis_ends`. A body of unknown radius has radius zero. With ``reuse`` a run
-    that keeps close to one that stayed clear is not looked at sample by sample, see :class:`_Clear`.
+    The axes of a body are those of :func:`axis_ends`. A body of unknown radius has radius zero. A run that
+    keeps close to another that stayed clear is not looked at sample by sample, see :class:`_Clear`.
     """
     found: list[Sinking] = []
     if not surfaces or not len(q):
         return found
-    clear = None
-    if reuse is not None:
-        # Of the same robot first, which is quickly told.
-        clear = reuse.of(
-            "clear robot",
-            lambda: reuse.of("clear", _Clear, [link.geometry for link in robot.links], robot.hand, len(q), surfaces),
-            *(robot, len(q), surfaces),
-        )
-        if clear.holds(q):
-            return found
+    # Of the same robot first, which is quickly told.
+    clear = recall(
+        "clear robot",
+        lambda: recall("clear", _Clear, [link.geometry for link in robot.links], robot.hand, len(q), surfaces),
+        *(robot, len(q), surfaces),
+    )
+    if clear.holds(q):
+        return found
     least = np.inf
     # Of a run that diverged the last samples may be beyond what squares of floats can hold.
     with np.errstate(over="ignore", invalid="ignore"):
@@ -168,7 +166,7 @@ def sinking(robot: Robot, surfaces: Mapping[str, Surface], q: Array, reuse: Reus
             beyond = np.flatnonzero(depth > link.radius + SLACK)
             if beyond.size:
                 found.append(Sinking(link.name, name, float(depth.max()), link.radius, int(beyond[0])))
-    if clear is not None and least > 0.0:
+    if least > 0.0:
         clear.remember(robot, surfaces, q, least)
     return found
 

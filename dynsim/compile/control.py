@@ -9,7 +9,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dynsim.compile.references.operated import Operated
+from dynsim.compile.references.teleop import TeleopOptions
 from dynsim.compile.rolling import coordinates, rolled
 from dynsim.compile.splines import quintic_coefficients
 from dynsim.dynamics import tables as ka
@@ -19,7 +19,7 @@ from dynsim.jit.kernel import integers, reals
 from dynsim.model.base_pose import base_pose, base_row
 from dynsim.model.description import Robot
 from dynsim.model.drives import TorqueSource
-from dynsim.system.reuse import Reuse
+from dynsim.system.memo import recall
 
 # Samples in a segment of the reference splines, and segments that are looked at together.
 _PER_SEGMENT = 4
@@ -62,7 +62,7 @@ class JointControl:
 
     Only DC motors take the gains; ``k_p`` of a servo says whether it follows its position. References of a torque
     source are its torques [N m]. ``sample_time`` is the period [s] at which commands are taken, to be held in between;
-    None: they follow the state continuously. Where there is ``operated``, an operator rewrites references on the way.
+    None: they follow the state continuously. Where there is ``teleop``, an operator rewrites references on the way.
     """
 
     k_p: NDArray[np.float64]
@@ -70,7 +70,7 @@ class JointControl:
     reference: ReferenceArrays
     path: HandPath | None
     sample_time: float | None = None
-    operated: Operated | None = None
+    teleop: TeleopOptions | None = None
 
     @classmethod
     def absent(cls, robot: Robot) -> JointControl:
@@ -89,7 +89,6 @@ class JointControl:
         path: HandPath | None = None,
         sample_time: float | None = None,
         voltages: ArrayLike | None = None,
-        reuse: Reuse | None = None,
     ) -> JointControl:
         """The voltage PD u = k_p (q_d − q) + k_d (v_d − v) on joint positions that are given as samples or functions.
 
@@ -104,7 +103,6 @@ class JointControl:
         path : what the hand is to follow, for tracking errors in summary and figures
         sample_time : period of a zero-order hold of the voltages [s]; None: continuous
         voltages : (T, na), planned ones that are added to those of DC motors [V]; None: none
-        reuse : what other runs have computed
 
         Raises
         ------
@@ -138,9 +136,7 @@ class JointControl:
         coefficients = np.zeros((len(grid) - 1, 0, 6))
         if columns:
             samples = np.stack(columns, axis=1)
-            coefficients = (reuse or Reuse()).of(
-                "splines", lambda: quintic_coefficients(spacing, samples), spacing, samples
-            )
+            coefficients = recall("splines", lambda: quintic_coefficients(spacing, samples), spacing, samples)
         reference = _reference(held, spline, (float(grid[0]), spacing), coefficients)
         if voltages is not None:
             planned = np.asarray(voltages, dtype=np.float64)
@@ -232,14 +228,14 @@ class JointControl:
         q[:, k : k + 4] = coordinates(robot.base, robot.initial[k + 2 : k + 4], wheels, spacing, t - begin)
         return base_pose(robot, q)
 
-    def target(self, t: NDArray[np.float64], reuse: Reuse | None = None) -> NDArray[np.float64] | None:
+    def target(self, t: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Target of the hand at times t, (T, 3) [m]; None without a path."""
-        return None if self.path is None else targets_on(self.path, t, reuse or Reuse())
+        return None if self.path is None else targets_on(self.path, t)
 
 
-def targets_on(path: HandPath, t: NDArray[np.float64], reuse: Reuse) -> NDArray[np.float64]:
+def targets_on(path: HandPath, t: NDArray[np.float64]) -> NDArray[np.float64]:
     """Positions on a path at times t [s], (T,) → (T, 3) [m], unless they are known."""
-    return reuse.of("targets", lambda: path.position(t), path, t)
+    return recall("targets", lambda: path.position(t), path, t)
 
 
 def _gains(name: str, value: ArrayLike, motors: int) -> NDArray[np.float64]:

@@ -17,7 +17,6 @@ from dynsim.errors import ModelError
 from dynsim.model.description import Contact, Robot
 from dynsim.model.drives import Drive
 from dynsim.model.surfaces import Box, HeightField, Quadric
-from dynsim.system.reuse import Reuse
 
 if TYPE_CHECKING:
     from dynsim.snake.description import SnakeDescription, TaskSpaceController
@@ -34,7 +33,6 @@ class BuildContext:
     joint : the joint of a motor, "" for the other families
     contacts : contacts of the scenario by name; declared : those that are points of it, not other candidates
     progress : to be called with the time [s] that references have come to, when they take long; None: nobody listens
-    reuse : what other runs have computed from the same bits
     """
 
     duration: float
@@ -43,7 +41,6 @@ class BuildContext:
     progress: Callable[[float], None] | None = None
     contacts: Mapping[str, Contact] = field(default_factory=dict)
     declared: Sequence[str] = ()
-    reuse: Reuse = field(default_factory=Reuse)
 
     def at_joint(self, joint: str) -> BuildContext:
         """The context of a motor on that joint."""

@@ -227,7 +227,7 @@ def _fields(schema: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
 
 
 def _models(annotation: Any) -> list[type[BaseModel]]:
-    """Configurations within an annotation; a choice by ``type`` (``families.Choice``) has them in ``models``."""
+    """Configurations within an annotation; a choice by ``type`` (``families.MemberField``) has them in ``models``."""
     if isinstance(annotation, type) and not isinstance(annotation, types.GenericAlias):
         return [annotation] if issubclass(annotation, BaseModel) else []
     if callable(choices := getattr(annotation, "models", None)):

@@ -17,7 +17,7 @@ from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, Simu
 from dynsim.record import Record
 from dynsim.scenario import Scenario, require_scenario
 from dynsim.system import interruption
-from dynsim.system.reuse import Reuse
+from dynsim.system.memo import remembering
 
 # A library says nothing unless it is asked to. Here, not in dynsim/__init__.py: everything that logs imports this.
 logging.getLogger("dynsim").addHandler(logging.NullHandler())
@@ -63,17 +63,14 @@ class Start:
     warnings: Sequence[str] = ()
 
 
-def simulate(
-    scenario: Scenario, progress: Progress | None = None, *, pictured: bool = True, reuse: Reuse | None = None
-) -> Record:
-    """Simulate a scenario.
+def simulate(scenario: Scenario, progress: Progress | None = None, *, pictured: bool = True) -> Record:
+    """Simulate a scenario; within :func:`dynsim.system.memo.remembering` it takes over what others have computed.
 
     Parameters
     ----------
     scenario : Scenario
     progress : called with time [s] and stage, see :class:`Progress`
     pictured : with scene, poses of bodies and provenance, which only figures, viewers and files need
-    reuse : what other runs have computed, for this one to take over; its numbers are the same with and without
 
     Returns
     -------
@@ -89,11 +86,11 @@ def simulate(
     ModelError, UnreachableReference
         The scenario describes no physics, or a path that the hand cannot follow.
     """
-    with named(scenario):
+    with named(scenario), remembering():
         interruption.heed()
         interruption.check()
         try:
-            record: Record = _module(scenario).simulate(scenario, progress, pictured=pictured, reuse=reuse)
+            record: Record = _module(scenario).simulate(scenario, progress, pictured=pictured)
         except SimulationStopped as stop:
             note_warnings(scenario, stop.record)
             raise
@@ -120,7 +117,7 @@ def check(scenario: Scenario, started: Callable[[Start], None] | None = None) ->
     ------
     ModelError, UnreachableReference, ScenarioError
     """
-    with named(scenario):
+    with named(scenario), remembering():
         start: Start = _module(scenario).check(scenario, started or (lambda start: None))
         return start
 

@@ -1,7 +1,7 @@
 """Compiled code in a thread of its own, while the thread that has called for it listens.
 
 Compiled code neither hears signals nor sees a clock, and one step of it may take a minute where a contact problem has
-no solution. So it runs without the interpreter's lock in a helper thread. The caller's thread wakes for a signal, and
+no solution. So it runs without the interpreter's lock in another thread. The caller's thread wakes for a signal, and
 looks ten times a second at whatever else may want the run to end. Then the piece is asked to end at its next step.
 Where it does not in time it is left alone: what was recorded until then is in its arrays. So is the compiler.
 """
@@ -9,13 +9,11 @@ Where it does not in time it is left alone: what was recorded until then is in i
 from __future__ import annotations
 
 import logging
-import os
 import threading
 import time as clock
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from queue import Empty, SimpleQueue
 from typing import Any
 
 import numpy as np
@@ -35,58 +33,10 @@ LOOK_S, PATIENCE_S = 0.1, 0.5
 STUCK_S = 600.0
 
 
-class _Helper:
-    """A thread that does what it is given, one thing after the other."""
-
-    def __init__(self) -> None:
-        # Of the process that it is a thread of: a fork has none.
-        self.pid = os.getpid()
-        self.todo: SimpleQueue[tuple[object, Callable[[], None]] | None] = SimpleQueue()
-        self.done: SimpleQueue[tuple[object, BaseException | None]] = SimpleQueue()
-        threading.Thread(target=_serve, args=(self.todo, self.done), name="compiled code", daemon=True).start()
-
-    def __del__(self) -> None:
-        self.todo.put(None)
-
-    def wait(self, task: object, timeout: float) -> tuple[bool, BaseException | None]:
-        """Whether a task is done by then, and what it has raised."""
-        try:
-            while True:
-                done, error = self.done.get(timeout=timeout)
-                # Others are of callers who were interrupted themselves.
-                if done is task:
-                    return True, error
-        except Empty:
-            return False, None
-
-
-def _serve(todo: SimpleQueue[Any], done: SimpleQueue[Any]) -> None:
-    while (item := todo.get()) is not None:
-        task, work = item
-        error: BaseException | None = None
-        try:
-            work()
-        except BaseException as raised:
-            error = raised
-        done.put((task, error))
-        # What it has worked on is not kept until the next task comes.
-        del item, work, error
-
-
-_of_this_thread = threading.local()
-
-
-def _helper() -> _Helper:
-    helper: _Helper | None = getattr(_of_this_thread, "helper", None)
-    if helper is None or helper.pid != os.getpid():
-        helper = _of_this_thread.helper = _Helper()
-    return helper
-
-
 def attend(
     work: Callable[[], None], ask: Callable[[], None], look: Callable[[], None]
 ) -> tuple[bool, BaseException | None]:
-    """Do ``work`` in the helper thread of this one, and listen meanwhile.
+    """Do ``work`` in a thread of its own, and listen meanwhile.
 
     Parameters
     ----------
@@ -104,28 +54,32 @@ def attend(
     Exception
         That of the work.
     """
-    helper, task = _helper(), object()
-    ended, error, wish = False, None, None
+    done, failure = threading.Event(), list[BaseException]()
+
+    def run() -> None:
+        try:
+            work()
+        except BaseException as raised:
+            failure.append(raised)
+        done.set()
+
+    ended, request = False, None
     try:
         try:
-            helper.todo.put((task, work))
-            while not ended:
-                ended, error = helper.wait(task, LOOK_S)
-                if not ended:
-                    look()
+            threading.Thread(target=run, name="compiled code", daemon=True).start()
+            while not (ended := done.wait(LOOK_S)):
+                look()
         except BaseException as raised:
-            wish = raised
+            request = raised
             ask()
-            if not ended:
-                ended, error = helper.wait(task, PATIENCE_S)
+            ended = done.wait(PATIENCE_S)
     finally:
         # Also after a second signal.
         if not ended:
-            _of_this_thread.helper = None
             interruption.leave()
-    if error is not None:
-        raise error
-    return ended, wish
+    if ended and failure:
+        raise failure[0]
+    return ended, request
 
 
 class OutOfTime(Exception):

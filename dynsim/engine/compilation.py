@@ -1,7 +1,7 @@
 """What is said while kernels are compiled: which, why anew, and how long it takes.
 
-One line in the log. On a terminal, where nobody else shows it, a line on stderr that counts the seconds. Commands show
-it in their bars: also what their worker processes compile, of which a file beside the kernels says so.
+One line in the log. On a terminal, where nobody else shows it, a line on stderr as it begins and as it ends. Commands
+show it in their bars: also what their worker processes compile, of which a file beside the kernels says so.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import sys
 import threading
 import time as clock
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -66,27 +66,27 @@ def kernels_logged(log: logging.Logger, kind: str = "", loads: bool = True) -> I
     kind : of what system they are
     loads : also say how long it took when none had to be compiled
     """
-    started, begun = clock.perf_counter(), list[Callable[[], None]]()
+    started, compiling, marks = clock.perf_counter(), False, ExitStack()
+    on_terminal = _on_terminal and sys.stderr is not None and sys.stderr.isatty()
 
     def begin() -> None:
-        compilation = _beginning(kind)
+        nonlocal compiling
+        compiling, compilation = True, _beginning(kind)
         log.info(compilation.text)
-        begun.append(_marked(compilation))
-        if _on_terminal and sys.stderr is not None and sys.stderr.isatty():
-            begun.append(_counted(compilation))
+        marks.enter_context(_marked(compilation))
+        if on_terminal:
+            print(f"dynsim: {compilation.text}", file=sys.stderr, flush=True)
 
-    try:
-        with told_of_compilation(begin):
-            yield
-    finally:
-        taken = clock.perf_counter() - started
-        for end in reversed(begun):
-            end()
-    if begun:
+    with marks, told_of_compilation(begin):
+        yield
+    taken = clock.perf_counter() - started
+    if compiling:
         with suppress(OSError):
             (cache_folder().parent / LAST).write_text(f"{taken:.0f}")
-    if begun or loads:
-        log.info("%s the kernels in %.1f s", "compiled" if begun else "loaded", taken)
+        if on_terminal:
+            print(f"dynsim: compiled the kernels in {taken:.0f} s", file=sys.stderr, flush=True)
+    if compiling or loads:
+        log.info("%s the kernels in %.1f s", "compiled" if compiling else "loaded", taken)
 
 
 def _beginning(kind: str) -> Compilation:
@@ -105,17 +105,17 @@ def _beginning(kind: str) -> Compilation:
     return Compilation(f"compiling the kernels{what}, {why}: {last}, later runs load them", clock.time(), expected)
 
 
-def _marked(compilation: Compilation) -> Callable[[], None]:
-    """Write what is compiled where displays look for it; what is returned takes it away."""
+@contextmanager
+def _marked(compilation: Compilation) -> Iterator[None]:
+    """What is compiled is written where displays look for it, within."""
     path = cache_folder() / f"{os.getpid()}{MARK}"
     with suppress(OSError):
         path.write_text(json.dumps([os.getpgrp(), compilation.text, compilation.since, compilation.expected]))
-
-    def end() -> None:
+    try:
+        yield
+    finally:
         with suppress(OSError):
             path.unlink()
-
-    return end
 
 
 def under_way() -> Compilation | None:
@@ -128,29 +128,6 @@ def under_way() -> Compilation | None:
             if group == os.getpgrp():
                 found.append(Compilation(str(text), float(since), expected))
     return min(found, key=lambda one: one.since, default=None)
-
-
-def _counted(compilation: Compilation) -> Callable[[], None]:
-    """Count the seconds on stderr, a terminal; what is returned says how many they were."""
-    over = threading.Event()
-
-    def count() -> None:
-        while True:
-            print(
-                f"\r\x1b[Kdynsim: {compilation.text} ({compilation.elapsed:.0f} s)", end="", file=sys.stderr, flush=True
-            )
-            if over.wait(1.0):
-                break
-        print(f"\r\x1b[Kdynsim: compiled the kernels in {compilation.elapsed:.0f} s", file=sys.stderr, flush=True)
-
-    thread = threading.Thread(target=count, name="compiling", daemon=True)
-    thread.start()
-
-    def end() -> None:
-        over.set()
-        thread.join()
-
-    return end
 
 
 @contextmanager

@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import logging
+import math
 import time as clock
 from functools import partial
 
 from dynsim.engine import SIMULATION, Progress, attended
-from dynsim.engine.outcome import raise_stopped
+from dynsim.engine.outcome import interrupted, raise_stopped
 from dynsim.engine.prepare import Prepared, prepare
 from dynsim.engine.recording import make_record
 from dynsim.engine.start import check
 from dynsim.engine.stepped import event_name, own_guards, take_log
 from dynsim.engine.stopping import last_state, stopped
-from dynsim.errors import SimulationInterrupted, SimulationStopped
+from dynsim.errors import SimulationStopped
 from dynsim.integrators import run as ki
 from dynsim.record import Event, Record
 from dynsim.scenario import Scenario
 from dynsim.system import interruption
-from dynsim.system.reuse import Reuse
+from dynsim.system.memo import recall
 
 __all__ = ["Prepared", "check", "prepare", "simulate"]
 
@@ -26,20 +27,18 @@ log = logging.getLogger(__name__)
 
 # More steps than any run takes.
 _ALL = 1 << 62
+# Ticks of an operator between two looks at Ctrl-C and the progress bar.
+TICKS = 10
 
 
-def simulate(
-    scenario: Scenario, progress: Progress | None = None, *, pictured: bool = True, reuse: Reuse | None = None
-) -> Record:
+def simulate(scenario: Scenario, progress: Progress | None = None, *, pictured: bool = True) -> Record:
     """See :func:`dynsim.engine.simulate`."""
-    prepared = prepare(scenario, progress, reuse=reuse)
-    if prepared.control.operated is not None:
-        from dynsim.engine import operated
-
-        return operated.simulate(scenario, progress, pictured=pictured)
+    prepared = prepare(scenario, progress)
+    if prepared.control.teleop is not None:
+        return _teleoperated(scenario, progress, pictured)
     size = prepared.model.n, len(prepared.contacts), len(prepared.stops)
     # Loading or compiling the kernels is no integration time.
-    prepared.reuse.of("kernels", partial(attended.load, prepared), prepared.choice.method, *size)
+    recall("kernels", partial(attended.load, prepared), prepared.choice.method, *size)
     watch, run = attended.WallWatch(scenario.integrator.wall_limit_s), prepared.run
 
     def look() -> None:
@@ -49,7 +48,8 @@ def simulate(
 
     own = own_guards(prepared)
     happened: list[Event] = []
-    started, interrupted = clock.perf_counter(), False
+    stop: SimulationStopped | None = None
+    started = clock.perf_counter()
     try:
         look()
         log.info("%s: integrating %g s by %s", scenario.title, scenario.duration_s, prepared.choice.method)
@@ -64,19 +64,44 @@ def simulate(
     except KeyboardInterrupt:
         interruption.keep()
         interruption.answered()
-        interrupted = True
+        stop = interrupted(scenario, float(run.clock[ki.TIME]), last_state(prepared, run.y))
     wall = clock.perf_counter() - started
     log.info("%s: integrated %g s in %d steps, %.3f s", scenario.title, run.clock[ki.TIME], run.count[ki.STEPS], wall)
     record = make_record(scenario, prepared, wall, happened=happened, pictured=pictured)
-    reached = float(run.clock[ki.TIME])
-    if interrupted or run.count[ki.STATUS] != ki.FINISHED:
-        if interrupted:
-            stop: SimulationStopped = SimulationInterrupted(
-                f"interrupted at t = {reached:.3f} s of {scenario.duration_s:g} s",
-                time=reached,
-                state=last_state(prepared, run.y),
-            )
-        else:
-            stop = stopped(scenario, prepared)
+    if stop is None and run.count[ki.STATUS] != ki.FINISHED:
+        stop = stopped(scenario, prepared)
+    if stop is not None:
         raise_stopped(stop, record)
+    return record
+
+
+def _teleoperated(scenario: Scenario, progress: Progress | None, pictured: bool) -> Record:
+    """The script of an operator, by the public stepper: its record is that of the session, bit for bit."""
+    from dynsim.engine.simulation import Simulation
+
+    # Without an end, as a session: a step that ends at a tick and one at the end of a run need not be the same.
+    simulation = Simulation(scenario, duration=math.inf)
+    assert simulation.operator is not None
+    rate, k = simulation.operator.options.rate, 0
+    stop: SimulationStopped | None = None
+    try:
+        while simulation.time < scenario.duration_s:
+            k += TICKS
+            # A signal within a callback would leave references half written.
+            interruption.keep()
+            simulation.advance(min(k / rate, scenario.duration_s))
+            if progress is not None:
+                progress(simulation.time, SIMULATION)
+            interruption.heed()
+            interruption.check()
+    except SimulationStopped as ended:
+        stop = ended
+    except KeyboardInterrupt:
+        interruption.answered()
+        stop = interrupted(scenario, simulation.time, {})
+    interruption.keep()
+    record = simulation.record(scenario, pictured=pictured)
+    if stop is not None:
+        raise_stopped(stop, record)
+    record.complete = True
     return record

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from dynsim.compile.model import Model
 from dynsim.compile.reaching import path_arrays
-from dynsim.compile.references.operated import Operated
+from dynsim.compile.references.teleop import TeleopOptions
 from dynsim.dynamics import inverse_kinematics as ki
 from dynsim.dynamics.tables import workspace
 from dynsim.jit.kernel import reals
@@ -40,19 +40,20 @@ HALVINGS = 6
 """Of λ; each costs a way to rest."""
 ROUNDING = 1e-9
 """Of joint rates and accelerations, in parts of their limits."""
+_STATE = ("target", "velocity", "joints", "rates", "hindrance", "_path")
 
 
 @dataclass(frozen=True)
-class Way:
+class StoppingPath:
     """A way to rest: velocities, targets of the hand and joints of each tick, (T, 3), (T, 3) and (T, c)."""
 
     velocity: Array
     targets: Array
     joints: Array
 
-    def rest(self) -> Way:
+    def rest(self) -> StoppingPath:
         """What is left of it after a tick."""
-        return Way(self.velocity[1:], self.targets[1:], self.joints[1:])
+        return StoppingPath(self.velocity[1:], self.targets[1:], self.joints[1:])
 
 
 class HandGovernor:
@@ -65,28 +66,27 @@ class HandGovernor:
     hindrance : why the hand is slower than it was asked to be; empty where it is not
     """
 
-    def __init__(self, model: Model, operated: Operated, target: Array, axes: Array) -> None:
-        self._operated, self._model, self._axes = operated, model, axes
-        self._arrays = path_arrays(model, operated.joints, operated.braces)
+    def __init__(self, model: Model, options: TeleopOptions, target: Array, axes: Array) -> None:
+        self._options, self._model, self._axes = options, model, axes
+        self._arrays = path_arrays(model, options.joints, options.braces)
         self._workspace = workspace(model.n, 0, 0)
         self._q = reals(model.robot.initial)
         links = {link.joint: link for link in model.robot.links}
-        self._low = np.array([links[joint].lower for joint in operated.joints])
-        self._high = np.array([links[joint].upper for joint in operated.joints])
+        self._low = np.array([links[joint].lower for joint in options.joints])
+        self._high = np.array([links[joint].upper for joint in options.joints])
         self.target, self.velocity = target.copy(), np.zeros(3)
         self.joints = self._q[self._arrays.place].copy()
         self.rates, self.hindrance = np.zeros(len(self.joints)), ""
-        self._way = Way(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, len(self.joints))))
+        self._path = StoppingPath(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, len(self.joints))))
 
     def state(self) -> dict[str, Any]:
-        """What the future depends on."""
-        kept = {name: getattr(self, name).copy() for name in ("target", "velocity", "joints", "rates")}
-        return {**kept, "hindrance": self.hindrance, "_way": self._way}
+        """What the future depends on: values that are replaced, and never written to."""
+        return {name: getattr(self, name) for name in _STATE}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go back to a state of this governor."""
         for name, value in state.items():
-            setattr(self, name, value.copy() if isinstance(value, np.ndarray) else value)
+            setattr(self, name, value)
 
     def go(self, wish: Array) -> None:
         """A tick towards a velocity (3,) [m/s] that differs from the last by no more than a h."""
@@ -94,21 +94,21 @@ class HandGovernor:
         if not (wish.any() or self.velocity.any()):
             self.rates = np.zeros_like(self.rates)
             return
-        slower = self._way.velocity[0] if len(self._way.velocity) else np.zeros(3)
-        found, why = self._way_to_rest(wish)
+        slower = self._path.velocity[0] if len(self._path.velocity) else np.zeros(3)
+        found, why = self._path_to_rest(wish)
         if found is None:
             self.hindrance = why
             found = self._bisected(slower, wish)
-        self._take(self._way if found is None else found)
+        self._take(self._path if found is None else found)
 
-    def _bisected(self, slower: Array, wish: Array) -> Way | None:
+    def _bisected(self, slower: Array, wish: Array) -> StoppingPath | None:
         """The way from the fastest admissible velocity between those two; None where it is the slower one."""
         low, high, best = 0.0, 1.0, None
-        at_rest, least = not self.velocity.any(), self._operated.hand_acceleration / self._operated.rate
+        at_rest, least = not self.velocity.any(), self._options.hand_acceleration / self._options.rate
         for _ in range(HALVINGS):
             part = 0.5 * (low + high)
             velocity = slower + part * (wish - slower)
-            found, _ = self._way_to_rest(velocity)
+            found, _ = self._path_to_rest(velocity)
             creeps = at_rest or float(np.linalg.norm(velocity)) < least
             if found is None or (creeps and not self._gets_easier(velocity)):
                 high = part
@@ -127,44 +127,44 @@ class HandGovernor:
         first, second = np.abs(np.diff(np.vstack([self.joints, joints]), axis=0)).max(axis=1)
         return bool(second < first)
 
-    def _take(self, way: Way) -> None:
+    def _take(self, path: StoppingPath) -> None:
         """The first tick of a way, or rest where none is left."""
-        if not len(way.velocity):
+        if not len(path.velocity):
             self.velocity, self.rates = np.zeros(3), np.zeros_like(self.rates)
             return
-        self.rates = (way.joints[0] - self.joints) * self._operated.rate
-        self.velocity, self.target, self.joints = way.velocity[0].copy(), way.targets[0].copy(), way.joints[0].copy()
-        self._way = way.rest()
+        self.rates = (path.joints[0] - self.joints) * self._options.rate
+        self.velocity, self.target, self.joints = path.velocity[0].copy(), path.targets[0].copy(), path.joints[0].copy()
+        self._path = path.rest()
 
-    def _way_to_rest(self, velocity: Array) -> tuple[Way | None, str]:
+    def _path_to_rest(self, velocity: Array) -> tuple[StoppingPath | None, str]:
         """The way to rest that begins with a velocity, or None and what is against it."""
-        operated = self._operated
-        speed, lost = float(np.linalg.norm(velocity)), operated.hand_acceleration / operated.rate
+        options = self._options
+        speed, lost = float(np.linalg.norm(velocity)), options.hand_acceleration / options.rate
         if speed == 0.0:
-            return Way(np.zeros((1, 3)), self.target[None].copy(), self.joints[None].copy()), ""
+            return StoppingPath(np.zeros((1, 3)), self.target[None].copy(), self.joints[None].copy()), ""
         parts = np.maximum(1.0 - lost / speed * np.arange(max(1, math.ceil(speed / lost - ROUNDING))), 0.0)
         velocities = parts[:, None] * velocity
         joints, targets = self._followed(velocities)
         if joints is None:
             return None, "out of reach"
-        rates = np.diff(np.vstack([self.joints, joints]), axis=0) * operated.rate
-        changes = np.diff(np.vstack([self.rates, rates, np.zeros_like(self.rates)]), axis=0) * operated.rate
+        rates = np.diff(np.vstack([self.joints, joints]), axis=0) * options.rate
+        changes = np.diff(np.vstack([self.rates, rates, np.zeros_like(self.rates)]), axis=0) * options.rate
         why = (
             self._first((joints < self._low) | (joints > self._high), "is at its limit")
-            or self._first(np.abs(rates) > operated.rate_limit * (1.0 + ROUNDING), "would be too fast")
-            or self._first(np.abs(changes) > operated.acceleration_limit * (1.0 + ROUNDING), "would speed up too fast")
+            or self._first(np.abs(rates) > options.rate_limit * (1.0 + ROUNDING), "would be too fast")
+            or self._first(np.abs(changes) > options.acceleration_limit * (1.0 + ROUNDING), "would speed up too fast")
         )
-        return (None, why) if why else (Way(velocities, targets, joints), "")
+        return (None, why) if why else (StoppingPath(velocities, targets, joints), "")
 
     def _first(self, broken: NDArray[np.bool_], what: str) -> str:
         """The joint that is the first to break a limit."""
         ticks, joints = np.nonzero(broken)
-        return f"{self._operated.joints[joints[0]]} {what}" if len(ticks) else ""
+        return f"{self._options.joints[joints[0]]} {what}" if len(ticks) else ""
 
     def _followed(self, velocities: Array) -> tuple[Array | None, Array]:
         """Joints (T, c) with the hand where velocities (T, 3) take it, None out of reach; and the targets (T, 3)."""
-        operated = self._operated
-        targets = self.target + np.cumsum(velocities @ self._axes.T, axis=0) / operated.rate
+        options = self._options
+        targets = self.target + np.cumsum(velocities @ self._axes.T, axis=0) / options.rate
         q, joints, count = self._q.copy(), np.zeros((len(targets), len(self.joints))), len(targets)
         q[self._arrays.place] = self.joints
         ended, _ = ki.follow_path(
@@ -176,7 +176,7 @@ class HandGovernor:
             0,
             0,
             count,
-            operated.tolerance,
+            options.tolerance,
             q,
             joints,
         )

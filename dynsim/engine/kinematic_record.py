@@ -9,25 +9,24 @@ from numpy.typing import NDArray
 
 from dynsim._version import __version__
 from dynsim.compile.scene import snake_scene
-from dynsim.engine.kinematic_run import Run
-from dynsim.engine.mode_switching import ModeSwitcher
+from dynsim.engine.kinematic_run import SnakeRun
+from dynsim.engine.provenance import provenance
 from dynsim.jit.kernel import reals
 from dynsim.record import Record
 from dynsim.record.poses import add_body_poses
 from dynsim.scenario import Scenario
 from dynsim.scenario.effect import without_effect
 from dynsim.snake import state as ss
-from dynsim.snake.description import conditioning
+from dynsim.snake.description import COORDINATES, conditioning
 from dynsim.snake.kinematics import new_chain, posture_points
-from dynsim.snake.state import Trace
+from dynsim.snake.state import SnakeTrace
 from dynsim.snake.ticks import record_row
 
-# Why the target waited, in the order of the counters of dynsim.snake.state.State; the last is the rest: after
+# Why the target waited, in the order of the counters of dynsim.snake.state.SnakeState; the last is the rest: after
 # an obstacle, until switching has brought the joints below switching.release_fraction of their limits.
 OBSTACLES = ("joint limit", "rate limit", "singular posture", "attitude at beta = 90 deg", "release of the joints")
 OUT_OF_REACH = 1.0
 """A target that waits for so long at the end of a run [s] is called out of reach."""
-COORDINATES = ("x", "y", "z", "alpha", "beta", "gamma")
 
 
 def _wrapped(angle: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -53,14 +52,7 @@ def attitude_distance(w: NDArray[np.float64], w_target: NDArray[np.float64]) -> 
     return 2.0 * np.arcsin(np.clip(norm / np.sqrt(8.0), 0.0, 1.0))
 
 
-def make_record(
-    run: Run,
-    scenario: Scenario,
-    provenance: dict[str, Any],
-    switcher: ModeSwitcher,
-    wall: float,
-    pictured: bool = True,
-) -> Record:
+def make_record(run: SnakeRun, scenario: Scenario, wall: float, pictured: bool = True) -> Record:
     """Signals, units, summary and provenance of a run, finished or not.
 
     Parameters
@@ -70,9 +62,9 @@ def make_record(
     pictured : with the scene and the poses of its bodies.
     """
     description, state, law = run.description, run.state, run.controller.law
-    model, period, ticks = run.model, run.controller.schedule.period, int(run.state.counts[ss.TICKS])
+    model, period, ticks = run.model, run.controller.schedule.period, run.tick
     rows = -(-ticks // run.stride) + 1
-    trace = Trace(*(array[:rows] for array in run.trace))
+    trace = SnakeTrace(*(array[:rows] for array in run.trace))
     record_row(model, law, state, run.rig, rows - 1, trace)
     if rows > 1:  # no control period begins at the end: what was held goes on
         for array in (trace.u, trace.slip, trace.at_limit):
@@ -94,7 +86,7 @@ def make_record(
 
     names, wheels = description.joint_names, description.wheel_names
     pairs = tuple(f"pair{i + 1}" for i in range(description.pairs))
-    record = Record(time, provenance=provenance)
+    record = Record(time, provenance=provenance(scenario))
     add = record.add
     add("phi", trace.phi, "rad", labels=names, description="joint angles, head to tail")
     add("rho", trace.rho, "rad", labels=wheels, description="angles of the active wheels")
@@ -122,7 +114,7 @@ def make_record(
     if pictured:
         record.scene = snake_scene(description)
         add_body_poses(record)
-    record.summary = _summary(run, scenario, switcher, record, wall)
+    record.summary = _summary(run, scenario, record, wall)
     return record
 
 
@@ -141,7 +133,7 @@ def _out_of_reach(counts: NDArray[np.int64], period: float, duration: float) -> 
     return {"since_s": duration - still, "reason": OBSTACLES[counts[ss.STILL_FOR] - 1]}
 
 
-def _summary(run: Run, scenario: Scenario, switcher: ModeSwitcher, record: Record, wall: float) -> dict[str, Any]:
+def _summary(run: SnakeRun, scenario: Scenario, record: Record, wall: float) -> dict[str, Any]:
     description, law, period = run.description, run.controller.law, run.controller.schedule.period
     counts = run.state.counts
     phi, w, at_limit = record["phi"], record["w"], record["at_limit"]
@@ -178,8 +170,8 @@ def _summary(run: Run, scenario: Scenario, switcher: ModeSwitcher, record: Recor
         "slip_max_m_s": float(record["slip"].max()),
         "cost_initial": float(record["cost"][0]),
         "cost_final": float(record["cost"][-1]),
-        "mode_switches": switcher.switches,
-        "modes_refused": sum(not refusal.taken for refusal in switcher.refusals),
+        "mode_switches": run.switcher.switches,
+        "modes_refused": sum(not refusal.taken for refusal in run.switcher.refusals),
         "refusals": [
             {
                 "time_s": refusal.tick * period,
@@ -188,7 +180,7 @@ def _summary(run: Run, scenario: Scenario, switcher: ModeSwitcher, record: Recor
                 "support_margin_m": refusal.margin if np.isfinite(refusal.margin) else None,
                 "taken": refusal.taken,
             }
-            for refusal in switcher.refusals
+            for refusal in run.switcher.refusals
         ],
         "sigma_min_min": float(record["sigma_min"].min()),
         "support_margin_min_m": float(record["support_margin"].min()),
@@ -204,7 +196,7 @@ def _summary(run: Run, scenario: Scenario, switcher: ModeSwitcher, record: Recor
     return summary
 
 
-def _warnings(run: Run, record: Record, summary: dict[str, Any]) -> list[str]:
+def _warnings(run: SnakeRun, record: Record, summary: dict[str, Any]) -> list[str]:
     found = []
     if summary["waiting_s"] > 0.0:
         share = 100.0 * summary["waiting_s"] / max(summary["duration_s"], 1e-9)

@@ -20,12 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.compile.model import Model
-from dynsim.compile.references.operated import BASE, HAND, VELOCITIES, Operated, VelocitySource
+from dynsim.compile.references.teleop import BASE, HAND, VELOCITIES, TeleopOptions, VelocitySource
 from dynsim.compile.rolling import wheel_angles
 from dynsim.engine.hand_governor import HandGovernor
 from dynsim.model.base_pose import base_pose, base_row
 
 Array = NDArray[np.float64]
+_STATE = ("ticks", "_moving", "_angles", "_base_velocity")
 
 
 class Referenced(Protocol):
@@ -51,13 +52,13 @@ class OperatorPath:
 class Operator:
     """Called at the ticks of a simulation."""
 
-    def __init__(self, model: Model, operated: Operated, source: VelocitySource | None = None) -> None:
+    def __init__(self, model: Model, options: TeleopOptions, source: VelocitySource | None = None) -> None:
         robot = model.robot
-        self.operated, self.source = operated, operated.script if source is None else source
+        self.options, self.source = options, options.script if source is None else source
         self.ticks, self._moving = 0, False
         self._model, self._start = model, np.array(model.point_position(*robot.hand, robot.initial), dtype=np.float64)
         # On a base that drives the target is in the axes of the base, where it has no path in the world.
-        self.path = OperatorPath(operated.rate, self._start) if robot.base is None and operated.joints else None
+        self.path = OperatorPath(options.rate, self._start) if robot.base is None and options.joints else None
         self._angles, axes = np.zeros(2), np.eye(3)
         self._base_velocity = np.zeros(VELOCITIES)[BASE]
         if robot.base is not None:
@@ -66,7 +67,7 @@ class Operator:
             heading = float(base_pose(robot, robot.initial[None])[0, 2])
             c, s = math.cos(heading), math.sin(heading)
             axes = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        self._hand = HandGovernor(model, operated, self._start, axes) if operated.joints else None
+        self._hand = HandGovernor(model, options, self._start, axes) if options.joints else None
 
     @property
     def target(self) -> Array:
@@ -79,24 +80,19 @@ class Operator:
         return "" if self._hand is None else self._hand.hindrance
 
     def state(self) -> dict[str, Any]:
-        """What the future depends on."""
+        """What the future depends on: values that are replaced, and never written to."""
         points = None if self.path is None else list(self.path.points)
-        kept = {"ticks": self.ticks, "_moving": self._moving}
         hand = None if self._hand is None else self._hand.state()
-        own = {name: getattr(self, name).copy() for name in ("_angles", "_base_velocity")}
-        return kept | own | {"points": points, "hand": hand}
+        return {name: getattr(self, name) for name in _STATE} | {"points": points, "hand": hand}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go back to a state of this operator."""
-        for name, value in state.items():
-            if name == "points":
-                if self.path is not None:
-                    self.path.points = list(value)
-            elif name == "hand":
-                if self._hand is not None:
-                    self._hand.restore(value)
-            else:
-                setattr(self, name, value.copy() if isinstance(value, np.ndarray) else value)
+        for name in _STATE:
+            setattr(self, name, state[name])
+        if self.path is not None:
+            self.path.points = list(state["points"])
+        if self._hand is not None:
+            self._hand.restore(state["hand"])
 
     def __call__(self, simulation: Referenced) -> None:
         """Rewrite the references for the time up to the next tick."""
@@ -111,25 +107,25 @@ class Operator:
 
     def _joint_lines(self, wanted: Array) -> dict[str, tuple[float, float]]:
         """Position and rate of each joint that follows the hand."""
-        hand, operated = self._hand, self.operated
+        hand, options = self._hand, self.options
         if hand is None:
             return {}
         begin = hand.joints
-        hand.go(_eased(hand.velocity, wanted, operated.hand_acceleration / operated.rate))
+        hand.go(_eased(hand.velocity, wanted, options.hand_acceleration / options.rate))
         if self.path is not None:
             self.path.points.append(hand.target.copy())
-        return dict(zip(operated.joints, zip(begin.tolist(), hand.rates.tolist(), strict=True), strict=True))
+        return dict(zip(options.joints, zip(begin.tolist(), hand.rates.tolist(), strict=True), strict=True))
 
     def _wheel_lines(self, wanted: Array) -> dict[str, tuple[float, float]]:
         """Position and rate of each wheel of the base."""
         base = self._model.robot.base
         if base is None or not set(base.wheels) <= {motor.joint for motor in self._model.robot.motors}:
             return {}
-        most = np.array(self.operated.base_acceleration) / self.operated.rate
+        most = np.array(self.options.base_acceleration) / self.options.rate
         before = self._base_velocity
         self._base_velocity = np.array([_eased(before[k : k + 1], wanted[k : k + 1], most[k])[0] for k in range(2)])
         begin, rates = self._angles.copy(), wheel_angles(base, self._base_velocity[None])[0]
-        self._angles = begin + rates / self.operated.rate
+        self._angles = begin + rates / self.options.rate
         return dict(zip(base.wheels, zip(begin.tolist(), rates.tolist(), strict=True), strict=True))
 
 

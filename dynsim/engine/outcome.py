@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import NoReturn
+from typing import Any, NoReturn
 
-from dynsim.errors import ScenarioError, SimulationStopped
+from dynsim.errors import ScenarioError, SimulationInterrupted, SimulationStopped
 from dynsim.record import Record
 from dynsim.scenario import Scenario
 
@@ -24,6 +24,13 @@ def check_size(scenario: Scenario, rows: int, columns: int) -> None:
             f"record.rate_hz = {rate:g}: {scenario.duration_s:g} s of {columns} columns need {size:.3g} GB, the limit "
             f"(record.size_limit_GB) is {limit:g} GB; {rate * limit / size:.3g} Hz would fit"
         )
+
+
+def interrupted(scenario: Scenario, time: float, state: dict[str, Any]) -> SimulationInterrupted:
+    """The stop of a run that Ctrl-C has ended at a time [s]."""
+    return SimulationInterrupted(
+        f"interrupted at t = {time:.3f} s of {scenario.duration_s:g} s", time=time, state=state
+    )
 
 
 def mark_stopped(stop: SimulationStopped, record: Record) -> None:

@@ -38,7 +38,7 @@ from dynsim.model.drives import Drive, Motor
 from dynsim.record.poses import pose_columns
 from dynsim.scenario import Scenario, build
 from dynsim.scenario.schema import Integrator
-from dynsim.system.reuse import Reuse
+from dynsim.system.memo import recall
 
 log = logging.getLogger(__name__)
 
@@ -62,7 +62,6 @@ class Prepared:
     loads: list[Load]
     stops: list[JointStop]
     choice: Choice
-    reuse: Reuse
     balance: Balance | None = None
 
     @property
@@ -90,9 +89,10 @@ def prepare(
     times: np.ndarray | None = None,
     end: float | None = None,
     motors: Sequence[Drive] | None = None,
-    reuse: Reuse | None = None,
 ) -> Prepared:
     """Compile a scenario; references that take long report to ``progress``.
+
+    Whoever changes tables of a run prepares it within a memo of its own.
 
     Parameters
     ----------
@@ -100,7 +100,6 @@ def prepare(
     times : of samples [s]; default: those of the whole record
     end : of the run [s]; default: the scenario's duration
     motors : instead of those of the plant
-    reuse : what other runs have computed; whoever changes tables of a run must not share it
 
     Raises
     ------
@@ -109,14 +108,13 @@ def prepare(
     ScenarioError
         The record would be larger than ``record.size_limit_GB``, or the explicit method would need too many steps.
     """
-    reuse = reuse or Reuse()
-    described, contacts = build.robot_and_contacts(scenario, reuse)
+    described, contacts = build.robot_and_contacts(scenario)
     if motors is not None:
         described = replace(described, motors=tuple(motors))
-    model = reuse.of("model", lambda: Model(described), described)
+    model = recall("model", lambda: Model(described), described)
     robot, places = model.robot, [contact.geometry for contact in contacts]
     law = scenario.config.contacts.law
-    reuse.of("start", lambda: build.check_start(scenario, model, contacts), model, law, places)
+    recall("start", lambda: build.check_start(scenario, model, contacts), model, law, places)
     loads = build.loads(scenario, robot)
     if pushable:
         loads = [*loads, *(_push(body) for body in robot.bodies)]
@@ -136,13 +134,13 @@ def prepare(
         )
     joint_rows = len(robot.couplings) + len(stops)
     _check_work(scenario, n, c + joint_rows, scenario.integrator.method)
-    control = _control(scenario, model, contacts, progress, reuse)
+    control = _control(scenario, model, contacts, progress)
     if not real:
-        _check_references(scenario, model, contacts, control, reuse)
+        _check_references(scenario, model, contacts, control)
     options, size = scenario.integrator, n + ka.row_limit(c, joint_rows) + robot.circuits
     sampled = control.sample_time is not None
     drives = compile_drives(robot, k_p=list(control.k_p), k_d=list(control.k_d), sampled=sampled)
-    choice = reuse.of(
+    choice = recall(
         "choice", lambda: choose(options, model, contacts, control, drives), options, model, control, places, *drives
     )
     _check_work(scenario, n, c + joint_rows, choice.method)
@@ -191,7 +189,7 @@ def prepare(
         rtol=options.rtol,
         atol=options.atol,
         ticks=_ticks(control),
-        breaks=_breaks(loads, control, method, options, reuse),
+        breaks=_breaks(loads, control, method, options),
         # Those who advance a run themselves may give it no end.
         least_progress=ki.PROGRESS * min(scenario.duration_s, end or np.inf),
         events=guards(robot, contacts if real else (), stops),
@@ -199,7 +197,7 @@ def prepare(
         stepping=stepping,
         lanes=has_forms(system),
     )
-    return Prepared(model, contacts, control, system, run, new_workspace(system), loads, stops, choice, reuse, balance)
+    return Prepared(model, contacts, control, system, run, new_workspace(system), loads, stops, choice, balance)
 
 
 def _ticks(control: JointControl) -> tuple[np.ndarray, np.ndarray] | None:
@@ -237,7 +235,7 @@ def slow_slip(atol: float) -> float:
     return max(1000.0 * atol, 1e-9)
 
 
-def _breaks(loads: Sequence[Load], control: JointControl, method: int, options: Integrator, reuse: Reuse) -> np.ndarray:
+def _breaks(loads: Sequence[Load], control: JointControl, method: int, options: Integrator) -> np.ndarray:
     """Times at which loads jump or bend [s]: a step that passed over them would not see a short push at all.
 
     Of an implicit method also those at which references do, whose knots are nearer than its steps are long.
@@ -245,7 +243,7 @@ def _breaks(loads: Sequence[Load], control: JointControl, method: int, options: 
     times = [load.knots for load in loads if len(load.coefficients) and (not load.hold or len(load.coefficients) > 1)]
     if method == ki.RADAU5:
         tolerances = options.rtol, options.atol
-        times.append(reuse.of("bends", lambda: control.bends(*tolerances), control, *tolerances))
+        times.append(recall("bends", lambda: control.bends(*tolerances), control, *tolerances))
     return np.unique(np.concatenate(times)) if times else np.zeros(0)
 
 
@@ -316,16 +314,14 @@ def _check_work(scenario: Scenario, n: int, p: int, method: str) -> None:
         )
 
 
-def _control(
-    scenario: Scenario, model: Model, contacts: Sequence[Contact], progress: Progress | None, reuse: Reuse
-) -> JointControl:
+def _control(scenario: Scenario, model: Model, contacts: Sequence[Contact], progress: Progress | None) -> JointControl:
     if scenario.controller is None:
         return JointControl.absent(model.robot)
     log.info("%s: planning references over %g s", scenario.title, scenario.duration_s)
     started = clock.perf_counter()
     with kernels_logged(log, "references", loads=False):
         control = build.controller(
-            scenario, model, None if progress is None else partial(progress, stage=REFERENCES), contacts, reuse
+            scenario, model, None if progress is None else partial(progress, stage=REFERENCES), contacts
         )
     log.info("%s: planned references in %.3f s", scenario.title, clock.perf_counter() - started)
     if not isinstance(control, JointControl):
@@ -333,9 +329,7 @@ def _control(
     return control
 
 
-def _check_references(
-    scenario: Scenario, model: Model, contacts: Sequence[Contact], control: JointControl, reuse: Reuse
-) -> None:
+def _check_references(scenario: Scenario, model: Model, contacts: Sequence[Contact], control: JointControl) -> None:
     """Refuse references that, followed exactly, would take a contact point off the surface that holds it."""
     robot, tolerance = model.robot, scenario.config.contacts.reference_tolerance_m
     places = [contact.geometry for contact in contacts]
@@ -347,10 +341,10 @@ def _check_references(
         driven = [motor.joint for motor in robot.motors]
         names = [(link.name, link.joint, link.parent) for link in robot.links]
         bits = model.geometry, robot.initial, names, robot.frames, driven, control.reference, control.k_p, robot.base
-        reuse.of("held places", check, *bits, places, tolerance)
+        recall("held places", check, *bits, places, tolerance)
 
     # Of the same objects first, which are quickly told.
-    reuse.of("held contacts", check_anew, model, control, places, tolerance)
+    recall("held contacts", check_anew, model, control, places, tolerance)
 
 
 def _check_held(model: Model, contacts: Sequence[Contact], control: JointControl, tolerance: float) -> None:

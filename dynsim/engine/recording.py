@@ -3,31 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.compile.scene import robot_scene
 from dynsim.dynamics import state as kst
-from dynsim.dynamics import tables as ka
 from dynsim.dynamics.tree import support as ks
 from dynsim.engine import summary as metrics
-from dynsim.engine.contact_metrics import beyond_stops
 from dynsim.engine.prepare import Prepared
 from dynsim.engine.provenance import provenance
-from dynsim.engine.ratings import motor_loads, overloaded
-from dynsim.engine.sharing import sharing
-from dynsim.engine.uniqueness import motion_spread
 from dynsim.integrators import run as ki
-from dynsim.integrators.stepping import tables as time_stepping
 from dynsim.model.base_pose import base_pose
 from dynsim.model.description import Link
 from dynsim.model.mobile_base import SUPPORTS, MobileBase
 from dynsim.record import Event, Record
 from dynsim.record.poses import add_body_poses
 from dynsim.scenario import Scenario, build
-from dynsim.scenario.effect import without_effect
 
 
 def make_record(
@@ -69,7 +61,7 @@ def make_record(
     record.add("torque", run.outputs("torque"), force, labels=driven, description="shaft torques, [WM] eq 25")
     record.add("power", current * voltage, "W", labels=driven, description="electrical power u i")
     record.add("hand_position", run.outputs("hand"), "m", labels=("x", "y", "z"))
-    target = prepared.control.target(record.time, prepared.reuse)
+    target = prepared.control.target(record.time)
     if target is not None:
         record.add("target_position", target, "m", labels=("x", "y", "z"))
     for integral, (name, text) in zip(_by_column(run.states("ledger")), metrics.INTEGRALS.items(), strict=True):
@@ -103,71 +95,15 @@ def make_record(
     for event in happened:
         record.add_event(event.time, event.kind, event.name)
     if pictured:
-        record.scene = robot_scene(robot, contacts, build.surfaces(scenario, prepared.reuse))
+        record.scene = robot_scene(robot, contacts, build.surfaces(scenario))
         add_body_poses(record)
-    deficient, spread = int(prepared.workspace.counts[ka.DEPENDENT]), None
-    shared: list[str] = []
-    if prepared.system.unilateral is not None and deficient and rows:
-        shared = sharing(prepared.model, contacts, record["q"], record["contact_mode"])
-    # Under the unilateral law rows of what sticks depend on each other, which leaves no motion open.
-    if (
-        prepared.system.unilateral is None
-        and deficient
-        and rows
-        and any(contact.friction > 0.0 for contact in contacts)
-    ):
-        joint_units = [(link.joint, link.units[2]) for link in robot.links]
-        spread = motion_spread(prepared.system, run.sample_time[:rows], run.sample[:rows], joint_units)
-    counts = metrics.Counts(
-        wall=wall,
-        choice=prepared.choice,
-        steps=int(run.count[ki.STEPS]),
-        rejected=int(run.count[ki.REJECTED]),
-        evaluations=int(run.count[ki.EVALUATIONS]),
-        projections=int(run.count[ki.PROJECTIONS]),
-        deficient=deficient,
-        extremes=run.extremes,
-        spread=spread,
-        shared=tuple(shared),
-        support=np.zeros(0) if run.support is None else run.support.least,
-        unilateral=prepared.system.unilateral,
-        stops=tuple(prepared.stops),
-        stepping=None if run.stepping is None else _stepping(run),
-    )
-    record.summary = metrics.summarise(record, scenario, contacts, robot, counts, prepared.reuse)
-    record.summary["warnings"] += beyond_stops(robot, prepared.stops, prepared.control)
-    record.summary["warnings"] += without_effect(scenario, bool(robot.motors))
-    record.summary["motors"] = motor_loads(record, robot)
-    record.summary["warnings"] += overloaded(record.summary["motors"])
-    if prepared.balance is not None:
-        record.summary["equilibrium"] = {
-            "heat_W": prepared.balance.heat,
-            **{f"{name}.normal_force_N": force for name, force in prepared.balance.normal_forces.items()},
-        }
-        record.summary["warnings"] += prepared.balance.warnings
+    record.summary = metrics.summarise(record, scenario, prepared, wall)
     return record
 
 
 def _by_column(table: NDArray[np.float64]) -> NDArray[np.float64]:
     """Columns beside each other in memory: the ledger is summed up from them again and again."""
     return np.ascontiguousarray(table.T)
-
-
-def _stepping(run: ki.Run) -> dict[str, Any]:
-    """How well time stepping has solved its contact problems, and how deep points came to lie."""
-    assert run.stepping is not None
-    found = run.stepping.found
-    return {
-        "step_s": float(run.clock[ki.STEP]),
-        "contact_solves": int(found[time_stepping.SOLVES]),
-        "long_solves": int(found[time_stepping.LONG_SOLVES]),
-        "capped_solves": int(found[time_stepping.CAPPED]),
-        "residual_max_m_s": float(found[time_stepping.WORST]),
-        "limits_unsettled": int(found[time_stepping.UNSETTLED]),
-        "scheme_loss_worst_J": float(found[time_stepping.TAKEN]),
-        "half_step_energy_J": float(found[time_stepping.HALF_STEP]),
-        "penetration_max_m": float(found[time_stepping.PENETRATION]),
-    }
 
 
 def _add_unilateral(record: Record, prepared: Prepared) -> None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import time as clock
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dynsim.compile.model import Model
-from dynsim.compile.references.operated import VelocitySource
+from dynsim.compile.references.teleop import VelocitySource
 from dynsim.compile.tables import check_couplings
 from dynsim.dynamics import state as kst
 from dynsim.dynamics import tables as ka
@@ -42,6 +42,7 @@ from dynsim.record.measures import TIP_OVER
 from dynsim.scenario import Scenario, require_scenario
 from dynsim.scenario.build import check_start
 from dynsim.system import interruption
+from dynsim.system.memo import Memo, remembering
 
 Array = NDArray[np.float64]
 
@@ -54,6 +55,8 @@ TICK_SLACK = 1e-12
 # End of a run without end [s]: far beyond any, and still a number to reckon with.
 _FAR = 1e300
 SERVO_MODES = {"position": ka.POSITION_MODE, "velocity": ka.VELOCITY_MODE, "off": ka.OFF}
+# What kernels sample into: of another size after each refill.
+_BUFFERS = {f"run.{field}": field for field in ("sample_time", "sample", "output")}
 # Inertia of a joint whose brake is closed [kg m² or kg]: what no load moves, not even by a rounding of its angle, so
 # that a contact point behind closed brakes alone stays where it is.
 BRAKED = 1e30
@@ -109,7 +112,9 @@ class Simulation:
             raise ScenarioError(f"a simulation from t = {start:g} s cannot end at {end:g} s")
         self._scenario = scenario
         self._end = min(end, _FAR)
-        self._prepared = prepare(scenario, pushable=True, times=np.full(1, np.inf), end=self._end, motors=motors)
+        # Tables that callers may change are nobody else's.
+        with remembering(Memo()):
+            self._prepared = prepare(scenario, pushable=True, times=np.full(1, np.inf), end=self._end, motors=motors)
         self._time, self._wall, self._loaded = start, 0.0, False
         # Of a ring, and of a run that goes on from another, the ledger counts from the first sample on.
         self._relative = trace is not None or state is not None
@@ -144,10 +149,10 @@ class Simulation:
         run.clock[[ki.TIME, ki.COUNTED_SINCE]] = start
         run.tick[:, [ki.TICK_NEXT, ki.TICK_PHASE]] = start
         self._refill()
-        operated = self._prepared.control.operated
-        self._operator = None if operated is None else Operator(self.model, operated, operator)
-        if operated is not None and self._operator is not None:
-            self.every(1.0 / operated.rate, self._operator)
+        options = self._prepared.control.teleop
+        self._operator = None if options is None else Operator(self.model, options, operator)
+        if self._operator is not None:
+            self.every(1.0 / self._operator.options.rate, self._operator)
         elif operator is not None:
             raise ScenarioError("an operator needs a scenario with controller.operator, which says what it moves")
 
@@ -462,13 +467,10 @@ class Simulation:
         if not isinstance(snapshot, Snapshot):
             raise ScenarioError(f"a simulation is restored from its snapshot, not from {shown(snapshot)}")
         own = self._arrays()
-        sizes = {name: array.shape for name, array in snapshot.arrays.items() if not name.startswith("trace.")}
-        if sizes != {name: array.shape for name, array in own.items() if not name.startswith("trace.")} or (
-            snapshot.owner is not self._token
-        ):
+        sizes = ({k: a.shape for k, a in arrays.items() if k not in _BUFFERS} for arrays in (own, snapshot.arrays))
+        if snapshot.owner is not self._token or next(sizes) != next(sizes):
             raise ScenarioError("the snapshot is of another simulation, or ticks or events were added since")
-        buffers = {name: snapshot.arrays[f"trace.{name}"].copy() for name in ("sample_time", "sample", "output")}
-        self._swap(**buffers)
+        self._swap(**{field: snapshot.arrays[name].copy() for name, field in _BUFFERS.items()})
         for name, array in self._arrays().items():
             array[...] = snapshot.arrays[name]
         self._trace.restore(snapshot.trace)
@@ -706,34 +708,19 @@ class Simulation:
         self._prepared = replace(self._prepared, run=self._prepared.run._replace(**arrays))
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
-        """Everything that changes in a run, by name."""
-        prepared, buffers = self._prepared, ("sample_time", "sample", "output")
-        system, found = prepared.system, {}
-        for name, array in prepared.run._asdict().items():
-            if isinstance(array, np.ndarray):
-                found[f"trace.{name}" if name in buffers else f"run.{name}"] = array
-        found |= {f"workspace.{name}": array for name, array in prepared.workspace._asdict().items()}
-        for owner, part in (
-            ("drives", system.drives._asdict()),
-            ("reference", system.reference._asdict()),
-            ("loads", system.loads._asdict()),
-            ("support", prepared.run.support._asdict() if prepared.run.support else {}),
-            ("stepping", prepared.run.stepping._asdict() if prepared.run.stepping else {}),
-            ("unilateral", {} if system.unilateral is None else system.unilateral._asdict()),
-            *_newton(prepared.run),
-        ):
-            found |= {f"{owner}.{name}": array for name, array in part.items() if isinstance(array, np.ndarray)}
-        # Closed brakes are seen there.
-        return found | {"model.body": system.model.body}
+        """All arrays of the run and its tables, by name: everything that changes is in them."""
+        prepared = self._prepared
+        parts = {"run": prepared.run, "workspace": prepared.workspace, "system": prepared.system}
+        return {name: array for owner, part in parts.items() for name, array in _arrays_in(part, owner)}
 
 
-def _newton(run: ki.Run) -> list[tuple[str, dict[str, Any]]]:
-    """What RADAU5 keeps from step to step, by owner; nothing of other methods."""
-    kept = run.newton
-    if kept is None:
-        return []
-    found, lanes = [("newton", kept._asdict())], kept.lanes
-    return found if lanes is None else [*found, ("lanes", lanes._asdict()), ("lanes.ws", lanes.ws._asdict())]
+def _arrays_in(value: Any, name: str) -> Iterator[tuple[str, NDArray[Any]]]:
+    """The arrays in named tuples and those within, with dotted names."""
+    if isinstance(value, np.ndarray):
+        yield name, value
+    elif hasattr(value, "_asdict"):
+        for field, part in value._asdict().items():
+            yield from _arrays_in(part, f"{name}.{field}")
 
 
 def _index(choices: dict[str, int], name: str, what: str) -> int:

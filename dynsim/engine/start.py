@@ -16,7 +16,7 @@ from dynsim.errors import ModelError
 from dynsim.model.description import Contact
 from dynsim.scenario import Scenario, build
 from dynsim.scenario.effect import without_effect
-from dynsim.system.reuse import Reuse
+from dynsim.system.memo import recall
 
 # Joints that the solution of a posture has moved by less stay where they were [rad or m].
 MOVED = 1e-12
@@ -24,17 +24,16 @@ MOVED = 1e-12
 
 def check(scenario: Scenario, started: Callable[[Start], None]) -> Start:
     """See :func:`dynsim.engine.check`."""
-    reuse = Reuse()
-    start = start_of(scenario, reuse)
+    start = start_of(scenario)
     started(start)
-    prepare(scenario, reuse=reuse)
+    prepare(scenario)
     return start
 
 
-def start_of(scenario: Scenario, reuse: Reuse) -> Start:
+def start_of(scenario: Scenario) -> Start:
     """Posture, gaps and margin at t = 0, whether they are allowed or not."""
-    described, contacts = build.robot_and_contacts(scenario, reuse)
-    model = reuse.of("model", lambda: Model(described), described)
+    described, contacts = build.robot_and_contacts(scenario)
+    model = recall("model", lambda: Model(described), described)
     robot = model.robot
     q, points = robot.initial, {}
     gaps: dict[str, float] = {}
@@ -48,7 +47,7 @@ def start_of(scenario: Scenario, reuse: Reuse) -> Start:
     aloft = [name for name, gap in gaps.items() if name in declared and abs(gap) > build.START_TOLERANCE]
     solved = {}
     if scenario.config.initial is not None and scenario.config.initial.on_surface:
-        before = build.unposed(scenario, reuse).initial
+        before = build.unposed(scenario).initial
         for link, k in zip(robot.links, robot.position_index, strict=True):
             if len(link.row.neutral) == 1 and abs(q[k] - before[k]) > MOVED:
                 angle = link.units[0] == "rad"

@@ -11,8 +11,8 @@ from dynsim.compile.contact_law import START_TOLERANCE
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.state import block
+from dynsim.engine.force_indeterminacy import paradox
 from dynsim.engine.prepare import Prepared
-from dynsim.engine.uniqueness import paradox
 from dynsim.errors import SimulationStopped
 from dynsim.integrators import project as kp
 from dynsim.integrators import run as ki

@@ -1,28 +1,26 @@
-"""From a record to the numbers of its summary: energies, tracking errors, contact forces, warnings."""
+"""From a run to the numbers of its summary: energies, tracking errors, contact forces, loads of the motors."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dynsim._version import __version__
-from dynsim.compile.clearance import Sinking, sinking
-from dynsim.compile.contact_law import JointStop, told
+from dynsim.compile.clearance import sinking
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.unilateral import UnilateralArrays
-from dynsim.engine.base_metrics import tipped
-from dynsim.engine.contact_metrics import capped, chattered, coarse, modes, never_touched, touched_stops
+from dynsim.engine.prepare import Prepared
+from dynsim.engine.warnings import warnings_of
 from dynsim.integrators import run as ki
-from dynsim.model.description import Contact, Robot
-from dynsim.model.drives import Drive, Motor, Servo, TorqueSource
+from dynsim.integrators.stepping import tables as kt
+from dynsim.model.description import Array, Contact, Robot
+from dynsim.model.drives import Drive, TorqueSource
 from dynsim.record import Record
-from dynsim.record.measures import RESIDUAL_LIMIT, STORES, base_summary, energy_turnover, hand_error, percent, sinks
+from dynsim.record.measures import RESIDUAL_LIMIT, STORES, base_summary, energy_turnover, hand_error, sinks
 from dynsim.scenario import Scenario, build
-from dynsim.system.reuse import Reuse
+from dynsim.system.memo import recall
 
 # Integrals that the integrator carries, in the order of the state (dynsim.dynamics.ledger).
 INTEGRALS = {
@@ -42,77 +40,11 @@ LOSSES = {"loss_impact": "energy that impacts of contacts take", "loss_stop": "e
 
 SCHEME = "energy that the steps of time stepping take; negative: that they make"
 
-DRIFT_LIMIT_M = 1e-9
-# Friction heat below zero by no more than this share of the turnover is rounding.
-FRICTION_ROUNDING = 1e-12
-# Limits in files are rounded: a joint that starts at 1.5707963 = 90° is not beyond it.
-LIMIT_SLACK = 1e-6
 # Heights below this are not resolved by landings [m]: each is found to AT_ROOT, which leaves the weight times that in
 # the ledger, and here ten of them reach the limit of its residual.
 RESOLVED_M = 10.0 * ku.AT_ROOT / RESIDUAL_LIMIT
-# Part of a limit of current that counts as reached.
-NEAR_LIMIT = 1e-3
-NOT_ENFORCED = "no law enforces this limit"
-
 
 _LOSS_KEYS = {"impact_loss": "loss_impact", "stop_loss": "loss_stop"}
-
-
-@dataclass(frozen=True)
-class MotionSpread:
-    """What dependent frictional rows leave open: the range of one joint's acceleration over all admissible splits.
-
-    Attributes
-    ----------
-    joint : name; unit : of its acceleration
-    time : [s]
-    low, high : least and greatest acceleration; taken : that of the run, from the split of least norm
-    """
-
-    joint: str
-    unit: str
-    time: float
-    low: float
-    high: float
-    taken: float
-
-
-@dataclass(frozen=True)
-class Counts:
-    """What the integrator counted.
-
-    Attributes
-    ----------
-    wall : wall time of the integration [s]
-    choice : method of integration, and why that one
-    steps, rejected : accepted and repeated steps
-    evaluations : right-hand sides, those for samples and projections included
-    projections : corrections onto the contact surfaces
-    deficient : right-hand sides whose constraint forces were not unique
-    extremes : (c, 6) over all steps, see dynsim.integrators: FORCE_MIN, FORCE_MAX, DRIFT_MAX, PULLING,
-        LAST_FORCE, LOCAL_SINCE
-    spread : motion that dependent rows leave open; None: none
-    shared : contacts that share forces which the motion does not determine; of the unilateral law
-    support : (4,) least loads of wheels and caster and least tip margin of a mobile base over all steps, else empty
-    unilateral : tables of the unilateral law with what they have counted; None under the other one
-    stops : joint stops, in their order there
-    stepping : how time stepping has solved its contact problems, for the summary; None of other methods
-    """
-
-    wall: float
-    choice: tuple[str, str]
-    steps: int
-    rejected: int
-    evaluations: int
-    projections: int
-    deficient: int
-    extremes: NDArray[np.float64]
-    spread: MotionSpread | None = None
-    shared: tuple[str, ...] = ()
-    support: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
-    unilateral: UnilateralArrays | None = None
-    stops: tuple[JointStop, ...] = ()
-    stepping: dict[str, Any] | None = None
 
 
 def energy_residual(record: Record) -> NDArray[np.float64]:
@@ -154,15 +86,10 @@ def gravity_lever(robot: Robot) -> tuple[float, float]:
     return lever * gravity, mass * gravity
 
 
-def summarise(
-    record: Record,
-    scenario: Scenario,
-    contacts: Sequence[Contact],
-    robot: Robot,
-    counts: Counts,
-    reuse: Reuse | None = None,
-) -> dict[str, Any]:
-    """The content of ``summary.json``; ``reuse``: what other runs have computed."""
+def summarise(record: Record, scenario: Scenario, prepared: Prepared, wall: float) -> dict[str, Any]:
+    """The content of ``summary.json`` for a run that has taken ``wall`` [s]."""
+    run, robot, contacts = prepared.run, prepared.model.robot, prepared.contacts
+    unilateral = prepared.system.unilateral
     duration = float(record.time[-1] - record.time[0]) if len(record) else 0.0
 
     def final(name: str) -> float:
@@ -170,23 +97,23 @@ def summarise(
 
     turnover = energy_turnover(record)
     residual = float(np.abs(record["energy_residual"]).max(initial=0.0))
-    lever = (reuse or Reuse()).of("lever", lambda: gravity_lever(robot), robot)
-    floor = residual_floor(record, robot, scenario.integrator.rtol, counts.unilateral is not None, lever)
-    denominator = max(turnover, floor)
-    sunk = sinking(robot, build.surfaces(scenario, reuse), record["q"], reuse)
+    lever = recall("lever", lambda: gravity_lever(robot), robot)
+    floor = residual_floor(record, robot, scenario.integrator.rtol, unilateral is not None, lever)
+    scale = max(turnover, floor)
+    sunk = sinking(robot, build.surfaces(scenario), record["q"])
     summary: dict[str, Any] = {
         "scenario": scenario.name,
         "variant": scenario.variant,
         "dynsim_version": __version__,
         "duration_s": duration,
-        "integration_wall_s": counts.wall,
-        "real_time_factor": duration / counts.wall if counts.wall > 0.0 else 0.0,
-        "method": counts.choice[0],
-        "method_reason": counts.choice[1],
-        "steps": counts.steps,
-        "steps_rejected": counts.rejected,
-        "rhs_evaluations": counts.evaluations,
-        "projections": counts.projections,
+        "integration_wall_s": wall,
+        "real_time_factor": duration / wall if wall > 0.0 else 0.0,
+        "method": prepared.choice.method,
+        "method_reason": prepared.choice.reason,
+        "steps": int(run.count[ki.STEPS]),
+        "steps_rejected": int(run.count[ki.REJECTED]),
+        "rhs_evaluations": int(run.count[ki.EVALUATIONS]),
+        "projections": int(run.count[ki.PROJECTIONS]),
         **hand_error(record, scenario.metrics.settle_s),
         "electrical_energy_J": final("energy_electrical"),
         "electrical_energy_supply_J": final("energy_electrical_supply"),
@@ -196,15 +123,15 @@ def summarise(
         "gear_loss_J": final("loss_gear"),
         "joint_loss_J": final("loss_joint"),
         "friction_heat_J": final("heat_friction"),
-        **({} if counts.unilateral is None else {f"{key}_J": final(name) for key, name in _LOSS_KEYS.items()}),
-        **({} if counts.stepping is None else {"scheme_loss_J": final("loss_scheme")}),
+        **({} if unilateral is None else {f"{key}_J": final(name) for key, name in _LOSS_KEYS.items()}),
+        **({} if run.stepping is None else {"scheme_loss_J": final("loss_scheme")}),
         **_loads(record),
         "energy_turnover_J": turnover,
-        "energy_residual_relative": residual / denominator if denominator > 0.0 else 0.0,
-        "constraint_drift_max_m": float(counts.extremes[:, ki.DRIFT_MAX].max(initial=0.0)),
-        **_base(record, scenario, robot, counts),
+        "energy_residual_relative": residual / scale if scale > 0.0 else 0.0,
+        "constraint_drift_max_m": float(run.extremes[:, ki.DRIFT_MAX].max(initial=0.0)),
+        **_base(record, scenario, prepared),
         "contacts": [
-            _contact(record, k, contact, counts, duration, contact.name in scenario.config.contacts.points)
+            _contact(record, k, contact, prepared, duration, contact.name in scenario.config.contacts.points)
             for k, contact in enumerate(contacts)
         ],
         "sinking": [
@@ -212,24 +139,31 @@ def summarise(
             for s in sunk
         ],
     }
-    if counts.unilateral is not None:
-        summary["joint_stops"] = touched_stops(record, robot, counts.stops, counts.unilateral, duration)
-    if counts.stepping is not None:
-        summary["time_stepping"] = counts.stepping
-    summary["warnings"] = _warnings(record, scenario, contacts, robot, counts, summary, denominator) + _sunk(
-        record, sunk
-    )
+    if unilateral is not None:
+        summary["joint_stops"] = _joint_stops(record, prepared, duration)
+    if run.stepping is not None:
+        summary["time_stepping"] = _time_stepping(run)
+    motors = motor_loads(record, robot)
+    summary["warnings"] = warnings_of(record, scenario, prepared, summary, scale, sunk, motors)
+    summary["motors"] = motors
+    if prepared.balance is not None:
+        forces = prepared.balance.normal_forces
+        summary["equilibrium"] = {
+            "heat_W": prepared.balance.heat,
+            **{f"{name}.normal_force_N": force for name, force in forces.items()},
+        }
     return summary
 
 
-def _base(record: Record, scenario: Scenario, robot: Robot, counts: Counts) -> dict[str, Any]:
+def _base(record: Record, scenario: Scenario, prepared: Prepared) -> dict[str, Any]:
     """What there is to say of a mobile base, where there is one."""
-    if robot.base is None:
+    base, support = prepared.model.robot.base, prepared.run.support
+    if base is None or support is None:
         return {}
-    columns = [record.labels["q"].index(joint) for joint in robot.base.wheels]
+    columns = [record.labels["q"].index(joint) for joint in base.wheels]
     # Rolling: s = r (φ_l + φ_r)/2, however far apart the samples are.
-    travel = robot.base.wheel_radius * record["q"][:, columns].mean(axis=1)
-    return {"base": base_summary(record, scenario.metrics.settle_s, counts.support, travel)}
+    travel = base.wheel_radius * record["q"][:, columns].mean(axis=1)
+    return {"base": base_summary(record, scenario.metrics.settle_s, support.least, travel)}
 
 
 def _loads(record: Record) -> dict[str, Any]:
@@ -241,14 +175,14 @@ def _loads(record: Record) -> dict[str, Any]:
 
 
 def _contact(
-    record: Record, k: int, contact: Contact, counts: Counts, duration: float, declared: bool
+    record: Record, k: int, contact: Contact, prepared: Prepared, duration: float, declared: bool
 ) -> dict[str, Any]:
     """What a contact has done; of a declared point under the unilateral law also how near it came."""
-    force = record["contact_normal_force"][:, k]
-    real = {} if counts.unilateral is None else modes(counts.unilateral, k, duration)
+    force, run, unilateral = record["contact_normal_force"][:, k], prepared.run, prepared.system.unilateral
+    real = {} if unilateral is None else _modes(unilateral, k, duration)
     # Under the unilateral law a force ends at zero; what lies below is the tolerance of that event.
-    least = -np.inf if counts.unilateral is None else 0.0
-    extremes = counts.extremes[k] if counts.steps else np.zeros(ki.EXTREMES_SIZE)
+    least = -np.inf if unilateral is None else 0.0
+    extremes = run.extremes[k] if run.count[ki.STEPS] else np.zeros(ki.EXTREMES_SIZE)
     # Extremes are those of every accepted step, which are closer together than the samples, and of the samples.
     return {
         "name": contact.name,
@@ -264,156 +198,113 @@ def _contact(
     }
 
 
-def _warnings(
-    record: Record,
-    scenario: Scenario,
-    contacts: Sequence[Contact],
-    robot: Robot,
-    counts: Counts,
-    summary: dict[str, Any],
-    scale: float,
-) -> list[str]:
-    found = [] if counts.unilateral is None else [*chattered(contacts, counts.unilateral)]
-    initial = scenario.config.initial
-    for contact in summary["contacts"]:
-        if contact["normal_force_min_N"] < 0.0:
-            found.append(
-                f"{contact['name']}: the {contact['surface']} pulls on this brace for "
-                f"{percent(contact['pulling_fraction'])} of the run, with up to "
-                f"{-contact['normal_force_min_N']:.3g} N; a real arm would lift off"
-            )
-    found.extend(never_touched(record, summary["contacts"], () if initial is None else initial.on_surface))
-    for contact, since in zip(contacts, counts.extremes[:, ki.LOCAL_SINCE], strict=True):
-        if np.isfinite(since):
-            found.append(
-                f"{contact.name}: from t = {since:.4g} s on, its friction turns its own force against it (negative "
-                "diagonal of J M⁻¹F, Painlevé's paradox at one contact): only the other braces hold it there, and "
-                "whether real ones do depends on their stiffness; lower contacts.friction or take another posture"
-            )
-    # Within an impact friction may give what the normal impulse takes: only their sum is a loss.
-    given = -summary["friction_heat_J"] - max(summary.get("impact_loss_J", 0.0), 0.0)
-    if given > FRICTION_ROUNDING * summary["energy_turnover_J"]:
-        put = f"friction has put {given:.3g} J into the arm: "
-        if counts.unilateral is None:
-            put += "f_t = μ f_n reverses with a pulling normal force "
-            put += "(contacts.pulling_friction: dissipative takes μ |f_n|)"
-        else:
-            put += "an error of the integration; shorten integrator.step_s or tighten integrator.rtol"
-        found.append(put)
-    limited = [(a, motor, limits) for a, motor in enumerate(robot.motors) for limits in _limits_of(motor)]
-    # Along samples: a third of the time.
-    peaks = {name: np.abs(record[name].T.copy()).max(axis=1, initial=0.0) for name in {one[1] for *_, one in limited}}
-    for a, motor, (what, signal, limit, unit) in limited:
-        # The current of a DC motor comes near to the limit of its driver, and does not reach it.
-        reached = limit * (1.0 - NEAR_LIMIT) if isinstance(motor, Motor) and what == "current" else limit
-        # A run that diverged may have NaN, which hides a peak.
-        if not peaks[signal][a] < reached:
-            saturated = np.abs(record[signal][:, a]) >= reached
-            if isinstance(motor, Servo):
-                # Without a current its voltage is the back-EMF.
-                saturated &= record["current"][:, a] != 0.0
-            if saturated.any():
-                found.append(
-                    f"{motor.joint}: {what} at its limit of {limit:g} {unit} for "
-                    f"{100 * saturated.mean():.1f} % of the run"
-                )
-    found.extend(_passed_limits(record, robot, counts.unilateral is not None))
-    if robot.base is not None:
-        found.extend(tipped(record, robot.base, counts.support, scenario.metrics.settle_s))
-    if summary["energy_residual_relative"] > RESIDUAL_LIMIT:
-        found.append(
-            f"the energy ledger does not close: residual {summary['energy_residual_relative']:.1e} of the turnover; "
-            "tighten integrator.rtol or the step"
-        )
-    if counts.stepping is not None:
-        found.extend(capped(counts.stepping))
-        found.extend(coarse(counts.stepping, scale))
-    elif summary["constraint_drift_max_m"] > DRIFT_LIMIT_M:
-        found.append(f"contacts drifted by {summary['constraint_drift_max_m']:.1e} m")
-    if counts.deficient and counts.unilateral is None:
-        found.append(
-            f"contact rows depended on each other in {counts.deficient} evaluations: forces are the split of least norm"
-        )
-    elif counts.shared:
-        found.append(
-            f"{', '.join(counts.shared)}: shared forces which the motion does not determine, as points that stick do: "
-            "they are the split of least norm among those that lie in all friction cones"
-        )
-    if counts.spread is not None:
-        s = counts.spread
-        found.append(
-            f"with friction, dependent contact rows leave the motion open too: at t = {s.time:.4g} s the acceleration "
-            f"of {s.joint} is anything from {s.low:.4g} to {s.high:.4g} {s.unit} over the splits of the normal forces "
-            f"that keep their signs (this run: {s.taken:.4g}); take away braces until the rest are independent"
-        )
-    return found
+def _modes(unilateral: UnilateralArrays, k: int, duration: float) -> dict[str, Any]:
+    """What a candidate has done under the unilateral law."""
+    tally = unilateral.tally[k]
+    fractions = tally[[ku.TIME_STICKING, ku.TIME_SLIDING]] / duration if duration > 0.0 else np.zeros(2)
+    sticking, sliding = np.minimum(fractions, 1.0).tolist()
+    return {
+        "closed_fraction": min(sticking + sliding, 1.0),
+        "pulling_fraction": 0.0,
+        "sticking_fraction": sticking,
+        "sliding_fraction": sliding,
+        "lift_offs": int(tally[ku.LIFT_OFFS]),
+        "landings": int(tally[ku.LANDINGS]),
+        "slip_starts": int(tally[ku.SLIP_STARTS]),
+        "bounces": int(tally[ku.BOUNCES]),
+        "impact_loss_J": float(tally[ku.LOSS]),
+        "penetration_max_m": float(tally[ku.DEEPEST]),
+    }
 
 
-def _limits_of(motor: Drive) -> list[tuple[str, str, float, str]]:
-    """Limits of a motor: what is limited, its signal, the limit and its unit."""
-    if isinstance(motor, TorqueSource):
-        return [("torque", "current", motor.torque_limit, "N m")]
-    limits = [("voltage", "voltage", motor.voltage_limit, "V")]
-    if isinstance(motor, Servo) or np.isfinite(motor.current_limit):
-        limits.append(("current", "current", motor.greatest_current, "A"))
-    return limits
-
-
-def _sunk(record: Record, sunk: Sequence[Sinking]) -> list[str]:
-    """One warning per surface: the bodies that samples of the record show below it, and the one that is deepest."""
+def _joint_stops(record: Record, prepared: Prepared, duration: float) -> list[dict[str, Any]]:
+    """The joint stops that were touched."""
+    unilateral = prepared.system.unilateral
+    assert unilateral is not None
+    units = {link.joint: link.units for link in prepared.model.robot.links}
     found = []
-    for surface in dict.fromkeys(s.surface for s in sunk):
-        below = [s for s in sunk if s.surface == surface]
-        deepest = max(below, key=lambda s: s.depth)
-        names = ", ".join(s.body for s in below)
-        verb = "passes" if len(below) == 1 else "pass"
-        # Bodies from URDF have no radius.
-        thick = any(s.radius > 0.0 for s in below)
-        beyond = " by more than the link's radius" if thick else ""
-        radius = f", of {1e3 * deepest.radius:g} mm," if thick else ""
-        found.append(
-            f"{names} {verb} below {surface}{beyond}: {deepest.body}{radius} by up to {1e3 * deepest.depth:.3g} mm in "
-            f"the samples, first at t = {record.time[min(s.sample for s in below)]:.4g} s; "
-            "surfaces hold only the points of contacts"
-        )
+    for stop, row in zip(prepared.stops, unilateral.stop, strict=True):
+        if row[ku.HITS] > 0 or row[ku.CLOSED_TIME] > 0.0:
+            # One column for both stops of a joint, positive at the lower one.
+            force = stop.side * record["stop_force"][:, record.labels["stop_force"].index(stop.joint)]
+            found.append(
+                {
+                    "joint": stop.joint,
+                    "limit": stop.position,
+                    "unit": units[stop.joint][0],
+                    "force_max": float(force.max(initial=0.0)),
+                    "force_unit": units[stop.joint][3],
+                    "hits": int(row[ku.HITS]),
+                    "closed_fraction": min(float(row[ku.CLOSED_TIME]) / duration, 1.0) if duration > 0.0 else 0.0,
+                    "impact_loss_J": float(row[ku.STOP_LOSS]),
+                }
+            )
     return found
 
 
-def _passed_limits(record: Record, robot: Robot, real: bool) -> list[str]:
-    """Limits of joints that samples of the record lie beyond.
+def _time_stepping(run: ki.Run) -> dict[str, Any]:
+    """How well time stepping has solved its contact problems, and how deep points came to lie."""
+    assert run.stepping is not None
+    found = run.stepping.found
+    return {
+        "step_s": float(run.clock[ki.STEP]),
+        "contact_solves": int(found[kt.SOLVES]),
+        "long_solves": int(found[kt.LONG_SOLVES]),
+        "capped_solves": int(found[kt.CAPPED]),
+        "residual_max_m_s": float(found[kt.WORST]),
+        "limits_unsettled": int(found[kt.UNSETTLED]),
+        "scheme_loss_worst_J": float(found[kt.TAKEN]),
+        "half_step_energy_J": float(found[kt.HALF_STEP]),
+        "penetration_max_m": float(found[kt.PENETRATION]),
+    }
 
-    Stops are the only ones that are enforced, and only under the unilateral law (``real``); beyond them lies then what
-    the steps of time stepping let joints go too far.
+
+def motor_loads(record: Record, robot: Robot) -> list[dict[str, Any]]:
+    """Of each motor the root mean square and the largest current and torque at the shaft, and its ratings.
+
+    Over the whole run, by trapezoids between the samples; a rating that is not known is left out.
     """
-    torque = dict(zip(record.labels["torque"], record["torque"].T, strict=True))
+    units = {link.joint: "N_m" if link.units[3] == "N m" else "N" for link in robot.links}
+    # Along samples, which lie together then: a third of the time.
+    values = {name: np.ascontiguousarray(record[name].T) for name in ("current", "torque")}
+    rms = {name: _rms(record.time, rows).tolist() for name, rows in values.items()}
+    most = {
+        name: np.maximum(rows.max(axis=1, initial=0.0), -rows.min(axis=1, initial=0.0)).tolist()
+        for name, rows in values.items()
+    }
     found = []
-    for link, k, v in zip(robot.links, robot.position_index, record["v"].T, strict=True):
-        if all(abs(one) == np.inf for one in (link.lower, link.upper, link.velocity_limit, link.effort_limit)):
-            continue
-        q = record["q"][:, k]
-        position, velocity, _, force = link.units
-        passed = (
-            "the stop holds only at the ends of steps: a shorter integrator.step_s lets it pass less"
-            if real
-            else "stops are enforced under contacts.law: unilateral"
-        )
-        for what, limit, unit, beyond, note in (
-            ("lower position", link.lower, position, link.lower - q, passed),
-            ("upper position", link.upper, position, q - link.upper, passed),
-            ("velocity", link.velocity_limit, velocity, np.abs(v) - link.velocity_limit, NOT_ENFORCED),
-            (
-                "effort",
-                link.effort_limit,
-                force,
-                np.abs(torque.get(link.joint, np.zeros_like(q))) - link.effort_limit,
-                NOT_ENFORCED,
-            ),
-        ):
-            over = np.flatnonzero(beyond > LIMIT_SLACK)
-            if over.size:
-                amount, first = beyond[over].max(), record.time[over[0]]
-                found.append(
-                    f"{link.joint}: passes its {what} limit of {told(limit, unit, 4)} by up to "
-                    f"{told(amount, unit, 3)}, first at t = {first:.4g} s; {note}"
-                )
+    for a, motor in enumerate(robot.motors):
+        unit = units[motor.joint]
+        entry: dict[str, Any] = {"joint": motor.joint}
+        torque = "torque" if unit == "N_m" else "force"
+        if not isinstance(motor, TorqueSource):
+            entry |= {"current_rms_A": rms["current"][a], "current_max_A": most["current"][a]}
+        entry |= {f"{torque}_rms_{unit}": rms["torque"][a], f"{torque}_max_{unit}": most["torque"][a]}
+        for key, rating in _ratings(motor, f"nominal_{torque}_{unit}").items():
+            if np.isfinite(rating):
+                entry[key] = rating
+        found.append(entry)
     return found
+
+
+def _ratings(motor: Drive, torque: str) -> dict[str, float]:
+    """Ratings by key, infinite where they are not known."""
+    if isinstance(motor, TorqueSource):
+        return {torque: motor.nominal_torque}
+    return {
+        "nominal_current_A": motor.nominal_current,
+        "peak_current_A": motor.greatest_current,
+        torque: motor.nominal_torque,
+    }
+
+
+def _rms(time: Array, values: Array) -> Array:
+    """Root mean square over time of each row, (k, T) → (k,)."""
+    if len(time) < 2:
+        return np.abs(values).max(axis=1, initial=0.0)
+    # Half of each interval belongs to the sample at either end of it.
+    weight = np.zeros(len(time))
+    weight[:-1] = np.diff(time)
+    weight[1:] += weight[:-1].copy()
+    mean: Array = (values * values) @ weight / (2.0 * (time[-1] - time[0]))
+    return np.sqrt(mean)

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, model_validator
 
 from dynsim.config.base import Positive, StrictConfig, error_at
 from dynsim.config.problems import suggest
@@ -179,12 +179,19 @@ class Kind(StrictConfig):
             yield "following_error", "is more than limits.velocity: a servo that stands still would not be noticed"
 
 
+def _not_a_flag(value: Any) -> Any:
+    """``True`` equals 1, so a choice among numbers takes it."""
+    if isinstance(value, bool):
+        raise ValueError("must be 1 or -1")
+    return value
+
+
 class ServoEntry(StrictConfig):
     """One servo: its kind, bus ID, sense, zero, and (held joints) the angle it keeps instead of following a record."""
 
     kind: str
     id: Annotated[int, Field(ge=0, le=MAX_ID)]
-    sign: Literal[1, -1] = 1
+    sign: Annotated[Literal[1, -1], BeforeValidator(_not_a_flag)] = 1
     zero_tick: Annotated[int, Field(ge=-(1 << 20), le=1 << 20)] = 2048
     label: str | None = None
     hold_at_deg: float | None = None

@@ -5,7 +5,7 @@
 - It takes named tuples apart wherever a function is called, see dynsim.jit.struct_types.
 - It looks the same things up again and again, see :func:`_quick_look_ups`.
 
-All of it acts in dynsim's own compilations alone; what it replaces is in dynsim.dynamics.numba_version.
+All of it acts in dynsim's own compilations alone; what it replaces is in dynsim.jit.numba_version.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Replaced blindly, the internals of another numba would give wrong code, not an error. So another minor version is
 refused when this module is imported, before its internals are; and another source of what is replaced, before a kernel
-is compiled. After a look at what changed, ``python -m dynsim.dynamics.numba_version`` prints the table anew.
+is compiled. After a look at what changed, ``python -m dynsim.jit.numba_version`` prints the table anew.
 """
 
 from __future__ import annotations

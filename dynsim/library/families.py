@@ -217,10 +217,10 @@ def union(family: str, only: tuple[str, ...] = ()) -> Any:
 
     ``only`` : these of the package's members and no others; default: all, and plug-ins
     """
-    return Annotated[Any, Choice(family, only)]
+    return Annotated[Any, MemberField(family, only)]
 
 
-class Choice:
+class MemberField:
     """Pydantic's side of :func:`union`: the member that ``type`` names, and no other is imported to validate it."""
 
     def __init__(self, family: str, only: tuple[str, ...] = ()) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from typing import Any, Self
 
 import numpy as np
@@ -10,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
 from dynsim.config.base import NonNegative, Positive, StrictConfig, Vector3, error_at
-from dynsim.model.drives import Drive, Motor
+from dynsim.model.drives import Motor
 
 
 def limit(value: float | None) -> float:
@@ -19,7 +18,7 @@ def limit(value: float | None) -> float:
 
 
 class DriveParameters(StrictConfig):
-    """A motor of any kind: what it weighs, and how it becomes part of a robot."""
+    """A motor of any kind: what it weighs, and what it stands for ever."""
 
     mass_kg: NonNegative = Field(
         default=0.0, description="of motor and gear, a point mass on the link before the joint"
@@ -47,10 +46,6 @@ class DriveParameters(StrictConfig):
     def nominal_torque(self) -> float:
         """[N m or N], infinite where it is not known."""
         return limit(self.nominal_torque_N_m)
-
-    @abstractmethod
-    def motor(self, joint: str) -> Drive:
-        """The motor on the joint of that name."""
 
 
 class MotorParameters(DriveParameters):

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping, Sequence
-from dataclasses import astuple, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -15,7 +13,7 @@ from dynsim.errors import RecordError
 from dynsim.record.scene import Scene
 
 FORMAT = "dynsim-record-2"
-"""Formats that are read too. 1 (dynsim 0.1) has one time axis, no events and no scene."""
+"""The one format that is written and read."""
 TIME = "time"
 """Name of the axis that signals are on unless they name another."""
 
@@ -140,22 +138,3 @@ def check_signal(name: str, signal: Signal, samples: Mapping[str, int]) -> None:
 def is_numeric(dtype: Any) -> bool:
     """Whether arrays of this type hold real numbers that a record can keep."""
     return bool(dtype.kind in "biuf" and dtype.itemsize <= 8)
-
-
-def checksum(content: Content, summary: str, provenance: str, scene: str) -> str:
-    """SHA-256 of everything that counts, in hexadecimal digits; the texts are those of the file.
-
-    What a record of format 1 cannot hold is left out where there is none of it, so that their checksums are the same.
-    """
-    total = hashlib.sha256(json.dumps([bool(content.complete), summary, provenance]).encode("ascii"))
-    axes = [(f"axes/{name}", Signal(times, "s")) for name, times in sorted(content.axes.items())]
-    for name, one in [("", Signal(content.time, "s")), *sorted(content.signals.items()), *axes]:
-        data = np.ascontiguousarray(one.data)
-        header = [name, data.dtype.str, data.shape, one.unit, one.labels, one.description]
-        header += [] if one.axis == TIME else [one.axis]
-        total.update(json.dumps(header).encode("ascii"))
-        total.update(data.data if data.size else b"")
-    if content.events:
-        total.update(json.dumps([astuple(event) for event in content.events]).encode("ascii"))
-    total.update(scene.encode("utf-8", errors="surrogatepass"))
-    return total.hexdigest()

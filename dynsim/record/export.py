@@ -5,31 +5,16 @@ from __future__ import annotations
 import importlib
 import json
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dynsim.errors import MissingEntry, RecordError, shown
-from dynsim.record.content import TIME, Event, Signal
-from dynsim.record.scene import Scene
+from dynsim.record.content import TIME, Content
 
 if TYPE_CHECKING:
     import pandas
     import xarray
-
-
-class Content(Protocol):
-    """What of a :class:`~dynsim.record.Record` is exported."""
-
-    time: NDArray[np.float64]
-    axes: dict[str, NDArray[np.float64]]
-    signals: dict[str, Signal]
-    events: list[Event]
-    scene: Scene | None
-    summary: Any
-    provenance: Any
-    complete: bool
 
 
 def to_dataframe(record: Content, axis: str) -> pandas.DataFrame:

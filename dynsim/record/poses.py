@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +35,8 @@ def add_body_poses(record: Record) -> bool:
     # The last samples of a run that diverged may be beyond all bounds.
     with np.errstate(over="ignore", invalid="ignore"):
         for k, body in enumerate(scene.bodies):
-            p, q = _pose(body, len(record), columns[body.joint.signal], known.get(body.parent))
+            moved = np.array([columns[body.joint.signal][label] for label in body.joint.labels])
+            p, q = _pose(body, moved, known.get(body.parent), (len(record),))
             if body.parent != WORLD:
                 left[body.parent] -= 1
                 if not left[body.parent]:
@@ -53,52 +53,13 @@ def add_body_poses(record: Record) -> bool:
 def poses_at(scene: Scene, positions: Mapping[str, Mapping[str, float]]) -> Array:
     """Poses of all bodies at one instant, (bodies, 7) [m, 1]: position, quaternion w, x, y, z.
 
-    For live views: in plain numbers, because arrays of one sample would take twenty times as long. ``positions`` are
-    those of the joints [rad or m], by signal and label.
+    ``positions`` are those of the joints [rad or m], by signal and label.
     """
-    found: list[tuple[float, ...]] = []
+    poses: list[tuple[Array, Array]] = []
     for body in scene.bodies:
-        joint = body.joint
-        x, y, z, *turn = (0.0, 0.0, 0.0, *HERE) if body.parent == WORLD else found[body.parent]
-        moved = [positions[joint.signal][label] for label in joint.labels]
-        x, y, z = _beside((x, y, z), turn, joint.position)
-        if joint.orientation != HERE:
-            turn = _turned(turn, joint.orientation)
-        if joint.kind == "ball":
-            size = math.hypot(*moved)
-            turn = _turned(turn, [value / size for value in moved])
-        elif joint.kind == "prismatic":
-            x, y, z = _beside((x, y, z), turn, [moved[0] * a for a in joint.axis])
-        elif joint.kind == "planar":
-            x, y, z = _beside((x, y, z), turn, (moved[0], moved[1], 0.0))
-            turn = _turned(turn, (math.cos(0.5 * moved[2]), 0.0, 0.0, math.sin(0.5 * moved[2])))
-        elif joint.kind != "fixed":
-            s = math.sin(0.5 * moved[0])
-            turn = _turned(turn, (math.cos(0.5 * moved[0]), *(s * a for a in joint.axis)))
-        found.append((x, y, z, *turn))
-    return np.array(found)
-
-
-def _turned(a: Sequence[float], b: Sequence[float]) -> list[float]:
-    """The turn b, then the turn a; see :func:`dynsim.record.quaternion.product`."""
-    (aw, ax, ay, az), (bw, bx, by, bz) = a, b
-    return [
-        aw * bw - ax * bx - ay * by - az * bz,
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-    ]
-
-
-def _beside(place: Sequence[float], turn: Sequence[float], vector: Sequence[float]) -> tuple[float, float, float]:
-    """A place and a vector in axes that are turned; see :func:`dynsim.record.quaternion.rotated`."""
-    (w, i, j, k), (x, y, z) = turn, vector
-    a, b, c = 2.0 * (j * z - k * y), 2.0 * (k * x - i * z), 2.0 * (i * y - j * x)
-    return (
-        place[0] + x + w * a + j * c - k * b,
-        place[1] + y + w * b + k * a - i * c,
-        place[2] + z + w * c + i * b - j * a,
-    )
+        moved = np.array([positions[body.joint.signal][label] for label in body.joint.labels])
+        poses.append(_pose(body, moved, None if body.parent == WORLD else poses[body.parent], ()))
+    return np.array([np.concatenate(pose) for pose in poses])
 
 
 def pose_columns(bodies: int) -> int:
@@ -131,24 +92,25 @@ def _columns(record: Record, name: str) -> dict[str, Array]:
     return dict(zip(record.labels[name], record[name].T, strict=True))
 
 
-def _pose(body: Body, count: int, columns: dict[str, Array], parent: tuple[Array, Array] | None) -> tuple[Array, Array]:
-    """Position, (3, T), and orientation, (4, T), of a body at T = ``count`` samples from those of its parent."""
+def _pose(body: Body, moved: Array, parent: tuple[Array, Array] | None, shape: tuple[int, ...]) -> tuple[Array, Array]:
+    """Position, (3, …), and orientation, (4, …), of a body at instants of a ``shape`` from those of its parent.
+
+    Parameters
+    ----------
+    moved : (k, …) positions of its joint [rad or m]
+    """
     joint = body.joint
-    moved = [columns[label] for label in joint.labels]
-    here = np.zeros((4, count))
-    here[0] = 1.0
-    p, q = (np.zeros((3, count)), here) if parent is None else parent
+    p, q = parent or (np.zeros((3, *shape)), np.array([np.ones(shape), *np.zeros((3, *shape))]))
     p = p + rotated(q, np.array(joint.position))
     if joint.orientation != HERE:
         q = product(q, np.array(joint.orientation))
-    if joint.kind == "fixed":
-        return p, q
     if joint.kind == "ball":
-        turn = np.stack(moved)
-        return p, product(q, turn / np.sqrt((turn * turn).sum(axis=0)))
-    if joint.kind == "prismatic":
-        return p + rotated(q, np.multiply.outer(np.array(joint.axis), moved[0])), q
-    if joint.kind == "planar":
-        p = p + rotated(q, np.stack([moved[0], moved[1], np.zeros_like(moved[0])]))
-        return p, product(q, of_turn((0.0, 0.0, 1.0), moved[2]))
-    return p, product(q, of_turn(joint.axis, moved[0]))
+        q = product(q, moved / np.sqrt((moved * moved).sum(axis=0)))
+    elif joint.kind == "prismatic":
+        p = p + rotated(q, np.multiply.outer(np.array(joint.axis), moved[0]))
+    elif joint.kind == "planar":
+        p = p + rotated(q, np.array([moved[0], moved[1], np.zeros(shape)]))
+        q = product(q, of_turn((0.0, 0.0, 1.0), moved[2]))
+    elif joint.kind == "revolute":
+        q = product(q, of_turn(joint.axis, moved[0]))
+    return p, q

@@ -13,7 +13,7 @@ def of_turn(axis: ArrayLike, angle: ArrayLike) -> Array:
     half = 0.5 * np.asarray(angle, dtype=np.float64)
     s = np.sin(half)
     x, y, z = np.asarray(axis, dtype=np.float64)
-    return np.stack([np.cos(half), x * s, y * s, z * s])
+    return np.array([np.cos(half), x * s, y * s, z * s])
 
 
 def of_matrix(R: ArrayLike) -> Array:
@@ -33,7 +33,7 @@ def product(a: Array, b: Array) -> Array:
     """The turn b, then the turn a."""
     aw, ax, ay, az = a
     bw, bx, by, bz = b
-    return np.stack(
+    return np.array(
         [
             aw * bw - ax * bx - ay * by - az * bz,
             aw * bx + ax * bw + ay * bz - az * by,
@@ -48,11 +48,11 @@ def rotated(q: Array, vector: Array) -> Array:
     w, u = q[0], q[1:]
     twice = 2.0 * _cross(u, vector)
     along = w * twice + _cross(u, twice)
-    return np.stack([v + a for v, a in zip(vector, along, strict=True)])
+    return np.array([v + a for v, a in zip(vector, along, strict=True)])
 
 
 def _cross(a: Array, b: Array) -> Array:
-    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
 def continuous(q: Array) -> Array:

@@ -2,9 +2,8 @@
 
 A file is HDF5 and, after its end, one line with the SHA-256 of all bytes before it. HDF5 ignores the line; with it,
 damage is found before the HDF5 library, which may crash or never return on a damaged file, has seen it. A file without
-that line, or with another digest, is read only where the caller trusts it. The attribute ``sha256`` is a checksum of
-the content: of times, signals and texts, however they are stored. Sizes are limited in both cases, before anything is
-unpacked.
+that line, or with another digest, is read only where the caller trusts it. Sizes are limited in both cases, before
+anything is unpacked.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ import json
 import math
 import os
 import re
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -30,11 +29,10 @@ from dynsim.record.content import (
     Signal,
     check_signal,
     check_time,
-    checksum,
     is_numeric,
 )
 from dynsim.record.scene import Scene
-from dynsim.record.writer import CHECKSUM, EVENT_COLUMNS
+from dynsim.record.writer import EVENT_COLUMNS
 from dynsim.system.files import check_complete
 from dynsim.system.inputs import is_file
 
@@ -71,7 +69,7 @@ def read(path: Path, *, trust: bool = False) -> Content:
         raise RecordError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
     if doubt and not trust:
         raise RecordError(f"{path}: {doubt}; {_TRUST}")
-    return decode(path, path, trust=trust)
+    return decode(path, path)
 
 
 _TRUST = "if you know where it comes from, --trust reads it (in Python: Record.load(path, trust=True))"
@@ -103,14 +101,13 @@ def _doubt(path: Path, stream: BinaryIO) -> str:
     return ""
 
 
-def decode(path: Path, source: Path | BinaryIO, *, trust: bool = False) -> Content:
+def decode(path: Path, source: Path | BinaryIO) -> Content:
     """What an HDF5 file holds, checked part by part.
 
     Parameters
     ----------
     path : its name, for messages
     source : the file, or its bytes
-    trust : whether the content may differ from its checksum
 
     Raises
     ------
@@ -122,7 +119,7 @@ def decode(path: Path, source: Path | BinaryIO, *, trust: bool = False) -> Conte
     try:
         size = source.stat().st_size if isinstance(source, Path) else source.seek(0, os.SEEK_END)
         with h5py.File(source, "r") as file:
-            return _Reader(file, size).content(trust)
+            return _Reader(file, size).content()
     except RecordError as error:
         raise RecordError(f"{path}: {error}") from error
     except MemoryError as error:
@@ -138,6 +135,15 @@ def _allowed(size: int) -> int:
     return max(SIZE_LIMIT, RATIO_LIMIT * size)
 
 
+# Groups of data sets, and what messages call these.
+_GROUPS = {"signals": "signal {!r}", "axes": "time axis {!r}", "events": "{} of the events", "labels": "labels of {!r}"}
+
+
+def _named(path: str) -> str:
+    group, _, name = path.rpartition("/")
+    return _GROUPS[group].format(name) if group else name
+
+
 class _Reader:
     """Reads an open file; its errors do not name it."""
 
@@ -146,117 +152,111 @@ class _Reader:
         self._size = size
         self._left = _allowed(size)
 
-    def content(self, trust: bool) -> Content:
-        import h5py
-
-        file = self._file
-        found = self._attribute(file, "format")
+    def content(self) -> Content:
+        found = self._attribute(self._file, "format")
         if not isinstance(found, str) or not found.startswith(_FORMATS):
             raise RecordError(f"an HDF5 file, but not a dynsim record ({FORMAT})")
         if found != FORMAT:
             raise RecordError(f"a record of another format, {shown(found)}; this version of dynsim reads {FORMAT}")
-        complete = self._attribute(file, "complete")
+        complete = self._attribute(self._file, "complete")
         if complete is None:
             raise RecordError("a dynsim record that lacks parts: no attribute complete")
         if not isinstance(complete, (bool, np.bool_)):
             raise RecordError("attribute complete is neither true nor false")
-        time = self._numbers(self._child(file, "time", "time", h5py.Dataset), "time")
-        check_time(time)
-        axes = self._axes()
-        samples = {TIME: len(time), **{name: len(times) for name, times in axes.items()}}
-        texts = [self._text(name) for name in ("summary", "provenance")]
-        summary, provenance = self._mapping("summary", texts[0]), self._mapping("provenance", texts[1])
-        drawn = self._text("scene") if "scene" in file else ""
-        scene = Scene.from_json(drawn) if drawn else None
-        signals = {}
-        if "signals" in file:
-            group = self._child(file, "signals", "group signals", h5py.Group)
-            for name in group:
-                what = f"signal {name!r}"
-                data = self._child(group, name, what, h5py.Dataset)
-                one = Signal(
-                    self._numbers(data, what),
-                    self._string(data, "unit", what),
-                    self._labels(data, name, what),
-                    self._string(data, "description", what),
-                    self._string(data, "axis", what) if "axis" in data.attrs else TIME,
-                )
-                check_signal(name, one, samples)
-                signals[name] = one
-        content = Content(time, signals, summary, provenance, bool(complete), axes, self._events(), scene)
-        wanted = self._attribute(file, CHECKSUM)
-        if not trust and not (isinstance(wanted, str) and wanted == checksum(content, texts[0], texts[1], drawn)):
-            raise RecordError(f"damaged, or changed since: its content does not agree with its checksum; {_TRUST}")
-        return replace(
-            content,
-            time=_native(time).astype(np.float64, copy=False),
-            signals={name: replace(one, data=_native(one.data)) for name, one in signals.items()},
-            axes={name: _native(times).astype(np.float64, copy=False) for name, times in axes.items()},
+        axes = {TIME: self._times(TIME)}
+        for name in self._names("axes"):
+            if name == TIME:
+                raise RecordError(f"{TIME} is the name of the record's own axis")
+            axes[name] = self._times(f"axes/{name}")
+        samples = {name: len(times) for name, times in axes.items()}
+        scene = self._text("scene") if "scene" in self._file else ""
+        signals = {name: self._signal(name, samples) for name in self._names("signals")}
+        return Content(
+            time=axes.pop(TIME),
+            signals=signals,
+            summary=_mapping("summary", self._text("summary")),
+            provenance=_mapping("provenance", self._text("provenance")),
+            complete=bool(complete),
+            axes=axes,
+            events=self._events(),
+            scene=Scene.from_json(scene) if scene else None,
         )
 
-    def _axes(self) -> dict[str, NDArray[Any]]:
-        """Further time axes."""
-        import h5py
+    def _times(self, path: str) -> NDArray[np.float64]:
+        times = self._numbers(path)
+        check_time(times, _named(path))
+        return times.astype(np.float64, copy=False)
 
-        if "axes" not in self._file:
-            return {}
-        found = {}
-        group = self._child(self._file, "axes", "group axes", h5py.Group)
-        for name in group:
-            what = f"time axis {name!r}"
-            found[name] = self._numbers(self._child(group, name, what, h5py.Dataset), what)
-            check_time(found[name], what)
-        if TIME in found:
-            raise RecordError(f"{TIME} is the name of the record's own axis")
-        return found
+    def _signal(self, name: str, samples: Mapping[str, int]) -> Signal:
+        path = f"signals/{name}"
+        data, attributes = self._numbers(path), self._file[path].attrs
+        kept = "labels" in attributes or "labels" not in self._file
+        labels = self._attribute(self._file[path], "labels") if kept else self._column(f"labels/{name}")
+        if labels is None:
+            raise RecordError(f"a dynsim record that lacks parts: no labels of {_named(path)}")
+        axis = self._string(path, "axis") if "axis" in attributes else TIME
+        texts = _texts(labels, f"{_named(path)} has labels")
+        signal = Signal(data, self._string(path, "unit"), texts, self._string(path, "description"), axis)
+        check_signal(name, signal, samples)
+        return signal
 
     def _events(self) -> list[Event]:
-        import h5py
-
-        if "events" not in self._file:
+        if not self._names("events"):
             return []
-        group = self._child(self._file, "events", "group events", h5py.Group)
-        columns: dict[str, list[Any]] = {}
+        columns: dict[str, Sequence[Any]] = {}
         for name, kind in EVENT_COLUMNS.items():
-            what = f"{name} of the events"
-            data = self._child(group, name, what, h5py.Dataset)
+            path = f"events/{name}"
             texts = kind is str
-            columns[name] = list(self._column(data, "events", name) if texts else self._numbers(data, what).ravel())
+            columns[name] = _texts(self._column(path), f"events has {name}") if texts else self._numbers(path).tolist()
             if len(columns[name]) != len(columns["time"]):
-                raise RecordError(f"{what} has {len(columns[name])} entries, their times {len(columns['time'])}")
-        columns["value"] = [None if np.isnan(value) else float(value) for value in columns["value"]]
-        columns["time"] = [float(time) for time in columns["time"]]
+                counts = len(columns[name]), len(columns["time"])
+                raise RecordError(f"{_named(path)} has {counts[0]} entries, their times {counts[1]}")
         if not all(map(math.isfinite, columns["time"])):
             raise RecordError("time of the events is not finite")
+        columns["value"] = [None if math.isnan(value) else value for value in columns["value"]]
         return [Event(*entries) for entries in zip(*(columns[name] for name in EVENT_COLUMNS), strict=True)]
 
-    def _child(self, parent: Any, name: str, what: str, kind: type) -> Any:
-        """A group or data set that lies in the file itself."""
+    def _names(self, group: str) -> list[str]:
+        return list(self._child(group, group=True)) if group in self._file else []
+
+    def _child(self, path: str, *, group: bool = False) -> Any:
+        """A data set, or a group of them, that lies in the file itself."""
         import h5py
 
-        link = parent.get(name, getlink=True)
+        what = f"group {path}" if group else _named(path)
+        link = self._file.get(path, getlink=True)
         if link is None:
             raise RecordError(f"a dynsim record that lacks parts: no {what}")
         if not isinstance(link, h5py.HardLink):
             raise RecordError(f"{what} is a link to somewhere else; links are not followed")
-        found = parent[name]
-        if not isinstance(found, kind):
-            raise RecordError(f"{what} is no {'group' if kind is h5py.Group else 'data set'}")
+        found = self._file[path]
+        if not isinstance(found, h5py.Group if group else h5py.Dataset):
+            raise RecordError(f"{what} is no {'group' if group else 'data set'}")
         return found
 
-    def _numbers(self, data: Any, what: str) -> NDArray[Any]:
+    def _numbers(self, path: str) -> NDArray[Any]:
         """An array of real numbers."""
-        dtype = data.dtype
-        if not is_numeric(dtype):
-            raise RecordError(f"{what} holds {dtype}, not real numbers")
-        self._check_storage(data, what)
-        return np.asarray(data[()])
+        data = self._child(path)
+        if not is_numeric(data.dtype):
+            raise RecordError(f"{_named(path)} holds {data.dtype}, not real numbers")
+        return np.asarray(self._values(data, path))
 
-    def _check_storage(self, data: Any, what: str) -> None:
-        """Refuse what lies outside of the file, and sizes that are not there or beyond the limit."""
+    def _column(self, path: str) -> NDArray[Any]:
+        """Texts, kept as a data set."""
+        return np.asarray(self._values(self._child(path), path))
+
+    def _text(self, name: str) -> str:
+        """A long text, kept as a data set."""
+        text = self._values(self._child(name), name)
+        if not isinstance(text, bytes):
+            raise RecordError(f"{name} is not a text")
+        return text.decode("utf-8")
+
+    def _values(self, data: Any, path: str) -> Any:
+        """The content of a data set; none that lies outside of the file, is not there, or is beyond the limit."""
         import h5py
 
-        properties = data.id.get_create_plist()
+        what, properties = _named(path), data.id.get_create_plist()
         if properties.get_external_count() or data.is_virtual:
             raise RecordError(f"{what} lies in other files, which are not opened")
         if data.shape is None:
@@ -275,25 +275,7 @@ class _Reader:
                 f"{what} would unpack to {size} bytes; a file of {self._size} bytes may unpack to "
                 f"{_allowed(self._size)} in all"
             )
-
-    def _text(self, name: str) -> str:
-        """A long text, kept as a data set."""
-        import h5py
-
-        data = self._child(self._file, name, name, h5py.Dataset)
-        if h5py.check_string_dtype(data.dtype) is None or data.shape != ():
-            raise RecordError(f"{name} is not a text")
-        self._check_storage(data, name)
-        return str(data.asstr()[()])
-
-    def _mapping(self, name: str, text: str) -> dict[str, Any]:
-        try:
-            found = json.loads(text)
-        except (ValueError, RecursionError) as error:
-            raise RecordError(f"{name} is not JSON ({error})") from error
-        if not isinstance(found, dict):
-            raise RecordError(f"{name} is {type(found).__name__}, not a mapping")
-        return found
+        return data[()]
 
     def _attribute(self, owner: Any, name: str) -> Any:
         """An attribute of a size that fits the file, None if there is none."""
@@ -304,43 +286,28 @@ class _Reader:
             raise RecordError(f"attribute {name} claims more bytes than the file has")
         return owner.attrs[name]
 
-    def _string(self, owner: Any, name: str, what: str) -> str:
-        value = self._attribute(owner, name)
-        if isinstance(value, bytes):
-            value = value.decode("utf-8")
+    def _string(self, path: str, name: str) -> str:
+        value = self._attribute(self._file[path], name)
         if not isinstance(value, str):
-            raise RecordError(f"{what} has no text as {name}")
+            raise RecordError(f"{_named(path)} has no text as {name}")
         return value
 
-    def _labels(self, data: Any, name: str, what: str) -> tuple[str, ...]:
-        import h5py
 
-        if "labels" in data.attrs:
-            return _texts(np.asarray(self._attribute(data, "labels")), f"{what} has labels")
-        if "labels" not in self._file:
-            raise RecordError(f"a dynsim record that lacks parts: no labels of {what}")
-        kept = self._child(self._file, "labels", "group labels", h5py.Group)
-        return self._column(self._child(kept, name, f"labels of {what}", h5py.Dataset), what, "labels")
-
-    def _column(self, data: Any, what: str, name: str) -> tuple[str, ...]:
-        """Texts, kept as a data set."""
-        import h5py
-
-        if h5py.check_string_dtype(data.dtype) is None:
-            raise RecordError(f"{what} has {name} that are no texts")
-        self._check_storage(data, f"{name} of {what}")
-        return _texts(np.asarray(data[()]), f"{what} has {name}")
+def _mapping(name: str, text: str) -> dict[str, Any]:
+    try:
+        found = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise RecordError(f"{name} is not JSON ({error})") from error
+    if not isinstance(found, dict):
+        raise RecordError(f"{name} is {type(found).__name__}, not a mapping")
+    return found
 
 
-def _texts(found: NDArray[Any], what: str) -> tuple[str, ...]:
-    if found.ndim != 1:
+def _texts(values: Any, what: str) -> tuple[str, ...]:
+    """Texts of an attribute or a data set, which h5py reads as str or as bytes."""
+    if np.ndim(values) != 1:
         raise RecordError(f"{what} that are no list")
-    texts = tuple(text.decode("utf-8") if isinstance(text, bytes) else text for text in found.tolist())
+    texts = tuple(text.decode("utf-8") if isinstance(text, bytes) else text for text in np.asarray(values).tolist())
     if not all(isinstance(text, str) for text in texts):
         raise RecordError(f"{what} that are no texts")
     return texts
-
-
-def _native(array: NDArray[Any]) -> NDArray[Any]:
-    """In the byte order of this machine."""
-    return array if array.dtype.isnative else array.astype(array.dtype.newbyteorder("="))

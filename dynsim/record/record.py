@@ -142,9 +142,7 @@ class Record:
         return self.signals[name]
 
     def __repr__(self) -> str:
-        scenario = self.provenance.get("scenario")
-        names = [scenario.get("name"), scenario.get("variant")] if isinstance(scenario, Mapping) else []
-        title = " / ".join(str(name) for name in names if name)
+        title = self.title
         span = f", {self.time[0]:g} to {self.time[-1]:g} s" if len(self) else ""
         first = ", ".join(list(self.signals)[:_SHOWN]) + (", …" if len(self.signals) > _SHOWN else "")
         parts = [f"{len(self)} samples{span}", f"{len(self.signals)} signals{f' ({first})' if first else ''}"]
@@ -196,6 +194,13 @@ class Record:
         return len(self.time)
 
     @property
+    def title(self) -> str:
+        """Scenario and variant, or the robot of a measured run; "" where neither is known."""
+        scenario, robot = self.provenance.get("scenario"), self.provenance.get("robot")
+        names = [scenario.get("name"), scenario.get("variant")] if isinstance(scenario, Mapping) else []
+        return " / ".join(str(name) for name in names if name) or (f"{robot}, measured" if robot else "")
+
+    @property
     def units(self) -> dict[str, str]:
         """Unit of every signal."""
         return Entries("signal", {name: signal.unit for name, signal in self.signals.items()})
@@ -240,17 +245,18 @@ class Record:
 
     def to_hdf5(self) -> memoryview:
         """The bytes of the file that :meth:`save` writes."""
-        return writer.encode(
-            Content(
-                time=self.time,
-                signals=self.signals,
-                summary=self.summary,
-                provenance=self.provenance,
-                complete=self.complete,
-                axes=self.axes,
-                events=self.events,
-                scene=self.scene,
-            )
+        return writer.encode(self._content())
+
+    def _content(self) -> Content:
+        return Content(
+            time=self.time,
+            signals=self.signals,
+            summary=self.summary,
+            provenance=self.provenance,
+            complete=self.complete,
+            axes=self.axes,
+            events=self.events,
+            scene=self.scene,
         )
 
     @classmethod
@@ -280,11 +286,11 @@ class Record:
 
     def to_dataframe(self, axis: str = TIME) -> pandas.DataFrame:
         """A pandas DataFrame of the signals on one time axis, see :func:`dynsim.record.export.to_dataframe`."""
-        return export.to_dataframe(self, axis)
+        return export.to_dataframe(self._content(), axis)
 
     def to_xarray(self) -> xarray.Dataset:
         """An xarray Dataset of all signals, see :func:`dynsim.record.export.to_xarray`."""
-        return export.to_xarray(self)
+        return export.to_xarray(self._content())
 
 
 def _entries(what: str, entries: Mapping[str, Any]) -> Entries:

@@ -182,23 +182,26 @@ class Surface:
         bent = np.einsum("...i,ij,...j", points, np.array(self.Q), points)
         return np.asarray(0.5 * bent + points @ np.array(self.b) + self.c)
 
-    def gradient(self, point: NDArray[np.float64]) -> NDArray[np.float64]:
-        """∇C at a point, (3,)."""
+    def gradient(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """∇C at points, (…, 3) → (…, 3)."""
         if self.kind in ("box", "height_field"):
             step = 1e-6
-            ends = point + step * np.stack([np.eye(3), -np.eye(3)])
-            value = self.value(ends)
-            return np.asarray((value[0] - value[1]) / (2.0 * step))
-        return np.asarray(np.array(self.Q) @ point + np.array(self.b))
+            ends = [(points + step * axis, points - step * axis) for axis in np.eye(3)]
+            return np.stack([self.value(ahead) - self.value(behind) for ahead, behind in ends], axis=-1) / (2.0 * step)
+        return np.asarray(points @ np.array(self.Q) + np.array(self.b))
 
-    def gap(self, point: NDArray[np.float64]) -> float:
-        """Signed distance [m] of a point along ∇C, exact for plane, sphere and cylinder."""
-        gradient = self.gradient(point)
-        slope = float(np.linalg.norm(gradient))
-        normal = gradient / slope
-        value, curvature = float(self.value(point)), float(normal @ np.array(self.Q) @ normal)
-        inner = slope * slope - 2.0 * curvature * value
-        return 2.0 * value / (slope + inner**0.5) if inner > 0.0 else value / slope
+    def normal(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Unit normals into the free side at points, (…, 3) → (…, 3); zero where ∇C is."""
+        slope = self.gradient(points)
+        size = np.linalg.norm(slope, axis=-1, keepdims=True)
+        return np.asarray(slope / np.where(size > 0.0, size, 1.0))
+
+    def gap(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Signed distances [m] of points along ∇C, (…, 3) → (…), exact for plane, sphere and cylinder."""
+        value, size, n = self.value(points), np.linalg.norm(self.gradient(points), axis=-1), self.normal(points)
+        inner = size * size - 2.0 * value * np.einsum("...i,ij,...j", n, np.array(self.Q), n)
+        with np.errstate(all="ignore"):
+            return np.asarray(np.where(inner > 0.0, 2.0 * value / (size + np.sqrt(inner)), value / size))
 
     @property
     def grid(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -209,15 +212,11 @@ class Surface:
 
     def _height(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Between the heights of the grid in straight lines; beyond it as at its edge."""
-        heights, place = np.array(self.heights), []
-        for values, lines in zip((y, x), self.grid[::-1], strict=True):
-            at = np.clip((values - lines[0]) / (lines[1] - lines[0]), 0.0, len(lines) - 1.0)
-            cell = np.minimum(at.astype(int), len(lines) - 2)
-            place.append((cell, at - cell))
-        (j, v), (i, u) = place
-        low = (1.0 - u) * heights[j, i] + u * heights[j, i + 1]
-        high = (1.0 - u) * heights[j + 1, i] + u * heights[j + 1, i + 1]
-        return np.asarray((1.0 - v) * low + v * high)
+        from scipy.ndimage import map_coordinates  # height fields are rare
+
+        start, spacing = np.array(self.position), np.array(self.spacing)
+        cells = np.stack([(y - start[1]) / spacing[1], (x - start[0]) / spacing[0]])
+        return np.asarray(map_coordinates(np.array(self.heights), cells, order=1, mode="nearest"))
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Records as HDF5 files, the writing half: everything with its checksum, made in memory."""
+"""Records as HDF5 files, the writing half: made in memory, with a digest of all bytes after the end."""
 
 from __future__ import annotations
 
@@ -11,12 +11,10 @@ from collections.abc import Sequence
 from typing import Any
 
 from dynsim.errors import RecordError
-from dynsim.record.content import FORMAT, TIME, Content, Event, Signal, check_name, check_time, checksum
+from dynsim.record.content import FORMAT, TIME, Content, Event, Signal, check_name, check_time
 
 EVENT_COLUMNS = {"time": float, "kind": str, "name": str, "value": float, "description": str}
 """Attributes of events; each is a data set of the group ``events``."""
-CHECKSUM = "sha256"
-"""Attribute of the file with the checksum of its content."""
 _LABELS_IN_ATTRIBUTE = 1000
 """More labels are a data set: HDF5 attributes end at 64 kB, which is 4090 labels."""
 
@@ -42,7 +40,6 @@ def encode(content: Content) -> memoryview:
     with h5py.File(image, "w") as file:
         file.attrs["format"] = FORMAT
         file.attrs["complete"] = content.complete
-        file.attrs[CHECKSUM] = checksum(content, summary, provenance, scene)
         # Long texts as data sets: HDF5 attributes end at 64 kB.
         file["summary"] = summary
         file["provenance"] = provenance

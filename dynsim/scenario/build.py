@@ -23,7 +23,7 @@ from dynsim.model.surfaces import SURFACES, Surface
 from dynsim.scenario.candidates import candidates
 from dynsim.scenario.loads import Payload
 from dynsim.scenario.schema import ContactPoint, Contacts, Scenario
-from dynsim.system.reuse import Reuse
+from dynsim.system.memo import recall
 
 if TYPE_CHECKING:
     from dynsim.snake.description import SnakeDescription, TaskSpaceController
@@ -55,25 +55,21 @@ def robot(scenario: Scenario) -> Robot:
     return built if scenario.config.initial is None else _posed(scenario, built, _nameable(scenario, built))
 
 
-def robot_and_contacts(scenario: Scenario, reuse: Reuse | None = None) -> tuple[Robot, list[Contact]]:
-    """:func:`robot` and all enabled contacts, each built once.
-
-    ``reuse`` : what other runs have computed; the robot is theirs where plant, payloads and posture are
-    """
-    reuse = reuse or Reuse()
-    config, built = scenario.config, unposed(scenario, reuse)
-    touching = contacts(scenario, built, reuse)
+def robot_and_contacts(scenario: Scenario) -> tuple[Robot, list[Contact]]:
+    """:func:`robot` and all enabled contacts, each built once."""
+    config, built = scenario.config, unposed(scenario)
+    touching = contacts(scenario, built)
     if config.initial is None:
         return built, touching
-    points = _nameable(scenario, built, reuse)
+    points = _nameable(scenario, built)
     places = [contact.geometry for contact in points]
-    return reuse.of("posture", lambda: _posed(scenario, built, points), built, config.initial, places), touching
+    return recall("posture", lambda: _posed(scenario, built, points), built, config.initial, places), touching
 
 
-def unposed(scenario: Scenario, reuse: Reuse) -> Robot:
+def unposed(scenario: Scenario) -> Robot:
     """The robot in the posture of its plant, before ``initial``."""
     config = scenario.config
-    return reuse.of("plant", lambda: _loaded(scenario), config.plant, config.duration_s, config.loads)
+    return recall("plant", lambda: _loaded(scenario), config.plant, config.duration_s, config.loads)
 
 
 def _loaded(scenario: Scenario) -> Robot:
@@ -92,7 +88,7 @@ def _loaded(scenario: Scenario) -> Robot:
     return replace(bare, links=tuple(links)) if inertias else bare
 
 
-def _nameable(scenario: Scenario, built: Robot, reuse: Reuse | None = None) -> list[Contact]:
+def _nameable(scenario: Scenario, built: Robot) -> list[Contact]:
     """What ``initial`` may name: all contacts, and disabled points, so that braced and free start in one posture."""
     initial = scenario.config.initial
     if initial is None or not initial.on_surface:
@@ -100,11 +96,11 @@ def _nameable(scenario: Scenario, built: Robot, reuse: Reuse | None = None) -> l
     options = scenario.config.contacts
     disabled = [name for name, point in options.points.items() if not point.enabled and name in initial.on_surface]
     if not disabled:
-        return contacts(scenario, built, reuse)
+        return contacts(scenario, built)
     chosen = {name: options.points[name].model_copy(update={"enabled": True}) for name in disabled}
     only = options.model_copy(update={"points": chosen, "candidates": "points"})
     alone = replace(scenario, config=scenario.config.model_copy(update={"contacts": only}))
-    return [*contacts(scenario, built, reuse), *contacts(alone, built, reuse)]
+    return [*contacts(scenario, built), *contacts(alone, built)]
 
 
 def _posed(scenario: Scenario, built: Robot, touching: Sequence[Contact]) -> Robot:
@@ -139,7 +135,6 @@ def controller(
     machine: Model,
     progress: Callable[[float], None] | None = None,
     touching: Sequence[Contact] | None = None,
-    reuse: Reuse | None = None,
 ) -> JointControl: ...
 @overload
 def controller(
@@ -150,7 +145,6 @@ def controller(
     machine: Model | SnakeDescription,
     progress: Callable[[float], None] | None = None,
     touching: Sequence[Contact] | None = None,
-    reuse: Reuse | None = None,
 ) -> JointControl | TaskSpaceController:
     """The controller for a machine.
 
@@ -158,7 +152,6 @@ def controller(
     ----------
     progress : called with the time [s] that the references have come to
     touching : the contacts of the scenario, when they are built already
-    reuse : what other runs have computed; a controller that looks at no contact is theirs where machine and section are
 
     Raises
     ------
@@ -176,21 +169,20 @@ def controller(
         touching = contacts(scenario, machine.robot) if isinstance(machine, Model) else ()
     points = {contact.name: contact for contact in touching}
     declared = [name for name in points if name in scenario.config.contacts.points]
-    reuse, looked = reuse or Reuse(), _Looked(points)
-    context = BuildContext(
-        scenario.duration_s, machine, progress=progress, contacts=looked, declared=declared, reuse=reuse
-    )
+    looked = _Looked(points)
+    context = BuildContext(scenario.duration_s, machine, progress=progress, contacts=looked, declared=declared)
     if isinstance(machine, Model):
 
         def built() -> JointControl:
             return families.build("controller", config, context, JointControl)
 
         def blind() -> JointControl | None:
+            # One that looks at no contact is that of all runs of the same machine and section.
             made.append(built())
             return None if looked.at else made[0]
 
         made: list[JointControl] = []
-        known = reuse.of("controller", blind, config, scenario.duration_s, machine, [*points], declared)
+        known = recall("controller", blind, config, scenario.duration_s, machine, [*points], declared)
         control = known or (made[0] if made else built())
         # The kernels would follow the last polynomial on.
         if control.end < scenario.duration_s * (1.0 - 1e-6):
@@ -223,21 +215,20 @@ class _Looked(Mapping[str, Contact]):
         return len(self._contacts)
 
 
-def surfaces(scenario: Scenario, reuse: Reuse | None = None) -> dict[str, Surface]:
+def surfaces(scenario: Scenario) -> dict[str, Surface]:
     """All surfaces by name, whether anything touches them or not."""
     context, configs = BuildContext(scenario.duration_s), scenario.config.surfaces
 
     def built() -> dict[str, Surface]:
         return {name: families.build("surface", config, context, SURFACES) for name, config in configs.items()}
 
-    return (reuse or Reuse()).of("surfaces", built, scenario.duration_s, configs)
+    return recall("surfaces", built, scenario.duration_s, configs)
 
 
-def contacts(scenario: Scenario, described: Robot | None = None, reuse: Reuse | None = None) -> list[Contact]:
+def contacts(scenario: Scenario, described: Robot | None = None) -> list[Contact]:
     """All enabled contact points with their surfaces, then the other candidates.
 
     ``described`` : the robot of the scenario, when it is known already; candidates that are not points are its parts
-    ``reuse`` : what other runs have computed
 
     Raises
     ------
@@ -245,7 +236,7 @@ def contacts(scenario: Scenario, described: Robot | None = None, reuse: Reuse | 
         A point on a surface that the scenario does not have.
     """
     options = scenario.config.contacts
-    known = surfaces(scenario, reuse)
+    known = surfaces(scenario)
     result = []
     for name, point in options.points.items():
         if not point.enabled:

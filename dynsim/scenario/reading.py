@@ -10,7 +10,7 @@ import io
 import itertools
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -114,24 +114,22 @@ class ScenarioFile:
 
     def load(self, variant: str | None = None, overrides: Mapping[str, Any] | None = None) -> Scenario:
         """See :func:`load_scenario`."""
-        path, data = self.path, self.data
         variants, variant = self.chosen(variant)
-        if overrides is not None and not (
-            isinstance(overrides, Mapping) and all(isinstance(key, str) for key in overrides)
-        ):
+        overrides = {} if overrides is None else overrides
+        if not (isinstance(overrides, Mapping) and all(isinstance(key, str) for key in overrides)):
             raise ScenarioError(
                 f"overrides must map dotted keys to values, as {{'integrator.rtol': 1e-8}} does, not {shown(overrides)}"
             )
-        merged, origin = _merged(path, data, variants, variant, overrides or {})
+        merged, origin = self._merged(variant, overrides)
         try:
             config = ScenarioConfig.model_validate(merged)
         except ValidationError as error:
             unknown = unknown_keys(error, merged, origin, ScenarioConfig, TOP)
             if unknown:
                 for other in [name for name in itertools.islice(variants, VARIANTS_SEARCHED) if name != variant]:
-                    unknown += _unknown_keys_of(path, data, variants, other, overrides or {})
+                    unknown += self._unknown_keys(other, overrides)
             raise ScenarioError(explain(error, merged, origin, unknown)) from None
-        return Scenario(config.name, config.variant, config, path, origin)
+        return Scenario(config.name, config.variant, config, self.path, origin)
 
     def chosen(self, variant: str | None) -> tuple[Mapping[str, Any], str | None]:
         """All variants, and the name of the one that is meant, None without any; ScenarioError if there is no such."""
@@ -153,100 +151,41 @@ class ScenarioFile:
             raise ScenarioError(f"{path}: has no variants, so there is no {variant!r}")
         return variants, variant
 
-    def near(self, variant: str | None, overrides: Mapping[str, Any]) -> Near:
-        """What loads scenarios that differ from one variant with some overrides in few values."""
-        return Near(self, variant, overrides)
+    def _merged(self, variant: str | None, overrides: Mapping[str, Any]) -> tuple[dict[str, Any], Origin]:
+        """One variant of a file with overrides on top, and where its values come from."""
+        shared = YamlMapping()
+        shared.update({key: value for key, value in self.data.items() if key != "variants"})
+        shared.lines = {key: line for key, line in self.data.lines.items() if key in shared}
+        variants: Any = self.data.get("variants")
+        difference: Any = variants.get(variant) if variants and variant is not None else None
+        if difference is None:
+            difference = {}
+        if not isinstance(difference, Mapping):
+            line = f":{variants.lines[variant]}" if isinstance(variants, YamlMapping) and variant is not None else ""
+            raise ScenarioError(f"{self.path}{line}: variant {value_text(variant)} must be a mapping of what differs")
+        overriding = "--set" if isinstance(overrides, SetOptions) else "overrides"
+        origin = Origin(self.path, (difference, shared), tuple(overrides), overriding)
+        merged = _plain(_merge(shared, difference))
+        for key, value in overrides.items():
+            _override(merged, key, _plain(value), overriding, variant)
+        if merged.get("name") in (None, ""):
+            merged["name"] = self.path.stem
+        if variant is not None:
+            merged["variant"] = variant
+        _make_absolute(merged, self.path.parent)
+        _check_sizes(merged, (), origin)
+        return merged, origin
 
-
-class Near:
-    """Scenarios of one variant that differ in few values: the rest is merged and validated once, and shared.
-
-    Sections (keys at the top) without a changed value are the same objects in all of them.
-    """
-
-    def __init__(self, file: ScenarioFile, variant: str | None, overrides: Mapping[str, Any]) -> None:
-        self._file, self._variant, self._overrides = file, variant, dict(overrides)
-        self._first: Scenario | None = None
-        self._merged: dict[str, Any] = {}
-        self._name: str | None = None
-
-    def load(self, values: Mapping[str, Any]) -> Scenario:
-        """What :meth:`ScenarioFile.load` gives for the overrides with ``values`` on top.
-
-        Raises
-        ------
-        ScenarioError
-            The same.
-        """
-        with suppress(ScenarioError, ValidationError):
-            if (scenario := self._changed(values)) is not None:
-                return scenario
-        # All that is unusual, errors above all, is found by the long way.
-        return self._file.load(self._variant, self._overrides | dict(values))
-
-    def _changed(self, values: Mapping[str, Any]) -> Scenario | None:
-        """The scenario, with nothing but the changed sections merged and validated anew; None where that is not all."""
-        if self._first is None:
-            self._first = self._file.load(self._variant, self._overrides)
-            variants, self._name = self._file.chosen(self._variant)
-            self._merged, _ = _merged(self._file.path, self._file.data, variants, self._name, self._overrides)
-        first, merged, origin = self._first, self._merged, self._first.origin
-        sections = {key.split(".")[0] for key in values}
-        sound = sections.isdisjoint(("name", "variant", *TOP)) and sections <= first.config.model_fields_set
-        if origin is None or not sound or not self._overrides.keys().isdisjoint(values):
-            return None
-        changed = {section: _plain(merged[section]) for section in sections}
-        for key, value in values.items():
-            _override(changed, key, _plain(value), origin.overriding, self._name)
-        _make_absolute(changed, self._file.path.parent)
-        _check_sizes(changed, (), origin)
-        # Parts that are models are not validated again.
-        parts = {name: getattr(first.config, name) for name in first.config.model_fields_set}
-        validated = ScenarioConfig.model_validate(parts | changed)
-        config = first.config.model_copy(update={name: getattr(validated, name) for name in sections})
-        origin = replace(origin, overrides=(*origin.overrides, *values))
-        return Scenario(config.name, config.variant, config, first.source, origin)
-
-
-def _merged(
-    path: Path, data: YamlMapping, variants: Mapping[str, Any], variant: str | None, overrides: Mapping[str, Any]
-) -> tuple[dict[str, Any], Origin]:
-    """One variant of a file with overrides on top, and where its values come from."""
-    shared = YamlMapping()
-    shared.update({key: value for key, value in data.items() if key != "variants"})
-    shared.lines = {key: line for key, line in data.lines.items() if key in shared}
-    difference: Any = variants.get(variant) if variant is not None else None
-    if difference is None:
-        difference = {}
-    if not isinstance(difference, Mapping):
-        line = f":{variants.lines[variant]}" if isinstance(variants, YamlMapping) and variant is not None else ""
-        raise ScenarioError(f"{path}{line}: variant {value_text(variant)} must be a mapping of what differs")
-    overriding = "--set" if isinstance(overrides, SetOptions) else "overrides"
-    origin = Origin(path, (difference, shared), tuple(overrides), overriding)
-    merged = _plain(_merge(shared, difference))
-    for key, value in overrides.items():
-        _override(merged, key, _plain(value), overriding, variant)
-    if merged.get("name") in (None, ""):
-        merged["name"] = path.stem
-    if variant is not None:
-        merged["variant"] = variant
-    _make_absolute(merged, path.parent)
-    _check_sizes(merged, (), origin)
-    return merged, origin
-
-
-def _unknown_keys_of(
-    path: Path, data: YamlMapping, variants: Mapping[str, Any], variant: str, overrides: Mapping[str, Any]
-) -> list[str]:
-    """Unknown keys of another variant; nothing when it has other faults."""
-    try:
-        merged, origin = _merged(path, data, variants, variant, overrides)
-        ScenarioConfig.model_validate(merged)
-    except ScenarioError:
+    def _unknown_keys(self, variant: str, overrides: Mapping[str, Any]) -> list[str]:
+        """Unknown keys of a variant; nothing when it has other faults."""
+        try:
+            merged, origin = self._merged(variant, overrides)
+            ScenarioConfig.model_validate(merged)
+        except ScenarioError:
+            return []
+        except ValidationError as error:
+            return unknown_keys(error, merged, origin, ScenarioConfig, TOP)
         return []
-    except ValidationError as error:
-        return unknown_keys(error, merged, origin, ScenarioConfig, TOP)
-    return []
 
 
 def scenario_from_resolved(resolved: Mapping[str, Any]) -> Scenario:
@@ -307,8 +246,6 @@ def _plain(value: Any) -> Any:
         return [_plain(item) for item in value]
     if isinstance(value, bool) or value is None:
         return value
-    if isinstance(value, np.generic):
-        return value.item()
     for kind in (int, float, str):
         if isinstance(value, kind):
             return kind(value)

@@ -172,15 +172,6 @@ class Integrator(StrictConfig):
             raise ValueError("is no longer there; radau5 does what it did, at any inductance, and takes longer steps")
         return value
 
-    @model_validator(mode="before")
-    @classmethod
-    def _renamed(cls, value: object) -> object:
-        if isinstance(value, dict) and "time_limit_h" in value:
-            raise error_at(
-                "time_limit_h", "is no longer there; wall_limit_s, in seconds, refuses runs too, and ends them"
-            )
-        return value
-
     @model_validator(mode="after")
     def _check_method(self) -> Self:
         stepping = self.method == "time_stepping"

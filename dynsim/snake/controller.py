@@ -29,7 +29,7 @@ LIMITS_NONE, LIMITS_SATURATE, LIMITS_ALLOCATE = 0, 1, 2
 NULL_PAPER, NULL_SAFE = 0, 1
 
 
-class Law(NamedTuple):
+class ControlLaw(NamedTuple):
     """Constants of the controller; SI units, rates [1/s]."""
 
     gain: np.ndarray  # (6 + m,) diagonal of K
@@ -47,7 +47,7 @@ class Law(NamedTuple):
     cost: Cost
 
 
-class Work(NamedTuple):
+class ControlWork(NamedTuple):
     """Workspace and results of one controller evaluation."""
 
     frame: np.ndarray  # (3, 3)
@@ -72,11 +72,11 @@ class Work(NamedTuple):
     at_limit: np.ndarray  # (n_phi,) 1 where a joint was taken out of the allocation, 2 where it could not be
 
 
-def new_work(model: SnakeModel) -> Work:
+def new_work(model: SnakeModel) -> ControlWork:
     """Empty workspace of :func:`control_input`."""
     joints = model.head_joints + model.base_joints
     rows, inputs = model.base_joints + 4 + model.wheels, joints + model.wheels
-    return Work(
+    return ControlWork(
         frame=np.zeros((3, 3)),
         chain=new_chain(model),
         support=new_support(model),

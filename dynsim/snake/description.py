@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 
 from dynsim.errors import ModelError
 from dynsim.jit.kernel import integers, reals
-from dynsim.snake.controller import Law
+from dynsim.snake.controller import ControlLaw
 from dynsim.snake.kinematics import SnakeModel, active_rows, constraint_matrices, new_chain, pose_of_point, walk_chain
 from dynsim.snake.state import Schedule
 
 Policy = Literal["fixed", "cyclic", "predictive"]
+
+COORDINATES = ("x", "y", "z", "alpha", "beta", "gamma")
 
 # Mode requests of an operator; a positive one is the number of a mode.
 NO_REQUEST, SWITCHING, FIXING = 0, -1, -2
@@ -201,7 +203,7 @@ class TaskSpaceController:
     ``prediction`` is the schedule of a predicted period: coarser steps, ``prediction_ticks`` of them.
     """
 
-    law: Law
+    law: ControlLaw
     schedule: Schedule
     prediction: Schedule
     prediction_ticks: int
@@ -217,7 +219,7 @@ class TaskSpaceController:
 
 
 def conditioning(
-    model: SnakeModel, law: Law, row: int, base: NDArray[np.float64], phi: NDArray[np.float64]
+    model: SnakeModel, law: ControlLaw, row: int, base: NDArray[np.float64], phi: NDArray[np.float64]
 ) -> Conditioning:
     """Ranks and singular values of A~ and B~ ([T] eqs 10, 11) of one mode at a posture on the ground."""
     chain, w, frame = new_chain(model), np.zeros(6), np.zeros((3, 3))

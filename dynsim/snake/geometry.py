@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from dynsim.errors import MissingEntry
 from dynsim.record import Record
 from dynsim.record.scene import Scene
 
@@ -34,23 +35,15 @@ class SnakeGeometry:
 
 
 def snake_geometry(record: Record) -> SnakeGeometry:
-    """Geometry of the snake of a record; one of version 0.1 has no scene, but has it in its provenance.
+    """Geometry of the snake of a record.
 
     Raises
     ------
     MissingEntry
-        It is in neither.
+        The record has no scene.
     """
     if record.scene is None:
-        old = record.provenance["snake"]
-        return SnakeGeometry(
-            head_joints=old["head_joints"],
-            pitch=np.array(old["pitch"], dtype=bool),
-            lower=np.array(old["lower_rad"]),
-            upper=np.array(old["upper_rad"]),
-            wheel_radius=old["wheel_radius_m"],
-            half_track=np.array(old["half_track_m"]),
-        )
+        raise MissingEntry("the record has no scene, which says what the snake is like")
     names = record.labels["phi"]
     joints = {body.joint.name: body.joint for body in record.scene.bodies}
     lower, upper = np.array([[joints[name].lower, joints[name].upper] for name in names], dtype=np.float64).T

@@ -12,11 +12,10 @@ from typing import NamedTuple
 import numpy as np
 
 from dynsim.record import Record
+from dynsim.snake.description import COORDINATES
 from dynsim.snake.geometry import snake_geometry
 
 Table = list[list[str]]  # head line first
-
-COORDINATES = ("x", "y", "z", "alpha", "beta", "gamma")
 
 
 class Displacement(NamedTuple):

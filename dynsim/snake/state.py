@@ -10,14 +10,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dynsim.snake.controller import Work, new_work
+from dynsim.snake.controller import ControlWork, new_work
 from dynsim.snake.kinematics import SnakeModel
 
 MEASURED, ESTIMATED, FEEDFORWARD = 0, 1, 2
 # Why a command cannot be carried out.
 NO_OBSTACLE, JOINT_LIMIT, RATE_LIMIT, SINGULAR, ATTITUDE = 0, 1, 2, 3, 4
 # State.counts
-MODE = 0  # row of the mode in Law.grounded
+MODE = 0  # row of the mode in ControlLaw.grounded
 TICKS = 1  # run
 CLAMPED = 2  # joint-ticks clamped at a limit
 PLACE = 3  # commands carried out of the present block
@@ -44,7 +44,7 @@ class Schedule(NamedTuple):
     null_start_tick: int
 
 
-class State(NamedTuple):
+class SnakeState(NamedTuple):
     """Everything that changes from tick to tick."""
 
     base: np.ndarray  # (3,) x, y, yaw at wheel pair 1
@@ -60,7 +60,7 @@ class State(NamedTuple):
 class Rig(NamedTuple):
     """Workspace of the tick loop."""
 
-    work: Work
+    work: ControlWork
     base_rate: np.ndarray  # (3,)
     base_sum: np.ndarray  # (3,)
     base_stage: np.ndarray  # (3,)
@@ -74,7 +74,7 @@ class Rig(NamedTuple):
     origin: np.ndarray  # (3,)
 
 
-class Trace(NamedTuple):
+class SnakeTrace(NamedTuple):
     """Recorded rows; row r belongs to tick r * stride."""
 
     base: np.ndarray  # (R, 3)
@@ -84,7 +84,7 @@ class Trace(NamedTuple):
     w: np.ndarray  # (R, 6)
     w_target: np.ndarray  # (R, 6)
     w_hat: np.ndarray  # (R, 6)
-    mode: np.ndarray  # (R,) row of Law.grounded
+    mode: np.ndarray  # (R,) row of ControlLaw.grounded
     cost: np.ndarray  # (R,)
     sigma: np.ndarray  # (R,)
     margin: np.ndarray  # (R,)
@@ -94,10 +94,10 @@ class Trace(NamedTuple):
     centre: np.ndarray  # (R, 3)
 
 
-def new_state(model: SnakeModel) -> State:
+def new_state(model: SnakeModel) -> SnakeState:
     """Zero state."""
     joints = model.head_joints + model.base_joints
-    return State(
+    return SnakeState(
         base=np.zeros(3),
         phi=np.zeros(joints),
         rho=np.zeros(model.wheels),
@@ -128,10 +128,10 @@ def new_rig(model: SnakeModel) -> Rig:
     )
 
 
-def new_trace(model: SnakeModel, rows: int) -> Trace:
+def new_trace(model: SnakeModel, rows: int) -> SnakeTrace:
     """Empty recording of ``rows`` samples."""
     joints = model.head_joints + model.base_joints
-    return Trace(
+    return SnakeTrace(
         base=np.zeros((rows, 3)),
         phi=np.zeros((rows, joints)),
         rho=np.zeros((rows, model.wheels)),

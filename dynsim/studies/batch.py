@@ -13,7 +13,7 @@ from dynsim.scenario import Scenario, require_scenario
 from dynsim.studies.outcome import LOST, RunResult
 from dynsim.studies.processes import SILENT, WorkerInterrupted, WorkerLost, WorkerSilent, run_in_processes
 from dynsim.system import interruption
-from dynsim.system.reuse import Reuse
+from dynsim.system.memo import Memo, remembering
 
 Keep = Literal["none", "failed", "all"]
 Task = TypeVar("Task")
@@ -71,7 +71,7 @@ def simulate_batch(
     return [results[k] for k in range(len(runs))]
 
 
-def _numbered(task: tuple[int, Scenario], reuse: Reuse) -> Scenario:
+def _numbered(task: tuple[int, Scenario]) -> Scenario:
     return task[1]
 
 
@@ -80,27 +80,28 @@ class Work(Generic[Task]):
 
     Parameters
     ----------
-    load : a task's scenario, sharing what can be shared; of a module, or bound to what can be sent to processes
+    load : a task's scenario; of a module, or bound to what can be sent to processes
     keep : whose records are kept, see :func:`simulate_batch`
     """
 
-    def __init__(self, load: Callable[[Task, Reuse], Scenario], keep: Keep) -> None:
-        self._load, self._keep, self._reuse = load, keep, Reuse()
+    def __init__(self, load: Callable[[Task], Scenario], keep: Keep) -> None:
+        self._load, self._keep, self._memo = load, keep, Memo()
 
     def __call__(self, task: Task, look: Progress | None) -> RunResult:
         """Load and simulate a task; see :func:`run_one`."""
-        try:
-            scenario = self._load(task, self._reuse)
-        except Exception as error:
-            return _failed(error)
-        return run_one(scenario, self._keep, look, self._reuse)
+        with remembering(self._memo):
+            try:
+                scenario = self._load(task)
+            except Exception as error:
+                return _failed(error)
+            return run_one(scenario, self._keep, look)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self._load, self._keep)
 
 
-def run_one(scenario: Scenario, keep: Keep, look: Progress | None, reuse: Reuse | None = None) -> RunResult:
-    """Simulate a scenario, whatever becomes of it; ``reuse``: what other runs have computed.
+def run_one(scenario: Scenario, keep: Keep, look: Progress | None) -> RunResult:
+    """Simulate a scenario, whatever becomes of it.
 
     Raises
     ------
@@ -109,7 +110,7 @@ def run_one(scenario: Scenario, keep: Keep, look: Progress | None, reuse: Reuse 
     """
     started = clock.perf_counter()
     try:
-        ended: Record | DynsimError = simulate(scenario, look, pictured=keep != "none", reuse=reuse)
+        ended: Record | DynsimError = simulate(scenario, look, pictured=keep != "none")
     except SimulationInterrupted:
         raise
     except DynsimError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -10,9 +11,9 @@ from types import TracebackType
 from typing import Any
 
 from dynsim.errors import RecordError, ScenarioError, shown
-from dynsim.studies.columns import is_text, numbers
+from dynsim.studies.columns import numbers
 from dynsim.studies.outcome import RunResult
-from dynsim.studies.plan import Point
+from dynsim.studies.sweep_plan import Point
 from dynsim.system.files import json_text, write_text
 
 PLAN, JOURNAL = "sweep.json", "runs.jsonl"
@@ -25,7 +26,7 @@ class Row:
 
     Attributes
     ----------
-    run, variant, values : see :class:`dynsim.studies.plan.Point`
+    run, variant, values : see :class:`dynsim.studies.sweep_plan.Point`
     status : ``ok``, ``failed`` (and would again) or ``lost`` with its process
     reason : why it failed
     numbers : of its summary, see :func:`dynsim.studies.columns.numbers`
@@ -67,8 +68,7 @@ class Row:
             "values": isinstance(row.values, dict),
             "status": row.status in (OK, FAILED, LOST),
             "reason": isinstance(row.reason, str),
-            "numbers": isinstance(row.numbers, dict)
-            and not any(is_text(value) or isinstance(value, (dict, list)) for value in row.numbers.values()),
+            "numbers": isinstance(row.numbers, dict) and all(map(_is_number, row.numbers.values())),
             "warnings": isinstance(row.warnings, str),
         }
         for name in names:
@@ -82,7 +82,7 @@ class Row:
 
     @property
     def identity(self) -> str:
-        """See :class:`dynsim.studies.plan.Point`."""
+        """See :class:`dynsim.studies.sweep_plan.Point`."""
         return Point(self.run, self.variant, self.values).identity
 
     def cells(self) -> dict[str, Any]:
@@ -127,6 +127,11 @@ class Journal:
                 content = content[self._stream.write(content) or 0 :]
         except OSError as error:
             raise RecordError(f"cannot write {self._path}: {error.strerror}") from error
+
+
+def _is_number(value: Any) -> bool:
+    """True for nothing and for what a double holds."""
+    return value is None or isinstance(value, float) or (isinstance(value, int) and abs(value) <= sys.float_info.max)
 
 
 def _line(row: Row) -> str:

@@ -18,7 +18,7 @@ from dynsim.studies.batch import Keep, Work, run_all
 from dynsim.studies.cluster import ClusterError
 from dynsim.studies.journal import JOURNAL, OK, PLAN, Journal, Row, earlier_rows
 from dynsim.studies.outcome import RunResult
-from dynsim.studies.plan import Plan, Point
+from dynsim.studies.sweep_plan import Plan, Point
 from dynsim.studies.sweep_statistics import statistics
 from dynsim.studies.worker import WorkerError
 from dynsim.system.files import check_writable, held, json_text, replacing, write_text

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dynsim.record.sensitivity import sensitivities, spread
-from dynsim.studies.plan import Plan
+from dynsim.studies.sweep_plan import Plan
 
 if TYPE_CHECKING:
     from dynsim.studies.journal import Row

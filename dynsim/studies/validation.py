@@ -116,44 +116,6 @@ def row(record: Record) -> dict[str, Any]:
     return found
 
 
-def against_rk43(found: dict[str, Record]) -> dict[str, dict[str, Any]]:
-    """Largest differences, over the variants of a scenario, between its own method and ``rk43``.
-
-    Of a joint over its own largest angle (at least 1e-3 rad), of energy and hand's error relative, of the times of
-    events in seconds; ledgers and evaluations of both.
-    """
-    moved: dict[str, dict[str, Any]] = {}
-    for name, scenario in arms().items():
-        one, other = found[name], ended(replace_method(scenario, "rk43"))
-        count = min(len(one), len(other))
-        q, reference = one["q"][:count], other["q"][:count]
-        entry = moved.setdefault(scenario.name, {"method": one.summary["method"]})
-        _largest(
-            entry, "joint", float((np.abs(q - reference).max(0) / np.maximum(np.abs(reference).max(0), 1e-3)).max())
-        )
-        for key in ("electrical_energy_J", "hand_error_rms_m"):
-            if one.summary[key] and other.summary[key]:
-                _largest(entry, key, abs(one.summary[key] / other.summary[key] - 1.0))
-        happened = [sorted((e.kind, e.name, e.time) for e in record.events) for record in (one, other)]
-        if [e[:2] for e in happened[0]] == [e[:2] for e in happened[1]] and happened[0]:
-            _largest(entry, "events_s", max(abs(a[2] - b[2]) for a, b in zip(*happened, strict=True)))
-        for which, record in (("", one), ("_rk43", other)):
-            _largest(entry, f"ledger{which}", record.summary["energy_residual_relative"])
-            evaluations = record.summary["rhs_evaluations"]
-            low, high = entry.get(f"evaluations{which}", (evaluations, evaluations))
-            entry[f"evaluations{which}"] = min(low, evaluations), max(high, evaluations)
-    return moved
-
-
-def replace_method(scenario: Scenario, method: str) -> Scenario:
-    """The scenario with another method of integration."""
-    return load_scenario(scenario.source or scenario.name, scenario.variant or None, {"integrator.method": method})
-
-
-def _largest(entry: dict[str, Any], key: str, value: float) -> None:
-    entry[key] = max(entry.get(key, 0.0), value)
-
-
 def time_stepping() -> dict[str, dict[str, float]]:
     """The balance of the discrete equations by time stepping, what the steps take, and how deep points sink."""
     cases: dict[str, tuple[str, str | None, dict[str, Any]]] = {
@@ -188,20 +150,14 @@ def _elbows(variant: str = "two_elbows", **integrator: Any) -> Record:
 
 
 def residuals_by_tolerance() -> dict[str, float]:
-    """Ledger residual over turnover of two elbows, by method, tolerance, step and duration."""
+    """Ledger residual over turnover of two elbows, by method, tolerance and duration."""
     cases: dict[str, dict[str, Any]] = {
-        "rk43, rtol 1e-6, 1 s": {"duration_s": 1, "method": "rk43"},
-        "rk43, rtol 1e-8, 1 s": {"duration_s": 1, "method": "rk43", "rtol": 1e-8, "atol": 1e-10},
         "dopri5, rtol 1e-6, 1 s": {"duration_s": 1, "method": "dopri5"},
         "dopri5, rtol 1e-8, 1 s": {"duration_s": 1, "method": "dopri5", "rtol": 1e-8, "atol": 1e-10},
         "dopri5, rtol 1e-6, 10 s": {"method": "dopri5"},
         "radau5, rtol 1e-6, 1 s": {"duration_s": 1, "method": "radau5"},
         "radau5, rtol 1e-8, 1 s": {"duration_s": 1, "method": "radau5", "rtol": 1e-8, "atol": 1e-10},
         "radau5, rtol 1e-6, 10 s": {"method": "radau5"},
-        "rk4, 1 ms, 1 s": {"duration_s": 1, "method": "rk4", "step_s": 1e-3},
-        "rk4, 1 ms, 10 s": {"method": "rk4", "step_s": 1e-3},
-        "rk4, 0.5 ms, 10 s": {"method": "rk4", "step_s": 5e-4},
-        "rk4, 0.25 ms, 10 s": {"method": "rk4", "step_s": 2.5e-4},
     }
     return {name: _elbows(**case).summary["energy_residual_relative"] for name, case in cases.items()}
 
@@ -211,10 +167,8 @@ def differences() -> dict[str, dict[str, float]]:
     reference = _elbows(method="dopri5", rtol=1e-11, atol=1e-13)
     found: dict[str, dict[str, float]] = {}
     cases: dict[str, dict[str, Any]] = {
-        "rk43": {"method": "rk43"},
         "dopri5": {"method": "dopri5"},
         "radau5": {"method": "radau5"},
-        "rk4, 1 ms": {"method": "rk4", "step_s": 1e-3},
     }
     for name, case in cases.items():
         record = _elbows(**case)
@@ -246,7 +200,6 @@ def validation() -> dict[str, Any]:
             name: record.summary["energy_residual_relative"] for name, record in free.items()
         },
         "ledger_residual_of_two_elbows": residuals_by_tolerance(),
-        "against_rk43": against_rk43(found),
         "differences": differences(),
         "elbows": {
             name: elbow_numbers(record, load_scenario(ELBOWS, name))

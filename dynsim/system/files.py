@@ -1,17 +1,15 @@
 """Files that are complete or not there at all, also several that belong together.
 
-A file is written beside its target under a name that no other process has, and renamed when it is complete. Devices,
-pipes and sockets are never replaced: they are written to, like any program does.
+A file is written beside its target under a name that no other process has, and renamed when it is complete. So what is
+no file, a device, pipe or socket, is refused.
 """
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import re
 import stat
-import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
@@ -34,8 +32,8 @@ _TEMPORARY = re.compile(r"\.dynsim-[0-9a-f]{16}\.tmp")
 _LEFT_BEHIND = 60.0
 """A temporary file that nobody holds is a dead run's when it is older than this [s]; a living one's may be unlocked for
 a moment after it is made."""
-_LINKS = 40
-"""Links that lead to each other, as many as Linux follows."""
+_STREAM = re.compile(r"/dev/(stdin|stdout|stderr|fd/.*)|/proc/.*")
+"""Names of what a process has open, which may be a file, but not one to be replaced."""
 _NAME_LENGTH = 120
 """Of a file name made from a text [characters]; file systems end at 255 bytes."""
 
@@ -55,7 +53,7 @@ def check_writable(folder: Path, names: Iterable[str] = ()) -> None:
                 raise RecordError(f"cannot write to {folder}: {existing} is a link to nothing")
             existing = existing.parent
         mark = folder / INCOMPLETE
-        blocked = [name for name in names if (folder / name).is_dir()]
+        blocked = [name for name in names if (folder / name).exists() and not (folder / name).is_file()]
         if blocked or (mark.exists() and not mark.is_file()):
             raise RecordError(f"cannot write to {folder}: {(*blocked, INCOMPLETE)[0]} there is in the way; remove it")
     except FileNotFoundError as error:  # only absolute() raises that
@@ -118,7 +116,7 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[BinaryIO]:
     """A stream whose content becomes the file ``path`` when the block ends well.
 
     A link at ``path`` is kept and the file it names replaced. A new file gets the mode that the umask asks for, a
-    replaced one keeps its own. A device, pipe or socket gets the content written to it.
+    replaced one keeps its own.
 
     Parameters
     ----------
@@ -127,16 +125,12 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[BinaryIO]:
     Raises
     ------
     RecordError
-        ``path`` is a folder, or cannot be written (no space, no permission); an older file there is left as it was.
+        ``path`` is no file, or cannot be written (no space, no permission); an older file there is left as it was.
     """
-    draft = _Draft(path)
-    try:
-        with draft.one_line_errors():
-            yield draft.open()
-            draft.complete(durable)
-            draft.publish()
-    finally:
-        draft.discard()
+    with _Draft(path) as draft:
+        yield draft.stream
+        draft.complete(durable)
+        draft.publish()
 
 
 def replace_together(folder: Path, contents: Mapping[str, bytes | memoryview]) -> None:
@@ -153,15 +147,12 @@ def replace_together(folder: Path, contents: Mapping[str, bytes | memoryview]) -
     places = {os.path.realpath(folder / name) for name in contents}
     if len(places) < len(contents):
         raise RecordError(f"cannot write to {folder}: two of {', '.join(contents)} are links to one file")
-    with ExitStack() as cleaning:
-        drafts = []
-        for name, content in contents.items():
-            draft = _Draft(folder / name)
-            cleaning.callback(draft.discard)
+    with ExitStack() as open_drafts:
+        drafts = [open_drafts.enter_context(_Draft(folder / name)) for name in contents]
+        for draft, content in zip(drafts, contents.values(), strict=True):
             with draft.one_line_errors():
-                draft.open().write(content)
+                draft.stream.write(content)
                 draft.complete(durable=True)
-            drafts.append(draft)
         with _marked(folder, contents) as published:
             for draft in drafts:
                 with draft.one_line_errors():
@@ -215,14 +206,25 @@ def json_text(data: Any) -> str:
 
 
 class _Draft:
-    """Content on its way to ``path``: in a temporary file beside it, or in memory when it goes to a device."""
+    """Content on its way to ``path``, in a temporary file beside it; errors within its ``with`` name the path."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._target: Path | None = None
-        self._descriptor: int | None = None
-        self._temporary: Path | None = None
-        self._stream: BinaryIO | None = None
+
+    def __enter__(self) -> _Draft:
+        with self.one_line_errors():
+            self._open()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: object) -> None:
+        """Close, and remove the temporary file if it was not published."""
+        with suppress(OSError):
+            self.stream.close()
+        with suppress(OSError):
+            self._temporary.unlink()
+        if isinstance(error, (OSError, UnicodeEncodeError)):
+            with self.one_line_errors():
+                raise error
 
     @contextmanager
     def one_line_errors(self) -> Iterator[None]:
@@ -230,12 +232,10 @@ class _Draft:
         try:
             yield
         except (OSError, UnicodeEncodeError) as error:
-            kept = "" if self._target is None else "; nothing was changed there"
-            raise RecordError(f"cannot write {self.path}: {_reason(error)}{kept}") from error
+            raise RecordError(f"cannot write {self.path}: {_reason(error)}; nothing was changed there") from error
 
-    def open(self) -> BinaryIO:
+    def _open(self) -> None:
         """Find out what is at the path, and make the temporary file."""
-        self._target = self.path
         self.path.parent.mkdir(parents=True, exist_ok=True)
         try:
             existing: os.stat_result | None = os.stat(self.path)
@@ -243,97 +243,41 @@ class _Draft:
             existing = None
         if existing is not None and stat.S_ISDIR(existing.st_mode):
             raise IsADirectoryError(0, "is a folder, not a file")
-        self._target, self._descriptor = _final_target(self.path)
-        if existing is not None and not stat.S_ISREG(existing.st_mode):
-            self._target = None
-        if self._target is None:
-            self._stream = io.BytesIO()
-            return self._stream
+        names = [os.fspath(self.path), *([os.readlink(self.path)] if self.path.is_symlink() else ())]
+        if (existing is not None and not stat.S_ISREG(existing.st_mode)) or any(map(_STREAM.fullmatch, names)):
+            raise OSError(0, "is a device, pipe or socket; write to a file and copy it there")
+        self._target = Path(os.path.realpath(self.path))
         if existing is not None and not os.access(self._target, os.W_OK):
             raise PermissionError(0, "the file may not be written")
         _remove_left_behind(self._target.parent)
         # The name is nobody else's: made anew or not at all, and a link that lies there is not followed.
         temporary = self._target.with_name(f".dynsim-{os.urandom(8).hex()}.tmp")
-        flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
-        descriptor = os.open(temporary, flags, 0o666)
-        self._temporary, self._stream = temporary, os.fdopen(descriptor, "w+b")
+        self.stream: BinaryIO = temporary.open("x+b")
+        self._temporary = temporary
+        descriptor = self.stream.fileno()
         lock(descriptor, wait=False)
         if existing is not None and hasattr(os, "fchmod"):
             with suppress(OSError):  # only root may give files away; then they are ours, as after any replacement
                 if (existing.st_uid, existing.st_gid) != (os.geteuid(), os.getegid()):
                     os.fchown(descriptor, existing.st_uid, existing.st_gid)
-            os.fchmod(descriptor, stat.S_IMODE(existing.st_mode))
-        return self._stream
+            with suppress(OSError):  # a file system without modes
+                os.fchmod(descriptor, stat.S_IMODE(existing.st_mode))
 
     def complete(self, durable: bool) -> None:
         """All content is there: hand it to the system, and let the disk have it."""
-        assert self._stream is not None
-        if self._temporary is not None:
-            self._stream.flush()
-            if durable:
-                os.fsync(self._stream.fileno())
+        self.stream.flush()
+        if durable:
+            os.fsync(self.stream.fileno())
 
     def publish(self) -> None:
         """Let the content be what the path holds."""
-        assert self._stream is not None
-        if self._target is None:
-            assert isinstance(self._stream, io.BytesIO)
-            with self._stream.getbuffer() as content:
-                _write_through(self.path, self._descriptor, content)
-        else:
-            assert self._temporary is not None
-            if not hasattr(os, "fchmod"):
-                self._stream.close()  # Windows renames no open file
-            os.replace(self._temporary, self._target)
-            self._temporary = None
-
-    def discard(self) -> None:
-        """Close, and remove the temporary file if it was not published."""
-        with suppress(OSError):
-            if self._stream is not None:
-                self._stream.close()
-        if self._temporary is not None:
-            with suppress(OSError):
-                self._temporary.unlink()
+        if not hasattr(os, "fchmod"):
+            self.stream.close()  # Windows renames no open file
+        os.replace(self._temporary, self._target)
 
 
 def _reason(error: Exception) -> str:
     return str(getattr(error, "strerror", None) or error)
-
-
-def _final_target(path: Path) -> tuple[Path | None, int | None]:
-    """The file that links at ``path`` lead to, there or not; None for an open file of a process (/dev/stdout).
-
-    If the process is this one, the descriptor of the open file comes with it.
-    """
-    for _ in range(_LINKS):
-        folder = os.path.realpath(path.parent)
-        if process := re.fullmatch(r"/proc/([0-9]+)(/task/[0-9]+)?/fd", folder):
-            return None, int(path.name) if int(process[1]) == os.getpid() else None
-        path = Path(folder, path.name)
-        if not path.is_symlink():
-            return path, None
-        path = Path(folder, os.readlink(path))
-    raise OSError(0, "too many links that lead to each other")
-
-
-def _write_through(path: Path, descriptor: int | None, content: memoryview) -> None:
-    if descriptor is not None:
-        # At its place: opened by name, it would begin at the beginning, and the next print too.
-        sys.stdout.flush()
-        with os.fdopen(os.dup(descriptor), "wb") as stream:
-            stream.write(content)
-        return
-    if stat.S_ISSOCK(os.stat(path).st_mode):
-        import socket
-
-        with socket.socket(socket.AF_UNIX) as connection:
-            connection.connect(os.fspath(path))
-            connection.sendall(content)
-        return
-    # Not created: what was there is written to, or nothing is.
-    with os.fdopen(os.open(path, os.O_WRONLY | os.O_TRUNC), "wb") as stream:
-        stream.write(content)
 
 
 def lock(descriptor: int, *, wait: bool) -> bool:

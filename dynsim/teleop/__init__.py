@@ -1,1 +1,1 @@
-"""Driving by hand: the arm, the snake, and the web page that drives them."""
+"""Teleoperation: sessions of the arm and the snake, and the web page that commands them."""

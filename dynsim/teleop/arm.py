@@ -1,4 +1,4 @@
-"""A pilot drives the hand of an arm, and its mobile base: velocities that become references at every tick."""
+"""A pilot commands the hand of an arm, and its mobile base: velocities that become references at every tick."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from dynsim.compile.control import PLANNED
-from dynsim.compile.references.operated import BASE, HAND, VELOCITIES
+from dynsim.compile.references.teleop import BASE, HAND, VELOCITIES
 from dynsim.engine.compilation import kernels_logged
 from dynsim.engine.simulation import Simulation
 from dynsim.errors import ScenarioError
@@ -19,103 +19,105 @@ from dynsim.model.drives import TorqueSource
 from dynsim.record import Record
 from dynsim.record.poses import poses_at
 from dynsim.scenario import Scenario, build
-from dynsim.teleop.driven import Array, Axis, Order, Pace, Shown, changed
+from dynsim.teleop.session import Array, Command, LiveFrame, PilotAxis, SpeedLimits, with_controller
 
 log = logging.getLogger(__name__)
 
 _NAMES = ("x", "y", "z", "ahead", "turn")
+# Velocity of the ticks by which kernels are loaded [m/s].
+_SMALL = 1e-6
 
 
-class _Newest:
-    """A source that tells the order of the moment."""
+class ArmSession:
+    """See :class:`dynsim.teleop.session.Session`; ``longest`` is the time that it may take [s].
 
-    def __init__(self) -> None:
-        self.velocity = np.zeros(VELOCITIES)
-
-    def read(self, tick: int) -> Array:
-        return self.velocity
-
-
-class DrivenArm:
-    """See :class:`dynsim.teleop.driven.Driven`; ``limit`` is the longest drive [s]."""
+    It is the :class:`~dynsim.compile.references.teleop.VelocitySource` of its own simulation.
+    """
 
     modes: tuple[int, ...] = ()
     has_gripper = False
 
-    def __init__(self, scenario: Scenario, pace: Pace, limit: float) -> None:
+    def __init__(self, scenario: Scenario, limits: SpeedLimits, longest: float) -> None:
         controller = scenario.resolved["controller"]
         if "operator" not in type(scenario.controller).model_fields:
             raise ScenarioError(f"controller {scenario.controller.type!r} follows no operator; joint_pd does")
         operator = controller.get("operator") or _followers(scenario, controller)
         self._controller = {key: value for key, value in controller.items() if key not in PLANNED}
         self._operator = {**operator, "commands": []}
-        self._scenario = scenario
-        begun = changed(scenario, limit, {**self._controller, "operator": self._operator})
-        self._source, self._limit = _Newest(), limit
-        self.simulation = Simulation(begun, duration=math.inf, operator=self._source)
-        robot = self.simulation.robot
-        self._still = _tried(begun, log)
-        scene = self._still.scene
-        assert scene is not None
-        self._scene = scene
+        self._scenario, self._longest = scenario, longest
+        self._velocity, self._last = np.zeros(VELOCITIES), np.zeros(VELOCITIES)
+        self._velocity[HAND] = _SMALL
+        begun = with_controller(scenario, longest, {**self._controller, "operator": self._operator})
+        # Two ticks of another simulation, by which the kernels are loaded, or compiled.
+        with kernels_logged(log):
+            trial = Simulation(begun, duration=math.inf, operator=self)
+            trial.advance(2.0 / trial.operator.options.rate if trial.operator is not None else 0.0)
+        self.still = trial.record()
+        self.still.complete = True
+        self._velocity = np.zeros(VELOCITIES)
+        self.simulation = Simulation(begun, duration=math.inf, operator=self)
         self._rate = float(self._operator.get("rate_hz", 100.0))
         self.period, self.ticks = 1.0 / self._rate, 0
         self._commands: list[dict[str, Any]] = []
-        self._last = np.zeros(VELOCITIES)
-        limits = {"ahead": ("m/s", pace.base), "turn": ("rad/s", pace.turn)}
+        robot = self.simulation.robot
+        units = {"ahead": ("m/s", limits.base), "turn": ("rad/s", limits.turn)}
         driven = {motor.joint for motor in robot.motors}
-        parts = list(range(VELOCITIES))[HAND] if self._operator.get("joints") else []
+        self._parts = list(range(VELOCITIES))[HAND] if self._operator.get("joints") else []
         if robot.base is not None and driven.issuperset(robot.base.wheels):
-            parts += list(range(VELOCITIES))[BASE]
-        if not parts:
+            self._parts += list(range(VELOCITIES))[BASE]
+        if not self._parts:
             raise ScenarioError(
                 "there is nothing to drive: name joints that follow the hand, controller.operator.joints "
                 f"(joints with a motor: {', '.join(sorted(driven)) or 'none'})"
             )
-        self._parts = parts
         self.axes = tuple(
-            Axis(_NAMES[k], "hand" if k < BASE.start else "base", *limits.get(_NAMES[k], ("m/s", pace.speed)))
-            for k in parts
+            PilotAxis(_NAMES[k], "hand" if k < BASE.start else "base", *units.get(_NAMES[k], ("m/s", limits.hand)))
+            for k in self._parts
         )
 
     @property
     def time(self) -> float:
-        """Half a tick behind the last one, whose order is yet to come [s]."""
+        """Half a tick behind the last one, whose command is yet to come [s]."""
         return self.simulation.time
 
     @property
     def finished(self) -> bool:
-        """The longest drive is over, or the run ended by itself."""
-        return self.simulation.finished or self.ticks >= self._limit * self._rate
+        """The longest time is over, or the run ended by itself."""
+        return self.simulation.finished or self.ticks >= self._longest * self._rate
 
-    def tick(self, order: Order) -> None:
-        """Up to just before the next tick, at which the next order is read."""
+    def read(self, tick: int) -> Array:
+        """The command of the moment, whatever tick it is."""
+        return self._velocity
+
+    def tick(self, command: Command) -> None:
+        """Up to just before the next tick, at which the next command is read."""
         velocity = np.zeros(VELOCITIES)
-        velocity[self._parts] = order.velocity
+        velocity[self._parts] = command.velocity
         velocity += 0.0
-        command: dict[str, Any] = {}
+        entry: dict[str, Any] = {}
         for name, part in (("hand", HAND), ("base", BASE)):
             if not np.array_equal(velocity[part], self._last[part]):
-                command[name] = velocity[part].tolist()
-        if command:
-            self._commands.append({"at_s": self.ticks / self._rate, **command})
-        self._source.velocity = self._last = velocity
+                entry[name] = velocity[part].tolist()
+        if entry:
+            self._commands.append({"at_s": self.ticks / self._rate, **entry})
+        self._velocity = self._last = velocity
         self.ticks += 1
         self.simulation.advance((self.ticks - 0.5) / self._rate)
 
-    def shown(self) -> Shown:
+    def frame(self) -> LiveFrame:
         """The posture now."""
-        simulation = self.simulation
+        simulation, scene = self.simulation, self.still.scene
         robot, operator = simulation.robot, simulation.operator
         assert operator is not None
+        assert scene is not None
         q = simulation.state.q
         positions = {"q": dict(zip(robot.position_names, q.tolist(), strict=True))}
         if robot.base is not None:
-            place = base_pose(robot, q[None])[0].tolist()
-            positions["base_pose"] = dict(zip(("x", "y", "heading"), place, strict=True))
-        return Shown(
+            pose = base_pose(robot, q[None])[0].tolist()
+            positions["base_pose"] = dict(zip(("x", "y", "heading"), pose, strict=True))
+        return LiveFrame(
             time=simulation.time,
-            poses=poses_at(self._scene, positions),
+            poses=poses_at(scene, positions),
             hand=operator.target.copy(),
             hindrance=operator.hindrance,
             extra={},
@@ -127,37 +129,21 @@ class DrivenArm:
         state = self.simulation.state
         return {"q": state.q, "v": state.v}
 
-    def still(self) -> Record:
-        """A moment of the same robot at its start, for a page to be made of."""
-        return self._still
-
     def record(self) -> Record:
-        """The record of the drive; its scenario is the script."""
+        """The record of all ticks so far; its scenario is the script."""
         before = self.simulation.snapshot()
         if not self.simulation.finished:
             self.simulation.advance(self.ticks * self.period)
         # As ticks are counted: a step that ends a rounding before one would not be that of a run which ends there.
         duration = max(self.ticks, 1) * self.period
-        script = changed(
-            self._scenario, duration, {**self._controller, "operator": {**self._operator, "commands": self._commands}}
+        operator = {**self._operator, "commands": self._commands}
+        record = self.simulation.record(
+            with_controller(self._scenario, duration, {**self._controller, "operator": operator})
         )
-        record = self.simulation.record(script)
-        # The order at this tick is yet to come.
+        # The command at this tick is yet to come.
         self.simulation.restore(before)
         record.complete = "stopped" not in record.provenance
         return record
-
-
-def _tried(scenario: Scenario, log: logging.Logger) -> Record:
-    """Two ticks of another simulation, by which the kernels are loaded, or compiled."""
-    source = _Newest()
-    source.velocity[HAND] = 1e-6
-    with kernels_logged(log):
-        trial = Simulation(scenario, duration=math.inf, operator=source)
-        trial.advance(2.0 / trial.operator.operated.rate if trial.operator is not None else 0.0)
-    moment = trial.record()
-    moment.complete = True
-    return moment
 
 
 def _followers(scenario: Scenario, controller: dict[str, Any]) -> dict[str, Any]:

@@ -19,16 +19,15 @@ import dynsim
 from dynsim import cli
 from dynsim.cli import commands
 from dynsim.cli.display import record_files
-from dynsim.draw.figures.style import BLUE, PULLING
+from dynsim.draw.figures.style import BLUE, DEEP, PULLING
 from dynsim.draw.film import Film, write
-from dynsim.draw.film.camera import view_axes
-from dynsim.draw.film.painter import DEEP, FINER, FRICTION, Painter
-from dynsim.draw.film.solids import solid
+from dynsim.draw.film.painter import FINER, FRICTION, Painter
 from dynsim.draw.film.strip import Strip, largest
 from dynsim.draw.film.strokes import font, labels
-from dynsim.draw.page.meshes import Meshes
-from dynsim.draw.page.robot import bounds
-from dynsim.draw.page.solids import body_shapes, from_z
+from dynsim.draw.geometry.camera import view_axes
+from dynsim.draw.geometry.meshes import Meshes
+from dynsim.draw.geometry.robot import bounds
+from dynsim.draw.geometry.shapes import body_shapes, from_z, solid
 from dynsim.errors import RecordError
 from dynsim.record import Record
 from dynsim.record.poses import ORIENTATION, POSITION, point_positions

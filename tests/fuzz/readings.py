@@ -111,7 +111,8 @@ def _same(said: Any, taken: Any) -> bool:
     if isinstance(taken, (int, float)):
         if isinstance(said, str):
             return DECIMAL.fullmatch(said.strip()) is not None and float(said) == taken
-        return said == taken
+        # Digits beyond those of a double are rounded, in an integer as in a decimal number.
+        return said == taken or (isinstance(said, int) and isinstance(taken, float) and float(said) == taken)
     # What this reader makes of dates, sets and the like is text as written to dynsim.
     return said == taken or (isinstance(taken, str) and not isinstance(said, str))
 

@@ -174,7 +174,7 @@ def _loose(lines: list[str], after: str) -> list[str]:
     for line in lines:
         if line == after or line.startswith((" ", "what was simulated")) or not line.strip():
             continue
-        warned = warned or "Warning: " in line
+        warned = warned or "Warning: " in line or line.startswith("warning: ")
         if not warned:
             loose.append(line)
     return loose

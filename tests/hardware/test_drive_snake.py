@@ -12,16 +12,15 @@ from dynsim import load_scenario
 from dynsim.errors import CheckRefused
 from dynsim.hardware.bus.clock import Clock
 from dynsim.hardware.replay.check import check_motion
-from dynsim.hardware.replay.drive import check_drive, lead
+from dynsim.hardware.replay.drive import check_drive
 from dynsim.hardware.replay.incremental_path import IncrementalPath, Sample
-from dynsim.hardware.replay.lift_lookahead import LiftLookahead
 from dynsim.hardware.replay.rules import Cause
 from dynsim.hardware.servo_map import ServoMap
 from dynsim.record import Record
 from dynsim.snake.description import FIXING, SWITCHING
-from dynsim.teleop.drive import drive
-from dynsim.teleop.driven import Order
-from dynsim.teleop.web.follower import NOT_LIFTED, NOT_YET, REGULAR, Columns, ServoFollower, lifting_columns
+from dynsim.teleop.begin import begin
+from dynsim.teleop.session import Command
+from dynsim.teleop.web.follower import NOT_LIFTED, NOT_YET, REGULAR, Columns, ServoFollower
 from dynsim.teleop.web.servos import PipeFeed
 
 from .conftest import Rig, Run, check_goals_within_limits
@@ -32,10 +31,10 @@ REQUESTS = {150: 4, 300: SWITCHING, 700: FIXING, 860: 2}
 """By ticks of 5 ms."""
 
 
-def order(tick: int, requests: Mapping[int, int]) -> Order:
+def command(tick: int, requests: Mapping[int, int]) -> Command:
     """Forward, aside and turning, one after the other."""
     velocity = (0.05 * (tick > 80), 0.02 * (tick > 250), 0.0, 0.0, 0.0, 0.05 * (tick > 400))
-    return Order(velocity, requests.get(tick, 0))
+    return Command(velocity, requests.get(tick, 0))
 
 
 class SimulatedSnake:
@@ -48,16 +47,12 @@ class SimulatedSnake:
         ticks: int = 1000,
         stall: tuple[int, float] = (0, 0.0),
     ) -> None:
-        self.driven = drive(load_scenario("snake_operator"))
+        self.session = begin(load_scenario("snake_operator"))
         self.requests, self.ticks, self.stall = requests, ticks, stall
         self.refused: CheckRefused | None = None
         reader, writer = get_context("spawn").Pipe(duplex=False)
         self.heard = [NOT_YET]
-        still, columns = self.driven.still(), Columns(self.driven.still(), servo_map, self.driven)
-        self.held_back = LiftLookahead(still, servo_map, self.driven.period)
-        self.follower = ServoFollower(
-            self.driven, columns, lead(servo_map), writer, self.heard, lifting_columns(servo_map), self.held_back
-        )
+        self.follower = ServoFollower(self.session, servo_map, writer, self.heard)
         self._feed = PipeFeed(reader, self.heard, servo_map)
         self.clock: Clock | None = None
         self._due: float | None = None
@@ -74,26 +69,26 @@ class SimulatedSnake:
 
     def take(self, most: int) -> list[Sample]:
         assert self.clock is not None
-        now, step = self.clock.now(), self.driven.period
+        now, step = self.clock.now(), self.session.period
         while self.follower.begun and not self._ended:
             self._due = now if self._due is None else self._due
             if self._due > now or not self.follower.ready:
                 break
             self._tick()
-            lost = self.stall[1] if self.driven.ticks == self.stall[0] else 0.0
+            lost = self.stall[1] if self.session.ticks == self.stall[0] else 0.0
             # What is lost beyond a cycle is lost.
             self._due = max(self._due + step, now - 1.0 / RATE) + lost
         return list(self._feed.take(most))
 
     def tell(self, time: float) -> None:
         self._feed.tell(time)
-        self.behind.append(self.driven.time - time)
+        self.behind.append(self.session.time - time)
 
     def _tick(self) -> None:
         """As follower.simulate does."""
         try:
-            if self.driven.ticks < self.ticks:
-                self.driven.tick(order(self.driven.ticks, self.requests))
+            if self.session.ticks < self.ticks:
+                self.session.tick(command(self.session.ticks, self.requests))
                 self.follower.hear()
                 return
             self.follower.finish()
@@ -106,7 +101,7 @@ class SimulatedSnake:
 
 def driven(servo_map: ServoMap, *, policy: str | None = None, **options: object) -> tuple[Run, SimulatedSnake]:
     feed = SimulatedSnake(servo_map, **options)  # type: ignore[arg-type]
-    motion = check_drive(feed.follower.first, servo_map, feed, step=feed.driven.period, longest=20.0, rate=RATE)
+    motion = check_drive(feed.follower.first, servo_map, feed, step=feed.session.period, longest=20.0, rate=RATE)
     posture = dict(zip(servo_map.joints, motion.start.tolist(), strict=True))
     run = Rig(servo_map, Record([0.0]), posture).prepare(motion=motion, policy=policy)
     feed.clock = run.clock
@@ -142,7 +137,7 @@ def test_goals_are_those_of_the_replay_of_the_finished_record(regular: tuple[Run
     run, feed = regular
     assert run.result.fault is None
     assert run.result.end_state == "holding"
-    simulated = feed.driven.record()
+    simulated = feed.session.record()
     assert simulated.summary["mode_switches"] >= 4
     goals = goals_of(run, simulated)
     time = run.result.record["record_time"]
@@ -152,13 +147,13 @@ def test_goals_are_those_of_the_replay_of_the_finished_record(regular: tuple[Run
     # A stop, what is held back, two samples and a cycle; at first and at the end more or less.
     behind = np.array(feed.behind)[50:-50]
     assert behind.min() >= 0.5 * run.map.safety.stop_time + BLEND
-    assert behind.max() <= 0.5 * run.map.safety.stop_time + feed.held_back.delay + 2.0 / RATE
+    assert behind.max() <= 0.5 * run.map.safety.stop_time + feed.follower.lookahead.delay + 2.0 / RATE
 
 
 def test_wheels_that_are_lifted_clear_the_floor_and_others_stand_on_it(regular: tuple[Run, SimulatedSnake]) -> None:
     """Of the goals that were sent, by the whole chain in Pinocchio."""
     run, feed = regular
-    simulated = feed.driven.record()
+    simulated = feed.session.record()
     goals, time = goals_of(run, simulated), run.result.record["record_time"]
     time = time[np.isfinite(time)]
     before = np.clip(np.searchsorted(simulated.time, time, side="right") - 1, 0, len(simulated) - 2)
@@ -180,7 +175,7 @@ def test_a_simulation_that_is_late_in_a_mode_switch_changes_no_goal() -> None:
     """The wheels come down when the simulation has them down, however long that takes."""
     run, feed = driven(snake_map(), ticks=500, stall=(330, 1.0))
     assert run.result.fault is None
-    simulated = feed.driven.record()
+    simulated = feed.session.record()
     goals_of(run, simulated)
     time = run.result.record["record_time"]
     time = time[np.isfinite(time)]
@@ -197,7 +192,7 @@ def check_stopped(run: Run, feed: SimulatedSnake, words: str) -> None:
     check_goals_within_limits(run)
     # At least as long before what is refused as postures are held back.
     time = run.result.record["record_time"]
-    assert np.nanmax(time) <= feed.driven.time - BLEND
+    assert np.nanmax(time) <= feed.session.time - BLEND
 
 
 def test_modes_that_follow_too_soon_are_not_followed() -> None:
@@ -214,12 +209,12 @@ def postures(duration: int, requests: Mapping[int, int]) -> tuple[list[Sample], 
     """What leaves a drive of so many ticks."""
     servo_map = snake_map()
     feed = SimulatedSnake(servo_map)
-    columns = Columns(feed.driven.still(), servo_map, feed.driven)
+    columns = Columns(feed.session, servo_map)
     found = []
     for tick in range(duration):
-        feed.driven.tick(order(tick, requests))
-        found += feed.held_back.add(columns.sample(), *columns.base(feed.held_back.yaw))
-    return [feed.follower.first, *found, *feed.held_back.rest()], feed.driven.record()
+        feed.session.tick(command(tick, requests))
+        found += feed.follower.lookahead.add(columns.sample(), *columns.base(feed.follower.lookahead.yaw))
+    return [feed.follower.first, *found, *feed.follower.lookahead.rest()], feed.session.record()
 
 
 @pytest.mark.parametrize("ticks", [1, 2, 30, 61, 63, 230, 270])
@@ -251,7 +246,7 @@ def test_it_is_known_when_modes_may_change(tick: int, steady: bool) -> None:
     servo_map = snake_map()
     feed = SimulatedSnake(servo_map)
     for k in range(tick):
-        feed.driven.tick(order(k, {150: 4}))
+        feed.session.tick(command(k, {150: 4}))
         feed.follower.hear()
         feed._feed.take(2)
     assert feed.follower.steady is steady
@@ -273,6 +268,6 @@ def test_what_cannot_be_lifted_is_said_before_anything_moves(change: dict[str, o
 def test_without_an_entry_in_the_map_wheels_would_be_dragged() -> None:
     servo_map = snake_map()
     servo_map.lifts = None
-    still = drive(load_scenario("snake_operator"))
+    still = begin(load_scenario("snake_operator"))
     with pytest.raises(CheckRefused, match="does not say how"):
-        Columns(still.still(), servo_map, still)
+        Columns(still, servo_map)

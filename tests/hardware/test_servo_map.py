@@ -68,6 +68,7 @@ MISTAKES = [
     ("baud: 1000000", "baud: 1234", r"map.yaml:2: bus.baud = 1234: is not one of 9600, 57600"),
     ("[-60, 60]", "[60, -60]", r"map.yaml:\d+: kinds.joint.limits.position_deg: 60.0 is not below -60.0"),
     ("position_deg: [-60, 60], ", "", r"a servo in position mode needs limits.position_deg"),
+    ("sign: -1", "sign: true", r"map.yaml:19: servos.elbow.sign = True: must be 1 or -1"),
     ("sign: -1", "sign: 2", r"map.yaml:19: servos.elbow.sign"),
     ("velocity: 3.0, torque: 6.0}", "velocity: -3.0, torque: 6.0}", r"map.yaml:9: kinds.joint.limits.velocity"),
     ("policy: decelerate", "policy: panic", r"map.yaml:3: safety.policy"),

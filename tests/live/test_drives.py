@@ -16,8 +16,8 @@ from dynsim.hardware.servo_map import load_servo_map
 from dynsim.record.poses import ORIENTATION, POSITION, poses_at
 from dynsim.scenario import scenario_from_resolved
 from dynsim.snake.description import FIXING, SWITCHING
-from dynsim.teleop.drive import drive
-from dynsim.teleop.driven import Order
+from dynsim.teleop.begin import begin
+from dynsim.teleop.session import Command
 
 
 def assert_same(a: Record, b: Record) -> None:
@@ -34,13 +34,13 @@ def replayed(record: Record) -> Record:
 
 def driven_at_random(scenario: Scenario, ticks: int, size: float, requests: dict[int, int] | None = None) -> Record:
     """A drive with new velocities every eighth tick, all of them zero now and then."""
-    driven, random = drive(scenario), np.random.default_rng(1)
-    velocity = (0.0,) * len(driven.axes)
+    session, random = begin(scenario), np.random.default_rng(1)
+    velocity = (0.0,) * len(session.axes)
     for k in range(ticks):
         if k % 8 == 3:
-            velocity = tuple((size * random.uniform(-1.0, 1.0, len(driven.axes)) * (k % 32 != 27)).tolist())
-        driven.tick(Order(velocity, (requests or {}).get(k, 0), closed=20 < k < 50))
-    return driven.record()
+            velocity = tuple((size * random.uniform(-1.0, 1.0, len(session.axes)) * (k % 32 != 27)).tolist())
+        session.tick(Command(velocity, (requests or {}).get(k, 0), closed=20 < k < 50))
+    return session.record()
 
 
 ARMS = [
@@ -80,35 +80,35 @@ def test_drive_of_a_snake_is_replayed_bit_for_bit(name: str, variant: str | None
     assert_same(record, replayed(record))
 
 
-def test_contacts_that_are_shown_are_those_of_the_record() -> None:
-    driven = drive(load_scenario("elbow_comparison_floor", "two_elbows"))
+def test_contacts_of_a_frame_are_those_of_the_record() -> None:
+    session = begin(load_scenario("elbow_comparison_floor", "two_elbows"))
     for _ in range(40):
-        driven.tick(Order((0.05, 0.0, 0.0)))
-    shown, record = driven.shown(), driven.record()
-    assert list(shown.touching) == list(record.labels["contact_normal_force"])
+        session.tick(Command((0.05, 0.0, 0.0)))
+    frame, record = session.frame(), session.record()
+    assert list(frame.touching) == list(record.labels["contact_normal_force"])
     # At one of the last samples before that instant: steps are longer than the time between samples.
     forces, vectors = record["contact_normal_force"], record["contact_force"]
-    (k,) = np.flatnonzero(forces[:, 1] == shown.touching["elbow_7"].force)
-    assert shown.time - 0.05 < record.time[k] <= shown.time
-    for c, touch in enumerate(shown.touching.values()):
+    (k,) = np.flatnonzero(forces[:, 1] == frame.touching["elbow_7"].force)
+    assert frame.time - 0.05 < record.time[k] <= frame.time
+    for c, touch in enumerate(frame.touching.values()):
         assert touch.force == forces[k, c]
         assert np.array_equal(touch.vector, vectors[k, c])
         assert touch.mode == record["contact_mode"][k, c]
-    assert any(touch.force > 0.0 for touch in shown.touching.values())
+    assert any(touch.force > 0.0 for touch in frame.touching.values())
 
 
 def test_hand_goes_as_fast_as_it_is_asked_to() -> None:
     """The target exactly, the hand as well as the controller follows it."""
-    driven = drive(load_scenario("six_axis_arm"))
-    start = driven.shown().hand.copy()
+    session = begin(load_scenario("six_axis_arm"))
+    start = session.frame().hand.copy()
     velocity, still = np.array([0.05, -0.03, 0.02]), (0.0, 0.0, 0.0)
     for k in range(100):
-        driven.tick(Order(tuple(velocity.tolist()) if k < 50 else still))
+        session.tick(Command(tuple(velocity.tolist()) if k < 50 else still))
     # What it loses while it speeds up it makes up for while it slows down; sums of ticks, so to rounding.
     way = 0.5 * velocity
-    assert driven.shown().hand - start == pytest.approx(way, abs=1e-3 * 0.025)
-    record = driven.record()
-    assert record["target_position"][-1] == pytest.approx(driven.shown().hand, abs=1e-12)
+    assert session.frame().hand - start == pytest.approx(way, abs=1e-3 * 0.025)
+    record = session.record()
+    assert record["target_position"][-1] == pytest.approx(session.frame().hand, abs=1e-12)
     speed = np.linalg.norm(np.diff(record["target_position"], axis=0), axis=1) / np.diff(record.time)
     assert speed.max() == pytest.approx(np.linalg.norm(velocity))
     # By ticks of 10 ms, seen in samples of 5 ms.
@@ -118,13 +118,13 @@ def test_hand_goes_as_fast_as_it_is_asked_to() -> None:
 
 def test_base_goes_along_its_arc() -> None:
     """V = 0.2 m/s and ω = 0.4 rad/s for 1 s: an arc of radius 0.5 m; the hand is carried along."""
-    driven = drive(load_scenario("mobile_path"))
-    names = [axis.name for axis in driven.axes]
-    order = Order(tuple({"ahead": 0.2, "turn": 0.4}.get(name, 0.0) for name in names))
-    still = Order((0.0,) * len(names))
+    session = begin(load_scenario("mobile_path"))
+    names = [axis.name for axis in session.axes]
+    command = Command(tuple({"ahead": 0.2, "turn": 0.4}.get(name, 0.0) for name in names))
+    still = Command((0.0,) * len(names))
     for k in range(200):
-        driven.tick(order if k < 100 else still)
-    record = driven.record()
+        session.tick(command if k < 100 else still)
+    record = session.record()
     x, y, heading = record["base_pose"][-1]
     # A little different where it speeds up and slows down: there the radius is another one.
     assert (x, y, heading) == pytest.approx((0.5 * math.sin(0.4), 0.5 * (1.0 - math.cos(0.4)), 0.4), abs=8e-3)
@@ -135,17 +135,17 @@ def test_base_goes_along_its_arc() -> None:
 
 def test_hand_waits_where_it_cannot_go() -> None:
     """Pulled straight up for ten times the arm's length: it stops at its reach, and comes back when asked to."""
-    driven = drive(load_scenario("six_axis_arm"))
+    session = begin(load_scenario("six_axis_arm"))
     for _ in range(1000):
-        driven.tick(Order((0.0, 0.0, 0.5)))
-    top = driven.shown().hand.copy()
-    assert "would speed up too fast" in driven.shown().hindrance
+        session.tick(Command((0.0, 0.0, 0.5)))
+    top = session.frame().hand.copy()
+    assert "would speed up too fast" in session.frame().hindrance
     assert top[2] < 3.0
-    rates = np.abs(driven.record()["v"])
+    rates = np.abs(session.record()["v"])
     assert rates.max() < 2.5
     for _ in range(20):
-        driven.tick(Order((0.0, 0.0, -0.05)))
-    assert driven.shown().hand[2] < top[2] - 0.005
+        session.tick(Command((0.0, 0.0, -0.05)))
+    assert session.frame().hand[2] < top[2] - 0.005
 
 
 HALF = math.sqrt(0.5)
@@ -165,15 +165,15 @@ WAYS = [
 @pytest.mark.parametrize("way", WAYS)
 def test_hand_eases_to_rest_at_its_edge(way: tuple[float, float, float]) -> None:
     """At 0.1 m/s for 3 s: its target speeds up and slows down at 0.5 m/s² at most, and servos may follow the drive."""
-    driven = drive(load_scenario("elbow_comparison", "two_elbows"))
-    operator = driven.simulation.operator
+    session = begin(load_scenario("elbow_comparison", "two_elbows"))
+    operator = session.simulation.operator
     targets, hindered = [operator.target.copy()], set()
     for _ in range(300):
-        driven.tick(Order(tuple(0.1 * part for part in way)))
+        session.tick(Command(tuple(0.1 * part for part in way)))
         targets.append(operator.target.copy())
-        hindered.add(driven.shown().hindrance)
-    velocity = np.diff(np.array([targets[0], *targets]), axis=0) / driven.period
-    acceleration = np.linalg.norm(np.diff(velocity, axis=0), axis=1) / driven.period
+        hindered.add(session.frame().hindrance)
+    velocity = np.diff(np.array([targets[0], *targets]), axis=0) / session.period
+    acceleration = np.linalg.norm(np.diff(velocity, axis=0), axis=1) / session.period
     assert acceleration.max() == pytest.approx(0.5, rel=1e-6)
     speed = np.linalg.norm(velocity, axis=1)
     if hindered == {""}:
@@ -183,31 +183,31 @@ def test_hand_eases_to_rest_at_its_edge(way: tuple[float, float, float]) -> None
         rests = int(np.flatnonzero(speed[20:] == 0.0)[0]) + 20
         assert not speed[rests:].any()
         assert np.diff(speed[rests - 15 : rests]).max() < 1e-9
-    check_motion(driven.record(), load_servo_map("arm"))
+    check_motion(session.record(), load_servo_map("arm"))
 
 
 def test_a_hand_at_its_edge_comes_back() -> None:
     """For a second in one of twenty directions at random, to the edge and along it, then back to where it began."""
-    driven = drive(load_scenario("elbow_comparison", "two_elbows"))
-    operator, random = driven.simulation.operator, np.random.default_rng(3)
+    session = begin(load_scenario("elbow_comparison", "two_elbows"))
+    operator, random = session.simulation.operator, np.random.default_rng(3)
     targets, hindered = [operator.target.copy()], 0
 
     def goes(way: np.ndarray[Any, Any]) -> None:
-        driven.tick(Order(tuple(way.tolist())))
+        session.tick(Command(tuple(way.tolist())))
         targets.append(operator.target.copy())
 
     for _ in range(20):
         way = random.normal(size=3)
         for _ in range(100):
             goes(0.2 * way / np.linalg.norm(way))
-        hindered += bool(driven.shown().hindrance)
+        hindered += bool(session.frame().hindrance)
         before = np.linalg.norm(targets[0] - targets[-1])
         for _ in range(150):
             left = targets[0] - targets[-1]
             goes(0.2 * left / max(float(np.linalg.norm(left)), 0.1))
         assert np.linalg.norm(targets[0] - targets[-1]) < max(0.5 * before, 0.02)
     assert hindered > 3
-    acceleration = np.diff(np.array(targets), n=2, axis=0) / driven.period**2
+    acceleration = np.diff(np.array(targets), n=2, axis=0) / session.period**2
     assert np.linalg.norm(acceleration, axis=1).max() < 0.5 + 1e-6
 
 
@@ -251,7 +251,7 @@ def test_what_cannot_be_driven_is_refused(name: str, change: dict[str, Any], rea
         scenario = load_scenario(name, None, change)
         if "commands" in change.get("controller.operator", {}):
             simulate(scenario)
-        drive(scenario)
+        begin(scenario)
 
 
 def test_an_operator_needs_something_to_move() -> None:

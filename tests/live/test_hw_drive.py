@@ -20,7 +20,7 @@ from dynsim import Record, load_scenario, simulate
 from dynsim.hardware.replay.check import check_motion
 from dynsim.hardware.replay.states import State
 from dynsim.hardware.servo_map import SHIPPED, load_servo_map
-from dynsim.teleop.web.session import NOT_READY
+from dynsim.teleop.web.live import NOT_READY
 
 pytestmark = pytest.mark.long
 

@@ -10,11 +10,11 @@ import pytest
 from dynsim.compile.protocols import BuildContext
 from dynsim.engine import simulate
 from dynsim.library.controllers import task_space
+from dynsim.library.controllers.task_space import TABLE_II
 from dynsim.library.plants import snake
 from dynsim.scenario import load_scenario
 from dynsim.snake.description import conditioning
 from dynsim.snake.kinematics import pose_of_point
-from dynsim.snake.modes import TABLE_II
 
 SCENARIOS = {
     "snake_positioning": ["x", "y", "z", "alpha", "beta", "gamma"],

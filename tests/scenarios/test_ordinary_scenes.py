@@ -1,4 +1,4 @@
-"""Two hundred of the drawn scenes of dynsim.studies.endings: each comes to its end, or says why it cannot."""
+"""Two hundred of the drawn scenes of support/endings.py: each comes to its end, or says why it cannot."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
+from support import endings
+from support.endings import FINISHED, METHODS, REFUSED, SURFACES, account, end, scene, write_terrains
 
 from dynsim.engine.stopping import KINDS
-from dynsim.studies import endings
-from dynsim.studies.endings import FINISHED, METHODS, REFUSED, SURFACES, account, end, scene, write_terrains
 
 # Stops that say nothing of the physics: of 10 000 scenes one (9300, by its wall limit) ends so.
 UNEXPLAINED = {"step_too_small", "not_finite", "no_progress", "out_of_time", "stuck"}

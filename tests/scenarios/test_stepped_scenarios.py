@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import dynsim
-from dynsim.engine.contact_metrics import capped
+from dynsim.engine.warnings import capped
 from dynsim.errors import ScenarioError
 from dynsim.record import Record
 

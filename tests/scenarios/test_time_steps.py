@@ -9,7 +9,7 @@ import pytest
 from stepping_benches import snake
 
 import dynsim
-from dynsim.engine.contact_metrics import HALF_STEP_LIMIT, PENETRATION_LIMIT_M, SCHEME_LIMIT, coarse
+from dynsim.engine.warnings import HALF_STEP_LIMIT, PENETRATION_LIMIT_M, SCHEME_LIMIT, coarse
 from dynsim.errors import ScenarioError
 from dynsim.model.urdf.writer import write_urdf
 

@@ -10,15 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from scipy.spatial import ConvexHull
 
 import dynsim
 from dynsim.draw import figures
-from dynsim.draw.figures import arm, base, motors, posture, skeleton, solids, style, top_view
+from dynsim.draw.figures import arm, base, motors, posture, skeleton, style, top_view
 from dynsim.record import Event, Record, measures
 from dynsim.record.joint_motion import export_record, joint_motion
 from dynsim.record.measures import percent
-from dynsim.record.scene import Scene, Shape
+from dynsim.record.scene import Scene
 from dynsim.scenario import load_scenario
 
 TRACK, CASTER = 0.3, 0.15
@@ -277,7 +276,7 @@ def test_tracking_shows_the_errors_of_the_record(turning: Record) -> None:
 def test_postures_show_the_base_and_its_wheels(turning: Record) -> None:
     body, _ = skeleton.skeleton(turning)
     assert body is not None
-    at_start, at_end = body.solids(0), body.solids(len(turning) - 1)
+    at_start, at_end = ([corners for corners, _ in body.solids(row)] for row in (0, len(turning) - 1))
     assert len(at_start) == 4  # plate, ball of the caster, two wheels
     for solid in at_end:
         assert solid[:, 2].min() > -1e-7
@@ -291,28 +290,6 @@ def test_postures_show_the_base_and_its_wheels(turning: Record) -> None:
     assert all(extent.contains(*corner) for patch in figure.axes[1].patches for corner in patch.get_xy())
     compared = drawn(posture.posture_comparison({"a": turning, "b": turning}))
     assert [len(axes.patches) for axes in compared.axes] == [4 * shown] * 2
-
-
-def test_shapes_are_hulls_of_their_surfaces() -> None:
-    turned = (math.cos(0.3), 0.0, math.sin(0.3), 0.0)
-
-    def volume(kind: str, *size: float) -> float:
-        points = solids.surface(Shape(kind, size, (1.0, 2.0, 3.0), turned))
-        triangles = solids.faces(points)
-        # Of a closed surface whose faces turn to the left seen from outside: Σ a·(b × c)/6.
-        enclosed = float((triangles[:, 0] * np.cross(triangles[:, 1], triangles[:, 2])).sum() / 6.0)
-        assert enclosed == pytest.approx(ConvexHull(points).volume, rel=1e-12)
-        return enclosed
-
-    n = solids.CORNERS
-    prism = 0.5 * n * math.sin(2.0 * math.pi / n)
-    assert volume("box", 0.2, 0.3, 0.4) == pytest.approx(0.024, rel=1e-12)
-    assert volume("cylinder", 0.1, 0.5) == pytest.approx(prism * 0.01 * 0.5, rel=1e-12)
-    ball = 4.0 / 3.0 * math.pi * 0.1**3
-    assert 0.95 * ball < volume("sphere", 0.1) < ball
-    assert volume("capsule", 0.1, 0.5) == pytest.approx(volume("sphere", 0.1) + prism * 0.01 * 0.5, rel=1e-12)
-    assert not len(solids.surface(Shape("mesh", (1.0, 1.0, 1.0), file="a.stl")))
-    assert not len(solids.faces(np.zeros((5, 3))))
 
 
 def test_supports_are_apart_from_the_points_that_older_versions_know(braced: Record, tmp_path: Path) -> None:

@@ -67,7 +67,7 @@ def test_the_log_says_what_why_and_how_long(folder: Path, caplog: pytest.LogCapt
 
 
 @pytest.mark.parametrize("shown", [True, False])
-def test_a_terminal_counts_the_seconds(folder: Path, monkeypatch: pytest.MonkeyPatch, shown: bool) -> None:
+def test_a_terminal_says_what_is_compiled(folder: Path, monkeypatch: pytest.MonkeyPatch, shown: bool) -> None:
     terminal = io.StringIO()
     terminal.isatty = lambda: True  # type: ignore[method-assign]
     monkeypatch.setattr(sys, "stderr", terminal)

@@ -11,12 +11,16 @@ from pathlib import Path
 import pytest
 
 import dynsim
+from dynsim.engine.results import VIEW
 from dynsim.library.families import FAMILIES
+from dynsim.record import FORMAT
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "dynsim"
 PAGES = ("architecture.md", "extending.md")
 # What the reader of an example makes.
+# How texts are made plain, known to Python by that name.
+NO_MODULES = {"dynsim.plain"}
 MADE = {"dynsim/surfaces/ellipsoid.py", "dynsim/model/joints/screw.py"}
 
 
@@ -77,6 +81,8 @@ def resolves(name: str) -> bool:
         if hasattr(thing, part):
             thing = getattr(thing, part)
             continue
+        if part in getattr(thing, "__dataclass_fields__", ()):
+            continue
         try:
             thing = importlib.import_module(place)
         except ImportError:
@@ -103,6 +109,16 @@ def test_what_a_page_names_exists(name: str) -> None:
     assert missing(text) == []
 
 
+DOCS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+@pytest.mark.parametrize("path", DOCS, ids=lambda path: path.name)
+def test_files_of_a_run_have_the_names_that_are_written(path: Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    assert set(re.findall(r"`([\w.]+\.html)`", text)) <= {VIEW}
+    assert set(re.findall(r"dynsim-record-\d", text)) <= {FORMAT}
+
+
 @pytest.mark.parametrize(
     "wrong",
     [
@@ -118,6 +134,19 @@ def test_what_a_page_names_exists(name: str) -> None:
 )
 def test_a_name_that_is_not_there_is_found(wrong: str) -> None:
     assert len(missing(f"See {wrong}.")) == 1
+
+
+def test_what_sources_name_exists() -> None:
+    """Modules, functions and classes by their whole names, in docstrings, comments and texts."""
+    groups = {family.group for family in FAMILIES.values()}
+    named = {
+        (name, path.relative_to(PACKAGE).as_posix())
+        for path in PACKAGE.rglob("*.py")
+        for name in re.findall(r"\bdynsim(?:\.[A-Za-z_]\w*)+", path.read_text(encoding="utf-8"))
+        if name not in groups | NO_MODULES
+    }
+    assert len(named) > 1000
+    assert [f"{path}: {name}" for name, path in sorted(named) if not resolves(name)] == []
 
 
 def test_examples_make_what_is_not_there() -> None:

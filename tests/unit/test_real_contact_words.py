@@ -11,7 +11,7 @@ import pytest
 import dynsim
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
-from dynsim.engine import check
+from dynsim.engine import check, warnings
 from dynsim.engine import summary as metrics
 from dynsim.engine.prepare import Prepared, prepare
 from dynsim.engine.stopping import _reason
@@ -93,7 +93,7 @@ def beyond(robot: dynsim.model.description.Robot, degrees: float) -> Record:
 
 def test_stops_that_are_enforced_are_not_advised_to_be(tmp_path: Path) -> None:
     robot = build.robot(load(tmp_path, ARM))
-    (glued,), (real,) = (metrics._passed_limits(beyond(robot, -10.5), robot, law) for law in (False, True))
+    (glued,), (real,) = (warnings._passed_limits(beyond(robot, -10.5), robot, law) for law in (False, True))
     both = (
         "joint_1: passes its lower position limit of -10° (-0.1745 rad) by up to 0.5° (0.00873 rad), first at t = 0.5 s"
     )

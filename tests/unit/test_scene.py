@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from dynsim.compile.protocols import BuildContext
+from dynsim.draw.geometry.surfaces import round_patch, surface_grids
 from dynsim.errors import RecordError
 from dynsim.library.surfaces import cylinder, plane, sphere
 from dynsim.model.description import Quadric
 from dynsim.record.scene import Body, Joint, Point, Scene, Shape, Surface, quaternion
-from dynsim.record.surface_points import normals, round_patch, surface_grids
 
 CONTEXT = BuildContext(1.0)
 HINGE = Joint("j", "revolute", (0.0, 1.0, 0.0), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), "q", ("j",))
@@ -118,7 +118,7 @@ def test_points_of_quadrics_are_on_them(drawn: Surface):
     # A flat one has no seams between cells.
     assert grid.shape[:2] == ((2, 2) if drawn.kind == "plane" else (41, 41))
     slopes = np.array([drawn.gradient(point) for point in points])
-    np.testing.assert_allclose(normals(drawn, points), slopes / np.linalg.norm(slopes, axis=1)[:, None], atol=1e-12)
+    np.testing.assert_allclose(drawn.normal(points), slopes / np.linalg.norm(slopes, axis=1)[:, None], atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", ["sphere", "cylinder"])

@@ -6,9 +6,9 @@ from pydantic import ValidationError
 
 from dynsim.engine.mode_switching import ModeSwitcher
 from dynsim.errors import ModelError
-from dynsim.library.controllers.snake_commands import Circle, Command, DoorArc, Ramp, Script, ScriptedSource
+from dynsim.library.controllers.snake_commands import Circle, DoorArc, Ramp, Script, ScriptedSource, SnakeCommand
+from dynsim.library.controllers.task_space import TABLE_II
 from dynsim.snake.description import FIXING, NO_REQUEST, SWITCHING, ModeTable
-from dynsim.snake.modes import TABLE_II
 
 MODES = ModeTable.from_lifted(TABLE_II, 7)
 PATHS = [
@@ -22,7 +22,7 @@ PATHS = [
 
 
 def source(*commands, paths=()):
-    return ScriptedSource([Command(**c) for c in commands], list(paths))
+    return ScriptedSource([SnakeCommand(**c) for c in commands], list(paths))
 
 
 @pytest.mark.parametrize("path", PATHS)

@@ -35,22 +35,19 @@ def test_draw_writes_every_figure_from_a_record_on_disk(record, tmp_path, monkey
         assert animation.n_frames == 4
 
 
-OLD = {"head_joints": 6, "base_joints": 6, "wheel_radius_m": 0.05, "driven_side": [1, -1, 1, -1, 1, -1, 1]}
-
-
-def test_geometry_of_the_scene_is_that_of_records_of_version_0_1(record):
+def test_geometry_is_that_of_the_scene(record):
     geometry = snake_geometry(record)
-    old = Record(record.time, provenance={"snake": OLD | {
+    assert (geometry.head_joints, geometry.wheel_radius) == (6, 0.05)
+    limits = [np.deg2rad(65), np.deg2rad(113)] * 3 + [np.deg2rad(65)] * 6
+    expected = {
         "pitch": [False, True] * 3 + [False] * 6,
-        "lower_rad": [-np.deg2rad(65), -np.deg2rad(113)] * 3 + [-np.deg2rad(65)] * 6,
-        "upper_rad": [np.deg2rad(65), np.deg2rad(113)] * 3 + [np.deg2rad(65)] * 6,
-        "half_track_m": [0.075, 0.06, 0.075, 0.06, 0.075, 0.06, 0.06],
-    }})  # fmt: skip
-    expected = snake_geometry(old)
-    assert (geometry.head_joints, geometry.wheel_radius) == (expected.head_joints, expected.wheel_radius) == (6, 0.05)
-    for name in ("pitch", "lower", "upper", "half_track"):
-        np.testing.assert_allclose(getattr(geometry, name), getattr(expected, name), atol=1e-15)
-    with pytest.raises(RecordError, match="'snake'"):
+        "lower": np.negative(limits),
+        "upper": limits,
+        "half_track": [0.075, 0.06, 0.075, 0.06, 0.075, 0.06, 0.06],
+    }
+    for name, values in expected.items():
+        np.testing.assert_allclose(getattr(geometry, name), values, atol=1e-15)
+    with pytest.raises(RecordError, match="no scene"):
         snake_geometry(Record(record.time))
 
 

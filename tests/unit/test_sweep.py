@@ -35,9 +35,9 @@ from dynsim.studies import batch, processes
 from dynsim.studies import sweep as module
 from dynsim.studies.columns import numbers
 from dynsim.studies.journal import JOURNAL, LOST, Row
-from dynsim.studies.plan import Axis, Law, Plan
 from dynsim.studies.processes import WorkerInterrupted, WorkerLost, WorkerSilent, run_in_processes
 from dynsim.studies.sweep import run_sweep
+from dynsim.studies.sweep_plan import Axis, Law, Plan
 
 PENDULUM = read_scenario("single_pendulum")
 SHORT = {"duration_s": 0.2}

@@ -16,8 +16,8 @@ from dynsim.errors import DynsimError, RecordError
 from dynsim.scenario import read_scenario
 from dynsim.studies import sweep as sweep_module
 from dynsim.studies.journal import JOURNAL, PLAN, Journal, Row
-from dynsim.studies.plan import Axis, Plan
 from dynsim.studies.sweep import run_sweep
+from dynsim.studies.sweep_plan import Axis, Plan
 from dynsim.system.files import held
 
 SHORT = {"duration_s": 0.01, "metrics.settle_s": 0.0}
@@ -142,6 +142,7 @@ DAMAGES: list[tuple[str, Callable[[Path], None], str, str]] = [
     ("row's reason a number", row(reason=0), SECOND, "reason = 0"),
     ("row's numbers nothing", row(numbers=None), SECOND, "numbers = None"),
     ("row's numbers texts", row(numbers={"energy": "much"}), SECOND, "numbers = {"),
+    ("row's numbers too large", row(numbers={"energy": 10**400}), SECOND, "numbers = {"),
     ("row's warnings a list", row(warnings=[]), SECOND, "warnings = []"),
     ("table a folder", as_folder("sweep.csv"), "sweep.csv", "in the way"),
     ("other table a folder", as_folder("sweep.parquet"), "sweep.parquet", "in the way"),

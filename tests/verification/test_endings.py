@@ -15,7 +15,7 @@ import pytest
 
 import dynsim
 from dynsim.engine import attended, kinematic
-from dynsim.errors import ScenarioError, SimulationInterrupted, SimulationStopped
+from dynsim.errors import SimulationInterrupted, SimulationStopped
 from dynsim.integrators import driver, events, steps
 from dynsim.integrators import run as ki
 from dynsim.integrators.radau5 import newton as kn
@@ -216,11 +216,6 @@ def test_the_wall_limit_ends_a_snake():
     with pytest.raises(SimulationStopped, match=r"wall limit, .*, is over, in mode") as raised:
         kinematic.simulate(scenario)
     assert len(raised.value.record.time) > 1
-
-
-def test_the_key_that_the_wall_limit_replaces_is_told():
-    with pytest.raises(ScenarioError, match=r"integrator\.time_limit_h = 3: is no longer there; wall_limit_s"):
-        dynsim.load_scenario("single_pendulum", overrides={"integrator.time_limit_h": 3})
 
 
 # ---- Who listens while compiled code runs

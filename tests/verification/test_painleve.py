@@ -14,7 +14,7 @@ from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact.uniqueness import ROOM, UNIQUE, force_verdict
 from dynsim.dynamics.derivative import new_workspace
 from dynsim.engine import dynamics, recording
-from dynsim.engine.uniqueness import acceleration_range, contact_matrices, motion_spread, paradox
+from dynsim.engine.force_indeterminacy import acceleration_range, contact_matrices, motion_spread, paradox
 from dynsim.errors import SimulationStopped
 from dynsim.integrators import driver
 from dynsim.integrators import run as ki

@@ -9,7 +9,7 @@ import pytest
 
 import dynsim
 from dynsim.dynamics.tables import OPEN, SLIDING, STICKING
-from dynsim.engine.sharing import sharing
+from dynsim.engine.force_indeterminacy import sharing
 from dynsim.scenario import build
 
 ARM = """\

@@ -8,10 +8,10 @@ from scipy.spatial import ConvexHull
 
 from dynsim.compile.protocols import BuildContext
 from dynsim.jit.kernel import reals
+from dynsim.library.controllers.task_space import TABLE_II
 from dynsim.library.plants.snake import Config, build
 from dynsim.snake.description import ModeTable
 from dynsim.snake.kinematics import new_chain, pose_of_point, walk_chain
-from dynsim.snake.modes import TABLE_II
 from dynsim.snake.support import (
     Cost,
     cost_gradient,

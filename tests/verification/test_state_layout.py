@@ -16,7 +16,7 @@ import dynsim
 from dynsim.dynamics.derivative import new_workspace
 from dynsim.dynamics.simd.tables import aligned
 from dynsim.dynamics.state import OutputLayout, StateLayout, block
-from dynsim.engine.uniqueness import acceleration_range
+from dynsim.engine.force_indeterminacy import acceleration_range
 from dynsim.integrators.run import FINISHED, METHODS, PROJECTIONS, STATUS, STEPS, Run
 
 PACKAGE, TESTS = Path(dynsim.__file__).parent, Path(__file__).parents[1]

@@ -12,7 +12,7 @@ from unilateral_checks import events, random_touch, violations
 
 import dynsim
 from dynsim.dynamics.state import OUT_VECTOR
-from dynsim.engine.uniqueness import paradox
+from dynsim.engine.force_indeterminacy import paradox
 from dynsim.errors import SimulationStopped
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts import events as ce

@@ -162,8 +162,8 @@ def test_meshes_have_the_colours_of_their_files(tmp_path: Path, opened: Opens) -
     path = meshed_robot(tmp_path)
     file = tmp_path / "wedges" / "meshes" / "wedge.dae"
     library = (
-        "<library_effects><effect id='e'><phong><diffuse><color>1 0 0 1</color></diffuse></phong></effect>"
-        "</library_effects>"
+        "<library_effects><effect id='e'><profile_COMMON><technique sid='t'><phong><diffuse><color>1 0 0 1</color>"
+        "</diffuse></phong></technique></profile_COMMON></effect></library_effects>"
         "<library_materials><material id='m'><instance_effect url='#e'/></material></library_materials>"
     )
     text = file.read_text().replace("<library_geometries>", library + "<library_geometries>")

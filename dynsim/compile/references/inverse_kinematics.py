@@ -17,7 +17,7 @@ from dynsim.errors import UnreachableReference
 from dynsim.jit.kernel import reals
 from dynsim.model.base_pose import base_row
 from dynsim.model.description import Contact
-from dynsim.system.reuse import Reuse
+from dynsim.system.memo import recall
 
 Array = NDArray[np.float64]
 
@@ -39,7 +39,6 @@ def follow(
     progress: Callable[[float], None] | None = None,
     base: Array | None = None,
     braces: Sequence[Contact] = (),
-    reuse: Reuse | None = None,
 ) -> Array:
     """Positions of ``joints`` that put the hand on ``targets`` at ``times``; the others stay as in ``q``.
 
@@ -59,7 +58,6 @@ def follow(
     progress : called now and then with the time on the path [s], when it takes longer than a second
     braces : points that stay on their surfaces on the way, as exactly as the hand is on its path
     base : (T, 4) coordinates of the mobile base at ``times``: its wheels [rad], x and y [m]; None: it stays
-    reuse : what other runs have computed; masses are not asked for
 
     Returns
     -------
@@ -106,8 +104,8 @@ def follow(
         return result
 
     inputs = geometry, path, wanted, carried, first, tolerance, np.asarray(q)
-    # The path has room for one step in it, which holds anything afterwards.
-    return (reuse or Reuse()).of("inverse kinematics", solved, *inputs)
+    # Not from masses. The path has room for one step in it, which holds anything afterwards.
+    return recall("inverse kinematics", solved, *inputs)
 
 
 def _check_start(model: Model, joints: Sequence[str], q: Array) -> None:

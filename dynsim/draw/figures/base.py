@@ -39,7 +39,7 @@ def overturning(record: Record) -> Figure | None:
     rows = style.time_rows(figure, [[(record.time, one)] for one in series], style.settle_time(record))
     for axes in rows[0]:
         _lines(axes, record, LOADS, "least {} N", np.nanmin)
-        _mark_negative(axes, "pulls: held down")
+        style.shade_below_zero(axes, "pulls: held down")
         _mark_tipping(axes, [record], [style.PULLING])
     for axes in rows[1]:
         style.line(axes, record.time, margin, color=style.BLACK, label=_margin_label("margin", record))
@@ -86,8 +86,7 @@ def margin_comparison(records: Mapping[str, Record]) -> Figure | None:
         _mark_tipping(axes, some, [colours[name] for name in shown])
     panels[0].set_ylabel("tip margin")
     events.explain(panels[-1], events.mark_variants([panels], shown, colours))
-    handles, labels = panels[-1].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=1)
+    style.legend_below(figure, panels[-1:], 1)
     return figure
 
 
@@ -209,16 +208,7 @@ def _pair(axes: Axes, time: Array, target: Array, actual: Array, name: str, colo
 def _frame_margin(axes: Axes) -> None:
     low, high = axes.get_ylim()
     axes.set_ylim(max(min(low, -0.05), MARGIN_LOW), max(high, 0.1))
-    _mark_negative(axes, "beyond the triangle")
-
-
-def _mark_negative(axes: Axes, label: str) -> None:
-    """The zero line, and what lies below it shaded, if any of the axis does."""
-    axes.axhline(0.0, color=style.PULLING, linewidth=0.8)
-    low, high = axes.get_ylim()
-    if low < 0.0:
-        axes.axhspan(low, 0.0, color=style.PULLING, alpha=0.1, linewidth=0, label=label)
-        axes.set_ylim(low, high)
+    style.shade_below_zero(axes, "beyond the triangle")
 
 
 def _mark_tipping(axes: Axes, records: Sequence[Record], colours: Sequence[str]) -> None:

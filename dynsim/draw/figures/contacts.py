@@ -14,7 +14,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from dynsim.draw.figures import events, style
-from dynsim.draw.figures.insets import inset_rows
 from dynsim.draw.figures.style import Array
 from dynsim.record import Record
 from dynsim.record.measures import percent
@@ -34,76 +33,53 @@ MODES = (
 
 def forces(record: Record) -> Figure | None:
     """Normal force of each contact; None without contacts, or if none ever touched."""
-    names = touching_names([record])
-    if not names:
-        return None
-    chosen = _most_interesting(names, [record])
-    note = "" if len(chosen) == len(names) else f", {len(chosen)} of {len(names)} contacts ({_choice([record])})"
-    figure = style.new_figure(0.9 + ROW * len(chosen), style.title(record, f"normal contact forces{note}"))
-    real = is_real(record)
-    # An inset would lie on the bands of modes, with bands of its own.
-    arrange = style.time_rows if real else inset_rows
-    rows = arrange(figure, [_series(record, name) for name in chosen], style.settle_time(record))
-    for name, panels in zip(chosen, rows, strict=True):
-        force = _force(record, name)
-        # What the panel of the beginning shows would be a heap of marks in the other one.
-        begun = panels[0].get_xlim()[1] if len(panels) > 1 else -np.inf
-        for axes in panels:
-            style.line(axes, record.time, force, color=style.BLUE, label=force_label(record, name))
-            _draw_extremes(axes, record, name, style.BLUE)
-            if real:
-                _draw_modes(axes, record, name)
-                found = events.marked(record, [name])
-                events.mark(axes, [one for one in found if axes is panels[0] or one.time > begun])
-                continue
-            axes.fill_between(
-                *_thin_negative(record.time, force), 0.0, color=style.PULLING, alpha=0.3, linewidth=0, label="_pulling"
-            )
-            _mark_pulling(axes)
-        if len(panels) > 1:
-            _draw_samples(panels[0], record, name, style.BLUE)
-        panels[0 if real else -1].set_ylabel(f"{name}\nfₙ [N]")
-        style.legend_above(panels[-1], columns=4 if real else 3)
-    _note_sampling(rows, [record], insets=not real)
-    events.explain(rows[-1][-1], events.marked(record, chosen))
-    return figure
+    return _forces({"": record}, style.title(record, "normal contact forces"))
 
 
 def forces_comparison(records: Mapping[str, Record]) -> Figure | None:
     """Normal force of each contact, all variants that have it over each other."""
-    names = touching_names(list(records.values()))
+    return _forces(records, style.comparison_title(list(records.values()), "normal contact forces"))
+
+
+def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
+    """Rows of forces; of one run, which has no name, with the modes of its contacts or the time in which they pull."""
+    runs, alone = list(records.values()), "" in records
+    names = touching_names(runs)
     if not names:
         return None
-    chosen = _most_interesting(names, list(records.values()))
+    chosen = _most_interesting(names, runs)
+    note = "" if len(chosen) == len(names) else f", {len(chosen)} of {len(names)} contacts ({_choice(runs)})"
     having = {name: {v: r for v, r in records.items() if _touched(r, name)} for name in chosen}
-    title = style.comparison_title(list(records.values()), "normal contact forces")
     # A legend has an entry for each variant and one for the shading.
     more = sum(-(-(len(having[name]) + 1) // 2) - 1 for name in chosen) * style.LEGEND_ROW / 72.0
-    figure = style.new_figure(1.0 + ROW * len(chosen) + more, title)
+    figure = style.new_figure(1.0 + ROW * len(chosen) + more, title + note)
     series = [[one for r in having[name].values() for one in _series(r, name)] for name in chosen]
-    settle = max(style.settle_time(record) for record in records.values())
-    styles = style.told_apart(
-        style.variant_styles(list(records)),
-        *({v: (r.time, _force(r, name)) for v, r in having[name].items()} for name in chosen),
-    )
-    rows = inset_rows(figure, series, settle)
+    styles = style.variant_styles(list(records))
+    rows = style.time_rows(figure, series, max(map(style.settle_time, runs)))
     for name, panels in zip(chosen, rows, strict=True):
+        # What the panel of the beginning shows would be a heap of marks in the other one.
+        begun = panels[0].get_xlim()[1] if len(panels) > 1 else -np.inf
         for axes in panels:
-            for variant, record in having[name].items():
-                label = f"{variant}: {_share(record, name)}{_within(record, name)}"
-                colour = str(styles[variant]["color"])
-                style.line(axes, record.time, _force(record, name), label=label, **styles[variant])
+            for row, (variant, record) in enumerate(having[name].items()):
+                force, colour = _force(record, name), str(styles[variant]["color"])
+                label = f"{variant or name}: {_share(record, name)}{_within(record, name)}"
+                style.line(axes, record.time, force, label=label, **styles[variant])
                 _draw_extremes(axes, record, name, colour)
-                events.mark(axes, events.marked(record, [name]), colour, row=list(having[name]).index(variant))
+                found = events.marked(record, [name])
+                events.mark(axes, [e for e in found if axes is panels[0] or e.time > begun], colour, row=row)
+                if alone and is_real(record):
+                    _draw_modes(axes, record, name)
+                elif alone:
+                    fill: dict[str, Any] = {"color": style.PULLING, "alpha": 0.3, "linewidth": 0, "interpolate": True}
+                    axes.fill_between(record.time, force, 0.0, where=force < 0.0, label="_pulling", **fill)
+                if len(panels) > 1 and axes is panels[0]:
+                    _draw_samples(axes, record, name, colour)
             if not all(map(is_real, having[name].values())):
-                _mark_pulling(axes)
-        if len(panels) > 1:
-            for variant, record in having[name].items():
-                _draw_samples(panels[0], record, name, str(styles[variant]["color"]))
-        panels[-1].set_ylabel(f"{name}\nfₙ [N]")
-        style.legend_above(panels[-1], columns=2)
-    _note_sampling(rows, list(records.values()))
-    events.explain(rows[-1][-1], [event for record in records.values() for event in events.marked(record, chosen)])
+                style.shade_below_zero(axes, "surface pulls")
+        panels[0].set_ylabel(f"{name}\nfₙ [N]")
+        style.legend_above(panels[-1], columns=4 if alone else 2)
+    _note_sampling(rows, runs)
+    events.explain(rows[-1][-1], [event for record in runs for event in events.marked(record, chosen)])
     return figure
 
 
@@ -129,15 +105,10 @@ def is_real(record: Record) -> bool:
     return MODE in record
 
 
-def force_label(record: Record, name: str) -> str:
-    """Share of the run in which the contact pulls or, if real, is closed, and the extremes of its force."""
-    return f"{name}: {_share(record, name)} of the run{_within(record, name)}"
-
-
 def _share(record: Record, name: str) -> str:
     what, key = ("closed", "closed_fraction") if is_real(record) else ("pulling", "pulling_fraction")
     contact = _summary(record, name)
-    return f"{what} {percent(contact[key])}" if contact else f"{what} unknown part"
+    return f"{what} {percent(contact[key])} of the run" if contact else f"{what} unknown part"
 
 
 def _within(record: Record, name: str) -> str:
@@ -177,8 +148,8 @@ def _draw_samples(axes: Axes, record: Record, name: str, colour: str) -> None:
         axes.plot(record.time[inside], _force(record, name)[inside], ".", color=colour, markersize=2.5)
 
 
-def _note_sampling(rows: Sequence[Sequence[Axes]], records: Sequence[Record], *, insets: bool = True) -> None:
-    """Under the last panel: how often the curves are sampled, what the dashed lines are, and the insets."""
+def _note_sampling(rows: Sequence[Sequence[Axes]], records: Sequence[Record]) -> None:
+    """Under the last panel: how often the curves are sampled, and what the dashed lines are."""
     steps = [float(np.median(np.diff(record.time))) for record in records if len(record) > 1]
     if not steps:
         return
@@ -186,8 +157,6 @@ def _note_sampling(rows: Sequence[Sequence[Axes]], records: Sequence[Record], *,
     if any(line.get_marker() == "." for panels in rows for line in panels[0].get_lines()):
         note += " (dots)"
     note += "; dashed: extremes of all steps"
-    if insets and any(len(panels) > 1 for panels in rows):
-        note += "\naxes cut to the settled range; inset: the shaded beginning in full"
     last = rows[-1][-1]
     last.set_xlabel(f"{last.get_xlabel()}\n{note}")
 
@@ -242,23 +211,3 @@ def _draw_modes(axes: Axes, record: Record, name: str) -> None:
             spans, (0.0, 1.0), transform=axes.get_xaxis_transform(), color=colour, linewidth=0, zorder=0.2, label=label
         )
     axes.set_xlim(limits)
-
-
-def _thin_negative(time: Array, force: Array) -> tuple[Array, Array]:
-    """The line cut off at zero, with its zero crossings, so that the filled area ends where the line does."""
-    time, force = style.thin(time, force)
-    a, b = force[:-1], force[1:]
-    crossing = np.flatnonzero(a * b < 0.0)
-    at = time[crossing] + (time[crossing + 1] - time[crossing]) * a[crossing] / (a[crossing] - b[crossing])
-    time, force = np.insert(time, crossing + 1, at), np.insert(force, crossing + 1, 0.0)
-    return time, np.minimum(force, 0.0)
-
-
-def _mark_pulling(axes: Axes) -> None:
-    """Shade what lies below zero, if any of the axis does."""
-    axes.axhline(0.0, color=style.PULLING, linewidth=0.8)
-    low, high = axes.get_ylim()
-    if low >= 0.0:
-        return
-    axes.axhspan(low, 0.0, color=style.PULLING, alpha=0.13, linewidth=0, label="surface pulls")
-    axes.set_ylim(low, high)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -84,15 +85,7 @@ def energy_comparison(records: Mapping[str, Record]) -> Figure | None:
     finals = np.array([record["energy_electrical"][-1] for record in shown.values()])
     logarithmic = bool(finals.min() > 0.0 and finals.max() > LOG_RATIO * finals.min())
     least = 0.02 * float(finals.min())
-    styles = style.told_apart(
-        style.variant_styles(list(records)),
-        {
-            name: (record.time, np.log(np.maximum(energy, least)) if logarithmic else energy)
-            for name, record in shown.items()
-            for energy in (record["energy_electrical"],)
-        },
-        {name: (record.time, record["work_mechanical"]) for name, record in shown.items()},
-    )
+    styles = style.variant_styles(list(records))
     for name, record in shown.items():
         style.line(over_time, record.time, record["energy_electrical"], label=name, **styles[name])
         style.line(work, record.time, record["work_mechanical"], **styles[name])
@@ -107,9 +100,8 @@ def energy_comparison(records: Mapping[str, Record]) -> Figure | None:
     work.set_xlabel("time [s]")
     colours = {name: str(look["color"]) for name, look in styles.items()}
     events.explain(work, events.mark_variants([(over_time,), (work,)], shown, colours))
-    totals = _dots if logarithmic else _bars
-    totals(total, list(shown), finals, [str(styles[name]["color"]) for name in shown])
-    figure.legend(*over_time.get_legend_handles_labels(), loc="outside lower center", ncols=min(len(shown), 5))
+    _totals(total, list(shown), finals, [str(styles[name]["color"]) for name in shown], logarithmic)
+    style.legend_below(figure, [over_time], 5)
     return figure
 
 
@@ -151,7 +143,7 @@ def ledger(record: Record) -> Figure | None:
     events.mark_all([(axes,) for axes in panels], record)
     if not near:
         panels[-1].set_xlabel(f"{panels[-1].get_xlabel()}\n{_residual_note(record, turnover)}")
-    figure.legend(*whole.get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    style.legend_below(figure, [whole], 3)
     return figure
 
 
@@ -209,41 +201,29 @@ def _residual(axes: Axes, record: Record, turnover: float) -> None:
     axes.set_ylabel("unexplained\n[J]")
 
 
-def _bars(axes: Axes, names: Sequence[str], values: Array, colours: Sequence[str]) -> None:
-    axes.bar(np.arange(len(names)), values, color=colours, width=0.7)
-    _write_totals(axes, names, values, [max(float(value), 0.0) for value in values])
-    axes.margins(x=0.05, y=0.08)
+def _totals(axes: Axes, names: Sequence[str], values: Array, colours: Sequence[str], logarithmic: bool) -> None:
+    """Totals as bars; on the logarithmic axis of the curves, where these would have no foot, as dots.
 
-
-def _dots(axes: Axes, names: Sequence[str], values: Array, colours: Sequence[str]) -> None:
-    """Totals on the logarithmic axis of the curves, where bars would have no foot, as parts of the largest."""
-    axes.scatter(np.arange(len(names)), values, s=60, c=colours, zorder=3)
-    largest = float(values.max())
-    parts = ["" if value == largest else f"\n1/{style.number(largest / value, 3)}" for value in values]
-    _write_totals(axes, names, values, values.tolist(), parts)
-    # Room for the numbers, on an axis of decades.
-    axes.set_ylim(0.6 * float(values.min()), 2.0 * largest)
-    style.log_axis(axes)
-    axes.margins(x=0.2)
-
-
-def _write_totals(
-    axes: Axes, names: Sequence[str], values: Array, heights: Sequence[float], parts: Sequence[str] = ()
-) -> None:
-    places = np.arange(len(names))
-    for place, value, height, part in zip(places, values, heights, parts or [""] * len(names), strict=True):
-        axes.annotate(
-            f"{style.number(float(value))}{part}",
-            (float(place), height),
-            xytext=(0, 6 if parts else 2),
-            textcoords="offset points",
-            ha="center",
-            va="bottom",
-            fontsize=7.5,
-        )
+    Those have what they are as parts of the largest beside them.
+    """
+    places, largest = np.arange(len(names)), float(values.max())
+    if logarithmic:
+        axes.scatter(places, values, s=60, c=colours, zorder=3)
+        # Room for the numbers, on an axis of decades.
+        axes.set_ylim(0.6 * float(values.min()), 2.0 * largest)
+        style.log_axis(axes)
+        axes.margins(x=0.2)
+    else:
+        axes.bar(places, values, color=colours, width=0.7)
+        axes.margins(x=0.05, y=0.08)
+    for place, value in zip(places.tolist(), values.tolist(), strict=True):
+        part = f"\n1/{style.number(largest / value, 3)}" if logarithmic and value < largest else ""
+        look: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "va": "bottom", "fontsize": 7.5}
+        text = f"{style.number(value)}{part}"
+        axes.annotate(text, (place, max(value, 0.0)), xytext=(0, 6 if logarithmic else 2), **look)
     axes.set_xticks(places, names, rotation=30 if len(names) <= 4 else 60, ha="right")
     axes.grid(axis="x", visible=False)
-    axes.set_title("electrical energy of the run, net [J]" + (",\nand as a part of the largest" if parts else ""))
+    axes.set_title("electrical energy of the run, net [J]" + (",\nand as a part of the largest" if logarithmic else ""))
 
 
 def _joules(values: Array, largest: float = 0.0) -> str:

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from dynsim.draw.figures import events, style
 from dynsim.draw.figures.style import Array
+from dynsim.draw.geometry.surfaces import box_about
 from dynsim.record import Record
 from dynsim.record.measures import hand_error, hand_target
 
@@ -33,32 +34,28 @@ START: dict[str, Any] = {
 
 def path(record: Record) -> Figure | None:
     """Hand path and target in xy, xz and yz at one scale; None without a hand."""
-    if "hand_position" not in record:
-        return None
-    figure = style.new_figure(_height(4), style.title(record, "hand path"))
-    panels = _planes(figure, [record])
-    for axes, plane in zip(panels, PLANES, strict=True):
-        _draw_target(axes, record, plane)
-        _draw_path(axes, record, plane, label="hand", color=style.BLUE)
-    _legend_below(figure, panels[0])
-    return figure
+    return _paths({"hand": record}, style.title(record, "hand path"))
 
 
 def path_comparison(records: Mapping[str, Record]) -> Figure | None:
     """Hand paths of all variants in xy, xz and yz."""
+    return _paths(records, style.comparison_title(list(records.values()), "hand paths"))
+
+
+def _paths(records: Mapping[str, Record], title: str) -> Figure | None:
     shown = {name: record for name, record in records.items() if "hand_position" in record}
     if not shown:
         return None
-    figure = style.new_figure(_height(3 + len(shown)), style.comparison_title(list(shown.values()), "hand paths"))
+    # Three square panels and the legend, without room above and below.
+    figure = style.new_figure(2.62 + style.LEGEND_ROW * -(-(3 + len(shown)) // 4) / 72.0, title)
     panels = _planes(figure, list(shown.values()))
-    styles = style.told_apart(
-        style.variant_styles(list(records)),
-        *({name: (r.time, r["hand_position"][:, k]) for name, r in shown.items()} for k in range(3)),
-    )
+    styles = style.variant_styles(list(records))
     for axes, plane in zip(panels, PLANES, strict=True):
         _draw_target(axes, next(iter(shown.values())), plane)
         for name, record in shown.items():
-            _draw_path(axes, record, plane, label=name, **styles[name])
+            position = style.sparse(record["hand_position"][:, plane])
+            axes.plot(*position.T, label=name, **styles[name])
+            axes.plot(*position[0], **START)
     _legend_below(figure, panels[0])
     return figure
 
@@ -73,12 +70,7 @@ def error(record: Record) -> Figure | None:
     figure = style.new_figure(4.1, style.title(record, "tracking error"))
     series = [[(record.time, deviation)], [(record.time, norm)]]
     rows = style.time_rows(figure, series, style.settle_time(record))
-    settled = record.time >= style.settle_time(record)
-    late = settled if settled.any() else slice(None)
-    looks = style.told_apart(
-        {name: {"color": colour} for name, colour in style.AXIS_COLOURS.items()},
-        {name: (record.time[late], deviation[late, k]) for k, name in enumerate("xyz")},
-    )
+    looks = style.variant_styles("xyz")
     for axes in rows[0]:
         for k, name in enumerate("xyz"):
             style.line(axes, record.time, deviation[:, k], label=name, **looks[name])
@@ -104,12 +96,7 @@ def error_comparison(records: Mapping[str, Record]) -> Figure | None:
     figure = style.new_figure(height, style.comparison_title(list(shown.values()), "tracking error"))
     deviations = {name: MILLI * (record["hand_position"] - hand_target(record)) for name, record in shown.items()}
     norms = {name: np.linalg.norm(deviation, axis=1) for name, deviation in deviations.items()}
-    least = min((float(norm[norm > 0.0].min()) for norm in norms.values() if (norm > 0.0).any()), default=1.0)
-    styles = style.told_apart(
-        style.variant_styles(list(records)),
-        {name: (record.time, np.log(np.maximum(norms[name], least))) for name, record in shown.items()},
-        {name: (record.time, deviations[name][:, 2]) for name, record in shown.items()},
-    )
+    styles = style.variant_styles(list(records))
     settle = max(map(style.settle_time, shown.values()))
     series = [[(r.time, norms[name]) for name, r in shown.items()]]
     series += [[(r.time, deviations[name][:, 2]) for name, r in shown.items()]]
@@ -126,7 +113,7 @@ def error_comparison(records: Mapping[str, Record]) -> Figure | None:
     rows[1][0].set_ylabel("vertical error [mm]")
     colours = {name: str(look["color"]) for name, look in styles.items()}
     events.explain(rows[1][-1], events.mark_variants(rows, shown, colours))
-    figure.legend(*rows[0][-1].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    style.legend_below(figure, rows[0][-1:], 2)
     return figure
 
 
@@ -140,18 +127,11 @@ def _log_rows(panels: Sequence[Axes], settled: Array) -> None:
         style.log_axis(panels[-1])
 
 
-def _height(named: int) -> float:
-    """Of a figure of three square panels and a legend of so many names [inch]: without room above and below."""
-    return 2.62 + style.LEGEND_ROW * -(-named // 4) / 72.0
-
-
 def _planes(figure: Figure, records: list[Record]) -> list[Axes]:
     """Three square panels of one scale, large enough for hands and targets."""
     points = [record["hand_position"] for record in records]
     points += [target for record in records if (target := hand_target(record)) is not None]
-    everything = np.concatenate(points)
-    everything = everything[np.isfinite(everything).all(axis=1)]
-    low, high = (everything.min(axis=0), everything.max(axis=0)) if len(everything) else (np.zeros(3), np.zeros(3))
+    low, high = box_about(points)
     span = float((high - low).max())
     half = 0.56 * span if span > 0.0 else 0.05
     middle = 0.5 * (low + high)
@@ -166,28 +146,18 @@ def _planes(figure: Figure, records: list[Record]) -> list[Axes]:
     return panels
 
 
-def _draw_path(axes: Axes, record: Record, plane: tuple[int, int], label: str, **options: Any) -> None:
-    position = style.sparse(record["hand_position"][:, plane])
-    axes.plot(*position.T, label=label, **options)
-    axes.plot(*position[0], **START)
-
-
 def _draw_target(axes: Axes, record: Record, plane: tuple[int, int]) -> None:
     wanted = hand_target(record)
     if wanted is None:
         return
     target = wanted[:, plane]
-    if _is_held(wanted):
+    known = wanted[np.isfinite(wanted).all(axis=1)]
+    if len(known) and float(np.ptp(known, axis=0).max()) <= HELD:
         # Larger than the start of the hand, which may lie on it.
         axes.plot(*target[0], "x", label=target_name(record), color=style.BLACK, markersize=8, zorder=3)
         return
     axes.plot(*edge_on(target).T, label=target_name(record), color=style.BLACK, linestyle=(0, (4, 2)), zorder=3, lw=0.9)
     axes.plot(*target[0], "x", color=style.BLACK, markersize=5, zorder=4)
-
-
-def _is_held(target: Array) -> bool:
-    known = target[np.isfinite(target).all(axis=1)]
-    return len(known) > 0 and float(np.ptp(known, axis=0).max()) <= HELD
 
 
 def target_name(record: Record) -> str:
@@ -212,16 +182,13 @@ def edge_on(points: Array) -> Array:
 
 
 def _legend_below(figure: Figure, axes: Axes) -> None:
-    handles, labels = axes.get_legend_handles_labels()
     followed = {line.get_label() for line in axes.get_lines() if line.get_linestyle() != "None"}
-    start = axes.plot([], [], **START)
-    handles, labels = [*handles, *start], [*labels, "start of the hand"]
+    axes.plot([], [], label="start of the hand", **START)
     for target in (TARGET, GOALS):
         # One that is held is a mark itself.
         if target in followed:
-            handles += axes.plot([], [], "x", color=style.BLACK, markersize=5)
-            labels.append(f"start of the {target}")
-    figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 4))
+            axes.plot([], [], "x", color=style.BLACK, markersize=5, label=f"start of the {target}")
+    style.legend_below(figure, [axes], 4)
 
 
 def _error_label(name: str, record: Record) -> str:

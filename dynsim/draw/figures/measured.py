@@ -10,7 +10,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from dynsim.draw.figures import arm, hand, posture, style
-from dynsim.draw.figures.motors import COLOURS, DASHES
 from dynsim.draw.figures.style import Array
 from dynsim.record import TIME, Record
 
@@ -48,12 +47,12 @@ def joints(record: Record) -> Figure | None:
         style.line(axes, record.time, measured, color=style.BLUE, label="measured")
         style.line(axes, record.time, goal, color=style.BLACK, linestyle=(0, (4, 2)), lw=0.9, label="goal")
         axes.set_ylabel(f"{label}\n[{unit}]")
-        _at_least(axes, 0.02)
+        style.at_least(axes, 0.02)
         _mark_replay(axes, record)
     for axes in grid.T.ravel()[len(shown) :]:
         axes.set_axis_off()
     _label_time(grid)
-    figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    style.legend_below(figure, [grid[0, 0]], 2)
     return figure
 
 
@@ -68,9 +67,10 @@ def following_error(record: Record) -> Figure | None:
     over_time, largest = figure.subplots(2, 1, height_ratios=[1.6, 1.0])
     units = {unit for _, unit, _, _ in shown}
     one_unit = f" [m{units.pop()}]" if len(units) == 1 else ""
-    for place, (label, unit, measured, goal) in enumerate(shown):
+    looks = style.variant_styles([label for label, *_ in shown])
+    for label, unit, measured, goal in shown:
         name = label if one_unit else f"{label} [m{unit}]"
-        style.line(over_time, record.time, MILLI * (measured - goal), label=name, **_look(place))
+        style.line(over_time, record.time, MILLI * (measured - goal), label=name, **looks[label])
     over_time.set_ylabel(f"measured − goal{one_unit}")
     over_time.set_xlabel("time [s]")
     _mark_replay(over_time, record, named=True)
@@ -114,11 +114,11 @@ def servos(record: Record) -> Figure | None:
     grid = figure.subplots(len(rows) + timed, 1, sharex=True, squeeze=False)
     for (name, label), axes in zip(rows, grid[:, 0], strict=False):
         columns = dict(zip(record.labels[name], record[name].T, strict=True))
-        for place, joint in enumerate(shown):
+        for joint, look in style.variant_styles(shown).items():
             if joint in columns:
-                style.line(axes, record.times(name), columns[joint], label=joint, **_look(place))
+                style.line(axes, record.times(name), columns[joint], label=joint, **look)
         axes.set_ylabel(label)
-        _at_least(axes, 0.5)
+        style.at_least(axes, 0.5)
         _mark_replay(axes, record, named=axes is grid[0, 0])
     if timed:
         _cycles(grid[-1, 0], record)
@@ -174,19 +174,6 @@ def _largest(found: Sequence[Followed], count: int) -> list[Followed]:
 def _finite(measure: Callable[[Array], float], values: Array) -> float:
     """A measure of the values that are there; 0 where there are none."""
     return float(measure(values)) if np.isfinite(values).any() else 0.0
-
-
-def _look(place: int) -> dict[str, object]:
-    row, colour = divmod(place, len(COLOURS))
-    return {"color": COLOURS[colour], "linestyle": DASHES[row % len(DASHES)], "lw": 1.0}
-
-
-def _at_least(axes: Axes, span: float) -> None:
-    """Do not blow up the steps of a sensor to the height of the panel."""
-    low, high = axes.get_ylim()
-    if high - low < span:
-        middle = 0.5 * (low + high)
-        axes.set_ylim(middle - 0.5 * span, middle + 0.5 * span)
 
 
 def _mark_replay(axes: Axes, record: Record, *, named: bool = False) -> None:

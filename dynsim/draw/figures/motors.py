@@ -14,9 +14,6 @@ from dynsim.record import Record
 
 # Up to so many motors a line each; beyond that as many with the largest currents, and the envelope of all.
 LARGEST = 6
-# Six colours that are told apart; dashes for six more.
-COLOURS = (style.BLUE, style.ORANGE, style.GREEN, style.PURPLE, style.SKY, style.BLACK)
-DASHES = ("-", (0, (4, 1.5)))
 
 
 def motors(record: Record) -> Figure | None:
@@ -34,10 +31,7 @@ def motors(record: Record) -> Figure | None:
     rows = style.time_rows(
         figure, [[(record.time, record[name])] for name, _ in signals], style.settle_time(record), compress=True
     )
-    looks = style.told_apart(
-        {k: {"color": COLOURS[place], "lw": 1.3} for place, k in enumerate(shown)},
-        *({k: (record.time[late], record[name][late, k]) for k in shown} for name, _ in signals),
-    )
+    looks = style.variant_styles(shown.tolist())
     for (name, label), panels in zip(signals, rows, strict=True):
         for axes in panels:
             _draw(axes, record, name, shown, looks)
@@ -52,18 +46,8 @@ def _draw(axes: Axes, record: Record, name: str, shown: np.ndarray, looks: Mappi
     values, labels = record[name], record.labels[name]
     called = {} if record.scene is None else record.scene.wheel_names
     if len(shown) < values.shape[1]:
-        low = style.thin(record.time, values.min(axis=1))
-        high = style.thin(record.time, values.max(axis=1))
-        # Both bounds on the times of either: thinning keeps different ones.
-        time = np.union1d(low[0], high[0])
-        axes.fill_between(
-            time,
-            np.interp(time, *low),
-            np.interp(time, *high),
-            color="#CFCFCF",
-            linewidth=0,
-            label=f"all {len(labels)} motors",
-        )
+        low, high = values.min(axis=1), values.max(axis=1)
+        axes.fill_between(record.time, low, high, color="#CFCFCF", linewidth=0, label=f"all {len(labels)} motors")
     for k in shown:
         style.line(axes, record.time, values[:, k], label=called.get(labels[k], labels[k]), **looks[k])
     axes.axhline(0.0, color=style.GREY, linewidth=0.6)

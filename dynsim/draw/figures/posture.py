@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D  # type: ignore[import-untyped]
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection  # type: ignore[import-untyped]
 
-from dynsim.draw.figures import penetration, style
+from dynsim.draw.figures import style
 from dynsim.draw.figures.hand import edge_on, target_name
 from dynsim.draw.figures.skeleton import (
     LABEL_SIZE,
@@ -27,12 +27,14 @@ from dynsim.draw.figures.skeleton import (
     skeleton,
     with_labels,
 )
-from dynsim.draw.figures.solids import faces, outline
 from dynsim.draw.figures.style import Array
+from dynsim.draw.geometry.robot import sunk
+from dynsim.draw.geometry.shapes import grid_faces, outline
+from dynsim.draw.geometry.surfaces import round_patch, surface_grids
 from dynsim.record import Record
 from dynsim.record.measures import hand_target
-from dynsim.record.scene import Surface
-from dynsim.record.surface_points import round_patch, surface_grids
+from dynsim.record.poses import point_positions
+from dynsim.record.scene import Point, Surface
 
 # An axis of the 3D view shorter than this share of the longest has two ticks.
 SHORT_AXIS = 0.45
@@ -40,16 +42,6 @@ SHORT_AXIS = 0.45
 DOTS = 40
 ARM_COLOUR = "#444444"
 BASE_COLOUR = "#D5D5D5"
-# Text at faint postures, and how far such a one is from the last at least, to be told from it [point].
-TIME_SIZE, APART = 6.0, 3.0
-# Points that times keep away from: of hand path and target, and on each segment of a posture.
-WAY, ALONG = 80, 30
-# Where else than ahead of the hand they may stand, and how far away in parts of their size; a line leads to those that
-# are further than this.
-AROUND = np.array(
-    [[0.0, 1.0], [1.0, 0.0], [0.0, -1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0], [-1.0, 0.0]]
-)
-AWAY, LED = (1.0, 1.8, 2.8, 4.0), 2.0
 # Width of a side view in a figure of one column, and of two [point].
 FULL, HALF = 440.0, 205.0
 
@@ -73,17 +65,19 @@ def posture(record: Record) -> Figure | None:
     height = 5.6 if wide else 1.15 + float(np.clip(HALF / 72.0 * size[1] / size[0], 1.5, 3.4))
     room = np.array([FULL, np.inf]) if wide else np.array([HALF, 72.0 * (height - 1.15)])
     extent, scale = _with_labels(extent, [body], plane, room)
-    figure = style.new_figure(height, style.title(record, f"posture at {record.time[-1]:.4g} s, and before (faint)"))
+    before = ", ".join(style.number(float(record.time[row]), 2) for row in body.shown()[:-1]) if body else ""
+    faint = f"; faint, at {before} s" if before else ""
+    figure = style.new_figure(height, style.title(record, f"posture at {record.time[-1]:.4g} s{faint}"))
     # Side by side, the labels of the 3D view need some room to their right.
     grid = figure.add_gridspec(2, 1, height_ratios=[1.25, 1.0]) if wide else figure.add_gridspec(1, 2, wspace=0.15)
     space: Any = figure.add_subplot(grid[0], projection="3d")
     side = figure.add_subplot(grid[1])
     _space_view(space, record, body, drawn, (low, high), zoom=1.65 if wide else 1.15)
-    _side_view(side, record, body, drawn, plane, scale, extent, colour=ARM_COLOUR)
+    _side_view(side, record, body, drawn, plane, scale, colour=ARM_COLOUR)
     _frame_side(side, plane, extent, () if body is None else body.scene.surfaces)
     if note:
         side.set_title(note, color=style.PULLING)
-    _legend(figure, [side])
+    style.legend_below(figure, [side], 5)
     return figure
 
 
@@ -104,28 +98,18 @@ def posture_comparison(records: Mapping[str, Record]) -> Figure | None:
     columns = min(len(shown), 4 if size[1] > size[0] else 2)
     lines = -(-len(shown) // columns)
     room = np.array([FULL if columns == 1 else 2.0 * HALF / columns, 72.0 * 3.2])
-    # All have one width; rows without labels need no height for them.
-    rows = [list(shown)[start : start + columns] for start in range(0, len(shown), columns)]
     framed, scale = _with_labels((low, high), list(shown.values()), plane, room)
-    extents = []
-    for row in rows:
-        labels = [label for name in row for label in contact_labels(shown[name], plane, scale)]
-        base, top = with_labels((low, high), labels, scale)
-        extents.append((np.array([framed[0][0], base[1]]), np.array([framed[1][0], top[1]])))
-    widest = 6.4 / columns
-    heights = [float(np.clip(widest * (top[1] - base[1]) / (top[0] - base[0]), 0.8, 3.2)) for base, top in extents]
+    size = framed[1] - framed[0]
+    each = float(np.clip(6.4 / columns * size[1] / size[0], 0.8, 3.2))
     figure = style.new_figure(
-        0.9 + 0.3 * lines + sum(heights), style.comparison_title(some, "postures at the end, and before (faint)")
+        0.9 + (0.3 + each) * lines, style.comparison_title(some, "postures at the end, and before (faint)")
     )
-    grid = figure.subplots(lines, columns, sharex=True, sharey="row", squeeze=False, height_ratios=heights)
+    grid = figure.subplots(lines, columns, sharex=True, sharey="row", squeeze=False)
     styles = style.variant_styles(list(records))
     for axes, (name, body) in zip(grid.ravel(), shown.items(), strict=False):
         colour = str(styles[name]["color"])
-        extent = extents[list(shown).index(name) // columns]
-        _side_view(
-            axes, records[name], body, drawn[name], plane, scale, extent, colour=colour, path=style.GREY, named=False
-        )
-        _frame_side(axes, plane, extent, body.scene.surfaces)
+        _side_view(axes, records[name], body, drawn[name], plane, scale, colour=colour, path=style.GREY, named=False)
+        _frame_side(axes, plane, framed, body.scene.surfaces)
         axes.set_title(name, color=styles[name]["color"], fontweight="bold")
         axes.label_outer()
     for axes in grid.ravel()[len(shown) :]:
@@ -133,7 +117,7 @@ def posture_comparison(records: Mapping[str, Record]) -> Figure | None:
     # Labels of narrow panels would overlap: one stands for all.
     for axes in grid[:, [k for k in range(columns) if columns > 2 and k != columns // 2]].ravel():
         axes.set_xlabel("")
-    _legend(figure, list(grid.ravel()))
+    style.legend_below(figure, list(grid.ravel()), 5)
     return figure
 
 
@@ -147,15 +131,6 @@ def _with_labels(
         wide = with_labels(extent, labels, scale)
         scale = float((room / (wide[1] - wide[0])).min())
     return wide, scale
-
-
-def _legend(figure: Figure, panels: Sequence[Axes]) -> None:
-    """One legend for all panels; the arm itself needs no entry."""
-    known: dict[str, Any] = {}
-    for axes in panels:
-        handles, labels = axes.get_legend_handles_labels()
-        known.update(dict(zip(labels, handles, strict=True)))
-    figure.legend(known.values(), known.keys(), loc="outside lower center", ncols=len(known))
 
 
 def _frame_side(axes: Axes, plane: SidePlane, extent: tuple[Array, Array], surfaces: Sequence[Surface]) -> None:
@@ -182,7 +157,6 @@ def _side_view(
     drawn: Sequence[Array],
     plane: SidePlane,
     scale: float,
-    extent: tuple[Array, Array],
     *,
     colour: str,
     path: str = style.BLUE,
@@ -197,7 +171,6 @@ def _side_view(
             axes.add_patch(
                 Polygon(corners, facecolor=face, edgecolor=colour, lw=0.8, alpha=1.0 if last else 0.22, zorder=2.5)
             )
-    sunk = [] if body is None else [penetration.below_surfaces(body, row) for row in body.shown()]
     for k, segments in enumerate(drawn):
         last = k == len(drawn) - 1
         flat = plane.project(segments)
@@ -205,16 +178,12 @@ def _side_view(
             list(flat),
             colors=colour,
             linewidths=2.4 if last else 1.2,
-            alpha=1.0 if last else 0.22,
+            alpha=_opacity(k, len(drawn)),
             # Round ends of faint segments would overlap to dark dots.
             capstyle="round" if last else "butt",
             zorder=3 if last else 2,
         )
         axes.add_collection(lines)
-        if len(sunk[k].pieces):
-            axes.add_collection(
-                LineCollection(list(plane.project(sunk[k].pieces)), zorder=3.2, **_sunk_look(last), capstyle="butt")
-            )
         if last and len(flat) <= DOTS:
             axes.plot(*flat[:-1, 1].T, "o", color="white", markeredgecolor=colour, markersize=4, zorder=4)
     if (wanted := hand_target(record)) is not None:
@@ -224,16 +193,16 @@ def _side_view(
     for _, _, position, force in () if body is None else body.contacts():
         axes.plot(*plane.project(position), zorder=6, linestyle="none", **_contact_mark(force))
     labels = contact_labels(body, plane, scale)
-    if body is not None:
-        curves = [record["hand_position"], *([] if wanted is None else [wanted])]
-        ways = [plane.project(curve[np.linspace(0, len(curve) - 1, WAY).astype(int)]) for curve in curves]
-        times = [float(record.time[row]) for row in body.shown()]
-        taken = [(label.middle(scale), label.half) for label in labels]
-        taken += [(scale * plane.project(position), np.full(2, 6.0)) for _, _, position, _ in body.contacts()]
-        _write_times(axes, times, [plane.project(s) for s in drawn], np.concatenate(ways), taken, extent, scale)
-    if (deepest := max(sunk, key=lambda one: one.depth, default=None)) is not None and deepest.depth > 0.0:
-        text = f"below {deepest.surface}, up to {style.number(1e3 * deepest.depth, 3)} mm"
-        axes.plot([], [], label=text if named else "below a surface", color=penetration.COLOUR, lw=4.0)
+    rows = np.array([] if body is None else body.shown(), dtype=np.intp)
+    if body is not None and (below := sunk(record, body.scene, rows)):
+        ring: dict[str, Any] = {"markersize": 9, "markerfacecolor": "none", "color": style.DEEP, "zorder": 5}
+        for one in below:
+            point = Point(one.name, "hand", one.body, one.position)
+            places = plane.project(point_positions(record, point, rows)[one.depth > one.least])
+            axes.plot(*places.T, "o", **ring)
+        deepest = max(below, key=lambda one: float(one.depth.max()))
+        text = f"below {deepest.surface}, up to {style.number(1e3 * float(deepest.depth.max()), 3)} mm"
+        axes.plot([], [], "o", label=text if named else "below a surface", **ring)
     for label in labels:
         axes.annotate(
             label.text,
@@ -249,71 +218,9 @@ def _side_view(
         )
 
 
-def _sunk_look(last: bool) -> dict[str, Any]:
-    """What of a posture lies below a surface."""
-    return {"colors": penetration.COLOUR, "linewidths": 4.0 if last else 2.2, "alpha": 1.0 if last else 0.5}
-
-
-def _write_times(
-    axes: Axes,
-    times: Sequence[float],
-    drawn: Sequence[Array],
-    ways: Array,
-    taken: Sequence[tuple[Array, Array]],
-    extent: tuple[Array, Array],
-    scale: float,
-) -> None:
-    """The times of the faint postures at their ends, as far as there is room: the earliest first.
-
-    ``ways``: points of other curves, (n, 2) [m]; ``taken``: middles and half sizes of other texts [point]. Nothing is
-    written over those, over a posture, or beside the panel.
-    """
-    half = 0.5 * TIME_SIZE * 0.62 * np.array([5.5, 1.9])
-    low, high = (scale * corner for corner in extent)
-    share = np.linspace(0.0, 1.0, ALONG)[:, None, None]
-    lines = [(flat[:, 0] + share * (flat[:, 1] - flat[:, 0])).reshape(-1, 2) for flat in drawn if len(flat)]
-    points = scale * np.concatenate([ways, *lines])
-    points = points[np.isfinite(points).all(axis=1)]
-    written = list(taken)
-
-    def free(end: Array, offset: Array, led: bool) -> bool:
-        place = end + offset
-        if (place - half < low).any() or (place + half > high).any():
-            return False
-        if (np.abs(points - place) < half + 1.0).all(axis=1).any():
-            return False
-        leader = end + share[:, :, 0] * offset if led else place[None]
-        return not any(
-            (np.abs(place - other) < half + room).all() or (np.abs(leader - other) < room).all(axis=1).any()
-            for other, room in written
-        )
-
-    for time, flat in zip(times[:-1], drawn[:-1], strict=False):
-        if not len(flat) or not np.isfinite(flat[-1]).all() or scale * np.abs(flat - drawn[-1]).max() < APART:
-            continue
-        along = flat[-1, 1] - flat[-1, 0]
-        size = float(np.linalg.norm(along))
-        ahead = along / size if size > 0.0 else np.array([1.0, 0.0])
-        end = scale * flat[-1, 1]
-        offsets = [(away, away * direction * (half + 2.0)) for away in AWAY for direction in (ahead, *AROUND)]
-        away, offset = next((one for one in offsets if free(end, one[1], one[0] > LED)), (0.0, half))
-        if not away:
-            continue
-        written.append((end + offset, half))
-        if away > LED:
-            written += [(end + part * offset, np.ones(2)) for part in share[:, 0, 0]]
-        axes.annotate(
-            f"{time:{'.2g' if time < 100.0 else '.0f'}} s".replace("-", "−"),
-            flat[-1, 1],
-            xytext=tuple(offset),
-            textcoords="offset points",
-            ha="center",
-            va="center",
-            fontsize=TIME_SIZE,
-            color=style.GREY,
-            zorder=7,
-            arrowprops={"arrowstyle": "-", "color": style.GREY, "lw": 0.4} if away > LED else None,
-        )
+def _opacity(k: int, count: int) -> float:
+    """Of the k-th posture: the later the darker, the last one in full."""
+    return 1.0 if k == count - 1 else 0.12 + 0.2 * k / count
 
 
 def _space_view(
@@ -332,23 +239,19 @@ def _space_view(
     base = [] if body is None or not drawn else body.solids(body.shown()[-1])
     if base:
         # One collection: it sorts its faces by depth.
-        shown = np.concatenate([faces(solid) for solid in base])
+        shown = np.concatenate([corners[faces] for corners, faces in base])
         solid = Poly3DCollection(shown, facecolors=BASE_COLOUR, linewidths=0, shade=True, antialiased=False, zorder=2.5)
         axes.add_collection3d(solid, autolim=False)
-    sunk = [] if body is None else [penetration.below_surfaces(body, row) for row in body.shown()]
     for k, segments in enumerate(drawn):
         last = k == len(drawn) - 1
         lines = Line3DCollection(
             list(segments),
             colors=ARM_COLOUR,
             linewidths=2.4 if last else 1.0,
-            alpha=1.0 if last else 0.2,
+            alpha=_opacity(k, len(drawn)),
             zorder=3 if last else 2,
         )
         axes.add_collection3d(lines, autolim=False)
-        if len(sunk[k].pieces):
-            sinking = Line3DCollection(list(sunk[k].pieces), zorder=3 if last else 2, **_sunk_look(last))
-            axes.add_collection3d(sinking, autolim=False)
         if last and len(segments) <= DOTS:
             axes.plot(*segments[:-1, 1].T, "o", color="white", markeredgecolor=ARM_COLOUR, markersize=3, zorder=4)
     if (wanted := hand_target(record)) is not None:
@@ -390,12 +293,7 @@ def _draw_surface(axes: Axes3D, surface: Surface, low: Array, high: Array) -> No
         grids = surface_grids(surface, low, high)
     if surface.kind in ("height_field", "box"):
         grids = [_within(grid, low, high) for grid in grids]
-    cells = [
-        np.stack([grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]], axis=2).reshape(-1, 4, 3)
-        for grid in grids
-    ]
-    quads = np.concatenate(cells)
-    quads = quads[np.isfinite(quads).all(axis=(1, 2))]
+    quads = np.concatenate([corners[faces] for corners, faces in map(grid_faces, grids)])
     if len(quads):
         axes.add_collection3d(
             Poly3DCollection(list(quads), facecolors="#BBBBBB", alpha=0.25, linewidths=0, zorder=0, antialiased=False),

@@ -8,11 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dynsim.draw.figures import style
-from dynsim.draw.figures.solids import solids
 from dynsim.draw.figures.style import Array
+from dynsim.draw.geometry.robot import placed
+from dynsim.draw.geometry.shapes import Faces, corners_of
+from dynsim.draw.geometry.surfaces import box_about
 from dynsim.record import Record
 from dynsim.record.measures import hand_target
-from dynsim.record.poses import ORIENTATION, POSITION, point_positions
+from dynsim.record.poses import POSITION, point_positions
 from dynsim.record.scene import WORLD, Joint, Point, Scene, Surface
 
 # Postures drawn faintly, evenly over the run, besides the last one.
@@ -37,45 +39,27 @@ class Skeleton:
 
         Nothing leads from the world or a body to what moves freely beside it.
         """
-        points = self.record[POSITION][row].astype(np.float64)
+        points, base = self.record[POSITION][row].astype(np.float64), self.scene.base
         lines = []
-        for carrier, body in self._segments():
-            if body is None:
-                hand = self.scene.hand
-                assert hand is not None
-                lines.append((points[hand.body], point_positions(self.record, hand, row)))
-            elif carrier is None:
-                # A sliding joint at the root moves its body away from where it is mounted.
-                lines.append((np.array(self.scene.bodies[body].joint.position), points[body]))
-            else:
-                lines.append((points[carrier], points[body]))
-        return np.array(lines)
-
-    def carriers(self) -> list[int | None]:
-        """The body that each of the :meth:`segments` is of; None of what leads there from the world."""
-        return [carrier for carrier, _ in self._segments()]
-
-    def _segments(self) -> list[tuple[int | None, int | None]]:
-        """The body that a segment is of and the one that it leads to: None for the world, and for the hand."""
-        # A mobile base is drawn as what it is, see dynsim.draw.figures.solids.
-        solid = self.scene.base
-        bodies = [
-            (k, body) for k, body in enumerate(self.scene.bodies) if k not in solid and not _moves_beside(body.joint)
-        ]
-        found: list[tuple[int | None, int | None]] = [(None, k) for k, body in bodies if body.parent == WORLD]
-        found += [(body.parent, k) for k, body in bodies if body.parent not in (WORLD, *solid)]
+        for k, body in enumerate(self.scene.bodies):
+            # A mobile base is drawn as what it is, see :meth:`solids`.
+            if k in base or body.parent in base or _moves_beside(body.joint):
+                continue
+            # A sliding joint at the root moves its body away from where it is mounted.
+            start = np.array(body.joint.position) if body.parent == WORLD else points[body.parent]
+            lines.append((start, points[k]))
         hand = self.scene.hand
         if hand is not None and hand.body != WORLD:
-            found.append((hand.body, None))
-        return found
+            lines.append((points[hand.body], point_positions(self.record, hand, row)))
+        return np.array(lines)
 
-    def solids(self, row: int) -> list[Array]:
-        """Points on the shapes of a mobile base and its wheels at a sample, (n, 3) [m] each."""
-        return solids(self.record, self.scene.base, row)
+    def solids(self, row: int) -> list[tuple[Array, Faces]]:
+        """Corners, (n, 3) [m], and faces of the shapes of a mobile base and its wheels at a sample."""
+        return [one for body in self.scene.base for one in corners_of(self.record, self.scene, body, row)]
 
     def bases(self) -> list[list[Array]]:
-        """Solids of a mobile base for each of the postures."""
-        return [self.solids(k) for k in self.shown()]
+        """Corners of a mobile base's solids for each of the postures."""
+        return [[corners for corners, _ in self.solids(k)] for k in self.shown()]
 
     def postures(self) -> list[Array]:
         """Segments at some samples, those of the last one last; a run that diverged may end in some without poses."""
@@ -117,14 +101,8 @@ def _moves_beside(joint: Joint) -> bool:
 
 def skeleton(record: Record) -> tuple[Skeleton | None, str]:
     """The robot of a record, or why it cannot be drawn."""
-    scene = record.scene
-    if scene is None or not scene.bodies:
-        return None, "posture not drawn: the record has no scene"
-    if POSITION not in record or ORIENTATION not in record:
-        return None, "posture not drawn: not every joint was recorded"
-    if record[POSITION].shape != (len(record), len(scene.bodies), 3):
-        return None, "posture not drawn: the scene has other bodies than the record"
-    return Skeleton(record, scene), ""
+    scene, lacking = placed(record)
+    return (None, f"posture not drawn: {lacking}") if scene is None else (Skeleton(record, scene), "")
 
 
 @dataclass(frozen=True)
@@ -231,10 +209,7 @@ def with_labels(extent: tuple[Array, Array], labels: Sequence[Label], scale: flo
 
 def bounds(records: Sequence[Record], drawn: Sequence[Array]) -> tuple[Array, Array]:
     """Corners of the box that a 3D view shows [m]."""
-    points = _points(records, drawn)
-    if not len(points):
-        return np.zeros(3), np.ones(3)
-    low, high = points.min(axis=0), points.max(axis=0)
+    low, high = box_about(_clouds(records, drawn))
     # A flat picture still needs some depth to stand in.
     extra = np.maximum(0.15 * float((high - low).max() or 1.0) - 0.5 * (high - low), 0.0)
     return low - extra, high + extra
@@ -242,18 +217,14 @@ def bounds(records: Sequence[Record], drawn: Sequence[Array]) -> tuple[Array, Ar
 
 def extent_of(plane: SidePlane, drawn: Sequence[Array], records: Sequence[Record]) -> tuple[Array, Array]:
     """Corners of what a side view shows [m]."""
-    flat = plane.project(_points(records, drawn))
-    low, high = flat.min(axis=0), flat.max(axis=0)
+    low, high = box_about([plane.project(points) for points in _clouds(records, drawn)])
     span = float((high - low).max() or 1.0)
     # An upright arm would leave no width for the axis.
     extra = np.maximum(np.array([0.3, 0.05]) * span - 0.5 * (high - low), 0.0) + 0.05 * span
     return low - extra, high + extra
 
 
-def _points(records: Sequence[Record], drawn: Sequence[Array]) -> Array:
-    """Everything that must be in the picture, (N, 3)."""
-    points = [record["hand_position"] for record in records]
-    points += [target for record in records if (target := hand_target(record)) is not None]
-    points += [segments.reshape(-1, 3) for segments in drawn]
-    pooled = np.concatenate(points)
-    return pooled[np.isfinite(pooled).all(axis=1)]
+def _clouds(records: Sequence[Record], drawn: Sequence[Array]) -> list[Array]:
+    """Everything that must be in the picture, (…, 3) each."""
+    targets = [target for record in records if (target := hand_target(record)) is not None]
+    return [*(record["hand_position"] for record in records), *targets, *drawn]

@@ -7,19 +7,17 @@ target; joint angles with their limits; cost, smallest singular value, support m
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import partial
 from pathlib import Path
-from typing import TypeVar
 
-import matplotlib.pyplot as plt
+import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from PIL import Image
 
+from dynsim.draw import film
 from dynsim.draw.figures import style, tanaka2019
 from dynsim.draw.figures.snake_view import (
     BODY,
@@ -27,7 +25,6 @@ from dynsim.draw.figures.snake_view import (
     HEAD,
     LEAST_HEIGHT,
     NUMBERED,
-    STYLE,
     SYMBOLS,
     TARGET,
     View,
@@ -40,15 +37,12 @@ from dynsim.draw.figures.snake_view import (
     moments,
     posture_grid,
     posture_strip,
-    relax,
     turns,
 )
 from dynsim.record import Record
 from dynsim.snake.geometry import snake_geometry
 from dynsim.snake.published import used_limit
-from dynsim.system.files import replacing
 
-T = TypeVar("T")
 # Postures of an animation, in a row, and over each other in one picture.
 FRAMES, IN_A_ROW, IN_A_PICTURE = 50, 6, 7
 # Postures over time in grey: the lines beside them have the colours.
@@ -57,28 +51,23 @@ SHADES = LinearSegmentedColormap.from_list("shades", ["#CFCFCF", "#000000"])
 
 def draw(record: Record, folder: Path, kind: str = "png", part: style.Part = style.ALL) -> list[Path]:
     """Write all figures of one run and the animation into ``folder``; returns the files."""
-    folder = Path(folder)
-    with plt.rc_context(STYLE):
-        makers: dict[str, Callable[[Record], Figure]] = {
-            "postures": postures,
-            "overview": overview,
-            "tracking": tracking,
-            "joints": joints,
-            "redundancy": redundancy,
-        }
-        works = [
-            partial(_save, make, record, folder / f"{name}.{kind}")
-            for name, make in (makers | tanaka2019.figures_of_run(record)).items()
-        ]
-        works.append(partial(animate, record, folder / "animation.gif"))
-        return [work() for work in style.part_of(works, part)]
+    makers: dict[str, Callable[[Record], Figure]] = {
+        "postures": postures,
+        "overview": overview,
+        "tracking": tracking,
+        "joints": joints,
+        "redundancy": redundancy,
+        **tanaka2019.figures_of_run(record),
+    }
+    written = style.save_all(makers, record, folder, kind, part)
+    first, many = part
+    return [*written, animate(record, folder / "animation.gif")] if len(makers) % many == first else written
 
 
 def draw_comparison(
     records: Mapping[str, Record], folder: Path, kind: str = "png", part: style.Part = style.ALL
 ) -> list[Path]:
     """Variants over each other, and figures and tables beside [T] where its experiments were run; returns the files."""
-    folder = Path(folder)
     makers: dict[str, Callable[[Mapping[str, Record]], Figure]] = {
         "comparison": comparison,
         "postures": strips,
@@ -89,23 +78,14 @@ def draw_comparison(
         makers |= tanaka2019.figures(scenario, records)
         if part[0] == 0:
             written += tanaka2019.write_tables(scenario, records, folder)
-    with plt.rc_context(STYLE):
-        for name, make in style.part_of(list(makers.items()), part):
-            written.append(_save(make, records, folder / f"{name}.{kind}"))
-    return written
-
-
-def _save(make: Callable[[T], Figure], of: T, path: Path) -> Path:
-    figure = make(of)
-    figure.set_dpi(plt.rcParams["savefig.dpi"])
-    style.write(figure, path)
-    plt.close(figure)
-    return path
+    return written + style.save_all(makers, records, folder, kind, part)
 
 
 def comparison(records: Mapping[str, Record]) -> Figure:
     """Cost, largest yaw angle in parts of its limit, support margin and head error of all variants."""
-    figure, axes = plt.subplots(4, 1, figsize=(7.2, 7.0), sharex=True)
+    title = style.comparison_title(list(records.values()), "cost, angles, margin and error")
+    figure = style.new_figure(7.0, title)
+    axes = figure.subplots(4, 1, sharex=True)
     for name, record in records.items():
         axes[0].plot(record.time, record["cost"], label=name)
         axes[1].plot(record.time, used_limit(record), label=name)
@@ -119,7 +99,7 @@ def comparison(records: Mapping[str, Record]) -> Figure:
         axes, ("cost V", "largest |θ| / limit", "support margin [mm]", "position error [m]"), strict=True
     ):
         axis.set_ylabel(label)
-    axes[0].legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+    axes[0].legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     axes[-1].set_xlabel("t [s]")
     return figure
 
@@ -132,13 +112,15 @@ def strips(records: Mapping[str, Record]) -> Figure:
         waiting = record.summary["waiting_s"]
         label = name.replace("_", "\n") + (f"\n(waited {waiting:.0f} s)" if waiting >= 0.5 else "")
         lines[label] = [(view, f"{view.time:.1f} s, mode {view.mode}") for view in views]
-    return posture_grid(lines, one_scale=False)
+    title = style.comparison_title(list(records.values()), "postures over time")
+    return posture_grid(title, lines, one_scale=False)
 
 
 def postures(record: Record) -> Figure:
     """Postures over time: top view above, side view along the base's heading below."""
     views = [View(record, row) for row in moments(record, IN_A_ROW)]
-    return posture_strip([(view, f"t = {view.time:.1f} s, mode {view.mode}") for view in views])
+    texts = [f"{view.time:.1f} s, mode {view.mode}" for view in views]
+    return posture_strip(style.title(record, "postures over time"), list(zip(views, texts, strict=True)))
 
 
 def overview(record: Record) -> Figure:
@@ -152,14 +134,13 @@ def overview(record: Record) -> Figure:
     views = [View(record, row) for row in rows] if flat else []
     width = 6.4 if flat else 5.0
     high = width * (y1 - y0) / (x1 - x0)
-    side = limits([view.side for view in views], 0.06) if flat else (0.0, 1.0, 0.0, 0.0)
+    side = limits([view.project(view.points, above=False) for view in views], 0.06) if flat else (0.0, 1.0, 0.0, 0.0)
     low = width * (side[3] - side[2]) / (side[1] - side[0])
-    figure, grid = plt.subplots(
-        1 + flat, 1, figsize=(width + 1.4, max(high + low, 1.0) + 0.9 + 0.5 * flat), squeeze=False,
-        height_ratios=[high, low] if flat else None,
-    )  # fmt: skip
+    height = max(high + low, 1.0) + 1.2 + 0.5 * flat
+    figure = style.new_figure(height, style.title(record, "the run from above"), width=width + 1.4)
+    grid = figure.subplots(1 + flat, 1, squeeze=False, height_ratios=[high, low] if flat else None)
     axis = grid[0, 0]
-    shades = plt.cm.ScalarMappable(plt.Normalize(0.0, record.time[-1]), plt.colormaps["viridis_r"] if flat else SHADES)
+    shades = ScalarMappable(Normalize(0.0, record.time[-1]), matplotlib.colormaps["viridis_r"] if flat else SHADES)
     body = {"lw": 1.6 if flat else 4.0, "solid_capstyle": "round"}
     for row in rows:
         points, shade = record["posture"][row], shades.to_rgba(record.time[row])
@@ -167,8 +148,9 @@ def overview(record: Record) -> Figure:
         axis.plot(*points[0, :2], "o", color=shade, ms=4 if flat else 6)
     for view in views:
         shade = shades.to_rgba(record.time[view.row])
-        grid[1, 0].plot(*view.side.T, "-", color=shade, **body)
-        grid[1, 0].plot(*view.side[0], "o", color=shade, ms=4)
+        flat_points = view.project(view.points, above=False)
+        grid[1, 0].plot(*flat_points.T, "-", color=shade, **body)
+        grid[1, 0].plot(*flat_points[0], "o", color=shade, ms=4)
     axis.plot(*record["w"][:, :2].T, color=HEAD, lw=1.0, label="controlled point")
     axis.plot(*record["w_target"][:, :2].T, "--", color=TARGET, lw=1.0, label="target")
     axis.plot(*record["base_pose"][:, :2].T, color=GROUND, lw=0.8, label="wheel pair 1")
@@ -181,18 +163,19 @@ def overview(record: Record) -> Figure:
         below.set(xlim=side[:2], ylim=(min(side[2], -0.02), side[3]))
         below.set_aspect("equal", adjustable="box")
     figure.colorbar(shades, ax=grid.ravel().tolist(), label="posture at t [s]")
-    figure.legend(loc="outside upper center", ncols=3, frameon=False)
+    figure.legend(loc="outside lower center", ncols=3)
     return figure
 
 
 def tracking(record: Record) -> Figure:
     """Six coordinates of the controlled point with their targets, and the errors."""
-    figure, axes = plt.subplots(4, 2, figsize=(7.2, 6.0), sharex=True)
+    figure = style.new_figure(6.2, style.title(record, "controlled point and its target"))
+    axes = figure.subplots(4, 2, sharex=True)
     labels = record.labels["w"]
     for i, (name, axis) in enumerate(zip(labels, axes[:3].T.ravel(), strict=True)):
         axis.plot(record.time, record["w"][:, i], color=GROUND, label="controlled point")
         axis.plot(record.time, record["w_target"][:, i], "--", color=HEAD, lw=0.9, label="target")
-        relax(axis, 1e-3)
+        style.at_least(axis, 2e-3)
         axis.set_ylabel(f"{SYMBOLS.get(name, name)} [{'m' if i < 3 else 'rad'}]")
         if record["gripper"].any():
             closed = axis.get_xaxis_transform()
@@ -223,7 +206,8 @@ def joints(record: Record) -> Figure:
         ("head pitch", np.flatnonzero(pitch[:n_h])),
         ("base yaw", np.arange(n_h, len(labels))),
     ]
-    figure, axes = plt.subplots(3, 1, figsize=(7.2, 5.6), sharex=True)
+    figure = style.new_figure(5.9, style.title(record, "joint angles and their limits"))
+    axes = figure.subplots(3, 1, sharex=True)
     for axis, (title, group) in zip(axes, parts, strict=True):
         for j in group:
             (line,) = axis.plot(record.time, phi[:, j], label=greek(labels[j]))
@@ -232,7 +216,7 @@ def joints(record: Record) -> Figure:
         for limit in {*upper[group], *lower[group]}:
             axis.axhline(limit, color="black", ls="-.", lw=0.8)
         axis.set_ylabel(f"{title} [rad]")
-        axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+        axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     axes[-1].set_xlabel("t [s]      (dash-dotted: limits; dots: joint out of the allocation at its limit)")
     return figure
 
@@ -241,9 +225,8 @@ def redundancy(record: Record) -> Figure:
     """Modes (grounded wheels), cost, smallest singular value and support margin over time."""
     many = len(mode_starts(record)) > NUMBERED  # then the numbers have axes of their own
     ratios = [1.3, *([0.8] if many else []), 1, 1, 1]
-    figure, axes = plt.subplots(
-        len(ratios), 1, figsize=(7.2, 6.4 + 1.1 * many), sharex=True, height_ratios=ratios, squeeze=False
-    )
+    figure = style.new_figure(6.7 + 1.1 * many, style.title(record, "modes and margins"))
+    axes = figure.subplots(len(ratios), 1, sharex=True, height_ratios=ratios, squeeze=False)
     cost, sigma, margin = axes[-3:, 0]
     mode_chart(axes[0, 0], record)
     if many:
@@ -276,37 +259,7 @@ def _over_time(axis: Axes, record: Record, values: NDArray[np.float64], many: bo
 
 
 def animate(record: Record, path: Path) -> Path:
-    """Animated GIF: top view and side view with grounded and lifted wheels."""
-    rows = moments(record, FRAMES)
-    views = [View(record, row) for row in rows]
-    top = limits([view.outline() for view in views], 0.08)
-    side = limits([np.vstack([view.side, view.side * [1, 0]]) for view in views], 0.08)
-    with plt.rc_context({"figure.constrained_layout.use": False, "font.size": 8}):
-        figure, (above, below) = plt.subplots(2, 1, figsize=(4.8, 4.8), dpi=90, height_ratios=[2.2, 1])
-        canvas = FigureCanvasAgg(figure)
-        figure.subplots_adjust(left=0.12, right=0.97, top=0.93, bottom=0.1, hspace=0.3)
-
-        above.set(xlim=top[:2], ylim=top[2:], xlabel="x [m]", ylabel="y [m]")
-        below.set(xlim=side[:2], ylim=(min(side[2], -0.02), side[3]), ylabel="height [m]")
-        below.set_xlabel("along the heading of the base part [m]")
-        for axis in (above, below):
-            axis.set_aspect("equal", adjustable="box")
-        above.plot(*record["w_target"][:, :2].T, "--", color=TARGET, lw=0.7)
-        canvas.draw()  # axes and target once; every frame adds only the robot
-        background = canvas.copy_from_bbox(figure.bbox)
-        images = []
-        for view in views:
-            drawn = [*view.draw_top(above), *view.draw_side(below)]
-            drawn += above.plot(*record["w"][: view.row + 1, :2].T, color=HEAD, lw=0.8, zorder=2)
-            drawn.append(above.set_title(f"t = {view.time:.1f} s, mode {view.mode}"))
-            canvas.restore_region(background)
-            for artist in sorted(drawn, key=lambda a: a.get_zorder()):
-                figure.draw_artist(artist)
-            image = Image.frombuffer("RGBA", canvas.get_width_height(), canvas.buffer_rgba(), "raw", "RGBA", 0, 1)
-            images.append(image.convert("RGB").quantize(32, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE))
-            for artist in drawn[:-1]:
-                artist.remove()
-        with replacing(path) as stream:
-            images[0].save(stream, format="GIF", save_all=True, append_images=images[1:], duration=100, loop=0)
-        plt.close(figure)
-    return path
+    """A short film of the run."""
+    fps = 10
+    speed = (record.time[-1] - record.time[0]) * fps / (FRAMES - 1)
+    return film.write({"": record}, path, size=(480, 420), fps=fps, speed=float(speed) or 1.0, plot="")

@@ -10,13 +10,12 @@ from typing import Any, TypeVar
 
 import matplotlib
 import numpy as np
-from matplotlib.artist import Artist
+from cycler import cycler
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
-from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter, NullLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 from numpy.typing import NDArray
 
 from dynsim.record import Record
@@ -24,7 +23,6 @@ from dynsim.system.files import replacing
 from dynsim.system.terminal import plain
 
 T = TypeVar("T")
-Name = TypeVar("Name", str, int)
 Array = NDArray[np.float64]
 # A quantity over time, (T,) and (T,) or (T, k).
 Series = tuple[Array, Array]
@@ -37,6 +35,8 @@ BLUE, ORANGE, GREEN, PURPLE, SKY, BLACK = "#0072B2", "#E69F00", "#009E73", "#CC7
 # Kept for pulling contacts in every figure, so no variant may have it.
 PULLING = "#D55E00"
 GREY = "#7F7F7F"
+# What lies below a surface that only contact points are held by.
+DEEP = "#882255"
 VARIANT_COLOURS = (BLUE, GREEN, ORANGE, PURPLE, SKY, BLACK, "#8C6D31")
 AXIS_COLOURS = {"x": BLUE, "y": GREEN, "z": ORANGE}
 
@@ -61,6 +61,7 @@ _LOOK: Any = {
     "axes.grid": True,
     "axes.axisbelow": True,
     "axes.xmargin": 0.0,
+    "axes.prop_cycle": cycler(color=VARIANT_COLOURS),
     "grid.color": "#E3E3E3",
     "grid.linewidth": 0.5,
     "xtick.major.width": 0.6,
@@ -70,13 +71,10 @@ _LOOK: Any = {
     # A line of a million points overflows Agg's cell block unless it is drawn in pieces.
     "agg.path.chunksize": 20_000,
 }
-# Lines of more points than this are thinned: a figure is some 1200 pixels wide.
+# Curves in space of more points than this are thinned: a figure is some 1200 pixels wide.
 LINE_POINTS = 4000
 # A panel of the transient shows this times its length, and there is none where that is most of the run.
 TRANSIENT_ROOM, TRANSIENT_MOST = 1.2, 0.8
-# Curves that lie closer together than this share of a panel's height hide each other; those on top get these dashes.
-SAME = 0.012
-OVER = ((0, (5, 4)), (0, (2, 2.5)), (0, (6, 2, 1.5, 2)))
 # Height of a row of a legend [point].
 LEGEND_ROW = 12.5
 
@@ -88,9 +86,9 @@ def look() -> Iterator[None]:
         yield
 
 
-def new_figure(height: float, title: str) -> Figure:
+def new_figure(height: float, title: str, *, width: float = WIDTH) -> Figure:
     """An empty figure [inch] that belongs to no pyplot and needs no display."""
-    figure = Figure(figsize=(WIDTH, height), layout="constrained")
+    figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     # A long title is smaller: it would be cut off at both sides.
     figure.suptitle(title, fontsize=TITLE * min(1.0, TITLE_LONG / max(len(title), 1)))
@@ -106,26 +104,10 @@ def save(figure: Figure, path: Path) -> Path:
         The file cannot be written; an older one is left as it was.
     """
     # Names from files: no font has a picture for a control character.
-    for text in _texts(figure):
+    for text in figure.findobj(Text):
         text.set_text(plain(text.get_text()))
-    for axes in figure.axes:
-        for axis in (axes.xaxis, axes.yaxis):
-            if not axis.label.get_text():
-                # Else matplotlib measures all numbers again, several times, for the place of nothing.
-                axis.set_label_coords(0.5, 0.0)
     figure.set_dpi(DPI)
     return write(figure, path)
-
-
-def _texts(artist: Artist) -> Iterator[Text]:
-    """All texts but numbers at axes: to ask for those would make all ticks, for one more time."""
-    if isinstance(artist, Text):
-        yield artist
-    elif isinstance(artist, Axis) and not isinstance(artist.get_major_locator(), FixedLocator):
-        yield artist.label
-    else:
-        for child in artist.get_children():
-            yield from _texts(child)
 
 
 def save_all(
@@ -167,12 +149,8 @@ def write(figure: Figure, path: Path) -> Path:
 
 def title(record: Record, what: str) -> str:
     """``what`` with scenario and variant (of a measured run: the robot), and how far an incomplete run came."""
-    scenario = record.provenance.get("scenario", {})
-    robot = record.provenance.get("robot")
-    name = " / ".join(text for text in (scenario.get("name", ""), scenario.get("variant", "")) if text)
-    name = name or (f"{robot}, measured" if robot else "")
     note = "" if record.complete else f" (incomplete: ends at {record.time[-1]:.3g} s)"
-    return f"{name or 'record'}: {what}{note}"
+    return f"{record.title or 'record'}: {what}{note}"
 
 
 def comparison_title(records: Sequence[Record], what: str) -> str:
@@ -180,10 +158,10 @@ def comparison_title(records: Sequence[Record], what: str) -> str:
     return f"{records[0].provenance.get('scenario', {}).get('name', '') or 'comparison'}: {what}"
 
 
-def variant_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Colour and width (and, beyond seven variants, line style) of every variant, by position.
+def variant_styles(names: Sequence[T]) -> dict[T, dict[str, Any]]:
+    """Colour and width (and, beyond seven curves, line style) of variants, or of curves of one run, by position.
 
-    Later variants lie on top and are thinner, so that equal curves are still seen to be several.
+    Later ones lie on top and are thinner, so that equal curves are still seen to be several.
     """
     many = len(VARIANT_COLOURS)
     dashes = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1, 1, 1)))
@@ -195,32 +173,6 @@ def variant_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
         }
         for k, name in enumerate(names)
     }
-
-
-def told_apart(looks: Mapping[Name, Mapping[str, Any]], *panels: Mapping[Name, Series]) -> dict[Name, dict[str, Any]]:
-    """The looks with dashes for curves that would hide an earlier one, in any of the panels that they share.
-
-    One hides another where it is within ``SAME`` of the panel's height for more than half of the time. What lies below
-    shows through the gaps.
-    """
-    found = {name: dict(look) for name, look in looks.items()}
-    over: dict[Name, int] = dict.fromkeys(looks, 0)
-    for curves in panels:
-        start, end = (pick(float(time[k]) for time, _ in curves.values()) for pick, k in ((max, 0), (min, -1)))
-        at = np.linspace(start, end, 200)
-        sampled = {name: np.interp(at, *curve) for name, curve in curves.items()}
-        values = np.concatenate(list(sampled.values()))
-        values = values[np.isfinite(values)]
-        near = SAME * float(np.ptp(values)) if values.size else 0.0
-        done: list[Name] = []
-        for name, one in sampled.items():
-            hidden: list[Name] = [other for other in done if np.mean(np.abs(one - sampled[other]) <= near) > 0.5]
-            over[name] = max([over[name], *(over[other] + 1 for other in hidden)])
-            done.append(name)
-    for name, depth in over.items():
-        if depth:
-            found[name]["linestyle"] = OVER[min(depth, len(OVER)) - 1]
-    return found
 
 
 def number(value: float, digits: int = 4) -> str:
@@ -239,6 +191,23 @@ def log_axis(axes: Axes, which: str = "y") -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
+def at_least(axes: Axes, span: float) -> None:
+    """Widen the vertical axis to a ``span``: rounding, or the steps of a sensor, are not blown up to its height."""
+    low, high = axes.get_ylim()
+    if high - low < span:
+        middle = 0.5 * (low + high)
+        axes.set_ylim(middle - 0.5 * span, middle + 0.5 * span)
+
+
+def shade_below_zero(axes: Axes, label: str) -> None:
+    """The zero line, and what lies below it shaded, if any of the axis does."""
+    axes.axhline(0.0, color=PULLING, linewidth=0.8)
+    low, high = axes.get_ylim()
+    if low < 0.0:
+        axes.axhspan(low, 0.0, color=PULLING, alpha=0.13, linewidth=0, label=label)
+        axes.set_ylim(low, high)
+
+
 def legend_above(axes: Axes, columns: int = 3) -> None:
     """The legend over the axes, where it hides nothing; room is kept for as many rows as it has."""
     rows = -(-len(axes.get_legend_handles_labels()[1]) // columns)
@@ -248,22 +217,18 @@ def legend_above(axes: Axes, columns: int = 3) -> None:
     axes.set_title(" ", y=1.0, pad=6.0 + LEGEND_ROW * max(rows - 1, 0))
 
 
+def legend_below(figure: Figure, panels: Sequence[Axes], columns: int) -> None:
+    """One legend for some panels, below all of the figure."""
+    named: dict[str, Any] = {}
+    for axes in panels:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            named.setdefault(label, handle)
+    figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=min(len(named), columns))
+
+
 def settle_time(record: Record) -> float:
     """``metrics.settle_s`` of the record's scenario [s]."""
     return float(record.provenance.get("scenario", {}).get("metrics", {}).get("settle_s", 0.0))
-
-
-def thin(time: Array, values: Array) -> Series:
-    """At most about ``LINE_POINTS`` points of a line: the smallest and the largest of each bin, so that peaks stay."""
-    size = -(-2 * len(time) // LINE_POINTS)
-    if len(time) <= LINE_POINTS:
-        return time, values
-    whole = len(time) // size * size
-    bins = values[:whole].reshape(-1, size)
-    first = np.arange(0, whole, size)
-    kept = np.concatenate([first + bins.argmin(axis=1), first + bins.argmax(axis=1), np.arange(whole, len(time))])
-    kept = np.unique(np.append(kept, len(time) - 1))
-    return time[kept], values[kept]
 
 
 def sparse(points: Array) -> Array:
@@ -274,7 +239,7 @@ def sparse(points: Array) -> Array:
 
 def line(axes: Axes, time: Array, values: Array, **options: Any) -> None:
     """Plot a quantity over time; a single sample as a dot."""
-    axes.plot(*thin(time, values), marker="o" if len(time) == 1 else None, markersize=3, **options)
+    axes.plot(time, values, marker="o" if len(time) == 1 else None, markersize=3, **options)
 
 
 def time_rows(
@@ -298,7 +263,9 @@ def time_rows(
         For each row (transient, whole run) or (whole run,); draw everything in all of them.
     """
     end = max(time[-1] for row in rows for time, _ in row)
-    found = [transient_of(row, settle, end) for row in rows]
+    found = [_transient(row, settle) for row in rows]
+    # One that lasts for most of the run needs no panel.
+    found = [one if one is not None and one.end < TRANSIENT_MOST * end / TRANSIENT_ROOM else None for one in found]
     window = max((one.end for one in found if one is not None), default=0.0)
     split = window > 0.0
     grid = figure.subplots(
@@ -329,12 +296,6 @@ class Transient:
     low: float
     high: float
     largest: float
-
-
-def transient_of(row: Sequence[Series], settle: float, end: float) -> Transient | None:
-    """The transient of a row of a run up to ``end`` [s]; None where it lasts for most of it or nothing need be cut."""
-    found = _transient(row, settle)
-    return found if found is not None and found.end < TRANSIENT_MOST * end / TRANSIENT_ROOM else None
 
 
 def _transient(row: Sequence[Series], settle: float) -> Transient | None:

@@ -12,12 +12,11 @@ from collections.abc import Callable, Mapping
 from itertools import pairwise
 from pathlib import Path
 
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
+from dynsim.draw.figures import style
 from dynsim.draw.figures.snake_view import (
-    CYCLE,
     GROUND,
     HEAD,
     SYMBOLS,
@@ -26,8 +25,8 @@ from dynsim.draw.figures.snake_view import (
     mode_chart,
     posture_grid,
     posture_strip,
-    relax,
 )
+from dynsim.draw.figures.style import VARIANT_COLOURS
 from dynsim.record import Record
 from dynsim.snake.geometry import snake_geometry
 from dynsim.snake.published import (
@@ -82,7 +81,8 @@ def write_tables(scenario: str, records: Mapping[str, Record], folder: Path) -> 
 def positioning(records: Mapping[str, Record]) -> Figure:
     """Table III of [T]: deviation from the target displacement, measured there and simulated here."""
     moved = [name for name in TABLE_III if name in records]
-    figure, axes = plt.subplots(2, 1, figsize=(7.2, 4.4), sharex=True)
+    figure = style.new_figure(4.7, "displacements of the head beside Table III of [T]")
+    axes = figure.subplots(2, 1, sharex=True)
     width = 0.8 / 3
     for axis, part, unit in ((axes[0], range(3), "mm"), (axes[1], range(3, 6), "rad")):
         scale = 1e3 if unit == "mm" else 1.0
@@ -92,12 +92,21 @@ def positioning(records: Mapping[str, Record]) -> Figure:
             off = [scale * (p.mean[i] - p.target[i]) for p in published]
             spread = [scale * p.deviation[i] for p in published]
             name = SYMBOLS.get(COORDINATES[i], COORDINATES[i])
-            axis.bar(place, off, 0.9 * width, yerr=spread, capsize=2, color=CYCLE[k], alpha=0.6, label=f"Δ{name}, [T]")
+            axis.bar(
+                place,
+                off,
+                0.9 * width,
+                yerr=spread,
+                capsize=2,
+                color=VARIANT_COLOURS[k],
+                alpha=0.6,
+                label=f"Δ{name}, [T]",
+            )
             ours = [scale * (displacement(records[m])[i] - TABLE_III[m].target[i]) for m in moved]
             axis.plot(place, ours, "D", color="black", ms=3, label="simulated, no slip" if k == 2 else None)
         axis.axhline(0.0, color="black", lw=0.6)
         axis.set_ylabel(f"off target [{unit}]")
-        axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+        axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     axes[1].set_xticks(range(len(moved)), [f"moving {SYMBOLS.get(m, m)}" for m in moved])
     axes[1].set_xlim(-0.6, len(moved) - 0.4)
     return figure
@@ -112,7 +121,7 @@ def motion(records: Mapping[str, Record]) -> Figure:
         views = [_view_at(record, t) for t in (0.0, 2.0, 7.0, 12.0, 17.0, np.inf)]
         area = record["support_area"]
         lines[label] = [(v, f"{v.time:.0f} s, mode {v.mode}, {area[v.row]:.3f} m²") for v in views]
-    return posture_grid(lines, "; in the titles: area of the support polygon")
+    return posture_grid("eq 19 and eq 20, as in Figs 8 and 16 of [T], with the area of the support", lines)
 
 
 def _view_at(record: Record, time: float) -> View:
@@ -121,15 +130,18 @@ def _view_at(record: Record, time: float) -> View:
 
 def head_and_cost(record: Record) -> Figure:
     """Fig 9: pose of the head, mode and V over time; lines as there, and the error that its text states."""
-    figure, axes = plt.subplots(4, 2, figsize=(7.2, 6.6), sharex=True)
+    figure = style.new_figure(6.9, style.title(record, "head, mode and cost, as in Fig 9 of [T]"))
+    axes = figure.subplots(4, 2, sharex=True)
     time = record.time
     for i, axis in enumerate(axes[:3].T.ravel()):
         scale, error, unit = (1e3, HEAD_ERROR[0], "mm") if i < 3 else (1.0, HEAD_ERROR[1], "rad")
         target = scale * record["w_target"][:, i]
-        band = axis.fill_between(time, target - scale * error, target + scale * error, color=CYCLE[4], alpha=0.25, lw=0)
+        band = axis.fill_between(
+            time, target - scale * error, target + scale * error, color=VARIANT_COLOURS[4], alpha=0.25, lw=0
+        )
         (actual,) = axis.plot(time, scale * record["w"][:, i], color=GROUND)
         (wanted,) = axis.plot(time, target, ":", color="red", lw=1.4)
-        relax(axis, 2 * scale * error)
+        style.at_least(axis, 4 * scale * error)
         axis.set_ylabel(f"{SYMBOLS.get(COORDINATES[i], COORDINATES[i])}$_h$ [{unit}]")
         off = scale * np.abs(record["w"][:, i] - record["w_target"][:, i]).max()
         axis.set_title(f"largest error {off:.1e} {unit}", fontsize=7)
@@ -142,9 +154,8 @@ def head_and_cost(record: Record) -> Figure:
     figure.legend(
         [actual, wanted, band],
         ["simulated", "target", "[T]: errors of about 30 mm and 0.1 rad"],
-        loc="outside upper center",
+        loc="outside lower center",
         ncols=3,
-        frameon=False,
     )
     return figure
 
@@ -153,7 +164,9 @@ def joint_angles(record: Record) -> Figure:
     """Fig 10: every joint angle over time with its limits, lines as there."""
     geometry, phi = snake_geometry(record), record["phi"]
     names, count = record.labels["phi"], phi.shape[1]
-    figure, axes = plt.subplots(-(-count // 3), 3, figsize=(7.2, 1.55 * -(-count // 3) + 0.4), sharex=True)
+    lines = -(-count // 3)
+    figure = style.new_figure(1.55 * lines + 0.7, style.title(record, "joint angles, as in Fig 10 of [T]"))
+    axes = figure.subplots(lines, 3, sharex=True)
     for axis in axes.ravel()[count:]:
         axis.set_visible(False)
     for j, axis in enumerate(axes.ravel()[:count]):
@@ -164,20 +177,21 @@ def joint_angles(record: Record) -> Figure:
         (held,) = axis.plot(record.time[out], phi[out, j], ".", color=HEAD, ms=3)
         reach = 1.15 * geometry.upper[j]
         axis.set(ylim=(-reach, reach), ylabel=f"{greek(names[j])} [rad]")
-    figure.supxlabel("t [s]", fontsize=8)
+    for axis in axes[-1]:
+        axis.set_xlabel("t [s]")
     figure.legend(
         [actual, limit, held],
         ["simulated", "joint limit", "out of the allocation at its limit"],
-        loc="outside upper center",
+        loc="outside lower center",
         ncols=3,
-        frameon=False,
     )
     return figure
 
 
 def policies(records: Mapping[str, Record]) -> Figure:
     """Modes of the three policies over time, with V, the largest yaw angle and the support margin."""
-    figure, axes = plt.subplots(6, 1, figsize=(7.2, 9.0), sharex=True, height_ratios=[1, 1, 1, 1.2, 1, 1])
+    figure = style.new_figure(9.3, style.comparison_title(list(records.values()), "policies of switching modes"))
+    axes = figure.subplots(6, 1, sharex=True, height_ratios=[1, 1, 1, 1.2, 1, 1])
     for axis, name in zip(axes, POLICIES, strict=False):
         mode_chart(axis, records[name], f"{name}: mode")
     for name in POLICIES:
@@ -188,7 +202,7 @@ def policies(records: Mapping[str, Record]) -> Figure:
         axes[5].plot(record.time, 1e3 * record["support_margin"])
     axes[3].set(ylabel="cost V")
     axes[3].set_ylim(bottom=0)
-    axes[3].legend(frameon=False)
+    axes[3].legend()
     axes[4].axhline(1.0, color="black", ls="-.", lw=0.8)
     axes[4].set(ylabel="largest |θ| / limit")
     axes[5].axhline(0.0, color="black", ls="-.", lw=0.8)
@@ -216,7 +230,8 @@ def door(record: Record) -> Figure:
         opened = abs(np.rad2deg(record["w"][view.row, 5] - record["w"][0, 5]))
         titled.append((view, f"({'abcdefghijklmnop'[place]}) {what}\n{view.time:.1f} s, {opened:.1f}°"))
     lines = {" " * start: titled[start : start + 3] for start in range(0, len(titled), 3)}
-    return posture_grid(lines, "; green: arc of the knob; in the titles: time, angle of the door")
+    title = style.title(record, "the door and its angle, as in Fig 14 of [T]; green: arc of the knob")
+    return posture_grid(title, lines)
 
 
 def picking_up(record: Record) -> Figure:
@@ -225,4 +240,5 @@ def picking_up(record: Record) -> Figure:
     height = record["w"][closed, 2]
     lifted = closed[np.argmax(height > height.max() - 1e-4)]  # the first time; later ones differ by rounding
     shown = ((closed[0] // 2, "1: reaching"), (closed[0], "2: grasping"), (lifted, "3: after picking up"))
-    return posture_strip([(View(record, int(row)), f"{what}, t = {record.time[row]:.1f} s") for row, what in shown])
+    line = [(View(record, int(row)), f"{what}, t = {record.time[row]:.1f} s") for row, what in shown]
+    return posture_strip(style.title(record, "picking up, as in Fig 13 of [T]"), line)

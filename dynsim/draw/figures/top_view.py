@@ -15,8 +15,9 @@ from dynsim.draw.figures import style
 from dynsim.draw.figures.hand import edge_on, target_name
 from dynsim.draw.figures.posture import ARM_COLOUR
 from dynsim.draw.figures.skeleton import Skeleton, skeleton
-from dynsim.draw.figures.solids import outline
 from dynsim.draw.figures.style import Array
+from dynsim.draw.geometry.shapes import outline
+from dynsim.draw.geometry.surfaces import box_about
 from dynsim.record import Record
 from dynsim.record.measures import hand_target
 from dynsim.record.poses import point_positions
@@ -47,28 +48,18 @@ def top_view(record: Record) -> Figure | None:
     wide = size[0] > 1.8 * size[1]
     # In a row of its own the world is as high as its width makes it, with 0.6 inch for its labels.
     above = 0.6 + 6.3 * float(size[1] / size[0])
-    height = 0.3 + above + BELOW if wide else 0.9 + float(np.clip(3.9 * size[1] / size[0], 3.3, 6.0))
+    height = 0.8 + above + BELOW if wide else 0.9 + float(np.clip(3.9 * size[1] / size[0], 3.3, 6.0))
     figure = style.new_figure(height, style.title(record, "base from above"))
     if wide:
-        grid = figure.add_gridspec(2, 2, height_ratios=[above, BELOW], width_ratios=[1.0, 1.25])
-        world, own = figure.add_subplot(grid[0, :]), figure.add_subplot(grid[1, 0])
+        world, own = figure.subplots(2, 1, height_ratios=[above, BELOW])
     else:
         world, own = figure.subplots(1, 2, width_ratios=[1.25, 1.0])
     _draw_world(world, body, rows)
-    world.set_xlim(low[0], high[0])
-    world.set_ylim(low[1], high[1])
+    world.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     _draw_own(own, body, rows)
     for axes in (world, own):
         axes.set_aspect("equal", adjustable="box", anchor="N")
-    handles, labels = world.get_legend_handles_labels()
-    more = [pair for pair in zip(*own.get_legend_handles_labels(), strict=True) if pair[1] not in labels]
-    handles, labels = [*handles, *(one for one, _ in more)], [*labels, *(text for _, text in more)]
-    if wide:
-        beside = figure.add_subplot(grid[1, 1])
-        beside.set_axis_off()
-        beside.legend(handles, labels, loc="center", ncols=2)
-    else:
-        figure.legend(handles, labels, loc="outside lower center", ncols=4)
+    style.legend_below(figure, [world, own], 4)
     return figure
 
 
@@ -91,13 +82,8 @@ def _extent(body: Skeleton, rows: Rows) -> tuple[Array, Array]:
     if (target := hand_target(record)) is not None:
         points.append(target[:, :2])
     points += [_track(body, one, rows) for one in (*body.scene.contacts, *body.scene.supports)]
-    points += [solid[:, :2] for row in rows[[0, -1]] for solid in body.solids(row)]
-    points.append(body.segments(int(rows[-1])).reshape(-1, 3)[:, :2])
-    everything = np.concatenate(points)
-    everything = everything[np.isfinite(everything).all(axis=1)]
-    low, high = everything.min(axis=0), everything.max(axis=0)
-    room = 0.05 * float((high - low).max())
-    return low - room, high + room
+    points += [corners[:, :2] for row in rows[[0, -1]] for corners, _ in body.solids(row)]
+    return box_about([*points, body.segments(int(rows[-1]))[..., :2]], 0.05)
 
 
 def _track(body: Skeleton, point: Point, rows: Rows) -> Array:
@@ -146,7 +132,7 @@ def _draw_own(axes: Axes, body: Skeleton, rows: Rows) -> None:
     record = body.record
     x, y, heading = record["base_pose"][rows[-1]]
     turn = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
-    parts = [(solid[:, :2] - [x, y]) @ turn for solid in body.solids(int(rows[-1]))]
+    parts = [(solid[:, :2] - [x, y]) @ turn for solid, _ in body.solids(int(rows[-1]))]
     for part in parts:
         axes.add_patch(Polygon(outline(part), facecolor="#EEEEEE", edgecolor=style.GREY, lw=0.7, zorder=1))
     corners = (support_corners(body, int(rows[-1])) - [x, y]) @ turn
@@ -176,11 +162,8 @@ def _draw_own(axes: Axes, body: Skeleton, rows: Rows) -> None:
     reach = 0.75 * float((high - low).max())
     known = path[np.isfinite(path).all(axis=1)]
     near = known[((known >= low - reach) & (known <= high + reach)).all(axis=1)]
-    everything = np.concatenate([drawn, near])
-    low, high = everything.min(axis=0), everything.max(axis=0)
-    room = 0.06 * float((high - low).max())
-    axes.set_xlim(low[0] - room, high[0] + room)
-    axes.set_ylim(low[1] - room, high[1] + room)
+    low, high = box_about([drawn, near], 0.06)
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     lost = 1.0 - len(near) / max(len(path), 1)
     axes.set_title("in the base's frame" + (f"; {100 * lost:.2g} % of the path is farther off" if lost > 0.0 else ""))
     axes.set_xlabel("ahead [m]")
@@ -188,7 +171,7 @@ def _draw_own(axes: Axes, body: Skeleton, rows: Rows) -> None:
 
 
 def _draw_outline(axes: Axes, body: Skeleton, row: int, *, label: str, **look: Any) -> None:
-    for k, solid in enumerate(body.solids(row)):
+    for k, (solid, _) in enumerate(body.solids(row)):
         patch = Polygon(outline(solid[:, :2]), edgecolor=ARM_COLOUR, lw=0.8, zorder=2, **look)
         patch.set_label(label if k == 0 else "_")
         axes.add_patch(patch)

@@ -13,14 +13,13 @@ from PIL import Image, ImageDraw
 from dynsim.draw.figures.style import GREY, VARIANT_COLOURS
 from dynsim.draw.figures.style import title as titled
 from dynsim.draw.film import encode
-from dynsim.draw.film.camera import FROM, Camera, View, view_axes
 from dynsim.draw.film.painter import FINER, PAPER, Painter
 from dynsim.draw.film.strip import Strip
 from dynsim.draw.film.strokes import font
-from dynsim.draw.page.robot import Array, azimuth, bounds, moving, robots
+from dynsim.draw.geometry.camera import FROM, Camera, View, view_axes
+from dynsim.draw.geometry.robot import Array, azimuth, bounds, robots
 from dynsim.errors import RecordError
 from dynsim.record import Record
-from dynsim.record.surface_points import box_corners
 from dynsim.system.files import replacing
 from dynsim.system.terminal import plain
 
@@ -82,22 +81,16 @@ class Film:
         has_plot = self._strip is not None and self._strip.signal is not None
         self._area = (0, HEAD, width, height - (strip[1] if has_plot else 0))
         some = list(shown.values())
-        turn = azimuth(some)
-        # Corners in the frame of the robots' longest way, where the box is tight.
-        low, high = bounds(some, turn)
-        c, s = math.cos(turn), math.sin(turn)
-        corners = box_corners(low, high) @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-        axes = view_axes(view, turn)
-        if view == "iso":
-            corners = _tight(corners, moving(some), axes)
-        self._places, cell = _layout(len(some), self._area, corners @ axes.T)
+        axes = view_axes(view, azimuth(some))
+        low, high = bounds(some, axes)
+        self._places, cell = _layout(len(some), self._area, high - low)
         if min(cell) < CELL_MIN:
             raise RecordError(f"{len(some)} robots need a larger --size than {width}x{height}, or fewer records")
         room = min(ROOM, round(ROOM_SHARE * min(cell)))
         area = [room * FINER, room * FINER, (cell[0] - room) * FINER, (cell[1] - room) * FINER]
         if len(some) > 1:
             area[1] += 14 * FINER
-        camera = Camera.fitted(view, turn, corners, (area[0], area[1], area[2], area[3]))
+        camera = Camera.fitted(axes, low, high, (area[0], area[1], area[2], area[3]))
         self.painters = {
             name: Painter(
                 robot,
@@ -121,7 +114,7 @@ class Film:
             image.paste(painter.frame(time), place)
         draw = ImageDraw.Draw(image)
         draw.text((10, 5), self._title, fill="#202428", font=font(13))
-        clock = f"{time:.2f} s" + (f"  ({self._speed:g}×)" if self._speed != 1.0 else "")
+        clock = f"{time:.2f} s" + (f"  ({self._speed:.3g}×)" if self._speed != 1.0 else "")
         draw.text((self.size[0] - 10, 5), clock, fill="#202428", font=font(13), anchor="ra")
         if len(self._places) > 1:
             for x, y in self._places:
@@ -201,33 +194,15 @@ def _times(records: Mapping[str, Record], speed: float, fps: int) -> Array:
     return np.minimum(start + np.arange(steps + 1) * (speed / fps), end)
 
 
-def _tight(corners: Array, points: Array, axes: Array) -> Array:
-    """Corners of what is seen of a box, (8, 3) → (8, 3) [m]: seen obliquely most of a box is empty.
-
-    Parameters
-    ----------
-    points : (n, 3) what moves in it; around them is room for thickness and arrows
-    axes : of the view
-    """
-    box, seen = corners @ axes.T, points @ axes.T
-    room = 0.06 * float(np.ptp(seen, axis=0)[:2].max()) if len(seen) else np.inf
-    low = np.maximum(box.min(axis=0), seen.min(axis=0) - room)
-    high = np.minimum(box.max(axis=0), seen.max(axis=0) + room)
-    # What hardly moves has all the box around it.
-    if (high - low)[:2].max() < 0.5 * np.ptp(box, axis=0)[:2].max():
-        return corners
-    return box_corners(low, high) @ axes
-
-
-def _layout(count: int, area: tuple[int, int, int, int], flat: Array) -> tuple[list[tuple[int, int]], tuple[int, int]]:
+def _layout(count: int, area: tuple[int, int, int, int], seen: Array) -> tuple[list[tuple[int, int]], tuple[int, int]]:
     """Places and size of so many pictures in an area, in the rows and columns that show robots largest.
 
     Parameters
     ----------
-    flat : (8, 3) corners of what is shown: right, up, near [m]
+    seen : (3,) size of what is shown: right, up, near [m]
     """
     left, top, right, bottom = area
-    wide, high = np.maximum(np.ptp(flat, axis=0)[:2], 1e-9)
+    wide, high = np.maximum(seen[:2], 1e-9)
     best, found = -1.0, (1, count)
     for columns in range(1, count + 1):
         rows = -(-count // columns)

@@ -10,22 +10,22 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from matplotlib.path import Path
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from PIL import Image, ImageColor, ImageDraw
 
-from dynsim.draw.figures.solids import outline
-from dynsim.draw.figures.style import BLACK, BLUE, GREEN, GREY, ORANGE, PULLING, SKY
-from dynsim.draw.film.camera import Camera
-from dynsim.draw.film.solids import grid_faces, solid
+from dynsim.draw.figures.style import BLACK, BLUE, DEEP, GREEN, GREY, ORANGE, PULLING, SKY
 from dynsim.draw.film.strokes import Box, arrow, dashes, font, labels, line, ring
-from dynsim.draw.page.meshes import Meshes, simplified
-from dynsim.draw.page.robot import Contact, Robot, Sunk, contacts, largest_force, paths, sunk
-from dynsim.draw.page.solids import body_shapes, drawn_shape, drawn_surface, gripper
-from dynsim.draw.page.wheels import cop_of, supports, wheel_groups
+from dynsim.draw.geometry.camera import Camera
+from dynsim.draw.geometry.meshes import Meshes, simplified
+from dynsim.draw.geometry.robot import Contact, Robot, Sunk, contacts, largest_force, paths, sunk
+from dynsim.draw.geometry.shapes import body_shapes, drawn_shape, drawn_surface, grid_faces, gripper, outline, solid
+from dynsim.draw.geometry.surfaces import round_patch, surface_grids
+from dynsim.draw.geometry.wheels import cop_of, supports, wheel_groups
 from dynsim.record.poses import ORIENTATION, POSITION
 from dynsim.record.quaternion import rotated
 from dynsim.record.scene import HERE, WORLD, Surface
-from dynsim.record.surface_points import round_patch, surface_grids
 
 Array = NDArray[np.float64]
 FINER = 2
@@ -36,7 +36,6 @@ BODY, HUB, WHEEL, SUPPORT = "#AEB7C4", "#4A5260", "#3A4048", "#D5EAF8"
 FRICTION = "#7A3E9D"
 # Friction of less than this share of the largest normal force has no arrow.
 FRICTION_SHOWN = 1e-3
-DEEP = "#882255"
 MODES = {0: GREY, 1: ORANGE, 2: GREEN}
 # Towards the light, seen by the viewer: right, up, near.
 LIGHT = np.array([-0.35, 0.75, 0.56]) / np.linalg.norm([-0.35, 0.75, 0.56])
@@ -44,8 +43,6 @@ LIGHT = np.array([-0.35, 0.75, 0.56]) / np.linalg.norm([-0.35, 0.75, 0.56])
 LOW = 200
 # Points of a path at most.
 WAY = 600
-# By an open and a closed gripper [m].
-_NOT_MOVED = np.zeros((2, 3))
 
 
 @dataclass(frozen=True)
@@ -101,7 +98,7 @@ class Painter:
         self._gripped = hand.body if hand is not None and "gripper" in record else WORLD
         self._solids = self._moving(shapes)
         self._contacts = contacts(robot)
-        self._sunk = sunk(robot)
+        self._sunk = sunk(record, robot.scene)
         self._full = largest_force(self._contacts)
         self._ways = dict(paths(record, robot.scene))
         self._supports = supports(robot.scene, self._wheels)
@@ -113,12 +110,10 @@ class Painter:
 
     def frame(self, time: float) -> Image.Image:
         """The robot at an instant [s], between samples in straight lines."""
-        row, share = self._place(time)
+        place, turn, row, share = self._pose(time)
         image = self._still.copy()
         draw = ImageDraw.Draw(image)
-        place, turn = (_between(values, row, share) for values in (self._position, self._turn))
         if np.isfinite(place).all() and np.isfinite(turn).all():
-            turn = turn / np.linalg.norm(turn, axis=1)[:, None]
             hull = self._support(place, turn, row)
             if len(hull) > 2:
                 corners = self.camera.project(np.column_stack([hull, np.zeros(len(hull))]))[:, :2]
@@ -136,55 +131,46 @@ class Painter:
 
     def hand(self, time: float) -> tuple[float, float] | None:
         """Where the hand's mark is in the picture [pixel]; None for a robot without a hand."""
-        row, share = self._place(time)
         point = self.robot.scene.hand
         if point is None:
             return None
-        turn = _between(self._turn, row, share)
-        turn = turn / np.linalg.norm(turn, axis=1)[:, None]
-        where = _on(point.body, np.array(point.position), _between(self._position, row, share), turn)
-        x, y, _ = self.camera.project(where)
+        place, turn, _, _ = self._pose(time)
+        x, y, _ = self.camera.project(_on(point.body, np.array(point.position), place, turn))
         return float(x) / FINER, float(y) / FINER
 
-    def _place(self, time: float) -> tuple[int, float]:
-        """The sample before an instant, and how far it is to the next one."""
-        if len(self._time) < 2:
-            return 0, 0.0
-        row = int(np.clip(np.searchsorted(self._time, time, side="right") - 1, 0, len(self._time) - 2))
-        share = (time - self._time[row]) / max(self._time[row + 1] - self._time[row], 1e-12)
-        return row, float(np.clip(share, 0.0, 1.0))
+    def _pose(self, time: float) -> tuple[Array, Array, int, float]:
+        """Places and turns of all bodies at an instant, the sample before it, and how far it is to the next one."""
+        row, share = 0, 0.0
+        if len(self._time) > 1:
+            row = int(np.clip(np.searchsorted(self._time, time, side="right") - 1, 0, len(self._time) - 2))
+            share = (time - self._time[row]) / max(self._time[row + 1] - self._time[row], 1e-12)
+            share = float(np.clip(share, 0.0, 1.0))
+        place, turn = (_between(values, row, share) for values in (self._position, self._turn))
+        return place, turn / np.linalg.norm(turn, axis=1)[:, None], row, share
 
     def _moving(self, shapes: list[list[dict[str, Any]]]) -> _Solids:
-        group = {place: k for k, places in enumerate(self._wheels.places) for place in places}
-        corners, bodies, faces, colours, wheels = [np.zeros((0, 3))], [np.zeros(0, int)], [], [], []
-        aside, count = [np.zeros((2, 0, 3))], 0
-
-        def add(body: int, shape: dict[str, Any], plain: str, wheel: int = -1, moved: Array = _NOT_MOVED) -> None:
-            nonlocal count
-            points, cells = solid(shape, self._meshes)
-            corners.append(points)
-            bodies.append(np.full(len(points), body))
-            faces.append(cells + count)
-            colours.append(self._colours(shape, len(cells), plain))
-            wheels.append(np.full(len(cells), wheel))
-            aside.append(np.broadcast_to(moved[:, None, :], (2, len(points), 3)))
-            count += len(points)
-
+        wheels = {place: k for k, places in enumerate(self._wheels.places) for place in places}
+        parts = []
         for k, own in enumerate(shapes):
             for j, shape in enumerate(own):
-                wheel = group.get((k, j), -1)
-                add(k, shape, WHEEL if wheel >= 0 else self._hub if shape.get("role") == "hub" else BODY, wheel)
-        for shape, moved in self._fingers(shapes):
-            add(self._gripped, shape, self.tint, moved=moved)
-        if not faces:
-            faces, colours, wheels = [np.zeros((0, 4), int)], [np.zeros((0, 3))], [np.zeros(0, int)]
+                wheel = wheels.get((k, j), -1)
+                plain = WHEEL if wheel >= 0 else self._hub if shape.get("role") == "hub" else BODY
+                parts.append((k, shape, plain, wheel, np.zeros((2, 3))))
+        parts += [(self._gripped, shape, self.tint, -1, moved) for shape, moved in self._fingers(shapes)]
+        solids = [solid(shape, self._meshes) for _, shape, *_ in parts]
+        points, cells = ([len(one[k]) for one in solids] for k in (0, 1))
+        starts = np.cumsum([0, *points])
+        colours = [
+            self._colours(shape, count, plain) for (_, shape, plain, *_), count in zip(parts, cells, strict=True)
+        ]
+        bodies, paired = ([part[k] for part in parts] for k in (0, 3))
         return _Solids(
-            np.concatenate(corners),
-            np.concatenate(bodies),
-            np.concatenate(faces),
-            np.concatenate(colours),
-            np.concatenate(wheels),
-            np.concatenate(aside, axis=1),
+            np.concatenate([np.zeros((0, 3)), *(corners for corners, _ in solids)]),
+            np.repeat(np.array(bodies, dtype=np.int64), points),
+            np.concatenate([np.zeros((0, 4), int), *(f + n for (_, f), n in zip(solids, starts, strict=False))]),
+            np.concatenate([np.zeros((0, 3)), *colours]),
+            np.repeat(np.array(paired, dtype=np.int64), cells),
+            np.repeat(np.reshape([part[4] for part in parts], (-1, 2, 3)), points, axis=0).swapaxes(0, 1),
         )
 
     def _fingers(self, shapes: list[list[dict[str, Any]]]) -> list[tuple[dict[str, Any], Array]]:
@@ -261,7 +247,8 @@ class Painter:
         flat = (seen - self.camera.middle) * np.array([1.0, -1.0]) / self.camera.scale
         points = self.camera.centre + flat @ self.camera.axes[:2]
         points += ((z - points[:, 2]) / up)[:, None] * self.camera.axes[2]
-        step = _round(float(np.linalg.norm(high - low)) / 10.0)
+        ticks = MaxNLocator(10, steps=[1, 2, 5, 10]).tick_values(0.0, float(np.linalg.norm(high - low)))
+        step = ticks[1] - ticks[0]
         (x0, y0), (x1, y1) = np.floor(points[:, :2].min(axis=0) / step), np.ceil(points[:, :2].max(axis=0) / step)
         x, y = step * np.arange(x0, x1 + 1), step * np.arange(y0, y1 + 1)
         if real:
@@ -328,10 +315,7 @@ class Painter:
         if self._pressure is None or not np.isfinite(self._pressure[1][row]).all():
             return
         at = self._pressure[1][row]
-        inside = False
-        if len(hull) > 2:
-            ahead, beside = np.roll(hull, -1, axis=0) - hull, at - hull
-            inside = bool((ahead[:, 0] * beside[:, 1] - ahead[:, 1] * beside[:, 0] >= 0.0).all())
+        inside = len(hull) > 2 and Path(hull).contains_point(at)
         x, y, _ = self.camera.project(np.array([*at, 0.0]))
         ring(draw, x, y, 5.0 * FINER, BLACK if inside else PULLING, 2 * FINER)
 
@@ -361,8 +345,7 @@ class Painter:
                 self._paint_force(draw, at, normal + friction, force < 0.0, FRICTION, 2 * FINER)
             end = self._paint_force(draw, at, normal, force < 0.0, colour, 3 * FINER)
             text = f"{force:+.3g} N".replace("-", "−"), end - [0.0, 2.0 * FINER], colour
-        radius = 3.0 * FINER
-        draw.ellipse([x - radius, y - radius, x + radius, y + radius], fill=dot, outline=PAPER)
+        draw.circle((x, y), 3.0 * FINER, fill=dot, outline=PAPER)
         return text
 
     def _paint_sunk(
@@ -393,8 +376,7 @@ class Painter:
         if hand is None or self._gripped != WORLD:
             return
         x, y, _ = self.camera.project(_on(hand.body, np.array(hand.position), place, turn))
-        radius = 4.0 * FINER
-        draw.ellipse([x - radius, y - radius, x + radius, y + radius], fill=self.tint, outline=PAPER, width=FINER)
+        draw.circle((x, y), 4.0 * FINER, fill=self.tint, outline=PAPER, width=FINER)
 
 
 def arrow_colour(force: float) -> str:
@@ -422,9 +404,3 @@ def _apart(points: Array) -> Array:
     """Points of a path as they are known, at most ``WAY`` of them."""
     points = points[np.isfinite(points).all(axis=1)]
     return points[np.linspace(0, len(points) - 1, min(len(points), WAY)).astype(int)] if len(points) else points
-
-
-def _round(x: float) -> float:
-    """The next of 1, 2, 5 times a power of ten."""
-    power = 10.0 ** np.floor(np.log10(x))
-    return float(next(m * power for m in (1.0, 2.0, 5.0, 10.0) if m * power >= 0.999 * x))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -54,26 +55,22 @@ class Strip:
         if self._image is None:
             return None
         image = self._image.copy()
-        x = self._at(time)
-        ImageDraw.Draw(image).line([x, self._top, x, self._bottom], fill=CURSOR, width=2)
+        box = self._axes.get_window_extent()
+        x, _ = self._axes.transData.transform((time, 0.0))
+        ImageDraw.Draw(image).line([x, self._size[1] - box.y1, x, self._size[1] - box.y0], fill=CURSOR, width=2)
         return image
-
-    def _at(self, time: float) -> float:
-        (t0, x0), (t1, x1) = self._scale
-        return x0 + (x1 - x0) * (time - t0) / (t1 - t0)
 
     def _draw(self, records: Mapping[str, Record], name: str) -> None:
         figure = Figure(figsize=(self._size[0] / DPI, self._size[1] / DPI), dpi=DPI, layout="constrained")
         canvas = FigureCanvasAgg(figure)
         axes = figure.add_subplot()
-        colours = style.variant_styles(list(records))
-        for label, record in records.items():
-            if name not in record:
-                continue
+        colours, several = style.variant_styles(list(records)), len(records) > 1
+        having = {label: record for label, record in records.items() if name in record}
+        for label, record in having.items():
             values = record[name].reshape(len(record), -1)
             called = {} if record.scene is None else record.scene.wheel_names
             names = [called.get(one, one) for one in record.labels[name] or (name,) * values.shape[1]]
-            several, many = len(records) > 1, values.shape[1] > 1
+            many = values.shape[1] > 1
             shown = largest(values, 1 if several else NAMED)
             if len(shown) < values.shape[1]:
                 colour, opacity = (colours[label]["color"], 0.2) if several else ("#CFCFCF", 1.0)
@@ -85,11 +82,9 @@ class Strip:
                 text = _cut(plain(label), LETTERS) if several else _cut(plain(names[k]), LETTERS)
                 text += f": {_cut(plain(names[k]), LETTERS)}" if several and many else ""
                 style.line(axes, record.time, values[:, k], color=colour, label=text)
-        some = next(record for record in records.values() if name in record)
-        unit = some.units[name]
+        unit = next(iter(having.values())).units[name]
         title = f"{name.replace('_', ' ')}{f' [{unit}]' if unit not in ('', '1') else ''}"
-        some_hidden = any(record[name][0].size > 1 for record in records.values() if name in record and len(record))
-        if len(records) > 1 and some_hidden:
+        if several and any(record[name][0].size > 1 for record in having.values() if len(record)):
             title += ": largest by rms, and range of all"
         axes.set_title(title, fontsize=7.5, loc="left", pad=3)
         axes.set_xlabel("time [s]", fontsize=7, labelpad=0)
@@ -97,26 +92,17 @@ class Strip:
         start = min(float(record.time[0]) for record in records.values())
         end = max(float(record.time[-1]) for record in records.values())
         axes.set_xlim(start, end if end > start else start + 1.0)
-        axes.set_ylim(*_limits([record[name] for record in records.values() if name in record]))
-        if len(records) > 1 or len(axes.lines) > 1:
+        axes.set_ylim(*_limits([record[name] for record in having.values()]))
+        if several or len(axes.lines) > 1:
             handles, labels = axes.get_legend_handles_labels()
             # The range of all first: it lies behind the others.
             most = max((self._size[1] - 20) // LEGEND_ROW, 1)
             self.legend = tuple(labels[:most])
-            axes.legend(
-                handles[:most],
-                labels[:most],
-                loc="upper left",
-                bbox_to_anchor=(1.0, 1.0),
-                fontsize=6.5,
-                borderaxespad=0.2,
-            )
+            look: dict[str, Any] = {"bbox_to_anchor": (1.0, 1.0), "fontsize": 6.5, "borderaxespad": 0.2}
+            axes.legend(handles[:most], labels[:most], loc="upper left", **look)
         canvas.draw()
         self._image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-        box = axes.get_window_extent()
-        low, high = axes.get_xlim()
-        self._scale = (low, float(box.x0)), (high, float(box.x1))
-        self._top, self._bottom = self._size[1] - float(box.y1), self._size[1] - float(box.y0)
+        self._axes = axes
 
 
 def largest(values: style.Array, count: int) -> list[int]:

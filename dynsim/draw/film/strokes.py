@@ -55,8 +55,8 @@ def arrow(draw: ImageDraw.ImageDraw, tail: Array, head: Array, colour: str, widt
 
 def ring(draw: ImageDraw.ImageDraw, x: float, y: float, radius: float, colour: str, width: int) -> None:
     """A circle about a dot [pixel]."""
-    draw.ellipse([x - radius, y - radius, x + radius, y + radius], outline=colour, width=width)
-    draw.ellipse([x - 2, y - 2, x + 2, y + 2], fill=colour)
+    draw.circle((x, y), radius, outline=colour, width=width)
+    draw.circle((x, y), 2, fill=colour)
 
 
 def labels(

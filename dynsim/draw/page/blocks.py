@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dynsim.draw.geometry.mesh_files import Mesh
+
 # Half a step of a code is at most this, where a largest error is asked for: else 32 bits are taken.
 _CODES = {16: 2**16 - 2, 32: 2**32 - 2}
 _TYPES: dict[int, np.dtype[Any]] = {16: np.dtype("<u2"), 32: np.dtype("<u4")}
@@ -64,3 +66,22 @@ class Blocks:
         content = len(text).to_bytes(4, "little") + text + b"".join(self._parts)
         # No time in it: the same record gives the same page.
         return base64.b64encode(gzip.compress(content, 6, mtime=0)).decode("ascii")
+
+
+def packed_mesh(mesh: Mesh, blocks: Blocks) -> dict[str, Any]:
+    """A mesh as the page reads it: corners in 16 bits within their box, triangles, and the colours of these."""
+    corners, triangles, colours = mesh
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    step = np.where(high > low, (high - low) / 65535.0, 1.0)
+    paint: dict[str, Any] = {}
+    if colours is not None:
+        # −1 for none: numbers that are none are equal to nothing.
+        palette, number = np.unique(np.round(np.nan_to_num(colours, nan=-1.0), 3), axis=0, return_inverse=True)
+        paint["palette"] = [None if row[0] < 0.0 else row.tolist() for row in palette]
+        paint["paint"] = blocks.raw(number.reshape(-1))
+    return paint | {
+        "vertices": blocks.raw(np.rint((corners - low) / step)),
+        "triangles": blocks.raw(triangles),
+        "low": low.tolist(),
+        "step": step.tolist(),
+    }

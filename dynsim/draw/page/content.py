@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dynsim._version import __version__
-from dynsim.draw.page.blocks import Blocks
-from dynsim.draw.page.meshes import Meshes, simplified
-from dynsim.draw.page.meshes import packed as packed_mesh
-from dynsim.draw.page.robot import POSE_ERROR, Robot, azimuth, bounds, contacts, paths, robot_of, robots, sunk
-from dynsim.draw.page.solids import body_shapes, drawn_shape, drawn_surface, gripper, thinnest
-from dynsim.draw.page.wheels import cop_of, supports, wheel_groups
+from dynsim.draw.geometry.camera import view_axes
+from dynsim.draw.geometry.meshes import Meshes, named, simplified
+from dynsim.draw.geometry.robot import POSE_ERROR, Robot, azimuth, bounds, contacts, paths, robot_of, robots, sunk
+from dynsim.draw.geometry.shapes import body_shapes, drawn_shape, drawn_surface, gripper, thinnest
+from dynsim.draw.geometry.wheels import cop_of, supports, wheel_groups
+from dynsim.draw.page.blocks import Blocks, packed_mesh
 from dynsim.record import TIME, Record, Signal
 from dynsim.record.measures import hand_target
 from dynsim.record.poses import ORIENTATION, POSITION
@@ -49,7 +49,7 @@ def packed(records: Mapping[str, Record], *, ghost: bool = False) -> str:
         "by": f"dynsim {__version__}",
         "ghost": ghost,
         "azimuth": turn,
-        "box": [corner.tolist() for corner in bounds(every, turn)],
+        "box": [corner.tolist() for corner in bounds(every, view_axes("top", turn))],
         "records": parts,
         "meshes": [packed_mesh(mesh, blocks) for mesh in simplified(meshes.found)],
         "notes": meshes.notes(),
@@ -77,7 +77,7 @@ def _record(name: str, robot: Robot, blocks: Blocks, meshes: Meshes, low: Array,
             bodies[body]["shapes"][shape]["wheel"] = group
     part: dict[str, Any] = {
         "name": name,
-        "title": _title(record),
+        "title": record.title or "record",
         "measured": "scenario" not in record.provenance or "q_goal" in record,
         "complete": bool(record.complete),
         "radius": thinnest(shapes),
@@ -93,7 +93,7 @@ def _record(name: str, robot: Robot, blocks: Blocks, meshes: Meshes, low: Array,
         "sunk": [
             {"name": one.name, "surface": one.surface, "body": one.body, "p": list(one.position)}
             | {"least": one.least, "depth": blocks.add(one.depth, 1e-5)}
-            for one in sunk(robot, rows)
+            for one in sunk(record, scene, rows)
         ],
         "wheels": None if groups.down is None else {"names": groups.names, "down": blocks.add(groups.down[rows])},
         "supports": supports(scene, groups),
@@ -112,14 +112,6 @@ def _record(name: str, robot: Robot, blocks: Blocks, meshes: Meshes, low: Array,
         part["hand"] = {"body": scene.hand.body, "p": list(scene.hand.position), "name": scene.hand.name}
     part["signals"], part["axes"] = _signals(record, blocks)
     return part
-
-
-def _title(record: Record) -> str:
-    scenario = record.provenance.get("scenario")
-    names = [scenario.get("name"), scenario.get("variant")] if isinstance(scenario, Mapping) else []
-    text = " / ".join(str(one) for one in names if one)
-    robot = record.provenance.get("robot")
-    return text or (f"{robot}, measured" if robot else "record")
 
 
 def _contacts(robot: Robot, blocks: Blocks) -> list[dict[str, Any]]:
@@ -157,7 +149,8 @@ def _motors(record: Record, scene: Scene) -> list[list[Any]]:
 
 def shared(record: Record, key: str) -> float | None:
     """A number of the motors by its key in the scenario; None where they have none, or several."""
-    found = set(_named(record.provenance.get("scenario", {}).get("plant", {}), key))
+    values = named(record.provenance.get("scenario", {}).get("plant", {}), key)
+    found = {float(value) for value in values if isinstance(value, (int, float))}
     return _finite(found.pop()) if len(found) == 1 else None
 
 
@@ -174,19 +167,6 @@ def resistance(record: Record) -> float | None:
 def _finite(value: float | None) -> float | None:
     """JSON has no infinity."""
     return value if value is not None and math.isfinite(value) else None
-
-
-def _named(tree: Any, key: str) -> Iterator[float]:
-    """Numbers of a key, wherever it is."""
-    if isinstance(tree, Mapping):
-        for name, value in tree.items():
-            if name == key and isinstance(value, (int, float)):
-                yield float(value)
-            else:
-                yield from _named(value, key)
-    elif isinstance(tree, (list, tuple)):
-        for value in tree:
-            yield from _named(value, key)
 
 
 def _signals(record: Record, blocks: Blocks) -> tuple[list[dict[str, Any]], dict[str, Any]]:

@@ -35,7 +35,8 @@ def page(records: Mapping[str, Record], *, ghost: bool = False, scripts: Sequenc
         There is nothing to be seen: no record with samples and a scene; or three.js is not installed.
     """
     data = packed(records, ghost=ghost)
-    title = next((str(name) for record in records.values() if (name := _scenario(record))), "record")
+    titles = (record.title.partition(" / ")[0] for record in records.values())
+    title = next(filter(None, titles), "record")
     allowed = f"; connect-src {html.escape(connect)}" if connect else ""
     return _filled({"title": html.escape(title), "data": data, "connect": allowed}, scripts)
 
@@ -82,9 +83,3 @@ def three() -> str:
 def _inline(program: str) -> str:
     """As it may stand within a script element."""
     return re.sub(r"</(script)", r"<\\/\1", program, flags=re.IGNORECASE).replace("<!--", r"<\!--")
-
-
-def _scenario(record: Record) -> object:
-    scenario = record.provenance.get("scenario")
-    named = scenario.get("name") if isinstance(scenario, Mapping) else None
-    return named or record.provenance.get("robot")

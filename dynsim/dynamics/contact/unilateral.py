@@ -2,7 +2,7 @@
 
 0 ≤ f_n ⟂ gap ≥ 0; a point that slides is driven by n − μ(s) t along t = v_t/|v_t|, one that is at rest is held while
 |f_t| ≤ μ_s f_n. Which candidates are open, slide or stick is constant within a step
-(:mod:`dynsim.dynamics.contact.contact_modes` chooses); this module is what a right-hand side needs of the law.
+(:mod:`dynsim.integrators.contacts.modes` chooses); this module is what a right-hand side needs of the law.
 """
 
 from __future__ import annotations

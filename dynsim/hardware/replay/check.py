@@ -287,6 +287,18 @@ class MotionLimits:
         for joint, quantity in np.argwhere(wanted):
             yield Margin(self._servos[joint].joint, quantities[quantity], *table[joint, quantity].tolist())
 
+    def surely_hold(self, path: Path) -> bool:
+        """Whether simple bounds say that the last interval, and the windows that end in it, break no limit."""
+        position, velocity, acceleration, jerk, shaking = path.bounds_of_last(JERK_WINDOW, SHAKING_WINDOW)
+        highest = self._highest
+        return bool(
+            np.all((position >= self._low) & (position <= self._high))
+            and np.all(velocity <= highest["velocity"])
+            and np.all(acceleration <= highest["acceleration"])
+            and np.all(jerk <= JERK_WINDOW * highest["jerk"])
+            and np.all(shaking <= highest["shaking"])
+        )
+
     def _tightest_position(self, position: Array, time: Array) -> tuple[Array, Array, Array, Array]:
         lowest, lowest_time = _of_each(position, time, position.argmin(axis=0))
         highest, highest_time = _of_each(position, time, position.argmax(axis=0))

@@ -13,10 +13,10 @@ from scipy.interpolate import PchipInterpolator
 
 from dynsim.compile.control import BasePath
 from dynsim.compile.protocols import BuildContext
+from dynsim.compile.references.plane_curve import AlongCurve, PlaneCurve, seen_from_start
 from dynsim.config.base import StrictConfig, error_at
 from dynsim.errors import ModelError
 from dynsim.record.csv_rows import read_table
-from dynsim.snake.plane_curve import AlongCurve, PlaneCurve, seen_from_start
 
 PLACES = ("t_s", "x_m", "y_m")
 RATES = ("t_s", "V_m_s", "omega_rad_s")

@@ -10,8 +10,8 @@ from scipy.interpolate import BPoly
 
 from dynsim.compile.control import BasePath
 from dynsim.compile.protocols import BuildContext
+from dynsim.compile.references.plane_curve import AlongCurve, PlaneCurve, seen_from_start
 from dynsim.config.base import NonNegative, StrictConfig, check_waypoints
-from dynsim.snake.plane_curve import AlongCurve, PlaneCurve, seen_from_start
 
 Point = Annotated[list[float], Field(min_length=2, max_length=2)]
 

@@ -16,16 +16,17 @@ from dynsim.compile.model import Model
 from dynsim.compile.protocols import BuildContext
 from dynsim.compile.references.feed_forward import planned_voltages
 from dynsim.compile.references.inverse_kinematics import follow
-from dynsim.compile.references.operated import Operated
+from dynsim.compile.references.teleop import TeleopOptions
 from dynsim.compile.rolling import rolled, wheel_angles
 from dynsim.compile.splines import clamped_cubic, quintic_coefficients
 from dynsim.config.base import NonNegative, Positive, StrictConfig, check_waypoints, error_at
 from dynsim.errors import ModelError
 from dynsim.library import families
-from dynsim.library.controllers.operator import Operator
+from dynsim.library.controllers.operator import OperatorConfig
 from dynsim.model.base_pose import base_row
 from dynsim.model.description import Contact, Robot
 from dynsim.model.drives import Motor, Servo, TorqueSource
+from dynsim.system.memo import recall
 
 ENGINE = "dynamics"
 
@@ -88,7 +89,9 @@ class Config(StrictConfig):
     k_d_V_s_per_rad: NonNegative | list[NonNegative] = Field(default=20.0, description="V s/m at a prismatic joint")
     hand: HandReference | None = Field(default=None, description="a path for the hand")
     base: BaseReference | None = Field(default=None, description="a path for the mobile base; none: it holds")
-    operator: Operator | None = Field(default=None, description="velocities for hand and mobile base, instead of paths")
+    operator: OperatorConfig | None = Field(
+        default=None, description="velocities for hand and mobile base, instead of paths"
+    )
     joints: dict[str, JointPath] = Field(default={}, description="waypoints by joint name")
     torques: dict[str, TorquePath] = Field(default={}, description="torques of motors of type torque by joint name")
     feed_forward: Literal["none", "gravity", "dynamics"] = Field(
@@ -148,10 +151,10 @@ def build(config: Config, context: BuildContext) -> JointControl:
     model = context.model
     robot = model.robot
     _check_names(config, model)
-    path, reuse = None, context.reuse
+    path = None
     if config.hand is not None:
         path_config = config.hand.path
-        path = reuse.of(
+        path = recall(
             "path", lambda: families.build("path", path_config, context, HandPath), path_config, context.duration
         )
     base_path = None if config.base is None else _base_path(config.base, context)
@@ -166,13 +169,11 @@ def build(config: Config, context: BuildContext) -> JointControl:
         if base_path is not None:
             positions |= _wheel_angles(robot, base_path, times)
         if config.hand is not None and path is not None:
-            hand, targets = config.hand, targets_on(path, times, reuse)
+            hand, targets = config.hand, targets_on(path, times)
             base = _base_coordinates(robot, positions, times)
             braces = [_contact(context, name, "hand.braces") for name in hand.braces]
             start, tolerance = robot.initial, hand.tolerance_m
-            followed = follow(
-                model, times, targets, hand.joints, start, tolerance, context.progress, base, braces, reuse
-            )
+            followed = follow(model, times, targets, hand.joints, start, tolerance, context.progress, base, braces)
             positions |= dict(zip(hand.joints, followed.T, strict=True))
     control = JointControl.following(
         robot,
@@ -183,16 +184,15 @@ def build(config: Config, context: BuildContext) -> JointControl:
         path=path,
         sample_time=config.sample_time_s,
         voltages=_planned(config, context, times, positions) if planned else None,
-        reuse=reuse,
     )
-    return control if config.operator is None else replace(control, operated=_operated(config.operator, context))
+    return control if config.operator is None else replace(control, teleop=_teleop(config.operator, context))
 
 
-def _operated(operator: Operator, context: BuildContext) -> Operated:
+def _teleop(operator: OperatorConfig, context: BuildContext) -> TeleopOptions:
     robot = context.model.robot
     if any(command.base is not None for command in operator.commands):
         _check_base(robot, ("controller", "operator"))
-    return Operated(
+    return TeleopOptions(
         rate=operator.rate_hz,
         joints=tuple(operator.joints),
         braces=tuple(_contact(context, name, "operator.braces") for name in operator.braces),

@@ -8,7 +8,7 @@ from typing import Annotated, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from dynsim.compile.references.operated import BASE, HAND, VELOCITIES, VelocityScript
+from dynsim.compile.references.teleop import BASE, HAND, VELOCITIES, VelocityScript
 from dynsim.config.base import NonNegative, Positive, StrictConfig, Vector3
 
 BaseVelocity = Annotated[list[float], Field(min_length=2, max_length=2)]
@@ -24,7 +24,7 @@ class Velocity(StrictConfig):
     base: BaseVelocity | None = Field(default=None, description="ahead [m/s], to the left [rad/s]")
 
 
-class Operator(StrictConfig):
+class OperatorConfig(StrictConfig):
     """References that follow velocities, rewritten at every tick; the commands may come from a live operator."""
 
     rate_hz: Positive = Field(default=100.0, description="ticks, at which references are rewritten")

@@ -24,7 +24,7 @@ Profile = Literal["linear", "smooth"]
 STATES = {"switching": SWITCHING, "fixing": FIXING}
 
 
-class Command(StrictConfig):
+class SnakeCommand(StrictConfig):
     """One entry of the operator's list; what it does not name stays as it was."""
 
     at_s: NonNegative
@@ -124,7 +124,7 @@ Path = Annotated[Ramp | Circle | DoorArc, Field(discriminator="type")]
 class Script(StrictConfig):
     """Operator's list and target paths of a scenario; their velocities add."""
 
-    commands: list[Command] = Field(default_factory=list)
+    commands: list[SnakeCommand] = Field(default_factory=list)
     paths: list[Path] = Field(default_factory=list)
 
     @model_validator(mode="after")
@@ -139,7 +139,7 @@ class Script(StrictConfig):
 class ScriptedSource:
     """A command source that knows its future."""
 
-    commands: Sequence[Command]
+    commands: Sequence[SnakeCommand]
     paths: Sequence[Ramp | Circle | DoorArc]
 
     def read(self, first: int, count: int, period: float, feedback: Feedback | None = None) -> CommandBlock:
@@ -173,7 +173,7 @@ class ScriptedSource:
 
 
 @dataclass
-class Timed:
+class TimedScript:
     """A script whose commands keep their times: told period by period, as a live operator tells them."""
 
     script: ScriptedSource

@@ -6,25 +6,24 @@ Transactions on Robotics 35(1), 2019. Values that [T] does not give are marked "
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, StrictInt, field_validator, model_validator
 
 from dynsim.compile.protocols import BuildContext
-from dynsim.config.base import NonNegative, Positive, error_at
+from dynsim.config.base import NonNegative, Positive, StrictConfig, error_at
 from dynsim.errors import ModelError
 from dynsim.jit.kernel import integers, reals
 from dynsim.library.controllers.snake_commands import STATES as MODE_STATES
-from dynsim.library.controllers.snake_commands import Script, ScriptedSource, Timed
+from dynsim.library.controllers.snake_commands import Script, ScriptedSource, TimedScript
 from dynsim.snake import controller as sc
 from dynsim.snake import state as ss
 from dynsim.snake import support as ssup
-from dynsim.snake.controller import Law, control_input, new_work
-from dynsim.snake.description import ModeTable, SnakeDescription, TaskSpaceController, conditioning
+from dynsim.snake.controller import ControlLaw, control_input, new_work
+from dynsim.snake.description import ModeTable, Policy, SnakeDescription, TaskSpaceController, conditioning
 from dynsim.snake.kinematics import SnakeModel, pose_of_point
-from dynsim.snake.modes import TABLE_II, Switching
 from dynsim.snake.state import Schedule
 from dynsim.snake.support import Cost
 
@@ -34,6 +33,29 @@ COSTS = {"eq19": ssup.COST_ANGLES, "eq20": ssup.COST_SUPPORT_NORM, "eq20_min": s
 LIMIT_POLICIES = {"none": sc.LIMITS_NONE, "saturate": sc.LIMITS_SATURATE, "allocate": sc.LIMITS_ALLOCATE}
 STATES = {"measured": ss.MEASURED, "estimated": ss.ESTIMATED, "feedforward": ss.FEEDFORWARD}
 FORMS = {"paper": sc.NULL_PAPER, "safe": sc.NULL_SAFE}
+
+
+# [T] Table II: mode number -> lifted wheel pairs of the base part (pair 1 at its head).
+TABLE_II: dict[int, list[int]] = {1: [3, 6], 2: [6, 7], 3: [5, 6], 4: [4, 5], 5: [3, 4], 6: [2, 3]}
+
+
+class Switching(StrictConfig):
+    """Switching state ([T] IV.C.5); it is entered by a command ``mode: switching``."""
+
+    policy: Policy = Field("cyclic", description="fixed: never switch; cyclic: [T]'s order; predictive: lowest cost")
+    order: list[StrictInt] = Field(
+        [2, 3, 4, 5, 6], min_length=1, description="mode numbers, also the predictive candidates"
+    )
+    period_s: Positive = Field(1.0, description="Delta T [s]")
+    least_margin_m: float = Field(0.0, description="a mode whose support margin is not above it counts as tipping")
+    when_blocked: bool = Field(
+        False,
+        description="enter the switching state by itself when a command cannot be carried out, the target waiting",
+    )
+    release_fraction: Annotated[float, Field(gt=0, lt=1)] = Field(
+        0.6, description="when_blocked: go on when every base joint is within this part of its limit (assumed)"
+    )
+    prediction_step_s: Positive = Field(0.02, description="step of the predicted period (assumed)")
 
 
 class Config(Script):
@@ -141,7 +163,7 @@ def build(config: Config, context: BuildContext) -> TaskSpaceController:
         diagonal = head + [9.6 / 2**i for i in range(model.base_joints)]
     weights = np.ones(inputs) * config.weight_wheel
     weights[:joints] = _per_entry("weight_joint", config.weight_joint, joints)
-    law = Law(
+    law = ControlLaw(
         gain=reals(_per_entry("gain", config.gain, 6 + len(shape_joints))),
         null_gain=config.null_gain,
         null_form=FORMS[config.null_form],
@@ -190,11 +212,11 @@ def build(config: Config, context: BuildContext) -> TaskSpaceController:
         least_margin=config.switching.least_margin_m,
         when_blocked=config.switching.when_blocked,
         release_fraction=config.switching.release_fraction,
-        source=script if config.commands_wait else Timed(script),
+        source=script if config.commands_wait else TimedScript(script),
     )
 
 
-def reference_sigma(model: SnakeModel, law: Law, row: int, plant: SnakeDescription) -> float:
+def reference_sigma(model: SnakeModel, law: ControlLaw, row: int, plant: SnakeDescription) -> float:
     """Smallest singular value of B~ W^(-1/2) with the head raised and the base straight.
 
     It falls with the length of the chain, the links and the weights; damping is measured by it, not in metres.
@@ -204,7 +226,9 @@ def reference_sigma(model: SnakeModel, law: Law, row: int, plant: SnakeDescripti
     return float(control_input(model, law, work, pose, joints, pose, np.zeros(6), row, 0.0))
 
 
-def check_controllable(model: SnakeModel, law: Law, modes: ModeTable, fixing_row: int, plant: SnakeDescription) -> None:
+def check_controllable(
+    model: SnakeModel, law: ControlLaw, modes: ModeTable, fixing_row: int, plant: SnakeDescription
+) -> None:
     """Refuse a table with a mode in which A~ w~' = B~ u ([T] eq 9) has no solution for every w~'.
 
     The side-slip row of wheel pair 1 and the three ground-contact rows contain head joints only. Every shape

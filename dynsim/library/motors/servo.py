@@ -55,31 +55,27 @@ class Config(DriveParameters):
                 raise error_at(foreign, f"has no effect in mode {self.mode}")
         return self
 
-    def motor(self, joint: str) -> Servo:
-        """The servo on the joint of that name."""
-        torque_constant = self.voltage_V / self.no_load_speed_rad_per_s
-        return Servo(
-            joint=joint,
-            torque_constant=torque_constant,
-            resistance=self.voltage_V * torque_constant / self.stall_torque_N_m,
-            k_p=self.k_p_V_per_rad,
-            k_d=self.k_d_V_s_per_rad,
-            k_v=self.k_v_V_s_per_rad,
-            velocity_mode=self.mode == "velocity",
-            armature=self.rotor_inertia_kg_m2,
-            reflected_damping=self.gear_damping_N_m_s_per_rad,
-            coulomb_friction=self.coulomb_friction_N_m,
-            coulomb_speed=self.coulomb_speed_rad_per_s,
-            voltage_limit=self.voltage_V,
-            current_limit=limit(self.current_limit_A),
-            torque_limit=limit(self.torque_limit_N_m),
-            mass=self.mass_kg,
-            mass_point=self.mass_point,
-            nominal_current=limit(self.nominal_current_A),
-            nominal_torque=self.nominal_torque,
-        )
-
 
 def build(config: Config, context: BuildContext) -> Servo:
     """The servo on ``context.joint``."""
-    return config.motor(context.joint)
+    torque_constant = config.voltage_V / config.no_load_speed_rad_per_s
+    return Servo(
+        joint=context.joint,
+        torque_constant=torque_constant,
+        resistance=config.voltage_V * torque_constant / config.stall_torque_N_m,
+        k_p=config.k_p_V_per_rad,
+        k_d=config.k_d_V_s_per_rad,
+        k_v=config.k_v_V_s_per_rad,
+        velocity_mode=config.mode == "velocity",
+        armature=config.rotor_inertia_kg_m2,
+        reflected_damping=config.gear_damping_N_m_s_per_rad,
+        coulomb_friction=config.coulomb_friction_N_m,
+        coulomb_speed=config.coulomb_speed_rad_per_s,
+        voltage_limit=config.voltage_V,
+        current_limit=limit(config.current_limit_A),
+        torque_limit=limit(config.torque_limit_N_m),
+        mass=config.mass_kg,
+        mass_point=config.mass_point,
+        nominal_current=limit(config.nominal_current_A),
+        nominal_torque=config.nominal_torque,
+    )

@@ -18,11 +18,8 @@ class Config(DriveParameters):
     type: Literal["torque"]
     limit_N_m: Positive | None = Field(default=None, description="N at a prismatic joint")
 
-    def motor(self, joint: str) -> TorqueSource:
-        """The torque on the joint of that name."""
-        return TorqueSource(joint, limit(self.limit_N_m), self.mass_kg, self.mass_point, self.nominal_torque)
-
 
 def build(config: Config, context: BuildContext) -> TorqueSource:
     """The torque on ``context.joint``."""
-    return config.motor(context.joint)
+    torque_limit, nominal = limit(config.limit_N_m), config.nominal_torque
+    return TorqueSource(context.joint, torque_limit, config.mass_kg, config.mass_point, nominal)

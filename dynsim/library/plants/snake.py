@@ -21,7 +21,7 @@ ENGINE = "kinematic"
 DrivenSide = Literal["left", "right", "none"]
 
 
-class Limits(StrictConfig):
+class JointLimits(StrictConfig):
     """Joint limits, symmetric about zero ([T] Table I)."""
 
     yaw: Positive = Field(65.0, lt=180, description="[deg]")
@@ -45,7 +45,7 @@ class Config(StrictConfig):
     driven_side: DrivenSide | list[DrivenSide] | None = Field(
         None, description="side of the active wheel of each pair. Default (assumed): left, right, left, ..."
     )
-    limits_deg: Limits = Field(default_factory=Limits)
+    limits_deg: JointLimits = Field(default_factory=JointLimits)
     gripper_length_m: NonNegative = Field(0.09, description="gripper tip ahead of the head point [m] ([T] IV.B)")
     mass_kg: Positive = Field(10.0, description="of the whole robot [kg], spread evenly over its links (assumed)")
     controlled_point: Literal["head", "gripper"] = Field(

@@ -1,8 +1,7 @@
 """URDF in: the tree of bodies, their joints, limits and viscous losses.
 
 Files are read strictly (:mod:`dynsim.model.urdf.reader`); everything behind fixed and locked joints is merged into the
-moving body that carries it. Pinocchio reads every file too, and both must have found the same bodies and joints.
-Motors, gears, contacts and gravity are not part of a URDF file; they belong to the scenario.
+moving body that carries it. Motors, gears, contacts and gravity are not part of a URDF file: the scenario has them.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -27,8 +25,6 @@ from dynsim.record.scene import Shape, quaternion
 HAND = "hand"
 # Makers of the rows of joints that have several.
 ROWS = {"floating": floating, "planar": planar}
-# Two readers of the same decimals differ by roundings: of the sines of angles, and of sums over merged bodies.
-_AGREEMENT = 1e-9
 
 
 @dataclass(frozen=True)
@@ -61,8 +57,8 @@ def read_urdf(path: Path, lock: Mapping[str, float] | None = None) -> Robot:
     ------
     ModelError
         No such file, not URDF, a number that is none, a mass without inertia and the like; a mimic joint whose leader
-        there is not; no joint of a name in ``lock``, or one without a single position; or Pinocchio reads the file
-        differently. The message names file, line, link or joint, value and what to do.
+        there is not; no joint of a name in ``lock``, or one without a single position. The message names file, line,
+        link or joint, value and what to do.
 
     Warns
     -----
@@ -72,7 +68,6 @@ def read_urdf(path: Path, lock: Mapping[str, float] | None = None) -> Robot:
     """
     tree = read_tree(path)
     locked = _locked(tree, {**_locked_followers(tree, lock or {}), **(lock or {})})
-    _compare_with_pinocchio(tree)
     places = _places(locked)
     links = _links(locked, places)
     if not links:
@@ -288,78 +283,3 @@ def _warn(tree: UrdfTree, places: Mapping[str, _Place], links: tuple[Link, ...])
             f"links are fixed to can have the sum ({', '.join(odd)})",
             stacklevel=3,
         )
-
-
-def _compare_with_pinocchio(tree: UrdfTree) -> None:
-    """Raise :class:`ModelError` unless Pinocchio finds the same joints and bodies in the file, before any is locked."""
-    # Imported here: Pinocchio takes a second to load, and only URDF files need it.
-    import pinocchio
-
-    try:
-        model = pinocchio.buildModelFromXML(tree.text)
-    except (ValueError, RuntimeError) as error:
-        raise ModelError(f"{tree.path}: not a valid URDF model: {' '.join(str(error).split())}") from error
-    neutral = pinocchio.neutral(model)
-    places = _places(tree)
-    links = _links(tree, places)
-    ours, theirs = {link.joint for link in links}, set(list(model.names)[1:])
-    if ours != theirs:
-        raise ModelError(
-            f"{tree.path}: two readers of the file differ in its moving joints: {', '.join(sorted(ours ^ theirs))}"
-        )
-    joint_of = {link.name: link.joint for link in links}
-    for link in links:
-        joint, j = tree.joints[link.joint], model.getJointId(link.joint)
-        inertia, placement = model.inertias[j], model.jointPlacements[j]
-        parent = "universe" if link.parent is None else joint_of[link.parent]
-        if model.names[model.parents[j]] != parent:
-            raise _difference(tree, link, "parent joint", parent, model.names[model.parents[j]])
-        length = max(1.0, float(np.abs(link.p_PJ).max()), float(np.abs(link.inertia.com).max()))
-        pairs: list[tuple[str, Any, Any, float]] = [
-            ("rotation of the joint", link.R_PJ, placement.rotation, 1.0),
-            ("position of the joint", link.p_PJ, placement.translation, length),
-            ("mass", link.inertia.mass, inertia.mass, link.inertia.mass),
-        ]
-        if link.inertia.mass > 0.0:
-            pairs.append(("centre of mass", link.inertia.com, inertia.lever, length))
-        size = float(np.abs(link.inertia.tensor).max()) + link.inertia.mass * length**2
-        pairs.append(("inertia", link.inertia.tensor, inertia.inertia, size))
-        pairs.append(("damping", link.damping, model.damping[model.joints[j].idx_v], link.damping))
-        if link.kind in SEVERAL:
-            # Of a plane Pinocchio does not read the normal: it takes z.
-            pairs.append(("number of rates", len(ROWS[link.kind](link)), model.joints[j].nv, 0.0))
-        else:
-            # Motion of the body per unit rate in its own frame: (0, a) of a revolute joint, (a, 0) of a prismatic one.
-            in_joint = model.joints[j].createData()
-            model.joints[j].calc(in_joint, neutral)
-            zero, revolute = np.zeros(3), link.kind == "revolute"
-            motion = np.concatenate([zero, link.axis] if revolute else [link.axis, zero])
-            pairs.append(("joint motion", motion, in_joint.S, 1.0))
-        if joint.kind not in ("continuous", *SEVERAL):
-            k = model.joints[j].idx_q
-            for name, value, limits in (
-                ("lower limit", link.lower, model.lowerPositionLimit),
-                ("upper limit", link.upper, model.upperPositionLimit),
-            ):
-                if math.isfinite(value):
-                    pairs.append((name, value, limits[k], abs(value)))
-        for name, value, limits in (
-            ("velocity limit", link.velocity_limit, model.velocityLimit),
-            ("effort limit", link.effort_limit, model.effortLimit),
-        ):
-            if math.isfinite(value):
-                pairs.append((name, value, limits[model.joints[j].idx_v], value))
-        for name, own, other, scale in pairs:
-            if not np.allclose(own, other, rtol=0.0, atol=_AGREEMENT * scale):
-                raise _difference(tree, link, name, own, other)
-
-
-def _difference(tree: UrdfTree, link: Link, name: str, own: Any, other: Any) -> ModelError:
-    def text(value: Any) -> str:
-        return " ".join(np.array2string(np.asarray(value), precision=12).split()) if np.ndim(value) else str(value)
-
-    return tree.error(
-        tree.links[link.name].line,
-        f"link {link.name!r} (joint {link.joint!r}): {name} is {text(own)} as written, but Pinocchio reads "
-        f"{text(other)}; write the numbers of this link and joint more plainly",
-    )

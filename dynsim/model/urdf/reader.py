@@ -15,11 +15,10 @@ import numpy as np
 from dynsim.errors import ModelError
 from dynsim.model.description import Array, Inertia
 from dynsim.model.urdf.visual import materials, visual_shapes
-from dynsim.model.urdf.xml import MOMENTS, Element, UrdfFile, cut, plain_text, shown, suggestion
+from dynsim.model.urdf.xml import MOMENTS, Element, UrdfFile, cut, shown, suggestion
 from dynsim.record.scene import Shape
 
-# The largest robots in use have some 100 links. Pinocchio walks the tree by recursion: some 5000 links in a chain
-# overflow its stack.
+# The largest robots in use have some 100 links.
 LINKS_MAX = 2000
 MOVING = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 # Joints with several rates.
@@ -72,14 +71,13 @@ class UrdfJoint:
 
 @dataclass(frozen=True)
 class UrdfTree:
-    """Links and joints by name in the order of the file, the root link, and ``text``, the same as plain URDF."""
+    """Links and joints by name in the order of the file, and the root link."""
 
     path: Path
     name: str
     links: dict[str, UrdfLink]
     joints: dict[str, UrdfJoint]
     root: str
-    text: str
 
     def error(self, line: int, text: str) -> ModelError:
         """An error about a line of the file."""
@@ -124,7 +122,7 @@ class _Reader:
                 joints[joint.name] = joint
         top = self.root(links, joints)
         name = root.attributes.get("name", "") or self.file.path.stem
-        return UrdfTree(self.file.path, name, links, joints, top, plain_text(root, name))
+        return UrdfTree(self.file.path, name, links, joints, top)
 
     def link(self, element: Element, others: dict[str, UrdfLink]) -> UrdfLink:
         name = self.file.name(element, others)

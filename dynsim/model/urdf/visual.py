@@ -6,28 +6,17 @@ drawn is passed over without a word. Meshes keep the name that the file gives th
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Protocol
+from collections.abc import Mapping
 
 import numpy as np
 
+from dynsim.model.urdf.xml import Element
 from dynsim.record.quaternion import of_turn, product
 from dynsim.record.scene import Shape, ShapeKind
 
 Colour = tuple[float, float, float, float]
 # As in urdf_reader: larger numbers are no lengths.
 _LARGEST = 1e15
-
-
-class Element(Protocol):
-    """An element of XML."""
-
-    tag: str
-    attributes: dict[str, str]
-
-    @property
-    def children(self) -> Sequence[Element]:
-        """Elements within."""
 
 
 def materials(robot: Element) -> dict[str, Colour]:
@@ -45,13 +34,13 @@ def visual_shapes(link: Element, known: Mapping[str, Colour]) -> tuple[Shape, ..
 
 
 def _shape(visual: Element, known: Mapping[str, Colour]) -> Shape | None:
-    geometry = _child(visual, "geometry")
+    geometry = visual.child("geometry")
     if geometry is None or len(geometry.children) != 1:
         return None
     solid = geometry.children[0]
-    material = _child(visual, "material")
+    material = visual.child("material")
     colour = None if material is None else _colour(material, known)
-    place = _child(visual, "origin")
+    place = visual.child("origin")
     xyz = (0.0, 0.0, 0.0) if place is None else _numbers(place, "xyz", 3, "0 0 0")
     rpy = (0.0, 0.0, 0.0) if place is None else _numbers(place, "rpy", 3, "0 0 0")
     kind: ShapeKind
@@ -77,12 +66,8 @@ def _shape(visual: Element, known: Mapping[str, Colour]) -> Shape | None:
     return Shape(kind, size, file=file, colour=colour).placed(np.array(xyz), turn)
 
 
-def _child(element: Element, tag: str) -> Element | None:
-    return next((child for child in element.children if child.tag == tag), None)
-
-
 def _colour(material: Element, known: Mapping[str, Colour]) -> Colour | None:
-    stated = _child(material, "color")
+    stated = material.child("color")
     numbers = () if stated is None else _numbers(stated, "rgba", 4)
     if not numbers or not all(0.0 <= number <= 1.0 for number in numbers):
         return known.get(material.attributes.get("name", ""))

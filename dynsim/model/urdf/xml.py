@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 from xml.parsers import expat
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
@@ -279,31 +278,6 @@ def _near(word: str, known: tuple[str, ...]) -> str:
         return ""
     near = difflib.get_close_matches(word[:40].casefold(), known, n=1, cutoff=0.8)
     return near[0] if near else ""
-
-
-def plain_text(root: Element, name: str) -> str:
-    """What physics depends on, with the numbers as the file has them, in UTF-8 without anything else.
-
-    For Pinocchio, whose parser knows no other encoding and drops the whole inertia over a space beside a number.
-    """
-
-    def written(element: Element, tags: tuple[str, ...]) -> str:
-        attributes = ""
-        for key, value in element.attributes.items():
-            if key in ("name", "type", "link", "joint"):
-                attributes += f" {key}={quoteattr(value)}"
-            elif key in _ATTRIBUTES.get(element.tag, ()):
-                attributes += f" {key}={quoteattr(' '.join(_words(value)))}"
-        # Pinocchio refuses dynamics without a loss, which the specification allows.
-        if element.tag == "dynamics" and not attributes:
-            return ""
-        inside = "".join(
-            written(child, _CHILDREN.get(child.tag, ())) for child in element.children if child.tag in tags
-        )
-        return f"<{element.tag}{attributes}>{inside}</{element.tag}>"
-
-    inside = "".join(written(child, _CHILDREN[child.tag]) for child in root.children if child.tag in ("link", "joint"))
-    return f"<robot name={quoteattr(name)}>{inside}</robot>"
 
 
 def _words(text: str) -> list[str]:

@@ -4,29 +4,21 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
+from functools import partial
+from statistics import median
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.dynamics.simd.system import has_forms
-from dynsim.dynamics.state import block
 from dynsim.engine.dynamics import Prepared, prepare
+from dynsim.engine.stepped import take_log
 from dynsim.integrators import run as ki
 from dynsim.integrators.driver import advance
-from dynsim.scenario import build, load_scenario
+from dynsim.scenario import build, load_scenario, variant_names
 from dynsim.studies.bench import mujoco_peer
-from dynsim.studies.bench.programs import (
-    DYNSIM_RADAU5,
-    DYNSIM_RK4,
-    DYNSIM_RK43,
-    MUJOCO_EULER,
-    MUJOCO_IMPLICIT,
-    SCENARIO,
-    STEP,
-)
-from dynsim.studies.bench.timing import Timed
+from dynsim.studies.bench.programs import DYNSIM_RADAU5, MUJOCO_EULER, MUJOCO_IMPLICIT, SCENARIO, STEP
 
 Array = NDArray[np.float64]
 
@@ -44,80 +36,75 @@ class Case:
     mujoco_contacts : str
         ``contacts`` of :func:`dynsim.studies.bench.mujoco_peer.build_mujoco`.
     same_physics : bool
-        Whether the programs solve the same equations; where not, MuJoCo's rows are marked and no ratio is given.
-    note : str
+        Whether the programs solve the same equations; where not, MuJoCo's rows are marked.
     """
 
     variant: str
-    mujoco_contacts: str
-    same_physics: bool
-    note: str
+    mujoco_contacts: Literal["none", "soft", "equality"]
+    same_physics: bool = True
 
 
 CASES = {
-    "free arm": Case("no_elbow", "none", True, "same equations in both"),
-    "two elbows held, no friction": Case(
-        "two_elbows", "equality", True, f"both hold the elbows to spheres of {SPHERE_RADIUS:g} m radius; MuJoCo softly"
-    ),
-    "two elbows, friction": Case(
-        "two_elbows", "soft", False, "dynsim: the paper's bilateral law; MuJoCo: its soft unilateral contact"
-    ),
+    "free arm": Case("no_elbow", "none"),
+    # Both hold the elbows to spheres; MuJoCo softly.
+    "two elbows held, no friction": Case("two_elbows", "equality"),
+    # dynsim: the paper's bilateral law; MuJoCo: its soft unilateral contact.
+    "two elbows, friction": Case("two_elbows", "soft", same_physics=False),
 }
-# Method, first or fixed step, rtol, atol.
-_INTEGRATORS = {
-    DYNSIM_RK43: ("rk43", 0.0, 1e-6, 1e-8),
-    DYNSIM_RADAU5: ("radau5", 0.0, 1e-6, 1e-8),
-    DYNSIM_RK4: ("rk4", STEP, 1e-6, 1e-8),
-}
+RADAU5 = {"integrator.method": "radau5", "integrator.rtol": 1e-6, "integrator.atol": 1e-8}
 _TIGHT = {"integrator.method": "dopri5", "integrator.rtol": 1e-11, "integrator.atol": 1e-13}
 
 
-def measure_job(case_name: str, rounds: int, *, with_mujoco: bool) -> list[dict[str, Any]]:
-    """Wall time and error of the 10 s run for every program; the reference is dynsim at rtol 1e-11."""
+class Outcome(NamedTuple):
+    """CPU time [s], joint positions (T, n) and motor currents (T, na)."""
+
+    cpu: float
+    q: Array
+    current: Array
+
+
+def measure(case_name: str, rounds: int, *, with_mujoco: bool) -> list[dict[str, Any]]:
+    """CPU time and error of the 10 s run for every program; the reference is dynsim at rtol 1e-11."""
     case = CASES[case_name]
     reference = prepare_case(case, _TIGHT)
-    _advance(reference)
-    run = reference.run
-    q, i = run.states("q"), run.states("current")
-    hand = _hand_path(reference, q)
-
-    paths: dict[str, tuple[Array, Array]] = {}
-    timed: list[Timed] = []
-    for name in _INTEGRATORS:
-        timed.append(Timed(name, _dynsim_job(name, reference, paths)))
+    exact = _run_dynsim(reference)
+    hand = _hand_path(reference, exact.q)
+    programs: dict[str, Callable[[], Outcome]] = {DYNSIM_RADAU5: lambda: _run_dynsim(prepare_case(case, RADAU5))}
     if with_mujoco:
-        for name, integrator in ((MUJOCO_EULER, "euler"), (MUJOCO_IMPLICIT, "implicitfast")):
-            timed.append(Timed(name, _mujoco_job(name, case, integrator, reference, paths)))
-    walls: dict[str, list[float]] = {job.name: [] for job in timed}
-    cores: dict[str, list[float]] = {job.name: [] for job in timed}
-    for job in timed:
-        job.call(1)
+        programs[MUJOCO_EULER] = partial(_run_mujoco, case, "euler", reference)
+        programs[MUJOCO_IMPLICIT] = partial(_run_mujoco, case, "implicitfast", reference)
+    # They take turns, so that a busy moment of the machine meets all of them; the first one warms the caches.
+    outcomes = {name: run() for name, run in programs.items()}
+    cpu: dict[str, list[float]] = {name: [] for name in programs}
     for _ in range(rounds):
-        for job in timed:
-            started, started_cpu = time.perf_counter(), time.thread_time()
-            job.call(1)
-            walls[job.name].append(time.perf_counter() - started)
-            cores[job.name].append(time.thread_time() - started_cpu)
+        for name, run in programs.items():
+            cpu[name].append(run().cpu)
     rows = []
-    for job in timed:
-        positions, currents = paths[job.name]
-        distance = np.linalg.norm(_hand_path(reference, positions) - hand, axis=1)
+    for name, outcome in outcomes.items():
+        distance = np.linalg.norm(_hand_path(reference, outcome.q) - hand, axis=1)
         rows.append(
             {
                 "case": case_name,
-                "note": case.note,
-                "program": job.name,
-                "wall_median_s": float(np.median(walls[job.name])),
-                "wall_minimum_s": float(np.min(walls[job.name])),
-                "cpu_median_s": float(np.median(cores[job.name])),
-                "cpu_minimum_s": float(np.min(cores[job.name])),
-                "same_physics": case.same_physics or job.name.startswith("dynsim"),
+                "program": name,
+                "cpu_median_s": median(cpu[name]),
+                "same_physics": case.same_physics or name == DYNSIM_RADAU5,
                 "hand_error_max_m": float(distance.max()),
                 "hand_error_rms_m": float(np.sqrt((distance**2).mean())),
-                "current_error_max_A": float(np.abs(currents - i).max()),
+                "current_error_max_A": float(np.abs(outcome.current - exact.current).max()),
             }
         )
     return rows
+
+
+def measure_variants(rounds: int) -> list[dict[str, Any]]:
+    """Least CPU time of each variant as it is shipped, by dynsim alone."""
+    return [
+        {
+            "variant": variant,
+            "cpu_minimum_s": min(integrate(prepare(load_scenario(SCENARIO, variant, RADAU5))) for _ in range(rounds)),
+        }
+        for variant in variant_names(SCENARIO)
+    ]
 
 
 def prepare_case(case: Case, options: dict[str, Any]) -> Prepared:
@@ -138,73 +125,39 @@ def prepare_case(case: Case, options: dict[str, Any]) -> Prepared:
     return prepare(load_scenario(SCENARIO, case.variant, overrides))
 
 
-def _advance(prepared: Prepared) -> None:
-    advance(prepared.system, prepared.workspace, prepared.run, np.iinfo(np.int64).max)
-    if prepared.run.count[ki.STATUS] != ki.FINISHED:
-        raise RuntimeError(f"the benchmark run stopped at t = {prepared.run.clock[ki.TIME]:.3f} s")
+def integrate(prepared: Prepared) -> float:
+    """Integrate from start to end; CPU seconds of that alone."""
+    run = prepared.run
+    # Loading the kernels is no integration time.
+    advance(prepared.system, prepared.workspace, run, 0)
+    started = time.thread_time()
+    while run.count[ki.STATUS] == ki.RUNNING:
+        advance(prepared.system, prepared.workspace, run, np.iinfo(np.int64).max)
+        take_log(run)
+    return time.thread_time() - started
 
 
-def _dynsim_job(name: str, reference: Prepared, paths: dict[str, tuple[Array, Array]]) -> Callable[[int], int]:
-    method, step, rtol, atol = _INTEGRATORS[name]
-    n, na, c = reference.model.n, len(reference.system.drives.table), len(reference.contacts)
-    y = np.zeros_like(reference.run.y)
-    y[block(reference.run.layout, "q")] = reference.model.robot.initial
-    run = ki.new_run(
-        ki.METHODS[method],
-        y,
-        reference.run.layout,
-        reference.run.columns,
-        n=n,
-        na=na,
-        c=c,
-        sample_time=reference.run.sample_time,
-        hand=(reference.run.hand_link, reference.run.hand_point),
-        end=float(reference.run.clock[ki.END]),
-        step=step,
-        step_max=np.inf,
-        rtol=rtol,
-        atol=atol,
-        lanes=has_forms(reference.system),
-    )
-    prepared = replace(reference, run=run)
-    fresh = [(table, table.copy()) for table in (run.y, run.clock, run.count, run.extremes)]
-    if run.newton is not None:
-        fresh += [(table, table.copy()) for table in (run.newton.clock, run.newton.count)]
-
-    def call(count: int) -> int:
-        for table, values in fresh:
-            table[:] = values
-        _advance(prepared)
-        paths[name] = prepared.run.states("q"), prepared.run.states("current")
-        return 1
-
-    return call
+def _run_dynsim(prepared: Prepared) -> Outcome:
+    cpu, run = integrate(prepared), prepared.run
+    if run.count[ki.STATUS] != ki.FINISHED:
+        raise RuntimeError(f"the benchmark run stopped at t = {run.clock[ki.TIME]:.3f} s")
+    return Outcome(cpu, run.states("q"), run.states("current"))
 
 
-def _mujoco_job(
-    name: str, case: Case, integrator: str, reference: Prepared, paths: dict[str, tuple[Array, Array]]
-) -> Callable[[int], int]:
+def _run_mujoco(case: Case, integrator: Literal["euler", "implicitfast"], reference: Prepared) -> Outcome:
     import mujoco
 
     times = reference.run.sample_time
-    model = mujoco_peer.build_mujoco(
-        reference.system,
-        step=STEP,
-        integrator=integrator,  # type: ignore[arg-type]
-        contacts=case.mujoco_contacts,  # type: ignore[arg-type]
-    )
+    model = mujoco_peer.build_mujoco(reference.system, step=STEP, integrator=integrator, contacts=case.mujoco_contacts)
     data = mujoco.MjData(model)
     start = mujoco_peer.state_of(model, reference.model.robot.initial)
     controls = mujoco_peer.setpoints(reference.system, np.arange(round(times[-1] / STEP)) * STEP)
-    rows = np.round(times[1:] / STEP).astype(int) - 1
-
-    def call(count: int) -> int:
-        q, _, i = mujoco_peer.roll_out(model, data, start, controls)
-        first = start[1 : 1 + model.nq], np.zeros(i.shape[1])
-        paths[name] = np.vstack([first[0], q[rows]]), np.vstack([first[1], i[rows]])
-        return 1
-
-    return call
+    started = time.thread_time()
+    q, _, i = mujoco_peer.roll_out(model, data, start, controls)
+    cpu = time.thread_time() - started
+    sampled = np.round(times[1:] / STEP).astype(int) - 1
+    first = start[1 : 1 + model.nq], np.zeros(i.shape[1])
+    return Outcome(cpu, np.vstack([first[0], q[sampled]]), np.vstack([first[1], i[sampled]]))
 
 
 def _hand_path(prepared: Prepared, q: Array) -> Array:

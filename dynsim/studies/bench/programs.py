@@ -1,15 +1,22 @@
 """Names of what is measured, and what all measurements share."""
 
 SCENARIO = "elbow_comparison"
-STEP = 1e-3  # MuJoCo's and RK4's step in the whole job [s]
+STEP = 1e-3  # MuJoCo's, in the whole job [s]
 
 DYNSIM_FREE, DYNSIM_CONTACTS = "dynsim", "dynsim, 2 contacts"
 ABA, CONSTRAINT_DYNAMICS, LCABA = "Pinocchio ABA", "Pinocchio constraintDynamics", "Pinocchio lcaba"
 MUJOCO_FREE, MUJOCO_CONTACTS = "MuJoCo mj_step", "MuJoCo mj_step, 2 contacts"
-CONTENDERS = (DYNSIM_FREE, DYNSIM_CONTACTS, ABA, CONSTRAINT_DYNAMICS, LCABA, MUJOCO_FREE, MUJOCO_CONTACTS)
-"""Of the right-hand side."""
+SAME_TASK = {
+    ABA: DYNSIM_FREE,
+    CONSTRAINT_DYNAMICS: DYNSIM_CONTACTS,
+    LCABA: DYNSIM_CONTACTS,
+    MUJOCO_FREE: DYNSIM_FREE,
+    MUJOCO_CONTACTS: DYNSIM_CONTACTS,
+}
+"""Of the right-hand side: peers, and what of dynsim does the same."""
+RIGHT_HAND_SIDES = (DYNSIM_FREE, DYNSIM_CONTACTS, *SAME_TASK)
 
-DYNSIM_RK43, DYNSIM_RK4 = "dynsim rk43 rtol 1e-6", "dynsim RK4 1 ms"
 DYNSIM_RADAU5 = "dynsim radau5 rtol 1e-6"
 MUJOCO_EULER, MUJOCO_IMPLICIT = "MuJoCo Euler 1 ms", "MuJoCo implicitfast 1 ms"
+JOBS = (DYNSIM_RADAU5, MUJOCO_EULER, MUJOCO_IMPLICIT)
 """Of the whole job."""

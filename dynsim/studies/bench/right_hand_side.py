@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
+from statistics import median
+from timeit import Timer
 from typing import Any
 
 import numpy as np
@@ -10,8 +13,6 @@ from numpy.typing import NDArray
 
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.derivative import System, derivative
-from dynsim.dynamics.simd.system import derivative_lanes
-from dynsim.dynamics.simd.tables import as_lanes, tables_as_lanes
 from dynsim.dynamics.state import block
 from dynsim.engine.dynamics import Prepared, prepare
 from dynsim.jit.kernel import kernel
@@ -28,12 +29,13 @@ from dynsim.studies.bench.programs import (
     SCENARIO,
     STEP,
 )
-from dynsim.studies.bench.timing import Timed, in_batches, one_by_one, take_turns
 
 Array = NDArray[np.float64]
+Contender = tuple[Callable[[], Any], int]
+"""A call, and how often it does the work."""
 
-# Measured in Python calls, with the cost of the call taken off.
-_CALLED_FROM_PYTHON = (CONSTRAINT_DYNAMICS, LCABA)
+# Pinocchio's Data grows with the square of the links: 0.85 GB at 300.
+PINOCCHIO_LINKS_MAX = 300
 _PYTHON_ABA = "Pinocchio ABA, one Python call each"
 
 
@@ -50,50 +52,44 @@ def repeat_derivative(system: System, y: Array, ws: ka.Workspace, dy: Array, cou
     return total
 
 
-@kernel
-def repeat_lanes(width: Any, system: System, y: Array, ws: ka.Workspace, dy: Array, count: int) -> None:
-    """``count`` right-hand sides of all lanes."""
-    for k in range(count):
-        derivative_lanes(
-            tables_as_lanes(system, width),  # type: ignore[call-arg]
-            1e-3 * (k & 1023),
-            as_lanes(y, width),  # type: ignore[call-arg]
-            tables_as_lanes(ws, width),  # type: ignore[call-arg]
-            as_lanes(dy, width),  # type: ignore[call-arg]
-        )
+def measure(sizes: Sequence[int], rounds: int, share: float, *, with_mujoco: bool) -> list[dict[str, Any]]:
+    """Median microseconds by links and program, of ``rounds`` samples of about ``share`` seconds each."""
+    rows, python_call = [], 0.0
+    for n in sizes:
+        arms = {contacts: prepare(_arm(n, contacts)) for contacts in (False, True)}
+        contenders = {DYNSIM_FREE: _derivative_loop(arms[False]), DYNSIM_CONTACTS: _derivative_loop(arms[True])}
+        if n <= PINOCCHIO_LINKS_MAX:
+            contenders |= _pinocchio_contenders(arms[True])
+        if with_mujoco:
+            contenders |= _mujoco_contenders(arms[True])
+        # What a call from Python costs does not depend on the size; where the work is least, it is seen best.
+        if n != sizes[0]:
+            contenders.pop(_PYTHON_ABA, None)
+        seconds = {name: median(samples) for name, samples in take_turns(contenders, rounds, share).items()}
+        if n == sizes[0]:
+            python_call = max(0.0, (called := seconds.pop(_PYTHON_ABA)) - seconds.get(ABA, called))
+        for name in seconds.keys() & {CONSTRAINT_DYNAMICS, LCABA}:
+            seconds[name] -= python_call
+        rows += [{"links": n, "program": name, "median_us": 1e6 * value} for name, value in seconds.items()]
+    return rows
 
 
-def measure(n: int, rounds: int, share: float, *, with_pinocchio: bool, with_mujoco: bool) -> dict[str, list[float]]:
-    """Seconds of every contender at ``n`` links, ``rounds`` samples of about ``share`` seconds each."""
-    arms = {contacts: prepare(_arm(n, contacts)) for contacts in (False, True)}
-    timed = [
-        Timed(DYNSIM_FREE, _derivative_loop(arms[False])),
-        Timed(DYNSIM_CONTACTS, _derivative_loop(arms[True])),
-    ]
-    if with_pinocchio:
-        timed += _pinocchio_contenders(arms[True])
-    if with_mujoco:
-        timed += _mujoco_contenders(arms[True])
-    return take_turns(timed, rounds, share)
+def take_turns(contenders: dict[str, Contender], rounds: int, share: float) -> dict[str, list[float]]:
+    """Seconds per unit of work of every contender, one sample per round, the contenders interleaved.
 
-
-def python_call_cost(samples: dict[str, list[float]]) -> float | None:
-    """What a call from Python costs [s], None when these samples do not tell."""
-    if _PYTHON_ABA not in samples or ABA not in samples:
-        return None
-    return max(0.0, float(np.median(samples[_PYTHON_ABA]) - np.median(samples[ABA])))
-
-
-def row(n: int, samples: dict[str, list[float]], python_call: float) -> dict[str, Any]:
-    """Microseconds of every contender at n links, Python calls taken off where the work is called from Python."""
-    found: dict[str, Any] = {"links": n, "median_us": {}, "minimum_us": {}}
-    for name, values in samples.items():
-        if name == _PYTHON_ABA:
-            continue
-        off = python_call if name in _CALLED_FROM_PYTHON else 0.0
-        found["median_us"][name] = 1e6 * (float(np.median(values)) - off)
-        found["minimum_us"][name] = 1e6 * (float(np.min(values)) - off)
-    return found
+    CPU time of this thread, in which all of them run: what other processes take does not count.
+    """
+    timers = {name: Timer(call, timer=time.thread_time) for name, (call, _) in contenders.items()}
+    # The first of the calls warms the caches.
+    calls = {name: max(1, int(share / min(timer.repeat(4, 1)))) for name, timer in timers.items()}
+    samples: dict[str, list[float]] = {name: [] for name in timers}
+    for k in range(rounds):
+        for name, timer in timers.items():
+            units = calls[name] * contenders[name][1]
+            # A contender that takes far longer than a sample should gets fewer of them.
+            if k < 3 or sum(samples[name]) * units < 4.0 * rounds * share:
+                samples[name].append(timer.timeit(calls[name]) / units)
+    return samples
 
 
 def _arm(n: int, contacts: bool) -> Any:
@@ -109,42 +105,36 @@ def _arm(n: int, contacts: bool) -> Any:
     return load_scenario(SCENARIO, "two_elbows" if contacts else "no_elbow", overrides)
 
 
-def _derivative_loop(prepared: Prepared) -> Callable[[int], int]:
+def _derivative_loop(prepared: Prepared) -> Contender:
     y, ws = prepared.run.y.copy(), prepared.workspace
     y[block(prepared.run.layout, "v")] = 0.1  # slipping, turning: no term is zero
-    dy = np.zeros_like(y)
-
-    def call(count: int) -> int:
-        repeat_derivative(prepared.system, y, ws, dy, count)
-        return count
-
-    call(1)
-    return call
+    dy, count = np.zeros_like(y), max(2, 3000 // prepared.model.n)
+    return lambda: repeat_derivative(prepared.system, y, ws, dy, count), count
 
 
-def _pinocchio_contenders(prepared: Prepared) -> list[Timed]:
+def _pinocchio_contenders(prepared: Prepared) -> dict[str, Contender]:
     import pinocchio
 
     model = pinocchio_peer.build_pinocchio(prepared.system.model)
     q, v = prepared.model.robot.initial, np.full(prepared.model.n, 0.1)
     links = [int(link) for link in prepared.system.contacts.link[:, ka.LINK]]
-    data = model.createData()
-    timed = [Timed(_PYTHON_ABA, one_by_one(pinocchio_peer.python_aba(model, data, q, v)))]
+    data, batch = model.createData(), max(2, 3000 // prepared.model.n)
+    contenders: dict[str, Contender] = {
+        _PYTHON_ABA: (pinocchio_peer.python_aba(model, data, q, v), 1),
+        CONSTRAINT_DYNAMICS: (pinocchio_peer.constrained(model, data, "constraintDynamics", links, q, v), 1),
+        LCABA: (pinocchio_peer.constrained(model, data, "lcaba", links, q, v), 1),
+    }
+    # Not where Pinocchio is built without threads.
     if hasattr(pinocchio, "abaInParallel"):
-        batch = max(2, 3000 // prepared.model.n)
-        timed.insert(0, Timed(ABA, in_batches(pinocchio_peer.native_aba(model, q, v, batch), batch)))
-    for algorithm, name in (("constraintDynamics", CONSTRAINT_DYNAMICS), ("lcaba", LCABA)):
-        if hasattr(pinocchio, algorithm):
-            timed.append(Timed(name, one_by_one(pinocchio_peer.constrained(model, data, algorithm, links, q, v))))
-    return timed
+        contenders[ABA] = pinocchio_peer.native_aba(model, q, v, batch), batch
+    return contenders
 
 
-def _mujoco_contenders(prepared: Prepared) -> list[Timed]:
-    timed = []
+def _mujoco_contenders(prepared: Prepared) -> dict[str, Contender]:
+    contenders, steps = {}, 5
     for name, contacts in ((MUJOCO_FREE, "none"), (MUJOCO_CONTACTS, "soft")):
         model = mujoco_peer.build_mujoco(prepared.system, step=STEP, motors=False, contacts=contacts)  # type: ignore[arg-type]
-        steps = 5
         batch = max(1, 20_000 // prepared.model.n**2)
         call = mujoco_peer.steps_call(model, prepared.model.robot.initial, batch, steps)
-        timed.append(Timed(name, in_batches(call, batch * steps)))
-    return timed
+        contenders[name] = call, batch * steps
+    return contenders

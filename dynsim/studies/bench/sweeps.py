@@ -9,9 +9,9 @@ from typing import Any
 
 from dynsim.scenario import read_scenario
 from dynsim.studies.bench.programs import SCENARIO
-from dynsim.studies.plan import Law, Plan
 from dynsim.studies.processes import cores
 from dynsim.studies.sweep import run_sweep
+from dynsim.studies.sweep_plan import Law, Plan
 
 RUNS = (250, 500, 1000)
 

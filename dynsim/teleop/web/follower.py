@@ -33,9 +33,9 @@ from dynsim.hardware.replay.trajectory import column_of
 from dynsim.hardware.servo_map import ServoMap
 from dynsim.record import Record
 from dynsim.scenario import Scenario
-from dynsim.teleop.drive import drive
-from dynsim.teleop.driven import Array, Driven, Pace
-from dynsim.teleop.web.session import Account, Session
+from dynsim.teleop.begin import begin
+from dynsim.teleop.session import Array, Session, SpeedLimits
+from dynsim.teleop.web.live import DriveReport, LiveDrive
 
 NOT_YET = -math.inf
 """Time that the servos tell before they are where the simulation begins."""
@@ -45,12 +45,12 @@ REGULAR, BROKEN, NOT_LIFTED = 0.0, 1.0, 2.0
 
 
 @dataclass(frozen=True)
-class Wanted:
+class DriveRequest:
     """A drive that is to be."""
 
     scenario: Scenario
     servo_map: ServoMap
-    pace: Pace
+    limits: SpeedLimits
     longest: float
     http_port: int
     until_closed: bool
@@ -71,7 +71,7 @@ class Ready:
 class Done:
     """How the drive went; ``saved`` is false where there was nothing to save, ``failure`` says why it was not."""
 
-    account: Account
+    report: DriveReport
     driven: float
     saved: bool
     failure: DynsimError | None
@@ -97,8 +97,8 @@ class Columns:
         not say how.
     """
 
-    def __init__(self, still: Record, servo_map: ServoMap, driven: Driven) -> None:
-        known = driven.joints()
+    def __init__(self, session: Session, servo_map: ServoMap) -> None:
+        still, known = session.still, session.joints()
         if servo_map.lifts is None and LIFTED in known:
             raise CheckRefused(
                 "the robot lifts wheel pairs and the servo map does not say how: without it they would drag over the "
@@ -107,84 +107,76 @@ class Columns:
         self._lifts = servo_map.lifts
         if self._lifts is not None and self._lifts.signal not in known:
             raise CheckRefused(f"lifts.signal: a live drive has no {self._lifts.signal!r}; it has {', '.join(known)}")
-        self._driven = driven
+        self._session = session
         self._position = np.array([servo.hold_at or 0.0 for servo in servo_map.servos])
         self._velocity = np.zeros(len(self._position))
-        self._sources: list[tuple[int, str, int, str | None, int]] = []
+        # Index of the servo, where its angle is, and where its rate; held rates are differences of the angles.
+        self._sources: list[tuple[int, tuple[str, int], tuple[str, int] | None]] = []
         for index, servo in enumerate(servo_map.servos):
             if servo.hold_at is not None:
                 continue
             follows = servo.kind.follows
-            column_of(still, follows.position, servo, "rad")
-            rates = None
+            signals = {follows.position: "rad"}
             if follows.rates == "continuous":
-                column_of(still, follows.velocity, servo, "rad/s")
-                rates = follows.velocity
-            missing = [name for name in (follows.position, rates) if name is not None and name not in known]
-            if missing:
+                signals[follows.velocity] = "rad/s"
+            for name, unit in signals.items():
+                column_of(still, name, servo, unit)
+            if missing := [name for name in signals if name not in known]:
                 raise CheckRefused(
                     f"{servo.joint} follows the signal {missing[0]!r}, which a live drive does not have; it has "
                     f"{', '.join(known)}. Rates of a sampled controller are `rates: held`"
                 )
-            column = still.labels[follows.position].index(servo.label)
-            self._sources.append(
-                (index, follows.position, column, rates, still.labels[rates].index(servo.label) if rates else 0)
-            )
+            position, *rates = ((name, still.labels[name].index(servo.label)) for name in signals)
+            self._sources.append((index, position, rates[0] if rates else None))
 
     def now(self) -> tuple[Array, Array]:
         """Angles [rad] and rates [rad/s] in the order of the map, shape (N,)."""
-        joints = self._driven.joints()
-        for index, signal, column, rates, of_rates in self._sources:
+        joints = self._session.joints()
+        for index, (signal, column), rates in self._sources:
             self._position[index] = joints[signal][column]
             if rates is not None:
-                self._velocity[index] = joints[rates][of_rates]
+                self._velocity[index] = joints[rates[0]][rates[1]]
         return self._position, self._velocity
 
     def sample(self) -> Sample:
         """The same, at the time of the simulation."""
         position, velocity = self.now()
-        return Sample(self._driven.time, position.copy(), velocity.copy())
+        return Sample(self._session.time, position.copy(), velocity.copy())
 
     def base(self, yaw: tuple[str, list[int]]) -> tuple[Array, Array]:
         """Yaw angles of the base part, from columns of a signal [rad], and which wheel pairs are on the ground."""
         assert self._lifts is not None
-        joints = self._driven.joints()
+        joints = self._session.joints()
         signal, columns = yaw
         return joints[signal][columns], joints[self._lifts.signal]
 
 
 class ServoFollower:
-    """A :class:`~dynsim.teleop.web.session.Follower` behind a pipe.
+    """A :class:`~dynsim.teleop.web.live.Follower` behind a pipe.
 
     Parameters
     ----------
-    driven : the simulation
-    columns : what of it the servos follow
-    ahead : by how much it may be ahead of them [s], besides what is held back
+    session : the simulation
+    servo_map : of the servos
     samples : the pipe
     heard : shared memory with the time of the servos [s]
-    lifting : which of the servos lift wheel pairs
-    held_back : where they do
+
+    Raises
+    ------
+    CheckRefused
+        See :class:`Columns`.
     """
 
-    def __init__(
-        self,
-        driven: Driven,
-        columns: Columns,
-        ahead: float,
-        samples: Connection,
-        heard: Any,
-        lifting: list[int],
-        held_back: LiftLookahead | None,
-    ) -> None:
-        self._driven, self._columns = driven, columns
-        self._ahead = ahead + (held_back.delay if held_back is not None else 0.0)
-        self._samples, self._heard = samples, heard
-        self._lifting, self._held_back = lifting, held_back
-        self.first = columns.sample()
-        self._frame = frame_of(len(self.first.position), len(lifting))
-        if held_back is not None:
-            self.first = held_back.begin(self.first, *columns.base(held_back.yaw))
+    def __init__(self, session: Session, servo_map: ServoMap, samples: Connection, heard: Any) -> None:
+        self._session, self._columns = session, Columns(session, servo_map)
+        self.lookahead = LiftLookahead(session.still, servo_map, session.period) if servo_map.lifts else None
+        # By how much the simulation may be ahead of the servos [s].
+        self._ahead = lead(servo_map) + (self.lookahead.delay if self.lookahead is not None else 0.0)
+        self._samples, self._heard, self._lifting = samples, heard, lifting_columns(servo_map)
+        self.first = self._columns.sample()
+        self._frame = frame_of(len(self.first.position), len(self._lifting))
+        if self.lookahead is not None:
+            self.first = self.lookahead.begin(self.first, *self._columns.base(self.lookahead.yaw))
 
     @property
     def begun(self) -> bool:
@@ -192,23 +184,20 @@ class ServoFollower:
 
     @property
     def ready(self) -> bool:
-        return (self._driven.ticks + 1) * self._driven.period <= self._heard[0] + self._ahead
+        return (self._session.ticks + 1) * self._session.period <= self._heard[0] + self._ahead
 
     @property
     def steady(self) -> bool:
-        return self._held_back is None or self._held_back.steady(self._driven.time)
+        return self.lookahead is None or self.lookahead.steady(self._session.time)
 
     def hear(self) -> None:
-        sample = self._columns.sample()
-        if self._held_back is None:
-            self._tell(sample)
-            return
-        for whole in self._held_back.add(sample, *self._columns.base(self._held_back.yaw)):
+        sample, lookahead = self._columns.sample(), self.lookahead
+        for whole in [sample] if lookahead is None else lookahead.add(sample, *self._columns.base(lookahead.yaw)):
             self._tell(whole)
 
     def finish(self) -> None:
         """There was no tick that is not to be followed: what is held back goes on."""
-        for sample in self._held_back.rest() if self._held_back is not None else []:
+        for sample in self.lookahead.rest() if self.lookahead is not None else []:
             self._tell(sample)
 
     def end(self, how: float) -> None:
@@ -228,7 +217,7 @@ class ServoFollower:
             os.write(self._samples.fileno(), self._frame.pack(*numbers))
 
 
-def simulate(wanted: Wanted, control: Connection, samples: Connection, heard: Any) -> None:
+def simulate(request: DriveRequest, control: Connection, samples: Connection, heard: Any) -> None:
     """What the process does: says Ready or an error, drives, saves, and says Done.
 
     It ends when it is told to by any word, or when whoever would tell it is gone.
@@ -240,51 +229,43 @@ def simulate(wanted: Wanted, control: Connection, samples: Connection, heard: An
         os.nice(NICENESS)
     ending = _Ending(control)
     try:
-        driven = drive(wanted.scenario, pace=wanted.pace, limit=wanted.longest)
-        still = driven.still()
-        columns = Columns(still, wanted.servo_map, driven)
-        held_back = LiftLookahead(still, wanted.servo_map, driven.period) if wanted.servo_map.lifts else None
-        lifting = lifting_columns(wanted.servo_map)
-        follower = ServoFollower(driven, columns, lead(wanted.servo_map), samples, heard, lifting, held_back)
-        session = Session(driven, wanted.scenario.variant or wanted.scenario.name, follower)
-        address = session.open(wanted.http_port)
+        session = begin(request.scenario, limits=request.limits, longest=request.longest)
+        follower = ServoFollower(session, request.servo_map, samples, heard)
+        drive = LiveDrive(session, request.scenario.variant or request.scenario.name, follower)
+        address = drive.open(request.http_port)
     except Exception as error:
         _say(control, error if isinstance(error, DynsimError) else DynsimError(f"the simulation failed: {error!r}"))
         return
     how = BROKEN
     refused: CheckRefused | None = None
     try:
-        ending.of(session)
-        _say(control, Ready(address, still, follower.first, driven.period))
-        account = session.run(until_closed=wanted.until_closed)
-        if account.stop is None:
+        ending.of(drive)
+        _say(control, Ready(address, session.still, follower.first, session.period))
+        if drive.run(until_closed=request.until_closed).stop is None:
             follower.finish()
             how = REGULAR
     except CheckRefused as error:
-        how, refused, account = NOT_LIFTED, error, session.account
-        account.ended = str(error)
+        how, refused, drive.report.ended = NOT_LIFTED, error, str(error)
     except DynsimError as error:
-        account = session.account
-        account.ended = str(error)
+        drive.report.ended = str(error)
     finally:
         follower.end(how)
-        session.close()
-    _say(control, _saved(driven, account, wanted.folder, refused))
+        drive.close()
+    _say(control, _saved(session, drive.report, request.folder, refused))
 
 
-def _saved(driven: Driven, account: Account, folder: Path, refused: CheckRefused | None) -> Done:
-    time = driven.ticks * driven.period
-    stop, account.stop = account.stop, None  # it holds a record, which need not go through the pipe
-    if driven.ticks == 0:
-        return Done(account, time, saved=False, failure=stop)
-    failure: DynsimError | None = refused if stop is None else type(stop)(str(stop))
+def _saved(session: Session, report: DriveReport, folder: Path, refused: CheckRefused | None) -> Done:
+    time = session.ticks * session.period
+    stop, report.stop = report.stop, None  # it holds a record, which need not go through the pipe
+    if session.ticks == 0:
+        return Done(report, time, saved=False, failure=stop)
     try:
-        save_drive(driven.record() if stop is None or stop.record is None else stop.record, folder)
+        save_drive(session.record() if stop is None or stop.record is None else stop.record, folder)
     except DynsimError as error:
-        return Done(account, time, saved=False, failure=error)
+        return Done(report, time, saved=False, failure=error)
     except Exception as error:
-        return Done(account, time, saved=False, failure=RecordError(f"the drive was not saved: {error!r}"))
-    return Done(account, time, saved=True, failure=failure)
+        return Done(report, time, saved=False, failure=RecordError(f"the drive was not saved: {error!r}"))
+    return Done(report, time, saved=True, failure=refused if stop is None else type(stop)(str(stop)))
 
 
 def _say(control: Connection, message: Any) -> None:
@@ -296,28 +277,28 @@ class _Ending:
     """Hears in a thread of its own that the drive is to end."""
 
     def __init__(self, control: Connection) -> None:
-        self._session: Session | None = None
+        self._drive: LiveDrive | None = None
         self._why = ""
         self._lock = threading.Lock()
         self._control = control
         threading.Thread(target=self._listen, name="dynsim ending", daemon=True).start()
 
-    def of(self, session: Session) -> None:
+    def of(self, drive: LiveDrive) -> None:
         """Whose end it is."""
         with self._lock:
-            self._session = session
+            self._drive = drive
             if self._why:
-                session.end(self._why, at_once=True)
+                drive.end(self._why, at_once=True)
 
     def _listen(self) -> None:
         try:
             why = str(self._control.recv())
         except (EOFError, OSError):
             why = "the process with the servos has gone"
-            if self._session is None:
+            if self._drive is None:
                 # Nothing has begun, and nobody waits for it.
                 os._exit(1)
         with self._lock:
             self._why = why
-            if self._session is not None:
-                self._session.end(why, at_once=True)
+            if self._drive is not None:
+                self._drive.end(why, at_once=True)

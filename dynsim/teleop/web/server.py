@@ -1,4 +1,4 @@
-"""The server: the page by HTTP, wishes and frames by a web socket, on this machine alone.
+"""The server: the page by HTTP, commands and frames by a web socket, on this machine alone.
 
 Every user of a machine can reach its loopback, and every web page can ask a browser to: so there is a token in the
 path, ``Host`` must be this server (against names that are bound to it anew), and a socket's ``Origin`` its own page.
@@ -24,8 +24,8 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from dynsim.errors import DynsimError
-from dynsim.teleop.web.helm import Helm
-from dynsim.teleop.web.wishes import MOST_BYTES, Refused, Wish, read
+from dynsim.teleop.web.deadman import Deadman
+from dynsim.teleop.web.pilot import MOST_BYTES, PilotCommand, Refused, parse
 
 HERE = "127.0.0.1"
 FRAMES = 60.0
@@ -41,7 +41,7 @@ _HEADERS = {
     "Cache-Control": "no-store",
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
-    "X-Frame-Options": "DENY",
+    "X-LiveFrame-Options": "DENY",
     "Content-Security-Policy": "frame-ancestors 'none'",
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
@@ -62,7 +62,7 @@ class Server:
 
     Parameters
     ----------
-    helm : hears the pilot
+    deadman : hears the pilot
     hello : said to every client at first
     axes, modes : of the robot
     page : the page, of the address of the socket
@@ -71,14 +71,14 @@ class Server:
 
     def __init__(
         self,
-        helm: Helm,
+        deadman: Deadman,
         hello: Mapping[str, Any],
         axes: int,
         modes: tuple[int, ...],
         page: Callable[[str], str],
         end: Callable[[], None],
     ) -> None:
-        self._helm, self._hello, self._axes, self._modes, self._end = helm, hello, axes, modes, end
+        self._deadman, self._hello, self._axes, self._modes, self._end = deadman, hello, axes, modes, end
         self._make_page = page
         self.token = secrets.token_urlsafe(24)
         self._clients: dict[ServerConnection, _Client] = {}
@@ -228,7 +228,7 @@ class Server:
 
     async def _hear(self, client: _Client, message: str | bytes) -> None:
         try:
-            heard = read(message, self._axes, self._modes)
+            heard = parse(message, self._axes, self._modes)
         except Refused as reason:
             client.refused += 1
             await client.socket.send(json.dumps({"refused": str(reason)}))
@@ -240,8 +240,8 @@ class Server:
             await self._tell_roles()
         elif client is not self._pilot:
             return
-        elif isinstance(heard, Wish):
-            self._helm.hear(heard)
+        elif isinstance(heard, PilotCommand):
+            self._deadman.hear(heard)
         elif heard == "leave":
             self._release()
             await self._tell_roles()
@@ -250,7 +250,7 @@ class Server:
 
     def _release(self) -> None:
         self._pilot = None
-        self._helm.forget()
+        self._deadman.forget()
 
     async def _tell_roles(self) -> None:
         for client in list(self._clients.values()):

@@ -23,8 +23,8 @@ from dynsim.teleop.web.follower import (
     NOT_LIFTED,
     NOT_YET,
     Done,
+    DriveRequest,
     Ready,
-    Wanted,
     frame_of,
     lifting_columns,
     simulate,
@@ -124,7 +124,7 @@ class SimulationProcess:
     feed : PipeFeed
     """
 
-    def __init__(self, wanted: Wanted) -> None:
+    def __init__(self, request: DriveRequest) -> None:
         self._done = False
         context: Any = get_context("spawn")
         self._control, control = context.Pipe()
@@ -136,13 +136,13 @@ class SimulationProcess:
         with signals_held(), safe_path():
             heard = context.RawArray("d", [NOT_YET])
             self._process = context.Process(
-                target=simulate, args=(wanted, control, there, heard), name="dynsim simulation", daemon=True
+                target=simulate, args=(request, control, there, heard), name="dynsim simulation", daemon=True
             )
             self._process.start()
         # Their ends here would hide the end of the process.
         control.close()
         there.close()
-        self.feed = PipeFeed(samples, heard, wanted.servo_map)
+        self.feed = PipeFeed(samples, heard, request.servo_map)
 
     def __enter__(self) -> SimulationProcess:
         return self

@@ -45,7 +45,7 @@ class VelocityScript:
 
 
 @dataclass(frozen=True)
-class Operated:
+class TeleopOptions:
     """What an operator moves, and how.
 
     Attributes

@@ -13,14 +13,14 @@ from dynsim.errors import RecordError
 from dynsim.record import Record
 from dynsim.record.measures import hand_target
 from dynsim.record.poses import ORIENTATION, POSITION, point_positions
-from dynsim.record.scene import NOT_BELOW, WORLD, Point, Scene, Surface, Vector3
-from dynsim.record.surface_points import normals
+from dynsim.record.scene import NOT_BELOW, WORLD, Point, Scene, Vector3
 
 Array = NDArray[np.float64]
 # Poses between the frames of a page are interpolated: to this [m].
 POSE_ERROR = 4e-5
 # Frames of a longer run are thinned though poses between them be off by more.
 FRAMES = 20_000
+WORLD_AXES = np.eye(3)
 HERE_POINT: Vector3 = (0.0, 0.0, 0.0)
 
 
@@ -48,12 +48,22 @@ class Robot:
     reach: float
 
 
+def placed(record: Record) -> tuple[Scene | None, str]:
+    """The scene of a record that has the poses of its bodies, or what it lacks to be drawn."""
+    scene = record.scene
+    if scene is None or not scene.bodies:
+        return None, "the record has no scene"
+    if POSITION not in record or ORIENTATION not in record:
+        return None, "not every joint was recorded"
+    if record[POSITION].shape != (len(record), len(scene.bodies), 3):
+        return None, "the scene has other bodies than the record"
+    return scene, ""
+
+
 def robot_of(record: Record) -> Robot | None:
     """The robot of a record; None without samples, a scene, or the poses of its bodies."""
-    scene = record.scene
-    if scene is None or not scene.bodies or not {POSITION, ORIENTATION} <= set(record) or not len(record):
-        return None
-    if record[POSITION].shape != (len(record), len(scene.bodies), 3):
+    scene, _ = placed(record)
+    if scene is None or not len(record):
         return None
     position = record[POSITION][np.isfinite(record[POSITION]).all(axis=(1, 2))]
     if not len(position):
@@ -92,11 +102,9 @@ def _every(count: int, stride: int) -> NDArray[np.intp]:
     return np.unique(np.append(np.arange(0, count, stride), count - 1))
 
 
-def bounds(robots: Sequence[Robot], turn: float = 0.0) -> tuple[Array, Array]:
-    """The box, turned about z by ``turn`` [rad], in which everything moves, with some room, (3,) and (3,) [m]."""
-    pooled = moving(robots)
-    c, s = math.cos(turn), math.sin(turn)
-    pooled = pooled @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+def bounds(robots: Sequence[Robot], axes: Array = WORLD_AXES) -> tuple[Array, Array]:
+    """The box along some axes, unit vectors (3, 3), in which everything moves, with some room, (3,) and (3,) [m]."""
+    pooled = moving(robots) @ axes.T
     low, high = pooled.min(axis=0), pooled.max(axis=0)
     # What hardly moves is not blown up to fill the window, and what is flat has some depth to stand in.
     span, reach = float((high - low).max()), max(robot.reach for robot in robots)
@@ -151,8 +159,6 @@ def paths(record: Record, scene: Scene) -> Iterator[tuple[str, Array]]:
     if scene.hand is not None:
         yield "hand", np.asarray(point_positions(record, scene.hand), dtype=np.float64)
     target = hand_target(record)
-    if target is None and "hand_position_goal" in record:
-        target = record["hand_position_goal"]
     if target is None and "w_target" in record:
         target = record["w_target"][:, :3]
     if target is not None:
@@ -196,7 +202,7 @@ def contacts(robot: Robot, rows: NDArray[np.intp] | slice = slice(None)) -> list
         if mode is not None and not mode.any():
             continue
         place = np.asarray(point_positions(record, point, rows), dtype=np.float64)
-        normal = normals(surface, place)
+        normal = surface.normal(place)
         force = np.asarray(record["contact_normal_force"][rows, k], dtype=np.float64)
         tangent = None
         if "contact_force" in record:
@@ -224,12 +230,11 @@ class Sunk:
     depth: Array
 
 
-def sunk(robot: Robot, rows: NDArray[np.intp] | slice = slice(None)) -> list[Sunk]:
+def sunk(record: Record, scene: Scene, rows: NDArray[np.intp] | slice = slice(None)) -> list[Sunk]:
     """Joints, and the hand, below surfaces at samples of the record: surfaces hold contact points only.
 
     Bodies of a mobile base, and wheels, stand where the model has them.
     """
-    record, scene = robot.record, robot.scene
     wheels = {k for k, body in enumerate(scene.bodies) if body.joint.signal == "rho"} | set(scene.base)
     points = [(body.joint.name, k, HERE_POINT) for k, body in enumerate(scene.bodies) if k not in wheels]
     if scene.hand is not None and scene.hand.body != WORLD:
@@ -240,23 +245,10 @@ def sunk(robot: Robot, rows: NDArray[np.intp] | slice = slice(None)) -> list[Sun
         allowed = scene.bodies[k].radius + NOT_BELOW
         for surface in scene.surfaces:
             with np.errstate(all="ignore"):
-                depth = -distance(surface, place)
+                depth = -surface.gap(place)
             if (depth > allowed).any():
                 found.append(Sunk(name, surface.name, k, position, allowed, depth))
     return found
-
-
-def distance(surface: Surface, points: Array) -> Array:
-    """Distance of points from a surface along the normal, (T, 3) → (T,) [m], as :meth:`Surface.gap` has it."""
-    value = surface.value(points)
-    if surface.kind in ("box", "height_field"):
-        return value
-    slope = points @ np.array(surface.Q) + np.array(surface.b)
-    size = np.linalg.norm(slope, axis=-1)
-    n = slope / np.where(size > 0.0, size, 1.0)[:, None]
-    inner = size * size - 2.0 * np.einsum("ti,ij,tj->t", n, np.array(surface.Q), n) * value
-    with np.errstate(all="ignore"):
-        return np.asarray(np.where(inner > 0.0, 2.0 * value / (size + np.sqrt(np.maximum(inner, 0.0))), value / size))
 
 
 def largest_force(found: Sequence[Contact]) -> float:

@@ -2,8 +2,12 @@
 
 Arms of 3 to 12 joints with DC motors lean on planes, pipes, spheres, boxes and terrain: points that are declared, all
 joints or all links may touch, with friction that holds more or as much at rest, payloads, pushes, soft and stiff gains,
-hand paths. ``python -m dynsim.studies.endings --count 10000 --jobs 2`` writes results/endings/endings.json, which
-docs/validation.md quotes, in about half an hour; ``--journal FILE`` keeps what is done, and goes on with it.
+hand paths.
+
+    PYTHONPATH=tests python -m support.endings --count 10000 --jobs 2
+
+writes results/endings/endings.json, which docs/validation.md quotes, in about half an hour; ``--journal FILE`` keeps
+what is done, and goes on with it.
 """
 
 from __future__ import annotations
@@ -342,7 +346,7 @@ def _why(reason: str) -> str:
 
 
 def _options() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="python -m dynsim.studies.endings", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m support.endings", description=__doc__)
     parser.add_argument("--count", type=int, default=10_000, help="scenes")
     parser.add_argument("--first", type=int, default=0, help="number of the first")
     parser.add_argument("--jobs", type=int, default=2, help="processes")
@@ -385,6 +389,6 @@ def main() -> None:
 
 if __name__ == "__main__":
     # By its name: other processes find it by that.
-    from dynsim.studies import endings as module
+    from support import endings as module
 
     module.main()

@@ -10,20 +10,20 @@ import pytest
 
 import dynsim
 from dynsim.compile.clearance import _Clear, gaps, sinking
-from dynsim.scenario import build, read_scenario, shipped_scenarios
+from dynsim.scenario import build, read_scenario
 from dynsim.studies.batch import Work
 from dynsim.studies.columns import numbers
-from dynsim.studies.plan import Axis, Plan
-from dynsim.system.reuse import KEPT, Reuse
+from dynsim.studies.sweep_plan import Axis, Plan
+from dynsim.system.memo import KEPT, Memo, recall, remembering
 
 ELBOWS = read_scenario("elbow_comparison")
 
 
 def test_results_are_known_by_the_bits_of_their_inputs():
-    reuse, made = Reuse(), itertools.count()
+    memo, made = Memo(), itertools.count()
 
     def of(*inputs: Any) -> int:
-        return reuse.of("count", lambda: next(made), *inputs)
+        return memo.recall("count", lambda: next(made), *inputs)
 
     array = np.array([1.0, 0.0])
     first = of(array, [1.0, {"a": (2, None)}])
@@ -46,13 +46,30 @@ def test_results_are_known_by_the_bits_of_their_inputs():
 
 
 def test_only_the_last_results_are_kept_and_no_errors():
-    reuse, made = Reuse(), []
+    memo, made = Memo(), []
     for k in [*range(KEPT + 1), 0, KEPT]:
-        reuse.of("k", lambda k=k: made.append(k), k)
+        memo.recall("k", lambda k=k: made.append(k), k)
     assert made == [*range(KEPT + 1), 0]
     for _ in range(2):
         with pytest.raises(ZeroDivisionError):
-            reuse.of("broken", lambda: 1 / 0)
+            memo.recall("broken", lambda: 1 / 0)
+
+
+def test_a_memo_lasts_as_long_as_its_context_and_the_outer_one_is_shared():
+    made = itertools.count()
+
+    def of(key: str) -> int:
+        return recall("count", lambda: next(made), key)
+
+    assert of("a") != of("a")
+    with remembering():
+        first = of("a")
+        with remembering():
+            assert of("a") == first
+        with remembering(Memo()):
+            assert of("a") != first
+        assert of("a") == first
+    assert of("a") != first
 
 
 def outcome(run: Callable[[], Any]) -> tuple[str, Any]:
@@ -98,23 +115,19 @@ def test_runs_that_share_are_those_that_do_not(variant: str, overrides: dict[str
             assert result.summary["warnings"] == summary["warnings"]
 
 
-@pytest.mark.parametrize("path", shipped_scenarios(), ids=lambda path: path.stem)
-def test_a_scenario_near_another_is_as_read_from_the_file(path: Any):
-    file = read_scenario(path)
-    variant = file.variants[-1] if file.variants else None
-    near = file.near(variant, {"record.rate_hz": 100})
-    fields = ["duration_s=1.5", "integrator.rtol=1e-7", "contacts.friction=0.2", "plant.name=x", "record.rate_hz=50"]
-    fields += ["duration_s=-1", "contacts=3", "description=other", "name=x", "integrator.method=rodas4", "metrics={}"]
-    for text in fields:
-        values = {text.split("=")[0]: Axis.parse(text).values[0]}
-        wanted = outcome(lambda of=values: file.load(variant, {"record.rate_hz": 100} | of))
-        found = outcome(lambda of=values: near.load(of))
-        assert found[0] == wanted[0]
-        if found[1] is not None and wanted[1] is not None:
-            assert found[1].resolved == wanted[1].resolved
-            assert found[1].config.model_fields_set == wanted[1].config.model_fields_set
-            for name in ("name", "variant", "source", "origin"):
-                assert getattr(found[1], name) == getattr(wanted[1], name)
+def test_configurations_are_known_by_their_values_and_by_what_was_set():
+    memo, made = Memo(), itertools.count()
+
+    def of(section: str, **overrides: Any) -> int:
+        config = getattr(ELBOWS.load("two_elbows", overrides).config, section)
+        return memo.recall("count", lambda: next(made), config)
+
+    first = of("plant")
+    assert of("plant", **{"integrator.rtol": 1e-7}) == first
+    assert of("plant", **{"plant.chain.0.mass_kg": 0.2}) != first
+    # A key that is set to its default may be an error where one that is not set is none.
+    default = type(ELBOWS.load().config.record).model_fields["rate_hz"].default
+    assert of("record", **{"record.rate_hz": default}) != of("record")
 
 
 def test_what_is_near_a_clear_run_is_clear():

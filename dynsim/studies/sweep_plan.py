@@ -16,7 +16,6 @@ import numpy as np
 from dynsim.errors import ScenarioError
 from dynsim.scenario import Scenario, ScenarioFile, SetOptions
 from dynsim.system.inputs import parse_yaml
-from dynsim.system.reuse import Reuse
 
 # More runs than this are a slip of the keyboard.
 RUNS_MOST = 10_000_000
@@ -196,16 +195,16 @@ class Plan:
             given = {axis.key: value for axis, value in zip(self.grid, values, strict=True)}
             yield Point(run, variant, given | {key: draws[k] for key, draws in drawn.items()})
 
-    def scenario(self, point: Point, reuse: Reuse | None = None) -> Scenario:
-        """What one run simulates; ``reuse``: what other runs have in common with it.
+    def scenario(self, point: Point) -> Scenario:
+        """What one run simulates.
 
         Raises
         ------
         ScenarioError
             Its values do not make a scenario.
         """
-        near = (reuse or Reuse()).of("near", lambda: self.file.near(point.variant, self.overrides), self, point.variant)
-        return near.load({entry: value for key, value in point.values.items() for entry in self._entries(key)})
+        values = {entry: value for key, value in point.values.items() for entry in self._entries(key)}
+        return self.file.load(point.variant, {**self.overrides, **values})
 
     def _entries(self, key: str) -> list[str]:
         """Keys that one with ``*`` stands for, by what the file has before its variants; the key itself without.

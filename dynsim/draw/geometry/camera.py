@@ -36,16 +36,8 @@ class Camera:
     middle: Array
 
     @classmethod
-    def fitted(cls, view: View, azimuth: float, corners: Array, area: tuple[float, float, float, float]) -> Camera:
-        """See all ``corners``, (n, 3) [m], within an area (left, top, right, bottom) [pixel].
-
-        Parameters
-        ----------
-        azimuth : direction of the robot's longest way about z [rad], from left to right in the picture
-        """
-        axes = view_axes(view, azimuth)
-        flat = corners @ axes.T
-        low, high = flat.min(axis=0), flat.max(axis=0)
+    def fitted(cls, axes: Array, low: Array, high: Array, area: tuple[float, float, float, float]) -> Camera:
+        """See a box along the axes of a view from ``low`` to ``high`` in an area (left, top, right, bottom) [pixel]."""
         left, top, right, bottom = area
         size = np.maximum(high - low, 1e-9)
         scale = float(min((right - left) / size[0], (bottom - top) / size[1]))

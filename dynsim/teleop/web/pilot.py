@@ -1,4 +1,4 @@
-"""What a pilot's browser may say: small JSON texts of a few known keys, everything else refused by name."""
+"""Commands of a pilot's browser: small JSON texts of a few known keys, everything else refused by name."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class Refused(ValueError):
 
 
 @dataclass(frozen=True)
-class Wish:
-    """What the pilot wants now.
+class PilotCommand:
+    """What the pilot asks for now.
 
     Attributes
     ----------
@@ -41,8 +41,8 @@ class Wish:
     closed: bool = False
 
 
-def read(text: str | bytes, axes: int, modes: tuple[int, ...]) -> Wish | str:
-    """A wish, or one of ``ACTIONS``.
+def parse(text: str | bytes, axes: int, modes: tuple[int, ...]) -> PilotCommand | str:
+    """A command, or one of ``ACTIONS``.
 
     Raises
     ------
@@ -65,7 +65,7 @@ def read(text: str | bytes, axes: int, modes: tuple[int, ...]) -> Wish | str:
         return str(message["do"])
     if unknown := set(message) - {"n", "axes", "held", "mode", "closed"}:
         raise Refused(f"unknown key {sorted(unknown)[0][:40]!r}")
-    return Wish(
+    return PilotCommand(
         count=_count(message.get("n")),
         axes=_axes(message.get("axes"), axes),
         held=_flag(message, "held"),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -55,10 +57,9 @@ def quadric_patch(surface: Surface, low: Array, high: Array) -> Array:
     """
     anchor, normal = 0.5 * (low + high), np.array([0.0, 0.0, 1.0])
     for _ in range(20):
-        slope = surface.gradient(anchor)
-        if not np.linalg.norm(slope) > 1e-12:
+        if not np.linalg.norm(surface.gradient(anchor)) > 1e-12:
             return np.full((2, 2, 3), np.nan)
-        normal = slope / np.linalg.norm(slope)
+        normal = surface.normal(anchor)
         anchor = anchor - surface.gap(anchor) * normal
     # Along the axes of the world where that is possible.
     across = np.eye(3)[:2] if abs(normal[2]) > 0.99 else np.linalg.svd(normal[None])[2][1:]
@@ -127,14 +128,15 @@ def box_corners(low: Array, high: Array) -> Array:
     return np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
 
 
-def normals(surface: Surface, points: Array) -> Array:
-    """Unit normals into the free side at points, (T, 3) → (T, 3)."""
-    if surface.kind in ("box", "height_field"):
-        step = 1e-6
-        ends = [points + side * step * axis for axis in np.eye(3) for side in (1.0, -1.0)]
-        values = [surface.value(end) for end in ends]
-        slope = np.stack([values[2 * k] - values[2 * k + 1] for k in range(3)], axis=-1)
-    else:
-        slope = points @ np.array(surface.Q) + np.array(surface.b)
-    size = np.linalg.norm(slope, axis=-1, keepdims=True)
-    return np.asarray(slope / np.where(size > 0.0, size, 1.0))
+def box_about(clouds: Sequence[Array], room: float = 0.0) -> tuple[Array, Array]:
+    """Corners of the box about all points that are finite, (…, k) each, with ``room`` in parts of its longest edge.
+
+    A unit box where there is none.
+    """
+    points = np.concatenate([cloud.reshape(-1, cloud.shape[-1]) for cloud in clouds])
+    points = points[np.isfinite(points).all(axis=1)]
+    if not len(points):
+        return np.zeros(points.shape[1]), np.ones(points.shape[1])
+    low, high = points.min(axis=0), points.max(axis=0)
+    edge = room * float((high - low).max())
+    return low - edge, high + edge

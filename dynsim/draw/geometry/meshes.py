@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.draw.page.blocks import Blocks
-from dynsim.draw.page.mesh_files import Mesh, read_mesh
+from dynsim.draw.geometry.mesh_files import Mesh, read_mesh
 from dynsim.errors import RecordError
 from dynsim.record import Record
 
@@ -26,7 +25,6 @@ _COARSE, _TOO_MANY = (1 / 500, 1 / 250, 1 / 120, 1 / 60, 1 / 30), 1.5
 _AGGRESSIVENESS = 2.5
 # Fewer triangles than a tetrahedron has are no solid.
 _LEAST = 4
-_CODES = 65535.0
 
 
 class Meshes:
@@ -41,8 +39,8 @@ class Meshes:
     def of_robot(self, record: Record) -> None:
         """Look for what follows where the robot of this record came from."""
         scenario = record.provenance.get("scenario", {})
-        files = _named(scenario.get("plant", {}) if isinstance(scenario, Mapping) else {}, "file")
-        self._folders = tuple(Path(file).parent for file in files)
+        files = named(scenario.get("plant", {}) if isinstance(scenario, Mapping) else {}, "file")
+        self._folders = tuple(Path(file).parent for file in files if isinstance(file, str))
 
     def index(self, file: str) -> int | None:
         """Number of a mesh among those of the page; None where there is none, or it cannot be read."""
@@ -83,25 +81,6 @@ class Meshes:
         except (RecordError, OSError, ValueError):
             return None
         return len(self.found) - 1
-
-
-def packed(mesh: Mesh, blocks: Blocks) -> dict[str, Any]:
-    """A mesh as the page reads it: corners in 16 bits within their box, triangles, and the colours of these."""
-    corners, triangles, colours = mesh
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    step = np.where(high > low, (high - low) / _CODES, 1.0)
-    paint: dict[str, Any] = {}
-    if colours is not None:
-        # −1 for none: numbers that are none are equal to nothing.
-        palette, number = np.unique(np.round(np.nan_to_num(colours, nan=-1.0), 3), axis=0, return_inverse=True)
-        paint["palette"] = [None if row[0] < 0.0 else row.tolist() for row in palette]
-        paint["paint"] = blocks.raw(number.reshape(-1))
-    return paint | {
-        "vertices": blocks.raw(np.rint((corners - low) / step)),
-        "triangles": blocks.raw(triangles),
-        "low": low.tolist(),
-        "step": step.tolist(),
-    }
 
 
 def welded(mesh: Mesh, near: float = _WELD) -> Mesh:
@@ -204,11 +183,13 @@ def _joined(parts: Sequence[Mesh]) -> Mesh:
     )
 
 
-def _named(tree: Any, key: str) -> Iterator[str]:
-    """Texts of a key, wherever it is."""
+def named(tree: Any, key: str) -> Iterator[Any]:
+    """Values of a key, wherever it is."""
     if isinstance(tree, Mapping):
         for name, value in tree.items():
-            if name == key and isinstance(value, str):
+            if name == key:
                 yield value
-            else:
-                yield from _named(value, key)
+            yield from named(value, key)
+    elif isinstance(tree, (list, tuple)):
+        for value in tree:
+            yield from named(value, key)

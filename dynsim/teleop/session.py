@@ -1,7 +1,7 @@
-"""A scenario in the hands of a pilot: tick by tick, with a script of what was asked that gives the same run again.
+"""A simulation in the hands of a pilot: tick by tick, with a script of all commands that gives the same run again.
 
-A script is part of a scenario, so a drive leaves a scenario: that of which it was made, with its commands and as long
-as it took. What the commands are is the plant's: :mod:`dynsim.teleop.snake`, :mod:`dynsim.teleop.arm`.
+A script is part of a scenario, so a session leaves a scenario: that of which it was made, with its commands and as long
+as it took. What a script looks like is the plant's: :mod:`dynsim.teleop.snake`, :mod:`dynsim.teleop.arm`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ NO_REQUEST = 0
 
 
 @dataclass(frozen=True)
-class Axis:
+class PilotAxis:
     """One velocity that a pilot gives.
 
     Attributes
@@ -38,8 +38,8 @@ class Axis:
 
 
 @dataclass(frozen=True)
-class Order:
-    """What a pilot asks for in one tick.
+class Command:
+    """What the simulation is to do in one tick.
 
     Attributes
     ----------
@@ -54,13 +54,13 @@ class Order:
 
 
 @dataclass(frozen=True)
-class Shown:
+class LiveFrame:
     """What a pilot sees after a tick.
 
     Attributes
     ----------
     time : [s]; poses : (bodies, 7) position [m], quaternion w, x, y, z; hand : (3,) [m]
-    hindrance : why not all of what was asked for is done; empty where it is
+    hindrance : why not all of what was commanded is done; empty where it is
     extra : by the names of a frame of the page: wheels, gripper; ``mode`` of a snake
     touching : what contact points do, by their names
     """
@@ -73,13 +73,35 @@ class Shown:
     touching: Mapping[str, Touch]
 
 
-class Driven(Protocol):
-    """A simulation that is driven."""
+@dataclass(frozen=True)
+class SpeedLimits:
+    """Fastest rates that a pilot can command.
 
-    axes: tuple[Axis, ...]
+    Attributes
+    ----------
+    hand : of a hand or head [m/s]; turn : of a head or base [rad/s]; base : of a mobile base [m/s]
+    """
+
+    hand: float = 0.1
+    turn: float = 0.5
+    base: float = 0.3
+
+
+class Session(Protocol):
+    """A simulation that a pilot commands.
+
+    Attributes
+    ----------
+    axes : velocities of a command; modes : numbers that it may request; has_gripper : it may close
+    period : of a tick [s]
+    still : a moment of the same robot at its start, for a page to be made of
+    """
+
+    axes: tuple[PilotAxis, ...]
     modes: tuple[int, ...]
     has_gripper: bool
     period: float
+    still: Record
 
     @property
     def ticks(self) -> int:
@@ -91,12 +113,12 @@ class Driven(Protocol):
 
     @property
     def finished(self) -> bool:
-        """The longest drive is over, or the run has ended by itself."""
+        """The longest time is over, or the run has ended by itself."""
 
-    def tick(self, order: Order) -> None:
+    def tick(self, command: Command) -> None:
         """Advance by one period; SimulationStopped where there is no going on."""
 
-    def shown(self) -> Shown:
+    def frame(self) -> LiveFrame:
         """What there is to see now."""
 
     def joints(self) -> Mapping[str, Array]:
@@ -106,28 +128,10 @@ class Driven(Protocol):
         By the names of the record's signals, in the order of their labels.
         """
 
-    def still(self) -> Record:
-        """A moment of the same robot at its start, for a page to be made of."""
-
     def record(self) -> Record:
-        """What was driven so far, with a scenario that drives it again."""
+        """The record of all ticks so far, with a scenario that makes it again."""
 
 
-@dataclass(frozen=True)
-class Pace:
-    """Fastest rates that a pilot can ask for.
-
-    Attributes
-    ----------
-    speed : of a hand or head [m/s]; turn : of a head or base [rad/s]; base : of a mobile base [m/s]
-    """
-
-    speed: float = 0.1
-    turn: float = 0.5
-    base: float = 0.3
-
-
-def changed(scenario: Scenario, duration: float, controller: dict[str, Any]) -> Scenario:
+def with_controller(scenario: Scenario, duration: float, controller: dict[str, Any]) -> Scenario:
     """The scenario with another duration [s] and controller."""
-    resolved = scenario.resolved
-    return scenario_from_resolved({**resolved, "duration_s": duration, "controller": controller})
+    return scenario_from_resolved({**scenario.resolved, "duration_s": duration, "controller": controller})

@@ -7,12 +7,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.draw.page.meshes import Meshes
-from dynsim.record.quaternion import of_turn
+from dynsim.draw.geometry.mesh_files import Mesh
+from dynsim.draw.geometry.meshes import Meshes
+from dynsim.draw.geometry.surfaces import box_corners, surface_grids
+from dynsim.record import Record
+from dynsim.record.poses import ORIENTATION, POSITION
+from dynsim.record.quaternion import of_turn, rotated
 from dynsim.record.scene import HERE, WORLD, Body, Scene, Shape, Surface
-from dynsim.record.surface_points import box_corners, surface_grids
 
 Array = NDArray[np.float64]
+Faces = NDArray[np.int64]
+# Faces around what is round, and between the equator and a pole.
+AROUND, RINGS = 28, 4
+# Pieces that are as long as thick, at either end of a long rod.
+ENDS = 3
 # Radius of a rod drawn for a body without shapes, in parts of the robot's reach.
 ROD = 0.008
 # A sphere or cylinder of more than this many times what is shown is drawn only next to the robot.
@@ -158,3 +166,95 @@ def drawn_surface(surface: Surface, low: Array, high: Array) -> dict[str, Any]:
     rows, columns, _ = grid.shape
     numbers = [None if not np.isfinite(value) else round(float(value), 5) for value in grid.ravel()]
     return found | {"kind": "grid", "rows": rows, "columns": columns, "points": numbers}
+
+
+def solid(shape: dict[str, Any], meshes: list[Mesh], finer: int = 1) -> tuple[Array, Faces]:
+    """Corners, (n, 3) [m], and faces, (m, 4), of a shape of :func:`drawn_shape`.
+
+    A triangle repeats a corner. What is round has ``finer`` times as many faces around it.
+    """
+    size = shape["size"]
+    if shape["kind"] == "mesh":
+        mesh = meshes[shape["mesh"]]
+        corners, faces = mesh.corners * np.array(size), np.concatenate([mesh.triangles, mesh.triangles[:, -1:]], axis=1)
+        if np.prod(size) < 0.0:
+            faces = faces[:, ::-1]
+    elif shape["kind"] == "box":
+        corners, faces = _box(np.array(size))
+    else:
+        # Radius and height of rings, from below.
+        rings_each = RINGS * finer
+        angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 2 * rings_each + 1)
+        radius = size[0]
+        if shape["kind"] == "cylinder":
+            half = 0.5 * size[1]
+            rings = [(0.0, -half), *((radius, z) for z in _cuts(radius, half)), (0.0, half)]
+        else:
+            half = 0.5 * size[1] if shape["kind"] == "capsule" else 0.0
+            ball = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+            apart = np.array([0.0, half])
+            low, high = ball[: rings_each + 1] - apart, ball[rings_each:] + apart
+            rings = [*low, *((radius, z) for z in _cuts(radius, half)[1:-1]), *(high if half else high[1:])]
+        corners, faces = _turned(np.array(rings), AROUND * finer)
+    turned = rotated(np.array(shape["q"]), corners.T).T
+    return np.array(shape["p"]) + turned, faces
+
+
+def _cuts(radius: float, half: float) -> Array:
+    """Heights from −half to half at which a round side is cut: into pieces as long as its radius, at most three an end.
+
+    Faces are painted in the order of their middles: those of a whole rod that leans to the viewer are nearer than a
+    hub at its end, which they would cover.
+    """
+    if 2.0 * half <= 2.0 * ENDS * radius:
+        return np.linspace(-half, half, max(int(np.ceil(2.0 * half / max(radius, 1e-12))), 1) + 1)
+    end = radius * np.arange(ENDS + 1)
+    return np.concatenate([end - half, half - end[::-1]])
+
+
+def _box(size: Array) -> tuple[Array, Faces]:
+    signs = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+    faces = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+    return signs * size, np.array(faces)
+
+
+def _turned(rings: Array, sides: int) -> tuple[Array, Faces]:
+    """The solid that rings (radius, height) about z enclose."""
+    angle = 2.0 * np.pi * np.arange(sides) / sides
+    around = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    corners = np.concatenate([np.column_stack([radius * around, np.full(sides, z)]) for radius, z in rings])
+    k = np.arange(sides)
+    after = (k + 1) % sides
+    faces = [
+        np.stack([a + k, a + after, a + sides + after, a + sides + k], axis=1)
+        for a in sides * np.arange(len(rings) - 1)
+    ]
+    return corners, np.concatenate(faces)
+
+
+def grid_faces(grid: Array) -> tuple[Array, Faces]:
+    """Corners and cells of a grid of points, (n, m, 3), as far as they are known."""
+    rows, columns, _ = grid.shape
+    number = np.arange(rows * columns).reshape(rows, columns)
+    cells = np.stack([number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]], axis=-1).reshape(-1, 4)
+    corners = grid.reshape(-1, 3)
+    return corners, cells[np.isfinite(corners[cells]).all(axis=(1, 2))]
+
+
+def corners_of(record: Record, scene: Scene, body: int, row: int) -> list[tuple[Array, Faces]]:
+    """Corners in the world, (n, 3) [m], and faces, (m, 4), of each shape of a body at a sample; meshes are left out."""
+    pose = record[POSITION][row, body].astype(np.float64), record[ORIENTATION][row, body].astype(np.float64)
+    if not np.isfinite(pose[0]).all():
+        return []
+    shapes = (drawn_shape(shape.placed(*pose), Meshes()) for shape in scene.bodies[body].shapes)
+    return [solid(shape, []) for shape in shapes if shape is not None]
+
+
+def outline(points: Array) -> Array:
+    """Corners of the convex hull of points in a plane, (n, 2) → (m, 2), turning to the left; of a line its ends."""
+    from scipy.spatial import ConvexHull, QhullError  # takes a third of a second
+
+    try:
+        return np.asarray(points[ConvexHull(points).vertices])
+    except QhullError:
+        return np.asarray(points[np.lexsort(points.T)[[0, -1]]])

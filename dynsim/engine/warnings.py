@@ -1,0 +1,387 @@
+"""What a run warns of: sentences with the place, the number, and what to do about it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from dynsim.compile.clearance import Sinking
+from dynsim.compile.contact_law import START_TOLERANCE, JointStop, told
+from dynsim.compile.control import JointControl
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact import unilateral as ku
+from dynsim.engine.force_indeterminacy import motion_spread, sharing
+from dynsim.engine.prepare import Prepared
+from dynsim.integrators import run as ki
+from dynsim.integrators.contacts import events as kev
+from dynsim.integrators.stepping import tables as kt
+from dynsim.model.description import Robot
+from dynsim.model.drives import Drive, Motor, Servo, TorqueSource
+from dynsim.record import Record
+from dynsim.record.measures import RESIDUAL_LIMIT, TIP_OVER, least_loads, overturns_settled, percent
+from dynsim.scenario import Scenario
+from dynsim.scenario.effect import without_effect
+
+DRIFT_LIMIT_M = 1e-9
+# Friction heat below zero by no more than this share of the turnover is rounding.
+FRICTION_ROUNDING = 1e-12
+# Limits in files are rounded: a joint that starts at 1.5707963 = 90° is not beyond it.
+LIMIT_SLACK = 1e-6
+# Part of a limit of current that counts as reached.
+NEAR_LIMIT = 1e-3
+NOT_ENFORCED = "no law enforces this limit"
+# Time stepping, without a warning: what its steps may take or make of the turnover, by how much of it the energy may
+# depend on when within a step something happens, and how deep points may sink.
+SCHEME_LIMIT = 1e-2
+HALF_STEP_LIMIT = 2e-2
+PENETRATION_LIMIT_M = 1e-3
+
+
+def warnings_of(
+    record: Record,
+    scenario: Scenario,
+    prepared: Prepared,
+    summary: dict[str, Any],
+    scale: float,
+    sunk: Sequence[Sinking],
+    motors: Sequence[dict[str, Any]],
+) -> list[str]:
+    """All warnings of a run, one sentence each.
+
+    Parameters
+    ----------
+    summary : numbers so far
+    scale : turnover of the energy, no less than what the ledger resolves [J]
+    sunk : bodies below surfaces; motors : their loads
+    """
+    robot = prepared.model.robot
+    found = [
+        *_contact_warnings(record, scenario, prepared, summary),
+        *_saturated(record, robot),
+        *_passed_limits(record, robot, prepared.system.unilateral is not None),
+        *_base_warnings(record, scenario, prepared),
+    ]
+    if summary["energy_residual_relative"] > RESIDUAL_LIMIT:
+        found.append(
+            f"the energy ledger does not close: residual {summary['energy_residual_relative']:.1e} of the turnover; "
+            "tighten integrator.rtol or the step"
+        )
+    if (stepping := summary.get("time_stepping")) is not None:
+        found += [*capped(stepping), *coarse(stepping, scale)]
+    elif summary["constraint_drift_max_m"] > DRIFT_LIMIT_M:
+        found.append(f"contacts drifted by {summary['constraint_drift_max_m']:.1e} m")
+    found += _undetermined(record, prepared)
+    found += _sunk(record, sunk)
+    found += _beyond_stops(robot, prepared.stops, prepared.control)
+    found += without_effect(scenario, bool(robot.motors))
+    found += _overloaded(motors)
+    return found if prepared.balance is None else [*found, *prepared.balance.warnings]
+
+
+def _contact_warnings(record: Record, scenario: Scenario, prepared: Prepared, summary: dict[str, Any]) -> list[str]:
+    """Contacts that chatter, pull, carry nothing or turn their own force against them; friction that gives energy."""
+    contacts, unilateral, found = prepared.contacts, prepared.system.unilateral, list[str]()
+    if unilateral is not None:
+        for contact, tally in zip(contacts, unilateral.tally, strict=True):
+            if tally[ku.CHATTERED]:
+                found.append(
+                    f"{contact.name}: chatter, more than {kev.MOST_EVENTS} contact events within {kev.WINDOW:g} s; "
+                    f"what left more slowly than {tally[ku.SETTLE]:.0e} m/s was kept on the surface"
+                )
+    for contact in summary["contacts"]:
+        if contact["normal_force_min_N"] < 0.0:
+            found.append(
+                f"{contact['name']}: the {contact['surface']} pulls on this brace for "
+                f"{percent(contact['pulling_fraction'])} of the run, with up to "
+                f"{-contact['normal_force_min_N']:.3g} N; a real arm would lift off"
+            )
+    initial, columns = scenario.config.initial, record.labels["contact_gap"]
+    placed = () if initial is None else initial.on_surface
+    for contact in summary["contacts"]:
+        name = contact["name"]
+        if "gap_min_m" in contact and contact["closed_fraction"] == 0.0:
+            nearest = int(record["contact_gap"][:, columns.index(name)].argmin())
+            found.append(
+                f"{name}: this brace never touches the {contact['surface']}: it carries nothing; nearest "
+                f"{1e3 * contact['gap_min_m']:.3g} mm at t = {record.time[nearest]:.4g} s"
+                f"{'' if name in placed else ' (initial.on_surface lets it start there)'}"
+            )
+    for brace, since in zip(contacts, prepared.run.extremes[:, ki.LOCAL_SINCE], strict=True):
+        if np.isfinite(since):
+            found.append(
+                f"{brace.name}: from t = {since:.4g} s on, its friction turns its own force against it (negative "
+                "diagonal of J M⁻¹F, Painlevé's paradox at one contact): only the other braces hold it there, and "
+                "whether real ones do depends on their stiffness; lower contacts.friction or take another posture"
+            )
+    # Within an impact friction may give what the normal impulse takes: only their sum is a loss.
+    given = -summary["friction_heat_J"] - max(summary.get("impact_loss_J", 0.0), 0.0)
+    if given > FRICTION_ROUNDING * summary["energy_turnover_J"]:
+        put = f"friction has put {given:.3g} J into the arm: "
+        if unilateral is None:
+            put += "f_t = μ f_n reverses with a pulling normal force "
+            put += "(contacts.pulling_friction: dissipative takes μ |f_n|)"
+        else:
+            put += "an error of the integration; shorten integrator.step_s or tighten integrator.rtol"
+        found.append(put)
+    return found
+
+
+def _saturated(record: Record, robot: Robot) -> list[str]:
+    """Motors at their limits of voltage, current or torque."""
+    found = []
+    limited = [(a, motor, limits) for a, motor in enumerate(robot.motors) for limits in _limits_of(motor)]
+    # Along samples: a third of the time.
+    peaks = {name: np.abs(record[name].T.copy()).max(axis=1, initial=0.0) for name in {one[1] for *_, one in limited}}
+    for a, motor, (what, signal, limit, unit) in limited:
+        # The current of a DC motor comes near to the limit of its driver, and does not reach it.
+        reached = limit * (1.0 - NEAR_LIMIT) if isinstance(motor, Motor) and what == "current" else limit
+        # A run that diverged may have NaN, which hides a peak.
+        if not peaks[signal][a] < reached:
+            saturated = np.abs(record[signal][:, a]) >= reached
+            if isinstance(motor, Servo):
+                # Without a current its voltage is the back-EMF.
+                saturated &= record["current"][:, a] != 0.0
+            if saturated.any():
+                found.append(
+                    f"{motor.joint}: {what} at its limit of {limit:g} {unit} for "
+                    f"{100 * saturated.mean():.1f} % of the run"
+                )
+    return found
+
+
+def _limits_of(motor: Drive) -> list[tuple[str, str, float, str]]:
+    """Limits of a motor: what is limited, its signal, the limit and its unit."""
+    if isinstance(motor, TorqueSource):
+        return [("torque", "current", motor.torque_limit, "N m")]
+    limits = [("voltage", "voltage", motor.voltage_limit, "V")]
+    if isinstance(motor, Servo) or np.isfinite(motor.current_limit):
+        limits.append(("current", "current", motor.greatest_current, "A"))
+    return limits
+
+
+def _undetermined(record: Record, prepared: Prepared) -> list[str]:
+    """Contact rows that depend on each other: forces, and with friction the motion too, that are one of many."""
+    run, system, contacts = prepared.run, prepared.system, prepared.contacts
+    evaluations = int(prepared.workspace.counts[ka.DEPENDENT])
+    if not evaluations:
+        return []
+    # Under the unilateral law rows of what sticks depend on each other, which leaves no motion open.
+    if system.unilateral is not None:
+        shared = sharing(prepared.model, contacts, record["q"], record["contact_mode"]) if len(record) else []
+        if not shared:
+            return []
+        return [
+            f"{', '.join(shared)}: shared forces which the motion does not determine, as points that stick do: "
+            "they are the split of least norm among those that lie in all friction cones"
+        ]
+    found = [f"contact rows depended on each other in {evaluations} evaluations: forces are the split of least norm"]
+    spread = None
+    if len(record) and any(contact.friction > 0.0 for contact in contacts):
+        units = [(link.joint, link.units[2]) for link in prepared.model.robot.links]
+        spread = motion_spread(system, record.time, run.sample[: len(record)], units)
+    if spread is not None:
+        found.append(
+            f"with friction, dependent contact rows leave the motion open too: at t = {spread.time:.4g} s the "
+            f"acceleration of {spread.joint} is anything from {spread.low:.4g} to {spread.high:.4g} {spread.unit} over "
+            "the splits of the normal forces "
+            f"that keep their signs (this run: {spread.taken:.4g}); take away braces until the rest are independent"
+        )
+    return found
+
+
+def _sunk(record: Record, sunk: Sequence[Sinking]) -> list[str]:
+    """One warning per surface: the bodies that samples of the record show below it, and the one that is deepest."""
+    found = []
+    for surface in dict.fromkeys(s.surface for s in sunk):
+        below = [s for s in sunk if s.surface == surface]
+        deepest = max(below, key=lambda s: s.depth)
+        names = ", ".join(s.body for s in below)
+        verb = "passes" if len(below) == 1 else "pass"
+        # Bodies from URDF have no radius.
+        thick = any(s.radius > 0.0 for s in below)
+        beyond = " by more than the link's radius" if thick else ""
+        radius = f", of {1e3 * deepest.radius:g} mm," if thick else ""
+        found.append(
+            f"{names} {verb} below {surface}{beyond}: {deepest.body}{radius} by up to {1e3 * deepest.depth:.3g} mm in "
+            f"the samples, first at t = {record.time[min(s.sample for s in below)]:.4g} s; "
+            "surfaces hold only the points of contacts"
+        )
+    return found
+
+
+def _passed_limits(record: Record, robot: Robot, real: bool) -> list[str]:
+    """Limits of joints that samples of the record lie beyond.
+
+    Stops are the only ones that are enforced, and only under the unilateral law (``real``); beyond them lies then what
+    the steps of time stepping let joints go too far.
+    """
+    torque = dict(zip(record.labels["torque"], record["torque"].T, strict=True))
+    found = []
+    for link, k, v in zip(robot.links, robot.position_index, record["v"].T, strict=True):
+        if all(abs(one) == np.inf for one in (link.lower, link.upper, link.velocity_limit, link.effort_limit)):
+            continue
+        q = record["q"][:, k]
+        position, velocity, _, force = link.units
+        passed = (
+            "the stop holds only at the ends of steps: a shorter integrator.step_s lets it pass less"
+            if real
+            else "stops are enforced under contacts.law: unilateral"
+        )
+        for what, limit, unit, beyond, note in (
+            ("lower position", link.lower, position, link.lower - q, passed),
+            ("upper position", link.upper, position, q - link.upper, passed),
+            ("velocity", link.velocity_limit, velocity, np.abs(v) - link.velocity_limit, NOT_ENFORCED),
+            (
+                "effort",
+                link.effort_limit,
+                force,
+                np.abs(torque.get(link.joint, np.zeros_like(q))) - link.effort_limit,
+                NOT_ENFORCED,
+            ),
+        ):
+            over = np.flatnonzero(beyond > LIMIT_SLACK)
+            if over.size:
+                amount, first = beyond[over].max(), record.time[over[0]]
+                found.append(
+                    f"{link.joint}: passes its {what} limit of {told(limit, unit, 4)} by up to "
+                    f"{told(amount, unit, 3)}, first at t = {first:.4g} s; {note}"
+                )
+    return found
+
+
+def _beyond_stops(robot: Robot, stops: Sequence[JointStop], control: JointControl) -> list[str]:
+    """References that lie beyond a joint stop: the controller will push against it, and miss what it follows."""
+    follows = {motor.joint: bool(k_p > 0.0) for motor, k_p in zip(robot.motors, control.k_p, strict=True)}
+    places = dict(zip(robot.joint_names, robot.position_index, strict=True))
+    units = {link.joint: link.units[0] for link in robot.links}
+    watched = [stop for stop in stops if follows.get(stop.joint, False)]
+    if not watched or not np.isfinite(control.end):
+        return []
+    worst: dict[JointStop, tuple[float, float]] = {}
+    first: dict[JointStop, float] = {}
+    for times, q in control.positions(robot):
+        for stop in watched:
+            beyond = stop.side * (stop.position - q[:, places[stop.joint]])
+            k = int(beyond.argmax())
+            if beyond[k] > START_TOLERANCE:
+                first.setdefault(stop, float(times[beyond > START_TOLERANCE][0]))
+                worst[stop] = max(worst.get(stop, (0.0, 0.0)), (float(beyond[k]), float(times[k])))
+    return [
+        f"{stop.joint}: its reference goes beyond its stop at {told(stop.position, units[stop.joint])} by up to "
+        f"{told(most, units[stop.joint])}, first at t = {first[stop]:.4g} s, most at t = {time:.4g} s; "
+        "the motor pushes against the stop and misses its path: change the path or the limit"
+        for stop, (most, time) in worst.items()
+    ]
+
+
+def coarse(stepping: dict[str, Any], scale: float) -> list[str]:
+    """Steps so long that they take or make energy, blur it, or let points sink in, and the step that would not.
+
+    scale : turnover of the energy, no less than what the ledger resolves; zero before anything moves [J]
+    """
+    step, worst, blurred = (stepping[key] for key in ("step_s", "scheme_loss_worst_J", "half_step_energy_J"))
+    warnings: list[str] = []
+    if scale > 0.0 and abs(worst) > SCHEME_LIMIT * scale:
+        warnings.append(
+            f"time stepping: the steps themselves {'took' if worst > 0.0 else 'made'} up to {abs(worst):.3g} J, "
+            f"{100 * abs(worst) / scale:.2g} % of the turnover (limit {100 * SCHEME_LIMIT:g} %); "
+            f"integrator.step_s is {step:g}: take {_shorter(step * SCHEME_LIMIT * scale / abs(worst)):g}"
+        )
+    if scale > 0.0 and blurred > HALF_STEP_LIMIT * scale:
+        warnings.append(
+            f"time stepping: the power changes so fast that the energy is known to {blurred:.3g} J only, "
+            f"{100 * blurred / scale:.2g} % of the turnover (limit {100 * HALF_STEP_LIMIT:g} %), as it "
+            f"would change if all came half a step later; integrator.step_s is {step:g}: take "
+            f"{_shorter(step * HALF_STEP_LIMIT * scale / blurred):g}"
+        )
+    deepest = stepping["penetration_max_m"]
+    if deepest > PENETRATION_LIMIT_M:
+        warnings.append(
+            f"time stepping: points sink up to {1e3 * deepest:.3g} mm into their surfaces as they land (limit "
+            f"{1e3 * PENETRATION_LIMIT_M:g} mm); integrator.step_s is {step:g}: take "
+            f"{_shorter(step * PENETRATION_LIMIT_M / deepest):g}"
+        )
+    return warnings
+
+
+def _shorter(step: float) -> float:
+    """The step with one digit, rounded down."""
+    power = 10.0 ** np.floor(np.log10(step))
+    return float(np.floor(step / power) * power)
+
+
+def capped(stepping: dict[str, Any]) -> list[str]:
+    """Contact problems that were not solved; what lies deep in a surface is no drift, but shrinks with the step."""
+    if not stepping["capped_solves"]:
+        return []
+    return [
+        f"time stepping: {stepping['capped_solves']} of {stepping['contact_solves']} contact problems were given up "
+        f"above {kt.BAD:g} m/s, the worst at {stepping['residual_max_m_s']:.1e} m/s: their forces are not quite "
+        "Coulomb's; shorten integrator.step_s"
+    ]
+
+
+def _base_warnings(record: Record, scenario: Scenario, prepared: Prepared) -> list[str]:
+    """What a mobile base does that a real one could not do."""
+    base, run, settle = prepared.model.robot.base, prepared.run, scenario.metrics.settle_s
+    if base is None or run.support is None:
+        return []
+    found = []
+    load, traction = record["wheel_load"], record["traction_demand"]
+    lowest = least_loads(record, run.support.least)
+    late = record["tip_margin"][record.time >= settle]
+    first = min((event.time for event in record.events if event.kind == TIP_OVER), default=np.inf)
+    if np.isfinite(first) and not base.stop_on_overturn:
+        pulled = ", ".join(
+            f"{name} {low:.3g}" for name, low in zip(record.labels["wheel_load"], lowest, strict=True) if low < 0.0
+        )
+        least = f" (least loads [N]: {pulled})" if pulled else ""
+        beyond = f"{100 * (record['tip_margin'] < 0.0).mean():.1f} % of the samples"
+        if late.size and overturns_settled(record, settle) is None:
+            found.append(
+                f"a jolt of the start takes the tip margin below zero at t = {first:.4f} s, in {beyond}, none from "
+                f"{settle:g} s on (margin at least {late.min():.3g}){least}: start with initial.equilibrium, or with a "
+                "motion that begins at rest"
+            )
+        else:
+            found.append(
+                f"the base tips over at t = {first:.4f} s, with a tip margin below zero in {beyond}; the run goes on "
+                f"as if it were held down{least}: plant.base.on_overturn: stop ends it there"
+            )
+    lifted = load.sum(axis=1) <= 0.0
+    if lifted.any():
+        found.append(
+            f"the base is lifted: no load on its wheels and caster in {100 * lifted.mean():.1f} % of the samples, "
+            f"first at t = {record.time[lifted.argmax()]:.4g} s (counts as a tip margin of -1)"
+        )
+    # Once it has tipped, the loads mean nothing.
+    standing = record.time < first
+    for name, demand in zip(record.labels["traction_demand"], traction[standing].T, strict=True):
+        slips = demand > 1.0
+        if slips.any():
+            found.append(
+                f"the {name} wheel would slip: it needs up to {np.nanmax(demand):.3g} times the traction that "
+                f"plant.base.wheel_friction = {base.wheel_friction:g} gives, first at "
+                f"t = {record.time[standing][slips.argmax()]:.4g} s; rolling is enforced all the same"
+            )
+    return found
+
+
+def _overloaded(loads: Sequence[dict[str, Any]]) -> list[str]:
+    """Warnings of motors whose root mean square is above what they can give for ever, the most loaded first."""
+    found = []
+    for what, quantity, unit in (("current", "current", "A"), ("torque", "torque", "N_m"), ("force", "force", "N")):
+        over = []
+        for one in loads:
+            rms, nominal = one.get(f"{quantity}_rms_{unit}"), one.get(f"nominal_{quantity}_{unit}")
+            if rms is not None and nominal is not None and rms > nominal:
+                over.append((rms / nominal, f"{one['joint']} {rms:.3g} of {nominal:g} {unit.replace('_', ' ')}"))
+        if over:
+            texts = [text for _, text in sorted(over, key=lambda entry: -entry[0])]
+            found.append(
+                f"{', '.join(texts)}: the {what}, rms over the run, is more than nominal, which a motor does not "
+                "stand for long; brace the arm, go slower, or take a larger motor"
+            )
+    return found

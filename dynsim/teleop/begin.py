@@ -1,0 +1,31 @@
+"""The session of a scenario: that of the arm or of the snake."""
+
+from __future__ import annotations
+
+from dynsim.engine import named
+from dynsim.errors import ScenarioError
+from dynsim.scenario import Scenario, require_scenario
+from dynsim.teleop.arm import ArmSession
+from dynsim.teleop.session import Session, SpeedLimits
+from dynsim.teleop.snake import SnakeSession
+
+
+def begin(scenario: Scenario, *, limits: SpeedLimits | None = None, longest: float = 600.0) -> Session:
+    """A session of a scenario: plant, surfaces, contacts and loads are its own, what moved its references is left out.
+
+    Parameters
+    ----------
+    limits : fastest rates
+    longest : time that the session may take [s]
+
+    Raises
+    ------
+    ScenarioError
+        The scenario has no controller that a pilot could take the place of.
+    """
+    require_scenario(scenario)
+    with named(scenario):
+        if scenario.controller is None:
+            raise ScenarioError("it has no controller, so there is nothing to drive: a pilot gives its references")
+        session = SnakeSession if scenario.engine == "kinematic" else ArmSession
+        return session(scenario, limits or SpeedLimits(), longest)

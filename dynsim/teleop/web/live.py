@@ -1,0 +1,254 @@
+"""A live drive: the simulation in the thread that asks for it, the server in another, frames in between."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time as clock
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
+from importlib import resources
+from typing import Any, Protocol
+
+import numpy as np
+
+from dynsim.draw.page import page
+from dynsim.errors import DynsimError, SimulationStopped
+from dynsim.record.quaternion import rotated
+from dynsim.record.scene import WORLD
+from dynsim.system import interruption
+from dynsim.teleop.session import NO_REQUEST, Command, LiveFrame, Session
+from dynsim.teleop.web.deadman import DRIVING, Deadman
+from dynsim.teleop.web.server import FRAMES, Server
+
+WAIT = 1e-3
+"""Between two looks whether a follower is ready [s]."""
+NOT_READY = "the robot is not ready yet"
+
+
+class RealTimeClock:
+    """Says when the next tick is due.
+
+    A tick that begins late makes the later ones late: at most one of them follows without a pause, whatever is lost
+    beyond that is lost, and the clock of the simulation falls behind that of the wall. So no motion is ever faster than
+    it was asked for, and no pilot sees his commands in a burst.
+
+    Attributes
+    ----------
+    late : of the tick that has begun last [s]; lost : wall time that the simulation did not follow [s]
+    """
+
+    def __init__(self, period: float, now: Callable[[], float], wait: Callable[[float], object]) -> None:
+        self._period, self._now, self._wait = period, now, wait
+        self._due: float | None = None
+        self.late = self.lost = 0.0
+
+    def next(self) -> None:
+        """Wait until the next tick is due."""
+        now = self._now()
+        if self._due is None:
+            self._due = now
+        if now < self._due:
+            self._wait(self._due - now)
+            now = self._now()
+        self.late = max(now - self._due, 0.0)
+        beyond = max(self.late - self._period, 0.0)
+        self.lost += beyond
+        self._due += self._period + beyond
+
+
+@dataclass
+class DriveReport:
+    """How a drive went.
+
+    Attributes
+    ----------
+    late : lateness of each tick [s]; lost : wall time that the simulation did not follow [s]
+    ended : why it ended
+    stop : what ended the simulation by itself, None otherwise
+    """
+
+    late: list[float] = field(default_factory=list)
+    lost: float = 0.0
+    ended: str = ""
+    stop: SimulationStopped | None = None
+
+
+class Follower(Protocol):
+    """What goes where the simulation does; the simulation waits for it."""
+
+    @property
+    def begun(self) -> bool:
+        """It is where the simulation begins."""
+
+    @property
+    def ready(self) -> bool:
+        """It is near enough for another tick."""
+
+    @property
+    def steady(self) -> bool:
+        """The robot may change its mode now, and the drive may end."""
+
+    def hear(self) -> None:
+        """There was a tick."""
+
+
+class LiveDrive:
+    """A session that is open to browsers from :meth:`open` to :meth:`close`.
+
+    Parameters
+    ----------
+    session : the simulation
+    name : shown in the page
+    follower : for whom it waits before each tick; what is lost by that counts as behind real time
+    """
+
+    def __init__(self, session: Session, name: str, follower: Follower | None = None) -> None:
+        self.session, self.name = session, name
+        self._follower = follower
+        self._framed_at = -1.0
+        self._over = threading.Event()
+        self._ended, self._at_once = "", False
+        self._requested = NO_REQUEST
+        self.deadman = Deadman(session.axes, clock.monotonic)
+        self._clock = RealTimeClock(session.period, clock.monotonic, self._over.wait)
+        hello = {
+            "axes": [asdict(axis) for axis in session.axes],
+            "modes": list(session.modes),
+            "gripper": session.has_gripper,
+            "period": session.period,
+        }
+        self.server = Server(self.deadman, hello, len(session.axes), session.modes, self._page, self.end)
+        self.report = DriveReport()
+
+    def open(self, port: int = 0) -> str:
+        """Listen, and give the address to open in a browser."""
+        self.server.start(port)
+        return self.server.address
+
+    def close(self) -> None:
+        """Tell the browsers why it is over, and stop listening; nothing is left running."""
+        self.server.stop(self.report.ended)
+
+    def run(self, *, until_closed: bool = False) -> DriveReport:
+        """Drive until the pilot ends it, Ctrl-C, the longest time, or with ``until_closed`` nobody is left.
+
+        Signals are heeded between ticks only, so that each one is driven and written down, or neither.
+        """
+        session, report = self.session, self.report
+        try:
+            while True:
+                interruption.heed()
+                interruption.check()
+                self._wait_for_follower(until_closed)
+                self._clock.next()
+                interruption.keep()
+                if self._is_over(until_closed):
+                    break
+                command, state, count = self.deadman.command()
+                session.tick(self._followed(command, state))
+                if self._follower is not None:
+                    self._follower.hear()
+                report.late.append(self._clock.late)
+                report.lost = self._clock.lost
+                self._show(state, count)
+        except KeyboardInterrupt:
+            interruption.answered()
+            report.ended = "interrupted"
+        except SimulationStopped as stop:
+            report.ended, report.stop = str(stop), stop
+        interruption.keep()
+        return report
+
+    def end(self, why: str = "ended by the pilot", *, at_once: bool = False) -> None:
+        """Let the drive be over before its next tick, or once its follower is steady; from any thread."""
+        self._ended = self._ended or why
+        self._at_once = self._at_once or at_once
+        self._over.set()
+
+    def _followed(self, command: Command, state: str) -> Command:
+        """A command of which the follower can do all: a request waits for it, for as long as the key is held."""
+        if self._follower is None:
+            return command
+        if self._over.is_set() or state != DRIVING:
+            self._requested = NO_REQUEST
+            over = self._over.is_set()
+            return Command((0.0,) * len(command.velocity), closed=command.closed) if over else command
+        self._requested = command.request if command.request != NO_REQUEST else self._requested
+        request = self._requested if self._follower.steady else NO_REQUEST
+        self._requested = NO_REQUEST if request == self._requested else self._requested
+        return replace(command, request=request)
+
+    def _is_over(self, until_closed: bool) -> bool:
+        if until_closed and self.server.came and not self.server.clients:
+            self.end("the last browser was closed")
+        if self.session.finished or (self._over.is_set() and self._may_end()):
+            self.report.ended = self._ended or "the longest time is over"
+        elif self.server.failure is not None:
+            raise DynsimError(f"the server ended: {self.server.failure!r}")
+        else:
+            return False
+        return True
+
+    def _may_end(self) -> bool:
+        return self._at_once or self._follower is None or self._follower.steady or self.session.ticks == 0
+
+    def _wait_for_follower(self, until_closed: bool) -> None:
+        """Whoever holds the key when a robot has come to its start must let it go first."""
+        follower = self._follower
+        while follower is not None and not follower.ready and not self._is_over(until_closed):
+            if not follower.begun:
+                self.deadman.disarm()
+                self._show(NOT_READY, self.deadman.command()[2])
+            # Not on the event: it is set where a drive goes on until its follower is steady.
+            clock.sleep(WAIT)
+
+    def _show(self, state: str, count: int) -> None:
+        now = clock.monotonic()
+        if now - self._framed_at >= 1.0 / FRAMES and self.server.clients:
+            self._framed_at = now
+            self.server.show(self._frame(state, count))
+
+    def _frame(self, state: str, count: int) -> dict[str, Any]:
+        frame = self.session.frame()
+        return {
+            "time": round(frame.time, 4),
+            "poses": np.round(frame.poses, 5).ravel().tolist(),
+            "hand": np.round(frame.hand, 4).tolist(),
+            "hindrance": frame.hindrance,
+            "state": state,
+            "n": count,
+            "late": round(1e3 * self._clock.late, 1),
+            "lost": round(self._clock.lost, 2),
+            "contacts": self._contacts(frame),
+            **frame.extra,
+        }
+
+    def _contacts(self, frame: LiveFrame) -> dict[str, Any]:
+        """Forces as the page takes them: the normal, and what is left beside it."""
+        scene, forces = self.session.still.scene, dict[str, Any]()
+        if scene is None:
+            return forces
+        for point in scene.contacts:
+            touch, surface = frame.touching.get(point.name), scene.surface(point.surface)
+            if touch is None or surface is None:
+                continue
+            at = np.array(point.position)
+            if point.body != WORLD:
+                pose = frame.poses[point.body]
+                at = pose[:3] + rotated(pose[3:], at)
+            normal = surface.normal(at)
+            forces[point.name] = {
+                "force": round(touch.force, 3),
+                "normal": np.round(normal, 5).tolist(),
+                "tangent": np.round(touch.vector - touch.force * normal, 3).tolist(),
+                "mode": touch.mode,
+            }
+        return forces
+
+    def _page(self, socket: str) -> str:
+        own = resources.files("dynsim.teleop.web").joinpath("page")
+        style = own.joinpath("drive.css").read_text(encoding="utf-8")
+        program = own.joinpath("drive.js").read_text(encoding="utf-8")
+        constants = f"const DRIVE = {json.dumps({'socket': socket, 'style': style})};"
+        return page({self.name: self.session.still}, scripts=[f"{constants}\n{program}"], connect=socket)
