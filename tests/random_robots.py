@@ -31,7 +31,7 @@ from dynsim.model.joints.wheels import wheeled
 
 SURFACES = ("plane", "sphere", "cylinder")
 # Methods that integrate the right-hand side, whose contacts hold both ways: time stepping has tests of its own.
-CONTINUOUS = tuple(name for name, method in METHODS.items() if method != TIME_STEPPING)
+ADAPTIVE = tuple(name for name, method in METHODS.items() if method != TIME_STEPPING)
 SEVERAL_ROWS = {
     "ball": ball,
     "floating": floating,

@@ -10,9 +10,8 @@ from typing import Annotated
 import typer
 
 from dynsim.cli.app import QuietOption, TrustOption
-from dynsim.cli.display import console, film_progress, labelled
+from dynsim.cli.display import film_progress, labelled, say_written
 from dynsim.errors import RecordError
-from dynsim.system.terminal import escaped
 
 
 class ViewName(StrEnum):
@@ -63,7 +62,7 @@ def animate(
             progress=report,
         )
     if not quiet:
-        console.print(f"Written to {escaped(out)}", highlight=False, soft_wrap=True)
+        say_written(out)
 
 
 def _size(text: str) -> tuple[int, int]:

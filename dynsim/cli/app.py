@@ -32,6 +32,10 @@ ScenarioArgument = Annotated[
 SetOption = Annotated[
     list[str] | None, typer.Option("--set", metavar="a.b.c=VALUE", help="Override a value; may be repeated.")
 ]
+VariantOption = Annotated[
+    str | None,
+    typer.Option(metavar="VARIANT", help="Variant to run; default: the first.", autocompletion=completion.variants),
+]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
 TrustOption = Annotated[
     bool,
@@ -45,6 +49,11 @@ def parsed_overrides(given: list[str] | None) -> dict[str, Any]:
     from dynsim.scenario import SetOptions, parse_override
 
     return SetOptions(parse_override(text) for text in given or ())
+
+
+def folder_option(default: str) -> Any:
+    """``--out`` of a command that writes several files."""
+    return typer.Option(metavar="FOLDER", help=f"For the files; default: {default}.")
 
 
 class FigureFormat(StrEnum):

@@ -19,10 +19,12 @@ from dynsim.cli.app import (
     ScenarioArgument,
     SetOption,
     TrustOption,
+    VariantOption,
     app,
+    folder_option,
     parsed_overrides,
 )
-from dynsim.cli.display import console, errors, labelled, progress, record_files, told_in
+from dynsim.cli.display import console, errors, labelled, progress, record_files, say, say_written, told_in
 from dynsim.cli.drawing import Figures, Page, draw, draw_all
 from dynsim.cli.hardware import export, hw
 from dynsim.cli.hw_drive import EXAMPLE, hw_drive
@@ -42,14 +44,9 @@ if TYPE_CHECKING:
 @app.command(epilog="Example: dynsim run elbow_comparison --variant two_elbows --set integrator.rtol=1e-8")
 def run(
     scenario: ScenarioArgument,
-    variant: Annotated[
-        str | None,
-        typer.Option(metavar="VARIANT", help="Variant to run; default: the first.", autocompletion=completion.variants),
-    ] = None,
+    variant: VariantOption = None,
     overrides: SetOption = None,
-    out: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="For the files; default: results/SCENARIO/VARIANT.")
-    ] = None,
+    out: Annotated[Path | None, folder_option("results/SCENARIO/VARIANT")] = None,
     no_figures: FiguresOption = False,
     format_: FormatOption = FigureFormat.png,
     view: Annotated[bool, typer.Option("--view", help="Open the page that shows the run in a browser.")] = False,
@@ -89,7 +86,7 @@ def run(
         from dynsim.cli.tables import print_summary
 
         print_summary(console, record.summary)
-        console.print(f"Written to {escaped(folder)}", highlight=False, soft_wrap=True)
+        say_written(folder)
     tell_of_view(page, quiet)
     if view and page is not None:
         open_page(page)
@@ -99,9 +96,7 @@ def run(
 def compare(
     scenario: ScenarioArgument,
     overrides: SetOption = None,
-    out: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="For the files; default: results/SCENARIO.")
-    ] = None,
+    out: Annotated[Path | None, folder_option("results/SCENARIO")] = None,
     jobs: Annotated[int, typer.Option(metavar="N", min=1, help="Processes that simulate variants.")] = 1,
     no_figures: FiguresOption = False,
     format_: FormatOption = FigureFormat.png,
@@ -158,7 +153,7 @@ def compare(
             from dynsim.cli.tables import print_comparison
 
             print_comparison(console, {name: record.summary for name, record in records.items()})
-            console.print(f"Written to {escaped(folder)}", highlight=False, soft_wrap=True)
+            say_written(folder)
         if not no_figures:
             tell_of_view(page, quiet)
     if failure is not None:
@@ -206,7 +201,7 @@ def check(
             errors.print(f"[red]error:[/] {escaped(str(error))}")
         else:
             count = f"{len(variants)} variants" if len(variants) > 1 else "1 variant"
-            console.print(f"{escaped(name)}: ok ({count})", highlight=False, soft_wrap=True)
+            say(f"{escaped(name)}: ok ({count})")
             print_starts(console, starts)
     _warn_of_plugins()
     if failed:

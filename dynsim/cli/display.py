@@ -13,7 +13,7 @@ from dynsim.errors import RecordError
 from dynsim.system.terminal import Terminal, escaped
 
 if TYPE_CHECKING:
-    from rich.progress import ProgressColumn, TaskID
+    from rich.progress import Progress, ProgressColumn, TaskID
     from rich.status import Status
 
     from dynsim.engine.compilation import Compilation
@@ -24,6 +24,17 @@ if TYPE_CHECKING:
 # emoji: rich would turn the ":b:" of a path or key into a picture.
 console = Terminal(emoji=False)
 errors = Terminal(stderr=True, soft_wrap=True, highlight=False, emoji=False)
+
+
+def say(text: str) -> None:
+    """A sentence on standard output, in as many lines as it has; names in it are :func:`escaped`."""
+    console.print(text, highlight=False, soft_wrap=True)
+
+
+def say_written(place: Path) -> None:
+    """Where the files of a command are."""
+    say(f"Written to {escaped(place)}")
+
 
 # Of a progress bar.
 _TITLE_WIDTH = 22
@@ -92,15 +103,18 @@ def drawing(folder: Path, quiet: bool) -> Iterator[None]:
         yield
 
 
-def _times() -> tuple[ProgressColumn, ...]:
-    """Columns of a bar: time since its start, and time to go."""
-    from rich.progress import TextColumn, TimeElapsedColumn, TimeRemainingColumn
+def _bars(*columns: str | ProgressColumn) -> Progress:
+    """Bars with these columns, time since their start and time to go; gone at their end where there is no terminal."""
+    from rich import progress
     from rich.table import Column
 
-    return (
-        TimeElapsedColumn(table_column=Column(no_wrap=True)),
-        TextColumn("to go"),
-        TimeRemainingColumn(table_column=Column(no_wrap=True)),
+    return progress.Progress(
+        *columns,
+        progress.TimeElapsedColumn(table_column=Column(no_wrap=True)),
+        "to go",
+        progress.TimeRemainingColumn(table_column=Column(no_wrap=True)),
+        console=console,
+        transient=not console.is_terminal,
     )
 
 
@@ -116,6 +130,10 @@ def _silence() -> None:
     shown_by_caller()
 
 
+def _say_compiled(now: Compilation) -> None:
+    console.print(f"{escaped(now.text[0].upper() + now.text[1:])}.", highlight=False)
+
+
 @contextmanager
 def progress(scenarios: Sequence[Scenario], quiet: bool) -> Iterator[VariantProgress]:
     """A progress bar per scenario, with time and time to go, and one while references take long; yields its report."""
@@ -123,18 +141,13 @@ def progress(scenarios: Sequence[Scenario], quiet: bool) -> Iterator[VariantProg
         _silence()
         yield lambda variant, time, stage="": None
         return
-    from rich.progress import BarColumn, Progress, TextColumn
+    from rich.progress import BarColumn
 
     from dynsim.engine import REFERENCES, SIMULATION
     from dynsim.engine.compilation import watched
 
     # In 80 columns all fits up to 9999 s: the bar gives way, the times do not.
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.completed:.2f} / {task.total:g} s {task.fields[what]}"),
-        *_times(),
-    )
+    done = "{task.completed:.2f} / {task.total:g} s {task.fields[what]}"
     said: list[TaskID] = []
 
     def compiling(now: Compilation | None) -> None:
@@ -142,11 +155,11 @@ def progress(scenarios: Sequence[Scenario], quiet: bool) -> Iterator[VariantProg
             bars.update(said[0], visible=False)
             return
         if not said:
-            console.print(f"{escaped(now.text[0].upper() + now.text[1:])}.", highlight=False)
+            _say_compiled(now)
             said.append(bars.add_task("kernels", total=now.expected or _COMPILED_S, what="compiled"))
         bars.update(said[0], completed=now.elapsed, visible=True)
 
-    with Progress(*columns, console=console, transient=not console.is_terminal) as bars, watched(compiling):
+    with _bars("{task.description}", BarColumn(), done) as bars, watched(compiling):
 
         def add(scenario: Scenario, what: str, visible: bool) -> TaskID:
             title = scenario.variant or scenario.name
@@ -171,25 +184,18 @@ def sweep_progress(runs: int, quiet: bool) -> Iterator[Callable[[int, int], None
         _silence()
         yield lambda done, failed: None
         return
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+    from rich.progress import BarColumn, MofNCompleteColumn
 
     from dynsim.engine.compilation import watched
 
-    columns = (
-        TextColumn("runs"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[failed]}"),
-        *_times(),
-    )
-    bar = Progress(*columns, console=console, transient=not console.is_terminal)
+    bar = _bars("runs", BarColumn(), MofNCompleteColumn(), "{task.fields[failed]}")
     task = bar.add_task("", total=runs, failed="")
     said: list[str] = []
 
     def compiling(now: Compilation | None) -> None:
         if now is not None and not said:
             said.append(now.text)
-            console.print(f"{escaped(now.text[0].upper() + now.text[1:])}.", highlight=False)
+            _say_compiled(now)
         if bar.live.is_started:
             bar.update(task, failed="" if now is None else f"compiling, {now.elapsed:.0f} s")
 
@@ -212,23 +218,8 @@ def film_progress(quiet: bool) -> Iterator[Callable[[int, int], None]]:
     if quiet:
         yield lambda done, total: None
         return
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+    from rich.progress import BarColumn, MofNCompleteColumn
 
-    columns = (
-        TextColumn("frames"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("to go"),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console, transient=not console.is_terminal) as bar:
+    with _bars("frames", BarColumn(), MofNCompleteColumn()) as bar:
         task = bar.add_task("", total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)

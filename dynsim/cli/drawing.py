@@ -79,7 +79,7 @@ def draw_all(wanted: Sequence[Figures], page: Page, quiet: bool) -> Path | None:
         try:
             done = result()
         except WorkerLost as lost:
-            raise RecordError(f"{task.folder}: the process that drew there was ended from outside") from lost
+            raise RecordError(f"{task.folder}: could not be drawn: {lost}") from lost
         if isinstance(task, Page):
             pages.append(done)
 

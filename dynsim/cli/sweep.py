@@ -19,9 +19,10 @@ from dynsim.cli.app import (
     QuietOption,
     ScenarioArgument,
     SetOption,
+    folder_option,
     parsed_overrides,
 )
-from dynsim.cli.display import console, drawing, errors, sweep_progress
+from dynsim.cli.display import drawing, errors, say, sweep_progress
 from dynsim.config.problems import suggest
 from dynsim.errors import ScenarioError, SimulationStopped
 from dynsim.system.terminal import escaped
@@ -65,9 +66,7 @@ def sweep(
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="Dask scheduler whose workers run instead, tcp://HOST:PORT.")
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="For the files; default: results/SCENARIO/sweep.")
-    ] = None,
+    out: Annotated[Path | None, folder_option("results/SCENARIO/sweep")] = None,
     keep_records: Annotated[KeepRecords, typer.Option(help="Runs whose records are saved.")] = KeepRecords.none,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the sweep in the folder.")] = False,
     plot: Annotated[
@@ -132,12 +131,8 @@ def sweep(
         _draw(name, rows, plan, folder, quiet, format_, plot or ())
     if not quiet:
         if not has_parquet():
-            console.print(escaped("No Parquet: it needs pyarrow (pip install 'dynsim[tables]')."), highlight=False)
-        console.print(
-            f"{len(rows) - len(failed)} of {len(rows)} runs ended well. Written to {escaped(folder)}",
-            highlight=False,
-            soft_wrap=True,
-        )
+            say(escaped("No Parquet: it needs pyarrow (pip install 'dynsim[tables]')."))
+        say(f"{len(rows) - len(failed)} of {len(rows)} runs ended well. Written to {escaped(folder)}")
     if len(failed) == len(rows):
         raise SimulationStopped(f"none of the {len(rows)} runs ended well; {folder / TABLES[0]} has their reasons")
 

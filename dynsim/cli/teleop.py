@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dynsim.cli.app import QuietOption, ScenarioArgument, SetOption, parsed_overrides
-from dynsim.cli.display import console, errors
+from dynsim.cli.app import QuietOption, ScenarioArgument, SetOption, VariantOption, folder_option, parsed_overrides
+from dynsim.cli.display import console, errors, say, say_written
 from dynsim.cli.view import open_address, write_view
-from dynsim.config import completion
 from dynsim.errors import DynsimError
 from dynsim.system import interruption
 from dynsim.system.terminal import escaped
@@ -19,10 +18,6 @@ from dynsim.system.terminal import escaped
 if TYPE_CHECKING:
     from dynsim.teleop.web.live import DriveReport
 
-VariantOption = Annotated[
-    str | None,
-    typer.Option(metavar="VARIANT", help="Variant to drive; default: the first.", autocompletion=completion.variants),
-]
 SpeedOption = Annotated[float, typer.Option(metavar="M/S", min=1e-3, max=10.0, help="Fastest hand or head.")]
 TurnOption = Annotated[float, typer.Option(metavar="RAD/S", min=1e-3, max=20.0, help="Fastest turn.")]
 BaseSpeedOption = Annotated[float, typer.Option(metavar="M/S", min=1e-3, max=10.0, help="Fastest mobile base.")]
@@ -43,9 +38,7 @@ def teleop(
     scenario: ScenarioArgument,
     variant: VariantOption = None,
     overrides: SetOption = None,
-    out: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="For the files; default: results/SCENARIO/drive_N, a new one.")
-    ] = None,
+    out: Annotated[Path | None, folder_option("results/SCENARIO/drive_N, a new one")] = None,
     speed: SpeedOption = 0.1,
     turn: TurnOption = 0.5,
     base_speed: BaseSpeedOption = 0.3,
@@ -109,7 +102,7 @@ def require_websockets() -> None:
 
 def tell_address(address: str, ending: str, *, open_: bool) -> None:
     """Say where to drive; also with --quiet: nobody could drive without it."""
-    console.print(f"To be driven in a browser on this machine: {address}", highlight=False, soft_wrap=True)
+    say(f"To be driven in a browser on this machine: {address}")
     console.print(ending, highlight=False)
     if open_:
         open_address(address)
@@ -126,7 +119,7 @@ def tell_drive(report: DriveReport, driven: float, folder: Path) -> None:
     middle, most = 1e3 * late[len(late) // 2], 1e3 * late[-1 - len(late) // 100]
     text = f"Driven for {driven:.1f} s ({escaped(report.ended)}); ticks late by {middle:.1f} ms, 99 % by {most:.1f} ms"
     behind = f"; {report.lost:.1f} s behind real time" if report.lost > LATE else ""
-    console.print(text + behind, highlight=False, soft_wrap=True)
-    console.print(f"Written to {escaped(folder)}", highlight=False, soft_wrap=True)
+    say(text + behind)
+    say_written(folder)
     script = escaped(folder / "scenario.yaml")
-    console.print(f"The same drive again: dynsim run {script}", highlight=False, soft_wrap=True)
+    say(f"The same drive again: dynsim run {script}")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from dynsim.cli.app import TrustOption
-from dynsim.cli.display import console, labelled, record_files
+from dynsim.cli.display import console, labelled, record_files, say, say_written
 from dynsim.cli.drawing import Page
 from dynsim.system.terminal import escaped
 
@@ -45,7 +45,7 @@ def view(
     page = out or (first if len(records) == 1 else Path()) / VIEW
     with console.status(f"writing {escaped(page)}"):
         write(named, page, ghost=ghost)
-    console.print(f"Written to {escaped(page)}", highlight=False, soft_wrap=True)
+    say_written(page)
     if open_:
         open_page(page)
 
@@ -60,7 +60,7 @@ def write_view(records: Mapping[str, Record], folder: Path, quiet: bool) -> Path
 def tell_of_view(page: Path | None, quiet: bool) -> None:
     """Say where a page is that was written."""
     if page is not None and not quiet:
-        console.print(f"To be seen in a browser: {escaped(page)}", highlight=False, soft_wrap=True)
+        say(f"To be seen in a browser: {escaped(page)}")
 
 
 def open_page(page: Path) -> None:
@@ -75,4 +75,4 @@ def open_address(address: str, name: str = "") -> None:
     # Without a display some systems start a browser within the terminal.
     display = sys.platform in ("win32", "darwin") or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")))
     if not display or not webbrowser.open(address):
-        console.print(f"No browser opened; open {name or address} in one", highlight=False, soft_wrap=True)
+        say(f"No browser opened; open {name or address} in one")

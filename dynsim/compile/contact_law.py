@@ -75,7 +75,7 @@ def compile_unilateral(
         stop_table[k, ku.STOP_JOINT] = robot.joint_names.index(limit.joint)
         stop[k, ku.SIDE], stop[k, ku.LIMIT] = limit.side, limit.side * limit.position
     slide = np.zeros((c, ku.SLIDE_SIZE))
-    slide[:, ku.LANDS_AT], slide[:, ku.LONGEST] = ku.DEPTH, np.inf
+    slide[:, ku.LANDS_AT] = ku.DEPTH
     tally, number = np.zeros((c, ku.TALLY_SIZE)), np.zeros(ku.NUMBERS)
     tally[:, ku.SETTLE], tally[:, ku.WINDOW_START], number[ku.LAST_CHANGE] = SETTLE_SPEED, -np.inf, -np.inf
     number[ku.SLOW] = slow

@@ -146,7 +146,7 @@ def prepare(
     _check_work(scenario, n, c + joint_rows, choice.method)
     _check_stiffness(choice.method, scenario.duration_s, robot)
     method = ki.METHODS[choice.method]
-    step = options.step_s or (1e-3 if method in ki.FIXED_STEP else 0.0)
+    step = options.step_s or (1e-3 if method == ki.TIME_STEPPING else 0.0)
     balance, initial = None, scenario.config.initial
     if initial is not None and initial.equilibrium:
         with kernels_logged(log, "the start at rest", loads=False):
@@ -266,12 +266,12 @@ def sample_times(scenario: Scenario, layout: StateLayout, columns: OutputLayout,
 def _check_stiffness(method: str, duration: float, robot: Robot) -> None:
     """Refuse an explicit method where the circuits' own poles R/L already ask for too many steps."""
     circuits = [motor for motor in robot.motors if isinstance(motor, Motor)]
-    if method not in ("rk43", "dopri5") or not circuits:
+    if method != "dopri5" or not circuits:
         return
     motor = max(circuits, key=lambda motor: motor.resistance / motor.inductance)
     pole = motor.resistance / motor.inductance
-    # Explicit methods of these orders are stable up to |h pole| of about 3.
-    steps = duration * pole / 3.0
+    # DOPRI5 is stable up to |h pole| of 3.3.
+    steps = duration * pole / 3.3
     if steps > STEPS_LIMIT:
         raise ScenarioError(
             f"{motor.joint}: R/L = {pole:.2g} 1/s holds integrator.method {method} to about {steps:.1g} steps for "
@@ -301,7 +301,7 @@ def _check_work(scenario: Scenario, n: int, p: int, method: str) -> None:
     seconds = right_hand_side(n, p, dense=options.solver == "m_star")
     # Motors and friction hold the explicit methods' steps at about a millisecond; an implicit one takes steps of some
     # hundredths of a second, of three iterations, with a Jacobian by differences and its factors now and then.
-    step = options.step_s if options.step_s and method != AUTO and ki.METHODS[method] in ki.FIXED_STEP else 1e-3
+    step = options.step_s if options.step_s and method == "time_stepping" else 1e-3
     explicit, implicit = 4.0 * seconds / step, ((2 * n + 14) * seconds + 3e-9 * n**3) / 1e-2
     rate = {"radau5": implicit, AUTO: min(explicit, implicit)}.get(method, explicit)
     wall = scenario.duration_s * rate

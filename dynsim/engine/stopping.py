@@ -42,8 +42,6 @@ def stopped(scenario: Scenario, prepared: Prepared) -> SimulationStopped:
     kind = KINDS[int(run.count[ki.STATUS])]
     if found := paradox(prepared.system, prepared.workspace, run, prepared.contacts):
         reached, y, words = found
-        if scenario.integrator.method == "rk4":
-            words += "; a shorter integrator.step_s or an adaptive method (auto) tells whether the step is to blame"
         return SimulationStopped(
             f"stopped at t = {reached:.6g} s: {words}", time=reached, state=last_state(prepared, y), kind=kind
         )
@@ -85,12 +83,7 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
     t, method = float(run.clock[ki.TIME]), prepared.choice.method
     where = f"stopped at t = {t:.6g} s"
     if status == ki.NOT_FINITE:
-        advice = (
-            f"take a smaller integrator.step_s than {run.clock[ki.STEP]:g}, or an adaptive method (auto)"
-            if method == "rk4"
-            else "look at the last state for a joint that runs away"
-        )
-        return f"{where}: the state is no longer finite (divergence); {advice}"
+        return f"{where}: the state is no longer finite (divergence); look at the last state for a joint that runs away"
     if status == ki.NO_FORCES:
         names = ", ".join(contact.name for contact in prepared.contacts)
         return (
@@ -156,6 +149,4 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
     else:
         what = f"contact {prepared.contacts[owner].name} cannot be kept on its surface (gap {gaps[worst]:+.2e} m, "
         what += f"rate {rates[worst]:+.2e} m/s)"
-    return f"{where}: {what}; the contacts contradict each other or the arm is singular here" + (
-        ", or integrator.step_s is too long (try integrator.method: auto)" if method == "rk4" else ""
-    )
+    return f"{where}: {what}; the contacts contradict each other or the arm is singular here"

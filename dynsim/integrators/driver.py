@@ -2,15 +2,12 @@
 
 Methods, all with dense output (so that records do not force steps):
 
-- ``RK43``: the classical method of order 4 with an embedded order 3, adaptive, four evaluations a step; cubic Hermite
-  dense output. The first choice: the motors of an arm hold the step at the stability limit (rates of −450 ± 1900i 1/s
-  in the published one), whatever the tolerance, and there the fewest evaluations per second win;
 - ``DOPRI5``: Dormand–Prince 5(4), adaptive, six evaluations a step; dense output of order 4 (Hairer, Nørsett, Wanner:
-  Solving Ordinary Differential Equations I, II.5–II.6). Better where accuracy sets the step;
-- ``RK4``: the classical method at a fixed step; cubic Hermite dense output;
+  Solving Ordinary Differential Equations I, II.5–II.6). For motion that nothing fast holds up;
 - ``RADAU5``: implicit, three stages of order 5 (order 3 in themselves), error estimate of order 3, adaptive: steps as
-  long as accuracy allows, however fast the motors are, see ``radau``; dense output of order 3;
-- ``TIME_STEPPING``: contacts that open and close within fixed steps, see ``time_stepping``; linear between their ends.
+  long as accuracy allows, however fast the motors are (−450 ± 1900i 1/s in the published arm), see ``radau5``; dense
+  output of order 3;
+- ``TIME_STEPPING``: contacts that open and close within fixed steps, see ``stepping``; linear between their ends.
 
 After each accepted step q and v are projected onto the active rows when they have left them by more than
 ``GAP_TOLERANCE`` or ``RATE_TOLERANCE``.
@@ -27,10 +24,9 @@ from dynsim.dynamics.tree.joints import normalise
 from dynsim.dynamics.tree.support import watch_support
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts.events import consistent, solve_modes, switch_contacts, take_directions, watch_modes
-from dynsim.integrators.contacts.slow_slip import longest_step
 from dynsim.integrators.dense import sample_step, write_waiting
 from dynsim.integrators.events import arm_events, cut_step, fire_events, take_ticks
-from dynsim.integrators.explicit import step_explicit
+from dynsim.integrators.explicit import step_dopri5
 from dynsim.integrators.project import settle
 from dynsim.integrators.radau5.ends import end_accepted
 from dynsim.integrators.radau5.newton import forget
@@ -109,14 +105,10 @@ def take_step(system: System, ws: Workspace, run: Run, error):
 
 
 @internal_kernel
-def propose(system: System, ws: Workspace, run: Run):
+def propose(run: Run):
     """The step to try next; while a root is searched it is given."""
     if run.count[ki.SEARCHING] == 0:
-        # What was passed over shortens one step of RK4, not all that follow: nothing would make them long again.
-        if run.method != ki.RK4 or run.count[ki.GRAZING] == 0:
-            run.clock[ki.PROPOSED] = run.clock[ki.STEP]
-        if run.method == ki.RK4:
-            run.clock[ki.STEP] = min(run.clock[ki.STEP], longest_step(system.unilateral, ws))
+        run.clock[ki.PROPOSED] = run.clock[ki.STEP]
         choose_step(run)
 
 
@@ -124,7 +116,7 @@ def propose(system: System, ws: Workspace, run: Run):
 def go_on(run: Run, order, beta):
     """The step size after an accepted step."""
     clock, count = run.clock, run.count
-    if run.method == ki.RK4 or count[ki.FIRED] == 1:
+    if count[ki.FIRED] == 1:
         clock[ki.STEP] = clock[ki.PROPOSED]
     else:
         next_step(run, clock[ki.ERROR], order, beta)
@@ -176,9 +168,8 @@ def conclude(system: System, ws: Workspace, run: Run, error, order):
 
 
 @free_kernel
-def advance_explicit(system: System, ws: Workspace, run: Run, limit):
-    """:func:`advance` of the explicit methods."""
-    order = 5.0 if run.method == ki.DOPRI5 else 4.0
+def advance_dopri5(system: System, ws: Workspace, run: Run, limit):
+    """:func:`advance` of DOPRI5."""
     taken, error = 0, 0.0
     if limit < 0:
         return
@@ -187,9 +178,9 @@ def advance_explicit(system: System, ws: Workspace, run: Run, limit):
             return
         taken += 1
         if run.count[ki.PENDING] == 0:
-            propose(system, ws, run)
-            error = step_explicit(system, ws, run)
-        if conclude(system, ws, run, error, order):
+            propose(run)
+            error = step_dopri5(system, ws, run)
+        if conclude(system, ws, run, error, 5.0):
             return
 
 
@@ -214,7 +205,7 @@ def advance_radau5(system: System, ws: Workspace, run: Run, limit):
             break
         taken += 1
         if run.count[ki.PENDING] == 0:
-            propose(system, ws, run)
+            propose(run)
             error = step_radau5(system, ws, run)
         steps, h = run.count[ki.STEPS], run.clock[ki.STEP]
         done = conclude_apart(system, ws, run, error, 4.0)
@@ -234,5 +225,5 @@ def advance(system: System, ws: Workspace, run: Run, limit: int) -> None:
 
     Three compiled functions behind one name, so that each is only compiled when it is used.
     """
-    methods = {ki.RADAU5: advance_radau5, ki.TIME_STEPPING: advance_moreau}
-    methods.get(run.method, advance_explicit)(system, ws, run, limit)
+    methods = {ki.DOPRI5: advance_dopri5, ki.RADAU5: advance_radau5, ki.TIME_STEPPING: advance_moreau}
+    methods[run.method](system, ws, run, limit)

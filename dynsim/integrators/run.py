@@ -15,10 +15,8 @@ from dynsim.integrators.radau5.newton import NewtonArrays, newton_arrays, stage_
 from dynsim.integrators.stepping.tables import SteppingArrays
 from dynsim.jit.kernel import integers, reals
 
-DOPRI5, RK4, RADAU5, RK43, TIME_STEPPING = 0, 1, 2, 3, 4
-METHODS = {"rk43": RK43, "dopri5": DOPRI5, "rk4": RK4, "radau5": RADAU5, "time_stepping": TIME_STEPPING}
-# Methods of one step length.
-FIXED_STEP = (RK4, TIME_STEPPING)
+DOPRI5, RADAU5, TIME_STEPPING = 0, 1, 2
+METHODS = {"dopri5": DOPRI5, "radau5": RADAU5, "time_stepping": TIME_STEPPING}
 
 RUNNING, FINISHED, NOT_FINITE, STEP_TOO_SMALL, NOT_PROJECTED, NO_FORCES = 0, 1, 2, 3, 4, 5
 FORCES_REVERSED, SEVERAL_FORCES, STOPPED = 6, 7, 8

@@ -97,7 +97,7 @@ def choose_step(run: Run):
     until = next_tick(run, clock[ki.END])
     remaining = until - clock[ki.TIME]
     run.count[ki.TRIMMED] = 1 if until < clock[ki.END] and remaining < 2.0 * clock[ki.STEP] else 0
-    if run.method in ki.FIXED_STEP:
+    if run.method == ki.TIME_STEPPING:
         # A remainder of a millionth of a step would turn the velocity change of an impact into an acceleration.
         if remaining < clock[ki.STEP] * (1.0 + 1e-6):
             clock[ki.STEP] = remaining
@@ -115,9 +115,6 @@ def rejected(ws: Workspace, run: Run, error, order):
         return True
     broken = ki.NO_FORCES if ws.counts[ka.CONTRADICTORY] > 0 else ki.NOT_FINITE
     if not (finite(run.y_new) and finite(run.stage[6])) or error != error:
-        if run.method == ki.RK4:
-            count[ki.STATUS] = broken
-            return True
         error = 1e10
     if error <= 1.0:
         return False

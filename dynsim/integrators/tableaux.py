@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-# Explicit methods: stage rows a_ij, with the solution as the last row, whose derivative is the next step's first stage.
+# DOPRI5: stage rows a_ij, with the solution as the last row, whose derivative is the next step's first stage.
 A_DOPRI5 = np.array(
     [
         [0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
@@ -20,16 +20,6 @@ A_DOPRI5 = np.array(
 )
 NODE_DOPRI5 = np.array([0.0, 0.2, 0.3, 0.8, 8 / 9, 1.0, 1.0])
 ERROR_DOPRI5 = np.array([71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40])
-A_RK4 = np.array(
-    [[0.0] * 4, [0.5, 0.0, 0.0, 0.0], [0.0, 0.5, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [1 / 6, 1 / 3, 1 / 3, 1 / 6]]
-)
-NODE_RK4 = np.array([0.0, 0.5, 0.5, 1.0, 1.0])
-# Weights of h (f(y_new) − k_4), the error estimate of RK43. The fourth stage and the derivative at y_new meet the same
-# third-order conditions, so moving any weight between them gives an embedded solution of order 3. All the weight that
-# the fourth stage has (1/6) makes the error of undamped motions about rtol. Where stability sets the step, the estimate
-# is the transient of modes that die out within some steps; a small weight keeps it from shortening steps for nothing.
-WEIGHT_ACCURACY = 1 / 6
-WEIGHT_STABILITY = 0.03
 
 # Radau IIA of order 5, coefficients of Hairer and Wanner (Solving Ordinary Differential Equations II, IV.8): T⁻¹ A⁻¹ T
 # has γ, and [[α, −β], [β, α]], on its diagonal. ERROR_RADAU: weights of the stages in h times the right side of the

@@ -12,7 +12,6 @@ from dynsim.library.families import member
 
 Keys = tuple[int | str, ...]
 
-FIXED_STEPS = ("rk4", "time_stepping")
 # Sections that only plants with dynamics read.
 OF_DYNAMICS = ("contacts", "initial", "integrator", "metrics")
 # Sections of joint_pd that move a reference, or plan along one.
@@ -67,13 +66,12 @@ def _of_kinematics(config: Any) -> Iterator[tuple[Keys, str]]:
 
 
 def _of_integrator(config: Any) -> Iterator[tuple[Keys, str]]:
-    method, real = config.integrator.method, config.contacts.law == "unilateral"
-    if method not in FIXED_STEPS:
+    if config.integrator.method != "time_stepping":
         return
-    why = f"{method} takes steps of integrator.step_s"
+    why = "time_stepping takes steps of integrator.step_s"
     yield ("integrator", "rtol"), why
     yield ("integrator", "step_max_s"), why
-    if not real:  # there it says below which speed slip has no direction
+    if config.contacts.law != "unilateral":  # there it says below which speed slip has no direction
         yield ("integrator", "atol"), why
 
 

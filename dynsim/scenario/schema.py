@@ -146,16 +146,16 @@ class Initial(StrictConfig):
 class Integrator(StrictConfig):
     """Time integration."""
 
-    method: Literal["auto", "rk43", "dopri5", "rk4", "radau5", "time_stepping"] = Field(
+    method: Literal["auto", "dopri5", "radau5", "time_stepping"] = Field(
         default="auto",
-        description="auto: one of the adaptive ones, by the system; adaptive 4(3), 5(4), fixed step, adaptive implicit "
-        "(where motors hold the steps of the others), or fixed step with contacts that open and close",
+        description="auto: one of the adaptive ones, by the system; adaptive 5(4), adaptive implicit (where motors "
+        "hold the steps of the other), or fixed step with contacts that open and close",
     )
     solver: Literal["articulated", "m_star"] = Field(default="articulated", description="O(n) sweeps or the dense M*")
     rtol: float = Field(default=1e-6, ge=1e-13, le=1e-1)
     atol: float = Field(default=1e-8, ge=1e-16, le=1e-1)
     step_s: Positive | None = Field(
-        default=None, description="fixed step of rk4 and time_stepping (default 0.001), else the first step"
+        default=None, description="fixed step of time_stepping (default 0.001), else the first step"
     )
     theta: float = Field(
         default=THETA, ge=0.5, le=1.0, description="time_stepping: 0.5 is second order between events, 1 damps"
@@ -168,8 +168,8 @@ class Integrator(StrictConfig):
     @field_validator("method", mode="before")
     @classmethod
     def _replaced(cls, value: object) -> object:
-        if value == "rodas4":
-            raise ValueError("is no longer there; radau5 does what it did, at any inductance, and takes longer steps")
+        if value in ("rk4", "rk43"):
+            raise ValueError("is no longer there; take dopri5, or time_stepping where steps are to be fixed")
         return value
 
     @model_validator(mode="after")

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import time as clock
 from collections.abc import Callable, Iterable, Sequence
+from operator import itemgetter
 from typing import Any, Generic, Literal, TypeVar, get_args
 
-from dynsim.engine import SIMULATION, Progress, simulate
+from dynsim.engine import Progress, simulate
 from dynsim.errors import DynsimError, ScenarioError, SimulationInterrupted, SimulationStopped, shown
-from dynsim.record import Record
 from dynsim.scenario import Scenario, require_scenario
-from dynsim.studies.outcome import LOST, RunResult
-from dynsim.studies.processes import SILENT, WorkerInterrupted, WorkerLost, WorkerSilent, run_in_processes
+from dynsim.studies.outcome import RunResult
+from dynsim.studies.processes import WorkerInterrupted, WorkerLost, run_in_processes
 from dynsim.system import interruption
 from dynsim.system.memo import Memo, remembering
 
@@ -66,13 +66,9 @@ def simulate_batch(
         if finished is not None:
             finished(task[0], result)
 
-    if run_all(Work(_numbered, keep_records), list(enumerate(runs)), take, jobs=jobs, scheduler=scheduler):
+    if run_all(Work(itemgetter(1), keep_records), list(enumerate(runs)), take, jobs=jobs, scheduler=scheduler):
         raise SimulationInterrupted(f"interrupted when {len(results)} of {len(runs)} runs were done")
     return [results[k] for k in range(len(runs))]
-
-
-def _numbered(task: tuple[int, Scenario]) -> Scenario:
-    return task[1]
 
 
 class Work(Generic[Task]):
@@ -88,59 +84,38 @@ class Work(Generic[Task]):
         self._load, self._keep, self._memo = load, keep, Memo()
 
     def __call__(self, task: Task, look: Progress | None) -> RunResult:
-        """Load and simulate a task; see :func:`run_one`."""
-        with remembering(self._memo):
-            try:
-                scenario = self._load(task)
-            except Exception as error:
-                return _failed(error)
-            return run_one(scenario, self._keep, look)
+        """Load and simulate a task, whatever becomes of it.
+
+        Raises
+        ------
+        SimulationInterrupted
+            ``look`` raised KeyboardInterrupt.
+        """
+        started, record, reason = clock.perf_counter(), None, ""
+        try:
+            with remembering(self._memo):
+                record = simulate(self._load(task), look, pictured=self._keep != "none")
+        except SimulationInterrupted:
+            raise
+        except Exception as error:
+            # Hours of other runs must not go for a fault of dynsim in one, which is told by its kind.
+            kind = "" if isinstance(error, DynsimError) else f"{type(error).__name__}: "
+            reason = " ".join(f"{kind}{error}".split())
+            record = error.record if isinstance(error, SimulationStopped) else None
+        kept = self._keep == "all" or (self._keep == "failed" and reason)
+        return RunResult(
+            {} if record is None else record.summary,
+            reason,
+            record=record if kept else None,
+            wall_s=clock.perf_counter() - started,
+        )
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self._load, self._keep)
 
 
-def run_one(scenario: Scenario, keep: Keep, look: Progress | None) -> RunResult:
-    """Simulate a scenario, whatever becomes of it.
-
-    Raises
-    ------
-    SimulationInterrupted
-        ``look`` raised KeyboardInterrupt.
-    """
-    started = clock.perf_counter()
-    try:
-        ended: Record | DynsimError = simulate(scenario, look, pictured=keep != "none")
-    except SimulationInterrupted:
-        raise
-    except DynsimError as error:
-        ended = error
-    except Exception as error:
-        # Hours of other runs must not go for a fault of dynsim in one.
-        return _failed(error)
-    return _ended(ended, keep, clock.perf_counter() - started)
-
-
-def _ended(ended: Record | DynsimError, keep: Keep, wall: float) -> RunResult:
-    """The record of a run that came to its end, or the error of one that did not, as its result."""
-    if isinstance(ended, Record):
-        return RunResult(ended.summary, record=ended if keep == "all" else None, wall_s=wall)
-    record = ended.record if isinstance(ended, SimulationStopped) else None
-    summary = {} if record is None else record.summary
-    return RunResult(summary, _line(ended), record=None if keep == "none" else record, wall_s=wall)
-
-
-def _failed(error: Exception) -> RunResult:
-    """Without anything simulated; a fault of dynsim by its kind."""
-    return RunResult({}, _line(error) if isinstance(error, DynsimError) else f"{type(error).__name__}: {_line(error)}")
-
-
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split())
-
-
 def run_all(
-    work: Callable[[Task, Progress], RunResult],
+    work: Callable[[Task, Progress | None], RunResult],
     tasks: Sequence[Task],
     take: Callable[[Task, RunResult], None],
     *,
@@ -172,17 +147,15 @@ def run_all(
                 ended = result()
             except (SimulationInterrupted, WorkerInterrupted):
                 return
-            except WorkerSilent:
-                ended = RunResult({}, SILENT, lost=True)
-            except WorkerLost:
-                ended = RunResult({}, f"{LOST}; is memory short for so many jobs?", lost=True)
+            except WorkerLost as lost:
+                ended = RunResult({}, str(lost), lost=True)
             if ended is not None:
                 take(task, ended)
 
         return run_in_processes(work, tasks, jobs, take_late, attempts=ATTEMPTS)
     try:
         for task in tasks:
-            result = work(task, _no_look)
+            result = work(task, None)
             interruption.keep()
             take(task, result)
             interruption.heed()
@@ -193,7 +166,3 @@ def run_all(
         interruption.answered()
         return True
     return False
-
-
-def _no_look(time: float, stage: str = SIMULATION) -> None:
-    """Runs here heed signals by themselves."""

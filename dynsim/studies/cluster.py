@@ -13,9 +13,9 @@ from contextlib import contextmanager
 from typing import Any, TypeVar
 
 from dynsim._version import __version__
-from dynsim.engine import SIMULATION, Progress
+from dynsim.engine import Progress
 from dynsim.errors import DynsimError
-from dynsim.studies.outcome import LOST, RunResult
+from dynsim.studies.outcome import RunResult
 from dynsim.studies.worker import keep_memory
 from dynsim.system import interruption
 
@@ -39,7 +39,7 @@ class ClusterError(DynsimError):
 
 
 def run_on_cluster(
-    work: Callable[[Task, Progress], RunResult],
+    work: Callable[[Task, Progress | None], RunResult],
     tasks: Sequence[Task],
     take: Callable[[Task, RunResult], None],
     address: str,
@@ -94,7 +94,9 @@ def run_on_cluster(
                     results = future.result()
                 except KilledWorker:
                     if len(piece) == 1:
-                        take(piece[0], RunResult({}, f"{LOST}, on several workers", lost=True))
+                        take(
+                            piece[0], RunResult({}, "its process was ended from outside, on several workers", lost=True)
+                        )
                     else:
                         queue.update([submit([task]) for task in piece])
                 except CancelledError as error:
@@ -132,14 +134,12 @@ def _quiet() -> Iterator[None]:
             logger.setLevel(level)
 
 
-def _work_through(work: Callable[[Task, Progress], RunResult], tasks: Sequence[Task], version: str) -> list[RunResult]:
+def _work_through(
+    work: Callable[[Task, Progress | None], RunResult], tasks: Sequence[Task], version: str
+) -> list[RunResult]:
     """On a worker: what there is to do for each task."""
     if version != __version__:
         raise ClusterError(f"a worker has dynsim {__version__}, this is {version}; install the same on all")
     keep_memory()
     with _one_at_a_time:
-        return [work(task, _no_look) for task in tasks]
-
-
-def _no_look(time: float, stage: str = SIMULATION) -> None:
-    """Dask ends a process that shall stop."""
+        return [work(task, None) for task in tasks]

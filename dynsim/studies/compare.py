@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -13,8 +11,8 @@ from dynsim.engine import SIMULATION, Progress, simulate
 from dynsim.errors import ScenarioError, SimulationInterrupted, SimulationStopped, shown
 from dynsim.record import Record
 from dynsim.scenario import Scenario, load_scenario, variant_names
-from dynsim.studies.columns import flat, is_scalar, is_text
-from dynsim.studies.processes import SILENT, WorkerInterrupted, WorkerLost, WorkerSilent, run_in_processes
+from dynsim.studies.columns import csv_table, flat, is_scalar, is_text
+from dynsim.studies.processes import WorkerInterrupted, WorkerLost, run_in_processes
 from dynsim.system.files import json_text, replace_together
 
 
@@ -72,12 +70,8 @@ def compare(
             place = scenarios[name].place(variant=f" ({name})")
             stops[name] = SimulationInterrupted(f"{place}: interrupted before there was anything to save")
             return
-        except WorkerSilent:
-            stops[name] = SimulationStopped(f"{name}: {SILENT}")
-            return
-        except WorkerLost:
-            # The operating system has ended it; a record would have come with a stop.
-            stops[name] = SimulationStopped(f"{name}: its process was ended from outside; is memory short for --jobs?")
+        except WorkerLost as lost:
+            stops[name] = SimulationStopped(f"{name}: {lost}")
             return
         except SimulationStopped as stop:
             if stopped is not None:
@@ -133,23 +127,15 @@ def _simulate(scenario: Scenario, look: Progress) -> Record:
 def save_comparison(records: Mapping[str, Record], folder: Path) -> None:
     """Write ``comparison.json`` and ``comparison.csv``."""
     summaries = {name: record.summary for name, record in records.items()}
-    level = {name: flat(summary) for name, summary in summaries.items()}
-    # A number that one variant lacks, another may have.
-    columns = ["variant"] + [key for one in level.values() for key, value in one.items() if is_scalar(value)]
-    columns = list(dict.fromkeys(columns))
-    contacts = list(dict.fromkeys(c["name"] for s in summaries.values() for c in s.get("contacts", ())))
-    # Those of the unilateral law are there if some variant has it.
-    keys = [key for s in summaries.values() for c in s.get("contacts", ()) for key, v in c.items() if not is_text(v)]
-    contact_keys = list(dict.fromkeys(keys))
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow([*columns, *(f"{name}.{key}" for name in contacts for key in contact_keys)])
-    for name, summary in summaries.items():
-        by_name = {c["name"]: c for c in summary.get("contacts", ())}
-        row = [name if key == "variant" else level[name].get(key, "") for key in columns]
-        row += [by_name.get(contact, {}).get(key, "") for contact in contacts for key in contact_keys]
-        writer.writerow(row)
-    table = json_text({"variants": summaries})
-    replace_together(
-        folder, {"comparison.json": table.encode("utf-8"), "comparison.csv": stream.getvalue().encode("utf-8")}
-    )
+    runs = [flat(summary) for summary in summaries.values()]
+    # A number that one variant lacks, another may have; of contacts those of the unilateral law.
+    names = dict.fromkeys(["variant", *(key for run in runs for key, value in run.items() if is_scalar(value))])
+    contacts = dict.fromkeys(c["name"] for run in runs for c in run.get("contacts", ()))
+    keys = dict.fromkeys(k for run in runs for c in run.get("contacts", ()) for k, v in c.items() if not is_text(v))
+    rows = []
+    for name, run in zip(summaries, runs, strict=True):
+        touching = {f"{c['name']}.{key}": c.get(key) for c in run.get("contacts", ()) for key in keys}
+        rows.append({key: run.get(key) for key in names} | touching | {"variant": name})
+    table = csv_table([*names, *(f"{name}.{key}" for name in contacts for key in keys)], rows)
+    content = json_text({"variants": summaries})
+    replace_together(folder, {"comparison.json": content.encode("utf-8"), "comparison.csv": table.encode("utf-8")})

@@ -198,8 +198,6 @@ def _check_header(path: Path, header: Mapping[str, Any]) -> None:
 
 
 def _content(path: Path) -> bytes:
-    if not path.is_file():
-        raise RecordError(f"{path}: is no file; move it away, or give another --out")
     try:
         return path.read_bytes()
     except OSError as error:

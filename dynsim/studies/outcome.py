@@ -7,8 +7,6 @@ from typing import Any
 
 from dynsim.record import Record
 
-LOST = "its process was ended from outside"
-
 
 @dataclass(frozen=True)
 class RunResult:

@@ -6,8 +6,6 @@ docs/validation.md quotes, in about two minutes.
 
 from __future__ import annotations
 
-import csv
-import io
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations, product
@@ -27,6 +25,7 @@ from dynsim.draw.figures.style import look, new_figure, save, variant_styles
 from dynsim.engine import simulate
 from dynsim.errors import DynsimError
 from dynsim.scenario import load_scenario, variant_names
+from dynsim.studies.columns import csv_table
 from dynsim.system.files import write_json, write_text
 
 Array = NDArray[np.float64]
@@ -215,13 +214,10 @@ def table(configurations: Mapping[str, Row]) -> str:
 
 
 def _as_csv(rows: Sequence[Row]) -> str:
-    stream = io.StringIO()
-    writer = csv.DictWriter(stream, COLUMNS, lineterminator="\n")
-    writer.writeheader()
-    for row in rows:
-        # Null is an empty field.
-        writer.writerow({key: f"{value:.6g}" if isinstance(value, float) else value for key, value in row.items()})
-    return stream.getvalue()
+    return csv_table(
+        COLUMNS,
+        [{key: f"{value:.6g}" if isinstance(value, float) else value for key, value in row.items()} for row in rows],
+    )
 
 
 def _report(done: int, of: int) -> None:

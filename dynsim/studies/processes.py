@@ -36,7 +36,6 @@ Result = TypeVar("Result")
 # them, so that they say nothing of how long its work takes: they end where the process is stopped, or compiled code
 # holds the interpreter's lock for good.
 SILENT_S, START_S = 60.0, 600.0
-SILENT = f"its process gave no sign of life for {SILENT_S:g} s and was ended"
 # So long a worker may take to hear of Ctrl-C; one that has heard may take any time to hand back what it has [s].
 _PATIENCE_S = 0.7
 # Between two looks for signals [s].
@@ -53,11 +52,17 @@ def cores() -> int:
 
 
 class WorkerLost(Exception):
-    """The process that had a task was ended from outside."""
+    """The process that had a task is gone; the message says how, in a sentence that begins with ``its process``."""
+
+    def __init__(self, how: str = "its process was ended from outside; is memory short for so many jobs?") -> None:
+        super().__init__(how)
 
 
 class WorkerSilent(WorkerLost):
     """It gave no sign of life any more, and was ended here."""
+
+    def __init__(self) -> None:
+        super().__init__(f"its process gave no sign of life for {SILENT_S:g} s and was ended")
 
 
 class WorkerInterrupted(WorkerLost):

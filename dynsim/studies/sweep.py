@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -16,6 +14,7 @@ from dynsim.engine.results import save_run
 from dynsim.errors import RecordError, SimulationInterrupted
 from dynsim.studies.batch import Keep, Work, run_all
 from dynsim.studies.cluster import ClusterError
+from dynsim.studies.columns import csv_table
 from dynsim.studies.journal import JOURNAL, OK, PLAN, Journal, Row, earlier_rows
 from dynsim.studies.outcome import RunResult
 from dynsim.studies.sweep_plan import Plan, Point
@@ -147,13 +146,7 @@ def write_tables(rows: Sequence[Row], plan: Plan, folder: Path) -> None:
         A file cannot be written.
     """
     names = columns(rows)
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(names)
-    for row in rows:
-        cells = row.cells()
-        writer.writerow(["" if cells.get(name) is None else cells[name] for name in names])
-    write_text(folder / TABLES[0], stream.getvalue())
+    write_text(folder / TABLES[0], csv_table(names, [row.cells() for row in rows]))
     if has_parquet():
         _write_parquet(rows, names, folder / TABLES[1], plan)
 

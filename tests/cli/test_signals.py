@@ -22,7 +22,7 @@ DEADLINE_S = 240.0
 VARIANTS = ("two_elbows", "elbow_7", "elbow_4", "no_elbow")
 # Long enough to be stopped on the way, which the implicit method is not; cheap to prepare.
 LONG = ["--set", "duration_s=5000", "--set", "controller.knot_spacing_s=10", "--set", "record.rate_hz=10"]
-LONG += ["--set", "integrator.method=rk43"]
+LONG += ["--set", "integrator.method=dopri5"]
 LONG += ["--set", "controller.hand.path.period_s=5000", "--no-figures"]
 # Many knots: the inverse kinematics take minutes.
 PLANNING = ["--set", "duration_s=50000", "--set", "record.rate_hz=1"]

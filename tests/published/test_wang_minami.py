@@ -114,7 +114,7 @@ def test_adaptive_run_meets_its_tolerance():
     [
         # Compiles the driver once more; the right-hand sides of both solvers are compared elsewhere.
         pytest.param({"integrator.solver": "m_star"}, marks=pytest.mark.slow),
-        {"integrator.method": "rk43"},
+        {"integrator.method": "dopri5"},
     ],
 )
 def test_other_solver_and_method_give_the_same_answer(records, settings):

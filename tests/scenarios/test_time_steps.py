@@ -65,7 +65,7 @@ def test_a_stop_is_hit_and_left(tmp_path: Path):
     )
     stepped = dynsim.simulate(dynsim.load_scenario(path))
     exact = dynsim.simulate(
-        dynsim.load_scenario(path, overrides={"integrator.method": "rk43", "integrator.step_s": None})
+        dynsim.load_scenario(path, overrides={"integrator.method": "dopri5", "integrator.step_s": None})
     )
     assert exact.events
     found = [(event.kind, event.name) for event in stepped.events]
@@ -96,8 +96,8 @@ def test_wheels_roll_along_their_axis(ratio, axis):
     ("change", "says"),
     [
         (
-            {"integrator.method": "rk43", "integrator.step_s": None},
-            "grip: needs .*method: time_stepping; rk43",
+            {"integrator.method": "dopri5", "integrator.step_s": None},
+            "grip: needs .*method: time_stepping; dopri5",
         ),
         ({"contacts.points.foot.grip.axis": [0, 0, 0]}, "no direction"),
         ({"contacts.points.foot.grip.ratio": 1.5}, "ratio"),

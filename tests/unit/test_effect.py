@@ -11,6 +11,7 @@ from dynsim.scenario.effect import idle_keys, is_set, without_effect
 from dynsim.scenario.reading import scenario_from_resolved, variant_names
 from dynsim.system.shipped import shipped_scenarios
 
+FLOOR, FIXED = "elbow_comparison_floor", {"method": "time_stepping"}
 LATE = {"type": "line", "from_m": [1, 1, 0.5], "to_m": [1, 1.1, 0.5], "start_s": 9, "duration_s": 1}
 PUSH = {"type": "samples", "body": "link_4", "times_s": [3, 4], "force_N": [[1, 0, 0], [1, 0, 0]]}
 
@@ -18,8 +19,8 @@ PUSH = {"type": "samples", "body": "link_4", "times_s": [3, 4], "force_N": [[1, 
 @pytest.mark.parametrize(
     ("name", "overrides", "key", "why"),
     [
-        ("elbow_comparison", {"integrator": {"method": "rk4", "rtol": 1e-8}}, "integrator.rtol", "rk4 takes steps of"),
-        ("elbow_comparison", {"integrator": {"method": "rk4", "step_max_s": 1}}, "integrator.step_max_s", "rk4 takes"),
+        (FLOOR, {"integrator": {**FIXED, "rtol": 1e-8}}, "integrator.rtol", "time_stepping takes steps of"),
+        (FLOOR, {"integrator": {**FIXED, "step_max_s": 1}}, "integrator.step_max_s", "time_stepping takes steps of"),
         ("falling_arm", {"contacts.reference_tolerance_m": 0.1}, "contacts.reference_tolerance_m", "law: bilateral"),
         ("single_pendulum", {"contacts": {"friction": 0.3}}, "contacts.friction", "no contacts.points"),
         ("single_pendulum", {"controller": {"type": "joint_pd", "k_p_V_per_rad": 9}}, "controller", "has no motors"),
@@ -68,9 +69,9 @@ def test_shipped_scenarios_say_nothing_in_vain(path) -> None:
 def test_defaults_that_change_nothing_are_not_resolved() -> None:
     """Of fixed steps the tolerance; that of the adaptive methods is there."""
     assert load_scenario("elbow_comparison").resolved["integrator"]["rtol"] == 1e-6
-    fixed = load_scenario("elbow_comparison", overrides={"integrator.method": "rk4"})
+    fixed = load_scenario(FLOOR, overrides={"integrator.method": "time_stepping"})
     assert "rtol" not in fixed.resolved["integrator"]
-    said = load_scenario("elbow_comparison", overrides={"integrator.method": "rk4", "integrator.rtol": 1e-6})
+    said = load_scenario(FLOOR, overrides={"integrator": {**FIXED, "rtol": 1e-6}})
     assert said.resolved["integrator"]["rtol"] == 1e-6
     assert ("integrator", "rtol") in idle_keys(said.config)
     assert is_set(said.config, ("integrator", "rtol"))

@@ -59,13 +59,13 @@ def test_motors_are_integrated_implicitly_and_the_summary_says_why() -> None:
 
 
 def test_what_is_named_is_taken() -> None:
-    for method in ("rk43", "dopri5", "rk4", "radau5"):
+    for method in ("dopri5", "radau5"):
         assert chosen(shipped("elbow_comparison", "no_elbow", **{"integrator.method": method})) == method
 
 
 @pytest.mark.parametrize(("rtol", "within"), [(1e-6, 1.0), (1e-8, 2.0)])
 def test_passive_systems_keep_their_energy_to_the_tolerance(rtol: float, within: float) -> None:
-    """A double pendulum that tumbles for 10 s. Measured in rtol: 0.6 and 1.0; rk43 17 and 10, dopri5 17 and 25."""
+    """A double pendulum that tumbles for 10 s. Measured in rtol: 0.6 and 1.0; dopri5 17 and 25."""
     integrator = {"rtol": rtol, "atol": 1e-2 * rtol}
     record = simulate(chain(joint={"initial_deg": 120}, integrator=integrator, duration_s=10))
     assert record.summary["method"] == "radau5"
@@ -73,21 +73,18 @@ def test_passive_systems_keep_their_energy_to_the_tolerance(rtol: float, within:
     assert record.summary["energy_residual_relative"] <= within * rtol
 
 
-def test_long_passive_chains_stay_with_rk43() -> None:
+def test_long_passive_chains_are_integrated_explicitly() -> None:
     """A Jacobian of theirs costs more than what it would save."""
-    assert chosen(chain(37)) == "rk43"
+    assert chosen(chain(37)) == "dopri5"
     assert chosen(chain(36)) == "radau5"
 
 
-def test_passive_systems_at_the_tightest_tolerances_stay_with_rk43() -> None:
-    """There rk43 is 6 rtol off at 1e-10, by 45 000 right-hand sides; radau5, 0.9 rtol off, takes 75 000."""
-    assert chosen(chain(integrator={"rtol": 1e-10, "atol": 1e-12})) == "rk43"
+def test_passive_systems_at_the_tightest_tolerances_are_integrated_explicitly() -> None:
+    assert chosen(chain(integrator={"rtol": 1e-10, "atol": 1e-12})) == "dopri5"
 
 
-def test_slow_losses_and_a_tight_tolerance_are_for_order_five() -> None:
-    damped = {"damping_N_m_s_per_rad": 0.1}
-    assert chosen(chain(joint=damped)) == "rk43"
-    assert chosen(chain(joint=damped, integrator={"rtol": 1e-9, "atol": 1e-11})) == "dopri5"
+def test_slow_losses_are_integrated_explicitly() -> None:
+    assert chosen(chain(joint={"damping_N_m_s_per_rad": 0.1})) == "dopri5"
 
 
 def test_fast_losses_without_motors_are_integrated_implicitly() -> None:
@@ -95,8 +92,8 @@ def test_fast_losses_without_motors_are_integrated_implicitly() -> None:
 
 
 def test_short_steps_of_a_sampled_controller_or_a_limit_are_for_explicit_methods() -> None:
-    assert chosen(shipped("elbow_comparison", "no_elbow", **{"integrator.step_max_s": 1e-3})) == "rk43"
-    assert chosen(shipped("elbow_comparison", "no_elbow", **{"controller.sample_time_s": 1e-3})) == "rk43"
+    assert chosen(shipped("elbow_comparison", "no_elbow", **{"integrator.step_max_s": 1e-3})) == "dopri5"
+    assert chosen(shipped("elbow_comparison", "no_elbow", **{"controller.sample_time_s": 1e-3})) == "dopri5"
 
 
 def test_the_largest_rate_of_a_long_chain_is_found_without_all_others() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from random_robots import CONTINUOUS, Bench, bench
+from random_robots import ADAPTIVE, Bench, bench
 from scipy.special import ellipk
 
 from dynsim.dynamics import tables as ka
@@ -16,12 +16,7 @@ from dynsim.model.drives import Motor
 G = 9.81
 X, Y, Z = np.eye(3)
 PLANE = np.zeros((3, 3))
-every_method = pytest.mark.parametrize("method", CONTINUOUS)
-
-
-def step_of(method: str, step: float) -> float:
-    """A step for the fixed-step method; the others choose theirs."""
-    return step if method == "rk4" else 0.0
+every_method = pytest.mark.parametrize("method", ADAPTIVE)
 
 
 def robot(*links: Link, motors: tuple[Motor, ...] = (), gravity: float = G) -> Robot:
@@ -46,9 +41,7 @@ def test_pendulum_period(amplitude, method):
     link = Link("bob", "hinge", None, "revolute", Y, Inertia(0.3, np.array([0.0, 0.0, -length])))
     period = 4.0 * np.sqrt(length / G) * ellipk(np.sin(0.5 * amplitude) ** 2)
     b = bench(robot(link))
-    run = b.simulate(
-        b.state([amplitude], [0.0]), np.array([0.25, 0.5, 1.0]) * period, method, step=step_of(method, 2e-4), rtol=1e-11
-    )
+    run = b.simulate(b.state([amplitude], [0.0]), np.array([0.25, 0.5, 1.0]) * period, method, rtol=1e-11)
     # A thousand times the tolerance: near the top the swing magnifies errors.
     np.testing.assert_allclose(run.states("q")[:, 0], [0.0, -amplitude, amplitude], rtol=0, atol=1e-8)
 
@@ -60,10 +53,10 @@ def test_current_in_a_blocked_motor_rises_exponentially(method):
     motor = Motor("shaft", 0.2, resistance=1.1, inductance=1.7e-3, rotor_inertia=0.0, gear_ratio=3.0)
     b = bench(robot(heavy, motors=(motor,)), held=np.array([0.4]), k_p=30.0, k_d=0.0)
     t = np.linspace(0.0, 8e-3, 9)
-    run = b.simulate(b.state([0.0], [0.0]), t, method, step=step_of(method, 1e-4), rtol=1e-9)
+    run = b.simulate(b.state([0.0], [0.0]), t, method, rtol=1e-9)
     expected = 30.0 * 0.4 / 1.1 * (1.0 - np.exp(-1.1 / 1.7e-3 * t))
-    # RK4: (h R/L)^5/120 per step = 1e-8; cubic dense output at grid points adds nothing. The others: 10 rtol |i|.
-    np.testing.assert_allclose(run.states("current")[:, 0], expected, rtol=0, atol=1e-6 if method == "rk4" else 1e-7)
+    # 10 rtol |i|.
+    np.testing.assert_allclose(run.states("current")[:, 0], expected, rtol=0, atol=1e-7)
 
 
 @every_method
@@ -72,7 +65,7 @@ def test_current_with_a_voltage_limit_rises_as_if_the_limit_were_the_voltage(met
     motor = Motor("shaft", 0.2, 1.1, 1.7e-3, rotor_inertia=0.0, gear_ratio=3.0, voltage_limit=5.0)
     b = bench(robot(heavy, motors=(motor,)), held=np.array([0.4]), k_p=30.0)
     t = np.array([1e-3, 5e-3])
-    run = b.simulate(b.state([0.0], [0.0]), t, method, step=step_of(method, 2e-5), rtol=1e-9)
+    run = b.simulate(b.state([0.0], [0.0]), t, method, rtol=1e-9)
     expected = 5.0 / 1.1 * (1.0 - np.exp(-1.1 / 1.7e-3 * t))
     np.testing.assert_allclose(run.states("current")[:, 0], expected, rtol=0, atol=1e-7)
 
@@ -96,7 +89,7 @@ def test_block_slides_down_an_incline(method):
     normal, down = np.array([np.sin(alpha), 0.0, np.cos(alpha)]), np.array([np.cos(alpha), 0.0, -np.sin(alpha)])
     b = bead(mass, Quadric(PLANE, normal, 0.0), friction=mu, v_s=v_s)
     t = np.array([0.5, 1.0])
-    run = b.simulate(b.state(np.zeros(3), v0 * down), t, method, step=step_of(method, 1e-3), rtol=1e-9)
+    run = b.simulate(b.state(np.zeros(3), v0 * down), t, method, rtol=1e-9)
     s = v0 * t + 0.5 * G * (np.sin(alpha) - mu * np.cos(alpha)) * t**2
     # v_s²/v² = 1e-12 and the tolerance of the integration.
     np.testing.assert_allclose(run.states("q") @ down, s, rtol=1e-8)
@@ -109,9 +102,7 @@ def test_bead_on_a_sphere_is_held_by_weight_less_centrifugal_force(method):
     radius, mass, theta = 0.8, 0.4, 0.2
     b = bead(mass, Quadric(np.eye(3), np.zeros(3), -0.5 * radius**2))
     start = radius * np.array([np.sin(theta), 0.0, np.cos(theta)])
-    run = b.simulate(
-        b.state(start, np.zeros(3)), np.linspace(0.1, 1.0, 10), method, step=step_of(method, 5e-4), rtol=1e-10
-    )
+    run = b.simulate(b.state(start, np.zeros(3)), np.linspace(0.1, 1.0, 10), method, rtol=1e-10)
     r, v = run.states("q"), run.states("v")
     square = 2.0 * G * (start[2] - r[:, 2])
     # A hundred times the tolerance of the integration.
@@ -128,9 +119,7 @@ def test_bead_on_a_cylinder_without_weight_runs_along_a_helix(method):
     radius, mass, around, along = 0.5, 0.3, 1.2, 0.7
     b = bead(mass, Quadric(np.diag([1.0, 1.0, 0.0]), np.zeros(3), -0.5 * radius**2), gravity=0.0)
     t = np.linspace(0.5, 3.0, 6)
-    run = b.simulate(
-        b.state([radius, 0.0, 0.0], [0.0, around, along]), t, method, step=step_of(method, 1e-3), rtol=1e-10
-    )
+    run = b.simulate(b.state([radius, 0.0, 0.0], [0.0, around, along]), t, method, rtol=1e-10)
     angle = around / radius * t
     expected = np.stack([radius * np.cos(angle), radius * np.sin(angle), along * t], axis=1)
     np.testing.assert_allclose(run.states("q"), expected, rtol=0, atol=1e-8)  # a hundred tolerances

@@ -43,7 +43,7 @@ def turned(b: Bench, times: np.ndarray, q: float = 0.0, v: float = 0.0, method: 
     return run.states("q")[:, 0], run.states("v")[:, 0]
 
 
-@pytest.mark.parametrize("method", ["dopri5", "rk43", "radau5"])
+@pytest.mark.parametrize("method", ["dopri5", "radau5"])
 @pytest.mark.parametrize(("k_p", "k_d"), [(40.0, 0.0), (40.0, 3.0), (4.0, 20.0)])
 def test_servo_step_response(method, k_p, k_d):
     """I q̈ = K_m/R (k_p (r − q) − (k_d + K_m) q̇) − D_m q̇, under- and overdamped, from rest to r."""
@@ -249,7 +249,7 @@ def mixed(tmp_path):
     return path
 
 
-@pytest.mark.parametrize("integrator", [{"method": "rk43"}, {"method": "radau5"}, {"solver": "m_star"}])
+@pytest.mark.parametrize("integrator", [{"method": "dopri5"}, {"method": "radau5"}, {"solver": "m_star"}])
 def test_the_ledger_closes_with_all_kinds_of_drives(mixed, integrator):
     overrides = {f"integrator.{key}": value for key, value in integrator.items()}
     record = simulate(load_scenario(mixed, overrides={**overrides, "integrator.rtol": 1e-10, "integrator.atol": 1e-12}))
@@ -264,7 +264,7 @@ def test_the_ledger_closes_with_all_kinds_of_drives(mixed, integrator):
 
 
 def test_all_methods_and_solvers_move_all_kinds_of_drives_alike(mixed):
-    tight = {"integrator.rtol": 1e-9, "integrator.atol": 1e-11}
+    tight = {"integrator.rtol": 1e-10, "integrator.atol": 1e-12}
     runs = [
         simulate(load_scenario(mixed, overrides={**tight, **kind}))["q"]
         for kind in ({}, {"integrator.method": "radau5"}, {"integrator.solver": "m_star"})

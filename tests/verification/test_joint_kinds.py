@@ -132,7 +132,7 @@ def euler_top(moments: np.ndarray, w: np.ndarray, times: np.ndarray) -> tuple[np
     return found, np.array(attitudes)
 
 
-@pytest.mark.parametrize("method", ["dopri5", "rk43", "radau5"])
+@pytest.mark.parametrize("method", ["dopri5", "radau5"])
 @pytest.mark.parametrize("moments", [(0.15, 0.2, 0.3), (0.2, 0.2, 0.3)], ids=["three moments", "symmetric"])
 def test_a_free_gyroscope_is_the_closed_form_for_100_seconds(method, moments):
     """Attitude, rates and the path of a point off the centre of mass, to 1e-9 at rtol = 1e-12."""
@@ -162,7 +162,7 @@ def test_a_free_gyroscope_is_the_closed_form_for_100_seconds(method, moments):
     assert abs(np.linalg.norm(bench(robot).part(run.y, "q")[3:]) - 1.0) < 1e-15
 
 
-@pytest.mark.parametrize("method", ["rk43", "dopri5", "rk4"])
+@pytest.mark.parametrize("method", ["dopri5", "radau5"])
 def test_momentum_and_energy_of_a_free_robot(method):
     """A body with a ball joint, a planar and a revolute one on it, which nothing outside acts on."""
     rng = np.random.default_rng(8)
@@ -172,8 +172,7 @@ def test_momentum_and_energy_of_a_free_robot(method):
     q, v = random_positions(rng, robot), 0.5 * rng.normal(size=model.n)
     b = bench(robot)
     times = np.linspace(0.0, 2.0, 21)
-    step = {"step": 2.5e-4} if method == "rk4" else {}
-    run = b.simulate(b.state(q, v), times, method, rtol=1e-11, **step)
+    run = b.simulate(b.state(q, v), times, method, rtol=1e-11)
     linear, angular = momenta(model, q, v)
     energy = model.kinetic_energy(q, v)
     for q, v in zip(run.states("q"), run.states("v"), strict=True):
@@ -224,9 +223,8 @@ def turned_starts(count: int) -> list[np.ndarray]:
     return [np.eye(3), *(random_rotation(rng) for _ in range(count))]
 
 
-@pytest.mark.parametrize("method", ["rk43", "dopri5"])
 @pytest.mark.parametrize("make", [ball, floating])
-def test_steps_do_not_depend_on_the_attitude_of_the_start(method, make):
+def test_steps_do_not_depend_on_the_attitude_of_the_start(make):
     """The same tumbling seen from turned frames: as many steps, the same errors, the same motion but for the turn."""
     robot = robot_of(make(body("body")))
     model, b, times = Model(robot), bench(robot), np.linspace(0.0, 5.0, 11)
@@ -234,7 +232,7 @@ def test_steps_do_not_depend_on_the_attitude_of_the_start(method, make):
     counts, attitudes = [], []
     for R in turned_starts(6):
         q = np.r_[np.zeros(robot.nq - 4), quaternion(R)]
-        run = b.simulate(b.state(q, np.r_[np.zeros(model.n - 3), w]), times, method, rtol=1e-8)
+        run = b.simulate(b.state(q, np.r_[np.zeros(model.n - 3), w]), times, "dopri5", rtol=1e-8)
         counts.append((int(run.count[STEPS]), int(run.count[REJECTED])))
         attitudes.append([R.T @ model.body_pose("body", q)[0] for q in run.states("q")])
     assert len(set(counts)) == 1
@@ -319,7 +317,7 @@ def test_a_rolling_base_with_its_mass_ahead_swings_round():
 PLANE = Quadric(np.zeros((3, 3)), np.array([0.0, 0.0, 1.0]), 0.0)
 
 
-@pytest.mark.parametrize("method", ["rk43", "dopri5", "rk4"])
+@pytest.mark.parametrize("method", ["dopri5", "radau5"])
 def test_a_free_body_on_three_points_slides_on_a_plane(method):
     """A table pushed and spun on a floor with friction: it stays there to 1e-9 m, and the ledger closes."""
     robot = robot_of(floating(body("table", inertia=Inertia(3.0, np.array([0.05, 0.02, 0.4]), 0.1 * np.eye(3)))), DOWN)
@@ -329,15 +327,14 @@ def test_a_free_body_on_three_points_slides_on_a_plane(method):
     b = bench(robot, contacts)
     times = np.linspace(0.0, 0.6, 61)
     start = b.state(np.r_[0.3, 0.1, 0.0, quaternion(about(2, 1.0))], np.array([1.5, 0.4, 0.0, 0.0, 0.0, 2.0]))
-    step = {"step": 1e-3} if method == "rk4" else {}
-    run = b.simulate(start, times, method, rtol=1e-8, **step)
+    run = b.simulate(start, times, method, rtol=1e-8)
     assert run.extremes[:, DRIFT_MAX].max() < 1e-9
     q, v = run.states("q"), run.states("v")
     for foot in feet:
         heights = [model.point_position("table", foot, state)[2] for state in q]
         assert np.abs(heights).max() < 1e-9
     assert np.linalg.norm(v[-1, :2]) < 0.7
-    check_ledger(model, run, 1e-5 if method == "rk4" else 1e-7)
+    check_ledger(model, run, 1e-7)
 
 
 def check_ledger(model: Model, run, tolerance: float) -> None:
@@ -349,7 +346,7 @@ def check_ledger(model: Model, run, tolerance: float) -> None:
     assert np.abs(balance).max() < tolerance * turnover
 
 
-@pytest.mark.parametrize("method", ["rk43", "dopri5"])
+@pytest.mark.parametrize("method", ["dopri5", "radau5"])
 @pytest.mark.parametrize("seed", range(6))
 def test_random_robots_stay_on_their_surfaces(method, seed):
     """Ball, floating, planar and rolling joints with two contacts: drift, ledger, unit quaternions."""

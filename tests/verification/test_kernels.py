@@ -33,7 +33,7 @@ for m_star in (False, True):
     b = bench(robot, contacts, m_star=m_star)
     rows.append(b.derivative(b.state(q, v, i)))
 free = bench(robot)
-rows += [free.simulate(free.state(q, v, i), np.array([4e-3]), m, step=1e-3).y for m in ("rk4", "radau5")]
+rows += [free.simulate(free.state(q, v, i), np.array([4e-3]), m, step=1e-3).y for m in ("dopri5", "radau5")]
 np.savez(sys.argv[1], *rows)
 """
 
@@ -47,7 +47,7 @@ def run_everything() -> None:
         b = bench(robot, contacts, m_star=m_star)
         b.derivative(b.state(q, np.zeros(4)))
     free = bench(robot)
-    free.simulate(free.state(q, np.zeros(4)), np.array([1e-3]), "rk4", step=1e-3)
+    free.simulate(free.state(q, np.zeros(4)), np.array([1e-3]), "dopri5", step=1e-3)
     free.simulate(free.state(q, np.zeros(4)), np.array([1e-3]), "radau5")
     model = Model(robot)
     model.mass_matrix(list(q))
@@ -89,7 +89,7 @@ def test_every_public_kernel_has_one_compiled_signature():
     run_everything()
     # Every one was called above, from Python: none at all would mean that this test looks at the wrong function.
     assert len(default_programs(system.derivative)) == 2  # one program per solver
-    for kernel in (driver.advance_explicit, driver.advance_radau5):
+    for kernel in (driver.advance_dopri5, driver.advance_radau5):
         assert 1 <= len(default_programs(kernel)) <= 2, kernel  # for m_star in slow tests only
     for kernel in (
         sweep.newton_euler,

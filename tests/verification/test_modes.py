@@ -30,7 +30,7 @@ def block(mass: float) -> Robot:
     return Robot("block", tuple(links), (), ("z", np.zeros(3)))
 
 
-@pytest.mark.parametrize("method", ["rk43", "dopri5", "rk4", "radau5"])
+@pytest.mark.parametrize("method", ["dopri5", "radau5"])
 @pytest.mark.parametrize("alpha", [0.1, 0.7, 1.3])
 def test_a_block_sticks_to_an_incline(method, alpha):
     """Friction is m g sin α up the slope, the normal force m g cos α, and nothing moves."""
@@ -40,7 +40,7 @@ def test_a_block_sticks_to_an_incline(method, alpha):
     b = bench(block(mass), [Contact("foot", "z", point, floor, friction=0.1)])
     y = b.state(np.zeros(3), np.zeros(3))
     switch(b, y, ka.STICKING)
-    run = b.simulate(y, np.linspace(0.0, 2.0, 5), method, step=1e-2 if method == "rk4" else 0.0)
+    run = b.simulate(y, np.linspace(0.0, 2.0, 5), method)
     assert np.abs(run.states("q")).max() <= 1e-12
     output = run.outputs("contact")[:, 0]
     np.testing.assert_allclose(output[:, OUT_FORCE], mass * G * np.cos(alpha), rtol=1e-12)

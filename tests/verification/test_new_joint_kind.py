@@ -40,7 +40,7 @@ for q, v in ((0.0, 0.0), (2.0, -3.0)):
     np.testing.assert_allclose(model.forward_dynamics([q], [v], [0.0]), rate, rtol=1e-14)
 b = bench(nut)
 times = np.linspace(0.0, 0.1, 6)
-run = b.simulate(b.state([0.3], [2.0]), times, "rk43", rtol=1e-8)
+run = b.simulate(b.state([0.3], [2.0]), times, "dopri5", rtol=1e-8)
 q, v = run.states("q")[:, 0], run.states("v")[:, 0]
 # The method is exact for a parabola.
 np.testing.assert_allclose(q, 0.3 + 2.0 * times + 0.5 * rate * times**2, rtol=0, atol=1e-12)

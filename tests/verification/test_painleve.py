@@ -23,7 +23,7 @@ from dynsim.scenario import build
 
 X, Y, Z = np.eye(3)
 FLOOR = Quadric(np.zeros((3, 3)), Z, 0.0)
-METHODS = ["rk43", "dopri5", "rk4", "radau5"]
+METHODS = ["dopri5", "radau5"]
 HALF, MU = 0.5, 2.0
 # A uniform rod of half length l that leans by θ, its tip sliding along +x: m A_11 = 1 + 3 s (s + μ c), with s = sin θ
 # and c = cos θ, is zero where 5 − 3 cos 2θ + 3 μ sin 2θ = 0. Under a pulling force, or sliding back, μ turns round.
@@ -51,8 +51,7 @@ def rod_state(b: Bench, lean: float, turn: float, slide: float = 3.0) -> np.ndar
 
 def started(b: Bench, y: np.ndarray, method: str, *, end: float = 0.3, rtol: float = 1e-6) -> ki.Run:
     """A run to its end or stop."""
-    step = 2e-4 if method == "rk4" else 0.0
-    return b.advance(b.new_run(y, np.linspace(0.0, end, 4), method, step=step, rtol=rtol))
+    return b.advance(b.new_run(y, np.linspace(0.0, end, 4), method, rtol=rtol))
 
 
 def test_the_critical_angle_is_where_the_diagonal_vanishes():
@@ -116,7 +115,7 @@ def test_a_dissipative_rod_is_stopped_where_a_second_solution_appears(method):
 def test_signed_friction_goes_where_dissipative_friction_has_two_solutions():
     """The trailing rod is determined under the printed law: no false alarm."""
     b, _ = rod("signed")
-    run = started(b, rod_state(b, 0.3, 0.5), "rk43", end=0.1)
+    run = started(b, rod_state(b, 0.3, 0.5), "dopri5", end=0.1)
     assert run.count[ki.STATUS] == ki.FINISHED
     assert b.part(run.y, "q")[2] > -CRITICAL
 
@@ -143,7 +142,7 @@ def test_the_compiled_watch_agrees_with_its_definition():
         values = [matrices.determinant(signs) for signs in matrices.choices()]
         if min(map(abs, values)) < 1e-6:
             continue
-        run = b.advance(b.new_run(y, np.array([1.0]), "rk43", step=1e-3), 0)
+        run = b.advance(b.new_run(y, np.array([1.0]), "dopri5", step=1e-3), 0)
         if run.count[ki.STATUS] in (ki.NOT_PROJECTED, ki.NO_FORCES, ki.NOT_FINITE):
             continue
         matrices = contact_matrices(b.system, b.ws, 0.0, run.y)
@@ -312,7 +311,7 @@ def test_a_contact_given_twice_is_stopped_like_one():
     b, (tip,) = rod("signed")
     twice = bench(b.robot, [tip, replace(tip, name="tip again")])
     for lean, status in ((0.3, ki.RUNNING), (-0.6, ki.FORCES_REVERSED)):
-        run = twice.advance(twice.new_run(rod_state(twice, lean, 0.0), np.array([1.0]), "rk43", step=1e-3), 0)
+        run = twice.advance(twice.new_run(rod_state(twice, lean, 0.0), np.array([1.0]), "dopri5", step=1e-3), 0)
         assert run.count[ki.STATUS] == status
 
 
@@ -342,8 +341,8 @@ def test_a_run_through_the_paradox_is_stopped_by_name_and_saved(tmp_path: Path, 
         dynsim.simulate(dynsim.load_scenario(str(path), overrides={"integrator.method": method}))
     error = stop.value
     assert error.exit_code == 3
-    # dopri5 at rtol 1e-10 stops at 0.168686 s; rk4 takes steps of 1 ms.
-    assert error.time == pytest.approx(0.168686, abs=1e-3 if method == "rk4" else 1e-5)
+    # dopri5 at rtol 1e-10 stops at 0.168686 s.
+    assert error.time == pytest.approx(0.168686, abs=1e-5)
     assert not error.record.complete
     assert error.record.time[-1] == pytest.approx(0.165)
     assert np.isfinite(error.record["contact_normal_force"]).all()

@@ -53,7 +53,7 @@ def test_the_peak_current_is_a_limit(arm, integrator):
     assert record["hand_position"][-1, 2] < free["hand_position"][-1, 2] - 0.01
     assert record.summary["energy_residual_relative"] < 1e-7
     assert any("joint_1: current at its limit of 7 A" in text for text in record.summary["warnings"])
-    reference = simulate(load_scenario(arm, overrides={"integrator.method": "rk43", **tight}))
+    reference = simulate(load_scenario(arm, overrides={"integrator.method": "dopri5", **tight}))
     np.testing.assert_allclose(record["q"][-1], reference["q"][-1], rtol=0, atol=2e-6)
 
 

@@ -31,9 +31,7 @@ NEXT = 5  # 3: direction at the end of the step
 NEXT_SPEED = 8  # |v_t| there [m/s]
 LANDS_AT = 9  # depth below its surface at which a candidate that is off it has landed [m]
 HEADWAY = 10  # what it began to slip with against its direction, because the rows could not take it away [m/s]
-MOBILITY = 11  # along its tangents, when modes were last chosen with it: the sum over both [1/kg]
-LONGEST = 12  # step in which friction turns its slip by no more than RK4 can follow [s]
-SLIDE_SIZE = 13
+SLIDE_SIZE = 11
 # It lands at DEPTH until it has been higher than that, because projection leaves closed ones within half of it on
 # either side; then at the root itself.
 DEPTH, AT_ROOT = 2e-10, 1e-13

@@ -187,7 +187,7 @@ def _bare(scenario: Scenario) -> Scenario:
         "controller": None,
         "contacts": Contacts(**{**given, "law": "unilateral"}),
         "loads": payloads,
-        "integrator": type(config.integrator)(method="rk43"),  # set points change every 2 ms, which ends steps
+        "integrator": type(config.integrator)(method="dopri5"),  # set points change every 2 ms, which ends steps
     }
     return replace(scenario, config=config.model_copy(update=changes))
 

@@ -22,7 +22,6 @@ from dynsim.dynamics.tables import Workspace
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts.impacts import evaluate, slip_speed
 from dynsim.integrators.contacts.modes import begin_slip, drops, resolve, slip_on
-from dynsim.integrators.contacts.slow_slip import note_turning
 from dynsim.integrators.run import Run
 from dynsim.jit.kernel import apart_kernel, internal_kernel
 
@@ -168,8 +167,6 @@ def watch_modes(unilateral: UnilateralArrays | None, ws: Workspace, h, gaps):
             slide[k, ku.NEXT + s] = (
                 state[k, ka.SLIP_VELOCITY + s] / speed if speed > 0.0 else slide[k, ku.REFERENCE + s]
             )
-        if ws.active[k, ka.MODE] == ka.SLIDING:
-            note_turning(unilateral, ws, k, speed)
     for k in range(unilateral.stop.shape[0]):
         if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
             unilateral.stop[k, ku.CLOSED_TIME] += h

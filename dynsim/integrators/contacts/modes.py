@@ -79,8 +79,6 @@ def choose(system: System, ws: Workspace, run: Run):
         if mode[k, ku.TOUCHING] == 1:
             mode[k, ku.WANTED] = ka.SLIDING if begins_sliding(system, ws, k) else ka.STICKING
             mode[k, ku.GIVES_WAY] = 1 if mode[k, ku.GIVES_WAY] == 1 and drops(system, k) else 0
-            r, W = ws.active[k, ka.FIRST_ROW], ws.small[0]
-            unilateral.slide[k, ku.MOBILITY] = W[r + 1, r + 1] + W[r + 2, r + 2]
     solved = False
     # Where static friction gives way to a smaller kinetic one, the others' forces change.
     for _ in range(1 + mode.shape[0]):

@@ -27,7 +27,7 @@ def build_mujoco(
     system: System,
     *,
     step: float,
-    integrator: Literal["euler", "implicitfast", "rk4"] = "euler",
+    integrator: Literal["euler", "implicitfast"] = "euler",
     motors: bool = True,
     contacts: Literal["none", "soft", "equality"] = "none",
     cone: Literal["pyramidal", "elliptic"] = "pyramidal",
@@ -58,7 +58,6 @@ def build_mujoco(
     spec.option.integrator = {
         "euler": mujoco.mjtIntegrator.mjINT_EULER,
         "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
-        "rk4": mujoco.mjtIntegrator.mjINT_RK4,
     }[integrator]
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC if cone == "elliptic" else mujoco.mjtCone.mjCONE_PYRAMIDAL
     bodies = _add_bodies(spec, system)
