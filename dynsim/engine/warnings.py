@@ -179,8 +179,8 @@ def _undetermined(record: Record, prepared: Prepared) -> list[str]:
     found = [f"contact rows depended on each other in {evaluations} evaluations: forces are the split of least norm"]
     spread = None
     if len(record) and any(contact.friction > 0.0 for contact in contacts):
-        units = [(link.joint, link.units[2]) for link in prepared.model.robot.links]
-        spread = motion_spread(system, record.time, run.sample[: len(record)], units)
+        rows, units = len(record), [(link.joint, link.units[2]) for link in prepared.model.robot.links]
+        spread = motion_spread(system, record.time, run.sample[:rows], units)
     if spread is not None:
         found.append(
             f"with friction, dependent contact rows leave the motion open too: at t = {spread.time:.4g} s the "
