@@ -19,7 +19,7 @@ from dynsim.dynamics.simd.system import has_forms
 from dynsim.dynamics.state import LOSSES, block, output_layout, state_layout
 from dynsim.engine.prepare import guards
 from dynsim.integrators.driver import advance
-from dynsim.integrators.radau5.newton import CLOSE
+from dynsim.integrators.radau5.tables import CLOSE
 from dynsim.integrators.run import FINISHED, METHODS, STATUS, TIME_STEPPING, Run, new_run
 from dynsim.integrators.stepping.tables import stepping_arrays
 from dynsim.jit.kernel import integers, reals
@@ -243,7 +243,7 @@ class Bench:
         couplings = len(self.robot.couplings) + len(self.stops)
         system, stepping = self.system, None
         if METHODS[method] == TIME_STEPPING:
-            stepping = stepping_arrays(system.model, system.contacts, na, couplings, theta, system.unilateral)
+            stepping = stepping_arrays(system.model, system.contacts, na, couplings, theta)
         run = new_run(
             METHODS[method],
             y,

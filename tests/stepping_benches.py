@@ -15,7 +15,7 @@ def stepped(b: Bench, y: np.ndarray, times: np.ndarray, step: float, theta: floa
     """A run by time stepping; law: columns of the contacts' law."""
     run = b.new_run(y, times, "time_stepping", step=step, theta=theta)
     for column, value in (law or {}).items():
-        run.stepping.law[:, column] = value
+        b.system.contacts.law[:, column] = value
     return b.finish(run)
 
 

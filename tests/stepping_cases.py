@@ -14,7 +14,6 @@ from stepping_benches import plane, stepped
 
 from dynsim.dynamics import tables as ka
 from dynsim.integrators.run import Run
-from dynsim.integrators.stepping.tables import GRIP, GRIP_AXIS
 from dynsim.jit.kernel import integers, reals
 from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot
 from dynsim.model.drives import Servo
@@ -139,7 +138,7 @@ def knife_edge() -> Case:
 
     end = solved(law, until, np.array([0.3, 4.0, 0.0, 0.0, 0.0]))
     # Across the blade μ, along it none: the axis of the grip is the blade's.
-    grip = {GRIP: 0.0, GRIP_AXIS: 1.0, GRIP_AXIS + 1: 0.0, GRIP_AXIS + 2: 0.0}
+    grip = {ka.GRIP: 0.0, ka.GRIP_AXIS: 1.0, ka.GRIP_AXIS + 1: 0.0, ka.GRIP_AXIS + 2: 0.0}
     return Case(b, np.zeros(4), np.array([0.3, 0.0, 0.0, 4.0]), until, np.array([end[3], end[4], 0.0, end[2]]), grip)
 
 

@@ -91,7 +91,7 @@ def violations(b: Bench, run: ki.Run) -> dict[str, float]:
         "ledger": float(np.abs(ledger_residual(run)).max()),
     }
     for k, contact in enumerate(b.contacts):
-        static, stribeck = b.system.unilateral.law[k, [ku.STATIC, ku.STRIBECK]]
+        static, stribeck = b.system.contacts.law[k, [ka.STATIC, ka.STRIBECK]]
         for s in range(len(touch)):
             if mode[s, k] == ka.OPEN:
                 assert f[s, k] == 0.0

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
@@ -56,15 +55,13 @@ class MissingClientLibrary(DynsimError):
     """The optional packages for servos are not installed."""
 
 
-@contextmanager
-def client_library() -> Iterator[None]:
+def require_client_library() -> None:
     """Raises MissingClientLibrary where the packages for servos are not installed."""
     try:
         import dynamixel_sdk  # noqa: F401
         import serial  # noqa: F401
     except ImportError as error:
         raise MissingClientLibrary(f"{error.name} is not installed: pip install 'dynsim[hardware]'") from error
-    yield
 
 
 @hw.command(epilog="Example: dynsim hw scan --port /dev/ttyUSB0 --map arm")
@@ -74,14 +71,15 @@ def scan(
     baud: Annotated[int | None, typer.Option("--baud", help="Only this bit rate [bit/s].")] = None,
 ) -> None:
     """List the servos that answer, at every usual bit rate. Reads only."""
-    with client_library():
-        from dynsim.hardware.bus import scan as survey
-        from dynsim.hardware.errors import VerificationFailed
-        from dynsim.hardware.servo_map import load_servo_map
+    require_client_library()
+    from dynsim.hardware.bus import scan as survey
+    from dynsim.hardware.bus.control_table import RETURN_DELAY_SECONDS_PER_UNIT, VOLT_PER_UNIT
+    from dynsim.hardware.errors import VerificationFailed
+    from dynsim.hardware.servo_map import load_servo_map
 
-        servo_map = load_servo_map(map_file) if map_file else None
-        bauds = (baud,) if baud else (servo_map.bus.baud,) if servo_map else survey.SCAN_BAUD_RATES
-        found = survey.scan(port, bauds)
+    servo_map = load_servo_map(map_file) if map_file else None
+    bauds = (baud,) if baud else (servo_map.bus.baud,) if servo_map else survey.SCAN_BAUD_RATES
+    found = survey.scan(port, bauds)
     if not found:
         raise VerificationFailed(
             f"{port}: no servo answered at {', '.join(f'{b}' for b in bauds)} bit/s. Is the power on, the cable right? "
@@ -90,11 +88,13 @@ def scan(
     owners = {servo.id: servo for servo in servo_map.servos} if servo_map else {}
     table = Table("ID", "model", "fw", "bit/s", "mode", "delay µs", "V", "°C", "torque", "error", "joint")
     for servo in found:
-        numbers = [f"{servo.return_delay * 1e6:.0f}", f"{servo.voltage:.1f}", f"{servo.temperature:.0f}"]
-        error = f"0x{servo.hardware_error:02x}" if servo.hardware_error else "-"
+        told = servo.registers
+        delay, volts = told["return_delay"] * RETURN_DELAY_SECONDS_PER_UNIT, told["present_voltage"] * VOLT_PER_UNIT
+        numbers = [f"{delay * 1e6:.0f}", f"{volts:.1f}", f"{told['present_temperature']:.0f}"]
+        error = f"0x{told['hardware_error']:02x}" if told["hardware_error"] else "-"
         joint = owners[servo.id].joint if servo.id in owners else "-"
-        who = [str(servo.id), servo.model_name, *map(str, (servo.firmware, servo.baud, servo.mode))]
-        table.add_row(*who, *numbers, "ON" if servo.torque else "off", error, joint)
+        who = [str(servo.id), servo.model_name, *map(str, (servo.firmware, servo.baud, told["operating_mode"]))]
+        table.add_row(*who, *numbers, "ON" if told["torque_enable"] else "off", error, joint)
     console.print(table)
     if servo_map:
         _compare_with_map(found, servo_map)
@@ -174,42 +174,42 @@ def replay(
 
     Ctrl-C once: controlled stop. Twice: torque off.
     """
-    with client_library():
-        from dynsim.cli.dialog import confirm_replay
-        from dynsim.hardware.errors import ServoMapError
-        from dynsim.hardware.ports import VIRTUAL, bus_on
-        from dynsim.hardware.replay.session import shown_by
-        from dynsim.hardware.virtual.faults import load_fault_script
+    require_client_library()
+    from dynsim.cli.dialog import confirm_replay
+    from dynsim.hardware.errors import ServoMapError
+    from dynsim.hardware.ports import VIRTUAL, bus_on
+    from dynsim.hardware.replay.session import shown_by
+    from dynsim.hardware.virtual.faults import load_fault_script
 
-        if (faults or plant) and port != VIRTUAL:
-            raise ServoMapError("--faults and --plant are for virtual servos: --port virtual")
-        simulated, servo_map, motion = _checked(record, map_file, rate, speed, trust)
-        script = load_fault_script(faults, servo_map.ids) if faults else None
-        robot = _plant(plant, variant, servo_map, motion) if plant else None
-        folder = out or Path("results") / file_name(f"{servo_map.robot}_replay")
-        for warning in motion.warnings:
-            console.print(f"warning: {warning}")
-        moves = live or port == VIRTUAL
-        if live and port != VIRTUAL:
-            confirm_replay(console, servo_map, motion, port, asked=not yes)
-        with shown_by({"standard output": sys.stdout}, folder) as lost:
-            result = replayed(
-                motion,
-                servo_map,
-                bus_on(port, servo_map, script=script, plant=robot),
-                folder,
-                lost,
-                quiet=quiet,
-                live=moves,
-                policy=policy,
-                write_eeprom=configure,
-                provenance={"port": port, "record": str(record), "simulated": simulated.provenance},
-            )
-            print_timing(result)
-            if moves:
-                tell_replay(result, "replayed", folder, record)
-            else:
-                tell_dry_run(result)
+    if (faults or plant) and port != VIRTUAL:
+        raise ServoMapError("--faults and --plant are for virtual servos: --port virtual")
+    simulated, servo_map, motion = _checked(record, map_file, rate, speed, trust)
+    script = load_fault_script(faults, servo_map.ids) if faults else None
+    robot = _plant(plant, variant, servo_map, motion) if plant else None
+    folder = out or Path("results") / file_name(f"{servo_map.robot}_replay")
+    for warning in motion.warnings:
+        console.print(f"warning: {warning}")
+    moves = live or port == VIRTUAL
+    if live and port != VIRTUAL:
+        confirm_replay(console, servo_map, motion, port, asked=not yes)
+    with shown_by({"standard output": sys.stdout}, folder) as lost:
+        result = replayed(
+            motion,
+            servo_map,
+            bus_on(port, servo_map, script=script, plant=robot),
+            folder,
+            lost,
+            quiet=quiet,
+            live=moves,
+            policy=policy,
+            write_eeprom=configure,
+            provenance={"port": port, "record": str(record), "simulated": simulated.provenance},
+        )
+        print_timing(result)
+        if moves:
+            tell_replay(result, "replayed", folder, record)
+        else:
+            tell_dry_run(result)
 
 
 def replayed(
@@ -338,29 +338,29 @@ def virtual(
     variant: Annotated[str | None, typer.Option("--variant", help="Variant of that scenario.")] = None,
 ) -> None:
     """Virtual servos behind a pseudo-terminal, for any Dynamixel tool. Ctrl-C ends it."""
-    with client_library():
-        from dynsim.hardware.replay.states import StopRequest, stop_on_signals
-        from dynsim.hardware.servo_map import load_servo_map
-        from dynsim.hardware.virtual.faults import load_fault_script
-        from dynsim.hardware.virtual.line import line_for_map
-        from dynsim.hardware.virtual.pseudo_terminal import PseudoTerminal
-        from dynsim.hardware.virtual.simulated_plant import simulated_arm
+    require_client_library()
+    from dynsim.hardware.replay.states import StopRequest, stop_on_signals
+    from dynsim.hardware.servo_map import load_servo_map
+    from dynsim.hardware.virtual.faults import load_fault_script
+    from dynsim.hardware.virtual.line import line_for_map
+    from dynsim.hardware.virtual.pseudo_terminal import PseudoTerminal
+    from dynsim.hardware.virtual.simulated_plant import simulated_arm
 
-        servo_map = load_servo_map(map_file)
-        script = load_fault_script(faults, servo_map.ids) if faults else None
-        robot = simulated_arm(plant, variant, servo_map, {}) if plant else None
-        terminal = PseudoTerminal(line_for_map(servo_map, script=script, plant=robot), link)
-        stop = StopRequest()
-        # A plain line: other programs wait for it.
-        print(
-            f"{len(servo_map.servos)} virtual servos at {servo_map.bus.baud} bit/s on {plain(link or terminal.device)}",
-            flush=True,
-        )
-        try:
-            with stop_on_signals(stop):
-                terminal.serve(lambda: stop.count == 0)
-        finally:
-            terminal.close()
+    servo_map = load_servo_map(map_file)
+    script = load_fault_script(faults, servo_map.ids) if faults else None
+    robot = simulated_arm(plant, variant, servo_map, {}) if plant else None
+    terminal = PseudoTerminal(line_for_map(servo_map, script=script, plant=robot), link)
+    stop = StopRequest()
+    # A plain line: other programs wait for it.
+    print(
+        f"{len(servo_map.servos)} virtual servos at {servo_map.bus.baud} bit/s on {plain(link or terminal.device)}",
+        flush=True,
+    )
+    try:
+        with stop_on_signals(stop):
+            terminal.serve(lambda: stop.count == 0)
+    finally:
+        terminal.close()
 
 
 @hw.command("stop", epilog="Example: dynsim hw stop --port /dev/ttyUSB0")
@@ -370,14 +370,14 @@ def stop_servos(
     baud: Annotated[int | None, typer.Option("--baud", help="Only this bit rate [bit/s].")] = None,
 ) -> None:
     """Torque off for every servo at every usual bit rate, beside a replay too; no substitute for a power cut."""
-    with client_library():
-        from dynsim.hardware.bus import scan as survey
-        from dynsim.hardware.errors import VerificationFailed
-        from dynsim.hardware.servo_map import load_servo_map
+    require_client_library()
+    from dynsim.hardware.bus import scan as survey
+    from dynsim.hardware.errors import VerificationFailed
+    from dynsim.hardware.servo_map import load_servo_map
 
-        servo_map = load_servo_map(map_file) if map_file else None
-        bauds = (baud,) if baud else (servo_map.bus.baud,) if servo_map else survey.STOP_BAUD_RATES
-        asked = survey.stop_all(port, bauds, servo_map.ids if servo_map else ())
+    servo_map = load_servo_map(map_file) if map_file else None
+    bauds = (baud,) if baud else (servo_map.bus.baud,) if servo_map else survey.STOP_BAUD_RATES
+    asked = survey.stop_all(port, bauds, servo_map.ids if servo_map else ())
     on = [id_ for id_, still_on in asked.torque.items() if still_on]
     # With a map everybody is known; without one those at a bit rate at which the port failed are not.
     if on or not asked.torque or (asked.trouble and not servo_map):
@@ -410,36 +410,36 @@ def calibrate(
 
     With --nudge: find swapped senses instead, joint by joint.
     """
-    with client_library():
-        from dynsim.cli.dialog import find_senses, may_write
-        from dynsim.hardware.calibrate import read_zero_ticks, write_into_map
-        from dynsim.hardware.errors import ServoMapError, VerificationFailed
-        from dynsim.hardware.ports import bus_on
-        from dynsim.hardware.servo_map import SHIPPED, load_servo_map
+    require_client_library()
+    from dynsim.cli.dialog import find_senses, may_write
+    from dynsim.hardware.calibrate import read_zero_ticks, write_into_map
+    from dynsim.hardware.errors import ServoMapError, VerificationFailed
+    from dynsim.hardware.ports import bus_on
+    from dynsim.hardware.servo_map import SHIPPED, load_servo_map
 
-        servo_map = load_servo_map(map_file)
-        target = out or servo_map.path
-        shipped = target.resolve().parent == SHIPPED
-        if shipped and (write or not nudge):
-            raise ServoMapError(f"{target} comes with dynsim; write your own map with --out")
-        unknown = [name for name in joint or () if name not in servo_map.joints]
-        if unknown:
-            raise ServoMapError(f"{map_file} has no joint {', '.join(unknown)}; it has {', '.join(servo_map.joints)}")
-        if nudge:
-            chosen = [servo for servo in servo_map.servos if servo.joint in (joint or servo_map.joints)]
-            signs, blocked = find_senses(console, servo_map, chosen, port, live=live, asked=not yes)
-            if signs and (write or (not shipped and may_write(console, list(signs), target))):
-                write_into_map(servo_map, "sign", signs, target)
-                console.print(f"written to {target}")
-            if blocked:
-                raise VerificationFailed(f"{', '.join(blocked)}: did not turn as told; is something in the way?")
-            return
-        if live or yes or write:
-            raise ServoMapError("--live, --yes and --write are for --nudge: zero ticks are read with the torque off")
-        chosen = [servo for servo in servo_map.servos if (servo.joint in joint if joint else servo.in_position_mode)]
-        with bus_on(port, servo_map) as (bus, _):
-            ticks = read_zero_ticks(bus, chosen)
-        write_into_map(servo_map, "zero_tick", ticks, target)
+    servo_map = load_servo_map(map_file)
+    target = out or servo_map.path
+    shipped = target.resolve().parent == SHIPPED
+    if shipped and (write or not nudge):
+        raise ServoMapError(f"{target} comes with dynsim; write your own map with --out")
+    unknown = [name for name in joint or () if name not in servo_map.joints]
+    if unknown:
+        raise ServoMapError(f"{map_file} has no joint {', '.join(unknown)}; it has {', '.join(servo_map.joints)}")
+    if nudge:
+        chosen = [servo for servo in servo_map.servos if servo.joint in (joint or servo_map.joints)]
+        signs, blocked = find_senses(console, servo_map, chosen, port, live=live, asked=not yes)
+        if signs and (write or (not shipped and may_write(console, list(signs), target))):
+            write_into_map(servo_map, "sign", signs, target)
+            console.print(f"written to {target}")
+        if blocked:
+            raise VerificationFailed(f"{', '.join(blocked)}: did not turn as told; is something in the way?")
+        return
+    if live or yes or write:
+        raise ServoMapError("--live, --yes and --write are for --nudge: zero ticks are read with the torque off")
+    chosen = [servo for servo in servo_map.servos if (servo.joint in joint if joint else servo.in_position_mode)]
+    with bus_on(port, servo_map) as (bus, _):
+        ticks = read_zero_ticks(bus, chosen)
+    write_into_map(servo_map, "zero_tick", ticks, target)
     table = Table("joint", "ID", "old zero", "new zero")
     for servo in chosen:
         table.add_row(servo.joint, str(servo.id), str(servo.zero_tick), str(ticks[servo.joint]))

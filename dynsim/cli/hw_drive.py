@@ -19,10 +19,10 @@ from dynsim.cli.hardware import (
     Rate,
     ReplayPort,
     Yes,
-    client_library,
     console,
     print_timing,
     replayed,
+    require_client_library,
     tell_dry_run,
     tell_replay,
 )
@@ -80,20 +80,20 @@ def hw_drive(
     Ctrl-C once: controlled stop. Twice: torque off. The button of the page ends the drive regularly.
     """
     require_websockets()
-    with client_library():
-        from dynsim.cli.dialog import confirm_replay
-        from dynsim.engine.results import RUN_FILES
-        from dynsim.hardware.errors import ServoMapError
-        from dynsim.hardware.ports import VIRTUAL, bus_on
-        from dynsim.hardware.replay.drive import check_drive
-        from dynsim.hardware.replay.session import shown_by
-        from dynsim.hardware.servo_map import load_servo_map
-        from dynsim.hardware.virtual.faults import load_fault_script
-        from dynsim.scenario import load_scenario
-        from dynsim.system.files import check_writable
-        from dynsim.teleop.session import SpeedLimits
-        from dynsim.teleop.web.follower import DriveRequest
-        from dynsim.teleop.web.servos import SimulationProcess
+    require_client_library()
+    from dynsim.cli.dialog import confirm_replay
+    from dynsim.engine.results import RUN_FILES
+    from dynsim.hardware.errors import ServoMapError
+    from dynsim.hardware.ports import VIRTUAL, bus_on
+    from dynsim.hardware.replay.drive import check_drive
+    from dynsim.hardware.replay.session import shown_by
+    from dynsim.hardware.servo_map import load_servo_map
+    from dynsim.hardware.virtual.faults import load_fault_script
+    from dynsim.scenario import load_scenario
+    from dynsim.system.files import check_writable
+    from dynsim.teleop.session import SpeedLimits
+    from dynsim.teleop.web.follower import DriveRequest
+    from dynsim.teleop.web.servos import SimulationProcess
 
     if faults and port != VIRTUAL:
         raise ServoMapError("--faults is for virtual servos: --port virtual")

@@ -11,7 +11,6 @@ import numpy as np
 
 from dynsim.model.description import Array, Link, Quadric, Robot
 from dynsim.model.surfaces import Surface
-from dynsim.system.memo import recall
 
 # Depth beyond its radius that does not count as passing below a surface [m]: what a contact may be off at the start.
 SLACK = 1e-6
@@ -140,67 +139,21 @@ def is_plane(surface: Surface) -> TypeGuard[Quadric]:
 def sinking(robot: Robot, surfaces: Mapping[str, Surface], q: Array) -> list[Sinking]:
     """Bodies whose axes lie below a surface by more than their radius, at samples q, (T, nq).
 
-    The axes of a body are those of :func:`axis_ends`. A body of unknown radius has radius zero. A run that
-    keeps close to another that stayed clear is not looked at sample by sample, see :class:`_Clear`.
+    The axes of a body are those of :func:`axis_ends`. A body of unknown radius has radius zero.
     """
     found: list[Sinking] = []
     if not surfaces or not len(q):
         return found
-    # Of the same robot first, which is quickly told.
-    clear = recall(
-        "clear robot",
-        lambda: recall("clear", _Clear, [link.geometry for link in robot.links], robot.hand, len(q), surfaces),
-        *(robot, len(q), surfaces),
-    )
-    if clear.holds(q):
-        return found
-    least = np.inf
     # Of a run that diverged the last samples may be beyond what squares of floats can hold.
     with np.errstate(over="ignore", invalid="ignore"):
         for link, name, gap in _axis_gaps(robot, surfaces, q):
-            lowest = gap.min()
-            least = min(least, lowest + link.radius) if np.isfinite(lowest) else -np.inf
-            if lowest >= -link.radius - SLACK:
+            if gap.min() >= -link.radius - SLACK:
                 continue
             depth = np.where(np.isfinite(gap), -gap, -np.inf)
             beyond = np.flatnonzero(depth > link.radius + SLACK)
             if beyond.size:
                 found.append(Sinking(link.name, name, float(depth.max()), link.radius, int(beyond[0])))
-    if least > 0.0:
-        clear.remember(robot, surfaces, q, least)
     return found
-
-
-class _Clear:
-    """Samples of a run whose bodies kept clear of planes, and by how much: those that are close to them do too.
-
-    Turning one joint after the other from there by Δq_j moves no point by more than Σ |Δq_j| r_j, with r_j the length
-    of all links from joint j on; so a sample whose sum is below the room that there was is clear without being looked
-    at. For revolute joints and planes, whose distances change by no more than points move.
-    """
-
-    def __init__(self) -> None:
-        self._room, self._q, self._reach = 0.0, np.zeros((0, 0)), np.zeros(0)  # _q: (n, T)
-
-    def remember(self, robot: Robot, surfaces: Mapping[str, Surface], q: Array, room: float) -> None:
-        """Take the samples q, (T, n), whose axes kept ``room`` [m] above their radii."""
-        if not all(map(is_plane, surfaces.values())) or any(link.kind != "revolute" for link in robot.links):
-            return
-        tips, reach = axis_ends(robot), dict.fromkeys((link.name for link in robot.links), 0.0)
-        for link in reversed(robot.links):
-            ends = (float(np.linalg.norm(tip)) for tip in tips[link.name])
-            reach[link.name] = max(reach[link.name], *ends, 0.0)
-            if link.parent is not None:
-                reach[link.parent] = max(reach[link.parent], float(np.linalg.norm(link.p_PJ)) + reach[link.name])
-        # Rounding is far below the slack.
-        self._room, self._q = room - SLACK, q.T.copy()
-        self._reach = np.array([reach[link.name] for link in robot.links])
-
-    def holds(self, q: Array) -> bool:
-        """Whether samples, (T, n), are clear for certain."""
-        if self._room <= 0.0 or q.T.shape != self._q.shape:
-            return False
-        return bool((np.abs(q.T - self._q).max(axis=1) * self._reach).sum() < self._room)
 
 
 def _axis_gaps(robot: Robot, surfaces: Mapping[str, Surface], q: Array) -> Iterator[tuple[Link, str, Array]]:

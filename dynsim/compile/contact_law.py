@@ -49,27 +49,9 @@ def compile_unilateral(
     ----------
     stops : what joints come up against
     slow : speed below which slip has no direction of its own [m/s]
-
-    Raises
-    ------
-    ModelError
-        Static friction below the kinetic one, negative numbers, or restitution above one.
     """
     c, s = len(contacts), len(stops)
     p = ka.row_limit(c, len(robot.couplings) + s)
-    law = np.zeros((c, ku.LAW_SIZE))
-    for k, contact in enumerate(contacts):
-        static = contact.friction if contact.static_friction is None else contact.static_friction
-        if not static >= contact.friction:
-            raise ModelError(
-                f"contact {contact.name}: static friction {static:g} is less than the kinetic {contact.friction:g}"
-            )
-        if not 0.0 <= contact.restitution <= 1.0:
-            raise ModelError(f"contact {contact.name}: restitution {contact.restitution:g} is not between 0 and 1")
-        if not (contact.stribeck >= 0.0 and contact.viscous_friction >= 0.0):
-            raise ModelError(f"contact {contact.name}: Stribeck speed and viscous friction must not be negative")
-        law[k, [ku.STATIC, ku.STRIBECK]] = static, contact.stribeck
-        law[k, [ku.VISCOUS, ku.RESTITUTION]] = contact.viscous_friction, contact.restitution
     stop_table, stop = np.zeros((s, ku.STOP_TABLE_SIZE), dtype=np.int64), np.zeros((s, ku.STOP_SIZE))
     for k, limit in enumerate(stops):
         stop_table[k, ku.STOP_JOINT] = robot.joint_names.index(limit.joint)
@@ -80,7 +62,6 @@ def compile_unilateral(
     tally[:, ku.SETTLE], tally[:, ku.WINDOW_START], number[ku.LAST_CHANGE] = SETTLE_SPEED, -np.inf, -np.inf
     number[ku.SLOW] = slow
     return UnilateralArrays(
-        law=reals(law),
         slide=reals(slide),
         mode=integers(np.zeros((c, ku.MODE_SIZE))),
         tally=reals(tally),
@@ -94,13 +75,36 @@ def compile_unilateral(
     )
 
 
-def compile_grips(robot: Robot, contacts: Sequence[Contact]) -> NDArray[np.float64]:
-    """Friction along an axis per that across, and the axis in the link's frame, (c, 4); 1 where it is isotropic."""
-    grips = np.ones((len(contacts), 4))
-    for row, contact in zip(grips, contacts, strict=True):
+def contact_laws(robot: Robot, contacts: Sequence[Contact]) -> NDArray[np.float64]:
+    """The law of each contact, (c, CONTACT_LAW_SIZE), see dynsim.dynamics.tables.
+
+    Raises
+    ------
+    ModelError
+        Static friction below the kinetic one, negative numbers, or restitution above one.
+    """
+    law = np.ones((len(contacts), ka.CONTACT_LAW_SIZE))
+    for row, contact in zip(law, contacts, strict=True):
+        where = f"contact {contact.name}"
+        if not contact.friction >= 0.0:
+            raise ModelError(f"{where}: friction {contact.friction} must be zero or positive")
+        if not contact.slip_smoothing > 0.0:
+            raise ModelError(f"{where}: slip smoothing {contact.slip_smoothing} m/s must be positive")
+        if not contact.friction_at_rest >= contact.friction:
+            raise ModelError(
+                f"{where}: static friction {contact.static_friction:g} is less than the kinetic {contact.friction:g}"
+            )
+        if not 0.0 <= contact.restitution <= 1.0:
+            raise ModelError(f"{where}: restitution {contact.restitution:g} is not between 0 and 1")
+        if not (contact.stribeck >= 0.0 and contact.viscous_friction >= 0.0):
+            raise ModelError(f"{where}: Stribeck speed and viscous friction must not be negative")
+        row[[ka.MU, ka.V_S, ka.STATIC]] = contact.friction, contact.slip_smoothing, contact.friction_at_rest
+        row[[ka.STRIBECK, ka.VISCOUS]] = contact.stribeck, contact.viscous_friction
+        row[ka.RESTITUTION] = contact.restitution
         if contact.grip_axis is not None:
-            row[0], row[1:] = contact.grip, robot.attached_axes(contact.body) @ contact.grip_axis
-    return grips
+            row[ka.GRIP] = contact.grip
+            row[ka.GRIP_AXIS : ka.GRIP_AXIS + 3] = robot.attached_axes(contact.body) @ contact.grip_axis
+    return law
 
 
 def joint_stops(robot: Robot) -> list[JointStop]:

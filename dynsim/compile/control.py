@@ -160,7 +160,7 @@ class JointControl:
         """
         spacing, found = float(self.reference.grid[1]), []
         for splines in (self.reference.coefficients, self.reference.voltage):
-            if self.sample_time is not None or splines is None or len(splines) < 2:
+            if self.sample_time is not None or len(splines) < 2:
                 continue
             jumps = np.abs(np.diff(splines[:, :, 5], axis=0))  # (segments - 1, splines)
             departure = jumps * (_STRADDLED * spacing) ** 5

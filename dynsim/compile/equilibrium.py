@@ -78,8 +78,7 @@ def rest(
     for share, least in attempts:
         rows = []
         for contact, link, point, normal, _ in touching:
-            static = contact.friction if contact.static_friction is None else contact.static_friction
-            rows.append(_row(link, point, normal, share * static, least))
+            rows.append(_row(link, point, normal, share * contact.friction_at_rest, least))
             if not real:
                 rows.append(_row(link, point, -normal, 0.0, 0.0))
         planner = BracePlanner(driven, model.arrays, [link for link, _ in (*rows, *pushes)])

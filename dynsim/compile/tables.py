@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from dynsim.compile.contact_law import contact_laws
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.tree import loads as kl
 from dynsim.dynamics.tree import support as ks
@@ -176,14 +177,9 @@ def compile_contacts(robot: Robot, contacts: Sequence[Contact]) -> ka.ContactArr
             body, on_body = robot.attach(contact.body, contact.point)
         except ModelError as error:
             raise ModelError(f"contact {contact.name}: {error}") from None
-        if not contact.friction >= 0.0:
-            raise ModelError(f"contact {contact.name}: friction {contact.friction} must be zero or positive")
-        if not contact.slip_smoothing > 0.0:
-            raise ModelError(f"contact {contact.name}: slip smoothing {contact.slip_smoothing} m/s must be positive")
         surface = contact.surface
         link[k, ka.LINK], link[k, ka.FRICTION_LAW] = body, _FRICTION[contact.pulling_friction]
         point[k, ka.POINT : ka.POINT + 3] = on_body
-        point[k, ka.MU], point[k, ka.V_S] = contact.friction, contact.slip_smoothing
         if not isinstance(surface, Quadric):  # any plane will do: its rows are overwritten
             point[k, ka.QUADRIC + 8] = 1.0
             continue
@@ -193,7 +189,7 @@ def compile_contacts(robot: Robot, contacts: Sequence[Contact]) -> ka.ContactArr
         point[k, ka.QUADRIC : ka.QUADRIC + 6] = surface.Q[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
         point[k, ka.QUADRIC + 6 : ka.QUADRIC + 9] = scale * surface.b
         point[k, ka.QUADRIC + 9] = scale * surface.c
-    return ka.ContactArrays(link=integers(link), point=reals(point))
+    return ka.ContactArrays(integers(link), reals(point), reals(contact_laws(robot, contacts)))
 
 
 def compile_loads(robot: Robot, loads: Sequence[Load]) -> LoadArrays:
@@ -230,8 +226,8 @@ def compile_couplings(robot: Robot) -> ka.CouplingArrays:
     return ka.CouplingArrays(joint=integers(joint), law=reals(law))
 
 
-def compile_support(robot: Robot) -> ks.SupportArrays | None:
-    """Tables of the mobile base; None for a robot without one.
+def compile_support(robot: Robot) -> ks.SupportArrays:
+    """Tables of the mobile base; of size zero for a robot without one.
 
     Raises
     ------
@@ -240,7 +236,7 @@ def compile_support(robot: Robot) -> ks.SupportArrays | None:
     """
     base = robot.base
     if base is None:
-        return None
+        return ks.no_support()
     sizes = ks.BASE_SIZE, ks.STATE_SIZE, ks.LEAST_SIZE
     arrays = ks.SupportArrays(integers(np.zeros(ks.INDEX_SIZE)), *(reals(np.full(size, np.inf)) for size in sizes))
     bodies, joints = [link.name for link in robot.links], robot.joint_names

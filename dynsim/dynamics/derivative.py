@@ -124,7 +124,7 @@ def derivative(system: System, t, y, ws: Workspace, dy):
     found = ws.counts[ka.DEPENDENT]
     constrained_acceleration(model, ws)
     m_star_acceleration(system.dense, model, drives, ws, found)
-    admissible_forces(system.unilateral, ws)
+    admissible_forces(system.contacts, system.unilateral, ws)
 
     if not plain:
         position_rates(model.compound, model, ws, dy, layout.q)

@@ -94,9 +94,17 @@ CONTACT_LINK_SIZE = 3
 # ContactArrays.point
 POINT = 0  # 3: in the body's frame [m]
 QUADRIC = 3  # 10: C(r) = r.Q r/2 + b.r + c: Q xx xy xz yy yz zz, b, c
-MU = 13  # kinetic friction coefficient
-V_S = 14  # smoothing speed of the slip direction [m/s]
-POINT_SIZE = 15
+POINT_SIZE = 13
+# ContactArrays.law: of friction and impacts; the bilateral law reads MU and V_S alone
+MU = 0  # kinetic coefficient μ
+V_S = 1  # smoothing speed of the slip direction [m/s]
+STATIC = 2  # static coefficient μ_s ≥ μ
+STRIBECK = 3  # speed v_s [m/s] of μ + (μ_s − μ) exp(−(s/v_s)²); 0: μ from the first slip on
+VISCOUS = 4  # [s/m]: adds c s to the coefficient
+RESTITUTION = 5
+GRIP = 6  # of time stepping: friction along GRIP_AXIS per that across; 1: isotropic
+GRIP_AXIS = 7  # 3: in the body's frame
+CONTACT_LAW_SIZE = 10
 # CouplingArrays.joint, int
 FOLLOWER = 0  # link whose joint follows
 LEADER = 1
@@ -206,7 +214,9 @@ class ReferenceArrays(NamedTuple):
     held: np.ndarray  # (na,) constant angle of a held joint
     grid: np.ndarray  # (2,) time of the first knot, knot distance [s]
     coefficients: np.ndarray  # (segments, splines, 6) ascending powers of t - t_knot
-    voltage: np.ndarray | None = None  # (segments, na, 6) added to the commands of DC motors [V]; None for none
+    voltage: np.ndarray = np.zeros(
+        (0, 0, 6)
+    )  # (segments, na, 6) added to the commands of DC motors [V]; no segments: nothing is
 
 
 class ContactArrays(NamedTuple):
@@ -214,6 +224,7 @@ class ContactArrays(NamedTuple):
 
     link: np.ndarray  # (c, CONTACT_LINK_SIZE) int
     point: np.ndarray  # (c, POINT_SIZE)
+    law: np.ndarray  # (c, CONTACT_LAW_SIZE)
 
 
 class CouplingArrays(NamedTuple):

@@ -69,7 +69,7 @@ def balanced(
     current, shift = np.zeros(len(motors)), np.zeros(len(motors))
     found: list[str] = []
     planned = control.reference.voltage
-    if planned is None:
+    if not len(planned):
         able = [
             motor.joint
             for motor, k_p in zip(motors, control.k_p, strict=True)
@@ -94,7 +94,7 @@ def balanced(
         drop = motor.resistance * torques[i] / motor.joint_constant
         k_p = motor.k_p if isinstance(motor, Servo) else control.k_p[a]
         current[a] = torques[i] / motor.joint_constant
-        if planned is not None:
+        if len(planned):
             current[a] += planned[0, a, 0] / motor.resistance
         if drop != 0.0 and k_p > 0.0:
             shift[a] = drop / k_p

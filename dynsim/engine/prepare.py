@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 
 from dynsim.compile.clearance import gaps
-from dynsim.compile.contact_law import JointStop, compile_grips, compile_unilateral, joint_stops
+from dynsim.compile.contact_law import JointStop, compile_unilateral, joint_stops
 from dynsim.compile.control import JointControl
 from dynsim.compile.model import Model
 from dynsim.compile.shapes import compile_shapes
@@ -31,7 +31,6 @@ from dynsim.errors import ModelError, ScenarioError
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts import events as kev
 from dynsim.integrators.events import TIP_MARGIN
-from dynsim.integrators.stepping import tables as kt
 from dynsim.integrators.stepping.tables import stepping_arrays
 from dynsim.model.description import Array, Contact, Load, Robot
 from dynsim.model.drives import Drive, Motor
@@ -67,15 +66,13 @@ class Prepared:
     @property
     def kind(self) -> str:
         """What its kernels are compiled for, in words."""
-        system, robot = self.system, self.model.robot
+        system = self.system
         parts = [self.choice.method]
         if self.contacts or self.stops:
             parts.append("contacts that are glued" if system.unilateral is None else "contacts that open and close")
         extras = {
             "spheres, boxes or height fields": system.shapes is not None,
             "joints of several rates": self.model.arrays.compound is not None,
-            "a mobile base": robot.base is not None,
-            "planned voltages": system.reference.voltage is not None,
             "the dense system": system.dense is not None,
         }
         return f"arms by {', '.join([*parts, *(name for name, there in extras.items() if there)])}"
@@ -165,8 +162,7 @@ def prepare(
     )
     stepping = None
     if method == ki.TIME_STEPPING and system.unilateral is not None:
-        stepping = stepping_arrays(model.arrays, system.contacts, na, joint_rows, options.theta, system.unilateral)
-        stepping.law[:, kt.GRIP : kt.GRIP_AXIS + 3] = compile_grips(robot, contacts)
+        stepping = stepping_arrays(model.arrays, system.contacts, na, joint_rows, options.theta)
     y = np.zeros(layout.size)
     y[block(layout, "q")] = robot.initial
     if balance is not None:
@@ -334,17 +330,10 @@ def _check_references(scenario: Scenario, model: Model, contacts: Sequence[Conta
     robot, tolerance = model.robot, scenario.config.contacts.reference_tolerance_m
     places = [contact.geometry for contact in contacts]
 
-    def check() -> None:
-        _check_held(model, contacts, control, tolerance)
-
-    def check_anew() -> None:
-        driven = [motor.joint for motor in robot.motors]
-        names = [(link.name, link.joint, link.parent) for link in robot.links]
-        bits = model.geometry, robot.initial, names, robot.frames, driven, control.reference, control.k_p, robot.base
-        recall("held places", check, *bits, places, tolerance)
-
-    # Of the same objects first, which are quickly told.
-    recall("held contacts", check_anew, model, control, places, tolerance)
+    driven = [motor.joint for motor in robot.motors]
+    names = [(link.name, link.joint, link.parent) for link in robot.links]
+    bits = model.geometry, robot.initial, names, robot.frames, driven, control.reference, control.k_p, robot.base
+    recall("held places", lambda: _check_held(model, contacts, control, tolerance), *bits, places, tolerance)
 
 
 def _check_held(model: Model, contacts: Sequence[Contact], control: JointControl, tolerance: float) -> None:

@@ -158,7 +158,7 @@ def summarise(record: Record, scenario: Scenario, prepared: Prepared, wall: floa
 def _base(record: Record, scenario: Scenario, prepared: Prepared) -> dict[str, Any]:
     """What there is to say of a mobile base, where there is one."""
     base, support = prepared.model.robot.base, prepared.run.support
-    if base is None or support is None:
+    if base is None:
         return {}
     columns = [record.labels["q"].index(joint) for joint in base.wheels]
     # Rolling: s = r (φ_l + φ_r)/2, however far apart the samples are.

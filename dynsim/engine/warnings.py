@@ -179,8 +179,8 @@ def _undetermined(record: Record, prepared: Prepared) -> list[str]:
     found = [f"contact rows depended on each other in {evaluations} evaluations: forces are the split of least norm"]
     spread = None
     if len(record) and any(contact.friction > 0.0 for contact in contacts):
-        units = [(link.joint, link.units[2]) for link in prepared.model.robot.links]
-        spread = motion_spread(system, record.time, run.sample[: len(record)], units)
+        rows, units = len(record), [(link.joint, link.units[2]) for link in prepared.model.robot.links]
+        spread = motion_spread(system, record.time, run.sample[:rows], units)
     if spread is not None:
         found.append(
             f"with friction, dependent contact rows leave the motion open too: at t = {spread.time:.4g} s the "
@@ -326,7 +326,7 @@ def capped(stepping: dict[str, Any]) -> list[str]:
 def _base_warnings(record: Record, scenario: Scenario, prepared: Prepared) -> list[str]:
     """What a mobile base does that a real one could not do."""
     base, run, settle = prepared.model.robot.base, prepared.run, scenario.metrics.settle_s
-    if base is None or run.support is None:
+    if base is None:
         return []
     found = []
     load, traction = record["wheel_load"], record["traction_demand"]

@@ -101,7 +101,7 @@ def nudge(
     start = servo.to_angle(tick)
     way = _way(servo, start)
     one = _alone(servo_map, servo)
-    motion = CheckedMotion(_out_and_back(start, way), 1.0, plan_cycle(one, one.bus.rate), (), ())
+    motion = CheckedMotion(path=_out_and_back(start, way), plan=plan_cycle(one, one.bus.rate))
     replay = Replay(motion, one, cast(Bus, _OneServo(bus, servo.id)), clock, live=live, stop=stop)
     result = replay.run()
     if result.fault is not None and result.fault_state is not None:

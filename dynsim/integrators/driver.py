@@ -25,12 +25,12 @@ from dynsim.dynamics.tree.support import watch_support
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts.events import consistent, solve_modes, switch_contacts, take_directions, watch_modes
 from dynsim.integrators.dense import sample_step, write_waiting
+from dynsim.integrators.dopri5 import step_dopri5
 from dynsim.integrators.events import arm_events, cut_step, fire_events, take_ticks
-from dynsim.integrators.explicit import step_dopri5
 from dynsim.integrators.project import settle
 from dynsim.integrators.radau5.ends import end_accepted
-from dynsim.integrators.radau5.newton import forget
 from dynsim.integrators.radau5.step import after_step, step_radau5
+from dynsim.integrators.radau5.tables import forget
 from dynsim.integrators.run import Run
 from dynsim.integrators.stepping.step import advance_moreau
 from dynsim.integrators.steps import choose_step, finished, finite, first_step, next_step, rejected, stalled

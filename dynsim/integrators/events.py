@@ -48,9 +48,9 @@ def guard(system: System, t, ws: Workspace, run: Run, e):
     elif kind == CONTACT_GAP:
         value = ws.contacts[k, ka.GAP]
     elif kind == TIP_MARGIN:
-        value = tip_margin(system.model, system.loads, t, ws, run.support)
+        value = tip_margin(system.model.compound, system.model, system.loads, t, ws, run.support)
     elif kind >= kev.NORMAL_GUARD:
-        value = contact_guard(system.unilateral, ws, kind, k)
+        value = contact_guard(system.contacts, system.unilateral, ws, kind, k)
     else:
         point_position(ws, run.hand_link, run.hand_point, run.hand)
         value = run.hand[kind - HAND_X]
@@ -150,7 +150,7 @@ def keep_passed(run: Run):
 @internal_kernel
 def passes_over(system: System, ws: Workspace, run: Run):
     """True when a contact has been passed over within the step: STEP is then the one to take instead."""
-    part = too_long(system.unilateral, ws, run.clock[ki.STEP], run.gaps)
+    part = too_long(system.contacts, system.unilateral, ws, run.clock[ki.STEP], run.gaps)
     # What is none, after all, does not shorten steps for ever, nor to nothing.
     shorter = part * run.clock[ki.STEP] > event_tolerance(run.clock[ki.TIME])
     if part < 1.0 and shorter and run.count[ki.GRAZING] < SEARCH_LIMIT:

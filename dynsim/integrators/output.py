@@ -12,7 +12,7 @@ from dynsim.dynamics.ledger import kinetic_energy, magnetic_energy, potential_en
 from dynsim.dynamics.tables import Workspace
 from dynsim.dynamics.tree import support as ks
 from dynsim.dynamics.tree.points import point_position
-from dynsim.dynamics.tree.support import SupportArrays, ground_reaction
+from dynsim.dynamics.tree.support import ground_reaction
 from dynsim.integrators.run import Run
 from dynsim.jit.kernel import internal_kernel
 
@@ -21,7 +21,7 @@ from dynsim.jit.kernel import internal_kernel
 def write_output(system: System, ws: Workspace, run: Run, row):
     """Everything worth recording that is not a state, after ``derivative``, into the columns of OutputLayout."""
     fill_output(system, ws, run, run.output[row])
-    write_support(system, ws, run, row, run.support)
+    write_support(system.model.compound, system, ws, run, row)
 
 
 @internal_kernel
@@ -67,10 +67,12 @@ def stop_forces(unilateral: UnilateralArrays | None, out):
 
 
 @internal_kernel
-def write_support(system: System, ws: Workspace, run: Run, row, support: SupportArrays | None):
+def write_support(compound, system: System, ws: Workspace, run: Run, row):
     """What the ground carries of a mobile base, into the columns ``support``."""
-    if support is None:  # known to the compiler
+    if compound is None:  # known to the compiler: the wheels of a base share rates
         return
-    ground_reaction(system.model, system.loads, run.sample_time[row], ws, support)
+    if run.support.index.shape[0] == 0:
+        return
+    ground_reaction(system.model, system.loads, run.sample_time[row], ws, run.support)
     for s in range(ks.OUTPUTS):
-        run.output[row, run.columns.support + s] = support.state[s]
+        run.output[row, run.columns.support + s] = run.support.state[s]

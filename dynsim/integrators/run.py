@@ -8,10 +8,11 @@ import numpy as np
 
 from dynsim.dynamics import state as kst
 from dynsim.dynamics.contact import uniqueness as kq
+from dynsim.dynamics.simd.system import stage_lanes
 from dynsim.dynamics.state import OutputLayout, StateLayout, block
 from dynsim.dynamics.tables import row_limit, workspace
-from dynsim.dynamics.tree.support import SupportArrays
-from dynsim.integrators.radau5.newton import NewtonArrays, newton_arrays, stage_lanes
+from dynsim.dynamics.tree.support import SupportArrays, no_support
+from dynsim.integrators.radau5.tables import NewtonArrays, newton_arrays
 from dynsim.integrators.stepping.tables import SteppingArrays
 from dynsim.jit.kernel import integers, reals
 
@@ -98,7 +99,7 @@ class Run(NamedTuple):
     log_event: np.ndarray  # (LOG_LENGTH,) int: which
     hand: np.ndarray  # (3,) room
     gaps: np.ndarray  # (c, GAPS_SIZE) gaps, their rates, normals and places at the start of the step
-    support: SupportArrays | None
+    support: SupportArrays
     columns: OutputLayout
     output: np.ndarray  # (T, columns.size)
     stepping: SteppingArrays | None  # of time stepping alone
@@ -191,7 +192,7 @@ def new_run(
         log_event=np.zeros(LOG_LENGTH, dtype=np.int64),
         hand=np.zeros(3),
         gaps=np.zeros((c, GAPS_SIZE)),
-        support=support,
+        support=no_support() if support is None else support,
         columns=columns,
         output=np.zeros((len(sample_time), columns.size)),
         stepping=stepping,

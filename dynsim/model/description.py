@@ -249,6 +249,11 @@ class Contact:
     tip: Array | None = None
 
     @property
+    def friction_at_rest(self) -> float:
+        """Static coefficient μ_s, by default the kinetic one."""
+        return self.friction if self.static_friction is None else self.static_friction
+
+    @property
     def geometry(self) -> tuple[str, str, Array, Surface, float, Array | None]:
         """What says where it is and what it can touch, without its law."""
         return self.name, self.body, self.point, self.surface, self.radius, self.tip

@@ -281,13 +281,12 @@ def contacts(scenario: Scenario, described: Robot | None = None) -> list[Contact
                 point=np.array(point.point_m),
                 surface=known[point.surface],
                 surface_name=point.surface,
-                friction=options.friction if point.friction is None else point.friction,
                 radius=point.radius_m,
-                **(_bilateral(options) if options.law == "bilateral" else _unilateral(options, point)),
+                **_law(options, point),
             )
         )
     if options.candidates != "points":
-        law = {"friction": options.friction, **_unilateral(options, ContactPoint(body=""))}
+        law = _law(options, ContactPoint(body=""))
         described = robot(scenario) if described is None else described
         result += [replace(one, **law) for one in candidates(options.candidates, described, known, result)]
     error = scenario.config.surface_error
@@ -300,16 +299,16 @@ def _rubbed(contact: Contact, factor: float) -> Contact:
     return replace(contact, friction=factor * contact.friction, static_friction=static)
 
 
-def _bilateral(options: Contacts) -> dict[str, Any]:
-    """What the bilateral law says of a contact."""
-    return {"slip_smoothing": options.slip_smoothing_m_s, "pulling_friction": options.pulling_friction}
-
-
-def _unilateral(options: Contacts, point: ContactPoint) -> dict[str, Any]:
-    """What the unilateral law says of a contact."""
+def _law(options: Contacts, point: ContactPoint) -> dict[str, Any]:
+    """What the law of the contacts says of one of them."""
+    friction, static = options.coefficients(point)
+    if options.law == "bilateral":
+        smoothing, pulling = options.slip_smoothing_m_s, options.pulling_friction
+        return {"friction": friction, "slip_smoothing": smoothing, "pulling_friction": pulling}
     return {
+        "friction": friction,
         "pulling_friction": "signed",
-        "static_friction": options.static_friction if point.static_friction is None else point.static_friction,
+        "static_friction": static,
         "stribeck": options.stribeck_m_s or 0.0,
         "viscous_friction": options.viscous_friction_s_per_m,
         "restitution": options.restitution if point.restitution is None else point.restitution,

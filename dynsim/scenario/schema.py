@@ -88,6 +88,14 @@ class Contacts(StrictConfig):
     )
     points: dict[str, ContactPoint] = {}
 
+    def coefficients(self, point: ContactPoint | None = None) -> tuple[float, float]:
+        """Kinetic and static coefficient of a point: its own, else those of contacts; static defaults to kinetic."""
+        kinetic, static = (
+            getattr(self, key) if point is None or getattr(point, key) is None else getattr(point, key)
+            for key in ("friction", "static_friction")
+        )
+        return kinetic, kinetic if static is None else static
+
     @property
     def other_keys(self) -> tuple[str, ...]:
         """Keys that only the other law reads."""
@@ -105,20 +113,19 @@ class Contacts(StrictConfig):
             raise error_at(
                 "candidates", f"{self.candidates!r} would glue all of them to their surfaces; it needs law: unilateral"
             )
-        static = self.friction if self.static_friction is None else self.static_friction
-        if static < self.friction:
+        kinetic, static = self.coefficients()
+        if static < kinetic:
             raise error_at("static_friction", f"is less than friction {self.friction:g}; it must hold as much or more")
         for name, point in self.points.items():
             given = sorted(point.model_fields_set & set(UNILATERAL_KEYS))
             if self.law == "bilateral" and given:
                 raise error_at(f"points.{name}.{given[0]}", fix)
-            kinetic = self.friction if point.friction is None else point.friction
-            holds = point.static_friction if point.static_friction is not None else self.static_friction
-            if holds is not None and holds < kinetic:
+            kinetic, static = self.coefficients(point)
+            if static < kinetic:
                 key = "friction" if point.static_friction is None else "static_friction"
                 raise error_at(
                     f"points.{name}.{key}",
-                    f"static_friction {holds:g} is less than friction {kinetic:g}; it must hold as much or more",
+                    f"static_friction {static:g} is less than friction {kinetic:g}; it must hold as much or more",
                 )
         return self
 

@@ -12,8 +12,10 @@ from support.fault_table import CASES, POLICIES, Case, broken_promises
 from dynsim.hardware.bus.control_table import RAD_PER_TICK
 from dynsim.hardware.bus.packet import Instruction
 from dynsim.hardware.replay.check import velocity_limit
-from dynsim.hardware.replay.rules import Cause, reaction_bound
+from dynsim.hardware.replay.motion import CyclePlan
+from dynsim.hardware.replay.rules import Cause
 from dynsim.hardware.replay.states import State
+from dynsim.hardware.servo_map import ServoMap
 from dynsim.hardware.virtual.servos import PHYSICS_STEP
 
 from .conftest import check_goals_within_limits
@@ -22,6 +24,23 @@ SILENCING = ("lost_status", "late_status", "truncated_status", "bad_crc", "drop_
 """Who suffers from these cannot say what it does."""
 DISABLING = ("reboot", "overload", "overheat", "temperature_ramp")
 """These take the torque from their victim, at once or by and by."""
+
+
+def reaction_bound(cause: Cause, servo_map: ServoMap, plan: CyclePlan) -> int:
+    """Cycles within which a rule declares its fault, counted from the first cycle that shows it."""
+    safety = servo_map.safety
+    in_turn = len(servo_map.servos) * plan.health_every
+    return {
+        Cause.MISSED_STATUS: safety.missed_cycles,
+        Cause.FOLLOWING_ERROR: safety.following_cycles,
+        Cause.TORQUE: safety.torque_cycles,
+        Cause.DEADLINE: safety.late_cycles,
+        Cause.ALERT: 1,
+        Cause.TORQUE_LOST: in_turn,
+        Cause.WATCHDOG: in_turn,
+        Cause.VOLTAGE: in_turn,
+        Cause.TEMPERATURE: in_turn,
+    }.get(cause, 1)
 
 
 def check_case(rig, case: Case, seed: int) -> None:

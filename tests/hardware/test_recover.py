@@ -16,7 +16,7 @@ import pytest
 
 from dynsim.errors import RecordError
 from dynsim.hardware.errors import OutputsFailed, PortError, ReplayAborted
-from dynsim.hardware.replay import output, session
+from dynsim.hardware.replay import measured, output, session
 from dynsim.hardware.replay.loop import Loop
 from dynsim.hardware.replay.measured import recover
 from dynsim.hardware.replay.output import PART, GrowingFile, move_away, row_type
@@ -237,7 +237,7 @@ def test_the_end_that_a_replay_has_told_is_kept(rig: Rig, tmp_path: Path, monkey
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(session, "replace_together", refuse)
+        patch.setattr(measured, "replace_together", refuse)
         with pytest.raises(ReplayAborted, match="measured record failed"):
             replay(rig, tmp_path, faults=[{"kind": "overload", "id": 2, "at": 1.7}])
     told = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))

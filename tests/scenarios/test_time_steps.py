@@ -162,3 +162,31 @@ def test_steps_that_are_too_long_are_told():
         "penetration_max_m": 0.0,
     }
     assert coarse(stepping, 1.0) == []
+
+
+def test_the_energy_of_a_run_is_known_to_what_half_a_step_of_its_power_says():
+    """A hand is pushed up a wall until it slips; at 1 ms nothing of it is an impact, and it never leaves the wall."""
+    exact = dynsim.simulate(dynsim.load_scenario("wall_push", "weak_hold"))
+    known = exact.summary["electrical_energy_J"]
+    for step, told in ((1e-3, False), (5e-2, True)):
+        record = with_steps("wall_push", "weak_hold", **{"integrator.step_s": step})
+        error = abs(record.summary["electrical_energy_J"] - known)
+        blurred = record.summary["time_stepping"]["half_step_energy_J"]
+        assert error <= blurred <= 4.0 * error
+        assert any("known to" in text for text in record.summary["warnings"]) is told
+    record = with_steps("wall_push", "weak_hold")
+    (contact,), (other,) = record.summary["contacts"], exact.summary["contacts"]
+    assert record.summary["electrical_energy_J"] == pytest.approx(known, rel=5e-4)
+    assert contact["normal_force_max_N"] == pytest.approx(other["normal_force_max_N"], rel=5e-3)
+    assert contact["lift_offs"] == 0
+    assert abs(contact["impact_loss_J"]) < 1e-5
+    damped = with_steps("wall_push", "weak_hold", **{"integrator.theta": 1.0})
+    assert abs(damped.summary["contacts"][0]["impact_loss_J"]) < 1e-5
+
+
+def test_what_rests_is_told_nothing_of_its_steps():
+    """Rounding is more than a hundredth of a turnover that is nothing but rounding itself."""
+    record = with_steps("block_on_slope", "rests")
+    worst = abs(record.summary["time_stepping"]["scheme_loss_worst_J"])
+    assert worst > SCHEME_LIMIT * record.summary["energy_turnover_J"]
+    assert record.summary["warnings"] == []

@@ -26,6 +26,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 def text(result: dict) -> str:
     console = Console(width=80, record=True, file=io.StringIO())
     for table in format_table(result):
+        assert table.__rich_measure__(console, console.options.update(max_width=200)).maximum <= 80
         console.print(table)
     return console.export_text()
 

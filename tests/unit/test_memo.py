@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 import dynsim
-from dynsim.compile.clearance import _Clear, gaps, sinking
-from dynsim.scenario import build, read_scenario
+from dynsim.scenario import read_scenario
 from dynsim.studies.batch import Work
 from dynsim.studies.columns import numbers
 from dynsim.studies.sweep_plan import Axis, Plan
@@ -128,24 +127,3 @@ def test_configurations_are_known_by_their_values_and_by_what_was_set():
     # A key that is set to its default may be an error where one that is not set is none.
     default = type(ELBOWS.load().config.record).model_fields["rate_hz"].default
     assert of("record", **{"record.rate_hz": default}) != of("record")
-
-
-def test_what_is_near_a_clear_run_is_clear():
-    scenario = dynsim.load_scenario("elbow_comparison", "no_elbow", {"surfaces.floor.point_m": [0, 0, -0.02]})
-    robot, surfaces = build.robot(scenario), build.surfaces(scenario)
-    generator = np.random.default_rng(5)
-    start = np.tile(robot.initial, (40, 1))
-    points = {link.name: [(surfaces["floor"], tip) for tip in (np.zeros(3), link.tip)] for link in robot.links}
-    room = min(float(gap.min()) + link.radius for link, each in gaps(robot, start, points) for gap in each)
-    clear = _Clear()
-    clear.remember(robot, surfaces, start, room)
-    held = 0
-    for size in np.geomspace(1e-4, 1e-1, 200):
-        q = start + size * generator.uniform(-1.0, 1.0, start.shape)
-        sunk = sinking(robot, surfaces, q)
-        if clear.holds(q):
-            held += 1
-            assert not sunk
-    assert 20 < held < 180
-    assert not clear.holds(start[:-1])
-    assert not clear.holds(np.full_like(start, np.nan))

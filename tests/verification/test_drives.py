@@ -153,8 +153,9 @@ def law(motor: Drive, drives: ka.DriveArrays, q_ref: float, sampled: bool):
     table, mode, held = drives.motor, drives.table[0, ka.SERVO_MODE], drives.input[0, ka.COMMAND]
 
     def dc(q, v, i):
+        drop = table[0, ka.RESISTANCE] * table[0, ka.I_MAX]
         asked = held if sampled else dc_command(table, 0, q_ref, 0.0, q, v)
-        u = within_current(table, 0, clipped(asked, table[0, ka.U_MAX]), v)
+        u = within_current(clipped(asked, table[0, ka.U_MAX]), v, table[0, ka.K_M], drop)
         return dc_torque(table, 0, i), dc_balance(table, 0, u, v, i) / table[0, ka.INDUCTANCE]
 
     def of_servo(q, v, i):

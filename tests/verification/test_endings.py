@@ -18,8 +18,8 @@ from dynsim.engine import attended, kinematic
 from dynsim.errors import ScenarioError, SimulationInterrupted, SimulationStopped
 from dynsim.integrators import driver, events, steps
 from dynsim.integrators import run as ki
-from dynsim.integrators.radau5 import newton as kn
 from dynsim.integrators.radau5 import step as radau
+from dynsim.integrators.radau5 import tables as kn
 from dynsim.system import interruption
 
 ENDLESS = Path(__file__).parents[1] / "data" / "endless" / "arm.yaml"

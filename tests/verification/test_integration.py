@@ -9,10 +9,9 @@ import pytest
 from random_robots import ADAPTIVE, Bench, bench
 
 from dynsim.dynamics.state import CONSTRAINT, ELECTRICAL, FRICTION, GEAR, JOINT, JOULE, OUT_GAP
-from dynsim.integrators.radau5.newton import ITERATIONS
 from dynsim.integrators.radau5.step import SHORT, guess_stages, keep_stages, missed, slack
+from dynsim.integrators.radau5.tables import ERROR_RADAU, GAMMA_RADAU, ITERATIONS, NODE_RADAU
 from dynsim.integrators.run import DRIFT_MAX, FINISHED, METHODS, REJECTED, STATUS, STEP, STEP_MAX, STEPS, Run
-from dynsim.integrators.tableaux import ERROR_RADAU, GAMMA_RADAU, NODE_RADAU
 from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot
 from dynsim.model.drives import Motor
 

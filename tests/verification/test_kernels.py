@@ -68,11 +68,10 @@ def default_programs(kernel: Any) -> list[Any]:
         system_type = signature[0]
         part = dict(zip(system_type.fields, system_type.types, strict=True))
         part |= dict(zip(part["model"].fields, part["model"].types, strict=True))
-        part |= dict(zip(part["reference"].fields, part["reference"].types, strict=True))
-        absent = [part[name] for name in ("compound", "shapes", "unilateral", "voltage")]
+        absent = [part[name] for name in ("compound", "shapes", "unilateral")]
         for other in signature[1:]:
             run = dict(zip(getattr(other, "fields", ()), getattr(other, "types", ()), strict=True))
-            absent += [run[name] for name in ("support", "stepping") if name in run]
+            absent += [run[name] for name in ("stepping",) if name in run]
         if all(kind == types.none for kind in absent):
             found.append(signature)
     return found

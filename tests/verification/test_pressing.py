@@ -113,11 +113,6 @@ def test_planned_voltages_are_what_the_motion_takes():
     assert len(model.robot.motors) == 10
 
 
-def test_default_programs_have_no_planned_voltages():
-    model = dynsim.build_model(scenario())
-    assert build.controller(scenario(), model).reference.voltage is None
-
-
 @pytest.mark.parametrize("law", ["bilateral", "unilateral"])
 def test_elbows_press_as_commanded(law, tmp_path):
     """Within 2 % (they are within 1e-4) after a second, glued floor and real one; and the hand follows better."""

@@ -8,7 +8,7 @@ from lanes import copies
 from random_robots import Bench, bench, random_positions, random_robot, random_robot_of
 
 from dynsim.integrators.radau5.linear_systems import factor_both, solve_both
-from dynsim.integrators.tableaux import ALPHA_RADAU, BETA_RADAU, GAMMA_RADAU
+from dynsim.integrators.radau5.tables import ALPHA_RADAU, BETA_RADAU, GAMMA_RADAU
 from dynsim.jit.kernel import kernel
 
 

@@ -9,9 +9,10 @@ from scipy.integrate import solve_ivp
 from stepping_benches import plane, snake, stepped
 
 import dynsim
+from dynsim.dynamics import tables as ka
 from dynsim.dynamics.state import CONSTRAINT, FRICTION, IMPACT_LOSS, OUT_FORCE
 from dynsim.integrators.run import FINISHED, STATUS, Run
-from dynsim.integrators.stepping.tables import GRIP, GRIP_AXIS, PENETRATION
+from dynsim.integrators.stepping.tables import PENETRATION
 from dynsim.model.description import Contact, Inertia, Link, Robot
 from dynsim.model.drives import Motor
 
@@ -95,7 +96,7 @@ def test_what_slides_comes_to_rest_where_it_should():
 
 def test_friction_that_differs_along_and_across():
     """Two runs, each along one axis: friction along it alone; then both, in the direction of the ellipse's normal."""
-    mu, ratio, law = 0.4, 0.25, {GRIP: 0.25, GRIP_AXIS: 1.0}
+    mu, ratio, law = 0.4, 0.25, {ka.GRIP: 0.25, ka.GRIP_AXIS: 1.0}
     for speed, friction in (([1.0, 0, 0], mu * ratio), ([0, 1.0, 0], mu)):
         b = block(mu)
         run = stepped(b, b.state(np.zeros(3), np.array(speed)), np.array([0.0, 0.1]), 1e-3, 0.5, law)

@@ -7,9 +7,10 @@ import pytest
 from random_robots import Bench, bench, random_contacts, random_positions, random_robot, random_robot_of
 from stepping_benches import snake, stepped
 
+from dynsim.dynamics import tables as ka
 from dynsim.dynamics.state import CONSTRAINT, ELECTRICAL, FRICTION, GEAR, JOINT, JOULE
 from dynsim.integrators.run import STEPS, Run
-from dynsim.integrators.stepping.tables import BAD, CAPPED, GRIP, GRIP_AXIS, PENETRATION, WORST
+from dynsim.integrators.stepping.tables import BAD, CAPPED, PENETRATION, WORST
 from dynsim.model.description import Coupling, Load, Robot
 from dynsim.model.drives import Servo, TorqueSource
 
@@ -98,7 +99,7 @@ def test_bodies_that_are_free(kinds):
 
 def test_a_scene_of_the_snakes_size_keeps_its_cones_and_its_ledger():
     b, y = snake()
-    run = stepped(b, y, np.linspace(0.0, 0.5, 101), 1e-3, 0.5, {GRIP: 0.05, GRIP_AXIS: 1.0})
+    run = stepped(b, y, np.linspace(0.0, 0.5, 101), 1e-3, 0.5, {ka.GRIP: 0.05, ka.GRIP_AXIS: 1.0})
     found, ledger = run.stepping.found, run.states("ledger")[-1]
     assert run.count[STEPS] == 500
     assert found[CAPPED] == 0

@@ -18,8 +18,8 @@ from dynsim.draw.figures.skeleton import SidePlane
 from dynsim.draw.figures.style import Array
 from dynsim.draw.geometry.shapes import corners_of, outline
 from dynsim.draw.geometry.wheels import wheel_groups
+from dynsim.errors import RecordError
 from dynsim.record import Record
-from dynsim.record.scene import Scene
 from dynsim.snake.geometry import snake_geometry
 
 BODY, HEAD, GROUND, LIFT, TARGET, SUPPORT = "#444444", style.PULLING, style.BLUE, "#FFFFFF", style.GREEN, style.SKY
@@ -41,7 +41,8 @@ class View:
 
     def __init__(self, record: Record, row: int) -> None:
         scene = record.scene
-        assert isinstance(scene, Scene)
+        if scene is None:
+            raise RecordError("a record of a snake without its scene cannot be drawn: wheels and links are in it")
         self.row, self.time, self.mode = row, float(record.time[row]), int(record["mode"][row])
         self.points: Array = record["posture"][row]
         self.path: Array = record["w"][:, :2]

@@ -89,7 +89,9 @@ def contact_rows(model: ModelArrays, contacts: ContactArrays, unilateral: Unilat
         rate = dot_vector(n, v)
         slip = v[0] - rate * n[0], v[1] - rate * n[1], v[2] - rate * n[2]
         if unilateral is None:
-            t = times_number(slip, 1.0 / math.sqrt(dot_vector(slip, slip) + point[k, ka.V_S] * point[k, ka.V_S]))
+            t = times_number(
+                slip, 1.0 / math.sqrt(dot_vector(slip, slip) + contacts.law[k, ka.V_S] * contacts.law[k, ka.V_S])
+            )
         else:
             x, y, z, mu = slide_direction(unilateral, contacts, k, slip[0], slip[1], slip[2])
             t = x, y, z

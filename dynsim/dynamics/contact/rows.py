@@ -60,7 +60,7 @@ def set_modes(
         if modes[k] == ka.SLIDING:
             new_row(ws, p, ka.SLIDING_ROW, k, i)
             active[p, ka.LAW] = contacts.link[k, ka.FRICTION_LAW]
-            rows[p, ka.ROW_MU] = contacts.point[k, ka.MU]
+            rows[p, ka.ROW_MU] = contacts.law[k, ka.MU]
             p += 1
         elif modes[k] == ka.STICKING:
             held += 1

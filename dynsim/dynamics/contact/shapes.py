@@ -108,7 +108,9 @@ def shaped_row(
     v = along(v, cross(w, n), -radius)
     slip = along(v, n, -rate)
     if unilateral is None:
-        t = times_number(slip, 1.0 / math.sqrt(dot_vector(slip, slip) + point[k, ka.V_S] * point[k, ka.V_S]))
+        t = times_number(
+            slip, 1.0 / math.sqrt(dot_vector(slip, slip) + contacts.law[k, ka.V_S] * contacts.law[k, ka.V_S])
+        )
     else:
         tx, ty, tz, rows[m, ka.ROW_MU] = slide_direction(unilateral, contacts, k, slip[0], slip[1], slip[2])
         t = tx, ty, tz

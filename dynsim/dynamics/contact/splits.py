@@ -13,7 +13,7 @@ from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.cone.socp import best_split, split_room_in
 from dynsim.dynamics.contact.unilateral import UnilateralArrays, note_stop_forces
-from dynsim.dynamics.tables import Workspace
+from dynsim.dynamics.tables import ContactArrays, Workspace
 from dynsim.jit.kernel import apart_kernel, internal_kernel
 
 # A pivot below this fraction of the largest is a row that depends on the others.
@@ -21,15 +21,15 @@ NULL_TOLERANCE = 1e-10
 
 
 @internal_kernel
-def margin(unilateral: UnilateralArrays, ws: Workspace, k):
+def margin(contacts: ContactArrays, ws: Workspace, k):
     """μ_s f_n − |f_t| of candidate k, which sticks [N]."""
     r, rows = ws.active[k, ka.FIRST_ROW], ws.rows
     a, b = rows[r + 1, ka.FORCE], rows[r + 2, ka.FORCE]
-    return unilateral.law[k, ku.STATIC] * rows[r, ka.FORCE] - math.sqrt(a * a + b * b)
+    return contacts.law[k, ka.STATIC] * rows[r, ka.FORCE] - math.sqrt(a * a + b * b)
 
 
 @internal_kernel
-def admissible_forces(unilateral: UnilateralArrays | None, ws: Workspace):
+def admissible_forces(contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: Workspace):
     """Replace the forces of dependent rows that stick where they do not lie in their cones; note those of stops.
 
     Accelerations do not change: the rows are their own directions, so what they cannot tell apart moves nothing.
@@ -38,30 +38,30 @@ def admissible_forces(unilateral: UnilateralArrays | None, ws: Workspace):
         return
     # Small, because it is merged into the right-hand side.
     if unilateral.number[ku.REDUNDANT] == 1.0 or unilateral.stop.shape[0] > 0:
-        look_at_forces(unilateral, ws)
+        look_at_forces(contacts, unilateral, ws)
 
 
 @apart_kernel
-def look_at_forces(unilateral: UnilateralArrays, ws: Workspace):
+def look_at_forces(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace):
     """:func:`admissible_forces` where there are dependent rows or stops."""
     note_stop_forces(unilateral, ws)
     unilateral.number[ku.SPLIT] = 0.0
     if unilateral.number[ku.REDUNDANT] == 1.0:
         for k in range(ws.contacts.shape[0]):
-            if ws.active[k, ka.MODE] == ka.STICKING and margin(unilateral, ws, k) < 0.0:
-                split_forces(unilateral, ws)
+            if ws.active[k, ka.MODE] == ka.STICKING and margin(contacts, ws, k) < 0.0:
+                split_forces(contacts, unilateral, ws)
                 return
 
 
 @apart_kernel
-def split_forces(unilateral: UnilateralArrays, ws: Workspace):
+def split_forces(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace):
     """The best split of the forces of all that sticks, into FORCE of its rows; its worst margin into BEST_MARGIN."""
     room, place, mu, rows = unilateral.room, unilateral.place, unilateral.vector[0], ws.rows
     first, row = place[0], place[1]
     count, p = 0, 0
     for k in range(ws.contacts.shape[0]):
         if ws.active[k, ka.MODE] == ka.STICKING:
-            first[count], mu[count] = p, unilateral.law[k, ku.STATIC]
+            first[count], mu[count] = p, contacts.law[k, ka.STATIC]
             for s in range(3):
                 row[p] = ws.active[k, ka.FIRST_ROW] + s
                 p += 1

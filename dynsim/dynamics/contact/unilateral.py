@@ -17,12 +17,6 @@ from dynsim.dynamics.contact.cone import problem as kc
 from dynsim.dynamics.tables import ContactArrays, Workspace
 from dynsim.jit.kernel import internal_kernel
 
-# UnilateralArrays.law; the kinetic coefficient is ContactArrays.point[:, MU].
-STATIC = 0  # static coefficient μ_s ≥ μ_k
-STRIBECK = 1  # speed v_s [m/s] of μ_k + (μ_s − μ_k) exp(−(s/v_s)²); 0: μ_k from the first slip on
-VISCOUS = 2  # [s/m]: adds c s to the coefficient
-RESTITUTION = 3
-LAW_SIZE = 4
 # UnilateralArrays.slide
 REFERENCE = 0  # 3: direction of slip at the start of the step, or since it began while FROZEN; 0 before any
 FROZEN = 3  # 1: slip is too slow to have a direction of its own, that of REFERENCE stands
@@ -83,7 +77,6 @@ NUMBERS = 6
 class UnilateralArrays(NamedTuple):
     """c candidates and s joint stops under the unilateral law; p is the most rows that there can be."""
 
-    law: np.ndarray  # (c, LAW_SIZE)
     slide: np.ndarray  # (c, SLIDE_SIZE)
     mode: np.ndarray  # (c, MODE_SIZE) int
     tally: np.ndarray  # (c, TALLY_SIZE)
@@ -104,7 +97,7 @@ def slide_direction(unilateral: UnilateralArrays, contacts: ContactArrays, k, x,
     goes on as it was, so that a step that passes the end of slip is smooth, and the end of slip is where
     v_t · REFERENCE is zero.
     """
-    slide, law = unilateral.slide, unilateral.law
+    slide = unilateral.slide
     a, b, c = slide[k, REFERENCE], slide[k, REFERENCE + 1], slide[k, REFERENCE + 2]
     along = x * a + y * b + z * c
     size = math.sqrt(x * x + y * y + z * z)
@@ -114,7 +107,7 @@ def slide_direction(unilateral: UnilateralArrays, contacts: ContactArrays, k, x,
         scale = 1.0 / size if along >= 0.0 else -1.0 / size
         a, b, c = x * scale, y * scale, z * scale
         speed = size if along >= 0.0 else -size
-    return a, b, c, sliding_friction(law, k, contacts.point[k, ka.MU], speed)
+    return a, b, c, sliding_friction(contacts.law, k, speed)
 
 
 @internal_kernel
@@ -134,9 +127,10 @@ def note_stop_forces(unilateral: UnilateralArrays, ws: Workspace):
 
 
 @internal_kernel
-def sliding_friction(law, k, mu, speed):
-    """Coefficient of friction of candidate k that slides at this speed, mu being the kinetic one."""
-    if law[k, STRIBECK] > 0.0:
-        ratio = speed / law[k, STRIBECK]
-        mu += (law[k, STATIC] - mu) * math.exp(-ratio * ratio)
-    return mu + law[k, VISCOUS] * speed
+def sliding_friction(law, k, speed):
+    """Coefficient of friction of candidate k that slides at this speed; law: (c, CONTACT_LAW_SIZE)."""
+    mu = law[k, ka.MU]
+    if law[k, ka.STRIBECK] > 0.0:
+        ratio = speed / law[k, ka.STRIBECK]
+        mu += (law[k, ka.STATIC] - mu) * math.exp(-ratio * ratio)
+    return mu + law[k, ka.VISCOUS] * speed

@@ -18,10 +18,13 @@ def dc_command(motor, a, q_ref, v_ref, q, v):
     return motor[a, ka.K_P] * (q_ref - q) + motor[a, ka.K_D] * (v_ref - v)
 
 
-def within_current(motor, a, u, v):
-    """The voltage u where it drives no more current than the limit [V], also beyond the limit of voltage."""
-    back = motor[a, ka.K_M] * v
-    return back + clipped(u - back, motor[a, ka.RESISTANCE] * motor[a, ka.I_MAX])
+def within_current(u, v, k_m, drop):
+    """The voltage u where it drives no more current than the limit [V], also beyond the limit of voltage.
+
+    drop : R I of the limit [V]
+    """
+    back = k_m * v
+    return back + clipped(u - back, drop)
 
 
 def dc_torque(motor, a, i):

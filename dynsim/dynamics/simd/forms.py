@@ -31,7 +31,7 @@ def any_lanes(*kinds):
 
 
 def times(*kinds):
-    """Where lanes have times of their own: t is the third argument."""
+    """Where there are several times: t is the third argument."""
     return lanes_of(kinds[2]) > 0
 
 
@@ -96,7 +96,7 @@ def all_clearly_unique(ws):
 @form_of(slide_direction, any_lanes)
 def slide_direction_lanes(unilateral, contacts, k, x, y, z):
     """Each lane's own direction; ``unilateral.slide`` keeps the speed of the last state that was evaluated alone."""
-    slide, law = unilateral.slide, unilateral.law
+    slide = unilateral.slide
     a, b, c = slide[k, ku.REFERENCE], slide[k, ku.REFERENCE + 1], slide[k, ku.REFERENCE + 2]
     along = x * a + y * b + z * c
     speed = along
@@ -106,17 +106,17 @@ def slide_direction_lanes(unilateral, contacts, k, x, y, z):
         scale = select(on, 1.0 / size, -1.0 / size)
         a, b, c = select(moves, x * scale, a), select(moves, y * scale, b), select(moves, z * scale, c)
         speed = select(moves, select(on, size, -size), along)
-    return a, b, c, sliding_friction(law, k, contacts.point[k, ka.MU], speed)
+    return a, b, c, sliding_friction(contacts.law, k, speed)
 
 
 @form_of(admissible_forces, any_lanes)
-def admissible_forces_lanes(unilateral, ws):
+def admissible_forces_lanes(contacts, unilateral, ws):
     """One by one, where there is something to look at."""
     if unilateral is None:  # known to the compiler
         return
     if unilateral.number[ku.REDUNDANT] == 1.0 or unilateral.stop.shape[0] > 0:
         for k in range(lane_count(ws)):
-            look_at_forces(unilateral, lane(ws, k))
+            look_at_forces(contacts, unilateral, lane(ws, k))
 
 
 @form_of(sign_changed, any_lanes)
@@ -136,18 +136,18 @@ def sign_changed_lanes(ws, passes):
 
 @form_of(evaluate_reference, times)
 def evaluate_reference_lanes(drives, reference, t, ws):
-    """At times of their own, which may lie in different segments."""
+    """At several times, which may lie in different segments."""
     for k in range(lane_count(t)):
-        evaluate_reference(lane(drives, k), lane(reference, k), lane(t, k), lane(ws, k))
+        evaluate_reference(drives, reference, lane(t, k), lane(ws, k))
 
 
 @form_of(fed_forward, times)
 def fed_forward_lanes(voltage, grid, t, a, asked):
     """The same of planned voltages."""
-    if voltage is None:  # known to the compiler
+    if voltage.shape[0] == 0:
         return asked
     for k in range(lane_count(t)):
-        asked = with_lane(asked, k, fed_forward(lane(voltage, k), grid, lane(t, k), a, lane(asked, k)))
+        asked = with_lane(asked, k, fed_forward(voltage, grid, lane(t, k), a, lane(asked, k)))
     return asked
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,27 +10,14 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array, populate_array
 
-from dynsim.dynamics.tables import ContactArrays, DriveArrays, ModelArrays, ReferenceArrays, Workspace
+from dynsim.dynamics.tables import Workspace
 from dynsim.jit.simd import INT32, Lanes, lanes_of
 from dynsim.jit.struct_types import Tables, made, parts_of
 
-# Axes of the float tables that may have lanes: one more, and the last one is the lanes. The others are shared by all.
-AXES: dict[type, dict[str, int]] = {
-    ModelArrays: {"body": 2, "gravity": 1},
-    DriveArrays: {"motor": 2, "input": 2},
-    ReferenceArrays: {"held": 1, "coefficients": 3, "voltage": 3},
-    ContactArrays: {"point": 2},
-    Workspace: {
-        "links": 2,
-        "joints": 2,
-        "trig": 2,
-        "motors": 2,
-        "contacts": 2,
-        "rows": 2,
-        "column": 2,
-        "small": 3,
-    },
-}
+# How many lanes there are: two registers of AVX2, one of AVX-512.
+WIDTH = 4
+# Tables of a workspace that have lanes, as one more axis, the last; rows and modes are the same for all.
+WITH_LANES = ("links", "joints", "trig", "motors", "contacts", "rows", "column", "small")
 
 
 def aligned(*shape: int) -> np.ndarray:
@@ -42,46 +28,14 @@ def aligned(*shape: int) -> np.ndarray:
     return room[start : start + size].reshape(shape)
 
 
-def spread_tables(tables: Any, count: int) -> Any:
-    """A named tuple whose tables of :data:`AXES` have so many equal lanes; the others are the same objects."""
-    return _mapped(tables, lambda table: _spread_table(table, count))
-
-
-def _spread_table(table: np.ndarray, count: int) -> np.ndarray:
-    result = aligned(*table.shape, count)
-    result[...] = table[..., None]
-    return result
-
-
-def stack_tables(tables: Sequence[Any]) -> Any:
-    """Named tuples of one kind as one, whose tables of :data:`AXES` have them as lanes; the others are the first's."""
-    first, parts = tables[0], {}
-    axes = AXES.get(type(first), {})
-    for name, part in first._asdict().items():
-        if hasattr(part, "_asdict"):
-            parts[name] = stack_tables([getattr(one, name) for one in tables])
-        elif part is not None and name in axes:
-            parts[name] = aligned(*part.shape, len(tables))
-            for k, one in enumerate(tables):
-                parts[name][..., k] = getattr(one, name)
-    return first._replace(**parts)
-
-
-def lane_tables(tables: Any, k: int) -> Any:
-    """Lane k of a named tuple of tables, views: what :func:`lane` is to the compiler."""
-    return _mapped(tables, lambda table: table[..., k], 1)
-
-
-def _mapped(value: Any, change: Any, more: int = 0) -> Any:
-    """The tuple with its tables changed that have ``more`` axes than AXES says; those in it likewise."""
-    axes = AXES.get(type(value), {})
-    parts = {}
-    for name, part in value._asdict().items():
-        if hasattr(part, "_asdict"):
-            parts[name] = _mapped(part, change, more)
-        elif part is not None and name in axes and part.ndim == axes[name] + more:
-            parts[name] = change(part)
-    return value._replace(**parts)
+def lane_workspace(ws: Workspace) -> Workspace:
+    """A workspace whose lanes are all what ``ws`` is; ``trig`` unpadded, as sines are computed a lane at a time."""
+    unpadded = ws._replace(trig=ws.trig[:, : len(ws.joints)])
+    tables = {name: getattr(unpadded, name)[..., None] for name in WITH_LANES}
+    found = {name: aligned(*table.shape[:-1], WIDTH) for name, table in tables.items()}
+    for name, table in found.items():
+        table[...] = tables[name]
+    return ws._replace(active=ws.active.copy(), counts=ws.counts.copy(), **found)
 
 
 @intrinsic
@@ -144,14 +98,18 @@ def with_lane(typingctx: Any, value: Any, k: Any, x: Any) -> Any:
 
 
 @intrinsic
-def as_lanes(typingctx: Any, array: Any, width: Any) -> Any:
-    """A C-contiguous array of doubles, its last axis the lanes, as an array of lanes; width: a tuple of N anything."""
-    result = types.Array(Lanes(len(width)), array.ndim - 1, "C", aligned=False)
+def as_lanes(typingctx: Any, array: Any) -> Any:
+    """A C-contiguous array of doubles, its last axis the lanes, as an array of lanes."""
+    result = _of_lanes(array)
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         return _as_lanes(context, builder, args[0], array, result)
 
-    return result(array, width), codegen
+    return result(array), codegen
+
+
+def _of_lanes(array: Any) -> Any:
+    return types.Array(Lanes(WIDTH), array.ndim - 1, "C", aligned=False)
 
 
 def _as_lanes(context: Any, builder: Any, value: Any, kind: Any, result: Any) -> Any:
@@ -175,37 +133,16 @@ def _viewed(context: Any, builder: Any, view: Any, data: Any, shape: Any, stride
 
 
 @intrinsic
-def tables_as_lanes(typingctx: Any, tables: Any, width: Any) -> Any:
-    """:func:`as_lanes` of all tables in a named tuple, and in those in it, that have an axis more than AXES says."""
-    result = _tables_type(tables, len(width))
+def tables_as_lanes(typingctx: Any, ws: Any) -> Any:
+    """:func:`as_lanes` of all tables of a workspace that have lanes."""
+    parts = [_of_lanes(part) if name in WITH_LANES else part for name, part in zip(ws.fields, ws, strict=True)]
+    result = Tables(parts, ws.instance_class)
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return _tables(context, builder, args[0], tables, result)
+        values = [
+            value if seen == kind else _as_lanes(context, builder, value, kind, seen)
+            for value, kind, seen in zip(parts_of(context, builder, ws, args[0]), ws, result, strict=True)
+        ]
+        return made(context, builder, result, values)
 
-    return result(tables, width), codegen
-
-
-def _tables_type(kind: Any, count: int) -> Any:
-    axes, parts = AXES.get(kind.instance_class, {}), []
-    for name, part in zip(kind.fields, kind, strict=True):
-        if isinstance(part, Tables):
-            parts.append(_tables_type(part, count))
-        elif isinstance(part, types.Array) and part.ndim == axes.get(name, part.ndim) + 1:
-            parts.append(types.Array(Lanes(count), part.ndim - 1, "C", aligned=False))
-        else:
-            parts.append(part)
-    return Tables(parts, kind.instance_class)
-
-
-def _tables(context: Any, builder: Any, value: Any, kind: Any, result: Any) -> Any:
-    if result == kind:
-        return value
-    if isinstance(kind, types.Array):
-        return _as_lanes(context, builder, value, kind, result)
-    parts = parts_of(context, builder, kind, value)
-    return made(
-        context,
-        builder,
-        result,
-        [_tables(context, builder, x, a, b) for x, a, b in zip(parts, kind, result, strict=True)],
-    )
+    return result(ws), codegen

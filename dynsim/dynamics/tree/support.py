@@ -30,7 +30,7 @@ from dynsim.dynamics.tree.spatial import (
     vector,
 )
 from dynsim.dynamics.tree.sweep import body_inertia, inertial_wrench
-from dynsim.jit.kernel import apart_kernel, internal_kernel
+from dynsim.jit.kernel import apart_kernel, integers, internal_kernel, reals
 
 # SupportArrays.index, int: the body, and the rows of the wheels' rates
 BODY, LEFT, RIGHT = 0, 1, 2
@@ -55,12 +55,17 @@ LEAST_SIZE = 4
 
 
 class SupportArrays(NamedTuple):
-    """The mobile base of a robot."""
+    """The mobile base of a robot; tables of size zero: it has none."""
 
     index: np.ndarray  # (INDEX_SIZE,) int
     base: np.ndarray  # (BASE_SIZE,)
     state: np.ndarray  # (STATE_SIZE,) written by ground_reaction
     least: np.ndarray  # (LEAST_SIZE,) of the loads and of the margin at accepted steps, see watch_support
+
+
+def no_support() -> SupportArrays:
+    """That of a robot without a mobile base."""
+    return SupportArrays(integers(np.zeros(0)), *(reals(np.zeros(0)) for _ in range(3)))
 
 
 @apart_kernel
@@ -138,18 +143,20 @@ def ground_reaction(model: ModelArrays, loads: LoadArrays, t, ws: Workspace, sup
 
 
 @internal_kernel
-def tip_margin(model: ModelArrays, loads: LoadArrays, t, ws: Workspace, support: SupportArrays | None):
+def tip_margin(compound, model: ModelArrays, loads: LoadArrays, t, ws: Workspace, support: SupportArrays):
     """The tip margin by :func:`ground_reaction`; a robot without a mobile base does not tip."""
-    if support is None:  # known to the compiler
+    if compound is None:  # known to the compiler: the wheels of a base share rates
+        return math.inf
+    if support.index.shape[0] == 0:
         return math.inf
     ground_reaction(model, loads, t, ws, support)
     return support.state[MARGIN]
 
 
 @internal_kernel
-def watch_support(support: SupportArrays | None):
+def watch_support(support: SupportArrays):
     """Least loads and margin so far, after :func:`ground_reaction` at the end of an accepted step."""
-    if support is None:  # known to the compiler
+    if support.index.shape[0] == 0:
         return
     state, least = support.state, support.least
     for k in range(3):

@@ -204,9 +204,9 @@ class DynamixelBus:
     def read(self, id_: int, field: Field) -> int:
         return field.decode(self.read_block(id_, field.address, field.size).data)
 
-    def read_block(self, id_: int, address: int, length: int, *, retries: int = RETRIES) -> ServoReply:
+    def read_block(self, id_: int, address: int, length: int) -> ServoReply:
         marks = self._marks.setdefault(("id", id_), Marks())
-        for _ in range(retries + 1):
+        for _ in range(RETRIES + 1):
             asked = marks.choose(length)
             with self._transaction():
                 result = self._library.readTx(self.port, id_, address, asked)

@@ -6,7 +6,7 @@ import termios
 from contextlib import suppress
 from dataclasses import dataclass
 
-from dynsim.hardware.bus.control_table import MODEL_BY_NUMBER, MX_106, RETURN_DELAY_SECONDS_PER_UNIT, VOLT_PER_UNIT
+from dynsim.hardware.bus.control_table import MODEL_BY_NUMBER, MX_106
 from dynsim.hardware.bus.dynamixel_bus import DynamixelBus, open_serial_port
 from dynsim.hardware.bus.protocol import NoAnswer, RequestRefused
 from dynsim.hardware.errors import PortError
@@ -16,31 +16,33 @@ STOP_BAUD_RATES = (3_000_000, 1_000_000, 57_600, 115_200, 2_000_000, 4_000_000)
 """Those in use come first."""
 
 
+SHOWN = (
+    "operating_mode",
+    "return_delay",
+    "present_voltage",
+    "present_temperature",
+    "torque_enable",
+    "hardware_error",
+)
+"""Registers that are read of every servo."""
+
+
 @dataclass(frozen=True)
 class Found:
     """A servo that answered a scan.
 
     Attributes
     ----------
-    id, model, firmware, baud, mode : int
-    return_delay : float
-        [s].
-    voltage, temperature : float
-        [V], [°C].
-    torque : bool
-    hardware_error : int
+    id, model, firmware, baud : int
+    registers : dict
+        Of ``SHOWN``, by name; -1 where the servo did not tell it.
     """
 
     id: int
     model: int
     firmware: int
     baud: int
-    mode: int
-    return_delay: float
-    voltage: float
-    temperature: float
-    torque: bool
-    hardware_error: int
+    registers: dict[str, int]
 
     @property
     def model_name(self) -> str:
@@ -60,31 +62,18 @@ def scan(port: str, bauds: tuple[int, ...] = SCAN_BAUD_RATES) -> list[Found]:
         bus = DynamixelBus(open_serial_port(port, baud))
         try:
             for id_, (model, firmware) in sorted(bus.ping_all().items()):
-                found.append(_describe(bus, id_, model, firmware, baud))
+                registers = {name: _register(bus, id_, name) for name in SHOWN}
+                found.append(Found(id_, model, firmware, baud, registers))
         finally:
             bus.close()
     return found
 
 
-def _describe(bus: DynamixelBus, id_: int, model: int, firmware: int, baud: int) -> Found:
-    def value(name: str) -> int:
-        try:
-            return bus.read(id_, MX_106.fields[name])
-        except (NoAnswer, RequestRefused):
-            return -1
-
-    return Found(
-        id=id_,
-        model=model,
-        firmware=firmware,
-        baud=baud,
-        mode=value("operating_mode"),
-        return_delay=value("return_delay") * RETURN_DELAY_SECONDS_PER_UNIT,
-        voltage=value("present_voltage") * VOLT_PER_UNIT,
-        temperature=value("present_temperature"),
-        torque=value("torque_enable") != 0,
-        hardware_error=value("hardware_error"),
-    )
+def _register(bus: DynamixelBus, id_: int, name: str) -> int:
+    try:
+        return bus.read(id_, MX_106.fields[name])
+    except (NoAnswer, RequestRefused):
+        return -1
 
 
 @dataclass(frozen=True)

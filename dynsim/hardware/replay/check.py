@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from dynsim.errors import CheckRefused
 from dynsim.hardware.bus.control_table import HEALTH_BLOCK, STATE_BLOCK, TICKS_PER_TURN
 from dynsim.hardware.replay.measured import unmeasured
-from dynsim.hardware.replay.motion import Array, Course, CyclePlan, Needs, Planned
+from dynsim.hardware.replay.motion import Array, Course, CyclePlan, Needs, Planned, Task
 from dynsim.hardware.replay.trajectory import (
     COMMON,
     JERK_WINDOW,
@@ -30,7 +30,6 @@ from dynsim.hardware.replay.trajectory import (
 )
 from dynsim.hardware.servo_map import Servo, ServoMap
 from dynsim.record import Record
-from dynsim.record.scene import Scene
 
 BITS_PER_BYTE = 10
 TURNAROUND = 50e-6
@@ -100,32 +99,21 @@ class Margin:
         )
 
 
-@dataclass(frozen=True)
-class CheckedMotion:
+@dataclass(frozen=True, kw_only=True)
+class CheckedMotion(Task):
     """A motion that passed: what the replay runs on.
 
     Attributes
     ----------
     path : Path
-    speed : float
-        Path seconds per second.
-    plan : CyclePlan
     margins : tuple of Margin
         Tightest place per joint and limit.
     warnings : tuple of str
-    scene : Scene or None
-        What the record says of the robot's looks; the measured record takes it over.
-    unmeasured : Record or None
-        See :func:`dynsim.hardware.replay.measured.unmeasured`.
     """
 
     path: Path
-    speed: float
-    plan: CyclePlan
-    margins: tuple[Margin, ...]
-    warnings: tuple[str, ...]
-    scene: Scene | None = None
-    unmeasured: Record | None = None
+    margins: tuple[Margin, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     def tightest(self, servo_map: ServoMap) -> tuple[Margin, float] | None:
         """The margin that is the least part of its limit, of a position the half of its range, and that part."""
@@ -200,7 +188,13 @@ def check_motion(
             f"{len(missing)} of {len(record) - 1} steps are long, samples of the record may be missing: {missing[0]}"
         )
     return CheckedMotion(
-        path, speed, plan, tuple(margins), tuple(warnings), record.scene, unmeasured(record, servo_map)
+        path=path,
+        speed=speed,
+        plan=plan,
+        margins=tuple(margins),
+        warnings=tuple(warnings),
+        scene=record.scene,
+        unmeasured=unmeasured(record, servo_map),
     )
 
 
@@ -292,6 +286,18 @@ class MotionLimits:
         quantities: list[Quantity] = ["position", *values]
         for joint, quantity in np.argwhere(wanted):
             yield Margin(self._servos[joint].joint, quantities[quantity], *table[joint, quantity].tolist())
+
+    def surely_hold(self, path: Path) -> bool:
+        """Whether simple bounds say that the last interval, and the windows that end in it, break no limit."""
+        position, velocity, acceleration, jerk, shaking = path.bounds_of_last(JERK_WINDOW, SHAKING_WINDOW)
+        highest = self._highest
+        return bool(
+            np.all((position >= self._low) & (position <= self._high))
+            and np.all(velocity <= highest["velocity"])
+            and np.all(acceleration <= highest["acceleration"])
+            and np.all(jerk <= JERK_WINDOW * highest["jerk"])
+            and np.all(shaking <= highest["shaking"])
+        )
 
     def _tightest_position(self, position: Array, time: Array) -> tuple[Array, Array, Array, Array]:
         lowest, lowest_time = _of_each(position, time, position.argmin(axis=0))

@@ -22,13 +22,12 @@ import numpy as np
 from dynsim.errors import CheckRefused
 from dynsim.hardware.replay.check import ROUNDING, MotionLimits, plan_cycle
 from dynsim.hardware.replay.incremental_path import IncrementalPath, Sample
-from dynsim.hardware.replay.motion import Array, Course, CyclePlan, Needs
+from dynsim.hardware.replay.motion import Array, Course, Needs, Task
 from dynsim.hardware.replay.rules import Cause, Fault
 from dynsim.hardware.replay.states import Stopped
 from dynsim.hardware.replay.trajectory import HOLE, Path
 from dynsim.hardware.replay.verify import needs_of_map
 from dynsim.hardware.servo_map import ServoMap
-from dynsim.record import Record
 from dynsim.record.scene import Scene
 
 SLACK = 0.1
@@ -75,9 +74,9 @@ def lead(servo_map: ServoMap) -> float:
     return 0.5 * servo_map.safety.stop_time + SLACK
 
 
-@dataclass(frozen=True)
-class DrivenMotion:
-    """What a pilot will ask for; a :class:`~dynsim.hardware.replay.motion.Task`.
+@dataclass(frozen=True, kw_only=True)
+class DrivenMotion(Task):
+    """What a pilot will ask for. Of the simulation that it follows nothing is known yet but its beginning.
 
     Attributes
     ----------
@@ -87,27 +86,25 @@ class DrivenMotion:
         Where it begins.
     step : float
         Between two samples [s].
-    plan : CyclePlan
-    duration : float
-        Longest drive [s].
-    scene : Scene or None
+    longest : float
+        Drive [s].
     """
 
     servo_map: ServoMap
     feed: Feed
     first: Sample
     step: float
-    plan: CyclePlan
-    duration: float
-    scene: Scene | None = None
-    # The simulation that it follows has no end yet.
-    unmeasured: Record | None = None
-    speed: float = 1.0
+    longest: float
 
     @property
     def start(self) -> Array:
         """Posture in which it begins [rad], shape (N,)."""
         return self.first.posture
+
+    @property
+    def duration(self) -> float:
+        """Longest drive [s]."""
+        return self.longest
 
     def needs(self) -> list[Needs]:
         """Where it will go is not known: all that the map allows."""
@@ -147,7 +144,7 @@ def check_drive(
         raise CheckRefused(
             f"the simulation begins in motion ({names}); servos begin at rest: let its rates begin at zero"
         )
-    return DrivenMotion(servo_map, feed, first, step, plan, longest, scene)
+    return DrivenMotion(servo_map=servo_map, feed=feed, first=first, step=step, longest=longest, plan=plan, scene=scene)
 
 
 class DrivenCourse:

@@ -16,7 +16,7 @@ import numpy as np
 from dynsim.hardware.bus.control_table import HEALTH_BLOCK, describe_hardware_error
 from dynsim.hardware.bus.protocol import Bus, NoAnswer, RequestRefused
 from dynsim.hardware.errors import PortError
-from dynsim.hardware.replay.loop import FIELDS, Array, Loop
+from dynsim.hardware.replay.loop import FIELDS, Array, GoalRegisters, Loop, goal_registers
 from dynsim.hardware.replay.output import Journal
 from dynsim.hardware.replay.rules import Cause, Cycle, Fault, decode_health
 from dynsim.hardware.replay.states import (
@@ -181,7 +181,7 @@ class Ending:
     def _hold_measured(self, indices: Iterable[int]) -> None:
         """Goals of the given servos := where they are."""
         loop = self._loop
-        goals: dict[str, dict[int, int]] = {"goal_position": {}, "goal_velocity": {}}
+        goals: GoalRegisters = {"goal_position": {}, "goal_velocity": {}}
         for index in indices:
             servo = self._servos[index]
             loop.goal_rate[index] = 0.0
@@ -228,16 +228,9 @@ class Ending:
     def _send(self, position: Array, velocity: Array) -> None:
         """Goals [rad], [rad/s] of the servos that are not in trouble."""
         loop = self._loop
-        goals: dict[str, dict[int, int]] = {"goal_position": {}, "goal_velocity": {}}
-        for index, servo in enumerate(self._servos):
-            if index in self._troubled:
-                continue
-            if servo.in_position_mode:
-                goals["goal_position"][servo.id] = servo.to_ticks(float(position[index]))
-            else:
-                goals["goal_velocity"][servo.id] = servo.to_velocity_units(float(velocity[index]))
-            loop.goal[index], loop.goal_rate[index] = position[index], velocity[index]
-        loop.write_goals(goals)
+        well = [index for index in range(len(self._servos)) if index not in self._troubled]
+        loop.goal[well], loop.goal_rate[well] = position[well], velocity[well]
+        loop.write_goals(goal_registers([self._servos[index] for index in well], position[well], velocity[well]))
 
     def _come_to_rest(self) -> None:
         """Wait until everybody answers and stands still, for REST_TIME at most."""

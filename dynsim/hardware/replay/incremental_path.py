@@ -2,7 +2,7 @@
 
 The limits are those of the offline check, and so is the function,
 :meth:`~dynsim.hardware.replay.check.MotionLimits.margins`: of a whole record it looks at every interval, here at the
-last one, and at the windows that end in it.
+last one, and at the windows that end in it, and only where simple bounds do not say that all is well.
 """
 
 from __future__ import annotations
@@ -75,11 +75,15 @@ class IncrementalPath:
             lift_rate = (sample.lift - last.lift) / h if len(path.time) == 1 else last.lift_rate
             after = np.where(self._held, held_rate, last.velocity) + lift_rate
             before = np.where(self._held, held_rate, sample.velocity) + sample.lift_rate
-            # Windows are looked at that end after the last knot. Knots before these have a part in their acceleration.
             longer = path.since(min(keep, path.end - SHAKING_WINDOW), 2).longer(
                 sample.time, sample.posture, after, before
             )
-            broken = [str(margin) for margin in self._limits.margins(longer, since=path.end, broken=True)]
+            # Windows are looked at that end after the last knot. Knots before these have a part in their acceleration.
+            windows = longer.since(path.end - SHAKING_WINDOW, 2)
+            # A pilot's robot is well within its limits most of the time, and a cycle is short.
+            sure = self._limits.surely_hold(windows)
+            margins = [] if sure else self._limits.margins(windows, since=path.end, broken=True)
+            broken = [str(margin) for margin in margins]
         if not broken:
             self._path, self._last = longer, sample
         return broken

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from dynsim.hardware.replay.motion import Course, Task
 from dynsim.hardware.replay.output import Journal, Recorder
 from dynsim.hardware.replay.rules import AbortRules, Cause, Cycle, Fault, decode_health
 from dynsim.hardware.replay.states import State, Stopped, StopRequest
-from dynsim.hardware.servo_map import ServoMap
+from dynsim.hardware.servo_map import Servo, ServoMap
 
 Array = NDArray[np.float64]
 
@@ -27,6 +28,21 @@ FIELDS = MX_106.fields
 """Items the two models share have the same address in both."""
 STATE = struct.Struct("<hii")
 """Effort, velocity and position in a block of :data:`~dynsim.hardware.bus.control_table.STATE_BLOCK`."""
+
+
+GoalRegisters = dict[str, dict[int, int]]
+"""By the name of the register and the ID of the servo."""
+
+
+def goal_registers(servos: Iterable[Servo], position: Iterable[float], velocity: Iterable[float]) -> GoalRegisters:
+    """Of servos in position mode the ticks of their angles [rad], of the others units of their rates [rad/s]."""
+    goals: GoalRegisters = {"goal_position": {}, "goal_velocity": {}}
+    for servo, angle, rate in zip(servos, position, velocity, strict=True):
+        if servo.in_position_mode:
+            goals["goal_position"][servo.id] = servo.to_ticks(float(angle))
+        else:
+            goals["goal_velocity"][servo.id] = servo.to_velocity_units(float(rate))
+    return goals
 
 
 class Loop:
@@ -225,22 +241,20 @@ class Loop:
 
     def _send(self, position: Array, velocity: Array) -> None:
         """The only place goals of a motion leave through. Refuses what no checked motion can ask for."""
-        goals: dict[str, dict[int, int]] = {"goal_position": {}, "goal_velocity": {}}
-        for index, servo in enumerate(self.map.servos):
+        servos = self.map.servos
+        goals = goal_registers(servos, position, velocity)
+        for servo, (low, high, step), fastest in zip(servos, self._tick_bounds, self._unit_bounds, strict=True):
             if servo.in_position_mode:
-                ticks = servo.to_ticks(float(position[index]))
-                low, high, step = self._tick_bounds[index]
-                if not low <= ticks <= high or abs(ticks - self._sent[servo.id]) > step:
-                    raise Stopped(Fault(Cause.GOAL_GUARD, f"{servo.joint}: goal {ticks} was not sent", (servo.id,)))
-                goals["goal_position"][servo.id] = ticks
+                goal = goals["goal_position"][servo.id]
+                allowed = low <= goal <= high and abs(goal - self._sent[servo.id]) <= step
             else:
-                units = servo.to_velocity_units(float(velocity[index]))
-                if abs(units) > self._unit_bounds[index]:
-                    raise Stopped(Fault(Cause.GOAL_GUARD, f"{servo.joint}: goal {units} was not sent", (servo.id,)))
-                goals["goal_velocity"][servo.id] = units
+                goal = goals["goal_velocity"][servo.id]
+                allowed = abs(goal) <= fastest
+            if not allowed:
+                raise Stopped(Fault(Cause.GOAL_GUARD, f"{servo.joint}: goal {goal} was not sent", (servo.id,)))
         self.write_goals(goals)
 
-    def write_goals(self, goals: dict[str, dict[int, int]]) -> None:
+    def write_goals(self, goals: GoalRegisters) -> None:
         """Goal registers by name and ID, as they are."""
         for name, values in goals.items():
             if not values:

@@ -210,24 +210,23 @@ def recover(folder: Path, out: Path | None = None) -> Record:
             record = _read(part)
             record.summary |= {"end_state": END_STATE} | _summary(folder / SUMMARY) | {"recovered": True}
         if out is not None:
-            _save(record, out, new=True)
+            out.mkdir(parents=True, exist_ok=True)
+            if there := [name for name in (MEASURED, SUMMARY, PART) if (out / name).exists()]:
+                raise RecordError(f"{out}: has {', '.join(there)} already; give another folder (--out)")
+            write_measured(record, record.summary, out)
             return record
         if whole is None:
-            _save(record, folder)
+            write_measured(record, record.summary, folder)
         part.unlink(missing_ok=True)
     except OSError as error:
         raise RecordError(f"{part}: cannot be recovered ({error.strerror})") from error
     return record
 
 
-def _save(record: Record, folder: Path, *, new: bool = False) -> None:
-    """Record and summary; where they are to be ``new``, none may be there."""
-    folder.mkdir(parents=True, exist_ok=True)
-    there = [name for name in (MEASURED, SUMMARY, PART) if new and (folder / name).exists()]
-    if there:
-        raise RecordError(f"{folder}: has {', '.join(there)} already; give another folder (--out)")
-    summary = json_text(record.summary).encode("utf-8")
-    replace_together(folder, {MEASURED: record.to_hdf5(), SUMMARY: summary})
+def write_measured(record: Record, summary: dict[str, Any], folder: Path) -> None:
+    """Record and summary, both or none."""
+    contents: dict[str, bytes | memoryview] = {MEASURED: record.to_hdf5(), SUMMARY: json_text(summary).encode("utf-8")}
+    replace_together(folder, contents)
 
 
 def _kept(measured: Path) -> Record | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
@@ -127,7 +128,8 @@ class CyclePlan:
     health_every: int
 
 
-class Task(Protocol):
+@dataclass(frozen=True, kw_only=True)
+class Task(ABC):
     """What a replay is to do: a checked record, or what a pilot will ask for.
 
     Attributes
@@ -141,29 +143,26 @@ class Task(Protocol):
         What is known of its place that no servo says; the measured record takes that over too.
     """
 
-    @property
-    def plan(self) -> CyclePlan: ...
+    plan: CyclePlan
+    speed: float = 1.0
+    scene: Scene | None = None
+    unmeasured: Record | None = None
 
     @property
-    def speed(self) -> float: ...
-
-    @property
-    def scene(self) -> Scene | None: ...
-
-    @property
-    def unmeasured(self) -> Record | None: ...
-
-    @property
+    @abstractmethod
     def start(self) -> Array:
         """Posture in which the motion begins [rad], shape (N,)."""
 
     @property
+    @abstractmethod
     def duration(self) -> float:
         """Longest time that it takes [s]."""
 
+    @abstractmethod
     def needs(self) -> list[Needs]:
         """What it may ask of every joint, in the order of the map."""
 
+    @abstractmethod
     def course(self) -> Course:
         """How to go along it, from its beginning."""
 

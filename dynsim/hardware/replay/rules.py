@@ -1,7 +1,8 @@
 """The abort rules: from what one cycle brought in, whether the replay may go on.
 
 Every rule has a bound on its reaction, in cycles from the first cycle in which the trouble can be seen on the wire to
-the cycle in which the fault is declared; :func:`reaction_bound` gives it.
+the cycle in which the fault is declared: those of the map's ``safety``, one for an alert, and of what only health reads
+show as many as it takes to read the health of all servos in turn.
 """
 
 from __future__ import annotations
@@ -117,23 +118,6 @@ class Cycle:
     @property
     def missed(self) -> NDArray[np.bool_]:
         return np.isnan(self.position)
-
-
-def reaction_bound(cause: Cause, servo_map: ServoMap, plan: CyclePlan) -> int:
-    """Cycles within which a rule declares its fault, counted from the first cycle that shows it."""
-    safety = servo_map.safety
-    in_turn = len(servo_map.servos) * plan.health_every
-    return {
-        Cause.MISSED_STATUS: safety.missed_cycles,
-        Cause.FOLLOWING_ERROR: safety.following_cycles,
-        Cause.TORQUE: safety.torque_cycles,
-        Cause.DEADLINE: safety.late_cycles,
-        Cause.ALERT: 1,
-        Cause.TORQUE_LOST: in_turn,
-        Cause.WATCHDOG: in_turn,
-        Cause.VOLTAGE: in_turn,
-        Cause.TEMPERATURE: in_turn,
-    }.get(cause, 1)
 
 
 def watchdog_units(safety: Safety) -> int:

@@ -15,6 +15,7 @@ from dynsim.hardware.bus.clock import Clock
 from dynsim.hardware.bus.protocol import Bus
 from dynsim.hardware.errors import OutputsFailed, PortError, ReplayAborted, ReplayInterrupted, VerificationFailed
 from dynsim.hardware.replay.machine import RECORD, Replay
+from dynsim.hardware.replay.measured import write_measured
 from dynsim.hardware.replay.motion import Task
 from dynsim.hardware.replay.output import (
     INTERVAL,
@@ -30,7 +31,7 @@ from dynsim.hardware.replay.output import (
 from dynsim.hardware.replay.rules import Cause
 from dynsim.hardware.replay.states import ReplayResult
 from dynsim.hardware.servo_map import ServoMap
-from dynsim.system.files import json_text, replace_together, write_json
+from dynsim.system.files import write_json
 
 Failures = dict[str, BaseException]
 
@@ -164,11 +165,7 @@ def _save(result: ReplayResult, folder: Path, failures: Failures) -> None:
     try:
         if RECORD not in failures:
             summary = result.record.summary | {"outputs_failed": _named(failures)}
-            contents: dict[str, bytes | memoryview] = {
-                MEASURED: result.record.to_hdf5(),
-                SUMMARY: json_text(summary).encode(),
-            }
-            replace_together(folder, contents)
+            write_measured(result.record, summary, folder)
     except Exception as error:
         failures[RECORD] = error
     if RECORD not in failures:

@@ -147,11 +147,8 @@ class Path:
         time : array, shape (N,)
             Where the window of that value ends [s].
         """
-        with np.errstate(over="ignore", invalid="ignore"):
-            first, last = self._accelerations
-            at_knots = np.concatenate([first[:1], 0.5 * (last[:-1] + first[1:]) + self._steps[1:], last[-1:]])
-            variation = np.abs(at_knots[1:] - at_knots[:-1]).cumsum(axis=0)
-        variation = np.concatenate([np.zeros_like(first[:1]), variation])
+        variation = np.zeros_like(self.position)
+        self._changes.cumsum(axis=0, out=variation[1:])
         ends, within = self._within(variation, window, since)
         jerk, where = self._worst(ends, within)
         return jerk / window, where
@@ -178,14 +175,13 @@ class Path:
             # q'' is straight in an interval: where it changes sign the rate turns on the way.
             turning = self.rate_after + 0.5 * h * first * (first / (first - last))
             turning = np.where(first * last < 0, turning, self.rate_before)
-            # Until the rate turns, from there on, and the step at the end of the interval: gained and lost.
-            changes = np.zeros((3, len(h), 2 * count))
-            changes[0, :, :count] = turning - self.rate_after
-            changes[1, :, :count] = self.rate_before - turning
-            changes[2, :-1, :count] = self.rate_after[1:] - self.rate_before[:-1]
-            changes[..., count:] = -changes[..., :count]
+            # Until the rate turns and from there on, and the step at the end of the interval.
+            gained = np.maximum(turning - self.rate_after, 0.0) + np.maximum(self.rate_before - turning, 0.0)
+            change, step = self.rate_before - self.rate_after, self.rate_after[1:] - self.rate_before[:-1]
+            gained[:-1] += np.maximum(step, 0.0)
+            change[:-1] += step
             total = np.zeros((len(self.time), 2 * count))
-            np.maximum(changes, 0.0).sum(axis=0).cumsum(axis=0, out=total[1:])
+            np.concatenate([gained, np.maximum(gained - change, 0.0)], axis=1).cumsum(axis=0, out=total[1:])
         ends, within = self._within(total, window, since)
         return self._worst(ends, np.minimum(within[:, :count], within[:, count:]))
 
@@ -194,6 +190,46 @@ class Path:
         """Acceleration of the interpolant at the beginning and the end of every interval [rad/s²], shape (T-1, N)."""
         h, _, _, b, a = self._cubics(slice(None))
         return 2 * b / h / h, (2 * b + 6 * a) / h / h
+
+    @cached_property
+    def _changes(self) -> Array:
+        """Change of acceleration from knot to knot in magnitude [rad/s²], shape (T-1, N)."""
+        first, last = self._accelerations
+        with np.errstate(over="ignore", invalid="ignore"):
+            at_knots = np.concatenate([first[:1], 0.5 * (last[:-1] + first[1:]) + self._steps[1:], last[-1:]])
+            return np.abs(at_knots[1:] - at_knots[:-1])
+
+    def bounds_of_last(self, jerk_window: float, shaking_window: float) -> tuple[Array, Array, Array, Array, Array]:
+        """What does not fall short of the extremes of the last interval, at a third of their cost.
+
+        A cubic is between its control points, and so is its rate; of its windows all intervals count that they touch.
+        What is gained and lost again in one is half of all that the rate changes by, or less.
+
+        Returns
+        -------
+        position : array, shape (3, N)
+            Control points [rad], but for the first.
+        velocity, acceleration, jerk, shaking : array, shape (N,)
+            In magnitude; times a window that of its jerk [rad/s²].
+        """
+        h, q0, q1 = float(self.time[-1] - self.time[-2]), self.position[-2], self.position[-1]
+        v0, v1 = self.rate_after[-1], self.rate_before[-1]
+        velocity = np.abs([v0, 3.0 * (q1 - q0) / h - v0 - v1, v1]).max(axis=0)
+        first, last = self._accelerations
+        acceleration = np.abs([first[-1], last[-1], self._steps[-1]]).max(axis=0)
+        jerk_from, shaking_from = np.maximum(
+            np.searchsorted(self.time, self.time[-2] - np.array([jerk_window, shaking_window]), side="right") - 1, 0
+        )
+        since = slice(shaking_from, None)
+        within = 0.5 * np.diff(self.time)[since, None] * (np.abs(first[since]) + np.abs(last[since]))
+        steps = np.abs(self.rate_after[1:] - self.rate_before[:-1])[since]
+        return (
+            np.array([q0 + h / 3.0 * v0, q1 - h / 3.0 * v1, q1]),
+            velocity,
+            acceleration,
+            self._changes[jerk_from:].sum(axis=0),
+            0.5 * (within.sum(axis=0) + steps.sum(axis=0)),
+        )
 
     def _within(self, total: Array, window: float, since: float) -> tuple[Array, Array]:
         """What ``total``, a running sum at the knots, grows by within windows: their ends (M,) [s], growth (M, N).

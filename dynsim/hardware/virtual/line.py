@@ -43,8 +43,6 @@ class VirtualLine:
     plant : ServoPlant, optional
         What the servos move; every one its own inertia if not given.
     script : FaultScript
-    supply : float
-        Voltage of the supply without load [V].
     listener : callable, optional
         Called with (time, packet) for every valid packet that a servo can hear.
     """
@@ -56,11 +54,10 @@ class VirtualLine:
         positions: Iterable[float],
         plant: ServoPlant | None = None,
         script: FaultScript | None = None,
-        supply: float = 12.0,
         listener: Listener | None = None,
     ) -> None:
         script = script or FaultScript()
-        self.servos = VirtualServos(servos, positions=positions, plant=plant, script=script, supply=supply)
+        self.servos = VirtualServos(servos, positions=positions, plant=plant, script=script)
         self.listener = listener
         self._faults = Injection(self.servos, script)
         self._firmware = Firmware(self.servos)

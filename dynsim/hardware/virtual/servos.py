@@ -38,7 +38,7 @@ THERMAL_RESISTANCE = 2.0  # K/W (unverified)
 THERMAL_TIME = 300.0  # s (unverified)
 OVERLOAD_FRACTION = 0.9  # of stall torque (unverified)
 OVERLOAD_TIME = 1.0  # s (unverified)
-SUPPLY_RESISTANCE = 0.05  # Ω
+SUPPLY, SUPPLY_RESISTANCE = 12.0, 0.05  # V, Ω
 BROWN_OUT = 6.0
 """Below this supply the servos' electronics stop, and start anew when it is back [V] (unverified)."""
 OVERHEATING, OVERLOAD, INPUT_VOLTAGE = 1 << 2, 1 << 5, 1 << 0
@@ -57,11 +57,11 @@ class VirtualServos:
         What the servos move; every one its own inertia if None.
     script : FaultScript
         Its sags, ramps and angle faults act here; :class:`~dynsim.hardware.virtual.injection.Injection` does the rest.
-    supply : float
-        Voltage of the supply without load [V].
 
     Attributes
     ----------
+    supply : float
+        Voltage of the supply without load [V].
     registers : dict
         ServoRegisters by the ID that a servo had at first.
     ids : list of int
@@ -87,14 +87,13 @@ class VirtualServos:
         positions: Iterable[float],
         plant: ServoPlant | None,
         script: FaultScript,
-        supply: float,
     ) -> None:
         self.registers = dict(registers)
         self.ids = list(registers)
         self.hearing = by_bit_rate(self.registers)
         self._models = [table.model for table in registers.values()]
         self.plant: ServoPlant = plant or InertialLoad(self._models, np.array(list(positions), dtype=np.float64))
-        self.supply = supply
+        self.supply = SUPPLY
         self.time = 0.0
         self.torque_since = math.inf
         self.dead: set[int] = set()
@@ -103,7 +102,7 @@ class VirtualServos:
         count = len(self.ids)
         self.heard = np.zeros(count)
         self._drive = Drive(
-            np.zeros(count, dtype=bool), np.ones(count, dtype=bool), self.plant.position.copy(), np.zeros(count), supply
+            np.zeros(count, dtype=bool), np.ones(count, dtype=bool), self.plant.position.copy(), np.zeros(count), SUPPLY
         )
         self._goal_position, self._goal_velocity = self.plant.position.copy(), np.zeros(count)
         self._profile_velocity, self._profile_acceleration = np.zeros(count), np.zeros(count)

@@ -18,7 +18,7 @@ from dynsim.dynamics.contact.rows import set_modes
 from dynsim.dynamics.contact.splits import margin
 from dynsim.dynamics.contact.unilateral import UnilateralArrays, stop_gap
 from dynsim.dynamics.derivative import System
-from dynsim.dynamics.tables import Workspace
+from dynsim.dynamics.tables import ContactArrays, Workspace
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts.impacts import evaluate, slip_speed
 from dynsim.integrators.contacts.modes import begin_slip, drops, resolve, slip_on
@@ -51,7 +51,7 @@ NO_FORCE = 1e-8
 
 
 @internal_kernel
-def contact_guard(unilateral: UnilateralArrays | None, ws: Workspace, kind, k):
+def contact_guard(contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: Workspace, kind, k):
     """Value of a guard of the unilateral law, right after ``derivative``."""
     if unilateral is None:  # known to the compiler
         return 1.0
@@ -66,7 +66,7 @@ def contact_guard(unilateral: UnilateralArrays | None, ws: Workspace, kind, k):
             if mode == ka.OPEN
             else ws.contacts[k, ka.NORMAL_FORCE]
         )
-    if mode == ka.SLIDING and unilateral.law[k, ku.STATIC] > 0.0:
+    if mode == ka.SLIDING and contacts.law[k, ka.STATIC] > 0.0:
         return unilateral.slide[k, ku.SPEED] + unilateral.slide[k, ku.HEADWAY] + BACKWARD
     if mode == ka.STICKING:
         best = unilateral.number[ku.BEST_MARGIN]
@@ -74,12 +74,12 @@ def contact_guard(unilateral: UnilateralArrays | None, ws: Workspace, kind, k):
         # nothing of what is left. Once none fit, those of the best margin show which contacts give way.
         if unilateral.number[ku.SPLIT] == 1.0 and best > 0.0:
             return best
-        return margin(unilateral, ws, k)
+        return margin(contacts, ws, k)
     return 1.0
 
 
 @internal_kernel
-def too_long(unilateral: UnilateralArrays | None, ws: Workspace, h, gaps):
+def too_long(contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: Workspace, h, gaps):
     """The fraction of a step to take instead, where it has passed over something; else 1.
 
     An open candidate may dip below its surface and be out again at the end: the minimum of the cubic through gaps and
@@ -94,7 +94,7 @@ def too_long(unilateral: UnilateralArrays | None, ws: Workspace, h, gaps):
         if (
             ws.active[k, ka.MODE] == ka.SLIDING
             and unilateral.slide[k, ku.FROZEN] == 1.0
-            and unilateral.law[k, ku.STATIC] > 0.0
+            and contacts.law[k, ka.STATIC] > 0.0
         ):
             speed = slip_speed(ws, k)
             if speed > 2.0 * slow:
@@ -212,13 +212,13 @@ def stay_tangential(slide, ws: Workspace, k):
 
 
 @internal_kernel
-def at_limit(unilateral: UnilateralArrays, ws: Workspace, k):
+def at_limit(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace, k):
     """True when candidate k, whose guard of slip has fallen through zero, is one that gives way.
 
     The guards of dependent rows fall together, with the best worst margin. Those with a better one hold.
     """
     slack = FORCE_SLACK * (1.0 + abs(ws.contacts[k, ka.NORMAL_FORCE]))
-    return unilateral.number[ku.SPLIT] == 0.0 or margin(unilateral, ws, k) <= unilateral.number[ku.BEST_MARGIN] + slack
+    return unilateral.number[ku.SPLIT] == 0.0 or margin(contacts, ws, k) <= unilateral.number[ku.BEST_MARGIN] + slack
 
 
 @internal_kernel
@@ -236,7 +236,7 @@ def consistent(system: System, ws: Workspace):
         mode = ws.active[k, ka.MODE]
         if mode != ka.OPEN and ws.contacts[k, ka.NORMAL_FORCE] < -slack:
             return False
-        if mode == ka.STICKING and contact_guard(unilateral, ws, SLIP_GUARD, k) < -slack:
+        if mode == ka.STICKING and contact_guard(system.contacts, unilateral, ws, SLIP_GUARD, k) < -slack:
             return False
     return True
 
@@ -367,7 +367,7 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
             mode[k, ku.WANTED] = ka.OPEN
             tell(system, run, k, LIFT_OFF)
         elif mode[k, ku.WANTED] == ka.STICKING:
-            if not at_limit(unilateral, ws, k):
+            if not at_limit(system.contacts, unilateral, ws, k):
                 continue
             r = ws.active[k, ka.FIRST_ROW]
             if ws.rows[r, ka.FORCE] <= NO_FORCE * strongest:

@@ -101,7 +101,7 @@ def come_down(system: System, ws: Workspace, run: Run):
     mode = unilateral.mode
     for k in range(mode.shape[0]):
         fast = mode[k, ku.STRUCK] == 1 and ws.contacts[k, ka.GAP_RATE] < -unilateral.tally[k, ku.SETTLE]
-        bounces = fast and mode[k, ku.BEFORE] == ka.OPEN and unilateral.law[k, ku.RESTITUTION] > 0.0
+        bounces = fast and mode[k, ku.BEFORE] == ka.OPEN and system.contacts.law[k, ka.RESTITUTION] > 0.0
         held = mode[k, ku.TOUCHING] == 1 and not bounces
         mode[k, ku.WANTED] = (
             ka.OPEN if not held else ka.STICKING if ws.active[k, ka.MODE] == ka.STICKING else ka.SLIDING
@@ -172,11 +172,11 @@ def impulses(system: System, ws: Workspace, p, largest, share):
     for k in range(mode.shape[0]):
         if mode[k, ku.TOUCHING] == 1:
             r = ws.active[k, ka.FIRST_ROW]
-            vector[ku.CONE_FRICTION, r] = system.contacts.point[k, ka.MU]
+            vector[ku.CONE_FRICTION, r] = system.contacts.law[k, ka.MU]
             # What was closed had no speed to turn round: a brake or another impact has just given it this one.
             falls = mode[k, ku.STRUCK] == 1 and mode[k, ku.BEFORE] == ka.OPEN
             if falls and -rows[r, ka.ROW_RATE] > unilateral.tally[k, ku.SETTLE]:
-                vector[ku.OFFSET, r] *= 1.0 + share * unilateral.law[k, ku.RESTITUTION]
+                vector[ku.OFFSET, r] *= 1.0 + share * system.contacts.law[k, ka.RESTITUTION]
     if not solve_problem(unilateral, ws.small[0], p, largest, BOUNCE_STARTS if share > 0.0 else 0):
         return False
     f, total, turnover = vector[ku.SOLUTION], 0.0, 0.0

@@ -128,7 +128,7 @@ def begins_sliding(system: System, ws: Workspace, k):
     # An impact may have turned it.
     if slip_on(unilateral, ws, k, 2.0 * unilateral.number[ku.SLOW]):
         return True
-    if unilateral.law[k, ku.STATIC] == 0.0:
+    if system.contacts.law[k, ka.STATIC] == 0.0:
         unilateral.slide[k, ku.FROZEN] = 0.0
         return True
     return False
@@ -232,15 +232,14 @@ def begin_slip(system: System, ws: Workspace, k, fx, fy):
 @internal_kernel
 def drops(system: System, k):
     """True for a candidate whose friction falls from a static coefficient to a smaller kinetic one when it slips."""
-    law = system.unilateral.law
-    return law[k, ku.STRIBECK] == 0.0 and law[k, ku.STATIC] > system.contacts.point[k, ka.MU]
+    law = system.contacts.law
+    return law[k, ka.STRIBECK] == 0.0 and law[k, ka.STATIC] > law[k, ka.MU]
 
 
 @internal_kernel
 def friction_at_rest(system: System, k):
     """Coefficient of the cone of candidate k, which is at rest along its surface."""
-    gives_way = system.unilateral.mode[k, ku.GIVES_WAY] == 1
-    return system.contacts.point[k, ka.MU] if gives_way else system.unilateral.law[k, ku.STATIC]
+    return system.contacts.law[k, ka.MU if system.unilateral.mode[k, ku.GIVES_WAY] == 1 else ka.STATIC]
 
 
 @internal_kernel
@@ -259,7 +258,7 @@ def give_way(system: System, ws: Workspace, size, largest):
         while place[ku.TABLE_ROW, i] != ws.active[k, ka.FIRST_ROW]:
             i += 1
         holds = mode[k, ku.WANTED] == ka.STICKING and mode[k, ku.GIVES_WAY] == 0 and f[i] > 0.0
-        if holds and drops(system, k) and slips(system, i, size, largest, unilateral.law[k, ku.STATIC]):
+        if holds and drops(system, k) and slips(system, i, size, largest, system.contacts.law[k, ka.STATIC]):
             mode[k, ku.GIVES_WAY] = 1
             changed = True
     return changed

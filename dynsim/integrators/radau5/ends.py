@@ -1,4 +1,4 @@
-"""The end of a step: its derivative, whether it is on the constraints and forces are unique there.
+"""The end of a step: its derivative, whether it is on the constraints and forces are unique there; samples on lanes.
 
 RADAU5 evaluates it on lanes, together with samples of the steps before: four states take no longer than one alone.
 """
@@ -10,20 +10,114 @@ from typing import Any
 from numba.core import types
 
 from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact.unilateral import UnilateralArrays
 from dynsim.dynamics.contact.uniqueness import clearly_unique
 from dynsim.dynamics.derivative import System, derivative
-from dynsim.dynamics.simd.system import FOUR
-from dynsim.dynamics.simd.tables import lane, tables_as_lanes
+from dynsim.dynamics.simd.system import StageLanes, evaluate_four
+from dynsim.dynamics.simd.tables import as_lanes, lane, tables_as_lanes
 from dynsim.dynamics.tables import Workspace
 from dynsim.integrators import run as ki
-from dynsim.integrators.dense import fill_lanes, load_samples, samples_on_lanes, take_samples
+from dynsim.integrators.dense import write_sample, write_samples, write_waiting
+from dynsim.integrators.output import fill_output
 from dynsim.integrators.project import off_surface, settle
-from dynsim.integrators.radau5.newton import NewtonArrays
-from dynsim.integrators.radau5.stages import evaluate_four
+from dynsim.integrators.radau5 import tables as kn
+from dynsim.integrators.radau5.tables import NewtonArrays
 from dynsim.integrators.run import Run
 from dynsim.integrators.watch import forces_unique, watch
 from dynsim.jit.compiler import form_of
 from dynsim.jit.kernel import internal_kernel
+
+
+def samples_on_lanes(newton: Any, system: Any, ws: Any, run: Any, *_: Any) -> bool:
+    """Where there are lanes, by types."""
+    return bool(newton != types.none and newton[newton.fields.index("lanes")] != types.none)
+
+
+@internal_kernel
+def may_wait(unilateral: UnilateralArrays | None, run: Run):
+    """True where nothing but steps happens between two samples: modes, commands and loads go on as they are."""
+    if unilateral is None:  # known to the compiler
+        return run.event.shape[0] + run.tick.shape[0] + run.breaks.shape[0] == 0
+    return False
+
+
+@internal_kernel
+def has_stops(unilateral: UnilateralArrays | None):
+    """True where joints have stops, whose forces are kept for one state alone."""
+    if unilateral is None:  # known to the compiler
+        return False
+    return unilateral.stop.shape[0] > 0
+
+
+@form_of(write_samples, samples_on_lanes)
+def write_samples_on_lanes(newton, system, ws, run, more):
+    """Four at a time; those that cannot wait by fewer, and one is done sooner alone."""
+    newton.count[kn.WAITING] += more
+    wait = may_wait(system.unilateral, run)
+    # What the ground carries is computed for one state alone too.
+    alone = has_stops(system.unilateral) or run.support.index.shape[0] > 0
+    while newton.count[kn.WAITING] >= 4 or (newton.count[kn.WAITING] > 0 and not wait):
+        if alone or newton.count[kn.WAITING] == 1:
+            newton.count[kn.WAITING] -= 1
+            write_sample(system, ws, run)
+        else:
+            write_together(newton, system, ws, run)
+
+
+@form_of(write_waiting, samples_on_lanes)
+def write_waiting_on_lanes(newton, system, ws, run):
+    """As lanes, even one: how a sample is computed does not depend on where a caller has looked."""
+    if newton.count[kn.WAITING] > 0:
+        write_together(newton, system, ws, run)
+
+
+@internal_kernel
+def write_together(newton: NewtonArrays, system: System, ws: Workspace, run: Run):
+    """Record up to four samples that wait, as lanes."""
+    count = load_samples(newton, run, 0)
+    fill_lanes(newton.lanes, run, count)
+    evaluate_four(newton.lanes, system)
+    take_samples(newton, system, ws, run, 0, count)
+
+
+@internal_kernel
+def load_samples(newton: NewtonArrays, run: Run, begin):
+    """Samples that wait into the lanes from ``begin`` on; returns how many."""
+    lanes, first, count = newton.lanes, run.count[ki.SAMPLE], min(newton.count[kn.WAITING], 4 - begin)
+    for k in range(count):
+        lanes.t[begin + k] = run.sample_time[first + k]
+        for j in range(run.y.shape[0]):
+            lanes.y[j, begin + k] = run.sample[first + k, j]
+    return count
+
+
+@internal_kernel
+def fill_lanes(lanes: StageLanes, run: Run, begin):
+    """The first lane into those from ``begin`` on, for which there is nothing else."""
+    for k in range(begin, 4):
+        lanes.t[k] = lanes.t[0]
+        for j in range(run.y.shape[0]):
+            lanes.y[j, k] = lanes.y[j, 0]
+
+
+@internal_kernel
+def take_samples(newton: NewtonArrays, system: System, ws: Workspace, run: Run, begin, count):
+    """Record so many samples from the lanes, from ``begin`` on; what has left its surfaces is projected, alone."""
+    if count == 0:
+        return
+    lanes = newton.lanes
+    tables = tables_as_lanes(lanes.ws)
+    fill_output(system, tables, run, as_lanes(lanes.output))
+    run.count[ki.EVALUATIONS] += count
+    newton.count[kn.WAITING] -= count
+    for k in range(begin, begin + count):
+        if off_surface(lane(tables, k)):
+            write_sample(system, ws, run)
+        else:
+            row = run.output[run.count[ki.SAMPLE]]
+            for j in range(lanes.output.shape[0]):
+                row[j] = lanes.output[j, k]
+            run.count[ki.SAMPLE] += 1
 
 
 @internal_kernel
@@ -94,7 +188,7 @@ def evaluate_end_on_lanes(newton, system, ws, run):
 @form_of(end_accepted, _on_lanes)
 def end_accepted_on_lanes(newton, system, ws, run):
     """By what the first lane has left, where the end was evaluated there, unless it must be projected."""
-    end, on_lanes = lane(tables_as_lanes(newton.lanes.ws, FOUR), 0), run.event.shape[0] == 0
+    end, on_lanes = lane(tables_as_lanes(newton.lanes.ws), 0), run.event.shape[0] == 0
     if on_lanes and not off_surface(end):
         return end_watched(system, end, run)
     return end_settled(system, ws, run, on_lanes or off_surface(ws)) and end_watched(system, ws, run)

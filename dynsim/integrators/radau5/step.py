@@ -17,19 +17,22 @@ some contraction where a body tumbles, not accuracy. Jacobian and factors are ke
 from __future__ import annotations
 
 import math
+from typing import Any
+
+from numba.core import types
 
 from dynsim.dynamics import state as kst
+from dynsim.dynamics import tables as ka
 from dynsim.dynamics.derivative import System, derivative
 from dynsim.dynamics.drive.law import drive_block
+from dynsim.dynamics.simd.system import StageLanes, evaluate_four, take_rows
 from dynsim.dynamics.tables import Workspace
+from dynsim.dynamics.tree.joints import displace
 from dynsim.integrators import run as ki
-from dynsim.integrators.radau5 import newton as kn
+from dynsim.integrators.radau5 import tables as kn
 from dynsim.integrators.radau5.ends import evaluate_end
 from dynsim.integrators.radau5.linear_systems import factor_both, solve_both
-from dynsim.integrators.radau5.stages import columns, evaluate_stages
-from dynsim.integrators.run import Run
-from dynsim.integrators.steps import error_norm
-from dynsim.integrators.tableaux import (
+from dynsim.integrators.radau5.tables import (
     A_RADAU,
     ALPHA_RADAU,
     BETA_RADAU,
@@ -38,7 +41,11 @@ from dynsim.integrators.tableaux import (
     NODE_RADAU,
     T_INVERSE_RADAU,
     T_RADAU,
+    NewtonArrays,
 )
+from dynsim.integrators.run import Run
+from dynsim.integrators.steps import error_norm
+from dynsim.jit.compiler import form_of
 from dynsim.jit.kernel import apart_kernel, internal_kernel
 
 # Newton's method: most iterations, and the contraction below which the Jacobian stays.
@@ -67,6 +74,78 @@ def differentiate(system: System, ws: Workspace, run: Run):
     r.count[kn.STALE], r.count[kn.MADE_AT], r.clock[kn.FACTORED] = 0, run.count[ki.STEPS], 0.0
     # Nothing is known of how Newton's method contracts with it.
     r.clock[kn.CONTRACTION] = 0.0
+
+
+@internal_kernel
+def displaced(system: System, ws: Workspace, y, s, x):
+    """x = y but for number s of the rates' displacements, the rates and the currents; returns by how much."""
+    n, layout = ws.joints.shape[0], system.layout
+    for j in range(y.shape[0]):
+        x[j] = y[j]
+    if s < n and layout.extra > 0:
+        for i in range(n):
+            ws.joints[i, ka.QDD] = 1e-7 if i == s else 0.0
+        displace(system.model.compound, system.model, ws, x, layout.q)
+        return 1e-7
+    j = layout.q + s if s < n else layout.v + s - n if s < 2 * n else layout.current + s - 2 * n
+    delta = 1e-3 if s >= 2 * n else 1e-8 * max(abs(y[j]), 0.1) if s >= n else 1e-7 * max(abs(y[j]), 1.0)
+    x[j] = y[j] + delta
+    return x[j] - y[j]
+
+
+@internal_kernel
+def columns(lanes: StageLanes | None, system: System, ws: Workspace, t, y, x, base, r: NewtonArrays):
+    """Finite differences of v̇ into ``r.along``, right after ``derivative`` at y, which is ``base``; x (m,) is room."""
+    v = system.layout.v
+    for s in range(r.along.shape[0]):
+        delta = displaced(system, ws, y, s, x)
+        derivative(system, t, x, ws, r.f[0])
+        r.count[kn.COLUMNS] += 1
+        for i in range(r.along.shape[1]):
+            r.along[s, i] = (r.f[0, v + i] - base[v + i]) / delta
+
+
+@internal_kernel
+def evaluate_stages(lanes: StageLanes | None, system: System, ws: Workspace, t, h, y, x, r: NewtonArrays):
+    """Derivatives at the stages, into ``r.f``; x (m,) is room."""
+    for s in range(3):
+        for j in range(r.kept.shape[1]):
+            x[j] = y[j] + r.z[s, j]
+        derivative(system, t + NODE_RADAU[s] * h, x, ws, r.f[s])
+
+
+def _given(lanes: Any, *_: Any) -> bool:
+    return bool(lanes != types.none)
+
+
+@form_of(columns, _given)
+def columns_on_lanes(lanes, system, ws, t, y, x, base, r):
+    """Four columns at a time; the last ones once more where their number is no multiple."""
+    v, last = system.layout.v, r.along.shape[0] - 1
+    take_rows(ws, lanes.ws)
+    for first in range(0, last + 1, 4):
+        for k in range(4):
+            lanes.t[k] = t
+            lanes.delta[k] = displaced(system, ws, y, min(first + k, last), lanes.y[:, k])
+        evaluate_four(lanes, system)
+        r.count[kn.COLUMNS] += 4
+        for k in range(4):
+            s = min(first + k, last)
+            for i in range(r.along.shape[1]):
+                r.along[s, i] = (lanes.f[v + i, k] - base[v + i]) / lanes.delta[k]
+
+
+@form_of(evaluate_stages, _given)
+def stages_on_lanes(lanes, system, ws, t, h, y, x, r):
+    """Three lanes, and the last of them again."""
+    for j in range(r.kept.shape[1]):
+        z0, z1, z2 = y[j] + r.z[0, j], y[j] + r.z[1, j], y[j] + r.z[2, j]
+        lanes.y[j, 0], lanes.y[j, 1], lanes.y[j, 2], lanes.y[j, 3] = z0, z1, z2, z2
+    for k in range(4):
+        lanes.t[k] = t + NODE_RADAU[min(k, 2)] * h
+    evaluate_four(lanes, system)
+    for j in range(y.shape[0]):
+        r.f[0, j], r.f[1, j], r.f[2, j] = lanes.f[j, 0], lanes.f[j, 1], lanes.f[j, 2]
 
 
 @internal_kernel

@@ -27,7 +27,7 @@ from dynsim.dynamics.contact.cone.problem import approach
 from dynsim.dynamics.contact.rows import point_row, set_modes
 from dynsim.dynamics.contact.unilateral import UnilateralArrays, sliding_friction, stop_gap
 from dynsim.dynamics.tables import Workspace
-from dynsim.dynamics.tree.spatial import times_number, vector
+from dynsim.dynamics.tree.spatial import dot_vector, point_velocity, six, times_number, vector
 from dynsim.integrators.stepping import tables as kt
 from dynsim.integrators.stepping.tables import SteppingArrays, geometry, place_joints
 from dynsim.jit.kernel import internal_kernel
@@ -61,31 +61,23 @@ def recall(system, s: SteppingArrays, ws: Workspace, y):
     place_joints(system, ws, y)
     for i in range(s.before.shape[1]):
         ws.joints[i, ka.QD], ws.joints[i, ka.QDD] = y[layout.v + i], 0.0
-    geometry(system, system.model, s, ws)
+    geometry(system, system.model, ws)
     for k in range(ws.contacts.shape[0]):
-        last, state, link = s.memory[kt.LAST, k], ws.contacts[k], ws.links[system.contacts.link[k, ka.LINK]]
+        last, state = s.memory[kt.LAST, k], ws.contacts[k]
         for m in range(kt.MEMORY_SIZE):
             last[m] = 0.0
         if state[ka.GAP] > TOUCHES:
             continue
         note_place(system, state, k, last)
-        velocity_at(link, state[ka.POSITION], state[ka.POSITION + 1], state[ka.POSITION + 2], last[kt.END_RATE :])
-        x, y_, z = last[kt.END_RATE], last[kt.END_RATE + 1], last[kt.END_RATE + 2]
+        at = vector(ws.contacts, k, ka.POSITION)
+        v = point_velocity(six(ws.links, system.contacts.link[k, ka.LINK], ka.V), at)
         for m in range(3):
             d = ka.NORMAL if m == 0 else ka.FIRST_TANGENT if m == 1 else ka.SECOND_TANGENT
-            last[kt.END_RATE + m] = x * state[d] + y_ * state[d + 1] + z * state[d + 2]
-        last[kt.END_RATE + 1] *= s.law[k, kt.GRIP]
+            last[kt.END_RATE + m] = dot_vector(v, vector(ws.contacts, k, d))
+        last[kt.END_RATE + 1] *= system.contacts.law[k, ka.GRIP]
         if last[kt.END_RATE] >= -kt.BAD:
-            slip = slip_of_rates(s, k, last[kt.END_RATE + 1], last[kt.END_RATE + 2])
+            slip = slip_of_rates(system.contacts.law, k, last[kt.END_RATE + 1], last[kt.END_RATE + 2])
             last[kt.LISTED], last[kt.CLOSED], last[kt.SLID] = 1.0, 1.0, 1.0 if slip > kt.BAD else 0.0
-
-
-@internal_kernel
-def velocity_at(link, x, y, z, out):
-    """Velocity of a body at a point [m/s], into out, (3,) or more, after a sweep."""
-    out[0] = link[ka.V + 3] + link[ka.V + 1] * z - link[ka.V + 2] * y
-    out[1] = link[ka.V + 4] + link[ka.V + 2] * x - link[ka.V] * z
-    out[2] = link[ka.V + 5] + link[ka.V] * y - link[ka.V + 1] * x
 
 
 @internal_kernel
@@ -118,7 +110,7 @@ def list_contacts(system, s: SteppingArrays, ws: Workspace, h):
     changed = close_stops(system.unilateral, ws)
     for k in range(ws.contacts.shape[0]):
         last = s.memory[kt.LAST, k]
-        known = last[kt.LISTED] == 1.0 and goes_on(system, s, last, ws, k, h)
+        known = last[kt.LISTED] == 1.0 and goes_on(system, last, ws, k, h)
         s.turn[k, kt.KNOWN] = 1.0 if known else 0.0
         listed = ws.contacts[k, ka.GAP] <= kt.MARGIN or (known and last[kt.CLOSED] == 1.0)
         mode = ka.STICKING if listed else ka.OPEN
@@ -130,29 +122,27 @@ def list_contacts(system, s: SteppingArrays, ws: Workspace, h):
 
 
 @internal_kernel
-def goes_on(system, s: SteppingArrays, last, ws: Workspace, k, h):
+def goes_on(system, last, ws: Workspace, k, h):
     """True when the normal of candidate k has turned a little, and its place has gone about as far as its body."""
     state, turned = ws.contacts[k], 0.0
     for m in range(3):
         turned += state[ka.NORMAL + m] * last[kt.NORMAL_THEN + m]
     if turned <= SAME_ROW:
         return False
-    return place_goes_on(system.shapes, s, last, state, ws.links[system.contacts.link[k, ka.LINK]], k, h)
+    return place_goes_on(system.shapes, last, state, six(ws.links, system.contacts.link[k, ka.LINK], ka.V), k, h)
 
 
 @internal_kernel
-def place_goes_on(shapes, s: SteppingArrays, last, state, link, k, h):
+def place_goes_on(shapes, last, state, V, k, h):
     """True unless the place of candidate k has jumped, as that of a capsule may from one of its ends to the other."""
     if shapes is None:  # known to the compiler
         return True
     if shapes.kind[k, kd.MOVES] == 0:
         return True
-    x, y, z = centre(shapes, state, k)
-    way = (x - last[kt.CENTRE]) ** 2 + (y - last[kt.CENTRE + 1]) ** 2 + (z - last[kt.CENTRE + 2]) ** 2
-    v = s.b
-    velocity_at(link, x, y, z, v)
-    speed = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
-    return math.sqrt(way) <= SAME_PLACE * h * speed + SHORT_WAY
+    at = centre(shapes, state, k)
+    way = (at[0] - last[kt.CENTRE]) ** 2 + (at[1] - last[kt.CENTRE + 1]) ** 2 + (at[2] - last[kt.CENTRE + 2]) ** 2
+    v = point_velocity(V, at)
+    return math.sqrt(way) <= SAME_PLACE * h * math.sqrt(dot_vector(v, v)) + SHORT_WAY
 
 
 @internal_kernel
@@ -198,7 +188,7 @@ def tangent_rows(system, s: SteppingArrays, ws: Workspace):
         at = vector(state, k, ka.POSITION)
         for m in range(ka.MOST_ROWS):
             r, d = first + m, ka.NORMAL if m == 0 else ka.FIRST_TANGENT if m == 1 else ka.SECOND_TANGENT
-            scale = s.law[k, kt.GRIP] if m == 1 else 1.0
+            scale = system.contacts.law[k, ka.GRIP] if m == 1 else 1.0
             point_row(rows, r, at, times_number(vector(state, k, d), scale))
             rows[r, ka.TARGET] = 0.0
             for j in range(6):
@@ -207,26 +197,26 @@ def tangent_rows(system, s: SteppingArrays, ws: Workspace):
 
 
 @internal_kernel
-def slip_of_rates(s: SteppingArrays, k, x, y):
+def slip_of_rates(law, k, x, y):
     """Slip of candidate k from the rates x, y of its tangents [m/s]."""
-    x = x / s.law[k, kt.GRIP] if s.law[k, kt.GRIP] > 0.0 else 0.0
+    x = x / law[k, ka.GRIP] if law[k, ka.GRIP] > 0.0 else 0.0
     return math.sqrt(x * x + y * y)
 
 
 @internal_kernel
-def friction_of(unilateral: UnilateralArrays, s: SteppingArrays, k, r):
+def friction_of(law, s: SteppingArrays, k, r):
     """Coefficient of friction of candidate k, first row r: at the slip with which the step begins.
 
     A point that sticks has tangential rates too where its rows turn: whether it has slid decides.
     """
-    last, speed = s.memory[kt.LAST, k], slip_of_rates(s, k, s.rate[0, r + 1], s.rate[0, r + 2])
+    last, speed = s.memory[kt.LAST, k], slip_of_rates(law, k, s.rate[0, r + 1], s.rate[0, r + 2])
     if speed <= kt.BAD or (last[kt.CLOSED] == 1.0 and last[kt.SLID] == 0.0):
-        return unilateral.law[k, ku.STATIC]
-    return sliding_friction(unilateral.law, k, s.law[k, kt.FRICTION_OF], speed)
+        return law[k, ka.STATIC]
+    return sliding_friction(law, k, speed)
 
 
 @internal_kernel
-def turn_rows(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, k, h):
+def turn_rows(law, s: SteppingArrays, ws: Workspace, k, h):
     """What the law adds to the end rates of listed candidate k, into ``s.turn``; its friction is in ``s.mu``."""
     turn, last, state, r = s.turn[k], s.memory[kt.LAST, k], ws.contacts[k], ws.active[k, ka.FIRST_ROW]
     share = h / (h + s.grid[kt.LENGTH_LAST]) if turn[kt.KNOWN] == 1.0 else 0.0
@@ -240,8 +230,8 @@ def turn_rows(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, k,
         turn[kt.ADDED + m] = turn[kt.TURNED + m]
     turn[kt.PUSH], turn[kt.MEAN] = 0.0, 0.0
     if last[kt.CLOSED] == 0.0:
-        if s.rate[0, r] < 0.0 and s.law[k, kt.RESTITUTION] > 0.0:
-            turn[kt.ADDED] = s.law[k, kt.RESTITUTION] * s.rate[0, r]
+        if s.rate[0, r] < 0.0 and law[k, ka.RESTITUTION] > 0.0:
+            turn[kt.ADDED] = law[k, ka.RESTITUTION] * s.rate[0, r]
         return
     turn[kt.PUSH] = return_rate(state[ka.GAP], turn[kt.TURNED], last[kt.BUDGET], h)
     turn[kt.ADDED] -= turn[kt.PUSH]
@@ -278,7 +268,7 @@ def largest_mobility(W, r):
 
 
 @internal_kernel
-def solve_contacts(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, h):
+def solve_contacts(law, s: SteppingArrays, ws: Workspace, h):
     """Impulses of all rows, by the last ones as a start, and their mean forces into ``ws.rows``; then ``s.memory``.
 
     Where the slip of a contact that was to slide on ends, or turns back, the law is that of the end after all: at most
@@ -294,8 +284,8 @@ def solve_contacts(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspac
     for k in range(ws.contacts.shape[0]):
         if ws.active[k, ka.MODE] == ka.STICKING:
             r = ws.active[k, ka.FIRST_ROW]
-            s.mu[r] = friction_of(unilateral, s, k, r)
-            turn_rows(unilateral, s, ws, k, h)
+            s.mu[r] = friction_of(law, s, k, r)
+            turn_rows(law, s, ws, k, h)
             for m in range(ka.MOST_ROWS):
                 s.f[r + m] = s.impulse[3 * k + m]
     for _ in range(1 + ws.contacts.shape[0]):
@@ -373,7 +363,7 @@ def note_contacts(system, s: SteppingArrays, ws: Workspace):
             now[kt.END_RATE + m] = s.rate[1, r + m]
         if s.f[r] > 0.0 or s.w[r] <= kt.BAD:
             now[kt.CLOSED] = 1.0
-            now[kt.SLID] = 1.0 if slip_of_rates(s, k, s.w[r + 1], s.w[r + 2]) > kt.BAD else 0.0
+            now[kt.SLID] = 1.0 if slip_of_rates(system.contacts.law, k, s.w[r + 1], s.w[r + 2]) > kt.BAD else 0.0
             s.motion[k] = ka.SLIDING if now[kt.SLID] == 1.0 else ka.STICKING
             now[kt.BUDGET] = last[kt.BUDGET] - s.f[r] * max(s.turn[k, kt.PUSH], 0.0)
             if last[kt.CLOSED] == 0.0:

@@ -55,7 +55,7 @@ def step_moreau(system: System, ws: Workspace, run: Run):
             # The last acceleration tells nothing of the next one.
             for i in range(ws.joints.shape[0]):
                 v_bias[i], ws.joints[i, ka.QD] = v0[i], v0[i]
-            geometry(system, model, s, ws)
+            geometry(system, model, ws)
         solve_step(system, model, ws, run)
         drive_at_theta(system, ws, run)
         if limits_agree(system, ws, run, tries):
@@ -90,7 +90,7 @@ def place_midpoint(system: System, model: ModelArrays, ws: Workspace, run: Run):
     place_joints(system, ws, run.y_new)
     for i in range(ws.joints.shape[0]):
         ws.joints[i, ka.QD], ws.joints[i, ka.QDD] = run.stepping.before[kt.V_BIAS, i], 0.0
-    geometry(system, model, run.stepping, ws)
+    geometry(system, model, ws)
 
 
 @internal_kernel
@@ -105,7 +105,7 @@ def solve_step(system: System, model: ModelArrays, ws: Workspace, run: Run):
     constraint_rates(model, ws, y, layout.v, s.rate[0])
     if ws.counts[ka.ROWS] > 0:
         row_system(model, ws)
-        solve_contacts(system.unilateral, s, ws, h)
+        solve_contacts(system.contacts.law, s, ws, h)
         note_stop_forces(system.unilateral, ws)
         add_row_forces(model, ws)
     accelerate(model, ws)
@@ -201,7 +201,7 @@ def book_contacts(system: System, s: SteppingArrays, ws: Workspace, y_new, h):
                     friction = 0.0
             if friction != 0.0 or now[kt.SLID] == 1.0:
                 x, z = 0.5 * (s.rate[0, r + 1] + s.rate[1, r + 1]), 0.5 * (s.rate[0, r + 2] + s.rate[1, r + 2])
-                y_new[first + kst.SLIP] += h * slip_of_rates(s, k, x, z)
+                y_new[first + kst.SLIP] += h * slip_of_rates(system.contacts.law, k, x, z)
             y_new[first + kst.IMPULSE] += h * force
             y_new[layout.loss + kst.IMPACT_LOSS] -= struck
             s.turn[k, kt.STRUCK] = -struck
@@ -277,7 +277,7 @@ def sample_moreau(system: System, ws: Workspace, run: Run):
         for i in range(ws.joints.shape[0]):
             ws.joints[i, ka.QD], ws.joints[i, ka.APPLIED] = row[system.layout.v + i], 0.0
         drive(system.drives, system.reference, run.sample_time[last], row, system.layout, ws)
-        geometry(system, system.model, s, ws)
+        geometry(system, system.model, ws)
         write_output(system, ws, run, last)
         # What lies between the ends of a step is linear, energy is not.
         between = -(1.0 - x) * (s.energy[kt.START, kt.MECHANICAL] + s.energy[kt.START, kt.MAGNETIC])

@@ -24,13 +24,12 @@ from typing import NamedTuple
 import numpy as np
 
 from dynsim.dynamics import tables as ka
-from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.cone import problem as kc
 from dynsim.dynamics.contact.quadrics import contact_rows
 from dynsim.dynamics.contact.shapes import shaped_rows
-from dynsim.dynamics.contact.unilateral import UnilateralArrays
 from dynsim.dynamics.tables import ContactArrays, ModelArrays, Workspace, row_limit
 from dynsim.dynamics.tree.joints import displace, normalise, read_positions
+from dynsim.dynamics.tree.spatial import cross, dot, dot_vector, put_vector, rotate, rotation, six, vector
 from dynsim.dynamics.tree.sweep import forward_sweep
 from dynsim.jit.kernel import integers, internal_kernel, reals
 
@@ -40,9 +39,6 @@ GOOD, BAD = 1e-11, 1e-8
 QUICK_ROUNDS, LAST_ROUNDS = 2, 12
 # A gap that counts as closed: far above rounding [m].
 MARGIN = 1e-10
-# SteppingArrays.law
-FRICTION_OF, RESTITUTION, GRIP, GRIP_AXIS = 0, 1, 2, 3
-LAW_SIZE = 6
 # SteppingArrays.memory: of the last accepted step, and of the one that is tried; its columns, of a candidate
 LAST, NOW = 0, 1
 LISTED = 0  # 1: it had rows
@@ -86,7 +82,6 @@ class SteppingArrays(NamedTuple):
     """What time stepping reads and writes beside ``Run``; p is the most rows that there can be."""
 
     theta: float
-    law: np.ndarray  # (c, LAW_SIZE) friction, restitution, and friction along GRIP_AXIS per that across (1: isotropic)
     body: np.ndarray  # (n, BODY_SIZE) as that of the model, its ARMATURE with what is implicit
     linear: np.ndarray  # (na, BLOCK_SIZE)
     segment: np.ndarray  # (na,) int: which limit holds each drive, see dynsim.dynamics.drive.law.segment_of
@@ -117,17 +112,12 @@ def stepping_arrays(
     na: int,
     joint_rows: int,
     theta: float,
-    unilateral: UnilateralArrays,
 ) -> SteppingArrays:
-    """Allocate :class:`SteppingArrays`: friction of the contacts and the law's restitution; isotropic."""
+    """Allocate :class:`SteppingArrays`."""
     n, c = model.body.shape[0], contacts.link.shape[0]
     p = row_limit(c, joint_rows)
-    law = np.zeros((c, LAW_SIZE))
-    law[:, FRICTION_OF], law[:, GRIP], law[:, GRIP_AXIS] = contacts.point[:, ka.MU], 1.0, 1.0
-    law[:, RESTITUTION] = unilateral.law[:, ku.RESTITUTION]
     return SteppingArrays(
         theta=float(theta),
-        law=law,
         body=reals(model.body),
         linear=np.zeros((na, ka.BLOCK_SIZE)),
         segment=integers(np.zeros(na)),
@@ -181,54 +171,37 @@ def place_joints(system, ws: Workspace, y):
 
 
 @internal_kernel
-def geometry(system, model: ModelArrays, s: SteppingArrays, ws: Workspace):
+def geometry(system, model: ModelArrays, ws: Workspace):
     """Poses, gaps and rows at the positions and rates in ``ws.joints``; tangents along and across the grip axis."""
     forward_sweep(model, ws, 1.0, 0.0, 1.0)
     contact_rows(model, system.contacts, system.unilateral, ws)
     shaped_rows(system.shapes, system.unilateral, model, system.contacts, ws)
     state = ws.contacts
     for k in range(state.shape[0]):
-        i, nx, ny, nz = (
-            system.contacts.link[k, ka.LINK],
-            state[k, ka.NORMAL],
-            state[k, ka.NORMAL + 1],
-            state[k, ka.NORMAL + 2],
-        )
-        x, y, z = s.law[k, GRIP_AXIS], s.law[k, GRIP_AXIS + 1], s.law[k, GRIP_AXIS + 2]
-        ax = ws.links[i, ka.R] * x + ws.links[i, ka.R + 1] * y + ws.links[i, ka.R + 2] * z
-        ay = ws.links[i, ka.R + 3] * x + ws.links[i, ka.R + 4] * y + ws.links[i, ka.R + 5] * z
-        az = ws.links[i, ka.R + 6] * x + ws.links[i, ka.R + 7] * y + ws.links[i, ka.R + 8] * z
-        across = ax * nx + ay * ny + az * nz
-        ax, ay, az = ax - across * nx, ay - across * ny, az - across * nz
-        length = math.sqrt(ax * ax + ay * ay + az * az)
+        R, n = rotation(ws.links, system.contacts.link[k, ka.LINK], ka.R), vector(state, k, ka.NORMAL)
+        t = rotate(R, vector(system.contacts.law, k, ka.GRIP_AXIS))
+        across = dot_vector(t, n)
+        t = t[0] - across * n[0], t[1] - across * n[1], t[2] - across * n[2]
+        length = math.sqrt(dot_vector(t, t))
         if not length > 1e-6:  # the axis is along the normal: any direction does
-            ax, ay, az = (0.0, nz, -ny) if abs(nx) < 0.7 else (-nz, 0.0, nx)
-            length = math.sqrt(ax * ax + ay * ay + az * az)
-        ax, ay, az = ax / length, ay / length, az / length
-        state[k, ka.FIRST_TANGENT], state[k, ka.FIRST_TANGENT + 1], state[k, ka.FIRST_TANGENT + 2] = ax, ay, az
-        state[k, ka.SECOND_TANGENT] = ny * az - nz * ay
-        state[k, ka.SECOND_TANGENT + 1] = nz * ax - nx * az
-        state[k, ka.SECOND_TANGENT + 2] = nx * ay - ny * ax
+            t = (0.0, n[2], -n[1]) if abs(n[0]) < 0.7 else (-n[2], 0.0, n[0])
+            length = math.sqrt(dot_vector(t, t))
+        t = t[0] / length, t[1] / length, t[2] / length
+        put_vector(state, k, ka.FIRST_TANGENT, t)
+        put_vector(state, k, ka.SECOND_TANGENT, cross(n, t))
 
 
 @internal_kernel
 def constraint_rates(model: ModelArrays, ws: Workspace, y, first, out):
     """J v of all rows, v from ``first`` on in y. A row's rate climbs from its link to the world."""
-    rows, links, active = ws.rows, ws.links, ws.active
+    rows, active = ws.rows, ws.active
     for r in range(ws.counts[ka.ROWS]):
+        a, b = active[r, ka.BODY_A], active[r, ka.BODY_B]
         if r < ws.counts[ka.COUPLED]:
-            out[r] = (
-                rows[r, ka.ROW] * y[first + active[r, ka.BODY_A]]
-                + rows[r, ka.ROW + 1] * y[first + active[r, ka.BODY_B]]
-            )
+            out[r] = rows[r, ka.ROW] * y[first + a] + rows[r, ka.ROW + 1] * y[first + b]
             continue
-        a, b, c = rows[r, ka.ROW], rows[r, ka.ROW + 1], rows[r, ka.ROW + 2]
-        d, e, f = rows[r, ka.ROW + 3], rows[r, ka.ROW + 4], rows[r, ka.ROW + 5]
-        total, i = 0.0, active[r, ka.BODY_A]
-        while i >= 0:
-            total += y[first + i] * (
-                ((a * links[i, ka.S] + b * links[i, ka.S + 1]) + (c * links[i, ka.S + 2] + d * links[i, ka.S + 3]))
-                + (e * links[i, ka.S + 4] + f * links[i, ka.S + 5])
-            )
-            i = model.tree[i, ka.PARENT]
+        row, total = six(rows, r, ka.ROW), 0.0
+        while a >= 0:
+            total += y[first + a] * dot(row, six(ws.links, a, ka.S))
+            a = model.tree[a, ka.PARENT]
         out[r] = total

@@ -68,9 +68,9 @@ def build_mujoco(
     radii = []
     for k in range(len(system.contacts.link)):
         body = bodies[system.contacts.link[k, ka.LINK]]
-        point = system.contacts.point[k]
+        point, mu = system.contacts.point[k], float(system.contacts.law[k, ka.MU])
         if contacts == "soft":
-            _add_soft_contact(spec, body, k, point, solref)
+            _add_soft_contact(spec, body, k, point, mu, solref)
         elif contacts == "equality":
             radii.append(_add_tendon(spec, body, k, point, solref))
     model = spec.compile()
@@ -197,7 +197,7 @@ def _add_motors(spec: Any, system: System) -> None:
         )
 
 
-def _add_soft_contact(spec: Any, body: Any, k: int, point: Array, solref: list[float]) -> None:
+def _add_soft_contact(spec: Any, body: Any, k: int, point: Array, mu: float, solref: list[float]) -> None:
     import mujoco
 
     if k == 0:
@@ -218,7 +218,6 @@ def _add_soft_contact(spec: Any, body: Any, k: int, point: Array, solref: list[f
         conaffinity=0,
         mass=0.0,
     )
-    mu = float(point[ka.MU])
     pair = spec.add_pair(geomname1="floor", geomname2=f"foot_{k}", condim=3 if mu > 0.0 else 1, solref=solref)
     pair.friction = [mu, mu, 0.0, 0.0, 0.0]
 

@@ -1,16 +1,45 @@
-"""What RADAU5 keeps from step to step: Jacobian, factors, stages."""
+"""RADAU5: its coefficients, and what it keeps from step to step, Jacobian, factors, stages."""
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from dynsim.dynamics import tables as ka
-from dynsim.dynamics.simd.system import FOUR, lane_workspace
+from dynsim.dynamics.simd.system import StageLanes
 from dynsim.dynamics.simd.tables import aligned
-from dynsim.dynamics.tables import Workspace
 from dynsim.jit.kernel import internal_kernel
+
+# Radau IIA of order 5, coefficients of Hairer and Wanner (Solving Ordinary Differential Equations II, IV.8): T⁻¹ A⁻¹ T
+# has γ, and [[α, −β], [β, α]], on its diagonal. ERROR_RADAU: weights of the stages in h times the right side of the
+# error estimate.
+_ROOT = math.sqrt(6.0)
+A_RADAU = np.array(
+    [
+        [(88 - 7 * _ROOT) / 360, (296 - 169 * _ROOT) / 1800, (-2 + 3 * _ROOT) / 225],
+        [(296 + 169 * _ROOT) / 1800, (88 + 7 * _ROOT) / 360, (-2 - 3 * _ROOT) / 225],
+        [(16 - _ROOT) / 36, (16 + _ROOT) / 36, 1 / 9],
+    ]
+)
+NODE_RADAU = np.array([(4 - _ROOT) / 10, (4 + _ROOT) / 10, 1.0])
+GAMMA_RADAU, ALPHA_RADAU, BETA_RADAU = 3.6378342527444957, 2.6810828736277523, 3.0504301992474105
+T_RADAU = np.array(
+    [
+        [9.1232394870892942792e-02, -0.14125529502095420843, -3.0029194105147424492e-02],
+        [0.24171793270710701896, 0.20412935229379993199, 0.38294211275726193779],
+        [0.96604818261509293619, 1.0, 0.0],
+    ]
+)
+T_INVERSE_RADAU = np.array(
+    [
+        [4.3255798900631553510, 0.33919925181580986954, 0.54177053993587487119],
+        [-4.1787185915519047273, -0.32768282076106238708, 0.47662355450055045196],
+        [-0.50287263494578687595, 2.5719269498556054292, -0.59603920482822492497],
+    ]
+)
+ERROR_RADAU = np.array([-(13 + 7 * _ROOT) / 3, (-13 + 7 * _ROOT) / 3, -1 / 3])
 
 # NewtonArrays.clock: step that the factors are of, that the stages are of, that the extrapolation is of [s];
 # contraction of Newton's method, and what it says of the error of the last iterate; the error
@@ -28,32 +57,13 @@ COLUMNS = 9
 NEWTON_COUNT_SIZE = 10
 
 
-class StageLanes(NamedTuple):
-    """Room for right-hand sides that are evaluated four at a time."""
-
-    ws: Workspace
-    t: np.ndarray  # (4,)
-    y: np.ndarray  # (m, 4)
-    f: np.ndarray  # (m, 4)
-    delta: np.ndarray  # (4,)
-    output: np.ndarray  # (columns.size, 4), see dynsim.dynamics.state.OutputLayout
-
-
-def stage_lanes(ws: Workspace, m: int, columns: int) -> StageLanes:
-    """Allocate :class:`StageLanes` beside a workspace, whose rows are taken whenever the Jacobian is made anew."""
-    return StageLanes(
-        lane_workspace(ws, FOUR), aligned(4), aligned(m, 4), aligned(m, 4), aligned(4), aligned(columns, 4)
-    )
-
-
 class NewtonArrays(NamedTuple):
     """Room of RADAU5: n rates, na motors, k circuits, s entries of the state with a tolerance, m in all."""
 
     along: np.ndarray  # (2 n + k, n) ∂v̇/∂(θ, v, i), θ being displacements along the rates
     linear: np.ndarray  # (na, BLOCK_SIZE) linear blocks of the drives
-    real: np.ndarray  # (n, n) factors of the real Newton matrix
-    complex: np.ndarray  # (n, n) and of the complex one
-    pivot: np.ndarray  # (2, n) int
+    inverse: np.ndarray  # (2, n, n) complex: of the real and the complex Newton matrix, as Python
+    pivot: np.ndarray  # (n,) int
     z: np.ndarray  # (3, m) stages of the step tried, from y on
     w: np.ndarray  # (3, s) the same, T⁻¹ z
     f: np.ndarray  # (3, m) derivatives at the stages
@@ -62,8 +72,6 @@ class NewtonArrays(NamedTuple):
     weight: np.ndarray  # (s,) 1 / tolerance
     one: np.ndarray  # (s,) right side and solution of the real system
     two: np.ndarray  # (s,) complex
-    room_one: np.ndarray  # (2, s)
-    room_two: np.ndarray  # (2, s) complex
     direct: np.ndarray  # (n, n, 4) inverses of both matrices, see dynsim.integrators.radau5.linear_systems
     crossed: np.ndarray  # (n, n, 4)
     over: np.ndarray  # (2, 4) 1/g
@@ -84,9 +92,8 @@ def newton_arrays(n: int, na: int, circuits: int, tracked: int, m: int) -> Newto
     return NewtonArrays(
         along=np.zeros((2 * n + circuits, n)),
         linear=np.zeros((na, ka.BLOCK_SIZE)),
-        real=np.zeros((n, n)),
-        complex=np.zeros((n, n), dtype=np.complex128),
-        pivot=np.zeros((2, n), dtype=np.int64),
+        inverse=np.zeros((2, n, n), dtype=np.complex128),
+        pivot=np.zeros(n, dtype=np.int64),
         z=np.zeros((3, m)),
         w=np.zeros((3, tracked)),
         f=np.zeros((3, m)),
@@ -95,8 +102,6 @@ def newton_arrays(n: int, na: int, circuits: int, tracked: int, m: int) -> Newto
         weight=np.zeros(tracked),
         one=np.zeros(tracked),
         two=np.zeros(tracked, dtype=np.complex128),
-        room_one=np.zeros((2, tracked)),
-        room_two=np.zeros((2, tracked), dtype=np.complex128),
         direct=aligned(n, n, 4),
         crossed=aligned(n, n, 4),
         over=aligned(2, 4),

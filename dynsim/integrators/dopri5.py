@@ -1,14 +1,30 @@
-"""The explicit Runge–Kutta method: one step of DOPRI5."""
+"""DOPRI5, Dormand and Prince's explicit Runge–Kutta method of order 5: one step."""
 
 from __future__ import annotations
+
+import numpy as np
 
 from dynsim.dynamics.derivative import System, derivative
 from dynsim.dynamics.tables import Workspace
 from dynsim.integrators import run as ki
 from dynsim.integrators.run import Run
 from dynsim.integrators.steps import error_norm
-from dynsim.integrators.tableaux import A_DOPRI5, ERROR_DOPRI5, NODE_DOPRI5
 from dynsim.jit.kernel import internal_kernel, merged_kernel
+
+# Stage rows a_ij, with the solution as the last row, whose derivative is the next step's first stage.
+A_DOPRI5 = np.array(
+    [
+        [0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+        [1 / 5, 0.0, 0.0, 0.0, 0.0, 0.0],
+        [3 / 40, 9 / 40, 0.0, 0.0, 0.0, 0.0],
+        [44 / 45, -56 / 15, 32 / 9, 0.0, 0.0, 0.0],
+        [19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729, 0.0, 0.0],
+        [9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0.0],
+        [35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84],
+    ]
+)
+NODE_DOPRI5 = np.array([0.0, 0.2, 0.3, 0.8, 8 / 9, 1.0, 1.0])
+ERROR_DOPRI5 = np.array([71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40])
 
 
 @internal_kernel
