@@ -213,15 +213,20 @@ class _Draft:
 
     def __enter__(self) -> _Draft:
         with self.one_line_errors():
-            self._open()
+            existing = self._existing()
+            # The name is nobody else's: made anew or not at all, and a link that lies there is not followed.
+            self._temporary = self._target.with_name(f".dynsim-{os.urandom(8).hex()}.tmp")
+            self.stream: BinaryIO = self._temporary.open("x+b")
+            try:
+                self._take_over(existing)
+            except BaseException:
+                self._discard()
+                raise
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: object) -> None:
         """Close, and remove the temporary file if it was not published."""
-        with suppress(OSError):
-            self.stream.close()
-        with suppress(OSError):
-            self._temporary.unlink()
+        self._discard()
         if isinstance(error, (OSError, UnicodeEncodeError)):
             with self.one_line_errors():
                 raise error
@@ -234,8 +239,14 @@ class _Draft:
         except (OSError, UnicodeEncodeError) as error:
             raise RecordError(f"cannot write {self.path}: {_reason(error)}; nothing was changed there") from error
 
-    def _open(self) -> None:
-        """Find out what is at the path, and make the temporary file."""
+    def _discard(self) -> None:
+        with suppress(OSError):
+            self.stream.close()
+        with suppress(OSError):
+            self._temporary.unlink()
+
+    def _existing(self) -> os.stat_result | None:
+        """Find out what is at the path, and which file is to be replaced."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
         try:
             existing: os.stat_result | None = os.stat(self.path)
@@ -250,10 +261,10 @@ class _Draft:
         if existing is not None and not os.access(self._target, os.W_OK):
             raise PermissionError(0, "the file may not be written")
         _remove_left_behind(self._target.parent)
-        # The name is nobody else's: made anew or not at all, and a link that lies there is not followed.
-        temporary = self._target.with_name(f".dynsim-{os.urandom(8).hex()}.tmp")
-        self.stream: BinaryIO = temporary.open("x+b")
-        self._temporary = temporary
+        return existing
+
+    def _take_over(self, existing: os.stat_result | None) -> None:
+        """Hold the temporary file, and give it owner and mode of the one that it replaces."""
         descriptor = self.stream.fileno()
         lock(descriptor, wait=False)
         if existing is not None and hasattr(os, "fchmod"):

@@ -93,7 +93,7 @@ def test_what_seems_to_be_passed_over_for_ever_does_not_shorten_steps_to_nothing
     run.clock[ki.STEP], run.gaps = 1e-3, None
     monkeypatch.setattr(events, "too_long", lambda *_: 0.01)
     trials = 0
-    while events.passes_over(SimpleNamespace(unilateral=None), None, run):
+    while events.passes_over(SimpleNamespace(unilateral=None, contacts=None), None, run):
         trials += 1
         assert trials <= events.SEARCH_LIMIT
     assert run.clock[ki.STEP] > events.event_tolerance(0.0)

@@ -54,7 +54,8 @@ def evaluate(lanes: StageLanes, system: System) -> None:
 def compare(b: Bench, y: np.ndarray, t: float | np.ndarray, tolerance: float) -> ka.Workspace:
     """All lanes against runs of their own: NaN where they have it, else per largest entry."""
     kept, lanes = copies(b.ws), stage_lanes(b.ws, len(y), 0)
-    lanes.t[:], lanes.y[:] = t, y
+    lanes.t[:] = t
+    np.copyto(lanes.y, y)
     evaluate(lanes, b.system)
     ws, dy = lanes.ws, lanes.f
     for k in range(WIDTH):

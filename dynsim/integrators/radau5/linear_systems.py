@@ -40,10 +40,11 @@ def reduced_inverse(system: System, r: NewtonArrays, g):
     """The inverse of the reduced matrix for g, real or complex; as Python only."""
     along, block, table = r.along, r.linear, system.drives.table
     n = along.shape[1]
-    matrix = g * np.eye(n) - along[n : 2 * n].T - along[:n].T / g
+    first = 2 * n  # of the rows of circuits
+    matrix = g * np.eye(n) - along[n:first].T - along[:n].T / g
     for row, (j, k) in zip(block, table[:, [ka.DRIVEN, ka.CIRCUIT]], strict=True):
         if k >= 0:
-            matrix[:, j] -= along[2 * n + k] * (row[ka.RATE_Q] / g + row[ka.RATE_V]) / (g - row[ka.RATE_I])
+            matrix[:, j] -= along[first + k] * (row[ka.RATE_Q] / g + row[ka.RATE_V]) / (g - row[ka.RATE_I])
     return np.linalg.inv(matrix)
 
 
@@ -51,6 +52,7 @@ def solve_newton(system: System, y, r: NewtonArrays, g, inverse, x):
     """(g I − J)⁻¹ x by the inverse of the reduced matrix, x (s,) real or complex; as Python only."""
     along, table, layout = r.along, system.drives.table, system.layout
     n, q, v = along.shape[1], layout.q, layout.v
+    first = 2 * n - layout.current  # of the rows of circuits
     angle, solved = x[q : q + n].copy(), x.copy()
     if layout.extra > 0:
         rates_across(system.model.compound, system.model, y, q, x, angle)
@@ -62,7 +64,7 @@ def solve_newton(system: System, y, r: NewtonArrays, g, inverse, x):
         if k >= 0
     ]
     for row, j, e in circuits:
-        u = u + along[2 * n + e - layout.current] * (x[e] + row[ka.RATE_Q] * angle[j]) / (g - row[ka.RATE_I])
+        u = u + along[first + e] * (x[e] + row[ka.RATE_Q] * angle[j]) / (g - row[ka.RATE_I])
     u = inverse @ u
     for row, j, e in circuits:
         pull = row[ka.RATE_Q] * (angle[j] + u[j] / g) + row[ka.RATE_V] * u[j]
