@@ -83,8 +83,8 @@ def contact_laws(robot: Robot, contacts: Sequence[Contact]) -> NDArray[np.float6
     ModelError
         Static friction below the kinetic one, negative numbers, or restitution above one.
     """
-    law = np.zeros((len(contacts), ka.CONTACT_LAW_SIZE))
-    law[:, [ka.GRIP, ka.GRIP_AXIS]] = 1.0  # as much along as across, and tangents along some axis
+    # Without an axis friction is isotropic; tangents follow one that is seldom along a normal.
+    law = np.ones((len(contacts), ka.CONTACT_LAW_SIZE))
     for row, contact in zip(law, contacts, strict=True):
         where = f"contact {contact.name}"
         if not contact.friction >= 0.0:
