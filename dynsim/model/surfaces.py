@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -101,8 +102,12 @@ class Quadric:
         return Drawn.of_quadric("", self.Q, self.b, self.c)
 
 
-class _Shaped:
+class _Shaped(ABC):
     """Distances by the kernels of dynsim.dynamics.contact.distance."""
+
+    @abstractmethod
+    def shifted(self, by: Array) -> Surface:
+        """The same surface elsewhere, moved by a vector [m]."""
 
     @property
     def shapes(self) -> ShapeArrays:

@@ -243,10 +243,12 @@ def surfaces(scenario: Scenario) -> dict[str, Surface]:
     error = scenario.config.surface_error
 
     def built() -> dict[str, Surface]:
-        found = {name: families.build("surface", config, context, SURFACES) for name, config in configs.items()}
+        nominal: dict[str, Surface] = {
+            name: families.build("surface", config, context, SURFACES) for name, config in configs.items()
+        }
         if error is None or not any(error.shift_m):
-            return found
-        return {name: surface.shifted(np.array(error.shift_m)) for name, surface in found.items()}
+            return nominal
+        return {name: surface.shifted(np.array(error.shift_m)) for name, surface in nominal.items()}
 
     return recall("surfaces", built, scenario.duration_s, configs, error)
 
