@@ -213,6 +213,29 @@ def sweep_progress(runs: int, quiet: bool) -> Iterator[Callable[[int, int], None
 
 
 @contextmanager
+def plan_progress(quiet: bool) -> Iterator[Callable[[str, float], None]]:
+    """A bar over the stages of a plan of braces; yields its report of a stage and the share that is done."""
+    if quiet:
+        _silence()
+        yield lambda stage, share: None
+        return
+    from rich.progress import BarColumn
+
+    from dynsim.engine.compilation import watched
+
+    said: list[str] = []
+
+    def compiling(now: Compilation | None) -> None:
+        if now is not None and not said:
+            said.append(now.text)
+            _say_compiled(now)
+
+    with _bars("{task.description}", BarColumn()) as bar, watched(compiling):
+        task = bar.add_task("searching", total=1.0)
+        yield lambda stage, share: bar.update(task, description=stage, completed=share)
+
+
+@contextmanager
 def film_progress(quiet: bool) -> Iterator[Callable[[int, int], None]]:
     """A bar over the frames of a film, with time and time to go; yields its report."""
     if quiet:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -16,10 +14,10 @@ from dynsim.cli.app import (
     QuietOption,
     ScenarioArgument,
     SetOption,
+    VariantOption,
     parsed_overrides,
 )
-from dynsim.cli.display import console
-from dynsim.config import completion
+from dynsim.cli.display import plan_progress, say, say_written
 from dynsim.errors import ScenarioError
 from dynsim.system.terminal import escaped
 
@@ -28,12 +26,7 @@ EXAMPLE = "Example: dynsim plan pressing --count 0:3 --candidates link_3:link_9"
 
 def plan(
     scenario: ScenarioArgument,
-    variant: Annotated[
-        str | None,
-        typer.Option(
-            metavar="VARIANT", help="Variant to plan; default: the first.", autocompletion=completion.variants
-        ),
-    ] = None,
+    variant: VariantOption = None,
     overrides: SetOption = None,
     candidates: Annotated[
         str,
@@ -112,7 +105,7 @@ def plan(
     factors = (1.0, 1.0 - friction_error, 1.0 + friction_error) if friction_error > 0.0 else (1.0,)
     chosen = Tolerances.gains if gains is None else _gains(gains)
     tolerances = Tolerances(friction=factors, shift_m=errors, gains=chosen)
-    with _progress(quiet) as tell:
+    with plan_progress(quiet) as tell:
         found = plan_braces(
             loaded,
             candidates=[name.strip() for name in candidates.split(",") if name.strip()],
@@ -137,30 +130,10 @@ def plan(
     if not quiet:
         from dynsim.cli.plan_table import print_plan
 
-        print_plan(console, found)
-        console.print(f"Written to {escaped(folder)}", highlight=False, soft_wrap=True)
+        print_plan(found)
+        say_written(folder)
         if found.best is not None:
-            console.print(
-                f"To run the best: dynsim run {escaped(folder / 'plan.yaml')}", highlight=False, soft_wrap=True
-            )
-
-
-@contextmanager
-def _progress(quiet: bool) -> Iterator[Callable[[str, float], None]]:
-    """What to tell of progress: a bar for each stage on a terminal."""
-    if quiet or not console.is_terminal:
-        yield lambda text, share: None
-        return
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-    with Progress(TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=console) as bar:
-        task = bar.add_task("searching", total=1.0)
-
-        def tell(text: str, share: float) -> None:
-            bar.update(task, description=text, completed=share)
-
-        yield tell
-        bar.update(task, completed=1.0)
+            say(f"To run the best: dynsim run {escaped(folder / 'plan.yaml')}")
 
 
 def _numbers(text: str) -> tuple[int, int]:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from rich.console import Console
 from rich.table import Table
 
+from dynsim.cli.display import console, say
 from dynsim.planner.answer import BracePlan, Size
 from dynsim.system.terminal import escaped
 
 
-def print_plan(console: Console, plan: BracePlan) -> None:
+def print_plan(plan: BracePlan) -> None:
     """A row for each number of braces, then what refused plans and what was not found."""
     table = Table(title=f"{escaped(plan.task.scenario.title)}: braces", title_justify="left")
     for head in ("braces", "on", "heat [W]", "simulated [W]", "k_p [V/rad]", "forces [N]", "found", "survives"):
@@ -19,17 +19,13 @@ def print_plan(console: Console, plan: BracePlan) -> None:
     console.print(table)
     best = plan.best
     if best is not None:
-        console.print(f"best: {escaped(best.label)}", highlight=False, soft_wrap=True)
+        say(f"best: {escaped(best.label)}")
     for size in plan.sizes:
         for text in _notes(size):
-            console.print(f"{size.count} braces: {escaped(text)}", highlight=False, soft_wrap=True)
+            say(f"{size.count} braces: {escaped(text)}")
     missed, reached = len(plan.tally.missed), len(plan.tally.reached)
     if missed:
-        console.print(
-            f"no posture found for {missed} of {missed + reached} sets tried: not found, which does not say impossible",
-            highlight=False,
-            soft_wrap=True,
-        )
+        say(f"no posture found for {missed} of {missed + reached} sets tried: not found, which does not say impossible")
 
 
 def _cells(size: Size) -> tuple[str, ...]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dynsim.compile.clearance import axis_ends
 from dynsim.compile.model import Model
 from dynsim.errors import ModelError
 from dynsim.jit.kernel import integers, reals
@@ -139,8 +140,6 @@ def axis_points(arm: MovingArm, shares: Sequence[float]) -> list[tuple[int, Arra
 
     From each link's joint to the ends that :func:`dynsim.compile.clearance.axis_ends` gives it.
     """
-    from dynsim.compile.clearance import axis_ends
-
     robot = arm.model.robot
     ends = axis_ends(robot)
     return [

@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dynsim.dynamics.contact.distance import ShapeArrays, distance
+from dynsim.dynamics.tree.spatial import dot_vector
 from dynsim.jit.kernel import internal_kernel, kernel
 
 # Slip [m/s] over which friction grows to its value: steep enough to charge braces that creep, smooth enough for steps.
@@ -126,11 +127,6 @@ def cross(u, v, out):
     out[0] = u[1] * v[2] - u[2] * v[1]
     out[1] = u[2] * v[0] - u[0] * v[2]
     out[2] = u[0] * v[1] - u[1] * v[0]
-
-
-@internal_kernel
-def dot(u, v):
-    return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
 
 
 @internal_kernel
@@ -258,7 +254,7 @@ def geometry(arm: Arm, points: Points, work: Work, q, k):
         # The touching point moves by J_centre − ρ ∂n/∂q, the material there by J_touch.
         for j in range(n):
             for r in range(3):
-                turned = dot(bend[r], work.centre[i, j])
+                turned = dot_vector(bend[r], work.centre[i, j])
                 work.shift[i, j, r] = work.centre[i, j, r] - radius * turned - work.touch[i, j, r]
 
 
@@ -290,7 +286,7 @@ def evaluate(arm: Arm, points: Points, course: Course, work: Work, Q, V, F, deri
                 for j in range(n):
                     rate += work.touch[i, j, r] * v[j]
                 slip[4 + r] = rate
-            ahead = dot(normal, slip[4:7])
+            ahead = dot_vector(normal, slip[4:7])
             square = SLIP_SCALE * SLIP_SCALE
             for r in range(3):
                 slip[r] = slip[4 + r] - ahead * normal[r]
@@ -301,7 +297,7 @@ def evaluate(arm: Arm, points: Points, course: Course, work: Work, Q, V, F, deri
                 u[r] = normal[r] - points.friction[i] * slip[r]
                 work.force[i, r] = F[e, i] * u[r]
             for j in range(n):
-                work.by_f[e, j, i] = -dot(work.touch[i, j], u)
+                work.by_f[e, j, i] = -dot_vector(work.touch[i, j], u)
         for j in range(n):
             # Weight and forces on what the joint carries: M_j = Σ J × w.
             if arm.prismatic[j]:
@@ -311,7 +307,7 @@ def evaluate(arm: Arm, points: Points, course: Course, work: Work, Q, V, F, deri
                 for r in range(3):
                     lever[r] = work.below[j, 1 + r] - work.below[j, 0] * work.p[j, r]
                 cross(work.a[j], lever, part)
-            torque = arm.losses[j] * v[j] - dot(arm.gravity, part)
+            torque = arm.losses[j] * v[j] - dot_vector(arm.gravity, part)
             for i in range(c):
                 torque += work.by_f[e, j, i] * F[e, i]
             work.torque[e, j] = torque
@@ -330,7 +326,7 @@ def evaluate(arm: Arm, points: Points, course: Course, work: Work, Q, V, F, deri
             i = j
             while i >= 0:
                 if not arm.prismatic[i]:
-                    bent = -dot(work.a[i], moment)
+                    bent = -dot_vector(work.a[i], moment)
                     work.by_q[e, i, j], work.by_q[e, j, i] = bent, bent
                 i = arm.parent[i]
         if derivatives:
@@ -379,13 +375,13 @@ def force_derivatives(arm: Arm, points: Points, work: Work, v, f, i, e):
         cross(whole, work.shift[i, j], part)
         for t in range(3):
             dw[t] += part[t]
-            dn[t] = dot(work.bend[i, t], work.centre[i, j])
-        ahead = dot(normal, dw) + dot(dn, slip[4:7])
-        level = dot(normal, slip[4:7])
+            dn[t] = dot_vector(work.bend[i, t], work.centre[i, j])
+        ahead = dot_vector(normal, dw) + dot_vector(dn, slip[4:7])
+        level = dot_vector(normal, slip[4:7])
         for t in range(3):
             dw[t] -= normal[t] * ahead + dn[t] * level
-            turned[t] = rate[t] - normal[t] * dot(normal, rate)
-        along, other = dot(slip[0:3], dw), dot(slip[0:3], turned)
+            turned[t] = rate[t] - normal[t] * dot_vector(normal, rate)
+        along, other = dot_vector(slip[0:3], dw), dot_vector(slip[0:3], turned)
         for t in range(3):
             work.turn[j, t] = f * (dn[t] - mu * (dw[t] - slip[t] * along) / slip[3])
             work.drift[j, t] = -f * mu * (turned[t] - slip[t] * other) / slip[3]
@@ -396,11 +392,11 @@ def force_derivatives(arm: Arm, points: Points, work: Work, v, f, i, e):
     while j >= 0:
         k = body
         while k >= 0:
-            work.by_q[e, j, k] -= dot(work.touch[i, j], work.turn[k])
-            work.by_v[e, j, k] -= dot(work.touch[i, j], work.drift[k])
+            work.by_q[e, j, k] -= dot_vector(work.touch[i, j], work.turn[k])
+            work.by_v[e, j, k] -= dot_vector(work.touch[i, j], work.drift[k])
             if not arm.prismatic[j]:
                 cross(work.a[j], work.shift[i, k], turned)
-                work.by_q[e, j, k] -= dot(turned, part)
+                work.by_q[e, j, k] -= dot_vector(turned, part)
             k = arm.parent[k]
         j = arm.parent[j]
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from dynsim.compile.clearance import axis_ends, gaps
 from dynsim.compile.references.feed_forward import pressing
 from dynsim.compile.splines import clamped_cubic, quintic_rates
 from dynsim.dynamics.contact.braces import tables as kb
@@ -143,8 +144,6 @@ def nearest(
     Links both of whose ends are braced may lie on the surface. ``shift`` : of all surfaces, (3,) [m]
     """
     best = (np.inf, "", 0.0)
-    from dynsim.compile.clearance import gaps
-
     robot, arm = task.arm.model.robot, task.arm
     surfaces = build.surfaces(task.scenario)
     if shift is not None and shift.any():
@@ -179,8 +178,6 @@ def touching_links(task: Task, times: Array, q: Array) -> str:
     """
     chosen = np.unique(np.linspace(0, np.searchsorted(times, task.span), LOOKS).astype(int))
     times, q = times[chosen], q[chosen]
-    from dynsim.compile.clearance import axis_ends
-
     arm = task.arm
     robot, ends = arm.model.robot, axis_ends(arm.model.robot)
     segments = [

@@ -208,7 +208,7 @@ def test_odd_provenance_of_records_is_one_error(tmp_path: Path, monkeypatch) -> 
     record = dynsim.simulate(load_scenario("single_pendulum", overrides={"duration_s": 0.2, "metrics.settle_s": 0.0}))
     record.provenance = {"scenario": "x"}
     assert figures.draw(record, tmp_path)  # the figures of one run need no name
-    with pytest.raises(RecordError, match="cannot be drawn"):
+    with pytest.raises(RecordError, match="the record cannot be drawn"):
         figures.draw_comparison({"a": record}, tmp_path)
     snake = dynsim.simulate(load_scenario("snake_circle", overrides={"duration_s": 0.2, "record.rate_hz": 50}))
     snake.scene = None

@@ -189,7 +189,7 @@ def test_colours_of_collada_files(tmp_path: Path) -> None:
     blocks = Blocks()
     head = packed(mesh, blocks)
     assert sorted(map(str, head["palette"])) == ["None", "[0.8, 0.1, 0.2]"]
-    for broken in ("red", "nan 0 0"):
+    for broken in ("red", "0.8 0.1", "nan 0 0", ""):
         (tmp_path / "c.dae").write_text(painted(dae()).replace("0.8 0.1 0.2 1", broken))
         assert read_mesh(tmp_path / "c.dae").colours is None
     (tmp_path / "b.dae").write_text(dae())

@@ -86,12 +86,16 @@ def _obj(content: bytes) -> Mesh:
     return Mesh(np.array(corners, dtype=np.float64).reshape(-1, 3), np.array(triangles, dtype=np.int64).reshape(-1, 3))
 
 
+_COLOUR = re.compile(rb"<color\b[^>]*>([^<]*)</color>")
+
+
 def _collada(content: bytes) -> Mesh:
     import collada
 
     if b"<!DOCTYPE" in content or b"<!ENTITY" in content:
         raise ValueError("entities are not read")
     # A mesh is worth more than its colours: broken ones would take what they are bound to with them.
+    content = _COLOUR.sub(lambda found: found[0] if len(found[1].split()) > 2 else b"", content)
     for text in (content, re.sub(b"<bind_material>.*?</bind_material>", b"", content, flags=re.DOTALL)):
         document = collada.Collada(io.BytesIO(text), ignore=[collada.DaeError])
         placed = list((document.scene or document.scenes[0]).objects("geometry"))
