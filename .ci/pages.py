@@ -475,6 +475,11 @@ def faults() -> str:
     return "\n" + markdown(data("reference/bridge_faults.json")["cells"]).strip("\n") + "\n\n"
 
 
+def planned_heat(count: int) -> str:
+    """Of the published arm with so many braces [W]."""
+    return fixed(next(size["heat_W"] for size in data("planner/published.json") if size["count"] == count), 2)
+
+
 def planned_arm() -> str:
     """The published arm: braces with friction and without."""
     rows = []
@@ -637,6 +642,10 @@ NUMBERS |= {
     "pressing_2_mm": lambda: error("pressing gravity", 2),
     "pressing_3_mm": lambda: fixed(1e3 * run("pressing commanded")["hand_error_rms_m"], 2),
     "pressing_4_mm": lambda: fixed(1e3 * run("pressing optimal")["hand_error_rms_m"], 2),
+    "published_W": lambda: fixed(0.1 * run("pressing plain")["electrical_energy_J"], 1),
+    "planned_1_W": lambda: planned_heat(1),
+    "planned_2_W": lambda: planned_heat(2),
+    "planned_3_W": lambda: planned_heat(3),
     "pipe_sticks": lambda: fixed(100 * run("brace_on_cylinder real")["contacts"]["elbow"]["sticking_fraction"], 1),
     "pipe_glued_J": lambda: energy("brace_on_cylinder glued"),
     "pipe_free_J": lambda: fixed(run("brace_on_cylinder free")["electrical_energy_J"], 0),
