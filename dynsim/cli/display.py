@@ -130,8 +130,21 @@ def _silence() -> None:
     shown_by_caller()
 
 
-def _say_compiled(now: Compilation) -> None:
-    console.print(f"{escaped(now.text[0].upper() + now.text[1:])}.", highlight=False)
+@contextmanager
+def _compilation_told(show: Callable[[Compilation | None], None] = lambda now: None) -> Iterator[None]:
+    """Within, the first compilation of kernels is told, and shown while it lasts."""
+    from dynsim.engine.compilation import watched
+
+    told: list[Compilation] = []
+
+    def compiling(now: Compilation | None) -> None:
+        if now is not None and not told:
+            told.append(now)
+            console.print(f"{escaped(now.text[0].upper() + now.text[1:])}.", highlight=False)
+        show(now)
+
+    with watched(compiling):
+        yield
 
 
 @contextmanager
@@ -144,22 +157,20 @@ def progress(scenarios: Sequence[Scenario], quiet: bool) -> Iterator[VariantProg
     from rich.progress import BarColumn
 
     from dynsim.engine import REFERENCES, SIMULATION
-    from dynsim.engine.compilation import watched
 
     # In 80 columns all fits up to 9999 s: the bar gives way, the times do not.
     done = "{task.completed:.2f} / {task.total:g} s {task.fields[what]}"
-    said: list[TaskID] = []
+    kernels: list[TaskID] = []
 
     def compiling(now: Compilation | None) -> None:
         if now is None:
-            bars.update(said[0], visible=False)
+            bars.update(kernels[0], visible=False)
             return
-        if not said:
-            _say_compiled(now)
-            said.append(bars.add_task("kernels", total=now.expected or _COMPILED_S, what="compiled"))
-        bars.update(said[0], completed=now.elapsed, visible=True)
+        if not kernels:
+            kernels.append(bars.add_task("kernels", total=now.expected or _COMPILED_S, what="compiled"))
+        bars.update(kernels[0], completed=now.elapsed, visible=True)
 
-    with _bars("{task.description}", BarColumn(), done) as bars, watched(compiling):
+    with _bars("{task.description}", BarColumn(), done) as bars, _compilation_told(compiling):
 
         def add(scenario: Scenario, what: str, visible: bool) -> TaskID:
             title = scenario.variant or scenario.name
@@ -186,16 +197,10 @@ def sweep_progress(runs: int, quiet: bool) -> Iterator[Callable[[int, int], None
         return
     from rich.progress import BarColumn, MofNCompleteColumn
 
-    from dynsim.engine.compilation import watched
-
     bar = _bars("runs", BarColumn(), MofNCompleteColumn(), "{task.fields[failed]}")
     task = bar.add_task("", total=runs, failed="")
-    said: list[str] = []
 
     def compiling(now: Compilation | None) -> None:
-        if now is not None and not said:
-            said.append(now.text)
-            _say_compiled(now)
         if bar.live.is_started:
             bar.update(task, failed="" if now is None else f"compiling, {now.elapsed:.0f} s")
 
@@ -205,7 +210,7 @@ def sweep_progress(runs: int, quiet: bool) -> Iterator[Callable[[int, int], None
         bar.update(task, completed=done, failed=f"{failed} failed" if failed else "")
 
     try:
-        with watched(compiling):
+        with _compilation_told(compiling):
             yield report
     finally:
         if bar.live.is_started:
@@ -221,16 +226,7 @@ def plan_progress(quiet: bool) -> Iterator[Callable[[str, float], None]]:
         return
     from rich.progress import BarColumn
 
-    from dynsim.engine.compilation import watched
-
-    said: list[str] = []
-
-    def compiling(now: Compilation | None) -> None:
-        if now is not None and not said:
-            said.append(now.text)
-            _say_compiled(now)
-
-    with _bars("{task.description}", BarColumn()) as bar, watched(compiling):
+    with _bars("{task.description}", BarColumn()) as bar, _compilation_told():
         task = bar.add_task("searching", total=1.0)
         yield lambda stage, share: bar.update(task, description=stage, completed=share)
 

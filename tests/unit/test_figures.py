@@ -152,14 +152,6 @@ def test_comparison(braced: Record, free: Record, tmp_path: Path) -> None:
     assert_pngs(figures.draw_comparison(records, tmp_path), tmp_path, COMPARISONS)
 
 
-def test_parts_are_all_figures_and_none_twice(braced: Record, free: Record, tmp_path: Path) -> None:
-    parts = [figures.draw(braced, tmp_path / str(k), part=(k, 3)) for k in range(3)]
-    assert sorted(path.stem for paths in parts for path in paths) == sorted(FIGURES)
-    both = {"two_elbows": braced, "no_elbow": free}
-    parts = [figures.draw_comparison(both, tmp_path / "all", part=(k, 2)) for k in range(2)]
-    assert sorted(path.stem for paths in parts for path in paths) == sorted(COMPARISONS)
-
-
 def test_comparison_of_pendulums(pendulum: Record, tmp_path: Path) -> None:
     paths = figures.draw_comparison({"a": pendulum, "b": pendulum}, tmp_path)
     assert_pngs(paths, tmp_path, {"compare_hand_path", "compare_posture"})

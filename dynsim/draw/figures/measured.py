@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from dynsim.draw.figures import arm, hand, posture, style
+from dynsim.draw.figures import hand, posture, style
 from dynsim.draw.figures.style import Array
 from dynsim.record import TIME, Record
 
@@ -20,16 +20,9 @@ LINES = 12
 MILLI = 1e3
 
 
-def draw(record: Record, folder: Path, kind: str = "png", part: style.Part = style.ALL) -> list[Path]:
+def draw(record: Record, folder: Path, kind: str = "png") -> list[Path]:
     """See :func:`dynsim.draw.figures.draw`."""
-    return style.save_all(FIGURES, record, folder, kind, part)
-
-
-def draw_comparison(
-    records: Mapping[str, Record], folder: Path, kind: str = "png", part: style.Part = style.ALL
-) -> list[Path]:
-    """See :func:`dynsim.draw.figures.draw_comparison`: measured runs beside each other, and beside simulated ones."""
-    return arm.draw_comparison(records, folder, kind, part)
+    return style.save_all(FIGURES, record, folder, kind)
 
 
 def joints(record: Record) -> Figure | None:

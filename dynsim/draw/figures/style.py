@@ -27,8 +27,6 @@ Array = NDArray[np.float64]
 # A quantity over time, (T,) and (T,) or (T, k).
 Series = tuple[Array, Array]
 # Which figures of a record are drawn: every ``many``-th from ``first`` on, (first, many).
-Part = tuple[int, int]
-ALL: Part = (0, 1)
 
 # Okabe and Ito's colours, which colour-blind readers tell apart; yellow is too faint on white.
 BLUE, ORANGE, GREEN, PURPLE, SKY, BLACK = "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#000000"
@@ -110,22 +108,12 @@ def save(figure: Figure, path: Path) -> Path:
     return write(figure, path)
 
 
-def save_all(
-    makers: Mapping[str, Callable[[T], Figure | None]], of: T, folder: Path, kind: str, part: Part = ALL
-) -> list[Path]:
+def save_all(makers: Mapping[str, Callable[[T], Figure | None]], of: T, folder: Path, kind: str) -> list[Path]:
     """Every figure, by its name, that the record or records have data for, in dynsim's look; returns the files."""
     with look():
         return [
-            save(figure, folder / f"{name}.{kind}")
-            for name, make in part_of(list(makers.items()), part)
-            if (figure := make(of)) is not None
+            save(figure, folder / f"{name}.{kind}") for name, make in makers.items() if (figure := make(of)) is not None
         ]
-
-
-def part_of(of: Sequence[T], part: Part) -> Sequence[T]:
-    """What one of several processes draws."""
-    first, many = part
-    return of[first::many]
 
 
 def write(figure: Figure, path: Path) -> Path:
