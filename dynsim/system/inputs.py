@@ -35,6 +35,7 @@ _FLOAT = re.compile(
 # What YAML does not allow in a text, escaped or not: control characters (but tab and line ends) and half characters.
 _FORBIDDEN = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f\x80-\x84\x86-\x9f\ud800-\udfff\ufffe\uffff]")
 _CORE = "tag:yaml.org,2002:"
+_TEXT_TAGS = (None, "!", _CORE + "str")
 # Events that begin a value, and the method that reads it; what those are that cannot begin a key.
 _VALUES = {"ScalarEvent": "_scalar", "MappingStartEvent": "_mapping", "SequenceStartEvent": "_list", "AliasEvent": ""}
 _NO_KEYS = {"MappingStartEvent": "a mapping", "SequenceStartEvent": "a list", "AliasEvent": "an alias"}
@@ -203,7 +204,7 @@ class _Reader:
         text, tag = self._allowed(event), _tag(event)
         if event.implicit[0] and tag is None:
             return self._plain(text, line)
-        return text if tag in (None, "!", _CORE + "str") else self._tagged(text, str(tag), line)
+        return text if tag in _TEXT_TAGS else self._tagged(text, str(tag), line)
 
     def _allowed(self, event: Any) -> str:
         if character := _FORBIDDEN.search(event.value):
@@ -272,6 +273,8 @@ class _Reader:
     def _key(self, event: Any, mapping: YamlMapping) -> str:
         if what := _NO_KEYS.get(type(event).__name__):
             self._fail(_line(event), f"{what} is no key; keys are texts")
+        if (tag := _tag(event)) not in _TEXT_TAGS:
+            self._fail_tag(str(tag), _line(event))
         name = self._allowed(event)
         if event.anchor is not None:
             self._anchors[event.anchor] = name
