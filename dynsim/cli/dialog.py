@@ -38,20 +38,20 @@ def confirm_replay(
         The posture cannot be read.
     """
     with bus_on(port, servo_map) as (bus, _):
-        way = way_to_start(bus, servo_map, motion.start)
+        approach = way_to_start(bus, servo_map, motion.start)
     console.print(
         f"{servo_map.robot}: {len(servo_map.servos)} servos will move for {motion.duration:.1f} s"
         f"{' at most' if at_most else ''}, "
-        f"after {way.duration:.1f} s to the start."
+        f"after {approach.duration:.1f} s to the start."
     )
-    for distance in way.distances[:1]:
+    for distance in approach.distances[:1]:
         console.print(f"furthest from its start: {distance}")
     agreed = not asked or _agreed(console, CLEAR, "move?")
-    if agreed and way.far:
+    if agreed and approach.far:
         still = "" if asked else " (asked with --yes too)"
         bound = servo_map.safety.start_distance
         console.print(f"further than safety.start_distance, {bound:g} rad, from their start{still}:")
-        for distance in way.far:
+        for distance in approach.far:
             console.print(f"  {distance}")
         agreed = _agreed(console, "All joints go there in step: is the whole way free?", "move there?")
     if not agreed:

@@ -31,9 +31,9 @@ def say(text: str) -> None:
     console.print(text, highlight=False, soft_wrap=True)
 
 
-def say_written(place: Path) -> None:
+def say_written(path: Path) -> None:
     """Where the files of a command are."""
-    say(f"Written to {escaped(place)}")
+    say(f"Written to {escaped(path)}")
 
 
 # Of a progress bar.
@@ -55,13 +55,13 @@ def labelled(paths: Sequence[Path], *, trust: bool = False) -> dict[str, Record]
     from dynsim.record import Record
     from dynsim.system.files import file_name
 
-    found: dict[str, Record] = {}
+    records: dict[str, Record] = {}
     for path in record_files(paths):
         record = Record.load(path, trust=trust)
         name = file_name(record.summary.get("variant") or path.parent.name or path.stem)
-        label = next(one for k in itertools.count(1) if (one := name if k == 1 else f"{name}_{k}") not in found)
-        found[label] = record
-    return found
+        label = next(label for k in itertools.count(1) if (label := name if k == 1 else f"{name}_{k}") not in records)
+        records[label] = record
+    return records
 
 
 def record_files(paths: Sequence[Path]) -> list[Path]:
@@ -72,28 +72,28 @@ def record_files(paths: Sequence[Path]) -> list[Path]:
     RecordError
         A folder has no records.
     """
-    found = []
+    files = []
     for path in paths:
         if not path.is_dir():
-            found.append(path)
+            files.append(path)
             continue
         inside = [path / RECORD] if (path / RECORD).is_file() else _of_variants(path)
         if not inside:
             raise RecordError(
                 f"{path}: no {RECORD} there, nor in a folder in it; name a record, or the folder of a run"
             )
-        found += inside
-    return found
+        files += inside
+    return files
 
 
 def _of_variants(folder: Path) -> list[Path]:
     """Records of the folders in a folder: in the order of a comparison's variants, others after them."""
-    found = sorted(folder.glob(f"*/{RECORD}"))
+    files = sorted(folder.glob(f"*/{RECORD}"))
     try:
         order = list(json.loads((folder / COMPARISON).read_text(encoding="utf-8"))["variants"])
     except (OSError, ValueError, KeyError, TypeError):
-        return found
-    return sorted(found, key=lambda path: order.index(path.parent.name) if path.parent.name in order else len(order))
+        return files
+    return sorted(files, key=lambda path: order.index(path.parent.name) if path.parent.name in order else len(order))
 
 
 @contextmanager
@@ -135,11 +135,11 @@ def _compilation_told(show: Callable[[Compilation | None], None] = lambda now: N
     """Within, the first compilation of kernels is told, and shown while it lasts."""
     from dynsim.engine.compilation import watched
 
-    told: list[Compilation] = []
+    shown: list[Compilation] = []
 
     def compiling(now: Compilation | None) -> None:
-        if now is not None and not told:
-            told.append(now)
+        if now is not None and not shown:
+            shown.append(now)
             console.print(f"{escaped(now.text[0].upper() + now.text[1:])}.", highlight=False)
         show(now)
 
@@ -172,10 +172,10 @@ def progress(scenarios: Sequence[Scenario], quiet: bool) -> Iterator[VariantProg
 
     with _bars("{task.description}", BarColumn(), done) as bars, _compilation_told(compiling):
 
-        def add(scenario: Scenario, what: str, visible: bool) -> TaskID:
+        def add(scenario: Scenario, kind: str, visible: bool) -> TaskID:
             title = scenario.variant or scenario.name
             title = title if len(title) <= _TITLE_WIDTH else title[: _TITLE_WIDTH - 1] + "…"
-            return bars.add_task(escaped(title), total=scenario.duration_s, what=what, visible=visible)
+            return bars.add_task(escaped(title), total=scenario.duration_s, what=kind, visible=visible)
 
         preparing = {s.variant: add(s, "references", False) for s in scenarios}
         simulating = {s.variant: add(s, "simulated", True) for s in scenarios}

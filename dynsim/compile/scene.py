@@ -64,7 +64,7 @@ def robot_scene(robot: Robot, contacts: Sequence[Contact], surfaces: Mapping[str
         points.append(Point(contact.name, "contact", body, vector3(point), contact.surface_name))
     return Scene(
         tuple(bodies),
-        tuple(_drawn(name, one) for name, one in surfaces.items()),
+        tuple(_drawn(name, surface) for name, surface in surfaces.items()),
         tuple(points),
         robot.fixed_shapes,
         supports,
@@ -113,8 +113,8 @@ def _wheels(base: MobileBase, body: int) -> list[Body]:
     """Wheels as bodies of their own, which turn on the base."""
     r, wheels = base.wheel_radius, []
     for name, side in zip(base.wheels, (0.5, -0.5), strict=True):
-        place = (0.0, side * base.track, r)
-        joint = Joint(f"{name}.axle", "revolute", (0.0, 1.0, 0.0), place, HERE, "q", (name,))
+        position = (0.0, side * base.track, r)
+        joint = Joint(f"{name}.axle", "revolute", (0.0, 1.0, 0.0), position, HERE, "q", (name,))
         wheels.append(
             Body(f"{name}.wheel", body, joint, (Shape("cylinder", (r, BASE_WHEEL_WIDTH * r), orientation=_ALONG_Y),))
         )
@@ -125,14 +125,14 @@ def _supports(base: MobileBase, body: int) -> tuple[Point, ...]:
     """Where wheels and caster touch the ground, with the names of their loads."""
     left, right = (vector3((0.0, side * base.track, 0.0)) for side in (0.5, -0.5))
     places = zip(SUPPORTS, (left, right, vector3(base.caster)), strict=True)
-    return tuple(Point(name, "support", body, place) for name, place in places)
+    return tuple(Point(name, "support", body, position) for name, position in places)
 
 
 def _joint(link: Link, kind: JointKind) -> Joint:
     if link.kind == "left_wheel":  # its angles are not where it is
-        place, columns = (0.0, 0.0, 0.0), ("x", "y", "heading")
+        position, columns = (0.0, 0.0, 0.0), ("x", "y", "heading")
         return Joint(
-            link.joint, kind, (0.0, 0.0, 1.0), place, HERE, "base_pose", columns, part_of=link.joint_of_rows or ""
+            link.joint, kind, (0.0, 0.0, 1.0), position, HERE, "base_pose", columns, part_of=link.joint_of_rows or ""
         )
     return Joint(
         name=link.joint,
@@ -225,7 +225,7 @@ def _active_wheel(d: SnakeDescription, pair: int, parent: int, x: float) -> Body
     if not side:
         return None
     name = d.wheel_names[int(np.count_nonzero(d.driven_side[:pair]))]
-    place = (x, side * float(d.half_track[pair]), 0.0)
-    joint = Joint(name, "revolute", (0.0, 1.0, 0.0), place, HERE, "rho", (name,))
+    position = (x, side * float(d.half_track[pair]), 0.0)
+    joint = Joint(name, "revolute", (0.0, 1.0, 0.0), position, HERE, "rho", (name,))
     shape = Shape("cylinder", (d.wheel_radius, WHEEL_WIDTH * d.wheel_radius), orientation=_ALONG_Y)
     return Body(f"wheel_{name}", parent, joint, (shape,))

@@ -75,7 +75,7 @@ class _OneServo:
         self._id = id_
 
     def ping_all(self) -> dict[int, tuple[int, int]]:
-        return {id_: found for id_, found in self._bus.ping_all().items() if id_ == self._id}
+        return {id_: answer for id_, answer in self._bus.ping_all().items() if id_ == self._id}
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._bus, name)
@@ -99,10 +99,10 @@ def nudge(
     refuse_torque(bus, servo_map.servos)
     tick = read_ticks(bus, [servo])[servo.id]
     start = servo.to_angle(tick)
-    way = _way(servo, start)
-    one = _alone(servo_map, servo)
-    motion = CheckedMotion(path=_out_and_back(start, way), plan=plan_cycle(one, one.bus.rate))
-    replay = Replay(motion, one, cast(Bus, _OneServo(bus, servo.id)), clock, live=live, stop=stop)
+    distance = _way(servo, start)
+    single = _alone(servo_map, servo)
+    motion = CheckedMotion(path=_out_and_back(start, distance), plan=plan_cycle(single, single.bus.rate))
+    replay = Replay(motion, single, cast(Bus, _OneServo(bus, servo.id)), clock, live=live, stop=stop)
     result = replay.run()
     if result.fault is not None and result.fault_state is not None:
         if result.fault.cause == Cause.VERIFICATION:
@@ -113,8 +113,8 @@ def nudge(
     if not live:
         return None
     angles = result.record[servo.kind.follows.position][:, 0][result.record["state"] == State.REPLAY]
-    moved = float(angles[np.nanargmax((angles - start) * np.sign(way))] - start)
-    return Nudge(servo.joint, servo.id, way, moved, round(servo.sign * servo.gear * moved / RAD_PER_TICK))
+    moved = float(angles[np.nanargmax((angles - start) * np.sign(distance))] - start)
+    return Nudge(servo.joint, servo.id, distance, moved, round(servo.sign * servo.gear * moved / RAD_PER_TICK))
 
 
 def swapped(servo_map: ServoMap, agrees: Mapping[str, bool]) -> dict[str, int]:
@@ -131,13 +131,13 @@ def _way(servo: Servo, start: float) -> float:
     raise VerificationFailed(f"{servo.joint} has no room for {math.degrees(ANGLE):g}° between its limits")
 
 
-def _out_and_back(start: float, way: float) -> Path:
+def _out_and_back(start: float, distance: float) -> Path:
     duration = QUINTIC_PEAK * ANGLE / SPEED
     leg = np.linspace(0.0, duration, KNOTS)
     fraction, rate = np.array([quintic(duration, t) for t in leg]).T
     time = np.concatenate([leg, duration + PAUSE + leg])
-    position = start + way * np.concatenate([fraction, 1 - fraction])[:, None]
-    rates = way * np.concatenate([rate, -rate])[:, None]
+    position = start + distance * np.concatenate([fraction, 1 - fraction])[:, None]
+    rates = distance * np.concatenate([rate, -rate])[:, None]
     return Path(time, position, rates[:-1], rates[1:])
 
 

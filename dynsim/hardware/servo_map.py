@@ -19,7 +19,7 @@ from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, model_v
 
 from dynsim.config.base import Positive, StrictConfig, error_at
 from dynsim.config.problems import suggest
-from dynsim.errors import shown
+from dynsim.errors import brief
 from dynsim.hardware.bus.control_table import (
     MAX_ID,
     MODELS,
@@ -416,7 +416,7 @@ def load_servo_map(path: str | Path) -> ServoMap:
     """
     if not isinstance(path, (str, Path)):
         raise ServoMapError(
-            f"a servo map is named by its file, or by its name when it is shipped, not by {shown(path)}"
+            f"a servo map is named by its file, or by its name when it is shipped, not by {brief(path)}"
         )
     path = Path(path)
     shipped = SHIPPED / f"{path.stem}.yaml"

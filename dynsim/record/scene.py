@@ -322,8 +322,8 @@ class Scene:
             return _adapter().validate_json(text)
         except ValidationError as error:
             first = error.errors(include_url=False)[0]
-            place = ".".join(map(str, first["loc"]))
-            raise RecordError(f"scene{f': {place}' if place else ''}: {first['msg']}") from error
+            key_path = ".".join(map(str, first["loc"]))
+            raise RecordError(f"scene{f': {key_path}' if key_path else ''}: {first['msg']}") from error
 
 
 @cache
@@ -373,6 +373,6 @@ def _simple_kind(Q: NDArray[np.float64], b: NDArray[np.float64], c: float) -> tu
             centre = -(b - axis * float(axis @ b)) / s
             square = float(centre @ centre) - 2.0 * c / s
             if square > 0.0:
-                place, radius = vector3(centre), float(np.copysign(square**0.5, s))
-                return "cylinder", {"position": place, "direction": vector3(axis), "radius": radius}
+                position, radius = vector3(centre), float(np.copysign(square**0.5, s))
+                return "cylinder", {"position": position, "direction": vector3(axis), "radius": radius}
     return "quadric", {}

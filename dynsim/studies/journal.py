@@ -9,7 +9,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from dynsim.errors import RecordError, ScenarioError, shown
+from dynsim.errors import RecordError, ScenarioError, brief
 from dynsim.studies.columns import is_finite, numbers
 from dynsim.studies.outcome import RunResult
 from dynsim.studies.sweep_plan import Point
@@ -72,7 +72,7 @@ class Row:
         }
         for name in names:
             if not fits[name]:
-                raise ValueError(f"{name} = {shown(data[name])} is nothing that dynsim has written")
+                raise ValueError(f"{name} = {brief(data[name])} is nothing that dynsim has written")
         return row
 
     def placed(self, point: Point) -> Row:
@@ -184,7 +184,7 @@ def _check_header(path: Path, header: Mapping[str, Any]) -> None:
         raise RecordError(f"{path}: is damaged, or not of a sweep (it has not all of {', '.join(keys)}); {fix}")
     for key in keys:
         if type(before[key]) is not type(now[key]) and None not in (before[key], now[key]):
-            raise RecordError(f"{path}: is damaged ({key} = {shown(before[key])}); {fix}")
+            raise RecordError(f"{path}: is damaged ({key} = {brief(before[key])}); {fix}")
         if before[key] != now[key]:
             raise ScenarioError(
                 f"{path.parent} holds a sweep of another {key}, which cannot be gone on with: give another --out"

@@ -20,7 +20,7 @@ from dynsim.studies.outcome import RunResult
 from dynsim.studies.sweep_plan import Plan, Point
 from dynsim.studies.sweep_statistics import statistics
 from dynsim.studies.worker import WorkerError
-from dynsim.system.files import check_writable, held, json_text, replacing, write_text
+from dynsim.system.files import check_writable, held_folder, json_text, replacing, write_text
 
 TABLES = ("sweep.csv", "sweep.parquet")
 STATISTICS, RECORDS = "statistics.json", "records"
@@ -70,7 +70,7 @@ def run_sweep(
     for point in {point.variant: point for point in reversed(points)}.values():
         plan.scenario(point)
     header = _header(plan)
-    with held(folder):
+    with held_folder(folder):
         earlier = earlier_rows(folder, header, resume, TABLES)
         rows = {point.run: earlier[point.identity].placed(point) for point in points if point.identity in earlier}
         left = [point for point in points if point.run not in rows]
@@ -167,7 +167,7 @@ def _write_parquet(rows: Sequence[Row], names: Sequence[str], path: Path, plan: 
     cells = [row.cells() for row in rows]
     arrays = []
     for name in names:
-        column = [one.get(name) for one in cells]
+        column = [row.get(name) for row in cells]
         if any(isinstance(value, float) for value in column):
             column = [float(value) if isinstance(value, int) else value for value in column]
         try:

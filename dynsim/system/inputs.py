@@ -178,8 +178,8 @@ class _Reader:
             self._fail(mark.line + 1 if mark else None, f"not YAML: {' '.join(problem.split())}")
 
     def _fail(self, line: int | None, problem: str) -> NoReturn:
-        place = f"{self._source}:{line}" if line and self._line_numbers else self._source
-        raise self._error(f"{place}: {problem}")
+        location = f"{self._source}:{line}" if line and self._line_numbers else self._source
+        raise self._error(f"{location}: {problem}")
 
     def _value(self, event: Any, depth: int) -> Any:
         """The value that begins with an event, within so many mappings and lists."""
@@ -271,8 +271,8 @@ class _Reader:
         return whole
 
     def _key(self, event: Any, mapping: YamlMapping) -> str:
-        if what := _NO_KEYS.get(type(event).__name__):
-            self._fail(_line(event), f"{what} is no key; keys are texts")
+        if kind := _NO_KEYS.get(type(event).__name__):
+            self._fail(_line(event), f"{kind} is no key; keys are texts")
         if (tag := _tag(event)) not in _TEXT_TAGS:
             self._fail_tag(str(tag), _line(event))
         name = self._allowed(event)

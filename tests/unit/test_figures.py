@@ -611,7 +611,7 @@ def test_ten_motors_are_an_envelope_and_six(braced: Record) -> None:
 def test_what_lies_below_a_surface_is_marked(braced: Record) -> None:
     body, _ = skeleton.skeleton(braced)
     assert body is not None
-    assert robot.sunk(braced, body.scene, np.array([0])) == []
+    assert robot.penetrations(braced, body.scene, np.array([0])) == []
     sunk = copy.copy(braced)
     sunk.signals = dict(braced.signals)
     moved = braced["body_position"].copy()
@@ -619,7 +619,7 @@ def test_what_lies_below_a_surface_is_marked(braced: Record) -> None:
     sunk.signals["body_position"] = dataclasses.replace(braced.signals["body_position"], data=moved)
     body, _ = skeleton.skeleton(sunk)
     assert body is not None
-    found = robot.sunk(sunk, body.scene, np.array([len(sunk) - 1]))
+    found = robot.penetrations(sunk, body.scene, np.array([len(sunk) - 1]))
     # Of a horizontal floor at zero the depth is the height of the lowest point.
     lowest = -body.segments(len(sunk) - 1)[..., 2].min()
     assert max(one.depth.max() for one in found) == pytest.approx(lowest, rel=1e-12)

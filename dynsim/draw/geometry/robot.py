@@ -32,10 +32,10 @@ def robots(records: Mapping[str, Record]) -> dict[str, Robot]:
     RecordError
         None has samples and a scene with the poses of its bodies.
     """
-    found = {name: robot for name, record in records.items() if (robot := robot_of(record)) is not None}
-    if not found:
+    drawn = {name: robot for name, record in records.items() if (robot := robot_of(record)) is not None}
+    if not drawn:
         raise RecordError("nothing to view: a record needs samples, a scene, and the poses of its bodies")
-    return found
+    return drawn
 
 
 @dataclass(frozen=True)
@@ -118,9 +118,12 @@ def moving(robots: Sequence[Robot]) -> Array:
     points = []
     for robot in robots:
         record = robot.record
-        found = [record[POSITION].reshape(-1, 3).astype(np.float64), *(one for _, one in paths(record, robot.scene))]
+        clouds = [
+            record[POSITION].reshape(-1, 3).astype(np.float64),
+            *(path for _, path in paths(record, robot.scene)),
+        ]
         # The last samples of a run that diverged are far from everything else.
-        points += found if record.complete else [_without_ends(one) for one in found]
+        points += clouds if record.complete else [_without_ends(cloud) for cloud in clouds]
         for shape in robot.scene.fixed:
             middle, half = np.array(shape.position), 0.5 * max(shape.size) if shape.kind != "mesh" else 0.0
             points += [np.stack([middle - half, middle + half])]
@@ -192,7 +195,7 @@ def contacts(robot: Robot, rows: NDArray[np.intp] | slice = slice(None)) -> list
     if "contact_normal_force" not in record:
         return []
     names = record.labels["contact_normal_force"]
-    found = []
+    result = []
     for point in scene.contacts:
         surface = scene.surface(point.surface)
         if surface is None or point.name not in names:
@@ -201,18 +204,18 @@ def contacts(robot: Robot, rows: NDArray[np.intp] | slice = slice(None)) -> list
         mode = record["contact_mode"][rows, k] if "contact_mode" in record else None
         if mode is not None and not mode.any():
             continue
-        place = np.asarray(point_positions(record, point, rows), dtype=np.float64)
-        normal = surface.normal(place)
+        positions = np.asarray(point_positions(record, point, rows), dtype=np.float64)
+        normal = surface.normal(positions)
         force = np.asarray(record["contact_normal_force"][rows, k], dtype=np.float64)
         tangent = None
         if "contact_force" in record:
             tangent = record["contact_force"][rows, k] - force[:, None] * normal
-        found.append(Contact(point, _friction(record, point.name), normal, force, tangent, mode))
-    return found
+        result.append(Contact(point, _friction(record, point.name), normal, force, tangent, mode))
+    return result
 
 
 @dataclass(frozen=True)
-class Sunk:
+class Penetration:
     """A joint or the hand that was below a surface by more than the radius of its link.
 
     Attributes
@@ -230,7 +233,7 @@ class Sunk:
     depth: Array
 
 
-def sunk(record: Record, scene: Scene, rows: NDArray[np.intp] | slice = slice(None)) -> list[Sunk]:
+def penetrations(record: Record, scene: Scene, rows: NDArray[np.intp] | slice = slice(None)) -> list[Penetration]:
     """Joints, and the hand, below surfaces at samples of the record: surfaces hold contact points only.
 
     Bodies of a mobile base, and wheels, stand where the model has them.
@@ -239,21 +242,21 @@ def sunk(record: Record, scene: Scene, rows: NDArray[np.intp] | slice = slice(No
     points = [(body.joint.name, k, HERE_POINT) for k, body in enumerate(scene.bodies) if k not in wheels]
     if scene.hand is not None and scene.hand.body != WORLD:
         points.append((scene.hand.name, scene.hand.body, scene.hand.position))
-    found = []
+    below = []
     for name, k, position in points:
-        place = np.asarray(point_positions(record, Point(name, "hand", k, position), rows), dtype=np.float64)
+        positions = np.asarray(point_positions(record, Point(name, "hand", k, position), rows), dtype=np.float64)
         allowed = scene.bodies[k].radius + NOT_BELOW
         for surface in scene.surfaces:
             with np.errstate(all="ignore"):
-                depth = -surface.gap(place)
+                depth = -surface.gap(positions)
             if (depth > allowed).any():
-                found.append(Sunk(name, surface.name, k, position, allowed, depth))
-    return found
+                below.append(Penetration(name, surface.name, k, position, allowed, depth))
+    return below
 
 
-def largest_force(found: Sequence[Contact]) -> float:
+def largest_force(contacts: Sequence[Contact]) -> float:
     """The force whose arrow has full length [N]: the 98th percentile, so that a spike does not shrink the rest."""
-    sizes = np.abs(np.concatenate([one.force for one in found])) if found else np.zeros(0)
+    sizes = np.abs(np.concatenate([contact.force for contact in contacts])) if contacts else np.zeros(0)
     sizes = sizes[np.isfinite(sizes)]
     return max(float(np.percentile(sizes, 98.0)) if len(sizes) else 1.0, 1e-6)
 
@@ -263,7 +266,7 @@ def _friction(record: Record, name: str) -> float:
     contacts = record.provenance.get("scenario", {}).get("contacts", {})
     points = contacts.get("points") or {}
     point = points.get(name, {}) if isinstance(points, Mapping) else {}
-    kinetic = [one.get("friction") for one in (point, contacts)]
-    held = [one.get("static_friction") for one in (point, contacts)]
-    known = [next((float(one) for one in both if one is not None), 0.0) for both in (kinetic, held)]
+    kinetic = [entry.get("friction") for entry in (point, contacts)]
+    static = [entry.get("static_friction") for entry in (point, contacts)]
+    known = [next((float(value) for value in both if value is not None), 0.0) for both in (kinetic, static)]
     return max(known)

@@ -32,12 +32,12 @@ def _box_faces(surface: Surface) -> list[Array]:
     """Points of the six faces of a box, its edges sharp, (n, n, 3) each."""
     half, R = 0.5 * np.array(surface.edges), rotated(np.array(surface.orientation), np.eye(3))
     u, v = np.meshgrid(*2 * [np.linspace(-1.0, 1.0, FACE)])
-    found = []
+    faces = []
     for axis in range(3):
         for side in (-1.0, 1.0):
             local = np.roll(np.stack([np.full_like(u, side), u, v], axis=-1), axis, axis=-1) * half
-            found.append(np.array(surface.position) + local @ R.T)
-    return found
+            faces.append(np.array(surface.position) + local @ R.T)
+    return faces
 
 
 def quadric_patch(surface: Surface, low: Array, high: Array) -> Array:

@@ -119,8 +119,11 @@ class CheckedMotion(Task):
         """The margin that is the least part of its limit, of a position the half of its range, and that part."""
         ranges = {servo.joint: servo.position_limits[1] - servo.position_limits[0] for servo in servo_map.servos}
         parts = [
-            (one.margin / (0.5 * ranges[one.joint] if one.quantity == "position" else abs(one.limit)), one)
-            for one in self.margins
+            (
+                margin.margin / (0.5 * ranges[margin.joint] if margin.quantity == "position" else abs(margin.limit)),
+                margin,
+            )
+            for margin in self.margins
         ]
         part, margin = min(parts, key=lambda entry: entry[0], default=(math.inf, None))
         return None if margin is None else (margin, part)
@@ -252,9 +255,9 @@ class MotionLimits:
         limits = [servo.kind.limits for servo in self._servos]
         self._highest: dict[Quantity, Array] = {
             "velocity": np.array([velocity_limit(servo) for servo in self._servos]),
-            "acceleration": np.array([one.acceleration for one in limits]),
-            "jerk": np.array([one.jerk for one in limits]),
-            "shaking": np.array([one.shaking for one in limits]),
+            "acceleration": np.array([limit.acceleration for limit in limits]),
+            "jerk": np.array([limit.jerk for limit in limits]),
+            "shaking": np.array([limit.shaking for limit in limits]),
         }
 
     def margins(

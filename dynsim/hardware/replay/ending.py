@@ -164,9 +164,9 @@ class Ending:
 
     def _known_as(self, ids: Collection[int]) -> list[int]:
         """Numbers of servos in the map, of which none was in trouble before."""
-        found = [index for index, servo in enumerate(self._servos) if servo.id in ids and index not in self._troubled]
-        self._troubled.update(found)
-        return found
+        indices = [index for index, servo in enumerate(self._servos) if servo.id in ids and index not in self._troubled]
+        self._troubled.update(indices)
+        return indices
 
     # -- ways of stopping ---------------------------------------------------------------------------------------------
 
@@ -295,14 +295,14 @@ def read_health(bus: Bus, servos: Sequence[Servo]) -> dict[int, dict[str, int]]:
     ------
     PortError
     """
-    found: dict[int, dict[str, int]] = {}
+    health: dict[int, dict[str, int]] = {}
     for _ in range(READS):
-        silent = [servo for servo in servos if servo.id not in found]
+        silent = [servo for servo in servos if servo.id not in health]
         if not silent:
             break
         replies = bus.sync_read([servo.id for servo in silent], *HEALTH_BLOCK).replies
-        found |= {servo.id: decode_health(servo, replies[servo.id].data) for servo in silent if servo.id in replies}
-    return found
+        health |= {servo.id: decode_health(servo, replies[servo.id].data) for servo in silent if servo.id in replies}
+    return health
 
 
 def read_back(bus: Bus, servos: Sequence[Servo]) -> tuple[ServoEnd, ...]:

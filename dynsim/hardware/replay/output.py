@@ -82,27 +82,27 @@ class Journal:
         self._last_logged = -math.inf
         self._kept: list[tuple[float, str, str]] | None = None
 
-    def guard(self, what: str, call: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T | None:
+    def guard(self, name: str, call: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T | None:
         """Run an output; None when it fails, and from then on without trying.
 
         Parameters
         ----------
-        what : str
+        name : str
             Its name: what :attr:`failures` lists, and what is switched off by an error.
         call : callable
             A KeyboardInterrupt or SystemExit out of it becomes a request to stop: nothing may leave a moving robot.
         """
-        if what in self.failures:
+        if name in self.failures:
             return None
         try:
             return call(*args, **kwargs)
         except Exception as error:
-            self.failures[what] = error
+            self.failures[name] = error
         except BaseException as error:
-            self.failures[what] = error
+            self.failures[name] = error
             self._stop()
-        if what != "log":
-            self.say(f"{what} failed and is off from here: {self.failures[what]!r}")
+        if name != "log":
+            self.say(f"{name} failed and is off from here: {self.failures[name]!r}")
         return None
 
     def enter(self, state: State) -> None:
@@ -274,7 +274,7 @@ class Layout:
         """(signal, "position" or "velocity", columns)."""
         for source, names in (("position", self.positions), ("velocity", self.velocities)):
             for name in dict.fromkeys(names):
-                yield name, source, [column for column, one in enumerate(names) if one == name]
+                yield name, source, [column for column, other in enumerate(names) if other == name]
 
 
 class GrowingFile:
@@ -519,17 +519,17 @@ def move_away(folder: Path) -> Path | None:
     OSError
         Something cannot be moved.
     """
-    found = [folder / name for name in FILES if os.path.lexists(folder / name)]
-    if not found:
+    paths = [folder / name for name in FILES if os.path.lexists(folder / name)]
+    if not paths:
         return None
     if is_held(folder / PART):
         raise PortError(f"{folder}: another replay is writing there; give this one another folder (--out)")
-    if folder / PART in found or folder / MEASURED in found:
-        found += [path for pattern in MADE_OF_THEM for path in folder.glob(pattern)]
-    place = _new_folder(folder)
-    for path in found:
-        path.rename(place / path.name)
-    return place
+    if folder / PART in paths or folder / MEASURED in paths:
+        paths += [path for pattern in MADE_OF_THEM for path in folder.glob(pattern)]
+    target = _new_folder(folder)
+    for path in paths:
+        path.rename(target / path.name)
+    return target
 
 
 def is_held(part: Path) -> bool:
@@ -546,10 +546,10 @@ def is_held(part: Path) -> bool:
 
 def _new_folder(folder: Path) -> Path:
     for number in itertools.count(1):
-        place = folder / f"previous_{number}"
+        target = folder / f"previous_{number}"
         try:
-            place.mkdir()
+            target.mkdir()
         except FileExistsError:
             continue
-        return place
+        return target
     raise AssertionError

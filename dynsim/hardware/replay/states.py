@@ -157,9 +157,9 @@ class ServoEnd:
 
     def as_dict(self) -> dict[str, Any]:
         """With units in the names, for summaries."""
-        found = asdict(self)
-        found["position_rad"], found["velocity_rad_s"] = found.pop("position"), found.pop("velocity")
-        return found
+        values = asdict(self)
+        values["position_rad"], values["velocity_rad_s"] = values.pop("position"), values.pop("velocity")
+        return values
 
     def __str__(self) -> str:
         text = f"{self.joint} (ID {self.id}): {self.doing}"
@@ -181,11 +181,11 @@ def of_the_whole(servos: Sequence[ServoEnd]) -> str:
         doing = next(iter(groups), SILENT)
         return WHOLE.get(doing, doing)
     largest = max(groups, key=lambda doing: len(groups[doing]))
-    told = [
+    descriptions = [
         f"{len(joints)} {doing}" if doing == largest and len(joints) > 1 else f"{', '.join(joints)} {doing}"
         for doing, joints in sorted(groups.items(), key=lambda group: -len(group[1]))
     ]
-    return f"mixed: {'; '.join(told)}"
+    return f"mixed: {'; '.join(descriptions)}"
 
 
 @dataclass(frozen=True)
@@ -295,9 +295,9 @@ class ReplayResult:
 
 def _joined(first: str, second: str) -> str:
     """Texts "who: what" of one cause; what befell several is said once."""
-    who, _, what = first.partition(": ")
+    who, _, text = first.partition(": ")
     other, _, the_same = second.partition(": ")
-    return f"{who}, {other}: {what}" if what and what == the_same else f"{first}; {second}"
+    return f"{who}, {other}: {text}" if text and text == the_same else f"{first}; {second}"
 
 
 class Stopped(Exception):

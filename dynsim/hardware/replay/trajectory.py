@@ -117,7 +117,7 @@ class Path:
         left = self.time[:-1][late, None]
         ends = np.stack([left, left + h, left]) + np.zeros_like(a)
         with np.errstate(over="ignore"):  # an infinite one is beyond any limit
-            acceleration = np.stack([*(one[late] for one in self._accelerations), self._steps[late]])
+            acceleration = np.stack([*(table[late] for table in self._accelerations), self._steps[late]])
         return Extremes(left + h * at_position, position, left + h * at_velocity, velocity, ends, acceleration)
 
     @cached_property
@@ -391,16 +391,16 @@ def _refuse_lifted_wheels(record: Record) -> None:
 
 def _at_rest_at_both_ends(path: Path, acceleration: float) -> Path:
     first, last = path.rate_after[0], path.rate_before[-1]
-    rest = np.zeros_like(first)
+    still = np.zeros_like(first)
     if (fastest := np.abs(last).max()) > REST:
         duration = fastest / acceleration
-        path = path.longer(path.end + duration, path.position[-1] + 0.5 * duration * last, last, rest)
+        path = path.longer(path.end + duration, path.position[-1] + 0.5 * duration * last, last, still)
     if (fastest := np.abs(first).max()) > REST:
         duration = fastest / acceleration
         path = Path(
             np.concatenate([[-duration], path.time]),
             np.concatenate([path.position[:1] - 0.5 * duration * first, path.position]),
-            np.concatenate([rest[None], path.rate_after]),
+            np.concatenate([still[None], path.rate_after]),
             np.concatenate([first[None], path.rate_before]),
         )
     return path
