@@ -1,4 +1,4 @@
-"""What docs/architecture.md, docs/extending.md and docs/dev name exists: files, what is said to be in them, and dotted names."""
+"""What the pages on architecture, extending and development name exists: files, what is in them, and dotted names."""
 
 from __future__ import annotations
 
