@@ -25,7 +25,7 @@ from dynsim.errors import ScenarioError, SimulationStopped
 from dynsim.system.terminal import escaped
 
 if TYPE_CHECKING:
-    from dynsim.studies.journal import Row
+    from dynsim.studies.journal import SweepRow
     from dynsim.studies.sweep_plan import Plan
 
 # Reasons of failed runs that are printed.
@@ -139,7 +139,13 @@ def _variants(known: Sequence[str], wanted: str | None) -> tuple[str | None, ...
 
 
 def _draw(
-    name: str, rows: Sequence[Row], plan: Plan, folder: Path, quiet: bool, format_: str, plotted: Sequence[str] = ()
+    name: str,
+    rows: Sequence[SweepRow],
+    plan: Plan,
+    folder: Path,
+    quiet: bool,
+    format_: str,
+    plotted: Sequence[str] = (),
 ) -> None:
     from dynsim.config.problems import suggest
     from dynsim.draw.figures.sweep import Sweep, draw

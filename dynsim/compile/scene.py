@@ -11,8 +11,7 @@ import numpy as np
 
 from dynsim.model.description import Array, Contact, Link, Robot
 from dynsim.model.mobile_base import SUPPORTS, MobileBase
-from dynsim.model.surfaces import Box, HeightField, Quadric
-from dynsim.model.surfaces import Surface as TouchedSurface
+from dynsim.model.surfaces import Box, HeightField, Quadric, Surface
 from dynsim.record.quaternion import of_turn
 from dynsim.record.scene import (
     HERE,
@@ -23,8 +22,8 @@ from dynsim.record.scene import (
     Point,
     Quaternion,
     Scene,
+    SceneSurface,
     Shape,
-    Surface,
     quaternion,
     vector3,
 )
@@ -43,7 +42,7 @@ _ALONG_X: Quaternion = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)
 _ALONG_Y: Quaternion = (math.sqrt(0.5), -math.sqrt(0.5), 0.0, 0.0)
 
 
-def robot_scene(robot: Robot, contacts: Sequence[Contact], surfaces: Mapping[str, TouchedSurface]) -> Scene | None:
+def robot_scene(robot: Robot, contacts: Sequence[Contact], surfaces: Mapping[str, Surface]) -> Scene | None:
     """The scene of a tree of bodies whose joint positions are the signal ``q``; None where one has no kind for it."""
     index = {link.name: k for k, link in enumerate(robot.links)}
     bodies = []
@@ -71,12 +70,12 @@ def robot_scene(robot: Robot, contacts: Sequence[Contact], surfaces: Mapping[str
     )
 
 
-def _drawn(name: str, surface: TouchedSurface) -> Surface:
+def _drawn(name: str, surface: Surface) -> SceneSurface:
     """A surface as a scene keeps it."""
     nothing = np.zeros((3, 3))
     if isinstance(surface, Box):
         return replace(
-            Surface.of_quadric(name, nothing, np.zeros(3), 0.0),
+            SceneSurface.of_quadric(name, nothing, np.zeros(3), 0.0),
             kind="box",
             position=vector3(surface.centre),
             orientation=quaternion(surface.axes.T),
@@ -88,14 +87,14 @@ def _drawn(name: str, surface: TouchedSurface) -> Surface:
         heights, dx = _thinned(heights.T, dx)
         heights, dy = _thinned(heights.T, dy)
         return replace(
-            Surface.of_quadric(name, nothing, np.zeros(3), 0.0),
+            SceneSurface.of_quadric(name, nothing, np.zeros(3), 0.0),
             kind="height_field",
             position=vector3([*surface.origin, 0.0]),
             spacing=(dx, dy),
             heights=tuple(tuple(row) for row in heights.tolist()),
         )
     assert isinstance(surface, Quadric)
-    return Surface.of_quadric(name, surface.Q, surface.b, surface.c)
+    return SceneSurface.of_quadric(name, surface.Q, surface.b, surface.c)
 
 
 def _thinned(rows: Array, spacing: float) -> tuple[Array, float]:
@@ -198,7 +197,7 @@ def snake_scene(description: SnakeDescription) -> Scene:
         wheels.append(_active_wheel(d, pair, len(bodies) - 1, -l))
     if d.pairs > 1:
         bodies[0] = Body("pair1", WORLD, base, (_tube(d, -l, 0.0), *bodies[0].shapes))
-    ground = Surface.of_quadric("ground", np.zeros((3, 3)), [0.0, 0.0, 1.0], 0.0)
+    ground = SceneSurface.of_quadric("ground", np.zeros((3, 3)), [0.0, 0.0, 1.0], 0.0)
     hand = Point("controlled point", "hand", head, (l + d.point_offset, 0.0, 0.0))
     return Scene((*bodies, *(wheel for wheel in wheels if wheel is not None)), (ground,), (hand,))
 

@@ -23,10 +23,10 @@ from dynsim.hardware.replay.check import CheckedMotion, plan_cycle
 from dynsim.hardware.replay.machine import Replay
 from dynsim.hardware.replay.motion import QUINTIC_PEAK, quintic
 from dynsim.hardware.replay.rules import Cause
-from dynsim.hardware.replay.states import State, StopRequest
+from dynsim.hardware.replay.states import ReplayState, StopRequest
 from dynsim.hardware.replay.trajectory import Path
 from dynsim.hardware.replay.verify import read_ticks
-from dynsim.hardware.servo_map import Servo, ServoMap
+from dynsim.hardware.servo_map import MappedServo, ServoMap
 
 ANGLE = math.radians(3.0)
 SPEED = 0.1
@@ -82,7 +82,7 @@ class _OneServo:
 
 
 def nudge(
-    servo_map: ServoMap, servo: Servo, bus: Bus, clock: Clock, *, live: bool, stop: StopRequest | None = None
+    servo_map: ServoMap, servo: MappedServo, bus: Bus, clock: Clock, *, live: bool, stop: StopRequest | None = None
 ) -> Nudge | None:
     """Turn one joint 3° and back; None where ``live`` is false: the servo is verified then, and nothing moves.
 
@@ -112,7 +112,7 @@ def nudge(
         raise kind(f"{text}; robot left {result.end_state}", result=result)
     if not live:
         return None
-    angles = result.record[servo.kind.follows.position][:, 0][result.record["state"] == State.REPLAY]
+    angles = result.record[servo.kind.follows.position][:, 0][result.record["state"] == ReplayState.REPLAY]
     moved = float(angles[np.nanargmax((angles - start) * np.sign(distance))] - start)
     return Nudge(servo.joint, servo.id, distance, moved, round(servo.sign * servo.gear * moved / RAD_PER_TICK))
 
@@ -122,7 +122,7 @@ def swapped(servo_map: ServoMap, agrees: Mapping[str, bool]) -> dict[str, int]:
     return {servo.joint: -servo.sign for servo in servo_map.servos if not agrees.get(servo.joint, True)}
 
 
-def _way(servo: Servo, start: float) -> float:
+def _way(servo: MappedServo, start: float) -> float:
     low, high = servo.position_limits
     if start + ANGLE <= high:
         return ANGLE
@@ -141,7 +141,7 @@ def _out_and_back(start: float, distance: float) -> Path:
     return Path(time, position, rates[:-1], rates[1:])
 
 
-def _alone(servo_map: ServoMap, servo: Servo) -> ServoMap:
+def _alone(servo_map: ServoMap, servo: MappedServo) -> ServoMap:
     """The map of one servo that yields to what is in its way, and is limp afterwards."""
     watched, alone = copy.copy(servo), copy.copy(servo_map)
     if servo.in_position_mode:

@@ -126,7 +126,7 @@ class Body:
 
 
 @dataclass(frozen=True)
-class Surface:
+class SceneSurface:
     """A surface C(r) = 0 in the world; C > 0 is the free side, where ∇C points.
 
     Attributes
@@ -161,7 +161,7 @@ class Surface:
             raise RecordError(f"surface {self.name!r} is a {self.kind} without {lacking[0]}")
 
     @classmethod
-    def of_quadric(cls, name: str, Q: ArrayLike, b: ArrayLike, c: float) -> Surface:
+    def of_quadric(cls, name: str, Q: ArrayLike, b: ArrayLike, c: float) -> SceneSurface:
         """A surface by its coefficients, with the parameters of the simple kind that it is of, if any."""
         Q, b = np.asarray(Q, dtype=np.float64), np.asarray(b, dtype=np.float64)
         with np.errstate(all="ignore"):
@@ -257,7 +257,7 @@ class Scene:
 
     __pydantic_config__: ClassVar[Any] = _CHECKS
     bodies: tuple[Body, ...] = ()
-    surfaces: tuple[Surface, ...] = ()
+    surfaces: tuple[SceneSurface, ...] = ()
     points: tuple[Point, ...] = ()
     fixed: tuple[Shape, ...] = ()
     supports: tuple[Point, ...] = ()
@@ -298,7 +298,7 @@ class Scene:
         labels = [label for k in self.base[1:] for label in self.bodies[k].joint.labels]
         return {label: f"{label.rpartition('.')[2]} wheel" for label in labels}
 
-    def surface(self, name: str) -> Surface | None:
+    def surface(self, name: str) -> SceneSurface | None:
         """The surface of a name."""
         return next((surface for surface in self.surfaces if surface.name == name), None)
 

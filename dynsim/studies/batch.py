@@ -66,12 +66,12 @@ def simulate_batch(
         if finished is not None:
             finished(task[0], result)
 
-    if run_all(Work(itemgetter(1), keep_records), list(enumerate(runs)), take, jobs=jobs, scheduler=scheduler):
+    if run_all(BatchWork(itemgetter(1), keep_records), list(enumerate(runs)), take, jobs=jobs, scheduler=scheduler):
         raise SimulationInterrupted(f"interrupted when {len(results)} of {len(runs)} runs were done")
     return [results[k] for k in range(len(runs))]
 
 
-class Work(Generic[Task]):
+class BatchWork(Generic[Task]):
     """What is done for tasks, in a process of its own too: what their runs have in common stays there with it.
 
     Parameters

@@ -99,7 +99,7 @@ class Law:
 
 
 @dataclass(frozen=True)
-class Point:
+class SweepPoint:
     """One run: its number, its variant, and what it changes by dotted key."""
 
     run: int
@@ -187,15 +187,15 @@ class Plan:
         """All keys that are varied, those of the grid first, as the columns of the table have them."""
         return [axis.key for axis in self.grid] + self.sampled
 
-    def points(self) -> Iterator[Point]:
+    def points(self) -> Iterator[SweepPoint]:
         """All runs: variants outermost, samples innermost."""
         drawn = {key: law.draw(key, self.seed, self.count) for law in self.laws for key in self._entries(law.key)}
         places = itertools.product(self.variants, *(axis.values for axis in self.grid), range(self.count))
         for run, (variant, *values, k) in enumerate(places):
             chosen = {axis.key: value for axis, value in zip(self.grid, values, strict=True)}
-            yield Point(run, variant, chosen | {key: draws[k] for key, draws in drawn.items()})
+            yield SweepPoint(run, variant, chosen | {key: draws[k] for key, draws in drawn.items()})
 
-    def scenario(self, point: Point) -> Scenario:
+    def scenario(self, point: SweepPoint) -> Scenario:
         """What one run simulates.
 
         Raises

@@ -13,16 +13,16 @@ from dynsim.record.sensitivity import sensitivities, spread
 from dynsim.studies.sweep_plan import Plan
 
 if TYPE_CHECKING:
-    from dynsim.studies.journal import Row
+    from dynsim.studies.journal import SweepRow
 
 
-def statistics(rows: Sequence[Row], plan: Plan) -> list[dict[str, Any]]:
+def statistics(rows: Sequence[SweepRow], plan: Plan) -> list[dict[str, Any]]:
     """For each variant and place of the grid: runs, those without numbers, and of each number that all others have
 
     its :class:`dynsim.record.sensitivity.Spread` and, where a line fits, what one standard deviation of each drawn key
     does to it (``effect``, with the half width of its interval) and how much of the variance the line explains.
     """
-    groups: dict[str, list[Row]] = {}
+    groups: dict[str, list[SweepRow]] = {}
     for row in rows:
         grid = {axis.key: row.values[axis.key] for axis in plan.grid}
         groups.setdefault(json.dumps([row.variant, grid]), []).append(row)

@@ -56,3 +56,14 @@ def test_what_is_looked_at() -> None:
         "class A:\n  one: int\n  def held(self, way): ...\nfor place in (): told = 1\ndef shown(): ...\nrest(what)\n"
     )
     assert sorted(bad_names(source)) == [("held", 3), ("place", 4), ("shown", 5), ("told", 4), ("way", 3)]
+
+
+def test_a_class_name_means_one_thing() -> None:
+    """``Config`` is what every member of a family has; private classes are their module's own."""
+    homes: dict[str, list[str]] = {}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef) and node.name != "Config" and not node.name.startswith("_"):
+                homes.setdefault(node.name, []).append(path.relative_to(PACKAGE).as_posix())
+    twice = {name: modules for name, modules in homes.items() if len(modules) > 1}
+    assert {name: modules for name, modules in twice.items() if not any(m.startswith(NOT_YET) for m in modules)} == {}

@@ -34,7 +34,7 @@ from dynsim.scenario import SetOptions, read_scenario
 from dynsim.studies import batch, processes
 from dynsim.studies import sweep as module
 from dynsim.studies.columns import numbers
-from dynsim.studies.journal import JOURNAL, LOST, Row
+from dynsim.studies.journal import JOURNAL, LOST, SweepRow
 from dynsim.studies.processes import WorkerInterrupted, WorkerLost, WorkerSilent, run_in_processes
 from dynsim.studies.sweep import run_sweep
 from dynsim.studies.sweep_plan import Axis, Law, Plan
@@ -672,7 +672,7 @@ def test_runs_that_failed_are_counted_and_not_drawn(monkeypatch: pytest.MonkeyPa
     """A base that tips after 5 s has taken a tenth of the energy: beside whole runs it looked like the best of all."""
     numbers = {pictures.ENERGY: 1.0, "hand_error_rms_m": 0.1}
     status = ["ok", "failed", "ok"]
-    rows = [Row(k, None, {"duration_s": k + 1}, one, "", numbers, "") for k, one in enumerate(status)]
+    rows = [SweepRow(k, None, {"duration_s": k + 1}, one, "", numbers, "") for k, one in enumerate(status)]
     seen: list[pictures.Sweep] = []
     monkeypatch.setattr(pictures, "draw", lambda sweep, *_: seen.append(sweep))
     sweep_command._draw("tipping", rows, plan(Axis("duration_s", (1, 2, 3))), tmp_path, True, "png")

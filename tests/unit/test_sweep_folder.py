@@ -15,7 +15,7 @@ import pytest
 from dynsim.errors import DynsimError, RecordError
 from dynsim.scenario import read_scenario
 from dynsim.studies import sweep as sweep_module
-from dynsim.studies.journal import JOURNAL, PLAN, Journal, Row
+from dynsim.studies.journal import JOURNAL, PLAN, SweepJournal, SweepRow
 from dynsim.studies.sweep import run_sweep
 from dynsim.studies.sweep_plan import Axis, Plan
 from dynsim.system.files import held_folder
@@ -284,8 +284,8 @@ def test_the_journal_names_itself(tmp_path: Path):
     """/dev/full takes nothing."""
     if not Path("/dev/full").exists():
         pytest.skip("needs /dev/full")
-    row = Row(0, None, {}, "ok", "", {}, "")
-    with Journal(tmp_path, []) as journal:
+    row = SweepRow(0, None, {}, "ok", "", {}, "")
+    with SweepJournal(tmp_path, []) as journal:
         journal._stream.close()
         (tmp_path / JOURNAL).unlink()
         (tmp_path / JOURNAL).symlink_to("/dev/full")

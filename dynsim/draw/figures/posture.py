@@ -34,7 +34,7 @@ from dynsim.draw.geometry.surfaces import round_patch, surface_grids
 from dynsim.record import Record
 from dynsim.record.measures import hand_target
 from dynsim.record.poses import point_positions
-from dynsim.record.scene import Point, Surface
+from dynsim.record.scene import Point, SceneSurface
 
 # An axis of the 3D view shorter than this share of the longest has two ticks.
 SHORT_AXIS = 0.45
@@ -133,7 +133,7 @@ def _with_labels(
     return wide, scale
 
 
-def _frame_side(axes: Axes, plane: SidePlane, extent: tuple[Array, Array], surfaces: Sequence[Surface]) -> None:
+def _frame_side(axes: Axes, plane: SidePlane, extent: tuple[Array, Array], surfaces: Sequence[SceneSurface]) -> None:
     """Limits, labels, and where surfaces are: grey inside (C < 0), a line where the plane cuts them."""
     low, high = extent
     axes.set_aspect("equal", adjustable="box")
@@ -285,7 +285,7 @@ def _space_view(
         axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
 
 
-def _draw_surface(axes: Axes3D, surface: Surface, low: Array, high: Array) -> None:
+def _draw_surface(axes: Axes3D, surface: SceneSurface, low: Array, high: Array) -> None:
     """The part of a surface next to the arm."""
     if surface.kind in ("sphere", "cylinder"):
         grids = [round_patch(surface, low, high)]

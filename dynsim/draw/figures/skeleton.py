@@ -15,7 +15,7 @@ from dynsim.draw.geometry.surfaces import box_about
 from dynsim.record import Record
 from dynsim.record.measures import hand_target
 from dynsim.record.poses import POSITION, point_positions
-from dynsim.record.scene import WORLD, Joint, Point, Scene, Surface
+from dynsim.record.scene import WORLD, Joint, Point, Scene, SceneSurface
 
 # Postures drawn faintly, evenly over the run, besides the last one.
 FAINT = 6
@@ -72,7 +72,7 @@ class Skeleton:
             return []
         return list(dict.fromkeys(rows[np.linspace(0, len(rows) - 1, FAINT + 1).astype(int)].tolist()))
 
-    def contacts(self) -> list[tuple[Point, Surface, Array, float]]:
+    def contacts(self) -> list[tuple[Point, SceneSurface, Array, float]]:
         """Contact, its surface, position and normal force at the end; NaN for a force that is not known.
 
         Of those that could touch, under the unilateral law, the ones that did in some sample.

@@ -19,13 +19,21 @@ from dynsim.draw.figures.style import BLACK, BLUE, DEEP, GREEN, GREY, ORANGE, PU
 from dynsim.draw.film.strokes import Box, arrow, dashes, font, labels, line, ring
 from dynsim.draw.geometry.camera import Camera
 from dynsim.draw.geometry.meshes import Meshes, simplified
-from dynsim.draw.geometry.robot import Contact, Penetration, Robot, contacts, largest_force, paths, penetrations
+from dynsim.draw.geometry.robot import (
+    DrawnContact,
+    DrawnRobot,
+    Penetration,
+    contacts,
+    largest_force,
+    paths,
+    penetrations,
+)
 from dynsim.draw.geometry.shapes import body_shapes, drawn_shape, drawn_surface, grid_faces, gripper, outline, solid
 from dynsim.draw.geometry.surfaces import round_patch, surface_grids
 from dynsim.draw.geometry.wheels import cop_of, supports, wheel_groups
 from dynsim.record.poses import ORIENTATION, POSITION
 from dynsim.record.quaternion import rotated
-from dynsim.record.scene import HERE, WORLD, Surface
+from dynsim.record.scene import HERE, WORLD, SceneSurface
 
 Array = NDArray[np.float64]
 FINER = 2
@@ -73,7 +81,7 @@ class Painter:
 
     def __init__(
         self,
-        robot: Robot,
+        robot: DrawnRobot,
         camera: Camera,
         size: tuple[int, int],
         bounds: tuple[Array, Array],
@@ -216,7 +224,7 @@ class Painter:
             draw.text((10 * FINER, 8 * FINER), self.title, fill=self.tint, font=self._font)
         return image
 
-    def _paint_surface(self, draw: ImageDraw.ImageDraw, surface: Surface, low: Array, high: Array) -> None:
+    def _paint_surface(self, draw: ImageDraw.ImageDraw, surface: SceneSurface, low: Array, high: Array) -> None:
         """A sphere or cylinder as a closed solid, or, if it is large, as the others: the part next to the robot."""
         colour = np.array(_rgb(SURFACE))
         round_one = surface.kind in ("sphere", "cylinder")
@@ -330,7 +338,7 @@ class Painter:
         line(draw, _apart(self.camera.project(path[: row + 1])[:, :2]), _rgb(self.tint), 2 * FINER)
 
     def _paint_contact(
-        self, draw: ImageDraw.ImageDraw, contact: Contact, position: Array, turn: Array, row: int, share: float
+        self, draw: ImageDraw.ImageDraw, contact: DrawnContact, position: Array, turn: Array, row: int, share: float
     ) -> tuple[str, Array, str] | None:
         """Arrows of the normal force, and of all of it with friction: away from the surface for a push, else to it.
 

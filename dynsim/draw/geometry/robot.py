@@ -24,7 +24,7 @@ WORLD_AXES = np.eye(3)
 HERE_POINT: Vector3 = (0.0, 0.0, 0.0)
 
 
-def robots(records: Mapping[str, Record]) -> dict[str, Robot]:
+def robots(records: Mapping[str, Record]) -> dict[str, DrawnRobot]:
     """Robots of those records that have something to be seen, by the names of the records.
 
     Raises
@@ -39,7 +39,7 @@ def robots(records: Mapping[str, Record]) -> dict[str, Robot]:
 
 
 @dataclass(frozen=True)
-class Robot:
+class DrawnRobot:
     """A record whose bodies were placed, and the samples that become frames of the page."""
 
     record: Record
@@ -60,7 +60,7 @@ def placed(record: Record) -> tuple[Scene | None, str]:
     return scene, ""
 
 
-def robot_of(record: Record) -> Robot | None:
+def robot_of(record: Record) -> DrawnRobot | None:
     """The robot of a record; None without samples, a scene, or the poses of its bodies."""
     scene, _ = placed(record)
     if scene is None or not len(record):
@@ -71,7 +71,7 @@ def robot_of(record: Record) -> Robot | None:
     ends = [position[0], *(point_positions(record, p, 0)[None] for p in scene.points)]
     known = np.concatenate(ends)
     reach = float(np.ptp(known[np.isfinite(known).all(axis=1)], axis=0).max(initial=0.0)) or 0.5
-    return Robot(record, scene, _frames(record, reach), reach)
+    return DrawnRobot(record, scene, _frames(record, reach), reach)
 
 
 def _frames(record: Record, reach: float) -> NDArray[np.intp]:
@@ -102,7 +102,7 @@ def _every(count: int, stride: int) -> NDArray[np.intp]:
     return np.unique(np.append(np.arange(0, count, stride), count - 1))
 
 
-def bounds(robots: Sequence[Robot], axes: Array = WORLD_AXES) -> tuple[Array, Array]:
+def bounds(robots: Sequence[DrawnRobot], axes: Array = WORLD_AXES) -> tuple[Array, Array]:
     """The box along some axes, unit vectors (3, 3), in which everything moves, with some room, (3,) and (3,) [m]."""
     pooled = moving(robots) @ axes.T
     low, high = pooled.min(axis=0), pooled.max(axis=0)
@@ -113,7 +113,7 @@ def bounds(robots: Sequence[Robot], axes: Array = WORLD_AXES) -> tuple[Array, Ar
     return low - room, high + room
 
 
-def moving(robots: Sequence[Robot]) -> Array:
+def moving(robots: Sequence[DrawnRobot]) -> Array:
     """Places of all bodies and the hand, its target, and ends of what stands still, (n, 3) [m]."""
     points = []
     for robot in robots:
@@ -137,7 +137,7 @@ def _without_ends(points: Array) -> Array:
     return np.clip(points, *np.percentile(points, (1.0, 99.0), axis=0)) if len(points) else points
 
 
-def _thickness(robot: Robot) -> float:
+def _thickness(robot: DrawnRobot) -> float:
     """How far shapes reach beside the lines between the bodies, more or less [m]."""
     shapes = [shape for body in robot.scene.bodies for shape in body.shapes]
     round_ = [shape.size[0] for shape in shapes if shape.kind in ("cylinder", "capsule", "sphere")]
@@ -146,7 +146,7 @@ def _thickness(robot: Robot) -> float:
     return min(max([*round_, *boxes, *meshes], default=0.0), 0.5 * robot.reach)
 
 
-def azimuth(robots: Sequence[Robot]) -> float:
+def azimuth(robots: Sequence[DrawnRobot]) -> float:
     """Direction in which robot and hand reach furthest, (−π/2, π/2] about z [rad]: the page looks across it."""
     clouds = [robot.record[POSITION][robot.rows][..., :2].reshape(-1, 2).astype(np.float64) for robot in robots]
     clouds += [path[robot.rows, :2] for robot in robots for _, path in paths(robot.record, robot.scene)]
@@ -169,7 +169,7 @@ def paths(record: Record, scene: Scene) -> Iterator[tuple[str, Array]]:
 
 
 @dataclass(frozen=True)
-class Contact:
+class DrawnContact:
     """What a contact point did.
 
     Attributes
@@ -189,7 +189,7 @@ class Contact:
     mode: Array | None
 
 
-def contacts(robot: Robot, rows: NDArray[np.intp] | slice = slice(None)) -> list[Contact]:
+def contacts(robot: DrawnRobot, rows: NDArray[np.intp] | slice = slice(None)) -> list[DrawnContact]:
     """Contact points at samples of the record; under the unilateral law those that ever touched."""
     record, scene = robot.record, robot.scene
     if "contact_normal_force" not in record:
@@ -210,7 +210,7 @@ def contacts(robot: Robot, rows: NDArray[np.intp] | slice = slice(None)) -> list
         tangent = None
         if "contact_force" in record:
             tangent = record["contact_force"][rows, k] - force[:, None] * normal
-        result.append(Contact(point, _friction(record, point.name), normal, force, tangent, mode))
+        result.append(DrawnContact(point, _friction(record, point.name), normal, force, tangent, mode))
     return result
 
 
@@ -254,7 +254,7 @@ def penetrations(record: Record, scene: Scene, rows: NDArray[np.intp] | slice = 
     return below
 
 
-def largest_force(contacts: Sequence[Contact]) -> float:
+def largest_force(contacts: Sequence[DrawnContact]) -> float:
     """The force whose arrow has full length [N]: the 98th percentile, so that a spike does not shrink the rest."""
     sizes = np.abs(np.concatenate([contact.force for contact in contacts])) if contacts else np.zeros(0)
     sizes = sizes[np.isfinite(sizes)]

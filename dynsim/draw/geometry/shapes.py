@@ -13,7 +13,7 @@ from dynsim.draw.geometry.surfaces import box_corners, surface_grids
 from dynsim.record import Record
 from dynsim.record.poses import ORIENTATION, POSITION
 from dynsim.record.quaternion import of_turn, rotated
-from dynsim.record.scene import HERE, WORLD, Body, Scene, Shape, Surface
+from dynsim.record.scene import HERE, WORLD, Body, Scene, SceneSurface, Shape
 
 Array = NDArray[np.float64]
 Faces = NDArray[np.int64]
@@ -133,7 +133,7 @@ def from_z(direction: Array) -> Array:
     return of_turn(axis / size, np.arctan2(size, direction[2]))
 
 
-def drawn_surface(surface: Surface, low: Array, high: Array) -> dict[str, Any]:
+def drawn_surface(surface: SceneSurface, low: Array, high: Array) -> dict[str, Any]:
     """A surface next to the box from ``low`` to ``high`` in which everything moves."""
     drawn: dict[str, Any] = {"name": surface.name, "kind": surface.kind}
     span = float((high - low).max())

@@ -14,7 +14,7 @@ from dynsim.draw.geometry.camera import view_axes
 from dynsim.draw.geometry.meshes import Meshes, named, simplified
 from dynsim.draw.geometry.robot import (
     POSE_ERROR,
-    Robot,
+    DrawnRobot,
     azimuth,
     bounds,
     contacts,
@@ -72,7 +72,7 @@ def viewable(record: Record) -> bool:
     return robot_of(record) is not None
 
 
-def _record(name: str, robot: Robot, blocks: Blocks, meshes: Meshes, low: Array, high: Array) -> dict[str, Any]:
+def _record(name: str, robot: DrawnRobot, blocks: Blocks, meshes: Meshes, low: Array, high: Array) -> dict[str, Any]:
     record, scene, rows = robot.record, robot.scene, robot.rows
     meshes.of_robot(record)
     position, turn = record[POSITION][rows], record[ORIENTATION][rows]
@@ -124,7 +124,7 @@ def _record(name: str, robot: Robot, blocks: Blocks, meshes: Meshes, low: Array,
     return part
 
 
-def _contacts(robot: Robot, blocks: Blocks) -> list[dict[str, Any]]:
+def _contacts(robot: DrawnRobot, blocks: Blocks) -> list[dict[str, Any]]:
     """Every contact point: on which body, its normal, normal force and friction over time, mode where there is one."""
     entries = []
     for contact in contacts(robot, robot.rows):

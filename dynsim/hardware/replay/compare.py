@@ -16,7 +16,7 @@ from dynsim.config.base import Positive, StrictConfig
 from dynsim.errors import RecordError, brief
 from dynsim.hardware.bus.control_table import RAD_PER_TICK
 from dynsim.hardware.errors import ComparisonGateFailed
-from dynsim.hardware.replay.states import State
+from dynsim.hardware.replay.states import ReplayState
 from dynsim.hardware.strict_yaml import read_yaml
 from dynsim.record import Record
 from dynsim.snake.lifting import Lifts, lifted
@@ -178,7 +178,7 @@ def compare_records(simulated: Record, measured: Record) -> Comparison:
     speed = measured.provenance.get("speed", 1.0)
     if not isinstance(speed, (int, float)) or not 0.0 < speed < np.inf:
         raise RecordError(f"the provenance of the measured run says speed {brief(speed)}; a replay has a positive one")
-    rows = measured["state"] == State.REPLAY if "state" in measured else np.ones(len(measured), dtype=bool)
+    rows = measured["state"] == ReplayState.REPLAY if "state" in measured else np.ones(len(measured), dtype=bool)
     time = measured["record_time"] if "record_time" in measured else measured.time  # noqa: SIM401
     rows &= np.isfinite(time) & (time >= 0) & (time <= simulated.time[-1] - simulated.time[0])
     if rows.sum() < 2:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from dynsim.errors import RecordError
 from dynsim.hardware.replay.output import MEASURED, PART, PART_FORMAT, SUMMARY, Layout, Rows, is_held, row_type
-from dynsim.hardware.replay.states import State, TimingStatistics
+from dynsim.hardware.replay.states import ReplayState, TimingStatistics
 from dynsim.hardware.replay.trajectory import GROUNDED, wheel_offsets
 from dynsim.hardware.servo_map import ServoMap
 from dynsim.record import TIME, Record
@@ -119,7 +119,7 @@ def describe(record: Record, scene: Scene | None, followed: Record | None = None
     """
     if len(record):
         for row in np.flatnonzero(np.diff(record["state"], prepend=-1)):
-            record.add_event(record.time[row], "state", State(int(record["state"][row])).name)
+            record.add_event(record.time[row], "state", ReplayState(int(record["state"][row])).name)
     record.scene = scene
     if scene is None or not len(record):
         return record

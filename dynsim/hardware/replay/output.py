@@ -25,7 +25,7 @@ from dynsim.hardware.bus.clock import Clock
 from dynsim.hardware.bus.control_table import VOLT_PER_UNIT
 from dynsim.hardware.errors import PortError
 from dynsim.hardware.replay.rules import Cycle
-from dynsim.hardware.replay.states import Progress, State, StopRequest
+from dynsim.hardware.replay.states import ReplayProgress, ReplayState, StopRequest
 from dynsim.hardware.servo_map import ServoMap
 from dynsim.record.scene import Scene
 from dynsim.system.files import INCOMPLETE, lock
@@ -55,7 +55,7 @@ class Journal:
 
     Attributes
     ----------
-    state : State
+    state : ReplayState
     log : RunLog
     observer : callable, optional
         Called with a Progress after every cycle and on every change of state.
@@ -68,10 +68,10 @@ class Journal:
         clock: Clock,
         recorder: Recorder,
         log: RunLog,
-        observer: Callable[[Progress], None] | None,
+        observer: Callable[[ReplayProgress], None] | None,
         stop: StopRequest,
     ) -> None:
-        self.state = State.CONNECT
+        self.state = ReplayState.CONNECT
         self.observer = observer
         self.log = log
         self.failures: dict[str, BaseException] = {}
@@ -105,7 +105,7 @@ class Journal:
             self.say(f"{name} failed and is off from here: {self.failures[name]!r}")
         return None
 
-    def enter(self, state: State) -> None:
+    def enter(self, state: ReplayState) -> None:
         self.state = state
         self.say("enter")
         self._observe(0.0, 0.0)
@@ -152,7 +152,7 @@ class Journal:
 
     def _observe(self, fraction: float, following_error: float) -> None:
         if self.observer and self._kept is None:
-            progress = Progress(self.state, fraction, following_error, self._recorder.hottest)
+            progress = ReplayProgress(self.state, fraction, following_error, self._recorder.hottest)
             self.guard("progress", self.observer, progress)
 
 
@@ -201,7 +201,7 @@ class Recorder:
     def __len__(self) -> int:
         return len(self._rows)
 
-    def add(self, cycle: Cycle, state: State, path_time: float, origin: float) -> None:
+    def add(self, cycle: Cycle, state: ReplayState, path_time: float, origin: float) -> None:
         """Keep one cycle.
 
         Parameters

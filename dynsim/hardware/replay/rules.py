@@ -22,7 +22,7 @@ from dynsim.hardware.bus.control_table import (
 )
 from dynsim.hardware.replay.motion import CyclePlan
 from dynsim.hardware.safety import Safety
-from dynsim.hardware.servo_map import Servo, ServoMap
+from dynsim.hardware.servo_map import MappedServo, ServoMap
 
 
 class Cause(StrEnum):
@@ -218,7 +218,7 @@ class AbortRules:
             )
         ]
 
-    def _health(self, servo: Servo, registers: dict[str, int]) -> list[Fault]:
+    def _health(self, servo: MappedServo, registers: dict[str, int]) -> list[Fault]:
         faults: list[Fault] = []
 
         def add(cause: Cause, text: str) -> None:
@@ -280,6 +280,6 @@ def _count(counters: NDArray[np.int64], hit: NDArray[np.bool_], unknown: NDArray
     return np.where(unknown, counters, np.where(hit, counters + 1, 0))
 
 
-def decode_health(servo: Servo, data: bytes) -> dict[str, int]:
+def decode_health(servo: MappedServo, data: bytes) -> dict[str, int]:
     """Registers in a health block, by name."""
     return servo.model.registers_in(HEALTH_BLOCK[0], data)

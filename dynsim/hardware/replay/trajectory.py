@@ -17,7 +17,7 @@ import numpy as np
 
 from dynsim.errors import CheckRefused
 from dynsim.hardware.replay.motion import Array
-from dynsim.hardware.servo_map import Servo, ServoMap
+from dynsim.hardware.servo_map import MappedServo, ServoMap
 from dynsim.record import TIME, Record
 from dynsim.snake.lifting import grounded_pairs, lifted
 
@@ -331,7 +331,7 @@ def long_steps(record: Record, factor: float, share: float) -> list[str]:
     ]
 
 
-def column_of(record: Record, signal: str, servo: Servo, unit: str) -> Array:
+def column_of(record: Record, signal: str, servo: MappedServo, unit: str) -> Array:
     """The column of ``signal`` that ``servo`` follows, shape (T,).
 
     Raises

@@ -27,9 +27,9 @@ from dynsim.hardware.bus.control_table import (
 )
 from dynsim.hardware.bus.protocol import Bus, NoAnswer, RequestRefused, too_busy
 from dynsim.hardware.errors import VerificationFailed
-from dynsim.hardware.replay.motion import QUINTIC_PEAK, Needs, Task
+from dynsim.hardware.replay.motion import QUINTIC_PEAK, MotionTask, Needs
 from dynsim.hardware.safety import Safety
-from dynsim.hardware.servo_map import Servo, ServoMap
+from dynsim.hardware.servo_map import MappedServo, ServoMap
 
 EEPROM_BLOCK = (0, 64)
 TRIAL_READS = 10
@@ -48,7 +48,7 @@ ATTEMPTS = 3
 Registers = dict[str, int]
 
 
-def snapshot(bus: Bus, servo: Servo) -> Registers:
+def snapshot(bus: Bus, servo: MappedServo) -> Registers:
     """All registers of a servo, by name. Raises NoAnswer or RequestRefused."""
     eeprom = bus.read_block(servo.id, *EEPROM_BLOCK).data
     ram = bus.read_block(servo.id, *HEALTH_BLOCK).data
@@ -82,7 +82,7 @@ def configure(bus: Bus, servo_map: ServoMap, report: Callable[[str], None]) -> N
                 report(f"{servo}: {name} {now[name]} -> {value}")
 
 
-def _wanted_eeprom(servo: Servo, servo_map: ServoMap) -> Registers:
+def _wanted_eeprom(servo: MappedServo, servo_map: ServoMap) -> Registers:
     return {
         "operating_mode": int(servo.operating_mode),
         "return_delay": int(servo_map.bus.return_delay / RETURN_DELAY_SECONDS_PER_UNIT),
@@ -91,7 +91,7 @@ def _wanted_eeprom(servo: Servo, servo_map: ServoMap) -> Registers:
 
 
 def verify(
-    bus: Bus, servo_map: ServoMap, motion: Task, *, poll: Callable[[], None]
+    bus: Bus, servo_map: ServoMap, motion: MotionTask, *, poll: Callable[[], None]
 ) -> tuple[list[str], list[LimitRow]]:
     """Everything that is wrong with the servos on the bus, one line each; empty when the robot may move.
 
@@ -134,7 +134,7 @@ def verify(
     return problems + missed, rows
 
 
-def _unfit(servo: Servo, registers: Registers, servo_map: ServoMap) -> list[str]:
+def _unfit(servo: MappedServo, registers: Registers, servo_map: ServoMap) -> list[str]:
     problems = []
     if registers["model_number"] != servo.model.number:
         return [f"is model {registers['model_number']}, the map says {servo.model.name} ({servo.model.number})"]
@@ -172,7 +172,7 @@ def _unfit(servo: Servo, registers: Registers, servo_map: ServoMap) -> list[str]
     return problems
 
 
-def _out_of_place(servo: Servo, registers: Registers) -> list[str]:
+def _out_of_place(servo: MappedServo, registers: Registers) -> list[str]:
     """A posture the robot must not start from."""
     tick = registers["present_position"]
     low, high = servo.tick_limits
@@ -225,13 +225,13 @@ class LimitRow:
     differs: tuple[str, ...]
 
 
-def needs_of_map(servo: Servo) -> Needs:
+def needs_of_map(servo: MappedServo) -> Needs:
     """All that the map allows."""
     low, high = servo.position_limits
     return Needs(low, high, servo.kind.limits.velocity)
 
 
-def compare_limits(servo: Servo, registers: Registers, safety: Safety, needs: Needs) -> LimitRow:
+def compare_limits(servo: MappedServo, registers: Registers, safety: Safety, needs: Needs) -> LimitRow:
     """The limits in a servo's EEPROM, beside those of the map.
 
     Refused are limits within which the servo would ignore goals of the motion or fall behind it, and thresholds with
@@ -260,7 +260,7 @@ class _Compared(NamedTuple):
     differs: str = ""
 
 
-def _position(servo: Servo, registers: Registers, needs: Needs) -> _Compared:
+def _position(servo: MappedServo, registers: Registers, needs: Needs) -> _Compared:
     if not servo.in_position_mode:
         return _Compared()
     low, high = registers["min_position"], registers["max_position"]
@@ -275,7 +275,7 @@ def _position(servo: Servo, registers: Registers, needs: Needs) -> _Compared:
     return _Compared(f"{own[0]:.0f} to {own[1]:.0f}", f"{bounds[0]:.0f} to {bounds[1]:.0f}", refused, differs)
 
 
-def _velocity(servo: Servo, registers: Registers, needs: Needs) -> _Compared:
+def _velocity(servo: MappedServo, registers: Registers, needs: Needs) -> _Compared:
     units, allowed = registers["velocity_limit"], servo.kind.limits.velocity
     own = units * RAD_S_PER_UNIT / servo.gear
     refused = differs = ""
@@ -289,7 +289,7 @@ def _velocity(servo: Servo, registers: Registers, needs: Needs) -> _Compared:
     return _Compared(f"{own:.2f}", f"{allowed:.2f}", refused, differs)
 
 
-def _torque(servo: Servo, registers: Registers) -> _Compared:
+def _torque(servo: MappedServo, registers: Registers) -> _Compared:
     allowed = servo.kind.limits.torque
     if "current_limit" not in registers:
         return _Compared(map=f"{allowed:.1f}")
@@ -299,7 +299,7 @@ def _torque(servo: Servo, registers: Registers) -> _Compared:
     return _Compared(f"{own:.1f}", f"{allowed:.1f}", differs=below)
 
 
-def _temperature(servo: Servo, registers: Registers, safety: Safety) -> _Compared:
+def _temperature(servo: MappedServo, registers: Registers, safety: Safety) -> _Compared:
     own, allowed = registers["temperature_limit"], safety.temperature_max
     refused = ""
     if own <= allowed:
@@ -389,7 +389,7 @@ def way_to_start(bus: Bus, servo_map: ServoMap, start: NDArray[np.float64]) -> W
     return WayToStart(tuple(distances), duration, tuple(far))
 
 
-def read_ticks(bus: Bus, servos: list[Servo]) -> dict[int, int]:
+def read_ticks(bus: Bus, servos: list[MappedServo]) -> dict[int, int]:
     """Servo position by ID. Raises VerificationFailed where one does not answer."""
     ticks: dict[int, int] = {}
     for _ in range(ATTEMPTS):

@@ -21,7 +21,7 @@ ENGINE = "dynamics"
 MotorChoice: Any = families.union("motor")
 
 
-class Pose(StrictConfig):
+class PoseConfig(StrictConfig):
     """Place and attitude of a body in the frame of its joint, R = Rz(yaw) Ry(pitch) Rx(roll)."""
 
     position_m: Vector3 = [0.0, 0.0, 0.0]
@@ -48,7 +48,7 @@ class Config(StrictConfig):
         default={}, description="initial angles of revolute joints by name; others 0, or where a leader has them"
     )
     initial_m: dict[str, float] = Field(default={}, description="initial positions of prismatic joints; others 0")
-    initial_pose: dict[str, Pose] = Field(
+    initial_pose: dict[str, PoseConfig] = Field(
         default={}, description="initial poses of the bodies of floating and planar joints, by joint name"
     )
     lock_deg: dict[str, float] = Field(default={}, description="revolute joints that are fixed, at these angles")
@@ -140,7 +140,7 @@ def build(config: Config, context: BuildContext) -> Robot:
     )
 
 
-def _initial(robot: Robot, positions: dict[str, float], poses: dict[str, Pose]) -> Array:
+def _initial(robot: Robot, positions: dict[str, float], poses: dict[str, PoseConfig]) -> Array:
     """Coordinates of all joints, (nq,); those of floating and planar joints from the poses of their bodies."""
     from dynsim.model.urdf.reader import rotation
     from dynsim.record.scene import quaternion
