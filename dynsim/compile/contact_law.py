@@ -47,11 +47,11 @@ class DryFriction:
 def dry_frictions(robot: Robot) -> list[DryFriction]:
     """The joints of a robot with friction that is not smoothed."""
     gears = {motor.joint: motor.dry_friction for motor in robot.motors if not isinstance(motor, TorqueSource)}
-    every = [DryFriction(link.joint, gears.get(link.joint, 0.0), link.friction) for link in robot.links]
-    return [one for one in every if one.gear + one.bearing > 0.0]
+    frictions = [DryFriction(link.joint, gears.get(link.joint, 0.0), link.friction) for link in robot.links]
+    return [friction for friction in frictions if friction.gear + friction.bearing > 0.0]
 
 
-def told(value: float, unit: str, digits: int = 5) -> str:
+def format_quantity(value: float, unit: str, digits: int = 5) -> str:
     """A joint coordinate for a line of text; an angle in degrees first, which scenarios are written in."""
     if unit != "rad":
         return f"{value:.{digits}g} {unit}"
@@ -77,13 +77,13 @@ def compile_unilateral(
         stop[k, ku.SIDE], stop[k, ku.LIMIT] = limit.side, limit.side * limit.position
     dry_table, frictions = np.zeros((len(dry), ku.DRY_TABLE_SIZE), dtype=np.int64), np.zeros((len(dry), ku.DRY_SIZE))
     driven = [motor.joint for motor in robot.motors]
-    for k, one in enumerate(dry):
-        dry_table[k, ku.DRY_JOINT] = robot.joint_names.index(one.joint)
-        dry_table[k, ku.DRY_DRIVE] = driven.index(one.joint) if one.gear > 0.0 else -1
-        frictions[k, [ku.OF_GEAR, ku.OF_JOINT]] = one.gear, one.bearing
+    for k, friction in enumerate(dry):
+        dry_table[k, ku.DRY_JOINT] = robot.joint_names.index(friction.joint)
+        dry_table[k, ku.DRY_DRIVE] = driven.index(friction.joint) if friction.gear > 0.0 else -1
+        frictions[k, [ku.OF_GEAR, ku.OF_JOINT]] = friction.gear, friction.bearing
     tie_table, tie = np.zeros((len(ties), ku.TIE_TABLE_SIZE), dtype=np.int64), np.zeros((len(ties), ku.TIE_SIZE))
-    for held, in_table, row in zip(ties, tie_table, tie, strict=True):
-        _compile_tie(robot, held, in_table, row)
+    for joined, ints, floats in zip(ties, tie_table, tie, strict=True):
+        _compile_tie(robot, joined, ints, floats)
     slide = np.zeros((c, ku.SLIDE_SIZE))
     slide[:, ku.LANDS_AT] = ku.DEPTH
     tally, number = np.zeros((c, ku.TALLY_SIZE)), np.zeros(ku.NUMBERS)
@@ -171,17 +171,17 @@ def joint_stops(robot: Robot) -> list[JointStop]:
     ModelError
         A joint starts beyond its stop.
     """
-    found = []
+    stops = []
     for link, k in zip(robot.links, robot.position_index, strict=True):
         for side, limit in ((1.0, link.lower), (-1.0, link.upper)):
             if np.isfinite(limit):
                 beyond = side * (limit - robot.initial[k])
                 if beyond > START_TOLERANCE:
                     raise ModelError(
-                        f"{link.joint}: starts at {told(robot.initial[k], link.units[0])}, beyond its stop at "
-                        f"{told(limit, link.units[0])}; "
+                        f"{link.joint}: starts at {format_quantity(robot.initial[k], link.units[0])}, beyond its "
+                        f"stop at {format_quantity(limit, link.units[0])}; "
                         "contacts.law: unilateral enforces it: change its initial position or its limit",
                         keys=("plant",),
                     )
-                found.append(JointStop(link.joint, side, float(limit)))
-    return found
+                stops.append(JointStop(link.joint, side, float(limit)))
+    return stops

@@ -23,9 +23,9 @@ def static_margin(model: Model, q: Array, forces: Sequence[tuple[int, Array, Arr
     axes, origin = model.body_pose(base.body, q)
     force, moment = np.zeros(3), np.zeros(3)
     weights = [(i, link.inertia.com, link.inertia.mass * robot.gravity) for i, link in enumerate(robot.links)]
-    for link, point, one in (*weights, *forces):
-        force += one
-        moment += np.cross(model.point_position(link, point, q) - origin, one)
+    for link, point, push in (*weights, *forces):
+        force += push
+        moment += np.cross(model.point_position(link, point, q) - origin, push)
     # What the ground gives back, in the axes of the base.
     carried, (turn_x, turn_y) = -float(axes[:, 2] @ force), (-axes.T @ moment)[:2]
     if carried <= 0.0:

@@ -142,9 +142,9 @@ class Contacts(StrictConfig):
         if static < kinetic:
             raise error_at("static_friction", f"is less than friction {self.friction:g}; it must hold as much or more")
         for name, point in self.points.items():
-            given = sorted(point.model_fields_set & set(UNILATERAL_KEYS))
-            if self.law == "bilateral" and given:
-                raise error_at(f"points.{name}.{given[0]}", fix)
+            keys = sorted(point.model_fields_set & set(UNILATERAL_KEYS))
+            if self.law == "bilateral" and keys:
+                raise error_at(f"points.{name}.{keys[0]}", fix)
             kinetic, static = self.coefficients(point)
             if static < kinetic:
                 key = "friction" if point.static_friction is None else "static_friction"
@@ -162,10 +162,10 @@ class Contacts(StrictConfig):
             anywhere = soft or (point is None and not all(p.stiffness_N_per_m is None for p in self.points.values()))
             if config.damping_N_s_per_m and not anywhere:
                 raise error_at(f"{where}damping_N_s_per_m", "is that of what gives way: give stiffness_N_per_m too")
-            given = self.restitution if point is None or point.restitution is None else point.restitution
-            if soft and given > 0.0:
+            restitution = self.restitution if point is None or point.restitution is None else point.restitution
+            if soft and restitution > 0.0:
                 key = "restitution" if config.restitution else "stiffness_N_per_m"
-                raise error_at(f"{where}{key}", f"what gives way has no restitution ({given:g}), but a damping")
+                raise error_at(f"{where}{key}", f"what gives way has no restitution ({restitution:g}), but a damping")
 
 
 class Initial(StrictConfig):
@@ -291,9 +291,9 @@ class ScenarioConfig(StrictConfig):
     @model_validator(mode="after")
     def _check_stiffness(self) -> Self:
         """The event-driven methods know rigid contacts only."""
-        given: dict[str, Contacts | ContactPoint] = {"contacts": self.contacts}
-        given |= {f"contacts.points.{name}": point for name, point in self.contacts.points.items()}
-        for where, config in given.items():
+        configs: dict[str, Contacts | ContactPoint] = {"contacts": self.contacts}
+        configs |= {f"contacts.points.{name}": point for name, point in self.contacts.points.items()}
+        for where, config in configs.items():
             if config.stiffness_N_per_m is not None and self.integrator.method != "time_stepping":
                 raise error_at(
                     f"{where}.stiffness_N_per_m",
@@ -414,14 +414,14 @@ class Scenario:
                 part.pop(key, None)
         # What changes nothing is not there, unless it was said.
         for keys in idle_keys(self.config):
-            section, *rest = map(str, keys)
-            if len(rest) == 1 and not is_set(self.config, keys) and isinstance(resolved.get(section), dict):
-                resolved[section].pop(rest[0], None)
+            section, *inner = map(str, keys)
+            if len(inner) == 1 and not is_set(self.config, keys) and isinstance(resolved.get(section), dict):
+                resolved[section].pop(inner[0], None)
                 if not resolved[section]:
                     del resolved[section]
         return resolved
 
-    def place(self, keys: Sequence[int | str] = (), variant: str = "") -> str:
+    def location(self, keys: Sequence[int | str] = (), variant: str = "") -> str:
         """``file:line`` of a key, the text for ``variant``, and how the key was overridden."""
         line, overridden = 0, ""
         if keys and self.origin is not None:

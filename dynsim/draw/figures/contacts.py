@@ -53,7 +53,7 @@ def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
     # A legend has an entry for each variant and one for the shading.
     more = sum(-(-(len(having[name]) + 1) // 2) - 1 for name in chosen) * style.LEGEND_ROW / 72.0
     figure = style.new_figure(1.0 + ROW * len(chosen) + more, title + note)
-    series = [[one for r in having[name].values() for one in _series(r, name)] for name in chosen]
+    series = [[values for r in having[name].values() for values in _series(r, name)] for name in chosen]
     styles = style.variant_styles(list(records))
     rows = style.time_rows(figure, series, max(map(style.settle_time, runs)))
     for name, panels in zip(chosen, rows, strict=True):
@@ -65,8 +65,8 @@ def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
                 label = f"{variant or name}: {_share(record, name)}{_within(record, name)}"
                 style.line(axes, record.time, force, label=label, **styles[variant])
                 _draw_extremes(axes, record, name, colour)
-                found = events.marked(record, [name])
-                events.mark(axes, [e for e in found if axes is panels[0] or e.time > begun], colour, row=row)
+                changes = events.marked(record, [name])
+                events.mark(axes, [e for e in changes if axes is panels[0] or e.time > begun], colour, row=row)
                 if alone and is_real(record):
                     _draw_modes(axes, record, name)
                 elif alone:
@@ -85,10 +85,10 @@ def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
 
 def contact_names(records: Sequence[Record]) -> list[str]:
     """Names of all contacts, in the order in which they first appear."""
-    found: dict[str, None] = {}
+    names: dict[str, None] = {}
     for record in records:
-        found.update(dict.fromkeys(record.labels.get("contact_normal_force", ())))
-    return list(found)
+        names.update(dict.fromkeys(record.labels.get("contact_normal_force", ())))
+    return list(names)
 
 
 def touching_names(records: Sequence[Record]) -> list[str]:
@@ -106,9 +106,9 @@ def is_real(record: Record) -> bool:
 
 
 def _share(record: Record, name: str) -> str:
-    what, key = ("closed", "closed_fraction") if is_real(record) else ("pulling", "pulling_fraction")
+    state, key = ("closed", "closed_fraction") if is_real(record) else ("pulling", "pulling_fraction")
     contact = _summary(record, name)
-    return f"{what} {percent(contact[key])} of the run" if contact else f"{what} unknown part"
+    return f"{state} {percent(contact[key])} of the run" if contact else f"{state} unknown part"
 
 
 def _within(record: Record, name: str) -> str:
@@ -174,7 +174,7 @@ def _most_interesting(names: list[str], records: Sequence[Record]) -> list[str]:
 
     def rank(name: str) -> float:
         values = [_force(r, name) for r in records if name in contact_names([r])]
-        return -max(float(one.max()) for one in values) if real else min(float(one.min()) for one in values)
+        return -max(float(force.max()) for force in values) if real else min(float(force.min()) for force in values)
 
     chosen = sorted(names, key=rank)[:ROWS]
     return [name for name in names if name in chosen]

@@ -36,13 +36,13 @@ class Hearing:
 
 def by_bit_rate(servos: Mapping[int, ServoRegisters]) -> dict[int, Hearing]:
     """Who understands a packet, by its bit rate [bit/s]; as the registers say now."""
-    found: dict[int, Hearing] = {}
-    for place, (first_id, registers) in enumerate(servos.items()):
+    hearings: dict[int, Hearing] = {}
+    for index, (first_id, registers) in enumerate(servos.items()):
         if registers["protocol"] != PROTOCOL:
             continue
-        hearing = found.setdefault(registers.baud, Hearing())
-        hearing.members = np.append(hearing.members, place)
+        hearing = hearings.setdefault(registers.baud, Hearing())
+        hearing.members = np.append(hearing.members, index)
         hearing.by_id.setdefault(registers["id"], []).append(first_id)
         if registers["shadow_id"] <= MAX_ID and registers["shadow_id"] != registers["id"]:
             hearing.by_shadow.setdefault(registers["shadow_id"], []).append(first_id)
-    return found
+    return hearings

@@ -160,8 +160,8 @@ class Firmware:
             speakers.append(servo)
             replies.append(reply)
         parts = encode_fast(replies, [length for _, _, length in entries])
-        for place, (servo, part) in enumerate(zip(speakers, parts, strict=True)):
-            yield Answer((servo,), part, chained=place > 0)
+        for index, (servo, part) in enumerate(zip(speakers, parts, strict=True)):
+            yield Answer((servo,), part, chained=index > 0)
 
     def _read(self, servo: int, id_: int, address: int, length: int) -> Packet | None:
         if self._servos.registers[servo]["status_return_level"] == 0:
