@@ -125,7 +125,7 @@ def _add_unilateral(record: Record, prepared: Prepared) -> None:
         record.add("stop_force", force, unit, labels=joints, description="of joint stops; positive at a lower limit")
     if prepared.dry:
         units = {link.joint: link.units[3] for link in robot.links}
-        joints = tuple(one.joint for one in prepared.dry)
+        joints = tuple(friction.joint for friction in prepared.dry)
         unit = " or ".join(dict.fromkeys(units[joint] for joint in joints))
         record.add("joint_friction", run.outputs("dry"), unit, labels=joints, description="dry friction on the joints")
     if robot.ties:
