@@ -19,6 +19,7 @@ from dynsim.dynamics import tables as ka
 from dynsim.dynamics.tree import articulated, joints, points, sweep
 from dynsim.errors import ModelError, shown
 from dynsim.model.description import Array, Contact, Robot
+from dynsim.model.surfaces import Surface
 from dynsim.record import notebook
 
 _FLOAT64 = np.dtype(np.float64)
@@ -111,10 +112,30 @@ class Model:
         return cls(read_urdf(Path(path), lock))
 
     def to_urdf(self) -> str:
-        """The tree of bodies as URDF text."""
+        """The tree of bodies as URDF text, with masses, limits, viscous losses and shapes."""
+        from dynsim.compile.scene import with_shapes
         from dynsim.model.urdf.writer import write_urdf
 
-        return write_urdf(self.robot)
+        return write_urdf(with_shapes(self.robot))
+
+    def to_mjcf(self, contacts: Sequence[Contact] = (), surfaces: Mapping[str, Surface] | None = None) -> str:
+        """The tree of bodies as MJCF, the format of MuJoCo, with what its motors add to it.
+
+        Parameters
+        ----------
+        contacts : points that become sites
+        surfaces : of which planes, spheres, cylinders and boxes become shapes that are drawn and do not touch
+
+        Raises
+        ------
+        ModelError
+            A joint of a kind that MJCF does not have, such as wheels that roll without slip.
+        """
+        from dynsim.compile.scene import drawn_surface, with_shapes
+        from dynsim.model.mjcf import write_mjcf
+
+        drawn = [drawn_surface(name, surface) for name, surface in (surfaces or {}).items()]
+        return write_mjcf(with_shapes(self.robot), contacts, drawn, self.damping, self.armature)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
