@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, cast
 
 import typer
 
@@ -80,11 +80,12 @@ def _export_robot(
 
 def _export_record(path: Path, format_: ExportFormat, rate: float | None, out: Path | None, trust: bool) -> Path:
     from dynsim.record import Record
-    from dynsim.record.joint_motion import SUFFIX, export_record
+    from dynsim.record.joint_motion import SUFFIX, Format, export_record
 
     record = Record.load(path, trust=trust)
     if format_ is not ExportFormat.mcap:
-        return export_record(record, out or path.with_suffix(SUFFIX[format_.value]), format_.value, rate=rate)
+        kind = cast(Format, format_.value)
+        return export_record(record, out or path.with_suffix(SUFFIX[kind]), kind, rate=rate)
     from dynsim.record.mcap_file import write_mcap
 
     if rate is not None:

@@ -67,7 +67,8 @@ def write_mjcf(
         for group in below.get(parent, ()):
             link = group[-1]
             place = {"pos": numbers(group[0].p_PJ), "quat": numbers(of_matrix(group[0].R_PJ))}
-            body = elements[link.name] = ElementTree.SubElement(elements[parent], "body", name=link.name, **place)
+            body = ElementTree.SubElement(elements[parent], "body", {"name": link.name, **place})
+            elements[link.name] = body
             _add_inertial(body, link)
             _add_joints(body, group, damping[[row[one.joint] for one in group]], armature[row[link.joint]])
             _add_shapes(body, link.shapes)
