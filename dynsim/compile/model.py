@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dynsim.compile.bracing import Brace, BraceStatics, PreparedBraces
+from dynsim.compile.derivatives import InverseDynamicsDerivatives, inverse_dynamics_derivatives
 from dynsim.compile.hand_posture import hand_posture
 from dynsim.compile.tables import compile_model
 from dynsim.config.problems import listed
@@ -185,6 +186,16 @@ class Model:
         self._workspace.joints[:, ka.APPLIED] = self._vector(tau, "tau", self.joint_names)
         articulated.forward_dynamics(self._bodies, self._workspace)
         return self._workspace.joints[:, ka.QDD].copy()
+
+    def derivatives(self, q: ArrayLike, v: ArrayLike, vdot: ArrayLike) -> InverseDynamicsDerivatives:
+        """Derivatives of inverse dynamics, ∂tau/∂q, ∂tau/∂v and ∂tau/∂v̇ = M, in closed form, (n, n) each.
+
+        Those of forward dynamics follow, at v̇ = M⁻¹ (tau − h − g): ∂v̇/∂q = −M⁻¹ ∂tau/∂q, ∂v̇/∂v = −M⁻¹ ∂tau/∂v.
+        Rotor inertia, losses and contacts are not part of them, as of all methods here;
+        :meth:`dynsim.Simulation.linearize` has them all.
+        """
+        self.inverse_dynamics(q, v, vdot)
+        return inverse_dynamics_derivatives(self.arrays, self._workspace.links)
 
     def brace_statics(self, q: ArrayLike, v: ArrayLike, vdot: ArrayLike, braces: Mapping[str, Brace]) -> BraceStatics:
         """Torques and brace forces that realise v̇ with the least heat, or a certificate that none do.
