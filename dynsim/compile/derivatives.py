@@ -17,6 +17,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.tables import ModelArrays
@@ -75,9 +76,9 @@ def inverse_dynamics_derivatives(arrays: ModelArrays, links: Array) -> InverseDy
     return InverseDynamicsDerivatives(by_q, by_v, mass)
 
 
-def _joint_bodies(parent: Array, base: Array) -> Array:
+def _joint_bodies(parent: NDArray[np.int64], base: NDArray[np.int64]) -> NDArray[np.int64]:
     """For each row the link of the body that its joint carries: that of the joint's last row."""
-    body = np.arange(len(parent))
+    body = np.arange(len(parent), dtype=np.int64)
     for i in range(len(parent) - 1, 0, -1):
         # A later row of a joint is mounted where the row before it, its parent, is.
         if parent[i] >= 0 and base[i] == base[parent[i]] and base[i] != parent[i]:

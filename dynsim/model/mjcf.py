@@ -66,11 +66,11 @@ def write_mjcf(
     def add(parent: str | None) -> None:
         for group in below.get(parent, ()):
             link = group[-1]
-            place = {"pos": numbers(group[0].p_PJ), "quat": numbers(of_matrix(group[0].R_PJ))}
-            body = ElementTree.SubElement(elements[parent], "body", {"name": link.name, **place})
+            origin = {"pos": numbers(group[0].p_PJ), "quat": numbers(of_matrix(group[0].R_PJ))}
+            body = ElementTree.SubElement(elements[parent], "body", {"name": link.name, **origin})
             elements[link.name] = body
             _add_inertial(body, link)
-            _add_joints(body, group, damping[[row[one.joint] for one in group]], armature[row[link.joint]])
+            _add_joints(body, group, damping[[row[link.joint] for link in group]], armature[row[link.joint]])
             _add_shapes(body, link.shapes)
             order.extend(group)
             add(link.name)
@@ -133,8 +133,8 @@ def _add_inertial(body: Element, link: Link) -> None:
     moments = (
         {"fullinertia": numbers([*np.diag(tensor), *off])} if off.any() else {"diaginertia": numbers(np.diag(tensor))}
     )
-    place = {"pos": numbers(inertia.com), "mass": numbers(max(inertia.mass, LEAST))}
-    ElementTree.SubElement(body, "inertial", {**place, **moments})
+    origin = {"pos": numbers(inertia.com), "mass": numbers(max(inertia.mass, LEAST))}
+    ElementTree.SubElement(body, "inertial", {**origin, **moments})
 
 
 def _add_shapes(body: Element, shapes: Sequence[Shape]) -> None:

@@ -52,7 +52,7 @@ def write_mcap(record: Record, path: Path) -> Path:
     with replacing(path) as stream:
         bag = _Bag(writer_module.Writer(stream), typesys.get_typestore(typesys.Stores.ROS2_JAZZY))
         bag.writer.start(profile="ros2", library=f"dynsim {__version__}")
-        for time, topic, kind, message in sorted(_messages(record, bag), key=lambda one: one[0]):
+        for time, topic, kind, message in sorted(_messages(record, bag), key=lambda entry: entry[0]):
             bag.write(time, topic, kind, message)
         bag.writer.finish()
     return path

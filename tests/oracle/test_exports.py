@@ -71,8 +71,8 @@ def test_mujoco_has_the_mass_matrix_bias_and_accelerations_of_an_exported_arm(na
         )
 
 
-def assert_near(found: np.ndarray, expected: np.ndarray) -> None:
-    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9 * max(1.0, float(np.abs(expected).max())))
+def assert_near(actual: np.ndarray, expected: np.ndarray) -> None:
+    np.testing.assert_allclose(actual, expected, rtol=0.0, atol=1e-9 * max(1.0, float(np.abs(expected).max())))
 
 
 def test_the_initial_posture_motors_and_surfaces_are_those_of_the_scenario() -> None:
@@ -187,7 +187,7 @@ def test_looks_are_in_the_urdf_and_are_read_back() -> None:
     link = Link("rod", "turn", None, "revolute", np.array([0.0, 0.0, 1.0]), BOX, shapes=shapes)
     text = Model(Robot("one", (link,), (), ("rod", np.zeros(3)), fixed_shapes=(shapes[0],))).to_urdf()
     file = ElementTree.fromstring(text)
-    assert [len(one.findall("visual")) for one in file.findall("link")] == [1, 5, 0]
+    assert [len(item.findall("visual")) for item in file.findall("link")] == [1, 5, 0]
     assert file.findall("link")[0].get("name") == ROOT
 
 
@@ -238,7 +238,7 @@ def test_an_mcap_reader_with_its_own_decoder_has_the_numbers_of_the_record(bag: 
     np.testing.assert_array_equal(forces, record["contact_force"][:, record.labels["contact_force"].index("elbow_4")])
     # The tree of frames, followed by hand, leads to the bodies of the scene.
     poses = poses_at(record.scene, {"q": dict(zip(record.labels["q"], record["q"][-1], strict=True))})
-    frames = {one.child_frame_id: one for one in messages["/tf"][-1][1].transforms}
+    frames = {item.child_frame_id: item for item in messages["/tf"][-1][1].transforms}
     for body, pose in zip(record.scene.bodies, poses, strict=True):
         np.testing.assert_allclose(_position(frames, body.name), pose[:3], atol=1e-12)
     assert {"contact_elbow_4", "contact_elbow_7"} < set(frames)
@@ -261,7 +261,7 @@ def test_rosbags_reads_the_file_too(bag: tuple[dynsim.Record, Path]) -> None:
 
     record, file = bag
     with AnyReader([file]) as reader:
-        kinds = {one.topic: one.msgtype for one in reader.connections}
+        kinds = {item.topic: item.msgtype for item in reader.connections}
         assert kinds == {
             "/joint_states": "sensor_msgs/msg/JointState",
             "/robot_description": "std_msgs/msg/String",
@@ -269,12 +269,12 @@ def test_rosbags_reads_the_file_too(bag: tuple[dynsim.Record, Path]) -> None:
             "/contacts/elbow_4": "geometry_msgs/msg/WrenchStamped",
             "/contacts/elbow_7": "geometry_msgs/msg/WrenchStamped",
         }
-        found = [
-            reader.deserialize(raw, one.msgtype).position
-            for one, _, raw in reader.messages()
-            if one.topic == "/joint_states"
+        actual = [
+            reader.deserialize(raw, item.msgtype).position
+            for item, _, raw in reader.messages()
+            if item.topic == "/joint_states"
         ]
-    np.testing.assert_array_equal(found, record["q"])
+    np.testing.assert_array_equal(actual, record["q"])
 
 
 def test_the_description_in_the_bag_is_the_scene_in_pinocchio(bag: tuple[dynsim.Record, Path]) -> None:
@@ -283,8 +283,8 @@ def test_the_description_in_the_bag_is_the_scene_in_pinocchio(bag: tuple[dynsim.
     data = peer.createData()
     q = pinocchio.neutral(peer)
     for joint, angle in zip(record.labels["q"], record["q"][-1], strict=True):
-        one = peer.joints[peer.getJointId(joint)]
-        q[one.idx_q : one.idx_q + one.nq] = [angle] if one.nq == 1 else [np.cos(angle), np.sin(angle)]
+        item = peer.joints[peer.getJointId(joint)]
+        q[item.idx_q : item.idx_q + item.nq] = [angle] if item.nq == 1 else [np.cos(angle), np.sin(angle)]
     pinocchio.framesForwardKinematics(peer, data, q)
     poses = poses_at(record.scene, {"q": dict(zip(record.labels["q"], record["q"][-1], strict=True))})
     for body, pose in zip(record.scene.bodies, poses, strict=True):

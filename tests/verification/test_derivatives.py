@@ -28,10 +28,10 @@ def test_they_are_those_of_pinocchio(name: str) -> None:
     rng = np.random.default_rng(5)
     for _ in range(3):
         q, v, vdot = rng.uniform(-1.5, 1.5, (3, model.n))
-        found = model.derivatives(q, v, vdot)
+        actual = model.derivatives(q, v, vdot)
         by_q, by_v, M = pin.computeRNEADerivatives(oracle.model, oracle.data, *map(oracle.to, (q, v, vdot)))
         M = np.triu(M) + np.triu(M, 1).T
-        for ours, theirs in ((found.q, by_q), (found.v, by_v), (found.vdot, M)):
+        for ours, theirs in ((actual.q, by_q), (actual.v, by_v), (actual.vdot, M)):
             expected = oracle.back(oracle.back(theirs).T).T
             np.testing.assert_allclose(ours, expected, rtol=0.0, atol=1e-12 * np.abs(expected).max())
 
@@ -68,13 +68,13 @@ def test_they_are_differences_for_every_kind_of_joint(name: str) -> None:
     rng = np.random.default_rng(6)
     q = rng.uniform(-1.0, 1.0, model.nq)
     v, vdot = rng.uniform(-1.0, 1.0, (2, model.n))
-    found = model.derivatives(q, v, vdot)
+    actual = model.derivatives(q, v, vdot)
     by_q = np.stack([difference(model, q, v, vdot, along) for along in np.eye(model.n)], axis=1)
     size = np.abs(by_q).max()
-    np.testing.assert_allclose(found.q, by_q, rtol=0.0, atol=1e-9 * size)
+    np.testing.assert_allclose(actual.q, by_q, rtol=0.0, atol=1e-9 * size)
     # tau is a quadratic of v: central differences are exact.
     by_v = [
         0.5 * (model.inverse_dynamics(q, v + e, vdot) - model.inverse_dynamics(q, v - e, vdot)) for e in np.eye(model.n)
     ]
-    np.testing.assert_allclose(found.v, np.stack(by_v, axis=1), rtol=0.0, atol=1e-11 * size)
-    np.testing.assert_allclose(found.vdot, model.mass_matrix(q), rtol=0.0, atol=1e-12 * size)
+    np.testing.assert_allclose(actual.v, np.stack(by_v, axis=1), rtol=0.0, atol=1e-11 * size)
+    np.testing.assert_allclose(actual.vdot, model.mass_matrix(q), rtol=0.0, atol=1e-12 * size)
