@@ -1,7 +1,7 @@
 """What tutorials and how-to pages show is run, page by page, in an empty folder.
 
-A block of ``yaml`` with a title is a file; each line of ``bash`` is a command of dynsim, which must end well; lines of a
-``text`` block after it must be in what it printed; blocks of ``python`` share their names. ``sh`` is not run.
+A block of ``yaml`` with a title is a file; each line of ``bash`` is a command of dynsim, which must end well; lines
+of a ``text`` block after it must be in what it printed; blocks of ``python`` share their names. ``sh`` is not run.
 """
 
 from __future__ import annotations
