@@ -15,7 +15,7 @@ python3 -m venv "$scratch/tools"
 wheel=$(echo "$scratch"/dist/*.whl)
 
 python_of() {  # the interpreter of a version, of the system or of pyenv; nothing where there is none
-  command -v "/usr/bin/python$1" || ls -d "${PYENV_ROOT:-$HOME/.pyenv}"/versions/"$1".*/bin/python 2> /dev/null | tail -1
+  command -v "/usr/bin/python$1" || { ls -d "${PYENV_ROOT:-$HOME/.pyenv}"/versions/"$1".*/bin/python 2> /dev/null || true; } | tail -1
 }
 
 for version in ${@:-3.11 3.12 3.13 3.14 oldest}; do

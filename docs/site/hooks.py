@@ -22,6 +22,7 @@ OUTSIDE = {
     "CONTRIBUTING.md": "dev/contributing.md",
     "results/README.md": "dev/results.md",
 }
+WORKER = "iframe-worker.js"
 _PICTURE = re.compile(r"\]\((?:\.\./)*(results/[\w/.-]+\.(?:png|gif))\)")
 _ROLE = re.compile(r":(?:class|func|meth|mod|data|attr):<code>~?(?:[\w.]+\.)?([\w ]+)</code>")
 
@@ -30,6 +31,7 @@ def on_files(files: Files, config: Any) -> Files:
     """Add what is generated, and what pages show of the repository."""
     files.append(File.generated(config, "reference/scenario-keys.md", content=reference.scenario_page()))
     files.append(File.generated(config, "reference/commands.md", content=reference.cli_page()))
+    files.append(File.generated(config, WORKER, abs_src_path=str(SITE / WORKER)))
     files.append(File.generated(config, "gallery.md", content=gallery.page()))
     for built in sorted(gallery.BUILT.glob("*/*.*")):
         name = f"gallery/{built.parent.name}/{built.name}"

@@ -13,11 +13,6 @@ Every key that a scenario file may have, from the schema that it is checked with
 examples, is in [Scenarios](../scenarios.md). `dynsim schema` prints the schema for editors.
 
 """
-CLI_INTRODUCTION = """# Commands
-
-Every command with its options, as `--help` shows them.
-
-"""
 
 
 def scenario_page() -> str:
@@ -111,45 +106,14 @@ def without_roles(text: str) -> str:
 
 
 def cli_page() -> str:
-    """The page on the commands."""
-    import click
+    """The page on the commands, as Typer describes them."""
     import typer
+    from typer.cli import get_docs_for_click
 
     from dynsim.cli.commands import app
 
-    parts = [CLI_INTRODUCTION]
-
-    def describe(command: Any, context: Any, depth: int) -> None:
-        parts.append(f"{'#' * depth} {context.command_path}\n\n")
-        parts.append(f"{_markup(command.help or '')}\n\n")
-        if isinstance(command, click.Group):
-            for name in command.list_commands(context):
-                inner = command.get_command(context, name)
-                if inner is not None and not inner.hidden:
-                    describe(inner, click.Context(inner, info_name=name, parent=context), depth + 1)
-            return
-        parts.append(f"```text\n{context.command_path} {' '.join(command.collect_usage_pieces(context))}\n```\n\n")
-        rows = []
-        for parameter in command.params:
-            if getattr(parameter, "hidden", False) or parameter.name == "help":
-                continue
-            if parameter.param_type_name == "argument":
-                label, text = f"`{parameter.make_metavar(context)}`", getattr(parameter, "help", "") or ""
-            else:
-                label, text = ", ".join(f"`{option}`" for option in parameter.opts), parameter.help or ""
-                if parameter.is_flag is False:
-                    label += f" `{parameter.make_metavar(context)}`"
-            rows.append(f"| {label.replace('|', chr(92) + '|')} | {_markup(text)} |")
-        if rows:
-            parts.append("| | |\n|---|---|\n" + "\n".join(rows) + "\n\n")
-        if command.epilog:
-            example = command.epilog.removeprefix("Example: ")
-            parts.append(f"Example:\n\n```text\n{example}\n```\n\n")
-
-    root = typer.main.get_command(app)
-    describe(root, click.Context(root, info_name="dynsim"), 2)
-    return "".join(parts)
-
-
-def _markup(text: str) -> str:
-    return text.replace("\n\n", "<br>").replace("\n", " ").replace("|", "\\|").replace("<br>", "\n\n").strip()
+    command = typer.main.get_command(app)
+    context = command.context_class(command, info_name="dynsim")
+    text = get_docs_for_click(obj=command, ctx=context, name="dynsim", title="Commands")
+    # Angle brackets outside of code are tags.
+    return re.sub(r"^Example: (.*)$", r"Example: `\1`", text, flags=re.MULTILINE)
