@@ -23,7 +23,6 @@ from dynsim.cli.app import (
     parsed_overrides,
 )
 from dynsim.cli.display import drawing, errors, say, sweep_progress
-from dynsim.config.problems import suggest
 from dynsim.errors import ScenarioError, SimulationStopped
 from dynsim.system.terminal import escaped
 
@@ -185,6 +184,7 @@ def _load_for_the_end(samples: bool, figures: bool) -> None:
 def _draw(
     name: str, rows: Sequence[Row], plan: Plan, folder: Path, quiet: bool, format_: str, plotted: Sequence[str] = ()
 ) -> None:
+    from dynsim.config.problems import suggest
     from dynsim.draw.figures.sweep import Sweep, draw
     from dynsim.studies.journal import OK
     from dynsim.studies.sweep import TABLES

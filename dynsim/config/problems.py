@@ -10,6 +10,7 @@ import itertools
 import re
 import types
 import typing
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -90,12 +91,12 @@ def explain(error: ValidationError, data: Any, origin: Origin, unknown: Sequence
     shown = texts[:UNKNOWN_SHOWN] + (["and more"] if len(texts) > UNKNOWN_SHOWN else [])
     problems = error.errors(include_url=False, include_input=False)
     others: dict[str, str] = {}
+    # Of a list of fixed length: one problem for every entry that it lacks.
+    alike = Counter((problem["type"], problem["loc"][:-1]) for problem in problems)
     for problem in problems:
         if problem["type"] == "extra_forbidden":
             continue
-        # Of a list of fixed length: one problem for every entry that it lacks.
-        alike = sum(one["type"] == problem["type"] and one["loc"][:-1] == problem["loc"][:-1] for one in problems)
-        keys, given, text = _problem(problem, data, alike)
+        keys, given, text = _problem(problem, data, alike[problem["type"], problem["loc"][:-1]])
         key = dotted(keys)
         # A misspelt key also makes the right one missing.
         misspelt = problem["type"] == "missing" and any(f"did you mean {str(keys[-1])!r}?" in one for one in texts)
