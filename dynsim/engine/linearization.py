@@ -26,7 +26,7 @@ from dynsim.dynamics.state import block
 from dynsim.dynamics.tree import loads as kl
 from dynsim.engine.attended import copied
 from dynsim.engine.prepare import Prepared
-from dynsim.errors import ScenarioError, shown
+from dynsim.errors import ScenarioError, brief
 from dynsim.integrators import run as ki
 from dynsim.integrators.output import fill_output
 
@@ -233,7 +233,7 @@ def _chosen(what: str, names: Sequence[str], families: dict[str, dict[str, Any]]
             near = difflib.get_close_matches(str(name), every, 1)
             hint = f"; did you mean {near[0]!r}?" if near else ""
             raise ScenarioError(
-                f"no {what} {shown(name)}{hint}; name a family ({', '.join(families)}) or one of it, such as "
+                f"no {what} {brief(name)}{hint}; name a family ({', '.join(families)}) or one of it, such as "
                 f"{next(iter(every))!r}"
             )
     return chosen

@@ -18,7 +18,7 @@ from dynsim.errors import ModelError
 from dynsim.model.description import Array, Contact, Link, Robot
 from dynsim.model.drives import TorqueSource
 from dynsim.record.quaternion import of_matrix
-from dynsim.record.scene import HERE, Shape, Surface
+from dynsim.record.scene import HERE, SceneSurface, Shape
 from dynsim.record.urdf_text import Element, numbers, xml_text
 
 # MuJoCo refuses bodies without mass or inertia; this much of both [kg, kg m²] is no number of any robot.
@@ -30,7 +30,7 @@ _BALL = ["ball_x", "ball_y", "ball_z"]
 
 
 def write_mjcf(
-    robot: Robot, contacts: Sequence[Contact], surfaces: Sequence[Surface], damping: Array, armature: Array
+    robot: Robot, contacts: Sequence[Contact], surfaces: Sequence[SceneSurface], damping: Array, armature: Array
 ) -> str:
     """Write the bodies, joints, torques and looks of a robot as MJCF text.
 
@@ -49,8 +49,8 @@ def write_mjcf(
     root = Element("mujoco", model=robot.name)
     ElementTree.SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
     ElementTree.SubElement(root, "option", timestep="0.001", integrator="implicitfast", gravity=numbers(robot.gravity))
-    shown = ElementTree.SubElement(ElementTree.SubElement(root, "default"), "geom")
-    shown.attrib.update(contype="0", conaffinity="0", group="1", mass="0")
+    looks = ElementTree.SubElement(ElementTree.SubElement(root, "default"), "geom")
+    looks.attrib.update(contype="0", conaffinity="0", group="1", mass="0")
     world = ElementTree.SubElement(root, "worldbody")
     ElementTree.SubElement(world, "light", pos="0 0 5", dir="0 0 -1", directional="true")
     for surface in surfaces:
@@ -155,7 +155,7 @@ def _add_shapes(body: Element, shapes: Sequence[Shape]) -> None:
         ElementTree.SubElement(body, "geom", geom)
 
 
-def _add_surface(world: Element, surface: Surface) -> None:
+def _add_surface(world: Element, surface: SceneSurface) -> None:
     geom = {"name": f"surface_{surface.name}", "rgba": "0.7 0.7 0.7 0.5"}
     # What the free side is inside of would hide it.
     if surface.kind == "plane":
