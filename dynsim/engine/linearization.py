@@ -220,7 +220,7 @@ class _Frozen:
         }
 
 
-def _chosen(what: str, names: Sequence[str], families: dict[str, dict[str, Any]]) -> dict[str, Any]:
+def _chosen(kind: str, names: Sequence[str], families: dict[str, dict[str, Any]]) -> dict[str, Any]:
     """The entries that names stand for: all of a family, all of a body or point in it, or one."""
     if isinstance(names, str):
         names = (names,)
@@ -233,7 +233,7 @@ def _chosen(what: str, names: Sequence[str], families: dict[str, dict[str, Any]]
             near = difflib.get_close_matches(str(name), every, 1)
             hint = f"; did you mean {near[0]!r}?" if near else ""
             raise ScenarioError(
-                f"no {what} {brief(name)}{hint}; name a family ({', '.join(families)}) or one of it, such as "
+                f"no {kind} {brief(name)}{hint}; name a family ({', '.join(families)}) or one of it, such as "
                 f"{next(iter(every))!r}"
             )
     return chosen

@@ -69,8 +69,8 @@ class _Bag:
         return self._types.types[kind](**fields)
 
     def time(self, nanoseconds: int) -> Any:
-        seconds, rest = divmod(nanoseconds, 1_000_000_000)
-        return self.make("builtin_interfaces/msg/Time", sec=seconds, nanosec=rest)
+        seconds, nanosec = divmod(nanoseconds, 1_000_000_000)
+        return self.make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanosec)
 
     def header(self, nanoseconds: int, frame: str) -> Any:
         return self.make("std_msgs/msg/Header", stamp=self.time(nanoseconds), frame_id=frame)
