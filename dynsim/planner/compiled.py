@@ -108,7 +108,9 @@ class Work(NamedTuple):
     step: np.ndarray  # (N,)
     B: np.ndarray  # (n, 2 n + c)
     column: np.ndarray  # (2 n + c,) int
-    start: np.ndarray  # (K + 1,) int, where the unknowns of each knot begin
+    start: np.ndarray  # (K,) int, where the unknowns of each knot's posture begin; the forces of its instants follow
+    pressed: np.ndarray  # (E,) int, where the forces of each instant begin
+    skyline: np.ndarray  # (N,) int, first column of each row of H that is not zero
     working: np.ndarray  # (W, 3) int: constraints of the step that have been violated: kind, knot or instant, which
     bound: np.ndarray  # (W,)
     normals: np.ndarray  # (W, N) their rows, then L⁻¹ times them
@@ -119,6 +121,7 @@ class Work(NamedTuple):
     small: np.ndarray  # (W, W)
     small_right: np.ndarray  # (W,)
     index: np.ndarray  # (W,) int
+    small_skyline: np.ndarray  # (W,) int
 
 
 @internal_kernel
@@ -402,12 +405,19 @@ def force_derivatives(arm: Arm, points: Points, work: Work, v, f, i, e):
 
 
 @internal_kernel
-def factor(A, n):
-    """Cholesky's L of the leading n × n part of A, in its lower half; pivots that are lost stop moving anything."""
+def factor(A, skyline, n):
+    """Cholesky's L of the leading n × n part of A, in its lower half; pivots that are lost stop moving anything.
+
+    skyline : (n,) int, out: first column of each row that is not zero; left of it L has zeros too
+    """
     for i in range(n):
-        for j in range(i + 1):
+        first = 0
+        while first < i and A[i, first] == 0.0:
+            first += 1
+        skyline[i] = first
+        for j in range(first, i + 1):
             s = A[i, j]
-            for k in range(j):
+            for k in range(max(first, skyline[j]), j):
                 s -= A[i, k] * A[j, k]
             if i == j:
                 A[i, i] = math.sqrt(s) if s > 1e-300 else 1e150
@@ -416,23 +426,22 @@ def factor(A, n):
 
 
 @internal_kernel
-def forward(L, b, n):
+def forward(L, skyline, b, n):
     """b ← L⁻¹ b."""
     for i in range(n):
         s = b[i]
-        for k in range(i):
+        for k in range(skyline[i], i):
             s -= L[i, k] * b[k]
         b[i] = s / L[i, i]
 
 
 @internal_kernel
-def backward(L, b, n):
+def backward(L, skyline, b, n):
     """b ← L⁻ᵀ b."""
     for i in range(n - 1, -1, -1):
-        s = b[i]
-        for k in range(i + 1, n):
-            s -= L[k, i] * b[k]
-        b[i] = s / L[i, i]
+        b[i] /= L[i, i]
+        for k in range(skyline[i], i):
+            b[k] -= L[i, k] * b[i]
 
 
 @internal_kernel
@@ -441,7 +450,7 @@ def nonnegative(work: Work, G, h, x, m):
 
     G: (m, m) positive semidefinite, with room for a little on its diagonal.
     """
-    passive, small, right, index = work.passive, work.small, work.small_right, work.index
+    passive, small, right, index, skyline = work.passive, work.small, work.small_right, work.index, work.small_skyline
     scale = 1e-300
     for i in range(m):
         scale = max(scale, abs(h[i]))
@@ -472,9 +481,9 @@ def nonnegative(work: Work, G, h, x, m):
                 for b in range(a + 1):
                     small[a, b] = G[index[a], index[b]]
                 small[a, a] *= 1.0 + 1e-12
-            factor(small, count)
-            forward(small, right, count)
-            backward(small, right, count)
+            factor(small, skyline, count)
+            forward(small, skyline, right, count)
+            backward(small, skyline, right, count)
             share = 1.0
             for a in range(count):
                 i = index[a]
@@ -588,9 +597,9 @@ def retract(arm: Arm, points: Points, course: Course, work: Work, Q, steps, tole
                         z += rows[r, j] * rows[s, j]
                     A[r, s] = z
                 A[r, r] += damping
-            factor(A, m)
-            forward(A, right, m)
-            backward(A, right, m)
+            factor(A, work.small_skyline, m)
+            forward(A, work.small_skyline, right, m)
+            backward(A, work.small_skyline, right, m)
             most = 1e-300
             for j in range(n):
                 z = 0.0
@@ -660,15 +669,25 @@ CLEAR, LOWER, UPPER, FORCE = 0, 1, 2, 3
 
 
 @internal_kernel
+def unknowns(work: Work):
+    """How many unknowns a step has."""
+    last = work.start.shape[0] - 1
+    N = work.start[last] + work.free[last]
+    for e in range(work.pressed.shape[0]):
+        N = max(N, work.pressed[e] + work.by_f.shape[2])
+    return N
+
+
+@internal_kernel
 def add_row(arm: Arm, points: Points, work: Work, m, kind, at, which, bound):
     """Constraint m of the step: its row over the unknowns, and its bound."""
-    n, N = arm.parent.shape[0], work.start[work.start.shape[0] - 1] + work.by_f.shape[0] * work.by_f.shape[2]
+    n, N = arm.parent.shape[0], unknowns(work)
     row = work.normals[m]
     work.working[m, 0], work.working[m, 1], work.working[m, 2], work.bound[m] = kind, at, which, bound
     for i in range(N):
         row[i] = 0.0
     if kind == FORCE:
-        row[work.start[work.start.shape[0] - 1] + at * work.by_f.shape[2] + which] = 1.0
+        row[work.pressed[at] + which] = 1.0
         return
     first = n - work.free[at]
     for d in range(work.free[at]):
@@ -709,12 +728,16 @@ def prepare(arm: Arm, points: Points, course: Course, work: Work, Q, weight, pul
     n, c = arm.parent.shape[0], points.friction.shape[0]
     K, E = Q.shape[0], course.knot.shape[0]
     H, g, B, column, start = work.H, work.g, work.B, work.column, work.start
-    start[0] = 0
+    # Unknowns that meet in the model are near each other, so that its matrix is a band.
+    N, behind = 0, 0
     for k in range(K):
         work.free[k] = split(work, k, constraint_rows(course, points, work, k))
-        start[k + 1] = start[k] + work.free[k]
-    forces = start[K]
-    N = forces + E * c
+        start[k] = N
+        N += work.free[k]
+        while behind < E and course.knot[behind] == k:
+            work.pressed[behind] = N
+            N += c
+            behind += 1
     for i in range(N):
         g[i] = 0.0
         for j in range(N):
@@ -738,7 +761,7 @@ def prepare(arm: Arm, points: Points, course: Course, work: Work, Q, weight, pul
                     B[r, m] = z
                 m += 1
         for i in range(c):
-            column[m] = forces + e * c + i
+            column[m] = work.pressed[e] + i
             for r in range(n):
                 B[r, m] = work.by_f[e, r, i]
             m += 1
@@ -771,8 +794,12 @@ def prepare(arm: Arm, points: Points, course: Course, work: Work, Q, weight, pul
                             z += work.basis[k, j, first + d] * work.basis[l, j, other + b]
                         if start[k] + d >= start[l] + b:
                             H[start[k] + d, start[l] + b] += course.smooth[k, l] * z
-    for i in range(N):
-        H[i, i] += damping if i < forces else 1e-9
+    for k in range(K):
+        for d in range(work.free[k]):
+            H[start[k] + d, start[k] + d] += damping
+    for e in range(E):
+        for i in range(c):
+            H[work.pressed[e] + i, work.pressed[e] + i] += 1e-9
     return N
 
 
@@ -786,12 +813,12 @@ def step(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, N, c
     """
     n, c, P = arm.parent.shape[0], points.friction.shape[0], points.body.shape[0]
     K, E = Q.shape[0], course.knot.shape[0]
-    H, g, x, forces = work.H, work.g, work.x, work.start[K]
-    factor(H, N)
+    H, g, x, skyline = work.H, work.g, work.x, work.skyline
+    factor(H, skyline, N)
     # x_0 = −H⁻¹ g, kept as L⁻¹ of it.
     for i in range(N):
         x[i] = -g[i]
-    forward(H, x, N)
+    forward(H, skyline, x, N)
     for a in range(work.multiplier.shape[0]):
         work.multiplier[a] = 0.0
     m, most = 0, work.bound.shape[0]
@@ -803,12 +830,12 @@ def step(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, N, c
             for a in range(m):
                 if work.multiplier[a] != 0.0:
                     full[i] += work.multiplier[a] * work.normals[a, i]
-        backward(H, full, N)
+        backward(H, skyline, full, N)
         before = m
         for e in range(E):
             for i in range(c):
                 slack = least - F[e, i]
-                if full[forces + e * c + i] < slack - 1e-9 and m < most and not known(work, before, FORCE, e, i):
+                if full[work.pressed[e] + i] < slack - 1e-9 and m < most and not known(work, before, FORCE, e, i):
                     add_row(arm, points, work, m, FORCE, e, i, slack)
                     m += 1
         for k in range(K):
@@ -834,7 +861,7 @@ def step(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, N, c
         if m == before:
             break
         for a in range(before, m):
-            forward(H, work.normals[a], N)
+            forward(H, skyline, work.normals[a], N)
             z = 0.0
             for i in range(N):
                 z += work.normals[a, i] * x[i]
@@ -856,5 +883,5 @@ def step(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, N, c
             change[k, j] = along(arm, work, full, k, j)
     for e in range(E):
         for i in range(c):
-            dF[e, i] = full[forces + e * c + i]
+            dF[e, i] = full[work.pressed[e] + i]
     return fall

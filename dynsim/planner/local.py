@@ -154,9 +154,9 @@ def workspace(n: int, c: int, P: int, K: int, E: int, h: int) -> Work:
         bend=zeros(c, 3, 3), shift=zeros(c, n, 3), slip=zeros(c, 8), force=zeros(c, 3), turn=zeros(n, 3),
         drift=zeros(n, 3), vector=zeros(12, 3), basis=zeros(K, n, n), free=ints(K), rows=zeros(R, n),
         normal_matrix=zeros(R, R), right=zeros(R), H=zeros(N, N), g=zeros(N), x=zeros(max(N, n)), step=zeros(N),
-        B=zeros(n, K * n + c), column=ints(K * n + c), start=ints(K + 1), working=ints(W, 3), bound=zeros(W),
+        B=zeros(n, K * n + c), column=ints(K * n + c), start=ints(K), pressed=ints(E), skyline=ints(N), working=ints(W, 3), bound=zeros(W),
         normals=zeros(W, N), dual=zeros(W, W), dual_right=zeros(W), multiplier=zeros(W), passive=ints(W),
-        small=zeros(W, W), small_right=zeros(W), index=ints(W),
+        small=zeros(W, W), small_right=zeros(W), index=ints(W), small_skyline=ints(max(W, R)),
     )  # fmt: skip
 
 

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from dynsim.cli.app import app
 from dynsim.errors import ScenarioError
-from dynsim.planner.scenes import scene
+from support.planner_scenes import scene
 from dynsim.scenario import load_scenario, to_yaml, variant_names
 
 import dynsim.cli.commands  # noqa: F401  # isort: skip

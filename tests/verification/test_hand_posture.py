@@ -8,7 +8,7 @@ import pytest
 import dynsim
 from dynsim.compile.hand_posture import turn_error
 from dynsim.errors import ModelError, UnreachableReference
-from dynsim.planner.scenes import scene
+from support.planner_scenes import scene
 from dynsim.scenario import build
 from dynsim.scenario.reading import scenario_from_resolved
 

@@ -18,7 +18,7 @@ from dynsim.planner.compiled import Arm, Course, Points
 from dynsim.planner.dense import CHARGED
 from dynsim.planner.local import Problem
 from dynsim.planner.problem import Options, task
-from dynsim.planner.scenes import scene, scene_scenario
+from support.planner_scenes import scene, scene_scenario
 from dynsim.planner.search import Search
 from dynsim.planner.verify import Tolerances, Verifier
 from dynsim.scenario.reading import scenario_from_resolved

@@ -1,4 +1,6 @@
-"""Random scenes for the planner, and the kept study of them: ``python -m dynsim.planner.scenes --out results/planner``.
+"""Random scenes for the planner, and the kept study of them.
+
+    PYTHONPATH=tests python -m support.planner_scenes --out results/planner
 
 Arms of 7 to 10 joints whose hand goes there and back along a short way, over a floor, a pipe, a box, or with a joint
 about a third axis. Nobody has tuned anything on a scene: its seed is its number.
