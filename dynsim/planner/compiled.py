@@ -26,6 +26,16 @@ from dynsim.jit.kernel import internal_kernel, kernel
 SLIP_SCALE = 2e-3
 # What is lost of a row of constraints that others imply.
 DEPENDENT = 1e-9
+# Distance from hand path and surfaces that counts as none [m].
+ON = 1e-9
+# First damping of the steps beside the curvature of the heat, and its bounds, over the largest of that curvature.
+DAMPING, DAMPING_MIN, DAMPING_MAX = 1e-3, 1e-7, 1e6
+# Longest step of a coordinate in one turn [rad or m].
+REACH = 0.6
+# Torques beyond this part of their limits cost extra, so many times what they cost as heat.
+NEAR_LIMIT, DEAR = 0.98, 100.0
+# Exponent of the mean that stands for the peak of the torques.
+PEAK_POWER = 12
 # Of multipliers and forces, relative to their scale: nothing is gained by letting go of a bound.
 NO_GAIN = 1e-11
 
@@ -122,6 +132,12 @@ class Work(NamedTuple):
     small_right: np.ndarray  # (W,)
     index: np.ndarray  # (W,) int
     small_skyline: np.ndarray  # (W,) int
+    rate: np.ndarray  # (E, n) velocities of the instants
+    weight: np.ndarray  # (E, n) of the squares of torques in the model of the cost
+    pull: np.ndarray  # (E, n) half the gradient of the cost by torques, over the share of time
+    change: np.ndarray  # (K, n) of postures in a step
+    trial: np.ndarray  # (K, n)
+    trial_forces: np.ndarray  # (E, c)
 
 
 @internal_kernel
@@ -267,8 +283,8 @@ def knot_of_first(course: Course, e):
     return e == 0 or course.knot[e] != course.knot[e - 1]
 
 
-@kernel
-def evaluate(arm: Arm, points: Points, course: Course, work: Work, Q, V, F, derivatives):
+@internal_kernel
+def statics(arm: Arm, points: Points, course: Course, work: Work, Q, V, F, derivatives):
     """Torques, and with ``derivatives`` those of them; geometry of all knots. Q: (K, n), V: (E, n), F: (E, c).
 
     ∂τ/∂q_r = H_jr − Σ_c J_cj · ∂F_c/∂q_r − Σ_c (a_j × s_cr) · F_c,
@@ -335,6 +351,12 @@ def evaluate(arm: Arm, points: Points, course: Course, work: Work, Q, V, F, deri
         if derivatives:
             for i in range(c):
                 force_derivatives(arm, points, work, v, F[e, i], i, e)
+
+
+@kernel
+def evaluate(arm: Arm, points: Points, course: Course, work: Work, Q, V, F, derivatives):
+    """See :func:`statics`: what several kernels call is none of its own."""
+    statics(arm, points, course, work, Q, V, F, derivatives)
 
 
 @internal_kernel
@@ -503,12 +525,9 @@ def nonnegative(work: Work, G, h, x, m):
                     x[i], passive[i] = 0.0, 0
 
 
-@kernel
-def least_heat(arm: Arm, work: Work, weight, least, F):
-    """Normal forces of least heat of each instant after :func:`evaluate` with forces of zero, at least ``least``.
-
-    weight : (E, n) of the squared torques
-    """
+@internal_kernel
+def least_heat(arm: Arm, work: Work, least, F):
+    """Normal forces of least heat of each instant after :func:`statics` with forces of zero, at least ``least``."""
     n, c = work.by_f.shape[1], work.by_f.shape[2]
     G, h, x = work.dual, work.dual_right, work.multiplier
     for e in range(F.shape[0]):
@@ -516,19 +535,98 @@ def least_heat(arm: Arm, work: Work, weight, least, F):
             for k in range(c):
                 s = 0.0
                 for j in range(n):
-                    s += weight[e, j] * work.by_f[e, j, i] * work.by_f[e, j, k]
+                    s += arm.heat[j] * work.by_f[e, j, i] * work.by_f[e, j, k]
                 G[i, k] = s
             G[i, i] += 1e-12
         for i in range(c):
             s = 0.0
             for j in range(n):
-                s -= weight[e, j] * work.by_f[e, j, i] * work.torque[e, j]
+                s -= arm.heat[j] * work.by_f[e, j, i] * work.torque[e, j]
             for k in range(c):
                 s -= G[i, k] * least
             h[i] = s
         nonnegative(work, G, h, x, c)
         for i in range(c):
             F[e, i] = least + x[i]
+
+
+@internal_kernel
+def equilibrium(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, forces):
+    """Torques and derivatives of postures, with normal forces of least heat where ``forces`` asks for those, in F."""
+    for e in range(F.shape[0]):
+        for i in range(F.shape[1]):
+            F[e, i] = 0.0 if forces else F[e, i]
+        for j in range(Q.shape[1]):
+            z = 0.0
+            for k in range(Q.shape[0]):
+                z += course.chord[e, k] * Q[k, j]
+            work.rate[e, j] = z
+    if forces and F.shape[1] > 0:
+        statics(arm, points, course, work, Q, work.rate, F, False)
+        least_heat(arm, work, least, F)
+    statics(arm, points, course, work, Q, work.rate, F, True)
+
+
+@kernel
+def settle(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, forces):
+    """See :func:`equilibrium`."""
+    equilibrium(arm, points, course, work, Q, F, least, forces)
+
+
+@internal_kernel
+def costs(arm: Arm, course: Course, work: Work, Q, peak):
+    """Cost and heat [W] of the torques in the workspace; weights and pull of the cost's quadratic model.
+
+    Torques near their limits are dear; ``peak`` : cost of the greatest torque [W/(N m)], by a mean of high power.
+    """
+    E, n = work.torque.shape
+    heat, cost, largest, mean = 0.0, 0.0, 0.0, 0.0
+    for e in range(E):
+        for j in range(n):
+            largest = max(largest, abs(work.torque[e, j]))
+    for e in range(E):
+        for j in range(n):
+            torque, w, share = work.torque[e, j], arm.heat[j], course.share[e]
+            heat += share * w * torque * torque
+            work.weight[e, j], work.pull[e, j] = w, w * torque
+            over = abs(torque) - NEAR_LIMIT * arm.greatest[j]
+            if over > 0.0:
+                cost += share * DEAR * w * over * over
+                work.weight[e, j] += DEAR * w
+                work.pull[e, j] += DEAR * w * math.copysign(over, torque)
+            if peak > 0.0 and largest > 0.0:
+                mean += (abs(torque) / largest) ** PEAK_POWER / (E * n)
+    if mean > 0.0:
+        cost += peak * largest * mean ** (1.0 / PEAK_POWER)
+        for e in range(E):
+            for j in range(n):
+                torque = abs(work.torque[e, j])
+                slope = peak * mean ** (1.0 / PEAK_POWER - 1.0) * (torque / largest) ** (PEAK_POWER - 1) / (E * n)
+                slope *= 0.5 / course.share[e]
+                work.pull[e, j] += math.copysign(slope, work.torque[e, j])
+                work.weight[e, j] += (PEAK_POWER - 1) * slope / max(torque, 1e-9)
+    for k in range(Q.shape[0]):
+        for l in range(Q.shape[0]):
+            if course.smooth[k, l] != 0.0:
+                cost += course.smooth[k, l] * dot(Q[k], Q[l])
+    return cost + heat, heat
+
+
+@internal_kernel
+def copy(a, out):
+    """Entries of a matrix to another one."""
+    for i in range(a.shape[0]):
+        for j in range(a.shape[1]):
+            out[i, j] = a[i, j]
+
+
+@internal_kernel
+def dot(u, v):
+    """u · v."""
+    z = 0.0
+    for i in range(u.shape[0]):
+        z += u[i] * v[i]
+    return z
 
 
 @internal_kernel
@@ -544,8 +642,8 @@ def constraint_rows(course: Course, points: Points, work: Work, k):
     return h + c
 
 
-@kernel
-def retract(arm: Arm, points: Points, course: Course, work: Work, Q, steps, tolerance, reach):
+@internal_kernel
+def put_back(arm: Arm, points: Points, course: Course, work: Work, Q, steps, tolerance, reach):
     """Put the postures of all knots onto hand and braces, clear of the rest and within limits: least change.
 
     Damped Gauss–Newton's steps on what is violated. Returns what is left at the worst knot [m].
@@ -611,6 +709,12 @@ def retract(arm: Arm, points: Points, course: Course, work: Work, Q, steps, tole
                 Q[k, j] += work.x[j] * min(1.0, reach / most)
         worst = max(worst, left)
     return worst
+
+
+@kernel
+def retract(arm: Arm, points: Points, course: Course, work: Work, Q, steps, tolerance, reach):
+    """See :func:`put_back`."""
+    return put_back(arm, points, course, work, Q, steps, tolerance, reach)
 
 
 @internal_kernel
@@ -718,13 +822,13 @@ def along(arm: Arm, work: Work, x, k, j):
     return z
 
 
-@kernel
-def prepare(arm: Arm, points: Points, course: Course, work: Work, Q, weight, pull, damping):
+@internal_kernel
+def prepare(arm: Arm, points: Points, course: Course, work: Work, Q, damping):
     """Matrix and gradient of Gauss and Newton's model, over what hand and braces leave free of each knot, and forces.
 
-    weight : (E, n) of the squares of torques; pull : (E, n) half their gradients
     Returns the number of unknowns.
     """
+    weight, pull = work.weight, work.pull
     n, c = arm.parent.shape[0], points.friction.shape[0]
     K, E = Q.shape[0], course.knot.shape[0]
     H, g, B, column, start = work.H, work.g, work.B, work.column, work.start
@@ -803,13 +907,13 @@ def prepare(arm: Arm, points: Points, course: Course, work: Work, Q, weight, pul
     return N
 
 
-@kernel
-def step(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, N, change, dF):
+@internal_kernel
+def step(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, N):
     """The step of least model value after :func:`prepare`, which keeps clearances, limits and least forces.
 
     The matrix is factored in place. Constraints are taken in when a step violates them: dual problems
-    min ½ λᵀ A H⁻¹ Aᵀ λ − λ·(b − A x_0) of those so far. Returns twice the fall of the model, −g·x − λ·b;
-    change : (K, n), dF : (E, c) of the step.
+    min ½ λᵀ A H⁻¹ Aᵀ λ − λ·(b − A x_0) of those so far. Returns twice the fall of the model, −g·x − λ·b; postures
+    change by ``work.change``.
     """
     n, c, P = arm.parent.shape[0], points.friction.shape[0], points.body.shape[0]
     K, E = Q.shape[0], course.knot.shape[0]
@@ -880,8 +984,59 @@ def step(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, N, c
         fall -= work.multiplier[a] * work.bound[a]
     for k in range(K):
         for j in range(n):
-            change[k, j] = along(arm, work, full, k, j)
-    for e in range(E):
-        for i in range(c):
-            dF[e, i] = full[work.pressed[e] + i]
+            work.change[k, j] = along(arm, work, full, k, j)
     return fall
+
+
+@kernel
+def solve(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, peak, turns, tolerance):
+    """Postures Q, (K, n), and forces F, (E, c), of least cost, in place, from postures near by.
+
+    Returns cost and heat [W] and steps taken; NaN where the start cannot be put onto path and surfaces.
+    """
+    if put_back(arm, points, course, work, Q, 60, ON, 2.0 * REACH / 3.0) > 2.0 * ON:
+        return math.nan, math.nan, 0
+    equilibrium(arm, points, course, work, Q, F, least, True)
+    cost, heat = costs(arm, course, work, Q, peak)
+    damping, quiet, taken, ratio = DAMPING, 0, 0, 0.0
+    scale = max(cost, 0.1)
+    trial, forces = work.trial, work.trial_forces
+    while taken < turns:
+        taken += 1
+        before = cost
+        while damping < DAMPING_MAX:
+            N = prepare(arm, points, course, work, Q, damping * scale + 1e-6)
+            fall = step(arm, points, course, work, Q, F, least, N)
+            if not fall > 0.0 or fall < tolerance * 0.1 * max(cost, 1e-3):
+                break
+            longest = 1e-300
+            for k in range(Q.shape[0]):
+                for j in range(Q.shape[1]):
+                    longest = max(longest, abs(work.change[k, j]))
+            share = min(1.0, REACH / longest)
+            for k in range(Q.shape[0]):
+                for j in range(Q.shape[1]):
+                    trial[k, j] = Q[k, j] + share * work.change[k, j]
+            if put_back(arm, points, course, work, trial, 12, ON, 2.0 * REACH / 3.0) <= 2.0 * ON:
+                equilibrium(arm, points, course, work, trial, forces, least, True)
+                there, warmth = costs(arm, course, work, trial, peak)
+                if there < cost:
+                    ratio = (cost - there) / (fall * share * (2.0 - share))
+                    cost, heat = there, warmth
+                    copy(trial, Q)
+                    copy(forces, F)
+                    break
+            damping *= 8.0
+            equilibrium(arm, points, course, work, Q, F, least, False)
+            costs(arm, course, work, Q, peak)
+        if not cost < before:
+            break
+        if ratio > 0.7:
+            damping = max(damping / 6.0, DAMPING_MIN)
+        elif ratio < 0.25:
+            damping *= 3.0
+        quiet = quiet + 1 if before - cost < tolerance * max(cost, 1e-3) else 0
+        if quiet >= 2:
+            break
+    equilibrium(arm, points, course, work, Q, F, least, False)
+    return cost, heat, taken

@@ -15,7 +15,7 @@ from dynsim.dynamics.contact.braces import tables as kb
 from dynsim.errors import ModelError
 from dynsim.jit.kernel import reals
 from dynsim.model.description import Array, Contact
-from dynsim.planner.local import ON
+from dynsim.planner.compiled import ON
 from dynsim.planner.problem import Candidate, Task
 from dynsim.scenario import build
 

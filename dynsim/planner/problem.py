@@ -112,7 +112,7 @@ class Task:
     friction: float
 
     @cached_property
-    def _courses(self) -> dict[int, tuple[Course, Array]]:
+    def _courses(self) -> dict[int, Course]:
         """Those that were asked for, by their number of knots."""
         return {}
 
@@ -194,8 +194,8 @@ class Task:
             friction=reals(np.full(len(braces), self.friction)),
         )
 
-    def course(self, count: int) -> tuple[Course, Array]:
-        """Knots and instants of so many knots, and the smoothness S of their postures.
+    def course(self, count: int) -> Course:
+        """Knots and instants of so many knots.
 
         Velocities are chords between neighbouring knots, never slopes of a spline through them: those an optimiser
         would make vanish exactly at the knots, and slide in between.
@@ -232,23 +232,21 @@ class Task:
             bend = np.roll(np.eye(count), 1, axis=1) - 2.0 * np.eye(count) + np.roll(np.eye(count), -1, axis=1)
         else:
             bend = np.diff(np.eye(count), 2, axis=0)
-        smooth = np.sqrt(SMOOTHNESS) * bend
-        course = Course(
+        return Course(
             target=reals(self.targets(times)),
             knot=integers([k for k, _, _ in instants]),
             chord=reals([row for _, row, _ in instants]),
             share=reals([share for _, _, share in instants]),
-            smooth=reals(smooth.T @ smooth),
+            smooth=reals(SMOOTHNESS * bend.T @ bend),
         )
-        return course, smooth
 
     def problem(self, braces: Sequence[Candidate], count: int) -> Problem:
         """Of one set of braces at so many knots; its targets are its own."""
         if count not in self._courses:
             self._courses[count] = self.course(count)
-        course, smooth = self._courses[count]
+        course = self._courses[count]
         course = course._replace(target=course.target.copy())
-        return Problem(self.arm.tables, self.points(braces), course, self.options.min_N, smooth, peak=self.options.peak)
+        return Problem(self.arm.tables, self.points(braces), course, self.options.min_N, self.options.peak)
 
 
 def task(scenario: Scenario, options: Options) -> Task:

@@ -11,8 +11,8 @@ import numpy as np
 from dynsim.model.description import Array
 from dynsim.model.drives import Motor
 from dynsim.planner import planned_scenario
+from dynsim.planner.compiled import ON
 from dynsim.planner.dense import Dense, nearest
-from dynsim.planner.local import ON
 from dynsim.planner.problem import Candidate, Task
 from dynsim.record import Record
 from dynsim.record.measures import hand_target

@@ -6,11 +6,11 @@ import json
 from pathlib import Path
 
 import pytest
+from support.planner_scenes import scene
 from typer.testing import CliRunner
 
 from dynsim.cli.app import app
 from dynsim.errors import ScenarioError
-from support.planner_scenes import scene
 from dynsim.scenario import load_scenario, to_yaml, variant_names
 
 import dynsim.cli.commands  # noqa: F401  # isort: skip

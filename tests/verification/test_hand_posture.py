@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.planner_scenes import scene
 
 import dynsim
 from dynsim.compile.hand_posture import turn_error
 from dynsim.errors import ModelError, UnreachableReference
-from support.planner_scenes import scene
 from dynsim.scenario import build
 from dynsim.scenario.reading import scenario_from_resolved
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.planner_scenes import scene, scene_scenario
 
 import dynsim
 from dynsim.compile.bracing import Brace
@@ -18,7 +19,6 @@ from dynsim.planner.compiled import Arm, Course, Points
 from dynsim.planner.dense import CHARGED
 from dynsim.planner.local import Problem
 from dynsim.planner.problem import Options, task
-from support.planner_scenes import scene, scene_scenario
 from dynsim.planner.search import Search
 from dynsim.planner.verify import Tolerances, Verifier
 from dynsim.scenario.reading import scenario_from_resolved
@@ -85,7 +85,7 @@ def tree() -> tuple[Problem, np.ndarray, np.ndarray, np.ndarray]:
         smooth=reals(np.zeros((2, 2))),
     )
     Q, V = rng.normal(size=(2, n)), 0.01 * rng.normal(size=(3, n))
-    return Problem(arm, points, course, 0.5, np.zeros((1, 2))), Q, V, rng.uniform(1.0, 5.0, size=(3, c))
+    return Problem(arm, points, course, 0.5), Q, V, rng.uniform(1.0, 5.0, size=(3, c))
 
 
 def test_derivatives_are_those_of_differences(tree: tuple[Problem, np.ndarray, np.ndarray, np.ndarray]) -> None:
@@ -156,7 +156,6 @@ def heat_at(masses: list[float], link: int, share: float) -> tuple[float, float]
     local = problem.problem((brace,), 1)
     Q = reals(problem.arm.model.robot.initial)[None]
     F = local.forces(Q)
-    local.evaluate(Q, F)
     return local.heat(), float(F[0, 0])
 
 
