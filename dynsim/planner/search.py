@@ -76,7 +76,7 @@ class Search:
     """A search with its problems, which are made once for each set."""
 
     def __init__(self, task: Task, tell: Tell | None = None) -> None:
-        self.task, self.tally = task, Tally()
+        self.task, self.tally, self.kept = task, Tally(), KEPT
         self._tell = tell or (lambda text, share: None)
         self.single_heats: dict[Set, float] = {}
         self._rng = np.random.default_rng(task.options.seed)
@@ -310,7 +310,7 @@ class Search:
     def _refined(self, paths: Sequence[tuple[Set, Local]]) -> list[Planned]:
         """The best of whole paths at more knots, by the heat of their dense references."""
         found = []
-        for braces, coarse in sorted(paths, key=lambda item: item[1].cost)[:KEPT]:
+        for braces, coarse in sorted(paths, key=lambda item: item[1].cost)[: self.kept]:
             kept: list[Planned] = []
             local, why = coarse, ""
             for count in (self.path, *self.fine):

@@ -1,6 +1,9 @@
 """Random scenes for the planner, and the kept study of them.
 
     PYTHONPATH=tests python -m support.planner_scenes --out results/planner
+    PYTHONPATH=tests python -m support.planner_scenes --reference --out results/planner
+
+The second one takes a hundred times as long for each search: how far the answers of the first are from the best known.
 
 Arms of 7 to 10 joints whose hand goes there and back along a short way, over a floor, a pipe, a box, or with a joint
 about a third axis. Nobody has tuned anything on a scene: its seed is its number.
@@ -8,8 +11,9 @@ about a third axis. Nobody has tuned anything on a scene: its seed is its number
 
 from __future__ import annotations
 
+import argparse
 import json
-import sys
+import math
 import time as clock
 from pathlib import Path
 from typing import Any
@@ -17,11 +21,16 @@ from typing import Any
 import numpy as np
 
 from dynsim.planner.answer import plan_braces
+from dynsim.planner.dense import references
+from dynsim.planner.problem import Options, task
+from dynsim.planner.search import Search
 from dynsim.scenario import Scenario
 from dynsim.scenario.reading import scenario_from_resolved
 from dynsim.studies.processes import cores
 from dynsim.system.files import write_json
 
+# Of the reference: so many times the rounds, from postures of another seed.
+EFFORT, OTHER_SEED = 100, 1000
 KINDS = ("floor", "pipe", "box", "third_axis")
 PERIOD_S = 10.0
 LIMIT_DEG = [-120.0, 120.0]
@@ -122,60 +131,87 @@ def planned(seed: int, jobs: int) -> dict[str, Any]:
     """The plan of a scene in numbers: heat, sets, corners, and what it cost."""
     scenario, started = scene_scenario(seed), clock.perf_counter()
     cpu = clock.process_time()
-    searched: list[float] = []
+    searched: list[tuple[float, float]] = []
 
     def tell(text: str, share: float) -> None:
         if text == "verifying" and not searched:
-            searched.append(clock.process_time() - cpu)
+            searched.append((clock.process_time() - cpu, clock.perf_counter()))
 
     plan = plan_braces(scenario, along=along_of(seed), jobs=jobs, tell=tell)
-    best = plan.best
+    ended = clock.perf_counter()
     rows = []
     for size in plan.sizes:
         corners = () if size.verdict is None else size.verdict.corners
-        nominal = corners[0].heat_W if corners else float("nan")
-        rows.append(
-            {
-                "count": size.count,
-                "braces": size.label if size.planned else None,
-                "heat_W": round(size.heat, 5) if size.planned else None,
-                "simulated_W": round(nominal, 5) if np.isfinite(nominal) else None,
-                "k_p_V_per_rad": size.k_p,
-                "survives": size.survives,
-                "reason": size.reason,
-                "rounds_that_found_it": f"{size.agreed}/{size.rounds}",
-            }
-        )
+        row = {
+            "count": size.count,
+            "braces": size.label if size.planned else None,
+            "heat_W": size.heat,
+            "least_W": min((heat for _, heat in plan.ranked[size.count]), default=math.inf),
+            "with_4_times_the_instants_W": math.nan,
+            "simulated_W": corners[0].heat_W if corners else math.nan,
+            "k_p_V_per_rad": size.k_p,
+            "survives": size.survives,
+            "reason": size.reason,
+            "rounds_that_found_it": f"{size.agreed}/{size.rounds}",
+        }
+        if size.planned is not None:
+            dense = references(plan.task, size.braces, size.planned.times, size.planned.local.Q, 4)
+            row["with_4_times_the_instants_W"] = math.nan if isinstance(dense, str) else dense.heat
+        rows.append({key: _rounded(value) for key, value in row.items()})
     return {
         "seed": seed,
         "kind": kind_of(seed),
         "joints": plan.task.arm.n,
         "candidates": len(plan.task.candidates),
         "friction": plan.task.friction,
-        "search_cpu_s": round(searched[0], 2) if searched else None,
-        "wall_s": round(clock.perf_counter() - started, 1),
-        "best": None if best is None else best.count,
+        "search_cpu_s": round(searched[0][0], 2) if searched else None,
+        "corners_wall_s": round(ended - searched[0][1], 1) if searched else None,
+        "wall_s": round(ended - started, 1),
+        "best": None if plan.best is None else plan.best.count,
         "sizes": rows,
     }
 
 
-def main(arguments: list[str]) -> None:
-    """Plan scenes and write their numbers: [--out FOLDER] [FIRST LAST]."""
-    folder = Path("results/planner")
-    if "--out" in arguments:
-        k = arguments.index("--out")
-        folder = Path(arguments[k + 1])
-        del arguments[k : k + 2]
-    first, last = (int(arguments[0]), int(arguments[-1])) if arguments else (1, 20)
-    found = []
-    # What is compiled, or loaded, is no part of a scene's time.
-    planned(first, 1)
+def _rounded(value: Any) -> Any:
+    """Numbers to five decimals; those that are none as nothing."""
+    return value if not isinstance(value, float) else round(value, 5) if math.isfinite(value) else None
+
+
+def best_known(seed: int) -> dict[str, Any]:
+    """Least heat of each number of braces by a search with a hundred times the rounds, from other random postures."""
+    options = Options(along=along_of(seed), starts=EFFORT * Options.starts, seed=OTHER_SEED)
+    search, cpu = Search(task(scene_scenario(seed), options)), clock.process_time()
+    search.kept = 3 * search.kept
+    found = search.run()
+    sizes = [
+        {
+            "count": count,
+            "braces": ", ".join(b.label for b in ranked[0].braces) if ranked else None,
+            "heat_W": _rounded(ranked[0].heat) if ranked else None,
+        }
+        for count, ranked in found.items()
+    ]
+    return {"seed": seed, "rounds": options.starts, "cpu_s": round(clock.process_time() - cpu, 1), "sizes": sizes}
+
+
+def main() -> None:
+    """Plan scenes, or search them for long, and write their numbers."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("--out", type=Path, default=Path("results/planner"), metavar="FOLDER")
+    parser.add_argument("--reference", action="store_true", help="the best known, by a hundred times the effort")
+    parser.add_argument("--scenes", type=int, nargs=2, default=(1, 20), metavar=("FIRST", "LAST"))
+    chosen = parser.parse_args()
+    first, last = chosen.scenes
+    rows = []
+    if not chosen.reference:
+        # What is compiled, or loaded, is no part of a scene's time.
+        planned(first, 1)
     for seed in range(first, last + 1):
-        found.append(planned(seed, cores()))
-        print(json.dumps(found[-1]), flush=True)
-    folder.mkdir(parents=True, exist_ok=True)
-    write_json(folder / "scenes.json", found)
+        rows.append(best_known(seed) if chosen.reference else planned(seed, cores()))
+        print(json.dumps(rows[-1]), flush=True)
+    chosen.out.mkdir(parents=True, exist_ok=True)
+    write_json(chosen.out / ("reference.json" if chosen.reference else "scenes.json"), rows)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()
