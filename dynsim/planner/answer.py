@@ -258,6 +258,7 @@ def _corner_json(corner: Corner) -> dict[str, Any]:
         "surface_shift_m": corner.shift_m,
         "heat_W": _number(corner.heat_W),
         "hand_rms_m": _number(corner.hand_rms_m),
+        "hand_turn_rms_rad": _number(corner.turn_rms_rad),
         "closed_fraction": corner.closed,
         "reason": corner.reason,
     }

@@ -75,7 +75,7 @@ def references(task: Task, braces: tuple[Candidate, ...], knots: Array, Q: Array
         spline = CubicSpline(knots, Q, bc_type="not-a-knot")
     q = reals(spline(half))
     single = task.problem(braces, 1)
-    for k, target in enumerate(task.targets(half)):
+    for k, target in enumerate(task.wanted(half)):
         single.course.target[0] = target
         row = q[k : k + 1]
         if (left := single.retract(row, 20, 0.1 * ON)) > ON:

@@ -125,6 +125,15 @@ class Task:
         """Of the hand [m], (T, 3)."""
         return np.asarray(self.path.position(np.asarray(times, dtype=np.float64)), dtype=np.float64)
 
+    def wanted(self, times: Array) -> Array:
+        """Of the hand, (T, 3) [m]; with an orientation also the z and the x axis that its link has then, (T, 9)."""
+        targets, hand = self.targets(times), self.scenario.controller.hand
+        if hand.orientation is None:
+            return targets
+        robot = self.arm.model.robot
+        axes = (hand.orientation.matrix() @ robot.attached_axes(robot.hand[0]).T)[:, [2, 0]].T
+        return np.hstack([targets, np.tile(axes.ravel(), (len(targets), 1))])
+
     @property
     def span(self) -> float:
         """Time that the knots cover [s]: of a path there and back, half of it."""
@@ -233,7 +242,7 @@ class Task:
         else:
             bend = np.diff(np.eye(count), 2, axis=0)
         return Course(
-            target=reals(self.targets(times)),
+            target=reals(self.wanted(times)),
             knot=integers([k for k, _, _ in instants]),
             chord=reals([row for _, row, _ in instants]),
             share=reals([share for _, _, share in instants]),

@@ -227,6 +227,21 @@ def test_more_seeds_give_the_same_plans() -> None:
     assert max(heats) < 1.02 * min(heats)
 
 
+def test_the_hand_keeps_the_orientation_that_its_path_asks_for() -> None:
+    """In the references of the plan and in its runs."""
+    data = scene(7)
+    data["controller"]["hand"]["orientation"] = {"rpy_deg": [0.0, 120.0, 0.0]}
+    plan = dynsim.plan_braces(scenario_from_resolved(data), count=(1, 1), starts=2)
+    size = plan.size(1)
+    assert size.survives, size.reason
+    model, dense = plan.task.arm.model, size.planned.dense  # type: ignore[union-attr]
+    wanted = np.array([[-0.5, 0.0, np.sqrt(0.75)], [0.0, 1.0, 0.0], [-np.sqrt(0.75), 0.0, -0.5]])
+    for q in dense.q:
+        assert np.abs(model.body_pose("link_10", q)[0] - wanted).max() < 1e-8
+    corners = size.verdict.corners  # type: ignore[union-attr]
+    assert 0.0 < corners[0].turn_rms_rad < 1e-3 < max(corner.turn_rms_rad for corner in corners) < 0.05
+
+
 def test_a_path_out_of_reach_is_answered_in_words() -> None:
     data = scene(4)
     points = data["controller"]["hand"]["path"]["points_m"]
