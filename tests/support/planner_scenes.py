@@ -1,9 +1,11 @@
 """Random scenes for the planner, and the kept study of them.
 
     PYTHONPATH=tests python -m support.planner_scenes --out results/planner
-    PYTHONPATH=tests python -m support.planner_scenes --reference --out results/planner
+    PYTHONPATH=tests python -m support.planner_scenes --study reference --out results/planner
+    PYTHONPATH=tests python -m support.planner_scenes --study gains --out results/planner
 
 The second one takes a hundred times as long for each search: how far the answers of the first are from the best known.
+The third one runs the best plans, and those of the published arm, on surfaces 5 mm off with gains from stiff to soft.
 
 Arms of 7 to 10 joints whose hand goes there and back along a short way, over a floor, a pipe, a box, or with a joint
 about a third axis. Nobody has tuned anything on a scene: its seed is its number.
@@ -15,6 +17,7 @@ import argparse
 import json
 import math
 import time as clock
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +27,16 @@ from dynsim.planner.answer import plan_braces
 from dynsim.planner.dense import references
 from dynsim.planner.problem import Options, task
 from dynsim.planner.search import Search
-from dynsim.scenario import Scenario
+from dynsim.planner.verify import Tolerances, Verifier
+from dynsim.scenario import Scenario, load_scenario
 from dynsim.scenario.reading import scenario_from_resolved
 from dynsim.studies.processes import cores
 from dynsim.system.files import write_json
 
 # Of the reference: so many times the rounds, from postures of another seed.
 EFFORT, OTHER_SEED = 100, 1000
+# Of the study of gains [V/rad].
+GAINS = (500.0, 200.0, 100.0, 50.0, 20.0)
 KINDS = ("floor", "pipe", "box", "third_axis")
 PERIOD_S = 10.0
 LIMIT_DEG = [-120.0, 120.0]
@@ -194,23 +200,63 @@ def best_known(seed: int) -> dict[str, Any]:
     return {"seed": seed, "rounds": options.starts, "cpu_s": round(clock.process_time() - cpu, 1), "sizes": sizes}
 
 
+def stiffness(scenario: Scenario, counts: Sequence[int], along: tuple[float, ...] = ()) -> list[dict[str, Any]]:
+    """What plans cost on surfaces that are 5 mm off, by the gain k_p of all joints that press braces.
+
+    Of each number of braces, or of the best of them where there are none, the plan of least heat.
+    """
+    plan = plan_braces(scenario, along=along, count=(min(counts, default=1), max(counts, default=3)), verify=False)
+    sizes = [size for size in plan.sizes if size.planned is not None]
+    rows = []
+    for size in sizes if counts else sizes and [min(sizes, key=lambda size: size.heat)]:
+        assert size.planned is not None
+        for k_p in GAINS:
+            tolerances = Tolerances(friction=(1.0,), gains=(k_p,))
+            (verdict,) = Verifier(plan.task, tolerances, cores()).verify([(size.braces, size.planned.dense)])
+            rows.append(
+                {
+                    "scene": scenario.title,
+                    "friction": plan.task.friction,
+                    "count": size.count,
+                    "heat_W": _rounded(size.heat),
+                    "k_p_V_per_rad": k_p,
+                    "times_the_heat": {
+                        f"{1e3 * c.shift_m:+g} mm": _rounded(c.heat_W / size.heat) for c in verdict.corners
+                    },
+                    "survives": verdict.survives,
+                    "reason": verdict.reason,
+                }
+            )
+    return rows
+
+
+def published(friction: float) -> Scenario:
+    """The published arm on its real floor."""
+    return load_scenario("pressing", overrides={"contacts.friction": friction})
+
+
 def main() -> None:
     """Plan scenes, or search them for long, and write their numbers."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--out", type=Path, default=Path("results/planner"), metavar="FOLDER")
-    parser.add_argument("--reference", action="store_true", help="the best known, by a hundred times the effort")
+    parser.add_argument("--study", choices=("scenes", "reference", "gains"), default="scenes")
     parser.add_argument("--scenes", type=int, nargs=2, default=(1, 20), metavar=("FIRST", "LAST"))
     chosen = parser.parse_args()
     first, last = chosen.scenes
     rows = []
-    if not chosen.reference:
+    if chosen.study == "scenes":
         # What is compiled, or loaded, is no part of a scene's time.
         planned(first, 1)
     for seed in range(first, last + 1):
-        rows.append(best_known(seed) if chosen.reference else planned(seed, cores()))
+        if chosen.study == "gains":
+            rows += stiffness(scene_scenario(seed), (), along_of(seed))
+        else:
+            rows.append(best_known(seed) if chosen.study == "reference" else planned(seed, cores()))
         print(json.dumps(rows[-1]), flush=True)
+    if chosen.study == "gains":
+        rows += [row for friction in (0.1, 0.0) for row in stiffness(published(friction), range(1, 5))]
     chosen.out.mkdir(parents=True, exist_ok=True)
-    write_json(chosen.out / ("reference.json" if chosen.reference else "scenes.json"), rows)
+    write_json(chosen.out / f"{chosen.study}.json", rows)
 
 
 if __name__ == "__main__":
