@@ -19,7 +19,24 @@ from typing import NamedTuple
 import numpy as np
 
 from dynsim.dynamics.contact.distance import ShapeArrays, distance
-from dynsim.dynamics.tree.spatial import dot_vector
+from dynsim.dynamics.tree.spatial import (
+    ZERO_VECTOR,
+    along,
+    compose,
+    cross,
+    dot_vector,
+    first_axis,
+    put_rotation,
+    put_vector,
+    rotate,
+    rotation,
+    third_axis,
+    times_inertia,
+    times_number,
+    transform,
+    turn,
+    vector,
+)
 from dynsim.jit.kernel import internal_kernel, kernel
 
 # Slip [m/s] over which friction grows to its value: steep enough to charge braces that creep, smooth enough for steps.
@@ -45,8 +62,8 @@ class Arm(NamedTuple):
 
     parent: np.ndarray  # (n,) int, −1: the base that stands
     prismatic: np.ndarray  # (n,) int, 1 or 0
-    rotation: np.ndarray  # (n, 3, 3) of the joint frame at q = 0 in the parent's, in W on the base
-    place: np.ndarray  # (n, 3) its origin there [m]
+    rotation: np.ndarray  # (n, 9) of the joint frame at q = 0 in the parent's, in W on the base
+    origin: np.ndarray  # (n, 3) of that frame there [m]
     axis: np.ndarray  # (n, 3)
     mass: np.ndarray  # (n,) [kg]
     com: np.ndarray  # (n, 3) centre of mass in the body's frame [m]
@@ -55,9 +72,9 @@ class Arm(NamedTuple):
     greatest: np.ndarray  # (n,) greatest torque at rest [N m], inf for none
     lower: np.ndarray  # (n,) limits of the joints
     upper: np.ndarray  # (n,)
-    gravity: np.ndarray  # (3,)
+    gravity: np.ndarray  # (1, 3)
     hand: np.ndarray  # (1,) int, its body
-    hand_point: np.ndarray  # (3,) [m]
+    hand_point: np.ndarray  # (1, 3) [m]
     shapes: ShapeArrays  # the surfaces
 
 
@@ -93,20 +110,18 @@ class Work(NamedTuple):
     gap_rate: np.ndarray  # (K, P, n)
     hand: np.ndarray  # (K, h)
     hand_rate: np.ndarray  # (K, h, n)
-    R: np.ndarray  # (n, 3, 3)
+    R: np.ndarray  # (n, 9)
     p: np.ndarray  # (n, 3)
     a: np.ndarray  # (n, 3) joint axes in W
     below: np.ndarray  # (n, 4) mass and first moment of what a joint carries
     touch: np.ndarray  # (c, n, 3) velocity of the touching point by each rate
-    centre: np.ndarray  # (c, n, 3) the same of the centre of its sphere
+    turned: np.ndarray  # (c, n, 3) ∂n/∂q: what the normal at the brace turns by
     normal: np.ndarray  # (c, 3)
-    bend: np.ndarray  # (c, 3, 3) curvature of the surface
     shift: np.ndarray  # (c, n, 3) what the touching point moves by on the body, by each coordinate
-    slip: np.ndarray  # (c, 8) velocity along the surface over its size, that size, velocity of the touching point
+    slip: np.ndarray  # (c, 7) velocity along the surface over its size, that of the touching point, that size
     force: np.ndarray  # (c, 3)
     turn: np.ndarray  # (n, 3) ∂F/∂q of a brace
     drift: np.ndarray  # (n, 3) ∂F/∂v
-    vector: np.ndarray  # (12, 3)
     basis: np.ndarray  # (K, n, n) columns that keep hand and braces come last
     free: np.ndarray  # (K,) int, how many of those
     rows: np.ndarray  # (R, n) constraints of one knot
@@ -141,146 +156,101 @@ class Work(NamedTuple):
 
 
 @internal_kernel
-def cross(u, v, out):
-    """out = u × v."""
-    out[0] = u[1] * v[2] - u[2] * v[1]
-    out[1] = u[2] * v[0] - u[0] * v[2]
-    out[2] = u[0] * v[1] - u[1] * v[0]
-
-
-@internal_kernel
 def poses(arm: Arm, work: Work, q):
     """Frames of all bodies, joint axes in W, and mass and first moment of what each joint carries."""
-    n = arm.parent.shape[0]
-    R, p, a = work.R, work.p, work.a
+    n, below = arm.parent.shape[0], work.below
     for j in range(n):
-        i = arm.parent[j]
-        x, y, z = arm.axis[j, 0], arm.axis[j, 1], arm.axis[j, 2]
-        angle = 0.0 if arm.prismatic[j] else q[j]
-        s, c = math.sin(angle), math.cos(angle)
-        v = 1.0 - c
-        turn = (
-            (c + x * x * v, x * y * v - z * s, x * z * v + y * s),
-            (y * x * v + z * s, c + y * y * v, y * z * v - x * s),
-            (z * x * v - y * s, z * y * v + x * s, c + z * z * v),
-        )
-        for r in range(3):
-            if i < 0:
-                p[j, r] = arm.place[j, r]
-            else:
-                p[j, r] = p[i, r] + R[i, r, 0] * arm.place[j, 0] + R[i, r, 1] * arm.place[j, 1]
-                p[j, r] += R[i, r, 2] * arm.place[j, 2]
-            if i < 0:
-                f0, f1, f2 = arm.rotation[j, r, 0], arm.rotation[j, r, 1], arm.rotation[j, r, 2]
-            else:
-                f0 = R[i, r, 0] * arm.rotation[j, 0, 0] + R[i, r, 1] * arm.rotation[j, 1, 0]
-                f0 += R[i, r, 2] * arm.rotation[j, 2, 0]
-                f1 = R[i, r, 0] * arm.rotation[j, 0, 1] + R[i, r, 1] * arm.rotation[j, 1, 1]
-                f1 += R[i, r, 2] * arm.rotation[j, 2, 1]
-                f2 = R[i, r, 0] * arm.rotation[j, 0, 2] + R[i, r, 1] * arm.rotation[j, 1, 2]
-                f2 += R[i, r, 2] * arm.rotation[j, 2, 2]
-            a[j, r] = f0 * x + f1 * y + f2 * z
-            for k in range(3):
-                R[j, r, k] = f0 * turn[0][k] + f1 * turn[1][k] + f2 * turn[2][k]
-            if arm.prismatic[j]:
-                p[j, r] += a[j, r] * q[j]
-    below = work.below
-    for j in range(n):
-        below[j, 0] = arm.mass[j]
-        for r in range(3):
-            middle = p[j, r] + R[j, r, 0] * arm.com[j, 0] + R[j, r, 1] * arm.com[j, 1] + R[j, r, 2] * arm.com[j, 2]
-            below[j, 1 + r] = arm.mass[j] * middle
-    for j in range(n - 1, -1, -1):
-        i = arm.parent[j]
+        i, u = arm.parent[j], vector(arm.axis, j, 0)
+        R, p = rotation(arm.rotation, j, 0), vector(arm.origin, j, 0)
         if i >= 0:
+            before = rotation(work.R, i, 0)
+            R, p = compose(before, R), transform(vector(work.p, i, 0), before, p)
+        a = rotate(R, u)
+        if arm.prismatic[j]:
+            p = along(p, a, q[j])
+        else:
+            R = turn(R, u, a, math.sin(q[j]), math.cos(q[j]))
+        put_rotation(work.R, j, 0, R)
+        put_vector(work.p, j, 0, p)
+        put_vector(work.a, j, 0, a)
+        below[j, 0] = arm.mass[j]
+        put_vector(below, j, 1, times_number(transform(p, R, vector(arm.com, j, 0)), arm.mass[j]))
+    for j in range(n - 1, -1, -1):
+        if arm.parent[j] >= 0:
             for r in range(4):
-                below[i, r] += below[j, r]
+                below[arm.parent[j], r] += below[j, r]
 
 
 @internal_kernel
-def body_point(work: Work, body, point, out):
-    """A point of a body in W [m]."""
-    R, p = work.R, work.p
-    for r in range(3):
-        out[r] = p[body, r] + R[body, r, 0] * point[0] + R[body, r, 1] * point[1] + R[body, r, 2] * point[2]
+def body_point(work: Work, body, point, i):
+    """Place of point i of a table, on a body, in W [m]."""
+    return transform(vector(work.p, body, 0), rotation(work.R, body, 0), vector(point, i, 0))
 
 
 @internal_kernel
 def rates(arm: Arm, work: Work, body, at, out):
     """Velocity of the material point of a body at a place ``at``, for each unit of rate, (n, 3)."""
-    lever = work.vector[11]
     for j in range(arm.parent.shape[0]):
-        for r in range(3):
-            out[j, r] = 0.0
+        put_vector(out, j, 0, ZERO_VECTOR)
     j = body
     while j >= 0:
-        if arm.prismatic[j]:
-            for r in range(3):
-                out[j, r] = work.a[j, r]
-        else:
-            for r in range(3):
-                lever[r] = at[r] - work.p[j, r]
-            cross(work.a[j], lever, out[j])
+        a = vector(work.a, j, 0)
+        if not arm.prismatic[j]:
+            a = cross(a, along(at, vector(work.p, j, 0), -1.0))
+        put_vector(out, j, 0, a)
         j = arm.parent[j]
+
+
+@internal_kernel
+def put_rows(table, out, row):
+    """A table (n, 3) as three rows of another one, from ``row`` on."""
+    for j in range(table.shape[0]):
+        for r in range(3):
+            out[row + r, j] = table[j, r]
 
 
 @internal_kernel
 def geometry(arm: Arm, points: Points, work: Work, q, k):
     """Of knot k: hand, gaps and their rates; of the braces also what their forces need."""
-    n, c, P = arm.parent.shape[0], points.friction.shape[0], points.body.shape[0]
-    x, lever, jacobian = work.vector[0], work.vector[1], work.turn
+    n, c, hand, jacobian = arm.parent.shape[0], points.friction.shape[0], arm.hand[0], work.turn
     poses(arm, work, q)
-    body_point(work, arm.hand[0], arm.hand_point, x)
-    rates(arm, work, arm.hand[0], x, jacobian)
-    for r in range(3):
-        work.hand[k, r] = x[r]
+    x = body_point(work, hand, arm.hand_point, 0)
+    rates(arm, work, hand, x, jacobian)
+    put_vector(work.hand, k, 0, x)
+    put_rows(jacobian, work.hand_rate[k], 0)
+    # Where an orientation is asked for: the z axis of the hand's body, then its x axis.
+    for row in range(3, work.hand.shape[1], 3):
+        R = rotation(work.R, hand, 0)
+        axis = third_axis(R) if row == 3 else first_axis(R)
         for j in range(n):
-            work.hand_rate[k, r, j] = jacobian[j, r]
-    # Components of the axes of the hand: x, y and z of its z axis, then of its x axis.
-    for r in range(3, work.hand.shape[1]):
-        axis, e = (2 if r < 6 else 0), r % 3
-        for i in range(3):
-            lever[i] = work.R[arm.hand[0], i, axis]
-        work.hand[k, r] = lever[e]
-        for j in range(n):
-            work.hand_rate[k, r, j] = 0.0
-        j = arm.hand[0]
+            put_vector(jacobian, j, 0, ZERO_VECTOR)
+        j = hand
         while j >= 0:
             if not arm.prismatic[j]:
-                cross(work.a[j], lever, x)
-                work.hand_rate[k, r, j] = x[e]
+                put_vector(jacobian, j, 0, cross(vector(work.a, j, 0), axis))
             j = arm.parent[j]
-    for i in range(P):
+        put_vector(work.hand, k, row, axis)
+        put_rows(jacobian, work.hand_rate[k], row)
+    for i in range(points.body.shape[0]):
         body, radius = points.body[i], points.radius[i]
-        body_point(work, body, points.point[i], x)
+        x = body_point(work, body, points.point, i)
         far, nx, ny, nz, xx, xy, xz, yy, yz, zz = distance(arm.shapes, points.surface[i], x[0], x[1], x[2])
+        normal = (nx, ny, nz)
         work.gap[k, i] = far - radius
         rates(arm, work, body, x, jacobian)
         for j in range(n):
-            work.gap_rate[k, i, j] = nx * jacobian[j, 0] + ny * jacobian[j, 1] + nz * jacobian[j, 2]
+            work.gap_rate[k, i, j] = dot_vector(normal, vector(jacobian, j, 0))
         if i >= c:
             continue
-        normal, bend = work.normal[i], work.bend[i]
-        normal[0], normal[1], normal[2] = nx, ny, nz
-        bend[0, 0], bend[0, 1], bend[0, 2], bend[1, 1], bend[1, 2], bend[2, 2] = xx, xy, xz, yy, yz, zz
-        bend[1, 0], bend[2, 0], bend[2, 1] = xy, xz, yz
-        for j in range(n):
-            for r in range(3):
-                work.centre[i, j, r] = jacobian[j, r]
-        for r in range(3):
-            x[r] -= radius * normal[r]
-        rates(arm, work, body, x, work.touch[i])
+        put_vector(work.normal, i, 0, normal)
+        touch, shift, turned = work.touch[i], work.shift[i], work.turned[i]
+        rates(arm, work, body, along(x, normal, -radius), touch)
         # The touching point moves by J_centre − ρ ∂n/∂q, the material there by J_touch.
         for j in range(n):
-            for r in range(3):
-                turned = dot_vector(bend[r], work.centre[i, j])
-                work.shift[i, j, r] = work.centre[i, j, r] - radius * turned - work.touch[i, j, r]
-
-
-@internal_kernel
-def knot_of_first(course: Course, e):
-    """Whether instant e is the first one of its knot in a row."""
-    return e == 0 or course.knot[e] != course.knot[e - 1]
+            centre = vector(jacobian, j, 0)
+            dn = times_inertia((xx, xy, xz, yy, yz, zz), centre)
+            put_vector(turned, j, 0, dn)
+            put_vector(shift, j, 0, along(along(centre, dn, -radius), vector(touch, j, 0), -1.0))
 
 
 @internal_kernel
@@ -291,52 +261,41 @@ def statics(arm: Arm, points: Points, course: Course, work: Work, Q, V, F, deriv
     H_ij = −a_i · M_j (joint i carries joint j, both directions alike), M_j = Σ_k J_kj × w_k over weights and forces;
     zero for a prismatic joint i. s_cr: what the touching point moves by on its body.
     """
-    n, c = arm.parent.shape[0], points.friction.shape[0]
-    vector = work.vector
-    lever, moment, part, u = vector[2], vector[3], vector[4], vector[5]
+    n, c, weight = arm.parent.shape[0], points.friction.shape[0], vector(arm.gravity, 0, 0)
     for e in range(course.knot.shape[0]):
-        if knot_of_first(course, e):
+        if e == 0 or course.knot[e] != course.knot[e - 1]:
             geometry(arm, points, work, Q[course.knot[e]], course.knot[e])
         v = V[e]
         for i in range(c):
-            slip, normal = work.slip[i], work.normal[i]
-            for r in range(3):
-                rate = 0.0
-                for j in range(n):
-                    rate += work.touch[i, j, r] * v[j]
-                slip[4 + r] = rate
-            ahead = dot_vector(normal, slip[4:7])
-            square = SLIP_SCALE * SLIP_SCALE
-            for r in range(3):
-                slip[r] = slip[4 + r] - ahead * normal[r]
-                square += slip[r] * slip[r]
-            slip[3] = math.sqrt(square)
-            for r in range(3):
-                slip[r] /= slip[3]
-                u[r] = normal[r] - points.friction[i] * slip[r]
-                work.force[i, r] = F[e, i] * u[r]
+            normal, w = vector(work.normal, i, 0), ZERO_VECTOR
             for j in range(n):
-                work.by_f[e, j, i] = -dot_vector(work.touch[i, j], u)
+                w = along(w, vector(work.touch[i], j, 0), v[j])
+            slip = along(w, normal, -dot_vector(normal, w))
+            size = math.sqrt(dot_vector(slip, slip) + SLIP_SCALE * SLIP_SCALE)
+            u = times_number(slip, 1.0 / size)
+            put_vector(work.slip, i, 0, u)
+            put_vector(work.slip, i, 3, w)
+            work.slip[i, 6] = size
+            pull = along(normal, u, -points.friction[i])
+            put_vector(work.force, i, 0, times_number(pull, F[e, i]))
+            for j in range(n):
+                work.by_f[e, j, i] = -dot_vector(vector(work.touch[i], j, 0), pull)
         for j in range(n):
             # Weight and forces on what the joint carries: M_j = Σ J × w.
+            a, mass = vector(work.a, j, 0), work.below[j, 0]
             if arm.prismatic[j]:
-                for r in range(3):
-                    part[r] = work.a[j, r] * work.below[j, 0]
+                lever = times_number(a, mass)
             else:
-                for r in range(3):
-                    lever[r] = work.below[j, 1 + r] - work.below[j, 0] * work.p[j, r]
-                cross(work.a[j], lever, part)
-            torque = arm.losses[j] * v[j] - dot_vector(arm.gravity, part)
+                lever = cross(a, along(vector(work.below, j, 1), vector(work.p, j, 0), -mass))
+            torque = arm.losses[j] * v[j] - dot_vector(weight, lever)
             for i in range(c):
                 torque += work.by_f[e, j, i] * F[e, i]
             work.torque[e, j] = torque
             if not derivatives:
                 continue
-            cross(part, arm.gravity, moment)
+            moment = cross(lever, weight)
             for i in range(c):
-                cross(work.touch[i, j], work.force[i], part)
-                for r in range(3):
-                    moment[r] += part[r]
+                moment = along(moment, cross(vector(work.touch[i], j, 0), vector(work.force, i, 0)), 1.0)
             for i in range(n):
                 work.by_v[e, i, j] = 0.0
                 if i <= j:
@@ -345,7 +304,7 @@ def statics(arm: Arm, points: Points, course: Course, work: Work, Q, V, F, deriv
             i = j
             while i >= 0:
                 if not arm.prismatic[i]:
-                    bent = -dot_vector(work.a[i], moment)
+                    bent = -dot_vector(vector(work.a, i, 0), moment)
                     work.by_q[e, i, j], work.by_q[e, j, i] = bent, bent
                 i = arm.parent[i]
         if derivatives:
@@ -365,63 +324,41 @@ def force_derivatives(arm: Arm, points: Points, work: Work, v, f, i, e):
 
     ∂F = f (∂n − μ G ∂w), w = v_t, G = (1 − u uᵀ)/s, s = √(|w|² + v_s²), u = w/s.
     """
-    mu, slip, normal, n = points.friction[i], work.slip[i], work.normal[i], arm.parent.shape[0]
-    vector = work.vector
-    carried, before, dw, dn, part, turned = vector[2], vector[3], vector[4], vector[5], vector[6], vector[7]
-    body = points.body[i]
-    whole = vector[8]
-    for r in range(3):
-        whole[r], carried[r] = 0.0, slip[4 + r]
+    touch, shift, turned, body = work.touch[i], work.shift[i], work.turned[i], points.body[i]
+    normal, u, w = vector(work.normal, i, 0), vector(work.slip, i, 0), vector(work.slip, i, 3)
+    blunt, level = points.friction[i] / work.slip[i, 6], dot_vector(normal, w)
+    whole = ZERO_VECTOR
     j = body
     while j >= 0:
         if not arm.prismatic[j]:
-            for r in range(3):
-                whole[r] += work.a[j, r] * v[j]
+            whole = along(whole, vector(work.a, j, 0), v[j])
         j = arm.parent[j]
-    for r in range(n):
-        for t in range(3):
-            work.turn[r, t], work.drift[r, t] = 0.0, 0.0
     # From the tip inwards: carried = Σ J_i v_i of joint j and those it carries, before = Σ a_i v_i of those before it.
-    for t in range(3):
-        before[t], carried[t] = whole[t], 0.0
+    before, carried = whole, ZERO_VECTOR
     j = body
     while j >= 0:
-        rate = work.touch[i, j]
-        for t in range(3):
-            carried[t] += rate[t] * v[j]
-            if not arm.prismatic[j]:
-                before[t] -= work.a[j, t] * v[j]
-        cross(before, rate, dw)
-        if not arm.prismatic[j]:
-            cross(work.a[j], carried, part)
-            for t in range(3):
-                dw[t] += part[t]
+        rate, a, dn = vector(touch, j, 0), vector(work.a, j, 0), vector(turned, j, 0)
+        carried = along(carried, rate, v[j])
         # The material at the touching point changes.
-        cross(whole, work.shift[i, j], part)
-        for t in range(3):
-            dw[t] += part[t]
-            dn[t] = dot_vector(work.bend[i, t], work.centre[i, j])
-        ahead = dot_vector(normal, dw) + dot_vector(dn, slip[4:7])
-        level = dot_vector(normal, slip[4:7])
-        for t in range(3):
-            dw[t] -= normal[t] * ahead + dn[t] * level
-            turned[t] = rate[t] - normal[t] * dot_vector(normal, rate)
-        along, other = dot_vector(slip[0:3], dw), dot_vector(slip[0:3], turned)
-        for t in range(3):
-            work.turn[j, t] = f * (dn[t] - mu * (dw[t] - slip[t] * along) / slip[3])
-            work.drift[j, t] = -f * mu * (turned[t] - slip[t] * other) / slip[3]
+        dw = cross(whole, vector(shift, j, 0))
+        if not arm.prismatic[j]:
+            before = along(before, a, -v[j])
+            dw = along(dw, cross(a, carried), 1.0)
+        dw = along(dw, cross(before, rate), 1.0)
+        dw = along(along(dw, normal, -dot_vector(normal, dw) - dot_vector(dn, w)), dn, -level)
+        across = along(rate, normal, -dot_vector(normal, rate))
+        put_vector(work.turn, j, 0, times_number(along(dn, along(dw, u, -dot_vector(u, dw)), -blunt), f))
+        put_vector(work.drift, j, 0, times_number(along(across, u, -dot_vector(u, across)), -f * blunt))
         j = arm.parent[j]
-    for t in range(3):
-        part[t] = work.force[i, t]
+    force = vector(work.force, i, 0)
     j = body
     while j >= 0:
-        k = body
+        rate, a, k = vector(touch, j, 0), vector(work.a, j, 0), body
         while k >= 0:
-            work.by_q[e, j, k] -= dot_vector(work.touch[i, j], work.turn[k])
-            work.by_v[e, j, k] -= dot_vector(work.touch[i, j], work.drift[k])
+            work.by_q[e, j, k] -= dot_vector(rate, vector(work.turn, k, 0))
+            work.by_v[e, j, k] -= dot_vector(rate, vector(work.drift, k, 0))
             if not arm.prismatic[j]:
-                cross(work.a[j], work.shift[i, k], turned)
-                work.by_q[e, j, k] -= dot_vector(turned, part)
+                work.by_q[e, j, k] -= dot_vector(cross(a, vector(shift, k, 0)), force)
             k = arm.parent[k]
         j = arm.parent[j]
 
@@ -608,7 +545,8 @@ def costs(arm: Arm, course: Course, work: Work, Q, peak):
     for k in range(Q.shape[0]):
         for l in range(Q.shape[0]):
             if course.smooth[k, l] != 0.0:
-                cost += course.smooth[k, l] * dot(Q[k], Q[l])
+                for j in range(n):
+                    cost += course.smooth[k, l] * Q[k, j] * Q[l, j]
     return cost + heat, heat
 
 
@@ -618,15 +556,6 @@ def copy(a, out):
     for i in range(a.shape[0]):
         for j in range(a.shape[1]):
             out[i, j] = a[i, j]
-
-
-@internal_kernel
-def dot(u, v):
-    """u · v."""
-    z = 0.0
-    for i in range(u.shape[0]):
-        z += u[i] * v[i]
-    return z
 
 
 @internal_kernel
@@ -654,7 +583,7 @@ def put_back(arm: Arm, points: Points, course: Course, work: Work, Q, steps, tol
     worst = 0.0
     for k in range(Q.shape[0]):
         left = math.inf
-        for turn in range(steps + 1):
+        for attempt in range(steps + 1):
             geometry(arm, points, work, Q[k], k)
             m = constraint_rows(course, points, work, k)
             left = 0.0
@@ -681,7 +610,7 @@ def put_back(arm: Arm, points: Points, course: Course, work: Work, Q, steps, tol
                     right[m] = over
                     left = max(left, abs(over) - tolerance)
                     m += 1
-            if left <= tolerance or turn == steps or not left < 1e6:
+            if left <= tolerance or attempt == steps or not left < 1e6:
                 break
             far = 0.0
             for r in range(m):
@@ -783,8 +712,13 @@ def unknowns(work: Work):
 
 
 @internal_kernel
-def add_row(arm: Arm, points: Points, work: Work, m, kind, at, which, bound):
-    """Constraint m of the step: its row over the unknowns, and its bound."""
+def taken_in(arm: Arm, points: Points, work: Work, m, before, kind, at, which, value, bound):
+    """How many constraints the step has with one that it violates: as constraint m its row over the unknowns."""
+    if value >= bound - 1e-9 or m == work.bound.shape[0]:
+        return m
+    for i in range(before):
+        if work.working[i, 0] == kind and work.working[i, 1] == at and work.working[i, 2] == which:
+            return m
     n, N = arm.parent.shape[0], unknowns(work)
     row = work.normals[m]
     work.working[m, 0], work.working[m, 1], work.working[m, 2], work.bound[m] = kind, at, which, bound
@@ -792,7 +726,7 @@ def add_row(arm: Arm, points: Points, work: Work, m, kind, at, which, bound):
         row[i] = 0.0
     if kind == FORCE:
         row[work.pressed[at] + which] = 1.0
-        return
+        return m + 1
     first = n - work.free[at]
     for d in range(work.free[at]):
         z = 0.0
@@ -802,19 +736,11 @@ def add_row(arm: Arm, points: Points, work: Work, m, kind, at, which, bound):
         else:
             z = work.basis[at, which, first + d] * (1.0 if kind == LOWER else -1.0)
         row[work.start[at] + d] = z
+    return m + 1
 
 
 @internal_kernel
-def known(work: Work, m, kind, at, which):
-    """Whether a constraint is among the first m of the step."""
-    for i in range(m):
-        if work.working[i, 0] == kind and work.working[i, 1] == at and work.working[i, 2] == which:
-            return True
-    return False
-
-
-@internal_kernel
-def along(arm: Arm, work: Work, x, k, j):
+def moved(arm: Arm, work: Work, x, k, j):
     """Change of coordinate j of knot k by a step x of the unknowns."""
     first, z = arm.parent.shape[0] - work.free[k], 0.0
     for d in range(work.free[k]):
@@ -925,7 +851,7 @@ def step(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, N):
     forward(H, skyline, x, N)
     for a in range(work.multiplier.shape[0]):
         work.multiplier[a] = 0.0
-    m, most = 0, work.bound.shape[0]
+    m = 0
     full = work.step
     for _ in range(12):
         # The step L⁻ᵀ (x + Σ λ L⁻¹ a).
@@ -938,10 +864,8 @@ def step(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, N):
         before = m
         for e in range(E):
             for i in range(c):
-                slack = least - F[e, i]
-                if full[work.pressed[e] + i] < slack - 1e-9 and m < most and not known(work, before, FORCE, e, i):
-                    add_row(arm, points, work, m, FORCE, e, i, slack)
-                    m += 1
+                value, slack = full[work.pressed[e] + i], least - F[e, i]
+                m = taken_in(arm, points, work, m, before, FORCE, e, i, value, slack)
         for k in range(K):
             for i in range(c, P):
                 slack = min(points.margin[i] - work.gap[k, i], 0.0)
@@ -949,19 +873,12 @@ def step(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, N):
                     continue
                 z = 0.0
                 for j in range(n):
-                    z += work.gap_rate[k, i, j] * along(arm, work, full, k, j)
-                if z < slack - 1e-9 and m < most and not known(work, before, CLEAR, k, i):
-                    add_row(arm, points, work, m, CLEAR, k, i, slack)
-                    m += 1
+                    z += work.gap_rate[k, i, j] * moved(arm, work, full, k, j)
+                m = taken_in(arm, points, work, m, before, CLEAR, k, i, z, slack)
             for j in range(n):
-                z = along(arm, work, full, k, j)
-                low, high = min(arm.lower[j] - Q[k, j], 0.0), max(arm.upper[j] - Q[k, j], 0.0)
-                if z < low - 1e-9 and m < most and not known(work, before, LOWER, k, j):
-                    add_row(arm, points, work, m, LOWER, k, j, low)
-                    m += 1
-                if z > high + 1e-9 and m < most and not known(work, before, UPPER, k, j):
-                    add_row(arm, points, work, m, UPPER, k, j, -high)
-                    m += 1
+                z, low, high = moved(arm, work, full, k, j), arm.lower[j] - Q[k, j], arm.upper[j] - Q[k, j]
+                m = taken_in(arm, points, work, m, before, LOWER, k, j, z, min(low, 0.0))
+                m = taken_in(arm, points, work, m, before, UPPER, k, j, -z, -max(high, 0.0))
         if m == before:
             break
         for a in range(before, m):
@@ -984,7 +901,7 @@ def step(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, N):
         fall -= work.multiplier[a] * work.bound[a]
     for k in range(K):
         for j in range(n):
-            work.change[k, j] = along(arm, work, full, k, j)
+            work.change[k, j] = moved(arm, work, full, k, j)
     return fall
 
 

@@ -87,10 +87,10 @@ def workspace(n: int, c: int, P: int, K: int, E: int, h: int) -> Work:
 
     return Work(
         torque=zeros(E, n), by_q=zeros(E, n, n), by_v=zeros(E, n, n), by_f=zeros(E, n, c), gap=zeros(K, P),
-        gap_rate=zeros(K, P, n), hand=zeros(K, h), hand_rate=zeros(K, h, n), R=zeros(n, 3, 3), p=zeros(n, 3),
-        a=zeros(n, 3), below=zeros(n, 4), touch=zeros(c, n, 3), centre=zeros(c, n, 3), normal=zeros(c, 3),
-        bend=zeros(c, 3, 3), shift=zeros(c, n, 3), slip=zeros(c, 8), force=zeros(c, 3), turn=zeros(n, 3),
-        drift=zeros(n, 3), vector=zeros(12, 3), basis=zeros(K, n, n), free=ints(K), rows=zeros(R, n),
+        gap_rate=zeros(K, P, n), hand=zeros(K, h), hand_rate=zeros(K, h, n), R=zeros(n, 9), p=zeros(n, 3),
+        a=zeros(n, 3), below=zeros(n, 4), touch=zeros(c, n, 3), turned=zeros(c, n, 3), normal=zeros(c, 3),
+        shift=zeros(c, n, 3), slip=zeros(c, 7), force=zeros(c, 3), turn=zeros(n, 3),
+        drift=zeros(n, 3), basis=zeros(K, n, n), free=ints(K), rows=zeros(R, n),
         normal_matrix=zeros(R, R), right=zeros(R), H=zeros(N, N), g=zeros(N), x=zeros(max(N, n)), step=zeros(N),
         B=zeros(n, K * n + c), column=ints(K * n + c), start=ints(K), pressed=ints(E), skyline=ints(N),
         working=ints(W, 3), bound=zeros(W),

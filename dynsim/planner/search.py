@@ -23,10 +23,12 @@ from dynsim.planner.problem import Candidate, Task
 BEAM = 5
 # Postures that a round begins with, and random ones that are tried for them.
 POSTURES, DRAWS = 2, 60
+# Standard deviation of their joints, drawn from so much to so much [rad]; of prismatic ones [m].
+SPREAD, PRISMATIC_SPREAD = (0.3, 1.5), 0.2
 # Sets of each size and round that whole paths are made for, and those that are made finer in the end.
-PATHS, KEPT = 4, 3
+PATHS, KEPT = 4, 6
 # Costs of one set whose ratio is nearer to 1 are the same posture, which needs no other path.
-SAME_COST = 0.99
+SAME_COST = 0.999
 # Knots of whole paths: the search's, and the answer's.
 PATH_KNOTS, FINE_KNOTS = 9, (17, 33)
 CLOSED_KNOTS, CLOSED_FINE = 12, (24, 48)
@@ -119,75 +121,11 @@ class Search:
         return found
 
     def draw(self) -> Array:
-        """A random posture: links forward along the way to the path, each bent from that by some 40°.
-
-        Joints that do not turn about a horizontal axis are near their initial position, those at the root turn towards
-        the target.
-        """
-        arm, rng = self.task.arm, self._rng
-        tables, model = arm.tables, arm.model
-        q = model.robot.initial[list(arm.columns)].copy()
-        target = self.task.targets(np.array([0.5 * self.task.span]))[0]
-        for j in range(arm.n):
-            low, high = tables.lower[j], tables.upper[j]
-            if tables.prismatic[j]:
-                q[j] += 0.2 * rng.normal()
-            else:
-                whole = arm.coordinates(q[None])[0]
-                R, p = model.body_pose(arm.links[j], whole)
-                axis = R @ tables.axis[j]
-                along = self._along(j)
-                way = target - p
-                if along is None or np.linalg.norm(np.cross(axis, way)) < 1e-6:
-                    # A link without length turns what comes after it towards the target.
-                    along = np.array([0.0, 0.0, 1.0])
-                now, there = R @ along, way
-                if abs(axis[2]) > 0.9:
-                    next_axis = self._horizontal_after(j, q)
-                    if next_axis is not None:
-                        # The plane of the joints after it holds the target.
-                        now = np.cross(next_axis, [0.0, 0.0, 1.0])
-                    spread = 0.1
-                else:
-                    spread = 0.7
-                    there = way * np.array([1.0, 1.0, 0.0])
-                if abs(axis[2]) <= 0.9 and abs(np.dot(axis, there)) > 0.7 * np.linalg.norm(there):
-                    q[j] += 0.2 * rng.normal()
-                else:
-                    now, there = now - axis * (axis @ now), there - axis * (axis @ there)
-                    angle = np.arctan2(axis @ np.cross(now, there), now @ there)
-                    q[j] += (
-                        angle
-                        + spread * rng.normal()
-                        - (rng.uniform(0.0, 1.2) * self._up(axis, there) if j < 2 else 0.0)
-                    )
-                    q[j] = (q[j] + np.pi) % (2.0 * np.pi) - np.pi
-            q[j] = min(max(q[j], low), high)
-        return q
-
-    @staticmethod
-    def _up(axis: Array, ahead: Array) -> float:
-        """Which turn about an axis lifts what points ahead: 1, −1, or 0 for an upright axis."""
-        return -float(np.sign(np.cross(axis, ahead)[2])) if abs(axis[2]) < 0.9 else 0.0
-
-    def _along(self, j: int) -> Array | None:
-        """From a joint to the next one or the hand, in its link's frame; None for a link without length."""
-        arm = self.task.arm
-        children = [k for k in range(arm.n) if arm.tables.parent[k] == j]
-        end = arm.tables.place[children[0]] if children else arm.tables.hand_point
-        size = float(np.linalg.norm(end))
-        return end / size if size > 1e-9 else None
-
-    def _horizontal_after(self, j: int, q: Array) -> Array | None:
-        """Axis of the first joint after j that lies level, in W."""
-        arm = self.task.arm
-        whole = arm.coordinates(q[None])[0]
-        for k in range(j + 1, arm.n):
-            R, _ = arm.model.body_pose(arm.links[k], whole)
-            axis = np.asarray(R @ arm.tables.axis[k])
-            if not arm.tables.prismatic[k] and abs(axis[2]) < 0.5:
-                return axis
-        return None
+        """A random posture about the initial one, sometimes near it and sometimes far."""
+        tables, rng = self.task.arm.tables, self._rng
+        initial = self.task.arm.model.robot.initial[list(self.task.arm.columns)]
+        spread = np.where(tables.prismatic, PRISMATIC_SPREAD, rng.uniform(*SPREAD))
+        return np.clip(initial + spread * rng.normal(size=len(spread)), tables.lower, tables.upper)
 
     def run(self) -> dict[int, list[Planned]]:
         """The best sets of each size with whole paths, by heat along their dense references; sizes may be empty.
@@ -307,27 +245,26 @@ class Search:
         local = self.solve(braces, Q, self.path, 30)
         return self._walked(braces, Q, self.path) if local is None else local
 
-    def _refined(self, paths: Sequence[tuple[Set, Local]]) -> list[Planned]:
+    def _refined(self, whole: Sequence[tuple[Set, Local]]) -> list[Planned]:
         """The best of whole paths at more knots, by the heat of their dense references."""
-        found = []
-        for braces, coarse in sorted(paths, key=lambda item: item[1].cost)[: self.kept]:
-            kept: list[Planned] = []
-            local, why = coarse, ""
-            for count in (self.path, *self.fine):
-                better = local if count == self.path else self.solve(braces, local.Q, count, 20)
-                if better is None:
-                    break
-                local = better
+        planned = []
+        for braces, coarse in sorted(whole, key=lambda item: item[1].cost)[: self.kept]:
+            paths, why = [(self.path, coarse)], ""
+            for count in self.fine:
+                finer = self.solve(braces, paths[-1][1].Q, count, 20)
+                if finer is not None:
+                    paths.append((count, finer))
+            # The finest that keeps path and surfaces between its knots.
+            for count, local in reversed(paths):
                 dense = references(self.task, braces, self.task.times(count), local.Q)
                 why = dense if isinstance(dense, str) else touching_links(self.task, dense.times, dense.q)
                 if not isinstance(dense, str) and not why:
-                    kept.append(Planned(braces, self.task.times(count), local, dense))
-            if kept:
-                found.append(min(kept, key=lambda one: one.heat))
-                self.tally.refused.pop(braces, None)
+                    planned.append(Planned(braces, self.task.times(count), local, dense))
+                    self.tally.refused.pop(braces, None)
+                    break
             else:
                 self.tally.refused[braces] = why
-        return sorted(found, key=lambda one: one.heat)
+        return sorted(planned, key=lambda plan: plan.heat)
 
     def _walked(self, braces: Set, Q: Array, count: int) -> Local | None:
         """A path from a posture in its middle, knot after knot: where all at once does not reach."""

@@ -54,8 +54,8 @@ def tree() -> tuple[Problem, np.ndarray, np.ndarray, np.ndarray]:
     arm = Arm(
         parent=integers([-1, 0, 1, 2, 2, 4, 5]),
         prismatic=integers([0, 0, 1, 0, 0, 1, 0]),
-        rotation=reals([rotation(rng) for _ in range(n)]),
-        place=reals(0.3 * rng.normal(size=(n, 3))),
+        rotation=reals([rotation(rng).ravel() for _ in range(n)]),
+        origin=reals(0.3 * rng.normal(size=(n, 3))),
         axis=reals(axes / np.linalg.norm(axes, axis=1)[:, None]),
         mass=reals(rng.uniform(0.1, 1.0, n)),
         com=reals(0.2 * rng.normal(size=(n, 3))),
@@ -64,9 +64,9 @@ def tree() -> tuple[Problem, np.ndarray, np.ndarray, np.ndarray]:
         greatest=reals(np.full(n, np.inf)),
         lower=reals(np.full(n, -9.0)),
         upper=reals(np.full(n, 9.0)),
-        gravity=reals([0.0, 0.5, -9.81]),
+        gravity=reals([[0.0, 0.5, -9.81]]),
         hand=integers([6]),
-        hand_point=reals([0.1, 0.0, 0.3]),
+        hand_point=reals([[0.1, 0.0, 0.3]]),
         shapes=shape_arrays([(surface, 0.0, np.zeros(3), False) for surface in surfaces]),
     )
     points = Points(
