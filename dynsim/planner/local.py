@@ -77,7 +77,8 @@ class Local:
 
 def workspace(n: int, c: int, P: int, K: int, E: int, h: int) -> Work:
     """Allocate a :class:`Work`."""
-    N, R, W = K * n + E * c, h + P + n, max(WORKING_SETS, c)
+    N, R = K * n + E * c, h + P + n
+    W = max(min(WORKING_SETS, K * (P + 2 * n) + E * c), c)
 
     def zeros(*shape: int) -> Array:
         return np.zeros(shape)

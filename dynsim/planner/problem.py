@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -66,6 +66,26 @@ class Candidate:
     def label(self) -> str:
         """Point and surface."""
         return f"{self.name} on {self.surface}"
+
+
+class Clear(NamedTuple):
+    """A point that stays clear: index of its joint, point [m] in the frame of that joint's link, radius [m], least
+    distance [m], name, index of the surface."""
+
+    joint: int
+    point: Array
+    radius: float
+    margin: float
+    label: str
+    surface: int
+
+
+Key = tuple[int, int, tuple[float, ...]]
+
+
+def key(joint: int, surface: int, point: Array) -> Key:
+    """The same for the same point and surface, by indices of its joint and of the surface."""
+    return joint, surface, tuple(point.round(9).tolist())
 
 
 @dataclass(frozen=True)
@@ -150,13 +170,10 @@ class Task:
         return np.linspace(0.0, self.span, count)
 
     @cached_property
-    def clear(self) -> list[tuple[int, Array, float, float, str, int]]:
-        """Points that stay clear where they are not braced.
-
-        Joint, point [m], radius [m], margin [m], name, index of the surface; of planes the ends of links are enough.
-        """
+    def clear(self) -> dict[Key, Clear]:
+        """Points that stay clear where they are not braced; of planes the ends of links are enough."""
         robot, arm = self.arm.model.robot, self.arm
-        found: list[tuple[int, Array, float, float, str, int]] = []
+        points: dict[Key, Clear] = {}
         rng = np.random.default_rng(0)
         postures = arm.coordinates(rng.normal(size=(4, arm.n)))
 
@@ -178,8 +195,8 @@ class Task:
             flat = isinstance(surface, Quadric) and surface.drawn.kind == "plane"
             for k, point, radius, least, label in ends if flat else [*ends, *middles]:
                 if moves(arm.links[k], point):
-                    found.append((k, point, radius, least, f"{label} on {name}", index))
-        return found
+                    points[key(k, index, point)] = Clear(k, point, radius, least, f"{label} on {name}", index)
+        return points
 
     def _thickness(self, k: int) -> float:
         """Radius about the beginning of a link: the larger one of those that meet there [m]."""
@@ -189,17 +206,18 @@ class Task:
 
     def points(self, braces: Sequence[Candidate]) -> Points:
         """Tables of braces, then of what stays clear."""
-        names = self.arm.surfaces
-        braced = [(b.joint, b.on_joint, b.radius, 0.0, b.name, names.index(b.surface)) for b in braces]
-        taken = {(b[0], b[5], *b[1].round(9).tolist()) for b in braced}
-        free = [point for point in self.clear if (point[0], point[5], *point[1].round(9).tolist()) not in taken]
-        rows = [*braced, *free]
+        on = [self.arm.surfaces.index(b.surface) for b in braces]
+        braced = {
+            key(b.joint, s, b.on_joint): Clear(b.joint, b.on_joint, b.radius, 0.0, b.name, s)
+            for b, s in zip(braces, on, strict=True)
+        }
+        rows = [*braced.values(), *(point for place, point in self.clear.items() if place not in braced)]
         return Points(
-            body=integers([row[0] for row in rows]),
-            point=reals(np.array([row[1] for row in rows]).reshape(-1, 3)),
-            radius=reals([row[2] for row in rows]),
-            surface=integers([row[5] for row in rows]),
-            margin=reals([row[3] for row in rows]),
+            body=integers([row.joint for row in rows]),
+            point=reals([row.point for row in rows]).reshape(-1, 3),
+            radius=reals([row.radius for row in rows]),
+            surface=integers([row.surface for row in rows]),
+            margin=reals([row.margin for row in rows]),
             friction=reals(np.full(len(braces), self.friction)),
         )
 

@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,9 +27,10 @@ POSTURES, DRAWS = 2, 60
 # Standard deviation of their joints, drawn from so much to so much [rad]; of prismatic ones [m].
 SPREAD, PRISMATIC_SPREAD = (0.3, 1.5), 0.2
 # Sets of each size and round that whole paths are made for, and those that are made finer in the end.
-PATHS, KEPT = 4, 6
-# Costs of one set whose ratio is nearer to 1 are the same posture, which needs no other path.
-SAME_COST = 0.999
+PATHS, KEPT = 4, 4
+# Costs of one set that differ by less, as a share, are of one path, and paths beyond that ratio to the least are none
+# that could become the best; so many of a set are made finer.
+SAME_COST, NEAR, ALTERNATIVES = 1e-3, 1.05, 3
 # Knots of whole paths: the search's, and the answer's.
 PATH_KNOTS, FINE_KNOTS = 9, (17, 33)
 CLOSED_KNOTS, CLOSED_FINE = 12, (24, 48)
@@ -50,6 +52,13 @@ class Planned:
     def heat(self) -> float:
         """Along the dense references [W]."""
         return self.dense.heat
+
+
+class Path(NamedTuple):
+    """Postures of a set at few knots, by their cost [W], and along the whole path: None, they do not reach."""
+
+    coarse: float
+    local: Local | None
 
 
 @dataclass
@@ -134,35 +143,32 @@ class Search:
         the distance to the optimum.
         """
         least, most = self.task.options.count
-        best: dict[Set, Local] = {}
-        coarse: dict[Set, float] = {}
+        paths: dict[Set, list[Path]] = {}
         rounds = self.task.options.starts
         for number in range(rounds):
             self._tell("searching", number / (rounds + 1))
             for size, ranked in self._round(number, most).items():
-                heats = [math.inf]
-                for cost, braces, Q in ranked[: PATHS if size else 1]:
-                    known = coarse.get(braces, math.inf)
-                    if cost > SAME_COST * known:
-                        # Nothing new: the path that is known already, or a worse posture of its set.
-                        if cost * SAME_COST <= known and braces in best:
-                            heats.append(best[braces].heat)
-                        continue
-                    coarse[braces] = cost
-                    local = self._whole(braces, Q)
-                    if local is None:
-                        self.tally.refused.setdefault(braces, "postures found, but none along the whole path")
-                        continue
-                    heats.append(local.heat)
-                    if braces not in best or local.cost < best[braces].cost:
-                        best[braces] = local
-                        self.tally.refused.pop(braces, None)
-                self.tally.heats.setdefault(size, []).append(min(heats))
+                heats = [self._path(paths.setdefault(one[1], []), *one) for one in ranked[: PATHS if size else 1]]
+                self.tally.heats.setdefault(size, []).append(min(heats, default=math.inf))
         planned: dict[int, list[Planned]] = {}
         for size in range(least, most + 1):
             self._tell("refining", (rounds + size / (most + 1)) / (rounds + 1))
-            planned[size] = self._refined([(braces, r) for braces, r in best.items() if len(braces) == size])
+            planned[size] = self._refined({braces: some for braces, some in paths.items() if len(braces) == size})
         return planned
+
+    def _path(self, known: list[Path], cost: float, braces: Set, Q: Array) -> float:
+        """Heat of a whole path from postures at few knots [W], which is put among those known of its set.
+
+        Costs of few knots that are nearly the same belong to one path; those that are far from the least to none.
+        """
+        if cost > NEAR * min((path.coarse for path in known), default=math.inf):
+            return math.inf
+        for path in known:
+            if abs(path.coarse - cost) <= SAME_COST * cost:
+                return math.inf if path.local is None else path.local.heat
+        local = self._whole(braces, Q)
+        known.append(Path(cost, local))
+        return math.inf if local is None else local.heat
 
     def _round(self, number: int, most: int) -> dict[int, list[tuple[float, Set, Array]]]:
         """Sets of each size with cost and posture, the best first, from new starts."""
@@ -245,26 +251,36 @@ class Search:
         local = self.solve(braces, Q, self.path, 30)
         return self._walked(braces, Q, self.path) if local is None else local
 
-    def _refined(self, whole: Sequence[tuple[Set, Local]]) -> list[Planned]:
-        """The best of whole paths at more knots, by the heat of their dense references."""
+    def _refined(self, paths: Mapping[Set, list[Path]]) -> list[Planned]:
+        """The best sets, their best paths at more knots, by the heat of their dense references."""
+        whole = {braces: sorted((p.local for p in some if p.local), key=_cost) for braces, some in paths.items()}
+        reached = {braces: some for braces, some in whole.items() if some}
+        for braces in whole.keys() - reached.keys():
+            self.tally.refused[braces] = "postures found, but none along the whole path"
         planned = []
-        for braces, coarse in sorted(whole, key=lambda item: item[1].cost)[: self.kept]:
-            paths, why = [(self.path, coarse)], ""
-            for count in self.fine:
-                finer = self.solve(braces, paths[-1][1].Q, count, 20)
-                if finer is not None:
-                    paths.append((count, finer))
-            # The finest that keeps path and surfaces between its knots.
-            for count, local in reversed(paths):
-                dense = references(self.task, braces, self.task.times(count), local.Q)
-                why = dense if isinstance(dense, str) else touching_links(self.task, dense.times, dense.q)
-                if not isinstance(dense, str) and not why:
-                    planned.append(Planned(braces, self.task.times(count), local, dense))
-                    self.tally.refused.pop(braces, None)
-                    break
+        for braces in sorted(reached, key=lambda braces: reached[braces][0].cost)[: self.kept]:
+            likely = [local for local in reached[braces] if local.cost <= NEAR * reached[braces][0].cost]
+            finest = [self._finest(braces, local) for local in likely[:ALTERNATIVES]]
+            if good := [plan for plan in finest if isinstance(plan, Planned)]:
+                planned.append(min(good, key=lambda plan: plan.heat))
             else:
-                self.tally.refused[braces] = why
+                self.tally.refused[braces] = str(finest[0])
         return sorted(planned, key=lambda plan: plan.heat)
+
+    def _finest(self, braces: Set, coarse: Local) -> Planned | str:
+        """A path at the most knots at which it keeps hand and surfaces in between; in words why at none."""
+        paths, why = [coarse], ""
+        for count in self.fine:
+            finer = self.solve(braces, paths[-1].Q, count, 20)
+            if finer is not None:
+                paths.append(finer)
+        for local in reversed(paths):
+            times = self.task.times(len(local.Q))
+            dense = references(self.task, braces, times, local.Q)
+            why = dense if isinstance(dense, str) else touching_links(self.task, dense.times, dense.q)
+            if not isinstance(dense, str) and not why:
+                return Planned(braces, times, local, dense)
+        return why
 
     def _walked(self, braces: Set, Q: Array, count: int) -> Local | None:
         """A path from a posture in its middle, knot after knot: where all at once does not reach."""
@@ -281,6 +297,10 @@ class Search:
                 out[k] = q[0]
         self.tally.solves += 1
         return solve(whole, out, 30)
+
+
+def _cost(local: Local) -> float:
+    return local.cost
 
 
 def _fits(braces: Sequence[Candidate]) -> bool:
