@@ -39,8 +39,6 @@ from dynsim.dynamics.tree.spatial import (
 )
 from dynsim.jit.kernel import internal_kernel, kernel
 
-# Slip [m/s] over which friction grows to its value: steep enough to charge braces that creep, smooth enough for steps.
-SLIP_SCALE = 2e-3
 # What is lost of a row of constraints that others imply.
 DEPENDENT = 1e-9
 # Distance from hand path and surfaces that counts as none [m].
@@ -97,6 +95,7 @@ class Course(NamedTuple):
     chord: np.ndarray  # (E, K) [1/s]
     share: np.ndarray  # (E,) of the time; their sum is 1
     smooth: np.ndarray  # (K, K) SᵀS of the smoothness S q
+    slip_scale: np.ndarray  # (1,) slip over which friction grows to its value [m/s]
 
 
 class Work(NamedTuple):
@@ -271,7 +270,7 @@ def statics(arm: Arm, points: Points, course: Course, work: Work, Q, V, F, deriv
             for j in range(n):
                 w = along(w, vector(work.touch[i], j, 0), v[j])
             slip = along(w, normal, -dot_vector(normal, w))
-            size = math.sqrt(dot_vector(slip, slip) + SLIP_SCALE * SLIP_SCALE)
+            size = math.sqrt(dot_vector(slip, slip) + course.slip_scale[0] ** 2)
             u = times_number(slip, 1.0 / size)
             put_vector(work.slip, i, 0, u)
             put_vector(work.slip, i, 3, w)

@@ -16,16 +16,13 @@ from dynsim.errors import ModelError
 from dynsim.jit.kernel import reals
 from dynsim.model.description import Array, Contact
 from dynsim.planner.compiled import ON
-from dynsim.planner.problem import Candidate, Clear, Task, key
+from dynsim.planner.problem import CHARGED, Candidate, Clear, Task, key
 from dynsim.scenario import build
 
 # Instants of one pass along the path, at least; and the most time between two [s].
 INSTANTS, SPACING = 50, 0.1
 # Slower than this the hand rests [m/s].
 RESTS = 1e-2
-# Slip [m/s] over which the friction that is charged grows to its value: a brace that creeps feels all of it, whatever
-# planned voltages, which must not ring, make of it.
-CHARGED = 1e-3
 # Instants at which links are compared with each other.
 LOOKS = 11
 

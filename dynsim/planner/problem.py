@@ -28,6 +28,9 @@ SMOOTHNESS = 1e-3
 ALONG = (0.33, 0.67)
 # Clearance of those points [m].
 LINK_CLEARANCE = 2e-3
+# Slip [m/s] over which the friction that is charged grows to its value: a brace that creeps feels all of it, whatever
+# planned voltages, which must not ring, make of it. The search begins with a smoother one, for long steps.
+CHARGED, SMOOTHER = 1e-3, 2e-3
 # Targets that differ by less are the same [m].
 SAME = 1e-6
 # Chords at knots of a single pass: how far from its ends the two of a coarse one lie.
@@ -114,7 +117,7 @@ class Options:
     peak: float = 0.0
     clearance_m: float = 0.01
     min_N: float = 0.5
-    starts: int = 12
+    starts: int = 8
     seed: int = 0
     exhaustive: bool = False
 
@@ -265,14 +268,15 @@ class Task:
             chord=reals([row for _, row, _ in instants]),
             share=reals([share for _, _, share in instants]),
             smooth=reals(SMOOTHNESS * bend.T @ bend),
+            slip_scale=reals([SMOOTHER]),
         )
 
-    def problem(self, braces: Sequence[Candidate], count: int) -> Problem:
+    def problem(self, braces: Sequence[Candidate], count: int, slip_scale: float = SMOOTHER) -> Problem:
         """Of one set of braces at so many knots; its targets are its own."""
         if count not in self._courses:
             self._courses[count] = self.course(count)
         course = self._courses[count]
-        course = course._replace(target=course.target.copy())
+        course = course._replace(target=course.target.copy(), slip_scale=reals([slip_scale]))
         return Problem(self.arm.tables, self.points(braces), course, self.options.min_N, self.options.peak)
 
 

@@ -17,8 +17,8 @@ import numpy as np
 from dynsim.jit.kernel import reals
 from dynsim.model.description import Array
 from dynsim.planner.dense import Dense, references, touching_links
-from dynsim.planner.local import Local, Problem, solve
-from dynsim.planner.problem import Candidate, Task
+from dynsim.planner.local import Local, solve
+from dynsim.planner.problem import CHARGED, SMOOTHER, Candidate, Task
 
 # Sets of each size that go on from the cheap problem, and from the one with slip.
 BEAM = 5
@@ -27,10 +27,10 @@ POSTURES, DRAWS = 2, 60
 # Standard deviation of their joints, drawn from so much to so much [rad]; of prismatic ones [m].
 SPREAD, PRISMATIC_SPREAD = (0.3, 1.5), 0.2
 # Sets of each size and round that whole paths are made for, and those that are made finer in the end.
-PATHS, KEPT = 4, 4
+PATHS, KEPT = 4, 3
 # Costs of one set that differ by less, as a share, are of one path, and paths beyond that ratio to the least are none
 # that could become the best; so many of a set are made finer.
-SAME_COST, NEAR, ALTERNATIVES = 1e-3, 1.05, 3
+SAME_COST, NEAR, ALTERNATIVES = 1e-3, 1.1, 3
 # Knots of whole paths: the search's, and the answer's.
 PATH_KNOTS, FINE_KNOTS = 9, (17, 33)
 CLOSED_KNOTS, CLOSED_FINE = 12, (24, 48)
@@ -95,14 +95,12 @@ class Search:
         self.path = CLOSED_KNOTS if task.kind == "closed" else PATH_KNOTS
         self.fine = CLOSED_FINE if task.kind == "closed" else FINE_KNOTS
 
-    def solve(self, braces: Set, start: Array, count: int, turns: int = 40) -> Local | None:
+    def solve(
+        self, braces: Set, start: Array, count: int, turns: int = 40, slip_scale: float = SMOOTHER
+    ) -> Local | None:
         """Local optimum from postures at other knots, or from one posture."""
-        problem = self.problem(braces, count)
         self.tally.solves += 1
-        return solve(problem, self.spread(start, count), turns)
-
-    def problem(self, braces: Set, count: int) -> Problem:
-        return self.task.problem(braces, count)
+        return solve(self.task.problem(braces, count, slip_scale), self.spread(start, count), turns)
 
     def spread(self, start: Array, count: int) -> Array:
         """Postures at so many knots, on lines between those given at others; (n,) or (K, n)."""
@@ -116,7 +114,7 @@ class Search:
 
     def _starts(self, first: bool) -> list[Array]:
         """Random postures with the hand in the middle of the path, clear of all surfaces; the initial one too."""
-        problem, found = self.problem((), 1), list[Array]()
+        problem, found = self.task.problem((), 1), list[Array]()
         arm = self.task.arm
         initial = arm.model.robot.initial[list(arm.columns)]
         for draw in range(DRAWS):
@@ -268,10 +266,10 @@ class Search:
         return sorted(planned, key=lambda plan: plan.heat)
 
     def _finest(self, braces: Set, coarse: Local) -> Planned | str:
-        """A path at the most knots at which it keeps hand and surfaces in between; in words why at none."""
-        paths, why = [coarse], ""
-        for count in self.fine:
-            finer = self.solve(braces, paths[-1].Q, count, 20)
+        """The better of the two finest paths that keep hand and surfaces between knots; in words why none does."""
+        paths, good, why = [coarse], list[Planned](), ""
+        for count, slip_scale in ((self.fine[0], SMOOTHER), (self.fine[1], SMOOTHER), (self.fine[1], CHARGED)):
+            finer = self.solve(braces, paths[-1].Q, count, 20, slip_scale)
             if finer is not None:
                 paths.append(finer)
         for local in reversed(paths):
@@ -279,14 +277,16 @@ class Search:
             dense = references(self.task, braces, times, local.Q)
             why = dense if isinstance(dense, str) else touching_links(self.task, dense.times, dense.q)
             if not isinstance(dense, str) and not why:
-                return Planned(braces, times, local, dense)
-        return why
+                good.append(Planned(braces, times, local, dense))
+                if len(good) == 2:
+                    break
+        return min(good, key=lambda plan: plan.heat, default=why)
 
     def _walked(self, braces: Set, Q: Array, count: int) -> Local | None:
         """A path from a posture in its middle, knot after knot: where all at once does not reach."""
-        whole = self.problem(braces, count)
+        whole = self.task.problem(braces, count)
         targets, middle = whole.course.target, count // 2
-        single = self.problem(braces, 1)
+        single = self.task.problem(braces, 1)
         out = np.zeros((count, self.task.arm.n))
         for knots in (range(middle, count), range(middle, -1, -1)):
             q = reals(np.atleast_2d(Q)[len(np.atleast_2d(Q)) // 2])[None]

@@ -1,10 +1,10 @@
 """Random scenes for the planner, and the kept study of them.
 
     PYTHONPATH=tests python -m support.planner_scenes --out results/planner
-    PYTHONPATH=tests python -m support.planner_scenes --study reference --out results/planner
+    PYTHONPATH=tests python -m support.planner_scenes --study reference --effort 100 --out results/planner
     PYTHONPATH=tests python -m support.planner_scenes --study gains --out results/planner
 
-The second one takes a hundred times as long for each search: how far the answers of the first are from the best known.
+The second one takes so many times as long for each search: how far the answers of the first are from the best known.
 The third one runs the best plans, and those of the published arm, on surfaces 5 mm off with gains from stiff to soft.
 
 Arms of 7 to 10 joints whose hand goes there and back along a short way, over a floor, a pipe, a box, or with a joint
@@ -33,8 +33,8 @@ from dynsim.scenario.reading import scenario_from_resolved
 from dynsim.studies.processes import cores
 from dynsim.system.files import write_json
 
-# Of the reference: so many times the rounds, from postures of another seed.
-EFFORT, OTHER_SEED = 100, 1000
+# Of the random postures of the reference.
+OTHER_SEED = 1000
 # Of the study of gains [V/rad].
 GAINS = (500.0, 200.0, 100.0, 50.0, 20.0)
 KINDS = ("floor", "pipe", "box", "third_axis")
@@ -183,9 +183,9 @@ def _rounded(value: Any) -> Any:
     return value if not isinstance(value, float) else round(value, 5) if math.isfinite(value) else None
 
 
-def best_known(seed: int) -> dict[str, Any]:
-    """Least heat of each number of braces by a search with a hundred times the rounds, from other random postures."""
-    options = Options(along=along_of(seed), starts=EFFORT * Options.starts, seed=OTHER_SEED)
+def best_known(seed: int, effort: int) -> dict[str, Any]:
+    """Least heat of each number of braces by a search of so many times the rounds, from other random postures."""
+    options = Options(along=along_of(seed), starts=effort * Options.starts, seed=OTHER_SEED)
     search, cpu = Search(task(scene_scenario(seed), options)), clock.process_time()
     search.kept = 3 * search.kept
     found = search.run()
@@ -197,7 +197,13 @@ def best_known(seed: int) -> dict[str, Any]:
         }
         for count, ranked in found.items()
     ]
-    return {"seed": seed, "rounds": options.starts, "cpu_s": round(clock.process_time() - cpu, 1), "sizes": sizes}
+    return {
+        "seed": seed,
+        "effort": effort,
+        "rounds": options.starts,
+        "cpu_s": round(clock.process_time() - cpu, 1),
+        "sizes": sizes,
+    }
 
 
 def stiffness(scenario: Scenario, counts: Sequence[int], along: tuple[float, ...] = ()) -> list[dict[str, Any]]:
@@ -240,6 +246,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--out", type=Path, default=Path("results/planner"), metavar="FOLDER")
     parser.add_argument("--study", choices=("scenes", "reference", "gains"), default="scenes")
+    parser.add_argument("--effort", type=int, default=100, metavar="N", help="of the reference, times the usual rounds")
     parser.add_argument("--scenes", type=int, nargs=2, default=(1, 20), metavar=("FIRST", "LAST"))
     chosen = parser.parse_args()
     first, last = chosen.scenes
@@ -251,7 +258,7 @@ def main() -> None:
         if chosen.study == "gains":
             rows += stiffness(scene_scenario(seed), (), along_of(seed))
         else:
-            rows.append(best_known(seed) if chosen.study == "reference" else planned(seed, cores()))
+            rows.append(best_known(seed, chosen.effort) if chosen.study == "reference" else planned(seed, cores()))
         print(json.dumps(rows[-1]), flush=True)
     if chosen.study == "gains":
         rows += [row for friction in (0.1, 0.0) for row in stiffness(published(friction), range(1, 5))]

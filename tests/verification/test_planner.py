@@ -16,9 +16,8 @@ from dynsim.jit.kernel import integers, reals
 from dynsim.model.surfaces import Box, HeightField, Quadric, shape_arrays
 from dynsim.planner import compiled
 from dynsim.planner.compiled import Arm, Course, Points
-from dynsim.planner.dense import CHARGED
 from dynsim.planner.local import Problem
-from dynsim.planner.problem import Options, task
+from dynsim.planner.problem import CHARGED, Options, task
 from dynsim.planner.search import Search
 from dynsim.planner.verify import Tolerances, Verifier
 from dynsim.scenario.reading import scenario_from_resolved
@@ -83,6 +82,7 @@ def tree() -> tuple[Problem, np.ndarray, np.ndarray, np.ndarray]:
         chord=reals(rng.normal(size=(3, 2))),
         share=reals([0.3, 0.3, 0.4]),
         smooth=reals(np.zeros((2, 2))),
+        slip_scale=reals([2e-3]),
     )
     Q, V = rng.normal(size=(2, n)), 0.01 * rng.normal(size=(3, n))
     return Problem(arm, points, course, 0.5), Q, V, rng.uniform(1.0, 5.0, size=(3, c))
