@@ -18,7 +18,7 @@ from dynsim.cli.app import (
     parsed_overrides,
 )
 from dynsim.cli.display import plan_progress, say, say_written
-from dynsim.errors import ScenarioError
+from dynsim.errors import ScenarioError, UnreachableReference
 from dynsim.system.terminal import escaped
 
 EXAMPLE = "Example: dynsim plan pressing --count 0:3 --candidates link_3:link_9"
@@ -95,6 +95,9 @@ def plan(
     folder = out or Path("results", loaded.name, loaded.variant, "plan")
     least, most = _numbers(count)
     peak = _weights(weight or [])
+    names = [name.strip() for name in candidates.split(",") if name.strip()]
+    if candidates and not names:
+        raise ScenarioError(f"--candidates {escaped(candidates)}: names nothing; leave it out for the default")
     from dynsim.planner.answer import plan_braces
     from dynsim.planner.files import check_plan_folder, save_plan
     from dynsim.planner.verify import Tolerances
@@ -108,7 +111,7 @@ def plan(
     with plan_progress(quiet) as tell:
         found = plan_braces(
             loaded,
-            candidates=[name.strip() for name in candidates.split(",") if name.strip()],
+            candidates=names,
             along=along or (),
             radius_m=radius,
             count=(least, most),
@@ -134,6 +137,8 @@ def plan(
         say_written(folder)
         if found.best is not None:
             say(f"To run the best: dynsim run {escaped(folder / 'plan.yaml')}")
+    if found.best is None:
+        raise UnreachableReference(f"no plan: {escaped(found.sizes[0].reason)}")
 
 
 def _numbers(text: str) -> tuple[int, int]:

@@ -331,6 +331,8 @@ def _candidates(scenario: Scenario, arm: MovingArm, options: Options, surfaces: 
         for end in (first, last):
             if end not in links:
                 raise ModelError(f"plan: no link {end!r} in {text!r}; links: {', '.join(links)}")
+        if links.index(first) > links.index(last):
+            raise ModelError(f"plan: {text!r} begins after its end; write {last}:{first}")
         wanted += links[links.index(first) : links.index(last) + 1]
     if not wanted:
         wanted = [*declared, *links[2:]]
