@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from dynsim.errors import ModelError, UnreachableReference
 from dynsim.model.description import Array, Contact, Robot
@@ -19,17 +19,14 @@ DAMPING = 1e-2
 
 
 class Kinematics(Protocol):
-    """Poses and Jacobians of a robot, such as :class:`dynsim.Model` computes."""
+    """Of :class:`dynsim.Model`, as far as postures need it."""
 
     robot: Robot
     n: int
     nq: int
 
-    def point_position_and_jacobian(self, body: str | int, point: Array, q: Array) -> tuple[Array, Array]:
-        """World position of a point of a body, (3,) [m], and its Jacobian, (3, n) [m/rad]."""
-
-    def body_pose(self, body: str | int, q: Array) -> tuple[Array, Array]:
-        """Rotation, (3, 3), and origin, (3,) [m], of a body."""
+    def body_pose(self, body: str | int, q: ArrayLike) -> tuple[Array, Array]: ...
+    def point_position_and_jacobian(self, body: str | int, point: ArrayLike, q: ArrayLike) -> tuple[Array, Array]: ...
 
 
 def turn_error(R: Array, wanted: Array) -> Array:
@@ -77,19 +74,19 @@ def hand_posture(
             errors.append(turn_error(R @ axes, orientation))
             rows.append(_turning(model, hand, R, origin, q) * revolute)
         for contact in braces:
-            point, rate = model.point_position_and_jacobian(contact.body, contact.point, q)
-            errors.append(np.array([contact.radius - contact.surface.gap(point)]))
-            rows.append((contact.surface.normal(point) @ rate)[None])
+            touching, rate = model.point_position_and_jacobian(contact.body, contact.point, q)
+            errors.append(np.array([contact.radius - contact.surface.gap(touching)]))
+            rows.append((contact.surface.normal(touching) @ rate)[None])
         error, J = np.concatenate(errors), np.vstack(rows)
         size = float(np.abs(error).max())
         if size <= tolerance:
             return q
         q = _stepped(q, J, error * min(1.0, 0.3 / size), size, lower, upper, movable)
     at = [robot.links[k].joint for k in range(model.n) if q[k] in (lower[k], upper[k])]
-    stopped = f"; at their limits: {', '.join(at)}" if at else ""
+    stuck = f"; at their limits: {', '.join(at)}" if at else ""
     left = float(np.abs(error).max())
     raise UnreachableReference(
-        f"no posture near the start has hand, orientation and braces in place: {left:.3g} m or rad are left{stopped}; "
+        f"no posture near the start has hand, orientation and braces in place: {left:.3g} m or rad are left{stuck}; "
         "start elsewhere, or ask for less"
     )
 
@@ -115,9 +112,9 @@ def _stepped(
 def _turning(model: Kinematics, body: int, R: Array, origin: Array, q: Array) -> Array:
     """Angular velocity of a body for each unit of rate, (3, n): from the velocities of two of its points."""
     at_origin = model.point_position_and_jacobian(body, np.zeros(3), q)[1]
-    turning = np.zeros((3, model.n))
+    jacobian = np.zeros((3, model.n))
     for k in range(3):
         # ω × e_k, and ω = ½ Σ e_k × (ω × e_k).
         swept = model.point_position_and_jacobian(body, np.eye(3)[k], q)[1] - at_origin
-        turning += 0.5 * np.cross(R[:, k], swept.T).T
-    return turning
+        jacobian += 0.5 * np.cross(R[:, k], swept.T).T
+    return jacobian

@@ -106,13 +106,13 @@ def build(config: Config, context: BuildContext) -> SnakeDescription:
 
     # [T] V.A; a head part of another length starts with a similar S that keeps the head level
     raised = [0.0, -0.8, 0.0, -1.1, 0.0, 1.9] if n_h == 6 else [0.0, 0.0] * (n_h // 2 - 2) + [0.0, -0.8, 0.0, 0.8]
-    given = raised if config.initial_joints_rad is None else config.initial_joints_rad
-    if len(given) not in (n_h, joints):
+    angles = raised if config.initial_joints_rad is None else config.initial_joints_rad
+    if len(angles) not in (n_h, joints):
         raise ModelError(
-            f"plant.initial_joints_rad has {len(given)} angles; give n_h = {n_h} (base straight) or all {joints}: "
+            f"plant.initial_joints_rad has {len(angles)} angles; give n_h = {n_h} (base straight) or all {joints}: "
             f"{', '.join(names)}"
         )
-    initial = np.concatenate([given, np.zeros(joints - len(given))])
+    initial = np.concatenate([angles, np.zeros(joints - len(angles))])
     for name, angle, limit in zip(names, initial, upper, strict=True):
         if abs(angle) > limit:
             raise ModelError(
