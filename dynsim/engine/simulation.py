@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import time as clock
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -332,6 +332,12 @@ class Simulation:
             values[0] += balance.shift[self._motor(joint)]
         self._follow_line(joint, values)
         self._leave_plan(joint)
+
+    def set_references(self, lines: Mapping[str, tuple[float, float]]) -> None:
+        """:meth:`set_reference` of several joints at once, (position, rate) by joint."""
+        self._settle_now()
+        for joint, line in lines.items():
+            self.set_reference(joint, *line)
 
     def _follow_line(self, joint: str, values: Array) -> None:
         a = self._motor(joint)
