@@ -19,13 +19,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dynsim.compile.scene import BODY_RADIUS, snake_tube, snake_wheel
 from dynsim.errors import ModelError
 from dynsim.model.description import Array, Foot, Inertia, Link, Robot
 from dynsim.model.drives import Drive, Servo
 from dynsim.model.joints.ball import floating
-from dynsim.record.scene import Shape
 from dynsim.snake.base_part import BasePart
 from dynsim.snake.description import SnakeDescription
 from dynsim.snake.lifting import Lifts
@@ -59,7 +59,7 @@ class SnakeTree(Robot):
 
     @property
     def lifting_joints(self) -> tuple[str, ...]:
-        """Pitch joints on the axles of pairs 1, 2, …, one less than there are pairs; the first is the last head joint."""
+        """Pitch joints on the axles of pairs 1, 2, …, all but the last; the first is the last head joint."""
         return self.lifts.joints
 
     @property
@@ -225,7 +225,7 @@ def _link_inertia(mass: float, length: float, ahead: float) -> Inertia:
     return Inertia(float(mass), np.array([0.5 * ahead * length, 0.0, 0.0]), tensor)
 
 
-def lifted_moments(robot: SnakeTree, height: Array) -> Array:
+def lifted_moments(robot: SnakeTree, lifted: NDArray[np.bool_]) -> Array:
     """Moments of weight at the pitch joints of lifted pairs, (pairs − 1,) [N m], as if the base part was straight.
 
     Between two pairs on the ground the base part is taken as simply supported there, behind the last one as a
@@ -234,9 +234,11 @@ def lifted_moments(robot: SnakeTree, height: Array) -> Array:
     d = robot.description
     n, l, g = d.pairs, d.link_length, float(-robot.gravity[2])
     # Weight of the plate behind each axle: the two links between it and the next one.
-    weight = g * np.array([d.link_mass[d.head_joints + 2 * k] + d.link_mass[d.head_joints + 2 * k + 1] for k in range(n - 1)])
+    weight = g * np.array(
+        [d.link_mass[d.head_joints + 2 * k] + d.link_mass[d.head_joints + 2 * k + 1] for k in range(n - 1)]
+    )
     moments = np.zeros(n - 1)
-    down = np.flatnonzero(height == 0.0)
+    down = np.flatnonzero(~lifted)
     for first, last in zip(down, [*down[1:], n], strict=True):
         count = last - first
         if last == n:  # the tail, behind the last pair on the ground
@@ -246,7 +248,5 @@ def lifted_moments(robot: SnakeTree, height: Array) -> Array:
             plates = weight[first:last]
             reaction = sum(plates[i] * (2 * (count - i) - 1) for i in range(count)) / (2 * count)
             for k in range(1, count):
-                moments[first + k] = -(
-                    reaction * 2 * l * k - sum(plates[i] * l * (2 * (k - i) - 1) for i in range(k))
-                )
+                moments[first + k] = -(reaction * 2 * l * k - sum(plates[i] * l * (2 * (k - i) - 1) for i in range(k)))
     return moments

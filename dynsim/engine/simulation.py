@@ -13,7 +13,7 @@ import math
 import time as clock
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -43,6 +43,10 @@ from dynsim.scenario import Scenario, require_scenario
 from dynsim.scenario.build import check_start
 from dynsim.system import interruption
 from dynsim.system.memo import Memo, remembering
+
+if TYPE_CHECKING:
+    from dynsim.engine.snake_pilot import SnakePilot
+    from dynsim.snake.description import CommandSource
 
 Array = NDArray[np.float64]
 
@@ -79,7 +83,7 @@ class Simulation:
     duration : end of the run [s], ``math.inf`` for none; default: the scenario's. References hold where they end.
     trace : samples that are kept: all (None), the last so many, or none (0)
     motors : instead of those of the plant, see :mod:`dynsim.model.description`; records still show the scenario's
-    operator : instead of the script of a scenario that has ``controller.operator``
+    operator : instead of the script of a scenario that has ``controller.operator``, or of a snake's
 
     Raises
     ------
@@ -95,7 +99,7 @@ class Simulation:
         duration: float | None = None,
         trace: int | None = None,
         motors: Sequence[Drive] | None = None,
-        operator: VelocitySource | None = None,
+        operator: VelocitySource | CommandSource | None = None,
     ) -> None:
         require_scenario(scenario)
         if scenario.engine != "dynamics":
@@ -149,12 +153,25 @@ class Simulation:
         run.clock[[ki.TIME, ki.COUNTED_SINCE]] = start
         run.tick[:, [ki.TICK_NEXT, ki.TICK_PHASE]] = start
         self._refill()
-        options = self._prepared.control.teleop
-        self._operator = None if options is None else Operator(self.model, options, operator)
+        self._operator = self._attendant(operator)
         if self._operator is not None:
-            self.every(1.0 / self._operator.options.rate, self._operator)
+            self.every(self._operator.period, self._operator)
         elif operator is not None:
             raise ScenarioError("an operator needs a scenario with controller.operator, which says what it moves")
+
+    def _attendant(self, source: Any) -> Operator | SnakePilot | None:
+        """Who rewrites references at the ticks of its own, where the scenario has somebody."""
+        control = self._prepared.control
+        if control.teleop is not None:
+            return Operator(self.model, control.teleop, source)
+        if control.task_space is None:
+            return None
+        # Imported here: an arm needs nothing of a snake.
+        from dynsim.engine.snake_control import control_periods
+        from dynsim.engine.snake_pilot import SnakePilot
+
+        periods = control_periods(self._scenario, control.task_space.schedule.period)
+        return SnakePilot(self.model, control.task_space, *periods, source)
 
     @property
     def scenario(self) -> Scenario:
@@ -191,8 +208,8 @@ class Simulation:
         }
 
     @property
-    def operator(self) -> Operator | None:
-        """Who rewrites the references of hand and base, where the scenario has ``controller.operator``."""
+    def operator(self) -> Operator | SnakePilot | None:
+        """Who rewrites references: of hand and base under ``controller.operator``, of a snake under ``task_space``."""
         return self._operator
 
     @property
@@ -458,7 +475,7 @@ class Simulation:
     def snapshot(self) -> Snapshot:
         """What :meth:`restore` needs to go on from here."""
         arrays = {name: array.copy() for name, array in self._arrays().items()}
-        operator = None if self._operator is None else self._operator.state()
+        operator = None if self._operator is None else self._operator.remembered()
         trace, happened = self._trace.snapshot(), tuple(self._happened)
         return Snapshot(self._token, arrays, self._time, trace, happened, self._frozen, operator)
 
@@ -522,6 +539,8 @@ class Simulation:
             base_as_planned=self._base_as_planned,
             pictured=pictured,
         )
+        if self._operator is not None:
+            self._operator.add_to(record)
         record.complete = self.finished
         if self._failed():
             mark_stopped(stopped(self._scenario, self._prepared), record)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from dynsim.engine.mode_switching import ModeSwitcher
 from dynsim.errors import ModelError, ScenarioError, SimulationStopped
 from dynsim.jit.kernel import integers, reals
+from dynsim.scenario import Scenario
 from dynsim.snake import state as ss
 from dynsim.snake.description import (
     COORDINATES,
@@ -27,6 +28,10 @@ from dynsim.snake.state import Rig, SnakeState, SnakeTrace, new_rig, new_state, 
 from dynsim.snake.ticks import record_row, run_ticks
 
 Array = NDArray[np.float64]
+
+# Why the target waited, in the order of the counters of dynsim.snake.state.SnakeState; the last is the rest: after
+# an obstacle, until switching has brought the joints below switching.release_fraction of their limits.
+OBSTACLES = ("joint limit", "rate limit", "singular posture", "attitude at beta = 90 deg", "release of the joints")
 
 
 def _no_commands() -> CommandBlock:
@@ -230,3 +235,25 @@ class SnakeControl:
 def copy_of(state: SnakeState) -> SnakeState:
     """The state with arrays of its own."""
     return SnakeState(*(array.copy() for array in state))
+
+
+def control_periods(scenario: Scenario, period: float) -> tuple[int, int]:
+    """Control periods [s] of a run, and how many of them go by between two samples of its record.
+
+    Raises
+    ------
+    ScenarioError
+        The run is shorter than a period, or the recording rate does not divide the control rate.
+    """
+    ticks = round(scenario.duration_s / period)
+    if ticks < 1:
+        raise ScenarioError(f"duration_s = {scenario.duration_s:g} is shorter than controller.period_s = {period:g}")
+    rate_hz = scenario.record.rate_hz
+    exact = 1.0 / (rate_hz * period)
+    stride = max(1, round(exact))
+    if abs(stride - exact) > 1e-6 * exact:
+        raise ScenarioError(
+            f"record.rate_hz = {rate_hz:g} does not divide the control rate of {1 / period:g} Hz "
+            f"(controller.period_s); {1 / (period * stride):g} does"
+        )
+    return ticks, stride

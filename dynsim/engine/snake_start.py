@@ -12,11 +12,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from dynsim.compile.control import JointControl
 from dynsim.compile.snake_tree import SnakeTree, configuration, lifted_moments
+from dynsim.errors import ModelError
 from dynsim.model.description import Array
 from dynsim.model.drives import Servo
-from dynsim.scenario import Scenario
+from dynsim.scenario import Scenario, build
 from dynsim.scenario.loads import Payload
+from dynsim.scenario.schema import Integrator
 from dynsim.snake.lifting import height_of
 from dynsim.system.memo import recall
 
@@ -72,25 +75,29 @@ class WheelLifter:
 
     def heights(self, time: float) -> Array:
         """Of the pairs at a time [s], (pairs,) [m]."""
-        return np.where(np.isfinite(self._up) | (self._up < 0), height_of(np.array(time), self._up, self._down, self._robot.lifts), 0.0)
+        return height_of(np.array(time), self._up, self._down, self._robot.lifts)
 
     def angles(self, time: float, yaw: Array) -> Array:
-        """What is added to the pitch joints on the axles at a time [s] and yaw angles (pairs − 1,), (pairs − 1,) [rad]."""
+        """What is added to the pitch joints on the axles at a time [s] and yaw angles, both (pairs − 1,) [rad]."""
         return told_by_heights(self._robot, self.heights(time), yaw, self._stiffness)
 
 
 def told_by_heights(robot: SnakeTree, height: Array, yaw: Array, stiffness: Array) -> Array:
-    """Angles that bring pairs to heights (pairs,) [m], with what servos of a stiffness (pairs − 1,) [N m/rad] give way."""
+    """Angles that bring pairs to heights (pairs,) [m], with what servos give way.
+
+    ``stiffness`` : (pairs − 1,) of these servos [N m/rad]
+    """
     if not height.any():
         return np.zeros(len(yaw))
     hinge = np.asarray(robot.base_part.fold(yaw[None], height[None]).hinge[0])
     if not robot.sag_compensation:
         return hinge
-    # By the part of the clearance that is there, so that lifting begins and ends at nothing.
-    full = 1e-3 * robot.lifts.clearance_mm
-    aloft = np.where(height > 0.0, full, 0.0)
-    share = float(height.max()) / full
-    return hinge + share * lifted_moments(robot, aloft) / stiffness
+    # Moments of what is higher than s, averaged over s from zero to the clearance: they change without a jump.
+    share, below = height / (1e-3 * robot.lifts.clearance_mm), 0.0
+    for level in np.unique(share[share > 0.0]).tolist():
+        hinge = hinge + (level - below) * lifted_moments(robot, share >= level) / stiffness
+        below = level
+    return hinge
 
 
 def told_angles(robot: SnakeTree, phi: Array, added: Array) -> dict[str, float]:
@@ -101,17 +108,42 @@ def told_angles(robot: SnakeTree, phi: Array, added: Array) -> dict[str, float]:
     return angles
 
 
-def begun(scenario: Scenario, robot: SnakeTree, grounded: Array) -> SnakeTree:
-    """The robot as a run begins, with these pairs, (pairs,) 1 or 0, on the ground."""
-    d = robot.description
+def begun(scenario: Scenario, robot: SnakeTree) -> tuple[SnakeTree, JointControl]:
+    """The robot as a run begins, and what its servos hold until the controller, if there is one, tells them otherwise.
+
+    Raises
+    ------
+    ModelError
+        See :func:`dynsim.scenario.build.controller`; or the control period is no multiple of the step.
+    """
+    d, config = robot.description, scenario.config
+    controller = None if scenario.controller is None else build.controller(scenario, d)
+    grounded = np.ones(d.pairs)
+    if controller is not None:
+        grounded = controller.law.grounded[controller.fixing_row].astype(np.float64)
+        _check_step(config.integrator, controller.schedule.period)
     lifter = WheelLifter(robot, grounded)
-    height = lifter.heights(0.0)
-    added = lifter.angles(0.0, np.asarray(d.initial_joints)[d.head_joints :])
-    if not robot.raised:
-        return replace(robot, q0=configuration(robot, d.initial_joints, height))
-    config = scenario.config
-    known = config.plant, config.contacts, config.integrator, config.surfaces, config.loads, grounded
-    return replace(robot, q0=recall("raised", lambda: _raised(scenario, robot, height, added), *known))
+    height, phi = lifter.heights(0.0), np.asarray(d.initial_joints)
+    added = lifter.angles(0.0, phi[d.head_joints :])
+    if robot.raised:
+        known = config.plant, config.contacts, config.integrator, config.surfaces, config.loads, grounded
+        q = recall("raised", lambda: _raised(scenario, robot, height, added), *known)
+    else:
+        q = configuration(robot, phi, height)
+    robot = replace(robot, q0=q)
+    control = JointControl.absent(robot, told_angles(robot, phi, added))
+    return robot, replace(control, task_space=controller)
+
+
+def _check_step(integrator: Integrator, period: float) -> None:
+    """ModelError unless the control period [s] is a multiple of the step of time stepping."""
+    step = integrator.step_s
+    if integrator.method == "time_stepping" and step and abs(period / step - round(period / step)) > 1e-9:
+        raise ModelError(
+            f"integrator.step_s = {step:g} s does not divide controller.period_s = {period:g} s; "
+            f"{period / math.ceil(period / step):g} does",
+            keys=("integrator", "step_s"),
+        )
 
 
 def _raised(scenario: Scenario, robot: SnakeTree, height: Array, added: Array) -> Array:

@@ -329,8 +329,8 @@ class Robot:
 
     ``hand``: the controlled point (body name, point in its frame [m]); ``q0``: initial configuration [rad or m], zero
     unless given; ``frames``: further names to attach points to; ``fixed_shapes``, ``fixed_inertia``: what stands still
-    in the world; ``couplings`` of joints to joints; ``base``: what it drives on, None: it stands fixed or floats; ``feet``:
-    what of it is made to touch, such as wheels.
+    in the world; ``couplings`` of joints to joints; ``base``: what it drives on, None: it stands fixed or floats;
+    ``feet``: what of it is made to touch, such as wheels.
     """
 
     name: str

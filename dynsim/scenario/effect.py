@@ -81,7 +81,8 @@ def _of_contacts(config: Any) -> Iterator[tuple[Keys, str]]:
     contacts = config.contacts
     if contacts.law == "unilateral":
         yield ("contacts", "reference_tolerance_m"), "it is of law: bilateral; real braces may leave their surfaces"
-    if not contacts.points and contacts.candidates == "points":
+    has_feet = getattr(config.plant, "level", "") == "dynamic"
+    if not contacts.points and contacts.candidates == "points" and not has_feet:
         for key in type(contacts).model_fields:
             if key not in ("law", "candidates", "points", "reference_tolerance_m"):
                 yield ("contacts", key), "there are no contacts.points, and contacts.candidates are points alone"

@@ -9,7 +9,8 @@ import numpy as np
 
 from dynsim.compile.scene import snake_scene
 from dynsim.engine.kinematic import prepare
-from dynsim.engine.kinematic_record import OBSTACLES, make_record
+from dynsim.engine.kinematic_record import make_record
+from dynsim.engine.snake_control import OBSTACLES
 from dynsim.record import Record
 from dynsim.record.poses import poses_at
 from dynsim.scenario import Scenario
