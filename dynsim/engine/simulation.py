@@ -344,24 +344,27 @@ class Simulation:
         Of an open torque ``position`` is the torque [N m]. What ``initial.equilibrium`` has moved the references by is
         added.
         """
-        values = _finite("reference", [position, rate])
-        if (balance := self._prepared.balance) is not None:
-            values[0] += balance.shift[self._motor(joint)]
-        self._follow_line(joint, values)
-        self._leave_plan(joint)
+        self.set_references({joint: (position, rate)})
 
     def set_references(self, lines: Mapping[str, tuple[float, float]]) -> None:
-        """:meth:`set_reference` of several joints at once, (position, rate) by joint."""
-        self._settle_now()
-        for joint, line in lines.items():
-            self.set_reference(joint, *line)
+        """:meth:`set_reference` of several joints at once: (position, rate) by joint."""
+        if not lines:
+            return
+        motors = [self._motor(joint) for joint in lines]
+        values = _finite("reference", list(lines.values()))
+        if (balance := self._prepared.balance) is not None:
+            values[:, 0] += balance.shift[motors]
+        self._follow_lines(motors, values)
+        for joint in lines:
+            self._leave_plan(joint)
 
-    def _follow_line(self, joint: str, values: Array) -> None:
-        a = self._motor(joint)
+    def _follow_lines(self, motors: list[int], values: Array) -> None:
+        """Let motors follow lines from now on, values (motors, 2)."""
         self._settle_now()
         drives, reference = self._prepared.system.drives, self._prepared.system.reference
-        reference.spline[a], drives.table[a, ka.SAMPLED] = ka.REWRITTEN, self._sampled[a]
-        drives.input[a, [ka.LINE_START, ka.LINE_RATE, ka.LINE_SINCE]] = values[0], values[1], self._time
+        reference.spline[motors], drives.table[motors, ka.SAMPLED] = ka.REWRITTEN, self._sampled[motors]
+        drives.input[motors, ka.LINE_START], drives.input[motors, ka.LINE_RATE] = values.T
+        drives.input[motors, ka.LINE_SINCE] = self._time
         self._restart()
 
     def set_command(self, joint: str, command: float) -> None:
@@ -712,7 +715,7 @@ class Simulation:
         reference = self._prepared.system.reference
         powers = reference.grid[1] ** np.arange(6)
         end = float(reference.coefficients[-1, self._splines[self._motors[joint]]] @ powers)
-        self._follow_line(joint, np.array([end, 0.0]))
+        self._follow_lines([self._motors[joint]], np.array([[end, 0.0]]))
 
     def _refill(self, until: float = -np.inf) -> None:
         """Move what was sampled to the trace, and give the buffer the times from there on, at least up to ``until``."""
