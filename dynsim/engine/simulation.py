@@ -171,7 +171,11 @@ class Simulation:
         from dynsim.engine.snake_pilot import SnakePilot
 
         periods = control_periods(self._scenario, control.task_space.schedule.period)
-        return SnakePilot(self.model, control.task_space, *periods, source)
+        pilot = SnakePilot(self.model, control.task_space, *periods, source, self._scenario.config.sensors)
+        for sensor in pilot.sensors:
+            # Before the controller, where both are due.
+            self.every(sensor.period, sensor)
+        return pilot
 
     @property
     def scenario(self) -> Scenario:

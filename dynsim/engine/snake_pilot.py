@@ -12,6 +12,7 @@ takes its state from:
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -20,12 +21,15 @@ import numpy as np
 from dynsim.compile.model import Model
 from dynsim.compile.snake_tree import SnakeTree
 from dynsim.engine.operator import Referenced
+from dynsim.engine.sensing import SampledSensor
 from dynsim.engine.snake_control import OBSTACLES, SnakeControl, copy_of
 from dynsim.engine.snake_record import add_task, hold_last, task_summary, task_warnings
 from dynsim.engine.snake_start import STEADY_TICKS, WheelLifter, told_angles
+from dynsim.engine.stepped import State
 from dynsim.errors import SimulationStopped
 from dynsim.model.description import Array
 from dynsim.record import Record
+from dynsim.scenario.sensors import Sensors
 from dynsim.snake import state as ss
 from dynsim.snake.description import CommandSource, TaskSpaceController
 from dynsim.snake.state import FEEDFORWARD, GIVEN, MEASURED, Schedule, SnakeTrace
@@ -56,6 +60,7 @@ class SnakePilot(SnakeControl):
     model : of a :class:`~dynsim.compile.snake_tree.SnakeTree`
     source : of the commands, instead of the controller's script
     ticks : control periods of the run; stride : of those that are recorded
+    sensors : through which the controller sees the robot
     """
 
     path = None  # the target is in the record with the rest of what the controller thinks
@@ -67,6 +72,7 @@ class SnakePilot(SnakeControl):
         ticks: int,
         stride: int,
         source: CommandSource | None = None,
+        sensors: Sensors | None = None,
     ) -> None:
         robot = model.robot
         assert isinstance(robot, SnakeTree)
@@ -83,6 +89,7 @@ class SnakePilot(SnakeControl):
         self._row = controller.fixing_row
         self._added = self._lifter.angles(0.0, self.state.phi[d.head_joints :])
         self._added_rate = np.zeros_like(self._added)
+        self.sensors = self._sensors(sensors or Sensors())
         self._next_look = self._commanded = 0
         self._seen: Any = None
         self.read_commands(waiting=False)
@@ -140,12 +147,33 @@ class SnakePilot(SnakeControl):
 
     def _look(self) -> None:
         """What the controller is told of the robot, into its beliefs."""
-        q = self._seen.q
-        self.state.base[:] = base_pose(q)
+        self.state.base[:] = base_pose(self._seen.q)
+        for sensor in self.sensors:
+            told = self.state.w_hat if self.believed == ss.MEASURED else self.state.phi_hat
+            told[:] = sensor.value(self._seen.time)
+
+    def _sensors(self, config: Sensors) -> list[SampledSensor]:
+        """What tells the controller of the robot: nothing under feedforward."""
+
+        def sensor(read: Callable[[State], Array], of: Any, noise: Array, resolution: float) -> SampledSensor:
+            period = self.period if of is None or of.rate_hz is None else 1.0 / of.rate_hz
+            delay = 0.0 if of is None else of.delay_s
+            return SampledSensor(
+                read, period=period, delay=delay, noise=noise, resolution=resolution, seed=[config.seed, self.believed]
+            )
+
         if self.believed == ss.MEASURED:
-            self.state.w_hat[:] = self.head_pose(q)
-        elif self.believed == ss.ESTIMATED:
-            self.state.phi_hat[:] = q[self._joints]
+            capture = config.motion_capture
+            noise = np.zeros(6)
+            if capture is not None:
+                noise[:3], noise[3:] = capture.position_noise_m, capture.attitude_noise_rad
+            return [sensor(lambda state: self.head_pose(state.q), capture, noise, 0.0)]
+        if self.believed == ss.ESTIMATED:
+            encoders = config.encoders
+            deg = np.zeros(2) if encoders is None else np.radians([encoders.noise_deg, encoders.resolution_deg])
+            noise = np.full(len(self._joints), deg[0])
+            return [sensor(lambda state: state.q[self._joints], encoders, noise, float(deg[1]))]
+        return []
 
     def _tell(self, simulation: Referenced, time: float, phi: Array) -> None:
         """References of joints and wheels from the tick at ``time`` on, at which joints are told ``phi``."""
@@ -191,6 +219,7 @@ class SnakePilot(SnakeControl):
             "trace": SnakeTrace(*(array.copy() for array in self.trace)),
             "gripper": self.gripper.copy(),
             "lifter": self._lifter.state(),
+            "sensors": [sensor.remembered() for sensor in self.sensors],
             "switcher": {name: getattr(switcher, name) for name in _SWITCHER} | {"refusals": list(switcher.refusals)},
             "own": {name: getattr(self, name) for name in _OWN},
         }
@@ -201,6 +230,8 @@ class SnakePilot(SnakeControl):
             mine[...] = array
         self.gripper[...] = kept["gripper"]
         self._lifter.restore(kept["lifter"])
+        for sensor, part in zip(self.sensors, kept["sensors"], strict=True):
+            sensor.restore(part)
         for name, value in kept["switcher"].items():
             setattr(self.switcher, name, list(value) if name == "refusals" else value)
         for name, value in kept["own"].items():

@@ -43,8 +43,7 @@ class WheelLifter:
         pairs = len(grounded)
         self._up, self._down = np.where(grounded == 0, -np.inf, np.inf), np.full(pairs, np.inf)
         servos = {motor.joint: motor for motor in robot.motors}
-        chosen = [servos[joint] for joint in robot.lifting_joints]
-        assert all(isinstance(servo, Servo) for servo in chosen)
+        chosen = [servo for joint in robot.lifting_joints if isinstance(servo := servos[joint], Servo)]
         # Torque per angle of the position loop [N m/rad].
         self._stiffness = np.array([servo.k_p * servo.torque_constant / servo.resistance for servo in chosen])
 

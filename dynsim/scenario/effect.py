@@ -63,6 +63,7 @@ def _of_kinematics(config: Any) -> Iterator[tuple[Keys, str]]:
         part = getattr(config, section)
         for key in () if part is None else type(part).model_fields:
             yield (section, key), f"plant {config.plant.type} is kinematic"
+    yield ("sensors",), f"plant {config.plant.type} is kinematic"
     if hasattr(config.plant, "dynamics"):
         yield ("plant", "dynamics"), "plant.level is kinematic"
 

@@ -15,6 +15,7 @@ from dynsim.library.families import engine, section_defaults, union
 from dynsim.record import notebook
 from dynsim.scenario.effect import idle_keys, is_set
 from dynsim.scenario.loads import LoadConfig
+from dynsim.scenario.sensors import Sensors
 
 # Bytes of the name of a folder on common file systems.
 NAME_LIMIT = 255
@@ -235,6 +236,7 @@ class ScenarioConfig(StrictConfig):
     )
     initial: Initial | None = Field(default=None, description="posture and currents of the start")
     loads: dict[str, LoadConfig] = Field(default={}, description="forces, torques and payloads by name")
+    sensors: Sensors | None = Field(default=None, description="what a sampled controller is told of the robot")
     integrator: Integrator = Integrator()
     record: RecordOptions = RecordOptions()
     metrics: Metrics = Metrics()

@@ -107,8 +107,12 @@ def section_defaults(plant: Mapping[str, Any], sections: Mapping[str, Any]) -> d
     integrator = sections.get("integrator")
     if not isinstance(integrator, Mapping) or integrator.get("method", "time_stepping") == "time_stepping":
         found["integrator"] = {"method": "time_stepping", "step_s": 0.0025}
-    if isinstance(sections.get("controller"), Mapping):
+    controller = sections.get("controller")
+    if isinstance(controller, Mapping):
         found["controller"] = {"state": "feedforward"}  # [T] IV.C.2
+        sensor = {"measured": "motion_capture", "estimated": "encoders"}.get(str(controller.get("state")))
+        if sensor is not None:
+            found["sensors"] = {sensor: {}}
     return found
 
 
