@@ -244,10 +244,12 @@ class SnakePilot(SnakeControl):
             return
         d, law, model = self.description, self.controller.law, self.model
         trace = SnakeTrace(*(array[:rows].copy() for array in self.trace))
+        told = trace.phi.copy()
         trace.base[:], trace.phi[:] = base_pose(q), q[:, self._joints]
         trace.rho[:] = q[:, _places(self.robot, self.robot.wheel_joints)]
         if rows > self._commanded:  # at the end no control period begins
             trace.mode[-1], trace.w_target[-1] = self.state.counts[ss.MODE], self.state.w_target
+            told[-1] = self.state.phi
             hold_last(trace, self.state)
         w, points, shown = np.zeros((rows, 6)), [], copy_of(self.state)
         for r in range(rows):
@@ -266,6 +268,7 @@ class SnakePilot(SnakeControl):
         add("phi_dot", rates, "rad/s", labels=names, description="joint rates")
         rates = np.stack([rate[joint] for joint in self.robot.wheel_joints], axis=1)
         add("rho_dot", rates, "rad/s", labels=d.wheel_names, description="rates of the active wheels")
+        add("phi_told", told, "rad", labels=names, description="joint angles that servos are told, without lifting")
         text = "rates held from this time on, as told"
         add("phi_dot_told", trace.u[:, :columns], "rad/s", labels=names, description=f"joint {text}")
         add("rho_dot_told", trace.u[:, columns:], "rad/s", labels=d.wheel_names, description=f"wheel {text}")

@@ -287,12 +287,14 @@ def record_command(schedule, state, rig, r, trace):
 def command_tick(model, law, schedule, state, velocity, moving, slows, rig, r, trace):
     """One control period of a robot that something else moves: joints and wheels of ``state`` are what they are told.
 
-    Parameters as of :func:`command`. What was believed at its beginning goes to row r of the trace, if it is not -1.
+    Parameters as of :func:`command`. What was told and believed at its beginning goes to row r of the trace, if it is
+    not -1.
     Returns True when the command was not carried out.
     """
     if r >= 0:
         trace.mode[r] = state.counts[ss.MODE]
         copy(state.w_target, trace.w_target[r])
+        copy(state.phi, trace.phi[r])
     reason, commanded, speed = command(model, law, schedule, state, velocity, moving, slows, rig)
     blocked = settle(schedule, state, moving, reason, commanded, speed, rig)
     if r >= 0:
