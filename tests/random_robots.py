@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dynsim.compile.contact_law import JointStop, compile_unilateral, joint_stops
+from dynsim.compile.contact_law import JointStop, compile_unilateral, dry_frictions, joint_stops
 from dynsim.compile.model import Model
 from dynsim.compile.shapes import compile_shapes
 from dynsim.compile.tables import compile_contacts, compile_couplings, compile_drives, compile_loads, compile_model
@@ -240,8 +240,9 @@ class Bench:
         Time stepping has arrays of its own, with ``theta``, and goes by the unilateral law.
         """
         n, na, c = self.sizes
-        couplings = len(self.robot.couplings) + len(self.stops)
         system, stepping = self.system, None
+        couplings = len(self.robot.couplings) + len(self.stops)
+        couplings += 0 if system.unilateral is None else len(system.unilateral.dry)
         if METHODS[method] == TIME_STEPPING:
             stepping = stepping_arrays(system.model, system.contacts, na, couplings, theta)
         run = new_run(
@@ -296,27 +297,30 @@ def bench(
     k_d: float = 1.0,
     real: bool = False,
     slow: float = 1e-5,
+    dry: bool = False,
 ) -> Bench:
     """Compile a robot and its contacts, with a voltage PD that holds ``held`` (zero by default).
 
     ``real``: under the unilateral law, with the robot's joint stops; slip below ``slow`` [m/s] keeps its direction.
+    ``dry``: with friction that holds joints at rest, which time stepping alone has.
     """
     na = len(robot.motors)
     contact_arrays = compile_contacts(robot, contacts or [])
     n, c, circuits = len(robot.links), len(contacts or []), robot.circuits
     stops = joint_stops(robot) if real else []
-    size = n + ka.row_limit(c, len(robot.couplings) + len(stops)) + circuits
+    rubbing = dry_frictions(robot) if dry else []
+    size = n + ka.row_limit(c, len(robot.couplings) + len(stops) + len(rubbing)) + circuits
     system = System(
         layout=state_layout(robot.nq, n, circuits, c, len(loads or ()), LOSSES if real else 0, 1),
         model=compile_model(robot),
-        drives=compile_drives(robot, k_p=[k_p] * na, k_d=[k_d] * na),
+        drives=compile_drives(robot, k_p=[k_p] * na, k_d=[k_d] * na, dry=dry),
         reference=held_reference(np.zeros(na) if held is None else held),
         contacts=contact_arrays,
         loads=compile_loads(robot, loads or ()),
         dense=np.zeros((size, size + 1)) if m_star else None,
         couplings=compile_couplings(robot),
         shapes=compile_shapes(robot, contacts or []),
-        unilateral=compile_unilateral(robot, contacts or [], stops, slow) if real else None,
+        unilateral=compile_unilateral(robot, contacts or [], stops, slow, rubbing) if real else None,
     )
     return Bench(robot, system, new_workspace(system), tuple(contacts or ()) if real else (), tuple(stops))
 

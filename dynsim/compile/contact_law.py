@@ -15,6 +15,7 @@ from dynsim.dynamics.contact.unilateral import UnilateralArrays
 from dynsim.errors import ModelError
 from dynsim.jit.kernel import integers, reals
 from dynsim.model.description import Contact, Robot
+from dynsim.model.drives import TorqueSource
 
 # A joint may start this far beyond its stop [rad or m].
 START_TOLERANCE = 1e-6
@@ -33,6 +34,22 @@ class JointStop:
     position: float
 
 
+@dataclass(frozen=True)
+class DryFriction:
+    """Friction of a joint that holds it at rest, of its gear and of its bearing [N m or N]."""
+
+    joint: str
+    gear: float
+    bearing: float
+
+
+def dry_frictions(robot: Robot) -> list[DryFriction]:
+    """The joints of a robot with friction that is not smoothed."""
+    gears = {motor.joint: motor.dry_friction for motor in robot.motors if not isinstance(motor, TorqueSource)}
+    every = [DryFriction(link.joint, gears.get(link.joint, 0.0), link.friction) for link in robot.links]
+    return [one for one in every if one.gear + one.bearing > 0.0]
+
+
 def told(value: float, unit: str, digits: int = 5) -> str:
     """A joint coordinate for a line of text; an angle in degrees first, which scenarios are written in."""
     if unit != "rad":
@@ -41,7 +58,7 @@ def told(value: float, unit: str, digits: int = 5) -> str:
 
 
 def compile_unilateral(
-    robot: Robot, contacts: Sequence[Contact], stops: Sequence[JointStop], slow: float
+    robot: Robot, contacts: Sequence[Contact], stops: Sequence[JointStop], slow: float, dry: Sequence[DryFriction] = ()
 ) -> UnilateralArrays:
     """Tables of the unilateral law.
 
@@ -49,13 +66,20 @@ def compile_unilateral(
     ----------
     stops : what joints come up against
     slow : speed below which slip has no direction of its own [m/s]
+    dry : joints that rub; time stepping only
     """
     c, s = len(contacts), len(stops)
-    p = ka.row_limit(c, len(robot.couplings) + s)
+    p = ka.row_limit(c, len(robot.couplings) + s + len(dry))
     stop_table, stop = np.zeros((s, ku.STOP_TABLE_SIZE), dtype=np.int64), np.zeros((s, ku.STOP_SIZE))
     for k, limit in enumerate(stops):
         stop_table[k, ku.STOP_JOINT] = robot.joint_names.index(limit.joint)
         stop[k, ku.SIDE], stop[k, ku.LIMIT] = limit.side, limit.side * limit.position
+    dry_table, frictions = np.zeros((len(dry), ku.DRY_TABLE_SIZE), dtype=np.int64), np.zeros((len(dry), ku.DRY_SIZE))
+    driven = [motor.joint for motor in robot.motors]
+    for k, one in enumerate(dry):
+        dry_table[k, ku.DRY_JOINT] = robot.joint_names.index(one.joint)
+        dry_table[k, ku.DRY_DRIVE] = driven.index(one.joint) if one.gear > 0.0 else -1
+        frictions[k, [ku.OF_GEAR, ku.OF_JOINT]] = one.gear, one.bearing
     slide = np.zeros((c, ku.SLIDE_SIZE))
     slide[:, ku.LANDS_AT] = ku.DEPTH
     tally, number = np.zeros((c, ku.TALLY_SIZE)), np.zeros(ku.NUMBERS)
@@ -67,6 +91,8 @@ def compile_unilateral(
         tally=reals(tally),
         stop_table=integers(stop_table),
         stop=reals(stop),
+        dry_table=integers(dry_table),
+        dry=reals(frictions),
         place=integers(np.zeros((ku.PLACES, max(p, c + 2)))),
         vector=reals(np.zeros((ku.VECTORS, p))),
         room=reals(np.zeros((ku.ROOM, p, p))),

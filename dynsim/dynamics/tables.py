@@ -140,7 +140,8 @@ Q_REF = 2  # [rad; N m for an open torque]
 V_REF = 3  # [rad/s]
 DIDT = 4  # [A/s]
 DRAG = 5  # gear friction that is not part of GEAR_DAMPING, against v [N m]
-MOTOR_STATE_SIZE = 6
+DRY_DRAG = 6  # that of a gear whose friction holds at rest, a row's: positive against v > 0 [N m or N]
+MOTOR_STATE_SIZE = 7
 # Workspace.contacts: what is known of each candidate, whether it has rows or not
 NORMAL = 0  # 3: surface normal in W
 TANGENT = 3  # 3: smoothed slip direction in W
@@ -168,7 +169,7 @@ ROW_OFFSET = 19  # of a joint row: what its two joints, times its coefficients, 
 ROW_STATE_SIZE = 20
 # Workspace.active, int: of each row
 ROW_KIND = 0
-OWNER = 1  # candidate, coupling or, counted on behind the couplings, joint stop
+OWNER = 1  # candidate, coupling or, counted on behind the couplings, joint stop, then dry friction of a joint
 BODY_A = 2  # link, or the following joint of a joint row
 BODY_B = 3  # link at the other end, -1 for the world; the leading joint of a joint row
 LAW = 4  # FRICTION_SIGNED unless the sign of the force decides about DIRECTION

@@ -40,6 +40,7 @@ def fill_output(system: System, ws: Workspace, run: Run, out):
             - motor[a, ka.J_M] * joints[i, ka.QDD]
             - motor[a, ka.D_M] * joints[i, ka.QD]
             - motors[a, ka.DRAG]
+            - motors[a, ka.DRY_DRAG]
         )
     point_position(ws, run.hand_link, run.hand_point, out[columns.hand : columns.hand + 3])
     out[columns.energy] = kinetic_energy(system.model, ws)

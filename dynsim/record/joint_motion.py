@@ -75,7 +75,7 @@ def joint_motion(
     Raises
     ------
     RecordError
-        The record holds none, or only one sample.
+        The record holds none, only one sample, or a value that is not finite.
     """
     joints: list[str] = []
     angles, rates = [], []
@@ -90,7 +90,14 @@ def joint_motion(
         raise RecordError(f"the record holds no joint motion ({pairs}); it has {', '.join(record)}")
     if len(record) < 2:
         raise RecordError(f"the record has {len(record)} samples; a motion needs two")
-    return joints, record.time - record.time[0], np.hstack(angles), np.hstack(rates)
+    position, velocity = np.hstack(angles), np.hstack(rates)
+    for quantity, values in (("position", position), ("rate", velocity)):
+        for sample, joint in np.argwhere(~np.isfinite(values))[:1]:
+            raise RecordError(
+                f"the {quantity} of {joints[joint]} is {values[sample, joint]} at sample {sample} "
+                f"(t = {record.time[sample]:.6g} s): the record is damaged"
+            )
+    return joints, record.time - record.time[0], position, velocity
 
 
 def _in_both(record: Record, name: str, rate: str) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -35,15 +36,20 @@ def is_scalar(value: Any) -> bool:
     return value is None or isinstance(value, (int, float, str))
 
 
+def is_finite(value: Any) -> bool:
+    """True for a number that a double holds; not for infinity, nor for what is no number."""
+    return isinstance(value, (int, float)) and abs(value) <= sys.float_info.max
+
+
 def numbers(summary: dict[str, Any]) -> dict[str, Any]:
-    """All numbers of a summary that do not depend on the machine; those of contacts under ``CONTACT.…``."""
-    found = {key: value for key, value in flat(summary).items() if is_scalar(value) and not is_text(value)}
+    """All finite numbers of a summary that do not depend on the machine; those of contacts under ``CONTACT.…``."""
+    values = flat(summary)
     for key, value in summary.items():
         if isinstance(value, dict) and key != "base":
-            found |= {f"{key}.{name}": one for name, one in value.items() if is_scalar(one) and not is_text(one)}
+            values |= {f"{key}.{name}": one for name, one in value.items()}
     for contact in summary.get("contacts", ()):
-        found |= {f"{contact['name']}.{key}": value for key, value in contact.items() if not is_text(value)}
-    return {key: value for key, value in found.items() if value is not None and key not in _NOT_OF_THE_RUN}
+        values |= {f"{contact['name']}.{key}": value for key, value in contact.items()}
+    return {key: value for key, value in values.items() if is_finite(value) and key not in _NOT_OF_THE_RUN}
 
 
 def csv_table(names: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:

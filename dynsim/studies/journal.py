@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -11,7 +10,7 @@ from types import TracebackType
 from typing import Any
 
 from dynsim.errors import RecordError, ScenarioError, shown
-from dynsim.studies.columns import numbers
+from dynsim.studies.columns import is_finite, numbers
 from dynsim.studies.outcome import RunResult
 from dynsim.studies.sweep_plan import Point
 from dynsim.system.files import json_text, write_text
@@ -68,7 +67,7 @@ class Row:
             "values": isinstance(row.values, dict),
             "status": row.status in (OK, FAILED, LOST),
             "reason": isinstance(row.reason, str),
-            "numbers": isinstance(row.numbers, dict) and all(map(_is_number, row.numbers.values())),
+            "numbers": isinstance(row.numbers, dict) and all(map(is_finite, row.numbers.values())),
             "warnings": isinstance(row.warnings, str),
         }
         for name in names:
@@ -127,11 +126,6 @@ class Journal:
                 content = content[self._stream.write(content) or 0 :]
         except OSError as error:
             raise RecordError(f"cannot write {self._path}: {error.strerror}") from error
-
-
-def _is_number(value: Any) -> bool:
-    """True for nothing and for what a double holds."""
-    return value is None or isinstance(value, float) or (isinstance(value, int) and abs(value) <= sys.float_info.max)
 
 
 def _line(row: Row) -> str:

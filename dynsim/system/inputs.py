@@ -36,6 +36,7 @@ _FLOAT = re.compile(
 # What YAML does not allow in a text, escaped or not: control characters (but tab and line ends) and half characters.
 _FORBIDDEN = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f\x80-\x84\x86-\x9f\ud800-\udfff\ufffe\uffff]")
 _CORE = "tag:yaml.org,2002:"
+_TEXT_TAGS = (None, "!", _CORE + "str")
 _MERGE = object()
 
 
@@ -210,6 +211,8 @@ class _Builder:
             self.fail(line, f"character U+{ord(found[0]):04X} is not allowed")
         top = self._open[-1] if self._open else None
         if isinstance(top, _Open) and isinstance(top.value, YamlMapping) and top.key is None:
+            if tag not in _TEXT_TAGS:
+                self._fail_tag(str(tag), line)
             if event.anchor is not None:
                 self._anchors[event.anchor] = (text, 1, 0)
             top.key, top.key_line = (_MERGE if plain and text == "<<" else text), line
@@ -218,7 +221,7 @@ class _Builder:
             return
         if plain:
             value = self._plain(text, line)
-        elif tag in (None, "!", _CORE + "str"):
+        elif tag in _TEXT_TAGS:
             value = text
         else:
             value = self._tagged(text, str(tag), line)

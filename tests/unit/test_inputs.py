@@ -54,6 +54,8 @@ def test_yaml_becomes_plain_values(text: str, value: object):
         ("a: !!set {x}", ":1: tag '!!set' is not known"),
         ("a: !!omap [x: 1]", ":1: tag '!!omap' is not known"),
         ("a: !own 1", ":1: tag '!own' is not known"),
+        ("a: 1\n!!merge b: {c: 1}", ":2: tag '!!merge' is not known"),
+        ("!!int 1: 2", ":1: tag '!!int' is not known"),
         ("a: !!int x", ":1: 'x' is no !!int"),
         ("a: " + "9" * 5000, ":1: a number of 5000 digits"),
         ("a: 0x" + "f" * 300, ":1: a number of 302 digits"),

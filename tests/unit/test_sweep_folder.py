@@ -141,6 +141,8 @@ DAMAGES: list[tuple[str, Callable[[Path], None], str, str]] = [
     ("row's status a list", row(status=["ok"]), SECOND, "status = ['ok']"),
     ("row's reason a number", row(reason=0), SECOND, "reason = 0"),
     ("row's numbers nothing", row(numbers=None), SECOND, "numbers = None"),
+    ("row's number endless", row(numbers={"duration_s": float("inf")}), SECOND, "numbers = {'duration_s': inf}"),
+    ("row's number none", row(numbers={"duration_s": float("nan")}), SECOND, "numbers = {'duration_s': nan}"),
     ("row's numbers texts", row(numbers={"energy": "much"}), SECOND, "numbers = {"),
     ("row's numbers too large", row(numbers={"energy": 10**400}), SECOND, "numbers = {"),
     ("row's warnings a list", row(warnings=[]), SECOND, "warnings = []"),

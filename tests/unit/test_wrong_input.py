@@ -267,6 +267,16 @@ def test_export_refuses_motion_without_columns_and_endless_rates(tmp_path: Path)
         export_record(record, tmp_path / "a.csv", "csv")
 
 
+@pytest.mark.parametrize(("signal", "quantity"), [("q", "position"), ("v", "rate")])
+def test_export_refuses_a_motion_that_is_not_finite(signal: str, quantity: str, tmp_path: Path) -> None:
+    record, _ = replayed()
+    record.add("v", record["q"].copy(), "rad/s", labels=record.labels["q"])
+    record[signal][7, 0] = np.nan
+    with pytest.raises(RecordError, match=rf"the {quantity} of {record.labels['q'][0]} is nan at sample 7 \(t = "):
+        export_record(record, tmp_path / "a.csv", "csv", rate=10.0)
+    assert not any(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize(("sample", "value"), [(100, np.inf), (0, -np.inf), (0, np.nan), (50, np.nan)])
 def test_times_that_are_none_are_refused(sample: int, value: float) -> None:
     record = Record(np.linspace(0.0, 2.0, 101))

@@ -1,4 +1,4 @@
-"""The unilateral law: tables of candidates and joint stops that only push, and the direction in which a point slides.
+"""The unilateral law: tables of candidates and joint stops that only push, of joints that rub, and the way of slip.
 
 0 ≤ f_n ⟂ gap ≥ 0; a point that slides is driven by n − μ(s) t along t = v_t/|v_t|, one that is at rest is held while
 |f_t| ≤ μ_s f_n. Which candidates are open, slide or stick is constant within a step
@@ -52,6 +52,15 @@ HITS = 3
 STOP_LOSS = 4  # [J]
 CLOSED_TIME = 5  # [s]
 STOP_SIZE = 6
+# UnilateralArrays.dry_table, int
+DRY_JOINT = 0  # link whose joint rubs
+DRY_ROW = 1
+DRY_DRIVE = 2  # whose gear does, -1 for none
+DRY_TABLE_SIZE = 3
+# UnilateralArrays.dry: the force of a joint at rest is any up to the sum of both, in motion that against it [N m or N]
+OF_GEAR, OF_JOINT = 0, 1
+DRY_FORCE = 2  # on the joint [N m or N]
+DRY_SIZE = 3
 # UnilateralArrays.mode, int: columns
 WANTED, BEFORE, TOUCHING, STRUCK = 0, 1, 2, 3
 GIVES_WAY = 4  # 1: it has come to its static cone, and the kinetic coefficient holds from now on
@@ -75,13 +84,15 @@ NUMBERS = 6
 
 
 class UnilateralArrays(NamedTuple):
-    """c candidates and s joint stops under the unilateral law; p is the most rows that there can be."""
+    """c candidates, s joint stops and d joints with dry friction; p is the most rows that there can be."""
 
     slide: np.ndarray  # (c, SLIDE_SIZE)
     mode: np.ndarray  # (c, MODE_SIZE) int
     tally: np.ndarray  # (c, TALLY_SIZE)
     stop_table: np.ndarray  # (s, STOP_TABLE_SIZE) int
     stop: np.ndarray  # (s, STOP_SIZE)
+    dry_table: np.ndarray  # (d, DRY_TABLE_SIZE) int; d is zero of methods that smooth such friction
+    dry: np.ndarray  # (d, DRY_SIZE)
     place: np.ndarray  # (PLACES, p or c + 2) int
     vector: np.ndarray  # (VECTORS, p)
     room: np.ndarray  # (ROOM, p, p) two matrices of the splits, one of the problem that chooses modes, its scratch

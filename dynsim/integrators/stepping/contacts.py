@@ -178,9 +178,11 @@ def tangent_rows(system, s: SteppingArrays, ws: Workspace):
     """
     state, rows, active = ws.contacts, ws.rows, ws.active
     for r in range(ws.counts[ka.COUPLED]):
-        # Behind the couplings come joint stops.
+        # Behind the couplings come dry frictions, then joint stops.
         s.kind[r] = kc.BOTH_WAYS if r < system.couplings.joint.shape[0] else kc.ONE_WAY
         s.mu[r], rows[r, ka.TARGET] = 0.0, 0.0
+    for k in range(system.unilateral.dry.shape[0]):
+        s.kind[system.unilateral.dry_table[k, ku.DRY_ROW]] = kc.BOX
     for k in range(state.shape[0]):
         if active[k, ka.MODE] != ka.STICKING:
             continue
@@ -268,7 +270,7 @@ def largest_mobility(W, r):
 
 
 @internal_kernel
-def solve_contacts(law, s: SteppingArrays, ws: Workspace, h):
+def solve_contacts(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, h):
     """Impulses of all rows, by the last ones as a start, and their mean forces into ``ws.rows``; then ``s.memory``.
 
     Where the slip of a contact that was to slide on ends, or turns back, the law is that of the end after all: at most
@@ -281,6 +283,8 @@ def solve_contacts(law, s: SteppingArrays, ws: Workspace, h):
         s.b[r] = s.rate[0, r] - h * rows[r, ka.RHS]
         s.right[r] = s.b[r]
         s.f[r] = s.impulse[start + r] if r < coupled else 0.0
+    for k in range(unilateral.dry.shape[0]):
+        s.mu[unilateral.dry_table[k, ku.DRY_ROW]] = h * (unilateral.dry[k, ku.OF_GEAR] + unilateral.dry[k, ku.OF_JOINT])
     for k in range(ws.contacts.shape[0]):
         if ws.active[k, ka.MODE] == ka.STICKING:
             r = ws.active[k, ka.FIRST_ROW]

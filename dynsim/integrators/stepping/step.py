@@ -105,7 +105,7 @@ def solve_step(system: System, model: ModelArrays, ws: Workspace, run: Run):
     constraint_rates(model, ws, y, layout.v, s.rate[0])
     if ws.counts[ka.ROWS] > 0:
         row_system(model, ws)
-        solve_contacts(system.contacts.law, s, ws, h)
+        solve_contacts(system.contacts.law, system.unilateral, s, ws, h)
         note_stop_forces(system.unilateral, ws)
         add_row_forces(model, ws)
     accelerate(model, ws)
@@ -156,6 +156,7 @@ def book(system: System, ws: Workspace, run: Run):
         y_new[layout.load + k] += h * run.stage[1, layout.load + k]
         s.grid[kt.POWER_NOW] += run.stage[1, layout.load + k]
     book_stops(system.unilateral, system, s, ws, y_new, h)
+    book_dry(system.unilateral, system, s, ws, y_new, h)
     book_contacts(system, s, ws, y_new, h)
     stored_energy(system, ws, y_new, s.energy[kt.STOP])
     y_new[layout.scheme] -= stored + (s.energy[kt.STOP, kt.MECHANICAL] - s.energy[kt.START, kt.MECHANICAL])
@@ -178,6 +179,22 @@ def book_stops(unilateral: UnilateralArrays, system: System, s: SteppingArrays, 
         work = work_of_row(s, ws, unilateral.stop_table[k, ku.STOP_ROW], h)
         y_new[system.layout.loss + kst.JOINT_STOP_LOSS] -= work
         y_new[system.layout.ledger + kst.CONSTRAINT] -= work
+
+
+@internal_kernel
+def book_dry(unilateral: UnilateralArrays, system: System, s: SteppingArrays, ws: Workspace, y_new, h):
+    """Dry friction: what it takes is a loss of gear and joint in the ratio of their bounds; forces into the tables."""
+    ledger = system.layout.ledger
+    for k in range(unilateral.dry.shape[0]):
+        dry, r, a = unilateral.dry[k], unilateral.dry_table[k, ku.DRY_ROW], unilateral.dry_table[k, ku.DRY_DRIVE]
+        dry[ku.DRY_FORCE], work = ws.rows[r, ka.FORCE], work_of_row(s, ws, r, h)
+        share = dry[ku.OF_GEAR] / (dry[ku.OF_GEAR] + dry[ku.OF_JOINT])
+        y_new[ledger + kst.GEAR] -= share * work
+        y_new[ledger + kst.JOINT] -= (1.0 - share) * work
+        y_new[ledger + kst.MECHANICAL] += share * work
+        y_new[ledger + kst.CONSTRAINT] -= work
+        if a >= 0:
+            ws.motors[a, ka.DRY_DRAG] = -share * dry[ku.DRY_FORCE]
 
 
 @internal_kernel
