@@ -21,6 +21,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from dynsim.compile.model import Model
 from dynsim.compile.scene import BODY_RADIUS, snake_tube, snake_wheel
 from dynsim.errors import ModelError
 from dynsim.model.description import Array, Foot, Inertia, Link, Robot
@@ -194,16 +195,15 @@ def snake_tree(
         sag_compensation=sag_compensation,
         raised=raised,
     )
-    return placed(robot, np.asarray(d.initial_joints), np.zeros(d.pairs))
-
-
-def placed(robot: SnakeTree, phi: Array, height: Array) -> SnakeTree:
-    """The tree standing on its wheels, at angles phi (n_phi,) [rad] and with the pairs at heights (pairs,) [m]."""
-    return replace(robot, q0=configuration(robot, phi, height))
+    return replace(robot, q0=configuration(robot, np.asarray(d.initial_joints), np.zeros(d.pairs)))
 
 
 def configuration(robot: SnakeTree, phi: Array, height: Array) -> Array:
-    """Coordinates (nq,) with which the tree stands as :func:`placed` says, pair 1 flat on the ground."""
+    """Coordinates (nq,) of the tree on its wheels, at angles phi (n_phi,) [rad], the pairs at heights (pairs,) [m].
+
+    Pair 1 is flat on the ground. The heights are those of thin discs; where a bent base twists, spheres beside them
+    would be lower, and the robot is raised until the lowest one touches.
+    """
     d = robot.description
     hinge = robot.base_part.fold(phi[None, d.head_joints :], height[None]).hinge[0]
     angles = dict(zip(d.joint_names, phi.tolist(), strict=True))
@@ -215,6 +215,8 @@ def configuration(robot: SnakeTree, phi: Array, height: Array) -> Array:
     cp, sp = np.cos(0.5 * hinge[0]), np.sin(0.5 * hinge[0])
     # Rz(yaw) Ry(hinge)
     q[:7] = x, y, d.wheel_radius, c * cp, -s * sp, c * sp, s * cp
+    model = Model(robot)
+    q[2] -= min(0.0, *(model.point_position(foot.body, foot.point, q)[2] - foot.radius for foot in robot.feet))
     return q
 
 
