@@ -34,7 +34,8 @@ def make_record(run: SnakeRun, scenario: Scenario, wall: float, pictured: bool =
     rows = -(-ticks // run.stride) + 1
     trace = SnakeTrace(*(array[:rows] for array in run.trace))
     record_row(model, law, state, run.rig, rows - 1, trace)
-    hold_last(trace, state)
+    hold_last(trace)
+    trace.w_hat[-1] = state.w_hat
     time = np.append(np.arange(rows - 1) * run.stride, ticks) * period
     points = np.zeros((rows, 1 + model.head_joints + 2 * model.base_joints, 3))
     posture_points(

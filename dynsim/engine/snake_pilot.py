@@ -216,7 +216,7 @@ class SnakePilot(SnakeControl):
         switcher = self.switcher
         return {
             "state": copy_of(self.state),
-            "trace": SnakeTrace(*(array.copy() for array in self.trace)),
+            "trace": [array[: self._commanded].copy() for array in self.trace],
             "gripper": self.gripper.copy(),
             "lifter": self._lifter.state(),
             "sensors": [sensor.remembered() for sensor in self.sensors],
@@ -226,8 +226,10 @@ class SnakePilot(SnakeControl):
 
     def restore(self, kept: dict[str, Any]) -> None:
         """Go back to what :meth:`remembered` gave."""
-        for mine, array in zip((*self.state, *self.trace), (*kept["state"], *kept["trace"]), strict=True):
+        for mine, array in zip(self.state, kept["state"], strict=True):
             mine[...] = array
+        for mine, array in zip(self.trace, kept["trace"], strict=True):
+            mine[: len(array)] = array
         self.gripper[...] = kept["gripper"]
         self._lifter.restore(kept["lifter"])
         for sensor, part in zip(self.sensors, kept["sensors"], strict=True):
@@ -242,15 +244,16 @@ class SnakePilot(SnakeControl):
         rows, q, v = len(record), record["q"], record["v"]
         if rows == 0:
             return
+        ticks = np.rint(record.time / self.period).astype(int) // self.stride
         d, law, model = self.description, self.controller.law, self.model
-        trace = SnakeTrace(*(array[:rows].copy() for array in self.trace))
+        trace = SnakeTrace(*(array[ticks] for array in self.trace))
         told = trace.phi.copy()
         trace.base[:], trace.phi[:] = base_pose(q), q[:, self._joints]
         trace.rho[:] = q[:, _places(self.robot, self.robot.wheel_joints)]
-        if rows > self._commanded:  # at the end no control period begins
+        if ticks[-1] >= self._commanded:
             trace.mode[-1], trace.w_target[-1] = self.state.counts[ss.MODE], self.state.w_target
-            told[-1] = self.state.phi
-            hold_last(trace, self.state)
+            told[-1], trace.w_hat[-1] = self.state.phi, self.state.w_hat
+        hold_last(trace)
         w, points, shown = np.zeros((rows, 6)), [], copy_of(self.state)
         for r in range(rows):
             shown.base[:], shown.phi[:], shown.w_target[:] = trace.base[r], trace.phi[r], trace.w_target[r]

@@ -11,7 +11,7 @@ from dynsim.engine.snake_control import OBSTACLES, SnakeControl
 from dynsim.record import Record
 from dynsim.snake import state as ss
 from dynsim.snake.description import COORDINATES, conditioning
-from dynsim.snake.state import SnakeState, SnakeTrace
+from dynsim.snake.state import SnakeTrace
 
 OUT_OF_REACH = 1.0
 """A target that waits for so long at the end of a run [s] is called out of reach."""
@@ -40,12 +40,11 @@ def attitude_distance(w: NDArray[np.float64], w_target: NDArray[np.float64]) -> 
     return 2.0 * np.arcsin(np.clip(norm / np.sqrt(8.0), 0.0, 1.0))
 
 
-def hold_last(trace: SnakeTrace, state: SnakeState) -> None:
+def hold_last(trace: SnakeTrace) -> None:
     """Complete the last row, at whose time no control period begins: what was held goes on."""
     if len(trace.u) > 1:
         for array in (trace.u, trace.slip, trace.at_limit):
             array[-1] = array[-2]
-    trace.w_hat[-1] = state.w_hat
 
 
 def add_task(
