@@ -15,7 +15,7 @@ Their masses are part of the links', which are those of the kinematic level; wha
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -209,14 +209,23 @@ def configuration(robot: SnakeTree, phi: Array, height: Array) -> Array:
     angles = dict(zip(d.joint_names, phi.tolist(), strict=True))
     for joint, angle in zip(robot.lifting_joints, hinge.tolist(), strict=True):
         angles[joint] = angles.get(joint, 0.0) + angle
+    return at_angles(robot, angles, float(hinge[0]))
+
+
+def at_angles(robot: SnakeTree, angles: Mapping[str, float], tilt: float = 0.0) -> Array:
+    """Coordinates (nq,) of the tree with its lowest wheel on the ground, the body behind pair 1 tilted tail up [rad].
+
+    ``angles`` : by joint [rad]; of others zero
+    """
+    d = robot.description
     q = robot.configuration(angles)
     x, y, yaw = d.initial_base_pose
     c, s = np.cos(0.5 * yaw), np.sin(0.5 * yaw)
-    cp, sp = np.cos(0.5 * hinge[0]), np.sin(0.5 * hinge[0])
+    cp, sp = np.cos(0.5 * tilt), np.sin(0.5 * tilt)
     # Rz(yaw) Ry(hinge)
     q[:7] = x, y, d.wheel_radius, c * cp, -s * sp, c * sp, s * cp
     model = Model(robot)
-    q[2] -= min(0.0, *(model.point_position(foot.body, foot.point, q)[2] - foot.radius for foot in robot.feet))
+    q[2] -= min(*(model.point_position(foot.body, foot.point, q)[2] - foot.radius for foot in robot.feet))
     return q
 
 
