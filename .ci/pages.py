@@ -5,7 +5,7 @@ between ``<!-- table: NAME -->`` and ``<!-- end -->``, NAME being that of a func
 files in results/, which say which version made them; results/README.md has the commands. ``--check`` changes nothing
 and ends with 1 where a page is stale (tests/unit/test_pages.py).
 
-Times are those of the last ``dynsim bench`` and ``python -m dynsim.studies.bench.start_up``; other numbers are the
+Times are those of the last ``dynsim bench`` and ``PYTHONPATH=tests python -m support.start_up``; other numbers are the
 same on every machine, to the digits shown.
 """
 
@@ -41,7 +41,7 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
 from support.fault_table import markdown  # noqa: E402
 
-PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
 NUMBER = re.compile(r"[−+-]?\d[\d.,]*(?:e[−+-]?\d+)?(?=<!-- = (\w+) -->)")
 TABLE = re.compile(r"(?<=<!-- table: )(\w+)( -->\n).*?(?=<!-- end -->)", re.DOTALL)
 

@@ -11,7 +11,7 @@ class DynsimError(Exception):
     exit_code: ClassVar[int] = 2
 
 
-def shown(value: object) -> str:
+def brief(value: object) -> str:
     """Any value in an error message: in one line, and not long."""
     text = " ".join(repr(value).split())
     return text if len(text) <= 80 else f"{text[:77]}..."

@@ -66,7 +66,7 @@ def animate(
 
 
 def _size(text: str) -> tuple[int, int]:
-    found = re.fullmatch(r"([0-9]{1,5})[x×]([0-9]{1,5})", text)
-    if found is None:
+    match = re.fullmatch(r"([0-9]{1,5})[x×]([0-9]{1,5})", text)
+    if match is None:
         raise RecordError(f"--size is WIDTHxHEIGHT, such as 960x540, not {text!r}")
-    return int(found[1]), int(found[2])
+    return int(match[1]), int(match[2])

@@ -44,11 +44,11 @@ TrustOption = Annotated[
 FiguresOption = Annotated[bool, typer.Option("--no-figures", help="Do not draw figures.")]
 
 
-def parsed_overrides(given: list[str] | None) -> dict[str, Any]:
+def parsed_overrides(texts: list[str] | None) -> dict[str, Any]:
     """Values by key of ``--set``."""
     from dynsim.scenario import SetOptions, parse_override
 
-    return SetOptions(parse_override(text) for text in given or ())
+    return SetOptions(parse_override(text) for text in texts or ())
 
 
 def folder_option(default: str) -> Any:

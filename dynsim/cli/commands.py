@@ -109,12 +109,12 @@ def compare(
     from dynsim.scenario import load_scenario, variant_names
     from dynsim.system.files import check_writable, discard
 
-    given = parsed_overrides(overrides)
-    loaded = [load_scenario(scenario, name, given) for name in variant_names(scenario)]
+    values = parsed_overrides(overrides)
+    loaded = [load_scenario(scenario, name, values) for name in variant_names(scenario)]
     folder = out or Path("results", loaded[0].name if loaded else "")
     check_writable(folder, COMPARISON_FILES[:2])
-    for one in loaded:
-        check_writable(folder / one.variant, RUN_FILES)
+    for variant in loaded:
+        check_writable(folder / variant.variant, RUN_FILES)
     from dynsim.studies.compare import compare as compare_variants
     from dynsim.studies.compare import save_comparison
 
@@ -136,7 +136,7 @@ def compare(
     failure: SimulationStopped | None = None
     try:
         with progress(loaded, quiet) as report:
-            compare_variants(scenario, overrides=given, jobs=jobs, progress=report, finished=finished, stopped=stopped)
+            compare_variants(scenario, overrides=values, jobs=jobs, progress=report, finished=finished, stopped=stopped)
     except SimulationInterrupted:
         raise
     except SimulationStopped as stop:
@@ -148,7 +148,7 @@ def compare(
         interruption.heed()
         interruption.check()
         if not no_figures:
-            wanted = [Figures({name: one}, folder / name / "figures", format_) for name, one in records.items()]
+            wanted = [Figures({name: record}, folder / name / "figures", format_) for name, record in records.items()]
             together = Figures(records, folder, format_, together=True)
             page = draw_all([together, *wanted], Page(records, folder), quiet)
         if not quiet:

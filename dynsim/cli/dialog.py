@@ -14,17 +14,17 @@ from dynsim.hardware.bus.protocol import Bus
 from dynsim.hardware.errors import ReplayInterrupted
 from dynsim.hardware.nudge import ANGLE, Nudge, nudge, swapped
 from dynsim.hardware.ports import VIRTUAL, bus_on
-from dynsim.hardware.replay.motion import Task
+from dynsim.hardware.replay.motion import MotionTask
 from dynsim.hardware.replay.states import StopRequest, stop_on_signals
 from dynsim.hardware.replay.verify import QUANTITIES, LimitRow, differences, way_to_start
-from dynsim.hardware.servo_map import Servo, ServoMap
+from dynsim.hardware.servo_map import MappedServo, ServoMap
 
 ANSWERS = ("y", "n", "again")
 CLEAR = "Is everybody clear of the robot, and the power cut within reach?"
 
 
 def confirm_replay(
-    console: Console, servo_map: ServoMap, motion: Task, port: str, *, asked: bool, at_most: bool = False
+    console: Console, servo_map: ServoMap, motion: MotionTask, port: str, *, asked: bool, at_most: bool = False
 ) -> None:
     """Say how far the start is, and ask; about a start beyond ``safety.start_distance`` also where not ``asked``.
 
@@ -38,20 +38,20 @@ def confirm_replay(
         The posture cannot be read.
     """
     with bus_on(port, servo_map) as (bus, _):
-        way = way_to_start(bus, servo_map, motion.start)
+        approach = way_to_start(bus, servo_map, motion.start)
     console.print(
         f"{servo_map.robot}: {len(servo_map.servos)} servos will move for {motion.duration:.1f} s"
         f"{' at most' if at_most else ''}, "
-        f"after {way.duration:.1f} s to the start."
+        f"after {approach.duration:.1f} s to the start."
     )
-    for distance in way.distances[:1]:
+    for distance in approach.distances[:1]:
         console.print(f"furthest from its start: {distance}")
     agreed = not asked or _agreed(console, CLEAR, "move?")
-    if agreed and way.far:
+    if agreed and approach.far:
         still = "" if asked else " (asked with --yes too)"
         bound = servo_map.safety.start_distance
         console.print(f"further than safety.start_distance, {bound:g} rad, from their start{still}:")
-        for distance in way.far:
+        for distance in approach.far:
             console.print(f"  {distance}")
         agreed = _agreed(console, "All joints go there in step: is the whole way free?", "move there?")
     if not agreed:
@@ -69,7 +69,7 @@ def print_limits(console: Console, rows: Sequence[LimitRow]) -> None:
 
 
 def find_senses(
-    console: Console, servo_map: ServoMap, chosen: Sequence[Servo], port: str, *, live: bool, asked: bool
+    console: Console, servo_map: ServoMap, chosen: Sequence[MappedServo], port: str, *, live: bool, asked: bool
 ) -> tuple[dict[str, int], list[str]]:
     """Nudge joint after joint, and ask whether it moved as the map says.
 
@@ -125,7 +125,7 @@ def may_write(console: Console, joints: Sequence[str], target: object) -> bool:
     return _agreed(console, f"The sign of {', '.join(joints)} is wrong in {target}.", "write it?")
 
 
-def _nudge(bus: Bus, clock: Clock, servo_map: ServoMap, servo: Servo, *, live: bool) -> Nudge | None:
+def _nudge(bus: Bus, clock: Clock, servo_map: ServoMap, servo: MappedServo, *, live: bool) -> Nudge | None:
     stop = StopRequest()
     with stop_on_signals(stop):
         return nudge(servo_map, servo, bus, clock, live=live, stop=stop)

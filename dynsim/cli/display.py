@@ -31,9 +31,9 @@ def say(text: str) -> None:
     console.print(text, highlight=False, soft_wrap=True)
 
 
-def say_written(place: Path) -> None:
+def say_written(path: Path) -> None:
     """Where the files of a command are."""
-    say(f"Written to {escaped(place)}")
+    say(f"Written to {escaped(path)}")
 
 
 # Of a progress bar.
@@ -55,13 +55,13 @@ def labelled(paths: Sequence[Path], *, trust: bool = False) -> dict[str, Record]
     from dynsim.record import Record
     from dynsim.system.files import file_name
 
-    found: dict[str, Record] = {}
+    records: dict[str, Record] = {}
     for path in record_files(paths):
         record = Record.load(path, trust=trust)
         name = file_name(record.summary.get("variant") or path.parent.name or path.stem)
-        label = next(one for k in itertools.count(1) if (one := name if k == 1 else f"{name}_{k}") not in found)
-        found[label] = record
-    return found
+        label = next(label for k in itertools.count(1) if (label := name if k == 1 else f"{name}_{k}") not in records)
+        records[label] = record
+    return records
 
 
 def record_files(paths: Sequence[Path]) -> list[Path]:
@@ -72,28 +72,28 @@ def record_files(paths: Sequence[Path]) -> list[Path]:
     RecordError
         A folder has no records.
     """
-    found = []
+    files = []
     for path in paths:
         if not path.is_dir():
-            found.append(path)
+            files.append(path)
             continue
         inside = [path / RECORD] if (path / RECORD).is_file() else _of_variants(path)
         if not inside:
             raise RecordError(
                 f"{path}: no {RECORD} there, nor in a folder in it; name a record, or the folder of a run"
             )
-        found += inside
-    return found
+        files += inside
+    return files
 
 
 def _of_variants(folder: Path) -> list[Path]:
     """Records of the folders in a folder: in the order of a comparison's variants, others after them."""
-    found = sorted(folder.glob(f"*/{RECORD}"))
+    files = sorted(folder.glob(f"*/{RECORD}"))
     try:
         order = list(json.loads((folder / COMPARISON).read_text(encoding="utf-8"))["variants"])
     except (OSError, ValueError, KeyError, TypeError):
-        return found
-    return sorted(found, key=lambda path: order.index(path.parent.name) if path.parent.name in order else len(order))
+        return files
+    return sorted(files, key=lambda path: order.index(path.parent.name) if path.parent.name in order else len(order))
 
 
 @contextmanager
@@ -130,8 +130,21 @@ def _silence() -> None:
     shown_by_caller()
 
 
-def _say_compiled(now: Compilation) -> None:
-    console.print(f"{escaped(now.text[0].upper() + now.text[1:])}.", highlight=False)
+@contextmanager
+def _compilation_told(show: Callable[[Compilation | None], None] = lambda now: None) -> Iterator[None]:
+    """Within, the first compilation of kernels is told, and shown while it lasts."""
+    from dynsim.engine.compilation import watched
+
+    shown: list[Compilation] = []
+
+    def compiling(now: Compilation | None) -> None:
+        if now is not None and not shown:
+            shown.append(now)
+            console.print(f"{escaped(now.text[0].upper() + now.text[1:])}.", highlight=False)
+        show(now)
+
+    with watched(compiling):
+        yield
 
 
 @contextmanager
@@ -144,27 +157,25 @@ def progress(scenarios: Sequence[Scenario], quiet: bool) -> Iterator[VariantProg
     from rich.progress import BarColumn
 
     from dynsim.engine import REFERENCES, SIMULATION
-    from dynsim.engine.compilation import watched
 
     # In 80 columns all fits up to 9999 s: the bar gives way, the times do not.
     done = "{task.completed:.2f} / {task.total:g} s {task.fields[what]}"
-    said: list[TaskID] = []
+    kernels: list[TaskID] = []
 
     def compiling(now: Compilation | None) -> None:
         if now is None:
-            bars.update(said[0], visible=False)
+            bars.update(kernels[0], visible=False)
             return
-        if not said:
-            _say_compiled(now)
-            said.append(bars.add_task("kernels", total=now.expected or _COMPILED_S, what="compiled"))
-        bars.update(said[0], completed=now.elapsed, visible=True)
+        if not kernels:
+            kernels.append(bars.add_task("kernels", total=now.expected or _COMPILED_S, what="compiled"))
+        bars.update(kernels[0], completed=now.elapsed, visible=True)
 
-    with _bars("{task.description}", BarColumn(), done) as bars, watched(compiling):
+    with _bars("{task.description}", BarColumn(), done) as bars, _compilation_told(compiling):
 
-        def add(scenario: Scenario, what: str, visible: bool) -> TaskID:
+        def add(scenario: Scenario, kind: str, visible: bool) -> TaskID:
             title = scenario.variant or scenario.name
             title = title if len(title) <= _TITLE_WIDTH else title[: _TITLE_WIDTH - 1] + "…"
-            return bars.add_task(escaped(title), total=scenario.duration_s, what=what, visible=visible)
+            return bars.add_task(escaped(title), total=scenario.duration_s, what=kind, visible=visible)
 
         preparing = {s.variant: add(s, "references", False) for s in scenarios}
         simulating = {s.variant: add(s, "simulated", True) for s in scenarios}
@@ -186,16 +197,10 @@ def sweep_progress(runs: int, quiet: bool) -> Iterator[Callable[[int, int], None
         return
     from rich.progress import BarColumn, MofNCompleteColumn
 
-    from dynsim.engine.compilation import watched
-
     bar = _bars("runs", BarColumn(), MofNCompleteColumn(), "{task.fields[failed]}")
     task = bar.add_task("", total=runs, failed="")
-    said: list[str] = []
 
     def compiling(now: Compilation | None) -> None:
-        if now is not None and not said:
-            said.append(now.text)
-            _say_compiled(now)
         if bar.live.is_started:
             bar.update(task, failed="" if now is None else f"compiling, {now.elapsed:.0f} s")
 
@@ -205,7 +210,7 @@ def sweep_progress(runs: int, quiet: bool) -> Iterator[Callable[[int, int], None
         bar.update(task, completed=done, failed=f"{failed} failed" if failed else "")
 
     try:
-        with watched(compiling):
+        with _compilation_told(compiling):
             yield report
     finally:
         if bar.live.is_started:
@@ -221,16 +226,7 @@ def plan_progress(quiet: bool) -> Iterator[Callable[[str, float], None]]:
         return
     from rich.progress import BarColumn
 
-    from dynsim.engine.compilation import watched
-
-    said: list[str] = []
-
-    def compiling(now: Compilation | None) -> None:
-        if now is not None and not said:
-            said.append(now.text)
-            _say_compiled(now)
-
-    with _bars("{task.description}", BarColumn()) as bar, watched(compiling):
+    with _bars("{task.description}", BarColumn()) as bar, _compilation_told():
         task = bar.add_task("searching", total=1.0)
         yield lambda stage, share: bar.update(task, description=stage, completed=share)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,32 +13,25 @@ from dynsim.errors import RecordError
 if TYPE_CHECKING:
     from dynsim.record import Record
 
-# Tasks that the figures of a run become, and those of all over each other: all processes are busy until the end.
-PARTS = 2
-
 
 @dataclass(frozen=True)
 class Figures:
-    """Figures of one record, or of several over each other, as files of a kind in a folder.
-
-    ``part``: which of them, see :func:`dynsim.draw.figures.draw`.
-    """
+    """Figures of one record, or of several over each other, as files of a kind in a folder."""
 
     records: dict[str, Record]
     folder: Path
     kind: str
     together: bool = False
-    part: tuple[int, int] = (0, 1)
 
     def draw(self) -> None:
         """See :func:`dynsim.draw.figures.draw`."""
         from dynsim.draw import figures
 
         if self.together:
-            figures.draw_comparison(self.records, self.folder, self.kind, self.part)
+            figures.draw_comparison(self.records, self.folder, self.kind)
         else:
             for record in self.records.values():
-                figures.draw(record, self.folder, self.kind, self.part)
+                figures.draw(record, self.folder, self.kind)
 
 
 @dataclass(frozen=True)
@@ -84,8 +77,7 @@ def draw_all(wanted: Sequence[Figures], page: Page, quiet: bool) -> Path | None:
             pages.append(done)
 
     # The longest first, the shortest last.
-    tasks: list[Figures | Page] = [replace(figures, part=(k, PARTS)) for figures in wanted for k in range(PARTS)]
-    tasks.append(page)
+    tasks: list[Figures | Page] = [*wanted, page]
     workers = min(cores(), len(tasks))
     with drawing(page.folder, quiet):
         if workers == 1:

@@ -97,11 +97,11 @@ def _plain_warnings() -> Iterator[None]:
     """Warnings about what the user gave, or keeps on disk, are a line on stderr without the place in dynsim's code."""
     shown = warnings.showwarning
 
-    def show(message: Warning | str, category: type[Warning], *place: Any, **options: Any) -> None:
+    def show(message: Warning | str, category: type[Warning], *location: Any, **options: Any) -> None:
         if issubclass(category, UserWarning):
             errors.print(f"[yellow]warning:[/] {escaped(str(message))}")
         else:
-            shown(message, category, *place, **options)
+            shown(message, category, *location, **options)
 
     warnings.showwarning = show
     try:

@@ -79,31 +79,34 @@ def scan(
 
     servo_map = load_servo_map(map_file) if map_file else None
     bauds = (baud,) if baud else (servo_map.bus.baud,) if servo_map else survey.SCAN_BAUD_RATES
-    found = survey.scan(port, bauds)
-    if not found:
+    answers = survey.scan(port, bauds)
+    if not answers:
         raise VerificationFailed(
             f"{port}: no servo answered at {', '.join(f'{b}' for b in bauds)} bit/s. Is the power on, the cable right? "
             "MX servos with Protocol 1 firmware do not answer: update them to 2.0"
         )
     owners = {servo.id: servo for servo in servo_map.servos} if servo_map else {}
     table = Table("ID", "model", "fw", "bit/s", "mode", "delay µs", "V", "°C", "torque", "error", "joint")
-    for servo in found:
-        told = servo.registers
-        delay, volts = told["return_delay"] * RETURN_DELAY_SECONDS_PER_UNIT, told["present_voltage"] * VOLT_PER_UNIT
-        numbers = [f"{delay * 1e6:.0f}", f"{volts:.1f}", f"{told['present_temperature']:.0f}"]
-        error = f"0x{told['hardware_error']:02x}" if told["hardware_error"] else "-"
+    for servo in answers:
+        registers = servo.registers
+        delay, volts = (
+            registers["return_delay"] * RETURN_DELAY_SECONDS_PER_UNIT,
+            registers["present_voltage"] * VOLT_PER_UNIT,
+        )
+        numbers = [f"{delay * 1e6:.0f}", f"{volts:.1f}", f"{registers['present_temperature']:.0f}"]
+        error = f"0x{registers['hardware_error']:02x}" if registers["hardware_error"] else "-"
         joint = owners[servo.id].joint if servo.id in owners else "-"
-        who = [str(servo.id), servo.model_name, *map(str, (servo.firmware, servo.baud, told["operating_mode"]))]
-        table.add_row(*who, *numbers, "ON" if told["torque_enable"] else "off", error, joint)
+        who = [str(servo.id), servo.model_name, *map(str, (servo.firmware, servo.baud, registers["operating_mode"]))]
+        table.add_row(*who, *numbers, "ON" if registers["torque_enable"] else "off", error, joint)
     console.print(table)
     if servo_map:
-        _compare_with_map(found, servo_map)
+        _compare_with_map(answers, servo_map)
 
 
-def _compare_with_map(found: list[Any], servo_map: Any) -> None:
+def _compare_with_map(answers: list[Any], servo_map: Any) -> None:
     from dynsim.hardware.errors import VerificationFailed
 
-    seen = {servo.id: servo for servo in found}
+    seen = {servo.id: servo for servo in answers}
     wrong = [f"{servo} did not answer" for servo in servo_map.servos if servo.id not in seen]
     wrong += [f"ID {id_} is not in the map" for id_ in seen if id_ not in servo_map.ids]
     wrong += [

@@ -106,7 +106,7 @@ def plan(
     chosen = Tolerances.gains if gains is None else _gains(gains)
     tolerances = Tolerances(friction=factors, shift_m=errors, gains=chosen)
     with plan_progress(quiet) as tell:
-        found = plan_braces(
+        result = plan_braces(
             loaded,
             candidates=[name.strip() for name in candidates.split(",") if name.strip()],
             along=along or (),
@@ -126,13 +126,13 @@ def plan(
             tell=tell,
         )
         tell("writing", 0.98)
-        save_plan(found, folder, figures=not no_figures, kind=format_.value)
+        save_plan(result, folder, figures=not no_figures, kind=format_.value)
     if not quiet:
         from dynsim.cli.plan_table import print_plan
 
-        print_plan(found)
+        print_plan(result)
         say_written(folder)
-        if found.best is not None:
+        if result.best is not None:
             say(f"To run the best: dynsim run {escaped(folder / 'plan.yaml')}")
 
 
@@ -164,9 +164,9 @@ def _weights(texts: list[str]) -> float:
 def _gains(text: str) -> tuple[float, ...]:
     """Gains from the largest on."""
     try:
-        found = tuple(sorted((float(part) for part in text.split(",")), reverse=True))
+        values = tuple(sorted((float(part) for part in text.split(",")), reverse=True))
     except ValueError:
-        found = ()
-    if not found or not all(0.0 < gain < float("inf") for gain in found):
+        values = ()
+    if not values or not all(0.0 < gain < float("inf") for gain in values):
         raise ScenarioError(f"--gains {escaped(text)}: must be positive numbers with commas, such as 500,100,20")
-    return found
+    return values

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
-from threading import Thread
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -23,12 +21,11 @@ from dynsim.cli.app import (
     parsed_overrides,
 )
 from dynsim.cli.display import drawing, errors, say, sweep_progress
-from dynsim.config.problems import suggest
 from dynsim.errors import ScenarioError, SimulationStopped
 from dynsim.system.terminal import escaped
 
 if TYPE_CHECKING:
-    from dynsim.studies.journal import Row
+    from dynsim.studies.journal import SweepRow
     from dynsim.studies.sweep_plan import Plan
 
 # Reasons of failed runs that are printed.
@@ -106,13 +103,7 @@ def sweep(
     others = scheduler is not None or min(jobs or cores(), plan.runs) > 1
     if not others:
         keep_memory()
-    with sweep_progress(plan.runs, quiet) as told, _loading(bool(laws), not no_figures) as load:
-
-        def report(done: int, failed: int) -> None:
-            if others:
-                load()
-            told(done, failed)
-
+    with sweep_progress(plan.runs, quiet) as report:
         rows = run_sweep(
             plan,
             folder,
@@ -147,44 +138,16 @@ def _variants(known: Sequence[str], wanted: str | None) -> tuple[str | None, ...
     return tuple(known) if wanted == "all" else tuple(name.strip() for name in wanted.split(","))
 
 
-@contextmanager
-def _loading(samples: bool, figures: bool) -> Iterator[Callable[[], None]]:
-    """What tables, statistics and figures need is imported beside the runs, from the first call of what is yielded on.
-
-    Only then, and awaited at the end: modules cannot be imported any more when the command has ended.
-    """
-    thread = Thread(target=_load_for_the_end, args=(samples, figures), name="imports")
-
-    def load() -> None:
-        if thread.ident is None:
-            thread.start()
-
-    try:
-        yield load
-    finally:
-        if thread.ident is not None:
-            thread.join()
-
-
-def _load_for_the_end(samples: bool, figures: bool) -> None:
-    """Import what is needed there, half a second in all; what is missing, or broken, is said there too."""
-    # Also what a second Ctrl-C does, which ends the command before this.
-    with suppress(Exception):
-        from dynsim.studies.sweep import has_parquet
-
-        if has_parquet():
-            import pyarrow
-
-            pyarrow.array([0.0])  # looks whether there is pandas
-        if samples:
-            import scipy.special  # noqa: F401
-        if figures:
-            import dynsim.draw.figures.sweep  # noqa: F401
-
-
 def _draw(
-    name: str, rows: Sequence[Row], plan: Plan, folder: Path, quiet: bool, format_: str, plotted: Sequence[str] = ()
+    name: str,
+    rows: Sequence[SweepRow],
+    plan: Plan,
+    folder: Path,
+    quiet: bool,
+    format_: str,
+    plotted: Sequence[str] = (),
 ) -> None:
+    from dynsim.config.problems import suggest
     from dynsim.draw.figures.sweep import Sweep, draw
     from dynsim.studies.journal import OK
     from dynsim.studies.sweep import TABLES

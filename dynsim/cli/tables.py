@@ -289,14 +289,14 @@ _STOP_ROWS: tuple[tuple[str, Callable[[Summary], str]], ...] = (
 
 def _stop_rows(summaries: Sequence[Summary], shown: Sequence[Summary]) -> Iterator[tuple[str, list[str]]]:
     """Rows of the joint stops that any run has touched, a cell for each run that is shown."""
-    stops = {_stop(one): one for summary in summaries for one in summary.get("joint_stops", ())}
+    stops = {_stop(stop): stop for summary in summaries for stop in summary.get("joint_stops", ())}
     for key, stop in stops.items():
-        cells = [{_stop(one): one for one in summary.get("joint_stops", ())}.get(key) for summary in shown]
+        cells = [{_stop(stop): stop for stop in summary.get("joint_stops", ())}.get(key) for summary in shown]
         joint, limit = key
-        place = f"{math.degrees(limit):.4g}°" if stop["unit"] == "rad" else f"{limit:.4g} {stop['unit']}"
+        position = f"{math.degrees(limit):.4g}°" if stop["unit"] == "rad" else f"{limit:.4g} {stop['unit']}"
         for heading, show in _STOP_ROWS:
-            text = _of(f"{joint}, stop at {place}", heading.format(**stop))
-            yield escaped_line(text), ["–" if one is None else show(one) for one in cells]
+            text = _of(f"{joint}, stop at {position}", heading.format(**stop))
+            yield escaped_line(text), ["–" if stop is None else show(stop) for stop in cells]
 
 
 def _motor_rows(summaries: Sequence[Summary], shown: Sequence[Summary]) -> Iterator[tuple[str, list[str]]]:
@@ -312,8 +312,8 @@ def _motor_rows(summaries: Sequence[Summary], shown: Sequence[Summary]) -> Itera
             load[motor["joint"]] = max(load[motor["joint"]], motor[rms] / motor[nominal])
         heaviest = sorted(load, key=lambda joint: -load[joint])[:_MOST_MOTORS]
         for joint in (joint for joint in load if joint in heaviest):
-            found: list[Summary] = [next((m for m in s.get("motors", ()) if m["joint"] == joint), {}) for s in shown]
-            cells = [f"{_loaded(m[rms], m[nominal])} of {m[nominal]:g}" if m.get(nominal) else "–" for m in found]
+            motors: list[Summary] = [next((m for m in s.get("motors", ()) if m["joint"] == joint), {}) for s in shown]
+            cells = [f"{_loaded(m[rms], m[nominal])} of {m[nominal]:g}" if m.get(nominal) else "–" for m in motors]
             yield escaped_line(f"{joint}: {label}"), cells
 
 

@@ -108,9 +108,9 @@ def tell_address(address: str, ending: str, *, open_: bool) -> None:
         open_address(address)
 
 
-def new_folder(place: Path) -> Path:
+def new_folder(parent: Path) -> Path:
     """The first of ``drive_1``, ``drive_2``, … that is not there: a drive cannot be made again by driving."""
-    return next(folder for k in itertools.count(1) if not (folder := place / f"drive_{k}").exists())
+    return next(folder for k in itertools.count(1) if not (folder := parent / f"drive_{k}").exists())
 
 
 def tell_drive(report: DriveReport, driven: float, folder: Path) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact.braces import tables as kb
 from dynsim.dynamics.contact.braces.statics import brace_motion, brace_statics
-from dynsim.errors import ModelError, shown
+from dynsim.errors import ModelError, brief
 from dynsim.jit.kernel import integers, reals
 from dynsim.model.description import Array, Robot
 from dynsim.model.drives import Motor, Servo, TorqueSource
@@ -78,9 +78,9 @@ def _vector(name: str, value: ArrayLike) -> Array:
     try:
         vector = np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise ModelError(f"brace: {name} must be three numbers, not {shown(value)}") from error
+        raise ModelError(f"brace: {name} must be three numbers, not {brief(value)}") from error
     if vector.shape != (3,) or not np.isfinite(vector).all():
-        raise ModelError(f"brace: {name} must be three finite numbers, not {shown(value)}")
+        raise ModelError(f"brace: {name} must be three finite numbers, not {brief(value)}")
     vector.flags.writeable = False
     return vector
 
@@ -183,10 +183,10 @@ class PreparedBraces:
             self._model, self._ws, arrays, self._q, self._v, self._vdot, self._tables, self._torques, True
         )
         feasible = solved == 1
-        torques, found, forces = self._torques[0].copy(), arrays.found, arrays.forces.copy()
+        torques, results, forces = self._torques[0].copy(), arrays.found, arrays.forces.copy()
         if not feasible:
-            torques[:], found[:], forces[:] = np.nan, np.nan, np.nan
-        numbers = found.tolist()
+            torques[:], results[:], forces[:] = np.nan, np.nan, np.nan
+        numbers = results.tolist()
         return BraceStatics(
             feasible=feasible,
             torques=torques,

@@ -111,24 +111,24 @@ def gaps(
     ``points`` : by body, with the surface of each; (3,) in the body's frame [m]. Of planes alone only what counts
     along their normals is computed, a third.
     """
-    surfaces = {id(surface): surface for held in points.values() for surface, _ in held}
+    surfaces = {id(surface): surface for pairs in points.values() for surface, _ in pairs}
     planes = {key: surface for key, surface in surfaces.items() if is_plane(surface)}
     flat = len(planes) == len(surfaces)
     # Of each plane its place among the normals, and its distance from the origin.
-    place = {key: (k, surface.c / np.linalg.norm(surface.b)) for k, (key, surface) in enumerate(planes.items())}
+    rows = {key: (k, surface.c / np.linalg.norm(surface.b)) for k, (key, surface) in enumerate(planes.items())}
     normals = np.array([surface.b / np.linalg.norm(surface.b) for surface in planes.values()])
     for link, R, p in poses(robot, q, points, normals if flat else None):
         if link.name not in points:
             continue
-        found = []
+        distances = []
         for surface, point in points[link.name]:
             position = p + point @ R if point.any() else p
             if flat:
-                k, offset = place[id(surface)]
-                found.append(position[k] + offset)
+                k, offset = rows[id(surface)]
+                distances.append(position[k] + offset)
             else:
-                found.append(surface.gaps(position.T))
-        yield link, found
+                distances.append(surface.gaps(position.T))
+        yield link, distances
 
 
 def is_plane(surface: Surface) -> TypeGuard[Quadric]:
@@ -141,9 +141,9 @@ def sinking(robot: Robot, surfaces: Mapping[str, Surface], q: Array) -> list[Sin
 
     The axes of a body are those of :func:`axis_ends`. A body of unknown radius has radius zero.
     """
-    found: list[Sinking] = []
+    sunk: list[Sinking] = []
     if not surfaces or not len(q):
-        return found
+        return sunk
     # Of a run that diverged the last samples may be beyond what squares of floats can hold.
     with np.errstate(over="ignore", invalid="ignore"):
         for link, name, gap in _axis_gaps(robot, surfaces, q):
@@ -152,8 +152,8 @@ def sinking(robot: Robot, surfaces: Mapping[str, Surface], q: Array) -> list[Sin
             depth = np.where(np.isfinite(gap), -gap, -np.inf)
             beyond = np.flatnonzero(depth > link.radius + SLACK)
             if beyond.size:
-                found.append(Sinking(link.name, name, float(depth.max()), link.radius, int(beyond[0])))
-    return found
+                sunk.append(Sinking(link.name, name, float(depth.max()), link.radius, int(beyond[0])))
+    return sunk
 
 
 def _axis_gaps(robot: Robot, surfaces: Mapping[str, Surface], q: Array) -> Iterator[tuple[Link, str, Array]]:

@@ -50,7 +50,7 @@ def dry_frictions(robot: Robot) -> list[DryFriction]:
     return [one for one in every if one.gear + one.bearing > 0.0]
 
 
-def told(value: float, unit: str, digits: int = 5) -> str:
+def format_quantity(value: float, unit: str, digits: int = 5) -> str:
     """A joint coordinate for a line of text; an angle in degrees first, which scenarios are written in."""
     if unit != "rad":
         return f"{value:.{digits}g} {unit}"
@@ -142,17 +142,17 @@ def joint_stops(robot: Robot) -> list[JointStop]:
     ModelError
         A joint starts beyond its stop.
     """
-    found = []
+    stops = []
     for link, k in zip(robot.links, robot.position_index, strict=True):
         for side, limit in ((1.0, link.lower), (-1.0, link.upper)):
             if np.isfinite(limit):
                 beyond = side * (limit - robot.initial[k])
                 if beyond > START_TOLERANCE:
                     raise ModelError(
-                        f"{link.joint}: starts at {told(robot.initial[k], link.units[0])}, beyond its stop at "
-                        f"{told(limit, link.units[0])}; "
+                        f"{link.joint}: starts at {format_quantity(robot.initial[k], link.units[0])}, beyond its "
+                        f"stop at {format_quantity(limit, link.units[0])}; "
                         "contacts.law: unilateral enforces it: change its initial position or its limit",
                         keys=("plant",),
                     )
-                found.append(JointStop(link.joint, side, float(limit)))
-    return found
+                stops.append(JointStop(link.joint, side, float(limit)))
+    return stops

@@ -78,14 +78,14 @@ class JointControl:
     task_space: TaskSpaceController | None = None
 
     @classmethod
-    def absent(cls, robot: Robot, told: Mapping[str, float] | None = None) -> JointControl:
+    def absent(cls, robot: Robot, targets: Mapping[str, float] | None = None) -> JointControl:
         """No controller: DC motors have zero volts and brake, servos hold where they start, torque sources rest.
 
-        ``told`` : what motors hold instead, by joint [rad or m]
+        ``targets`` : what motors hold instead, by joint [rad or m]
         """
         motors, held = len(robot.motors), held_values(robot)
         for a, motor in enumerate(robot.motors):
-            held[a] = (told or {}).get(motor.joint, held[a])
+            held[a] = (targets or {}).get(motor.joint, held[a])
         return cls(np.zeros(motors), np.zeros(motors), _reference(held), None)
 
     @classmethod
@@ -121,13 +121,13 @@ class JointControl:
         """
         positions = positions or {}
         driven = [motor.joint for motor in robot.motors]
-        held = held_values(robot)
+        values = held_values(robot)
         gains = _gains("k_p", k_p, len(driven)), _gains("k_d", k_d, len(driven))
         for name in positions:
             if name not in driven:
                 raise ModelError(f"{name!r} is no joint with a motor; those are: {', '.join(driven) or 'none'}")
         if not positions and voltages is None:
-            return cls(*gains, _reference(held), path, sample_time)
+            return cls(*gains, _reference(values), path, sample_time)
         grid = np.asarray(times, dtype=np.float64)
         if grid.ndim != 1 or len(grid) < 6 or not np.allclose(np.diff(grid), grid[1] - grid[0], rtol=1e-6, atol=0.0):
             raise ModelError("references need six or more equally spaced times [s]")
@@ -147,7 +147,7 @@ class JointControl:
         if columns:
             samples = np.stack(columns, axis=1)
             coefficients = recall("splines", lambda: quintic_coefficients(spacing, samples), spacing, samples)
-        reference = _reference(held, spline, (float(grid[0]), spacing), coefficients)
+        reference = _reference(values, spline, (float(grid[0]), spacing), coefficients)
         if voltages is not None:
             planned = np.asarray(voltages, dtype=np.float64)
             if planned.shape != (len(grid), len(driven)) or not np.isfinite(planned).all():
@@ -168,7 +168,7 @@ class JointControl:
         The fifth derivative jumps there: three knots further on the polynomials of the segments before and behind
         differ by more than ``atol`` + ``rtol`` × the spline's span. Commands that are taken at ticks bend nowhere.
         """
-        spacing, found = float(self.reference.grid[1]), []
+        spacing, times = float(self.reference.grid[1]), []
         for splines in (self.reference.coefficients, self.reference.voltage):
             if self.sample_time is not None or len(splines) < 2:
                 continue
@@ -176,8 +176,8 @@ class JointControl:
             departure = jumps * (_STRADDLED * spacing) ** 5
             values = splines[:, :, 0]  # at the knots
             span = values.max(axis=0) - values.min(axis=0)
-            found.append((departure > atol + rtol * span).any(axis=1).nonzero()[0])
-        knots = np.unique(np.concatenate(found)) if found else np.zeros(0)
+            times.append((departure > atol + rtol * span).any(axis=1).nonzero()[0])
+        knots = np.unique(np.concatenate(times)) if times else np.zeros(0)
         return np.asarray(self.reference.grid[0] + spacing * (knots + 1.0))
 
     def positions(self, robot: Robot) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
@@ -205,8 +205,8 @@ class JointControl:
             if robot.base is not None:
                 k, _ = base_row(robot)
                 angles = self._wheels(robot, slice(first, first + _PIECE))
-                way = rolled(robot.base, q[k + 2 : k + 4] if start is None else start, angles, spacing, _PER_SEGMENT)
-                positions[:, k + 2 : k + 4], start = way.reshape(-1, 2), way[-1, -1]
+                poses = rolled(robot.base, q[k + 2 : k + 4] if start is None else start, angles, spacing, _PER_SEGMENT)
+                positions[:, k + 2 : k + 4], start = poses.reshape(-1, 2), poses[-1, -1]
             yield times.ravel(), positions
 
     def _wheels(self, robot: Robot, segments: slice) -> NDArray[np.float64]:
@@ -257,15 +257,15 @@ def _gains(name: str, value: ArrayLike, motors: int) -> NDArray[np.float64]:
 
 
 def _reference(
-    held: NDArray[np.float64],
+    values: NDArray[np.float64],
     spline: NDArray[np.int64] | None = None,
     grid: tuple[float, float] = (0.0, 1.0),
     coefficients: NDArray[np.float64] | None = None,
 ) -> ReferenceArrays:
-    """References as the kernels take them: ``held``, (na,), where ``spline`` is HELD_POSITION, else that column."""
+    """References as the kernels take them: ``values``, (na,), where ``spline`` is HELD_POSITION, else that column."""
     return ReferenceArrays(
-        spline=integers(np.full(len(held), ka.HELD_POSITION) if spline is None else spline),
-        held=reals(held),
+        spline=integers(np.full(len(values), ka.HELD_POSITION) if spline is None else spline),
+        held=reals(values),
         grid=reals(grid),
         coefficients=reals(np.zeros((1, 0, 6)) if coefficients is None else coefficients),
     )

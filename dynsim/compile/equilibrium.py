@@ -45,7 +45,7 @@ class Rest:
     forces: list[tuple[int, Array, Array]]
 
 
-def rest(
+def holding_torques(
     model: Model, q: Array, contacts: Sequence[Contact], loads: Sequence[Load], able: Sequence[str], real: bool
 ) -> Rest:
     """Least-heat torques that hold a posture.
@@ -67,7 +67,7 @@ def rest(
     if robot.couplings:
         raise ModelError("initial.equilibrium: not for robots with coupled joints, which share a motor", keys=KEYS)
     touching = [(contact, *_touching_point(model, contact, q)) for contact in contacts]
-    touching = [one for one in touching if abs(one[-1]) <= TOUCHING or (real and one[-1] < 0.0)]
+    touching = [contact for contact in touching if abs(contact[-1]) <= TOUCHING or (real and contact[-1] < 0.0)]
     # Frictionless first, then all that Coulomb allows; with a least force first, so that what presses goes on to press.
     attempts = [(0.0, MIN_N), (0.0, 0.0), (1.0, MIN_N), (1.0, 0.0)] if real and touching else [(0.0, 0.0)]
     pushes = [
@@ -86,25 +86,25 @@ def rest(
         torques, still = np.zeros((1, model.n)), np.zeros((1, model.n))
         arrays, workspace = planner.arrays, planner.workspace
         if brace_statics(model.arrays, workspace, arrays, reals(q[None]), still, still, tables, torques, False) == 1:
-            found = arrays.found[: len(rows), kb.FORCES]
-            normal = found if real else found[::2] - found[1::2]
+            normal_N = arrays.found[: len(rows), kb.FORCES]
+            normal = normal_N if real else normal_N[::2] - normal_N[1::2]
             names = [contact.name for contact, *_ in touching]
             forces = arrays.forces[: len(rows)] if real else arrays.forces[: len(rows)].reshape(-1, 2, 3).sum(axis=1)
             places = [(link, point, force) for (_, link, point, *_), force in zip(touching, forces, strict=True)]
             return Rest(torques[0], dict(zip(names, normal.tolist(), strict=True)), places)
-    raise ModelError(_why(model, arrays.motors, arrays.free, [one[0].name for one in touching]), keys=KEYS)
+    raise ModelError(_why(model, arrays.motors, arrays.free, [contact[0].name for contact in touching]), keys=KEYS)
 
 
 def _touching_point(model: Model, contact: Contact, q: Array) -> tuple[int, Array, Array, float]:
     """Link, point in its frame [m] where a contact touches, normal there in the world, and gap [m]."""
     robot = model.robot
-    place, point = model.point_position(contact.body, contact.point, q), contact.point
+    position, point = model.point_position(contact.body, contact.point, q), contact.point
     if contact.tip is not None:
         end = model.point_position(contact.body, contact.tip, q)
-        share = share_of_axis(contact, place, end)
-        place, point = place + share * (end - place), point + share * (contact.tip - point)
-    normal = np.asarray(contact.surface.normal(place), dtype=np.float64)
-    gap = contact.surface.gap(place) - contact.radius
+        share = share_of_axis(contact, position, end)
+        position, point = position + share * (end - position), point + share * (contact.tip - point)
+    normal = np.asarray(contact.surface.normal(position), dtype=np.float64)
+    gap = contact.surface.gap(position) - contact.radius
     link, on_link = robot.attach(contact.body, point)
     if contact.radius > 0.0:
         on_link = on_link - contact.radius * (model.body_pose(link, q)[0].T @ normal)
@@ -131,7 +131,7 @@ def load_forces(model: Model, q: Array, loads: Sequence[Load]) -> list[tuple[int
 
     A torque M is the couple of M × d and −M × d at ±d/2, with d a unit vector across M.
     """
-    found = []
+    forces = []
     for load in loads:
         wrench = load.components(np.zeros(1))[0]
         link, point = model.robot.attach(load.body, load.point)
@@ -143,8 +143,8 @@ def load_forces(model: Model, q: Array, loads: Sequence[Load]) -> list[tuple[int
             across /= np.linalg.norm(across)
             lever, couple = 0.5 * axes.T @ across, np.cross(torque, across)
             pushes += [(point + lever, couple), (point - lever, -couple)]
-        found += [(link, at, push) for at, push in pushes if push.any()]
-    return found
+        forces += [(link, at, push) for at, push in pushes if push.any()]
+    return forces
 
 
 def _why(model: Model, limits: Array, needed: Array, braces: Sequence[str]) -> str:
@@ -167,8 +167,37 @@ def _why(model: Model, limits: Array, needed: Array, braces: Sequence[str]) -> s
         weak.append((abs(torque), f"{link.joint} {torque:.4g} {unit} ({reason})"))
     text = "initial.equilibrium: nothing holds this posture at rest"
     if weak:
-        shown = [one for _, one in sorted(weak, key=lambda one: -one[0])[:4]]
+        shown = [entry for _, entry in sorted(weak, key=lambda entry: -entry[0])[:4]]
         more = f" and {len(weak) - len(shown)} more" if len(weak) > len(shown) else ""
         text += f": weight and loads ask for {', '.join(shown)}{more}"
     carries = f"; {', '.join(braces)} cannot carry it" if braces else "; no contact touches"
     return f"{text}{carries}. Change the posture, let a brace carry it, or take initial.equilibrium away"
+
+
+def static_margin(model: Model, q: Array, forces: Sequence[tuple[int, Array, Array]] = ()) -> float:
+    """Tip margin of a base at rest, see :mod:`dynsim.dynamics.tree.support`: 1 at the incentre, 0 tips, −1 lifted.
+
+    Parameters
+    ----------
+    q : (nq,) coordinates
+    forces : from outside beside the weight: index of the link, point in its frame [m], force in the world [N]
+    """
+    robot, base = model.robot, model.robot.base
+    assert base is not None
+    axes, origin = model.body_pose(base.body, q)
+    force, moment = np.zeros(3), np.zeros(3)
+    weights = [(i, link.inertia.com, link.inertia.mass * robot.gravity) for i, link in enumerate(robot.links)]
+    for link, point, push in (*weights, *forces):
+        force += push
+        moment += np.cross(model.point_position(link, point, q) - origin, push)
+    # What the ground gives back, in the axes of the base.
+    carried, (turn_x, turn_y) = -float(axes[:, 2] @ force), (-axes.T @ moment)[:2]
+    if carried <= 0.0:
+        return -1.0
+    x, y = base.caster[:2]
+    caster = -turn_y / x
+    difference = 2.0 * (turn_x - caster * y) / base.track
+    loads = np.array([carried - caster + difference, carried - caster - difference, 2.0 * caster]) / 2.0
+    half = 0.5 * base.track
+    sides = np.array([np.hypot(x, y + half), np.hypot(x, y - half), base.track])
+    return float((loads / carried * sides.sum() / sides).min())

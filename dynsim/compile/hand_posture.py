@@ -3,21 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from dynsim.errors import ModelError, UnreachableReference
-from dynsim.model.description import Array, Contact
-
-if TYPE_CHECKING:
-    from dynsim.compile.model import Model
+from dynsim.model.description import Array, Contact, Robot
 
 ITERATIONS = 200
 # Longest step of a coordinate in one turn [rad or m], so that the branch of the start is kept.
 STEP_MAX = 0.3
 # Greatest damping, far from the target; near it the steps are Newton's.
 DAMPING = 1e-2
+
+
+class Kinematics(Protocol):
+    """Of :class:`dynsim.Model`, as far as postures need it."""
+
+    robot: Robot
+    n: int
+    nq: int
+
+    def body_pose(self, body: str | int, q: ArrayLike) -> tuple[Array, Array]: ...
+    def point_position_and_jacobian(self, body: str | int, point: ArrayLike, q: ArrayLike) -> tuple[Array, Array]: ...
 
 
 def turn_error(R: Array, wanted: Array) -> Array:
@@ -28,7 +37,7 @@ def turn_error(R: Array, wanted: Array) -> Array:
 
 
 def hand_posture(
-    model: Model, target: Array, q: Array, orientation: Array | None, braces: Sequence[Contact], tolerance: float
+    model: Kinematics, target: Array, q: Array, orientation: Array | None, braces: Sequence[Contact], tolerance: float
 ) -> Array:
     """See :meth:`dynsim.Model.inverse_kinematics`."""
     robot = model.robot
@@ -49,19 +58,19 @@ def hand_posture(
             errors.append(turn_error(R @ axes, orientation))
             rows.append(_turning(model, hand, R, origin, q) * revolute)
         for contact in braces:
-            place, rate = model.point_position_and_jacobian(contact.body, contact.point, q)
-            errors.append(np.array([contact.radius - contact.surface.gap(place)]))
-            rows.append((contact.surface.normal(place) @ rate)[None])
+            touching, rate = model.point_position_and_jacobian(contact.body, contact.point, q)
+            errors.append(np.array([contact.radius - contact.surface.gap(touching)]))
+            rows.append((contact.surface.normal(touching) @ rate)[None])
         error, J = np.concatenate(errors), np.vstack(rows)
         size = float(np.abs(error).max())
         if size <= tolerance:
             return q
         q = _stepped(q, J, error * min(1.0, 0.3 / size), size, lower, upper)
     at = [robot.links[k].joint for k in range(model.n) if q[k] in (lower[k], upper[k])]
-    held = f"; at their limits: {', '.join(at)}" if at else ""
+    stuck = f"; at their limits: {', '.join(at)}" if at else ""
     left = float(np.abs(error).max())
     raise UnreachableReference(
-        f"no posture near the start has hand, orientation and braces in place: {left:.3g} m or rad are left{held}; "
+        f"no posture near the start has hand, orientation and braces in place: {left:.3g} m or rad are left{stuck}; "
         "start elsewhere, or ask for less"
     )
 
@@ -82,12 +91,12 @@ def _stepped(q: Array, J: Array, error: Array, size: float, lower: Array, upper:
     return np.clip(q + step, lower, upper)
 
 
-def _turning(model: Model, body: int, R: Array, origin: Array, q: Array) -> Array:
+def _turning(model: Kinematics, body: int, R: Array, origin: Array, q: Array) -> Array:
     """Angular velocity of a body for each unit of rate, (3, n): from the velocities of two of its points."""
     at_origin = model.point_position_and_jacobian(body, np.zeros(3), q)[1]
-    found = np.zeros((3, model.n))
+    jacobian = np.zeros((3, model.n))
     for k in range(3):
         # ω × e_k, and ω = ½ Σ e_k × (ω × e_k).
         swept = model.point_position_and_jacobian(body, np.eye(3)[k], q)[1] - at_origin
-        found += 0.5 * np.cross(R[:, k], swept.T).T
-    return found
+        jacobian += 0.5 * np.cross(R[:, k], swept.T).T
+    return jacobian

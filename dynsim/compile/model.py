@@ -17,7 +17,7 @@ from dynsim.config.problems import listed
 from dynsim.dynamics import ledger
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.tree import articulated, joints, points, sweep
-from dynsim.errors import ModelError, shown
+from dynsim.errors import ModelError, brief
 from dynsim.model.description import Array, Contact, Robot
 from dynsim.record import notebook
 
@@ -47,7 +47,7 @@ class Model:
     def __init__(self, robot: Robot) -> None:
         if not isinstance(robot, Robot):
             raise ModelError(
-                f"needs a Robot, not {shown(robot)}; Model.from_urdf(file) and build_model(scenario) give a model"
+                f"needs a Robot, not {brief(robot)}; Model.from_urdf(file) and build_model(scenario) give a model"
             )
         robot = robot.with_motors_mounted() if any(motor.mass for motor in robot.motors) else robot
         self.robot = robot
@@ -107,7 +107,7 @@ class Model:
         from dynsim.model.urdf.build import read_urdf
 
         if not isinstance(path, (str, os.PathLike)):
-            raise ModelError(f"a URDF file is named by its path, not by {shown(path)}")
+            raise ModelError(f"a URDF file is named by its path, not by {brief(path)}")
         return cls(read_urdf(Path(path), lock))
 
     def to_urdf(self) -> str:
@@ -310,8 +310,8 @@ class Model:
     def _vector(self, values: ArrayLike, name: str, labels: tuple[str, ...]) -> Array:
         array = _numbers(values, name)
         if array.shape != (len(labels),):
-            what = "joints" if self.nq == self.n else "coordinates" if name == "q" else "rates"
-            raise ModelError(f"{name} has shape {array.shape}; this model has {len(labels)} {what}")
+            names = "joints" if self.nq == self.n else "coordinates" if name == "q" else "rates"
+            raise ModelError(f"{name} has shape {array.shape}; this model has {len(labels)} {names}")
         # The sum of Python's numbers first: it neither warns nor takes as long as a look by numpy at every element.
         if not math.isfinite(sum(array.tolist())) and not np.isfinite(array).all():
             k = int(np.flatnonzero(~np.isfinite(array))[0])
@@ -338,5 +338,5 @@ def _numbers(values: ArrayLike, name: str) -> Array:
     except ValueError as error:
         raise ModelError(f"{name} is no array of numbers: {error}") from error
     if array.dtype.kind not in "fiu":
-        raise ModelError(f"{name} must be real numbers, not {shown(values)}")
+        raise ModelError(f"{name} must be real numbers, not {brief(values)}")
     return np.asarray(array, dtype=np.float64)

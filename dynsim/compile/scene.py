@@ -11,8 +11,7 @@ import numpy as np
 
 from dynsim.model.description import Array, Contact, Link, Robot
 from dynsim.model.mobile_base import SUPPORTS, MobileBase
-from dynsim.model.surfaces import Box, HeightField, Quadric
-from dynsim.model.surfaces import Surface as TouchedSurface
+from dynsim.model.surfaces import Box, HeightField, Quadric, Surface
 from dynsim.record.quaternion import of_turn
 from dynsim.record.scene import (
     HERE,
@@ -23,8 +22,8 @@ from dynsim.record.scene import (
     Point,
     Quaternion,
     Scene,
+    SceneSurface,
     Shape,
-    Surface,
     quaternion,
     vector3,
 )
@@ -43,7 +42,7 @@ _ALONG_X: Quaternion = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)
 _ALONG_Y: Quaternion = (math.sqrt(0.5), -math.sqrt(0.5), 0.0, 0.0)
 
 
-def robot_scene(robot: Robot, contacts: Sequence[Contact], surfaces: Mapping[str, TouchedSurface]) -> Scene | None:
+def robot_scene(robot: Robot, contacts: Sequence[Contact], surfaces: Mapping[str, Surface]) -> Scene | None:
     """The scene of a tree of bodies whose joint positions are the signal ``q``; None where one has no kind for it."""
     index = {link.name: k for k, link in enumerate(robot.links)}
     bodies = []
@@ -64,19 +63,19 @@ def robot_scene(robot: Robot, contacts: Sequence[Contact], surfaces: Mapping[str
         points.append(Point(contact.name, "contact", body, vector3(point), contact.surface_name))
     return Scene(
         tuple(bodies),
-        tuple(_drawn(name, one) for name, one in surfaces.items()),
+        tuple(_drawn(name, surface) for name, surface in surfaces.items()),
         tuple(points),
         robot.fixed_shapes,
         supports,
     )
 
 
-def _drawn(name: str, surface: TouchedSurface) -> Surface:
+def _drawn(name: str, surface: Surface) -> SceneSurface:
     """A surface as a scene keeps it."""
     nothing = np.zeros((3, 3))
     if isinstance(surface, Box):
         return replace(
-            Surface.of_quadric(name, nothing, np.zeros(3), 0.0),
+            SceneSurface.of_quadric(name, nothing, np.zeros(3), 0.0),
             kind="box",
             position=vector3(surface.centre),
             orientation=quaternion(surface.axes.T),
@@ -88,14 +87,14 @@ def _drawn(name: str, surface: TouchedSurface) -> Surface:
         heights, dx = _thinned(heights.T, dx)
         heights, dy = _thinned(heights.T, dy)
         return replace(
-            Surface.of_quadric(name, nothing, np.zeros(3), 0.0),
+            SceneSurface.of_quadric(name, nothing, np.zeros(3), 0.0),
             kind="height_field",
             position=vector3([*surface.origin, 0.0]),
             spacing=(dx, dy),
             heights=tuple(tuple(row) for row in heights.tolist()),
         )
     assert isinstance(surface, Quadric)
-    return Surface.of_quadric(name, surface.Q, surface.b, surface.c)
+    return SceneSurface.of_quadric(name, surface.Q, surface.b, surface.c)
 
 
 def _thinned(rows: Array, spacing: float) -> tuple[Array, float]:
@@ -113,8 +112,8 @@ def _wheels(base: MobileBase, body: int) -> list[Body]:
     """Wheels as bodies of their own, which turn on the base."""
     r, wheels = base.wheel_radius, []
     for name, side in zip(base.wheels, (0.5, -0.5), strict=True):
-        place = (0.0, side * base.track, r)
-        joint = Joint(f"{name}.axle", "revolute", (0.0, 1.0, 0.0), place, HERE, "q", (name,))
+        position = (0.0, side * base.track, r)
+        joint = Joint(f"{name}.axle", "revolute", (0.0, 1.0, 0.0), position, HERE, "q", (name,))
         wheels.append(
             Body(f"{name}.wheel", body, joint, (Shape("cylinder", (r, BASE_WHEEL_WIDTH * r), orientation=_ALONG_Y),))
         )
@@ -125,14 +124,14 @@ def _supports(base: MobileBase, body: int) -> tuple[Point, ...]:
     """Where wheels and caster touch the ground, with the names of their loads."""
     left, right = (vector3((0.0, side * base.track, 0.0)) for side in (0.5, -0.5))
     places = zip(SUPPORTS, (left, right, vector3(base.caster)), strict=True)
-    return tuple(Point(name, "support", body, place) for name, place in places)
+    return tuple(Point(name, "support", body, position) for name, position in places)
 
 
 def _joint(link: Link, kind: JointKind) -> Joint:
     if link.kind == "left_wheel":  # its angles are not where it is
-        place, columns = (0.0, 0.0, 0.0), ("x", "y", "heading")
+        position, columns = (0.0, 0.0, 0.0), ("x", "y", "heading")
         return Joint(
-            link.joint, kind, (0.0, 0.0, 1.0), place, HERE, "base_pose", columns, part_of=link.joint_of_rows or ""
+            link.joint, kind, (0.0, 0.0, 1.0), position, HERE, "base_pose", columns, part_of=link.joint_of_rows or ""
         )
     return Joint(
         name=link.joint,
@@ -198,7 +197,7 @@ def snake_scene(description: SnakeDescription) -> Scene:
         wheels.append(_active_wheel(d, pair, len(bodies) - 1, -l))
     if d.pairs > 1:
         bodies[0] = Body("pair1", WORLD, base, (snake_tube(d, -l, 0.0), *bodies[0].shapes))
-    ground = Surface.of_quadric("ground", np.zeros((3, 3)), [0.0, 0.0, 1.0], 0.0)
+    ground = SceneSurface.of_quadric("ground", np.zeros((3, 3)), [0.0, 0.0, 1.0], 0.0)
     hand = Point("controlled point", "hand", head, (l + d.point_offset, 0.0, 0.0))
     return Scene((*bodies, *(wheel for wheel in wheels if wheel is not None)), (ground,), (hand,))
 
@@ -231,6 +230,6 @@ def _active_wheel(d: SnakeDescription, pair: int, parent: int, x: float) -> Body
     if not side:
         return None
     name = d.wheel_names[int(np.count_nonzero(d.driven_side[:pair]))]
-    place = (x, side * float(d.half_track[pair]), 0.0)
-    joint = Joint(name, "revolute", (0.0, 1.0, 0.0), place, HERE, "rho", (name,))
+    position = (x, side * float(d.half_track[pair]), 0.0)
+    joint = Joint(name, "revolute", (0.0, 1.0, 0.0), position, HERE, "rho", (name,))
     return Body(f"wheel_{name}", parent, joint, (snake_wheel(d),))

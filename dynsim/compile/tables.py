@@ -11,7 +11,7 @@ from dynsim.dynamics import tables as ka
 from dynsim.dynamics.tree import loads as kl
 from dynsim.dynamics.tree import support as ks
 from dynsim.dynamics.tree.loads import LoadArrays
-from dynsim.errors import ModelError, shown
+from dynsim.errors import ModelError, brief
 from dynsim.jit.kernel import integers, reals
 from dynsim.model.description import Contact, Coupling, Link, Load, Quadric, Robot
 from dynsim.model.drives import Drive, Motor, Servo, TorqueSource
@@ -131,7 +131,7 @@ def compile_drives(
     joints = {link.joint: i for i, link in enumerate(robot.links)}
     table = np.zeros((len(robot.motors), ka.DRIVE_SIZE), dtype=np.int64)
     motor = np.zeros((len(robot.motors), ka.MOTOR_SIZE))
-    given = np.zeros((len(robot.motors), ka.INPUT_SIZE))
+    inputs = np.zeros((len(robot.motors), ka.INPUT_SIZE))
     circuits = 0
     for a, m in enumerate(robot.motors):
         table[a, ka.DRIVEN], table[a, ka.CIRCUIT], table[a, ka.SAMPLED] = (
@@ -153,7 +153,7 @@ def compile_drives(
         else:
             table[a, ka.DRIVE_KIND] = ka.OPEN_TORQUE
             motor[a, ka.K_M], motor[a, ka.I_MAX], motor[a, ka.U_MAX] = 1.0, m.torque_limit, np.inf
-    return ka.DriveArrays(table=integers(table), motor=reals(motor), input=reals(given))
+    return ka.DriveArrays(table=integers(table), motor=reals(motor), input=reals(inputs))
 
 
 def _dc_motor(m: Motor, k_p: float, k_d: float) -> np.ndarray:
@@ -206,16 +206,16 @@ def compile_loads(robot: Robot, loads: Sequence[Load]) -> LoadArrays:
     """
     table = np.zeros((len(loads), kl.TABLE_SIZE), dtype=np.int64)
     parts: list[np.ndarray] = []
-    place = 0
+    offset = 0
     for k, load in enumerate(loads):
         try:
             body, on_body = robot.attach(load.body, load.point)
         except ModelError as error:
             raise ModelError(f"load {load.name}: {error}") from None
         segments = np.column_stack([load.knots[:-1], load.coefficients.reshape(len(load.coefficients), 24)])
-        table[k] = body, load.in_body, load.hold, place, len(segments)
+        table[k] = body, load.in_body, load.hold, offset, len(segments)
         parts += [on_body, np.zeros(6), segments.ravel(), load.knots[-1:]]
-        place += kl.FIRST_SEGMENT + segments.size + 1
+        offset += kl.FIRST_SEGMENT + segments.size + 1
     return LoadArrays(table=integers(table), data=reals(np.concatenate(parts) if parts else np.zeros(0)))
 
 
@@ -282,7 +282,7 @@ def _check_couplings(robot: Robot) -> None:
         for quantity in ("ratio", "offset"):
             value = getattr(coupling, quantity)
             if not (isinstance(value, (int, float, np.floating)) and np.isfinite(value)):
-                raise ModelError(f"{name}: {quantity} {shown(value)} must be a finite number")
+                raise ModelError(f"{name}: {quantity} {brief(value)} must be a finite number")
         leads[coupling.joint] = coupling
     for start in leads:
         circle, joint = [start], leads[start].leader
@@ -329,14 +329,14 @@ def _check_shapes(robot: Robot) -> None:
             (f"{link.name}: centre of mass", inertia.com, (3,)),
             (f"{link.name}: inertia tensor", inertia.tensor, (3, 3)),
         ]
-    for what, value, shape in quantities:
+    for quantity, value, shape in quantities:
         try:
             array = np.asarray(value)
         except ValueError:  # rows of unequal length
             array = np.array(None)
         if array.dtype.kind not in "fiu" or array.shape != shape or not np.isfinite(array).all():
             wanted = f"an array of shape {shape} of finite numbers" if shape else "a finite number"
-            raise ModelError(f"{what} is {shown(value)}; it must be {wanted}")
+            raise ModelError(f"{quantity} is {brief(value)}; it must be {wanted}")
 
 
 def _joint_kind(link: Link) -> int:

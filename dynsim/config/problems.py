@@ -10,6 +10,7 @@ import itertools
 import re
 import types
 import typing
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -57,10 +58,10 @@ class Origin:
     def line(self, keys: Sequence[int | str]) -> int:
         """Line of the last of ``keys`` that the file has; 0 when it has none of them."""
         # The mapping that has most of the keys; of equals the first, because the variant lies over the rest.
-        found = [_line(mapping, keys) for mapping in self.mappings]
-        return max(found, key=lambda depth_and_line: depth_and_line[0], default=(0, 0))[1]
+        lines = [_line(mapping, keys) for mapping in self.mappings]
+        return max(lines, key=lambda depth_and_line: depth_and_line[0], default=(0, 0))[1]
 
-    def place(self, keys: Sequence[int | str]) -> str:
+    def location(self, keys: Sequence[int | str]) -> str:
         """``file:line`` of a key, or how it was overridden."""
         if self.sets(keys):
             return self.overriding
@@ -80,7 +81,7 @@ def unknown_keys(
         suggestion = suggest(str(keys[-1]), known)
         if not suggestion and known:
             suggestion = f"; known here: {', '.join(known)}"
-        texts.append(f"{origin.place(keys)}: {dotted(keys)}: unknown key{suggestion}")
+        texts.append(f"{origin.location(keys)}: {dotted(keys)}: unknown key{suggestion}")
     return texts
 
 
@@ -90,18 +91,18 @@ def explain(error: ValidationError, data: Any, origin: Origin, unknown: Sequence
     shown = texts[:UNKNOWN_SHOWN] + (["and more"] if len(texts) > UNKNOWN_SHOWN else [])
     problems = error.errors(include_url=False, include_input=False)
     others: dict[str, str] = {}
+    # Of a list of fixed length: one problem for every entry that it lacks.
+    alike = Counter((problem["type"], problem["loc"][:-1]) for problem in problems)
     for problem in problems:
         if problem["type"] == "extra_forbidden":
             continue
-        # Of a list of fixed length: one problem for every entry that it lacks.
-        alike = sum(one["type"] == problem["type"] and one["loc"][:-1] == problem["loc"][:-1] for one in problems)
-        keys, given, text = _problem(problem, data, alike)
+        keys, value, text = _problem(problem, data, alike[problem["type"], problem["loc"][:-1]])
         key = dotted(keys)
         # A misspelt key also makes the right one missing.
-        misspelt = problem["type"] == "missing" and any(f"did you mean {str(keys[-1])!r}?" in one for one in texts)
+        misspelt = problem["type"] == "missing" and any(f"did you mean {str(keys[-1])!r}?" in other for other in texts)
         if not misspelt:
             # A value that may be of several types has a problem with each of them: the first is told.
-            others.setdefault(key, f"{origin.place(keys)}: {key and f'{key}{given}: '}{text}")
+            others.setdefault(key, f"{origin.location(keys)}: {key and f'{key}{value}: '}{text}")
     shown += itertools.islice(others.values(), OTHERS_SHOWN)
     if (more := len(others) - OTHERS_SHOWN) > 0:
         shown.append(f"and {more} more problem{'s' if more > 1 else ''}")
@@ -112,7 +113,7 @@ def _problem(problem: ErrorDetails, data: Any, alike: int) -> tuple[list[int | s
     """Keys of a value, " = value" where it is short, and what is wrong; ``alike`` problems are in one list."""
     context, kind, message = problem.get("ctx", {}), problem["type"], problem["msg"].removeprefix("Value error, ")
     loc = (*problem["loc"], *context.get("key", "").split("."))
-    keys, value, found = _locate(data, tuple(part for part in loc if part != ""))
+    keys, value, exists = _locate(data, tuple(part for part in loc if part != ""))
     if kind in ("union_tag_invalid", "union_tag_not_found"):
         return _wrong_tag(keys, value, context)
     if kind == "missing" and isinstance(problem["loc"][-1], int) and isinstance(value, list):
@@ -134,8 +135,8 @@ def _problem(problem: ErrorDetails, data: Any, alike: int) -> tuple[list[int | s
         text = "must be " + message.removeprefix("Input should be ")
     else:
         text = " ".join((message[0].lower() + message[1:]).splitlines())
-    given = f" = {value_text(value)}" if found and not isinstance(value, (Mapping, list)) else ""
-    return keys, given, text
+    shown_value = f" = {value_text(value)}" if exists and not isinstance(value, (Mapping, list)) else ""
+    return keys, shown_value, text
 
 
 def _wrong_tag(keys: list[int | str], value: Any, context: Mapping[str, Any]) -> tuple[list[int | str], str, str]:
@@ -181,23 +182,23 @@ def suggest(word: str, known: Any) -> str:
 def _locate(data: Any, loc: tuple[int | str, ...]) -> tuple[list[int | str], Any, bool]:
     """Keys of a pydantic location without its union tags; the value there, and whether there is one."""
     keys: list[int | str] = []
-    node, found = data, True
+    node, exists = data, True
     for part in loc:
         if isinstance(node, list) and isinstance(part, str) and INDEX.fullmatch(part):
             part = int(part)  # of a dotted key
         in_mapping = isinstance(node, Mapping) and part in node
         in_list = isinstance(node, list) and isinstance(part, int) and part < len(node)
-        if found and (in_mapping or in_list):
+        if exists and (in_mapping or in_list):
             node = node[part]
         elif isinstance(node, Mapping) and part in (node.get(tag) for tag in TAGS):
             continue
-        elif found and isinstance(node, (int, float, str, list)):
+        elif exists and isinstance(node, (int, float, str, list)):
             # Branches of a union of plain types, such as "float" and "list[float]".
             continue
         else:
-            found = False
+            exists = False
         keys.append(part)
-    return keys, node, found
+    return keys, node, exists
 
 
 def _line(mapping: Any, keys: Sequence[int | str]) -> tuple[int, int]:
@@ -217,9 +218,9 @@ def _fields(schema: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
     """Keys that data of a schema may have at a pydantic location."""
     classes = [schema]
     for part in loc:
-        held = [c.model_fields[part] for c in classes if isinstance(part, str) and part in c.model_fields]
-        if held:
-            classes = [c for field in held for held_in in (field.annotation, *field.metadata) for c in _models(held_in)]
+        fields = [c.model_fields[part] for c in classes if isinstance(part, str) and part in c.model_fields]
+        if fields:
+            classes = [c for field in fields for kind in (field.annotation, *field.metadata) for c in _models(kind)]
         else:
             tagged = [c for c in classes if part in _literals(c)]
             classes = tagged or classes

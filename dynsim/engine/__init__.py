@@ -127,11 +127,11 @@ def named(scenario: Scenario) -> Iterator[None]:
     """Say in errors which scenario and variant they are about; those of reading it name file and line themselves."""
     require_scenario(scenario)
     variant = f" ({scenario.variant})" if scenario.variant else ""
-    name = scenario.place(variant=variant)
+    name = scenario.location(variant=variant)
     try:
         yield
     except ModelError as error:
-        raise ModelError(f"{scenario.place(error.keys, variant)}: {error}") from error
+        raise ModelError(f"{scenario.location(error.keys, variant)}: {error}") from error
     except (ScenarioError, UnreachableReference) as error:
         raise type(error)(f"{name}: {error}") from error
     except (ArithmeticError, np.linalg.LinAlgError) as error:

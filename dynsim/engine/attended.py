@@ -196,8 +196,8 @@ def advance(
         # Not where it has come to what its caller is to look at. (A pending step at the begin is to be accepted.)
         due = run.count[ki.STATUS] == ki.RUNNING and not run.count[[ki.PENDING, ki.TICKED, ki.LOGGED]].any()
     if due and limit > few:
-        rest = partial(driver.advance, prepared.system, prepared.workspace, run, limit - few)
-        ended, raised = attend(rest, ask, both)
+        remainder = partial(driver.advance, prepared.system, prepared.workspace, run, limit - few)
+        ended, raised = attend(remainder, ask, both)
     watch.spend()
     if not ended:
         prepared = _copied(prepared)

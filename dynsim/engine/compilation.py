@@ -101,8 +101,8 @@ def _beginning(kind: str) -> Compilation:
     with suppress(OSError, ValueError):
         expected = float((folder.parent / LAST).read_text())
     last = USUAL if expected is None else f"the last time took {expected:.0f} s"
-    what = f" for {kind}" if kind else ""
-    return Compilation(f"compiling the kernels{what}, {why}: {last}, later runs load them", clock.time(), expected)
+    purpose = f" for {kind}" if kind else ""
+    return Compilation(f"compiling the kernels{purpose}, {why}: {last}, later runs load them", clock.time(), expected)
 
 
 @contextmanager
@@ -120,14 +120,14 @@ def _marked(compilation: Compilation) -> Iterator[None]:
 
 def under_way() -> Compilation | None:
     """What this process or one of its group compiles, the one that began first; None: nothing."""
-    found = []
+    running = []
     for path in cache_folder().glob(f"*{MARK}"):
         with suppress(OSError, ValueError, TypeError):
             group, text, since, expected = json.loads(path.read_text())
             os.kill(int(path.name.removesuffix(MARK)), 0)  # of a process that died it stays
             if group == os.getpgrp():
-                found.append(Compilation(str(text), float(since), expected))
-    return min(found, key=lambda one: one.since, default=None)
+                running.append(Compilation(str(text), float(since), expected))
+    return min(running, key=lambda compilation: compilation.since, default=None)
 
 
 @contextmanager

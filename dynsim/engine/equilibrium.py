@@ -16,9 +16,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from dynsim.compile.contact_law import told
+from dynsim.compile.contact_law import format_quantity
 from dynsim.compile.control import JointControl
-from dynsim.compile.equilibrium import load_torques, rest
+from dynsim.compile.equilibrium import holding_torques, load_torques
 from dynsim.compile.model import Model
 from dynsim.dynamics.tables import ReferenceArrays
 from dynsim.model.description import Array, Contact, Load
@@ -67,7 +67,7 @@ def balanced(
     index = [model.joint_names.index(motor.joint) for motor in motors]
     begin, rate = _begin(control.reference, len(motors))
     current, shift = np.zeros(len(motors)), np.zeros(len(motors))
-    found: list[str] = []
+    jumps: list[str] = []
     planned = control.reference.voltage
     if not len(planned):
         able = [
@@ -76,8 +76,8 @@ def balanced(
             if isinstance(motor, TorqueSource) or (isinstance(motor, Servo) and not motor.velocity_mode)
             or (isinstance(motor, Motor) and k_p > 0.0)
         ]  # fmt: skip
-        held = rest(model, robot.initial, contacts, loads, able, real)
-        torques, forces = held.torques, held.normal_forces
+        balance = holding_torques(model, robot.initial, contacts, loads, able, real)
+        torques, forces = balance.torques, balance.normal_forces
     else:
         # The plan says what presses; loads it does not know, and the motors carry them.
         torques, forces = load_torques(model, robot.initial, loads), {}
@@ -87,7 +87,7 @@ def balanced(
             if control.reference.spline[a] < 0:
                 shift[a] = torques[i] - begin[a]
             elif abs(torques[i] - begin[a]) > AT_REST:
-                found.append(
+                jumps.append(
                     f"the torque of {motor.joint} begins with {begin[a]:.4g} N m, at rest it would be {torques[i]:.4g}"
                 )
             continue
@@ -101,16 +101,17 @@ def balanced(
         unit = robot.links[i].units
         at = robot.initial[robot.position_index[i]]
         if k_p > 0.0 and abs(begin[a] - at) > AT_REST:
-            found.append(
-                f"the reference of {motor.joint} begins {told(begin[a] - at, unit[0], 3)} from where it stands"
+            jumps.append(
+                f"the reference of {motor.joint} begins {format_quantity(begin[a] - at, unit[0], 3)} from "
+                "where it stands"
             )
         elif k_p > 0.0 and abs(rate[a]) > AT_REST:
-            found.append(f"the reference of {motor.joint} begins with {rate[a]:.3g} {unit[1]}")
+            jumps.append(f"the reference of {motor.joint} begins with {rate[a]:.3g} {unit[1]}")
     resistance = np.array([getattr(motor, "resistance", 0.0) for motor in motors])
     said = (
-        ("initial.equilibrium: " + "; ".join(found) + ": that jumps at the start all the same; a path that begins at "
+        ("initial.equilibrium: " + "; ".join(jumps) + ": that jumps at the start all the same; a path that begins at "
          "rest where the hand is does not",)
-        if found
+        if jumps
         else ()
     )  # fmt: skip
     return Balance(current, shift, float(resistance @ current**2), forces, said)

@@ -113,7 +113,7 @@ class ContactMatrices:
 
     def solutions(self) -> list[Array]:
         """Forces (p,) of every choice of signs that agrees with them, each once; only for independent rows."""
-        found: list[Array] = []
+        solutions: list[Array] = []
         for signs in self.choices():
             try:
                 force = np.asarray(np.linalg.solve(self.matrix(signs), self.rhs), dtype=np.float64)
@@ -121,9 +121,9 @@ class ContactMatrices:
                 continue
             scale = kq.FORCE_TOLERANCE * max(np.abs(force).max(), np.abs(self.force).max())
             agrees = (force * signs >= -scale)[self.free].all()
-            if agrees and all(np.abs(force - other).max() > scale for other in found):
-                found.append(force)
-        return found
+            if agrees and all(np.abs(force - other).max() > scale for other in solutions):
+                solutions.append(force)
+        return solutions
 
     def critical_friction(self) -> float | None:
         """The least factor s ≤ 1 on all friction at which a determinant vanishes, det(A0 − s B diag(σ)) = 0."""
@@ -225,27 +225,27 @@ def paradox(
         solutions = [solution[sliding] for solution in solutions]
         forces = " and ".join(f"({', '.join(f'{force:.4g}' for force in solution)}) N" for solution in solutions)
         count = "two" if len(solutions) == 2 else len(solutions)
-        what = (
+        finding = (
             f"{count} consistent solutions (Painlevé's paradox) at {names}: normal forces {forces} agree with "
             "dissipative friction, so that the motion is not determined"
         )
     elif near:
-        what = (
+        finding = (
             f"Painlevé's paradox at {names}: det J M⁻¹F falls to zero ({value:.1e} of its value without friction), "
             "where normal forces have no bound"
         )
     elif abs(value) < NEAR_ZERO:
-        what = (
+        finding = (
             f"Painlevé's paradox at {names}: det J M⁻¹F passes through zero, where normal forces have no bound and "
             "turn round"
         )
     elif value < 0.0:
-        what = (
+        finding = (
             f"Painlevé's paradox at {names}: det J M⁻¹F is negative ({value:.2g} of its value without friction), so "
             "that the contact moves against a force that pushes it"
         )
     else:
-        what = (
+        finding = (
             f"Painlevé's paradox at {names}: {'every' if turned.all() else 'its'} diagonal entry of J M⁻¹F is "
             "negative, so that each of these points moves against a force that pushes it"
         )
@@ -255,7 +255,7 @@ def paradox(
         coefficients = {contact.friction for contact in contacts}
         below = f" below {factor * max(coefficients):.3g}" if len(coefficients) == 1 else f" to less than {factor:.0%}"
     advice = f"lower contacts.friction{below}, or take another posture or direction of slip"
-    return t, y, f"{what}; {advice}"
+    return t, y, f"{finding}; {advice}"
 
 
 def motion_spread(
@@ -317,14 +317,14 @@ def acceleration_range(system: System, t: float, y: Array) -> tuple[Array, Array
         change = np.zeros(n)
         for j in range(n):
             # In units of the largest force, so that the solver's absolute tolerances mean something.
-            found = linprog(
+            optimum = linprog(
                 direction * slope[j],
                 A_ub=-signs[:, None] * N,
                 b_ub=np.maximum(signs * force / scale, 0.0),
                 bounds=(None, None),
             )
-            unbounded = found.status == 3
-            change[j] = -direction * np.inf if unbounded else direction * (found.fun or 0.0) * scale
+            unbounded = optimum.status == 3
+            change[j] = -direction * np.inf if unbounded else direction * (optimum.fun or 0.0) * scale
         ends.append(taken + change)
     return taken, np.minimum(ends[0], taken), np.maximum(ends[1], taken)
 
@@ -342,7 +342,7 @@ def sharing(model: Model, contacts: Sequence[Contact], q: Array, modes: Array) -
     modes : of the contacts in them, (T, c), dynsim.dynamics.tables: OPEN, SLIDING, STICKING
     """
     free = _free(model)
-    found: set[int] = set()
+    shared: set[int] = set()
     _, first = np.unique(modes, axis=0, return_index=True)
     several = [
         t for t in sorted(first) if np.count_nonzero(modes[t] != ka.OPEN) > 1 and (modes[t] == ka.STICKING).any()
@@ -355,8 +355,8 @@ def sharing(model: Model, contacts: Sequence[Contact], q: Array, modes: Array) -
             owner += [k] * len(basis)
         left, sizes, _ = np.linalg.svd(np.vstack(bases))
         rank = int(np.count_nonzero(sizes > DEPENDENT))
-        found.update(np.array(owner, dtype=int)[np.abs(left[:, rank:]).max(axis=1, initial=0.0) > DEPENDENT].tolist())
-    return [contacts[k].name for k in sorted(found)]
+        shared.update(np.array(owner, dtype=int)[np.abs(left[:, rank:]).max(axis=1, initial=0.0) > DEPENDENT].tolist())
+    return [contacts[k].name for k in sorted(shared)]
 
 
 def _free(model: Model) -> Array:

@@ -51,7 +51,7 @@ class StoppingPath:
     targets: Array
     joints: Array
 
-    def rest(self) -> StoppingPath:
+    def remainder(self) -> StoppingPath:
         """What is left of it after a tick."""
         return StoppingPath(self.velocity[1:], self.targets[1:], self.joints[1:])
 
@@ -95,11 +95,11 @@ class HandGovernor:
             self.rates = np.zeros_like(self.rates)
             return
         slower = self._path.velocity[0] if len(self._path.velocity) else np.zeros(3)
-        found, why = self._path_to_rest(wish)
-        if found is None:
+        path, why = self._path_to_rest(wish)
+        if path is None:
             self.hindrance = why
-            found = self._bisected(slower, wish)
-        self._take(self._path if found is None else found)
+            path = self._bisected(slower, wish)
+        self._take(self._path if path is None else path)
 
     def _bisected(self, slower: Array, wish: Array) -> StoppingPath | None:
         """The way from the fastest admissible velocity between those two; None where it is the slower one."""
@@ -108,12 +108,12 @@ class HandGovernor:
         for _ in range(HALVINGS):
             part = 0.5 * (low + high)
             velocity = slower + part * (wish - slower)
-            found, _ = self._path_to_rest(velocity)
+            path, _ = self._path_to_rest(velocity)
             creeps = at_rest or float(np.linalg.norm(velocity)) < least
-            if found is None or (creeps and not self._gets_easier(velocity)):
+            if path is None or (creeps and not self._gets_easier(velocity)):
                 high = part
             else:
-                low, best = part, found
+                low, best = part, path
         return best
 
     def _gets_easier(self, velocity: Array) -> bool:
@@ -134,7 +134,7 @@ class HandGovernor:
             return
         self.rates = (path.joints[0] - self.joints) * self._options.rate
         self.velocity, self.target, self.joints = path.velocity[0].copy(), path.targets[0].copy(), path.joints[0].copy()
-        self._path = path.rest()
+        self._path = path.remainder()
 
     def _path_to_rest(self, velocity: Array) -> tuple[StoppingPath | None, str]:
         """The way to rest that begins with a velocity, or None and what is against it."""
@@ -156,10 +156,10 @@ class HandGovernor:
         )
         return (None, why) if why else (StoppingPath(velocities, targets, joints), "")
 
-    def _first(self, broken: NDArray[np.bool_], what: str) -> str:
+    def _first(self, broken: NDArray[np.bool_], reason: str) -> str:
         """The joint that is the first to break a limit."""
         ticks, joints = np.nonzero(broken)
-        return f"{self._options.joints[joints[0]]} {what}" if len(ticks) else ""
+        return f"{self._options.joints[joints[0]]} {reason}" if len(ticks) else ""
 
     def _followed(self, velocities: Array) -> tuple[Array | None, Array]:
         """Joints (T, c) with the hand where velocities (T, 3) take it, None out of reach; and the targets (T, 3)."""

@@ -57,12 +57,12 @@ def choose(
         return Choice(options.method, "named in the scenario")
     pace = min(PACE, control.sample_time or PACE, options.step_max_s or PACE)
     rate = fastest_rate(model, contacts, drives)
-    told = f"fastest rate {rate:.3g} 1/s, steps of {1e3 * pace:.3g} ms"
+    reason = f"fastest rate {rate:.3g} 1/s, steps of {1e3 * pace:.3g} ms"
     if rate * pace > worth_it(model.n):
-        return Choice("radau5", f"{told}: an implicit method is not held by it")
+        return Choice("radau5", f"{reason}: an implicit method is not held by it")
     if rate == 0.0 and model.n <= SMALL and options.rtol >= TIGHT:
         return Choice("radau5", "no drive and no loss damps errors: the implicit method keeps energy to the tolerance")
-    return Choice("dopri5", f"{told}: an explicit method takes them")
+    return Choice("dopri5", f"{reason}: an explicit method takes them")
 
 
 def worth_it(n: int) -> float:
@@ -93,10 +93,10 @@ def fastest_rate(model: Model, contacts: Sequence[Contact], drives: ka.DriveArra
     if not (torque_q.any() or torque_v.any() or torque_i.any()):
         return 0.0
     mobility = np.linalg.inv(model.mass_matrix(q) + np.diag(model.armature))
-    held = _held(model, contacts, q)
-    if len(held):
-        through = mobility @ held.T
-        mobility = mobility - through @ np.linalg.pinv(held @ through) @ through.T
+    rows = _held(model, contacts, q)
+    if len(rows):
+        through = mobility @ rows.T
+        mobility = mobility - through @ np.linalg.pinv(rows @ through) @ through.T
     still = np.zeros((n, circuits))
     return _spectral_radius(
         np.block(

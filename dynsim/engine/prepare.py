@@ -362,7 +362,7 @@ def _check_held(model: Model, contacts: Sequence[Contact], control: JointControl
     robot = model.robot
     links = {link.name: link for link in robot.links}
     motor_of = {motor.joint: a for a, motor in enumerate(robot.motors)}
-    held: dict[str, list[tuple[Contact, Array]]] = {}
+    followed: dict[str, list[tuple[Contact, Array]]] = {}
     for contact in contacts:
         index, point = robot.attach(contact.body, contact.point)
         carrier = body = robot.links[index].name
@@ -377,15 +377,15 @@ def _check_held(model: Model, contacts: Sequence[Contact], control: JointControl
         # moves, the point stays where it starts, which has its own check.
         follows = all(a >= 0 and control.k_p[a] > 0.0 for a in chain)
         if follows and any(control.reference.spline[a] >= 0 for a in chain):
-            held.setdefault(carrier, []).append((contact, point))
-    if not held:
+            followed.setdefault(carrier, []).append((contact, point))
+    if not followed:
         return
     worst: dict[str, tuple[float, float, np.ndarray]] = {}
     first: dict[str, float] = {}
-    points = {body: [(contact.surface, point) for contact, point in pairs] for body, pairs in held.items()}
+    points = {body: [(contact.surface, point) for contact, point in pairs] for body, pairs in followed.items()}
     for times, q in control.positions(robot):
-        for link, found in gaps(robot, q, points):
-            for (contact, _), distance in zip(held[link.name], found, strict=True):
+        for link, distances in gaps(robot, q, points):
+            for (contact, _), distance in zip(followed[link.name], distances, strict=True):
                 gap = distance - contact.radius
                 k = int(np.abs(gap).argmax())
                 if abs(gap[k]) > tolerance:

@@ -33,7 +33,7 @@ from dynsim.engine.recording import make_record
 from dynsim.engine.stepped import GUARDS, Snapshot, State, Touch, event_name, own_guards, take_log
 from dynsim.engine.stopping import stopped
 from dynsim.engine.trace import Trace
-from dynsim.errors import ModelError, ScenarioError, shown
+from dynsim.errors import ModelError, ScenarioError, brief
 from dynsim.integrators import run as ki
 from dynsim.integrators.dense import state_within
 from dynsim.model.drives import Drive
@@ -105,9 +105,9 @@ class Simulation:
         if scenario.engine != "dynamics":
             raise ModelError(f"plant {scenario.plant.type!r} is kinematic: only plants with dynamics can be stepped")
         if state is not None and not isinstance(state, State):
-            raise ModelError(f"a simulation starts from a State, such as State.of(record), not from {shown(state)}")
+            raise ModelError(f"a simulation starts from a State, such as State.of(record), not from {brief(state)}")
         if trace is not None and (not isinstance(trace, int) or trace < 0):
-            raise ScenarioError(f"trace is a number of samples, or None for all, not {shown(trace)}")
+            raise ScenarioError(f"trace is a number of samples, or None for all, not {brief(trace)}")
         start = 0.0 if state is None else float(state.time)
         if not math.isfinite(start):
             raise ModelError(f"the state to start from has time {start}")
@@ -200,7 +200,7 @@ class Simulation:
         last = outputs[-1] if len(outputs) else self._trace.last_output()
         if last is None or not self._prepared.contacts:
             return {}
-        found = last[block(run.columns, "contact")].reshape(len(self._prepared.contacts), -1)
+        rows = last[block(run.columns, "contact")].reshape(len(self._prepared.contacts), -1)
         real = self._prepared.system.unilateral is not None
         return {
             contact.name: Touch(
@@ -208,7 +208,7 @@ class Simulation:
                 vector=row[kst.OUT_VECTOR : kst.OUT_VECTOR + 3].copy(),
                 mode=int(row[kst.OUT_MODE]) if real else None,
             )
-            for contact, row in zip(self._prepared.contacts, found, strict=True)
+            for contact, row in zip(self._prepared.contacts, rows, strict=True)
         }
 
     @property
@@ -259,7 +259,7 @@ class Simulation:
         if self._calling:
             raise ScenarioError("a callback cannot advance the simulation that calls it")
         if not isinstance(until, (int, float, np.number)) or not until >= self._time:
-            raise ScenarioError(f"cannot advance to t = {shown(until)} s: the simulation is at {self._time:g} s")
+            raise ScenarioError(f"cannot advance to t = {brief(until)} s: the simulation is at {self._time:g} s")
         until = min(float(until), self._end)
         last = self._prepared.control.end
         if not self._frozen and until > last:
@@ -324,7 +324,7 @@ class Simulation:
                 "another method"
             )
         if kind not in GUARDS:
-            raise ModelError(f"no event {shown(kind)}; events: {', '.join(GUARDS)}")
+            raise ModelError(f"no event {brief(kind)}; events: {', '.join(GUARDS)}")
         number, family = GUARDS[kind]
         contacts = {contact.name: k for k, contact in enumerate(self._prepared.contacts)}
         base = {} if self.robot.base is None else {self.robot.base.body: 0}
@@ -472,9 +472,9 @@ class Simulation:
             raise ModelError("point, force and torque have three components each")
         self._settle_now()
         loads = self._prepared.system.loads
-        place = loads.table[k, kl.DATA]
+        offset = loads.table[k, kl.DATA]
         loads.table[k, kl.IN_BODY] = int(in_body)
-        loads.data[place + kl.POINT : place + kl.POINT + 9] = values
+        loads.data[offset + kl.POINT : offset + kl.POINT + 9] = values
         if values[3:].any():
             self._pushed.add(k)
         self._restart()
@@ -495,7 +495,7 @@ class Simulation:
             Events or ticks were added since, or the snapshot is of another simulation.
         """
         if not isinstance(snapshot, Snapshot):
-            raise ScenarioError(f"a simulation is restored from its snapshot, not from {shown(snapshot)}")
+            raise ScenarioError(f"a simulation is restored from its snapshot, not from {brief(snapshot)}")
         own = self._arrays()
         sizes = ({k: a.shape for k, a in arrays.items() if k not in _BUFFERS} for arrays in (own, snapshot.arrays))
         if snapshot.owner is not self._token or next(sizes) != next(sizes):
@@ -755,17 +755,17 @@ def _arrays_in(value: Any, name: str) -> Iterator[tuple[str, NDArray[Any]]]:
             yield from _arrays_in(part, f"{name}.{field}")
 
 
-def _index(choices: dict[str, int], name: str, what: str) -> int:
+def _index(choices: dict[str, int], name: str, family: str) -> int:
     if name not in choices:
-        raise ModelError(f"no {what} {shown(name)}; those are: {', '.join(choices) or 'none'}")
+        raise ModelError(f"no {family} {brief(name)}; those are: {', '.join(choices) or 'none'}")
     return choices[name]
 
 
-def _finite(what: str, values: Sequence[Any] | Array) -> Array:
+def _finite(quantity: str, values: Sequence[Any] | Array) -> Array:
     try:
         array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
-        raise ModelError(f"{what} {shown(values)} must be numbers") from None
+        raise ModelError(f"{quantity} {brief(values)} must be numbers") from None
     if not np.isfinite(array).all():
-        raise ModelError(f"{what} {array.tolist()} must be finite")
+        raise ModelError(f"{quantity} {array.tolist()} must be finite")
     return array

@@ -24,7 +24,7 @@ from dynsim.engine.operator import Referenced
 from dynsim.engine.sensing import SampledSensor
 from dynsim.engine.snake_control import OBSTACLES, SnakeControl, copy_of
 from dynsim.engine.snake_record import add_task, hold_last, task_summary, task_warnings
-from dynsim.engine.snake_start import STEADY_TICKS, WheelLifter, told_angles
+from dynsim.engine.snake_start import STEADY_TICKS, WheelLifter, command_angles
 from dynsim.engine.stepped import State
 from dynsim.errors import SimulationStopped
 from dynsim.model.description import Array
@@ -149,8 +149,8 @@ class SnakePilot(SnakeControl):
         """What the controller is told of the robot, into its beliefs."""
         self.state.base[:] = base_pose(self._seen.q)
         for sensor in self.sensors:
-            told = self.state.w_hat if self.believed == ss.MEASURED else self.state.phi_hat
-            told[:] = sensor.value(self._seen.time)
+            belief = self.state.w_hat if self.believed == ss.MEASURED else self.state.phi_hat
+            belief[:] = sensor.value(self._seen.time)
 
     def _sensors(self, config: Sensors) -> list[SampledSensor]:
         """What tells the controller of the robot: nothing under feedforward."""
@@ -180,8 +180,8 @@ class SnakePilot(SnakeControl):
         rates, joints = self.rig.work.u, len(phi)
         self._lift(time)
         at, rate = (
-            told_angles(self.robot, one, added)
-            for one, added in ((phi, self._added), (rates[:joints], self._added_rate))
+            command_angles(self.robot, angles, added)
+            for angles, added in ((phi, self._added), (rates[:joints], self._added_rate))
         )
         lines = {joint: (angle, rate[joint]) for joint, angle in at.items()}
         wheels = zip(self.robot.wheel_joints, rates[joints:].tolist(), strict=True)
@@ -247,12 +247,12 @@ class SnakePilot(SnakeControl):
         ticks = np.rint(record.time / self.period).astype(int) // self.stride
         d, law, model = self.description, self.controller.law, self.model
         trace = SnakeTrace(*(array[ticks] for array in self.trace))
-        told = trace.phi.copy()
+        commanded = trace.phi.copy()
         trace.base[:], trace.phi[:] = base_pose(q), q[:, self._joints]
         trace.rho[:] = q[:, _places(self.robot, self.robot.wheel_joints)]
         if ticks[-1] >= self._commanded:
             trace.mode[-1], trace.w_target[-1] = self.state.counts[ss.MODE], self.state.w_target
-            told[-1], trace.w_hat[-1] = self.state.phi, self.state.w_hat
+            commanded[-1], trace.w_hat[-1] = self.state.phi, self.state.w_hat
         hold_last(trace)
         w, points, shown = np.zeros((rows, 6)), [], copy_of(self.state)
         for r in range(rows):
@@ -271,10 +271,11 @@ class SnakePilot(SnakeControl):
         add("phi_dot", rates, "rad/s", labels=names, description="joint rates")
         rates = np.stack([rate[joint] for joint in self.robot.wheel_joints], axis=1)
         add("rho_dot", rates, "rad/s", labels=d.wheel_names, description="rates of the active wheels")
-        add("phi_told", told, "rad", labels=names, description="joint angles that servos are told, without lifting")
-        text = "rates held from this time on, as told"
-        add("phi_dot_told", trace.u[:, :columns], "rad/s", labels=names, description=f"joint {text}")
-        add("rho_dot_told", trace.u[:, columns:], "rad/s", labels=d.wheel_names, description=f"wheel {text}")
+        text = "joint angles that servos are commanded, without lifting"
+        add("phi_command", commanded, "rad", labels=names, description=text)
+        text = "rates held from this time on, as commanded"
+        add("phi_dot_command", trace.u[:, :columns], "rad/s", labels=names, description=f"joint {text}")
+        add("rho_dot_command", trace.u[:, columns:], "rad/s", labels=d.wheel_names, description=f"wheel {text}")
         add_task(record, self, trace, w, np.array(points))
         summary, own = record.summary, task_summary(self, record)
         record.summary = {**summary, **own, "warnings": [*summary["warnings"], *task_warnings(self, record, own)]}

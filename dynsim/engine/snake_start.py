@@ -78,10 +78,10 @@ class WheelLifter:
 
     def angles(self, time: float, yaw: Array) -> Array:
         """What is added to the pitch joints on the axles at a time [s] and yaw angles, both (pairs − 1,) [rad]."""
-        return told_by_heights(self._robot, self.heights(time), yaw, self._stiffness)
+        return angles_of_heights(self._robot, self.heights(time), yaw, self._stiffness)
 
 
-def told_by_heights(robot: SnakeTree, height: Array, yaw: Array, stiffness: Array) -> Array:
+def angles_of_heights(robot: SnakeTree, height: Array, yaw: Array, stiffness: Array) -> Array:
     """Angles that bring pairs to heights (pairs,) [m], with what servos give way.
 
     ``stiffness`` : (pairs − 1,) of these servos [N m/rad]
@@ -99,7 +99,7 @@ def told_by_heights(robot: SnakeTree, height: Array, yaw: Array, stiffness: Arra
     return hinge
 
 
-def told_angles(robot: SnakeTree, phi: Array, added: Array) -> dict[str, float]:
+def command_angles(robot: SnakeTree, phi: Array, added: Array) -> dict[str, float]:
     """What each joint servo is told: phi (n_phi,) and what lifting adds (pairs − 1,) [rad]."""
     angles = dict(zip(robot.description.joint_names, phi.tolist(), strict=True))
     for joint, angle in zip(robot.lifting_joints, added.tolist(), strict=True):
@@ -130,7 +130,7 @@ def begun(scenario: Scenario, robot: SnakeTree) -> tuple[SnakeTree, JointControl
     else:
         q = configuration(robot, phi, height)
     robot = replace(robot, q0=q)
-    control = JointControl.absent(robot, told_angles(robot, phi, added))
+    control = JointControl.absent(robot, command_angles(robot, phi, added))
     return robot, replace(control, task_space=controller)
 
 
@@ -165,7 +165,7 @@ def _raised(scenario: Scenario, robot: SnakeTree, height: Array, added: Array) -
     robot = replace(robot, q0=configuration(robot, below, height))
     start = State(0.0, robot.initial, np.zeros(len(robot.links)), np.zeros(0))
     simulation = Simulation(bare, state=start, duration=math.inf, trace=0)
-    first, last = told_angles(robot, below, added), told_angles(robot, d.initial_joints, added)
+    first, last = command_angles(robot, below, added), command_angles(robot, d.initial_joints, added)
     simulation.set_references({joint: (angle, 0.0) for joint, angle in first.items()})
     simulation.advance(SETTLE)
     simulation.set_references({joint: (angle, (last[joint] - angle) / RAISE) for joint, angle in first.items()})

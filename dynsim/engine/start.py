@@ -6,10 +6,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from dynsim.compile.equilibrium import load_forces, rest
+from dynsim.compile.equilibrium import holding_torques, load_forces, static_margin
 from dynsim.compile.model import Model
 from dynsim.compile.shapes import gap_at
-from dynsim.compile.static_margin import static_margin
 from dynsim.engine import Start
 from dynsim.engine.prepare import prepare
 from dynsim.errors import ModelError
@@ -69,7 +68,7 @@ def _margins(scenario: Scenario, model: Model, contacts: Sequence[Contact]) -> t
     forces = load_forces(model, q, loads)
     alone, able = static_margin(model, q, forces), [motor.joint for motor in robot.motors]
     try:
-        held = rest(model, q, contacts, loads, able, scenario.config.contacts.law == "unilateral")
+        balance = holding_torques(model, q, contacts, loads, able, scenario.config.contacts.law == "unilateral")
     except ModelError:
         return alone, None
-    return alone, static_margin(model, q, [*forces, *held.forces]) if held.forces else None
+    return alone, static_margin(model, q, [*forces, *balance.forces]) if balance.forces else None

@@ -40,8 +40,8 @@ def stopped(scenario: Scenario, prepared: Prepared) -> SimulationStopped:
     """The stop of a run whose STATUS says that it has not come to its end."""
     run = prepared.run
     kind = KINDS[int(run.count[ki.STATUS])]
-    if found := paradox(prepared.system, prepared.workspace, run, prepared.contacts):
-        reached, y, words = found
+    if finding := paradox(prepared.system, prepared.workspace, run, prepared.contacts):
+        reached, y, words = finding
         return SimulationStopped(
             f"stopped at t = {reached:.6g} s: {words}", time=reached, state=last_state(prepared, y), kind=kind
         )
@@ -145,8 +145,8 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
             joint = prepared.stops[owner - len(couplings)].joint
             return f"{where}: joint {joint} cannot be kept at its stop (off by {gaps[worst]:+.2e})"
         coupling = couplings[owner]
-        what = f"joint {coupling.joint} cannot be kept where {coupling.leader} leads it (off by {gaps[worst]:+.2e})"
+        failure = f"joint {coupling.joint} cannot be kept where {coupling.leader} leads it (off by {gaps[worst]:+.2e})"
     else:
-        what = f"contact {prepared.contacts[owner].name} cannot be kept on its surface (gap {gaps[worst]:+.2e} m, "
-        what += f"rate {rates[worst]:+.2e} m/s)"
-    return f"{where}: {what}; the contacts contradict each other or the arm is singular here"
+        failure = f"contact {prepared.contacts[owner].name} cannot be kept on its surface (gap {gaps[worst]:+.2e} m, "
+        failure += f"rate {rates[worst]:+.2e} m/s)"
+    return f"{where}: {failure}; the contacts contradict each other or the arm is singular here"

@@ -222,12 +222,12 @@ def _joint_stops(record: Record, prepared: Prepared, duration: float) -> list[di
     unilateral = prepared.system.unilateral
     assert unilateral is not None
     units = {link.joint: link.units for link in prepared.model.robot.links}
-    found = []
+    stops = []
     for stop, row in zip(prepared.stops, unilateral.stop, strict=True):
         if row[ku.HITS] > 0 or row[ku.CLOSED_TIME] > 0.0:
             # One column for both stops of a joint, positive at the lower one.
             force = stop.side * record["stop_force"][:, record.labels["stop_force"].index(stop.joint)]
-            found.append(
+            stops.append(
                 {
                     "joint": stop.joint,
                     "limit": stop.position,
@@ -239,23 +239,23 @@ def _joint_stops(record: Record, prepared: Prepared, duration: float) -> list[di
                     "impact_loss_J": float(row[ku.STOP_LOSS]),
                 }
             )
-    return found
+    return stops
 
 
 def _time_stepping(run: ki.Run) -> dict[str, Any]:
     """How well time stepping has solved its contact problems, and how deep points came to lie."""
     assert run.stepping is not None
-    found = run.stepping.found
+    results = run.stepping.found
     return {
         "step_s": float(run.clock[ki.STEP]),
-        "contact_solves": int(found[kt.SOLVES]),
-        "long_solves": int(found[kt.LONG_SOLVES]),
-        "capped_solves": int(found[kt.CAPPED]),
-        "residual_max_m_s": float(found[kt.WORST]),
-        "limits_unsettled": int(found[kt.UNSETTLED]),
-        "scheme_loss_worst_J": float(found[kt.TAKEN]),
-        "half_step_energy_J": float(found[kt.HALF_STEP]),
-        "penetration_max_m": float(found[kt.PENETRATION]),
+        "contact_solves": int(results[kt.SOLVES]),
+        "long_solves": int(results[kt.LONG_SOLVES]),
+        "capped_solves": int(results[kt.CAPPED]),
+        "residual_max_m_s": float(results[kt.WORST]),
+        "limits_unsettled": int(results[kt.UNSETTLED]),
+        "scheme_loss_worst_J": float(results[kt.TAKEN]),
+        "half_step_energy_J": float(results[kt.HALF_STEP]),
+        "penetration_max_m": float(results[kt.PENETRATION]),
     }
 
 
@@ -272,7 +272,7 @@ def motor_loads(record: Record, robot: Robot) -> list[dict[str, Any]]:
         name: np.maximum(rows.max(axis=1, initial=0.0), -rows.min(axis=1, initial=0.0)).tolist()
         for name, rows in values.items()
     }
-    found = []
+    entries = []
     for a, motor in enumerate(robot.motors):
         unit = units[motor.joint]
         entry: dict[str, Any] = {"joint": motor.joint}
@@ -283,8 +283,8 @@ def motor_loads(record: Record, robot: Robot) -> list[dict[str, Any]]:
         for key, rating in _ratings(motor, f"nominal_{torque}_{unit}").items():
             if np.isfinite(rating):
                 entry[key] = rating
-        found.append(entry)
-    return found
+        entries.append(entry)
+    return entries
 
 
 def _ratings(motor: Drive, torque: str) -> dict[str, float]:

@@ -75,11 +75,11 @@ class Trace:
         first, count = self._next, BLOCK
         if self._times is not None:
             more = int(np.searchsorted(self._times, until, side="right")) - first
-            found = self._times[first : first + max(count, more + 1)].copy()
+            times = self._times[first : first + max(count, more + 1)].copy()
         else:
             if math.isfinite(until):
                 count = max(count, int((until - self._start) * self._rate) + 2 - first)
-            found = self._start + np.arange(first, first + count) / self._rate
-            found = found[found <= self._end * (1.0 + 1e-12)]
+            times = self._start + np.arange(first, first + count) / self._rate
+            times = times[times <= self._end * (1.0 + 1e-12)]
         # After the last sample the buffer must not hold steps back.
-        return np.append(found, np.inf) if len(found) < count else found
+        return np.append(times, np.inf) if len(times) < count else times

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from dynsim.compile.clearance import Sinking
-from dynsim.compile.contact_law import START_TOLERANCE, JointStop, told
+from dynsim.compile.contact_law import START_TOLERANCE, JointStop, format_quantity
 from dynsim.compile.control import JointControl
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
@@ -57,42 +57,42 @@ def warnings_of(
     sunk : bodies below surfaces; motors : their loads
     """
     robot = prepared.model.robot
-    found = [
+    warnings = [
         *_contact_warnings(record, scenario, prepared, summary),
         *_saturated(record, robot),
         *_passed_limits(record, robot, prepared.system.unilateral is not None),
         *_base_warnings(record, scenario, prepared),
     ]
     if summary["energy_residual_relative"] > RESIDUAL_LIMIT:
-        found.append(
+        warnings.append(
             f"the energy ledger does not close: residual {summary['energy_residual_relative']:.1e} of the turnover; "
             "tighten integrator.rtol or the step"
         )
     if (stepping := summary.get("time_stepping")) is not None:
-        found += [*capped(stepping), *coarse(stepping, scale)]
+        warnings += [*capped(stepping), *coarse(stepping, scale)]
     elif summary["constraint_drift_max_m"] > DRIFT_LIMIT_M:
-        found.append(f"contacts drifted by {summary['constraint_drift_max_m']:.1e} m")
-    found += _undetermined(record, prepared)
-    found += _sunk(record, sunk)
-    found += _beyond_stops(robot, prepared.stops, prepared.control)
-    found += without_effect(scenario, bool(robot.motors))
-    found += _overloaded(motors)
-    return found if prepared.balance is None else [*found, *prepared.balance.warnings]
+        warnings.append(f"contacts drifted by {summary['constraint_drift_max_m']:.1e} m")
+    warnings += _undetermined(record, prepared)
+    warnings += _sunk(record, sunk)
+    warnings += _beyond_stops(robot, prepared.stops, prepared.control)
+    warnings += without_effect(scenario, bool(robot.motors))
+    warnings += _overloaded(motors)
+    return warnings if prepared.balance is None else [*warnings, *prepared.balance.warnings]
 
 
 def _contact_warnings(record: Record, scenario: Scenario, prepared: Prepared, summary: dict[str, Any]) -> list[str]:
     """Contacts that chatter, pull, carry nothing or turn their own force against them; friction that gives energy."""
-    contacts, unilateral, found = prepared.contacts, prepared.system.unilateral, list[str]()
+    contacts, unilateral, warnings = prepared.contacts, prepared.system.unilateral, list[str]()
     if unilateral is not None:
         for contact, tally in zip(contacts, unilateral.tally, strict=True):
             if tally[ku.CHATTERED]:
-                found.append(
+                warnings.append(
                     f"{contact.name}: chatter, more than {kev.MOST_EVENTS} contact events within {kev.WINDOW:g} s; "
                     f"what left more slowly than {tally[ku.SETTLE]:.0e} m/s was kept on the surface"
                 )
     for contact in summary["contacts"]:
         if contact["normal_force_min_N"] < 0.0:
-            found.append(
+            warnings.append(
                 f"{contact['name']}: the {contact['surface']} pulls on this brace for "
                 f"{percent(contact['pulling_fraction'])} of the run, with up to "
                 f"{-contact['normal_force_min_N']:.3g} N; a real arm would lift off"
@@ -103,40 +103,42 @@ def _contact_warnings(record: Record, scenario: Scenario, prepared: Prepared, su
         name = contact["name"]
         if "gap_min_m" in contact and contact["closed_fraction"] == 0.0:
             nearest = int(record["contact_gap"][:, columns.index(name)].argmin())
-            found.append(
+            warnings.append(
                 f"{name}: this brace never touches the {contact['surface']}: it carries nothing; nearest "
                 f"{1e3 * contact['gap_min_m']:.3g} mm at t = {record.time[nearest]:.4g} s"
                 f"{'' if name in placed else ' (initial.on_surface lets it start there)'}"
             )
     for brace, since in zip(contacts, prepared.run.extremes[:, ki.LOCAL_SINCE], strict=True):
         if np.isfinite(since):
-            found.append(
+            warnings.append(
                 f"{brace.name}: from t = {since:.4g} s on, its friction turns its own force against it (negative "
                 "diagonal of J M⁻¹F, Painlevé's paradox at one contact): only the other braces hold it there, and "
                 "whether real ones do depends on their stiffness; lower contacts.friction or take another posture"
             )
     # Within an impact friction may give what the normal impulse takes: only their sum is a loss.
-    given = -summary["friction_heat_J"] - max(summary.get("impact_loss_J", 0.0), 0.0)
-    if given > FRICTION_ROUNDING * summary["energy_turnover_J"]:
-        put = f"friction has put {given:.3g} J into the arm: "
+    gained = -summary["friction_heat_J"] - max(summary.get("impact_loss_J", 0.0), 0.0)
+    if gained > FRICTION_ROUNDING * summary["energy_turnover_J"]:
+        put = f"friction has put {gained:.3g} J into the arm: "
         if unilateral is None:
             put += "f_t = μ f_n reverses with a pulling normal force "
             put += "(contacts.pulling_friction: dissipative takes μ |f_n|)"
         else:
             put += "an error of the integration; shorten integrator.step_s or tighten integrator.rtol"
-        found.append(put)
-    return found
+        warnings.append(put)
+    return warnings
 
 
 def _saturated(record: Record, robot: Robot) -> list[str]:
     """Motors at their limits of voltage, current or torque."""
-    found = []
+    warnings = []
     limited = [(a, motor, limits) for a, motor in enumerate(robot.motors) for limits in _limits_of(motor)]
     # Along samples: a third of the time.
-    peaks = {name: np.abs(record[name].T.copy()).max(axis=1, initial=0.0) for name in {one[1] for *_, one in limited}}
-    for a, motor, (what, signal, limit, unit) in limited:
+    peaks = {
+        name: np.abs(record[name].T.copy()).max(axis=1, initial=0.0) for name in {limit[1] for *_, limit in limited}
+    }
+    for a, motor, (quantity, signal, limit, unit) in limited:
         # The current of a DC motor comes near to the limit of its driver, and does not reach it.
-        reached = limit * (1.0 - NEAR_LIMIT) if isinstance(motor, Motor) and what == "current" else limit
+        reached = limit * (1.0 - NEAR_LIMIT) if isinstance(motor, Motor) and quantity == "current" else limit
         # A run that diverged may have NaN, which hides a peak.
         if not peaks[signal][a] < reached:
             saturated = np.abs(record[signal][:, a]) >= reached
@@ -144,11 +146,11 @@ def _saturated(record: Record, robot: Robot) -> list[str]:
                 # Without a current its voltage is the back-EMF.
                 saturated &= record["current"][:, a] != 0.0
             if saturated.any():
-                found.append(
-                    f"{motor.joint}: {what} at its limit of {limit:g} {unit} for "
+                warnings.append(
+                    f"{motor.joint}: {quantity} at its limit of {limit:g} {unit} for "
                     f"{100 * saturated.mean():.1f} % of the run"
                 )
-    return found
+    return warnings
 
 
 def _limits_of(motor: Drive) -> list[tuple[str, str, float, str]]:
@@ -176,24 +178,24 @@ def _undetermined(record: Record, prepared: Prepared) -> list[str]:
             f"{', '.join(shared)}: shared forces which the motion does not determine, as points that stick do: "
             "they are the split of least norm among those that lie in all friction cones"
         ]
-    found = [f"contact rows depended on each other in {evaluations} evaluations: forces are the split of least norm"]
+    warnings = [f"contact rows depended on each other in {evaluations} evaluations: forces are the split of least norm"]
     spread = None
     if len(record) and any(contact.friction > 0.0 for contact in contacts):
         rows, units = len(record), [(link.joint, link.units[2]) for link in prepared.model.robot.links]
         spread = motion_spread(system, record.time, run.sample[:rows], units)
     if spread is not None:
-        found.append(
+        warnings.append(
             f"with friction, dependent contact rows leave the motion open too: at t = {spread.time:.4g} s the "
             f"acceleration of {spread.joint} is anything from {spread.low:.4g} to {spread.high:.4g} {spread.unit} over "
             "the splits of the normal forces "
             f"that keep their signs (this run: {spread.taken:.4g}); take away braces until the rest are independent"
         )
-    return found
+    return warnings
 
 
 def _sunk(record: Record, sunk: Sequence[Sinking]) -> list[str]:
     """One warning per surface: the bodies that samples of the record show below it, and the one that is deepest."""
-    found = []
+    warnings = []
     for surface in dict.fromkeys(s.surface for s in sunk):
         below = [s for s in sunk if s.surface == surface]
         deepest = max(below, key=lambda s: s.depth)
@@ -203,12 +205,12 @@ def _sunk(record: Record, sunk: Sequence[Sinking]) -> list[str]:
         thick = any(s.radius > 0.0 for s in below)
         beyond = " by more than the link's radius" if thick else ""
         radius = f", of {1e3 * deepest.radius:g} mm," if thick else ""
-        found.append(
+        warnings.append(
             f"{names} {verb} below {surface}{beyond}: {deepest.body}{radius} by up to {1e3 * deepest.depth:.3g} mm in "
             f"the samples, first at t = {record.time[min(s.sample for s in below)]:.4g} s; "
             "surfaces hold only the points of contacts"
         )
-    return found
+    return warnings
 
 
 def _passed_limits(record: Record, robot: Robot, real: bool) -> list[str]:
@@ -218,9 +220,9 @@ def _passed_limits(record: Record, robot: Robot, real: bool) -> list[str]:
     the steps of time stepping let joints go too far.
     """
     torque = dict(zip(record.labels["torque"], record["torque"].T, strict=True))
-    found = []
+    warnings = []
     for link, k, v in zip(robot.links, robot.position_index, record["v"].T, strict=True):
-        if all(abs(one) == np.inf for one in (link.lower, link.upper, link.velocity_limit, link.effort_limit)):
+        if all(abs(bound) == np.inf for bound in (link.lower, link.upper, link.velocity_limit, link.effort_limit)):
             continue
         q = record["q"][:, k]
         position, velocity, _, force = link.units
@@ -229,7 +231,7 @@ def _passed_limits(record: Record, robot: Robot, real: bool) -> list[str]:
             if real
             else "stops are enforced under contacts.law: unilateral"
         )
-        for what, limit, unit, beyond, note in (
+        for quantity, limit, unit, beyond, note in (
             ("lower position", link.lower, position, link.lower - q, passed),
             ("upper position", link.upper, position, q - link.upper, passed),
             ("velocity", link.velocity_limit, velocity, np.abs(v) - link.velocity_limit, NOT_ENFORCED),
@@ -244,11 +246,11 @@ def _passed_limits(record: Record, robot: Robot, real: bool) -> list[str]:
             over = np.flatnonzero(beyond > LIMIT_SLACK)
             if over.size:
                 amount, first = beyond[over].max(), record.time[over[0]]
-                found.append(
-                    f"{link.joint}: passes its {what} limit of {told(limit, unit, 4)} by up to "
-                    f"{told(amount, unit, 3)}, first at t = {first:.4g} s; {note}"
+                warnings.append(
+                    f"{link.joint}: passes its {quantity} limit of {format_quantity(limit, unit, 4)} by up to "
+                    f"{format_quantity(amount, unit, 3)}, first at t = {first:.4g} s; {note}"
                 )
-    return found
+    return warnings
 
 
 def _beyond_stops(robot: Robot, stops: Sequence[JointStop], control: JointControl) -> list[str]:
@@ -269,9 +271,9 @@ def _beyond_stops(robot: Robot, stops: Sequence[JointStop], control: JointContro
                 first.setdefault(stop, float(times[beyond > START_TOLERANCE][0]))
                 worst[stop] = max(worst.get(stop, (0.0, 0.0)), (float(beyond[k]), float(times[k])))
     return [
-        f"{stop.joint}: its reference goes beyond its stop at {told(stop.position, units[stop.joint])} by up to "
-        f"{told(most, units[stop.joint])}, first at t = {first[stop]:.4g} s, most at t = {time:.4g} s; "
-        "the motor pushes against the stop and misses its path: change the path or the limit"
+        f"{stop.joint}: its reference goes beyond its stop at {format_quantity(stop.position, units[stop.joint])} by "
+        f"up to {format_quantity(most, units[stop.joint])}, first at t = {first[stop]:.4g} s, most at t = {time:.4g} "
+        "s; the motor pushes against the stop and misses its path: change the path or the limit"
         for stop, (most, time) in worst.items()
     ]
 
@@ -328,7 +330,7 @@ def _base_warnings(record: Record, scenario: Scenario, prepared: Prepared) -> li
     base, run, settle = prepared.model.robot.base, prepared.run, scenario.metrics.settle_s
     if base is None:
         return []
-    found = []
+    warnings = []
     load, traction = record["wheel_load"], record["traction_demand"]
     lowest = least_loads(record, run.support.least)
     late = record["tip_margin"][record.time >= settle]
@@ -340,19 +342,19 @@ def _base_warnings(record: Record, scenario: Scenario, prepared: Prepared) -> li
         least = f" (least loads [N]: {pulled})" if pulled else ""
         beyond = f"{100 * (record['tip_margin'] < 0.0).mean():.1f} % of the samples"
         if late.size and overturns_settled(record, settle) is None:
-            found.append(
+            warnings.append(
                 f"a jolt of the start takes the tip margin below zero at t = {first:.4f} s, in {beyond}, none from "
                 f"{settle:g} s on (margin at least {late.min():.3g}){least}: start with initial.equilibrium, or with a "
                 "motion that begins at rest"
             )
         else:
-            found.append(
+            warnings.append(
                 f"the base tips over at t = {first:.4f} s, with a tip margin below zero in {beyond}; the run goes on "
                 f"as if it were held down{least}: plant.base.on_overturn: stop ends it there"
             )
     lifted = load.sum(axis=1) <= 0.0
     if lifted.any():
-        found.append(
+        warnings.append(
             f"the base is lifted: no load on its wheels and caster in {100 * lifted.mean():.1f} % of the samples, "
             f"first at t = {record.time[lifted.argmax()]:.4g} s (counts as a tip margin of -1)"
         )
@@ -361,27 +363,27 @@ def _base_warnings(record: Record, scenario: Scenario, prepared: Prepared) -> li
     for name, demand in zip(record.labels["traction_demand"], traction[standing].T, strict=True):
         slips = demand > 1.0
         if slips.any():
-            found.append(
+            warnings.append(
                 f"the {name} wheel would slip: it needs up to {np.nanmax(demand):.3g} times the traction that "
                 f"plant.base.wheel_friction = {base.wheel_friction:g} gives, first at "
                 f"t = {record.time[standing][slips.argmax()]:.4g} s; rolling is enforced all the same"
             )
-    return found
+    return warnings
 
 
 def _overloaded(loads: Sequence[dict[str, Any]]) -> list[str]:
     """Warnings of motors whose root mean square is above what they can give for ever, the most loaded first."""
-    found = []
-    for what, quantity, unit in (("current", "current", "A"), ("torque", "torque", "N_m"), ("force", "force", "N")):
+    warnings = []
+    for label, quantity, unit in (("current", "current", "A"), ("torque", "torque", "N_m"), ("force", "force", "N")):
         over = []
-        for one in loads:
-            rms, nominal = one.get(f"{quantity}_rms_{unit}"), one.get(f"nominal_{quantity}_{unit}")
+        for load in loads:
+            rms, nominal = load.get(f"{quantity}_rms_{unit}"), load.get(f"nominal_{quantity}_{unit}")
             if rms is not None and nominal is not None and rms > nominal:
-                over.append((rms / nominal, f"{one['joint']} {rms:.3g} of {nominal:g} {unit.replace('_', ' ')}"))
+                over.append((rms / nominal, f"{load['joint']} {rms:.3g} of {nominal:g} {unit.replace('_', ' ')}"))
         if over:
             texts = [text for _, text in sorted(over, key=lambda entry: -entry[0])]
-            found.append(
-                f"{', '.join(texts)}: the {what}, rms over the run, is more than nominal, which a motor does not "
+            warnings.append(
+                f"{', '.join(texts)}: the {label}, rms over the run, is more than nominal, which a motor does not "
                 "stand for long; brace the arm, go slower, or take a larger motor"
             )
-    return found
+    return warnings

@@ -15,7 +15,7 @@ from dynsim.errors import RecordError
 from dynsim.hardware.bus.control_table import MX_106, STATE_BLOCK
 from dynsim.hardware.bus.protocol import Bus, NoAnswer, RequestRefused
 from dynsim.hardware.errors import ServoMapError, VerificationFailed
-from dynsim.hardware.servo_map import Servo, ServoMap, load_servo_map
+from dynsim.hardware.servo_map import MappedServo, ServoMap, load_servo_map
 from dynsim.system.files import write_text
 
 Key = Literal["zero_tick", "sign"]
@@ -24,7 +24,7 @@ STILL = 3
 """Spread over the reads that still counts as standing still [ticks]."""
 
 
-def read_zero_ticks(bus: Bus, servos: Iterable[Servo]) -> dict[str, int]:
+def read_zero_ticks(bus: Bus, servos: Iterable[MappedServo]) -> dict[str, int]:
     """Median servo position of each joint, torque being off.
 
     Raises
@@ -49,7 +49,7 @@ def read_zero_ticks(bus: Bus, servos: Iterable[Servo]) -> dict[str, int]:
     return {joint: int(np.median(seen)) for joint, seen in ticks.items()}
 
 
-def refuse_torque(bus: Bus, servos: Iterable[Servo]) -> None:
+def refuse_torque(bus: Bus, servos: Iterable[MappedServo]) -> None:
     """Raises VerificationFailed where a servo has its torque on, or does not answer."""
     for servo in servos:
         try:

@@ -23,10 +23,10 @@ from dynsim.hardware.replay.check import CheckedMotion, plan_cycle
 from dynsim.hardware.replay.machine import Replay
 from dynsim.hardware.replay.motion import QUINTIC_PEAK, quintic
 from dynsim.hardware.replay.rules import Cause
-from dynsim.hardware.replay.states import State, StopRequest
+from dynsim.hardware.replay.states import ReplayState, StopRequest
 from dynsim.hardware.replay.trajectory import Path
 from dynsim.hardware.replay.verify import read_ticks
-from dynsim.hardware.servo_map import Servo, ServoMap
+from dynsim.hardware.servo_map import MappedServo, ServoMap
 
 ANGLE = math.radians(3.0)
 SPEED = 0.1
@@ -75,14 +75,14 @@ class _OneServo:
         self._id = id_
 
     def ping_all(self) -> dict[int, tuple[int, int]]:
-        return {id_: found for id_, found in self._bus.ping_all().items() if id_ == self._id}
+        return {id_: answer for id_, answer in self._bus.ping_all().items() if id_ == self._id}
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._bus, name)
 
 
 def nudge(
-    servo_map: ServoMap, servo: Servo, bus: Bus, clock: Clock, *, live: bool, stop: StopRequest | None = None
+    servo_map: ServoMap, servo: MappedServo, bus: Bus, clock: Clock, *, live: bool, stop: StopRequest | None = None
 ) -> Nudge | None:
     """Turn one joint 3° and back; None where ``live`` is false: the servo is verified then, and nothing moves.
 
@@ -99,10 +99,10 @@ def nudge(
     refuse_torque(bus, servo_map.servos)
     tick = read_ticks(bus, [servo])[servo.id]
     start = servo.to_angle(tick)
-    way = _way(servo, start)
-    one = _alone(servo_map, servo)
-    motion = CheckedMotion(path=_out_and_back(start, way), plan=plan_cycle(one, one.bus.rate))
-    replay = Replay(motion, one, cast(Bus, _OneServo(bus, servo.id)), clock, live=live, stop=stop)
+    distance = _way(servo, start)
+    single = _alone(servo_map, servo)
+    motion = CheckedMotion(path=_out_and_back(start, distance), plan=plan_cycle(single, single.bus.rate))
+    replay = Replay(motion, single, cast(Bus, _OneServo(bus, servo.id)), clock, live=live, stop=stop)
     result = replay.run()
     if result.fault is not None and result.fault_state is not None:
         if result.fault.cause == Cause.VERIFICATION:
@@ -112,9 +112,9 @@ def nudge(
         raise kind(f"{text}; robot left {result.end_state}", result=result)
     if not live:
         return None
-    angles = result.record[servo.kind.follows.position][:, 0][result.record["state"] == State.REPLAY]
-    moved = float(angles[np.nanargmax((angles - start) * np.sign(way))] - start)
-    return Nudge(servo.joint, servo.id, way, moved, round(servo.sign * servo.gear * moved / RAD_PER_TICK))
+    angles = result.record[servo.kind.follows.position][:, 0][result.record["state"] == ReplayState.REPLAY]
+    moved = float(angles[np.nanargmax((angles - start) * np.sign(distance))] - start)
+    return Nudge(servo.joint, servo.id, distance, moved, round(servo.sign * servo.gear * moved / RAD_PER_TICK))
 
 
 def swapped(servo_map: ServoMap, agrees: Mapping[str, bool]) -> dict[str, int]:
@@ -122,7 +122,7 @@ def swapped(servo_map: ServoMap, agrees: Mapping[str, bool]) -> dict[str, int]:
     return {servo.joint: -servo.sign for servo in servo_map.servos if not agrees.get(servo.joint, True)}
 
 
-def _way(servo: Servo, start: float) -> float:
+def _way(servo: MappedServo, start: float) -> float:
     low, high = servo.position_limits
     if start + ANGLE <= high:
         return ANGLE
@@ -131,17 +131,17 @@ def _way(servo: Servo, start: float) -> float:
     raise VerificationFailed(f"{servo.joint} has no room for {math.degrees(ANGLE):g}° between its limits")
 
 
-def _out_and_back(start: float, way: float) -> Path:
+def _out_and_back(start: float, distance: float) -> Path:
     duration = QUINTIC_PEAK * ANGLE / SPEED
     leg = np.linspace(0.0, duration, KNOTS)
     fraction, rate = np.array([quintic(duration, t) for t in leg]).T
     time = np.concatenate([leg, duration + PAUSE + leg])
-    position = start + way * np.concatenate([fraction, 1 - fraction])[:, None]
-    rates = way * np.concatenate([rate, -rate])[:, None]
+    position = start + distance * np.concatenate([fraction, 1 - fraction])[:, None]
+    rates = distance * np.concatenate([rate, -rate])[:, None]
     return Path(time, position, rates[:-1], rates[1:])
 
 
-def _alone(servo_map: ServoMap, servo: Servo) -> ServoMap:
+def _alone(servo_map: ServoMap, servo: MappedServo) -> ServoMap:
     """The map of one servo that yields to what is in its way, and is limp afterwards."""
     watched, alone = copy.copy(servo), copy.copy(servo_map)
     if servo.in_position_mode:

@@ -25,7 +25,7 @@ FaultPolicy = Literal["hold", "decelerate", "off"]
 _BAUD_CHOICES = [rate for rate in BAUD_RATES if rate <= 4_000_000]
 
 
-class Bus(StrictConfig):
+class BusSettings(StrictConfig):
     """The serial line.
 
     Attributes
@@ -48,7 +48,7 @@ class Bus(StrictConfig):
     return_delay: Annotated[float, Field(ge=0, le=508e-6)] = 0.0
 
     @model_validator(mode="after")
-    def _baud_is_one_of_the_servos(self) -> Bus:
+    def _baud_is_one_of_the_servos(self) -> BusSettings:
         if self.baud not in _BAUD_CHOICES:
             raise error_at("baud", f"is not one of {', '.join(map(str, _BAUD_CHOICES))}")
         return self
@@ -104,7 +104,7 @@ class Safety(StrictConfig):
     at_end: Literal["off", "hold"] = "off"
 
 
-def objections_to_times(bus: Bus, safety: Safety) -> Iterable[Objection]:
+def objections_to_times(bus: BusSettings, safety: Safety) -> Iterable[Objection]:
     """Rules that would fire too late to matter at the rate of the map, and stops shorter than cycles."""
     if bus.latency >= safety.watchdog:
         yield "bus.latency", "is not below safety.watchdog: one lost answer would trip the watchdogs"

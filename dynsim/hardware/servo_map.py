@@ -19,7 +19,7 @@ from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, model_v
 
 from dynsim.config.base import Positive, StrictConfig, error_at
 from dynsim.config.problems import suggest
-from dynsim.errors import shown
+from dynsim.errors import brief
 from dynsim.hardware.bus.control_table import (
     MAX_ID,
     MODELS,
@@ -31,7 +31,7 @@ from dynsim.hardware.bus.control_table import (
     ServoModel,
 )
 from dynsim.hardware.errors import ServoMapError
-from dynsim.hardware.safety import Bus, Safety, objections_to_times
+from dynsim.hardware.safety import BusSettings, Safety, objections_to_times
 from dynsim.hardware.strict_yaml import Objection, Within, read_yaml, rounded_up
 from dynsim.snake.lifting import Lifts
 from dynsim.system.files import file_name
@@ -211,7 +211,7 @@ class _MapFile(StrictConfig):
     model_config = ConfigDict(title="ServoMap")
 
     robot: Annotated[str, AfterValidator(_is_a_file_name)]
-    bus: Bus = Bus()
+    bus: BusSettings = BusSettings()
     safety: Safety = Safety()
     lifts: Lifts | None = None
     kinds: dict[str, Kind]
@@ -291,7 +291,7 @@ class _MapFile(StrictConfig):
             if entry.hold_at_deg is not None and not limits[0] <= entry.hold_at_deg <= limits[1]:
                 text = f"is beyond limits.position_deg; use {limits[0]:g} to {limits[1]:g}"
                 yield f"servos.{joint}.hold_at_deg", text
-            lowest, highest = Servo(joint, entry, kind).tick_limits
+            lowest, highest = MappedServo(joint, entry, kind).tick_limits
             if lowest > highest:
                 text = (
                     f"leaves no tick of 0 to {TICKS_PER_TURN - 1}, the turn of position mode, within "
@@ -300,7 +300,7 @@ class _MapFile(StrictConfig):
                 yield f"servos.{joint}.zero_tick", text
 
 
-class Servo:
+class MappedServo:
     """One servo of the map, with its conversions.
 
     Attributes
@@ -375,10 +375,10 @@ class ServoMap:
     ----------
     robot : str
     path : Path
-    bus : Bus
+    bus : BusSettings
     safety : Safety
     lifts : Lifts or None
-    servos : tuple of Servo
+    servos : tuple of MappedServo
     """
 
     def __init__(self, path: Path, content: _MapFile) -> None:
@@ -387,7 +387,9 @@ class ServoMap:
         self.bus = content.bus
         self.safety = content.safety
         self.lifts = content.lifts
-        self.servos = tuple(Servo(joint, entry, content.kinds[entry.kind]) for joint, entry in content.servos.items())
+        self.servos = tuple(
+            MappedServo(joint, entry, content.kinds[entry.kind]) for joint, entry in content.servos.items()
+        )
 
     @property
     def ids(self) -> tuple[int, ...]:
@@ -416,7 +418,7 @@ def load_servo_map(path: str | Path) -> ServoMap:
     """
     if not isinstance(path, (str, Path)):
         raise ServoMapError(
-            f"a servo map is named by its file, or by its name when it is shipped, not by {shown(path)}"
+            f"a servo map is named by its file, or by its name when it is shipped, not by {brief(path)}"
         )
     path = Path(path)
     shipped = SHIPPED / f"{path.stem}.yaml"

@@ -23,7 +23,7 @@ from pydantic_core import PydanticKnownError, SchemaValidator, core_schema
 
 from dynsim.compile.protocols import BuildContext
 from dynsim.config.base import StrictConfig, error_at
-from dynsim.errors import ModelError, PluginError, shown
+from dynsim.errors import ModelError, PluginError, brief
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -91,10 +91,10 @@ def _entry_points(family: str) -> Mapping[str, list[EntryPoint]]:
     # Imported here: most scenarios need none.
     from importlib.metadata import entry_points
 
-    found: dict[str, list[EntryPoint]] = {}
+    points: dict[str, list[EntryPoint]] = {}
     for point in entry_points(group=FAMILIES[family].group):
-        found.setdefault(point.name, []).append(point)
-    return found
+        points.setdefault(point.name, []).append(point)
+    return points
 
 
 def names(family: str) -> tuple[str, ...]:
@@ -104,29 +104,29 @@ def names(family: str) -> tuple[str, ...]:
 
 def members(family: str) -> tuple[str, ...]:
     """Names of the members that work; imports every plug-in of the family."""
-    found = list(shipped(family))
+    usable = list(shipped(family))
     for name in _entry_points(family):
         try:
-            found += [name] if name not in found and _plugin(family, name) else []
+            usable += [name] if name not in usable and _plugin(family, name) else []
         except PluginError:
             continue
-    return tuple(sorted(found))
+    return tuple(sorted(usable))
 
 
 def faults() -> list[str]:
     """What is wrong with the plug-ins that are installed, a line for each; imports all of them."""
-    found = []
+    texts = []
     for family in FAMILIES:
         for name, points in _entry_points(family).items():
             if name in shipped(family):
                 owners = " and ".join(map(_title, points))
-                found.append(f"{family} {name!r} of {owners} is not used: dynsim has its own of that name")
+                texts.append(f"{family} {name!r} of {owners} is not used: dynsim has its own of that name")
                 continue
             try:
                 _plugin(family, name)
             except PluginError as error:
-                found.append(str(error))
-    return found
+                texts.append(str(error))
+    return texts
 
 
 def libraries() -> dict[str, str]:
@@ -155,8 +155,8 @@ def build(family: str, config: Any, context: BuildContext, expected: type[T] | U
     """
     result = member(family, config.type).build(config, context)
     if not isinstance(result, expected):
-        wanted = " or ".join(one.__name__ for one in typing.get_args(expected) or (expected,))
-        raise ModelError(f"{family} {config.type!r}: its build must return a {wanted}, not {shown(result)}")
+        wanted = " or ".join(kind.__name__ for kind in typing.get_args(expected) or (expected,))
+        raise ModelError(f"{family} {config.type!r}: its build must return a {wanted}, not {brief(result)}")
     return cast(T, result)
 
 

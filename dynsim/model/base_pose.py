@@ -21,6 +21,6 @@ def base_pose(robot: Robot, q: Array) -> Array:
     """
     k, link = base_row(robot)
     left, right, x, y = q[:, k : k + 4].T
-    place = link.p_PJ[:, None] + link.R_PJ @ np.stack([x, y, np.zeros_like(x)])
+    position = link.p_PJ[:, None] + link.R_PJ @ np.stack([x, y, np.zeros_like(x)])
     start = np.arctan2(link.R_PJ[1, 0], link.R_PJ[0, 0])
-    return np.stack([place[0], place[1], start + link.parameter * (right - left)], axis=1)
+    return np.stack([position[0], position[1], start + link.parameter * (right - left)], axis=1)

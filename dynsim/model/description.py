@@ -399,9 +399,9 @@ class Robot:
         """Initial configuration, (nq,)."""
         return self.configuration({}) if self.q0 is None else np.asarray(self.q0, dtype=np.float64)
 
-    def configuration(self, given: Mapping[str, float]) -> Array:
+    def configuration(self, positions: Mapping[str, float]) -> Array:
         """Coordinates [rad or m], (nq,): as given by joint, followers where their leaders have them, others neutral."""
-        leads = {coupling.joint: coupling for coupling in self.couplings if coupling.joint not in given}
+        leads = {coupling.joint: coupling for coupling in self.couplings if coupling.joint not in positions}
         q = np.array([value for link in self.links for value in link.row.neutral])
 
         def position(joint: str) -> float:
@@ -410,13 +410,13 @@ class Robot:
             while joint in leads and len(chain) <= len(leads):
                 chain.append(leads[joint])
                 joint = chain[-1].leader
-            found = float(given.get(joint, 0.0))
+            value = float(positions.get(joint, 0.0))
             for coupling in reversed(chain):
-                found = coupling.ratio * found + coupling.offset
-            return found
+                value = coupling.ratio * value + coupling.offset
+            return value
 
         for joint, k in zip(self.joint_names, self.position_index, strict=True):
-            if joint in given or joint in leads:
+            if joint in positions or joint in leads:
                 q[k] = position(joint)
         return q
 
@@ -428,12 +428,12 @@ class Robot:
     @property
     def position_index(self) -> tuple[int, ...]:
         """For each link where its own coordinates begin in q."""
-        found, first, beyond = [], 0, 0
+        index, first, beyond = [], 0, 0
         for link in self.links:
             if link.row.neutral:
                 first, beyond = beyond, beyond + len(link.row.neutral)
-            found.append(first + link.row.offset)
-        return tuple(found)
+            index.append(first + link.row.offset)
+        return tuple(index)
 
     @property
     def position_names(self) -> tuple[str, ...]:

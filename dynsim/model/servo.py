@@ -51,10 +51,10 @@ class ServoBank:
 
     def torque(self, q: Array, v: Array) -> Array:
         """Torques at the output shafts at positions [rad] and rates [rad/s], (N,) → (N,) [N m]."""
-        found = np.empty(len(self._mode))
+        torques = np.empty(len(self._mode))
         for a, (mode, q_ref, v_ref, at, rate) in enumerate(
             zip(self._mode, self._position, self._velocity, q, v, strict=True)
         ):
             asked = law.servo_command(self._table, a, mode, q_ref, v_ref, at, rate)
-            found[a] = law.servo_torque(self._table, a, mode, asked, rate)
-        return found
+            torques[a] = law.servo_torque(self._table, a, mode, asked, rate)
+        return torques

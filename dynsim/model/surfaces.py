@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.errors import ModelError
-from dynsim.record.scene import Surface as Drawn
+from dynsim.record.scene import SceneSurface
 
 if TYPE_CHECKING:
     from dynsim.dynamics.contact.distance import ShapeArrays
@@ -97,9 +97,9 @@ class Quadric:
         return np.divide(gradients, slopes, out=np.zeros_like(gradients), where=slopes > 0.0)
 
     @cached_property
-    def drawn(self) -> Drawn:
+    def drawn(self) -> SceneSurface:
         """The surface with the parameters of the simple kind that it is of, if any; without a name."""
-        return Drawn.of_quadric("", self.Q, self.b, self.c)
+        return SceneSurface.of_quadric("", self.Q, self.b, self.c)
 
 
 class _Shaped(ABC):

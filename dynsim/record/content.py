@@ -79,7 +79,7 @@ class Content:
     scene: Scene | None = None
 
 
-def check_name(what: str, name: str) -> None:
+def check_name(kind: str, name: str) -> None:
     """Refuse a name that HDF5 would take for something else.
 
     Raises
@@ -87,10 +87,10 @@ def check_name(what: str, name: str) -> None:
     RecordError
     """
     if name in ("", ".") or "/" in name or "\0" in name:
-        raise RecordError(f"{what} {name!r}: a name must not be empty, a dot, or hold a slash")
+        raise RecordError(f"{kind} {name!r}: a name must not be empty, a dot, or hold a slash")
 
 
-def check_time(time: NDArray[Any], what: str = TIME) -> None:
+def check_time(time: NDArray[Any], axis: str = TIME) -> None:
     """Refuse a time axis that is none.
 
     Raises
@@ -99,11 +99,11 @@ def check_time(time: NDArray[Any], what: str = TIME) -> None:
         Not one-dimensional, not finite, or running backwards.
     """
     if time.ndim != 1:
-        raise RecordError(f"{what} has the shape {time.shape}; it must have one axis")
+        raise RecordError(f"{axis} has the shape {time.shape}; it must have one axis")
     if not np.isfinite(time).all():
-        raise RecordError(f"{what} is not finite at sample {int(np.flatnonzero(~np.isfinite(time))[0])}")
+        raise RecordError(f"{axis} is not finite at sample {int(np.flatnonzero(~np.isfinite(time))[0])}")
     if (backwards := np.flatnonzero(np.diff(time) < 0.0)).size:
-        raise RecordError(f"{what} runs backwards after sample {int(backwards[0])}")
+        raise RecordError(f"{axis} runs backwards after sample {int(backwards[0])}")
 
 
 def check_signal(name: str, signal: Signal, samples: Mapping[str, int]) -> None:

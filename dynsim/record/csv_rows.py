@@ -16,17 +16,17 @@ SIZE_LIMIT = 100_000_000
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", re.ASCII | re.IGNORECASE)
 
 
-def read_rows(file: str, *headers: Sequence[str], what: str) -> list[list[float]]:
+def read_rows(file: str, *headers: Sequence[str], kind: str) -> list[list[float]]:
     """The rows that :func:`read_table` reads, where their number of columns tells which header it was."""
-    return read_table(file, *headers, what=what)[1]
+    return read_table(file, *headers, kind=kind)[1]
 
 
-def read_table(file: str, *headers: Sequence[str], what: str) -> tuple[tuple[str, ...], list[list[float]]]:
+def read_table(file: str, *headers: Sequence[str], kind: str) -> tuple[tuple[str, ...], list[list[float]]]:
     """Two or more rows of a file whose first line is one of ``headers``, which comes first; first column increasing.
 
     Parameters
     ----------
-    what : what needs the rows, for the message
+    kind : what needs the rows, for the message
 
     Raises
     ------
@@ -47,7 +47,7 @@ def read_table(file: str, *headers: Sequence[str], what: str) -> tuple[tuple[str
                 "it must increase from row to row"
             )
     if len(rows) < 2:
-        raise ValueError(f"{file}: {len(rows)} rows below the header; {what} needs two or more")
+        raise ValueError(f"{file}: {len(rows)} rows below the header; {kind} needs two or more")
     return columns, rows
 
 
@@ -84,13 +84,13 @@ def _contents(lines: Iterable[str], first: int) -> Iterator[tuple[int, str]]:
             yield number, content
 
 
-def _row(line: str, columns: Sequence[str], place: str) -> list[float]:
+def _row(line: str, columns: Sequence[str], location: str) -> list[float]:
     cells = [cell.strip(" \t") for cell in line.split(",")]
     if len(cells) != len(columns):
         names = f": {','.join(columns)}" if columns[0] != "1" else ", as in the first row"
-        raise ValueError(f"{place}: {len(cells)} values; there must be {len(columns)}{names}")
+        raise ValueError(f"{location}: {len(cells)} values; there must be {len(columns)}{names}")
     if not all(_NUMBER.fullmatch(cell) and math.isfinite(float(cell)) for cell in cells):
-        raise ValueError(f"{place}: {_shown(line)} is not {len(columns)} numbers, finite and in digits 0 to 9")
+        raise ValueError(f"{location}: {_shown(line)} is not {len(columns)} numbers, finite and in digits 0 to 9")
     return [float(cell) for cell in cells]
 
 

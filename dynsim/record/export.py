@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dynsim.errors import MissingEntry, RecordError, shown
+from dynsim.errors import MissingEntry, RecordError, brief
 from dynsim.record.content import TIME, Content
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ def to_dataframe(record: Content, axis: str) -> pandas.DataFrame:
     pandas = _optional("pandas")
     axes = {TIME: record.time, **record.axes}
     if axis not in axes:
-        raise MissingEntry(f"no time axis {shown(axis)}; this record has: {', '.join(axes)}")
+        raise MissingEntry(f"no time axis {brief(axis)}; this record has: {', '.join(axes)}")
     times = axes[axis]
     columns, names, units = [], [], {}
     for name, signal in record.signals.items():

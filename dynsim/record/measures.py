@@ -72,8 +72,8 @@ def hand_error(record: Record, settle: float) -> dict[str, float | None]:
 
 def least_loads(record: Record, steps: NDArray[np.float64]) -> NDArray[np.float64]:
     """Least loads of wheels and caster, (3,) [N], over the samples and over all steps (``steps``, empty: unknown)."""
-    found = record["wheel_load"].min(axis=0, initial=np.inf)
-    return np.minimum(found, steps[:3]) if len(steps) else found
+    loads = record["wheel_load"].min(axis=0, initial=np.inf)
+    return np.minimum(loads, steps[:3]) if len(steps) else loads
 
 
 def base_summary(
@@ -92,10 +92,10 @@ def base_summary(
     traction, labels = record["traction_demand"], record.labels["wheel_load"]
 
     def least(values: NDArray[np.float64], since: float) -> float | None:
-        found = [*values[record.time >= since].tolist(), *(0.0 for time in tips if time >= since)]
+        margins = [*values[record.time >= since].tolist(), *(0.0 for time in tips if time >= since)]
         if np.isfinite(steps).all() and len(steps) and since == -np.inf:
-            found.append(float(steps[-1]))
-        return min(found, default=None)
+            margins.append(float(steps[-1]))
+        return min(margins, default=None)
 
     def named(loads: NDArray[np.float64] | None) -> dict[str, float] | None:
         return None if loads is None else dict(zip(labels, loads.tolist(), strict=True))

@@ -20,7 +20,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.errors import RecordError, shown
+from dynsim.errors import RecordError, brief
 from dynsim.record.content import (
     FORMAT,
     TIME,
@@ -85,18 +85,18 @@ def _doubt(path: Path, stream: BinaryIO) -> str:
     """
     size = stream.seek(0, os.SEEK_END)
     stream.seek(max(size - _LAST_LINE_SIZE, 0))
-    found = _LAST_LINE.fullmatch(stream.read())
+    match = _LAST_LINE.fullmatch(stream.read())
     stream.seek(0)
     if not stream.read(8).startswith(b"\x89HDF\r\n\x1a\n"):
         raise RecordError(f"{path}: not a readable HDF5 file (it does not begin like one)")
-    if found is None:
+    if match is None:
         return "it has no digest (SHA-256) at its end: it was cut short, or written by another program"
     stream.seek(0)
     actual, left = hashlib.sha256(), size - _LAST_LINE_SIZE
     while left and (block := stream.read(min(left, 1 << 20))):
         actual.update(block)
         left -= len(block)
-    if actual.hexdigest().encode("ascii") != found[1]:
+    if actual.hexdigest().encode("ascii") != match[1]:
         return "damaged, or changed since dynsim wrote it: its bytes do not agree with its digest (SHA-256)"
     return ""
 
@@ -153,11 +153,11 @@ class _Reader:
         self._left = _allowed(size)
 
     def content(self) -> Content:
-        found = self._attribute(self._file, "format")
-        if not isinstance(found, str) or not found.startswith(_FORMATS):
+        version = self._attribute(self._file, "format")
+        if not isinstance(version, str) or not version.startswith(_FORMATS):
             raise RecordError(f"an HDF5 file, but not a dynsim record ({FORMAT})")
-        if found != FORMAT:
-            raise RecordError(f"a record of another format, {shown(found)}; this version of dynsim reads {FORMAT}")
+        if version != FORMAT:
+            raise RecordError(f"a record of another format, {brief(version)}; this version of dynsim reads {FORMAT}")
         complete = self._attribute(self._file, "complete")
         if complete is None:
             raise RecordError("a dynsim record that lacks parts: no attribute complete")
@@ -223,16 +223,16 @@ class _Reader:
         """A data set, or a group of them, that lies in the file itself."""
         import h5py
 
-        what = f"group {path}" if group else _named(path)
+        name = f"group {path}" if group else _named(path)
         link = self._file.get(path, getlink=True)
         if link is None:
-            raise RecordError(f"a dynsim record that lacks parts: no {what}")
+            raise RecordError(f"a dynsim record that lacks parts: no {name}")
         if not isinstance(link, h5py.HardLink):
-            raise RecordError(f"{what} is a link to somewhere else; links are not followed")
-        found = self._file[path]
-        if not isinstance(found, h5py.Group if group else h5py.Dataset):
-            raise RecordError(f"{what} is no {'group' if group else 'data set'}")
-        return found
+            raise RecordError(f"{name} is a link to somewhere else; links are not followed")
+        item = self._file[path]
+        if not isinstance(item, h5py.Group if group else h5py.Dataset):
+            raise RecordError(f"{name} is no {'group' if group else 'data set'}")
+        return item
 
     def _numbers(self, path: str) -> NDArray[Any]:
         """An array of real numbers."""
@@ -256,23 +256,23 @@ class _Reader:
         """The content of a data set; none that lies outside of the file, is not there, or is beyond the limit."""
         import h5py
 
-        what, properties = _named(path), data.id.get_create_plist()
+        name, properties = _named(path), data.id.get_create_plist()
         if properties.get_external_count() or data.is_virtual:
-            raise RecordError(f"{what} lies in other files, which are not opened")
+            raise RecordError(f"{name} lies in other files, which are not opened")
         if data.shape is None:
-            raise RecordError(f"{what} is empty")
+            raise RecordError(f"{name} is empty")
         filters = [properties.get_filter(k)[0] for k in range(properties.get_nfilters())]
         if filters not in ([], [h5py.h5z.FILTER_DEFLATE]):
             raise RecordError(
-                f"{what} is packed in a way (HDF5 filters {filters}) that dynsim does not read; gzip it does"
+                f"{name} is packed in a way (HDF5 filters {filters}) that dynsim does not read; gzip it does"
             )
         size, stored = math.prod(data.shape) * data.dtype.itemsize, data.id.get_storage_size()
         if stored > self._size or (size > stored and not filters):
-            raise RecordError(f"{what} claims {size} bytes, but the file ({self._size} bytes) holds {stored} of them")
+            raise RecordError(f"{name} claims {size} bytes, but the file ({self._size} bytes) holds {stored} of them")
         self._left -= size
         if self._left < 0:
             raise RecordError(
-                f"{what} would unpack to {size} bytes; a file of {self._size} bytes may unpack to "
+                f"{name} would unpack to {size} bytes; a file of {self._size} bytes may unpack to "
                 f"{_allowed(self._size)} in all"
             )
         return data[()]
@@ -295,19 +295,19 @@ class _Reader:
 
 def _mapping(name: str, text: str) -> dict[str, Any]:
     try:
-        found = json.loads(text)
+        mapping = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise RecordError(f"{name} is not JSON ({error})") from error
-    if not isinstance(found, dict):
-        raise RecordError(f"{name} is {type(found).__name__}, not a mapping")
-    return found
+    if not isinstance(mapping, dict):
+        raise RecordError(f"{name} is {type(mapping).__name__}, not a mapping")
+    return mapping
 
 
-def _texts(values: Any, what: str) -> tuple[str, ...]:
+def _texts(values: Any, name: str) -> tuple[str, ...]:
     """Texts of an attribute or a data set, which h5py reads as str or as bytes."""
     if np.ndim(values) != 1:
-        raise RecordError(f"{what} that are no list")
+        raise RecordError(f"{name} that are no list")
     texts = tuple(text.decode("utf-8") if isinstance(text, bytes) else text for text in np.asarray(values).tolist())
     if not all(isinstance(text, str) for text in texts):
-        raise RecordError(f"{what} that are no texts")
+        raise RecordError(f"{name} that are no texts")
     return texts

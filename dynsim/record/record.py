@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dynsim.errors import MissingEntry, RecordError, shown
+from dynsim.errors import MissingEntry, RecordError, brief
 from dynsim.record import export, notebook, reader, writer
 from dynsim.record.content import TIME, Content, Event, Signal, check_name, check_signal, check_time
 from dynsim.record.scene import Scene
@@ -34,12 +34,12 @@ _SHOWN = 6
 class Entries(dict[str, Any]):
     """A mapping that says in words which entry it does not have."""
 
-    def __init__(self, what: str, entries: Mapping[str, Any]) -> None:
+    def __init__(self, kind: str, entries: Mapping[str, Any]) -> None:
         super().__init__(entries)
-        self._what = what
+        self._what = kind
 
     def __missing__(self, key: object) -> Any:
-        raise MissingEntry(f"no {self._what} {shown(key)}; this record has: {', '.join(self) or 'none'}")
+        raise MissingEntry(f"no {self._what} {brief(key)}; this record has: {', '.join(self) or 'none'}")
 
 
 class Record:
@@ -85,7 +85,7 @@ class Record:
         if name in self.axes:
             raise RecordError(f"signal {name!r}: a time axis has that name")
         signal = Signal(np.asarray(data), unit, tuple(labels), description, axis)
-        samples = {TIME: len(self.time), **{one: len(times) for one, times in self.axes.items()}}
+        samples = {TIME: len(self.time), **{axis: len(times) for axis, times in self.axes.items()}}
         check_signal(name, signal, samples)
         self.signals[name] = signal
 
@@ -129,7 +129,7 @@ class Record:
             raise RecordError(f"event {kind!r} at {time} s: the time must be finite")
         number = None if value is None or math.isnan(value) else float(value)
         event = Event(float(time), kind, name, number, description)
-        bisect.insort(self.events, event, key=lambda one: one.time)
+        bisect.insort(self.events, event, key=lambda entry: entry.time)
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         return self._signal(name).data
@@ -138,7 +138,7 @@ class Record:
         if not isinstance(name, str) or name not in self.signals:
             near = difflib.get_close_matches(str(name), self.signals, 1)
             hint = f" (did you mean {near[0]!r}?)" if near else ""
-            raise MissingEntry(f"no signal {shown(name)}{hint}; this record has: {', '.join(self.signals) or 'none'}")
+            raise MissingEntry(f"no signal {brief(name)}{hint}; this record has: {', '.join(self.signals) or 'none'}")
         return self.signals[name]
 
     def __repr__(self) -> str:
@@ -155,8 +155,8 @@ class Record:
             (name, "×".join(map(str, signal.data.shape)), signal.unit, signal.description)
             for name, signal in self.signals.items()
         ]
-        what = "" if self.scene is None else "<p><code>record.view()</code> shows it in 3D.</p>"
-        return notebook.table(repr(self)[1:-1], rows, what)
+        hint = "" if self.scene is None else "<p><code>record.view()</code> shows it in 3D.</p>"
+        return notebook.table(repr(self)[1:-1], rows, hint)
 
     def view(self, *others: Record, ghost: bool = False, height: int = 640) -> Any:
         """A page that shows the run in 3D, with plots over time; notebooks show it inline.
@@ -293,7 +293,7 @@ class Record:
         return export.to_xarray(self._content())
 
 
-def _entries(what: str, entries: Mapping[str, Any]) -> Entries:
+def _entries(kind: str, entries: Mapping[str, Any]) -> Entries:
     if not isinstance(entries, Mapping):
-        raise RecordError(f"the {what} of a record is a mapping of names to values, not {shown(entries)}")
-    return Entries(f"entry of the {what}", entries)
+        raise RecordError(f"the {kind} of a record is a mapping of names to values, not {brief(entries)}")
+    return Entries(f"entry of the {kind}", entries)

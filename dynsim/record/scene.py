@@ -126,7 +126,7 @@ class Body:
 
 
 @dataclass(frozen=True)
-class Surface:
+class SceneSurface:
     """A surface C(r) = 0 in the world; C > 0 is the free side, where ∇C points.
 
     Attributes
@@ -161,14 +161,14 @@ class Surface:
             raise RecordError(f"surface {self.name!r} is a {self.kind} without {lacking[0]}")
 
     @classmethod
-    def of_quadric(cls, name: str, Q: ArrayLike, b: ArrayLike, c: float) -> Surface:
+    def of_quadric(cls, name: str, Q: ArrayLike, b: ArrayLike, c: float) -> SceneSurface:
         """A surface by its coefficients, with the parameters of the simple kind that it is of, if any."""
         Q, b = np.asarray(Q, dtype=np.float64), np.asarray(b, dtype=np.float64)
         with np.errstate(all="ignore"):
             kind, parameters = _simple_kind(Q, b, float(c))
         if not all(np.isfinite(value).all() for value in parameters.values()):
             kind, parameters = "quadric", {}
-        return cls(name, _matrix(Q), vector3(b), float(c), kind, **parameters)
+        return cls(name, (vector3(Q[0]), vector3(Q[1]), vector3(Q[2])), vector3(b), float(c), kind, **parameters)
 
     def value(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """C at points, (…, 3) → (…)."""
@@ -257,7 +257,7 @@ class Scene:
 
     __pydantic_config__: ClassVar[Any] = _CHECKS
     bodies: tuple[Body, ...] = ()
-    surfaces: tuple[Surface, ...] = ()
+    surfaces: tuple[SceneSurface, ...] = ()
     points: tuple[Point, ...] = ()
     fixed: tuple[Shape, ...] = ()
     supports: tuple[Point, ...] = ()
@@ -298,7 +298,7 @@ class Scene:
         labels = [label for k in self.base[1:] for label in self.bodies[k].joint.labels]
         return {label: f"{label.rpartition('.')[2]} wheel" for label in labels}
 
-    def surface(self, name: str) -> Surface | None:
+    def surface(self, name: str) -> SceneSurface | None:
         """The surface of a name."""
         return next((surface for surface in self.surfaces if surface.name == name), None)
 
@@ -322,8 +322,8 @@ class Scene:
             return _adapter().validate_json(text)
         except ValidationError as error:
             first = error.errors(include_url=False)[0]
-            place = ".".join(map(str, first["loc"]))
-            raise RecordError(f"scene{f': {place}' if place else ''}: {first['msg']}") from error
+            key_path = ".".join(map(str, first["loc"]))
+            raise RecordError(f"scene{f': {key_path}' if key_path else ''}: {first['msg']}") from error
 
 
 @cache
@@ -349,10 +349,6 @@ def _four(values: ArrayLike) -> Quaternion:
     return w, x, y, z
 
 
-def _matrix(values: NDArray[np.float64]) -> Matrix3:
-    return vector3(values[0]), vector3(values[1]), vector3(values[2])
-
-
 def _simple_kind(Q: NDArray[np.float64], b: NDArray[np.float64], c: float) -> tuple[Any, dict[str, Any]]:
     """Plane, sphere or cylinder, and its parameters."""
     if not Q.any():
@@ -373,6 +369,6 @@ def _simple_kind(Q: NDArray[np.float64], b: NDArray[np.float64], c: float) -> tu
             centre = -(b - axis * float(axis @ b)) / s
             square = float(centre @ centre) - 2.0 * c / s
             if square > 0.0:
-                place, radius = vector3(centre), float(np.copysign(square**0.5, s))
-                return "cylinder", {"position": place, "direction": vector3(axis), "radius": radius}
+                position, radius = vector3(centre), float(np.copysign(square**0.5, s))
+                return "cylinder", {"position": position, "direction": vector3(axis), "radius": radius}
     return "quadric", {}

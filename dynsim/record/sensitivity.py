@@ -81,7 +81,7 @@ def sensitivities(parameters: Array, values: Array) -> Sensitivities | None:
     if np.linalg.matrix_rank(scaled) <= size:
         return None
     inverse = np.linalg.inv(normal)
-    found = inverse @ (scaled.T @ values)
-    rest = float(((values - scaled @ found) ** 2).sum())
-    half = student(free) * np.sqrt(np.diag(inverse) * rest / free)
-    return Sensitivities(found[1:], half[1:], 1.0 - rest / total)
+    effects = inverse @ (scaled.T @ values)
+    unexplained = float(((values - scaled @ effects) ** 2).sum())
+    half = student(free) * np.sqrt(np.diag(inverse) * unexplained / free)
+    return Sensitivities(effects[1:], half[1:], 1.0 - unexplained / total)

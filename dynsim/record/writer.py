@@ -49,11 +49,11 @@ def encode(content: Content) -> memoryview:
         for name, times in content.axes.items():
             _write(file, f"axes/{name}", Signal(times, "s"))
         _write_events(file, content.events)
-        for name, one in content.signals.items():
+        for name, signal in content.signals.items():
             try:
-                _write(file, f"signals/{name}", one)
-                if len(one.labels) > _LABELS_IN_ATTRIBUTE:
-                    file.create_dataset(f"labels/{name}", data=list(one.labels), dtype=h5py.string_dtype())
+                _write(file, f"signals/{name}", signal)
+                if len(signal.labels) > _LABELS_IN_ATTRIBUTE:
+                    file.create_dataset(f"labels/{name}", data=list(signal.labels), dtype=h5py.string_dtype())
             except ValueError as error:
                 raise RecordError(f"signal {name!r} cannot be saved: {error}") from error
     image.seek(0, os.SEEK_END)
@@ -61,16 +61,16 @@ def encode(content: Content) -> memoryview:
     return image.getbuffer()
 
 
-def _write(file: Any, name: str, one: Signal) -> None:
+def _write(file: Any, name: str, signal: Signal) -> None:
     # gzip only where it pays: it costs time on every run, and short records are small anyway.
-    options = {"compression": "gzip", "compression_opts": 1} if one.data.nbytes > 1 << 22 else {}
-    data = file.create_dataset(name, data=one.data, **options)
-    data.attrs["unit"] = one.unit
-    if len(one.labels) <= _LABELS_IN_ATTRIBUTE:
-        data.attrs["labels"] = list(one.labels)
-    data.attrs["description"] = one.description
-    if one.axis != TIME:
-        data.attrs["axis"] = one.axis
+    options = {"compression": "gzip", "compression_opts": 1} if signal.data.nbytes > 1 << 22 else {}
+    data = file.create_dataset(name, data=signal.data, **options)
+    data.attrs["unit"] = signal.unit
+    if len(signal.labels) <= _LABELS_IN_ATTRIBUTE:
+        data.attrs["labels"] = list(signal.labels)
+    data.attrs["description"] = signal.description
+    if signal.axis != TIME:
+        data.attrs["axis"] = signal.axis
 
 
 def _write_events(file: Any, events: Sequence[Event]) -> None:

@@ -16,7 +16,7 @@ from dynsim.compile.protocols import BuildContext
 from dynsim.compile.shapes import gap_at
 from dynsim.config.base import BodyPoint
 from dynsim.config.problems import dotted, suggest
-from dynsim.errors import ModelError, ScenarioError, shown
+from dynsim.errors import ModelError, ScenarioError, brief
 from dynsim.library import families
 from dynsim.model.description import Array, Contact, Foot, Inertia, Load, Robot
 from dynsim.model.surfaces import SURFACES, Surface
@@ -291,7 +291,7 @@ def contacts(scenario: Scenario, described: Robot | None = None) -> list[Contact
         )
     if options.candidates != "points":
         law = _law(options, ContactPoint(body=""))
-        result += [replace(one, **law) for one in candidates(options.candidates, described, known, result)]
+        result += [replace(contact, **law) for contact in candidates(options.candidates, described, known, result)]
     error = scenario.config.surface_error
     return result if error is None else [_rubbed(contact, error.friction_factor) for contact in result]
 
@@ -403,7 +403,7 @@ def check_start(
             f"{dotted(keys)}: {'its point' if declared else contact.name} starts {gap:+.4g} m "
             f"from surface {contact.surface_name!r} "
             f"(limit {START_TOLERANCE:g} m), at {position.tolist()}{f' (also {others})' if others else ''}; "
-            f"{_remedy(scenario, [one[0] for one in off if one[1]])}change the initial configuration or the surface, "
+            f"{_remedy(scenario, [c for c, own, *_ in off if own])}change the initial configuration or the surface, "
             "or disable the contact",
             keys=keys,
         )
@@ -426,4 +426,4 @@ def on_surface_key(scenario: Scenario, names: Sequence[str]) -> str:
 def require_scenario(scenario: object) -> None:
     """Raise :class:`ScenarioError` for what is none, such as the name of one."""
     if not isinstance(scenario, Scenario):
-        raise ScenarioError(f"needs a Scenario, not {shown(scenario)}; load_scenario(name or file) gives one")
+        raise ScenarioError(f"needs a Scenario, not {brief(scenario)}; load_scenario(name or file) gives one")

@@ -43,7 +43,7 @@ def candidates(kind: str, robot: Robot, surfaces: Mapping[str, Surface], declare
     configurations = _configurations(robot)
     taken = [contact for contact in declared if contact.tip is None]
     names = {contact.name for contact in declared}
-    found: list[Contact] = []
+    contacts: list[Contact] = []
     still: list[str] = []
     replaced: list[str] = []
     for surface_name, surface in surfaces.items():
@@ -56,20 +56,20 @@ def candidates(kind: str, robot: Robot, surfaces: Mapping[str, Surface], declare
         for contact in (_joints if kind == "joints" else _links)(robot, surface, surface_name):
             places = _places(model, contact, configurations)
             if contact.tip is None:
-                twins = [one for one, other in known if _same(places, other)]
+                twins = [entry for entry, other in known if _same(places, other)]
                 if twins:
-                    replaced.extend(one.name for one in twins if contact.radius > one.radius)
+                    replaced.extend(entry.name for entry in twins if contact.radius > entry.radius)
                     continue
-                twin = next((k for k, (one, other) in enumerate(kept) if one.tip is None and _same(places, other)), -1)
+                twin = next((k for k, (own, other) in enumerate(kept) if own.tip is None and _same(places, other)), -1)
                 if twin >= 0:
-                    one, other = kept[twin]
-                    kept[twin] = replace(one, radius=max(one.radius, contact.radius)), other
+                    earlier, other = kept[twin]
+                    kept[twin] = replace(earlier, radius=max(earlier.radius, contact.radius)), other
                     continue
             kept.append((contact, places))
         for contact, _ in kept:
             name = contact.name if len(surfaces) == 1 else f"{contact.name}_{surface_name}"
             if _moves(model, contact, configurations):
-                found.append(replace(contact, name=_unused(name, names)))
+                contacts.append(replace(contact, name=_unused(name, names)))
             else:
                 still.append(name)
     if replaced:
@@ -79,18 +79,18 @@ def candidates(kind: str, robot: Robot, surfaces: Mapping[str, Surface], declare
         )
     if still:
         log.info("contacts.candidates: left out, because nothing moves them along the normal: %s", ", ".join(still))
-    return found
+    return contacts
 
 
 def _joints(robot: Robot, surface: Surface, name: str) -> list[Contact]:
     """Origins of all joints, and the hand."""
     carriers = robot.carriers
-    found = [
+    joints = [
         Contact(link.joint_of_rows or link.joint, link.name, np.zeros(3), surface, name)
         for link in robot.links
         if link.name not in carriers
     ]
-    return [*found, Contact("hand", *robot.hand, surface, name)]
+    return [*joints, Contact("hand", *robot.hand, surface, name)]
 
 
 def _links(robot: Robot, surface: Surface, on: str) -> list[Contact]:
@@ -115,7 +115,7 @@ def _links(robot: Robot, surface: Surface, on: str) -> list[Contact]:
 def _configurations(robot: Robot) -> list[Array]:
     """Random coordinates; quaternions are unit."""
     rng = np.random.default_rng(0)
-    found = []
+    configurations = []
     for _ in range(CONFIGURATIONS):
         q = np.zeros(robot.nq)
         for link, k in zip(robot.links, robot.position_index, strict=True):
@@ -123,8 +123,8 @@ def _configurations(robot: Robot) -> list[Array]:
             q[k : k + size] = rng.normal(size=size)
             if size == 4:
                 q[k : k + 4] /= np.linalg.norm(q[k : k + 4])
-        found.append(q)
-    return found
+        configurations.append(q)
+    return configurations
 
 
 def _places(model: Model, contact: Contact, configurations: Iterable[Array]) -> Array:
@@ -151,9 +151,9 @@ def _moves(model: Model, contact: Contact, configurations: Iterable[Array]) -> b
 
 def _unused(name: str, names: set[str]) -> str:
     """The name, with a number if another candidate has it; it is taken from then on."""
-    found, count = name, 1
-    while found in names:
+    unused, count = name, 1
+    while unused in names:
         count += 1
-        found = f"{name}_{count}"
-    names.add(found)
-    return found
+        unused = f"{name}_{count}"
+    names.add(unused)
+    return unused

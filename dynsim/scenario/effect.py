@@ -24,15 +24,15 @@ def without_effect(scenario: Any, motors: bool = True) -> list[str]:
     ``scenario`` : a :class:`~dynsim.scenario.schema.Scenario`; ``motors`` : whether the plant has any
     """
     config = scenario.config
-    found: dict[Keys, str] = {}
+    texts: dict[Keys, str] = {}
     if config.controller is not None and not motors:
-        found[("controller",)] = "the plant has no motors"
+        texts[("controller",)] = "the plant has no motors"
     for keys, why in idle_keys(config).items():
-        if keys[:1] not in found:
-            found[keys] = why
+        if keys[:1] not in texts:
+            texts[keys] = why
     return [
-        f"{dotted(keys)} has no effect: {why} ({scenario.place(keys)})"
-        for keys, why in found.items()
+        f"{dotted(keys)} has no effect: {why} ({scenario.location(keys)})"
+        for keys, why in texts.items()
         if is_set(config, keys)
     ]
 

@@ -94,14 +94,14 @@ class Samples(Sampled):
     def _check(self) -> Self:
         if np.any(np.diff(self.times_s) <= 0.0):
             raise error_at("times_s", "must increase")
-        given = {"force_N": self.force_N, "torque_N_m": self.torque_N_m}
-        for key, vectors in given.items():
+        values = {"force_N": self.force_N, "torque_N_m": self.torque_N_m}
+        for key, vectors in values.items():
             if vectors is not None and len(vectors) != len(self.times_s):
                 raise error_at(key, f"{len(vectors)} vectors and {len(self.times_s)} times_s: there must be as many")
         if self.force_N is None and self.torque_N_m is None:
             raise ValueError("has neither force_N nor torque_N_m")
         nothing = np.zeros((len(self.times_s), 3))
-        columns = [nothing if vectors is None else np.array(vectors) for vectors in given.values()]
+        columns = [nothing if vectors is None else np.array(vectors) for vectors in values.values()]
         self._pieces = self._interpolate(self.times_s, np.hstack(columns))
         return self
 
@@ -117,7 +117,7 @@ class Table(Sampled):
 
     @model_validator(mode="after")
     def _read(self) -> Self:
-        rows = np.array(read_rows(self.file, FORCE_COLUMNS, FORCE_COLUMNS + TORQUE_COLUMNS, what="a load"))
+        rows = np.array(read_rows(self.file, FORCE_COLUMNS, FORCE_COLUMNS + TORQUE_COLUMNS, kind="a load"))
         values = np.zeros((len(rows), 6))
         values[:, : rows.shape[1] - 1] = rows[:, 1:]
         try:

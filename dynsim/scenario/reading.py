@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from dynsim.config.problems import INDEX, Origin, dotted, explain, key_text, suggest, unknown_keys, value_text
-from dynsim.errors import ScenarioError, shown
+from dynsim.errors import ScenarioError, brief
 from dynsim.scenario.schema import Scenario, ScenarioConfig
 from dynsim.system.files import check_complete
 from dynsim.system.inputs import DEPTH_LIMIT, YamlMapping, is_file, parse_yaml, read_text
@@ -43,7 +43,7 @@ def find_scenario(name: str | Path) -> Path:
         The scenario of a run that died while it was saved.
     """
     if not isinstance(name, (str, Path)):
-        raise ScenarioError(f"a scenario is named by its file, or by its name when it is shipped, not by {shown(name)}")
+        raise ScenarioError(f"a scenario is named by its file, or by its name when it is shipped, not by {brief(name)}")
     path = Path(name)
     shipped = shipped_scenario(path)
     try:
@@ -118,7 +118,7 @@ class ScenarioFile:
         overrides = {} if overrides is None else overrides
         if not (isinstance(overrides, Mapping) and all(isinstance(key, str) for key in overrides)):
             raise ScenarioError(
-                f"overrides must map dotted keys to values, as {{'integrator.rtol': 1e-8}} does, not {shown(overrides)}"
+                f"overrides must map dotted keys to values, as {{'integrator.rtol': 1e-8}} does, not {brief(overrides)}"
             )
         merged, origin = self._merged(variant, overrides)
         try:
@@ -197,7 +197,7 @@ def scenario_from_resolved(resolved: Mapping[str, Any]) -> Scenario:
         It was written by a version of dynsim with other keys.
     """
     if not isinstance(resolved, Mapping):
-        raise ScenarioError(f"the scenario in this record must be a mapping of keys to values, not {shown(resolved)}")
+        raise ScenarioError(f"the scenario in this record must be a mapping of keys to values, not {brief(resolved)}")
     try:
         config = ScenarioConfig.model_validate(resolved)
     except ValidationError as error:
@@ -268,23 +268,23 @@ def _merge(base: Any, difference: Any) -> Any:
 def _override(data: Any, key: str, value: Any, overriding: str, variant: str | None) -> None:
     """Set the dotted ``key`` in nested mappings and lists."""
     node, parts = data, str(key).split(".")
-    place = f"{overriding} {key_text(key)}"
+    location = f"{overriding} {key_text(key)}"
     if "" in parts:
-        raise ScenarioError(f"{place}: a part of the key is empty; it must look like integrator.rtol")
+        raise ScenarioError(f"{location}: a part of the key is empty; it must look like integrator.rtol")
     if len(parts) > DEPTH_LIMIT:
-        raise ScenarioError(f"{place}: has {len(parts)} parts; no key of a scenario has more than {DEPTH_LIMIT}")
+        raise ScenarioError(f"{location}: has {len(parts)} parts; no key of a scenario has more than {DEPTH_LIMIT}")
     if parts[0] == "variants" or (parts[0] == "variant" and variant is not None):
-        raise ScenarioError(f"{place}: which variant runs is chosen by its name (dynsim run --variant), not set")
+        raise ScenarioError(f"{location}: which variant runs is chosen by its name (dynsim run --variant), not set")
     for depth, part in enumerate(parts):
         last = depth == len(parts) - 1
         if isinstance(node, list):
             if not INDEX.fullmatch(part) or int(part) >= len(node):
-                raise ScenarioError(f"{place}: {value_text(part)} is no index of a list of {len(node)}")
+                raise ScenarioError(f"{location}: {value_text(part)} is no index of a list of {len(node)}")
             index: Any = int(part)
         elif isinstance(node, Mapping):
             index = part
         else:
-            raise ScenarioError(f"{place}: {dotted(parts[:depth])} is a value, not a mapping")
+            raise ScenarioError(f"{location}: {dotted(parts[:depth])} is a value, not a mapping")
         if last:
             node[index] = value
             return
@@ -315,7 +315,7 @@ def _check_sizes(value: Any, keys: tuple[int | str, ...], origin: Origin) -> Non
             _check_sizes(item, (*keys, key), origin)
     elif isinstance(value, int | float) and (SIZE_MAX < abs(value) < np.inf or 0 < abs(value) < 1.0 / SIZE_MAX):
         raise ScenarioError(
-            f"{origin.place(keys)}: {dotted(keys)} = {value_text(value)}: its size must be between "
+            f"{origin.location(keys)}: {dotted(keys)} = {value_text(value)}: its size must be between "
             f"{1.0 / SIZE_MAX:g} and {SIZE_MAX:g}, or zero"
         )
 

@@ -118,9 +118,9 @@ class Contacts(StrictConfig):
         if static < kinetic:
             raise error_at("static_friction", f"is less than friction {self.friction:g}; it must hold as much or more")
         for name, point in self.points.items():
-            given = sorted(point.model_fields_set & set(UNILATERAL_KEYS))
-            if self.law == "bilateral" and given:
-                raise error_at(f"points.{name}.{given[0]}", fix)
+            keys = sorted(point.model_fields_set & set(UNILATERAL_KEYS))
+            if self.law == "bilateral" and keys:
+                raise error_at(f"points.{name}.{keys[0]}", fix)
             kinetic, static = self.coefficients(point)
             if static < kinetic:
                 key = "friction" if point.static_friction is None else "static_friction"
@@ -380,14 +380,14 @@ class Scenario:
                 part.pop(key, None)
         # What changes nothing is not there, unless it was said.
         for keys in idle_keys(self.config):
-            section, *rest = map(str, keys)
-            if len(rest) == 1 and not is_set(self.config, keys) and isinstance(resolved.get(section), dict):
-                resolved[section].pop(rest[0], None)
+            section, *inner = map(str, keys)
+            if len(inner) == 1 and not is_set(self.config, keys) and isinstance(resolved.get(section), dict):
+                resolved[section].pop(inner[0], None)
                 if not resolved[section]:
                     del resolved[section]
         return resolved
 
-    def place(self, keys: Sequence[int | str] = (), variant: str = "") -> str:
+    def location(self, keys: Sequence[int | str] = (), variant: str = "") -> str:
         """``file:line`` of a key, the text for ``variant``, and how the key was overridden."""
         line, overridden = 0, ""
         if keys and self.origin is not None:

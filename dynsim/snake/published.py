@@ -84,19 +84,21 @@ def table_iii(records: Mapping[str, Record]) -> Table:
 
 UNITS = ("m", "m", "m", "rad", "rad", "rad")
 # Variants of `snake_positioning_dynamic`: what is appended to the moved coordinate, by the column of the table.
-WAYS = {"kinematic": "_kinematic", "dynamic": "", "measured": "_measured"}
+SOURCES = {"kinematic": "_kinematic", "dynamic": "", "measured": "_measured"}
 
 
 def table_iii_dynamic(records: Mapping[str, Record]) -> Table:
     """Table III beside what was simulated without forces, with them, and with the head measured; a line a number."""
-    rows = [["variant", "quantity", "paper_mean", "paper_sd", *WAYS]]
+    rows = [["variant", "quantity", "paper_mean", "paper_sd", *SOURCES]]
     for moved, published in TABLE_III.items():
-        names = {way: moved + ending for way, ending in WAYS.items()}
-        found = {way: displacement(records[name]) for way, name in names.items() if name in records}
-        if not found:
+        names = {source: moved + ending for source, ending in SOURCES.items()}
+        displacements = {source: displacement(records[name]) for source, name in names.items() if name in records}
+        if not displacements:
             continue
         for i, (coordinate, unit) in enumerate(zip(COORDINATES, UNITS, strict=True)):
-            simulated = [f"{found[way][i] + 0.0:.6f}" if way in found else "" for way in WAYS]
+            simulated = [
+                f"{displacements[source][i] + 0.0:.6f}" if source in displacements else "" for source in SOURCES
+            ]
             numbers = [f"{published.mean[i]:.4g}", f"{published.deviation[i]:.3g}"]
             rows.append([moved, f"d{coordinate}_{unit}", *numbers, *simulated])
     return rows

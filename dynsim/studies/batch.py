@@ -8,7 +8,7 @@ from operator import itemgetter
 from typing import Any, Generic, Literal, TypeVar, get_args
 
 from dynsim.engine import Progress, simulate
-from dynsim.errors import DynsimError, ScenarioError, SimulationInterrupted, SimulationStopped, shown
+from dynsim.errors import DynsimError, ScenarioError, SimulationInterrupted, SimulationStopped, brief
 from dynsim.scenario import Scenario, require_scenario
 from dynsim.studies.outcome import RunResult
 from dynsim.studies.processes import WorkerInterrupted, WorkerLost, run_in_processes
@@ -58,7 +58,7 @@ def simulate_batch(
     for scenario in runs:
         require_scenario(scenario)
     if keep_records not in get_args(Keep):
-        raise ScenarioError(f"keep_records = {shown(keep_records)}: must be one of {', '.join(get_args(Keep))}")
+        raise ScenarioError(f"keep_records = {brief(keep_records)}: must be one of {', '.join(get_args(Keep))}")
     results: dict[int, RunResult] = {}
 
     def take(task: tuple[int, Scenario], result: RunResult) -> None:
@@ -66,12 +66,12 @@ def simulate_batch(
         if finished is not None:
             finished(task[0], result)
 
-    if run_all(Work(itemgetter(1), keep_records), list(enumerate(runs)), take, jobs=jobs, scheduler=scheduler):
+    if run_all(BatchWork(itemgetter(1), keep_records), list(enumerate(runs)), take, jobs=jobs, scheduler=scheduler):
         raise SimulationInterrupted(f"interrupted when {len(results)} of {len(runs)} runs were done")
     return [results[k] for k in range(len(runs))]
 
 
-class Work(Generic[Task]):
+class BatchWork(Generic[Task]):
     """What is done for tasks, in a process of its own too: what their runs have in common stays there with it.
 
     Parameters
@@ -135,7 +135,7 @@ def run_all(
         No such ``jobs``, or no such scheduler.
     """
     if not isinstance(jobs, int) or jobs < 1:
-        raise ScenarioError(f"jobs = {shown(jobs)}: must be a whole number of processes, 1 or more")
+        raise ScenarioError(f"jobs = {brief(jobs)}: must be a whole number of processes, 1 or more")
     if scheduler is not None:
         from dynsim.studies.cluster import run_on_cluster
 

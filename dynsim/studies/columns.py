@@ -46,7 +46,7 @@ def numbers(summary: dict[str, Any]) -> dict[str, Any]:
     values = flat(summary)
     for key, value in summary.items():
         if isinstance(value, dict) and key != "base":
-            values |= {f"{key}.{name}": one for name, one in value.items()}
+            values |= {f"{key}.{name}": entry for name, entry in value.items()}
     for contact in summary.get("contacts", ()):
         values |= {f"{contact['name']}.{key}": value for key, value in contact.items()}
     return {key: value for key, value in values.items() if is_finite(value) and key not in _NOT_OF_THE_RUN}

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from dynsim.engine import SIMULATION, Progress, simulate
-from dynsim.errors import ScenarioError, SimulationInterrupted, SimulationStopped, shown
+from dynsim.errors import ScenarioError, SimulationInterrupted, SimulationStopped, brief
 from dynsim.record import Record
 from dynsim.scenario import Scenario, load_scenario, variant_names
 from dynsim.studies.columns import csv_table, flat, is_scalar, is_text
@@ -55,7 +55,7 @@ def compare(
         not started; holds the record of the first.
     """
     if not isinstance(jobs, int) or jobs < 1:
-        raise ScenarioError(f"jobs = {shown(jobs)}: must be a whole number of processes, 1 or more")
+        raise ScenarioError(f"jobs = {brief(jobs)}: must be a whole number of processes, 1 or more")
     names = variant_names(path)
     if not names:
         raise ScenarioError(f"{path}: has no variants to compare; use `dynsim run`")
@@ -67,8 +67,8 @@ def compare(
         try:
             record = result()
         except WorkerInterrupted:
-            place = scenarios[name].place(variant=f" ({name})")
-            stops[name] = SimulationInterrupted(f"{place}: interrupted before there was anything to save")
+            location = scenarios[name].location(variant=f" ({name})")
+            stops[name] = SimulationInterrupted(f"{location}: interrupted before there was anything to save")
             return
         except WorkerLost as lost:
             stops[name] = SimulationStopped(f"{name}: {lost}")

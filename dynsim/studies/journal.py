@@ -9,10 +9,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from dynsim.errors import RecordError, ScenarioError, shown
+from dynsim.errors import RecordError, ScenarioError, brief
 from dynsim.studies.columns import is_finite, numbers
 from dynsim.studies.outcome import RunResult
-from dynsim.studies.sweep_plan import Point
+from dynsim.studies.sweep_plan import SweepPoint
 from dynsim.system.files import json_text, write_text
 
 PLAN, JOURNAL = "sweep.json", "runs.jsonl"
@@ -20,12 +20,12 @@ OK, FAILED, LOST = "ok", "failed", "lost"
 
 
 @dataclass(frozen=True)
-class Row:
+class SweepRow:
     """One run of the table: its numbers, or why there are none.
 
     Attributes
     ----------
-    run, variant, values : see :class:`dynsim.studies.sweep_plan.Point`
+    run, variant, values : see :class:`dynsim.studies.sweep_plan.SweepPoint`
     status : ``ok``, ``failed`` (and would again) or ``lost`` with its process
     reason : why it failed
     numbers : of its summary, see :func:`dynsim.studies.columns.numbers`
@@ -41,14 +41,14 @@ class Row:
     warnings: str
 
     @classmethod
-    def of(cls, point: Point, result: RunResult) -> Row:
+    def of(cls, point: SweepPoint, result: RunResult) -> SweepRow:
         """A result as a row."""
         status = OK if result.ok else LOST if result.lost else FAILED
         warnings = "; ".join(result.summary.get("warnings", ()))
         return cls(point.run, point.variant, point.values, status, result.reason, numbers(result.summary), warnings)
 
     @classmethod
-    def read(cls, line: str) -> Row:
+    def read(cls, line: str) -> SweepRow:
         """A line of a journal as a row.
 
         Raises
@@ -72,17 +72,17 @@ class Row:
         }
         for name in names:
             if not fits[name]:
-                raise ValueError(f"{name} = {shown(data[name])} is nothing that dynsim has written")
+                raise ValueError(f"{name} = {brief(data[name])} is nothing that dynsim has written")
         return row
 
-    def placed(self, point: Point) -> Row:
+    def placed(self, point: SweepPoint) -> SweepRow:
         """This row, in the place that another plan has for it."""
-        return Row(point.run, point.variant, point.values, self.status, self.reason, self.numbers, self.warnings)
+        return SweepRow(point.run, point.variant, point.values, self.status, self.reason, self.numbers, self.warnings)
 
     @property
     def identity(self) -> str:
-        """See :class:`dynsim.studies.sweep_plan.Point`."""
-        return Point(self.run, self.variant, self.values).identity
+        """See :class:`dynsim.studies.sweep_plan.SweepPoint`."""
+        return SweepPoint(self.run, self.variant, self.values).identity
 
     def cells(self) -> dict[str, Any]:
         """By column."""
@@ -91,7 +91,7 @@ class Row:
         return {"run": self.run, **variant, **self.values, **ended, **self.numbers, "warnings": self.warnings}
 
 
-class Journal:
+class SweepJournal:
     """The file, with rows that are known written anew, open for those that come.
 
     Raises
@@ -100,19 +100,19 @@ class Journal:
         It cannot be written.
     """
 
-    def __init__(self, folder: Path, rows: Iterable[Row]) -> None:
+    def __init__(self, folder: Path, rows: Iterable[SweepRow]) -> None:
         self._path = folder / JOURNAL
         write_text(self._path, "".join(map(_line, rows)))
         # Without a buffer, which would be written once more at the end of a disk that is full.
         self._stream = self._path.open("ab", buffering=0)
 
-    def __enter__(self) -> Journal:
+    def __enter__(self) -> SweepJournal:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self._stream.close()
 
-    def add(self, row: Row) -> None:
+    def add(self, row: SweepRow) -> None:
         """Write a row.
 
         Raises
@@ -128,11 +128,11 @@ class Journal:
             raise RecordError(f"cannot write {self._path}: {error.strerror}") from error
 
 
-def _line(row: Row) -> str:
+def _line(row: SweepRow) -> str:
     return json.dumps(vars(row)) + "\n"
 
 
-def earlier_rows(folder: Path, header: Mapping[str, Any], resume: bool, tables: Iterable[str]) -> dict[str, Row]:
+def earlier_rows(folder: Path, header: Mapping[str, Any], resume: bool, tables: Iterable[str]) -> dict[str, SweepRow]:
     """Rows of a folder's journal by their identity, but for lost ones; ``header`` is what they must be of.
 
     Raises
@@ -159,7 +159,7 @@ def earlier_rows(folder: Path, header: Mapping[str, Any], resume: bool, tables: 
     rows = {}
     for number, line in enumerate(lines, start=1):
         try:
-            row = Row.read(line.decode("utf-8"))
+            row = SweepRow.read(line.decode("utf-8"))
         except (ValueError, RecursionError) as error:
             raise RecordError(
                 f"{journal}, line {number}: is damaged ({error}); remove that line, and --resume does its run again"
@@ -184,7 +184,7 @@ def _check_header(path: Path, header: Mapping[str, Any]) -> None:
         raise RecordError(f"{path}: is damaged, or not of a sweep (it has not all of {', '.join(keys)}); {fix}")
     for key in keys:
         if type(before[key]) is not type(now[key]) and None not in (before[key], now[key]):
-            raise RecordError(f"{path}: is damaged ({key} = {shown(before[key])}); {fix}")
+            raise RecordError(f"{path}: is damaged ({key} = {brief(before[key])}); {fix}")
         if before[key] != now[key]:
             raise ScenarioError(
                 f"{path.parent} holds a sweep of another {key}, which cannot be gone on with: give another --out"

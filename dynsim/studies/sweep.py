@@ -5,22 +5,25 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from dynsim._version import __version__
 from dynsim.engine.provenance import commit
 from dynsim.engine.results import save_run
 from dynsim.errors import RecordError, SimulationInterrupted
-from dynsim.studies.batch import Keep, Work, run_all
+from dynsim.record.sensitivity import sensitivities, spread
+from dynsim.studies.batch import BatchWork, Keep, run_all
 from dynsim.studies.cluster import ClusterError
 from dynsim.studies.columns import csv_table
-from dynsim.studies.journal import JOURNAL, OK, PLAN, Journal, Row, earlier_rows
+from dynsim.studies.journal import JOURNAL, OK, PLAN, SweepJournal, SweepRow, earlier_rows
 from dynsim.studies.outcome import RunResult
-from dynsim.studies.sweep_plan import Plan, Point
-from dynsim.studies.sweep_statistics import statistics
+from dynsim.studies.sweep_plan import Plan, SweepPoint
 from dynsim.studies.worker import WorkerError
-from dynsim.system.files import check_writable, held, json_text, replacing, write_text
+from dynsim.system.files import check_writable, held_folder, json_text, replacing, write_text
 
 TABLES = ("sweep.csv", "sweep.parquet")
 STATISTICS, RECORDS = "statistics.json", "records"
@@ -35,7 +38,7 @@ def run_sweep(
     resume: bool = False,
     scheduler: str | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> list[Row]:
+) -> list[SweepRow]:
     """Run what a plan asks for and write plan, journal, records, tables and statistics of samples to a folder.
 
     Parameters
@@ -47,7 +50,7 @@ def run_sweep(
 
     Returns
     -------
-    list of Row
+    list of SweepRow
         In the order of the plan, the same whatever the jobs and the order in which they ended.
 
     Raises
@@ -70,21 +73,21 @@ def run_sweep(
     for point in {point.variant: point for point in reversed(points)}.values():
         plan.scenario(point)
     header = _header(plan)
-    with held(folder):
+    with held_folder(folder):
         earlier = earlier_rows(folder, header, resume, TABLES)
         rows = {point.run: earlier[point.identity].placed(point) for point in points if point.identity in earlier}
         left = [point for point in points if point.run not in rows]
         failed = sum(row.status != OK for row in rows.values())
         with _goes_on(folder):
             write_text(folder / PLAN, json_text(header))
-            with Journal(folder, rows.values()) as journal:
+            with SweepJournal(folder, rows.values()) as journal:
 
-                def take(point: Point, result: RunResult) -> None:
+                def take(point: SweepPoint, result: RunResult) -> None:
                     nonlocal failed
                     # Before its row: a run that has one is not run again.
                     if result.record is not None:
                         save_run(result.record, folder / RECORDS / f"{point.run:06d}")
-                    row = rows[point.run] = Row.of(point, result)
+                    row = rows[point.run] = SweepRow.of(point, result)
                     journal.add(row)
                     failed += row.status != OK
                     if progress is not None:
@@ -92,7 +95,7 @@ def run_sweep(
 
                 if progress is not None:
                     progress(len(rows), failed)
-                work = Work(plan.scenario, keep_records)
+                work = BatchWork(plan.scenario, keep_records)
                 interrupted = run_all(work, left, take, jobs=jobs, scheduler=scheduler)
             done = [rows[run] for run in sorted(rows)]
             write_tables(done, plan, folder)
@@ -130,14 +133,14 @@ def _header(plan: Plan) -> dict[str, Any]:
     }
 
 
-def columns(rows: Sequence[Row]) -> list[str]:
+def columns(rows: Sequence[SweepRow]) -> list[str]:
     """Columns of the table: of all rows, in the order in which the first that has one has it."""
     names = dict.fromkeys(name for row in rows for name in row.cells())
     # Failed runs have no numbers.
     return [*(name for name in names if name != "warnings"), "warnings"]
 
 
-def write_tables(rows: Sequence[Row], plan: Plan, folder: Path) -> None:
+def write_tables(rows: Sequence[SweepRow], plan: Plan, folder: Path) -> None:
     """Write ``sweep.csv`` and, with pyarrow, ``sweep.parquet``: all digits, an empty field or null for no number.
 
     Raises
@@ -160,14 +163,14 @@ def has_parquet() -> bool:
     return True
 
 
-def _write_parquet(rows: Sequence[Row], names: Sequence[str], path: Path, plan: Plan) -> None:
+def _write_parquet(rows: Sequence[SweepRow], names: Sequence[str], path: Path, plan: Plan) -> None:
     import pyarrow
     from pyarrow import parquet
 
     cells = [row.cells() for row in rows]
     arrays = []
     for name in names:
-        column = [one.get(name) for one in cells]
+        column = [row.get(name) for row in cells]
         if any(isinstance(value, float) for value in column):
             column = [float(value) if isinstance(value, int) else value for value in column]
         try:
@@ -181,3 +184,41 @@ def _write_parquet(rows: Sequence[Row], names: Sequence[str], path: Path, plan: 
     parquet.write_table(table.replace_schema_metadata(described), sink)
     with replacing(path) as stream:
         stream.write(sink.getvalue().to_pybytes())
+
+
+def statistics(rows: Sequence[SweepRow], plan: Plan) -> list[dict[str, Any]]:
+    """For each variant and place of the grid: runs, those without numbers, and of each number that all others have
+
+    its :class:`dynsim.record.sensitivity.Spread` and, where a line fits, what one standard deviation of each drawn key
+    does to it (``effect``, with the half width of its interval) and how much of the variance the line explains.
+    """
+    groups: dict[str, list[SweepRow]] = {}
+    for row in rows:
+        grid = {axis.key: row.values[axis.key] for axis in plan.grid}
+        groups.setdefault(json.dumps([row.variant, grid]), []).append(row)
+    entries = []
+    for name, group in groups.items():
+        variant, grid = json.loads(name)
+        good = [row for row in group if row.status == OK]
+        shared = [key for key in good[0].numbers if all(key in row.numbers for row in good)] if len(good) > 1 else []
+        drawn = np.array([[row.values[key] for key in plan.sampled] for row in good], dtype=float)
+        table = {key: np.array([row.numbers[key] for row in good], dtype=float) for key in shared}
+        entries.append(
+            {
+                "variant": variant,
+                "grid": grid,
+                "runs": len(group),
+                "without_numbers": len(group) - len(good),
+                "numbers": {key: _statistics_of(drawn, values, plan.sampled) for key, values in table.items()},
+            }
+        )
+    return entries
+
+
+def _statistics_of(drawn: np.ndarray, values: np.ndarray, keys: Sequence[str]) -> dict[str, Any]:
+    fit = sensitivities(drawn, values)
+    if fit is None:
+        return asdict(spread(values))
+    effect = dict(zip(keys, fit.effect.tolist(), strict=True))
+    half_width = dict(zip(keys, fit.half_width.tolist(), strict=True))
+    return asdict(spread(values)) | {"effect": effect, "half_width": half_width, "explained": fit.explained}

@@ -45,8 +45,8 @@ class Axis:
             Neither of them.
         """
         key, value = _split(text, "--grid", "contacts.friction=0:1:5 or contacts.friction=0,0.1")
-        if found := _RANGE.fullmatch(value):
-            start, stop, count = float(found[1]), float(found[2]), int(found[3])
+        if match := _RANGE.fullmatch(value):
+            start, stop, count = float(match[1]), float(match[2]), int(match[3])
             if not 2 <= count <= RUNS_MOST:
                 raise ScenarioError(
                     f"--grid {text}: the count must be 2 or more, as both ends are included, and at most {RUNS_MOST}"
@@ -79,16 +79,16 @@ class Law:
             None of them, or a spread that is not positive.
         """
         key, value = _split(text, "--sample", "plant.link.mass_kg=normal(0.1,0.005)")
-        found = _LAW.fullmatch(value)
-        if not found or found[1] not in LAWS:
+        match = _LAW.fullmatch(value)
+        if not match or match[1] not in LAWS:
             known = ", ".join(f"{name}({numbers})" for name, numbers in LAWS.items())
             raise ScenarioError(f"--sample {text}: no law of that form; laws: {known}")
-        a, b = float(found[2]), float(found[3])
-        if not (b > 0.0 if found[1] == "normal" else b > a):
-            raise ScenarioError(f"--sample {text}: {found[1]}({LAWS[found[1]]}) needs a spread that is positive")
+        a, b = float(match[2]), float(match[3])
+        if not (b > 0.0 if match[1] == "normal" else b > a):
+            raise ScenarioError(f"--sample {text}: {match[1]}({LAWS[match[1]]}) needs a spread that is positive")
         if not (math.isfinite(a) and math.isfinite(b) and math.isfinite(b - a)):
             raise ScenarioError(f"--sample {text}: numbers of that size cannot be drawn")
-        return cls(key, found[1], (a, b))
+        return cls(key, match[1], (a, b))
 
     def draw(self, key: str, seed: int, count: int) -> list[float]:
         """Values for one key, the same whatever else is drawn; a longer draw begins like a shorter one."""
@@ -99,7 +99,7 @@ class Law:
 
 
 @dataclass(frozen=True)
-class Point:
+class SweepPoint:
     """One run: its number, its variant, and what it changes by dotted key."""
 
     run: int
@@ -153,23 +153,23 @@ class Plan:
         """
         # In Python they are a base, of values that may well be varied; who writes --set wants that value.
         overrides = self.overrides if isinstance(self.overrides, SetOptions) else {}
-        given = [("--set", key, [key]) for key in overrides]
-        given += [("--grid", axis.key, self._entries(axis.key)) for axis in self.grid]
-        given += [("--sample", law.key, self._entries(law.key)) for law in self.laws]
+        options = [("--set", key, [key]) for key in overrides]
+        options += [("--grid", axis.key, self._entries(axis.key)) for axis in self.grid]
+        options += [("--sample", law.key, self._entries(law.key)) for law in self.laws]
         # What was given, by itself and by all that it is a part of.
         inside: dict[str, str] = {}
-        for option, key, entries in given:
+        for option, key, entries in options:
             # Later overrides replace earlier ones, as in every command.
             for entry in entries if option != "--set" else []:
-                if (place := _plain(entry)) in inside:
-                    other = inside[place]
+                if (key_path := _plain(entry)) in inside:
+                    other = inside[key_path]
                     fix = f", or write out the entries of {ANY} that the other leaves" if ANY in key + other else ""
                     raise ScenarioError(
                         f"{option} {key}: replaces what {other} gives {entry}, in every run; "
                         f"take one of the two away{fix}"
                     )
-            for place in map(_plain, entries):
-                parts = place.split(".")
+            for key_path in map(_plain, entries):
+                parts = key_path.split(".")
                 inside |= {".".join(parts[:many]): f"{option} {key}" for many in range(1, len(parts) + 1)}
 
     @property
@@ -187,15 +187,15 @@ class Plan:
         """All keys that are varied, those of the grid first, as the columns of the table have them."""
         return [axis.key for axis in self.grid] + self.sampled
 
-    def points(self) -> Iterator[Point]:
+    def points(self) -> Iterator[SweepPoint]:
         """All runs: variants outermost, samples innermost."""
         drawn = {key: law.draw(key, self.seed, self.count) for law in self.laws for key in self._entries(law.key)}
         places = itertools.product(self.variants, *(axis.values for axis in self.grid), range(self.count))
         for run, (variant, *values, k) in enumerate(places):
-            given = {axis.key: value for axis, value in zip(self.grid, values, strict=True)}
-            yield Point(run, variant, given | {key: draws[k] for key, draws in drawn.items()})
+            chosen = {axis.key: value for axis, value in zip(self.grid, values, strict=True)}
+            yield SweepPoint(run, variant, chosen | {key: draws[k] for key, draws in drawn.items()})
 
-    def scenario(self, point: Point) -> Scenario:
+    def scenario(self, point: SweepPoint) -> Scenario:
         """What one run simulates.
 
         Raises
@@ -217,17 +217,17 @@ class Plan:
         parts = key.split(".")
         if ANY not in parts:
             return [key]
-        found: list[tuple[list[str], Any]] = [([], self.file.data)]
+        nodes: list[tuple[list[str], Any]] = [([], self.file.data)]
         for part in parts:
             inner: list[tuple[list[str], Any]] = []
-            for before, node in found:
+            for before, node in nodes:
                 entries = _children(node)
                 names = list(entries) if part == ANY else [part]
                 inner += [([*before, name], entries.get(name)) for name in names]
-            found = inner
-        if not found:
+            nodes = inner
+        if not nodes:
             raise ScenarioError(f"{key}: {self.file.path} has no entries that {ANY} could stand for")
-        return [".".join(names) for names, _ in found]
+        return [".".join(names) for names, _ in nodes]
 
 
 def _plain(key: str) -> str:

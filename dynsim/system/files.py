@@ -67,7 +67,7 @@ def check_writable(folder: Path, names: Iterable[str] = ()) -> None:
 
 
 @contextmanager
-def held(folder: Path) -> Iterator[None]:
+def held_folder(folder: Path) -> Iterator[None]:
     """Make a folder, if need be; within, no other process holds it. File systems without locks, and Windows, let it.
 
     Raises

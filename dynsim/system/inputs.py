@@ -11,7 +11,6 @@ import os
 import re
 import stat
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -37,7 +36,11 @@ _FLOAT = re.compile(
 _FORBIDDEN = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f\x80-\x84\x86-\x9f\ud800-\udfff\ufffe\uffff]")
 _CORE = "tag:yaml.org,2002:"
 _TEXT_TAGS = (None, "!", _CORE + "str")
-_MERGE = object()
+# Events that begin a value, and the method that reads it; what those are that cannot begin a key.
+_VALUES = {"ScalarEvent": "_scalar", "MappingStartEvent": "_mapping", "SequenceStartEvent": "_list", "AliasEvent": ""}
+_NO_KEYS = {"MappingStartEvent": "a mapping", "SequenceStartEvent": "a list", "AliasEvent": "an alias"}
+# Stands for the value of an anchor whose end has not come yet.
+_INCOMPLETE = object()
 
 
 def is_file(path: str | os.PathLike[str], error: ErrorClass) -> bool:
@@ -137,98 +140,76 @@ def parse_yaml(text: str, error: ErrorClass, source: str, *, line_numbers: bool 
     DynsimError
         Of the class ``error``, with source and line, whatever is wrong with the text.
     """
-    builder = _Builder(error, source, line_numbers)
-    if found := _FORBIDDEN.search(text):
-        line = text.count("\n", 0, found.start()) + 1
-        builder.fail(line, f"not YAML: character U+{ord(found[0]):04X} is not allowed")
-    for event in _events(text, builder):
-        builder.take(event)
-    return builder.root
+    return _Reader(text, error, source, line_numbers).document()
 
 
-def _events(text: str, builder: _Builder) -> Iterator[Any]:
-    from ruamel.yaml import YAML
-
-    try:
-        yield from YAML(typ="safe").parse(text)
-    except (DynsimError, KeyboardInterrupt, GeneratorExit):
-        raise
-    except Exception as reason:
-        # Any text may come: whatever the parser stumbles over, the text is at fault.
-        mark = getattr(reason, "problem_mark", None) or getattr(reason, "context_mark", None)
-        problem = getattr(reason, "problem", None) or getattr(reason, "context", None) or str(reason)
-        builder.fail(mark.line + 1 if mark else None, f"not YAML: {' '.join(problem.split())}")
-
-
-@dataclass
-class _Open:
-    """A mapping or list whose end has not come yet."""
-
-    value: YamlMapping | YamlList
-    line: int
-    anchor: str | None
-    nodes_before: int
-    key: Any = None
-    key_line: int = 0
-    merged: list[YamlMapping] = field(default_factory=list)
-    height: int = 1
-
-
-class _Builder:
+class _Reader:
     """Puts the values of a document together from its events."""
 
-    def __init__(self, error: ErrorClass, source: str, line_numbers: bool) -> None:
-        self.root: Any = None
+    def __init__(self, text: str, error: ErrorClass, source: str, line_numbers: bool) -> None:
         self._error, self._source, self._line_numbers = error, source, line_numbers
-        self._open: list[_Open] = []
-        # Anchor → value, its number of nodes and of levels; None until it is complete.
-        self._anchors: dict[str, tuple[Any, int, int] | None] = {}
-        self._nodes = self._documents = 0
+        self._text, self._events = text, self._parsed(text)
+        self._anchors: dict[str, Any] = {}
+        self._nodes = 0
 
-    def fail(self, line: int | None, problem: str) -> NoReturn:
-        place = f"{self._source}:{line}" if line and self._line_numbers else self._source
-        raise self._error(f"{place}: {problem}")
+    def document(self) -> Any:
+        if character := _FORBIDDEN.search(self._text):
+            line = self._text.count("\n", 0, character.start()) + 1
+            self._fail(line, f"not YAML: character U+{ord(character[0]):04X} is not allowed")
+        root, documents = None, 0
+        for event in self._events:
+            kind = type(event).__name__
+            if kind in _VALUES:
+                root = self._value(event, 0)
+            documents += kind == "DocumentStartEvent"
+            if documents > 1:
+                self._fail(_line(event), "a second document begins; there must be one")
+        return root
 
-    def take(self, event: Any) -> None:
-        kind = type(event).__name__
-        if kind == "ScalarEvent":
-            self._scalar(event)
-        elif kind in ("MappingStartEvent", "SequenceStartEvent"):
-            self._start(event, YamlMapping() if kind == "MappingStartEvent" else YamlList())
-        elif kind in ("MappingEndEvent", "SequenceEndEvent"):
-            self._end()
-        elif kind == "AliasEvent":
-            self._alias(event)
-        elif kind == "DocumentStartEvent":
-            self._documents += 1
-            if self._documents > 1:
-                self.fail(event.start_mark.line + 1, "a second document begins; there must be one")
+    def _parsed(self, text: str) -> Iterator[Any]:
+        from ruamel.yaml import YAML
 
-    def _scalar(self, event: Any) -> None:
-        line, text, tag = event.start_mark.line + 1, event.value, _tag(event)
-        plain = event.implicit[0] and tag is None
-        if found := _FORBIDDEN.search(text):
-            self.fail(line, f"character U+{ord(found[0]):04X} is not allowed")
-        top = self._open[-1] if self._open else None
-        if isinstance(top, _Open) and isinstance(top.value, YamlMapping) and top.key is None:
-            if tag not in _TEXT_TAGS:
-                self._fail_tag(str(tag), line)
-            if event.anchor is not None:
-                self._anchors[event.anchor] = (text, 1, 0)
-            top.key, top.key_line = (_MERGE if plain and text == "<<" else text), line
-            if top.key in top.value:
-                self.fail(line, f"duplicate key {text!r} (first in line {top.value.lines[text]})")
-            return
-        if plain:
-            value = self._plain(text, line)
-        elif tag in _TEXT_TAGS:
-            value = text
-        else:
-            value = self._tagged(text, str(tag), line)
-        self._count(1, line)
-        if event.anchor is not None:
-            self._anchors[event.anchor] = (value, 1, 0)
-        self._add(value, line)
+        try:
+            yield from YAML(typ="safe").parse(text)
+        except Exception as reason:
+            # Any text may come: whatever the parser stumbles over, the text is at fault.
+            mark = getattr(reason, "problem_mark", None) or getattr(reason, "context_mark", None)
+            problem = getattr(reason, "problem", None) or getattr(reason, "context", None) or str(reason)
+            self._fail(mark.line + 1 if mark else None, f"not YAML: {' '.join(problem.split())}")
+
+    def _fail(self, line: int | None, problem: str) -> NoReturn:
+        location = f"{self._source}:{line}" if line and self._line_numbers else self._source
+        raise self._error(f"{location}: {problem}")
+
+    def _value(self, event: Any, depth: int) -> Any:
+        """The value that begins with an event, within so many mappings and lists."""
+        kind, line, anchor = type(event).__name__, _line(event), event.anchor
+        if kind == "AliasEvent":
+            if anchor not in self._anchors:
+                self._fail(line, f"alias *{anchor}: there is no anchor &{anchor} before it")
+            if self._anchors[anchor] is _INCOMPLETE:
+                self._fail(line, f"alias *{anchor} is within &{anchor} itself: it would never end")
+            return self._copy(self._anchors[anchor], line, depth)
+        if kind != "ScalarEvent":
+            self._check_depth(line, depth)
+        self._count(line)
+        if anchor is not None:
+            self._anchors[anchor] = _INCOMPLETE
+        value = getattr(self, _VALUES[kind])(event, line, depth)
+        if anchor is not None:
+            self._anchors[anchor] = value
+        return value
+
+    def _scalar(self, event: Any, line: int, depth: int) -> Any:
+        text, tag = self._allowed(event), _tag(event)
+        if event.implicit[0] and tag is None:
+            return self._plain(text, line)
+        return text if tag in _TEXT_TAGS else self._tagged(text, str(tag), line)
+
+    def _allowed(self, event: Any) -> str:
+        if character := _FORBIDDEN.search(event.value):
+            self._fail(_line(event), f"character U+{ord(character[0]):04X} is not allowed")
+        return str(event.value)
 
     def _plain(self, text: str, line: int) -> Any:
         if text in _NULLS:
@@ -238,7 +219,7 @@ class _Builder:
         if _INTEGER.fullmatch(text):
             base = 0 if text.lstrip("+-")[:2] in ("0b", "0o", "0x") else 10
             if len(text) > DIGITS_LIMIT or abs(number := int(text, base)) >= 10**DIGITS_LIMIT:
-                self.fail(line, f"a number of {len(text)} digits; no quantity has more than {DIGITS_LIMIT}")
+                self._fail(line, f"a number of {len(text)} digits; no quantity has more than {DIGITS_LIMIT}")
             return number
         if _FLOAT.fullmatch(text):
             return float(text if text[-1] in "0123456789." else text.lower().replace(".", ""))
@@ -254,107 +235,87 @@ class _Builder:
         if kind is float and type(value) is int:
             value = float(value)
         if type(value) is not kind:
-            self.fail(line, f"{text[:40]!r} is no !!{tag.removeprefix(_CORE)}")
+            self._fail(line, f"{text[:40]!r} is no !!{tag.removeprefix(_CORE)}")
         return value
 
     def _fail_tag(self, tag: str, line: int) -> NoReturn:
         shown = tag.replace(_CORE, "!!")[:60]
-        self.fail(line, f"tag {shown!r} is not known; write plain mappings, lists, numbers and texts")
+        self._fail(line, f"tag {shown!r} is not known; write plain mappings, lists, numbers and texts")
 
-    def _start(self, event: Any, value: YamlMapping | YamlList) -> None:
-        line, tag = event.start_mark.line + 1, _tag(event)
-        if tag not in (None, "!", _CORE + ("map" if isinstance(value, YamlMapping) else "seq")):
-            self._fail_tag(str(tag), line)
-        self._check_no_key(line, "a mapping" if isinstance(value, YamlMapping) else "a list")
-        if len(self._open) >= DEPTH_LIMIT:
-            self._fail_depth(line)
-        self._count(1, line)
+    def _list(self, event: Any, line: int, depth: int) -> YamlList:
+        self._check_tag(event, "seq")
+        entries = YamlList()
+        while (entry := next(self._events)) and type(entry).__name__ in _VALUES:
+            entries.lines[len(entries)] = _line(entry)
+            entries.append(self._value(entry, depth + 1))
+        return entries
+
+    def _mapping(self, event: Any, line: int, depth: int) -> YamlMapping:
+        self._check_tag(event, "map")
+        own, merged = YamlMapping(), list[YamlMapping]()
+        while (key := next(self._events)) and type(key).__name__ in _VALUES:
+            name, start = self._key(key, own), next(self._events)
+            value = self._value(start, depth + 1)
+            if key.implicit[0] and _tag(key) is None and name == "<<":
+                mappings = value if isinstance(value, YamlList) else [value]
+                if not all(isinstance(mapping, YamlMapping) for mapping in mappings):
+                    self._fail(_line(start), "<< takes a mapping, or a list of mappings")
+                merged.extend(mappings)
+            else:
+                own[name], own.lines[name] = value, _line(key)
+        # Its own keys win, then those that were merged first.
+        whole = YamlMapping()
+        for mapping in (*reversed(merged), own):
+            whole.update(mapping)
+            whole.lines.update(mapping.lines)
+        return whole
+
+    def _key(self, event: Any, mapping: YamlMapping) -> str:
+        if kind := _NO_KEYS.get(type(event).__name__):
+            self._fail(_line(event), f"{kind} is no key; keys are texts")
+        if (tag := _tag(event)) not in _TEXT_TAGS:
+            self._fail_tag(str(tag), _line(event))
+        name = self._allowed(event)
         if event.anchor is not None:
-            self._anchors[event.anchor] = None
-        self._open.append(_Open(value, line, event.anchor, self._nodes - 1))
+            self._anchors[event.anchor] = name
+        if name in mapping:
+            self._fail(_line(event), f"duplicate key {name!r} (first in line {mapping.lines[name]})")
+        return name
 
-    def _end(self) -> None:
-        ended = self._open.pop()
-        value = ended.value
-        if ended.merged and isinstance(value, YamlMapping):
-            # Its own keys win, then those that were merged first.
-            own = YamlMapping()
-            own.update(value)
-            own.lines = value.lines
-            value.clear()
-            value.lines = {}
-            for mapping in (*reversed(ended.merged), own):
-                value.update(mapping)
-                value.lines.update(mapping.lines)
-        if ended.anchor is not None:
-            self._anchors[ended.anchor] = (value, self._nodes - ended.nodes_before, ended.height)
-        if self._open:
-            self._open[-1].height = max(self._open[-1].height, ended.height + 1)
-        self._add(value, ended.line)
+    def _copy(self, value: Any, line: int, depth: int) -> Any:
+        """A copy of a value, at an alias, that shares no mapping or list with it."""
+        self._count(line)
+        if isinstance(value, YamlMapping | YamlList):
+            self._check_depth(line, depth)
+        if isinstance(value, YamlMapping):
+            mapping = YamlMapping()
+            mapping.update((key, self._copy(item, line, depth + 1)) for key, item in value.items())
+            mapping.lines = value.lines
+            return mapping
+        if isinstance(value, YamlList):
+            entries = YamlList()
+            entries.extend(self._copy(item, line, depth + 1) for item in value)
+            entries.lines = value.lines
+            return entries
+        return value
 
-    def _alias(self, event: Any) -> None:
-        line, name = event.start_mark.line + 1, event.anchor
-        self._check_no_key(line, "an alias")
-        if name not in self._anchors:
-            self.fail(line, f"alias *{name}: there is no anchor &{name} before it")
-        anchored = self._anchors[name]
-        if anchored is None:
-            self.fail(line, f"alias *{name} is within &{name} itself: it would never end")
-        value, nodes, height = anchored
-        if len(self._open) + height > DEPTH_LIMIT:
-            self._fail_depth(line)
-        self._count(nodes, line)
-        if self._open:
-            self._open[-1].height = max(self._open[-1].height, height + 1)
-        self._add(_copy(value), line)
+    def _check_tag(self, event: Any, kind: str) -> None:
+        if (tag := _tag(event)) not in (None, "!", _CORE + kind):
+            self._fail_tag(str(tag), _line(event))
 
-    def _check_no_key(self, line: int, what: str) -> None:
-        top = self._open[-1] if self._open else None
-        if top is not None and isinstance(top.value, YamlMapping) and top.key is None:
-            self.fail(line, f"{what} is no key; keys are texts")
+    def _check_depth(self, line: int, depth: int) -> None:
+        if depth >= DEPTH_LIMIT:
+            self._fail(line, f"more than {DEPTH_LIMIT} mappings and lists within each other")
 
-    def _fail_depth(self, line: int) -> NoReturn:
-        self.fail(line, f"more than {DEPTH_LIMIT} mappings and lists within each other")
-
-    def _count(self, nodes: int, line: int) -> None:
-        self._nodes += nodes
+    def _count(self, line: int) -> None:
+        self._nodes += 1
         if self._nodes > NODE_LIMIT:
-            self.fail(line, f"more than {NODE_LIMIT:,} values (aliases written out)".replace(",", " "))
+            self._fail(line, f"more than {NODE_LIMIT:,} values (aliases written out)".replace(",", " "))
 
-    def _add(self, value: Any, line: int) -> None:
-        if not self._open:
-            self.root = value
-            return
-        top = self._open[-1]
-        if isinstance(top.value, YamlList):
-            top.value.lines[len(top.value)] = line
-            top.value.append(value)
-            return
-        if top.key is _MERGE:
-            mappings = value if isinstance(value, YamlList) else [value]
-            if not all(isinstance(mapping, YamlMapping) for mapping in mappings):
-                self.fail(line, "<< takes a mapping, or a list of mappings")
-            top.merged.extend(mappings)
-        else:
-            top.value[top.key] = value
-            top.value.lines[top.key] = top.key_line
-        top.key = None
+
+def _line(event: Any) -> int:
+    return int(event.start_mark.line) + 1
 
 
 def _tag(event: Any) -> str | None:
     return None if event.tag is None else str(event.tag)
-
-
-def _copy(value: Any) -> Any:
-    """A copy of a value that shares no mapping or list with it; as deep as ``DEPTH_LIMIT`` allows."""
-    if isinstance(value, YamlMapping):
-        mapping = YamlMapping()
-        mapping.update({key: _copy(item) for key, item in value.items()})
-        mapping.lines = value.lines
-        return mapping
-    if isinstance(value, YamlList):
-        entries = YamlList()
-        entries.extend(_copy(item) for item in value)
-        entries.lines = value.lines
-        return entries
-    return value

@@ -79,7 +79,7 @@ def _bits(value: Any) -> Hashable:
     if kind is list or isinstance(value, tuple):
         return kind, tuple(map(_bits, value))
     if kind is dict:
-        return kind, tuple((name, _bits(one)) for name, one in value.items())
+        return kind, tuple((name, _bits(entry)) for name, entry in value.items())
     if value is None or kind in (int, bool, str, bytes):
         return kind, value
     if isinstance(value, BaseModel):

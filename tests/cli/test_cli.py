@@ -1,11 +1,14 @@
 """The command line as a user meets it: files, exit codes, one-line errors, Ctrl-C."""
 
 import csv
+import io
 import json
 import os
 import re
 import subprocess
 import sys
+import warnings
+from contextlib import ExitStack, chdir, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +26,21 @@ SHORT = ["--set", "duration_s=0.2", "--set", "metrics.settle_s=0.05"]
 
 
 def dynsim(*arguments: str, folder: Path, **options: Any) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "dynsim", *arguments], cwd=folder, capture_output=True, text=True, timeout=300, **options
-    )
+    """The command in this process; in one of its own where that has options, such as an environment."""
+    if options:
+        command = [sys.executable, "-m", "dynsim", *arguments]
+        return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300, **options)
+    output, errors = io.StringIO(), io.StringIO()
+    with ExitStack() as inside, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["dynsim", *arguments])
+        # As outside of pytest: a warning is printed.
+        inside.enter_context(warnings.catch_warnings())
+        warnings.simplefilter("default")
+        for part in (chdir(folder), redirect_stdout(output), redirect_stderr(errors)):
+            inside.enter_context(part)
+        with pytest.raises(SystemExit) as ended:
+            main()
+    return subprocess.CompletedProcess(arguments, int(ended.value.code or 0), output.getvalue(), errors.getvalue())
 
 
 def test_run_writes_everything_that_is_promised(tmp_path: Path):

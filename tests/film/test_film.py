@@ -31,7 +31,7 @@ from dynsim.draw.geometry.shapes import body_shapes, from_z, solid
 from dynsim.errors import RecordError
 from dynsim.record import Record
 from dynsim.record.poses import ORIENTATION, POSITION, point_positions
-from dynsim.record.scene import Surface
+from dynsim.record.scene import SceneSurface
 from dynsim.scenario import build_model, load_scenario
 
 MARK = "#FF00FF"
@@ -133,7 +133,7 @@ def test_round_surfaces_are_whole(braced: Record, view: str, curved: tuple[int, 
     radius = size * float((high - low).max())
     centre = 0.5 * (low + high) - [0.0, 0.0, max(radius, 0.0)]
     Q = np.sign(size) * np.diag(curved).astype(float)
-    surface = Surface.of_quadric("round", Q, -Q @ centre, 0.5 * (centre @ Q @ centre - np.sign(size) * radius**2))
+    surface = SceneSurface.of_quadric("round", Q, -Q @ centre, 0.5 * (centre @ Q @ centre - np.sign(size) * radius**2))
     assert surface.radius == pytest.approx(radius)
     painter = Painter(known.robot, known.camera, known.size, (low, high))
     painter._ways.clear()

@@ -15,6 +15,13 @@ pytestmark = pytest.mark.long
 # Damaged records are slower to read than the rest.
 QUICK = {**dict.fromkeys(KINDS, 30), "record": 10}
 ALL = 6000
+# Cases that something was wrong with once: seed, kind, number.
+ONCE = (
+    (7_700_000, "record", 793),
+    (7_700_000, "sweep", 1443),
+    (9_100_000, "servo_map", 440),
+    (9_100_000, "scenario", 816),
+)
 
 
 def check(results: list[campaign.Result], count: int) -> None:
@@ -26,6 +33,11 @@ def check(results: list[campaign.Result], count: int) -> None:
 def test_a_sample_of_broken_inputs(records: Path) -> None:
     cases = [(kind, index) for kind, count in QUICK.items() for index in range(count)]
     check(campaign.run(cases, records=records), len(cases))
+
+
+@pytest.mark.parametrize(("seed", "kind", "index"), ONCE)
+def test_a_case_that_was_found_once(seed: int, kind: str, index: int, records: Path) -> None:
+    check(campaign.run([(kind, index)], records=records, seed=seed), 1)
 
 
 @pytest.mark.slow

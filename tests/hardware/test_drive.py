@@ -24,7 +24,7 @@ from dynsim.hardware.replay.drive import SILENCE, DrivenMotion, check_drive, lea
 from dynsim.hardware.replay.incremental_path import IncrementalPath, Sample
 from dynsim.hardware.replay.rules import Cause
 from dynsim.hardware.replay.session import run_replay, shown_by
-from dynsim.hardware.replay.states import Progress, State, StopRequest
+from dynsim.hardware.replay.states import ReplayProgress, ReplayState, StopRequest
 from dynsim.hardware.replay.trajectory import Path as RobotPath
 from dynsim.hardware.servo_map import load_servo_map
 
@@ -208,7 +208,7 @@ def test_a_loop_that_is_late_makes_no_burst(rig: Rig) -> None:
     count = itertools.count()
 
     def sleep_until(deadline: float) -> None:
-        late = 0.15 if run.replay.journal.state == State.REPLAY and next(count) % 40 == 39 else 0.0
+        late = 0.15 if run.replay.journal.state == ReplayState.REPLAY and next(count) % 40 == 39 else 0.0
         sleep(deadline + late)
 
     run.clock.sleep_until = sleep_until  # type: ignore[method-assign]
@@ -265,7 +265,7 @@ def test_what_is_beyond_a_limit_is_never_followed(rig: Rig, what: str) -> None:
     assert run.result.fault is not None
     assert run.result.fault.cause == Cause.LIMIT
     assert WORDS[what] in run.result.fault.text
-    assert run.result.fault_state == State.REPLAY
+    assert run.result.fault_state == ReplayState.REPLAY
     assert run.result.end_state == "holding"
     check_goals_within_limits(run)
     time, _, _ = followed(run)
@@ -298,8 +298,8 @@ def test_the_policy_says_how_a_drive_ends(rig: Rig, trouble: str, policy: str) -
         assert run.result.policy_goals == []
 
 
-def interrupting(run: Run, progress: Progress, stop: StopRequest) -> bool:
-    return progress.state == State.REPLAY and feed_of(run).told[-1:] > [1.1] and not stop.count
+def interrupting(run: Run, progress: ReplayProgress, stop: StopRequest) -> bool:
+    return progress.state == ReplayState.REPLAY and feed_of(run).told[-1:] > [1.1] and not stop.count
 
 
 @pytest.mark.parametrize("at", [0.05, 0.4, 1.0, 1.9])
@@ -308,8 +308,8 @@ def test_a_stop_stays_on_what_is_known_of_the_path(rig: Rig, at: float, stalls: 
     """Also while the robot is slowing down for a late simulation, and with nothing more to come from it."""
     stop = StopRequest()
 
-    def observe(progress: Progress) -> None:
-        if progress.state == State.REPLAY and feed_of(run).told[-1:] > [at] and not stop.count:
+    def observe(progress: ReplayProgress) -> None:
+        if progress.state == ReplayState.REPLAY and feed_of(run).told[-1:] > [at] and not stop.count:
             stop()
             feed_of(run).take = lambda most: []  # type: ignore[method-assign]
 
@@ -325,7 +325,7 @@ def test_a_stop_stays_on_what_is_known_of_the_path(rig: Rig, at: float, stalls: 
 def test_a_second_ctrl_c_releases(rig: Rig) -> None:
     stop = StopRequest()
 
-    def observe(progress: Progress) -> None:
+    def observe(progress: ReplayProgress) -> None:
         if interrupting(run, progress, stop):
             stop()
             stop()
@@ -495,7 +495,7 @@ def test_the_loop_of_a_drive_lets_nothing_out_while_the_robot_is_armed(undisturb
     assert isinstance(case.error, ReplayAborted) == (ending in ("limit", "dead"))
     seen = case.outputs.seen
     assert [call for call in seen if call.looping and call.state in ARMED] == []
-    assert {call.state for call in seen} >= {BEFORE, AFTER, State.ARM.name, State.REPLAY.name}
+    assert {call.state for call in seen} >= {BEFORE, AFTER, ReplayState.ARM.name, ReplayState.REPLAY.name}
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")

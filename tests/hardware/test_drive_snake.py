@@ -214,7 +214,7 @@ def postures(duration: int, requests: Mapping[int, int]) -> tuple[list[Sample], 
     for tick in range(duration):
         feed.session.tick(command(tick, requests))
         found += feed.follower.lookahead.add(columns.sample(), *columns.base(feed.follower.lookahead.yaw))
-    return [feed.follower.first, *found, *feed.follower.lookahead.rest()], feed.session.record()
+    return [feed.follower.first, *found, *feed.follower.lookahead.remaining()], feed.session.record()
 
 
 @pytest.mark.parametrize("ticks", [1, 2, 30, 61, 63, 230, 270])

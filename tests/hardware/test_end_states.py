@@ -14,7 +14,7 @@ from dynsim.hardware.bus.packet import Instruction, Packet
 from dynsim.hardware.errors import ReplayAborted
 from dynsim.hardware.replay.rules import Cause
 from dynsim.hardware.replay.session import run_replay
-from dynsim.hardware.replay.states import ServoEnd, State, StopRequest, of_the_whole
+from dynsim.hardware.replay.states import ReplayState, ServoEnd, StopRequest, of_the_whole
 from dynsim.hardware.servo_map import load_servo_map
 
 from .conftest import Rig, Run
@@ -45,7 +45,7 @@ def check_against_the_servos(run: Run) -> None:
             assert abs(servos.plant.velocity[index]) < 0.15
 
 
-def at_cycle(run: Run, state: State, number: int, act: Callable[[], object]) -> None:
+def at_cycle(run: Run, state: ReplayState, number: int, act: Callable[[], object]) -> None:
     """Do something while the ``number``-th request for states of a state is on the line."""
     seen = 0
 
@@ -75,8 +75,10 @@ def finish(run: Run) -> Run:
 
 
 @pytest.mark.parametrize("policy", POLICIES)
-@pytest.mark.parametrize("state", [State.MOVE_TO_START, State.SETTLE, State.REPLAY], ids=lambda state: state.name)
-def test_a_stall_is_seen_in_every_state_and_nobody_is_sent_on(rig, state: State, policy: str) -> None:
+@pytest.mark.parametrize(
+    "state", [ReplayState.MOVE_TO_START, ReplayState.SETTLE, ReplayState.REPLAY], ids=lambda state: state.name
+)
+def test_a_stall_is_seen_in_every_state_and_nobody_is_sent_on(rig, state: ReplayState, policy: str) -> None:
     run = rig.prepare(policy=policy)
     at_cycle(run, state, 8, stall(run))
     result = finish(run).result
@@ -96,7 +98,7 @@ def test_a_stall_is_seen_in_every_state_and_nobody_is_sent_on(rig, state: State,
 
 def test_a_pause_shorter_than_the_watchdogs_is_no_stall(rig) -> None:
     run = rig.prepare()
-    at_cycle(run, State.REPLAY, 30, stall(run, 0.15))
+    at_cycle(run, ReplayState.REPLAY, 30, stall(run, 0.15))
     result = finish(run).result
     assert result.fault is None
     assert result.end_state == "off"
@@ -109,8 +111,8 @@ def largest_steps(run: Run) -> dict[int, int]:
 
 
 @pytest.mark.parametrize("pause", [0.05, 0.1, 0.17])
-@pytest.mark.parametrize("state", [State.MOVE_TO_START, State.REPLAY], ids=lambda state: state.name)
-def test_after_a_pause_the_path_waits_and_no_goal_is_far(rig, clean_run: Run, state: State, pause: float) -> None:
+@pytest.mark.parametrize("state", [ReplayState.MOVE_TO_START, ReplayState.REPLAY], ids=lambda state: state.name)
+def test_after_a_pause_the_path_waits_and_no_goal_is_far(rig, clean_run: Run, state: ReplayState, pause: float) -> None:
     run = rig.prepare()
     at_cycle(run, state, 30, stall(run, pause))
     result = finish(run).result
@@ -120,7 +122,7 @@ def test_after_a_pause_the_path_waits_and_no_goal_is_far(rig, clean_run: Run, st
     assert all(step <= before[id_] + 1 for id_, step in largest_steps(run).items())
     skipped = result.timing.skipped_cycles * run.replay.loop.period
     assert skipped >= pause - 2 * run.replay.loop.period
-    assert result.timing.path_late == pytest.approx(skipped if state == State.REPLAY else 0.0)
+    assert result.timing.path_late == pytest.approx(skipped if state == ReplayState.REPLAY else 0.0)
     # No place of the path is left out, and it takes so much longer.
     times, straight = result.record["record_time"], clean_run.result.record["record_time"]
     on_path, planned = np.isfinite(times), np.isfinite(straight)
@@ -133,7 +135,7 @@ def test_after_a_pause_the_path_waits_and_no_goal_is_far(rig, clean_run: Run, st
 @pytest.mark.parametrize("number", [1, 5])
 def test_after_a_pause_while_it_slows_down_no_goal_is_far(rig, clean_run: Run, number: int) -> None:
     run = rig.prepare({"kind": "overload", "id": 1, "at": 1.7}, policy="decelerate")
-    at_cycle(run, State.FAULT, number, stall(run, 0.15))
+    at_cycle(run, ReplayState.FAULT, number, stall(run, 0.15))
     assert finish(run).result.fault.cause == Cause.ALERT
     assert largest_steps(run)[2] <= largest_steps(clean_run)[2] + 1
 
@@ -150,7 +152,7 @@ def test_who_is_stopped_by_another_program_while_arming_is_released(rig, armed: 
     def listen(time: float, packet: Packet) -> None:
         nonlocal seen
         run.sent.append((time, packet))
-        if run.replay.journal.state != State.ARM or packet.instruction != Instruction.WRITE:
+        if run.replay.journal.state != ReplayState.ARM or packet.instruction != Instruction.WRITE:
             return
         address = int.from_bytes(packet.parameters[:2], "little")
         seen += address == 64
@@ -161,7 +163,7 @@ def test_who_is_stopped_by_another_program_while_arming_is_released(rig, armed: 
     run.line.listener = listen
     result = finish(run).result
     assert result.fault.cause == Cause.TORQUE_LOST
-    assert result.fault_state == State.ARM
+    assert result.fault_state == ReplayState.ARM
     assert "torque is off again" in result.fault.text
     assert result.end_state == "off"
     check_against_the_servos(run)
@@ -241,7 +243,7 @@ def test_a_supply_lost_while_slowing_down_is_noticed(rig) -> None:
 @pytest.mark.parametrize("policy", POLICIES)
 def test_a_stop_by_another_program_is_named(rig, policy: str) -> None:
     run = rig.prepare(policy=policy)
-    at_cycle(run, State.REPLAY, 40, lambda: [run.line.servos.write(id_, 64, b"\0") for id_ in run.map.ids])
+    at_cycle(run, ReplayState.REPLAY, 40, lambda: [run.line.servos.write(id_, 64, b"\0") for id_ in run.map.ids])
     result = finish(run).result
     assert result.fault.cause == Cause.TORQUE_LOST
     assert "switched off by another program" in result.fault.text
@@ -261,7 +263,7 @@ def test_a_port_that_dies_during_the_policy_is_named(rig, policy: str) -> None:
 @pytest.mark.parametrize("number", [2, 15, 40])
 def test_a_stall_during_the_policy_is_named(rig, number: int) -> None:
     run = rig.prepare({"kind": "overload", "id": 1, "at": 1.7}, policy="decelerate")
-    at_cycle(run, State.FAULT, number, stall(run))
+    at_cycle(run, ReplayState.FAULT, number, stall(run))
     result = finish(run).result
     assert [fault.cause for fault in result.faults][:2] == [Cause.ALERT, Cause.STALL]
     assert result.end_state == "mixed: 2 holding; shoulder limp: overload"
@@ -274,7 +276,7 @@ def test_an_error_within_the_policy_falls_back_to_holding(rig) -> None:
     def at(time: float) -> Any:
         raise ZeroDivisionError
 
-    at_cycle(run, State.REPLAY, 10**9, lambda: None)
+    at_cycle(run, ReplayState.REPLAY, 10**9, lambda: None)
     after_fault = run.replay._ending.after_fault
 
     def broken(*arguments: Any, **options: Any) -> None:
@@ -292,7 +294,7 @@ def test_an_error_within_the_policy_falls_back_to_holding(rig) -> None:
 def test_a_regular_end_that_did_not_come_about_is_a_fault(write_map) -> None:
     rig = Rig(load_servo_map(write_map(('at_end: "off"', 'at_end: "hold"'))))
     run = rig.prepare()
-    at_cycle(run, State.DISARM, 1, lambda: run.line.servos.raise_error(1, 1 << 5))
+    at_cycle(run, ReplayState.DISARM, 1, lambda: run.line.servos.raise_error(1, 1 << 5))
     result = finish(run).result
     assert result.fault.cause == Cause.END_STATE
     assert result.end_state == "mixed: 2 holding; elbow limp: overload"

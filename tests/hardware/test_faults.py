@@ -14,7 +14,7 @@ from dynsim.hardware.bus.packet import Instruction
 from dynsim.hardware.replay.check import velocity_limit
 from dynsim.hardware.replay.motion import CyclePlan
 from dynsim.hardware.replay.rules import Cause
-from dynsim.hardware.replay.states import State
+from dynsim.hardware.replay.states import ReplayState
 from dynsim.hardware.servo_map import ServoMap
 from dynsim.hardware.virtual.servos import PHYSICS_STEP
 
@@ -170,7 +170,7 @@ def check_reaction(run, onset: float, case: Case, what: str) -> None:
         return
     record, plan = run.result.record, run.replay.motion.plan
     bound = reaction_bound(run.result.fault.cause, run.map, plan)
-    before = record["state"] != State.FAULT
+    before = record["state"] != ReplayState.FAULT
     if run.result.fault.cause in (Cause.FOLLOWING_ERROR, Cause.TORQUE):
         over = over_the_threshold(run)[before]
         run_length = len(over) if over.all() else int(np.argmin(over[::-1]))
@@ -235,7 +235,11 @@ def test_torque_taken_away_by_another_program_is_noticed_in_turn(rig) -> None:
     run = rig.prepare(policy="decelerate")
 
     def take_away(progress) -> None:
-        if progress.state == State.REPLAY and run.line.servos.registers[2]["torque_enable"] and run.clock.now() > 1.9:
+        if (
+            progress.state == ReplayState.REPLAY
+            and run.line.servos.registers[2]["torque_enable"]
+            and run.clock.now() > 1.9
+        ):
             run.line.servos.write(2, 64, b"\0")
 
     run.replay.journal.observer = take_away

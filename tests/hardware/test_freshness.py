@@ -13,7 +13,7 @@ from dynsim.hardware.bus.dynamixel_bus import MARKS, DynamixelBus
 from dynsim.hardware.bus.packet import Instruction
 from dynsim.hardware.bus.protocol import NoAnswer
 from dynsim.hardware.replay.rules import Cause
-from dynsim.hardware.replay.states import State
+from dynsim.hardware.replay.states import ReplayState
 from dynsim.hardware.virtual.faults import FaultScript
 from dynsim.hardware.virtual.line import line_for_map
 from dynsim.hardware.virtual.port import VirtualPort
@@ -32,7 +32,7 @@ def test_a_late_servo_aborts_within_three_cycles(rig, periods: float) -> None:
     assert result.fault.ids == (2,)
     started = run.line.servos.torque_since + 1.7
     begun = run.replay.loop.path_started + result.record.time
-    cycles = (begun >= started) & (result.record["state"] != State.FAULT)
+    cycles = (begun >= started) & (result.record["state"] != ReplayState.FAULT)
     assert cycles.sum() <= run.map.safety.missed_cycles + 1
     missed = result.record["missed"][:, 1]
     assert missed[cycles][1:].all()

@@ -16,7 +16,7 @@ from dynsim.draw.figures import style
 from dynsim.draw.page import viewable
 from dynsim.hardware.replay.check import check_motion
 from dynsim.hardware.replay.measured import describe
-from dynsim.hardware.replay.states import State
+from dynsim.hardware.replay.states import ReplayState
 from dynsim.hardware.servo_map import SHIPPED, load_servo_map
 from dynsim.record import Record
 from dynsim.record.scene import HERE, WORLD, Body, Joint, Point, Scene
@@ -198,7 +198,7 @@ def test_a_measured_snake_can_be_viewed() -> None:
     goals = np.array([motion.path.at(time)[0] for time in simulated.time])
     measured = Record(simulated.time, provenance={"robot": "snake"})
     measured.add("record_time", simulated.time, "s")
-    measured.add("state", np.full(len(simulated), int(State.REPLAY)), "1")
+    measured.add("state", np.full(len(simulated), int(ReplayState.REPLAY)), "1")
     for name in ("phi", "rho"):
         columns = [k for k, servo in enumerate(servo_map.servos) if servo.kind.follows.position == name]
         labels = tuple(servo_map.servos[k].label for k in columns)

@@ -15,7 +15,7 @@ from dynsim.errors import DynsimError
 from dynsim.hardware.errors import OutputsFailed, PortError, ReplayAborted
 from dynsim.hardware.replay.display import displayed
 from dynsim.hardware.replay.session import run_replay, shown_by
-from dynsim.hardware.replay.states import State, StopRequest
+from dynsim.hardware.replay.states import ReplayState, StopRequest
 
 from .conftest import TORQUE_ADDRESS, Rig, Run, swing
 from .output_faults import AFTER, BEFORE, Call, Outputs, watched
@@ -26,13 +26,21 @@ ENDINGS: dict[str, dict[str, Any]] = {
     "decelerate": {"faults": [DEAD], "policy": "decelerate"},
     "hold": {"faults": [DEAD], "policy": "hold"},
     "off": {"faults": [DEAD], "policy": "off"},
-    "on the way": {"faults": [DEAD | {"at": 0.8}], "policy": "decelerate", "struck": State.MOVE_TO_START},
+    "on the way": {"faults": [DEAD | {"at": 0.8}], "policy": "decelerate", "struck": ReplayState.MOVE_TO_START},
     "unplugged": {"faults": [{"kind": "unplug", "at": 1.9}]},
     "interrupted": {"stop_at": 2.8},
 }
 # In these the robot may be moving, or is being left: the loop must wait for nobody.
 ARMED = [
-    state.name for state in (State.ARM, State.MOVE_TO_START, State.SETTLE, State.REPLAY, State.DISARM, State.FAULT)
+    state.name
+    for state in (
+        ReplayState.ARM,
+        ReplayState.MOVE_TO_START,
+        ReplayState.SETTLE,
+        ReplayState.REPLAY,
+        ReplayState.DISARM,
+        ReplayState.FAULT,
+    )
 ]
 
 
@@ -41,7 +49,7 @@ class Case:
 
     def __init__(self, rig: Rig, ending: str, folder: Path, outputs: Outputs) -> None:
         options = ENDINGS[ending]
-        self.struck = options.get("struck", State.REPLAY).name
+        self.struck = options.get("struck", ReplayState.REPLAY).name
         stop = StopRequest()
         short = Rig(rig.map, swing(duration=0.3))
         motion = short.motion()
@@ -104,7 +112,7 @@ def test_the_loop_lets_nothing_out_while_the_robot_is_armed(undisturbed: tuple[s
     _, case = undisturbed
     seen = case.outputs.seen
     assert [call for call in seen if call.looping and call.state in ARMED] == []
-    gone_through = {State.ARM.name, State.MOVE_TO_START.name, case.struck}
+    gone_through = {ReplayState.ARM.name, ReplayState.MOVE_TO_START.name, case.struck}
     assert {call.state for call in seen} >= {BEFORE, AFTER, *gone_through}, "other threads are at work in every state"
 
 

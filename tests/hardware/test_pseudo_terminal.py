@@ -21,7 +21,7 @@ from dynsim.hardware.bus.control_table import MX_106
 from dynsim.hardware.bus.dynamixel_bus import DynamixelBus, open_serial_port
 from dynsim.hardware.bus.protocol import NoAnswer
 from dynsim.hardware.errors import PortError
-from dynsim.hardware.replay.states import State
+from dynsim.hardware.replay.states import ReplayState
 from dynsim.hardware.virtual.line import line_for_map
 from dynsim.hardware.virtual.pseudo_terminal import PseudoTerminal
 from dynsim.record import Record
@@ -159,7 +159,7 @@ def test_replay_over_a_serial_device(servos: Servos) -> None:
     assert live.returncode == 0, live.stderr + servos.log
     measured = Record.load(servos.folder / "out" / "measured.h5")
     assert measured.complete
-    replayed = measured["state"] == State.REPLAY
+    replayed = measured["state"] == ReplayState.REPLAY
     assert replayed.sum() > 10
     assert np.nanmax(measured["q"][replayed]) > 0.4, "the servos moved"
     summary = json.loads((servos.folder / "out" / "summary.json").read_text(encoding="utf-8"))

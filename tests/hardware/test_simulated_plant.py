@@ -400,10 +400,10 @@ def test_servos_that_get_the_goals_of_a_dynamic_snake_go_its_way() -> None:
     }
     scenario = dynsim.load_scenario(SCENARIOS / "snake_positioning.yaml", "gamma", overrides)
     record = dynsim.simulate(scenario)
-    plant = SimulatedArm(scenario, servo_map, np.array([*record["phi_told"][0], *np.zeros(5 + 7)]))
+    plant = SimulatedArm(scenario, servo_map, np.array([*record["phi_command"][0], *np.zeros(5 + 7)]))
     names = [servo.label for servo in servo_map.servos]
-    told = {name: record["phi_told"][:, k] for k, name in enumerate(record.labels["phi_told"])}
-    rates = {name: record["rho_dot_told"][:, k] for k, name in enumerate(record.labels["rho_dot_told"])}
+    told = {name: record["phi_command"][:, k] for k, name in enumerate(record.labels["phi_command"])}
+    rates = {name: record["rho_dot_command"][:, k] for k, name in enumerate(record.labels["rho_dot_command"])}
     still = np.zeros(len(record))
     zero = np.array([servo.zero_tick * RAD_PER_TICK for servo in servo_map.servos])
     sense = np.array([servo.sign for servo in servo_map.servos])

@@ -10,18 +10,26 @@ import pytest
 
 from dynsim.hardware.bus.packet import Instruction, Packet
 from dynsim.hardware.replay.rules import Cause
-from dynsim.hardware.replay.states import Progress, State, StopRequest, stop_on_signals
+from dynsim.hardware.replay.states import ReplayProgress, ReplayState, StopRequest, stop_on_signals
 
-ON_THE_WAY = [State.CONNECT, State.VERIFY, State.ARM, State.MOVE_TO_START, State.SETTLE, State.REPLAY, State.DISARM]
+ON_THE_WAY = [
+    ReplayState.CONNECT,
+    ReplayState.VERIFY,
+    ReplayState.ARM,
+    ReplayState.MOVE_TO_START,
+    ReplayState.SETTLE,
+    ReplayState.REPLAY,
+    ReplayState.DISARM,
+]
 
 
-def interrupted(rig, state: State, signals: list[int], *, policy: str = "decelerate", after: int = 1):
+def interrupted(rig, state: ReplayState, signals: list[int], *, policy: str = "decelerate", after: int = 1):
     """Run with real signals raised at the ``after``-th report from ``state``."""
     stop = StopRequest()
     run = rig.prepare(stop=stop, policy=policy)
     seen = 0
 
-    def observe(progress: Progress) -> None:
+    def observe(progress: ReplayProgress) -> None:
         nonlocal seen
         if progress.state == state:
             seen += 1
@@ -47,31 +55,31 @@ def broadcast_torque_off(run) -> list[float]:
 
 @pytest.mark.parametrize("policy", ["hold", "decelerate", "off"])
 @pytest.mark.parametrize("state", ON_THE_WAY, ids=lambda state: state.name)
-def test_second_ctrl_c_switches_the_torque_off_at_every_state(rig, state: State, policy: str) -> None:
+def test_second_ctrl_c_switches_the_torque_off_at_every_state(rig, state: ReplayState, policy: str) -> None:
     run = interrupted(rig, state, [signal.SIGINT, signal.SIGINT], policy=policy)
     assert len(broadcast_torque_off(run)) >= 3
     assert run.result.end_state == "off"
     assert run.result.torque_still_on == ()
     assert not any(servo["torque_enable"] for servo in run.line.servos.registers.values())
-    assert not run.result.policy_goals or run.result.fault_state == State.DISARM
+    assert not run.result.policy_goals or run.result.fault_state == ReplayState.DISARM
 
 
 @pytest.mark.parametrize("state", ON_THE_WAY, ids=lambda state: state.name)
-def test_first_ctrl_c_is_a_controlled_stop(rig, state: State) -> None:
+def test_first_ctrl_c_is_a_controlled_stop(rig, state: ReplayState) -> None:
     run = interrupted(rig, state, [signal.SIGINT])
     torque = [servo["torque_enable"] for servo in run.line.servos.registers.values()]
-    if state == State.DISARM:
+    if state == ReplayState.DISARM:
         # The motion is over: disarming goes on to its end.
         assert run.result.fault is None
         assert not any(torque)
         return
     assert run.result.fault.cause == Cause.INTERRUPTED
     assert run.result.fault_state == state
-    if state in (State.CONNECT, State.VERIFY):
+    if state in (ReplayState.CONNECT, ReplayState.VERIFY):
         assert run.result.end_state == "not armed"
         assert not broadcast_torque_off(run), "a robot that is held by an earlier run must not fall"
         assert not run.goals()
-    elif state == State.ARM:
+    elif state == ReplayState.ARM:
         assert run.result.end_state == "off"
         assert not any(torque)
     else:
@@ -103,13 +111,13 @@ BROKEN = {"SIGSEGV", "SIGBUS", "SIGILL", "SIGFPE", "SIGABRT", "SIGTRAP", "SIGSYS
     ids=lambda number: number.name,
 )
 def test_other_signals_stop_like_ctrl_c(rig, number: int) -> None:
-    run = interrupted(rig, State.REPLAY, [number], after=30)
+    run = interrupted(rig, ReplayState.REPLAY, [number], after=30)
     assert run.result.fault.cause == Cause.INTERRUPTED
     assert run.result.end_state == "holding"
 
 
 def test_ctrl_c_under_the_policy_off_comes_to_rest_before_it_releases(rig) -> None:
-    run = interrupted(rig, State.REPLAY, [signal.SIGINT], policy="off", after=30)
+    run = interrupted(rig, ReplayState.REPLAY, [signal.SIGINT], policy="off", after=30)
     assert run.result.end_state == "off"
     moved = [value for _, id_, value in run.result.policy_goals if id_ == 7]
     assert moved[-1] == 0
@@ -124,7 +132,7 @@ def test_second_ctrl_c_during_the_controlled_stop_releases_at_once(rig) -> None:
     def listen(time: float, packet: Packet) -> None:
         nonlocal reads
         run.sent.append((time, packet))
-        if run.replay.journal.state in (State.REPLAY, State.FAULT):
+        if run.replay.journal.state in (ReplayState.REPLAY, ReplayState.FAULT):
             reads += packet.instruction == Instruction.SYNC_READ
             if (reads, stop.count) in ((60, 0), (72, 1)):
                 stop()
@@ -155,7 +163,7 @@ def test_an_exception_out_of_the_blue_still_stops_the_robot(rig, error) -> None:
     read = run.replay.bus.port.readPort
 
     def read_port(length: int) -> bytes:
-        if run.replay.journal.state == State.REPLAY and run.clock.now() > 1.9 and run.replay.result.fault is None:
+        if run.replay.journal.state == ReplayState.REPLAY and run.clock.now() > 1.9 and run.replay.result.fault is None:
             raise error("out of the blue")
         return read(length)
 
@@ -172,8 +180,8 @@ def test_a_robot_found_holding_is_not_dropped_by_a_ctrl_c_while_arming(rig) -> N
     run = rig.prepare(stop=stop)
     for id_ in run.map.ids:
         run.line.servos.write(id_, 64, b"\1")
-    run.replay.journal.observer = lambda progress: stop() if progress.state == State.ARM else None
+    run.replay.journal.observer = lambda progress: stop() if progress.state == ReplayState.ARM else None
     result = run.replay.run()
-    assert result.fault_state == State.ARM
+    assert result.fault_state == ReplayState.ARM
     assert result.end_state == "holding"
     assert all(servo["torque_enable"] for servo in run.line.servos.registers.values())

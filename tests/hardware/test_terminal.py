@@ -16,7 +16,7 @@ import pytest
 from processes import wait_for
 
 from dynsim.hardware.replay.output import PART
-from dynsim.hardware.replay.states import State
+from dynsim.hardware.replay.states import ReplayState
 from dynsim.record import Record
 
 from .test_pseudo_terminal import Servos, command, virtual_servos
@@ -175,5 +175,5 @@ def test_a_killed_replay_keeps_its_cycles(servos: Servos) -> None:
     assert again.returncode == 2
     assert "nothing to recover" in again.stderr
     assert not recovered.complete
-    assert recovered["state"][-1] == State.REPLAY
+    assert recovered["state"][-1] == ReplayState.REPLAY
     assert np.isfinite(recovered["record_time"][-1])

@@ -12,7 +12,7 @@ import pytest
 from dynsim.hardware.bus.control_table import OperatingMode
 from dynsim.hardware.bus.dynamixel_bus import READ_WAIT, SerialPort
 from dynsim.hardware.replay.rules import Cause
-from dynsim.hardware.replay.states import State
+from dynsim.hardware.replay.states import ReplayState
 
 
 @pytest.mark.parametrize(
@@ -69,9 +69,9 @@ BUSY = "run 80 ms too late while it waited for answers: the computer is too slow
 @pytest.mark.parametrize(
     ("fault", "state", "text"),
     [
-        ({"kind": "drop_off", "id": 2}, State.VERIFY, "elbow: ID 2: no answer"),
-        ({"kind": "lost_status", "id": 2, "probability": 0.9}, State.VERIFY, "2"),
-        ({"kind": "drop_off", "id": 2, "at": 0.0}, State.ARM, "ID 2: no answer"),
+        ({"kind": "drop_off", "id": 2}, ReplayState.VERIFY, "elbow: ID 2: no answer"),
+        ({"kind": "lost_status", "id": 2, "probability": 0.9}, ReplayState.VERIFY, "2"),
+        ({"kind": "drop_off", "id": 2, "at": 0.0}, ReplayState.ARM, "ID 2: no answer"),
     ],
 )
 def test_an_answer_that_is_missing_on_a_busy_computer_says_so(rig, fault, state, text, pause: float) -> None:

@@ -18,7 +18,7 @@ from websockets.exceptions import ConnectionClosed
 
 from dynsim import Record, load_scenario, simulate
 from dynsim.hardware.replay.check import check_motion
-from dynsim.hardware.replay.states import State
+from dynsim.hardware.replay.states import ReplayState
 from dynsim.hardware.servo_map import SHIPPED, load_servo_map
 from dynsim.teleop.web.live import NOT_READY
 
@@ -141,7 +141,7 @@ def followed(record: Record) -> tuple[np.ndarray, np.ndarray]:
     assert np.diff(time).min() >= 0.0
     # Whatever was late: from goal to goal never more than a period of the simulation. A cycle in which the port failed
     # has sent its goals and left no row.
-    struck = record["state"][rows][1:] == State.FAULT
+    struck = record["state"][rows][1:] == ReplayState.FAULT
     assert (np.diff(time) <= np.where(struck, 2.0, 1.0) * period * (1.0 + 1e-9)).all()
     return time, goals
 
@@ -152,7 +152,7 @@ def check_against_the_simulation(one: Drive, *, in_trouble: bool = False) -> Rec
     time, goals = followed(measured)
     expected = np.column_stack([np.interp(time, simulated.time, column) for column in simulated["q"].T])
     if in_trouble:
-        well = measured["state"][np.isfinite(measured["record_time"])] == State.REPLAY
+        well = measured["state"][np.isfinite(measured["record_time"])] == ReplayState.REPLAY
         goals, expected = goals[well], expected[well]
     # Of a chord over 5 ms at the 6.5 rad/s² with which the arm sags at first: 2.0e-5 rad; a tick is 1.5e-3.
     assert goals == pytest.approx(expected, abs=5e-5)
@@ -173,7 +173,7 @@ def test_servos_follow_a_pilot_and_leave_a_run(drives: Callable[..., Drive]) -> 
     measured, summary = one.measured()
     assert summary["end_state"] == "holding"
     assert measured.complete
-    assert measured["state"][-1] == State.SETTLE
+    assert measured["state"][-1] == ReplayState.SETTLE
     assert followed(measured)[0][-1] == pytest.approx(simulated.time[-1], abs=0.006)
     assert np.ptp(measured["q"], axis=0).max() > 0.05
     assert b"measured" in (one.folder / "view.html").read_bytes()

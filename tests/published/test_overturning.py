@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support import overturning as study
 
 from dynsim import load_scenario, simulate
 from dynsim.scenario import variant_names
-from dynsim.studies import overturning as study
 
 G = 9.81
 

@@ -69,5 +69,5 @@ def test_mode_switching_shakes_the_head():
     assert 0.010 <= position <= 0.045
     assert 0.04 <= attitude <= 0.13
     assert record.summary["mode_switches"] == 10
-    told = record["phi_told"][:, 6:]
+    told = record["phi_command"][:, 6:]
     assert np.abs(told[-1]).max() < 0.7 * np.abs(told[0]).max()  # the base straightens, as in Fig 10

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from support.wang_minami import elbow_forces, elbow_numbers
 
 import dynsim
-from dynsim.studies.published.wang_minami import elbow_forces, elbow_numbers
 
 
 @pytest.fixture(scope="module")

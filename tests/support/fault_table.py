@@ -32,7 +32,7 @@ from dynsim.hardware.bus.packet import Instruction, Packet
 from dynsim.hardware.replay.check import CheckedMotion, check_motion
 from dynsim.hardware.replay.machine import Replay
 from dynsim.hardware.replay.rules import Cause
-from dynsim.hardware.replay.states import SILENT, Progress, ReplayResult, State, StopRequest
+from dynsim.hardware.replay.states import SILENT, ReplayProgress, ReplayResult, ReplayState, StopRequest
 from dynsim.hardware.replay.trajectory import path_of_record
 from dynsim.hardware.safety import FaultPolicy
 from dynsim.hardware.servo_map import ServoMap, load_servo_map
@@ -70,7 +70,7 @@ GOAL_ADDRESSES = (104, 116)
 TORQUE_ADDRESS = 64
 STOPPING = "stopping"
 """While the robot slows down after a Ctrl-C."""
-STATES = (State.MOVE_TO_START.name, State.REPLAY.name, STOPPING)
+STATES = (ReplayState.MOVE_TO_START.name, ReplayState.REPLAY.name, STOPPING)
 POLICIES: tuple[FaultPolicy, ...] = get_args(FaultPolicy)
 
 
@@ -266,8 +266,8 @@ def spans() -> dict[str, tuple[float, float]]:
     since = run.result.record.time + run.started() - run.line.servos.torque_since
     states = run.result.record["state"]
     found = {}
-    for name in (State.MOVE_TO_START.name, State.REPLAY.name):
-        times = since[states == State[name]]
+    for name in (ReplayState.MOVE_TO_START.name, ReplayState.REPLAY.name):
+        times = since[states == ReplayState[name]]
         found[name] = float(times[0]), float(times[-1])
     return found
 
@@ -280,13 +280,13 @@ def strike(case: Case, state: str, policy: FaultPolicy, seed: int) -> Outcome:
         entry["id"] = draw.choice(case.ids)
     asked = math.inf
     if case.scripted_onset:
-        begin, end = spans()[State.REPLAY.name if state == STOPPING else state]
+        begin, end = spans()[ReplayState.REPLAY.name if state == STOPPING else state]
         entry["at"] = draw.uniform(begin, end)
         if state == STOPPING:
             asked = entry["at"] - draw.uniform(0.0, 0.8 * rig().map.safety.stop_time)
     run = rig().prepare(entry, seed=seed, policy=policy, stop=stop)
 
-    def ask(_: Progress) -> None:
+    def ask(_: ReplayProgress) -> None:
         if run.clock.now() - run.line.servos.torque_since >= asked and not stop.count:
             stop()
 
@@ -371,7 +371,7 @@ class Cell:
 def cells(runs: int, cases: Iterable[Case] = CASES, first: int = 0) -> Iterator[Cell]:
     """All cells of these faults, with so many runs each, of the seeds from ``first`` on."""
     for case in cases:
-        for state in STATES if case.scripted_onset else (State.VERIFY.name,):
+        for state in STATES if case.scripted_onset else (ReplayState.VERIFY.name,):
             for policy in POLICIES:
                 outcomes = [strike(case, state, policy, seed) for seed in range(first, first + runs)]
                 yield Cell(case.name, state, policy, outcomes)
@@ -395,7 +395,9 @@ def markdown(table: list[dict[str, Any]]) -> str:
             every = [cell for row in rows for cell in row]
             cycles = [cell["cycles_max"] for cell in every if cell["cycles_max"] is not None]
             states = ", ".join(row[0]["state"] for row in rows)
-            text = next((cell["text"] for cell in every if f"in {State.REPLAY.name}" in cell["text"]), every[0]["text"])
+            text = next(
+                (cell["text"] for cell in every if f"in {ReplayState.REPLAY.name}" in cell["text"]), every[0]["text"]
+            )
             goals = "/".join(str(max(row[k]["goal_packets_max"] for row in rows)) for k in range(len(POLICIES)))
             lines.append(
                 f"| `{case}` | {states} | {' | '.join(ends)} | {max(cycles) if cycles else '–'} | {goals} | "

@@ -1,4 +1,4 @@
-"""What docs/architecture.md and docs/extending.md name exists: files, what is said to be in them, and dotted names."""
+"""What the pages on architecture, extending and development name exists: files, what is in them, and dotted names."""
 
 from __future__ import annotations
 
@@ -109,7 +109,13 @@ def test_what_a_page_names_exists(name: str) -> None:
     assert missing(text) == []
 
 
-DOCS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+def test_what_the_pages_for_developers_name_exists() -> None:
+    pages = sorted((ROOT / "docs" / "dev").glob("*.md"))
+    assert len(pages) == 5
+    assert {path.name: wrong for path in pages if (wrong := missing(path.read_text(encoding="utf-8")))} == {}
+
+
+DOCS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 @pytest.mark.parametrize("path", DOCS, ids=lambda path: path.name)
@@ -155,8 +161,8 @@ def test_examples_make_what_is_not_there() -> None:
 
 
 def house() -> dict[str, str]:
-    """The tree of the page: room or file → what is said of it."""
-    block = page("architecture.md").split("## The house")[1].split("```text\n")[1].split("```")[0]
+    """The rooms, file by file: room or file → what is said of it."""
+    block = page("dev/rooms.md").split("```text\n")[1].split("```")[0]
     lines: dict[str, str] = {}
     for line in block.splitlines():
         if line.startswith(" "):

@@ -152,14 +152,6 @@ def test_comparison(braced: Record, free: Record, tmp_path: Path) -> None:
     assert_pngs(figures.draw_comparison(records, tmp_path), tmp_path, COMPARISONS)
 
 
-def test_parts_are_all_figures_and_none_twice(braced: Record, free: Record, tmp_path: Path) -> None:
-    parts = [figures.draw(braced, tmp_path / str(k), part=(k, 3)) for k in range(3)]
-    assert sorted(path.stem for paths in parts for path in paths) == sorted(FIGURES)
-    both = {"two_elbows": braced, "no_elbow": free}
-    parts = [figures.draw_comparison(both, tmp_path / "all", part=(k, 2)) for k in range(2)]
-    assert sorted(path.stem for paths in parts for path in paths) == sorted(COMPARISONS)
-
-
 def test_comparison_of_pendulums(pendulum: Record, tmp_path: Path) -> None:
     paths = figures.draw_comparison({"a": pendulum, "b": pendulum}, tmp_path)
     assert_pngs(paths, tmp_path, {"compare_hand_path", "compare_posture"})
@@ -619,7 +611,7 @@ def test_ten_motors_are_an_envelope_and_six(braced: Record) -> None:
 def test_what_lies_below_a_surface_is_marked(braced: Record) -> None:
     body, _ = skeleton.skeleton(braced)
     assert body is not None
-    assert robot.sunk(braced, body.scene, np.array([0])) == []
+    assert robot.penetrations(braced, body.scene, np.array([0])) == []
     sunk = copy.copy(braced)
     sunk.signals = dict(braced.signals)
     moved = braced["body_position"].copy()
@@ -627,7 +619,7 @@ def test_what_lies_below_a_surface_is_marked(braced: Record) -> None:
     sunk.signals["body_position"] = dataclasses.replace(braced.signals["body_position"], data=moved)
     body, _ = skeleton.skeleton(sunk)
     assert body is not None
-    found = robot.sunk(sunk, body.scene, np.array([len(sunk) - 1]))
+    found = robot.penetrations(sunk, body.scene, np.array([len(sunk) - 1]))
     # Of a horizontal floor at zero the depth is the height of the lowest point.
     lowest = -body.segments(len(sunk) - 1)[..., 2].min()
     assert max(one.depth.max() for one in found) == pytest.approx(lowest, rel=1e-12)

@@ -10,7 +10,7 @@ import pytest
 
 import dynsim
 from dynsim.scenario import read_scenario
-from dynsim.studies.batch import Work
+from dynsim.studies.batch import BatchWork
 from dynsim.studies.columns import numbers
 from dynsim.studies.sweep_plan import Axis, Plan
 from dynsim.system.memo import KEPT, Memo, recall, remembering
@@ -102,7 +102,7 @@ def test_runs_that_share_are_those_that_do_not(variant: str, overrides: dict[str
     fixed = {"integrator.method": "radau5", "duration_s": 0.3, "metrics.settle_s": 0.1} | overrides
     plan = Plan(ELBOWS, (variant,), fixed, tuple(map(Axis.parse, grid)))
     points = list(plan.points())
-    work = Work(plan.scenario, "none")
+    work = BatchWork(plan.scenario, "none")
     # Twice, the second time from the end: whatever was before.
     for point in points + points[::-1]:
         result = work(point, None)

@@ -189,6 +189,7 @@ for one in (generators, parallel, object_mode, lifted_loops, containers, named_t
 '''
 
 
+@pytest.mark.long
 def test_what_others_compile_does_not_depend_on_dynsim(tmp_path: Path) -> None:
     environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), "PYTHONPATH": os.pathsep.join(sys.path)}
     environment.pop("NUMBA_CACHE_DIR", None)

@@ -33,6 +33,7 @@ print(json.dumps([[run.reason or run.summary["duration_s"] for run in runs], lis
 DONE = [[0.2, 0.3], ["two_elbows", "elbow_7", "elbow_4", "no_elbow"]]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("from_file", [True, False], ids=["a file", "standard input"])
 def test_a_script_needs_no_guard(tmp_path: Path, from_file: bool):
     """Once: workers run nothing of it."""
@@ -56,6 +57,7 @@ exec(sys.stdin.read())
 """
 
 
+@pytest.mark.long
 def test_a_notebook_has_its_folder_first_and_workers_do_not(tmp_path: Path):
     for name in ("signal", "json", "pickle", "numpy"):
         (tmp_path / f"{name}.py").write_text("raise RuntimeError('not this one')\n")
@@ -170,6 +172,7 @@ run_in_processes(deaf, [(k, sys.argv[1]) for k in range(2)], 2, print)
 """
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks at processes in /proc")
 def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path):
     tests = os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)

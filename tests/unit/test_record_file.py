@@ -18,7 +18,7 @@ import pytest
 
 from dynsim.errors import RecordError
 from dynsim.record import Record, reader
-from dynsim.record.scene import Body, Joint, Point, Scene, Shape, Surface
+from dynsim.record.scene import Body, Joint, Point, Scene, SceneSurface, Shape
 
 
 def sample() -> Record:
@@ -40,7 +40,7 @@ SCENE = Scene(
             (Shape("box", (0.1, 0.2, 0.3), colour=(1.0, 0.5, 0.0, 1.0)), Shape("mesh", (1.0, 1.0, 1.0), file="b.stl")),
         ),
     ),
-    surfaces=(Surface.of_quadric("floor", np.zeros((3, 3)), [0.0, 0.0, 2.0], 1.0),),
+    surfaces=(SceneSurface.of_quadric("floor", np.zeros((3, 3)), [0.0, 0.0, 2.0], 1.0),),
     points=(Point("hand", "hand", 1, (0.0, 0.0, 0.5)), Point("elbow", "contact", 0, (0.0, 0.0, 0.1), "floor")),
     fixed=(Shape("cylinder", (0.1, 0.4), (0.0, 0.0, -0.2)),),
 )

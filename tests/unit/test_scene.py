@@ -12,14 +12,14 @@ from dynsim.draw.geometry.surfaces import round_patch, surface_grids
 from dynsim.errors import RecordError
 from dynsim.library.surfaces import cylinder, plane, sphere
 from dynsim.model.description import Quadric
-from dynsim.record.scene import Body, Joint, Point, Scene, Shape, Surface, quaternion
+from dynsim.record.scene import Body, Joint, Point, Scene, SceneSurface, Shape, quaternion
 
 CONTEXT = BuildContext(1.0)
 HINGE = Joint("j", "revolute", (0.0, 1.0, 0.0), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), "q", ("j",))
 
 
-def surface(quadric: Quadric) -> Surface:
-    return Surface.of_quadric("s", quadric.Q, quadric.b, quadric.c)
+def surface(quadric: Quadric) -> SceneSurface:
+    return SceneSurface.of_quadric("s", quadric.Q, quadric.b, quadric.c)
 
 
 def test_round_trip_and_unknown_keys():
@@ -66,13 +66,13 @@ def test_planes_spheres_and_cylinders_are_recognised():
         np.testing.assert_allclose(np.abs(axis), [0.5**0.5, 0.5**0.5, 0.0], atol=1e-12)
         off = np.array(found.position) - [1.0, 0.0, 2.0]
         np.testing.assert_allclose(off - axis * (axis @ off), 0.0, atol=1e-12)
-    cone = Surface.of_quadric("s", np.diag([1.0, 1.0, -1.0]), np.zeros(3), 0.0)
+    cone = SceneSurface.of_quadric("s", np.diag([1.0, 1.0, -1.0]), np.zeros(3), 0.0)
     assert (cone.kind, cone.position) == ("quadric", None)
     # No direction is its normal, so it has no parameters that a file could not hold.
-    nowhere = Surface.of_quadric("s", np.zeros((3, 3)), np.zeros(3), 1.0)
+    nowhere = SceneSurface.of_quadric("s", np.zeros((3, 3)), np.zeros(3), 1.0)
     assert (nowhere.kind, nowhere.direction) == ("quadric", None)
     # No point is on it.
-    assert Surface.of_quadric("s", np.eye(3), np.zeros(3), 1.0).kind == "quadric"
+    assert SceneSurface.of_quadric("s", np.eye(3), np.zeros(3), 1.0).kind == "quadric"
 
 
 def test_distances_are_those_of_the_model():
@@ -103,12 +103,12 @@ def test_quaternions_of_rotations():
 @pytest.mark.parametrize(
     "drawn",
     [
-        Surface.of_quadric("cone", np.diag([1.0, 1.0, -1.0]), np.zeros(3), 0.0),
-        Surface.of_quadric("ellipsoid", np.diag([1.0, 4.0, 2.0]), [0.1, 0.0, -0.3], -0.5),
-        Surface.of_quadric("slope", np.zeros((3, 3)), [0.0, 0.6, 0.8], -0.1),
+        SceneSurface.of_quadric("cone", np.diag([1.0, 1.0, -1.0]), np.zeros(3), 0.0),
+        SceneSurface.of_quadric("ellipsoid", np.diag([1.0, 4.0, 2.0]), [0.1, 0.0, -0.3], -0.5),
+        SceneSurface.of_quadric("slope", np.zeros((3, 3)), [0.0, 0.6, 0.8], -0.1),
     ],
 )
-def test_points_of_quadrics_are_on_them(drawn: Surface):
+def test_points_of_quadrics_are_on_them(drawn: SceneSurface):
     low, high = np.array([0.1, -0.4, 0.2]), np.array([0.9, 0.5, 0.8])
     (grid,) = surface_grids(drawn, low, high)
     points = grid[np.isfinite(grid).all(axis=-1)]
@@ -165,5 +165,5 @@ def test_the_radius_of_a_body_is_that_of_its_thickest_round_shape():
 
 
 def test_a_surface_without_points_has_none_to_draw():
-    (grid,) = surface_grids(Surface.of_quadric("s", np.eye(3), np.zeros(3), 1.0), np.full(3, -1.0), np.ones(3))
+    (grid,) = surface_grids(SceneSurface.of_quadric("s", np.eye(3), np.zeros(3), 1.0), np.full(3, -1.0), np.ones(3))
     assert np.isnan(grid).all()

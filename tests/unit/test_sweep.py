@@ -34,7 +34,7 @@ from dynsim.scenario import SetOptions, read_scenario
 from dynsim.studies import batch, processes
 from dynsim.studies import sweep as module
 from dynsim.studies.columns import numbers
-from dynsim.studies.journal import JOURNAL, LOST, Row
+from dynsim.studies.journal import JOURNAL, LOST, SweepRow
 from dynsim.studies.processes import WorkerInterrupted, WorkerLost, WorkerSilent, run_in_processes
 from dynsim.studies.sweep import run_sweep
 from dynsim.studies.sweep_plan import Axis, Law, Plan
@@ -260,6 +260,7 @@ def test_a_task_outlives_the_process_that_it_had_first(tmp_path: Path):
     assert taken == {number: number**2 for number in range(8)}
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="no signal stops a process here")
 def test_a_process_that_gives_no_sign_of_life_costs_only_its_task(monkeypatch: pytest.MonkeyPatch):
     """One is in compiled code for good, one is stopped; both are ended, and others do what is left."""
@@ -276,6 +277,7 @@ def test_a_process_that_gives_no_sign_of_life_costs_only_its_task(monkeypatch: p
     assert taken == {number: number**2 for number in range(10)} | {DEADLY: WorkerSilent, REFUSED: WorkerSilent}
 
 
+@pytest.mark.long
 def test_a_process_that_takes_its_time_is_not_given_up(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(processes, "SILENT_S", 1.3)
     taken: dict[int, int] = {}
@@ -388,12 +390,12 @@ def test_resuming_runs_what_is_not_there(tmp_path: Path, monkeypatch: pytest.Mon
     journal.write_text(lines[0] + lost + lines[2][:40])
     ran: list[int] = []
 
-    class Watched(module.Work):
+    class Watched(module.BatchWork):
         def __call__(self, point: Any, look: Any) -> Any:
             ran.append(point.run)
             return super().__call__(point, look)
 
-    monkeypatch.setattr(module, "Work", Watched)
+    monkeypatch.setattr(module, "BatchWork", Watched)
     assert run_sweep(swept, tmp_path, resume=True) == whole
     assert ran == [1, 2, 3, 4]
     assert (tmp_path / "sweep.csv").read_bytes() == table
@@ -576,6 +578,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     return (folder / "sweep.csv").read_bytes()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL], ids=lambda number: number.name)
 def test_whatever_ends_a_sweep_it_goes_on(tmp_path: Path, number: signal.Signals, whole: bytes):
     out = tmp_path / "out"
@@ -594,6 +597,7 @@ def test_whatever_ends_a_sweep_it_goes_on(tmp_path: Path, number: signal.Signals
     assert (out / "sweep.csv").read_bytes() == whole
 
 
+@pytest.mark.long
 def test_a_killed_worker_costs_nothing_but_time(tmp_path: Path, whole: bytes):
     out = tmp_path / "out"
     with started(command("--out", str(out), "-q"), tmp_path / "errors") as child:
@@ -614,6 +618,7 @@ def _hears() -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
+@pytest.mark.long
 def test_a_cluster_gives_the_same_and_outlives_a_worker(tmp_path: Path, whole: bytes):
     pytest.importorskip("distributed")
     file, out = tmp_path / "scheduler.json", tmp_path / "out"
@@ -634,6 +639,7 @@ def test_a_cluster_gives_the_same_and_outlives_a_worker(tmp_path: Path, whole: b
     assert (out / "sweep.csv").read_bytes() == whole
 
 
+@pytest.mark.long
 def test_a_scheduler_that_dies_is_one_line(tmp_path: Path):
     pytest.importorskip("distributed")
     file, out = tmp_path / "scheduler.json", tmp_path / "out"
@@ -666,7 +672,7 @@ def test_runs_that_failed_are_counted_and_not_drawn(monkeypatch: pytest.MonkeyPa
     """A base that tips after 5 s has taken a tenth of the energy: beside whole runs it looked like the best of all."""
     numbers = {pictures.ENERGY: 1.0, "hand_error_rms_m": 0.1}
     status = ["ok", "failed", "ok"]
-    rows = [Row(k, None, {"duration_s": k + 1}, one, "", numbers, "") for k, one in enumerate(status)]
+    rows = [SweepRow(k, None, {"duration_s": k + 1}, one, "", numbers, "") for k, one in enumerate(status)]
     seen: list[pictures.Sweep] = []
     monkeypatch.setattr(pictures, "draw", lambda sweep, *_: seen.append(sweep))
     sweep_command._draw("tipping", rows, plan(Axis("duration_s", (1, 2, 3))), tmp_path, True, "png")

@@ -15,10 +15,10 @@ import pytest
 from dynsim.errors import DynsimError, RecordError
 from dynsim.scenario import read_scenario
 from dynsim.studies import sweep as sweep_module
-from dynsim.studies.journal import JOURNAL, PLAN, Journal, Row
+from dynsim.studies.journal import JOURNAL, PLAN, SweepJournal, SweepRow
 from dynsim.studies.sweep import run_sweep
 from dynsim.studies.sweep_plan import Axis, Plan
-from dynsim.system.files import held
+from dynsim.system.files import held_folder
 
 SHORT = {"duration_s": 0.01, "metrics.settle_s": 0.0}
 SWEPT = Plan(read_scenario("single_pendulum"), (None,), SHORT, (Axis.parse("plant.chain.0.mass_kg=1,2,3,4"),))
@@ -214,7 +214,7 @@ def test_a_first_value_that_is_left_and_makes_no_scenario_is_a_row(tmp_path: Pat
 @pytest.mark.parametrize("resume", [False, True])
 def test_a_folder_is_one_process_at_a_time(folder: Path, resume: bool):
     before = contents(folder)
-    with held(folder), pytest.raises(RecordError, match="another process is at work there; wait"):
+    with held_folder(folder), pytest.raises(RecordError, match="another process is at work there; wait"):
         run_sweep(SWEPT, folder, resume=resume)
     assert contents(folder) == before
     # And afterwards it is free.
@@ -222,8 +222,8 @@ def test_a_folder_is_one_process_at_a_time(folder: Path, resume: bool):
 
 
 def test_a_dead_process_holds_nothing(folder: Path):
-    code = "import os, sys; from pathlib import Path; from dynsim.system.files import held\n"
-    code += "with held(Path(sys.argv[1])): os.kill(os.getpid(), 9)"
+    code = "import os, sys; from pathlib import Path; from dynsim.system.files import held_folder\n"
+    code += "with held_folder(Path(sys.argv[1])): os.kill(os.getpid(), 9)"
     subprocess.run([sys.executable, "-c", code, str(folder)], check=False, timeout=120)
     run_sweep(SWEPT, folder, resume=True)
 
@@ -284,8 +284,8 @@ def test_the_journal_names_itself(tmp_path: Path):
     """/dev/full takes nothing."""
     if not Path("/dev/full").exists():
         pytest.skip("needs /dev/full")
-    row = Row(0, None, {}, "ok", "", {}, "")
-    with Journal(tmp_path, []) as journal:
+    row = SweepRow(0, None, {}, "ok", "", {}, "")
+    with SweepJournal(tmp_path, []) as journal:
         journal._stream.close()
         (tmp_path / JOURNAL).unlink()
         (tmp_path / JOURNAL).symlink_to("/dev/full")

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from support.validation import FREE, free_scenario
 
 import dynsim
 from dynsim.engine import summary as metrics
 from dynsim.scenario import build, scenario_from_resolved
-from dynsim.studies.validation import FREE, free_scenario
 
 MOTOR = {
     "type": "dc", "torque_constant_N_m_per_A": 0.2, "resistance_ohm": 0.1, "inductance_H": 0.001,

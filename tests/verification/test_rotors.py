@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from support.rotors import rotor_energies, rotor_model
 
 import dynsim
 from dynsim.dynamics.derivative import derivative
@@ -9,7 +10,6 @@ from dynsim.dynamics.state import ELECTRICAL, block
 from dynsim.engine.dynamics import prepare
 from dynsim.errors import ScenarioError
 from dynsim.scenario import build_model, load_scenario
-from dynsim.studies.published.rotors import rotor_energies, rotor_model
 
 ARM = """
 duration_s: 1

@@ -128,7 +128,7 @@ def test_the_head_sags_by_its_weight_over_the_stiffness_of_its_servos(x_run, tre
     joints = [link.joint for link in tree.links]
     for name in ("psi1", "psi2", "psi3"):
         j = index.index(name)
-        off = x_run["phi_told"][0, j] - x_run["phi"][0, j]
+        off = x_run["phi_command"][0, j] - x_run["phi"][0, j]
         servo = next(motor for motor in tree.motors if motor.joint == name)
         stiffness = servo.k_p * servo.torque_constant / servo.resistance
         assert stiffness == pytest.approx(41.0, rel=2e-3)

@@ -253,7 +253,7 @@ def test_other_indices_are_not(line):
 
 
 # A model of its own, with a state of its own.
-OWN_STATE = {PACKAGE / "studies" / "published" / "rotors.py"}
+OWN_STATE = {TESTS / "support" / "rotors.py"}
 
 
 def _sources() -> list[Path]:

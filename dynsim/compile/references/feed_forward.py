@@ -65,8 +65,8 @@ def planned_voltages(
     if whole:
         torques = _pressing_torques(model, times, q, v, vdot, braces, min_N)
     else:
-        rest = np.zeros(model.n)
-        torques = np.array([model.bias_forces(row, rest) for row in q])
+        still = np.zeros(model.n)
+        torques = np.array([model.bias_forces(row, still) for row in q])
     columns = [model.joint_names.index(joint) for joint in driven]
     motors = [motor for motor in robot.motors if isinstance(motor, Motor)]
     constant = np.array([motor.joint_constant for motor in motors])

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.compile.contact_law import told
+from dynsim.compile.contact_law import format_quantity
 from dynsim.compile.model import Model
 from dynsim.compile.reaching import path_arrays
 from dynsim.dynamics import inverse_kinematics as ki
@@ -116,14 +116,15 @@ def _check_start(model: Model, joints: Sequence[str], q: Array) -> None:
         for which, limit, beyond in (("lower", link.lower, link.lower - at), ("upper", link.upper, at - link.upper)):
             if beyond > LIMIT_SLACK:
                 raise UnreachableReference(
-                    f"{name} follows the hand's path, but starts at {told(at, link.units[0])}, beyond its {which} "
-                    f"limit of {told(limit, link.units[0])}; change its initial position or its limit"
+                    f"{name} follows the hand's path, but starts at {format_quantity(at, link.units[0])}, beyond "
+                    f"its {which} limit of {format_quantity(limit, link.units[0])}; change its initial "
+                    "position or its limit"
                 )
 
 
 def _passed_limits(model: Model, joints: Sequence[str], times: Array, positions: Array) -> str:
     """What joints without limits would do: joint, limit, time and amount of the one that goes furthest beyond."""
-    found: list[tuple[float, str]] = []
+    passed: list[tuple[float, str]] = []
     for name, column in zip(joints, positions.T, strict=True):
         link = model.robot.links[model.joint_names.index(name)]
         unit = link.units[0]
@@ -132,6 +133,6 @@ def _passed_limits(model: Model, joints: Sequence[str], times: Array, positions:
             over = np.flatnonzero(beyond > LIMIT_SLACK)
             if over.size:
                 most, since = float(beyond[over].max()), times[over[0]]
-                text = f"{name} would pass its {which} limit of {told(limit, unit)} from t = {since:.3f} s on"
-                found.append((most, f"{text}, by up to {told(most, unit, 3)}"))
-    return "; ".join(text for _, text in sorted(found, reverse=True))
+                text = f"{name} would pass its {which} limit of {format_quantity(limit, unit)} from"
+                passed.append((most, f"{text} t = {since:.3f} s on, by up to {format_quantity(most, unit, 3)}"))
+    return "; ".join(text for _, text in sorted(passed, reverse=True))

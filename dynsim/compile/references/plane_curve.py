@@ -26,12 +26,12 @@ def seen_from_start(robot: Robot, points: ArrayLike, frame: str) -> Array:
 
     ``frame`` : "start", that they are in already, or "world"
     """
-    given = np.asarray(points, dtype=np.float64)
+    rows = np.asarray(points, dtype=np.float64)
     if frame == "start":
-        return given
+        return rows
     # The coordinates of the base are zero at the start, so it stands in the frame of its joint.
     _, joint = base_row(robot)
-    return (given - joint.p_PJ[:2]) @ joint.R_PJ[:2, :2]
+    return (rows - joint.p_PJ[:2]) @ joint.R_PJ[:2, :2]
 
 
 class PlaneCurve:

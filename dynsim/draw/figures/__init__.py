@@ -24,10 +24,8 @@ MODULES: dict[str, tuple[set[str], ...]] = {
 }
 
 
-def draw(record: Record, folder: Path, kind: str = "png", part: tuple[int, int] = (0, 1)) -> list[Path]:
+def draw(record: Record, folder: Path, kind: str = "png") -> list[Path]:
     """Draw every figure that the record has data for, as files of a kind: "png", "pdf" or "svg".
-
-    ``part`` (first, many): only every ``many``-th figure from ``first`` on, for whoever shares the work.
 
     Returns
     -------
@@ -42,12 +40,10 @@ def draw(record: Record, folder: Path, kind: str = "png", part: tuple[int, int] 
     if not len(record):
         return []
     with _drawable():
-        return list(_module(record).draw(record, Path(folder), kind, part))
+        return list(_module(record).draw(record, Path(folder), kind))
 
 
-def draw_comparison(
-    records: Mapping[str, Record], folder: Path, kind: str = "png", part: tuple[int, int] = (0, 1)
-) -> list[Path]:
+def draw_comparison(records: Mapping[str, Record], folder: Path, kind: str = "png") -> list[Path]:
     """Draw variants over each other, in the order of ``records``; those without samples are left out.
 
     Raises
@@ -56,17 +52,15 @@ def draw_comparison(
         See :func:`draw`; or the records are of different kinds.
     """
     drawn = {name: record for name, record in records.items() if len(record)}
-    modules = {_module(record) for record in drawn.values()}
+    # Measured runs too are drawn as simulated ones: what both have.
+    arm = importlib.import_module(SIMULATED)
+    modules = {arm if module.__name__ == MEASURED else module for module in map(_module, drawn.values())}
     if not modules:
         return []
-    arms = {MEASURED, SIMULATED} & {module.__name__ for module in modules}
-    if len(arms) == len(modules) > 1:
-        # Measured beside simulated: what both have is drawn.
-        modules = {importlib.import_module(SIMULATED)}
     if len(modules) > 1:
         raise RecordError("records of different kinds cannot be drawn over each other")
     with _drawable():
-        return list(modules.pop().draw_comparison(drawn, Path(folder), kind, part))
+        return list(modules.pop().draw_comparison(drawn, Path(folder), kind))
 
 
 @contextmanager

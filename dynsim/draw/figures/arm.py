@@ -33,13 +33,11 @@ COMPARISONS: dict[str, Callable[[Mapping[str, Record]], Figure | None]] = {
 }
 
 
-def draw(record: Record, folder: Path, kind: str = "png", part: style.Part = style.ALL) -> list[Path]:
+def draw(record: Record, folder: Path, kind: str = "png") -> list[Path]:
     """See :func:`dynsim.draw.figures.draw`."""
-    return style.save_all(FIGURES, record, folder, kind, part)
+    return style.save_all(FIGURES, record, folder, kind)
 
 
-def draw_comparison(
-    records: Mapping[str, Record], folder: Path, kind: str = "png", part: style.Part = style.ALL
-) -> list[Path]:
+def draw_comparison(records: Mapping[str, Record], folder: Path, kind: str = "png") -> list[Path]:
     """See :func:`dynsim.draw.figures.draw_comparison`."""
-    return style.save_all(COMPARISONS, records, folder, kind, part)
+    return style.save_all(COMPARISONS, records, folder, kind)

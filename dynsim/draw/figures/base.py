@@ -36,7 +36,7 @@ def overturning(record: Record) -> Figure | None:
     bare = np.asarray(np.isnan(traction).any(axis=1))
     demanded = np.minimum(traction, TRACTION_TOP)
     series = [loads, np.maximum(margin, MARGIN_LOW), demanded]
-    rows = style.time_rows(figure, [[(record.time, one)] for one in series], style.settle_time(record))
+    rows = style.time_rows(figure, [[(record.time, values)] for values in series], style.settle_time(record))
     for axes in rows[0]:
         _lines(axes, record, LOADS, "least {} N", np.nanmin)
         style.shade_below_zero(axes, "pulls: held down")
@@ -106,10 +106,10 @@ def tracking(record: Record) -> Figure | None:
     parts = {"error [mm]": away, "heading error [°]": turned}
     if not stands:
         parts = {"position [m]": np.hstack([target[:, :2], pose[:, :2]]), "heading [°]": heading, **parts}
-    what = "base, which stands: actual − reference" if stands else "base, reference and actual"
-    figure = style.new_figure(0.6 + 1.5 * len(parts), style.title(record, what))
-    found = style.time_rows(figure, [[(record.time, one)] for one in parts.values()], style.settle_time(record))
-    rows = dict(zip(parts, found, strict=True))
+    subject = "base, which stands: actual − reference" if stands else "base, reference and actual"
+    figure = style.new_figure(0.6 + 1.5 * len(parts), style.title(record, subject))
+    grid = style.time_rows(figure, [[(record.time, values)] for values in parts.values()], style.settle_time(record))
+    rows = dict(zip(parts, grid, strict=True))
     for name, panels in rows.items():
         for axes in panels:
             values = parts[name]
@@ -137,8 +137,8 @@ def tracking(record: Record) -> Figure | None:
     for name, panels in rows.items():
         panels[0].set_ylabel(name)
         style.legend_above(panels[-1], columns=4)
-    events.mark_all(found, record)
-    figure.align_ylabels([panels[0] for panels in found])
+    events.mark_all(grid, record)
+    figure.align_ylabels([panels[0] for panels in grid])
     return figure
 
 

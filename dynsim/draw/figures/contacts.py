@@ -48,12 +48,13 @@ def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
     if not names:
         return None
     chosen = _most_interesting(names, runs)
-    note = "" if len(chosen) == len(names) else f", {len(chosen)} of {len(names)} contacts ({_choice(runs)})"
+    kind = "highest" if any(map(is_real, runs)) else "lowest"
+    note = "" if len(chosen) == len(names) else f", {len(chosen)} of {len(names)} contacts ({kind} forces)"
     having = {name: {v: r for v, r in records.items() if _touched(r, name)} for name in chosen}
     # A legend has an entry for each variant and one for the shading.
     more = sum(-(-(len(having[name]) + 1) // 2) - 1 for name in chosen) * style.LEGEND_ROW / 72.0
     figure = style.new_figure(1.0 + ROW * len(chosen) + more, title + note)
-    series = [[one for r in having[name].values() for one in _series(r, name)] for name in chosen]
+    series = [[values for r in having[name].values() for values in _series(r, name)] for name in chosen]
     styles = style.variant_styles(list(records))
     rows = style.time_rows(figure, series, max(map(style.settle_time, runs)))
     for name, panels in zip(chosen, rows, strict=True):
@@ -64,9 +65,10 @@ def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
                 force, colour = _force(record, name), str(styles[variant]["color"])
                 label = f"{variant or name}: {_share(record, name)}{_within(record, name)}"
                 style.line(axes, record.time, force, label=label, **styles[variant])
-                _draw_extremes(axes, record, name, colour)
-                found = events.marked(record, [name])
-                events.mark(axes, [e for e in found if axes is panels[0] or e.time > begun], colour, row=row)
+                for value in _extremes(record, name):
+                    axes.axhline(value, color=colour, linestyle=(0, (5, 3)), linewidth=0.7)
+                changes = events.marked(record, [name])
+                events.mark(axes, [e for e in changes if axes is panels[0] or e.time > begun], colour, row=row)
                 if alone and is_real(record):
                     _draw_modes(axes, record, name)
                 elif alone:
@@ -85,10 +87,10 @@ def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
 
 def contact_names(records: Sequence[Record]) -> list[str]:
     """Names of all contacts, in the order in which they first appear."""
-    found: dict[str, None] = {}
+    names: dict[str, None] = {}
     for record in records:
-        found.update(dict.fromkeys(record.labels.get("contact_normal_force", ())))
-    return list(found)
+        names.update(dict.fromkeys(record.labels.get("contact_normal_force", ())))
+    return list(names)
 
 
 def touching_names(records: Sequence[Record]) -> list[str]:
@@ -106,9 +108,9 @@ def is_real(record: Record) -> bool:
 
 
 def _share(record: Record, name: str) -> str:
-    what, key = ("closed", "closed_fraction") if is_real(record) else ("pulling", "pulling_fraction")
+    state, key = ("closed", "closed_fraction") if is_real(record) else ("pulling", "pulling_fraction")
     contact = _summary(record, name)
-    return f"{what} {percent(contact[key])} of the run" if contact else f"{what} unknown part"
+    return f"{state} {percent(contact[key])} of the run" if contact else f"{state} unknown part"
 
 
 def _within(record: Record, name: str) -> str:
@@ -134,11 +136,6 @@ def _series(record: Record, name: str) -> list[style.Series]:
     """What must find room: the samples, and the extremes, which most often fall into the first milliseconds."""
     extremes = _extremes(record, name)
     return [(record.time, _force(record, name)), *([(record.time[[0, 0]], extremes)] if extremes.size else [])]
-
-
-def _draw_extremes(axes: Axes, record: Record, name: str, colour: str) -> None:
-    for value in _extremes(record, name):
-        axes.axhline(value, color=colour, linestyle=(0, (5, 3)), linewidth=0.7)
 
 
 def _draw_samples(axes: Axes, record: Record, name: str, colour: str) -> None:
@@ -174,14 +171,10 @@ def _most_interesting(names: list[str], records: Sequence[Record]) -> list[str]:
 
     def rank(name: str) -> float:
         values = [_force(r, name) for r in records if name in contact_names([r])]
-        return -max(float(one.max()) for one in values) if real else min(float(one.min()) for one in values)
+        return -max(float(force.max()) for force in values) if real else min(float(force.min()) for force in values)
 
     chosen = sorted(names, key=rank)[:ROWS]
     return [name for name in names if name in chosen]
-
-
-def _choice(records: Sequence[Record]) -> str:
-    return "highest forces" if any(map(is_real, records)) else "lowest forces"
 
 
 def mode_bands(record: Record, name: str) -> list[tuple[float, float, int]]:

@@ -131,8 +131,8 @@ def ledger(record: Record) -> Figure | None:
         whole.set_title("with Joule heat", loc="left")
         whole.set_xlabel("time [s]")
         main = figure.add_subplot(grid[0, 0], sharex=whole)
-        rest = {name: values for name, values in terms.items() if name != "heat_joule"}
-        _stack(main, record.time, rest, supplied - terms["heat_joule"], source)
+        others = {name: values for name, values in terms.items() if name != "heat_joule"}
+        _stack(main, record.time, others, supplied - terms["heat_joule"], source)
         main.set_title("without Joule heat", loc="left")
     main.set_ylabel("energy since start [J]")
     panels = [main, figure.add_subplot(grid[1, 0], sharex=main)] if near else [main]
@@ -216,11 +216,11 @@ def _totals(axes: Axes, names: Sequence[str], values: Array, colours: Sequence[s
     else:
         axes.bar(places, values, color=colours, width=0.7)
         axes.margins(x=0.05, y=0.08)
-    for place, value in zip(places.tolist(), values.tolist(), strict=True):
+    for x, value in zip(places.tolist(), values.tolist(), strict=True):
         part = f"\n1/{style.number(largest / value, 3)}" if logarithmic and value < largest else ""
         look: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "va": "bottom", "fontsize": 7.5}
         text = f"{style.number(value)}{part}"
-        axes.annotate(text, (place, max(value, 0.0)), xytext=(0, 6 if logarithmic else 2), **look)
+        axes.annotate(text, (x, max(value, 0.0)), xytext=(0, 6 if logarithmic else 2), **look)
     axes.set_xticks(places, names, rotation=30 if len(names) <= 4 else 60, ha="right")
     axes.grid(axis="x", visible=False)
     axes.set_title("electrical energy of the run, net [J]" + (",\nand as a part of the largest" if logarithmic else ""))

@@ -52,34 +52,34 @@ def draw_errors(title: str, time: Array, quantities: Sequence[Followed], named: 
     named : joints in colour, of any quantity; the ``STRONG`` worst of one of which none is named
     """
     with style.look():
-        rows = [style.LEGEND_ROW / 72.0 * (3 + min(len(one.names), STRONG)) / 2 for one in quantities]
+        rows = [style.LEGEND_ROW / 72.0 * (3 + min(len(quantity.names), STRONG)) / 2 for quantity in quantities]
         figure = style.new_figure(sum(4.2 + row for row in rows), title)
         panels = figure.subplots(2 * len(quantities), 1, sharex=True)
-        for one, (values, errors) in zip(quantities, panels.reshape(-1, 2), strict=True):
-            _draw(values, errors, time, one, named)
+        for quantity, (values, errors) in zip(quantities, panels.reshape(-1, 2), strict=True):
+            _draw(values, errors, time, quantity, named)
         panels[-1].set_xlabel("record time [s]")
         return style.save(figure, path)
 
 
-def _draw(values: Axes, errors: Axes, time: Array, one: Followed, named: Sequence[str]) -> None:
-    ranking = sorted(range(len(one.names)), key=lambda k: -one.rms[k])
-    chosen = [one.names.index(name) for name in dict.fromkeys(named) if name in one.names] or ranking[:STRONG]
-    looks = style.variant_styles([one.names[k] for k in chosen])
-    simulated, measured = one.values
+def _draw(values: Axes, errors: Axes, time: Array, quantity: Followed, named: Sequence[str]) -> None:
+    ranking = sorted(range(len(quantity.names)), key=lambda k: -quantity.rms[k])
+    chosen = [quantity.names.index(name) for name in dict.fromkeys(named) if name in quantity.names] or ranking[:STRONG]
+    looks = style.variant_styles([quantity.names[k] for k in chosen])
+    simulated, measured = quantity.values
     coloured = {
-        k: {key: looks[one.names[k]][key] for key in ("color", "linestyle")} | {"linewidth": 1.2} for k in chosen
+        k: {key: looks[quantity.names[k]][key] for key in ("color", "linestyle")} | {"linewidth": 1.2} for k in chosen
     }
     for k in chosen:
         style.line(values, time, measured[:, k], **coloured[k])
         style.line(values, time, simulated[:, k], **SIMULATED)
     for k in [k for k in reversed(ranking) if k not in chosen] + chosen:
-        look = coloured[k] | {"label": one.texts[k]} if k in chosen else FAINT
-        style.line(errors, time, one.scale * (measured[:, k] - simulated[:, k]), **look)
-    if others := len(one.names) - len(chosen):
-        errors.plot([], [], label=f"the other {others} {one.kind}", **FAINT)
+        look = coloured[k] | {"label": quantity.texts[k]} if k in chosen else FAINT
+        style.line(errors, time, quantity.scale * (measured[:, k] - simulated[:, k]), **look)
+    if others := len(quantity.names) - len(chosen):
+        errors.plot([], [], label=f"the other {others} {quantity.kind}", **FAINT)
     values.plot([], [], label="simulated (measured in colour)", **SIMULATED)
     style.legend_above(values)
     style.legend_above(errors, columns=2)
-    values.set_ylabel(one.quantity)
+    values.set_ylabel(quantity.quantity)
     errors.axhline(0.0, color=style.GREY, linewidth=0.6)
-    errors.set_ylabel(one.error)
+    errors.set_ylabel(quantity.error)

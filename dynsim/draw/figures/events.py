@@ -46,13 +46,13 @@ def mark(axes: Axes, events: Sequence[Event], colour: str = COLOUR, *, row: int 
     low, high = axes.get_xlim()
     inside = [event for event in events if low <= event.time <= high]
     down = ScaledTranslation(0.0, -(BELOW + ROW * row) / 72.0, axes.figure.dpi_scale_trans)
-    place = axes.get_xaxis_transform() + down
+    transform = axes.get_xaxis_transform() + down
     look: dict[str, Any] = {"color": colour, "markersize": 3.2, "markeredgewidth": 0.0, "zorder": 6, "clip_on": False}
     for kind, (marker, _, _) in MARKS.items():
         times = [event.time for event in inside if event.kind == kind]
         if not times:
             continue
-        axes.plot(times, [1.0] * len(times), marker, transform=place, label="_event", **look)
+        axes.plot(times, [1.0] * len(times), marker, transform=transform, label="_event", **look)
         if lines and len(inside) <= LINES:
             for time in times:
                 axes.axvline(time, color=colour, linewidth=0.5, alpha=0.35 if row >= 0 else 0.2, zorder=0.5)
@@ -61,13 +61,13 @@ def mark(axes: Axes, events: Sequence[Event], colour: str = COLOUR, *, row: int 
 
 def mark_all(rows: Iterable[Sequence[Axes]], record: Record) -> None:
     """Mark all events of a run in every panel, and name the marks under the last one."""
-    found = marked(record)
-    if not found:
+    events = marked(record)
+    if not events:
         return
     for panels in (rows := list(rows)):
         for axes in panels:
-            mark(axes, found)
-    explain(rows[-1][-1], found)
+            mark(axes, events)
+    explain(rows[-1][-1], events)
 
 
 def height_of_variants(records: Mapping[str, Record]) -> float:
@@ -82,14 +82,14 @@ def mark_variants(
 
     Inside they would lie on the curves of the other variants.
     """
-    having = {name: found for name, record in records.items() if (found := marked(record))}
-    everything = [event for found in having.values() for event in found]
+    having = {name: events for name, record in records.items() if (events := marked(record))}
+    everything = [event for events in having.values() for event in events]
     if not everything:
         return []
     for panels in rows:
         for axes in panels:
-            for row, (name, found) in enumerate(having.items()):
-                mark(axes, found, colours[name], row=-1 - row, lines=len(everything) <= LINES)
+            for row, (name, events) in enumerate(having.items()):
+                mark(axes, events, colours[name], row=-1 - row, lines=len(everything) <= LINES)
             # The empty title keeps the room.
             axes.set_title(" ", fontsize=1.0, y=1.0, pad=ROW * len(having))
     return everything

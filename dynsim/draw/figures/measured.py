@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from dynsim.draw.figures import arm, hand, posture, style
+from dynsim.draw.figures import hand, posture, style
 from dynsim.draw.figures.style import Array
 from dynsim.record import TIME, Record
 
@@ -20,27 +20,20 @@ LINES = 12
 MILLI = 1e3
 
 
-def draw(record: Record, folder: Path, kind: str = "png", part: style.Part = style.ALL) -> list[Path]:
+def draw(record: Record, folder: Path, kind: str = "png") -> list[Path]:
     """See :func:`dynsim.draw.figures.draw`."""
-    return style.save_all(FIGURES, record, folder, kind, part)
-
-
-def draw_comparison(
-    records: Mapping[str, Record], folder: Path, kind: str = "png", part: style.Part = style.ALL
-) -> list[Path]:
-    """See :func:`dynsim.draw.figures.draw_comparison`: measured runs beside each other, and beside simulated ones."""
-    return arm.draw_comparison(records, folder, kind, part)
+    return style.save_all(FIGURES, record, folder, kind)
 
 
 def joints(record: Record) -> Figure | None:
     """Every joint with its goal over time; None where no goal was recorded."""
-    found = _followed(record)
-    if not found:
+    followed = _followed(record)
+    if not followed:
         return None
-    shown = _largest(found, JOINTS)
+    shown = _largest(followed, JOINTS)
     columns = 2 if len(shown) > 3 else 1
     lines = -(-len(shown) // columns)
-    note = "" if len(shown) == len(found) else f"; {len(shown)} of {len(found)} with the largest error"
+    note = "" if len(shown) == len(followed) else f"; {len(shown)} of {len(followed)} with the largest error"
     figure = style.new_figure(1.0 + 1.15 * lines, style.title(record, f"joints and their goals{note}"))
     grid = figure.subplots(lines, columns, sharex=True, squeeze=False)
     for axes, (label, unit, measured, goal) in zip(grid.T.ravel(), shown, strict=False):
@@ -58,11 +51,11 @@ def joints(record: Record) -> Figure | None:
 
 def following_error(record: Record) -> Figure | None:
     """Measured minus goal of every joint over time, and how large it is; None where no goal was recorded."""
-    found = _followed(record)
-    if not found:
+    followed = _followed(record)
+    if not followed:
         return None
-    shown = _largest(found, LINES)
-    note = "" if len(shown) == len(found) else f"; {len(shown)} of {len(found)} with the largest error"
+    shown = _largest(followed, LINES)
+    note = "" if len(shown) == len(followed) else f"; {len(shown)} of {len(followed)} with the largest error"
     figure = style.new_figure(3.4 + 0.12 * len(shown), style.title(record, f"following error{note}"))
     over_time, largest = figure.subplots(2, 1, height_ratios=[1.6, 1.0])
     units = {unit for _, unit, _, _ in shown}
@@ -77,8 +70,8 @@ def following_error(record: Record) -> Figure | None:
     during = record.time >= 0.0 if (record.time >= 0.0).any() else slice(None)
     errors = [MILLI * np.abs(measured - goal)[during] for _, _, measured, goal in shown]
     places = np.arange(len(shown))
-    largest.bar(places, [_finite(np.nanmax, one) for one in errors], color="#CFCFCF", width=0.7, label="largest")
-    rms = [_finite(lambda e: np.sqrt(np.nanmean(e**2)), one) for one in errors]
+    largest.bar(places, [_finite(np.nanmax, error) for error in errors], color="#CFCFCF", width=0.7, label="largest")
+    rms = [_finite(lambda e: np.sqrt(np.nanmean(e**2)), error) for error in errors]
     largest.bar(places, rms, color=style.BLUE, width=0.4, label="rms")
     largest.set_xticks(places, [label for label, *_ in shown], rotation=30 if len(shown) > 6 else 0, ha="center")
     largest.set_ylabel(f"size in the replay{one_unit}")
@@ -153,22 +146,22 @@ Followed = tuple[str, str, Array, Array]
 
 def _followed(record: Record) -> list[Followed]:
     """Label, unit, measured and goal of everything that had goals: positions, and rates of what has no position."""
-    found: dict[str, Followed] = {}
+    followed: dict[str, Followed] = {}
     own = [name for name, signal in record.signals.items() if signal.axis == TIME and signal.data.ndim == 2]
     names = [name for name in own if f"{name}_goal" in own and name != "hand_position"]
     for name in sorted(names, key=lambda name: record.units[name].endswith("/s")):
         goals = dict(zip(record.labels[f"{name}_goal"], record[f"{name}_goal"].T, strict=True))
         for label, measured in zip(record.labels[name], record[name].T, strict=True):
             if label in goals and np.isfinite(goals[label]).any():
-                found.setdefault(label, (label, record.units[name], measured, goals[label]))
-    return list(found.values())
+                followed.setdefault(label, (label, record.units[name], measured, goals[label]))
+    return list(followed.values())
 
 
-def _largest(found: Sequence[Followed], count: int) -> list[Followed]:
+def _largest(followed: Sequence[Followed], count: int) -> list[Followed]:
     """All, or those with the largest error, in their order."""
-    errors = [_finite(np.nanmax, np.abs(measured - goal)) for _, _, measured, goal in found]
+    errors = [_finite(np.nanmax, np.abs(measured - goal)) for _, _, measured, goal in followed]
     kept = np.sort(np.argsort(errors)[::-1][:count])
-    return [found[k] for k in kept]
+    return [followed[k] for k in kept]
 
 
 def _finite(measure: Callable[[Array], float], values: Array) -> float:

@@ -28,13 +28,13 @@ from dynsim.draw.figures.skeleton import (
     with_labels,
 )
 from dynsim.draw.figures.style import Array
-from dynsim.draw.geometry.robot import sunk
+from dynsim.draw.geometry.robot import penetrations
 from dynsim.draw.geometry.shapes import grid_faces, outline
 from dynsim.draw.geometry.surfaces import round_patch, surface_grids
 from dynsim.record import Record
 from dynsim.record.measures import hand_target
 from dynsim.record.poses import point_positions
-from dynsim.record.scene import Point, Surface
+from dynsim.record.scene import Point, SceneSurface
 
 # An axis of the 3D view shorter than this share of the longest has two ticks.
 SHORT_AXIS = 0.45
@@ -65,7 +65,7 @@ def posture(record: Record) -> Figure | None:
     height = 5.6 if wide else 1.15 + float(np.clip(HALF / 72.0 * size[1] / size[0], 1.5, 3.4))
     room = np.array([FULL, np.inf]) if wide else np.array([HALF, 72.0 * (height - 1.15)])
     extent, scale = _with_labels(extent, [body], plane, room)
-    before = ", ".join(style.number(float(record.time[row]), 2) for row in body.shown()[:-1]) if body else ""
+    before = ", ".join(style.number(float(record.time[row]), 2) for row in body.rows_shown()[:-1]) if body else ""
     faint = f"; faint, at {before} s" if before else ""
     figure = style.new_figure(height, style.title(record, f"posture at {record.time[-1]:.4g} s{faint}"))
     # Side by side, the labels of the 3D view need some room to their right.
@@ -89,7 +89,7 @@ def posture_comparison(records: Mapping[str, Record]) -> Figure | None:
         return None
     some = [records[name] for name in shown]
     drawn = {name: body.postures() for name, body in shown.items()}
-    everything = [segments for one in drawn.values() for segments in one]
+    everything = [segments for postures in drawn.values() for segments in postures]
     plane = side_plane(some[0], everything)
     everything += [solid for body in shown.values() for base in body.bases() for solid in base]
     low, high = extent_of(plane, everything, some)
@@ -133,7 +133,7 @@ def _with_labels(
     return wide, scale
 
 
-def _frame_side(axes: Axes, plane: SidePlane, extent: tuple[Array, Array], surfaces: Sequence[Surface]) -> None:
+def _frame_side(axes: Axes, plane: SidePlane, extent: tuple[Array, Array], surfaces: Sequence[SceneSurface]) -> None:
     """Limits, labels, and where surfaces are: grey inside (C < 0), a line where the plane cuts them."""
     low, high = extent
     axes.set_aspect("equal", adjustable="box")
@@ -193,14 +193,14 @@ def _side_view(
     for _, _, position, force in () if body is None else body.contacts():
         axes.plot(*plane.project(position), zorder=6, linestyle="none", **_contact_mark(force))
     labels = contact_labels(body, plane, scale)
-    rows = np.array([] if body is None else body.shown(), dtype=np.intp)
-    if body is not None and (below := sunk(record, body.scene, rows)):
+    rows = np.array([] if body is None else body.rows_shown(), dtype=np.intp)
+    if body is not None and (below := penetrations(record, body.scene, rows)):
         ring: dict[str, Any] = {"markersize": 9, "markerfacecolor": "none", "color": style.DEEP, "zorder": 5}
-        for one in below:
-            point = Point(one.name, "hand", one.body, one.position)
-            places = plane.project(point_positions(record, point, rows)[one.depth > one.least])
+        for point_below in below:
+            point = Point(point_below.name, "hand", point_below.body, point_below.position)
+            places = plane.project(point_positions(record, point, rows)[point_below.depth > point_below.least])
             axes.plot(*places.T, "o", **ring)
-        deepest = max(below, key=lambda one: float(one.depth.max()))
+        deepest = max(below, key=lambda point_below: float(point_below.depth.max()))
         text = f"below {deepest.surface}, up to {style.number(1e3 * float(deepest.depth.max()), 3)} mm"
         axes.plot([], [], "o", label=text if named else "below a surface", **ring)
     for label in labels:
@@ -236,7 +236,7 @@ def _space_view(
     axes.computed_zorder = False
     for surface in () if body is None else body.scene.surfaces:
         _draw_surface(axes, surface, low, high)
-    base = [] if body is None or not drawn else body.solids(body.shown()[-1])
+    base = [] if body is None or not drawn else body.solids(body.rows_shown()[-1])
     if base:
         # One collection: it sorts its faces by depth.
         shown = np.concatenate([corners[faces] for corners, faces in base])
@@ -285,7 +285,7 @@ def _space_view(
         axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
 
 
-def _draw_surface(axes: Axes3D, surface: Surface, low: Array, high: Array) -> None:
+def _draw_surface(axes: Axes3D, surface: SceneSurface, low: Array, high: Array) -> None:
     """The part of a surface next to the arm."""
     if surface.kind in ("sphere", "cylinder"):
         grids = [round_patch(surface, low, high)]

@@ -15,7 +15,7 @@ from dynsim.draw.geometry.surfaces import box_about
 from dynsim.record import Record
 from dynsim.record.measures import hand_target
 from dynsim.record.poses import POSITION, point_positions
-from dynsim.record.scene import WORLD, Joint, Point, Scene, Surface
+from dynsim.record.scene import WORLD, Joint, Point, Scene, SceneSurface
 
 # Postures drawn faintly, evenly over the run, besides the last one.
 FAINT = 6
@@ -55,24 +55,24 @@ class Skeleton:
 
     def solids(self, row: int) -> list[tuple[Array, Faces]]:
         """Corners, (n, 3) [m], and faces of the shapes of a mobile base and its wheels at a sample."""
-        return [one for body in self.scene.base for one in corners_of(self.record, self.scene, body, row)]
+        return [solid for body in self.scene.base for solid in corners_of(self.record, self.scene, body, row)]
 
     def bases(self) -> list[list[Array]]:
         """Corners of a mobile base's solids for each of the postures."""
-        return [[corners for corners, _ in self.solids(k)] for k in self.shown()]
+        return [[corners for corners, _ in self.solids(k)] for k in self.rows_shown()]
 
     def postures(self) -> list[Array]:
         """Segments at some samples, those of the last one last; a run that diverged may end in some without poses."""
-        return [self.segments(k) for k in self.shown()]
+        return [self.segments(k) for k in self.rows_shown()]
 
-    def shown(self) -> list[int]:
+    def rows_shown(self) -> list[int]:
         """Samples at which the robot is drawn, the last one last; none where it never had a pose."""
         rows = np.flatnonzero(np.isfinite(self.record[POSITION]).all(axis=(1, 2)))
         if not len(rows):
             return []
         return list(dict.fromkeys(rows[np.linspace(0, len(rows) - 1, FAINT + 1).astype(int)].tolist()))
 
-    def contacts(self) -> list[tuple[Point, Surface, Array, float]]:
+    def contacts(self) -> list[tuple[Point, SceneSurface, Array, float]]:
         """Contact, its surface, position and normal force at the end; NaN for a force that is not known.
 
         Of those that could touch, under the unilateral law, the ones that did in some sample.
@@ -86,7 +86,9 @@ class Skeleton:
         untouched: set[str] = set()
         if "contact_mode" in record:
             open_always = (record["contact_mode"] == 0.0).all(axis=0)
-            untouched = {name for name, one in zip(record.labels["contact_mode"], open_always, strict=True) if one}
+            untouched = {
+                name for name, always in zip(record.labels["contact_mode"], open_always, strict=True) if always
+            }
         return [
             (point, surface, point_positions(record, point, len(record) - 1), float(forces.get(point.name, np.nan)))
             for point in self.scene.contacts
@@ -184,18 +186,18 @@ def contact_labels(body: Skeleton | None, plane: SidePlane, scale: float) -> lis
 
     Labels that would overprint each other at ``scale`` [point/m] are moved away from the surface.
     """
-    found: list[Label] = []
-    points = [(*one, plane.project(one[2])) for one in ([] if body is None else body.contacts())]
-    for contact, surface, position, force, at in sorted(points, key=lambda one: float(one[4][0])):
+    labels: list[Label] = []
+    points = [(*contact, plane.project(contact[2])) for contact in ([] if body is None else body.contacts())]
+    for contact, surface, position, force, at in sorted(points, key=lambda entry: float(entry[4][0])):
         along, up = plane.project(plane.origin + surface.gradient(position)) - plane.project(plane.origin)
         steep = abs(along) > abs(up)
         side = (-1 if along > 0.0 else 1, 0) if steep else (0, 1 if up < 0.0 else -1)
         text = contact.name if np.isnan(force) else f"{contact.name}\n{style.number(force, 3)} N"
         label = Label(text, at, side, 0)
-        while any(label.overprints(other, scale) for other in found):
+        while any(label.overprints(other, scale) for other in labels):
             label = replace(label, level=label.level + 1)
-        found.append(label)
-    return found
+        labels.append(label)
+    return labels
 
 
 def with_labels(extent: tuple[Array, Array], labels: Sequence[Label], scale: float) -> tuple[Array, Array]:

@@ -49,7 +49,7 @@ FRAMES, IN_A_ROW, IN_A_PICTURE = 50, 6, 7
 SHADES = LinearSegmentedColormap.from_list("shades", ["#CFCFCF", "#000000"])
 
 
-def draw(record: Record, folder: Path, kind: str = "png", part: style.Part = style.ALL) -> list[Path]:
+def draw(record: Record, folder: Path, kind: str = "png") -> list[Path]:
     """Write all figures of one run and the animation into ``folder``; returns the files."""
     makers: dict[str, Callable[[Record], Figure]] = {
         "postures": postures,
@@ -59,14 +59,10 @@ def draw(record: Record, folder: Path, kind: str = "png", part: style.Part = sty
         "redundancy": redundancy,
         **tanaka2019.figures_of_run(record),
     }
-    written = style.save_all(makers, record, folder, kind, part)
-    first, many = part
-    return [*written, animate(record, folder / "animation.gif")] if len(makers) % many == first else written
+    return [*style.save_all(makers, record, folder, kind), animate(record, folder / "animation.gif")]
 
 
-def draw_comparison(
-    records: Mapping[str, Record], folder: Path, kind: str = "png", part: style.Part = style.ALL
-) -> list[Path]:
+def draw_comparison(records: Mapping[str, Record], folder: Path, kind: str = "png") -> list[Path]:
     """Variants over each other, and figures and tables beside [T] where its experiments were run; returns the files."""
     makers: dict[str, Callable[[Mapping[str, Record]], Figure]] = {
         "comparison": comparison,
@@ -76,9 +72,8 @@ def draw_comparison(
     if len(names := {record.summary["scenario"] for record in records.values()}) == 1:
         scenario = names.pop()
         makers |= tanaka2019.figures(scenario, records)
-        if part[0] == 0:
-            written += tanaka2019.write_tables(scenario, records, folder)
-    return written + style.save_all(makers, records, folder, kind, part)
+        written = tanaka2019.write_tables(scenario, records, folder)
+    return written + style.save_all(makers, records, folder, kind)
 
 
 def comparison(records: Mapping[str, Record]) -> Figure:

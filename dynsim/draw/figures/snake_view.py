@@ -107,14 +107,14 @@ def posture_grid(title: str, lines: Mapping[str, Sequence[tuple[View, str]]], on
         sharey="row",
         height_ratios=heights,
     )
-    for place, ((label, line), (x0, x1, y0, y1)) in enumerate(zip(lines.items(), boxes, strict=True)):
-        row = axes[place]
+    for k, ((label, line), (x0, x1, y0, y1)) in enumerate(zip(lines.items(), boxes, strict=True)):
+        row = axes[k]
         row[0].set_ylabel(label, rotation=0, ha="right", va="center")
         row[0].tick_params(axis="y", labelsize=SMALL)
         for column in range(len(line), columns):
             row[column].set_visible(False)
-            if place > 0:
-                axes[place - 1, column].tick_params(labelbottom=True)  # the lowest one there
+            if k > 0:
+                axes[k - 1, column].tick_params(labelbottom=True)  # the lowest one there
         for axis, (view, text) in zip(row, line, strict=False):
             axis.plot(*view.path.T, color=TARGET, lw=1.0, zorder=2)
             view.draw(axis, above=True)
@@ -215,8 +215,8 @@ def _shares(axis: Axes, record: Record, holds: NDArray[Any], places: NDArray[np.
     many = np.diff(starts, append=len(record.time))[:, None]
     shares = np.add.reduceat(holds.astype(float), starts, axis=0) / many
     edges = np.append(record.time[starts], record.time[-1])
-    for place, share in zip(places, shares.T, strict=True):
-        bar = [place - 0.4, place + 0.4]
+    for position, share in zip(places, shares.T, strict=True):
+        bar = [position - 0.4, position + 0.4]
         axis.pcolormesh(edges, bar, share[None], cmap=SHARES, vmin=0.0, vmax=1.0)
 
 

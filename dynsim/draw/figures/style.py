@@ -27,8 +27,6 @@ Array = NDArray[np.float64]
 # A quantity over time, (T,) and (T,) or (T, k).
 Series = tuple[Array, Array]
 # Which figures of a record are drawn: every ``many``-th from ``first`` on, (first, many).
-Part = tuple[int, int]
-ALL: Part = (0, 1)
 
 # Okabe and Ito's colours, which colour-blind readers tell apart; yellow is too faint on white.
 BLUE, ORANGE, GREEN, PURPLE, SKY, BLACK = "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#000000"
@@ -110,22 +108,12 @@ def save(figure: Figure, path: Path) -> Path:
     return write(figure, path)
 
 
-def save_all(
-    makers: Mapping[str, Callable[[T], Figure | None]], of: T, folder: Path, kind: str, part: Part = ALL
-) -> list[Path]:
+def save_all(makers: Mapping[str, Callable[[T], Figure | None]], of: T, folder: Path, kind: str) -> list[Path]:
     """Every figure, by its name, that the record or records have data for, in dynsim's look; returns the files."""
     with look():
         return [
-            save(figure, folder / f"{name}.{kind}")
-            for name, make in part_of(list(makers.items()), part)
-            if (figure := make(of)) is not None
+            save(figure, folder / f"{name}.{kind}") for name, make in makers.items() if (figure := make(of)) is not None
         ]
-
-
-def part_of(of: Sequence[T], part: Part) -> Sequence[T]:
-    """What one of several processes draws."""
-    first, many = part
-    return of[first::many]
 
 
 def write(figure: Figure, path: Path) -> Path:
@@ -147,15 +135,15 @@ def write(figure: Figure, path: Path) -> Path:
     return path
 
 
-def title(record: Record, what: str) -> str:
-    """``what`` with scenario and variant (of a measured run: the robot), and how far an incomplete run came."""
+def title(record: Record, subject: str) -> str:
+    """``subject`` with scenario and variant (of a measured run: the robot), and how far an incomplete run came."""
     note = "" if record.complete else f" (incomplete: ends at {record.time[-1]:.3g} s)"
-    return f"{record.title or 'record'}: {what}{note}"
+    return f"{record.title or 'record'}: {subject}{note}"
 
 
-def comparison_title(records: Sequence[Record], what: str) -> str:
-    """``what`` with the scenario that the variants share."""
-    return f"{records[0].provenance.get('scenario', {}).get('name', '') or 'comparison'}: {what}"
+def comparison_title(records: Sequence[Record], subject: str) -> str:
+    """``subject`` with the scenario that the variants share."""
+    return f"{records[0].provenance.get('scenario', {}).get('name', '') or 'comparison'}: {subject}"
 
 
 def variant_styles(names: Sequence[T]) -> dict[T, dict[str, Any]]:
@@ -263,23 +251,26 @@ def time_rows(
         For each row (transient, whole run) or (whole run,); draw everything in all of them.
     """
     end = max(time[-1] for row in rows for time, _ in row)
-    found = [_transient(row, settle) for row in rows]
+    transients = [_transient(row, settle) for row in rows]
     # One that lasts for most of the run needs no panel.
-    found = [one if one is not None and one.end < TRANSIENT_MOST * end / TRANSIENT_ROOM else None for one in found]
-    window = max((one.end for one in found if one is not None), default=0.0)
+    transients = [
+        transient if transient is not None and transient.end < TRANSIENT_MOST * end / TRANSIENT_ROOM else None
+        for transient in transients
+    ]
+    window = max((transient.end for transient in transients if transient is not None), default=0.0)
     split = window > 0.0
     grid = figure.subplots(
         len(rows), 1 + split, sharex="col", squeeze=False, width_ratios=[1.0, 2.4] if split else [1.0]
     )
-    for one, axes in zip(found, grid, strict=True):
+    for transient, axes in zip(transients, grid, strict=True):
         if end > 0.0:
             axes[-1].set_xlim(0.0, end)
         if split:
             axes[0].set_xlim(0.0, TRANSIENT_ROOM * window)
-        if one is not None:
-            axes[-1].set_ylim(one.low, one.high)
+        if transient is not None:
+            axes[-1].set_ylim(transient.low, transient.high)
             if compress:
-                _compress(axes[0], one)
+                _compress(axes[0], transient)
     for axis in grid[-1]:
         axis.set_xlabel("time [s]")
     if split:

@@ -170,8 +170,8 @@ def heat_map(sweep: Sweep) -> Figure | None:
         for table, variant in zip(tables, variants, strict=True):
             for j, b in enumerate(ys):
                 for i, a in enumerate(xs):
-                    found = _values(_at(sweep.of(variant), {x: a, y: b}), metric) * scale
-                    table[j, i] = found.mean() if len(found) else np.nan
+                    values = _values(_at(sweep.of(variant), {x: a, y: b}), metric) * scale
+                    table[j, i] = values.mean() if len(values) else np.nan
         low, high = np.nanmin(tables), np.nanmax(tables)
         norm = LogNorm(low, high) if _is_wide(low, high) else Normalize(low, high)
         for axes, table, variant in zip(column, tables, variants, strict=True):
@@ -201,10 +201,10 @@ def pareto(sweep: Sweep) -> Figure | None:
     axes = figure.subplots()
     styles, last = sweep.looks, max(len(sweep.variants) - 1, 1)
     for k, variant in enumerate(sweep.variants):
-        found = [
+        points = [
             (row[error], row[energy]) for row in sweep.of(variant) if None not in (row.get(error), row.get(energy))
         ]
-        xs, ys = np.array(found, dtype=float).reshape(-1, 2).T
+        xs, ys = np.array(points, dtype=float).reshape(-1, 2).T
         # Earlier ones are larger: equal runs of several variants are rings about each other.
         larger = 1.0 + 1.8 * (len(sweep.variants) - 1 - k) / last
         size = (14 if len(sweep.rows) < 500 else 4) * larger**2
@@ -235,11 +235,11 @@ def pareto(sweep: Sweep) -> Figure | None:
 
 def best(points: Sequence[tuple[float, float]]) -> Array:
     """Points that no other one is below in one coordinate and not above in the other, by the first, (k, 2)."""
-    found: list[tuple[float, float]] = []
+    front: list[tuple[float, float]] = []
     for x, y in sorted(points):
-        if not found or y < found[-1][1]:
-            found.append((x, y))
-    return np.array(found).reshape(-1, 2)
+        if not front or y < front[-1][1]:
+            front.append((x, y))
+    return np.array(front).reshape(-1, 2)
 
 
 def samples(sweep: Sweep) -> Figure | None:
@@ -262,14 +262,14 @@ def samples(sweep: Sweep) -> Figure | None:
         _PANEL * len(variants) * len(shown) + _ROOM,
         f"{sweep.name}: {len(sweep.rows)} runs by the law of their parameters{sweep.failed}{note}",
     )
-    rows = [(variant, place) for variant in variants for place in shown]
+    rows = [(variant, grid_place) for variant in variants for grid_place in shown]
     ends = [key.split(".")[-1] for key in sweep.grid]
     names = {key: end if ends.count(end) == 1 else key for key, end in zip(sweep.grid, ends, strict=True)}
     panels = figure.subplots(len(rows), len(metrics), squeeze=False)
-    for row, (variant, place) in zip(panels, rows, strict=True):
-        here = list(_at(sweep.of(variant), place))
+    for row, (variant, grid_place) in zip(panels, rows, strict=True):
+        here = list(_at(sweep.of(variant), grid_place))
         # Where there is one place, it goes without saying.
-        where = [f"{names[key]} = {_level(value)}" for key, value in place.items()] if len(places) > 1 else []
+        where = [f"{names[key]} = {_level(value)}" for key, value in grid_place.items()] if len(places) > 1 else []
         texts = [variant] * bool(variant) + [_short(", ".join(where), _HEAD - len(variant))] * bool(where)
         head = f"{', '.join(texts)}\n" if texts else ""
         for axes, (metric, (label, scale)) in zip(row, metrics.items(), strict=True):
@@ -287,13 +287,13 @@ def _distribution(axes: Axes, values: Array, head: str, colour: str) -> None:
     # Freedman and Diaconis: as narrow as the number of samples allows.
     bins = min(_BINS, len(np.histogram_bin_edges(values, "fd")) - 1)
     axes.hist(values, bins=bins, color=colour, alpha=0.7)
-    one = spread(values)
-    axes.axvline(one.mean, color=style.BLACK, linewidth=1.0)
-    for limit in (one.low, one.high):
+    statistics = spread(values)
+    axes.axvline(statistics.mean, color=style.BLACK, linewidth=1.0)
+    for limit in (statistics.low, statistics.high):
         axes.axvline(limit, color=style.BLACK, linewidth=0.8, linestyle=(0, (4, 2)))
     of_all = (
-        f"{one.count} runs: mean {_with_interval(one.mean, one.mean_high - one.mean)}, "
-        f"{100 * LEVEL:g} % in {style.number(one.low)} … {style.number(one.high)}"
+        f"{statistics.count} runs: mean {_with_interval(statistics.mean, statistics.mean_high - statistics.mean)}, "
+        f"{100 * LEVEL:g} % in {style.number(statistics.low)} … {style.number(statistics.high)}"
     )
     axes.set_title(f"{head}{of_all}", fontsize=7.5)
     axes.margins(x=0.03)
@@ -301,13 +301,13 @@ def _distribution(axes: Axes, values: Array, head: str, colour: str) -> None:
 
 def tornado(sweep: Sweep) -> Figure | None:
     """What one standard deviation of each sampled key does to energy and error; None where no line can be fitted."""
-    found = {
+    effects = {
         (variant, metric): fit
         for variant in sweep.variants
         for metric in sweep.metrics
         if (fit := _fit(sweep, variant, metric)) is not None
     }
-    if not found:
+    if not effects:
         return None
     variants, metrics = sweep.variants, sweep.metrics
     bars = min(len(sweep.sampled), _BARS)
@@ -317,13 +317,13 @@ def tornado(sweep: Sweep) -> Figure | None:
     for row, variant in zip(panels, variants, strict=True):
         for axes, (metric, (label, scale)) in zip(row, metrics.items(), strict=True):
             axes.set_xlabel(f"change of {label}")
-            fit = found.get((variant, metric))
+            fit = effects.get((variant, metric))
             if fit is None:
                 axes.set_title(f"{variant}: no line fits")
                 continue
             order = np.argsort(-np.abs(fit.effect), kind="stable")[:bars][::-1]
             effect, half = scale * fit.effect[order], scale * fit.half_width[order]
-            colours = [style.BLUE if one > 0.0 else style.ORANGE for one in effect]
+            colours = [style.BLUE if value > 0.0 else style.ORANGE for value in effect]
             axes.barh(range(len(order)), effect, xerr=half, color=colours, height=0.7, error_kw={"elinewidth": 0.8})
             axes.set_yticks(range(len(order)), [_short(sweep.sampled[k]) for k in order])
             axes.axvline(0.0, color=style.BLACK, linewidth=0.6)
@@ -350,22 +350,22 @@ def _fit(sweep: Sweep, variant: str, metric: str) -> Any:
 
 def _together(rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> dict[tuple[str, ...], list[int]]:
     """Which rows share the values of some keys, by those."""
-    found: dict[tuple[str, ...], list[int]] = {}
+    groups: dict[tuple[str, ...], list[int]] = {}
     for k, row in enumerate(rows):
-        found.setdefault(tuple(str(row[key]) for key in keys), []).append(k)
-    return found
+        groups.setdefault(tuple(str(row[key]) for key in keys), []).append(k)
+    return groups
 
 
 def _grid_places(sweep: Sweep) -> list[dict[str, Any]]:
     """Values of the grid's keys, each set of them once, in the order of the table."""
-    firsts = [found[0] for found in _together(sweep.rows, sweep.grid).values()]
+    firsts = [rows[0] for rows in _together(sweep.rows, sweep.grid).values()]
     return [{key: sweep.rows[k][key] for key in sweep.grid} for k in firsts]
 
 
 def _levels(rows: Sequence[Mapping[str, Any]], key: str) -> list[Any]:
     """Values of a key of the grid: numbers by size, others as they come."""
-    found = list({str(row[key]): row[key] for row in rows}.values())
-    return sorted(found) if _numeric(found) else found
+    levels = list({str(row[key]): row[key] for row in rows}.values())
+    return sorted(levels) if _numeric(levels) else levels
 
 
 def _numeric(levels: Sequence[Any]) -> bool:
@@ -389,8 +389,8 @@ def _name_cells(axes: Axes, which: str, key: str, levels: Sequence[Any]) -> None
     axes.set(**{f"{which}ticks": list(shown), f"{which}ticklabels": texts, f"{which}label": _short(key)})
 
 
-def _at(rows: Sequence[Mapping[str, Any]], place: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
-    return (row for row in rows if all(row[key] == value for key, value in place.items()))
+def _at(rows: Sequence[Mapping[str, Any]], values: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
+    return (row for row in rows if all(row[key] == value for key, value in values.items()))
 
 
 def _values(rows: Sequence[Mapping[str, Any]] | Iterator[Mapping[str, Any]], metric: str) -> Array:

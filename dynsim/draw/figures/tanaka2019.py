@@ -33,8 +33,8 @@ from dynsim.snake.published import (
     COORDINATES,
     HEAD_ERROR,
     POLICIES,
+    SOURCES,
     TABLE_III,
-    WAYS,
     displacement,
     mode_sequence,
     tables,
@@ -49,25 +49,25 @@ Maker = Callable[[Mapping[str, Record]], Figure]
 
 def figures(scenario: str, records: Mapping[str, Record]) -> dict[str, Maker]:
     """Makers of the figures beside [T] by file name, as far as their variants were run."""
-    found: dict[str, Maker] = {}
+    makers: dict[str, Maker] = {}
     if scenario == "snake_positioning" and set(records) & set(TABLE_III):
-        found["table_iii"] = positioning
+        makers["table_iii"] = positioning
     if scenario == "snake_positioning_dynamic":
         moved = [name for name in TABLE_III if name in records]
         if moved:
-            found |= {"table_iii": dynamic_positioning, "wheel_loads": wheel_loads}
+            makers |= {"table_iii": dynamic_positioning, "wheel_loads": wheel_loads}
         if {"beta", "beta_measured"} <= set(records):
-            found["fig_7"] = sag_and_feedback
+            makers["fig_7"] = sag_and_feedback
     if scenario == "snake_joint_limits":
         if "cyclic" in records:
-            found |= {"fig_9": lambda r: head_and_cost(r["cyclic"]), "fig_10": lambda r: joint_angles(r["cyclic"])}
+            makers |= {"fig_9": lambda r: head_and_cost(r["cyclic"]), "fig_10": lambda r: joint_angles(r["cyclic"])}
         if {"cyclic", "eq20", "eq20_min"} <= set(records):
-            found["fig_8_and_16"] = motion
+            makers["fig_8_and_16"] = motion
         if set(POLICIES) <= set(records):
-            found["policies"] = policies
+            makers["policies"] = policies
     if scenario == "snake_door_arc" and "pull_switching" in records:
-        found["fig_14"] = lambda r: door(r["pull_switching"])
-    return found
+        makers["fig_14"] = lambda r: door(r["pull_switching"])
+    return makers
 
 
 def figures_of_run(record: Record) -> dict[str, Callable[[Record], Figure]]:
@@ -94,13 +94,13 @@ def positioning(records: Mapping[str, Record]) -> Figure:
     for axis, part, unit in ((axes[0], range(3), "mm"), (axes[1], range(3, 6), "rad")):
         scale = 1e3 if unit == "mm" else 1.0
         for k, i in enumerate(part):
-            place = np.arange(len(moved)) + (k - 1) * width
+            positions = np.arange(len(moved)) + (k - 1) * width
             published = [TABLE_III[m] for m in moved]
             off = [scale * (p.mean[i] - p.target[i]) for p in published]
             spread = [scale * p.deviation[i] for p in published]
             name = SYMBOLS.get(COORDINATES[i], COORDINATES[i])
             axis.bar(
-                place,
+                positions,
                 off,
                 0.9 * width,
                 yerr=spread,
@@ -110,7 +110,7 @@ def positioning(records: Mapping[str, Record]) -> Figure:
                 label=f"Δ{name}, [T]",
             )
             ours = [scale * (displacement(records[m])[i] - TABLE_III[m].target[i]) for m in moved]
-            axis.plot(place, ours, "D", color="black", ms=3, label="simulated, no slip" if k == 2 else None)
+            axis.plot(positions, ours, "D", color="black", ms=3, label="simulated, no slip" if k == 2 else None)
         axis.axhline(0.0, color="black", lw=0.6)
         axis.set_ylabel(f"off target [{unit}]")
         axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
@@ -131,11 +131,11 @@ def dynamic_positioning(records: Mapping[str, Record]) -> Figure:
         off = [scale * (TABLE_III[m].mean[i] - TABLE_III[m].target[i]) for m in moved]
         spread = [2.0 * scale * TABLE_III[m].deviation[i] for m in moved]
         axis.bar(place, off, 0.6, yerr=spread, capsize=2, color=VARIANT_COLOURS[2], alpha=0.5, label="[T], ± 2 SD")
-        for way, (mark, colour) in marks.items():
-            names = [m + WAYS[way] for m in moved]
+        for source, (mark, colour) in marks.items():
+            names = [m + SOURCES[source] for m in moved]
             there = [k for k, name in enumerate(names) if name in records]
             ours = [scale * (displacement(records[names[k]])[i] - TABLE_III[moved[k]].target[i]) for k in there]
-            axis.plot(place[there], ours, mark, color=colour, ms=5, label=way)
+            axis.plot(place[there], ours, mark, color=colour, ms=5, label=source)
         axis.axhline(0.0, color="black", lw=0.6)
         axis.set_ylabel(f"Δ{SYMBOLS.get(COORDINATES[i], COORDINATES[i])} [{unit}]")
     handles, labels = axes[0].get_legend_handles_labels()
@@ -242,19 +242,19 @@ def joint_angles(record: Record) -> Figure:
         axis.set_visible(False)
     for j, axis in enumerate(axes.ravel()[:count]):
         (actual,) = axis.plot(record.time, phi[:, j], color=GROUND)
-        if "phi_told" in record:
-            (told,) = axis.plot(record.time, record["phi_told"][:, j], ":", color="red", lw=1.2)
+        if "phi_command" in record:
+            (commanded,) = axis.plot(record.time, record["phi_command"][:, j], ":", color="red", lw=1.2)
         for bound in (geometry.lower[j], geometry.upper[j]):
             limit = axis.axhline(bound, color="black", ls="-.", lw=0.8)
         out = record["at_limit"][:, j] > 0
-        (held,) = axis.plot(record.time[out], phi[out, j], ".", color=HEAD, ms=3)
+        (stuck,) = axis.plot(record.time[out], phi[out, j], ".", color=HEAD, ms=3)
         reach = 1.15 * geometry.upper[j]
         axis.set(ylim=(-reach, reach), ylabel=f"{greek(names[j])} [rad]")
     for axis in axes[-1]:
         axis.set_xlabel("t [s]")
-    lines, texts = [actual, limit, held], ["simulated", "joint limit", "out of the allocation at its limit"]
-    if "phi_told" in record:
-        lines, texts = [*lines, told], [*texts, "what the servo is told"]
+    lines, texts = [actual, limit, stuck], ["simulated", "joint limit", "out of the allocation at its limit"]
+    if "phi_command" in record:
+        lines, texts = [*lines, commanded], [*texts, "commanded"]
     figure.legend(lines, texts, loc="outside lower center", ncols=len(lines))
     return figure
 
@@ -294,12 +294,12 @@ def door(record: Record) -> Figure:
     closed = record.time[np.flatnonzero(record["gripper"])[0]]
     shown = [(0.0, "initial"), (closed, "knob grasped"), *stops, (record.time[-1], "end")]
     titled = []
-    for place, (time, what) in enumerate(shown):
+    for k, (time, caption) in enumerate(shown):
         view = _view_at(record, time)
-        if what == STOPPED:
+        if caption == STOPPED:
             view = View(record, max(view.row - 1, 0))  # before the change that ends the stop
         opened = abs(np.rad2deg(record["w"][view.row, 5] - record["w"][0, 5]))
-        titled.append((view, f"({'abcdefghijklmnop'[place]}) {what}\n{view.time:.1f} s, {opened:.1f}°"))
+        titled.append((view, f"({'abcdefghijklmnop'[k]}) {caption}\n{view.time:.1f} s, {opened:.1f}°"))
     lines = {" " * start: titled[start : start + 3] for start in range(0, len(titled), 3)}
     title = style.title(record, "the door and its angle, as in Fig 14 of [T]; green: arc of the knob")
     return posture_grid(title, lines)
@@ -311,5 +311,5 @@ def picking_up(record: Record) -> Figure:
     height = record["w"][closed, 2]
     lifted = closed[np.argmax(height > height.max() - 1e-4)]  # the first time; later ones differ by rounding
     shown = ((closed[0] // 2, "1: reaching"), (closed[0], "2: grasping"), (lifted, "3: after picking up"))
-    line = [(View(record, int(row)), f"{what}, t = {record.time[row]:.1f} s") for row, what in shown]
+    line = [(View(record, int(row)), f"{caption}, t = {record.time[row]:.1f} s") for row, caption in shown]
     return posture_strip(style.title(record, "picking up, as in Fig 13 of [T]"), line)

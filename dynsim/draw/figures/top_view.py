@@ -81,7 +81,7 @@ def _extent(body: Skeleton, rows: Rows) -> tuple[Array, Array]:
     points = [record["hand_position"][:, :2]] if "hand_position" in record else []
     if (target := hand_target(record)) is not None:
         points.append(target[:, :2])
-    points += [_track(body, one, rows) for one in (*body.scene.contacts, *body.scene.supports)]
+    points += [_track(body, point, rows) for point in (*body.scene.contacts, *body.scene.supports)]
     points += [corners[:, :2] for row in rows[[0, -1]] for corners, _ in body.solids(row)]
     return box_about([*points, body.segments(int(rows[-1]))[..., :2]], 0.05)
 
@@ -190,8 +190,8 @@ def _draw_pressure(axes: Axes, body: Skeleton, path: Array) -> None:
             )
             axes.plot([], [], color=colour, lw=1.1, label=label)
     known = np.flatnonzero(np.isfinite(path).all(axis=1))
-    for place, face in ((known[:1], "white"), (known[-1:], style.BLACK)):
-        axes.plot(*path[place].T, "o", markersize=4, color=style.BLACK, markerfacecolor=face, zorder=10)
+    for ends, face in ((known[:1], "white"), (known[-1:], style.BLACK)):
+        axes.plot(*path[ends].T, "o", markersize=4, color=style.BLACK, markerfacecolor=face, zorder=10)
 
 
 def pressure_pieces(path: Array, corners: Array) -> tuple[Array, NDArray[np.bool_]]:
@@ -219,8 +219,9 @@ def pressure_pieces(path: Array, corners: Array) -> tuple[Array, NDArray[np.bool
 
 def _spread(pose: Array, rows: Rows, apart: float) -> list[int]:
     """Rows at which the base has gone on by at least ``apart`` [m], the first and the last among them."""
-    way = np.append(0.0, np.cumsum(np.hypot(*np.diff(pose[rows, :2], axis=0).T)))
-    count = int(np.clip(way[-1] / max(apart, 1e-9), 1, TRIANGLES - 1)) + 1
+    distance = np.append(0.0, np.cumsum(np.hypot(*np.diff(pose[rows, :2], axis=0).T)))
+    count = int(np.clip(distance[-1] / max(apart, 1e-9), 1, TRIANGLES - 1)) + 1
     return [
-        int(rows[np.searchsorted(way, share).clip(max=len(rows) - 1)]) for share in np.linspace(0.0, way[-1], count)
+        int(rows[np.searchsorted(distance, share).clip(max=len(rows) - 1)])
+        for share in np.linspace(0.0, distance[-1], count)
     ]

@@ -64,14 +64,14 @@ def check(kind: str, fps: int) -> None:
 
 
 def write_gif(
-    stream: BinaryIO, frames: Iterable[Image.Image], sampled: Iterable[Image.Image], count: int, fps: int, hold: float
+    stream: BinaryIO, frames: Iterable[Image.Image], sampled: Iterable[Image.Image], count: int, fps: int, last_s: float
 ) -> None:
     """One palette for all frames, from those ``sampled``, so that nothing flickers; the last frame is held [s]."""
     palette = _palette(list(sampled))
     # Hundredths of a second, rounded so that none is lost over the film.
     ends = np.rint(100.0 * np.arange(count + 1) / fps).astype(int)
     times = (10 * np.diff(ends)).tolist()
-    times[-1] += round(1000 * hold)
+    times[-1] += round(1000 * last_s)
     indexed = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
     first = next(indexed)
     first.save(stream, "GIF", save_all=True, append_images=indexed, duration=times, loop=0, optimize=True, disposal=1)
@@ -83,16 +83,16 @@ def _palette(frames: list[Image.Image]) -> Image.Image:
     for k, frame in enumerate(frames):
         sheet.paste(frame, (0, k * height))
     # Small marks have few pixels, and their colours must be told apart all the same; what is nearly one of them is it.
-    kept = np.array([ImageColor.getrgb(one) for one in (*VARIANT_COLOURS, PULLING, GREY, "#FFFFFF")])
-    found = sheet.quantize(120, method=Image.Quantize.MEDIANCUT).getpalette() or []
-    others = np.array(found, dtype=int).reshape(-1, 3)[:120]
+    kept = np.array([ImageColor.getrgb(colour) for colour in (*VARIANT_COLOURS, PULLING, GREY, "#FFFFFF")])
+    colours = sheet.quantize(120, method=Image.Quantize.MEDIANCUT).getpalette() or []
+    others = np.array(colours, dtype=int).reshape(-1, 3)[:120]
     others = others[np.abs(others[:, None] - kept).max(axis=2).min(axis=1) > NEARLY]
     palette = Image.new("P", (1, 1))
     palette.putpalette(np.concatenate([kept, others]).ravel().tolist())
     return palette
 
 
-def write_mp4(stream: BinaryIO, frames: Iterable[Image.Image], fps: int, hold: float) -> None:
+def write_mp4(stream: BinaryIO, frames: Iterable[Image.Image], fps: int, last_s: float) -> None:
     """H.264 as every browser and office program plays it; the last frame is repeated for ``hold`` [s].
 
     Raises
@@ -116,7 +116,7 @@ def write_mp4(stream: BinaryIO, frames: Iterable[Image.Image], fps: int, hold: f
         for frame in frames:
             add(frame)
             last = frame
-        for _ in range(round(hold * fps)):
+        for _ in range(round(last_s * fps)):
             add(last)
         container.mux(track.encode())
 

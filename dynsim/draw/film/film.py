@@ -104,14 +104,14 @@ class Film:
         }
         first = next(iter(kept.values()))
         name = first.provenance.get("scenario", {}).get("name", "")
-        one = titled(first, "").replace(":  (", " (").rstrip(": ")
-        self._title = plain(str(name) if len(some) > 1 else one)
+        title = titled(first, "").replace(":  (", " (").rstrip(": ")
+        self._title = plain(str(name) if len(some) > 1 else title)
 
     def frame(self, time: float) -> Image.Image:
         """The picture at an instant of the records [s]."""
         image = Image.new("RGB", self.size, PAPER)
-        for place, painter in zip(self._places, self.painters.values(), strict=True):
-            image.paste(painter.frame(time), place)
+        for corner, painter in zip(self._places, self.painters.values(), strict=True):
+            image.paste(painter.frame(time), corner)
         draw = ImageDraw.Draw(image)
         draw.text((10, 5), self._title, fill="#202428", font=font(13))
         clock = f"{time:.2f} s" + (f"  ({self._speed:.3g}×)" if self._speed != 1.0 else "")
@@ -203,13 +203,13 @@ def _layout(count: int, area: tuple[int, int, int, int], seen: Array) -> tuple[l
     """
     left, top, right, bottom = area
     wide, high = np.maximum(seen[:2], 1e-9)
-    best, found = -1.0, (1, count)
+    best, shape = -1.0, (1, count)
     for columns in range(1, count + 1):
         rows = -(-count // columns)
         scale = min((right - left) / columns / wide, (bottom - top) / rows / high)
         if scale > best:
-            best, found = scale, (rows, columns)
-    rows, columns = found
+            best, shape = scale, (rows, columns)
+    rows, columns = shape
     cell = (right - left) // columns, (bottom - top) // rows
     places = [(left + k % columns * cell[0], top + k // columns * cell[1]) for k in range(count)]
     return places, cell

@@ -19,13 +19,21 @@ from dynsim.draw.figures.style import BLACK, BLUE, DEEP, GREEN, GREY, ORANGE, PU
 from dynsim.draw.film.strokes import Box, arrow, dashes, font, labels, line, ring
 from dynsim.draw.geometry.camera import Camera
 from dynsim.draw.geometry.meshes import Meshes, simplified
-from dynsim.draw.geometry.robot import Contact, Robot, Sunk, contacts, largest_force, paths, sunk
+from dynsim.draw.geometry.robot import (
+    DrawnContact,
+    DrawnRobot,
+    Penetration,
+    contacts,
+    largest_force,
+    paths,
+    penetrations,
+)
 from dynsim.draw.geometry.shapes import body_shapes, drawn_shape, drawn_surface, grid_faces, gripper, outline, solid
 from dynsim.draw.geometry.surfaces import round_patch, surface_grids
 from dynsim.draw.geometry.wheels import cop_of, supports, wheel_groups
 from dynsim.record.poses import ORIENTATION, POSITION
 from dynsim.record.quaternion import rotated
-from dynsim.record.scene import HERE, WORLD, Surface
+from dynsim.record.scene import HERE, WORLD, SceneSurface
 
 Array = NDArray[np.float64]
 FINER = 2
@@ -73,7 +81,7 @@ class Painter:
 
     def __init__(
         self,
-        robot: Robot,
+        robot: DrawnRobot,
         camera: Camera,
         size: tuple[int, int],
         bounds: tuple[Array, Array],
@@ -87,18 +95,18 @@ class Painter:
         self._time = record.time
         self._position = record[POSITION].astype(np.float64)
         self._turn = record[ORIENTATION].astype(np.float64)
-        found = Meshes()
-        found.of_robot(record)
-        shapes = body_shapes(robot.scene, robot.reach, found)
-        self._fixed = [shown for shape in robot.scene.fixed if (shown := drawn_shape(shape, found)) is not None]
-        self._meshes = simplified(found.found, TRIANGLES)
+        meshes = Meshes()
+        meshes.of_robot(record)
+        shapes = body_shapes(robot.scene, robot.reach, meshes)
+        self._fixed = [shown for shape in robot.scene.fixed if (shown := drawn_shape(shape, meshes)) is not None]
+        self._meshes = simplified(meshes.found, TRIANGLES)
         self._wheels = wheel_groups(record, robot.scene)
         # The body that has a gripper.
         hand = robot.scene.hand
         self._gripped = hand.body if hand is not None and "gripper" in record else WORLD
         self._solids = self._moving(shapes)
         self._contacts = contacts(robot)
-        self._sunk = sunk(record, robot.scene)
+        self._sunk = penetrations(record, robot.scene)
         self._full = largest_force(self._contacts)
         self._ways = dict(paths(record, robot.scene))
         self._supports = supports(robot.scene, self._wheels)
@@ -110,23 +118,23 @@ class Painter:
 
     def frame(self, time: float) -> Image.Image:
         """The robot at an instant [s], between samples in straight lines."""
-        place, turn, row, share = self._pose(time)
+        position, turn, row, share = self._pose(time)
         image = self._still.copy()
         draw = ImageDraw.Draw(image)
-        if np.isfinite(place).all() and np.isfinite(turn).all():
-            hull = self._support(place, turn, row)
+        if np.isfinite(position).all() and np.isfinite(turn).all():
+            hull = self._support(position, turn, row)
             if len(hull) > 2:
                 corners = self.camera.project(np.column_stack([hull, np.zeros(len(hull))]))[:, :2]
-                draw.polygon([tuple(one) for one in corners.tolist()], fill=SUPPORT, outline=SKY)
-            self._paint_bodies(draw, place, turn, row)
+                draw.polygon([tuple(corner) for corner in corners.tolist()], fill=SUPPORT, outline=SKY)
+            self._paint_bodies(draw, position, turn, row)
             self._paint_pressure(draw, hull, row)
             self._paint_way(draw, time, row)
-            for one in self._sunk:
-                self._paint_sunk(draw, one, place, turn, row, share)
-            forces = [self._paint_contact(draw, contact, place, turn, row, share) for contact in self._contacts]
-            self._paint_hand(draw, place, turn)
+            for point in self._sunk:
+                self._paint_sunk(draw, point, position, turn, row, share)
+            forces = [self._paint_contact(draw, contact, position, turn, row, share) for contact in self._contacts]
+            self._paint_hand(draw, position, turn)
             # Last, so that nothing lies over a sign.
-            self.labels = labels(draw, [one for one in forces if one], self._font, image.size, PAPER)
+            self.labels = labels(draw, [force for force in forces if force], self._font, image.size, PAPER)
         return image.reduce(FINER)
 
     def hand(self, time: float) -> tuple[float, float] | None:
@@ -134,8 +142,8 @@ class Painter:
         point = self.robot.scene.hand
         if point is None:
             return None
-        place, turn, _, _ = self._pose(time)
-        x, y, _ = self.camera.project(_on(point.body, np.array(point.position), place, turn))
+        position, turn, _, _ = self._pose(time)
+        x, y, _ = self.camera.project(_on(point.body, np.array(point.position), position, turn))
         return float(x) / FINER, float(y) / FINER
 
     def _pose(self, time: float) -> tuple[Array, Array, int, float]:
@@ -145,11 +153,11 @@ class Painter:
             row = int(np.clip(np.searchsorted(self._time, time, side="right") - 1, 0, len(self._time) - 2))
             share = (time - self._time[row]) / max(self._time[row + 1] - self._time[row], 1e-12)
             share = float(np.clip(share, 0.0, 1.0))
-        place, turn = (_between(values, row, share) for values in (self._position, self._turn))
-        return place, turn / np.linalg.norm(turn, axis=1)[:, None], row, share
+        position, turn = (_between(values, row, share) for values in (self._position, self._turn))
+        return position, turn / np.linalg.norm(turn, axis=1)[:, None], row, share
 
     def _moving(self, shapes: list[list[dict[str, Any]]]) -> _Solids:
-        wheels = {place: k for k, places in enumerate(self._wheels.places) for place in places}
+        wheels = {shape_index: k for k, places in enumerate(self._wheels.places) for shape_index in places}
         parts = []
         for k, own in enumerate(shapes):
             for j, shape in enumerate(own):
@@ -158,7 +166,7 @@ class Painter:
                 parts.append((k, shape, plain, wheel, np.zeros((2, 3))))
         parts += [(self._gripped, shape, self.tint, -1, moved) for shape, moved in self._fingers(shapes)]
         solids = [solid(shape, self._meshes) for _, shape, *_ in parts]
-        points, cells = ([len(one[k]) for one in solids] for k in (0, 1))
+        points, cells = ([len(pair[k]) for pair in solids] for k in (0, 1))
         starts = np.cumsum([0, *points])
         colours = [
             self._colours(shape, count, plain) for (_, shape, plain, *_), count in zip(parts, cells, strict=True)
@@ -179,8 +187,8 @@ class Painter:
         if hand is None or self._gripped == WORLD:
             return []
         both = gripper(shapes, self.robot.reach)
-        place = np.array(hand.position) + np.array([both["ahead"], 0.0, 0.0])
-        shape = {"kind": "box", "size": both["size"], "p": place.tolist(), "q": list(HERE)}
+        position = np.array(hand.position) + np.array([both["ahead"], 0.0, 0.0])
+        shape = {"kind": "box", "size": both["size"], "p": position.tolist(), "q": list(HERE)}
         return [(shape, side * np.outer(both["aside"], [0.0, 1.0, 0.0])) for side in (-1.0, 1.0)]
 
     def _colours(self, shape: dict[str, Any], faces: int, plain: str) -> Array:
@@ -209,14 +217,14 @@ class Painter:
             self._paint_faces(draw, points, cells, self._colours(shape, len(cells), HUB))
         if (target := self._ways.get("target")) is not None:
             dashes(draw, _apart(self.camera.project(target)[:, :2]), 6.0 * FINER, BLACK, FINER)
-        if (way := self._ways.get("hand")) is not None:
+        if (path := self._ways.get("hand")) is not None:
             faint = tuple(int(0.65 * 255 + 0.35 * part) for part in _rgb(self.tint))
-            line(draw, _apart(self.camera.project(way)[:, :2]), faint, FINER)
+            line(draw, _apart(self.camera.project(path)[:, :2]), faint, FINER)
         if self.title:
             draw.text((10 * FINER, 8 * FINER), self.title, fill=self.tint, font=self._font)
         return image
 
-    def _paint_surface(self, draw: ImageDraw.ImageDraw, surface: Surface, low: Array, high: Array) -> None:
+    def _paint_surface(self, draw: ImageDraw.ImageDraw, surface: SceneSurface, low: Array, high: Array) -> None:
         """A sphere or cylinder as a closed solid, or, if it is large, as the others: the part next to the robot."""
         colour = np.array(_rgb(SURFACE))
         round_one = surface.kind in ("sphere", "cylinder")
@@ -257,14 +265,14 @@ class Painter:
         for row in self.camera.project(np.array(ends))[..., :2]:
             draw.line(row.ravel().tolist(), fill=LINES if real else FAINT, width=FINER)
 
-    def _paint_bodies(self, draw: ImageDraw.ImageDraw, place: Array, turn: Array, row: int) -> None:
+    def _paint_bodies(self, draw: ImageDraw.ImageDraw, position: Array, turn: Array, row: int) -> None:
         solids = self._solids
         if not len(solids.faces):
             return
         own = solids.corners
         if self._gripped != WORLD:
             own = own + solids.aside[int(self.robot.record["gripper"][row] > 0)]
-        corners = place[solids.body] + rotated(turn[solids.body].T, own.T).T
+        corners = position[solids.body] + rotated(turn[solids.body].T, own.T).T
         colour = solids.colour
         if self._wheels.down is not None:
             lifted = (solids.wheel >= 0) & (self._wheels.down[row][solids.wheel] == 0.0)
@@ -303,11 +311,15 @@ class Painter:
         for corner, fill in zip(points, fills, strict=True):
             draw.polygon(corner, fill=tuple(fill))
 
-    def _support(self, place: Array, turn: Array, row: int) -> Array:
+    def _support(self, position: Array, turn: Array, row: int) -> Array:
         """Corners of what the robot stands on, (n, 2) [m], turning to the left."""
         down = self._wheels.down
-        on = [one for one in self._supports if one["group"] < 0 or down is None or down[row][one["group"]] > 0.0]
-        points = [_on(one["body"], np.array(one["p"]), place, turn)[:2] for one in on]
+        on = [
+            support
+            for support in self._supports
+            if support["group"] < 0 or down is None or down[row][support["group"]] > 0.0
+        ]
+        points = [_on(s["body"], np.array(s["p"]), position, turn)[:2] for s in on]
         return outline(np.array(points)) if points else np.zeros((0, 2))
 
     def _paint_pressure(self, draw: ImageDraw.ImageDraw, hull: Array, row: int) -> None:
@@ -320,19 +332,19 @@ class Painter:
         ring(draw, x, y, 5.0 * FINER, BLACK if inside else PULLING, 2 * FINER)
 
     def _paint_way(self, draw: ImageDraw.ImageDraw, time: float, row: int) -> None:
-        way = self._ways.get("hand")
-        if way is None or row < 1:
+        path = self._ways.get("hand")
+        if path is None or row < 1:
             return
-        line(draw, _apart(self.camera.project(way[: row + 1])[:, :2]), _rgb(self.tint), 2 * FINER)
+        line(draw, _apart(self.camera.project(path[: row + 1])[:, :2]), _rgb(self.tint), 2 * FINER)
 
     def _paint_contact(
-        self, draw: ImageDraw.ImageDraw, contact: Contact, place: Array, turn: Array, row: int, share: float
+        self, draw: ImageDraw.ImageDraw, contact: DrawnContact, position: Array, turn: Array, row: int, share: float
     ) -> tuple[str, Array, str] | None:
         """Arrows of the normal force, and of all of it with friction: away from the surface for a push, else to it.
 
         Returns the force in words, where to write it [pixel], and its colour; None where there is none.
         """
-        at = _on(contact.point.body, np.array(contact.point.position), place, turn)
+        at = _on(contact.point.body, np.array(contact.point.position), position, turn)
         force = float(_between(contact.force, row, share))
         mode, text = None if contact.mode is None else int(contact.mode[row]), None
         x, y, _ = self.camera.project(at)
@@ -349,13 +361,13 @@ class Painter:
         return text
 
     def _paint_sunk(
-        self, draw: ImageDraw.ImageDraw, one: Sunk, place: Array, turn: Array, row: int, share: float
+        self, draw: ImageDraw.ImageDraw, point: Penetration, position: Array, turn: Array, row: int, share: float
     ) -> None:
         """A ring about a joint that is below a surface, and by how much."""
-        depth = float(_between(one.depth, row, share))
-        if not depth > one.least:
+        depth = float(_between(point.depth, row, share))
+        if not depth > point.least:
             return
-        x, y, _ = self.camera.project(_on(one.body, np.array(one.position), place, turn))
+        x, y, _ = self.camera.project(_on(point.body, np.array(point.position), position, turn))
         ring(draw, x, y, 6.0 * FINER, DEEP, 2 * FINER)
         text = f"{1e3 * depth:.0f} mm" if depth >= 1e-3 else ""
         draw.text((x, y + 8 * FINER), text, fill=DEEP, font=font(11 * FINER), anchor="mt")
@@ -371,11 +383,11 @@ class Painter:
         arrow(draw, *((there, here) if pulls else (here, there)), colour, width)
         return np.asarray(there)
 
-    def _paint_hand(self, draw: ImageDraw.ImageDraw, place: Array, turn: Array) -> None:
+    def _paint_hand(self, draw: ImageDraw.ImageDraw, position: Array, turn: Array) -> None:
         hand = self.robot.scene.hand
         if hand is None or self._gripped != WORLD:
             return
-        x, y, _ = self.camera.project(_on(hand.body, np.array(hand.position), place, turn))
+        x, y, _ = self.camera.project(_on(hand.body, np.array(hand.position), position, turn))
         draw.circle((x, y), 4.0 * FINER, fill=self.tint, outline=PAPER, width=FINER)
 
 
@@ -395,9 +407,9 @@ def _between(values: Array, row: int, share: float) -> Array:
     return np.asarray(values[row] + share * (values[row + 1] - values[row]))
 
 
-def _on(body: int, point: Array, place: Array, turn: Array) -> Array:
+def _on(body: int, point: Array, position: Array, turn: Array) -> Array:
     """Where a point on a body is in the world, (3,) [m]."""
-    return point if body == WORLD else np.asarray(place[body] + rotated(turn[body], point))
+    return point if body == WORLD else np.asarray(position[body] + rotated(turn[body], point))
 
 
 def _apart(points: Array) -> Array:

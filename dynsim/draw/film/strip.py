@@ -69,7 +69,7 @@ class Strip:
         for label, record in having.items():
             values = record[name].reshape(len(record), -1)
             called = {} if record.scene is None else record.scene.wheel_names
-            names = [called.get(one, one) for one in record.labels[name] or (name,) * values.shape[1]]
+            names = [called.get(text, text) for text in record.labels[name] or (name,) * values.shape[1]]
             many = values.shape[1] > 1
             shown = largest(values, 1 if several else NAMED)
             if len(shown) < values.shape[1]:
@@ -77,8 +77,8 @@ class Strip:
                 low, high = np.fmin.reduce(values, axis=1), np.fmax.reduce(values, axis=1)
                 text = None if several else f"all {values.shape[1]}"
                 axes.fill_between(record.time, low, high, color=colour, alpha=opacity, linewidth=0, label=text)
-            for place, k in enumerate(shown):
-                colour = style.VARIANT_COLOURS[place] if many and not several else colours[label]["color"]
+            for rank, k in enumerate(shown):
+                colour = style.VARIANT_COLOURS[rank] if many and not several else colours[label]["color"]
                 text = _cut(plain(label), LETTERS) if several else _cut(plain(names[k]), LETTERS)
                 text += f": {_cut(plain(names[k]), LETTERS)}" if several and many else ""
                 style.line(axes, record.time, values[:, k], color=colour, label=text)
@@ -133,7 +133,7 @@ def chosen(records: Mapping[str, Record], signal: str | None) -> str | None:
 
 def _limits(values: list[style.Array]) -> tuple[float, float]:
     """Range of the axis: a spike at the start does not squeeze the rest."""
-    pooled = np.concatenate([one.ravel() for one in values])
+    pooled = np.concatenate([array.ravel() for array in values])
     pooled = pooled[np.isfinite(pooled)]
     if not len(pooled):
         return -1.0, 1.0

@@ -31,10 +31,10 @@ def dashes(draw: ImageDraw.ImageDraw, points: Array, length: float, colour: str,
     """A path as dashes that are as long as their gaps [pixel]."""
     if len(points) < 2:
         return
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    for start in np.arange(0.0, way[-1], 2.0 * length):
-        ends = np.linspace(start, min(start + length, way[-1]), 5)
-        dash = np.stack([np.interp(ends, way, points[:, k]) for k in (0, 1)], axis=1)
+    distance = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    for start in np.arange(0.0, distance[-1], 2.0 * length):
+        ends = np.linspace(start, min(start + length, distance[-1]), 5)
+        dash = np.stack([np.interp(ends, distance, points[:, k]) for k in (0, 1)], axis=1)
         draw.line(dash.ravel().tolist(), fill=colour, width=width)
 
 
@@ -50,7 +50,7 @@ def arrow(draw: ImageDraw.ImageDraw, tail: Array, head: Array, colour: str, widt
     neck = head - long * along
     draw.line([*tail.tolist(), *neck.tolist()], fill=colour, width=width)
     corners: Sequence[Array] = (head, neck + 0.45 * long * across, neck - 0.45 * long * across)
-    draw.polygon([tuple(one.tolist()) for one in corners], fill=colour)
+    draw.polygon([tuple(corner.tolist()) for corner in corners], fill=colour)
 
 
 def ring(draw: ImageDraw.ImageDraw, x: float, y: float, radius: float, colour: str, width: int) -> None:
@@ -79,18 +79,18 @@ def labels(
         Where they are: left, top, right, bottom.
     """
     edge = 0.2 * face.size
-    found: list[Box] = []
-    for text, place, colour in texts:
+    boxes: list[Box] = []
+    for text, anchor, colour in texts:
         width, height = draw.textlength(text, font=face) + 2.0 * edge, 1.1 * face.size
-        x = min(max(float(place[0]) - 0.5 * width, 0.0), size[0] - width)
-        y = min(max(float(place[1]) - height, 0.0), size[1] - height)
+        x = min(max(float(anchor[0]) - 0.5 * width, 0.0), size[0] - width)
+        y = min(max(float(anchor[1]) - height, 0.0), size[1] - height)
         for _ in texts:
             # Above what it would hide.
-            hidden = [one for one in found if x < one[2] and one[0] < x + width and y < one[3] and one[1] < y + height]
+            hidden = [box for box in boxes if x < box[2] and box[0] < x + width and y < box[3] and box[1] < y + height]
             if not hidden:
                 break
-            y = min(one[1] for one in hidden) - height
-        found.append((x, y, x + width, y + height))
-        draw.rounded_rectangle(found[-1], radius=edge, fill=paper)
+            y = min(box[1] for box in hidden) - height
+        boxes.append((x, y, x + width, y + height))
+        draw.rounded_rectangle(boxes[-1], radius=edge, fill=paper)
         draw.text((x + 0.5 * width, y + 0.5 * height), text, fill=colour, font=face, anchor="mm")
-    return found
+    return boxes

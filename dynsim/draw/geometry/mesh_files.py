@@ -80,8 +80,8 @@ def _obj(content: bytes) -> Mesh:
         if len(words) >= 4 and words[0] == "v":
             corners.append([float(word) for word in words[1:4]])
         elif len(words) >= 4 and words[0] == "f":
-            found = [int(word.split("/")[0]) for word in words[1:]]
-            face = [k - 1 if k > 0 else len(corners) + k for k in found]
+            indices = [int(word.split("/")[0]) for word in words[1:]]
+            face = [k - 1 if k > 0 else len(corners) + k for k in indices]
             triangles += [(face[0], b, c) for b, c in itertools.pairwise(face[1:])]
     return Mesh(np.array(corners, dtype=np.float64).reshape(-1, 3), np.array(triangles, dtype=np.int64).reshape(-1, 3))
 
@@ -95,7 +95,7 @@ def _collada(content: bytes) -> Mesh:
     if b"<!DOCTYPE" in content or b"<!ENTITY" in content:
         raise ValueError("entities are not read")
     # A mesh is worth more than its colours: broken ones would take what they are bound to with them.
-    content = _COLOUR.sub(lambda found: found[0] if len(found[1].split()) > 2 else b"", content)
+    content = _COLOUR.sub(lambda match: match[0] if len(match[1].split()) > 2 else b"", content)
     for text in (content, re.sub(b"<bind_material>.*?</bind_material>", b"", content, flags=re.DOTALL)):
         document = collada.Collada(io.BytesIO(text), ignore=[collada.DaeError])
         placed = list((document.scene or document.scenes[0]).objects("geometry"))

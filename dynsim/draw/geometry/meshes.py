@@ -47,8 +47,8 @@ class Meshes:
         for path in self._places(file):
             if path not in self._known:
                 self._known[path] = self._read(path)
-            if (found := self._known[path]) is not None:
-                return found
+            if (index := self._known[path]) is not None:
+                return index
         self._missing[file.rpartition("/")[2]] = None
         return None
 
@@ -64,14 +64,16 @@ class Meshes:
             for folder in self._folders:
                 yield folder / file.removeprefix("file://")
             return
-        package, _, rest = file.removeprefix("package://").partition("/")
+        package, _, inside = file.removeprefix("package://").partition("/")
         roots = [above for folder in self._folders for above in (folder, *folder.parents)]
-        roots += [Path(one) for one in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if one]
-        roots += [Path(one, "share") for one in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if one]
+        roots += [Path(root) for root in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if root]
+        roots += [
+            Path(folder, "share") for folder in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if folder
+        ]
         for root in roots:
-            yield root / package / rest
+            yield root / package / inside
             if root.name == package:
-                yield root / rest
+                yield root / inside
 
     def _read(self, path: Path) -> int | None:
         try:
@@ -95,7 +97,7 @@ def welded(mesh: Mesh, near: float = _WELD) -> Mesh:
     low, size = _box(corners[triangles])
     if not size > 0.0:
         raise ValueError("a mesh without size")
-    _, place, number = np.unique(
+    _, first, number = np.unique(
         np.rint((corners - low) / (near * size)), axis=0, return_index=True, return_inverse=True
     )
     faces = number.reshape(-1)[triangles]
@@ -103,7 +105,7 @@ def welded(mesh: Mesh, near: float = _WELD) -> Mesh:
     if not whole.any():
         raise ValueError("a mesh without faces")
     used, faces = np.unique(faces[whole], return_inverse=True)
-    return Mesh(corners[place[used]], faces.reshape(-1, 3), None if colours is None else colours[whole])
+    return Mesh(corners[first[used]], faces.reshape(-1, 3), None if colours is None else colours[whole])
 
 
 def _box(corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
@@ -131,10 +133,10 @@ def _simplified(mesh: Mesh, most: int) -> Mesh:
         return mesh
     for near in _COARSE:
         coarse = welded(mesh, near)
-        found = welded(_joined([_decimated(coarse, rows, most) for rows in _by_colour(coarse)]))
-        if len(found.triangles) <= _TOO_MANY * wanted:
+        coarser = welded(_joined([_decimated(coarse, rows, most) for rows in _by_colour(coarse)]))
+        if len(coarser.triangles) <= _TOO_MANY * wanted:
             break
-    return found
+    return coarser
 
 
 def _by_colour(mesh: Mesh) -> list[NDArray[np.intp]]:

@@ -24,7 +24,7 @@ WORLD_AXES = np.eye(3)
 HERE_POINT: Vector3 = (0.0, 0.0, 0.0)
 
 
-def robots(records: Mapping[str, Record]) -> dict[str, Robot]:
+def robots(records: Mapping[str, Record]) -> dict[str, DrawnRobot]:
     """Robots of those records that have something to be seen, by the names of the records.
 
     Raises
@@ -32,14 +32,14 @@ def robots(records: Mapping[str, Record]) -> dict[str, Robot]:
     RecordError
         None has samples and a scene with the poses of its bodies.
     """
-    found = {name: robot for name, record in records.items() if (robot := robot_of(record)) is not None}
-    if not found:
+    drawn = {name: robot for name, record in records.items() if (robot := robot_of(record)) is not None}
+    if not drawn:
         raise RecordError("nothing to view: a record needs samples, a scene, and the poses of its bodies")
-    return found
+    return drawn
 
 
 @dataclass(frozen=True)
-class Robot:
+class DrawnRobot:
     """A record whose bodies were placed, and the samples that become frames of the page."""
 
     record: Record
@@ -60,7 +60,7 @@ def placed(record: Record) -> tuple[Scene | None, str]:
     return scene, ""
 
 
-def robot_of(record: Record) -> Robot | None:
+def robot_of(record: Record) -> DrawnRobot | None:
     """The robot of a record; None without samples, a scene, or the poses of its bodies."""
     scene, _ = placed(record)
     if scene is None or not len(record):
@@ -71,7 +71,7 @@ def robot_of(record: Record) -> Robot | None:
     ends = [position[0], *(point_positions(record, p, 0)[None] for p in scene.points)]
     known = np.concatenate(ends)
     reach = float(np.ptp(known[np.isfinite(known).all(axis=1)], axis=0).max(initial=0.0)) or 0.5
-    return Robot(record, scene, _frames(record, reach), reach)
+    return DrawnRobot(record, scene, _frames(record, reach), reach)
 
 
 def _frames(record: Record, reach: float) -> NDArray[np.intp]:
@@ -102,7 +102,7 @@ def _every(count: int, stride: int) -> NDArray[np.intp]:
     return np.unique(np.append(np.arange(0, count, stride), count - 1))
 
 
-def bounds(robots: Sequence[Robot], axes: Array = WORLD_AXES) -> tuple[Array, Array]:
+def bounds(robots: Sequence[DrawnRobot], axes: Array = WORLD_AXES) -> tuple[Array, Array]:
     """The box along some axes, unit vectors (3, 3), in which everything moves, with some room, (3,) and (3,) [m]."""
     pooled = moving(robots) @ axes.T
     low, high = pooled.min(axis=0), pooled.max(axis=0)
@@ -113,14 +113,17 @@ def bounds(robots: Sequence[Robot], axes: Array = WORLD_AXES) -> tuple[Array, Ar
     return low - room, high + room
 
 
-def moving(robots: Sequence[Robot]) -> Array:
+def moving(robots: Sequence[DrawnRobot]) -> Array:
     """Places of all bodies and the hand, its target, and ends of what stands still, (n, 3) [m]."""
     points = []
     for robot in robots:
         record = robot.record
-        found = [record[POSITION].reshape(-1, 3).astype(np.float64), *(one for _, one in paths(record, robot.scene))]
+        clouds = [
+            record[POSITION].reshape(-1, 3).astype(np.float64),
+            *(path for _, path in paths(record, robot.scene)),
+        ]
         # The last samples of a run that diverged are far from everything else.
-        points += found if record.complete else [_without_ends(one) for one in found]
+        points += clouds if record.complete else [_without_ends(cloud) for cloud in clouds]
         for shape in robot.scene.fixed:
             middle, half = np.array(shape.position), 0.5 * max(shape.size) if shape.kind != "mesh" else 0.0
             points += [np.stack([middle - half, middle + half])]
@@ -134,7 +137,7 @@ def _without_ends(points: Array) -> Array:
     return np.clip(points, *np.percentile(points, (1.0, 99.0), axis=0)) if len(points) else points
 
 
-def _thickness(robot: Robot) -> float:
+def _thickness(robot: DrawnRobot) -> float:
     """How far shapes reach beside the lines between the bodies, more or less [m]."""
     shapes = [shape for body in robot.scene.bodies for shape in body.shapes]
     round_ = [shape.size[0] for shape in shapes if shape.kind in ("cylinder", "capsule", "sphere")]
@@ -143,7 +146,7 @@ def _thickness(robot: Robot) -> float:
     return min(max([*round_, *boxes, *meshes], default=0.0), 0.5 * robot.reach)
 
 
-def azimuth(robots: Sequence[Robot]) -> float:
+def azimuth(robots: Sequence[DrawnRobot]) -> float:
     """Direction in which robot and hand reach furthest, (−π/2, π/2] about z [rad]: the page looks across it."""
     clouds = [robot.record[POSITION][robot.rows][..., :2].reshape(-1, 2).astype(np.float64) for robot in robots]
     clouds += [path[robot.rows, :2] for robot in robots for _, path in paths(robot.record, robot.scene)]
@@ -166,7 +169,7 @@ def paths(record: Record, scene: Scene) -> Iterator[tuple[str, Array]]:
 
 
 @dataclass(frozen=True)
-class Contact:
+class DrawnContact:
     """What a contact point did.
 
     Attributes
@@ -186,13 +189,13 @@ class Contact:
     mode: Array | None
 
 
-def contacts(robot: Robot, rows: NDArray[np.intp] | slice = slice(None)) -> list[Contact]:
+def contacts(robot: DrawnRobot, rows: NDArray[np.intp] | slice = slice(None)) -> list[DrawnContact]:
     """Contact points at samples of the record; under the unilateral law those that ever touched."""
     record, scene = robot.record, robot.scene
     if "contact_normal_force" not in record:
         return []
     names = record.labels["contact_normal_force"]
-    found = []
+    result = []
     for point in scene.contacts:
         surface = scene.surface(point.surface)
         if surface is None or point.name not in names:
@@ -201,18 +204,18 @@ def contacts(robot: Robot, rows: NDArray[np.intp] | slice = slice(None)) -> list
         mode = record["contact_mode"][rows, k] if "contact_mode" in record else None
         if mode is not None and not mode.any():
             continue
-        place = np.asarray(point_positions(record, point, rows), dtype=np.float64)
-        normal = surface.normal(place)
+        positions = np.asarray(point_positions(record, point, rows), dtype=np.float64)
+        normal = surface.normal(positions)
         force = np.asarray(record["contact_normal_force"][rows, k], dtype=np.float64)
         tangent = None
         if "contact_force" in record:
             tangent = record["contact_force"][rows, k] - force[:, None] * normal
-        found.append(Contact(point, _friction(record, point.name), normal, force, tangent, mode))
-    return found
+        result.append(DrawnContact(point, _friction(record, point.name), normal, force, tangent, mode))
+    return result
 
 
 @dataclass(frozen=True)
-class Sunk:
+class Penetration:
     """A joint or the hand that was below a surface by more than the radius of its link.
 
     Attributes
@@ -230,7 +233,7 @@ class Sunk:
     depth: Array
 
 
-def sunk(record: Record, scene: Scene, rows: NDArray[np.intp] | slice = slice(None)) -> list[Sunk]:
+def penetrations(record: Record, scene: Scene, rows: NDArray[np.intp] | slice = slice(None)) -> list[Penetration]:
     """Joints, and the hand, below surfaces at samples of the record: surfaces hold contact points only.
 
     Bodies of a mobile base, and wheels, stand where the model has them.
@@ -239,21 +242,21 @@ def sunk(record: Record, scene: Scene, rows: NDArray[np.intp] | slice = slice(No
     points = [(body.joint.name, k, HERE_POINT) for k, body in enumerate(scene.bodies) if k not in wheels]
     if scene.hand is not None and scene.hand.body != WORLD:
         points.append((scene.hand.name, scene.hand.body, scene.hand.position))
-    found = []
+    below = []
     for name, k, position in points:
-        place = np.asarray(point_positions(record, Point(name, "hand", k, position), rows), dtype=np.float64)
+        positions = np.asarray(point_positions(record, Point(name, "hand", k, position), rows), dtype=np.float64)
         allowed = scene.bodies[k].radius + NOT_BELOW
         for surface in scene.surfaces:
             with np.errstate(all="ignore"):
-                depth = -surface.gap(place)
+                depth = -surface.gap(positions)
             if (depth > allowed).any():
-                found.append(Sunk(name, surface.name, k, position, allowed, depth))
-    return found
+                below.append(Penetration(name, surface.name, k, position, allowed, depth))
+    return below
 
 
-def largest_force(found: Sequence[Contact]) -> float:
+def largest_force(contacts: Sequence[DrawnContact]) -> float:
     """The force whose arrow has full length [N]: the 98th percentile, so that a spike does not shrink the rest."""
-    sizes = np.abs(np.concatenate([one.force for one in found])) if found else np.zeros(0)
+    sizes = np.abs(np.concatenate([contact.force for contact in contacts])) if contacts else np.zeros(0)
     sizes = sizes[np.isfinite(sizes)]
     return max(float(np.percentile(sizes, 98.0)) if len(sizes) else 1.0, 1e-6)
 
@@ -263,7 +266,7 @@ def _friction(record: Record, name: str) -> float:
     contacts = record.provenance.get("scenario", {}).get("contacts", {})
     points = contacts.get("points") or {}
     point = points.get(name, {}) if isinstance(points, Mapping) else {}
-    kinetic = [one.get("friction") for one in (point, contacts)]
-    held = [one.get("static_friction") for one in (point, contacts)]
-    known = [next((float(one) for one in both if one is not None), 0.0) for both in (kinetic, held)]
+    kinetic = [entry.get("friction") for entry in (point, contacts)]
+    static = [entry.get("static_friction") for entry in (point, contacts)]
+    known = [next((float(value) for value in both if value is not None), 0.0) for both in (kinetic, static)]
     return max(known)

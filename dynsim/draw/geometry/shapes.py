@@ -13,7 +13,7 @@ from dynsim.draw.geometry.surfaces import box_corners, surface_grids
 from dynsim.record import Record
 from dynsim.record.poses import ORIENTATION, POSITION
 from dynsim.record.quaternion import of_turn, rotated
-from dynsim.record.scene import HERE, WORLD, Body, Scene, Shape, Surface
+from dynsim.record.scene import HERE, WORLD, Body, Scene, SceneSurface, Shape
 
 Array = NDArray[np.float64]
 Faces = NDArray[np.int64]
@@ -29,29 +29,29 @@ LARGE = 4.0
 
 def drawn_shape(shape: Shape, meshes: Meshes) -> dict[str, Any] | None:
     """A shape as the page reads it; None for a mesh that was not found."""
-    found: dict[str, Any] = {
+    drawn: dict[str, Any] = {
         "kind": shape.kind,
         "size": list(shape.size),
         "p": list(shape.position),
         "q": list(shape.orientation),
     }
     if shape.colour is not None:
-        found["colour"] = list(shape.colour)
+        drawn["colour"] = list(shape.colour)
     if shape.kind == "mesh":
         mesh = meshes.index(shape.file)
         if mesh is None:
             return None
-        found["mesh"] = mesh
-    return found
+        drawn["mesh"] = mesh
+    return drawn
 
 
 def body_shapes(scene: Scene, reach: float, meshes: Meshes) -> list[list[dict[str, Any]]]:
     """Shapes of every body; rods to what it carries where it has none, and a hub about the axis of its joint."""
     radius = _radius(scene, ROD * reach)
     base = set(scene.base)
-    found = []
+    drawn = []
     for k, body in enumerate(scene.bodies):
-        shapes = [one for shape in body.shapes if (one := drawn_shape(shape, meshes)) is not None]
+        shapes = [shown for shape in body.shapes if (shown := drawn_shape(shape, meshes)) is not None]
         wanted = [child for child in scene.bodies if child.parent == k]
         # A rod leads away from its joint, a wheel lies about it.
         bare = not shapes or (_is_tube(body) and np.abs(body.shapes[0].position).max() > 1e-9)
@@ -63,12 +63,12 @@ def body_shapes(scene: Scene, reach: float, meshes: Meshes) -> list[list[dict[st
             shapes += _stems(scene, k)
         if body.joint.kind == "revolute" and not body.joint.part_of and k not in base and bare:
             shapes.append(_hub(body, 1.45 * radius))
-        found.append(shapes)
-    if not any(found):
+        drawn.append(shapes)
+    if not any(drawn):
         hands = {point.body for point in scene.points if point.body != WORLD} or {len(scene.bodies) - 1}
         for k in hands & set(range(len(scene.bodies))):
-            found[k] = [{"kind": "box", "size": 3 * [0.06 * reach], "p": [0.0, 0.0, 0.03 * reach], "q": list(HERE)}]
-    return found
+            drawn[k] = [{"kind": "box", "size": 3 * [0.06 * reach], "p": [0.0, 0.0, 0.03 * reach], "q": list(HERE)}]
+    return drawn
 
 
 def _stems(scene: Scene, k: int) -> list[dict[str, Any]]:
@@ -81,7 +81,9 @@ def _stems(scene: Scene, k: int) -> list[dict[str, Any]]:
 
 def thinnest(shapes: list[list[dict[str, Any]]]) -> float:
     """The least radius of what is round [m], but for stems; 0 where nothing is."""
-    round_ones = (s for one in shapes for s in one if s["kind"] in ("cylinder", "capsule") and s.get("role") != "stem")
+    round_ones = (
+        s for shape in shapes for s in shape if s["kind"] in ("cylinder", "capsule") and s.get("role") != "stem"
+    )
     return min((shape["size"][0] for shape in round_ones), default=0.0)
 
 
@@ -131,33 +133,33 @@ def from_z(direction: Array) -> Array:
     return of_turn(axis / size, np.arctan2(size, direction[2]))
 
 
-def drawn_surface(surface: Surface, low: Array, high: Array) -> dict[str, Any]:
+def drawn_surface(surface: SceneSurface, low: Array, high: Array) -> dict[str, Any]:
     """A surface next to the box from ``low`` to ``high`` in which everything moves."""
-    found: dict[str, Any] = {"name": surface.name, "kind": surface.kind}
+    drawn: dict[str, Any] = {"name": surface.name, "kind": surface.kind}
     span = float((high - low).max())
     near = abs(surface.radius or 0.0) <= LARGE * span
     if surface.kind == "plane" and surface.direction is not None:
         centre = 0.5 * (low + high)
         normal = np.array(surface.direction)
-        return found | {
+        return drawn | {
             "p": (centre - surface.gap(centre) * normal).tolist(),
             "q": from_z(normal).tolist(),
             "half": 1.1 * float(np.linalg.norm(high - low)),
         }
     if surface.kind == "sphere" and near:
-        return found | {"p": list(surface.position or ()), "radius": surface.radius}
+        return drawn | {"p": list(surface.position or ()), "radius": surface.radius}
     if surface.kind == "cylinder" and near and surface.direction is not None:
-        axis, place = np.array(surface.direction), np.array(surface.position)
-        along = [(corner - place) @ axis for corner in box_corners(low, high)]
+        axis, position = np.array(surface.direction), np.array(surface.position)
+        along = [(corner - position) @ axis for corner in box_corners(low, high)]
         start, end = min(along) - 0.1 * span, max(along) + 0.1 * span
-        return found | {
-            "p": (place + 0.5 * (start + end) * axis).tolist(),
+        return drawn | {
+            "p": (position + 0.5 * (start + end) * axis).tolist(),
             "q": from_z(axis).tolist(),
             "radius": surface.radius,
             "length": end - start,
         }
     if surface.kind == "box":
-        return found | {
+        return drawn | {
             "p": list(surface.position or ()),
             "q": list(surface.orientation or HERE),
             "size": list(surface.edges or ()),
@@ -165,7 +167,7 @@ def drawn_surface(surface: Surface, low: Array, high: Array) -> dict[str, Any]:
     (grid,) = surface_grids(surface, low, high)
     rows, columns, _ = grid.shape
     numbers = [None if not np.isfinite(value) else round(float(value), 5) for value in grid.ravel()]
-    return found | {"kind": "grid", "rows": rows, "columns": columns, "points": numbers}
+    return drawn | {"kind": "grid", "rows": rows, "columns": columns, "points": numbers}
 
 
 def solid(shape: dict[str, Any], meshes: list[Mesh], finer: int = 1) -> tuple[Array, Faces]:

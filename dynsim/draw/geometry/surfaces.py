@@ -8,14 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.record.quaternion import rotated
-from dynsim.record.scene import Surface
+from dynsim.record.scene import SceneSurface
 
 Array = NDArray[np.float64]
 # Points along each side of the part of a curved surface that is drawn, and of a face of a box.
 PATCH, FACE = 41, 13
 
 
-def surface_grids(surface: Surface, low: Array, high: Array) -> list[Array]:
+def surface_grids(surface: SceneSurface, low: Array, high: Array) -> list[Array]:
     """Grids of points on a surface, (n, m, 3) [m] each, NaN where there are none.
 
     All of a height field and of the six faces of a box, of a quadric the part next to the box from ``low`` to ``high``.
@@ -28,19 +28,19 @@ def surface_grids(surface: Surface, low: Array, high: Array) -> list[Array]:
     return [quadric_patch(surface, low, high)]
 
 
-def _box_faces(surface: Surface) -> list[Array]:
+def _box_faces(surface: SceneSurface) -> list[Array]:
     """Points of the six faces of a box, its edges sharp, (n, n, 3) each."""
     half, R = 0.5 * np.array(surface.edges), rotated(np.array(surface.orientation), np.eye(3))
     u, v = np.meshgrid(*2 * [np.linspace(-1.0, 1.0, FACE)])
-    found = []
+    faces = []
     for axis in range(3):
         for side in (-1.0, 1.0):
             local = np.roll(np.stack([np.full_like(u, side), u, v], axis=-1), axis, axis=-1) * half
-            found.append(np.array(surface.position) + local @ R.T)
-    return found
+            faces.append(np.array(surface.position) + local @ R.T)
+    return faces
 
 
-def quadric_patch(surface: Surface, low: Array, high: Array) -> Array:
+def quadric_patch(surface: SceneSurface, low: Array, high: Array) -> Array:
     """Points of a quadric over its tangent plane next to a box, along the normal to the nearest root of C.
 
     With r = r₀ + s n on the normal n, C(r) = a s² + b s + c, where a = n·Q n/2, b = n·(Q r₀ + b) and c = C(r₀).
@@ -80,7 +80,7 @@ def quadric_patch(surface: Surface, low: Array, high: Array) -> Array:
     return np.asarray(points)
 
 
-def round_patch(surface: Surface, low: Array, high: Array) -> Array:
+def round_patch(surface: SceneSurface, low: Array, high: Array) -> Array:
     """Points of a sphere or cylinder, (n, n, 3) [m]: all of a small one, else the part around the point next to a box.
 
     Its meridians or generators start there, so that the part ends in a smooth edge: an ellipse on a sphere, as long and

@@ -56,11 +56,11 @@ def supports(scene: Scene, groups: WheelGroups) -> list[dict[str, Any]]:
     """Points whose hull the robot stands on: on which body, and with which group of wheels they are on the ground."""
     if scene.supports:
         return [{"body": point.body, "p": list(point.position), "group": -1} for point in scene.supports]
-    found = []
+    points = []
     for group, places in enumerate(groups.places):
         for body, shape in places:
-            found.append({"body": body, "p": list(scene.bodies[body].shapes[shape].position), "group": group})
-    return found
+            points.append({"body": body, "p": list(scene.bodies[body].shapes[shape].position), "group": group})
+    return points
 
 
 def cop_of(record: Record) -> tuple[str, Array] | None:

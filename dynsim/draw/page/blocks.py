@@ -49,8 +49,8 @@ class Blocks:
         content = np.ascontiguousarray(planes).tobytes()
         self._parts.append(content)
         start, self._size = self._size, self._size + len(content)
-        place = {"at": start, "rows": len(data), "columns": int(codes.shape[1]), "bits": bits}
-        return place | {"offset": low.tolist(), "scale": scale.tolist()}
+        header = {"at": start, "rows": len(data), "columns": int(codes.shape[1]), "bits": bits}
+        return header | {"offset": low.tolist(), "scale": scale.tolist()}
 
     def raw(self, data: NDArray[Any]) -> dict[str, Any]:
         """Add an array of whole numbers ≥ 0 as it is (a mesh), little endian: in 16 bits, or 32 if one needs them."""

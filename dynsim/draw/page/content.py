@@ -12,7 +12,17 @@ from numpy.typing import NDArray
 from dynsim._version import __version__
 from dynsim.draw.geometry.camera import view_axes
 from dynsim.draw.geometry.meshes import Meshes, named, simplified
-from dynsim.draw.geometry.robot import POSE_ERROR, Robot, azimuth, bounds, contacts, paths, robot_of, robots, sunk
+from dynsim.draw.geometry.robot import (
+    POSE_ERROR,
+    DrawnRobot,
+    azimuth,
+    bounds,
+    contacts,
+    paths,
+    penetrations,
+    robot_of,
+    robots,
+)
 from dynsim.draw.geometry.shapes import body_shapes, drawn_shape, drawn_surface, gripper, thinnest
 from dynsim.draw.geometry.wheels import cop_of, supports, wheel_groups
 from dynsim.draw.page.blocks import Blocks, packed_mesh
@@ -62,15 +72,15 @@ def viewable(record: Record) -> bool:
     return robot_of(record) is not None
 
 
-def _record(name: str, robot: Robot, blocks: Blocks, meshes: Meshes, low: Array, high: Array) -> dict[str, Any]:
+def _record(name: str, robot: DrawnRobot, blocks: Blocks, meshes: Meshes, low: Array, high: Array) -> dict[str, Any]:
     record, scene, rows = robot.record, robot.scene, robot.rows
     meshes.of_robot(record)
     position, turn = record[POSITION][rows], record[ORIENTATION][rows]
     shapes = body_shapes(scene, robot.reach, meshes)
     groups = wheel_groups(record, scene)
     bodies: list[dict[str, Any]] = [
-        {"name": body.name, "parent": body.parent, "joint": body.joint.name, "shapes": one}
-        for body, one in zip(scene.bodies, shapes, strict=True)
+        {"name": body.name, "parent": body.parent, "joint": body.joint.name, "shapes": shapes_of_body}
+        for body, shapes_of_body in zip(scene.bodies, shapes, strict=True)
     ]
     for group, places in enumerate(groups.places):
         for body, shape in places:
@@ -83,7 +93,7 @@ def _record(name: str, robot: Robot, blocks: Blocks, meshes: Meshes, low: Array,
         "radius": thinnest(shapes),
         "reach": robot.reach,
         "bodies": bodies,
-        "fixed": [one for shape in scene.fixed if (one := drawn_shape(shape, meshes)) is not None],
+        "fixed": [shape_drawn for shape in scene.fixed if (shape_drawn := drawn_shape(shape, meshes)) is not None],
         "surfaces": [drawn_surface(surface, low, high) for surface in scene.surfaces],
         "frames": blocks.add(record.time[rows], 1e-9),
         "position": blocks.add(position, 0.5 * POSE_ERROR),
@@ -91,9 +101,9 @@ def _record(name: str, robot: Robot, blocks: Blocks, meshes: Meshes, low: Array,
         "paths": {key: blocks.add(path[rows], 1e-5) for key, path in paths(record, scene)},
         "contacts": _contacts(robot, blocks),
         "sunk": [
-            {"name": one.name, "surface": one.surface, "body": one.body, "p": list(one.position)}
-            | {"least": one.least, "depth": blocks.add(one.depth, 1e-5)}
-            for one in sunk(record, scene, rows)
+            {"name": point.name, "surface": point.surface, "body": point.body, "p": list(point.position)}
+            | {"least": point.least, "depth": blocks.add(point.depth, 1e-5)}
+            for point in penetrations(record, scene, rows)
         ],
         "wheels": None if groups.down is None else {"names": groups.names, "down": blocks.add(groups.down[rows])},
         "supports": supports(scene, groups),
@@ -114,12 +124,12 @@ def _record(name: str, robot: Robot, blocks: Blocks, meshes: Meshes, low: Array,
     return part
 
 
-def _contacts(robot: Robot, blocks: Blocks) -> list[dict[str, Any]]:
+def _contacts(robot: DrawnRobot, blocks: Blocks) -> list[dict[str, Any]]:
     """Every contact point: on which body, its normal, normal force and friction over time, mode where there is one."""
-    found = []
+    entries = []
     for contact in contacts(robot, robot.rows):
         point = contact.point
-        one: dict[str, Any] = {
+        entry: dict[str, Any] = {
             "name": point.name,
             "surface": point.surface,
             "body": point.body,
@@ -129,11 +139,11 @@ def _contacts(robot: Robot, blocks: Blocks) -> list[dict[str, Any]]:
             "force": blocks.add(contact.force),
         }
         if contact.tangent is not None:
-            one["tangent"] = blocks.add(contact.tangent)
+            entry["tangent"] = blocks.add(contact.tangent)
         if contact.mode is not None:
-            one["mode"] = blocks.add(contact.mode)
-        found.append(one)
-    return found
+            entry["mode"] = blocks.add(contact.mode)
+        entries.append(entry)
+    return entries
 
 
 def _motors(record: Record, scene: Scene) -> list[list[Any]]:
@@ -150,8 +160,8 @@ def _motors(record: Record, scene: Scene) -> list[list[Any]]:
 def shared(record: Record, key: str) -> float | None:
     """A number of the motors by its key in the scenario; None where they have none, or several."""
     values = named(record.provenance.get("scenario", {}).get("plant", {}), key)
-    found = {float(value) for value in values if isinstance(value, (int, float))}
-    return _finite(found.pop()) if len(found) == 1 else None
+    numbers = {float(value) for value in values if isinstance(value, (int, float))}
+    return _finite(numbers.pop()) if len(numbers) == 1 else None
 
 
 def resistance(record: Record) -> float | None:
@@ -160,8 +170,8 @@ def resistance(record: Record) -> float | None:
     if R is None or not {"current", "heat_joule"} <= set(record) or len(record) < 2:
         return None
     heat = float(record["heat_joule"][-1] - record["heat_joule"][0])
-    found = R * float(np.trapezoid((record["current"] ** 2).sum(axis=1), record.time))
-    return R if abs(found - heat) <= HEAT_ERROR * abs(heat) else None
+    loss = R * float(np.trapezoid((record["current"] ** 2).sum(axis=1), record.time))
+    return R if abs(loss - heat) <= HEAT_ERROR * abs(heat) else None
 
 
 def _finite(value: float | None) -> float | None:
@@ -171,7 +181,7 @@ def _finite(value: float | None) -> float | None:
 
 def _signals(record: Record, blocks: Blocks) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Signals for the plots, and their time axes."""
-    found, axes = [], {}
+    signals, axes = [], {}
     for name, signal in (record.signals | _hand_error(record)).items():
         data = signal.data
         if name in _SHOWN or not data.size or data.ndim > 3:
@@ -184,7 +194,7 @@ def _signals(record: Record, blocks: Blocks) -> tuple[list[dict[str, Any]], dict
         time, values = _thinned(every, data.reshape(len(data), -1))
         if signal.axis not in axes:
             axes[signal.axis] = blocks.add(time, 1e-9)
-        found.append(
+        signals.append(
             {
                 "name": name,
                 "unit": signal.unit,
@@ -196,7 +206,7 @@ def _signals(record: Record, blocks: Blocks) -> tuple[list[dict[str, Any]], dict
         )
     if TIME not in axes:
         axes[TIME] = blocks.add(_thinned(record.time, record.time[:, None])[0], 1e-9)
-    return found, axes
+    return signals, axes
 
 
 def _resolution(values: Array) -> float:

@@ -62,7 +62,7 @@ def _filled(values: Mapping[str, str], scripts: Sequence[str]) -> str:
     program = "\n".join([program, *scripts])
     parts = {"style": style, "three": _inline(three()), "program": _inline(program), **values}
     text = own.joinpath("page.html").read_text(encoding="utf-8")
-    return re.sub(r"<!--\{(\w+)\}-->", lambda found: parts[found[1]], text)
+    return re.sub(r"<!--\{(\w+)\}-->", lambda match: parts[match[1]], text)
 
 
 def three() -> str:

@@ -198,8 +198,8 @@ class DynamixelBus:
 
     def ping_all(self) -> dict[int, tuple[int, int]]:
         with self._transaction():
-            found, _ = self._library.broadcastPing(self.port)
-        return {id_: (model, firmware) for id_, (model, firmware) in found.items()}
+            answers, _ = self._library.broadcastPing(self.port)
+        return {id_: (model, firmware) for id_, (model, firmware) in answers.items()}
 
     def read(self, id_: int, field: Field) -> int:
         return field.decode(self.read_block(id_, field.address, field.size).data)

@@ -57,16 +57,16 @@ def scan(port: str, bauds: tuple[int, ...] = SCAN_BAUD_RATES) -> list[Found]:
     PortError
         The port cannot be opened or died.
     """
-    found = []
+    servos = []
     for baud in bauds:
         bus = DynamixelBus(open_serial_port(port, baud))
         try:
             for id_, (model, firmware) in sorted(bus.ping_all().items()):
                 registers = {name: _register(bus, id_, name) for name in SHOWN}
-                found.append(Found(id_, model, firmware, baud, registers))
+                servos.append(Found(id_, model, firmware, baud, registers))
         finally:
             bus.close()
-    return found
+    return servos
 
 
 def _register(bus: DynamixelBus, id_: int, name: str) -> int:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from dynsim.errors import CheckRefused
 from dynsim.hardware.bus.control_table import HEALTH_BLOCK, STATE_BLOCK, TICKS_PER_TURN
 from dynsim.hardware.replay.measured import unmeasured
-from dynsim.hardware.replay.motion import Array, Course, CyclePlan, Needs, Planned, Task
+from dynsim.hardware.replay.motion import Array, CyclePlan, GoalCourse, MotionTask, Needs, PlannedCourse
 from dynsim.hardware.replay.trajectory import (
     COMMON,
     JERK_WINDOW,
@@ -28,7 +28,7 @@ from dynsim.hardware.replay.trajectory import (
     long_steps,
     path_of_record,
 )
-from dynsim.hardware.servo_map import Servo, ServoMap
+from dynsim.hardware.servo_map import MappedServo, ServoMap
 from dynsim.record import Record
 
 BITS_PER_BYTE = 10
@@ -100,7 +100,7 @@ class Margin:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CheckedMotion(Task):
+class CheckedMotion(MotionTask):
     """A motion that passed: what the replay runs on.
 
     Attributes
@@ -119,8 +119,11 @@ class CheckedMotion(Task):
         """The margin that is the least part of its limit, of a position the half of its range, and that part."""
         ranges = {servo.joint: servo.position_limits[1] - servo.position_limits[0] for servo in servo_map.servos}
         parts = [
-            (one.margin / (0.5 * ranges[one.joint] if one.quantity == "position" else abs(one.limit)), one)
-            for one in self.margins
+            (
+                margin.margin / (0.5 * ranges[margin.joint] if margin.quantity == "position" else abs(margin.limit)),
+                margin,
+            )
+            for margin in self.margins
         ]
         part, margin = min(parts, key=lambda entry: entry[0], default=(math.inf, None))
         return None if margin is None else (margin, part)
@@ -142,9 +145,9 @@ class CheckedMotion(Task):
         fastest = self.speed * np.abs(extremes.velocity).max(axis=(0, 1))
         return [Needs(float(a), float(b), float(v)) for a, b, v in zip(low, high, fastest, strict=True)]
 
-    def course(self) -> Course:
+    def course(self) -> GoalCourse:
         """How to go along the path, from its beginning."""
-        return Planned(self.path, self.path.start, self.path.end, speed=self.speed)
+        return PlannedCourse(self.path, self.path.start, self.path.end, speed=self.speed)
 
 
 def check_motion(
@@ -252,9 +255,9 @@ class MotionLimits:
         limits = [servo.kind.limits for servo in self._servos]
         self._highest: dict[Quantity, Array] = {
             "velocity": np.array([velocity_limit(servo) for servo in self._servos]),
-            "acceleration": np.array([one.acceleration for one in limits]),
-            "jerk": np.array([one.jerk for one in limits]),
-            "shaking": np.array([one.shaking for one in limits]),
+            "acceleration": np.array([limit.acceleration for limit in limits]),
+            "jerk": np.array([limit.jerk for limit in limits]),
+            "shaking": np.array([limit.shaking for limit in limits]),
         }
 
     def margins(
@@ -317,13 +320,13 @@ def _of_each(values: Array, times: Array, rows: NDArray[np.intp]) -> tuple[Array
     return values.reshape(-1, len(rows))[rows, columns], times.reshape(-1, len(rows))[rows, columns]
 
 
-def position_bounds(servo: Servo) -> tuple[float, float]:
+def position_bounds(servo: MappedServo) -> tuple[float, float]:
     """Limits of the map, narrowed to the single turn position mode knows [rad]."""
     turn = sorted((servo.to_angle(0), servo.to_angle(TICKS_PER_TURN - 1)))
     return max(servo.position_limits[0], turn[0]), min(servo.position_limits[1], turn[1])
 
 
-def velocity_limit(servo: Servo) -> float:
+def velocity_limit(servo: MappedServo) -> float:
     """Joint speed limit [rad/s]: the map's, or the model's no-load speed where that is lower."""
     return min(servo.kind.limits.velocity, servo.model.no_load_speed / servo.gear)
 

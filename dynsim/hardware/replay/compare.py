@@ -13,10 +13,10 @@ from pydantic import ValidationError
 from scipy.optimize import minimize_scalar
 
 from dynsim.config.base import Positive, StrictConfig
-from dynsim.errors import RecordError, shown
+from dynsim.errors import RecordError, brief
 from dynsim.hardware.bus.control_table import RAD_PER_TICK
 from dynsim.hardware.errors import ComparisonGateFailed
-from dynsim.hardware.replay.states import State
+from dynsim.hardware.replay.states import ReplayState
 from dynsim.hardware.strict_yaml import read_yaml
 from dynsim.record import Record
 from dynsim.snake.lifting import Lifts, lifted
@@ -177,8 +177,8 @@ def compare_records(simulated: Record, measured: Record) -> Comparison:
             )
     speed = measured.provenance.get("speed", 1.0)
     if not isinstance(speed, (int, float)) or not 0.0 < speed < np.inf:
-        raise RecordError(f"the provenance of the measured run says speed {shown(speed)}; a replay has a positive one")
-    rows = measured["state"] == State.REPLAY if "state" in measured else np.ones(len(measured), dtype=bool)
+        raise RecordError(f"the provenance of the measured run says speed {brief(speed)}; a replay has a positive one")
+    rows = measured["state"] == ReplayState.REPLAY if "state" in measured else np.ones(len(measured), dtype=bool)
     time = measured["record_time"] if "record_time" in measured else measured.time  # noqa: SIM401
     rows &= np.isfinite(time) & (time >= 0) & (time <= simulated.time[-1] - simulated.time[0])
     if rows.sum() < 2:
@@ -235,7 +235,7 @@ def _wheel_errors(
     """Errors of the wheels, and their rates as :class:`Comparison` has them."""
     angles = {label: (ours, theirs) for label, ours, theirs in _columns(simulated, measured, WHEEL_ANGLE)}
     own_time = simulated.time - simulated.time[0]
-    found, rates = [], np.zeros((2, len(time), 0))
+    errors, rates = [], np.zeros((2, len(time), 0))
     for label, ours, theirs in _columns(simulated, measured, WHEEL_RATE):
         if label not in angles:
             continue
@@ -247,7 +247,7 @@ def _wheel_errors(
         seen = np.flatnonzero(np.isfinite(turned))  # not NaN, as where an answer was missed
         angle = (turned - turned[seen[0]]) - (asked - asked[seen[0]])
         rate_max, time_of_max = _largest(rate, time)
-        found.append(
+        errors.append(
             WheelError(
                 wheel=label,
                 rate_rms=_rms(rate),
@@ -258,7 +258,7 @@ def _wheel_errors(
                 angle_end=float(angle[seen[-1]]),
             )
         )
-    return tuple(found), rates
+    return tuple(errors), rates
 
 
 def _columns(simulated: Record, measured: Record, name: str) -> list[tuple[str, Array, Array]]:
@@ -266,12 +266,12 @@ def _columns(simulated: Record, measured: Record, name: str) -> list[tuple[str, 
     if name not in simulated or name not in measured or simulated[name].ndim != 2 or measured[name].ndim != 2:
         return []
     ours, theirs = simulated.labels[name], measured.labels[name]
-    found = []
+    columns = []
     for label in (label for label in ours if label in theirs):
         data = np.asarray(measured[name][:, theirs.index(label)], dtype=np.float64)
         if np.isfinite(data).any():
-            found.append((label, np.asarray(simulated[name][:, ours.index(label)], dtype=np.float64), data))
-    return found
+            columns.append((label, np.asarray(simulated[name][:, ours.index(label)], dtype=np.float64), data))
+    return columns
 
 
 def _common_angles(simulated: Record, measured: Record) -> list[tuple[str, Array, Array]]:
@@ -298,7 +298,7 @@ def _lifting(simulated: Record, measured: Record) -> dict[str, Array]:
     try:
         lifts = Lifts.model_validate(entry)
     except ValidationError:
-        raise RecordError(f"the provenance of the measured run says lifts {shown(entry)}") from None
+        raise RecordError(f"the provenance of the measured run says lifts {brief(entry)}") from None
     return dict(zip(lifts.joints, lifted(simulated, lifts).hinge.T, strict=True))
 
 
@@ -320,8 +320,8 @@ def _delay(at: Any, time: Array, actual: Array, columns: NDArray[np.bool_]) -> f
     if nearest in (0, len(grid) - 1):
         return float("nan")
     best, step = grid[nearest], grid[1] - grid[0]
-    found = minimize_scalar(misfit, bounds=(best - step, best + step), method="bounded", options={"xatol": 1e-5})
-    return float(found.x) if found.fun <= 0.5 * misfit(0.0) else float("nan")
+    optimum = minimize_scalar(misfit, bounds=(best - step, best + step), method="bounded", options={"xatol": 1e-5})
+    return float(optimum.x) if optimum.fun <= 0.5 * misfit(0.0) else float("nan")
 
 
 def load_gate(path: str | Path) -> Gate:
@@ -343,13 +343,13 @@ def check_gate(comparison: Comparison, gate: Gate) -> None:
     ComparisonGateFailed
         With every bound exceeded.
     """
-    found = comparison.summary()
+    summary = comparison.summary()
     bounds = {name: bound for name, bound in gate.model_dump().items() if bound is not None}
-    exceeded = [f"{name}: no wheels to compare" for name in bounds if found[name] is None]
+    exceeded = [f"{name}: no wheels to compare" for name in bounds if summary[name] is None]
     exceeded += [
-        f"{name} {found[name]:.4g} > {bound:.4g}"
+        f"{name} {summary[name]:.4g} > {bound:.4g}"
         for name, bound in bounds.items()
-        if found[name] is not None and found[name] > bound
+        if summary[name] is not None and summary[name] > bound
     ]
     if exceeded:
         raise ComparisonGateFailed(f"gate failed (worst joint {comparison.worst.joint}): {', '.join(exceeded)}")
@@ -373,18 +373,20 @@ def draw_comparison(comparison: Comparison, path: Path, joints: Sequence[str] = 
     wheels = [wheel.wheel for wheel in comparison.wheels]
     for name in joints:
         if name not in names + wheels:
-            raise RecordError(f"no joint {shown(name)} was compared; there are: {', '.join(names + wheels)}")
-    texts = [f"{one.joint}: rms {1e3 * one.rms:.3g} mrad, at most {1e3 * one.max:.3g}" for one in comparison.joints]
-    rms, both = [one.rms for one in comparison.joints], np.stack([comparison.simulated, comparison.measured])
+            raise RecordError(f"no joint {brief(name)} was compared; there are: {', '.join(names + wheels)}")
+    texts = [
+        f"{joint.joint}: rms {1e3 * joint.rms:.3g} mrad, at most {1e3 * joint.max:.3g}" for joint in comparison.joints
+    ]
+    rms, both = [joint.rms for joint in comparison.joints], np.stack([comparison.simulated, comparison.measured])
     quantities = [
         Followed("joints", "joint angle [rad]", "measured − simulated [mrad]", 1e3, names, rms, texts, both),
     ]
     if wheels:
         texts = [
-            f"{one.wheel}: rms {one.rate_rms:.3g} rad/s, angle at most {one.angle_max:.3g} rad"
-            for one in comparison.wheels
+            f"{wheel.wheel}: rms {wheel.rate_rms:.3g} rad/s, angle at most {wheel.angle_max:.3g} rad"
+            for wheel in comparison.wheels
         ]
-        rms, both = [one.rate_rms for one in comparison.wheels], comparison.wheel_rates
+        rms, both = [wheel.rate_rms for wheel in comparison.wheels], comparison.wheel_rates
         quantities.append(
             Followed("wheels", "wheel rate [rad/s]", "measured − sim. [rad/s]", 1.0, wheels, rms, texts, both)
         )

@@ -10,7 +10,7 @@ from rich.progress import BarColumn, TextColumn
 from rich.progress import Progress as Bar
 
 from dynsim.hardware.replay.output import Background
-from dynsim.hardware.replay.states import Progress
+from dynsim.hardware.replay.states import ReplayProgress
 
 DRAWING_INTERVAL = 0.1
 """Between two drawings [s]."""
@@ -31,7 +31,7 @@ class Display:
 
     def __init__(self, console: Console) -> None:
         self.failure: Exception | None = None
-        self._latest: Progress | None = None
+        self._latest: ReplayProgress | None = None
         self._bar = Bar(
             TextColumn("{task.description:<13}"),
             BarColumn(),
@@ -47,7 +47,7 @@ class Display:
         )
         self._task = self._bar.add_task("", total=1.0, error=0.0, temperature="-")
 
-    def __call__(self, progress: Progress) -> None:
+    def __call__(self, progress: ReplayProgress) -> None:
         self._latest = progress
 
     def pump(self) -> None:

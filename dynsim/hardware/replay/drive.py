@@ -22,7 +22,7 @@ import numpy as np
 from dynsim.errors import CheckRefused
 from dynsim.hardware.replay.check import ROUNDING, MotionLimits, plan_cycle
 from dynsim.hardware.replay.incremental_path import IncrementalPath, Sample
-from dynsim.hardware.replay.motion import Array, Course, Needs, Task
+from dynsim.hardware.replay.motion import Array, GoalCourse, MotionTask, Needs
 from dynsim.hardware.replay.rules import Cause, Fault
 from dynsim.hardware.replay.states import Stopped
 from dynsim.hardware.replay.trajectory import HOLE, Path
@@ -75,7 +75,7 @@ def lead(servo_map: ServoMap) -> float:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DrivenMotion(Task):
+class DrivenMotion(MotionTask):
     """What a pilot will ask for. Of the simulation that it follows nothing is known yet but its beginning.
 
     Attributes
@@ -110,7 +110,7 @@ class DrivenMotion(Task):
         """Where it will go is not known: all that the map allows."""
         return [needs_of_map(servo) for servo in self.servo_map.servos]
 
-    def course(self) -> Course:
+    def course(self) -> GoalCourse:
         """Along what comes."""
         return DrivenCourse(self)
 

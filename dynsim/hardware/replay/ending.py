@@ -27,12 +27,12 @@ from dynsim.hardware.replay.states import (
     TRIPPED,
     UNARMED,
     ReplayResult,
+    ReplayState,
     ServoEnd,
-    State,
     of_the_whole,
 )
 from dynsim.hardware.safety import FaultPolicy
-from dynsim.hardware.servo_map import Servo
+from dynsim.hardware.servo_map import MappedServo
 
 REST_TIME = 1.0
 """Longest wait for the servos to stand still, and for silent ones to come back (a restart takes 0.3 s) [s]."""
@@ -72,25 +72,25 @@ class Ending:
         else:
             self._release()
 
-    def after_fault(self, struck: State, *, found_holding: bool) -> None:
+    def after_fault(self, struck: ReplayState, *, found_holding: bool) -> None:
         """Carry out the fault policy for the faults of the result; raises nothing.
 
         Parameters
         ----------
-        struck : State
+        struck : ReplayState
             In which the fault happened.
         found_holding : bool
             Torque was on before the robot was armed.
         """
-        self._at_rest = struck == State.SETTLE
+        self._at_rest = struck == ReplayState.SETTLE
         interrupted = self._result.faults[0].cause == Cause.INTERRUPTED
         if self._loop.stop.for_release:
             self._try(self._release)
         elif struck in UNARMED:
             return
-        elif struck == State.DISARM:
+        elif struck == ReplayState.DISARM:
             self._try(self.regular)
-        elif struck == State.ARM:
+        elif struck == ReplayState.ARM:
             # Nothing has moved yet: back to how the robot was found, unless somebody else took its torque meanwhile.
             taken = any(fault.cause == Cause.TORQUE_LOST for fault in self._result.faults)
             self._try(self._leave_holding if found_holding and not taken else self._release)
@@ -164,9 +164,9 @@ class Ending:
 
     def _known_as(self, ids: Collection[int]) -> list[int]:
         """Numbers of servos in the map, of which none was in trouble before."""
-        found = [index for index, servo in enumerate(self._servos) if servo.id in ids and index not in self._troubled]
-        self._troubled.update(found)
-        return found
+        indices = [index for index, servo in enumerate(self._servos) if servo.id in ids and index not in self._troubled]
+        self._troubled.update(indices)
+        return indices
 
     # -- ways of stopping ---------------------------------------------------------------------------------------------
 
@@ -288,24 +288,24 @@ class Ending:
         self._journal.say(f"torque off{confirmed}")
 
 
-def read_health(bus: Bus, servos: Sequence[Servo]) -> dict[int, dict[str, int]]:
+def read_health(bus: Bus, servos: Sequence[MappedServo]) -> dict[int, dict[str, int]]:
     """Registers 64 to 146 of every servo that answers, by ID and name.
 
     Raises
     ------
     PortError
     """
-    found: dict[int, dict[str, int]] = {}
+    health: dict[int, dict[str, int]] = {}
     for _ in range(READS):
-        silent = [servo for servo in servos if servo.id not in found]
+        silent = [servo for servo in servos if servo.id not in health]
         if not silent:
             break
         replies = bus.sync_read([servo.id for servo in silent], *HEALTH_BLOCK).replies
-        found |= {servo.id: decode_health(servo, replies[servo.id].data) for servo in silent if servo.id in replies}
-    return found
+        health |= {servo.id: decode_health(servo, replies[servo.id].data) for servo in silent if servo.id in replies}
+    return health
 
 
-def read_back(bus: Bus, servos: Sequence[Servo]) -> tuple[ServoEnd, ...]:
+def read_back(bus: Bus, servos: Sequence[MappedServo]) -> tuple[ServoEnd, ...]:
     """What every servo is doing now. Raises PortError."""
     health = read_health(bus, servos)
     return tuple(
@@ -313,7 +313,7 @@ def read_back(bus: Bus, servos: Sequence[Servo]) -> tuple[ServoEnd, ...]:
     )
 
 
-def _end(servo: Servo, registers: dict[str, int]) -> ServoEnd:
+def _end(servo: MappedServo, registers: dict[str, int]) -> ServoEnd:
     torque, error = bool(registers["torque_enable"]), registers["hardware_error"]
     position, velocity = servo.to_angle(registers["present_position"]), servo.to_velocity(registers["present_velocity"])
     if not torque:

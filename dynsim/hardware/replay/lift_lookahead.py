@@ -130,7 +130,7 @@ class LiftLookahead:
         self._hold(sample, yaw)
         return self._whole(time - self._lifts.blend_s + ROUNDING)
 
-    def rest(self) -> list[Sample]:
+    def remaining(self) -> list[Sample]:
         """All that are still held back: there are no more. What is lifted stays so."""
         return [*self._whole(np.inf), *self._last()]
 
@@ -146,40 +146,40 @@ class LiftLookahead:
             up = float(self._up[pair])
             always = not np.isfinite(up)
             refuse_short_lift(self._lifts, self._pairs[pair], max(up, 0.0), time, 1 if always else 2)
-            for one in self._held:
-                if one.up[pair] == up:
-                    one.down[pair] = time
+            for entry in self._held:
+                if entry.up[pair] == up:
+                    entry.down[pair] = time
         self._up = np.where(grounded == 1, np.nan, np.where(self._grounded == 1, time, self._up))
         self._grounded, self._changed = grounded.copy(), time
         since.up = self._up.copy()
 
     def _whole(self, until: float) -> list[Sample]:
         """What is known up to a time [s], folded; each leaves when the one after it is."""
-        found: list[Sample] = []
+        samples: list[Sample] = []
         # The first of those held is the last one folded.
         while len(self._held) > 1 and self._held[1].sample.time <= until:
             del self._held[0]
             self._folded.append(self._fold(self._held[0]))
             if len(self._folded) == 3:
-                found.append(self._with_rate(1))
+                samples.append(self._with_rate(1))
                 del self._folded[0]
-        return found
+        return samples
 
     def _last(self) -> list[Sample]:
         if len(self._folded) < 2:
             return []
         return [self._with_rate(len(self._folded) - 1)]
 
-    def _fold(self, held: _Held) -> Sample:
-        sample = held.sample
+    def _fold(self, entry: _Held) -> Sample:
+        sample = entry.sample
         time = np.array([sample.time])
-        height = np.where(np.isnan(held.up), 0.0, height_of(time, held.up, held.down, self._lifts))[None]
-        fold = folded(self._part, held.yaw[None], height, self._lifts, time)
+        height = np.where(np.isnan(entry.up), 0.0, height_of(time, entry.up, entry.down, self._lifts))[None]
+        fold = folded(self._part, entry.yaw[None], height, self._lifts, time)
         lift = np.zeros(len(sample.position))
         lift[self._joints] = fold.hinge[0]
         return sample._replace(lift=lift)
 
     def _with_rate(self, index: int) -> Sample:
-        lifts = np.array([one.lift for one in self._folded])
-        rates = np.gradient(lifts, np.array([one.time for one in self._folded]), axis=0)
+        lifts = np.array([entry.lift for entry in self._folded])
+        rates = np.gradient(lifts, np.array([entry.time for entry in self._folded]), axis=0)
         return self._folded[index]._replace(lift_rate=rates[index])

@@ -16,11 +16,11 @@ from dynsim.hardware.bus.clock import Clock
 from dynsim.hardware.bus.control_table import HEALTH_BLOCK, MX_106, RAD_PER_TICK, STATE_BLOCK
 from dynsim.hardware.bus.protocol import Bus
 from dynsim.hardware.replay.check import velocity_limit
-from dynsim.hardware.replay.motion import Course, Task
+from dynsim.hardware.replay.motion import GoalCourse, MotionTask
 from dynsim.hardware.replay.output import Journal, Recorder
 from dynsim.hardware.replay.rules import AbortRules, Cause, Cycle, Fault, decode_health
-from dynsim.hardware.replay.states import State, Stopped, StopRequest
-from dynsim.hardware.servo_map import Servo, ServoMap
+from dynsim.hardware.replay.states import ReplayState, Stopped, StopRequest
+from dynsim.hardware.servo_map import MappedServo, ServoMap
 
 Array = NDArray[np.float64]
 
@@ -34,7 +34,9 @@ GoalRegisters = dict[str, dict[int, int]]
 """By the name of the register and the ID of the servo."""
 
 
-def goal_registers(servos: Iterable[Servo], position: Iterable[float], velocity: Iterable[float]) -> GoalRegisters:
+def goal_registers(
+    servos: Iterable[MappedServo], position: Iterable[float], velocity: Iterable[float]
+) -> GoalRegisters:
     """Of servos in position mode the ticks of their angles [rad], of the others units of their rates [rad/s]."""
     goals: GoalRegisters = {"goal_position": {}, "goal_velocity": {}}
     for servo, angle, rate in zip(servos, position, velocity, strict=True):
@@ -62,7 +64,7 @@ class Loop:
         Where every joint was seen last [rad].
     origin, tick :
         Clock time [s] of the first deadline, and the number of the last one.
-    course : Course or None
+    course : GoalCourse or None
         What is followed, or was last.
     path_started : float or None
         Clock time [s] of path time 0, once the replay of the path began.
@@ -72,7 +74,7 @@ class Loop:
 
     def __init__(
         self,
-        motion: Task,
+        motion: MotionTask,
         servo_map: ServoMap,
         bus: Bus,
         clock: Clock,
@@ -90,7 +92,7 @@ class Loop:
         self.measured = np.zeros(count)
         self.origin = clock.now()
         self.tick = 0
-        self.course: Course | None = None
+        self.course: GoalCourse | None = None
         self.path_started: float | None = None
         self.policy_goals: list[tuple[float, int, int]] = []
         self._clock = clock
@@ -146,7 +148,7 @@ class Loop:
         self._clock.sleep_until(self.deadline_of(self.tick))
         return self._clock.now() - self.deadline_of(self.tick) + skipped * self.period, skipped
 
-    def follow(self, course: Course) -> None:
+    def follow(self, course: GoalCourse) -> None:
         """Go along a course to its end.
 
         From goal to goal one period of it passes, also where cycles in between were skipped: made up for at once they
@@ -261,6 +263,6 @@ class Loop:
                 continue
             self.bus.sync_write(FIELDS[name], values)
             self._sent.update(values)
-            if self._journal.state == State.FAULT:
+            if self._journal.state == ReplayState.FAULT:
                 now = self._clock.now()
                 self.policy_goals += [(now, id_, value) for id_, value in values.items()]

@@ -23,13 +23,13 @@ from dynsim.hardware.replay.check import velocity_limit
 from dynsim.hardware.replay.ending import AT_REST, Ending, read_health
 from dynsim.hardware.replay.loop import FIELDS, Loop
 from dynsim.hardware.replay.measured import describe, measured_record, timing_of
-from dynsim.hardware.replay.motion import QUINTIC_PEAK, Approach, Planned, Task
+from dynsim.hardware.replay.motion import QUINTIC_PEAK, Approach, MotionTask, PlannedCourse
 from dynsim.hardware.replay.output import REGISTERS, REGISTERS_AFTER_FAULT, Journal, Layout, Recorder, RunLog
 from dynsim.hardware.replay.rules import Cause, Fault, watchdog_units
-from dynsim.hardware.replay.states import UNARMED, Progress, ReplayResult, State, Stopped, StopRequest
+from dynsim.hardware.replay.states import UNARMED, ReplayProgress, ReplayResult, ReplayState, Stopped, StopRequest
 from dynsim.hardware.replay.verify import Registers, all_registers, configure, difference_lines, verify
 from dynsim.hardware.safety import FaultPolicy
-from dynsim.hardware.servo_map import Servo, ServoMap
+from dynsim.hardware.servo_map import MappedServo, ServoMap
 from dynsim.system.files import write_json
 
 APPROACH_ACCELERATION = 10.0
@@ -48,7 +48,7 @@ class Replay:
 
     Parameters
     ----------
-    motion : Task
+    motion : MotionTask
     servo_map : ServoMap
     bus : Bus
     clock : Clock
@@ -76,7 +76,7 @@ class Replay:
 
     def __init__(
         self,
-        motion: Task,
+        motion: MotionTask,
         servo_map: ServoMap,
         bus: Bus,
         clock: Clock,
@@ -87,7 +87,7 @@ class Replay:
         stop: StopRequest | None = None,
         log: RunLog | None = None,
         dump_folder: FilePath | None = None,
-        observer: Callable[[Progress], None] | None = None,
+        observer: Callable[[ReplayProgress], None] | None = None,
         provenance: dict[str, Any] | None = None,
     ) -> None:
         self.motion = motion
@@ -130,7 +130,7 @@ class Replay:
         except PortError as error:
             self._fault(Fault(Cause.PORT, str(error)))
         except (NoAnswer, RequestRefused) as error:
-            cause = Cause.ARMING if self.journal.state == State.ARM else Cause.VERIFICATION
+            cause = Cause.ARMING if self.journal.state == ReplayState.ARM else Cause.VERIFICATION
             busy = too_busy(self.bus) if isinstance(error, NoAnswer) else ""
             self._fault(Fault(cause, f"{error}{busy and '; '}{busy}", (error.id,)))
         except BaseException as error:
@@ -142,9 +142,9 @@ class Replay:
         return self.result
 
     def _verify(self) -> None:
-        self.journal.enter(State.CONNECT)
+        self.journal.enter(ReplayState.CONNECT)
         self.stop.check()
-        self.journal.enter(State.VERIFY)
+        self.journal.enter(ReplayState.VERIFY)
         if self.write_eeprom:
             configure(self.bus, self.map, self.journal.say)
         problems, limits = verify(self.bus, self.map, self.motion, poll=self.stop.check)
@@ -157,7 +157,7 @@ class Replay:
         self.journal.say(f"{len(self._servos)} servos as the map says")
 
     def _dry_run(self) -> None:
-        self.journal.enter(State.DRY_RUN)
+        self.journal.enter(ReplayState.DRY_RUN)
         self.loop.goal = self.loop.goal_rate = np.full(len(self._servos), np.nan)
         self.loop.begin()
         for _ in range(math.ceil(DRY_RUN_TIME / self.loop.period)):
@@ -165,7 +165,7 @@ class Replay:
         self.journal.say("dry run: nothing was moved (--live moves)")
 
     def _arm(self) -> None:
-        self.journal.enter(State.ARM)
+        self.journal.enter(ReplayState.ARM)
         on = {servo.id for servo in self._servos if self.bus.read(servo.id, FIELDS["torque_enable"])}
         self._found_holding = bool(on)
         for index, servo in enumerate(self._servos):
@@ -193,7 +193,7 @@ class Replay:
             self.bus.write(servo.id, FIELDS["bus_watchdog"], units)
         self.journal.say(f"torque on, bus watchdogs at {units * WATCHDOG_SECONDS_PER_UNIT * 1e3:.0f} ms")
 
-    def _check_still_on(self, servos: Sequence[Servo]) -> None:
+    def _check_still_on(self, servos: Sequence[MappedServo]) -> None:
         """Raises Stopped where one has lost its torque, NoAnswer where one is silent."""
         health = read_health(self.bus, servos)
         for servo in servos:
@@ -211,14 +211,14 @@ class Replay:
         goal = np.where(in_position_mode, self.motion.start, here)
         distance = float(np.abs(goal - here).max())
         duration = max(QUINTIC_PEAK * distance / self.map.safety.approach_velocity, self.loop.period)
-        self.journal.enter(State.MOVE_TO_START)
+        self.journal.enter(ReplayState.MOVE_TO_START)
         self.journal.say(f"{distance:.3f} rad in {duration:.1f} s")
         self.loop.begin()
-        self.loop.follow(Planned(Approach(here, goal, duration), 0.0, duration, speed=1.0))
+        self.loop.follow(PlannedCourse(Approach(here, goal, duration), 0.0, duration, speed=1.0))
         self._settle()
 
     def _settle(self) -> None:
-        self.journal.enter(State.SETTLE)
+        self.journal.enter(ReplayState.SETTLE)
         loop, quiet, cycles = self.loop, 0, 0
         goal = loop.goal.copy()
         while quiet < SETTLE_CYCLES:
@@ -238,14 +238,14 @@ class Replay:
         for name in ("profile_velocity", "profile_acceleration"):
             values = {servo.id: self._profile(servo, approaching=False)[name] for servo in self._servos}
             self.bus.sync_write(FIELDS[name], values)
-        self.journal.enter(State.REPLAY)
+        self.journal.enter(ReplayState.REPLAY)
         course = self.motion.course()
         self.loop.path_started = self.loop.deadline_of(self.loop.tick + 1) - course.time / self.motion.speed
         self.loop.follow(course)
         self._settle()
 
     def _disarm(self) -> None:
-        self.journal.enter(State.DISARM)
+        self.journal.enter(ReplayState.DISARM)
         self._ending.regular()
         self._ending.read_back(armed=True)
         asked = "holding" if self.map.safety.at_end == "hold" else "off"
@@ -254,7 +254,7 @@ class Replay:
             raise Stopped(Fault(cause, f"should be {asked}, but is {self.result.end_state}"))
         self._tell_end()
 
-    def _profile(self, servo: Servo, *, approaching: bool) -> dict[str, int]:
+    def _profile(self, servo: MappedServo, *, approaching: bool) -> dict[str, int]:
         """The firmware's own limits: slow towards the start, the joint's speed limit during the replay.
 
         0 would mean "no limit" and is never written as a velocity; as an acceleration it leaves shaping to the path.
@@ -273,7 +273,7 @@ class Replay:
         # The robot first: whatever writes, is told afterwards.
         with self.journal.held_back():
             result.fault_state, result.fault_time = struck, self.clock.now()
-            self.journal.enter(State.FAULT)
+            self.journal.enter(ReplayState.FAULT)
             for fault in faults:
                 result.declare(replace(fault, time=result.fault_time))
                 self.journal.say(f"in {struck.name}: {fault.cause}: {fault.text}")

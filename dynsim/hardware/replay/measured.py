@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from dynsim.errors import RecordError
 from dynsim.hardware.replay.output import MEASURED, PART, PART_FORMAT, SUMMARY, Layout, Rows, is_held, row_type
-from dynsim.hardware.replay.states import State, TimingStatistics
+from dynsim.hardware.replay.states import ReplayState, TimingStatistics
 from dynsim.hardware.replay.trajectory import GROUNDED, wheel_offsets
 from dynsim.hardware.servo_map import ServoMap
 from dynsim.record import TIME, Record
@@ -87,26 +87,26 @@ def unmeasured(record: Record, servo_map: ServoMap) -> Record | None:
     """
     if record.scene is None:
         return None
-    found = Record(record.time - record.time[0])
+    followed = Record(record.time - record.time[0])
     servos = {(servo.kind.follows.position, servo.label) for servo in servo_map.servos}
     for name in dict.fromkeys(body.joint.signal for body in record.scene.bodies):
-        wanted = [one for body in record.scene.bodies if body.joint.signal == name for one in body.joint.labels]
+        wanted = [label for body in record.scene.bodies if body.joint.signal == name for label in body.joint.labels]
         missing = tuple(dict.fromkeys(label for label in wanted if (name, label) not in servos))
         if not missing:
             continue
         if name not in record or record.signals[name].axis != TIME or not set(missing) <= set(record.labels[name]):
             return None
         columns = [record.labels[name].index(label) for label in missing]
-        found.add(name, record[name][:, columns], record.units[name], labels=missing, description=FOLLOWED)
+        followed.add(name, record[name][:, columns], record.units[name], labels=missing, description=FOLLOWED)
     if GROUNDED in record:
-        found.add(GROUNDED, record[GROUNDED], "1", labels=record.labels[GROUNDED], description=FOLLOWED)
+        followed.add(GROUNDED, record[GROUNDED], "1", labels=record.labels[GROUNDED], description=FOLLOWED)
     if servo_map.lifts is not None:
         added = wheel_offsets(record, servo_map)
         label = dict(zip(servo_map.joints, (servo.label for servo in servo_map.servos), strict=True))
         if added:
             data = np.column_stack(list(added.values()))
-            found.add(LIFTING, data, "rad", labels=tuple(label[joint] for joint in added), description=FOLLOWED)
-    return found
+            followed.add(LIFTING, data, "rad", labels=tuple(label[joint] for joint in added), description=FOLLOWED)
+    return followed
 
 
 def describe(record: Record, scene: Scene | None, followed: Record | None = None) -> Record:
@@ -119,7 +119,7 @@ def describe(record: Record, scene: Scene | None, followed: Record | None = None
     """
     if len(record):
         for row in np.flatnonzero(np.diff(record["state"], prepend=-1)):
-            record.add_event(record.time[row], "state", State(int(record["state"][row])).name)
+            record.add_event(record.time[row], "state", ReplayState(int(record["state"][row])).name)
     record.scene = scene
     if scene is None or not len(record):
         return record
@@ -141,8 +141,8 @@ def describe(record: Record, scene: Scene | None, followed: Record | None = None
     if scene.hand is None:
         return record
     axes = ("x", "y", "z")
-    place = point_positions(actual, scene.hand)
-    record.add("hand_position", place, "m", labels=axes, description=f"from joints{on}")
+    position = point_positions(actual, scene.hand)
+    record.add("hand_position", position, "m", labels=axes, description=f"from joints{on}")
     if (goals := _placed(record, scene, followed, at, "_goal")) is not None:
         where = point_positions(goals, scene.hand)
         record.add("hand_position_goal", where, "m", labels=axes, description=f"from the goals of the joints{on}")
@@ -163,8 +163,8 @@ def _at(followed: Record, name: str, at: Array) -> Array:
 
 def _placed(record: Record, scene: Scene, followed: Record, at: Array, suffix: str) -> Record | None:
     """A record of the poses of all bodies, by measured joints or their goals (``suffix``); None where some lack."""
-    found = Record(record.time)
-    found.scene = scene
+    poses = Record(record.time)
+    poses.scene = scene
     added: dict[str, Array] = {}
     if LIFTING in followed:
         added = dict(zip(followed.labels[LIFTING], _at(followed, LIFTING, at).T, strict=True))
@@ -178,8 +178,8 @@ def _placed(record: Record, scene: Scene, followed: Record, at: Array, suffix: s
             columns |= {label: column - added.get(label, 0.0) for label, column in own.items()}
         if not columns:
             return None
-        found.add(name, np.column_stack(list(columns.values())), "rad", labels=tuple(columns))
-    return found if add_body_poses(found) else None
+        poses.add(name, np.column_stack(list(columns.values())), "rad", labels=tuple(columns))
+    return poses if add_body_poses(poses) else None
 
 
 def recover(folder: Path, out: Path | None = None) -> Record:
@@ -239,8 +239,8 @@ def _kept(measured: Path) -> Record | None:
 def _summary(path: Path) -> dict[str, Any]:
     """What a replay that came to its end has said of it; empty where there is nothing, or nothing whole."""
     with suppress(FileNotFoundError, ValueError):
-        found = json.loads(path.read_bytes())
-        return found if isinstance(found, dict) else {}
+        summary = json.loads(path.read_bytes())
+        return summary if isinstance(summary, dict) else {}
     return {}
 
 

@@ -27,7 +27,7 @@ class Motion(Protocol):
         ...
 
 
-class Course(Motion, Protocol):
+class GoalCourse(Motion, Protocol):
     """How the loop goes along a motion: a period further from goal to goal, whatever the clock says.
 
     Attributes
@@ -66,7 +66,7 @@ class Course(Motion, Protocol):
         ...
 
 
-class Planned:
+class PlannedCourse:
     """A motion that is known from its time ``start`` to ``end`` [s], ``speed`` of it per second."""
 
     def __init__(self, motion: Motion, start: float, end: float, *, speed: float) -> None:
@@ -129,7 +129,7 @@ class CyclePlan:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Task(ABC):
+class MotionTask(ABC):
     """What a replay is to do: a checked record, or what a pilot will ask for.
 
     Attributes
@@ -163,7 +163,7 @@ class Task(ABC):
         """What it may ask of every joint, in the order of the map."""
 
     @abstractmethod
-    def course(self) -> Course:
+    def course(self) -> GoalCourse:
         """How to go along it, from its beginning."""
 
 

@@ -25,7 +25,7 @@ from dynsim.hardware.bus.clock import Clock
 from dynsim.hardware.bus.control_table import VOLT_PER_UNIT
 from dynsim.hardware.errors import PortError
 from dynsim.hardware.replay.rules import Cycle
-from dynsim.hardware.replay.states import Progress, State, StopRequest
+from dynsim.hardware.replay.states import ReplayProgress, ReplayState, StopRequest
 from dynsim.hardware.servo_map import ServoMap
 from dynsim.record.scene import Scene
 from dynsim.system.files import INCOMPLETE, lock
@@ -55,7 +55,7 @@ class Journal:
 
     Attributes
     ----------
-    state : State
+    state : ReplayState
     log : RunLog
     observer : callable, optional
         Called with a Progress after every cycle and on every change of state.
@@ -68,10 +68,10 @@ class Journal:
         clock: Clock,
         recorder: Recorder,
         log: RunLog,
-        observer: Callable[[Progress], None] | None,
+        observer: Callable[[ReplayProgress], None] | None,
         stop: StopRequest,
     ) -> None:
-        self.state = State.CONNECT
+        self.state = ReplayState.CONNECT
         self.observer = observer
         self.log = log
         self.failures: dict[str, BaseException] = {}
@@ -82,30 +82,30 @@ class Journal:
         self._last_logged = -math.inf
         self._kept: list[tuple[float, str, str]] | None = None
 
-    def guard(self, what: str, call: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T | None:
+    def guard(self, name: str, call: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T | None:
         """Run an output; None when it fails, and from then on without trying.
 
         Parameters
         ----------
-        what : str
+        name : str
             Its name: what :attr:`failures` lists, and what is switched off by an error.
         call : callable
             A KeyboardInterrupt or SystemExit out of it becomes a request to stop: nothing may leave a moving robot.
         """
-        if what in self.failures:
+        if name in self.failures:
             return None
         try:
             return call(*args, **kwargs)
         except Exception as error:
-            self.failures[what] = error
+            self.failures[name] = error
         except BaseException as error:
-            self.failures[what] = error
+            self.failures[name] = error
             self._stop()
-        if what != "log":
-            self.say(f"{what} failed and is off from here: {self.failures[what]!r}")
+        if name != "log":
+            self.say(f"{name} failed and is off from here: {self.failures[name]!r}")
         return None
 
-    def enter(self, state: State) -> None:
+    def enter(self, state: ReplayState) -> None:
         self.state = state
         self.say("enter")
         self._observe(0.0, 0.0)
@@ -152,7 +152,7 @@ class Journal:
 
     def _observe(self, fraction: float, following_error: float) -> None:
         if self.observer and self._kept is None:
-            progress = Progress(self.state, fraction, following_error, self._recorder.hottest)
+            progress = ReplayProgress(self.state, fraction, following_error, self._recorder.hottest)
             self.guard("progress", self.observer, progress)
 
 
@@ -201,7 +201,7 @@ class Recorder:
     def __len__(self) -> int:
         return len(self._rows)
 
-    def add(self, cycle: Cycle, state: State, path_time: float, origin: float) -> None:
+    def add(self, cycle: Cycle, state: ReplayState, path_time: float, origin: float) -> None:
         """Keep one cycle.
 
         Parameters
@@ -274,7 +274,7 @@ class Layout:
         """(signal, "position" or "velocity", columns)."""
         for source, names in (("position", self.positions), ("velocity", self.velocities)):
             for name in dict.fromkeys(names):
-                yield name, source, [column for column, one in enumerate(names) if one == name]
+                yield name, source, [column for column, other in enumerate(names) if other == name]
 
 
 class GrowingFile:
@@ -519,17 +519,17 @@ def move_away(folder: Path) -> Path | None:
     OSError
         Something cannot be moved.
     """
-    found = [folder / name for name in FILES if os.path.lexists(folder / name)]
-    if not found:
+    paths = [folder / name for name in FILES if os.path.lexists(folder / name)]
+    if not paths:
         return None
     if is_held(folder / PART):
         raise PortError(f"{folder}: another replay is writing there; give this one another folder (--out)")
-    if folder / PART in found or folder / MEASURED in found:
-        found += [path for pattern in MADE_OF_THEM for path in folder.glob(pattern)]
-    place = _new_folder(folder)
-    for path in found:
-        path.rename(place / path.name)
-    return place
+    if folder / PART in paths or folder / MEASURED in paths:
+        paths += [path for pattern in MADE_OF_THEM for path in folder.glob(pattern)]
+    target = _new_folder(folder)
+    for path in paths:
+        path.rename(target / path.name)
+    return target
 
 
 def is_held(part: Path) -> bool:
@@ -546,10 +546,10 @@ def is_held(part: Path) -> bool:
 
 def _new_folder(folder: Path) -> Path:
     for number in itertools.count(1):
-        place = folder / f"previous_{number}"
+        target = folder / f"previous_{number}"
         try:
-            place.mkdir()
+            target.mkdir()
         except FileExistsError:
             continue
-        return place
+        return target
     raise AssertionError

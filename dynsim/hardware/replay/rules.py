@@ -22,7 +22,7 @@ from dynsim.hardware.bus.control_table import (
 )
 from dynsim.hardware.replay.motion import CyclePlan
 from dynsim.hardware.safety import Safety
-from dynsim.hardware.servo_map import Servo, ServoMap
+from dynsim.hardware.servo_map import MappedServo, ServoMap
 
 
 class Cause(StrEnum):
@@ -164,7 +164,7 @@ class AbortRules:
         self._late = self._late + 1 if cycle.lateness > self._late_after else 0
         safety = self._safety
         return [
-            *self._stall(cycle.silence),
+            *([self.stall(cycle.silence)] if self.stalled(cycle.silence) else ()),
             *(self._alert(cycle) if cycle.alert.any() else ()),
             *(fault for id_, registers in cycle.health.items() for fault in self._health(self._by_id[id_], registers)),
             *self._silent(np.flatnonzero(self._missed >= safety.missed_cycles), cycle),
@@ -183,9 +183,6 @@ class AbortRules:
         """True where the servos heard nothing for so long [s] that their watchdogs have tripped."""
         return silence > self._watchdog
 
-    def _stall(self, silence: float) -> list[Fault]:
-        return [self.stall(silence)] if self.stalled(silence) else []
-
     def stall(self, silence: float) -> Fault:
         """Nobody spoke to the servos for ``silence`` [s]."""
         self._new(Cause.STALL)
@@ -201,9 +198,6 @@ class AbortRules:
         self._declared.add((cause, id_))
         return not known
 
-    def _in_trouble(self, id_: int) -> bool:
-        return any(who == id_ for _, who in self._declared)
-
     def _alert(self, cycle: Cycle) -> list[Fault]:
         hit = [
             servo
@@ -218,12 +212,12 @@ class AbortRules:
             )
         ]
 
-    def _health(self, servo: Servo, registers: dict[str, int]) -> list[Fault]:
-        found: list[Fault] = []
+    def _health(self, servo: MappedServo, registers: dict[str, int]) -> list[Fault]:
+        faults: list[Fault] = []
 
         def add(cause: Cause, text: str) -> None:
             if self._new(cause, servo.id):
-                found.append(Fault(cause, f"{servo}: {text}", (servo.id,)))
+                faults.append(Fault(cause, f"{servo}: {text}", (servo.id,)))
 
         if registers["hardware_error"]:
             add(Cause.ALERT, describe_hardware_error(registers["hardware_error"]))
@@ -238,8 +232,8 @@ class AbortRules:
         if not supply.lowest <= volts <= supply.highest and self._new(Cause.VOLTAGE):
             # One supply feeds all: no servo is singled out, they keep step.
             text = f"{servo}: {volts:.1f} V, allowed {supply.lowest:g} to {supply.highest:g} V"
-            found.append(Fault(Cause.VOLTAGE, text))
-        return found
+            faults.append(Fault(Cause.VOLTAGE, text))
+        return faults
 
     def _silent(self, indices: NDArray[np.intp], cycle: Cycle) -> list[Fault]:
         hit = [self._servos[k] for k in indices if self._new(Cause.MISSED_STATUS, self._servos[k].id)]
@@ -253,18 +247,19 @@ class AbortRules:
             text += "; nobody answers: is the supply or the line lost?"
         return [Fault(Cause.MISSED_STATUS, text, tuple(servo.id for servo in hit))]
 
-    def _beyond(self, cause: Cause, over: NDArray[np.bool_], values: NDArray[np.float64], what: str) -> list[Fault]:
+    def _beyond(self, cause: Cause, over: NDArray[np.bool_], values: NDArray[np.float64], quantity: str) -> list[Fault]:
         if not over.any():
             return []
         # A servo that is limp or silent is off its goal too: that is no news.
-        hit = [k for k in np.flatnonzero(over) if not self._in_trouble(self._servos[k].id)]
+        in_trouble = {id_ for _, id_ in self._declared}
+        hit = [k for k in np.flatnonzero(over) if self._servos[k].id not in in_trouble]
         if not hit:
             return []
         ids = tuple(self._servos[k].id for k in hit)
         for id_ in ids:
             self._new(cause, id_)
         names = ", ".join(f"{self._servos[k].joint} (ID {self._servos[k].id}, {values[k]:.3f})" for k in hit)
-        return [Fault(cause, f"{what}: {names}", ids)]
+        return [Fault(cause, f"{quantity}: {names}", ids)]
 
     def _deadline(self, cycle: Cycle) -> list[Fault]:
         if self._late < self._safety.late_cycles or not self._new(Cause.DEADLINE):
@@ -280,6 +275,6 @@ def _count(counters: NDArray[np.int64], hit: NDArray[np.bool_], unknown: NDArray
     return np.where(unknown, counters, np.where(hit, counters + 1, 0))
 
 
-def decode_health(servo: Servo, data: bytes) -> dict[str, int]:
+def decode_health(servo: MappedServo, data: bytes) -> dict[str, int]:
     """Registers in a health block, by name."""
     return servo.model.registers_in(HEALTH_BLOCK[0], data)

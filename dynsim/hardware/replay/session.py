@@ -16,7 +16,7 @@ from dynsim.hardware.bus.protocol import Bus
 from dynsim.hardware.errors import OutputsFailed, PortError, ReplayAborted, ReplayInterrupted, VerificationFailed
 from dynsim.hardware.replay.machine import RECORD, Replay
 from dynsim.hardware.replay.measured import write_measured
-from dynsim.hardware.replay.motion import Task
+from dynsim.hardware.replay.motion import MotionTask
 from dynsim.hardware.replay.output import (
     INTERVAL,
     LOG,
@@ -37,7 +37,7 @@ Failures = dict[str, BaseException]
 
 
 def run_replay(
-    motion: Task,
+    motion: MotionTask,
     servo_map: ServoMap,
     connection: AbstractContextManager[tuple[Bus, Clock]],
     folder: Path,

@@ -16,7 +16,7 @@ from dynsim.hardware.replay.verify import LimitRow
 from dynsim.record import Record
 
 
-class State(IntEnum):
+class ReplayState(IntEnum):
     """Where the replay is; recorded cycle by cycle."""
 
     CONNECT = 0
@@ -30,7 +30,7 @@ class State(IntEnum):
     DRY_RUN = 8
 
 
-UNARMED = (State.CONNECT, State.VERIFY, State.DRY_RUN)
+UNARMED = (ReplayState.CONNECT, ReplayState.VERIFY, ReplayState.DRY_RUN)
 
 NOT_ARMED = "not armed"
 
@@ -109,12 +109,12 @@ def ignore_stops() -> None:
 
 
 @dataclass(frozen=True)
-class Progress:
+class ReplayProgress:
     """What a display may show after every cycle.
 
     Attributes
     ----------
-    state : State
+    state : ReplayState
     fraction : float
         Of the current motion, 0 to 1.
     following_error : float
@@ -123,7 +123,7 @@ class Progress:
         Hottest servo [°C], NaN before it is known.
     """
 
-    state: State
+    state: ReplayState
     fraction: float
     following_error: float
     temperature: float
@@ -157,9 +157,9 @@ class ServoEnd:
 
     def as_dict(self) -> dict[str, Any]:
         """With units in the names, for summaries."""
-        found = asdict(self)
-        found["position_rad"], found["velocity_rad_s"] = found.pop("position"), found.pop("velocity")
-        return found
+        values = asdict(self)
+        values["position_rad"], values["velocity_rad_s"] = values.pop("position"), values.pop("velocity")
+        return values
 
     def __str__(self) -> str:
         text = f"{self.joint} (ID {self.id}): {self.doing}"
@@ -181,11 +181,11 @@ def of_the_whole(servos: Sequence[ServoEnd]) -> str:
         doing = next(iter(groups), SILENT)
         return WHOLE.get(doing, doing)
     largest = max(groups, key=lambda doing: len(groups[doing]))
-    told = [
+    descriptions = [
         f"{len(joints)} {doing}" if doing == largest and len(joints) > 1 else f"{', '.join(joints)} {doing}"
         for doing, joints in sorted(groups.items(), key=lambda group: -len(group[1]))
     ]
-    return f"mixed: {'; '.join(told)}"
+    return f"mixed: {'; '.join(descriptions)}"
 
 
 @dataclass(frozen=True)
@@ -233,7 +233,7 @@ class ReplayResult:
         What every servo was read to do.
     faults : list of Fault
         All that were declared, one of each cause; the first one stopped the motion.
-    fault_state : State | None
+    fault_state : ReplayState | None
         Where the first one struck.
     fault_time : float
         Of the first one, on the replay's clock [s], NaN without one.
@@ -250,7 +250,7 @@ class ReplayResult:
     end_state: str = NOT_ARMED
     servos: tuple[ServoEnd, ...] = ()
     faults: list[Fault] = field(default_factory=list)
-    fault_state: State | None = None
+    fault_state: ReplayState | None = None
     fault_time: float = math.nan
     policy_goals: list[tuple[float, int, int]] = field(default_factory=list)
     record: Record = field(default_factory=lambda: Record([]))
@@ -295,9 +295,9 @@ class ReplayResult:
 
 def _joined(first: str, second: str) -> str:
     """Texts "who: what" of one cause; what befell several is said once."""
-    who, _, what = first.partition(": ")
+    who, _, text = first.partition(": ")
     other, _, the_same = second.partition(": ")
-    return f"{who}, {other}: {what}" if what and what == the_same else f"{first}; {second}"
+    return f"{who}, {other}: {text}" if text and text == the_same else f"{first}; {second}"
 
 
 class Stopped(Exception):

@@ -17,7 +17,7 @@ import numpy as np
 
 from dynsim.errors import CheckRefused
 from dynsim.hardware.replay.motion import Array
-from dynsim.hardware.servo_map import Servo, ServoMap
+from dynsim.hardware.servo_map import MappedServo, ServoMap
 from dynsim.record import TIME, Record
 from dynsim.snake.lifting import grounded_pairs, lifted
 
@@ -117,7 +117,7 @@ class Path:
         left = self.time[:-1][late, None]
         ends = np.stack([left, left + h, left]) + np.zeros_like(a)
         with np.errstate(over="ignore"):  # an infinite one is beyond any limit
-            acceleration = np.stack([*(one[late] for one in self._accelerations), self._steps[late]])
+            acceleration = np.stack([*(table[late] for table in self._accelerations), self._steps[late]])
         return Extremes(left + h * at_position, position, left + h * at_velocity, velocity, ends, acceleration)
 
     @cached_property
@@ -331,7 +331,7 @@ def long_steps(record: Record, factor: float, share: float) -> list[str]:
     ]
 
 
-def column_of(record: Record, signal: str, servo: Servo, unit: str) -> Array:
+def column_of(record: Record, signal: str, servo: MappedServo, unit: str) -> Array:
     """The column of ``signal`` that ``servo`` follows, shape (T,).
 
     Raises
@@ -391,16 +391,16 @@ def _refuse_lifted_wheels(record: Record) -> None:
 
 def _at_rest_at_both_ends(path: Path, acceleration: float) -> Path:
     first, last = path.rate_after[0], path.rate_before[-1]
-    rest = np.zeros_like(first)
+    still = np.zeros_like(first)
     if (fastest := np.abs(last).max()) > REST:
         duration = fastest / acceleration
-        path = path.longer(path.end + duration, path.position[-1] + 0.5 * duration * last, last, rest)
+        path = path.longer(path.end + duration, path.position[-1] + 0.5 * duration * last, last, still)
     if (fastest := np.abs(first).max()) > REST:
         duration = fastest / acceleration
         path = Path(
             np.concatenate([[-duration], path.time]),
             np.concatenate([path.position[:1] - 0.5 * duration * first, path.position]),
-            np.concatenate([rest[None], path.rate_after]),
+            np.concatenate([still[None], path.rate_after]),
             np.concatenate([first[None], path.rate_before]),
         )
     return path

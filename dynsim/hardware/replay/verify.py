@@ -27,9 +27,9 @@ from dynsim.hardware.bus.control_table import (
 )
 from dynsim.hardware.bus.protocol import Bus, NoAnswer, RequestRefused, too_busy
 from dynsim.hardware.errors import VerificationFailed
-from dynsim.hardware.replay.motion import QUINTIC_PEAK, Needs, Task
+from dynsim.hardware.replay.motion import QUINTIC_PEAK, MotionTask, Needs
 from dynsim.hardware.safety import Safety
-from dynsim.hardware.servo_map import Servo, ServoMap
+from dynsim.hardware.servo_map import MappedServo, ServoMap
 
 EEPROM_BLOCK = (0, 64)
 TRIAL_READS = 10
@@ -48,7 +48,7 @@ ATTEMPTS = 3
 Registers = dict[str, int]
 
 
-def snapshot(bus: Bus, servo: Servo) -> Registers:
+def snapshot(bus: Bus, servo: MappedServo) -> Registers:
     """All registers of a servo, by name. Raises NoAnswer or RequestRefused."""
     eeprom = bus.read_block(servo.id, *EEPROM_BLOCK).data
     ram = bus.read_block(servo.id, *HEALTH_BLOCK).data
@@ -82,7 +82,7 @@ def configure(bus: Bus, servo_map: ServoMap, report: Callable[[str], None]) -> N
                 report(f"{servo}: {name} {now[name]} -> {value}")
 
 
-def _wanted_eeprom(servo: Servo, servo_map: ServoMap) -> Registers:
+def _wanted_eeprom(servo: MappedServo, servo_map: ServoMap) -> Registers:
     return {
         "operating_mode": int(servo.operating_mode),
         "return_delay": int(servo_map.bus.return_delay / RETURN_DELAY_SECONDS_PER_UNIT),
@@ -91,7 +91,7 @@ def _wanted_eeprom(servo: Servo, servo_map: ServoMap) -> Registers:
 
 
 def verify(
-    bus: Bus, servo_map: ServoMap, motion: Task, *, poll: Callable[[], None]
+    bus: Bus, servo_map: ServoMap, motion: MotionTask, *, poll: Callable[[], None]
 ) -> tuple[list[str], list[LimitRow]]:
     """Everything that is wrong with the servos on the bus, one line each; empty when the robot may move.
 
@@ -123,54 +123,56 @@ def verify(
         except RequestRefused as refused:
             problems.append(f"{servo.joint}: {refused}")
             continue
-        found = _unfit(servo, registers, servo_map)
+        unfit = _unfit(servo, registers, servo_map)
         if registers["model_number"] == servo.model.number:
             rows.append(compare_limits(servo, registers, servo_map.safety, needs))
-            found += [*rows[-1].refused, *_out_of_place(servo, registers)]
-        problems += [f"{servo}: {text}" for text in found]
+            unfit += [*rows[-1].refused, *_out_of_place(servo, registers)]
+        problems += [f"{servo}: {text}" for text in unfit]
     missed = [] if problems else _trial_reads(bus, servo_map, poll)
     if (silent or missed) and (busy := too_busy(bus)):
         missed.append(busy)
     return problems + missed, rows
 
 
-def _unfit(servo: Servo, registers: Registers, servo_map: ServoMap) -> list[str]:
-    found = []
+def _unfit(servo: MappedServo, registers: Registers, servo_map: ServoMap) -> list[str]:
+    problems = []
     if registers["model_number"] != servo.model.number:
         return [f"is model {registers['model_number']}, the map says {servo.model.name} ({servo.model.number})"]
     if registers["firmware"] < servo.kind.firmware_min:
-        found.append(f"firmware {registers['firmware']} is older than {servo.kind.firmware_min}")
+        problems.append(f"firmware {registers['firmware']} is older than {servo.kind.firmware_min}")
     if registers["operating_mode"] != servo.operating_mode:
         mode = registers["operating_mode"]
         name = OperatingMode(mode).name.lower() if mode in list(OperatingMode) else str(mode)
-        found.append(f"is in mode {name}, must be {servo.kind.mode} (--configure sets it)")
+        problems.append(f"is in mode {name}, must be {servo.kind.mode} (--configure sets it)")
     if registers["drive_mode"]:
-        found.append(
+        problems.append(
             f"drive mode is {registers['drive_mode']}, must be 0: the sense belongs into the map (--configure sets it)"
         )
     delay = registers["return_delay"] * RETURN_DELAY_SECONDS_PER_UNIT
     if delay > servo_map.bus.return_delay + 1e-9:
-        found.append(
+        problems.append(
             f"return delay is {delay * 1e6:.0f} µs, planned {servo_map.bus.return_delay * 1e6:.0f} µs "
             "(--configure sets it)"
         )
     if registers["status_return_level"] != STATUS_TO_ALL:
-        found.append(f"status return level is {registers['status_return_level']}, must be {STATUS_TO_ALL}")
+        problems.append(f"status return level is {registers['status_return_level']}, must be {STATUS_TO_ALL}")
     if registers["shutdown"] & NEEDED_SHUTDOWN != NEEDED_SHUTDOWN:
-        found.append(f"shutdown is 0x{registers['shutdown']:02x}: overheating and overload must switch the torque off")
+        problems.append(
+            f"shutdown is 0x{registers['shutdown']:02x}: overheating and overload must switch the torque off"
+        )
     if registers["hardware_error"]:
-        found.append(
+        problems.append(
             f"hardware error: {describe_hardware_error(registers['hardware_error'])}; only a restart clears it"
         )
     volts, supply = registers["present_voltage"] * VOLT_PER_UNIT, servo_map.safety.supply
     if not supply.lowest <= volts <= supply.highest:
-        found.append(f"supply is {volts:.1f} V, allowed {supply.lowest:g} to {supply.highest:g} V")
+        problems.append(f"supply is {volts:.1f} V, allowed {supply.lowest:g} to {supply.highest:g} V")
     if registers["present_temperature"] > servo_map.safety.temperature_max:
-        found.append(f"{registers['present_temperature']} °C is above {servo_map.safety.temperature_max:g} °C")
-    return found
+        problems.append(f"{registers['present_temperature']} °C is above {servo_map.safety.temperature_max:g} °C")
+    return problems
 
 
-def _out_of_place(servo: Servo, registers: Registers) -> list[str]:
+def _out_of_place(servo: MappedServo, registers: Registers) -> list[str]:
     """A posture the robot must not start from."""
     tick = registers["present_position"]
     low, high = servo.tick_limits
@@ -223,13 +225,13 @@ class LimitRow:
     differs: tuple[str, ...]
 
 
-def needs_of_map(servo: Servo) -> Needs:
+def needs_of_map(servo: MappedServo) -> Needs:
     """All that the map allows."""
     low, high = servo.position_limits
     return Needs(low, high, servo.kind.limits.velocity)
 
 
-def compare_limits(servo: Servo, registers: Registers, safety: Safety, needs: Needs) -> LimitRow:
+def compare_limits(servo: MappedServo, registers: Registers, safety: Safety, needs: Needs) -> LimitRow:
     """The limits in a servo's EEPROM, beside those of the map.
 
     Refused are limits within which the servo would ignore goals of the motion or fall behind it, and thresholds with
@@ -245,9 +247,9 @@ def compare_limits(servo: Servo, registers: Registers, safety: Safety, needs: Ne
     return LimitRow(
         servo.joint,
         servo.id,
-        tuple((one.servo, one.map) for one in compared),
-        tuple(one.refused for one in compared if one.refused),
-        tuple(one.differs for one in compared if one.differs),
+        tuple((row.servo, row.map) for row in compared),
+        tuple(row.refused for row in compared if row.refused),
+        tuple(row.differs for row in compared if row.differs),
     )
 
 
@@ -258,66 +260,66 @@ class _Compared(NamedTuple):
     differs: str = ""
 
 
-def _position(servo: Servo, registers: Registers, needs: Needs) -> _Compared:
+def _position(servo: MappedServo, registers: Registers, needs: Needs) -> _Compared:
     if not servo.in_position_mode:
         return _Compared()
     low, high = registers["min_position"], registers["max_position"]
     own = np.degrees(sorted((servo.to_angle(low), servo.to_angle(high))))
-    told = np.degrees(servo.position_limits)
+    bounds = np.degrees(servo.position_limits)
     goals, allowed = sorted((servo.to_ticks(needs.low), servo.to_ticks(needs.high))), servo.tick_limits
     refused = differs = ""
     if goals[0] < low or goals[1] > high:
         refused = f"the motion needs ticks {goals[0]} to {goals[1]}, its own limits are {low} to {high}"
     elif allowed[0] < low or allowed[1] > high:
         differs = f"its own position limits are narrower than the map's: ticks {low} to {high}"
-    return _Compared(f"{own[0]:.0f} to {own[1]:.0f}", f"{told[0]:.0f} to {told[1]:.0f}", refused, differs)
+    return _Compared(f"{own[0]:.0f} to {own[1]:.0f}", f"{bounds[0]:.0f} to {bounds[1]:.0f}", refused, differs)
 
 
-def _velocity(servo: Servo, registers: Registers, needs: Needs) -> _Compared:
-    units, told = registers["velocity_limit"], servo.kind.limits.velocity
+def _velocity(servo: MappedServo, registers: Registers, needs: Needs) -> _Compared:
+    units, allowed = registers["velocity_limit"], servo.kind.limits.velocity
     own = units * RAD_S_PER_UNIT / servo.gear
     refused = differs = ""
-    below = units < abs(servo.to_velocity_units(told))
+    below = units < abs(servo.to_velocity_units(allowed))
     if below and not servo.in_position_mode:
         refused = f"its velocity limit is {own:.2f} rad/s, below the map's; faster goals would be ignored silently"
     elif units < abs(servo.to_velocity_units(needs.fastest)):
         refused = f"the motion needs {needs.fastest:.2f} rad/s, its velocity limit is {own:.2f}: it would lag"
     elif below:
         differs = f"its velocity limit of {own:.2f} rad/s is below the map's"
-    return _Compared(f"{own:.2f}", f"{told:.2f}", refused, differs)
+    return _Compared(f"{own:.2f}", f"{allowed:.2f}", refused, differs)
 
 
-def _torque(servo: Servo, registers: Registers) -> _Compared:
-    told = servo.kind.limits.torque
+def _torque(servo: MappedServo, registers: Registers) -> _Compared:
+    allowed = servo.kind.limits.torque
     if "current_limit" not in registers:
-        return _Compared(map=f"{told:.1f}")
+        return _Compared(map=f"{allowed:.1f}")
     # It bounds the goals of the modes that control current; neither of those that a map can name is one.
     own = servo.gear * servo.model.torque(registers["current_limit"])
-    below = f"its current limit is worth {own:.1f} N m, below the map's" if own < told else ""
-    return _Compared(f"{own:.1f}", f"{told:.1f}", differs=below)
+    below = f"its current limit is worth {own:.1f} N m, below the map's" if own < allowed else ""
+    return _Compared(f"{own:.1f}", f"{allowed:.1f}", differs=below)
 
 
-def _temperature(servo: Servo, registers: Registers, safety: Safety) -> _Compared:
-    own, told = registers["temperature_limit"], safety.temperature_max
+def _temperature(servo: MappedServo, registers: Registers, safety: Safety) -> _Compared:
+    own, allowed = registers["temperature_limit"], safety.temperature_max
     refused = ""
-    if own <= told:
-        refused = f"goes limp at {own} °C, before the map's temperature_max of {told:g} °C stops the robot"
+    if own <= allowed:
+        refused = f"goes limp at {own} °C, before the map's temperature_max of {allowed:g} °C stops the robot"
     elif own > (highest := servo.model.fields["temperature_limit"].default):
         refused = f"its temperature limit is {own} °C, a {servo.model.name} is to shut down at {highest} °C"
-    return _Compared(f"{own}", f"{told:g}", refused)
+    return _Compared(f"{own}", f"{allowed:g}", refused)
 
 
 def _supply(registers: Registers, safety: Safety) -> _Compared:
     low, high = registers["min_voltage"] * VOLT_PER_UNIT, registers["max_voltage"] * VOLT_PER_UNIT
-    told = safety.supply
+    allowed = safety.supply
     refused = differs = ""
-    if not (low <= told.lowest and told.highest <= high):
+    if not (low <= allowed.lowest and allowed.highest <= high):
         outside = f"outside of {low:g} to {high:g} V, within the map's supply range"
         if registers["shutdown"] & VOLTAGE_SHUTDOWN:
             refused = f"goes limp {outside}"
         else:
             differs = f"raises its alert {outside}"
-    return _Compared(f"{low:g} to {high:g}", f"{told.lowest:g} to {told.highest:g}", refused, differs)
+    return _Compared(f"{low:g} to {high:g}", f"{allowed.lowest:g} to {allowed.highest:g}", refused, differs)
 
 
 def difference_lines(rows: Sequence[LimitRow]) -> list[str]:
@@ -380,14 +382,14 @@ def way_to_start(bus: Bus, servo_map: ServoMap, start: NDArray[np.float64]) -> W
         for servo, target in zip(servo_map.servos, start, strict=True)
         if servo.in_position_mode
     ]
-    distances.sort(key=lambda one: -abs(one.start - one.now))
+    distances.sort(key=lambda distance: -abs(distance.start - distance.now))
     furthest = abs(distances[0].start - distances[0].now) if distances else 0.0
-    far = [one for one in distances if abs(one.start - one.now) > servo_map.safety.start_distance]
+    far = [distance for distance in distances if abs(distance.start - distance.now) > servo_map.safety.start_distance]
     duration = QUINTIC_PEAK * furthest / servo_map.safety.approach_velocity
     return WayToStart(tuple(distances), duration, tuple(far))
 
 
-def read_ticks(bus: Bus, servos: list[Servo]) -> dict[int, int]:
+def read_ticks(bus: Bus, servos: list[MappedServo]) -> dict[int, int]:
     """Servo position by ID. Raises VerificationFailed where one does not answer."""
     ticks: dict[int, int] = {}
     for _ in range(ATTEMPTS):

@@ -7,8 +7,7 @@ from typing import NamedTuple
 
 from dynsim.hardware.bus.control_table import BROADCAST_ID, EEPROM_END, RAD_S_PER_UNIT
 from dynsim.hardware.bus.packet import ALERT, STATUS, Instruction, Packet, StatusError, encode, encode_fast
-from dynsim.hardware.virtual.addresses import Hearing
-from dynsim.hardware.virtual.servos import VirtualServos
+from dynsim.hardware.virtual.servos import Hearing, VirtualServos
 
 CLEAR_TURNS = b"\x01\x44\x58\x4c\x22"
 RESET_ALL = 0xFF
@@ -160,8 +159,8 @@ class Firmware:
             speakers.append(servo)
             replies.append(reply)
         parts = encode_fast(replies, [length for _, _, length in entries])
-        for place, (servo, part) in enumerate(zip(speakers, parts, strict=True)):
-            yield Answer((servo,), part, chained=place > 0)
+        for index, (servo, part) in enumerate(zip(speakers, parts, strict=True)):
+            yield Answer((servo,), part, chained=index > 0)
 
     def _read(self, servo: int, id_: int, address: int, length: int) -> Packet | None:
         if self._servos.registers[servo]["status_return_level"] == 0:

@@ -42,12 +42,12 @@ class ServoRegisters:
         self["id"], self["baud"] = id_, baud_code
 
     def __getitem__(self, name: str) -> int:
-        place, _, signed = self._places[name]
-        return int.from_bytes(self._table[place], "little", signed=signed)
+        span, _, signed = self._places[name]
+        return int.from_bytes(self._table[span], "little", signed=signed)
 
     def __setitem__(self, name: str, value: int) -> None:
-        place, size, signed = self._places[name]
-        self._table[place] = value.to_bytes(size, "little", signed=signed)
+        span, size, signed = self._places[name]
+        self._table[span] = value.to_bytes(size, "little", signed=signed)
 
     @property
     def baud(self) -> int:

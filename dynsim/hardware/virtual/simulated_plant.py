@@ -118,14 +118,14 @@ class SimulatedArm:
         rates = drive.set_velocity / self._scale
         for k, label in enumerate(self._labels):
             simulation.set_brake(label, bool(self._on_stand[k] or self._jammed[k]))
-            told = ("off", 0.0, 0.0)
+            command = ("off", 0.0, 0.0)
             if drive.enabled[k]:
                 in_position_mode = drive.in_position_mode[k]
-                told = ("position", positions[k], 0.0) if in_position_mode else ("velocity", 0.0, rates[k])
-            if told != self._told[k]:
-                simulation.set_mode(label, told[0])
-                simulation.set_reference(label, *told[1:])
-                self._told[k] = told
+                command = ("position", positions[k], 0.0) if in_position_mode else ("velocity", 0.0, rates[k])
+            if command != self._told[k]:
+                simulation.set_mode(label, command[0])
+                simulation.set_reference(label, *command[1:])
+                self._told[k] = command
         self._jammed[:] = False
         simulation.advance(simulation.time + dt)
         self.position, self.velocity = self._shafts()
@@ -210,10 +210,10 @@ def _bare(scenario: Scenario) -> Scenario:
 
     config = scenario.config
     payloads = {name: load for name, load in config.loads.items() if isinstance(load, Payload)}
-    given = config.contacts.model_dump(exclude_unset=True, exclude=set(BILATERAL_KEYS))
+    keys = config.contacts.model_dump(exclude_unset=True, exclude=set(BILATERAL_KEYS))
     changes = {
         "controller": None,
-        "contacts": Contacts(**{**given, "law": "unilateral"}),
+        "contacts": Contacts(**{**keys, "law": "unilateral"}),
         "loads": payloads,
         "integrator": type(config.integrator)(method="dopri5"),  # set points change every 2 ms, which ends steps
     }

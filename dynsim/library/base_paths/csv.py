@@ -42,7 +42,7 @@ class Config(StrictConfig):
 
     @model_validator(mode="after")
     def _read(self) -> Self:
-        columns, rows = read_table(self.file, PLACES, RATES, what="a path")
+        columns, rows = read_table(self.file, PLACES, RATES, kind="a path")
         self._rows, self._are_rates = np.array(rows), columns == RATES
         if self._rows[0, 0] < 0.0:
             raise ValueError(f"{self.file}: begins at {self._rows[0, 0]:g} s, before the run")
@@ -76,7 +76,7 @@ def build(config: Config, context: BuildContext) -> BasePath:
     if config._are_rates:
         return Rates(PchipInterpolator(times, rows))
     points = seen_from_start(context.model.robot, rows, config.frame or "world")
-    kept, way = _along(points)
+    kept, distance = _along(points)
     if len(kept) < 2:
         raise ModelError(f"{config.file}: no row is {SPACING:g} m from the first; for a base that stands take hold")
     names = [f"row {k + 1} ({rows[k, 0]:g}, {rows[k, 1]:g}) m, t = {times[k]:g} s" for k in kept]
@@ -84,7 +84,7 @@ def build(config: Config, context: BuildContext) -> BasePath:
         curve = PlaneCurve(points[kept], names, start_limit=TURN_LIMIT, turn_limit=TURN_LIMIT, samples=8)
     except ModelError as error:
         raise ModelError(f"{config.file}: {error}") from error
-    return AlongCurve(curve, PchipInterpolator(times, way))
+    return AlongCurve(curve, PchipInterpolator(times, distance))
 
 
 def _along(points: NDArray[np.float64]) -> tuple[list[int], NDArray[np.float64]]:

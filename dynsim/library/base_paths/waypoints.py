@@ -46,11 +46,11 @@ def build(config: Config, context: BuildContext) -> BasePath:
         The path starts elsewhere or sideways, or has a corner: with the point.
     """
     points = seen_from_start(context.model.robot, config.points_m, config.frame)
-    given = enumerate(zip(config.points_m, config.times_s, strict=True))
-    names = [f"point {k} ({x:g}, {y:g}) m, t = {t:g} s" for k, ((x, y), t) in given]
+    entries = enumerate(zip(config.points_m, config.times_s, strict=True))
+    names = [f"point {k} ({x:g}, {y:g}) m, t = {t:g} s" for k, ((x, y), t) in entries]
     curve = PlaneCurve(points, names, start_limit=0.5 * np.pi, turn_limit=np.pi, samples=128)
     speeds = np.diff(curve.nodes) / np.diff(config.times_s)
     middle = 2.0 / (1.0 / speeds[:-1] + 1.0 / speeds[1:])
     rates = np.concatenate([[0.0], middle, [0.0]])
-    way = BPoly.from_derivatives(config.times_s, np.stack([curve.nodes, rates, np.zeros_like(rates)], axis=1))
-    return AlongCurve(curve, way)
+    distance = BPoly.from_derivatives(config.times_s, np.stack([curve.nodes, rates, np.zeros_like(rates)], axis=1))
+    return AlongCurve(curve, distance)

@@ -356,6 +356,6 @@ def _gains(config: Config, robot: Robot, name: str) -> NDArray[np.float64]:
     if isinstance(gain, list) and len(gain) != sum(circuits):
         kind = "motors" if all(circuits) else "DC motors"
         raise ModelError(f"controller: {key} has {len(gain)} values, there are {sum(circuits)} {kind}")
-    found = np.array([getattr(motor, name) if isinstance(motor, Servo) else 0.0 for motor in motors])
-    found[np.array(circuits, dtype=bool)] = gain
-    return found
+    gains = np.array([getattr(motor, name) if isinstance(motor, Servo) else 0.0 for motor in motors])
+    gains[np.array(circuits, dtype=bool)] = gain
+    return gains

@@ -53,11 +53,11 @@ class OperatorConfig(StrictConfig):
 
     def script(self) -> VelocityScript:
         """The commands; each takes effect at the first tick at or after its time."""
-        velocity, held = np.zeros((len(self.commands), VELOCITIES)), np.zeros(VELOCITIES)
+        velocity, current = np.zeros((len(self.commands), VELOCITIES)), np.zeros(VELOCITIES)
         for row, command in zip(velocity, self.commands, strict=True):
             for part, values in ((HAND, command.hand), (BASE, command.base)):
                 if values is not None:
-                    held[part] = values
-            row[:] = held
+                    current[part] = values
+            row[:] = current
         ticks = [math.ceil(command.at_s * self.rate_hz - 1e-6) for command in self.commands]
         return VelocityScript(np.array(ticks, dtype=np.int64), velocity)

@@ -83,11 +83,11 @@ class Circle(StrictConfig):
             out[:, 1] = self.radius_m * np.sin(angle)
             out[:, 2] = self.radius_m * (np.cos(angle) - 1.0)
             return out
-        way = -1.0 if self.backward else 1.0
-        out[:, 0] = way * self.radius_m * np.sin(np.abs(angle))
+        sense = -1.0 if self.backward else 1.0
+        out[:, 0] = sense * self.radius_m * np.sin(np.abs(angle))
         out[:, 1] = self.radius_m * np.sign(self.turns) * (1.0 - np.cos(angle))
         if self.turn_head:
-            out[:, 5] = way * angle
+            out[:, 5] = sense * angle
         return out
 
 
@@ -155,13 +155,13 @@ class ScriptedSource:
                 s = s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
             # The mean rate of a period makes the integrated target exact at every tick.
             block.velocity[...] += np.diff(path.offset(s), axis=0) / period
-        held, gripper = np.zeros(6), 0
+        lasting, gripper = np.zeros(6), 0
         pieces = []
         for command in self.commands:
             tick = int(np.ceil(command.at_s / period - 1e-9))
-            held = held if command.velocity is None else np.array(command.velocity)
+            lasting = lasting if command.velocity is None else np.array(command.velocity)
             gripper = gripper if command.gripper is None else int(command.gripper == "closed")
-            pieces.append((tick, held, gripper))
+            pieces.append((tick, lasting, gripper))
             if command.mode is not None and 0 <= tick - first < count:
                 block.request[tick - first] = STATES[command.mode] if isinstance(command.mode, str) else command.mode
         for i, (tick, velocity, closed) in enumerate(pieces):

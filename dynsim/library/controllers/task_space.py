@@ -267,12 +267,12 @@ def check_controllable(
                 f"points = {redundancy}): no joint and wheel rates satisfy every row; lift wheels or drop shape points"
             )
         postures = [random.uniform(0.4 * model.lower, 0.4 * model.upper) for _ in range(4)]
-        found = [conditioning(model, law, row, np.zeros(3), phi) for phi in postures]
-        rank_a, rank_b = max(c.rank_A for c in found), max(c.rank_B for c in found)
-        if rank_a < 6 + len(law.shape_joints) or rank_b < found[0].rows:
+        samples = [conditioning(model, law, row, np.zeros(3), phi) for phi in postures]
+        rank_a, rank_b = max(c.rank_A for c in samples), max(c.rank_B for c in samples)
+        if rank_a < 6 + len(law.shape_joints) or rank_b < samples[0].rows:
             raise ModelError(
                 f"{mode}: rank of A is {rank_a} of {6 + len(law.shape_joints)}, rank of B is {rank_b} of "
-                f"{found[0].rows} at random postures: the controlled variables are not independent"
+                f"{samples[0].rows} at random postures: the controlled variables are not independent"
             )
     start = conditioning(model, law, fixing_row, plant.initial_base_pose, plant.initial_joints)
     if start.rank_B < start.rows or start.rank_A < 6 + len(law.shape_joints):

@@ -13,14 +13,14 @@ from pydantic import Field
 
 from dynsim.compile.protocols import BuildContext
 from dynsim.config.base import NonNegative, Positive
-from dynsim.library.motors import servo
 from dynsim.model.drives import Servo
+from dynsim.model.servo_parameters import ServoParameters
 
 
-class Config(servo.Config):
+class Config(ServoParameters):
     """8.4 N m, 45 rpm; 41 N m/rad; gear friction 0.8 N m; the last three numbers are not in the data sheet."""
 
-    type: Literal["mx_106"]  # type: ignore[assignment]
+    type: Literal["mx_106"]
     voltage_V: Positive = 12.0
     stall_torque_N_m: Positive = 8.4
     no_load_speed_rad_per_s: Positive = 4.71
@@ -33,4 +33,4 @@ class Config(servo.Config):
 
 def build(config: Config, context: BuildContext) -> Servo:
     """The servo on ``context.joint``."""
-    return servo.build(config, context)
+    return config.servo(context.joint)

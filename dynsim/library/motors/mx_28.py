@@ -12,14 +12,14 @@ from pydantic import Field
 
 from dynsim.compile.protocols import BuildContext
 from dynsim.config.base import NonNegative, Positive
-from dynsim.library.motors import servo
 from dynsim.model.drives import Servo
+from dynsim.model.servo_parameters import ServoParameters
 
 
-class Config(servo.Config):
+class Config(ServoParameters):
     """2.5 N m, 55 rpm; gain and rotor inertia are not in the data sheet."""
 
-    type: Literal["mx_28"]  # type: ignore[assignment]
+    type: Literal["mx_28"]
     voltage_V: Positive = 12.0
     stall_torque_N_m: Positive = 2.5
     no_load_speed_rad_per_s: Positive = 5.76
@@ -30,4 +30,4 @@ class Config(servo.Config):
 
 def build(config: Config, context: BuildContext) -> Servo:
     """The servo on ``context.joint``."""
-    return servo.build(config, context)
+    return config.servo(context.joint)

@@ -27,7 +27,7 @@ class Config(StrictConfig):
 
     @model_validator(mode="after")
     def _read(self) -> Self:
-        self._rows = read_rows(self.file, COLUMNS, what="a path")
+        self._rows = read_rows(self.file, COLUMNS, kind="a path")
         _check_curve(self._rows, self.file)
         return self
 

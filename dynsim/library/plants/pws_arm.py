@@ -30,7 +30,7 @@ ArmChoice: Any = families.union("plant", only=("serial_arm", "urdf_arm"))
 WHEEL_WIDTH = 0.5
 
 
-class Wheel(StrictConfig):
+class WheelConfig(StrictConfig):
     """Both wheels: solid discs at axle height r, each on its own motor."""
 
     mass_kg: NonNegative = 0.25
@@ -76,7 +76,7 @@ class Base(StrictConfig):
         max_length=6,
         description="xx xy xz yy yz zz of the body about its com",
     )
-    wheel: Wheel = Wheel()
+    wheel: WheelConfig = WheelConfig()
     track_m: Positive = Field(default=0.3, description="distance of the wheels")
     caster_m: Vector3 = Field(default=[0.15, 0.0, 0.0], description="where the caster touches the floor: no friction")
     wheel_friction: Positive = Field(default=0.8, description="between wheels and floor, for the traction demand")

@@ -100,20 +100,20 @@ def section_defaults(plant: Mapping[str, Any], sections: Mapping[str, Any]) -> d
     """What other sections of a scenario say where they do not say otherwise; both as they were read."""
     if plant.get("level") != "dynamic":
         return {}
-    found: dict[str, Any] = {
+    defaults: dict[str, Any] = {
         "surfaces": {GROUND: {"type": "plane"}},
         "contacts": {"law": "unilateral", "friction": 0.6},
     }
     integrator = sections.get("integrator")
     if not isinstance(integrator, Mapping) or integrator.get("method", "time_stepping") == "time_stepping":
-        found["integrator"] = {"method": "time_stepping", "step_s": 0.0025}
+        defaults["integrator"] = {"method": "time_stepping", "step_s": 0.0025}
     controller = sections.get("controller")
     if isinstance(controller, Mapping):
-        found["controller"] = {"state": "feedforward"}  # [T] IV.C.2
+        defaults["controller"] = {"state": "feedforward"}  # [T] IV.C.2
         sensor = {"measured": "motion_capture", "estimated": "encoders"}.get(str(controller.get("state")))
         if sensor is not None:
-            found["sensors"] = {sensor: {}}
-    return found
+            defaults["sensors"] = {sensor: {}}
+    return defaults
 
 
 def build(config: Config, context: BuildContext) -> SnakeDescription | SnakeTree:
@@ -186,13 +186,13 @@ def describe(config: Config) -> SnakeDescription:
 
     # [T] V.A; a head part of another length starts with a similar S that keeps the head level
     raised = [0.0, -0.8, 0.0, -1.1, 0.0, 1.9] if n_h == 6 else [0.0, 0.0] * (n_h // 2 - 2) + [0.0, -0.8, 0.0, 0.8]
-    given = raised if config.initial_joints_rad is None else config.initial_joints_rad
-    if len(given) not in (n_h, joints):
+    angles = raised if config.initial_joints_rad is None else config.initial_joints_rad
+    if len(angles) not in (n_h, joints):
         raise ModelError(
-            f"plant.initial_joints_rad has {len(given)} angles; give n_h = {n_h} (base straight) or all {joints}: "
+            f"plant.initial_joints_rad has {len(angles)} angles; give n_h = {n_h} (base straight) or all {joints}: "
             f"{', '.join(names)}"
         )
-    initial = np.concatenate([given, np.zeros(joints - len(given))])
+    initial = np.concatenate([angles, np.zeros(joints - len(angles))])
     for name, angle, limit in zip(names, initial, upper, strict=True):
         if abs(angle) > limit:
             raise ModelError(

@@ -21,7 +21,7 @@ ENGINE = "dynamics"
 MotorChoice: Any = families.union("motor")
 
 
-class Pose(StrictConfig):
+class PoseConfig(StrictConfig):
     """Place and attitude of a body in the frame of its joint, R = Rz(yaw) Ry(pitch) Rx(roll)."""
 
     position_m: Vector3 = [0.0, 0.0, 0.0]
@@ -48,7 +48,7 @@ class Config(StrictConfig):
         default={}, description="initial angles of revolute joints by name; others 0, or where a leader has them"
     )
     initial_m: dict[str, float] = Field(default={}, description="initial positions of prismatic joints; others 0")
-    initial_pose: dict[str, Pose] = Field(
+    initial_pose: dict[str, PoseConfig] = Field(
         default={}, description="initial poses of the bodies of floating and planar joints, by joint name"
     )
     lock_deg: dict[str, float] = Field(default={}, description="revolute joints that are fixed, at these angles")
@@ -70,25 +70,25 @@ class Config(StrictConfig):
         units = {"revolute": "deg", "prismatic": "m"}
         for key in ("motors", "initial_deg", "initial_m", "initial_pose", "lock_deg", "lock_m"):
             for name in getattr(self, key):
-                place = f"{key}.{name}"
+                path = f"{key}.{name}"
                 if name not in joints:
                     moving = ", ".join(joint.name for joint in joints.values() if joint.kind != "fixed")
-                    raise error_at(place, f"no joint {name!r}{suggestion(name, joints)}; joints of the file: {moving}")
+                    raise error_at(path, f"no joint {name!r}{suggestion(name, joints)}; joints of the file: {moving}")
                 kind = MOVING.get(joints[name].kind, joints[name].kind)
                 if kind in SEVERAL:
                     if key == "initial_pose":
                         continue
                     start = "" if key == "motors" else f"; it starts where plant.initial_pose.{name} says"
-                    raise error_at(place, f"{name!r} is {kind}: it has no motor, angle or distance{start}")
+                    raise error_at(path, f"{name!r} is {kind}: it has no motor, angle or distance{start}")
                 if kind not in units:
-                    raise error_at(place, f"{name!r} is {kind}: it has no motor and no position")
+                    raise error_at(path, f"{name!r} is {kind}: it has no motor and no position")
                 if key == "initial_pose":
-                    raise error_at(place, f"{name!r} is {kind}; give it in plant.initial_{units[kind]}")
+                    raise error_at(path, f"{name!r} is {kind}; give it in plant.initial_{units[kind]}")
                 family, _, unit = key.partition("_")
                 if unit and unit != units[kind]:
-                    raise error_at(place, f"{name!r} is {kind}; give it in plant.{family}_{units[kind]}")
+                    raise error_at(path, f"{name!r} is {kind}; give it in plant.{family}_{units[kind]}")
                 if name in locked and family != "lock":
-                    raise error_at(place, f"{name!r} is locked by plant.lock_{units[kind]}; remove one of the two")
+                    raise error_at(path, f"{name!r} is locked by plant.lock_{units[kind]}; remove one of the two")
         return self
 
 
@@ -106,12 +106,12 @@ def build(config: Config, context: BuildContext) -> Robot:
     lock = {**{name: float(np.deg2rad(angle)) for name, angle in config.lock_deg.items()}, **config.lock_m}
     robot = read_urdf(Path(config.file), lock)
     initial = {**{name: np.deg2rad(angle) for name, angle in config.initial_deg.items()}, **config.initial_m}
-    given = {"revolute": config.damping_N_m_s_per_rad, "prismatic": config.damping_N_s_per_m}
+    damping = {"revolute": config.damping_N_m_s_per_rad, "prismatic": config.damping_N_s_per_m}
     # Joints with several rates have neither losses nor motors.
     single = [link for link in robot.links if link.joint_of_rows is None]
     links = tuple(
         dataclasses.replace(link, damping=loss)
-        if link.joint_of_rows is None and (loss := given[link.kind]) is not None
+        if link.joint_of_rows is None and (loss := damping[link.kind]) is not None
         else link
         for link in robot.links
     )
@@ -140,7 +140,7 @@ def build(config: Config, context: BuildContext) -> Robot:
     )
 
 
-def _initial(robot: Robot, positions: dict[str, float], poses: dict[str, Pose]) -> Array:
+def _initial(robot: Robot, positions: dict[str, float], poses: dict[str, PoseConfig]) -> Array:
     """Coordinates of all joints, (nq,); those of floating and planar joints from the poses of their bodies."""
     from dynsim.model.urdf.reader import rotation
     from dynsim.record.scene import quaternion
@@ -153,9 +153,9 @@ def _initial(robot: Robot, positions: dict[str, float], poses: dict[str, Pose]) 
             q[index[rows[0]] : index[rows[0]] + 7] = *p, *quaternion(R)
             continue
         x, y, normal = (robot.links[i].axis for i in rows)
-        place = f"plant.initial_pose.{name}"
+        path = f"plant.initial_pose.{name}"
         for key, off in (("position_m", abs(normal @ p)), ("rpy_deg", float(np.abs(R @ normal - normal).max()))):
             if off > 1e-9:
-                raise ModelError(f"{place}.{key}: leaves the plane of the joint, whose normal is {normal.tolist()}")
+                raise ModelError(f"{path}.{key}: leaves the plane of the joint, whose normal is {normal.tolist()}")
         q[index[rows[0]] : index[rows[0]] + 3] = x @ p, y @ p, np.arctan2(y @ R @ x, x @ R @ x)
     return q

@@ -57,10 +57,10 @@ class Row:
 @cache
 def rows() -> dict[str, Row]:
     """Rows of all joints by name."""
-    found: dict[str, Row] = {}
+    table: dict[str, Row] = {}
     for info in pkgutil.iter_modules(__path__):
-        found.update(importlib.import_module(f"{__name__}.{info.name}").ROWS)
-    return found
+        table.update(importlib.import_module(f"{__name__}.{info.name}").ROWS)
+    return table
 
 
 def turned(axis: Array, angle: Array) -> Array:

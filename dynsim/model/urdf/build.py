@@ -73,7 +73,7 @@ def read_urdf(path: Path, lock: Mapping[str, float] | None = None) -> Robot:
     if not links:
         raise ModelError(f"{path}: no moving joint")
     _warn(locked, places, links)
-    frames = [Frame(name, place.body, place.R, place.p) for name, place in places.items() if place.body != name]
+    frames = [Frame(name, pose.body, pose.R, pose.p) for name, pose in places.items() if pose.body != name]
     rows = tuple(row for link in links for row in (ROWS[link.kind](link) if link.kind in ROWS else (link,)))
     for joint in locked.joints.values():
         for name in (joint.name, joint.mimics or joint.name):
@@ -101,16 +101,16 @@ def read_urdf(path: Path, lock: Mapping[str, float] | None = None) -> Robot:
 def _fixed(tree: UrdfTree, places: Mapping[str, _Place]) -> Inertia:
     """Mass properties of all that is fixed to the root, in its frame."""
     parts = [
-        inertia.placed(place.R, place.p)
-        for name, place in places.items()
-        if place.body is None and (inertia := tree.links[name].inertia) is not None
+        inertia.placed(pose.R, pose.p)
+        for name, pose in places.items()
+        if pose.body is None and (inertia := tree.links[name].inertia) is not None
     ]
     return Inertia.merged(parts) if parts else Inertia(0.0)
 
 
 def _locked_followers(tree: UrdfTree, lock: Mapping[str, float]) -> dict[str, float]:
     """Positions of the mimic joints whose leader is locked or fixed, directly or through others [rad or m]."""
-    found: dict[str, float] = {}
+    positions: dict[str, float] = {}
     for follower in tree.joints.values():
         chain, joint = [], follower
         while joint.mimics is not None and joint.name not in lock and joint.kind != "fixed":
@@ -128,8 +128,8 @@ def _locked_followers(tree: UrdfTree, lock: Mapping[str, float]) -> dict[str, fl
             q = lock.get(joint.name, 0.0)
             for link in reversed(chain):
                 q = link.multiplier * q + link.offset
-            found[follower.name] = q
-    return found
+            positions[follower.name] = q
+    return positions
 
 
 def _locked(tree: UrdfTree, lock: Mapping[str, float]) -> UrdfTree:
@@ -197,16 +197,16 @@ def _places(tree: UrdfTree) -> dict[str, _Place]:
 def _links(tree: UrdfTree, places: Mapping[str, _Place]) -> tuple[Link, ...]:
     """The moving bodies, with all that is fixed to them; a floating or planar joint is still one, of this kind."""
     parts: dict[str | None, list[Inertia]] = {}
-    for name, place in places.items():
+    for name, pose in places.items():
         inertia = tree.links[name].inertia
-        if inertia is not None and place.body is not None:
-            own = name == place.body
-            parts.setdefault(place.body, []).append(inertia if own else inertia.placed(place.R, place.p))
+        if inertia is not None and pose.body is not None:
+            own = name == pose.body
+            parts.setdefault(pose.body, []).append(inertia if own else inertia.placed(pose.R, pose.p))
     joint_to = {joint.child: joint for joint in tree.joints.values()}
     shapes = _shapes(tree, places)
     links = []
-    for name, place in places.items():
-        if place.body != name:
+    for name, pose in places.items():
+        if pose.body != name:
             continue
         joint = joint_to[name]
         parent = places[joint.parent]
@@ -233,12 +233,12 @@ def _links(tree: UrdfTree, places: Mapping[str, _Place]) -> tuple[Link, ...]:
 
 def _shapes(tree: UrdfTree, places: Mapping[str, _Place]) -> dict[str | None, tuple[Shape, ...]]:
     """What each moving body, and the world (None), looks like, with all that is fixed to it."""
-    found: dict[str | None, tuple[Shape, ...]] = {}
-    for name, place in places.items():
-        turn = quaternion(place.R)
-        shapes = tuple(shape.placed(place.p, turn) for shape in tree.links[name].shapes)
-        found[place.body] = (*found.get(place.body, ()), *shapes)
-    return found
+    drawn: dict[str | None, tuple[Shape, ...]] = {}
+    for name, pose in places.items():
+        turn = quaternion(pose.R)
+        shapes = tuple(shape.placed(pose.p, turn) for shape in tree.links[name].shapes)
+        drawn[pose.body] = (*drawn.get(pose.body, ()), *shapes)
+    return drawn
 
 
 def _hand(tree: UrdfTree, places: Mapping[str, _Place]) -> tuple[str, Array]:
@@ -265,7 +265,7 @@ def _warn(tree: UrdfTree, places: Mapping[str, _Place], links: tuple[Link, ...])
     empty = [link.joint for link in links if link.name not in loaded and (link.parent in loaded or not link.parent)]
     if empty:
         warnings.warn(f"{tree.path}: nothing beyond these joints has a mass ({', '.join(empty)})", stacklevel=3)
-    moving = [tree.links[name] for name, place in places.items() if place.body is not None]
+    moving = [tree.links[name] for name, pose in places.items() if pose.body is not None]
     bare = [link.name for link in moving if link.inertia is None and link.shaped]
     if bare:
         warnings.warn(

@@ -15,7 +15,7 @@ import numpy as np
 from dynsim.errors import ModelError
 from dynsim.model.description import Array, Inertia
 from dynsim.model.urdf.visual import materials, visual_shapes
-from dynsim.model.urdf.xml import MOMENTS, Element, UrdfFile, cut, shown, suggestion
+from dynsim.model.urdf.xml import MOMENTS, Element, UrdfFile, cut, quoted, suggestion
 from dynsim.record.scene import Shape
 
 # The largest robots in use have some 100 links.
@@ -126,7 +126,7 @@ class _Reader:
 
     def link(self, element: Element, others: dict[str, UrdfLink]) -> UrdfLink:
         name = self.file.name(element, others)
-        who = f"link {shown(name)}"
+        who = f"link {quoted(name)}"
         self.file.check_children(element, who)
         for shape in element.children:
             for lost in shape.children if shape.tag not in ("inertial", "gazebo") else ():
@@ -156,12 +156,12 @@ class _Reader:
 
     def joint(self, element: Element, others: dict[str, UrdfJoint], links: dict[str, UrdfLink]) -> UrdfJoint:
         name = self.file.name(element, others)
-        who = f"joint {shown(name)}"
+        who = f"joint {quoted(name)}"
         self.file.check_children(element, who)
         kind = element.attributes.get("type")
         known = (*MOVING, "fixed", *SEVERAL)
         if kind not in known:
-            stated = "has no type" if kind is None else f"is {shown(kind)}{suggestion(kind, known)}"
+            stated = "has no type" if kind is None else f"is {quoted(kind)}{suggestion(kind, known)}"
             raise self.file.error(element.line, f"{who} {stated}; known: {', '.join(known)}")
         ends = []
         for tag in ("parent", "child"):
@@ -169,7 +169,7 @@ class _Reader:
             link = self.file.text(end, "link", who)
             if link not in links:
                 raise self.file.error(
-                    end.line, f"{who}: its {tag} link {shown(link)} is not in the file{suggestion(link, links)}"
+                    end.line, f"{who}: its {tag} link {quoted(link)} is not in the file{suggestion(link, links)}"
                 )
             ends.append(link)
         for tag in ("limit", "dynamics") if kind in SEVERAL else ():
@@ -261,7 +261,7 @@ class _Reader:
             return np.array(default)
         length = float(np.linalg.norm(axis))
         if stated is not None and not 1e-12 < length < math.inf:
-            raise self.file.error(stated.line, f"{who}: axis {shown(stated.attributes['xyz'])} is no direction")
+            raise self.file.error(stated.line, f"{who}: axis {quoted(stated.attributes['xyz'])} is no direction")
         # A unit axis stays as it is: dividing by 1 − 1e-16 would take it off the exact coordinate directions.
         return axis if abs(length - 1.0) < 1e-15 else axis / length
 
@@ -273,8 +273,8 @@ class _Reader:
             if other is not joint:
                 raise self.file.error(
                     joint.line,
-                    f"joint {shown(joint.name)}: its child {shown(joint.child)} already hangs on joint "
-                    f"{shown(other.name)} (line {other.line}): a kinematic loop, which URDF cannot state; "
+                    f"joint {quoted(joint.name)}: its child {quoted(joint.child)} already hangs on joint "
+                    f"{quoted(other.name)} (line {other.line}): a kinematic loop, which URDF cannot state; "
                     "remove one of the two",
                 )
         roots = [name for name in links if name not in above]
@@ -293,11 +293,11 @@ class _Reader:
         if lost is not None:
             raise self.file.error(
                 lost.line,
-                f"joint {shown(lost.name)} is part of a kinematic loop that no root link leads to; "
+                f"joint {quoted(lost.name)} is part of a kinematic loop that no root link leads to; "
                 "the joints of a URDF file form a tree",
             )
         if len(roots) != 1:
-            names = ", ".join(shown(name) for name in roots[:5]) + (", …" if len(roots) > 5 else "")
+            names = ", ".join(quoted(name) for name in roots[:5]) + (", …" if len(roots) > 5 else "")
             line = links[roots[1]].line if roots else 1
             raise self.file.error(line, f"a tree has one root link; here: {names or 'none'}; connect them with joints")
         return roots[0]

@@ -21,16 +21,16 @@ _LARGEST = 1e15
 
 def materials(robot: Element) -> dict[str, Colour]:
     """Colours that the file defines by name, outside of its links."""
-    found = {
+    colours = {
         child.attributes.get("name", ""): _colour(child, {}) for child in robot.children if child.tag == "material"
     }
-    return {name: colour for name, colour in found.items() if colour is not None}
+    return {name: colour for name, colour in colours.items() if colour is not None}
 
 
 def visual_shapes(link: Element, known: Mapping[str, Colour]) -> tuple[Shape, ...]:
     """Shapes of a link in its frame; ``known`` are colours by name."""
-    found = [_shape(child, known) for child in link.children if child.tag == "visual"]
-    return tuple(shape for shape in found if shape is not None)
+    shapes = [_shape(child, known) for child in link.children if child.tag == "visual"]
+    return tuple(shape for shape in shapes if shape is not None)
 
 
 def _shape(visual: Element, known: Mapping[str, Colour]) -> Shape | None:
@@ -40,9 +40,9 @@ def _shape(visual: Element, known: Mapping[str, Colour]) -> Shape | None:
     solid = geometry.children[0]
     material = visual.child("material")
     colour = None if material is None else _colour(material, known)
-    place = visual.child("origin")
-    xyz = (0.0, 0.0, 0.0) if place is None else _numbers(place, "xyz", 3, "0 0 0")
-    rpy = (0.0, 0.0, 0.0) if place is None else _numbers(place, "rpy", 3, "0 0 0")
+    origin = visual.child("origin")
+    xyz = (0.0, 0.0, 0.0) if origin is None else _numbers(origin, "xyz", 3, "0 0 0")
+    rpy = (0.0, 0.0, 0.0) if origin is None else _numbers(origin, "rpy", 3, "0 0 0")
     kind: ShapeKind
     file = ""
     match solid.tag:

@@ -50,8 +50,8 @@ def write_urdf(robot: Robot) -> str:
         if link.kind in MOVING.values() and not (endless and all(map(math.isinf, limits))):
             # A continuous joint has no lower and upper.
             texts = [_text(min(max(limit, -UNLIMITED), UNLIMITED)) for limit in limits]
-            given = dict(zip(("lower", "upper", "effort", "velocity"), texts, strict=True))
-            ElementTree.SubElement(joint, "limit", dict(list(given.items())[2:]) if endless else given)
+            attributes = dict(zip(("lower", "upper", "effort", "velocity"), texts, strict=True))
+            ElementTree.SubElement(joint, "limit", dict(list(attributes.items())[2:]) if endless else attributes)
         if link.damping:
             ElementTree.SubElement(joint, "dynamics", damping=_text(link.damping), friction="0.0")
         if coupling := leads.get(link.joint):

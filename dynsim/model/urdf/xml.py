@@ -121,12 +121,12 @@ class UrdfFile:
             if len(attributes) > ATTRIBUTES_MAX:
                 raise self.error(line, f"<{cut(tag)}> has more than {ATTRIBUTES_MAX} attributes; simplify the model")
             around = [element.tag for element in open_elements]
-            place = {"link": ["robot"], "inertial": ["robot", "link"]}.get(tag, around)
+            parents = {"link": ["robot"], "inertial": ["robot", "link"]}.get(tag, around)
             in_robot = around[:1] == ["robot"] and "gazebo" not in around
-            if in_robot and around != place and not (tag == "inertial" and around[:2] == place):
+            if in_robot and around != parents and not (tag == "inertial" and around[:2] == parents):
                 raise self.error(
                     line,
-                    f"<{tag}> in <{cut(around[-1])}> would be ignored; it belongs in <{place[-1]}>, move it there",
+                    f"<{tag}> in <{cut(around[-1])}> would be ignored; it belongs in <{parents[-1]}>, move it there",
                 )
             element = Element(tag, attributes, line)
             (open_elements[-1].children if open_elements else roots).append(element)
@@ -142,7 +142,7 @@ class UrdfFile:
                 tag = element.tag
                 raise self.error(
                     parser.CurrentLineNumber,
-                    f"<{tag}> holds the text {shown(content.strip())}; URDF has values in attributes only",
+                    f"<{tag}> holds the text {quoted(content.strip())}; URDF has values in attributes only",
                 )
 
         def document_type(*_: object) -> None:
@@ -174,13 +174,15 @@ class UrdfFile:
             raise self.error(element.line, f"<{element.tag}> has no name; give it one")
         self._check_expanded(element, "name", f"<{element.tag}>")
         if not name.isprintable():
-            raise self.error(element.line, f"{element.tag} {shown(name)}: the name has control characters; remove them")
+            raise self.error(
+                element.line, f"{element.tag} {quoted(name)}: the name has control characters; remove them"
+            )
         if len(name) > NAME_LENGTH_MAX:
-            raise self.error(element.line, f"{element.tag} {shown(name)}: a name has at most {NAME_LENGTH_MAX} signs")
+            raise self.error(element.line, f"{element.tag} {quoted(name)}: a name has at most {NAME_LENGTH_MAX} signs")
         if name in others:
             raise self.error(
                 element.line,
-                f"{element.tag} {shown(name)} is there twice (also in line {others[name].line}); rename one of them",
+                f"{element.tag} {quoted(name)} is there twice (also in line {others[name].line}); rename one of them",
             )
         return name
 
@@ -210,11 +212,11 @@ class UrdfFile:
 
     def required(self, element: Element, tag: str, who: str, fix: str) -> Element:
         """The child of that kind; without it ``fix`` says what to do."""
-        found = element.child(tag)
-        if found is None:
+        child = element.child(tag)
+        if child is None:
             where = f"{who}: <{element.tag}>" if element.tag == "inertial" else who
             raise self.error(element.line, f"{where} has no <{tag}>; {fix}")
-        return found
+        return child
 
     def text(self, element: Element, key: str, who: str) -> str:
         """An attribute that must be there and not empty."""
@@ -238,7 +240,7 @@ class UrdfFile:
             raise self.error(element.line, f"{who}: <{element.tag}> has no {key}; add it, like {key}={_EXAMPLE[count]}")
         self._check_expanded(element, key, who)
         words = _words(text)
-        stated = f"{who}: <{element.tag} {key}={shown(text)}>"
+        stated = f"{who}: <{element.tag} {key}={quoted(text)}>"
         if len(words) != count:
             raise self.error(
                 element.line, f"{stated} has {len(words)} entries, {count} are needed, like {_EXAMPLE[count]}"
@@ -262,7 +264,7 @@ class UrdfFile:
     def _check_expanded(self, element: Element, key: str, who: str) -> None:
         if "${" in element.attributes[key] or "$(" in element.attributes[key]:
             raise self.error(
-                element.line, f"{who}: <{element.tag} {key}={shown(element.attributes[key])}>: {self._expand}"
+                element.line, f"{who}: <{element.tag} {key}={quoted(element.attributes[key])}>: {self._expand}"
             )
 
 
@@ -285,7 +287,7 @@ def _words(text: str) -> list[str]:
     return [word for word in re.split(r"[ \t\r\n]+", text) if word]
 
 
-def shown(text: str) -> str:
+def quoted(text: str) -> str:
     """A text of the file, quoted and cut to what fits in a message."""
     return repr(cut(text))
 

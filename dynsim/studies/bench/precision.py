@@ -62,7 +62,7 @@ def measure(name: str, rounds: int) -> list[dict[str, Any]]:
                     "scenario": name,
                     "method": method,
                     "rtol": rtol,
-                    "cpu_minimum_s": min(one.cpu for by, one in runs if by == method),
+                    "cpu_minimum_s": min(attempt.cpu for by, attempt in runs if by == method),
                     "error": float((np.abs(run.q[:common] - reference.q[:common]) / scale).max()),
                     "ledger": run.ledger,
                     "evaluations": run.evaluations,

@@ -197,7 +197,7 @@ class ServoFollower:
 
     def finish(self) -> None:
         """There was no tick that is not to be followed: what is held back goes on."""
-        for sample in self.lookahead.rest() if self.lookahead is not None else []:
+        for sample in self.lookahead.remaining() if self.lookahead is not None else []:
             self._tell(sample)
 
     def end(self, how: float) -> None:
@@ -207,8 +207,8 @@ class ServoFollower:
 
     def _tell(self, sample: Sample) -> None:
         added: list[float] = []
-        for one in (sample.lift, sample.lift_rate) if self._lifting else ():
-            added += np.asarray(one)[self._lifting].tolist()
+        for values in (sample.lift, sample.lift_rate) if self._lifting else ():
+            added += np.asarray(values)[self._lifting].tolist()
         self._write(sample.time, *sample.position, *sample.velocity, *added)
 
     def _write(self, *numbers: float) -> None:

@@ -88,7 +88,7 @@ def _axes(values: Any, count: int) -> tuple[float, ...]:
     """As many as there are, finite; what is beyond full speed is full speed."""
     if not isinstance(values, list) or len(values) != count:
         raise Refused(f"axes: must be a list of {count} numbers")
-    found = []
+    axes = []
     for value in values:
         # Whole numbers may have thousands of digits, and decimals overflow to infinity.
         if (
@@ -97,8 +97,8 @@ def _axes(values: Any, count: int) -> tuple[float, ...]:
             or not (isinstance(value, int) or math.isfinite(value))
         ):
             raise Refused("axes: must be finite numbers")
-        found.append(round(STEPS * max(-1.0, min(1.0, value))) / STEPS)
-    return tuple(found)
+        axes.append(round(STEPS * max(-1.0, min(1.0, value))) / STEPS)
+    return tuple(axes)
 
 
 def _flag(message: dict[str, Any], key: str) -> bool:

@@ -167,10 +167,10 @@ class Server:
             self._page = self._make_page(self.socket).encode()
             self._ready.set()
             await self._quit.wait()
-            told = (client.socket.send(json.dumps({"over": self._why})) for client in self._clients.values())
+            messages = (client.socket.send(json.dumps({"over": self._why})) for client in self._clients.values())
             # A browser that takes nothing more is not waited for.
             with suppress(TimeoutError):
-                await asyncio.wait_for(asyncio.gather(*told, return_exceptions=True), GOODBYE)
+                await asyncio.wait_for(asyncio.gather(*messages, return_exceptions=True), GOODBYE)
 
     def _guard(self, connection: ServerConnection, request: Request) -> Response | None:
         """None for the pilot's own socket; the page, or a refusal that says nothing."""
@@ -180,12 +180,12 @@ class Server:
             return _answer(http.HTTPStatus.FORBIDDEN)
         if request.path == "/favicon.ico":
             return _answer(http.HTTPStatus.NO_CONTENT)
-        _, token, *rest = (*request.path.split("/"), "", "")
+        _, token, *others = (*request.path.split("/"), "", "")
         if not hmac.compare_digest(token.encode("utf-8", "replace"), self.token.encode()):
             return _answer(http.HTTPStatus.FORBIDDEN)
-        if rest[:2] == ["", ""]:
+        if others[:2] == ["", ""]:
             return _answer(http.HTTPStatus.OK, self._page)
-        if rest[0] != "drive" or rest[1:] != ["", ""]:
+        if others[0] != "drive" or others[1:] != ["", ""]:
             return _answer(http.HTTPStatus.FORBIDDEN)
         if len(origins) != 1 or origins[0] not in {f"http://{name}" for name in own}:
             return _answer(http.HTTPStatus.FORBIDDEN)

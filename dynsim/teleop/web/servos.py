@@ -63,20 +63,20 @@ class PipeFeed:
     def take(self, most: int) -> Sequence[Sample]:
         self._read()
         size = self._frame.size
-        found: list[Sample] = []
-        while len(self._bytes) >= size and len(found) < most and not self.over and not self.fault:
+        samples: list[Sample] = []
+        while len(self._bytes) >= size and len(samples) < most and not self.over and not self.fault:
             numbers = np.array(self._frame.unpack(self._bytes[:size]))
             self._bytes = self._bytes[size:]
             time, values = float(numbers[0]), numbers[1:]
             if time == time:
-                found.append(self._sample(time, values))
+                samples.append(self._sample(time, values))
             elif values[0] in FAULTS:
                 self.fault = FAULTS[values[0]]
             else:
                 self.over = True
         if self._gone and len(self._bytes) < size and not self.over and not self.fault:
             self.fault = "the process of the simulation is gone"
-        return found
+        return samples
 
     def tell(self, time: float) -> None:
         self._heard[0] = time

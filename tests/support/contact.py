@@ -1,7 +1,7 @@
 """The published arm glued to its floor, on a real floor, and on one that all of its links can touch.
 
-``python -m dynsim.studies.contact`` writes results/contact/, which README.md and docs/validation.md quote, in about ten
-seconds once the kernels are compiled.
+``PYTHONPATH=tests python -m support.contact`` writes results/contact/, which README.md and docs/validation.md quote, in
+about ten seconds once the kernels are compiled.
 """
 
 from __future__ import annotations

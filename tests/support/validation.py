@@ -1,6 +1,6 @@
 """The numbers that README.md and docs/ quote, measured anew.
 
-``python -m dynsim.studies.validation`` writes results/reference/validation.json in about four minutes;
+``PYTHONPATH=tests python -m support.validation`` writes results/reference/validation.json in about four minutes;
 ``python .ci/pages.py`` writes them into the pages.
 """
 
@@ -20,9 +20,9 @@ from dynsim.hardware.servo_map import load_servo_map
 from dynsim.record import Record
 from dynsim.scenario import Scenario, load_scenario, scenario_from_resolved, shipped_scenarios, variant_names
 from dynsim.studies.compare import compare
-from dynsim.studies.published.rotors import rotor_energies
-from dynsim.studies.published.wang_minami import ELBOWS, elbow_forces, elbow_numbers
 from dynsim.system.files import write_json
+from support.rotors import rotor_energies
+from support.wang_minami import ELBOWS, elbow_forces, elbow_numbers
 
 FILE = Path("results/reference/validation.json")
 # Of a summary, what is not the same on every machine.

@@ -1,6 +1,6 @@
 """What the first run of all takes, which compiles the kernels, and a later one.
 
-``python -m dynsim.studies.bench.start_up`` writes results/reference/start_up.json in two minutes: on a machine that
+``PYTHONPATH=tests python -m support.start_up`` writes results/reference/start_up.json in two minutes: on a machine that
 does nothing else, the one of results/reference/bench.json.
 """
 

@@ -1,7 +1,7 @@
 """Does bracing keep a mobile base from tipping over? The four elbow configurations, and what of the base decides.
 
-``python -m dynsim.studies.overturning`` writes results/overturning/ (configurations.json, sweep.csv, sweep.png), which
-docs/validation.md quotes, in about two minutes.
+``PYTHONPATH=tests python -m support.overturning`` writes results/overturning/ (configurations.json, sweep.csv,
+sweep.png), which docs/validation.md quotes, in about two minutes.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """How far the elbow comparison depends on what the paper does not say: one assumption changed at a time.
 
-``python -m dynsim.studies.assumptions`` writes results/reference/assumptions.json, which docs/validation.md quotes.
+``PYTHONPATH=tests python -m support.assumptions`` writes results/reference/assumptions.json, which docs/validation.md
+quotes.
 """
 
 from __future__ import annotations
@@ -8,8 +9,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from dynsim._version import __version__
-from dynsim.studies.published.wang_minami import changed_assumptions
 from dynsim.system.files import write_json
+from support.wang_minami import changed_assumptions
 
 if __name__ == "__main__":
     rows = changed_assumptions()

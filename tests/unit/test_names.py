@@ -1,0 +1,69 @@
+"""Names that say nothing: no variable, argument or function of the package has one."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import dynsim
+
+PACKAGE = Path(dynsim.__file__).parent
+BANNED = {"found", "given", "held", "hold", "one", "place", "rest", "told", "way", "what"}
+# Functions are named by what they do or give.
+PARTICIPLES = {"folded", "shown", "sunk"}
+# Of the public interface: how long the last frame of a film stays.
+PUBLIC = {("cli/animate.py", "hold"), ("draw/film/film.py", "hold")}
+# Rooms whose names are still to be changed.
+NOT_YET = ("dynamics/", "engine/kinematic", "engine/mode_switching", "integrators/", "jit/", "planner/", "snake/")
+
+
+def bad_names(source: str) -> Iterator[tuple[str, int]]:
+    """Banned names of variables, arguments and functions with their lines; attributes are not looked at."""
+    tree = ast.parse(source)
+    fields = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ClassDef):
+            plain = (statement for statement in node.body if not isinstance(statement, ast.FunctionDef))
+            fields |= {id(inner) for statement in plain for inner in ast.walk(statement)}
+    for node in ast.walk(tree):
+        name, banned = "", BANNED
+        if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store) and id(node) not in fields:
+            name = node.id
+        elif isinstance(node, ast.arg):
+            name = node.arg
+        elif isinstance(node, ast.FunctionDef) and "property" not in map(ast.unparse, node.decorator_list):
+            name, banned = node.name, BANNED | PARTICIPLES
+        elif isinstance(node, ast.ExceptHandler | ast.MatchAs):
+            name = node.name or ""
+        if name in banned:
+            yield name, getattr(node, "lineno", 0)
+
+
+def test_names_say_what_they_are() -> None:
+    wrong = [
+        f"{module}:{line}: {name}"
+        for path in sorted(PACKAGE.rglob("*.py"))
+        if not (module := path.relative_to(PACKAGE).as_posix()).startswith(NOT_YET)
+        for name, line in bad_names(path.read_text(encoding="utf-8"))
+        if (module, name) not in PUBLIC
+    ]
+    assert wrong == []
+
+
+def test_what_is_looked_at() -> None:
+    source = (
+        "class A:\n  one: int\n  def held(self, way): ...\nfor place in (): told = 1\ndef shown(): ...\nrest(what)\n"
+    )
+    assert sorted(bad_names(source)) == [("held", 3), ("place", 4), ("shown", 5), ("told", 4), ("way", 3)]
+
+
+def test_a_class_name_means_one_thing() -> None:
+    """``Config`` is what every member of a family has; private classes are their module's own."""
+    homes: dict[str, list[str]] = {}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef) and node.name != "Config" and not node.name.startswith("_"):
+                homes.setdefault(node.name, []).append(path.relative_to(PACKAGE).as_posix())
+    twice = {name: modules for name, modules in homes.items() if len(modules) > 1}
+    assert {name: modules for name, modules in twice.items() if not any(m.startswith(NOT_YET) for m in modules)} == {}
