@@ -16,7 +16,7 @@ from dynsim.compile.tables import compile_contacts, compile_couplings, compile_d
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.derivative import System, derivative, new_workspace
 from dynsim.dynamics.simd.system import has_forms
-from dynsim.dynamics.state import LOSSES, block, output_layout, state_layout
+from dynsim.dynamics.state import ELASTIC_SIZE, LOSSES, block, output_layout, state_layout
 from dynsim.engine.prepare import guards
 from dynsim.integrators.driver import advance
 from dynsim.integrators.radau5.tables import CLOSE
@@ -242,14 +242,15 @@ class Bench:
         n, na, c = self.sizes
         system, stepping = self.system, None
         couplings = len(self.robot.couplings) + len(self.stops)
-        couplings += 0 if system.unilateral is None else len(system.unilateral.dry)
+        dry, ties = (0, 0) if system.unilateral is None else (len(system.unilateral.dry), len(self.robot.ties))
+        couplings += dry + ties
         if METHODS[method] == TIME_STEPPING:
             stepping = stepping_arrays(system.model, system.contacts, na, couplings, theta)
         run = new_run(
             METHODS[method],
             y,
             self.system.layout,
-            output_layout(n, na, c, 0, len(self.stops)),
+            output_layout(n, na, c, 0, len(self.stops), dry, ties),
             n=n,
             na=na,
             c=c,
@@ -309,9 +310,10 @@ def bench(
     n, c, circuits = len(robot.links), len(contacts or []), robot.circuits
     stops = joint_stops(robot) if real else []
     rubbing = dry_frictions(robot) if dry else []
-    size = n + ka.row_limit(c, len(robot.couplings) + len(stops) + len(rubbing)) + circuits
+    size = n + ka.row_limit(c, len(robot.couplings) + len(stops) + len(rubbing) + len(robot.ties)) + circuits
+    gives = ELASTIC_SIZE if robot.ties or any(contact.stiffness for contact in contacts or ()) else 0
     system = System(
-        layout=state_layout(robot.nq, n, circuits, c, len(loads or ()), LOSSES if real else 0, 1),
+        layout=state_layout(robot.nq, n, circuits, c, len(loads or ()), LOSSES if real else 0, 1, gives),
         model=compile_model(robot),
         drives=compile_drives(robot, k_p=[k_p] * na, k_d=[k_d] * na, dry=dry),
         reference=held_reference(np.zeros(na) if held is None else held),

@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 
 from dynsim.compile.clearance import gaps
-from dynsim.compile.contact_law import JointStop, compile_unilateral, dry_frictions, joint_stops
+from dynsim.compile.contact_law import DryFriction, JointStop, compile_unilateral, dry_frictions, joint_stops
 from dynsim.compile.control import JointControl
 from dynsim.compile.model import Model
 from dynsim.compile.shapes import compile_shapes
@@ -65,6 +65,7 @@ class Prepared:
     stops: list[JointStop]
     choice: Choice
     balance: Balance | None = None
+    dry: Sequence[DryFriction] = ()
 
     @property
     def kind(self) -> str:
@@ -128,8 +129,10 @@ def prepare(
     dry = dry_frictions(robot) if stepped else []
     if not stepped:
         _check_friction(robot)
-    layout = state_layout(model.nq, n, robot.circuits, c, len(loads), kst.LOSSES if real else 0, 1 if stepped else 0)
-    columns = output_layout(n, na, c, ks.OUTPUTS if robot.base else 0, len(stops))
+    gives = bool(robot.ties) or any(contact.stiffness > 0.0 for contact in contacts)
+    sizes = kst.LOSSES if real else 0, 1 if stepped else 0, kst.ELASTIC_SIZE if gives else 0
+    layout = state_layout(model.nq, n, robot.circuits, c, len(loads), *sizes)
+    columns = output_layout(n, na, c, ks.OUTPUTS if robot.base else 0, len(stops), len(dry), len(robot.ties))
     if times is None:
         times = sample_times(scenario, layout, columns, n)
     if stepped and robot.base is not None:
@@ -138,7 +141,7 @@ def prepare(
             "take auto, or a plant without mobile base",
             keys=("integrator", "method"),
         )
-    joint_rows = len(robot.couplings) + len(stops) + len(dry)
+    joint_rows = len(robot.couplings) + len(stops) + len(dry) + len(robot.ties)
     _check_work(scenario, n, c + joint_rows, scenario.integrator.method)
     control = piloted or _control(scenario, model, contacts, progress)
     if not real:
@@ -202,11 +205,13 @@ def prepare(
         stepping=stepping,
         lanes=has_forms(system),
     )
-    return Prepared(model, contacts, control, system, run, new_workspace(system), loads, stops, choice, balance)
+    return Prepared(model, contacts, control, system, run, new_workspace(system), loads, stops, choice, balance, dry)
 
 
 def _check_friction(robot: Robot) -> None:
-    """Refuse friction that holds joints at rest where the method has none."""
+    """Refuse friction that holds joints at rest, and ties, where the method has none."""
+    if robot.ties:
+        raise ModelError(f"tie {robot.ties[0].name}: only integrator.method: time_stepping has ties", keys=("plant",))
     rubbing = [link.joint for link in robot.links if link.friction > 0.0]
     rubbing += [motor.joint for motor in robot.motors if isinstance(motor, Motor) and motor.dry_friction > 0.0]
     if rubbing:

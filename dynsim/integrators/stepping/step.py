@@ -20,6 +20,7 @@ from dynsim.integrators.events import take_ticks
 from dynsim.integrators.output import write_output
 from dynsim.integrators.run import Run
 from dynsim.integrators.stepping import tables as kt
+from dynsim.integrators.stepping.compliance import book_soft_contact, book_ties
 from dynsim.integrators.stepping.contacts import (
     list_contacts,
     note_contacts,
@@ -157,6 +158,7 @@ def book(system: System, ws: Workspace, run: Run):
         s.grid[kt.POWER_NOW] += run.stage[1, layout.load + k]
     book_stops(system.unilateral, system, s, ws, y_new, h)
     book_dry(system.unilateral, system, s, ws, y_new, h)
+    book_ties(system.unilateral, layout, s, ws, y_new, h)
     book_contacts(system, s, ws, y_new, h)
     stored_energy(system, ws, y_new, s.energy[kt.STOP])
     y_new[layout.scheme] -= stored + (s.energy[kt.STOP, kt.MECHANICAL] - s.energy[kt.START, kt.MECHANICAL])
@@ -205,6 +207,7 @@ def book_contacts(system: System, s: SteppingArrays, ws: Workspace, y_new, h):
     for k in range(ws.contacts.shape[0]):
         now, last = s.memory[kt.NOW, k], s.memory[kt.LAST, k]
         ws.contacts[k, ka.NORMAL_FORCE], s.turn[k, kt.STRUCK] = 0.0, 0.0
+        soft, normal = system.contacts.law[k, ka.CONTACT_STIFFNESS] > 0.0, 0.0
         if now[kt.LISTED] == 1.0:
             r = ws.active[k, ka.FIRST_ROW]
             force = ws.rows[r, ka.FORCE]
@@ -220,16 +223,22 @@ def book_contacts(system: System, s: SteppingArrays, ws: Workspace, y_new, h):
                 x, z = 0.5 * (s.rate[0, r + 1] + s.rate[1, r + 1]), 0.5 * (s.rate[0, r + 2] + s.rate[1, r + 2])
                 y_new[first + kst.SLIP] += h * slip_of_rates(system.contacts.law, k, x, z)
             y_new[first + kst.IMPULSE] += h * force
-            y_new[layout.loss + kst.IMPACT_LOSS] -= struck
-            s.turn[k, kt.STRUCK] = -struck
             y_new[layout.ledger + kst.FRICTION] -= friction
-            y_new[layout.scheme] -= (normal - struck) + (tangential - friction)
-            y_new[layout.ledger + kst.CONSTRAINT] -= normal + tangential
+            if soft:
+                y_new[layout.scheme] -= tangential - friction
+                y_new[layout.ledger + kst.CONSTRAINT] -= tangential
+            else:
+                y_new[layout.loss + kst.IMPACT_LOSS] -= struck
+                s.turn[k, kt.STRUCK] = -struck
+                y_new[layout.scheme] -= (normal - struck) + (tangential - friction)
+                y_new[layout.ledger + kst.CONSTRAINT] -= normal + tangential
+        if soft:
+            book_soft_contact(system.contacts.law, layout, s, ws, k, normal, y_new, h)
         first += kst.CONTACT_SIZE
 
 
 @internal_kernel
-def count_step(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, h):
+def count_step(unilateral: UnilateralArrays, law, s: SteppingArrays, ws: Workspace, h):
     """Times, depths and losses of candidates and joint stops in the step that is accepted."""
     for k in range(unilateral.stop.shape[0]):
         if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
@@ -241,7 +250,8 @@ def count_step(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, h
         if s.memory[kt.NOW, k, kt.LISTED] == 1.0:
             tally[ku.LOSS] += s.turn[k, kt.STRUCK]
             tally[ku.DEEPEST] = max(tally[ku.DEEPEST], -ws.contacts[k, ka.GAP])
-            s.found[kt.PENETRATION] = max(s.found[kt.PENETRATION], -ws.contacts[k, ka.GAP])
+            if law[k, ka.CONTACT_STIFFNESS] == 0.0:
+                s.found[kt.PENETRATION] = max(s.found[kt.PENETRATION], -ws.contacts[k, ka.GAP])
 
 
 @internal_kernel
@@ -363,11 +373,11 @@ def advance_moreau(system: System, ws: Workspace, run: Run, limit):
                 return
         count[ki.PENDING] = 0
         watch(ws, run, clock[ki.STEP])
-        count_step(system.unilateral, run.stepping, ws, clock[ki.STEP])
+        count_step(system.unilateral, system.contacts.law, run.stepping, ws, clock[ki.STEP])
         sample_moreau(system, ws, run)
         for j in range(run.y.shape[0]):
             run.y[j] = run.y_new[j]
-        remember(run.stepping, run.y, system.layout.v, clock[ki.STEP])
+        remember(system.unilateral, run.stepping, run.y, system.layout.v, clock[ki.STEP])
         advance_time(run.stepping, clock)
         count[ki.STEPS] += 1
         if tell_changes(system.unilateral, run.stepping, run):
