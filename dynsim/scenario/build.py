@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 # A contact point must start this close to its surface [m].
 START_TOLERANCE = 1e-6
+# What gives way may start pressed in by this much [m].
+PRESSED = 5e-3
 
 
 def machine(scenario: Scenario) -> Robot | SnakeDescription:
@@ -394,7 +396,7 @@ def check_start(
             gap = gap_at(model, contact, q)
         except ModelError as error:
             raise ModelError(f"{dotted((*keys, 'body'))}: {error}", keys=(*keys, "body")) from error
-        if scenario.config.contacts.law == "unilateral" and gap > 0.0:
+        if scenario.config.contacts.law == "unilateral" and gap > (-PRESSED if contact.stiffness > 0.0 else 0.0):
             continue
         if not abs(gap) <= START_TOLERANCE:
             off.append((contact, declared, keys, gap))

@@ -141,7 +141,7 @@ def energy_table(records: Mapping[str, Record]) -> Table:
         supply = record["energy_electrical_supply"][-1]
         power = supply / (record.time[-1] - record.time[0])
         battery = power * BATTERY_LIFE / 60.0
-        tyre = record["loss_contact_damping"][-1] if "loss_contact_damping" in record else 0.0
+        tyre = record["loss_damper"][-1] if "loss_damper" in record else 0.0
         parts = (supply, record["heat_joule"][-1], record["loss_gear"][-1], record["heat_friction"][-1], tyre, power)
         rows.append([variant, *(f"{value:.3f}" for value in (*parts, battery, more * battery))])
     return rows

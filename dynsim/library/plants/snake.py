@@ -23,6 +23,8 @@ from dynsim.snake.lifting import Lifts
 
 ENGINE = "kinematic"
 
+# Tyres that give way (assumed): with rigid ones nothing says how left and right share the load of a pair.
+TYRES = {"stiffness_N_per_m": 1e5, "damping_N_s_per_m": 200.0}
 MotorChoice: Any = families.union("motor")
 DrivenSide = Literal["left", "right", "none"]
 
@@ -104,9 +106,11 @@ def section_defaults(plant: Mapping[str, Any], sections: Mapping[str, Any]) -> d
         "surfaces": {GROUND: {"type": "plane"}},
         "contacts": {"law": "unilateral", "friction": 0.6},
     }
-    integrator = sections.get("integrator")
+    integrator, contacts = sections.get("integrator"), sections.get("contacts")
     if not isinstance(integrator, Mapping) or integrator.get("method", "time_stepping") == "time_stepping":
         defaults["integrator"] = {"method": "time_stepping", "step_s": 0.0025}
+        if not isinstance(contacts, Mapping) or contacts.get("stiffness_N_per_m", TYRES) is not None:
+            defaults["contacts"] |= TYRES
     controller = sections.get("controller")
     if isinstance(controller, Mapping):
         defaults["controller"] = {"state": "feedforward"}  # [T] IV.C.2
