@@ -95,6 +95,7 @@ def snake_tree(
     *,
     wheel_inertia: float,
     bearing_drag: float,
+    massless_wheels: bool,
     lifts: Lifts,
     sag_compensation: bool,
     raised: bool,
@@ -106,6 +107,7 @@ def snake_tree(
     joint_servo, wheel_servo : the servo of a joint by its name
     wheel_inertia : about its axle, of each wheel without its servo [kg m²]
     bearing_drag : viscous drag of each wheel [N m s/rad]
+    massless_wheels : wheels without servo are no bodies: they have no friction along their way, and no drag
 
     Raises
     ------
@@ -158,6 +160,9 @@ def snake_tree(
         for side in (1, -1):
             name = wheel_joint(pair_index, side)
             place = np.array([x, side * float(d.half_track[pair_index]), 0.0])
+            if massless_wheels and side != d.driven_side[pair_index]:
+                feet.append(Foot(name, body, place, d.wheel_radius, GROUND, grip_axis=_X))
+                continue
             wheels.append(
                 Link(
                     f"{name}.wheel",

@@ -24,7 +24,7 @@ from dynsim.compile.model import Model
 from dynsim.compile.references.teleop import BASE, HAND, VELOCITIES, TeleopOptions, VelocitySource
 from dynsim.compile.rolling import wheel_angles
 from dynsim.engine.hand_governor import HandGovernor
-from dynsim.engine.stepped import State
+from dynsim.engine.stepped import State, Touch
 from dynsim.model.base_pose import base_pose, base_row
 from dynsim.record import Record
 
@@ -38,6 +38,11 @@ class Referenced(Protocol):
     @property
     def state(self) -> State:
         """See :attr:`dynsim.engine.simulation.Simulation.state`."""
+        ...
+
+    @property
+    def touching(self) -> dict[str, Touch]:
+        """See :attr:`dynsim.engine.simulation.Simulation.touching`."""
         ...
 
     def set_references(self, lines: Mapping[str, tuple[float, float]]) -> None:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from dynsim.compile.model import Model
-from dynsim.compile.snake_tree import SnakeTree
+from dynsim.compile.snake_tree import HEAD, SnakeTree
 from dynsim.engine.operator import Referenced
 from dynsim.engine.sensing import SampledSensor
 from dynsim.engine.snake_control import OBSTACLES, SnakeControl, copy_of
@@ -28,6 +28,7 @@ from dynsim.engine.snake_start import STEADY_TICKS, WheelLifter, command_angles
 from dynsim.engine.stepped import State
 from dynsim.errors import SimulationStopped
 from dynsim.model.description import Array
+from dynsim.model.drives import Servo
 from dynsim.record import Record
 from dynsim.scenario.sensors import Sensors
 from dynsim.snake import state as ss
@@ -36,6 +37,8 @@ from dynsim.snake.state import FEEDFORWARD, GIVEN, MEASURED, Schedule, SnakeTrac
 from dynsim.snake.ticks import command_tick, record_row
 
 _ROOT_COORDINATES = 7
+# How often somebody looks whether the head lies on the ground, and how long it does until the run ends [s].
+OVERLOAD_LOOK, LIES_FOR = 0.1, 0.5
 # What a snapshot keeps of the switcher and of the pilot itself: values that are replaced, and never written to.
 _SWITCHER = ("row", "switching", "next_switch", "switches", "_place")
 _OWN = (
@@ -49,6 +52,7 @@ _OWN = (
     "_added_rate",
     "_next_look",
     "_commanded",
+    "_lies_since",
 )
 
 
@@ -89,6 +93,10 @@ class SnakePilot(SnakeControl):
         self._row = controller.fixing_row
         self._added = self._lifter.angles(0.0, self.state.phi[d.head_joints :])
         self._added_rate = np.zeros_like(self._added)
+        servos = {motor.joint: motor for motor in robot.motors if isinstance(motor, Servo)}
+        self._volts_per_rad = np.array([servos[joint].k_p for joint in d.joint_names])
+        self._volts = np.array([servos[joint].voltage_limit for joint in d.joint_names])
+        self._overload_ticks, self._lies_since = max(1, round(OVERLOAD_LOOK / self.period)), tuple[float, ...]()
         self.sensors = self._sensors(sensors or Sensors())
         self._next_look = self._commanded = 0
         self._seen: Any = None
@@ -119,6 +127,7 @@ class SnakePilot(SnakeControl):
         if self.tick >= self.ticks:
             return
         self._seen = simulation.state
+        self._refuse_overload(simulation)
         self._look()
         self.begin_period()
         state, row = self.state, self.tick // self.stride if self.tick % self.stride == 0 else -1
@@ -144,6 +153,27 @@ class SnakePilot(SnakeControl):
             raise self.diverged()
         self.end_period(bool(blocked))
         self._tell(simulation, time, phi)
+
+    def _refuse_overload(self, simulation: Referenced) -> None:
+        """Stop where the head has come to lie on the ground because a servo can do no more."""
+        if self.tick % self._overload_ticks:
+            return
+        touch, overloaded = simulation.touching.get(HEAD), ()
+        if touch is not None and touch.force > 0.0:
+            off = self._volts_per_rad * (self.state.phi - self._seen.q[self._joints])
+            names = self.description.joint_names
+            overloaded = tuple(names[j] for j in np.flatnonzero(np.abs(off) >= self._volts))
+        if overloaded and not self._lies_since:
+            self._lies_since = (self.time,)
+        elif not overloaded:
+            self._lies_since = ()
+        elif self.time - self._lies_since[0] >= LIES_FOR:
+            raise SimulationStopped(
+                f"too_heavy: the head lies on the ground from t = {self._lies_since[0]:g} s on, "
+                f"{', '.join(overloaded)} at the limit of its voltage",
+                time=self.time,
+                state=self.postures(),
+            )
 
     def _look(self) -> None:
         """What the controller is told of the robot, into its beliefs."""

@@ -274,6 +274,7 @@ class Foot:
     ----------
     point : (3,) centre of the sphere in the body's frame [m]; radius [m]
     surface : name of the surface in the scenario
+    grip_axis : (3,) in the body's frame, or None: no friction along it, as of a wheel without mass
     """
 
     name: str
@@ -281,6 +282,7 @@ class Foot:
     point: Array
     radius: float
     surface: str
+    grip_axis: Array | None = None
 
 
 @dataclass(frozen=True)

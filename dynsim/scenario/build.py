@@ -303,6 +303,8 @@ def _foot(foot: Foot, known: Mapping[str, Surface], options: Contacts) -> Contac
     if foot.surface not in known:
         raise ModelError(f"surfaces: {foot.name} stands on surface {foot.surface!r}, which there is not")
     law = _law(options, ContactPoint(body=foot.body))
+    if foot.grip_axis is not None:
+        law |= {"grip": 0.0, "grip_axis": foot.grip_axis}
     return Contact(
         foot.name, foot.body, foot.point, known[foot.surface], surface_name=foot.surface, radius=foot.radius, **law
     )

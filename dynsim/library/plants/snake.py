@@ -51,6 +51,9 @@ class Dynamics(StrictConfig):
     wheel_servo: MotorChoice = Field({"type": "mx_28"}, description="of every driven wheel ([T] IV.A)")
     wheel_inertia_kg_m2: Positive = Field(4e-5, description="about its axle, of each wheel without its servo (assumed)")
     bearing_drag_N_m_s_per_rad: NonNegative = Field(1e-4, description="of each wheel (assumed)")
+    passive_wheels: Literal["bodies", "massless"] = Field(
+        "bodies", description="massless: no friction along their way, instead of bodies that turn"
+    )
     lifting: Lifting = Field(default_factory=Lifting)
     start: Literal["soft", "released"] = Field(
         "soft", description="soft: the head has been raised from below and has settled; released: it is let go at t = 0"
@@ -137,6 +140,7 @@ def build(config: Config, context: BuildContext) -> SnakeDescription | SnakeTree
         lambda joint: servo(dynamics.wheel_servo, joint),
         wheel_inertia=dynamics.wheel_inertia_kg_m2,
         bearing_drag=dynamics.bearing_drag_N_m_s_per_rad,
+        massless_wheels=dynamics.passive_wheels == "massless",
         lifts=Lifts(
             joints=lifting_joints(description), clearance_mm=1e3 * lifting.clearance_m, blend_s=lifting.blend_s
         ),
