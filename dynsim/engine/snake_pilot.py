@@ -158,7 +158,7 @@ class SnakePilot(SnakeControl):
         """Stop where the head has come to lie on the ground because a servo can do no more."""
         if self.tick % self._overload_ticks:
             return
-        touch, overloaded = simulation.touching.get(HEAD), ()
+        touch, overloaded = simulation.touching.get(HEAD), tuple[str, ...]()
         if touch is not None and touch.force > 0.0:
             off = self._volts_per_rad * (self.state.phi - self._seen.q[self._joints])
             names = self.description.joint_names
