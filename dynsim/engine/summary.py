@@ -18,7 +18,15 @@ from dynsim.integrators.stepping import tables as kt
 from dynsim.model.description import Array, Contact, Robot
 from dynsim.model.drives import Drive, TorqueSource
 from dynsim.record import Record
-from dynsim.record.measures import RESIDUAL_LIMIT, STORES, base_summary, energy_turnover, hand_error, sinks
+from dynsim.record.measures import (
+    RESIDUAL_LIMIT,
+    STORES,
+    base_summary,
+    energy_turnover,
+    hand_error,
+    hand_turn_error,
+    sinks,
+)
 from dynsim.scenario import Scenario, build
 from dynsim.system.memo import recall
 
@@ -36,6 +44,10 @@ INTEGRALS = {
 }
 
 # Those that runs under the unilateral law have beside them.
+ELASTIC = {
+    "energy_elastic": "energy that contacts and ties have stored since the start",
+    "loss_damper": "energy that dampers of contacts and ties take, and what ties lose beyond their bounds",
+}
 LOSSES = {"loss_impact": "energy that impacts of contacts take", "loss_stop": "energy that impacts at joint stops take"}
 
 SCHEME = "energy that the steps of time stepping take; negative: that they make"
@@ -115,6 +127,7 @@ def summarise(record: Record, scenario: Scenario, prepared: Prepared, wall: floa
         "rhs_evaluations": int(run.count[ki.EVALUATIONS]),
         "projections": int(run.count[ki.PROJECTIONS]),
         **hand_error(record, scenario.metrics.settle_s),
+        **hand_turn_error(record, scenario.metrics.settle_s),
         "electrical_energy_J": final("energy_electrical"),
         "electrical_energy_supply_J": final("energy_electrical_supply"),
         "electrical_energy_drawn_J": final("energy_electrical_drawn"),
@@ -125,6 +138,7 @@ def summarise(record: Record, scenario: Scenario, prepared: Prepared, wall: floa
         "friction_heat_J": final("heat_friction"),
         **({} if unilateral is None else {f"{key}_J": final(name) for key, name in _LOSS_KEYS.items()}),
         **({} if run.stepping is None else {"scheme_loss_J": final("loss_scheme")}),
+        **({"damper_loss_J": final("loss_damper")} if "loss_damper" in record else {}),
         **_loads(record),
         "energy_turnover_J": turnover,
         "energy_residual_relative": residual / scale if scale > 0.0 else 0.0,

@@ -12,8 +12,8 @@ from dynsim.record import Record
 
 # Where the electrical energy goes, in the order in which it is drawn and printed.
 SINKS = ("heat_joule", "loss_gear", "loss_joint", "heat_friction")
-# Sinks that only some runs have: under the unilateral law, by time stepping.
-MORE_SINKS = ("loss_impact", "loss_stop", "loss_scheme")
+# Sinks that only some runs have: under the unilateral law, by time stepping. Elastic energy counts from the start.
+MORE_SINKS = ("loss_impact", "loss_stop", "loss_damper", "energy_elastic", "loss_scheme")
 STORES = ("energy_kinetic", "energy_potential", "energy_magnetic")
 
 RESIDUAL_LIMIT = 1e-6
@@ -68,6 +68,20 @@ def hand_error(record: Record, settle: float) -> dict[str, float | None]:
     square = x + y + z
     values = (_mean(square, time) ** 0.5, square.max() ** 0.5, _mean(z, time) ** 0.5)
     return dict(zip(names, map(float, values), strict=True))
+
+
+def hand_turn_error(record: Record, settle: float) -> dict[str, float | None]:
+    """Root mean square and maximum of the angle between the hand's orientation and its target [rad].
+
+    Counted from t = ``settle`` on; None when the run is shorter, nothing where no orientation is asked for.
+    """
+    if "hand_turn_error" not in record:
+        return {}
+    names, late = ("hand_turn_error_rms_rad", "hand_turn_error_max_rad"), record.time >= settle
+    angle, time = record["hand_turn_error"][late], record.time[late]
+    if len(time) < 2:
+        return dict.fromkeys(names)
+    return dict(zip(names, (_mean(angle**2, time) ** 0.5, float(angle.max())), strict=True))
 
 
 def least_loads(record: Record, steps: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -304,6 +304,7 @@ def _rubbed(contact: Contact, factor: float) -> Contact:
 def _law(options: Contacts, point: ContactPoint) -> dict[str, Any]:
     """What the law of the contacts says of one of them."""
     friction, static = options.coefficients(point)
+    stiffness, damping = options.compliance(point)
     if options.law == "bilateral":
         smoothing, pulling = options.slip_smoothing_m_s, options.pulling_friction
         return {"friction": friction, "slip_smoothing": smoothing, "pulling_friction": pulling}
@@ -314,6 +315,8 @@ def _law(options: Contacts, point: ContactPoint) -> dict[str, Any]:
         "stribeck": options.stribeck_m_s or 0.0,
         "viscous_friction": options.viscous_friction_s_per_m,
         "restitution": options.restitution if point.restitution is None else point.restitution,
+        "stiffness": stiffness,
+        "damping": damping if stiffness else 0.0,
         **({} if point.grip is None else {"grip": point.grip.ratio, "grip_axis": np.array(point.grip.axis)}),
     }
 

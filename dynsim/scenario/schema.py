@@ -22,7 +22,15 @@ NAME_LIMIT = 255
 
 # Keys that only one law reads.
 BILATERAL_KEYS = ("slip_smoothing_m_s", "pulling_friction")
-UNILATERAL_KEYS = ("static_friction", "stribeck_m_s", "viscous_friction_s_per_m", "restitution", "grip")
+UNILATERAL_KEYS = (
+    "static_friction",
+    "stribeck_m_s",
+    "viscous_friction_s_per_m",
+    "restitution",
+    "grip",
+    "stiffness_N_per_m",
+    "damping_N_s_per_m",
+)
 # The trapezoidal rule of time stepping.
 THETA = 0.5
 Share = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
@@ -51,6 +59,10 @@ class ContactPoint(BodyPoint):
     static_friction: NonNegative | None = Field(default=None, description="default: that of contacts; unilateral law")
     restitution: Share | None = Field(default=None, description="default: that of contacts; unilateral law")
     grip: Grip | None = Field(default=None, description="anisotropic friction; only of integrator.method time_stepping")
+    stiffness_N_per_m: Positive | None = Field(
+        default=None, description="default: that of contacts; time_stepping only"
+    )
+    damping_N_s_per_m: NonNegative | None = Field(default=None, description="default: that of contacts")
     enabled: bool = True
 
 
@@ -75,6 +87,10 @@ class Contacts(StrictConfig):
     restitution: Share = Field(
         default=0.0, description="share of the normal speed that an impact turns round; unilateral law"
     )
+    stiffness_N_per_m: Positive | None = Field(
+        default=None, description="of body and surface along the normal; default: rigid; time_stepping only"
+    )
+    damping_N_s_per_m: NonNegative = Field(default=0.0, description="along the normal, beside the stiffness")
     slip_smoothing_m_s: Positive = Field(default=1e-3, description="v_s of the slip direction v_t/√(v_t² + v_s²)")
     pulling_friction: Literal["signed", "dissipative"] = Field(
         default="dissipative", description="f_t = μ f_n as printed in the paper, or μ |f_n|"
@@ -96,6 +112,14 @@ class Contacts(StrictConfig):
         )
         return kinetic, kinetic if static is None else static
 
+    def compliance(self, point: ContactPoint | None = None) -> tuple[float, float]:
+        """Stiffness [N/m], 0 of a rigid one, and damping [N s/m] of a point: its own, else those of contacts."""
+        stiffness, damping = (
+            getattr(self, key) if point is None or getattr(point, key) is None else getattr(point, key)
+            for key in ("stiffness_N_per_m", "damping_N_s_per_m")
+        )
+        return stiffness or 0.0, damping
+
     @property
     def other_keys(self) -> tuple[str, ...]:
         """Keys that only the other law reads."""
@@ -113,6 +137,7 @@ class Contacts(StrictConfig):
             raise error_at(
                 "candidates", f"{self.candidates!r} would glue all of them to their surfaces; it needs law: unilateral"
             )
+        self._check_compliance()
         kinetic, static = self.coefficients()
         if static < kinetic:
             raise error_at("static_friction", f"is less than friction {self.friction:g}; it must hold as much or more")
@@ -128,6 +153,19 @@ class Contacts(StrictConfig):
                     f"static_friction {static:g} is less than friction {kinetic:g}; it must hold as much or more",
                 )
         return self
+
+    def _check_compliance(self) -> None:
+        """Refuse damping where nothing gives way, and restitution where something does."""
+        for where, point in {"": None, **{f"points.{name}.": point for name, point in self.points.items()}}.items():
+            config = self if point is None else point
+            soft = self.compliance(point)[0] > 0.0
+            anywhere = soft or (point is None and not all(p.stiffness_N_per_m is None for p in self.points.values()))
+            if config.damping_N_s_per_m and not anywhere:
+                raise error_at(f"{where}damping_N_s_per_m", "is that of what gives way: give stiffness_N_per_m too")
+            restitution = self.restitution if point is None or point.restitution is None else point.restitution
+            if soft and restitution > 0.0:
+                key = "restitution" if config.restitution else "stiffness_N_per_m"
+                raise error_at(f"{where}{key}", f"what gives way has no restitution ({restitution:g}), but a damping")
 
 
 class Initial(StrictConfig):
@@ -247,6 +285,19 @@ class ScenarioConfig(StrictConfig):
                     f"contacts.points.{name}.grip",
                     f"needs integrator.method: time_stepping; {self.integrator.method} finds begin and end of slip by "
                     "one coefficient for all directions",
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _check_stiffness(self) -> Self:
+        """The event-driven methods know rigid contacts only."""
+        configs: dict[str, Contacts | ContactPoint] = {"contacts": self.contacts}
+        configs |= {f"contacts.points.{name}": point for name, point in self.contacts.points.items()}
+        for where, config in configs.items():
+            if config.stiffness_N_per_m is not None and self.integrator.method != "time_stepping":
+                raise error_at(
+                    f"{where}.stiffness_N_per_m",
+                    f"needs integrator.method: time_stepping; contacts of {self.integrator.method} are rigid",
                 )
         return self
 

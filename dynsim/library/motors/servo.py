@@ -31,7 +31,10 @@ class Config(DriveParameters):
     rotor_inertia_kg_m2: NonNegative = Field(default=0.0, description="of rotor and gear, at the output shaft")
     gear_damping_N_m_s_per_rad: NonNegative = Field(default=0.0, description="at the output shaft")
     coulomb_friction_N_m: NonNegative = Field(default=0.0, description="of the gear, at the output shaft")
-    coulomb_speed_rad_per_s: Positive = Field(default=0.01, description="below it the Coulomb friction fades")
+    coulomb_speed_rad_per_s: Positive | None = Field(
+        default=None,
+        description="below it the Coulomb friction fades; default: it holds at rest in time stepping, else 0.01",
+    )
     current_limit_A: Positive | None = None
     torque_limit_N_m: Positive | None = Field(default=None, description="of the current, without the gear's friction")
     nominal_current_A: Positive | None = Field(
