@@ -22,6 +22,7 @@ from dynsim.engine.compilation import kernels_logged
 from dynsim.engine.prepare import Prepared, right_hand_side
 from dynsim.integrators import driver
 from dynsim.integrators import run as ki
+from dynsim.integrators.stepping import tables as kt
 from dynsim.system import interruption
 
 log = logging.getLogger(__name__)
@@ -31,6 +32,8 @@ LOOK_S, PATIENCE_S = 0.1, 0.5
 # After so long in one and the same step it is stuck [s]: the longest that was ever seen, of 24 contacts whose forces no
 # method of the solver finds, took 80.
 STUCK_S = 600.0
+# A round of the solver of contact problems, times the cube of their rows [s].
+ROUND = 2e-9
 
 
 def attend(
@@ -151,10 +154,12 @@ def _short_steps(prepared: Prepared) -> int:
     """How many steps are over before anybody would have looked, whatever happens within them.
 
     They are taken in the caller's own thread: to hand a short run to another one costs some hundredths of its time.
-    None under the unilateral law, where one step may take a minute.
+    None under the unilateral law, where one step may take a minute; but steps of one length, whose contact problems
+    are given up after so many rounds.
     """
     if prepared.system.unilateral is not None:
-        return 0
+        rows = prepared.workspace.small.shape[1]
+        return int(LOOK_S / (kt.LAST_ROUNDS * ROUND * rows**3)) if prepared.run.stepping is not None else 0
     n, p = len(prepared.workspace.joints), prepared.workspace.small.shape[1]
     seconds = right_hand_side(n, p, dense=prepared.system.dense is not None)
     # Of RADAU5 with a Jacobian and its factors.

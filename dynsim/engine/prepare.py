@@ -15,6 +15,7 @@ from dynsim.compile.contact_law import DryFriction, JointStop, compile_unilatera
 from dynsim.compile.control import JointControl
 from dynsim.compile.model import Model
 from dynsim.compile.shapes import compile_shapes
+from dynsim.compile.snake_tree import SnakeTree
 from dynsim.compile.tables import compile_contacts, compile_couplings, compile_drives, compile_loads, compile_support
 from dynsim.config.problems import listed
 from dynsim.dynamics import state as kst
@@ -28,6 +29,7 @@ from dynsim.engine.compilation import kernels_logged
 from dynsim.engine.equilibrium import Balance, balanced, shifted
 from dynsim.engine.method import AUTO, Choice, choose
 from dynsim.engine.outcome import check_size
+from dynsim.engine.snake_start import begun
 from dynsim.errors import ModelError, ScenarioError
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts import events as kev
@@ -108,6 +110,9 @@ def prepare(
         The record would be larger than ``record.size_limit_GB``, or the explicit method would need too many steps.
     """
     described, contacts = build.robot_and_contacts(scenario)
+    piloted: JointControl | None = None
+    if isinstance(described, SnakeTree):
+        described, piloted = begun(scenario, described)
     if motors is not None:
         described = replace(described, motors=tuple(motors))
     model = recall("model", lambda: Model(described), described)
@@ -138,7 +143,7 @@ def prepare(
         )
     joint_rows = len(robot.couplings) + len(stops) + len(dry) + len(robot.ties)
     _check_work(scenario, n, c + joint_rows, scenario.integrator.method)
-    control = _control(scenario, model, contacts, progress)
+    control = piloted or _control(scenario, model, contacts, progress)
     if not real:
         _check_references(scenario, model, contacts, control)
     options, size = scenario.integrator, n + ka.row_limit(c, joint_rows) + robot.circuits
