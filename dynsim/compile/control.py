@@ -65,6 +65,8 @@ class JointControl:
 
     Only DC motors take the gains; ``k_p`` of a servo says whether it follows its position. References of a torque
     source are its torques [N m]. ``sample_time`` is the period [s] at which commands are taken, to be held in between;
+    None: they follow the state continuously. Where there is ``teleop``, an operator rewrites references on the way.
+    ``orientation`` : rotation of the hand in the world that goes with ``path``, (3, 3); None: any.
     None: they follow the state continuously. Where there is ``teleop``, an operator rewrites references on the way, and
     where there is ``task_space``, the controller of a snake does.
     """
@@ -75,6 +77,7 @@ class JointControl:
     path: HandPath | None
     sample_time: float | None = None
     teleop: TeleopOptions | None = None
+    orientation: NDArray[np.float64] | None = None
     task_space: TaskSpaceController | None = None
 
     @classmethod

@@ -51,7 +51,7 @@ def robot_scene(robot: Robot, contacts: Sequence[Contact], surfaces: Mapping[str
         if kind is None:
             return None
         parent = WORLD if link.parent is None else index[link.parent]
-        bodies.append(Body(link.name, parent, _joint(link, kind), link.shapes or _rod(link)))
+        bodies.append(Body(link.name, parent, _joint(link, kind), shapes(link)))
     hand_body, hand_point = robot.hand
     points = [Point("hand", "hand", index[hand_body], vector3(hand_point))]
     supports: tuple[Point, ...] = ()
@@ -63,14 +63,14 @@ def robot_scene(robot: Robot, contacts: Sequence[Contact], surfaces: Mapping[str
         points.append(Point(contact.name, "contact", body, vector3(point), contact.surface_name))
     return Scene(
         tuple(bodies),
-        tuple(_drawn(name, surface) for name, surface in surfaces.items()),
+        tuple(drawn_surface(name, surface) for name, surface in surfaces.items()),
         tuple(points),
         robot.fixed_shapes,
         supports,
     )
 
 
-def _drawn(name: str, surface: Surface) -> SceneSurface:
+def drawn_surface(name: str, surface: Surface) -> SceneSurface:
     """A surface as a scene keeps it."""
     nothing = np.zeros((3, 3))
     if isinstance(surface, Box):
@@ -149,6 +149,16 @@ def _joint(link: Link, kind: JointKind) -> Joint:
 
 def _limit(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
+
+
+def shapes(link: Link) -> tuple[Shape, ...]:
+    """The looks of a link's body: its shapes, else the cylinder about its axis where that is known."""
+    return link.shapes or _rod(link)
+
+
+def with_shapes(robot: Robot) -> Robot:
+    """The same robot whose links name the shapes that they are drawn with."""
+    return replace(robot, links=tuple(replace(link, shapes=shapes(link)) for link in robot.links))
 
 
 def _rod(link: Link) -> tuple[Shape, ...]:

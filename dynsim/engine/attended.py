@@ -200,7 +200,7 @@ def advance(
         ended, raised = attend(remainder, ask, both)
     watch.spend()
     if not ended:
-        prepared = _copied(prepared)
+        prepared = copied(prepared)
     count = prepared.run.count
     count[ki.ASKED] = 0
     if not ended or count[ki.STATUS] == ki.RUNNING:
@@ -213,13 +213,13 @@ def advance(
     return prepared, None if isinstance(raised, OutOfTime) else raised
 
 
-def _copied(value: Any) -> Any:
+def copied(value: Any) -> Any:
     """Tables and arrays of their own, in which nothing moves any more."""
     if isinstance(value, Prepared):
-        return replace(value, run=_copied(value.run), workspace=_copied(value.workspace), system=_copied(value.system))
+        return replace(value, run=copied(value.run), workspace=copied(value.workspace), system=copied(value.system))
     if isinstance(value, np.ndarray):
         return value.copy()
     if isinstance(value, tuple):
-        parts = map(_copied, value)
+        parts = map(copied, value)
         return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
     return value

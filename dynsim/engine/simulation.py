@@ -26,6 +26,7 @@ from dynsim.dynamics import tables as ka
 from dynsim.dynamics.state import block
 from dynsim.dynamics.tree import loads as kl
 from dynsim.engine import attended
+from dynsim.engine.linearization import Linearization, linearized
 from dynsim.engine.operator import Operator
 from dynsim.engine.outcome import mark_stopped, raise_stopped
 from dynsim.engine.prepare import prepare, sample_times
@@ -34,6 +35,7 @@ from dynsim.engine.stepped import GUARDS, Snapshot, State, Touch, event_name, ow
 from dynsim.engine.stopping import stopped
 from dynsim.engine.trace import Trace
 from dynsim.errors import ModelError, ScenarioError, brief
+from dynsim.integrators import driver
 from dynsim.integrators import run as ki
 from dynsim.integrators.dense import state_within
 from dynsim.model.drives import Drive
@@ -478,6 +480,41 @@ class Simulation:
         if values[3:].any():
             self._pushed.add(k)
         self._restart()
+
+    def linearize(
+        self, inputs: Sequence[str] = ("command",), outputs: Sequence[str] = ("hand_position",)
+    ) -> Linearization:
+        """Linear equations of the whole system about the present state: δẋ = A δx + B δu, δy = C δx + D δu.
+
+        x is q, v and the currents of motors with a circuit; contacts, stops and couplings are held as they are now, and
+        the controller is part of the system. The simulation stays as it is.
+
+        >>> A, B, C, D = simulation.linearize(inputs=["reference"], outputs=["hand_position", "contact_normal_force"])
+
+        Parameters
+        ----------
+        inputs : ``command`` of motors, beyond what the controller asks for [V; N m of an open torque], ``reference``
+            [rad or m], ``reference_rate``, ``force`` [N] and ``torque`` [N m] on bodies, in the axes of the wrench
+            that is set; a family of them, or one: ``"command.joint_3"``, ``"force.link_10.z"``
+        outputs : ``q``, ``v``, ``current``, ``vdot``, ``voltage``, ``motor_torque``, ``hand_position``,
+            ``contact_normal_force``, ``contact_force``, ``contact_gap``, likewise
+
+        Raises
+        ------
+        ScenarioError
+            No such input or output, or ``integrator.method: time_stepping``, which knows no modes between its steps.
+        """
+        if self._prepared.run.method == ki.TIME_STEPPING:
+            raise ScenarioError("integrator.method: time_stepping has no modes to linearize with; take another method")
+        before = self.snapshot()
+        try:
+            self._settle_now()
+            if self._prepared.run.count[ki.STARTED] == 0:
+                # Modes of contacts are chosen where a step starts; none is taken.
+                driver.advance(self._prepared.system, self._prepared.workspace, self._prepared.run, 0)
+            return linearized(self._prepared, inputs, outputs)
+        finally:
+            self.restore(before)
 
     def snapshot(self) -> Snapshot:
         """What :meth:`restore` needs to go on from here."""

@@ -258,6 +258,7 @@ def _corner_json(corner: Corner) -> dict[str, Any]:
         "surface_shift_m": corner.shift_m,
         "heat_W": _number(corner.heat_W),
         "hand_rms_m": _number(corner.hand_rms_m),
+        "hand_turn_rms_rad": _number(corner.turn_rms_rad),
         "closed_fraction": corner.closed,
         "reason": corner.reason,
     }
@@ -295,7 +296,7 @@ def plan_braces(
     verify: bool = True,
     explain: bool = False,
     exhaustive: bool = False,
-    starts: int = 6,
+    starts: int = 8,
     seed: int = 0,
     jobs: int = 1,
     tolerances: Tolerances | None = None,
@@ -335,8 +336,14 @@ def plan_braces(
     least, most = count
     if not 0 <= least <= most:
         raise ScenarioError(f"count = {least}:{most}: must be numbers of braces, the least first")
-    if starts < 1:
-        raise ScenarioError(f"starts = {starts}: must be 1 or more")
+    for key, number, smallest in (("starts", starts, 1), ("seed", seed, 0), ("jobs", jobs, 1)):
+        if number < smallest:
+            raise ScenarioError(f"{key} = {number}: must be {smallest} or more")
+    tolerances = tolerances or Tolerances()
+    positive = {"radius_m": radius_m, "peak_W_per_N_m": peak_W_per_N_m, "clearance_m": clearance_m, "min_N": min_N}
+    for key, value in (positive | {"shift_m": max(map(abs, tolerances.shift_m), default=0.0)}).items():
+        if value is not None and not 0.0 <= value < math.inf:
+            raise ScenarioError(f"{key} = {value}: must be a finite number, zero or more")
     if any(not 0.0 < share <= 1.0 for share in along):
         raise ScenarioError(f"along = {list(along)}: shares of the way along links, above 0 and at most 1")
     options = Options(
@@ -350,7 +357,7 @@ def plan_braces(
         found = search.run()
         sizes = [_answered(search, size, found[size]) for size in range(least, most + 1)]
         if verify:
-            sizes = _verified(problem, search, sizes, found, tolerances or Tolerances(), jobs, explain, tell)
+            sizes = _verified(problem, search, sizes, found, tolerances, jobs, explain, tell)
     singles = {one[0].label: heat for one, heat in search.single_heats.items()}
     singles = {one.label: singles[one.label] for one in problem.candidates if one.label in singles}
     ranked = {size.count: _ranked(size, found[size.count]) for size in sizes}
@@ -378,7 +385,7 @@ def _why(search: Search, count: int) -> str:
     if not tally.drawn_on:
         return (
             f"none of {tally.drawn} random postures could be brought onto the hand's path, within joint limits and "
-            "clear of the surfaces: the path may be out of reach"
+            "clear of the surfaces: it may be out of reach, or the orientation that it asks for"
         )
     refused = [why for one, why in tally.refused.items() if len(one) == count]
     if refused:

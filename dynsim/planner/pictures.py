@@ -79,7 +79,7 @@ def picture(plan: BracePlan) -> PlanPicture:
 
 def _heading(task: Task) -> Array:
     """Level unit vector from the arm's base to its path."""
-    middle = task.targets(np.array([0.5 * task.span]))[0] - task.arm.tables.place[0]
+    middle = task.targets(np.array([0.5 * task.span]))[0] - task.arm.tables.origin[0]
     middle[2] = 0.0
     size = float(np.linalg.norm(middle))
     return middle / size if size > 1e-9 else np.array([1.0, 0.0, 0.0])

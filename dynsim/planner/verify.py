@@ -11,8 +11,8 @@ import numpy as np
 from dynsim.model.description import Array
 from dynsim.model.drives import Motor
 from dynsim.planner import planned_scenario
+from dynsim.planner.compiled import ON
 from dynsim.planner.dense import Dense, nearest
-from dynsim.planner.local import ON
 from dynsim.planner.problem import Candidate, Task
 from dynsim.record import Record
 from dynsim.record.measures import hand_target
@@ -39,6 +39,7 @@ class Tolerances:
     heat : times the planned one
     nominal : share of the planned heat by which the nominal run may differ
     hand_m : root mean square of the hand's error beside the surface's [m]
+    turn_rad : root mean square of the angle between the hand's orientation and the one that is asked for
     wall_s : longer than so a corner is refused [s]
     """
 
@@ -47,6 +48,7 @@ class Tolerances:
     heat: float = 1.5
     nominal: float = 0.05
     hand_m: float = 0.005
+    turn_rad: float = 0.05
     wall_s: float = 10.0
     gains: tuple[float, ...] = (500.0, 200.0, 100.0, 50.0, 20.0, 10.0, 5.0)
 
@@ -58,6 +60,7 @@ class Corner:
     Attributes
     ----------
     heat_W : mean; hand_rms_m: of the hand's error; NaN where the run ended early
+    turn_rms_rad : of the hand's orientation; NaN where any will do
     closed : share of the time that each brace touches
     reason : why it is refused, with time and quantity; empty: it survives
     """
@@ -66,6 +69,7 @@ class Corner:
     shift_m: float
     heat_W: float = float("nan")
     hand_rms_m: float = float("nan")
+    turn_rms_rad: float = float("nan")
     closed: dict[str, float] = field(default_factory=dict)
     reason: str = ""
 
@@ -200,6 +204,9 @@ class Verifier:
         error = np.linalg.norm(record["hand_position"] - target, axis=1)
         rms = float(np.sqrt(np.mean(error**2)))
         closed = {one["name"]: float(one["closed_fraction"]) for one in record.summary["contacts"]}
+        turn = float("nan")
+        if "hand_turn_error" in record:
+            turn = float(np.sqrt(np.mean(record["hand_turn_error"] ** 2)))
         reason = ""
         allowed = abs(shift) + tolerances.hand_m
         if heat > tolerances.heat * dense.heat:
@@ -214,9 +221,12 @@ class Verifier:
         elif rms > allowed:
             k = int(error.argmax())
             reason = f"hand off by {1e3 * rms:.3g} mm rms (allowed {1e3 * allowed:.3g} mm), most at t = {time[k]:.3g} s"
+        elif turn > tolerances.turn_rad:
+            k = int(record["hand_turn_error"].argmax())
+            reason = f"hand turned by {turn:.3g} rad rms (allowed {tolerances.turn_rad:g}), most at t = {time[k]:.3g} s"
         else:
             reason = self._touches(braces, record, shift) or self._limits(record)
-        return Corner(mu, shift, heat, rms, closed, reason)
+        return Corner(mu, shift, heat, rms, turn, closed, reason)
 
     def _touches(self, braces: tuple[Candidate, ...], record: Record, shift: float) -> str:
         """What is not declared and would touch."""
