@@ -216,11 +216,16 @@ def test_stiff_wheel_loops_roll_without_slipping(gain, theta):
 
 
 def test_left_and_right_carry_the_same_while_it_is_straight(x_run):
-    """With tyres that give way the split is determined: half a newton, of 26."""
-    load = x_run["contact_normal_force"][-1, :14].reshape(7, 2)
-    assert np.abs(load[:, 0] - load[:, 1]).max() < 0.5
-    at_rest = x_run["contact_normal_force"][x_run.time < 1.0]
-    assert np.abs(np.diff(at_rest, axis=0)).max() < 0.1  # from sample to sample
+    """With tyres that give way the split is determined: half a newton, of 26 at pair 1.
+
+    In the posture of the start, where it is exact by symmetry. Driven wheels on one side bend the base by a milliradian
+    while it rolls and stops; the last pair is 1.4 N apart then, which gear friction keeps.
+    """
+    at_rest = (x_run.time > 0.1) & (x_run.time < 1.0)
+    load = x_run["contact_normal_force"][at_rest][:, :14]
+    pairs = load.reshape(-1, 7, 2)
+    assert np.abs(pairs[:, :, 0] - pairs[:, :, 1]).max() < 0.5
+    assert np.abs(np.diff(load, axis=0)).max() < 0.1  # from sample to sample, two steps
 
 
 def test_passive_wheels_without_mass_are_those_that_turn():
