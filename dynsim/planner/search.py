@@ -23,7 +23,7 @@ from dynsim.planner.problem import CHARGED, SMOOTHER, Candidate, Task
 # Sets of each size that go on from the cheap problem, and from the one with slip.
 BEAM = 5
 # Postures that a round begins with, and random ones that are tried for them.
-POSTURES, DRAWS = 2, 60
+POSTURES, DRAWS = 4, 60
 # Standard deviation of their joints, drawn from so much to so much [rad]; of prismatic ones [m].
 SPREAD, PRISMATIC_SPREAD = (0.3, 1.5), 0.2
 # Sets of each size and round that whole paths are made for, and those that are made finer in the end.
@@ -137,7 +137,7 @@ class Search:
     def run(self) -> dict[int, list[Planned]]:
         """The best sets of each size with whole paths, by heat along their dense references; sizes may be empty.
 
-        Rounds are independent searches, each from two postures of its own: how often they agree is what can be said of
+        Rounds are independent searches, each from postures of its own: how often they agree is what can be said of
         the distance to the optimum.
         """
         least, most = self.task.options.count
@@ -146,7 +146,7 @@ class Search:
         for number in range(rounds):
             self._tell("searching", number / (rounds + 1))
             for size, ranked in self._round(number, most).items():
-                heats = [self._path(paths.setdefault(item[1], []), *item) for item in ranked[: PATHS if size else 1]]
+                heats = [self._path(paths.setdefault(item[1], []), *item) for item in ranked[:PATHS]]
                 self.tally.heats.setdefault(size, []).append(min(heats, default=math.inf))
         planned: dict[int, list[Planned]] = {}
         for size in range(least, most + 1):
@@ -175,9 +175,9 @@ class Search:
         unbraced = [r for q in starts if (r := self.solve((), q, 1)) is not None]
         if not unbraced:
             return best
-        hanging = min(unbraced, key=lambda r: r.cost)
-        best[0] = [(hanging.cost, (), hanging.Q)]
-        front: list[tuple[Set, list[Array]]] = [((), [*starts, hanging.Q])]
+        unbraced.sort(key=_cost)
+        best[0] = [(r.cost, (), r.Q) for r in unbraced]
+        front: list[tuple[Set, list[Array]]] = [((), [*starts, unbraced[0].Q])]
         for size in range(1, most + 1):
             cheap = self._cheap(self._sets(size, front))
             slipping = self._slipping(cheap, 2 * BEAM)
