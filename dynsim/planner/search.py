@@ -257,12 +257,19 @@ class Search:
             self.tally.refused[braces] = "postures found, but none along the whole path"
         planned = []
         for braces in sorted(reached, key=lambda braces: reached[braces][0].cost)[: self.kept]:
-            likely = [local for local in reached[braces] if local.cost <= NEAR * reached[braces][0].cost]
-            finest = [self._finest(braces, local) for local in likely[:ALTERNATIVES]]
-            if good := [plan for plan in finest if isinstance(plan, Planned)]:
+            good, near = list[Planned](), math.inf
+            for local in reached[braces][: 2 * ALTERNATIVES]:
+                if len(good) == ALTERNATIVES or local.cost > near:
+                    break
+                plan = self._finest(braces, local)
+                if isinstance(plan, str):
+                    self.tally.refused.setdefault(braces, plan)
+                else:
+                    good.append(plan)
+                    near = min(near, NEAR * local.cost)
+            if good:
                 planned.append(min(good, key=lambda plan: plan.heat))
-            else:
-                self.tally.refused[braces] = str(finest[0])
+                self.tally.refused.pop(braces, None)
         return sorted(planned, key=lambda plan: plan.heat)
 
     def _finest(self, braces: Set, coarse: Local) -> Planned | str:
