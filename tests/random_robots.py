@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from dynsim.compile.contact_law import JointStop, compile_unilateral, joint_stops
+from dynsim.compile.contact_law import JointStop, compile_unilateral, dry_frictions, joint_stops
 from dynsim.compile.model import Model
 from dynsim.compile.shapes import compile_shapes
 from dynsim.compile.tables import compile_contacts, compile_couplings, compile_drives, compile_loads, compile_model
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.derivative import System, derivative, new_workspace
 from dynsim.dynamics.simd.system import has_forms
-from dynsim.dynamics.state import LOSSES, block, output_layout, state_layout
+from dynsim.dynamics.state import ELASTIC_SIZE, LOSSES, block, output_layout, state_layout
 from dynsim.engine.prepare import guards
 from dynsim.integrators.driver import advance
 from dynsim.integrators.radau5.tables import CLOSE
@@ -240,15 +240,17 @@ class Bench:
         Time stepping has arrays of its own, with ``theta``, and goes by the unilateral law.
         """
         n, na, c = self.sizes
-        couplings = len(self.robot.couplings) + len(self.stops)
         system, stepping = self.system, None
+        couplings = len(self.robot.couplings) + len(self.stops)
+        dry, ties = (0, 0) if system.unilateral is None else (len(system.unilateral.dry), len(self.robot.ties))
+        couplings += dry + ties
         if METHODS[method] == TIME_STEPPING:
             stepping = stepping_arrays(system.model, system.contacts, na, couplings, theta)
         run = new_run(
             METHODS[method],
             y,
             self.system.layout,
-            output_layout(n, na, c, 0, len(self.stops)),
+            output_layout(n, na, c, 0, len(self.stops), dry, ties),
             n=n,
             na=na,
             c=c,
@@ -296,27 +298,31 @@ def bench(
     k_d: float = 1.0,
     real: bool = False,
     slow: float = 1e-5,
+    dry: bool = False,
 ) -> Bench:
     """Compile a robot and its contacts, with a voltage PD that holds ``held`` (zero by default).
 
     ``real``: under the unilateral law, with the robot's joint stops; slip below ``slow`` [m/s] keeps its direction.
+    ``dry``: with friction that holds joints at rest, which time stepping alone has.
     """
     na = len(robot.motors)
     contact_arrays = compile_contacts(robot, contacts or [])
     n, c, circuits = len(robot.links), len(contacts or []), robot.circuits
     stops = joint_stops(robot) if real else []
-    size = n + ka.row_limit(c, len(robot.couplings) + len(stops)) + circuits
+    rubbing = dry_frictions(robot) if dry else []
+    size = n + ka.row_limit(c, len(robot.couplings) + len(stops) + len(rubbing) + len(robot.ties)) + circuits
+    gives = ELASTIC_SIZE if robot.ties or any(contact.stiffness for contact in contacts or ()) else 0
     system = System(
-        layout=state_layout(robot.nq, n, circuits, c, len(loads or ()), LOSSES if real else 0, 1),
+        layout=state_layout(robot.nq, n, circuits, c, len(loads or ()), LOSSES if real else 0, 1, gives),
         model=compile_model(robot),
-        drives=compile_drives(robot, k_p=[k_p] * na, k_d=[k_d] * na),
+        drives=compile_drives(robot, k_p=[k_p] * na, k_d=[k_d] * na, dry=dry),
         reference=held_reference(np.zeros(na) if held is None else held),
         contacts=contact_arrays,
         loads=compile_loads(robot, loads or ()),
         dense=np.zeros((size, size + 1)) if m_star else None,
         couplings=compile_couplings(robot),
         shapes=compile_shapes(robot, contacts or []),
-        unilateral=compile_unilateral(robot, contacts or [], stops, slow) if real else None,
+        unilateral=compile_unilateral(robot, contacts or [], stops, slow, rubbing) if real else None,
     )
     return Bench(robot, system, new_workspace(system), tuple(contacts or ()) if real else (), tuple(stops))
 

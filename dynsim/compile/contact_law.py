@@ -10,11 +10,13 @@ from numpy.typing import NDArray
 
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
+from dynsim.dynamics.contact.cone import problem as kc
 from dynsim.dynamics.contact.cone.socp import split_size
 from dynsim.dynamics.contact.unilateral import UnilateralArrays
 from dynsim.errors import ModelError
 from dynsim.jit.kernel import integers, reals
-from dynsim.model.description import Contact, Robot
+from dynsim.model.description import Contact, Robot, Tie
+from dynsim.model.drives import TorqueSource
 
 # A joint may start this far beyond its stop [rad or m].
 START_TOLERANCE = 1e-6
@@ -33,6 +35,22 @@ class JointStop:
     position: float
 
 
+@dataclass(frozen=True)
+class DryFriction:
+    """Friction of a joint that holds it at rest, of its gear and of its bearing [N m or N]."""
+
+    joint: str
+    gear: float
+    bearing: float
+
+
+def dry_frictions(robot: Robot) -> list[DryFriction]:
+    """The joints of a robot with friction that is not smoothed."""
+    gears = {motor.joint: motor.dry_friction for motor in robot.motors if not isinstance(motor, TorqueSource)}
+    frictions = [DryFriction(link.joint, gears.get(link.joint, 0.0), link.friction) for link in robot.links]
+    return [friction for friction in frictions if friction.gear + friction.bearing > 0.0]
+
+
 def format_quantity(value: float, unit: str, digits: int = 5) -> str:
     """A joint coordinate for a line of text; an angle in degrees first, which scenarios are written in."""
     if unit != "rad":
@@ -41,7 +59,7 @@ def format_quantity(value: float, unit: str, digits: int = 5) -> str:
 
 
 def compile_unilateral(
-    robot: Robot, contacts: Sequence[Contact], stops: Sequence[JointStop], slow: float
+    robot: Robot, contacts: Sequence[Contact], stops: Sequence[JointStop], slow: float, dry: Sequence[DryFriction] = ()
 ) -> UnilateralArrays:
     """Tables of the unilateral law.
 
@@ -49,13 +67,23 @@ def compile_unilateral(
     ----------
     stops : what joints come up against
     slow : speed below which slip has no direction of its own [m/s]
+    dry : joints that rub; time stepping only
     """
-    c, s = len(contacts), len(stops)
-    p = ka.row_limit(c, len(robot.couplings) + s)
+    c, s, ties = len(contacts), len(stops), robot.ties
+    p = ka.row_limit(c, len(robot.couplings) + s + len(dry) + len(ties))
     stop_table, stop = np.zeros((s, ku.STOP_TABLE_SIZE), dtype=np.int64), np.zeros((s, ku.STOP_SIZE))
     for k, limit in enumerate(stops):
         stop_table[k, ku.STOP_JOINT] = robot.joint_names.index(limit.joint)
         stop[k, ku.SIDE], stop[k, ku.LIMIT] = limit.side, limit.side * limit.position
+    dry_table, frictions = np.zeros((len(dry), ku.DRY_TABLE_SIZE), dtype=np.int64), np.zeros((len(dry), ku.DRY_SIZE))
+    driven = [motor.joint for motor in robot.motors]
+    for k, friction in enumerate(dry):
+        dry_table[k, ku.DRY_JOINT] = robot.joint_names.index(friction.joint)
+        dry_table[k, ku.DRY_DRIVE] = driven.index(friction.joint) if friction.gear > 0.0 else -1
+        frictions[k, [ku.OF_GEAR, ku.OF_JOINT]] = friction.gear, friction.bearing
+    tie_table, tie = np.zeros((len(ties), ku.TIE_TABLE_SIZE), dtype=np.int64), np.zeros((len(ties), ku.TIE_SIZE))
+    for joined, ints, floats in zip(ties, tie_table, tie, strict=True):
+        _compile_tie(robot, joined, ints, floats)
     slide = np.zeros((c, ku.SLIDE_SIZE))
     slide[:, ku.LANDS_AT] = ku.DEPTH
     tally, number = np.zeros((c, ku.TALLY_SIZE)), np.zeros(ku.NUMBERS)
@@ -67,12 +95,35 @@ def compile_unilateral(
         tally=reals(tally),
         stop_table=integers(stop_table),
         stop=reals(stop),
+        dry_table=integers(dry_table),
+        dry=reals(frictions),
+        tie_table=integers(tie_table),
+        tie=reals(tie),
         place=integers(np.zeros((ku.PLACES, max(p, c + 2)))),
         vector=reals(np.zeros((ku.VECTORS, p))),
         room=reals(np.zeros((ku.ROOM, p, p))),
         split_room=reals(np.zeros(split_size(3 * c, c))),
         number=reals(number),
     )
+
+
+def _compile_tie(robot: Robot, tie: Tie, table: NDArray[np.int64], row: NDArray[np.float64]) -> None:
+    """Rows of the tables of a tie."""
+    where = f"tie {tie.name}"
+    if not (tie.stiffness >= 0.0 and tie.damping >= 0.0 and tie.stiffness + tie.damping > 0.0 and tie.bound > 0.0):
+        raise ModelError(f"{where}: needs a stiffness or a damping, neither negative, and a positive bound")
+    (a, point), (b, other) = robot.attach(tie.body, tie.point), robot.attach(tie.other, tie.other_point)
+    if a == b:
+        raise ModelError(f"{where}: both ends are on {robot.links[a].name}")
+    length = float(np.linalg.norm(tie.axis))
+    if not length > 0.0:
+        raise ModelError(f"{where}: its axis has no direction")
+    kind = kc.ONE_WAY if tie.pushes else kc.BOX
+    table[[ku.TIE_A, ku.TIE_B, ku.TIE_TURNS, ku.TIE_KIND]] = a, b, tie.turns, kind if tie.holds else -1
+    row[[ku.TIE_STIFFNESS, ku.TIE_DAMPING, ku.TIE_BOUND, ku.TIE_REST]] = tie.stiffness, tie.damping, tie.bound, tie.rest
+    row[ku.TIE_AXIS : ku.TIE_AXIS + 3] = robot.attached_axes(tie.body) @ np.asarray(tie.axis) / length
+    row[ku.TIE_POINT : ku.TIE_POINT + 3], row[ku.TIE_OTHER_POINT : ku.TIE_OTHER_POINT + 3] = point, other
+    row[ku.TIE_ATTITUDE : ku.TIE_ATTITUDE + 9] = np.eye(3).ravel()
 
 
 def contact_laws(robot: Robot, contacts: Sequence[Contact]) -> NDArray[np.float64]:
@@ -102,6 +153,10 @@ def contact_laws(robot: Robot, contacts: Sequence[Contact]) -> NDArray[np.float6
         row[[ka.MU, ka.V_S, ka.STATIC]] = contact.friction, contact.slip_smoothing, contact.friction_at_rest
         row[[ka.STRIBECK, ka.VISCOUS]] = contact.stribeck, contact.viscous_friction
         row[ka.RESTITUTION] = contact.restitution
+        stiffness, damping = contact.stiffness, contact.damping
+        if not (stiffness >= 0.0 and damping >= 0.0) or (damping > 0.0 and stiffness == 0.0):
+            raise ModelError(f"{where}: stiffness and damping must not be negative, and damping needs a stiffness")
+        row[[ka.CONTACT_STIFFNESS, ka.CONTACT_DAMPING]] = stiffness, damping
         if contact.grip_axis is not None:
             row[ka.GRIP] = contact.grip
             row[ka.GRIP_AXIS : ka.GRIP_AXIS + 3] = robot.attached_axes(contact.body) @ contact.grip_axis

@@ -61,8 +61,9 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
         if link.parent is not None and link.parent not in index:
             raise ModelError(f"{link.name}: its parent {link.parent!r} must be a body that comes before it")
         link.inertia.check(link.name)
-        if not link.damping >= 0.0:
-            raise ModelError(f"{link.joint}: damping {link.damping}; a loss must be zero or positive")
+        for loss in ("damping", "friction"):
+            if not getattr(link, loss) >= 0.0:
+                raise ModelError(f"{link.joint}: {loss} {getattr(link, loss)}; a loss must be zero or positive")
         norm = float(np.linalg.norm(link.axis))
         if not abs(norm - 1.0) < 1e-9:
             raise ModelError(f"{link.joint}: the axis {link.axis} has length {norm:.6g}; it must be a unit vector")
@@ -117,7 +118,7 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
 
 
 def compile_drives(
-    robot: Robot, *, k_p: Sequence[float], k_d: Sequence[float], sampled: bool = False
+    robot: Robot, *, k_p: Sequence[float], k_d: Sequence[float], sampled: bool = False, dry: bool = False
 ) -> ka.DriveArrays:
     """Tables of the motors.
 
@@ -125,6 +126,7 @@ def compile_drives(
     ----------
     k_p, k_d : gains of the voltage PD, one per motor [V/rad, V s/rad]; only DC motors take them
     sampled : commands are held between ticks, see :func:`dynsim.dynamics.drive.law.take_commands`
+    dry : friction of gears that need not be smoothed has rows, see :func:`dynsim.compile.contact_law.dry_frictions`
     """
     joints = {link.joint: i for i, link in enumerate(robot.links)}
     table = np.zeros((len(robot.motors), ka.DRIVE_SIZE), dtype=np.int64)
@@ -146,6 +148,8 @@ def compile_drives(
             table[a, ka.DRIVE_KIND] = ka.POSITION_SERVO
             table[a, ka.SERVO_MODE] = ka.VELOCITY_MODE if m.velocity_mode else ka.POSITION_MODE
             motor[a] = servo_row(m)
+            if dry:
+                motor[a, ka.COULOMB] -= m.dry_friction
         else:
             table[a, ka.DRIVE_KIND] = ka.OPEN_TORQUE
             motor[a, ka.K_M], motor[a, ka.I_MAX], motor[a, ka.U_MAX] = 1.0, m.torque_limit, np.inf
@@ -350,7 +354,7 @@ _POSITIVE: dict[type, dict[str, str]] = {
     TorqueSource: {},
 }
 _NOT_NEGATIVE: dict[type, tuple[str, ...]] = {
-    Motor: ("rotor_inertia", "gear_damping"),
+    Motor: ("rotor_inertia", "gear_damping", "dry_friction"),
     Servo: ("k_p", "k_d", "k_v", "armature", "reflected_damping", "coulomb_friction", "free_drag"),
     TorqueSource: (),
 }
@@ -360,8 +364,9 @@ def _check_motor(motor: Drive, joints: dict[str, Link]) -> None:
     if motor.joint not in joints:
         raise ModelError(f"motor: no joint {motor.joint!r}; joints: {', '.join(joints)}")
     for quantity, unit in _POSITIVE[type(motor)].items():
-        if not getattr(motor, quantity) > 0.0:
-            raise ModelError(f"motor of {motor.joint}: {quantity} {getattr(motor, quantity)} {unit} must be positive")
+        value = getattr(motor, quantity)
+        if value is not None and not value > 0.0:
+            raise ModelError(f"motor of {motor.joint}: {quantity} {value} {unit} must be positive")
     if isinstance(motor, Motor) and not motor.inductance > 0.0:
         raise ModelError(
             f"motor of {motor.joint}: inductance {motor.inductance} H must be positive; "

@@ -59,7 +59,7 @@ def new_workspace(system: System) -> Workspace:
     contacts, couplings, unilateral = system.contacts, system.couplings, system.unilateral
     c, joint_rows = contacts.link.shape[0], couplings.joint.shape[0]
     if unilateral is not None:
-        joint_rows += unilateral.stop.shape[0]
+        joint_rows += unilateral.stop.shape[0] + unilateral.dry.shape[0] + unilateral.tie.shape[0]
     ws = workspace(system.model.tree.shape[0], system.drives.table.shape[0], c, joint_rows)
     set_modes(contacts, couplings, unilateral, ws, integers(np.full(c, ka.SLIDING if unilateral is None else ka.OPEN)))
     return ws

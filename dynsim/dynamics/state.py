@@ -10,6 +10,8 @@ State y, all in one vector, blocks in this order:
     load     (l,)   work of each external wrench [J]
     loss     (2,)   what impacts of contacts and of joint stops take [J]; only under the unilateral law
     scheme   (1,)   what time steps take of the energy [J]; only of time stepping, see its discretisation_energy
+    elastic  (2,)   energy that contacts and ties have stored since the start, and what their dampers have taken [J];
+                    only where some give way, see dynsim.integrators.stepping.compliance
 
 The first three are what error control looks at; the rest are integrals that nothing depends on.
 """
@@ -29,6 +31,9 @@ CONTACT_SIZE = 2
 # Losses of impacts [J].
 IMPACT_LOSS, JOINT_STOP_LOSS = 0, 1
 LOSSES = 2
+# Of what gives way [J].
+STORED, DAMPED = 0, 1
+ELASTIC_SIZE = 2
 
 
 class StateLayout(NamedTuple):
@@ -42,6 +47,7 @@ class StateLayout(NamedTuple):
     load: int
     loss: int
     scheme: int
+    elastic: int
     size: int
     tracked: int  # how many entries, from the first on, error control looks at: all that derivatives depend on
     extra: int  # nq − n
@@ -49,11 +55,11 @@ class StateLayout(NamedTuple):
 
 
 def state_layout(
-    nq: int, n: int, circuits: int, contacts: int, loads: int = 0, losses: int = 0, scheme: int = 0
+    nq: int, n: int, circuits: int, contacts: int, loads: int = 0, losses: int = 0, scheme: int = 0, elastic: int = 0
 ) -> StateLayout:
-    """The layout for nq positions, n rates, and so many of circuits, contact points, wrenches, losses, schemes."""
-    starts = np.cumsum([0, nq, n, circuits, LEDGER_SIZE, CONTACT_SIZE * contacts, loads, losses, scheme])
-    q, v, current, ledger, contact, load, loss, scheme_start, size = (int(start) for start in starts)
+    """The layout for nq positions, n rates, so many circuits, contact points, wrenches, and last blocks so long."""
+    starts = np.cumsum([0, nq, n, circuits, LEDGER_SIZE, CONTACT_SIZE * contacts, loads, losses, scheme, elastic])
+    q, v, current, ledger, contact, load, loss, scheme_start, elastic_start, size = (int(start) for start in starts)
     return StateLayout(
         q,
         v,
@@ -63,6 +69,7 @@ def state_layout(
         load,
         loss,
         scheme_start,
+        elastic_start,
         size,
         tracked=ledger,
         extra=nq - n,
@@ -85,6 +92,8 @@ class OutputLayout(NamedTuple):
     contact: int
     support: int
     stop: int
+    dry: int
+    tie: int
     size: int
 
 
@@ -101,7 +110,11 @@ OUT_FORCE, OUT_VECTOR, OUT_GAP, OUT_SLIP, OUT_MODE = 0, 1, 4, 5, 8
 OUTPUTS_PER_CONTACT = 9
 
 
-def output_layout(n: int, motors: int, contacts: int, support: int = 0, stops: int = 0) -> OutputLayout:
-    """The columns for n joints, so many motors, contact points and joint stops, and so many of a base's support."""
-    starts = np.cumsum([0, n, motors, motors, motors, 3, ENERGIES, OUTPUTS_PER_CONTACT * contacts, support, stops])
+def output_layout(
+    n: int, motors: int, contacts: int, support: int = 0, stops: int = 0, dry: int = 0, ties: int = 0
+) -> OutputLayout:
+    """The columns for n joints, so many motors, contact points, joint stops, joints that rub, ties, and so many of a
+    base's support."""
+    parts = [n, motors, motors, motors, 3, ENERGIES, OUTPUTS_PER_CONTACT * contacts, support, stops, dry, ties]
+    starts = np.cumsum([0, *parts])
     return OutputLayout(*(int(start) for start in starts))

@@ -104,7 +104,9 @@ VISCOUS = 4  # [s/m]: adds c s to the coefficient
 RESTITUTION = 5
 GRIP = 6  # of time stepping: friction along GRIP_AXIS per that across; 1: isotropic
 GRIP_AXIS = 7  # 3: in the body's frame
-CONTACT_LAW_SIZE = 10
+CONTACT_STIFFNESS = 10  # of time stepping: of surface and body along the normal [N/m]; 0: rigid
+CONTACT_DAMPING = 11  # [N s/m]
+CONTACT_LAW_SIZE = 12
 # CouplingArrays.joint, int
 FOLLOWER = 0  # link whose joint follows
 LEADER = 1
@@ -140,7 +142,8 @@ Q_REF = 2  # [rad; N m for an open torque]
 V_REF = 3  # [rad/s]
 DIDT = 4  # [A/s]
 DRAG = 5  # gear friction that is not part of GEAR_DAMPING, against v [N m]
-MOTOR_STATE_SIZE = 6
+DRY_DRAG = 6  # that of a gear whose friction holds at rest, a row's: positive against v > 0 [N m or N]
+MOTOR_STATE_SIZE = 7
 # Workspace.contacts: what is known of each candidate, whether it has rows or not
 NORMAL = 0  # 3: surface normal in W
 TANGENT = 3  # 3: smoothed slip direction in W
@@ -168,7 +171,7 @@ ROW_OFFSET = 19  # of a joint row: what its two joints, times its coefficients, 
 ROW_STATE_SIZE = 20
 # Workspace.active, int: of each row
 ROW_KIND = 0
-OWNER = 1  # candidate, coupling or, counted on behind the couplings, joint stop
+OWNER = 1  # candidate, tie, coupling or, counted on behind the couplings, joint stop, then dry friction of a joint
 BODY_A = 2  # link, or the following joint of a joint row
 BODY_B = 3  # link at the other end, -1 for the world; the leading joint of a joint row
 LAW = 4  # FRICTION_SIGNED unless the sign of the force decides about DIRECTION

@@ -11,11 +11,13 @@ from functools import partial
 import numpy as np
 
 from dynsim.compile.clearance import gaps
-from dynsim.compile.contact_law import JointStop, compile_unilateral, joint_stops
+from dynsim.compile.contact_law import DryFriction, JointStop, compile_unilateral, dry_frictions, joint_stops
 from dynsim.compile.control import JointControl
 from dynsim.compile.model import Model
 from dynsim.compile.shapes import compile_shapes
+from dynsim.compile.snake_tree import SnakeTree
 from dynsim.compile.tables import compile_contacts, compile_couplings, compile_drives, compile_loads, compile_support
+from dynsim.config.problems import listed
 from dynsim.dynamics import state as kst
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.derivative import System, new_workspace
@@ -27,6 +29,7 @@ from dynsim.engine.compilation import kernels_logged
 from dynsim.engine.equilibrium import Balance, balanced, shifted
 from dynsim.engine.method import AUTO, Choice, choose
 from dynsim.engine.outcome import check_size
+from dynsim.engine.snake_start import begun
 from dynsim.errors import ModelError, ScenarioError
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts import events as kev
@@ -62,6 +65,7 @@ class Prepared:
     stops: list[JointStop]
     choice: Choice
     balance: Balance | None = None
+    dry: Sequence[DryFriction] = ()
 
     @property
     def kind(self) -> str:
@@ -106,6 +110,9 @@ def prepare(
         The record would be larger than ``record.size_limit_GB``, or the explicit method would need too many steps.
     """
     described, contacts = build.robot_and_contacts(scenario)
+    piloted: JointControl | None = None
+    if isinstance(described, SnakeTree):
+        described, piloted = begun(scenario, described)
     if motors is not None:
         described = replace(described, motors=tuple(motors))
     model = recall("model", lambda: Model(described), described)
@@ -119,8 +126,13 @@ def prepare(
     real = scenario.config.contacts.law == "unilateral"
     stops = joint_stops(robot) if real else []
     stepped = scenario.integrator.method == "time_stepping"
-    layout = state_layout(model.nq, n, robot.circuits, c, len(loads), kst.LOSSES if real else 0, 1 if stepped else 0)
-    columns = output_layout(n, na, c, ks.OUTPUTS if robot.base else 0, len(stops))
+    dry = dry_frictions(robot) if stepped else []
+    if not stepped:
+        _check_friction(robot)
+    gives = bool(robot.ties) or any(contact.stiffness > 0.0 for contact in contacts)
+    sizes = kst.LOSSES if real else 0, 1 if stepped else 0, kst.ELASTIC_SIZE if gives else 0
+    layout = state_layout(model.nq, n, robot.circuits, c, len(loads), *sizes)
+    columns = output_layout(n, na, c, ks.OUTPUTS if robot.base else 0, len(stops), len(dry), len(robot.ties))
     if times is None:
         times = sample_times(scenario, layout, columns, n)
     if stepped and robot.base is not None:
@@ -129,14 +141,14 @@ def prepare(
             "take auto, or a plant without mobile base",
             keys=("integrator", "method"),
         )
-    joint_rows = len(robot.couplings) + len(stops)
+    joint_rows = len(robot.couplings) + len(stops) + len(dry) + len(robot.ties)
     _check_work(scenario, n, c + joint_rows, scenario.integrator.method)
-    control = _control(scenario, model, contacts, progress)
+    control = piloted or _control(scenario, model, contacts, progress)
     if not real:
         _check_references(scenario, model, contacts, control)
     options, size = scenario.integrator, n + ka.row_limit(c, joint_rows) + robot.circuits
     sampled = control.sample_time is not None
-    drives = compile_drives(robot, k_p=list(control.k_p), k_d=list(control.k_d), sampled=sampled)
+    drives = compile_drives(robot, k_p=list(control.k_p), k_d=list(control.k_d), sampled=sampled, dry=stepped)
     choice = recall(
         "choice", lambda: choose(options, model, contacts, control, drives), options, model, control, places, *drives
     )
@@ -158,7 +170,7 @@ def prepare(
         dense=np.zeros((size, size + 1)) if options.solver == "m_star" else None,
         couplings=compile_couplings(robot),
         shapes=compile_shapes(robot, contacts),
-        unilateral=compile_unilateral(robot, contacts, stops, slow_slip(options.atol)) if real else None,
+        unilateral=compile_unilateral(robot, contacts, stops, slow_slip(options.atol), dry) if real else None,
     )
     stepping = None
     if method == ki.TIME_STEPPING and system.unilateral is not None:
@@ -193,7 +205,21 @@ def prepare(
         stepping=stepping,
         lanes=has_forms(system),
     )
-    return Prepared(model, contacts, control, system, run, new_workspace(system), loads, stops, choice, balance)
+    return Prepared(model, contacts, control, system, run, new_workspace(system), loads, stops, choice, balance, dry)
+
+
+def _check_friction(robot: Robot) -> None:
+    """Refuse friction that holds joints at rest, and ties, where the method has none."""
+    if robot.ties:
+        raise ModelError(f"tie {robot.ties[0].name}: only integrator.method: time_stepping has ties", keys=("plant",))
+    rubbing = [link.joint for link in robot.links if link.friction > 0.0]
+    rubbing += [motor.joint for motor in robot.motors if isinstance(motor, Motor) and motor.dry_friction > 0.0]
+    if rubbing:
+        raise ModelError(
+            f"dry friction of {listed(rubbing)}: only time stepping has it; take integrator.method: time_stepping, "
+            "or a damping instead",
+            keys=("plant",),
+        )
 
 
 def _ticks(control: JointControl) -> tuple[np.ndarray, np.ndarray] | None:

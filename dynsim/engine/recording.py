@@ -75,6 +75,9 @@ def make_record(
             record.add(name, integral, "J", description=text)
     if run.stepping is not None:
         record.add("loss_scheme", run.states("scheme")[:, 0], "J", description=metrics.SCHEME)
+    if run.states("elastic").size:
+        for integral, (name, text) in zip(_by_column(run.states("elastic")), metrics.ELASTIC.items(), strict=True):
+            record.add(name, integral, "J", description=text)
     others = 0 if pushed is None else len(robot.bodies)
     shown = [*range(len(prepared.loads) - others), *(pushed or ())]
     if shown:
@@ -111,7 +114,7 @@ def _by_column(table: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _add_unilateral(record: Record, prepared: Prepared) -> None:
-    """Modes of the contacts, forces of the joint stops."""
+    """Modes of the contacts, forces of joint stops, dry frictions and ties."""
     run, robot = prepared.run, prepared.model.robot
     names = tuple(contact.name for contact in prepared.contacts)
     modes = run.outputs("contact")[:, :, kst.OUT_MODE]
@@ -124,6 +127,15 @@ def _add_unilateral(record: Record, prepared: Prepared) -> None:
             force[:, joints.index(stop.joint)] += stop.side * column
         unit = " or ".join(dict.fromkeys(units[joint] for joint in joints))
         record.add("stop_force", force, unit, labels=joints, description="of joint stops; positive at a lower limit")
+    if prepared.dry:
+        units = {link.joint: link.units[3] for link in robot.links}
+        joints = tuple(friction.joint for friction in prepared.dry)
+        unit = " or ".join(dict.fromkeys(units[joint] for joint in joints))
+        record.add("joint_friction", run.outputs("dry"), unit, labels=joints, description="dry friction on the joints")
+    if robot.ties:
+        unit = " or ".join(dict.fromkeys("N m" if tie.turns else "N" for tie in robot.ties))
+        names = tuple(tie.name for tie in robot.ties)
+        record.add("tie_force", run.outputs("tie"), unit, labels=names, description="on the first body of each tie")
 
 
 def _add_base(record: Record, prepared: Prepared, base: MobileBase, as_planned: bool) -> None:

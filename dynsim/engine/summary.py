@@ -44,6 +44,10 @@ INTEGRALS = {
 }
 
 # Those that runs under the unilateral law have beside them.
+ELASTIC = {
+    "energy_elastic": "energy that contacts and ties have stored since the start",
+    "loss_damper": "energy that dampers of contacts and ties take, and what ties lose beyond their bounds",
+}
 LOSSES = {"loss_impact": "energy that impacts of contacts take", "loss_stop": "energy that impacts at joint stops take"}
 
 SCHEME = "energy that the steps of time stepping take; negative: that they make"
@@ -134,6 +138,7 @@ def summarise(record: Record, scenario: Scenario, prepared: Prepared, wall: floa
         "friction_heat_J": final("heat_friction"),
         **({} if unilateral is None else {f"{key}_J": final(name) for key, name in _LOSS_KEYS.items()}),
         **({} if run.stepping is None else {"scheme_loss_J": final("loss_scheme")}),
+        **({"damper_loss_J": final("loss_damper")} if "loss_damper" in record else {}),
         **_loads(record),
         "energy_turnover_J": turnover,
         "energy_residual_relative": residual / scale if scale > 0.0 else 0.0,

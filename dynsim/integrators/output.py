@@ -40,6 +40,7 @@ def fill_output(system: System, ws: Workspace, run: Run, out):
             - motor[a, ka.J_M] * joints[i, ka.QDD]
             - motor[a, ka.D_M] * joints[i, ka.QD]
             - motors[a, ka.DRAG]
+            - motors[a, ka.DRY_DRAG]
         )
     point_position(ws, run.hand_link, run.hand_point, out[columns.hand : columns.hand + 3])
     out[columns.energy] = kinetic_energy(system.model, ws)
@@ -54,16 +55,20 @@ def fill_output(system: System, ws: Workspace, run: Run, out):
             out[k + kst.OUT_VECTOR + s] = state[c, ka.FORCE_VECTOR + s]
             out[k + kst.OUT_SLIP + s] = state[c, ka.SLIP_VELOCITY + s]
         k += kst.OUTPUTS_PER_CONTACT
-    stop_forces(system.unilateral, out[columns.stop :])
+    row_forces(system.unilateral, out[columns.stop :], out[columns.dry :], out[columns.tie :])
 
 
 @internal_kernel
-def stop_forces(unilateral: UnilateralArrays | None, out):
-    """Forces of the joint stops, (s,) or more."""
+def row_forces(unilateral: UnilateralArrays | None, stop, dry, tie):
+    """Forces of joint stops, (s,), of dry frictions, (d,), and of ties, (e,), or more."""
     if unilateral is None:  # known to the compiler
         return
     for k in range(unilateral.stop.shape[0]):
-        out[k] = unilateral.stop[k, ku.STOP_FORCE]
+        stop[k] = unilateral.stop[k, ku.STOP_FORCE]
+    for k in range(unilateral.dry.shape[0]):
+        dry[k] = unilateral.dry[k, ku.DRY_FORCE]
+    for k in range(unilateral.tie.shape[0]):
+        tie[k] = unilateral.tie[k, ku.TIE_FORCE]
 
 
 @internal_kernel

@@ -111,6 +111,7 @@ class Link:
     R_PJ, p_PJ : (3, 3), (3,) placement of the joint in the parent's frame [m]
     damping : float
         Viscous loss D of the joint [N m s/rad or N s/m].
+    friction : of its bearing, against any motion and up to which it holds [N m or N]; time stepping only
     lower, upper, velocity_limit, effort_limit : float
         Limits of the joint [rad or m; rad/s or m/s; N m or N]. Nothing enforces them: a run that passes one warns.
     parameter : what else its kind of joint needs
@@ -141,6 +142,7 @@ class Link:
     parameter: float = 0.0
     joint_of_rows: str | None = None
     armature: float = 0.0
+    friction: float = 0.0
 
     @property
     def row(self) -> Row:
@@ -225,6 +227,7 @@ class Contact:
     viscous_friction : what each m/s adds to the coefficient [s/m]
     restitution : share of the normal speed that is left after an impact, with its sign turned
     grip_axis : (3,) in the body's frame, or None: friction along it is ``grip`` times that across; time stepping only
+    stiffness, damping : of body and surface along the normal [N/m, N s/m], 0: rigid; time stepping only
     radius : of sphere or capsule [m]
     tip : (3,) or None
         The other end of a capsule's axis, in the same frame [m]. Where the surface bends away from the free side the
@@ -245,6 +248,8 @@ class Contact:
     restitution: float = 0.0
     grip: float = 1.0
     grip_axis: Array | None = None
+    stiffness: float = 0.0
+    damping: float = 0.0
     radius: float = 0.0
     tip: Array | None = None
 
@@ -260,6 +265,27 @@ class Contact:
 
 
 @dataclass(frozen=True)
+class Foot:
+    """A sphere of a body that can touch one of the scenario's surfaces, whatever contact points that declares.
+
+    On a body that spins about its own centre it is a wheel: the point that touches is that of the sphere, so it rolls.
+
+    Attributes
+    ----------
+    point : (3,) centre of the sphere in the body's frame [m]; radius [m]
+    surface : name of the surface in the scenario
+    grip_axis : (3,) in the body's frame, or None: no friction along it, as of a wheel without mass
+    """
+
+    name: str
+    body: str
+    point: Array
+    radius: float
+    surface: str
+    grip_axis: Array | None = None
+
+
+@dataclass(frozen=True)
 class Coupling:
     """A joint that follows another one, q = ratio q_leader + offset: a gear, a belt, a URDF mimic joint.
 
@@ -270,6 +296,41 @@ class Coupling:
     leader: str
     ratio: float = 1.0
     offset: float = 0.0
+
+
+@dataclass(frozen=True)
+class Tie:
+    """One direction in which two bodies hold each other by a spring, a damper and a bound; time stepping only.
+
+    The force on ``body``, along the axis or about it, and its opposite on ``other`` is f = −k (x − x_0) − c dx/dt
+    within its bound, x = axis · (point − other point), or the part along the axis of the rotation of ``body`` against
+    ``other``. Beyond the bound x_0 moves. Bodies may be of different trees.
+
+    Attributes
+    ----------
+    point, other_point : (3,) in the frames of ``body`` and ``other`` [m]
+    axis : (3,) in the frame of ``body``
+    stiffness, damping : k, c [N/m, N s/m; N m/rad, N m s/rad]
+    bound : of the force [N or N m]
+    turns : about the axis, not along it
+    pushes : one-sided: it only pushes ``body`` along the axis, without a bound
+    rest : x_0 [m or rad]; NaN: x when the tie begins
+    holds : from the start on
+    """
+
+    name: str
+    body: str
+    other: str
+    axis: Array
+    stiffness: float
+    damping: float = 0.0
+    bound: float = np.inf
+    point: Array = field(default_factory=lambda: np.zeros(3))
+    other_point: Array = field(default_factory=lambda: np.zeros(3))
+    turns: bool = False
+    pushes: bool = False
+    rest: float = 0.0
+    holds: bool = True
 
 
 @dataclass(frozen=True)
@@ -310,7 +371,8 @@ class Robot:
 
     ``hand``: the controlled point (body name, point in its frame [m]); ``q0``: initial configuration [rad or m], zero
     unless given; ``frames``: further names to attach points to; ``fixed_shapes``, ``fixed_inertia``: what stands still
-    in the world; ``couplings`` of joints to joints; ``base``: what it drives on, None: it stands fixed or floats.
+    in the world; ``couplings`` of joints to joints; ``ties`` of bodies to bodies; ``base``: what it drives on, None: it
+    stands fixed or floats; ``feet``: what of it is made to touch, such as wheels.
     """
 
     name: str
@@ -322,8 +384,10 @@ class Robot:
     frames: tuple[Frame, ...] = ()
     fixed_shapes: tuple[Shape, ...] = ()
     couplings: tuple[Coupling, ...] = ()
+    ties: tuple[Tie, ...] = ()
     base: MobileBase | None = None
     fixed_inertia: Inertia = field(default_factory=lambda: Inertia(0.0))
+    feet: tuple[Foot, ...] = ()
 
     @property
     def bodies(self) -> tuple[str, ...]:

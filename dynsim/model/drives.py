@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+SMOOTHING = 1e-2
+"""Speed below which gear friction fades where nothing is said of it [rad/s]."""
 
 
 @dataclass(frozen=True)
@@ -20,6 +22,7 @@ class Motor:
     torque_constant : K [N m/A = V s/rad]
     resistance : R [Ω]; inductance : L [H]; rotor_inertia : I_m [kg m²]
     gear_ratio : k; gear_damping : d_m on the motor side [N m s/rad]
+    dry_friction : of the gear, at the joint [N m or N]: it holds at rest; time stepping only
     voltage_limit : [V], inf for none
     current_limit : [A] that its driver keeps, inf for none
     nominal_current : [A] that it stands for ever; nominal_torque : at the joint [N m or N]; inf where not known
@@ -41,6 +44,7 @@ class Motor:
     current_limit: float = np.inf
     nominal_current: float = np.inf
     nominal_torque: float = np.inf
+    dry_friction: float = 0.0
 
     @property
     def greatest_current(self) -> float:
@@ -76,6 +80,7 @@ class Servo:
     velocity_mode : the loop follows the rate of the reference, not its position
     armature : J_m [kg m²]; reflected_damping : D_m [N m s/rad]
     coulomb_friction : τ_c [N m]; coulomb_speed : v_s [rad/s], below which it fades
+        None: in time stepping it does not, and holds at rest; elsewhere below SMOOTHING
     voltage_limit, current_limit : [V], [A]; torque_limit : of the current, K_m i [N m]; inf for none
     nominal_current, nominal_torque : as of a :class:`Motor`
     free_drag : viscous drag of the gear while the servo is off [N m s/rad]
@@ -92,7 +97,7 @@ class Servo:
     armature: float = 0.0
     reflected_damping: float = 0.0
     coulomb_friction: float = 0.0
-    coulomb_speed: float = 1e-2
+    coulomb_speed: float | None = None
     voltage_limit: float = np.inf
     current_limit: float = np.inf
     torque_limit: float = np.inf
@@ -106,6 +111,11 @@ class Servo:
     def joint_constant(self) -> float:
         """K_m [N m/A = V s/rad] at the joint."""
         return self.torque_constant
+
+    @property
+    def dry_friction(self) -> float:
+        """Friction of the gear that is not smoothed where the method can do without [N m]."""
+        return self.coulomb_friction if self.coulomb_speed is None else 0.0
 
     @property
     def greatest_current(self) -> float:

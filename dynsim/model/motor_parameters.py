@@ -57,6 +57,9 @@ class MotorParameters(DriveParameters):
     rotor_inertia_kg_m2: NonNegative
     gear_ratio: Positive = Field(description="motor turns per joint turn; at a prismatic joint rad of the motor per m")
     gear_damping_N_m_s_per_rad: NonNegative = Field(default=0.0, description="on the motor side")
+    coulomb_friction_N_m: NonNegative = Field(
+        default=0.0, description="of the gear, at the joint: holds at rest; N at a prismatic joint; time stepping only"
+    )
     voltage_limit_V: Positive | None = None
     nominal_current_A: Positive | None = Field(
         default=None, description="that it stands for ever: a run that needs more warns"
@@ -87,6 +90,7 @@ class MotorParameters(DriveParameters):
             rotor_inertia=self.rotor_inertia_kg_m2,
             gear_ratio=self.gear_ratio,
             gear_damping=self.gear_damping_N_m_s_per_rad,
+            dry_friction=self.coulomb_friction_N_m,
             voltage_limit=limit(self.voltage_limit_V),
             mass=self.mass_kg,
             mass_point=self.mass_point,

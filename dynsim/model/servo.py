@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.drive import servo as law
-from dynsim.model.drives import Servo
+from dynsim.model.drives import SMOOTHING, Servo
 
 Array = NDArray[np.float64]
 
@@ -23,7 +23,8 @@ def servo_row(m: Servo) -> Array:
     row[ka.K_P], row[ka.K_D], row[ka.K_V] = m.k_p, m.k_d, m.k_v
     row[ka.U_MAX] = m.voltage_limit
     row[ka.I_MAX] = m.greatest_current
-    row[ka.COULOMB], row[ka.COULOMB_SPEED], row[ka.FREE_DRAG] = m.coulomb_friction, m.coulomb_speed, m.free_drag
+    speed = SMOOTHING if m.coulomb_speed is None else m.coulomb_speed
+    row[ka.COULOMB], row[ka.COULOMB_SPEED], row[ka.FREE_DRAG] = m.coulomb_friction, speed, m.free_drag
     return row
 
 

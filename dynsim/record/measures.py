@@ -12,8 +12,8 @@ from dynsim.record import Record
 
 # Where the electrical energy goes, in the order in which it is drawn and printed.
 SINKS = ("heat_joule", "loss_gear", "loss_joint", "heat_friction")
-# Sinks that only some runs have: under the unilateral law, by time stepping.
-MORE_SINKS = ("loss_impact", "loss_stop", "loss_scheme")
+# Sinks that only some runs have: under the unilateral law, by time stepping. Elastic energy counts from the start.
+MORE_SINKS = ("loss_impact", "loss_stop", "loss_damper", "energy_elastic", "loss_scheme")
 STORES = ("energy_kinetic", "energy_potential", "energy_magnetic")
 
 RESIDUAL_LIMIT = 1e-6

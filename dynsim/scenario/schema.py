@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -11,10 +11,11 @@ from pydantic import Field, field_validator, model_validator
 
 from dynsim.config.base import BodyPoint, NonNegative, Positive, StrictConfig, Vector3, error_at
 from dynsim.config.problems import Origin, listed
-from dynsim.library.families import member, union
+from dynsim.library.families import engine, section_defaults, union
 from dynsim.record import notebook
 from dynsim.scenario.effect import idle_keys, is_set
 from dynsim.scenario.loads import LoadConfig
+from dynsim.scenario.sensors import Sensors
 
 # Bytes of the name of a folder on common file systems.
 NAME_LIMIT = 255
@@ -22,7 +23,15 @@ NAME_LIMIT = 255
 
 # Keys that only one law reads.
 BILATERAL_KEYS = ("slip_smoothing_m_s", "pulling_friction")
-UNILATERAL_KEYS = ("static_friction", "stribeck_m_s", "viscous_friction_s_per_m", "restitution", "grip")
+UNILATERAL_KEYS = (
+    "static_friction",
+    "stribeck_m_s",
+    "viscous_friction_s_per_m",
+    "restitution",
+    "grip",
+    "stiffness_N_per_m",
+    "damping_N_s_per_m",
+)
 # The trapezoidal rule of time stepping.
 THETA = 0.5
 Share = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
@@ -51,6 +60,10 @@ class ContactPoint(BodyPoint):
     static_friction: NonNegative | None = Field(default=None, description="default: that of contacts; unilateral law")
     restitution: Share | None = Field(default=None, description="default: that of contacts; unilateral law")
     grip: Grip | None = Field(default=None, description="anisotropic friction; only of integrator.method time_stepping")
+    stiffness_N_per_m: Positive | None = Field(
+        default=None, description="default: that of contacts; time_stepping only"
+    )
+    damping_N_s_per_m: NonNegative | None = Field(default=None, description="default: that of contacts")
     enabled: bool = True
 
 
@@ -75,6 +88,10 @@ class Contacts(StrictConfig):
     restitution: Share = Field(
         default=0.0, description="share of the normal speed that an impact turns round; unilateral law"
     )
+    stiffness_N_per_m: Positive | None = Field(
+        default=None, description="of body and surface along the normal; default: rigid; time_stepping only"
+    )
+    damping_N_s_per_m: NonNegative = Field(default=0.0, description="along the normal, beside the stiffness")
     slip_smoothing_m_s: Positive = Field(default=1e-3, description="v_s of the slip direction v_t/√(v_t² + v_s²)")
     pulling_friction: Literal["signed", "dissipative"] = Field(
         default="dissipative", description="f_t = μ f_n as printed in the paper, or μ |f_n|"
@@ -96,6 +113,14 @@ class Contacts(StrictConfig):
         )
         return kinetic, kinetic if static is None else static
 
+    def compliance(self, point: ContactPoint | None = None) -> tuple[float, float]:
+        """Stiffness [N/m], 0 of a rigid one, and damping [N s/m] of a point: its own, else those of contacts."""
+        stiffness, damping = (
+            getattr(self, key) if point is None or getattr(point, key) is None else getattr(point, key)
+            for key in ("stiffness_N_per_m", "damping_N_s_per_m")
+        )
+        return stiffness or 0.0, damping
+
     @property
     def other_keys(self) -> tuple[str, ...]:
         """Keys that only the other law reads."""
@@ -113,6 +138,7 @@ class Contacts(StrictConfig):
             raise error_at(
                 "candidates", f"{self.candidates!r} would glue all of them to their surfaces; it needs law: unilateral"
             )
+        self._check_compliance()
         kinetic, static = self.coefficients()
         if static < kinetic:
             raise error_at("static_friction", f"is less than friction {self.friction:g}; it must hold as much or more")
@@ -128,6 +154,19 @@ class Contacts(StrictConfig):
                     f"static_friction {static:g} is less than friction {kinetic:g}; it must hold as much or more",
                 )
         return self
+
+    def _check_compliance(self) -> None:
+        """Refuse damping where nothing gives way, and restitution where something does."""
+        for where, point in {"": None, **{f"points.{name}.": point for name, point in self.points.items()}}.items():
+            config = self if point is None else point
+            soft = self.compliance(point)[0] > 0.0
+            anywhere = soft or (point is None and not all(p.stiffness_N_per_m is None for p in self.points.values()))
+            if config.damping_N_s_per_m and not anywhere:
+                raise error_at(f"{where}damping_N_s_per_m", "is that of what gives way: give stiffness_N_per_m too")
+            restitution = self.restitution if point is None or point.restitution is None else point.restitution
+            if soft and restitution > 0.0:
+                key = "restitution" if config.restitution else "stiffness_N_per_m"
+                raise error_at(f"{where}{key}", f"what gives way has no restitution ({restitution:g}), but a damping")
 
 
 class Initial(StrictConfig):
@@ -212,6 +251,13 @@ class Metrics(StrictConfig):
     settle_s: NonNegative = Field(default=2.0, description="tracking errors count from this time on")
 
 
+def laid_under(defaults: Any, said: Any) -> Any:
+    """``said`` with ``defaults`` where it says nothing; mappings merge."""
+    if not (isinstance(defaults, Mapping) and isinstance(said, Mapping)):
+        return said
+    return {**defaults, **{key: laid_under(defaults.get(key), value) for key, value in said.items()}}
+
+
 class ScenarioConfig(StrictConfig):
     """A dynsim scenario."""
 
@@ -228,9 +274,18 @@ class ScenarioConfig(StrictConfig):
     )
     initial: Initial | None = Field(default=None, description="posture and currents of the start")
     loads: dict[str, LoadConfig] = Field(default={}, description="forces, torques and payloads by name")
+    sensors: Sensors | None = Field(default=None, description="what a sampled controller is told of the robot")
     integrator: Integrator = Integrator()
     record: RecordOptions = RecordOptions()
     metrics: Metrics = Metrics()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_plant(cls, data: Any) -> Any:
+        """Some plants want other defaults in other sections."""
+        if not isinstance(data, Mapping):
+            return data
+        return laid_under(section_defaults(data.get("plant"), data), data)
 
     @model_validator(mode="after")
     def _check_stepped_contacts(self) -> Self:
@@ -247,6 +302,19 @@ class ScenarioConfig(StrictConfig):
                     f"contacts.points.{name}.grip",
                     f"needs integrator.method: time_stepping; {self.integrator.method} finds begin and end of slip by "
                     "one coefficient for all directions",
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _check_stiffness(self) -> Self:
+        """The event-driven methods know rigid contacts only."""
+        configs: dict[str, Contacts | ContactPoint] = {"contacts": self.contacts}
+        configs |= {f"contacts.points.{name}": point for name, point in self.contacts.points.items()}
+        for where, config in configs.items():
+            if config.stiffness_N_per_m is not None and self.integrator.method != "time_stepping":
+                raise error_at(
+                    f"{where}.stiffness_N_per_m",
+                    f"needs integrator.method: time_stepping; contacts of {self.integrator.method} are rigid",
                 )
         return self
 
@@ -345,8 +413,8 @@ class Scenario:
 
     @property
     def engine(self) -> str:
-        """What simulates the plant: the ``ENGINE`` of its module."""
-        return str(member("plant", self.plant.type).ENGINE)
+        """What simulates the plant."""
+        return engine(self.plant)
 
     @property
     def resolved(self) -> dict[str, Any]:

@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import lsq_linear
 
 from dynsim.dynamics.contact.cone.problem import (
     BOTH_WAYS,
+    BOX,
     CONE,
     CONE_ROOM,
     NO_SOLUTION,
@@ -42,6 +44,11 @@ def violation(W, b, kind, mu, f):
         w = np.trace(W[k : k + 3, k : k + 3]) / 3 if kind[k] == CONE else W[k, k]
         if kind[k] == BOTH_WAYS:
             worst = max(worst, abs(u[k]))
+            k += 1
+            continue
+        if kind[k] == BOX:
+            # Within the bounds it does not move; at one of them it moves against the force.
+            worst = max(worst, w * (abs(f[k]) - mu[k]), min(abs(u[k]), abs(w * (f[k] + np.sign(u[k]) * mu[k]))))
             k += 1
             continue
         # One of the two vanishes, and neither is negative.
@@ -140,6 +147,37 @@ def test_random_problems(seeds):
         if not (0.0 <= residual <= 1e-9 * scale and violation(W, b, kind, mu, f) <= 3e-9 * scale):
             unsolved.append((seed, residual / scale, violation(W, b, kind, mu, f) / scale))
     assert not unsolved
+
+
+@pytest.mark.parametrize("seeds", [range(1000), pytest.param(range(1000, 5000), marks=pytest.mark.slow)])
+def test_random_problems_with_bounded_rows(seeds):
+    """Contacts of bodies whose joints rub, with bounds of any size; some of those rows give way."""
+    unsolved = []
+    for seed in seeds:
+        W, b, kind, mu = random_problem(seed)
+        random = np.random.default_rng(seed)
+        rubs = (kind == BOTH_WAYS) | (kind == ONE_WAY)
+        kind[rubs] = BOX
+        mu[rubs] = (
+            random.choice([0.0, 0.1, 1.0, 10.0, 1e6], size=rubs.sum()) * np.abs(b).max() / max(np.diag(W).max(), 1e-9)
+        )
+        W += np.diag(np.where(rubs, random.choice([0.0, 0.3], size=len(b)), 0.0) * np.diag(W))
+        scale = np.abs(b).max()
+        residual, f = solve(W, b, kind, mu, tolerance=1e-10 * scale)
+        if not (0.0 <= residual <= 1e-9 * scale and violation(W, b, kind, mu, f) <= 3e-9 * scale):
+            unsolved.append((seed, residual / scale, violation(W, b, kind, mu, f) / scale))
+    assert not unsolved
+
+
+def test_bounded_rows_are_a_quadratic_problem():
+    """Without cones f is the least of f·W f/2 + b·f within the bounds."""
+    rng = np.random.default_rng(1)
+    for _ in range(10):
+        A, b, mu = rng.normal(size=(6, 6)), rng.normal(size=6), rng.uniform(0.05, 0.5, size=6)
+        expected = lsq_linear(A.T, -np.linalg.solve(A, b), (-mu, mu), tol=1e-14).x
+        residual, f = solve(A @ A.T, b, [BOX] * 6, mu)
+        assert residual <= 1e-12
+        np.testing.assert_allclose(f, expected, rtol=0, atol=1e-7)
 
 
 def test_the_residual_is_that_of_the_forces_returned():

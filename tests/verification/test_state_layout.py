@@ -39,7 +39,7 @@ def width(standard: StateLayout | OutputLayout, name: str) -> int:
 
 def scattered_state(standard: StateLayout, gap: int) -> StateLayout:
     """Currents first and positions last, then the integrals in another order too."""
-    head, tail = ("current", "v", "q"), ("contact", "load", "scheme", "loss", "ledger")
+    head, tail = ("current", "v", "q"), ("contact", "elastic", "load", "scheme", "loss", "ledger")
     tracked = scatter(standard, head, gap).size
     return scatter(standard, head + tail, gap, tracked=tracked)
 
@@ -60,8 +60,8 @@ def part(
     return values[..., start : start + width(standard, name)]
 
 
-BLOCKS = ("q", "v", "current", "ledger", "contact", "load", "loss", "scheme")
-COLUMNS = ("vdot", "current", "voltage", "torque", "hand", "energy", "contact", "support", "stop")
+BLOCKS = ("q", "v", "current", "ledger", "contact", "load", "loss", "scheme", "elastic")
+COLUMNS = ("vdot", "current", "voltage", "torque", "hand", "energy", "contact", "support", "stop", "dry", "tie")
 
 
 class Pair:

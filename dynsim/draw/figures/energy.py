@@ -23,6 +23,8 @@ TERMS = {
     "heat_friction": ("contact friction", "#882255"),
     "loss_impact": ("impacts of contacts", "#8C6D31"),
     "loss_stop": ("impacts at joint stops", "#F0E442"),
+    "loss_damper": ("dampers of contacts and ties", "#44AA99"),
+    "energy_elastic": ("Δ elastic energy", "#AA4499"),
     "loss_scheme": ("taken by time steps", "#999933"),
     "energy_kinetic": ("Δ kinetic energy", "#009E73"),
     "energy_potential": ("Δ potential energy", "#CC79A7"),

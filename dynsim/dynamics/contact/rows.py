@@ -35,7 +35,8 @@ def set_modes(
 ):
     """Give every candidate its mode, (c,) of OPEN, SLIDING or STICKING, and rebuild the table of rows.
 
-    Behind the couplings come the joint stops that are closed, then the candidates.
+    Behind the couplings come the joints with dry friction, the joint stops that are closed, then the candidates, and
+    ties between bodies.
 
     Call it right after ``derivative`` at the state where modes change, and ``derivative`` once more afterwards: a
     candidate that begins to stick is held where the last evaluation has seen it. Its slip should have come to rest:
@@ -50,7 +51,8 @@ def set_modes(
         rows[k, ka.DIRECTION], rows[k, ka.DIRECTION + 1] = rows[k, ka.ROW], rows[k, ka.ROW + 1]
         rows[k, ka.ROW_OFFSET] = couplings.law[k, ka.OFFSET]
     if unilateral is not None:
-        p = stop_rows(unilateral, ws, p)
+        p = dry_rows(unilateral, ws, p)
+        p = stop_rows(unilateral, couplings.joint.shape[0], ws, p)
     joint_rows = p
     for k in range(contacts.link.shape[0]):
         i = contacts.link[k, ka.LINK]
@@ -67,6 +69,8 @@ def set_modes(
             for _ in range(ka.MOST_ROWS):
                 new_row(ws, p, ka.STICKING_ROW, k, i)
                 p += 1
+    if unilateral is not None:
+        p = tie_rows(unilateral, ws, p)
     ws.counts[ka.ROWS], ws.counts[ka.COUPLED], ws.counts[ka.HELD] = p, joint_rows, held
     for k in range(contacts.link.shape[0]):
         if modes[k] == ka.OPEN:
@@ -80,9 +84,35 @@ def set_modes(
 
 
 @internal_kernel
-def stop_rows(unilateral: UnilateralArrays, ws: Workspace, p):
+def dry_rows(unilateral: UnilateralArrays, ws: Workspace, p):
+    """A joint row, of one joint, for every joint with dry friction; returns the number of rows then."""
+    table, owner = unilateral.dry_table, p + unilateral.stop_table.shape[0]
+    for k in range(table.shape[0]):
+        joint = table[k, ku.DRY_JOINT]
+        new_row(ws, p, ka.JOINT_ROW, owner + k, joint)
+        ws.active[p, ka.BODY_B] = joint
+        ws.rows[p, ka.ROW], ws.rows[p, ka.DIRECTION] = 1.0, 1.0
+        table[k, ku.DRY_ROW] = p
+        p += 1
+    return p
+
+
+@internal_kernel
+def tie_rows(unilateral: UnilateralArrays, ws: Workspace, p):
+    """A row between two bodies for every tie that holds; returns the number of rows then."""
+    table = unilateral.tie_table
+    for k in range(table.shape[0]):
+        if table[k, ku.TIE_HOLDS] == 1:
+            new_row(ws, p, ka.BODY_ROW, k, table[k, ku.TIE_A])
+            ws.active[p, ka.BODY_B], table[k, ku.TIE_ROW] = table[k, ku.TIE_B], p
+            p += 1
+    return p
+
+
+@internal_kernel
+def stop_rows(unilateral: UnilateralArrays, couplings, ws: Workspace, p):
     """A joint row, of one joint, for every stop that is closed; returns the number of rows then."""
-    table, stop, couplings = unilateral.stop_table, unilateral.stop, p
+    table, stop = unilateral.stop_table, unilateral.stop
     for k in range(table.shape[0]):
         stop[k, ku.STOP_FORCE] = 0.0
         if table[k, ku.STOP_CLOSED] == 1:

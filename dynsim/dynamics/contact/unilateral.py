@@ -1,4 +1,4 @@
-"""The unilateral law: tables of candidates and joint stops that only push, and the direction in which a point slides.
+"""The unilateral law: tables of candidates and joint stops that only push, of joints that rub, and the way of slip.
 
 0 ≤ f_n ⟂ gap ≥ 0; a point that slides is driven by n − μ(s) t along t = v_t/|v_t|, one that is at rest is held while
 |f_t| ≤ μ_s f_n. Which candidates are open, slide or stick is constant within a step
@@ -52,6 +52,34 @@ HITS = 3
 STOP_LOSS = 4  # [J]
 CLOSED_TIME = 5  # [s]
 STOP_SIZE = 6
+# UnilateralArrays.dry_table, int
+DRY_JOINT = 0  # link whose joint rubs
+DRY_ROW = 1
+DRY_DRIVE = 2  # whose gear does, -1 for none
+DRY_TABLE_SIZE = 3
+# UnilateralArrays.dry: the force of a joint at rest is any up to the sum of both, in motion that against it [N m or N]
+OF_GEAR, OF_JOINT = 0, 1
+DRY_FORCE = 2  # on the joint [N m or N]
+DRY_SIZE = 3
+# UnilateralArrays.tie_table, int
+TIE_A, TIE_B = 0, 1  # links
+TIE_TURNS = 2  # 1: about its axis, 0: along it
+TIE_KIND = 3  # BOX, ONE_WAY (A is pushed along the axis), or -1 where it does not hold; may be written between steps
+TIE_HOLDS = 4  # 1: it has a row
+TIE_ROW = 5
+TIE_TABLE_SIZE = 6
+# UnilateralArrays.tie; what it may have is written between steps too
+TIE_STIFFNESS, TIE_DAMPING = 0, 1  # [N/m, N s/m; N m/rad, N m s/rad]
+TIE_BOUND = 2  # of a BOX [N or N m]
+TIE_AXIS = 3  # 3: in the axes of A
+TIE_POINT, TIE_OTHER_POINT = 6, 9  # 3 each: on A, on B [m]
+TIE_ATTITUDE = 12  # 9: rotation of B in the axes of A where it is not turned
+TIE_REST = 21  # deflection without force [m or rad]; NaN: what it is when the tie begins
+TIE_FORCE = 22  # on A along or about the axis [N or N m]
+TIE_STORED = 23  # in its spring [J]
+TIE_GIVEN = 24  # how far its rest has moved since it began, there and back [m or rad]
+TIE_REST_NOW, TIE_STORED_NOW, TIE_AT, TIE_IMPLICIT = 25, 26, 27, 28  # of the step that is tried
+TIE_SIZE = 29
 # UnilateralArrays.mode, int: columns
 WANTED, BEFORE, TOUCHING, STRUCK = 0, 1, 2, 3
 GIVES_WAY = 4  # 1: it has come to its static cone, and the kinetic coefficient holds from now on
@@ -75,13 +103,17 @@ NUMBERS = 6
 
 
 class UnilateralArrays(NamedTuple):
-    """c candidates and s joint stops under the unilateral law; p is the most rows that there can be."""
+    """c candidates, s joint stops, d joints with dry friction, e ties; p is the most rows that there can be."""
 
     slide: np.ndarray  # (c, SLIDE_SIZE)
     mode: np.ndarray  # (c, MODE_SIZE) int
     tally: np.ndarray  # (c, TALLY_SIZE)
     stop_table: np.ndarray  # (s, STOP_TABLE_SIZE) int
     stop: np.ndarray  # (s, STOP_SIZE)
+    dry_table: np.ndarray  # (d, DRY_TABLE_SIZE) int; d is zero of methods that smooth such friction
+    dry: np.ndarray  # (d, DRY_SIZE)
+    tie_table: np.ndarray  # (e, TIE_TABLE_SIZE) int, of time stepping alone: see dynsim.integrators.stepping.compliance
+    tie: np.ndarray  # (e, TIE_SIZE)
     place: np.ndarray  # (PLACES, p or c + 2) int
     vector: np.ndarray  # (VECTORS, p)
     room: np.ndarray  # (ROOM, p, p) two matrices of the splits, one of the problem that chooses modes, its scratch

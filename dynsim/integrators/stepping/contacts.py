@@ -29,6 +29,14 @@ from dynsim.dynamics.contact.unilateral import UnilateralArrays, sliding_frictio
 from dynsim.dynamics.tables import Workspace
 from dynsim.dynamics.tree.spatial import dot_vector, point_velocity, six, times_number, vector
 from dynsim.integrators.stepping import tables as kt
+from dynsim.integrators.stepping.compliance import (
+    accept_ties,
+    list_ties,
+    place_ties,
+    soften_contact,
+    soften_ties,
+    spring_energy,
+)
 from dynsim.integrators.stepping.tables import SteppingArrays, geometry, place_joints
 from dynsim.jit.kernel import internal_kernel
 
@@ -69,6 +77,7 @@ def recall(system, s: SteppingArrays, ws: Workspace, y):
         if state[ka.GAP] > TOUCHES:
             continue
         note_place(system, state, k, last)
+        last[kt.STORED] = spring_energy(system.contacts.law[k, ka.CONTACT_STIFFNESS], state[ka.GAP])
         at = vector(ws.contacts, k, ka.POSITION)
         v = point_velocity(six(ws.links, system.contacts.link[k, ka.LINK], ka.V), at)
         for m in range(3):
@@ -89,8 +98,9 @@ def note_place(system, state, k, note):
 
 
 @internal_kernel
-def remember(s: SteppingArrays, y, first, h):
+def remember(unilateral: UnilateralArrays, s: SteppingArrays, y, first, h):
     """The step has been accepted, and its rates are those of y."""
+    accept_ties(unilateral)
     for i in range(s.before.shape[1]):
         s.before[kt.V_LAST, i] = y[first + i]
     for k in range(s.memory.shape[1]):
@@ -107,7 +117,8 @@ def list_contacts(system, s: SteppingArrays, ws: Workspace, h):
 
     What was closed stays on the list while its place goes on: over convex surfaces the midpoint is above them.
     """
-    changed = close_stops(system.unilateral, ws)
+    stops, ties = close_stops(system.unilateral, ws), list_ties(system.unilateral, ws)
+    changed = stops or ties
     for k in range(ws.contacts.shape[0]):
         last = s.memory[kt.LAST, k]
         known = last[kt.LISTED] == 1.0 and goes_on(system, last, ws, k, h)
@@ -178,9 +189,12 @@ def tangent_rows(system, s: SteppingArrays, ws: Workspace):
     """
     state, rows, active = ws.contacts, ws.rows, ws.active
     for r in range(ws.counts[ka.COUPLED]):
-        # Behind the couplings come joint stops.
+        # Behind the couplings come dry frictions, then joint stops.
         s.kind[r] = kc.BOTH_WAYS if r < system.couplings.joint.shape[0] else kc.ONE_WAY
         s.mu[r], rows[r, ka.TARGET] = 0.0, 0.0
+    for k in range(system.unilateral.dry.shape[0]):
+        s.kind[system.unilateral.dry_table[k, ku.DRY_ROW]] = kc.BOX
+    place_ties(system.unilateral, s, ws)
     for k in range(state.shape[0]):
         if active[k, ka.MODE] != ka.STICKING:
             continue
@@ -229,12 +243,15 @@ def turn_rows(law, s: SteppingArrays, ws: Workspace, k, h):
     for m in range(3):
         turn[kt.ADDED + m] = turn[kt.TURNED + m]
     turn[kt.PUSH], turn[kt.MEAN] = 0.0, 0.0
+    soft = law[k, ka.CONTACT_STIFFNESS] > 0.0
+    soften_contact(law, s, ws, k, h)
     if last[kt.CLOSED] == 0.0:
-        if s.rate[0, r] < 0.0 and law[k, ka.RESTITUTION] > 0.0:
+        if not soft and s.rate[0, r] < 0.0 and law[k, ka.RESTITUTION] > 0.0:
             turn[kt.ADDED] = law[k, ka.RESTITUTION] * s.rate[0, r]
         return
-    turn[kt.PUSH] = return_rate(state[ka.GAP], turn[kt.TURNED], last[kt.BUDGET], h)
-    turn[kt.ADDED] -= turn[kt.PUSH]
+    if not soft:
+        turn[kt.PUSH] = return_rate(state[ka.GAP], turn[kt.TURNED], last[kt.BUDGET], h)
+        turn[kt.ADDED] -= turn[kt.PUSH]
     if last[kt.SLID] == 1.0:
         slip = math.sqrt(s.rate[0, r + 1] ** 2 + s.rate[0, r + 2] ** 2)
         # Of a start nothing is known.
@@ -268,7 +285,7 @@ def largest_mobility(W, r):
 
 
 @internal_kernel
-def solve_contacts(law, s: SteppingArrays, ws: Workspace, h):
+def solve_contacts(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, h):
     """Impulses of all rows, by the last ones as a start, and their mean forces into ``ws.rows``; then ``s.memory``.
 
     Where the slip of a contact that was to slide on ends, or turns back, the law is that of the end after all: at most
@@ -281,6 +298,9 @@ def solve_contacts(law, s: SteppingArrays, ws: Workspace, h):
         s.b[r] = s.rate[0, r] - h * rows[r, ka.RHS]
         s.right[r] = s.b[r]
         s.f[r] = s.impulse[start + r] if r < coupled else 0.0
+    for k in range(unilateral.dry.shape[0]):
+        s.mu[unilateral.dry_table[k, ku.DRY_ROW]] = h * (unilateral.dry[k, ku.OF_GEAR] + unilateral.dry[k, ku.OF_JOINT])
+    soften_ties(unilateral, s, ws, h)
     for k in range(ws.contacts.shape[0]):
         if ws.active[k, ka.MODE] == ka.STICKING:
             r = ws.active[k, ka.FIRST_ROW]

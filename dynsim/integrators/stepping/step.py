@@ -20,6 +20,7 @@ from dynsim.integrators.events import take_ticks
 from dynsim.integrators.output import write_output
 from dynsim.integrators.run import Run
 from dynsim.integrators.stepping import tables as kt
+from dynsim.integrators.stepping.compliance import book_soft_contact, book_ties
 from dynsim.integrators.stepping.contacts import (
     list_contacts,
     note_contacts,
@@ -105,7 +106,7 @@ def solve_step(system: System, model: ModelArrays, ws: Workspace, run: Run):
     constraint_rates(model, ws, y, layout.v, s.rate[0])
     if ws.counts[ka.ROWS] > 0:
         row_system(model, ws)
-        solve_contacts(system.contacts.law, s, ws, h)
+        solve_contacts(system.contacts.law, system.unilateral, s, ws, h)
         note_stop_forces(system.unilateral, ws)
         add_row_forces(model, ws)
     accelerate(model, ws)
@@ -156,6 +157,8 @@ def book(system: System, ws: Workspace, run: Run):
         y_new[layout.load + k] += h * run.stage[1, layout.load + k]
         s.grid[kt.POWER_NOW] += run.stage[1, layout.load + k]
     book_stops(system.unilateral, system, s, ws, y_new, h)
+    book_dry(system.unilateral, system, s, ws, y_new, h)
+    book_ties(system.unilateral, layout, s, ws, y_new, h)
     book_contacts(system, s, ws, y_new, h)
     stored_energy(system, ws, y_new, s.energy[kt.STOP])
     y_new[layout.scheme] -= stored + (s.energy[kt.STOP, kt.MECHANICAL] - s.energy[kt.START, kt.MECHANICAL])
@@ -181,6 +184,22 @@ def book_stops(unilateral: UnilateralArrays, system: System, s: SteppingArrays, 
 
 
 @internal_kernel
+def book_dry(unilateral: UnilateralArrays, system: System, s: SteppingArrays, ws: Workspace, y_new, h):
+    """Dry friction: what it takes is a loss of gear and joint in the ratio of their bounds; forces into the tables."""
+    ledger = system.layout.ledger
+    for k in range(unilateral.dry.shape[0]):
+        dry, r, a = unilateral.dry[k], unilateral.dry_table[k, ku.DRY_ROW], unilateral.dry_table[k, ku.DRY_DRIVE]
+        dry[ku.DRY_FORCE], work = ws.rows[r, ka.FORCE], work_of_row(s, ws, r, h)
+        share = dry[ku.OF_GEAR] / (dry[ku.OF_GEAR] + dry[ku.OF_JOINT])
+        y_new[ledger + kst.GEAR] -= share * work
+        y_new[ledger + kst.JOINT] -= (1.0 - share) * work
+        y_new[ledger + kst.MECHANICAL] += share * work
+        y_new[ledger + kst.CONSTRAINT] -= work
+        if a >= 0:
+            ws.motors[a, ka.DRY_DRAG] = -share * dry[ku.DRY_FORCE]
+
+
+@internal_kernel
 def book_contacts(system: System, s: SteppingArrays, ws: Workspace, y_new, h):
     """What contacts take: normals of what strikes as impact loss, tangents of what slides, or comes to stick, as
     friction. What is left of held rows is the scheme's; what pushes out of the surface comes from the impact losses."""
@@ -188,6 +207,7 @@ def book_contacts(system: System, s: SteppingArrays, ws: Workspace, y_new, h):
     for k in range(ws.contacts.shape[0]):
         now, last = s.memory[kt.NOW, k], s.memory[kt.LAST, k]
         ws.contacts[k, ka.NORMAL_FORCE], s.turn[k, kt.STRUCK] = 0.0, 0.0
+        soft, normal = system.contacts.law[k, ka.CONTACT_STIFFNESS] > 0.0, 0.0
         if now[kt.LISTED] == 1.0:
             r = ws.active[k, ka.FIRST_ROW]
             force = ws.rows[r, ka.FORCE]
@@ -203,16 +223,22 @@ def book_contacts(system: System, s: SteppingArrays, ws: Workspace, y_new, h):
                 x, z = 0.5 * (s.rate[0, r + 1] + s.rate[1, r + 1]), 0.5 * (s.rate[0, r + 2] + s.rate[1, r + 2])
                 y_new[first + kst.SLIP] += h * slip_of_rates(system.contacts.law, k, x, z)
             y_new[first + kst.IMPULSE] += h * force
-            y_new[layout.loss + kst.IMPACT_LOSS] -= struck
-            s.turn[k, kt.STRUCK] = -struck
             y_new[layout.ledger + kst.FRICTION] -= friction
-            y_new[layout.scheme] -= (normal - struck) + (tangential - friction)
-            y_new[layout.ledger + kst.CONSTRAINT] -= normal + tangential
+            if soft:
+                y_new[layout.scheme] -= tangential - friction
+                y_new[layout.ledger + kst.CONSTRAINT] -= tangential
+            else:
+                y_new[layout.loss + kst.IMPACT_LOSS] -= struck
+                s.turn[k, kt.STRUCK] = -struck
+                y_new[layout.scheme] -= (normal - struck) + (tangential - friction)
+                y_new[layout.ledger + kst.CONSTRAINT] -= normal + tangential
+        if soft:
+            book_soft_contact(system.contacts.law, layout, s, ws, k, normal, y_new, h)
         first += kst.CONTACT_SIZE
 
 
 @internal_kernel
-def count_step(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, h):
+def count_step(unilateral: UnilateralArrays, law, s: SteppingArrays, ws: Workspace, h):
     """Times, depths and losses of candidates and joint stops in the step that is accepted."""
     for k in range(unilateral.stop.shape[0]):
         if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
@@ -224,7 +250,8 @@ def count_step(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, h
         if s.memory[kt.NOW, k, kt.LISTED] == 1.0:
             tally[ku.LOSS] += s.turn[k, kt.STRUCK]
             tally[ku.DEEPEST] = max(tally[ku.DEEPEST], -ws.contacts[k, ka.GAP])
-            s.found[kt.PENETRATION] = max(s.found[kt.PENETRATION], -ws.contacts[k, ka.GAP])
+            if law[k, ka.CONTACT_STIFFNESS] == 0.0:
+                s.found[kt.PENETRATION] = max(s.found[kt.PENETRATION], -ws.contacts[k, ka.GAP])
 
 
 @internal_kernel
@@ -263,9 +290,9 @@ def tell_changes(unilateral: UnilateralArrays, s: SteppingArrays, run: Run):
 @internal_kernel
 def sample_moreau(system: System, ws: Workspace, run: Run):
     """Record every sample time within the step, the state linear in between; forces are the means of the step."""
-    t, h, last, clock = run.clock[ki.TIME], run.clock[ki.STEP], run.count[ki.SAMPLE], run.clock
+    t, h, last = run.clock[ki.TIME], run.clock[ki.STEP], run.count[ki.SAMPLE]
     s = run.stepping
-    until = t + h + 1e-12 * max(1.0, clock[ki.END])
+    until = t + h + 1e-12 * max(1.0, t + h)
     while last < run.sample_time.shape[0] and run.sample_time[last] <= until:
         x = min(max((run.sample_time[last] - t) / h, 0.0), 1.0)
         row = run.sample[last]
@@ -346,11 +373,11 @@ def advance_moreau(system: System, ws: Workspace, run: Run, limit):
                 return
         count[ki.PENDING] = 0
         watch(ws, run, clock[ki.STEP])
-        count_step(system.unilateral, run.stepping, ws, clock[ki.STEP])
+        count_step(system.unilateral, system.contacts.law, run.stepping, ws, clock[ki.STEP])
         sample_moreau(system, ws, run)
         for j in range(run.y.shape[0]):
             run.y[j] = run.y_new[j]
-        remember(run.stepping, run.y, system.layout.v, clock[ki.STEP])
+        remember(system.unilateral, run.stepping, run.y, system.layout.v, clock[ki.STEP])
         advance_time(run.stepping, clock)
         count[ki.STEPS] += 1
         if tell_changes(system.unilateral, run.stepping, run):

@@ -49,7 +49,8 @@ END_RATE = 4  # 3: rates of its rows at the end of that step
 NORMAL_THEN, TANGENT_THEN = 7, 10  # 3 each: directions of its first two rows
 CENTRE = 13  # 3: of the sphere that touches [m]
 BUDGET = 16  # energy that its landing has taken, and that pushing it out of its surface may give back [J]
-MEMORY_SIZE = 17
+STORED = 17  # energy in its spring [J]
+MEMORY_SIZE = 18
 # SteppingArrays.turn, of a candidate with rows
 ADDED = 0  # 3: what the law adds to the end rates of its rows [m/s]
 TURNED = 3  # 3: the share of that which is due to rows that turn
@@ -57,7 +58,8 @@ PUSH = 6  # rate at which it is pushed out of its surface; negative: let into it
 MEAN = 7  # 1: it slides on, along the mean of its rates
 KNOWN = 8  # 1: its rows are those of the last step, turned
 STRUCK = 9  # what the step books as its impact loss [J]
-TURN_SIZE = 10
+PRESSED_IN, IMPLICIT = 10, 11  # of what gives way: gap at the start [m], and φ of its law
+TURN_SIZE = 12
 # SteppingArrays.found: largest residual [m/s], solves above BAD, largest penetration [m]; solves, and those that took
 # more than the quick rounds; most of what steps have taken of the energy, or made (negative), at any time [J]; steps
 # whose limits of drives contradict each other; energy that would be another one if all came half a step later [J].
@@ -204,4 +206,8 @@ def constraint_rates(model: ModelArrays, ws: Workspace, y, first, out):
         while a >= 0:
             total += y[first + a] * dot(row, six(ws.links, a, ka.S))
             a = model.tree[a, ka.PARENT]
+        if active[r, ka.ROW_KIND] == ka.BODY_ROW:
+            while b >= 0:
+                total -= y[first + b] * dot(row, six(ws.links, b, ka.S))
+                b = model.tree[b, ka.PARENT]
         out[r] = total

@@ -39,6 +39,10 @@ class LinkKeys(StrictConfig):
     )
     damping_N_m_s_per_rad: NonNegative = Field(default=0.0, description="viscous loss of a revolute joint")
     damping_N_s_per_m: NonNegative = Field(default=0.0, description="viscous loss of a prismatic joint")
+    friction_N_m: NonNegative = Field(
+        default=0.0, description="dry friction of a revolute joint, which holds at rest; time stepping only"
+    )
+    friction_N: NonNegative = Field(default=0.0, description="the same of a prismatic joint")
     motor: MotorChoice | None = Field(default=None, description="motor of the joint; none: the joint swings free")
     limit_deg: Limits | None = Field(default=None, description="stops of a revolute joint; default: it turns freely")
     limit_m: Limits | None = Field(default=None, description="stops of a prismatic joint")
@@ -56,6 +60,7 @@ class LinkKeys(StrictConfig):
 # Keys that only one kind of joint has → their counterpart for the other kind.
 ONLY_REVOLUTE = {
     "damping_N_m_s_per_rad": "damping_N_s_per_m",
+    "friction_N_m": "friction_N",
     "initial_deg": "initial_m",
     "limit_deg": "limit_m",
 }
@@ -85,6 +90,11 @@ class LinkConfig(LinkKeys):
     def damping(self) -> float:
         """Viscous loss D of the joint [N m s/rad, or N s/m when prismatic]."""
         return self.damping_N_s_per_m if self.kind == "prismatic" else self.damping_N_m_s_per_rad
+
+    @property
+    def friction(self) -> float:
+        """Dry friction of the joint [N m, or N when prismatic]."""
+        return self.friction_N if self.kind == "prismatic" else self.friction_N_m
 
     @property
     def initial(self) -> float:
@@ -206,6 +216,7 @@ def build(config: Config, context: BuildContext) -> Robot:
                     R_PJ=turn if first else np.eye(3),
                     p_PJ=np.array(config.base.position_m) if first else vector(0.0, 0.0, reach),
                     damping=group.damping,
+                    friction=group.friction,
                     lower=group.limits[0],
                     upper=group.limits[1],
                     radius=group.radius_m,

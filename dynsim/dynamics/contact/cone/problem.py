@@ -5,8 +5,11 @@ Find f with u = W f + b (forces and accelerations, or impulses and velocities) s
     BOTH_WAYS    u = 0
     ONE_WAY      0 ≤ f ⟂ u ≥ 0
     CONE         0 ≤ f_n ⟂ u_n ≥ 0,  |f_t| ≤ μ f_n,  u_t = −λ f_t with λ ≥ 0, and λ = 0 inside the cone
+    BOX          |f| ≤ μ,  u = −λ f with λ ≥ 0, and λ = 0 within the bounds: dry friction of a joint
 
-A CONE row is followed by its two TANGENT rows. Friction is not associated: u_n does not depend on μ |u_t|.
+A CONE row is followed by its two TANGENT rows. Friction is not associated: u_n does not depend on μ |u_t|. A row that
+gives way, u = W f + b + ε f, is one with ε more on the diagonal of W; bounds that are not ±μ are those of f less their
+mean f_m, with W f_m more in b.
 
 The method is a semismooth Newton method on the natural map of Alart and Curnier (Computer Methods in Applied Mechanics
 and Engineering 92, 1991), from the caller's last forces: a few steps where little has changed. Where it does not
@@ -23,6 +26,7 @@ from dynsim.dynamics.contact.cone.steps import (
     ANCHOR,
     BEST,
     BOTH_WAYS,
+    BOX,
     CONE,
     CONE_ROOM,
     GOAL,
@@ -45,7 +49,7 @@ from dynsim.dynamics.contact.cone.steps import (
 )
 from dynsim.jit.kernel import internal_kernel, kernel
 
-__all__ = ["BOTH_WAYS", "CONE", "CONE_ROOM", "NO_SOLUTION", "ONE_WAY", "TANGENT", "approach", "solve_cones"]
+__all__ = ["BOTH_WAYS", "BOX", "CONE", "CONE_ROOM", "NO_SOLUTION", "ONE_WAY", "TANGENT", "approach", "solve_cones"]
 
 # What ``solve_cones`` returns instead of a residual when it has proved that there is no solution.
 NO_SOLUTION = -1.0
@@ -66,14 +70,15 @@ def solve_cones(W, b, kind, mu, p, f, room, tolerance):
 
     The residual is the largest error of a block in the units of u, by the natural map with the block's own mobility w
     (the mean of its diagonal entries): |u| of BOTH_WAYS, |min(w f, u)| of ONE_WAY and of normals, and
-    |w f_t − P(w f_t − u_t)| of tangents, P the projection on the disc of radius μ w f_n. It is zero exactly at
-    solutions, and nothing in it is regularised. One above ``tolerance`` means that no better f was found.
+    |w f_t − P(w f_t − u_t)| of tangents, P the projection on the disc of radius μ w f_n; the same of BOX rows, with
+    that on ±μ w. It is zero exactly at solutions, and nothing in it is regularised. One above ``tolerance`` means that
+    no better f was found.
 
     Parameters
     ----------
     W, b : (p, p), (p,) or more; need not be symmetric in ONE_WAY columns, and may be of deficient rank
-    kind : (p,) int, BOTH_WAYS, ONE_WAY, CONE or TANGENT
-    mu : (p,) friction coefficients at the CONE rows
+    kind : (p,) int, BOTH_WAYS, ONE_WAY, CONE, TANGENT or BOX
+    mu : (p,) friction coefficients at the CONE rows, bounds of the forces at BOX rows, which may be infinite
     f : (p,) start, overwritten by the solution or the best that was found
     room : (CONE_ROOM, p, p) or more, scratch
     tolerance : residual that is good enough [units of u]
@@ -240,9 +245,9 @@ def impossible(W, b, kind, mu, p, room):
     """True when it is proved that no forces up to PROVED_FORCE |b| / w solve the problem.
 
     The proof is a combination d of motions, of any sign for BOTH_WAYS rows, not negative for ONE_WAY rows and normals,
-    zero for tangents. A solution has d·u ≥ 0; but d·u = (Wᵀd)·f + d·b, which is negative when d·b is, and no force that
-    is allowed makes (Wᵀd)·f positive: bodies that close in on each other from all sides. Such a d is what is left of
-    motion, −ε w f, when the problem without friction is solved with ε w added to W.
+    zero for tangents and BOX rows. A solution has d·u ≥ 0; but d·u = (Wᵀd)·f + d·b, which is negative when d·b is, and
+    no force that is allowed makes (Wᵀd)·f positive: bodies that close in on each other from all sides. Such a d is what
+    is left of motion, −ε w f, when the problem without friction is solved with ε w added to W.
     """
     proof, none, scale = room[PROOF, 0], room[NO_FRICTION, 0], 0.0
     right, mobility = room[SHIFTED_RIGHT, 0], room[MOBILITY, 0]
@@ -255,7 +260,8 @@ def impossible(W, b, kind, mu, p, room):
         approach(room[SHIFTED], right, kind, none, p, proof, room, 1e-9 * scale, PATH_ROUNDS)
         mobilities(W, kind, p, room)
         for k in range(p):
-            proof[k] = 0.0 if kind[k] == TANGENT else PROOF_SHIFT * mobility[k] * proof[k]
+            free = kind[k] == TANGENT or kind[k] == BOX
+            proof[k] = 0.0 if free else PROOF_SHIFT * mobility[k] * proof[k]
             if kind[k] != BOTH_WAYS:
                 proof[k] = max(proof[k], 0.0)
             right[k] = -proof[k]
@@ -270,7 +276,7 @@ def impossible(W, b, kind, mu, p, room):
         power = 0.0
         for m in range(p):
             power += proof[m] * W[m, k]
-        if kind[k] == BOTH_WAYS:
+        if kind[k] == BOTH_WAYS or kind[k] == BOX:
             power = abs(power)
         elif kind[k] == CONE:
             x, y = 0.0, 0.0
@@ -278,6 +284,7 @@ def impossible(W, b, kind, mu, p, room):
                 x += proof[m] * W[m, k + 1]
                 y += proof[m] * W[m, k + 2]
             power += mu[k] * math.sqrt(x * x + y * y)
-        total += max(power, 0.0) * PROVED_FORCE * scale / mobility[k]
+        most = PROVED_FORCE * scale / mobility[k]
+        total += max(power, 0.0) * (min(most, mu[k]) if kind[k] == BOX else most)
         k += block_size(kind, k)
     return total < 0.0

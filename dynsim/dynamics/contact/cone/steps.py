@@ -9,16 +9,16 @@ import math
 
 from dynsim.jit.kernel import internal_kernel
 
-BOTH_WAYS, ONE_WAY, CONE, TANGENT = 0, 1, 2, 3
+BOTH_WAYS, ONE_WAY, CONE, TANGENT, BOX = 0, 1, 2, 3, 4
 
 # Blocks of the scratch: two matrices, then vectors in first rows.
 MATRIX, SHIFTED = 0, 1
 MOTION, MOBILITY, RIGHT, PLACE, FIRST, SECOND, BETA = 2, 3, 4, 5, 6, 7, 8
 BEST, SWEPT, START, GOAL = 9, 10, 11, 12
-SHIFTED_RIGHT, KEPT, LAST, ANCHOR, PROOF, NO_FRICTION = 13, 14, 15, 16, 17, 18
-CONE_ROOM = 19
-# PLACE of a block at its first row: no force, u = 0, slides.
-OFF, HOLDS, SLIDES = 0.0, 1.0, 2.0
+SHIFTED_RIGHT, KEPT, LAST, ANCHOR, PROOF, NO_FRICTION, KNOWN = 13, 14, 15, 16, 17, 18, 19
+CONE_ROOM = 20
+# PLACE of a block at its first row: no force, u = 0, slides, at the bound FIRST.
+OFF, HOLDS, SLIDES, CLAMPED = 0.0, 1.0, 2.0, 3.0
 # The proximal term is this times the relative residual, but no less than what keeps elimination far from rounding.
 PROXIMAL_FACTOR, LEAST_PROXIMAL = 1e3, 1e-11
 ROOT_STEPS = 60
@@ -63,6 +63,8 @@ def measure(W, b, kind, mu, p, f, room):
     while k < p:
         w = mobility[k]
         error = abs(u[k]) if kind[k] == BOTH_WAYS else abs(min(w * f[k], u[k]))
+        if kind[k] == BOX:
+            error = abs(w * (f[k] - bounded(f[k] - u[k] / w, mu[k])))
         merit += error * error / w
         # Written so that NaN stays.
         residual = residual if error <= residual else error
@@ -79,10 +81,17 @@ def measure(W, b, kind, mu, p, f, room):
 
 
 @internal_kernel
+def bounded(x, bound):
+    """x within ±bound."""
+    return min(max(x, -bound), bound)
+
+
+@internal_kernel
 def newton_step(W, b, kind, mu, p, f, room, relative, most):
     """One step of f by Newton's method, from u of f in ``room[MOTION, 0]``.
 
-    Blocks that are off (z_n = w f_n − u_n ≤ 0) get f = 0 and have no unknown. The others have u_n' = 0, and with
+    Blocks that are off (z_n = w f_n − u_n ≤ 0) get f = 0 and have no unknown, nor have BOX rows with |z| ≥ w μ, whose
+    bound goes to the right-hand side of all rows. The others have u_n' = 0, and with
     z_t = w f_t − u_t inside the disc of radius μ z_n u_t' = 0. Outside, along d = z_t / |z_t| and e across it,
 
         d·f_t' = μ f_n',    (1 − β) w e·f_t' + β e·u_t' = 0,    β = μ z_n / |z_t|,
@@ -95,6 +104,13 @@ def newton_step(W, b, kind, mu, p, f, room, relative, most):
     place, first, second, beta = room[PLACE, 0], room[FIRST, 0], room[SECOND, 0], room[BETA, 0]
     near = min(max(PROXIMAL_FACTOR * most * relative, LEAST_PROXIMAL), most)
     find_places(kind, mu, p, f, room)
+    known = room[KNOWN, 0]
+    for k in range(p):
+        known[k] = b[k]
+    for m in range(p):
+        if place[m] == CLAMPED:
+            for k in range(p):
+                known[k] += W[k, m] * first[m]
     r, k = 0, 0
     while k < p:
         more = near * mobility[k]
@@ -102,18 +118,18 @@ def newton_step(W, b, kind, mu, p, f, room, relative, most):
             for i in range(k, k + block_size(kind, k)):
                 fill_row(W, kind, mu, p, i, i, 1.0, 0.0, room, r)
                 A[r, r] += more
-                x[r] = more * f[i] - b[i]
+                x[r] = more * f[i] - known[i]
                 r += 1
         elif place[k] == SLIDES:
             fill_row(W, kind, mu, p, k, k, 1.0, 0.0, room, r)
             A[r, r] += more
-            x[r] = more * f[k] - b[k]
+            x[r] = more * f[k] - known[k]
             r += 1
             if beta[k] > 0.0:
                 ex, ey = -second[k], first[k]
                 fill_row(W, kind, mu, p, k + 1, k + 2, ex, ey, room, r)
                 A[r, r] += (1.0 - beta[k]) / beta[k] * mobility[k] + more
-                x[r] = more * (ex * f[k + 1] + ey * f[k + 2]) - (ex * b[k + 1] + ey * b[k + 2])
+                x[r] = more * (ex * f[k + 1] + ey * f[k + 2]) - (ex * known[k + 1] + ey * known[k + 2])
                 r += 1
         k += block_size(kind, k)
     eliminate(A, x, r)
@@ -134,12 +150,14 @@ def newton_step(W, b, kind, mu, p, f, room, relative, most):
                 if place[k] == HOLDS:
                     f[i] = x[r]
                     r += 1
+                elif place[k] == CLAMPED:
+                    f[i] = first[k]
         k += block_size(kind, k)
 
 
 @internal_kernel
 def find_places(kind, mu, p, f, room):
-    """PLACE of each block, and of those that slide FIRST, SECOND = d and BETA."""
+    """PLACE of each block, of those that slide FIRST, SECOND = d and BETA, of those at a bound FIRST."""
     u, mobility = room[MOTION, 0], room[MOBILITY, 0]
     place, first, second, beta = room[PLACE, 0], room[FIRST, 0], room[SECOND, 0], room[BETA, 0]
     k = 0
@@ -147,6 +165,10 @@ def find_places(kind, mu, p, f, room):
         w = mobility[k]
         normal = w * f[k] - u[k]
         place[k] = HOLDS if kind[k] == BOTH_WAYS or normal > 0.0 else OFF
+        if kind[k] == BOX:
+            place[k] = HOLDS
+            if abs(normal) >= w * mu[k]:
+                place[k], first[k] = CLAMPED, mu[k] if normal > 0.0 else -mu[k]
         if kind[k] == CONE and normal > 0.0:
             x, y = w * f[k + 1] - u[k + 1], w * f[k + 2] - u[k + 2]
             length = math.sqrt(x * x + y * y)
@@ -227,6 +249,8 @@ def sweep(W, b, kind, mu, p, f, room):
             total += W[k, m] * f[m]
         new = f[k] - total / max(W[k, k], 1e-12 * mobility[k]) if W[k, k] > 0.0 else 0.0
         f[k] = new if kind[k] == BOTH_WAYS else max(new, 0.0)
+        if kind[k] == BOX:
+            f[k] = bounded(new, mu[k])
         k += 1
 
 

@@ -1,0 +1,241 @@
+"""Rows that give way in time stepping: springs and dampers of contacts, and ties between bodies.
+
+A spring k and a damper c on a row whose motion is x, and whose rates are u at the start and u' at the end of a step:
+
+    f = −k x_φ − c u_φ,    u_φ = u + φ (u' − u),    x_φ = x + φ h u_φ
+
+With K = φ h k + c its impulse p = h f makes a row of the contact problem with compliance ε, bounded or one-sided:
+
+    u' + a + ε p = 0,    ε = 1/(h φ K),    a = (k x + (1 − φ) K u)/(φ K)
+
+φ is θ of the step as long as that resolves the spring, z = h² k w ≤ 1 with the row's mobility w. With φ = ½ what is
+stiffer would swing with the factor −1, and throw off what lands: 1 − φ falls with 1/z, and to K comes a damping that
+grows to 2 h k, whose work is the scheme's. Its limit is a rigid row that is brought back by half of its depth a step.
+
+What a spring has stored is integrated with the state, and so is what dampers take. Beyond its bound a tie gives: its
+rest moves, so that its spring stays at the bound.
+"""
+
+from __future__ import annotations
+
+import math
+
+from dynsim.dynamics import state as kst
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact import unilateral as ku
+from dynsim.dynamics.contact.cone import problem as kc
+from dynsim.dynamics.contact.unilateral import UnilateralArrays
+from dynsim.dynamics.tables import Workspace
+from dynsim.dynamics.tree.spatial import (
+    ZERO_VECTOR,
+    compose,
+    dot_vector,
+    first_axis,
+    put_rotation,
+    put_six,
+    put_vector,
+    rotate,
+    rotate_back,
+    rotation,
+    second_axis,
+    third_axis,
+    transform,
+    vector,
+    wrench_at,
+)
+from dynsim.integrators.stepping import tables as kt
+from dynsim.integrators.stepping.tables import SteppingArrays
+from dynsim.jit.kernel import internal_kernel
+
+# A force is at its bound when less than this share of it is missing.
+AT_BOUND = 1e-12
+# Time in which what steps do not resolve comes back, in steps.
+RETURN_STEPS = 2.0
+
+
+@internal_kernel
+def give_way(k, c, w, x, u, h, theta):
+    """φ, compliance ε and what is added to the end rate, a, of a row with mobility w that is at x with rate u."""
+    resolved = 1.0 / max(1.0, h * h * k * w)
+    phi = 1.0 - (1.0 - theta) * resolved
+    K = phi * h * k + c + (1.0 - resolved) * RETURN_STEPS * h * k
+    return phi, 1.0 / (h * phi * K), (k * x + (1.0 - phi) * K * u) / (phi * K)
+
+
+@internal_kernel
+def soften_contact(law, s: SteppingArrays, ws: Workspace, k, h):
+    """Let the normal row of candidate k, which is listed, give way, if it does; into W and ``s.turn``."""
+    stiffness, damping = law[k, ka.CONTACT_STIFFNESS], law[k, ka.CONTACT_DAMPING]
+    if stiffness == 0.0:
+        return
+    r, turn, W = ws.active[k, ka.FIRST_ROW], s.turn[k], ws.small[0]
+    turn[kt.PRESSED_IN] = ws.contacts[k, ka.GAP] - 0.5 * h * s.rate[0, r]
+    phi, more, added = give_way(stiffness, damping, W[r, r], turn[kt.PRESSED_IN], s.rate[0, r], h, s.theta)
+    W[r, r] += more
+    turn[kt.IMPLICIT], turn[kt.ADDED] = phi, added
+
+
+@internal_kernel
+def spring_energy(stiffness, x):
+    """½ k x² of what is pressed in by −x [J]."""
+    return 0.5 * stiffness * min(x, 0.0) ** 2
+
+
+@internal_kernel
+def book_soft_contact(law, layout, s: SteppingArrays, ws: Workspace, k, work, y_new, h):
+    """What the normal force of candidate k, whose work is ``work``, has stored and lost; the rest is the scheme's.
+
+    Where there is no force the surface comes back by itself, and its damper takes all.
+    """
+    now, last, stiffness = s.memory[kt.NOW, k], s.memory[kt.LAST, k], law[k, ka.CONTACT_STIFFNESS]
+    lost = last[kt.STORED]
+    if now[kt.LISTED] == 1.0:
+        r, turn = ws.active[k, ka.FIRST_ROW], s.turn[k]
+        change = s.rate[1, r] - s.rate[0, r]
+        now[kt.STORED] = spring_energy(stiffness, turn[kt.PRESSED_IN] + h * (s.rate[0, r] + s.theta * change))
+        lost -= now[kt.STORED]
+        if s.f[r] > 0.0:
+            lost = h * law[k, ka.CONTACT_DAMPING] * (s.rate[0, r] + turn[kt.IMPLICIT] * change) ** 2
+    book_spring(layout, now[kt.STORED] - last[kt.STORED], lost, work, y_new)
+
+
+@internal_kernel
+def book_spring(layout, stored, lost, work, y_new):
+    """More energy in a spring, and what its damper takes, of the work −``work`` that both are given [J]."""
+    y_new[layout.elastic + kst.STORED] += stored
+    y_new[layout.elastic + kst.DAMPED] += lost
+    y_new[layout.scheme] -= work + stored + lost
+    y_new[layout.ledger + kst.CONSTRAINT] -= work
+
+
+@internal_kernel
+def list_ties(unilateral: UnilateralArrays, ws: Workspace):
+    """Begin and end ties as their kinds say; True when one has changed. A rest that is NaN is where the bodies are."""
+    table, tie, changed = unilateral.tie_table, unilateral.tie, False
+    for k in range(table.shape[0]):
+        holds = 1 if table[k, ku.TIE_KIND] >= 0 else 0
+        if holds != table[k, ku.TIE_HOLDS]:
+            table[k, ku.TIE_HOLDS], changed = holds, True
+            if holds == 1:
+                begin_tie(unilateral, ws, k)
+                x = tie_deflection(unilateral, ws, k) - tie[k, ku.TIE_REST]
+                tie[k, ku.TIE_STORED], tie[k, ku.TIE_GIVEN] = 0.5 * tie[k, ku.TIE_STIFFNESS] * x * x, 0.0
+                if table[k, ku.TIE_KIND] == kc.ONE_WAY:
+                    tie[k, ku.TIE_STORED] = spring_energy(tie[k, ku.TIE_STIFFNESS], x)
+    return changed
+
+
+@internal_kernel
+def begin_tie(unilateral: UnilateralArrays, ws: Workspace, k):
+    """The rest of tie k where it is NaN: as its bodies are now."""
+    table, tie = unilateral.tie_table, unilateral.tie
+    if tie[k, ku.TIE_REST] == tie[k, ku.TIE_REST]:
+        return
+    if table[k, ku.TIE_TURNS] == 1:
+        put_rotation(tie, k, ku.TIE_ATTITUDE, relative_attitude(ws, table[k, ku.TIE_A], table[k, ku.TIE_B]))
+        tie[k, ku.TIE_REST] = 0.0
+    else:
+        tie[k, ku.TIE_REST] = tie_deflection(unilateral, ws, k)
+
+
+@internal_kernel
+def relative_attitude(ws: Workspace, a, b):
+    """Rotation of body b in the axes of body a."""
+    A, B = rotation(ws.links, a, ka.R), rotation(ws.links, b, ka.R)
+    x, y, z = rotate_back(A, first_axis(B)), rotate_back(A, second_axis(B)), rotate_back(A, third_axis(B))
+    return x[0], y[0], z[0], x[1], y[1], z[1], x[2], y[2], z[2]
+
+
+@internal_kernel
+def tie_deflection(unilateral: UnilateralArrays, ws: Workspace, k):
+    """How far A of tie k is before B along the axis, or turned about it, of the rotation vector [m or rad]."""
+    table, tie = unilateral.tie_table, unilateral.tie
+    a, b, axis = table[k, ku.TIE_A], table[k, ku.TIE_B], vector(tie, k, ku.TIE_AXIS)
+    if table[k, ku.TIE_TURNS] == 1:
+        R = rotation(tie, k, ku.TIE_ATTITUDE)
+        E = compose(relative_attitude(ws, a, b), (R[0], R[3], R[6], R[1], R[4], R[7], R[2], R[5], R[8]))
+        twice = E[7] - E[5], E[2] - E[6], E[3] - E[1]
+        sine = 0.5 * math.sqrt(dot_vector(twice, twice))
+        angle = math.atan2(sine, 0.5 * (E[0] + E[4] + E[8] - 1.0))
+        return -0.5 * dot_vector(axis, twice) * (angle / sine if sine > 1e-9 else 1.0)
+    A, B = rotation(ws.links, a, ka.R), rotation(ws.links, b, ka.R)
+    at = transform(vector(ws.links, a, ka.P), A, vector(tie, k, ku.TIE_POINT))
+    other = transform(vector(ws.links, b, ka.P), B, vector(tie, k, ku.TIE_OTHER_POINT))
+    return dot_vector(rotate(A, axis), (at[0] - other[0], at[1] - other[1], at[2] - other[2]))
+
+
+@internal_kernel
+def place_ties(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace):
+    """Rows of the ties that hold, at the geometry of the sweep: the motion of A against B at the point of B."""
+    table, tie, rows = unilateral.tie_table, unilateral.tie, ws.rows
+    for k in range(table.shape[0]):
+        if table[k, ku.TIE_HOLDS] == 0:
+            continue
+        r, b = table[k, ku.TIE_ROW], table[k, ku.TIE_B]
+        axis = rotate(rotation(ws.links, table[k, ku.TIE_A], ka.R), vector(tie, k, ku.TIE_AXIS))
+        if table[k, ku.TIE_TURNS] == 1:
+            put_vector(rows, r, ka.ROW, axis)
+            put_vector(rows, r, ka.ROW + 3, ZERO_VECTOR)
+        else:
+            R = rotation(ws.links, b, ka.R)
+            at = transform(vector(ws.links, b, ka.P), R, vector(tie, k, ku.TIE_OTHER_POINT))
+            put_six(rows, r, ka.ROW, wrench_at(at, axis, ZERO_VECTOR))
+        for j in range(6):
+            rows[r, ka.DIRECTION + j] = rows[r, ka.ROW + j]
+        rows[r, ka.TARGET], s.kind[r] = 0.0, table[k, ku.TIE_KIND]
+        tie[k, ku.TIE_AT] = tie_deflection(unilateral, ws, k) - tie[k, ku.TIE_REST]
+
+
+@internal_kernel
+def soften_ties(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, h):
+    """Let the rows of ties give way, within their bounds; starts from their last impulses."""
+    table, tie, W = unilateral.tie_table, unilateral.tie, ws.small[0]
+    for k in range(table.shape[0]):
+        if table[k, ku.TIE_HOLDS] == 0:
+            continue
+        r = table[k, ku.TIE_ROW]
+        s.mu[r], s.f[r] = h * tie[k, ku.TIE_BOUND], h * tie[k, ku.TIE_FORCE]
+        tie[k, ku.TIE_AT] -= 0.5 * h * s.rate[0, r]
+        tie[k, ku.TIE_IMPLICIT], more, added = give_way(
+            tie[k, ku.TIE_STIFFNESS], tie[k, ku.TIE_DAMPING], W[r, r], tie[k, ku.TIE_AT], s.rate[0, r], h, s.theta
+        )
+        W[r, r] += more
+        s.right[r] += added
+
+
+@internal_kernel
+def book_ties(unilateral: UnilateralArrays, layout, s: SteppingArrays, ws: Workspace, y_new, h):
+    """What ties have stored and lost, and where their rests are, should the step be accepted."""
+    table, tie = unilateral.tie_table, unilateral.tie
+    for k in range(table.shape[0]):
+        row, stored = tie[k], tie[k, ku.TIE_STORED]
+        row[ku.TIE_FORCE], row[ku.TIE_REST_NOW], row[ku.TIE_STORED_NOW] = 0.0, row[ku.TIE_REST], 0.0
+        if table[k, ku.TIE_HOLDS] == 0:
+            book_spring(layout, -stored, stored, 0.0, y_new)
+            continue
+        r, one_sided = table[k, ku.TIE_ROW], table[k, ku.TIE_KIND] == kc.ONE_WAY
+        force, change = ws.rows[r, ka.FORCE], s.rate[1, r] - s.rate[0, r]
+        x = row[ku.TIE_AT] + h * (s.rate[0, r] + s.theta * change)
+        at_bound = force == 0.0 if one_sided else abs(force) >= row[ku.TIE_BOUND] * (1.0 - AT_BOUND)
+        if at_bound and not one_sided:
+            most = row[ku.TIE_BOUND] / row[ku.TIE_STIFFNESS] if row[ku.TIE_STIFFNESS] > 0.0 else 0.0
+            kept = min(max(x, -most), most)
+            row[ku.TIE_REST_NOW] += x - kept
+            x = kept
+        if one_sided:
+            x = min(x, 0.0)
+        row[ku.TIE_FORCE], row[ku.TIE_STORED_NOW] = force, 0.5 * row[ku.TIE_STIFFNESS] * x * x
+        work = 0.5 * h * force * (s.rate[0, r] + s.rate[1, r])
+        lost = h * row[ku.TIE_DAMPING] * (s.rate[0, r] + row[ku.TIE_IMPLICIT] * change) ** 2
+        if at_bound:
+            lost = stored - row[ku.TIE_STORED_NOW] - work
+        book_spring(layout, row[ku.TIE_STORED_NOW] - stored, lost, work, y_new)
+
+
+@internal_kernel
+def accept_ties(unilateral: UnilateralArrays):
+    """The step has been accepted: rests and energies are those of its end."""
+    for k in range(unilateral.tie.shape[0]):
+        tie = unilateral.tie[k]
+        tie[ku.TIE_GIVEN] += abs(tie[ku.TIE_REST_NOW] - tie[ku.TIE_REST])
+        tie[ku.TIE_REST], tie[ku.TIE_STORED] = tie[ku.TIE_REST_NOW], tie[ku.TIE_STORED_NOW]

@@ -1,0 +1,213 @@
+"""Friction that holds joints at rest, of gears and bearings in time stepping: closed forms and the ledger."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from random_robots import Bench, bench, random_robot
+from stepping_benches import plane, stepped
+
+from dynsim import load_scenario, simulate
+from dynsim.compile.model import Model
+from dynsim.dynamics.state import ELECTRICAL, GEAR, JOINT, JOULE
+from dynsim.errors import ModelError
+from dynsim.integrators.stepping.tables import CAPPED
+from dynsim.model.description import Contact, Inertia, Link, Load, Robot, vector
+from dynsim.model.drives import Motor, Servo
+
+MASS, FRICTION = 2.0, 3.0
+
+
+def sliding(load: np.ndarray, friction: float = FRICTION) -> Bench:
+    """A mass on a horizontal guide that rubs, pushed by load[0] + load[1] t [N]."""
+    link = Link("slide", "guide", None, "prismatic", vector(1, 0, 0), Inertia(MASS), friction=friction)
+    coefficients = np.zeros((1, 6, 4))
+    coefficients[0, 0, :2] = load
+    push = Load("push", "slide", np.zeros(3), False, np.array([0.0, 100.0]), coefficients, True)
+    return bench(Robot("slide", (link,), (), ("slide", np.zeros(3))), loads=[push], real=True, dry=True)
+
+
+def test_a_bearing_holds_up_to_its_friction_and_no_further():
+    times = np.array([0.0, 1.0])
+    for share in (0.0, 0.5, 1.0 - 1e-9):
+        b = sliding(np.array([share * FRICTION, 0.0]))
+        run = stepped(b, b.state(np.zeros(1), np.zeros(1)), times, 1e-2, 0.5)
+        assert abs(run.states("q")[-1, 0]) < 1e-12
+        assert b.system.unilateral.dry[0, 2] == pytest.approx(-share * FRICTION, abs=1e-9)
+    excess = 1e-6 * FRICTION
+    b = sliding(np.array([FRICTION + excess, 0.0]))
+    run = stepped(b, b.state(np.zeros(1), np.zeros(1)), times, 1e-2, 0.5)
+    assert run.states("q")[-1, 0] == pytest.approx(0.5 * excess / MASS, rel=1e-6)
+
+
+@pytest.mark.parametrize("theta", [0.5, 1.0])
+def test_a_growing_push_breaks_it_loose_when_it_reaches_the_friction(theta):
+    """At t_0 = F/r of a push r t; then x = r (t − t_0)³/6m, and all that friction takes is F x."""
+    rate, until = 4.0, 1.75
+    moved, errors = rate * (until - FRICTION / rate) ** 3 / (6.0 * MASS), []
+    for step in (1e-2, 5e-3):
+        b = sliding(np.array([0.0, rate]))
+        run = stepped(b, b.state(np.zeros(1), np.zeros(1)), np.array([0.0, until]), step, theta)
+        q = run.states("q")[-1, 0]
+        errors.append(abs(q - moved))
+        lost = run.states("ledger")[-1, JOINT]
+        assert lost == pytest.approx(FRICTION * q, rel=1e-12) if theta == 0.5 else lost > 0.0
+    assert errors[1] < 0.6 * errors[0]
+    assert errors[1] < (1e-5 if theta == 0.5 else 1e-2)
+
+
+def oscillator(start: float, friction: float = 0.4) -> tuple[Bench, np.ndarray, float, float]:
+    """A wheel on a servo that is a spring of 20 N m/rad and a little damping; its state, stiffness and damping."""
+    k_m, resistance, stiffness = 0.1, 2.0, 20.0
+    servo = Servo("shaft", k_m, resistance, stiffness * resistance / k_m, coulomb_friction=friction)
+    link = Link("wheel", "shaft", None, "revolute", vector(0, 0, 1), Inertia(1.0, tensor=np.diag([0.3, 0.3, 0.3])))
+    b = bench(Robot("wheel", (link,), (servo,), ("wheel", np.zeros(3))), real=True, dry=True)
+    return b, b.state(np.array([start]), np.zeros(1)), stiffness, k_m**2 / resistance
+
+
+def test_a_spring_is_held_where_its_force_is_below_the_friction():
+    """The bound is exact: just below it nothing moves, just above it does."""
+    band = 0.4 / 20.0
+    for share, moves in ((1.0 - 1e-9, False), (1.0 + 1e-6, True)):
+        b, y, _, _ = oscillator(share * band)
+        run = stepped(b, y, np.array([0.0, 1.0]), 1e-3, 0.5)
+        assert (abs(run.states("q")[-1, 0] - share * band) > 1e-9 * band) == moves
+
+
+def test_a_spring_with_dry_friction_comes_to_rest_in_closed_form():
+    """Each half swing is about the place ±τ/k where spring and friction balance; it ends within that band, for ever."""
+    b, y, stiffness, damping = oscillator(0.5)
+    band, inertia, x, swings = 0.4 / stiffness, 0.3, 0.5, 0
+    rate = damping / (2.0 * inertia)
+    period = np.pi / np.sqrt(stiffness / inertia - rate**2)
+    while abs(x) > band:
+        centre = np.sign(x) * band
+        x = centre - np.exp(-rate * period) * (x - centre)
+        swings += 1
+    assert swings == 12
+    errors = []
+    for step in (2e-3, 1e-3):
+        run = stepped(b, y, np.array([0.0, 6.0, 26.0]), step, 0.5)
+        q = run.states("q")[:, 0]
+        errors.append(abs(q[1] - x))
+        assert abs(q[2] - q[1]) < 1e-10
+        assert run.stepping.found[CAPPED] == 0
+    assert errors[0] < 1e-4
+    assert errors[1] < 0.5 * errors[0]
+
+
+def test_a_wheel_rolls_down_a_slope_against_its_bearing():
+    """(m + I/r²) a = m g sin α − τ/r, if that is positive; the bearing takes τ times the turned angle."""
+    radius, mass, inertia, slope = 0.05, 1.2, 2e-3, 0.2
+    pull = mass * 9.81 * np.sin(slope)
+    for drag in (0.6 * pull * radius, 1.1 * pull * radius):
+        links = (
+            Link("x", "along", None, "prismatic", vector(1, 0, 0), Inertia(0.0)),
+            Link("z", "up", "x", "prismatic", vector(0, 0, 1), Inertia(0.2)),
+            Link(
+                "wheel",
+                "axle",
+                "z",
+                "revolute",
+                vector(0, 1, 0),
+                Inertia(1.0, tensor=inertia * np.eye(3)),
+                friction=drag,
+            ),
+        )
+        gravity = 9.81 * vector(np.sin(slope), 0, -np.cos(slope))
+        robot = Robot("wheel", links, (), ("wheel", np.zeros(3)), gravity=gravity)
+        contact = Contact("tyre", "wheel", np.zeros(3), plane(vector(0, 0, 1)), friction=0.8, radius=radius)
+        b = bench(robot, [contact], real=True, dry=True)
+        run = stepped(b, b.state(np.array([0.0, radius, 0.0]), np.zeros(3)), np.array([0.0, 1.0]), 2.5e-3, 0.5)
+        acceleration = max(pull - drag / radius, 0.0) / (mass + inertia / radius**2)
+        x, _, angle = run.states("q")[-1]
+        assert x == pytest.approx(0.5 * acceleration, rel=1e-9, abs=1e-11)
+        assert x == pytest.approx(radius * angle, rel=1e-9, abs=1e-11)
+        assert run.states("ledger")[-1, JOINT] == pytest.approx(drag * angle, rel=1e-9, abs=1e-11)
+
+
+def arm(gear: float, **more: float) -> Robot:
+    """Three links that hang sideways on servos, with gears that rub."""
+    links, motors = [], []
+    for k in range(3):
+        inertia = Inertia.solid_cylinder(0.5, 0.02, 0.3)
+        p = vector(0, 0, 0.3 if k else 0)
+        links.append(
+            Link(
+                f"link_{k}", f"joint_{k}", f"link_{k - 1}" if k else None, "revolute", vector(0, 1, 0), inertia, p_PJ=p
+            )
+        )
+        motors.append(
+            Servo(f"joint_{k}", 2.5, 3.6, 58.6, armature=0.01, coulomb_friction=gear, voltage_limit=12.0, **more)
+        )
+    return Robot("arm", tuple(links), tuple(motors), ("link_2", vector(0, 0, 0.3)))
+
+
+def test_a_held_arm_does_not_creep():
+    """It sags, is held, and stays for 20 s; smoothed friction lets it creep by millimetres."""
+    times, moved = np.array([0.0, 3.0, 23.0]), []
+    for speed in (None, 1e-2):
+        b = bench(arm(0.8, coulomb_speed=speed), held=np.array([1.2, 0.3, 0.0]), real=True, dry=True)
+        run = stepped(b, b.state(np.array([1.2, 0.3, 0.0]), np.zeros(3)), times, 2.5e-3, 0.5)
+        hand = run.outputs("hand")
+        moved.append(np.abs(hand[2] - hand[1]).max())
+        assert run.stepping.found[CAPPED] == 0
+    assert moved[0] < 1e-8
+    assert moved[1] > 1e-4
+
+
+def test_joint_torques_have_the_friction_of_their_gear_in_them():
+    """At rest the shaft carries the weight alone, whatever motor and gear share of it."""
+    b = bench(arm(0.8), held=np.array([1.2, 0.3, 0.0]), real=True, dry=True)
+    run = stepped(b, b.state(np.array([1.2, 0.3, 0.0]), np.zeros(3)), np.array([0.0, 3.0]), 2.5e-3, 0.5)
+    q, torque = run.states("q")[-1], run.outputs("torque")[-1]
+    np.testing.assert_allclose(torque, Model(b.robot).bias_forces(q, np.zeros(3)), rtol=0, atol=1e-8)
+    assert abs(torque - 2.5 * run.outputs("current")[-1]).max() > 1e-3
+
+
+@pytest.mark.parametrize("theta", [0.5, 0.8, 1.0])
+def test_the_ledger_of_random_arms_that_rub(theta):
+    rng = np.random.default_rng(3)
+    robot = random_robot(rng, 6)
+    robot = replace(
+        robot,
+        links=tuple(replace(link, friction=rng.uniform(0.0, 0.5)) for link in robot.links),
+        motors=tuple(replace(motor, dry_friction=0.3) for motor in robot.motors),
+    )
+    assert any(isinstance(motor, Motor) for motor in robot.motors)
+    b = bench(robot, real=True, dry=True)
+    run = stepped(b, b.state(rng.normal(size=6), rng.normal(size=6)), np.linspace(0.0, 0.5, 6), 2e-3, theta)
+    energy, ledger, scheme = run.outputs("energy"), run.states("ledger"), run.states("scheme")[:, 0]
+    stored = energy.sum(axis=1)
+    used = ledger[:, JOULE] + ledger[:, GEAR] + ledger[:, JOINT] + scheme
+    residual = ledger[:, ELECTRICAL] - used - (stored - stored[0])
+    assert np.abs(residual).max() < 1e-9 * max(1.0, np.abs(stored - stored[0]).max())
+    assert (np.diff(ledger[:, [GEAR, JOINT]], axis=0) > 0.0).all()
+
+
+SCENARIO = """
+name: rubbing
+duration_s: 0.5
+plant:
+  type: serial_arm
+  chain:
+    - {axis: y, initial_deg: 60, friction_N_m: 0.2}
+    - {axis: y, motor: {type: wang_minami, coulomb_friction_N_m: 0.3}}
+    - {kind: prismatic, axis: z, friction_N: 20, mass_kg: 0.1}
+controller: {type: joint_pd, k_p_V_per_rad: 50, k_d_V_s_per_rad: 1}
+contacts: {law: unilateral}
+integrator: {method: time_stepping, step_s: 0.001}
+"""
+
+
+def test_scenarios_say_what_rubs(tmp_path: Path):
+    file = tmp_path / "rubbing.yaml"
+    file.write_text(SCENARIO)
+    record = simulate(load_scenario(file))
+    assert np.abs(record["q"][:, 2]).max() < 1e-10  # below its friction
+    assert record.summary["energy_residual_relative"] < 1e-9
+    with pytest.raises(ModelError, match=r"dry friction of joint_1, joint_3, joint_2: .*time_stepping"):
+        simulate(load_scenario(file, overrides={"integrator.method": "radau5"}))
