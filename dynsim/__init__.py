@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from dynsim.compile.model import Model
     from dynsim.draw import film
     from dynsim.draw import page as view
+    from dynsim.draw.figures import figure
     from dynsim.engine import check, simulate
     from dynsim.engine.simulation import Simulation, State
     from dynsim.planner.answer import BracePlan, plan_braces
@@ -40,6 +41,7 @@ __all__ = [
     "build_model",
     "check",
     "compare",
+    "figure",
     "film",
     "load_scenario",
     "plan_braces",
@@ -60,6 +62,7 @@ _HOME = {
     "build_model": "dynsim.scenario",
     "check": "dynsim.engine",
     "compare": "dynsim.studies.compare",
+    "figure": "dynsim.draw.figures",
     "load_scenario": "dynsim.scenario",
     "plan_braces": "dynsim.planner.answer",
     "simulate": "dynsim.engine",

@@ -26,7 +26,8 @@ from dynsim.cli.app import (
 )
 from dynsim.cli.display import console, errors, labelled, progress, record_files, say, say_written, told_in
 from dynsim.cli.drawing import Figures, Page, draw, draw_all
-from dynsim.cli.hardware import export, hw
+from dynsim.cli.export import export
+from dynsim.cli.hardware import hw
 from dynsim.cli.hw_drive import EXAMPLE, hw_drive
 from dynsim.cli.plan import EXAMPLE as PLAN_EXAMPLE
 from dynsim.cli.plan import plan

@@ -1,4 +1,4 @@
-"""`dynsim hw …` and `dynsim export`. Serial and servo modules are imported by the commands that need them."""
+"""`dynsim hw …`. Serial and servo modules are imported by the commands that need them."""
 
 from __future__ import annotations
 
@@ -28,12 +28,6 @@ class Policy(StrEnum):
     hold = "hold"
     decelerate = "decelerate"
     off = "off"
-
-
-class ExportFormat(StrEnum):
-    csv = "csv"
-    joint_trajectory = "joint-trajectory"
-    urdf_log = "urdf-log"
 
 
 RecordFile = Annotated[Path, typer.Argument(metavar="RECORD", help="record.h5 of a run.")]
@@ -448,20 +442,3 @@ def calibrate(
         table.add_row(servo.joint, str(servo.id), str(servo.zero_tick), str(ticks[servo.joint]))
     console.print(table)
     console.print(f"zero ticks of {len(ticks)} joints written to {target}")
-
-
-def export(
-    record: RecordFile,
-    format_: Annotated[
-        ExportFormat, typer.Option("--format", help="csv, joint-trajectory (ROS), urdf-log (JSON lines).")
-    ],
-    rate: Annotated[float | None, typer.Option("--rate", help="Resample [Hz]; default: the record's samples.")] = None,
-    out: Annotated[Path | None, typer.Option("--out", help="File; default: beside the record.")] = None,
-    trust: TrustOption = False,
-) -> None:
-    """Write the joint motion of a record for other programs."""
-    from dynsim.record import Record
-    from dynsim.record.joint_motion import SUFFIX, export_record
-
-    target = out or record.with_suffix(SUFFIX[format_.value])
-    console.print(f"written: {export_record(Record.load(record, trust=trust), target, format_.value, rate=rate)}")

@@ -18,7 +18,7 @@ from dynsim.cli.app import (
     parsed_overrides,
 )
 from dynsim.cli.display import plan_progress, say, say_written
-from dynsim.errors import ScenarioError
+from dynsim.errors import ScenarioError, UnreachableReference
 from dynsim.system.terminal import escaped
 
 EXAMPLE = "Example: dynsim plan pressing --count 0:3 --candidates link_3:link_9"
@@ -71,7 +71,7 @@ def plan(
     exhaustive: Annotated[
         bool, typer.Option("--exhaustive", help="Try all sets of candidates, not only those that grow from the best.")
     ] = False,
-    starts: Annotated[int, typer.Option(metavar="N", min=1, help="Independent rounds of the search.")] = 6,
+    starts: Annotated[int, typer.Option(metavar="N", min=1, help="Independent rounds of the search.")] = 8,
     seed: Annotated[int, typer.Option(metavar="S", help="Of its random postures.")] = 0,
     explain: Annotated[
         bool, typer.Option("--explain", help="Find the errors of the scene that refused plans do bear.")
@@ -95,6 +95,9 @@ def plan(
     folder = out or Path("results", loaded.name, loaded.variant, "plan")
     least, most = _numbers(count)
     peak = _weights(weight or [])
+    names = [name.strip() for name in candidates.split(",") if name.strip()]
+    if candidates and not names:
+        raise ScenarioError(f"--candidates {escaped(candidates)}: names nothing; leave it out for the default")
     from dynsim.planner.answer import plan_braces
     from dynsim.planner.files import check_plan_folder, save_plan
     from dynsim.planner.verify import Tolerances
@@ -108,7 +111,7 @@ def plan(
     with plan_progress(quiet) as tell:
         result = plan_braces(
             loaded,
-            candidates=[name.strip() for name in candidates.split(",") if name.strip()],
+            candidates=names,
             along=along or (),
             radius_m=radius,
             count=(least, most),
@@ -134,6 +137,8 @@ def plan(
         say_written(folder)
         if result.best is not None:
             say(f"To run the best: dynsim run {escaped(folder / 'plan.yaml')}")
+    if result.best is None:
+        raise UnreachableReference(f"no plan: {escaped(result.sizes[0].reason)}")
 
 
 def _numbers(text: str) -> tuple[int, int]:

@@ -19,10 +19,10 @@ def print_plan(plan: BracePlan) -> None:
     console.print(table)
     best = plan.best
     if best is not None:
-        say(f"best: {escaped(best.label)}")
+        say(f"best: {escaped(best.label)}{', though it is refused' if best.survives is False else ''}")
     for size in plan.sizes:
         for text in _notes(size):
-            say(f"{size.count} braces: {escaped(text)}")
+            say(f"{size.count} brace{'' if size.count == 1 else 's'}: {escaped(text)}")
     missed, reached = len(plan.tally.missed), len(plan.tally.reached)
     if missed:
         say(f"no posture found for {missed} of {missed + reached} sets tried: not found, which does not say impossible")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,6 +20,9 @@ from dynsim.model.base_pose import base_pose, base_row
 from dynsim.model.description import Robot
 from dynsim.model.drives import TorqueSource
 from dynsim.system.memo import recall
+
+if TYPE_CHECKING:
+    from dynsim.snake.description import TaskSpaceController
 
 # Samples in a segment of the reference splines, and segments that are looked at together.
 _PER_SEGMENT = 4
@@ -63,6 +66,9 @@ class JointControl:
     Only DC motors take the gains; ``k_p`` of a servo says whether it follows its position. References of a torque
     source are its torques [N m]. ``sample_time`` is the period [s] at which commands are taken, to be held in between;
     None: they follow the state continuously. Where there is ``teleop``, an operator rewrites references on the way.
+    ``orientation`` : rotation of the hand in the world that goes with ``path``, (3, 3); None: any.
+    None: they follow the state continuously. Where there is ``teleop``, an operator rewrites references on the way, and
+    where there is ``task_space``, the controller of a snake does.
     """
 
     k_p: NDArray[np.float64]
@@ -71,12 +77,19 @@ class JointControl:
     path: HandPath | None
     sample_time: float | None = None
     teleop: TeleopOptions | None = None
+    orientation: NDArray[np.float64] | None = None
+    task_space: TaskSpaceController | None = None
 
     @classmethod
-    def absent(cls, robot: Robot) -> JointControl:
-        """No controller: DC motors have zero volts and brake, servos hold where they start, torque sources rest."""
-        motors = len(robot.motors)
-        return cls(np.zeros(motors), np.zeros(motors), _reference(held_values(robot)), None)
+    def absent(cls, robot: Robot, targets: Mapping[str, float] | None = None) -> JointControl:
+        """No controller: DC motors have zero volts and brake, servos hold where they start, torque sources rest.
+
+        ``targets`` : what motors hold instead, by joint [rad or m]
+        """
+        motors, values = len(robot.motors), held_values(robot)
+        for a, motor in enumerate(robot.motors):
+            values[a] = (targets or {}).get(motor.joint, values[a])
+        return cls(np.zeros(motors), np.zeros(motors), _reference(values), None)
 
     @classmethod
     def following(

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from dynsim.errors import ModelError, UnreachableReference
 from dynsim.model.description import Array, Contact, Robot
@@ -36,10 +36,25 @@ def turn_error(R: Array, wanted: Array) -> Array:
     return np.asarray(Rotation.from_matrix(wanted @ R.T).as_rotvec())
 
 
+def hand_turns(model: Kinematics, q: Array, orientation: Array) -> Array:
+    """Angles between the hand's orientation and a wanted one, postures (T, nq) → (T,) [rad]."""
+    from scipy.spatial.transform import Rotation  # takes a third of a second
+
+    body, axes = model.robot.attach(*model.robot.hand)[0], model.robot.attached_axes(model.robot.hand[0])
+    R = np.array([model.body_pose(body, row)[0] for row in q]).reshape(-1, 3, 3)
+    return np.asarray(Rotation.from_matrix(orientation.T @ R @ axes).magnitude())
+
+
 def hand_posture(
-    model: Kinematics, target: Array, q: Array, orientation: Array | None, braces: Sequence[Contact], tolerance: float
+    model: Kinematics,
+    target: Array,
+    q: Array,
+    orientation: Array | None,
+    braces: Sequence[Contact],
+    tolerance: float,
+    moving: Sequence[str] | None = None,
 ) -> Array:
-    """See :meth:`dynsim.Model.inverse_kinematics`."""
+    """See :meth:`dynsim.Model.inverse_kinematics`; ``moving`` : the joints that may move, None: all."""
     robot = model.robot
     if robot.couplings or model.nq != model.n:
         raise ModelError("inverse_kinematics: for arms whose joints each have a coordinate of their own")
@@ -47,6 +62,7 @@ def hand_posture(
         raise ModelError("inverse_kinematics: braces are points or spheres, no axes of links")
     lower, upper = (np.array([getattr(link, side) for link in robot.links]) for side in ("lower", "upper"))
     revolute = np.array([link.units[0] == "rad" for link in robot.links])
+    movable = np.array([moving is None or link.joint in moving for link in robot.links])
     hand, axes = robot.attach(*robot.hand)[0], robot.attached_axes(robot.hand[0])
     q = np.clip(q, lower, upper)
     error = np.zeros(0)
@@ -65,7 +81,7 @@ def hand_posture(
         size = float(np.abs(error).max())
         if size <= tolerance:
             return q
-        q = _stepped(q, J, error * min(1.0, 0.3 / size), size, lower, upper)
+        q = _stepped(q, J, error * min(1.0, 0.3 / size), size, lower, upper, movable)
     at = [robot.links[k].joint for k in range(model.n) if q[k] in (lower[k], upper[k])]
     stuck = f"; at their limits: {', '.join(at)}" if at else ""
     left = float(np.abs(error).max())
@@ -75,9 +91,11 @@ def hand_posture(
     )
 
 
-def _stepped(q: Array, J: Array, error: Array, size: float, lower: Array, upper: Array) -> Array:
+def _stepped(
+    q: Array, J: Array, error: Array, size: float, lower: Array, upper: Array, movable: NDArray[np.bool_]
+) -> Array:
     """A damped Gauss–Newton step; joints that it would take beyond their limits stay there, and the rest take over."""
-    free = np.ones(len(q), dtype=bool)
+    free = movable.copy()
     for _ in range(len(q)):
         A = J[:, free]
         damping = 1e-12 + DAMPING * min(size, 1.0) ** 2

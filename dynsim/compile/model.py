@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dynsim.compile.bracing import Brace, BraceStatics, PreparedBraces
+from dynsim.compile.derivatives import InverseDynamicsDerivatives, inverse_dynamics_derivatives
 from dynsim.compile.hand_posture import hand_posture
 from dynsim.compile.tables import compile_model
 from dynsim.config.problems import listed
@@ -19,6 +20,7 @@ from dynsim.dynamics import tables as ka
 from dynsim.dynamics.tree import articulated, joints, points, sweep
 from dynsim.errors import ModelError, brief
 from dynsim.model.description import Array, Contact, Robot
+from dynsim.model.surfaces import Surface
 from dynsim.record import notebook
 
 _FLOAT64 = np.dtype(np.float64)
@@ -111,10 +113,30 @@ class Model:
         return cls(read_urdf(Path(path), lock))
 
     def to_urdf(self) -> str:
-        """The tree of bodies as URDF text."""
+        """The tree of bodies as URDF text, with masses, limits, viscous losses and shapes."""
+        from dynsim.compile.scene import with_shapes
         from dynsim.model.urdf.writer import write_urdf
 
-        return write_urdf(self.robot)
+        return write_urdf(with_shapes(self.robot))
+
+    def to_mjcf(self, contacts: Sequence[Contact] = (), surfaces: Mapping[str, Surface] | None = None) -> str:
+        """The tree of bodies as MJCF, the format of MuJoCo, with what its motors add to it.
+
+        Parameters
+        ----------
+        contacts : points that become sites
+        surfaces : of which planes, spheres, cylinders and boxes become shapes that are drawn and do not touch
+
+        Raises
+        ------
+        ModelError
+            A joint of a kind that MJCF does not have, such as wheels that roll without slip.
+        """
+        from dynsim.compile.scene import drawn_surface, with_shapes
+        from dynsim.model.mjcf import write_mjcf
+
+        drawn = [drawn_surface(name, surface) for name, surface in (surfaces or {}).items()]
+        return write_mjcf(with_shapes(self.robot), contacts, drawn, self.damping, self.armature)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -164,6 +186,16 @@ class Model:
         self._workspace.joints[:, ka.APPLIED] = self._vector(tau, "tau", self.joint_names)
         articulated.forward_dynamics(self._bodies, self._workspace)
         return self._workspace.joints[:, ka.QDD].copy()
+
+    def derivatives(self, q: ArrayLike, v: ArrayLike, vdot: ArrayLike) -> InverseDynamicsDerivatives:
+        """Derivatives of inverse dynamics, ∂tau/∂q, ∂tau/∂v and ∂tau/∂v̇ = M, in closed form, (n, n) each.
+
+        Those of forward dynamics follow, at v̇ = M⁻¹ (tau − h − g): ∂v̇/∂q = −M⁻¹ ∂tau/∂q, ∂v̇/∂v = −M⁻¹ ∂tau/∂v.
+        Rotor inertia, losses and contacts are not part of them, as of all methods here;
+        :meth:`dynsim.Simulation.linearize` has them all.
+        """
+        self.inverse_dynamics(q, v, vdot)
+        return inverse_dynamics_derivatives(self.arrays, self._workspace.links)
 
     def brace_statics(self, q: ArrayLike, v: ArrayLike, vdot: ArrayLike, braces: Mapping[str, Brace]) -> BraceStatics:
         """Torques and brace forces that realise v̇ with the least heat, or a certificate that none do.

@@ -51,7 +51,7 @@ def robot_scene(robot: Robot, contacts: Sequence[Contact], surfaces: Mapping[str
         if kind is None:
             return None
         parent = WORLD if link.parent is None else index[link.parent]
-        bodies.append(Body(link.name, parent, _joint(link, kind), link.shapes or _rod(link)))
+        bodies.append(Body(link.name, parent, _joint(link, kind), shapes(link)))
     hand_body, hand_point = robot.hand
     points = [Point("hand", "hand", index[hand_body], vector3(hand_point))]
     supports: tuple[Point, ...] = ()
@@ -63,14 +63,14 @@ def robot_scene(robot: Robot, contacts: Sequence[Contact], surfaces: Mapping[str
         points.append(Point(contact.name, "contact", body, vector3(point), contact.surface_name))
     return Scene(
         tuple(bodies),
-        tuple(_drawn(name, surface) for name, surface in surfaces.items()),
+        tuple(drawn_surface(name, surface) for name, surface in surfaces.items()),
         tuple(points),
         robot.fixed_shapes,
         supports,
     )
 
 
-def _drawn(name: str, surface: Surface) -> SceneSurface:
+def drawn_surface(name: str, surface: Surface) -> SceneSurface:
     """A surface as a scene keeps it."""
     nothing = np.zeros((3, 3))
     if isinstance(surface, Box):
@@ -151,6 +151,16 @@ def _limit(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
+def shapes(link: Link) -> tuple[Shape, ...]:
+    """The looks of a link's body: its shapes, else the cylinder about its axis where that is known."""
+    return link.shapes or _rod(link)
+
+
+def with_shapes(robot: Robot) -> Robot:
+    """The same robot whose links name the shapes that they are drawn with."""
+    return replace(robot, links=tuple(replace(link, shapes=shapes(link)) for link in robot.links))
+
+
 def _rod(link: Link) -> tuple[Shape, ...]:
     """The cylinder about the body's axis; nothing where its radius or its end is not known."""
     if link.tip is None or not link.radius > 0.0:
@@ -187,16 +197,16 @@ def snake_scene(description: SnakeDescription) -> Scene:
         forward = 0.0 if j == n_h - 1 else l
         axis = (0.0, -1.0, 0.0) if d.pitch[j] else (0.0, 0.0, -1.0)
         joint = _snake_joint(d, j, axis, forward)
-        bodies.append(Body(f"head_{d.joint_names[j]}", len(bodies) - 1, joint, (_tube(d, 0.0, l),)))
+        bodies.append(Body(f"head_{d.joint_names[j]}", len(bodies) - 1, joint, (snake_tube(d, 0.0, l),)))
     head = len(bodies) - 1
     for pair in range(1, d.pairs):
         joint = _snake_joint(d, n_h + pair - 1, (0.0, 0.0, 1.0), -l if pair == 1 else -2.0 * l)
         parent = 0 if pair == 1 else len(bodies) - 1
-        tube = _tube(d, -2.0 * l if pair < d.pairs - 1 else -l, 0.0)
+        tube = snake_tube(d, -2.0 * l if pair < d.pairs - 1 else -l, 0.0)
         bodies.append(Body(f"pair{pair + 1}", parent, joint, (tube, *_passive_wheels(d, pair, -l))))
         wheels.append(_active_wheel(d, pair, len(bodies) - 1, -l))
     if d.pairs > 1:
-        bodies[0] = Body("pair1", WORLD, base, (_tube(d, -l, 0.0), *bodies[0].shapes))
+        bodies[0] = Body("pair1", WORLD, base, (snake_tube(d, -l, 0.0), *bodies[0].shapes))
     ground = SceneSurface.of_quadric("ground", np.zeros((3, 3)), [0.0, 0.0, 1.0], 0.0)
     hand = Point("controlled point", "hand", head, (l + d.point_offset, 0.0, 0.0))
     return Scene((*bodies, *(wheel for wheel in wheels if wheel is not None)), (ground,), (hand,))
@@ -208,15 +218,21 @@ def _snake_joint(d: SnakeDescription, j: int, axis: tuple[float, float, float], 
     return Joint(name, "revolute", axis, (x, 0.0, 0.0), HERE, "phi", (name,), lower, upper)
 
 
-def _tube(d: SnakeDescription, start: float, end: float) -> Shape:
+def snake_tube(d: SnakeDescription, start: float, end: float) -> Shape:
+    """The body of a snake along x of a link, from start to end [m]."""
     return Shape("cylinder", (BODY_RADIUS * d.wheel_radius, end - start), (0.5 * (start + end), 0.0, 0.0), _ALONG_X)
 
 
 def _passive_wheels(d: SnakeDescription, pair: int, x: float) -> tuple[Shape, ...]:
     """Wheels that follow the ground: their angle is not recorded."""
     sides = [side for side in (1, -1) if side != d.driven_side[pair]]
-    size = (d.wheel_radius, WHEEL_WIDTH * d.wheel_radius)
-    return tuple(Shape("cylinder", size, (x, side * float(d.half_track[pair]), 0.0), _ALONG_Y) for side in sides)
+    wheel = snake_wheel(d)
+    return tuple(replace(wheel, position=(x, side * float(d.half_track[pair]), 0.0)) for side in sides)
+
+
+def snake_wheel(d: SnakeDescription) -> Shape:
+    """A wheel of a snake about y of its body."""
+    return Shape("cylinder", (d.wheel_radius, WHEEL_WIDTH * d.wheel_radius), orientation=_ALONG_Y)
 
 
 def _active_wheel(d: SnakeDescription, pair: int, parent: int, x: float) -> Body | None:
@@ -226,5 +242,4 @@ def _active_wheel(d: SnakeDescription, pair: int, parent: int, x: float) -> Body
     name = d.wheel_names[int(np.count_nonzero(d.driven_side[:pair]))]
     position = (x, side * float(d.half_track[pair]), 0.0)
     joint = Joint(name, "revolute", (0.0, 1.0, 0.0), position, HERE, "rho", (name,))
-    shape = Shape("cylinder", (d.wheel_radius, WHEEL_WIDTH * d.wheel_radius), orientation=_ALONG_Y)
-    return Body(f"wheel_{name}", parent, joint, (shape,))
+    return Body(f"wheel_{name}", parent, joint, (snake_wheel(d),))

@@ -1,4 +1,7 @@
-"""Splines through samples, by B-splines on their knots; scipy has them too, but costs a run 0.3 s to import."""
+"""Splines through samples, by B-splines on their knots, and the way from rest to rest of least jerk.
+
+scipy has splines too, but costs a run 0.3 s to import.
+"""
 
 from __future__ import annotations
 
@@ -95,3 +98,9 @@ def clamped_cubic(knots: ArrayLike, values: Array, times: Array, level: bool = T
     third = (a + b - 2.0 * d) / h[k]
     curve = y[k] + x * (a + x * ((d - a) / h[k] - third + x * (third / h[k])))
     return np.asarray(curve.reshape(len(t), *values.shape[1:]))
+
+
+def minimum_jerk(t: Array, start: float, duration: float) -> Array:
+    """s(x) = 10x³ − 15x⁴ + 6x⁵ with x = (t − start)/duration, 0 before and 1 after: least integral of squared jerk."""
+    x = np.clip((np.asarray(t) - start) / duration, 0.0, 1.0)
+    return x**3 * (10.0 - 15.0 * x + 6.0 * x**2)

@@ -22,6 +22,7 @@ from dynsim.engine.compilation import kernels_logged
 from dynsim.engine.prepare import Prepared, right_hand_side
 from dynsim.integrators import driver
 from dynsim.integrators import run as ki
+from dynsim.integrators.stepping import tables as kt
 from dynsim.system import interruption
 
 log = logging.getLogger(__name__)
@@ -31,6 +32,8 @@ LOOK_S, PATIENCE_S = 0.1, 0.5
 # After so long in one and the same step it is stuck [s]: the longest that was ever seen, of 24 contacts whose forces no
 # method of the solver finds, took 80.
 STUCK_S = 600.0
+# A round of the solver of contact problems, times the cube of their rows [s].
+ROUND = 2e-9
 
 
 def attend(
@@ -151,10 +154,12 @@ def _short_steps(prepared: Prepared) -> int:
     """How many steps are over before anybody would have looked, whatever happens within them.
 
     They are taken in the caller's own thread: to hand a short run to another one costs some hundredths of its time.
-    None under the unilateral law, where one step may take a minute.
+    None under the unilateral law, where one step may take a minute; but steps of one length, whose contact problems
+    are given up after so many rounds.
     """
     if prepared.system.unilateral is not None:
-        return 0
+        rows = max(prepared.workspace.small.shape[1], 1)
+        return int(LOOK_S / (kt.LAST_ROUNDS * ROUND * rows**3)) if prepared.run.stepping is not None else 0
     n, p = len(prepared.workspace.joints), prepared.workspace.small.shape[1]
     seconds = right_hand_side(n, p, dense=prepared.system.dense is not None)
     # Of RADAU5 with a Jacobian and its factors.
@@ -195,7 +200,7 @@ def advance(
         ended, raised = attend(remainder, ask, both)
     watch.spend()
     if not ended:
-        prepared = _copied(prepared)
+        prepared = copied(prepared)
     count = prepared.run.count
     count[ki.ASKED] = 0
     if not ended or count[ki.STATUS] == ki.RUNNING:
@@ -208,13 +213,13 @@ def advance(
     return prepared, None if isinstance(raised, OutOfTime) else raised
 
 
-def _copied(value: Any) -> Any:
+def copied(value: Any) -> Any:
     """Tables and arrays of their own, in which nothing moves any more."""
     if isinstance(value, Prepared):
-        return replace(value, run=_copied(value.run), workspace=_copied(value.workspace), system=_copied(value.system))
+        return replace(value, run=copied(value.run), workspace=copied(value.workspace), system=copied(value.system))
     if isinstance(value, np.ndarray):
         return value.copy()
     if isinstance(value, tuple):
-        parts = map(_copied, value)
+        parts = map(copied, value)
         return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
     return value

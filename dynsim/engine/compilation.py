@@ -110,12 +110,17 @@ def _marked(compilation: Compilation) -> Iterator[None]:
     """What is compiled is written where displays look for it, within."""
     path = cache_folder() / f"{os.getpid()}{MARK}"
     with suppress(OSError):
-        path.write_text(json.dumps([os.getpgrp(), compilation.text, compilation.since, compilation.expected]))
+        path.write_text(json.dumps([_group(), compilation.text, compilation.since, compilation.expected]))
     try:
         yield
     finally:
         with suppress(OSError):
             path.unlink()
+
+
+def _group() -> int:
+    """Number of this process's group; of a system without groups that of the process."""
+    return os.getpgrp() if hasattr(os, "getpgrp") else os.getpid()
 
 
 def under_way() -> Compilation | None:
@@ -124,8 +129,9 @@ def under_way() -> Compilation | None:
     for path in cache_folder().glob(f"*{MARK}"):
         with suppress(OSError, ValueError, TypeError):
             group, text, since, expected = json.loads(path.read_text())
-            os.kill(int(path.name.removesuffix(MARK)), 0)  # of a process that died it stays
-            if group == os.getpgrp():
+            if hasattr(os, "getpgrp"):  # elsewhere signal 0 would end it
+                os.kill(int(path.name.removesuffix(MARK)), 0)  # of a process that died it stays
+            if group == _group():
                 running.append(Compilation(str(text), float(since), expected))
     return min(running, key=lambda compilation: compilation.since, default=None)
 

@@ -34,7 +34,7 @@ TICKS = 10
 def simulate(scenario: Scenario, progress: Progress | None = None, *, pictured: bool = True) -> Record:
     """See :func:`dynsim.engine.simulate`."""
     prepared = prepare(scenario, progress)
-    if prepared.control.teleop is not None:
+    if prepared.control.teleop is not None or prepared.control.task_space is not None:
         return _teleoperated(scenario, progress, pictured)
     size = prepared.model.n, len(prepared.contacts), len(prepared.stops)
     # Loading or compiling the kernels is no integration time.
@@ -76,13 +76,13 @@ def simulate(scenario: Scenario, progress: Progress | None = None, *, pictured: 
 
 
 def _teleoperated(scenario: Scenario, progress: Progress | None, pictured: bool) -> Record:
-    """The script of an operator, by the public stepper: its record is that of the session, bit for bit."""
+    """The script of an operator, or of a snake's, by the public stepper: its record is the session's, bit for bit."""
     from dynsim.engine.simulation import Simulation
 
     # Without an end, as a session: a step that ends at a tick and one at the end of a run need not be the same.
     simulation = Simulation(scenario, duration=math.inf)
     assert simulation.operator is not None
-    rate, k = simulation.operator.options.rate, 0
+    rate, k = simulation.operator.rate, 0
     stop: SimulationStopped | None = None
     try:
         while simulation.time < scenario.duration_s:

@@ -12,7 +12,8 @@ from dynsim.engine.compilation import kernels_logged
 from dynsim.engine.kinematic_record import make_record
 from dynsim.engine.kinematic_run import SnakeRun
 from dynsim.engine.outcome import check_size, interrupted, raise_stopped
-from dynsim.errors import ModelError, ScenarioError, SimulationStopped
+from dynsim.engine.snake_control import control_periods
+from dynsim.errors import ModelError, SimulationStopped
 from dynsim.library.families import member
 from dynsim.record import Record
 from dynsim.record.poses import pose_columns
@@ -48,10 +49,7 @@ def prepare(scenario: Scenario, source: CommandSource | None = None) -> SnakeRun
     assert isinstance(description, SnakeDescription)
     controller = build.controller(scenario, description)
     model, period = description.arrays(), controller.schedule.period
-    ticks = round(scenario.duration_s / period)
-    if ticks < 1:
-        raise ScenarioError(f"duration_s = {scenario.duration_s:g} is shorter than controller.period_s = {period:g}")
-    stride = _stride(scenario.record.rate_hz, period)
+    ticks, stride = control_periods(scenario, period)
     rows, bodies = -(-ticks // stride) + 1, len(snake_scene(description).bodies)
     check_size(scenario, rows, sum(array[0].size for array in new_trace(model, 1)) + pose_columns(bodies))
     run = SnakeRun(description, model, controller, controller.source if source is None else source, ticks, stride)
@@ -116,14 +114,3 @@ def _check_wall(run: SnakeRun, spent: float, limit: float | None) -> None:
             time=run.time,
             state=run.postures(),
         )
-
-
-def _stride(rate_hz: float, period: float) -> int:
-    exact = 1.0 / (rate_hz * period)
-    stride = max(1, round(exact))
-    if abs(stride - exact) > 1e-6 * exact:
-        raise ScenarioError(
-            f"record.rate_hz = {rate_hz:g} does not divide the control rate of {1 / period:g} Hz "
-            f"(controller.period_s); {1 / (period * stride):g} does"
-        )
-    return stride

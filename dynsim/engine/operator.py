@@ -14,6 +14,7 @@ hand comes to the edge of what its joints can do (:mod:`dynsim.engine.hand_gover
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any, Protocol
 
 import numpy as np
@@ -23,7 +24,9 @@ from dynsim.compile.model import Model
 from dynsim.compile.references.teleop import BASE, HAND, VELOCITIES, TeleopOptions, VelocitySource
 from dynsim.compile.rolling import wheel_angles
 from dynsim.engine.hand_governor import HandGovernor
+from dynsim.engine.stepped import State, Touch
 from dynsim.model.base_pose import base_pose, base_row
+from dynsim.record import Record
 
 Array = NDArray[np.float64]
 _STATE = ("ticks", "_moving", "_angles", "_base_velocity")
@@ -32,8 +35,18 @@ _STATE = ("ticks", "_moving", "_angles", "_base_velocity")
 class Referenced(Protocol):
     """A simulation whose references can be rewritten."""
 
-    def set_reference(self, joint: str, position: float, rate: float = 0.0) -> None:
-        """See :meth:`dynsim.engine.simulation.Simulation.set_reference`."""
+    @property
+    def state(self) -> State:
+        """See :attr:`dynsim.engine.simulation.Simulation.state`."""
+        ...
+
+    @property
+    def touching(self) -> dict[str, Touch]:
+        """See :attr:`dynsim.engine.simulation.Simulation.touching`."""
+        ...
+
+    def set_references(self, lines: Mapping[str, tuple[float, float]]) -> None:
+        """See :meth:`dynsim.engine.simulation.Simulation.set_references`."""
 
 
 class OperatorPath:
@@ -54,6 +67,7 @@ class Operator:
 
     def __init__(self, model: Model, options: TeleopOptions, source: VelocitySource | None = None) -> None:
         robot = model.robot
+        self.rate, self.period = options.rate, 1.0 / options.rate
         self.options, self.source = options, options.script if source is None else source
         self.ticks, self._moving = 0, False
         self._model, self._start = model, np.array(model.point_position(*robot.hand, robot.initial), dtype=np.float64)
@@ -79,11 +93,14 @@ class Operator:
         """Why the hand is slower than it was asked to be; empty where it is not."""
         return "" if self._hand is None else self._hand.hindrance
 
-    def state(self) -> dict[str, Any]:
+    def remembered(self) -> dict[str, Any]:
         """What the future depends on: values that are replaced, and never written to."""
         points = None if self.path is None else list(self.path.points)
         hand = None if self._hand is None else self._hand.state()
         return {name: getattr(self, name) for name in _STATE} | {"points": points, "hand": hand}
+
+    def add_to(self, record: Record) -> None:
+        """Nothing: what it does is in the references."""
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go back to a state of this operator."""
@@ -101,8 +118,7 @@ class Operator:
         lines = self._joint_lines(wanted[HAND]) | self._wheel_lines(wanted[BASE])
         moving = any(rate != 0.0 for _, rate in lines.values())
         if moving or self._moving:
-            for joint, (position, rate) in lines.items():
-                simulation.set_reference(joint, position, rate)
+            simulation.set_references(lines)
         self._moving = moving
 
     def _joint_lines(self, wanted: Array) -> dict[str, tuple[float, float]]:

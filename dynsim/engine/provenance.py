@@ -13,7 +13,9 @@ from dynsim._version import __version__
 from dynsim.library import families
 from dynsim.scenario import Scenario
 
-LIBRARIES = ("numpy", "scipy", "numba", "h5py", "pin")
+LIBRARIES = ("numpy", "scipy", "numba", "h5py")
+# In a built package: the commit that it was built from.
+BUILT_FROM = "commit.txt"
 
 
 def provenance(scenario: Scenario) -> dict[str, Any]:
@@ -35,13 +37,18 @@ def _version(library: str) -> str:
     try:
         return metadata.version(library)
     except metadata.PackageNotFoundError:
-        # Pinocchio has another name in other distributions than PyPI's.
         return "unknown"
 
 
 @lru_cache
 def commit() -> str:
-    """Commit of the checkout that runs, "" when it is not one. Read from .git, once: starting git would cost more."""
+    """Commit of the checkout that runs, or that an installed package was built from; "" where neither is known.
+
+    Read from .git, once: starting git would cost more. A package has it from ``.ci/build_hook.py``.
+    """
+    built = Path(__file__).resolve().parents[1] / BUILT_FROM
+    if built.is_file():
+        return built.read_text(encoding="ascii").strip()
     git = Path(__file__).resolve().parents[2] / ".git"
     try:
         if git.is_file():  # a linked work tree

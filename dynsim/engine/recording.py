@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from dynsim.compile.hand_posture import hand_turns
 from dynsim.compile.scene import robot_scene
 from dynsim.dynamics import state as kst
 from dynsim.dynamics.tree import support as ks
@@ -64,6 +65,9 @@ def make_record(
     target = prepared.control.target(record.time)
     if target is not None:
         record.add("target_position", target, "m", labels=("x", "y", "z"))
+    if prepared.control.orientation is not None:
+        turned = hand_turns(model, run.states("q"), prepared.control.orientation)
+        record.add("hand_turn_error", turned, "rad", description="angle between the hand's orientation and its target")
     for integral, (name, text) in zip(_by_column(run.states("ledger")), metrics.INTEGRALS.items(), strict=True):
         record.add(name, integral, "J", description=text)
     if prepared.system.unilateral is not None:

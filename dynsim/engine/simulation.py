@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import math
 import time as clock
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,6 +26,7 @@ from dynsim.dynamics import tables as ka
 from dynsim.dynamics.state import block
 from dynsim.dynamics.tree import loads as kl
 from dynsim.engine import attended
+from dynsim.engine.linearization import Linearization, linearized
 from dynsim.engine.operator import Operator
 from dynsim.engine.outcome import mark_stopped, raise_stopped
 from dynsim.engine.prepare import prepare, sample_times
@@ -34,6 +35,7 @@ from dynsim.engine.stepped import GUARDS, Snapshot, State, Touch, event_name, ow
 from dynsim.engine.stopping import stopped
 from dynsim.engine.trace import Trace
 from dynsim.errors import ModelError, ScenarioError, brief
+from dynsim.integrators import driver
 from dynsim.integrators import run as ki
 from dynsim.integrators.dense import state_within
 from dynsim.model.drives import Drive
@@ -43,6 +45,10 @@ from dynsim.scenario import Scenario, require_scenario
 from dynsim.scenario.build import check_start
 from dynsim.system import interruption
 from dynsim.system.memo import Memo, remembering
+
+if TYPE_CHECKING:
+    from dynsim.engine.snake_pilot import SnakePilot
+    from dynsim.snake.description import CommandSource
 
 Array = NDArray[np.float64]
 
@@ -79,7 +85,7 @@ class Simulation:
     duration : end of the run [s], ``math.inf`` for none; default: the scenario's. References hold where they end.
     trace : samples that are kept: all (None), the last so many, or none (0)
     motors : instead of those of the plant, see :mod:`dynsim.model.description`; records still show the scenario's
-    operator : instead of the script of a scenario that has ``controller.operator``
+    operator : instead of the script of a scenario that has ``controller.operator``, or of a snake's
 
     Raises
     ------
@@ -95,7 +101,7 @@ class Simulation:
         duration: float | None = None,
         trace: int | None = None,
         motors: Sequence[Drive] | None = None,
-        operator: VelocitySource | None = None,
+        operator: VelocitySource | CommandSource | None = None,
     ) -> None:
         require_scenario(scenario)
         if scenario.engine != "dynamics":
@@ -149,12 +155,29 @@ class Simulation:
         run.clock[[ki.TIME, ki.COUNTED_SINCE]] = start
         run.tick[:, [ki.TICK_NEXT, ki.TICK_PHASE]] = start
         self._refill()
-        options = self._prepared.control.teleop
-        self._operator = None if options is None else Operator(self.model, options, operator)
+        self._operator = self._attendant(operator)
         if self._operator is not None:
-            self.every(1.0 / self._operator.options.rate, self._operator)
+            self.every(self._operator.period, self._operator)
         elif operator is not None:
             raise ScenarioError("an operator needs a scenario with controller.operator, which says what it moves")
+
+    def _attendant(self, source: Any) -> Operator | SnakePilot | None:
+        """Who rewrites references at the ticks of its own, where the scenario has somebody."""
+        control = self._prepared.control
+        if control.teleop is not None:
+            return Operator(self.model, control.teleop, source)
+        if control.task_space is None:
+            return None
+        # Imported here: an arm needs nothing of a snake.
+        from dynsim.engine.snake_control import control_periods
+        from dynsim.engine.snake_pilot import SnakePilot
+
+        periods = control_periods(self._scenario, control.task_space.schedule.period)
+        pilot = SnakePilot(self.model, control.task_space, *periods, source, self._scenario.config.sensors)
+        for sensor in pilot.sensors:
+            # Before the controller, where both are due.
+            self.every(sensor.period, sensor)
+        return pilot
 
     @property
     def scenario(self) -> Scenario:
@@ -191,8 +214,8 @@ class Simulation:
         }
 
     @property
-    def operator(self) -> Operator | None:
-        """Who rewrites the references of hand and base, where the scenario has ``controller.operator``."""
+    def operator(self) -> Operator | SnakePilot | None:
+        """Who rewrites references: of hand and base under ``controller.operator``, of a snake under ``task_space``."""
         return self._operator
 
     @property
@@ -327,18 +350,27 @@ class Simulation:
         Of an open torque ``position`` is the torque [N m]. What ``initial.equilibrium`` has moved the references by is
         added.
         """
-        values = _finite("reference", [position, rate])
-        if (balance := self._prepared.balance) is not None:
-            values[0] += balance.shift[self._motor(joint)]
-        self._follow_line(joint, values)
-        self._leave_plan(joint)
+        self.set_references({joint: (position, rate)})
 
-    def _follow_line(self, joint: str, values: Array) -> None:
-        a = self._motor(joint)
+    def set_references(self, lines: Mapping[str, tuple[float, float]]) -> None:
+        """:meth:`set_reference` of several joints at once: (position, rate) by joint."""
+        if not lines:
+            return
+        motors = [self._motor(joint) for joint in lines]
+        values = _finite("reference", list(lines.values()))
+        if (balance := self._prepared.balance) is not None:
+            values[:, 0] += balance.shift[motors]
+        self._follow_lines(motors, values)
+        for joint in lines:
+            self._leave_plan(joint)
+
+    def _follow_lines(self, motors: list[int], values: Array) -> None:
+        """Let motors follow lines from now on, values (motors, 2)."""
         self._settle_now()
         drives, reference = self._prepared.system.drives, self._prepared.system.reference
-        reference.spline[a], drives.table[a, ka.SAMPLED] = ka.REWRITTEN, self._sampled[a]
-        drives.input[a, [ka.LINE_START, ka.LINE_RATE, ka.LINE_SINCE]] = values[0], values[1], self._time
+        reference.spline[motors], drives.table[motors, ka.SAMPLED] = ka.REWRITTEN, self._sampled[motors]
+        drives.input[motors, ka.LINE_START], drives.input[motors, ka.LINE_RATE] = values.T
+        drives.input[motors, ka.LINE_SINCE] = self._time
         self._restart()
 
     def set_command(self, joint: str, command: float) -> None:
@@ -449,10 +481,45 @@ class Simulation:
             self._pushed.add(k)
         self._restart()
 
+    def linearize(
+        self, inputs: Sequence[str] = ("command",), outputs: Sequence[str] = ("hand_position",)
+    ) -> Linearization:
+        """Linear equations of the whole system about the present state: δẋ = A δx + B δu, δy = C δx + D δu.
+
+        x is q, v and the currents of motors with a circuit; contacts, stops and couplings are held as they are now, and
+        the controller is part of the system. The simulation stays as it is.
+
+        >>> A, B, C, D = simulation.linearize(inputs=["reference"], outputs=["hand_position", "contact_normal_force"])
+
+        Parameters
+        ----------
+        inputs : ``command`` of motors, beyond what the controller asks for [V; N m of an open torque], ``reference``
+            [rad or m], ``reference_rate``, ``force`` [N] and ``torque`` [N m] on bodies, in the axes of the wrench
+            that is set; a family of them, or one: ``"command.joint_3"``, ``"force.link_10.z"``
+        outputs : ``q``, ``v``, ``current``, ``vdot``, ``voltage``, ``motor_torque``, ``hand_position``,
+            ``contact_normal_force``, ``contact_force``, ``contact_gap``, likewise
+
+        Raises
+        ------
+        ScenarioError
+            No such input or output, or ``integrator.method: time_stepping``, which knows no modes between its steps.
+        """
+        if self._prepared.run.method == ki.TIME_STEPPING:
+            raise ScenarioError("integrator.method: time_stepping has no modes to linearize with; take another method")
+        before = self.snapshot()
+        try:
+            self._settle_now()
+            if self._prepared.run.count[ki.STARTED] == 0:
+                # Modes of contacts are chosen where a step starts; none is taken.
+                driver.advance(self._prepared.system, self._prepared.workspace, self._prepared.run, 0)
+            return linearized(self._prepared, inputs, outputs)
+        finally:
+            self.restore(before)
+
     def snapshot(self) -> Snapshot:
         """What :meth:`restore` needs to go on from here."""
         arrays = {name: array.copy() for name, array in self._arrays().items()}
-        operator = None if self._operator is None else self._operator.state()
+        operator = None if self._operator is None else self._operator.remembered()
         trace, happened = self._trace.snapshot(), tuple(self._happened)
         return Snapshot(self._token, arrays, self._time, trace, happened, self._frozen, operator)
 
@@ -516,6 +583,8 @@ class Simulation:
             base_as_planned=self._base_as_planned,
             pictured=pictured,
         )
+        if self._operator is not None:
+            self._operator.add_to(record)
         record.complete = self.finished
         if self._failed():
             mark_stopped(stopped(self._scenario, self._prepared), record)
@@ -687,7 +756,7 @@ class Simulation:
         reference = self._prepared.system.reference
         powers = reference.grid[1] ** np.arange(6)
         end = float(reference.coefficients[-1, self._splines[self._motors[joint]]] @ powers)
-        self._follow_line(joint, np.array([end, 0.0]))
+        self._follow_lines([self._motors[joint]], np.array([[end, 0.0]]))
 
     def _refill(self, until: float = -np.inf) -> None:
         """Move what was sampled to the trace, and give the buffer the times from there on, at least up to ``until``."""

@@ -6,10 +6,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from dynsim.compile.equilibrium import holding_torques, load_forces
+from dynsim.compile.equilibrium import holding_torques, load_forces, static_margin
 from dynsim.compile.model import Model
 from dynsim.compile.shapes import gap_at
-from dynsim.compile.static_margin import static_margin
 from dynsim.engine import Start
 from dynsim.engine.prepare import prepare
 from dynsim.errors import ModelError

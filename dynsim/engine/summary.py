@@ -18,7 +18,15 @@ from dynsim.integrators.stepping import tables as kt
 from dynsim.model.description import Array, Contact, Robot
 from dynsim.model.drives import Drive, TorqueSource
 from dynsim.record import Record
-from dynsim.record.measures import RESIDUAL_LIMIT, STORES, base_summary, energy_turnover, hand_error, sinks
+from dynsim.record.measures import (
+    RESIDUAL_LIMIT,
+    STORES,
+    base_summary,
+    energy_turnover,
+    hand_error,
+    hand_turn_error,
+    sinks,
+)
 from dynsim.scenario import Scenario, build
 from dynsim.system.memo import recall
 
@@ -119,6 +127,7 @@ def summarise(record: Record, scenario: Scenario, prepared: Prepared, wall: floa
         "rhs_evaluations": int(run.count[ki.EVALUATIONS]),
         "projections": int(run.count[ki.PROJECTIONS]),
         **hand_error(record, scenario.metrics.settle_s),
+        **hand_turn_error(record, scenario.metrics.settle_s),
         "electrical_energy_J": final("energy_electrical"),
         "electrical_energy_supply_J": final("energy_electrical_supply"),
         "electrical_energy_drawn_J": final("energy_electrical_drawn"),

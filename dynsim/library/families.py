@@ -160,6 +160,22 @@ def build(family: str, config: Any, context: BuildContext, expected: type[T] | U
     return cast(T, result)
 
 
+def engine(plant: Any) -> str:
+    """What simulates the plant of a configuration: the ``engine(config)`` of its module, or its ``ENGINE``."""
+    module = member("plant", plant.type)
+    chosen = getattr(module, "engine", None)
+    return str(module.ENGINE if chosen is None else chosen(plant))
+
+
+def section_defaults(plant: Any, sections: Mapping[str, Any]) -> dict[str, Any]:
+    """What a plant that was read, not validated, wants other sections to say where they do not say otherwise."""
+    name = plant.get("type") if isinstance(plant, Mapping) else None
+    if not isinstance(name, str) or not is_shipped("plant", name):
+        return {}
+    defaults = getattr(member("plant", name), "section_defaults", None)
+    return {} if defaults is None else dict(defaults(plant, sections))
+
+
 def _plugin(family: str, name: str) -> Plugin:
     if (family, name) in _imported:
         return _imported[family, name]

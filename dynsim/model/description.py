@@ -265,6 +265,27 @@ class Contact:
 
 
 @dataclass(frozen=True)
+class Foot:
+    """A sphere of a body that can touch one of the scenario's surfaces, whatever contact points that declares.
+
+    On a body that spins about its own centre it is a wheel: the point that touches is that of the sphere, so it rolls.
+
+    Attributes
+    ----------
+    point : (3,) centre of the sphere in the body's frame [m]; radius [m]
+    surface : name of the surface in the scenario
+    grip_axis : (3,) in the body's frame, or None: no friction along it, as of a wheel without mass
+    """
+
+    name: str
+    body: str
+    point: Array
+    radius: float
+    surface: str
+    grip_axis: Array | None = None
+
+
+@dataclass(frozen=True)
 class Coupling:
     """A joint that follows another one, q = ratio q_leader + offset: a gear, a belt, a URDF mimic joint.
 
@@ -351,7 +372,7 @@ class Robot:
     ``hand``: the controlled point (body name, point in its frame [m]); ``q0``: initial configuration [rad or m], zero
     unless given; ``frames``: further names to attach points to; ``fixed_shapes``, ``fixed_inertia``: what stands still
     in the world; ``couplings`` of joints to joints; ``ties`` of bodies to bodies; ``base``: what it drives on, None: it
-    stands fixed or floats.
+    stands fixed or floats; ``feet``: what of it is made to touch, such as wheels.
     """
 
     name: str
@@ -366,6 +387,7 @@ class Robot:
     ties: tuple[Tie, ...] = ()
     base: MobileBase | None = None
     fixed_inertia: Inertia = field(default_factory=lambda: Inertia(0.0))
+    feet: tuple[Foot, ...] = ()
 
     @property
     def bodies(self) -> tuple[str, ...]:

@@ -91,17 +91,17 @@ def moving_arm(model: Model, surfaces: Mapping[str, Surface]) -> MovingArm:
         heat.append(motor.resistance / motor.joint_constant**2)
         current = min(motor.greatest_current, motor.voltage_limit / motor.resistance)
         greatest.append(min(motor.joint_constant * current, link.effort_limit))
-    place_of, start = {robot.links[i].name: k for k, i in enumerate(links)}, robot.initial
-    parent, rotation, place = [], [], []
+    index, start = {robot.links[i].name: k for k, i in enumerate(links)}, robot.initial
+    parent, rotation, origin = [], [], []
     for i in links:
         link = robot.links[i]
         R, p = link.R_PJ, link.p_PJ
-        if link.parent is not None and link.parent not in place_of:
+        if link.parent is not None and link.parent not in index:
             R_WP, p_WP = model.body_pose(link.parent, start)
             R, p = R_WP @ R, p_WP + R_WP @ p
-        parent.append(place_of.get(link.parent, -1) if link.parent is not None else -1)
+        parent.append(index.get(link.parent, -1) if link.parent is not None else -1)
         rotation.append(R)
-        place.append(p)
+        origin.append(p)
     hand, hand_point = robot.attach(*robot.hand)
     if hand not in links:
         raise ModelError("plan: no joint moves the hand")
@@ -109,8 +109,8 @@ def moving_arm(model: Model, surfaces: Mapping[str, Surface]) -> MovingArm:
     tables = Arm(
         parent=integers(parent),
         prismatic=integers([link.kind == "prismatic" for link in chosen]),
-        rotation=reals(rotation),
-        place=reals(place),
+        rotation=reals(rotation).reshape(-1, 9),
+        origin=reals(origin),
         axis=reals([link.axis for link in chosen]),
         mass=reals([link.inertia.mass for link in chosen]),
         com=reals([link.inertia.com for link in chosen]),
@@ -119,9 +119,9 @@ def moving_arm(model: Model, surfaces: Mapping[str, Surface]) -> MovingArm:
         greatest=reals(greatest),
         lower=reals([link.lower for link in chosen]),
         upper=reals([link.upper for link in chosen]),
-        gravity=reals(robot.gravity),
+        gravity=reals([robot.gravity]),
         hand=integers([links.index(hand)]),
-        hand_point=reals(hand_point),
+        hand_point=reals([hand_point]),
         shapes=shape_arrays([(surface, 0.0, np.zeros(3), False) for surface in surfaces.values()]),
     )
     room = np.minimum(FROM_STOP, FROM_STOP_SHARE * (tables.upper - tables.lower))

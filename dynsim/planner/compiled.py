@@ -19,13 +19,38 @@ from typing import NamedTuple
 import numpy as np
 
 from dynsim.dynamics.contact.distance import ShapeArrays, distance
-from dynsim.dynamics.tree.spatial import dot_vector
+from dynsim.dynamics.tree.spatial import (
+    ZERO_VECTOR,
+    along,
+    compose,
+    cross,
+    dot_vector,
+    first_axis,
+    put_rotation,
+    put_vector,
+    rotate,
+    rotation,
+    third_axis,
+    times_inertia,
+    times_number,
+    transform,
+    turn,
+    vector,
+)
 from dynsim.jit.kernel import internal_kernel, kernel
 
-# Slip [m/s] over which friction grows to its value: steep enough to charge braces that creep, smooth enough for steps.
-SLIP_SCALE = 2e-3
 # What is lost of a row of constraints that others imply.
 DEPENDENT = 1e-9
+# Distance from hand path and surfaces that counts as none [m].
+ON = 1e-9
+# First damping of the steps beside the curvature of the heat, and its bounds, over the largest of that curvature.
+DAMPING, DAMPING_MIN, DAMPING_MAX = 1e-3, 1e-7, 1e6
+# Longest step of a coordinate in one turn [rad or m].
+REACH = 0.6
+# Torques beyond this part of their limits cost extra, so many times what they cost as heat.
+NEAR_LIMIT, DEAR = 0.98, 100.0
+# Exponent of the mean that stands for the peak of the torques.
+PEAK_POWER = 12
 # Of multipliers and forces, relative to their scale: nothing is gained by letting go of a bound.
 NO_GAIN = 1e-11
 
@@ -35,8 +60,8 @@ class Arm(NamedTuple):
 
     parent: np.ndarray  # (n,) int, −1: the base that stands
     prismatic: np.ndarray  # (n,) int, 1 or 0
-    rotation: np.ndarray  # (n, 3, 3) of the joint frame at q = 0 in the parent's, in W on the base
-    place: np.ndarray  # (n, 3) its origin there [m]
+    rotation: np.ndarray  # (n, 9) of the joint frame at q = 0 in the parent's, in W on the base
+    origin: np.ndarray  # (n, 3) of that frame there [m]
     axis: np.ndarray  # (n, 3)
     mass: np.ndarray  # (n,) [kg]
     com: np.ndarray  # (n, 3) centre of mass in the body's frame [m]
@@ -45,9 +70,9 @@ class Arm(NamedTuple):
     greatest: np.ndarray  # (n,) greatest torque at rest [N m], inf for none
     lower: np.ndarray  # (n,) limits of the joints
     upper: np.ndarray  # (n,)
-    gravity: np.ndarray  # (3,)
+    gravity: np.ndarray  # (1, 3)
     hand: np.ndarray  # (1,) int, its body
-    hand_point: np.ndarray  # (3,) [m]
+    hand_point: np.ndarray  # (1, 3) [m]
     shapes: ShapeArrays  # the surfaces
 
 
@@ -70,6 +95,7 @@ class Course(NamedTuple):
     chord: np.ndarray  # (E, K) [1/s]
     share: np.ndarray  # (E,) of the time; their sum is 1
     smooth: np.ndarray  # (K, K) SᵀS of the smoothness S q
+    slip_scale: np.ndarray  # (1,) slip over which friction grows to its value [m/s]
 
 
 class Work(NamedTuple):
@@ -83,20 +109,18 @@ class Work(NamedTuple):
     gap_rate: np.ndarray  # (K, P, n)
     hand: np.ndarray  # (K, h)
     hand_rate: np.ndarray  # (K, h, n)
-    R: np.ndarray  # (n, 3, 3)
+    R: np.ndarray  # (n, 9)
     p: np.ndarray  # (n, 3)
     a: np.ndarray  # (n, 3) joint axes in W
     below: np.ndarray  # (n, 4) mass and first moment of what a joint carries
     touch: np.ndarray  # (c, n, 3) velocity of the touching point by each rate
-    centre: np.ndarray  # (c, n, 3) the same of the centre of its sphere
+    turned: np.ndarray  # (c, n, 3) ∂n/∂q: what the normal at the brace turns by
     normal: np.ndarray  # (c, 3)
-    bend: np.ndarray  # (c, 3, 3) curvature of the surface
     shift: np.ndarray  # (c, n, 3) what the touching point moves by on the body, by each coordinate
-    slip: np.ndarray  # (c, 8) velocity along the surface over its size, that size, velocity of the touching point
+    slip: np.ndarray  # (c, 7) velocity along the surface over its size, that of the touching point, that size
     force: np.ndarray  # (c, 3)
     turn: np.ndarray  # (n, 3) ∂F/∂q of a brace
     drift: np.ndarray  # (n, 3) ∂F/∂v
-    vector: np.ndarray  # (12, 3)
     basis: np.ndarray  # (K, n, n) columns that keep hand and braces come last
     free: np.ndarray  # (K,) int, how many of those
     rows: np.ndarray  # (R, n) constraints of one knot
@@ -108,7 +132,9 @@ class Work(NamedTuple):
     step: np.ndarray  # (N,)
     B: np.ndarray  # (n, 2 n + c)
     column: np.ndarray  # (2 n + c,) int
-    start: np.ndarray  # (K + 1,) int, where the unknowns of each knot begin
+    start: np.ndarray  # (K,) int, where the unknowns of each knot's posture begin; the forces of its instants follow
+    pressed: np.ndarray  # (E,) int, where the forces of each instant begin
+    skyline: np.ndarray  # (N,) int, first column of each row of H that is not zero
     working: np.ndarray  # (W, 3) int: constraints of the step that have been violated: kind, knot or instant, which
     bound: np.ndarray  # (W,)
     normals: np.ndarray  # (W, N) their rows, then L⁻¹ times them
@@ -119,205 +145,156 @@ class Work(NamedTuple):
     small: np.ndarray  # (W, W)
     small_right: np.ndarray  # (W,)
     index: np.ndarray  # (W,) int
-
-
-@internal_kernel
-def cross(u, v, out):
-    """out = u × v."""
-    out[0] = u[1] * v[2] - u[2] * v[1]
-    out[1] = u[2] * v[0] - u[0] * v[2]
-    out[2] = u[0] * v[1] - u[1] * v[0]
+    small_skyline: np.ndarray  # (W,) int
+    rate: np.ndarray  # (E, n) velocities of the instants
+    weight: np.ndarray  # (E, n) of the squares of torques in the model of the cost
+    pull: np.ndarray  # (E, n) half the gradient of the cost by torques, over the share of time
+    change: np.ndarray  # (K, n) of postures in a step
+    trial: np.ndarray  # (K, n)
+    trial_forces: np.ndarray  # (E, c)
 
 
 @internal_kernel
 def poses(arm: Arm, work: Work, q):
     """Frames of all bodies, joint axes in W, and mass and first moment of what each joint carries."""
-    n = arm.parent.shape[0]
-    R, p, a = work.R, work.p, work.a
+    n, below = arm.parent.shape[0], work.below
     for j in range(n):
-        i = arm.parent[j]
-        x, y, z = arm.axis[j, 0], arm.axis[j, 1], arm.axis[j, 2]
-        angle = 0.0 if arm.prismatic[j] else q[j]
-        s, c = math.sin(angle), math.cos(angle)
-        v = 1.0 - c
-        turn = (
-            (c + x * x * v, x * y * v - z * s, x * z * v + y * s),
-            (y * x * v + z * s, c + y * y * v, y * z * v - x * s),
-            (z * x * v - y * s, z * y * v + x * s, c + z * z * v),
-        )
-        for r in range(3):
-            if i < 0:
-                p[j, r] = arm.place[j, r]
-            else:
-                p[j, r] = p[i, r] + R[i, r, 0] * arm.place[j, 0] + R[i, r, 1] * arm.place[j, 1]
-                p[j, r] += R[i, r, 2] * arm.place[j, 2]
-            if i < 0:
-                f0, f1, f2 = arm.rotation[j, r, 0], arm.rotation[j, r, 1], arm.rotation[j, r, 2]
-            else:
-                f0 = R[i, r, 0] * arm.rotation[j, 0, 0] + R[i, r, 1] * arm.rotation[j, 1, 0]
-                f0 += R[i, r, 2] * arm.rotation[j, 2, 0]
-                f1 = R[i, r, 0] * arm.rotation[j, 0, 1] + R[i, r, 1] * arm.rotation[j, 1, 1]
-                f1 += R[i, r, 2] * arm.rotation[j, 2, 1]
-                f2 = R[i, r, 0] * arm.rotation[j, 0, 2] + R[i, r, 1] * arm.rotation[j, 1, 2]
-                f2 += R[i, r, 2] * arm.rotation[j, 2, 2]
-            a[j, r] = f0 * x + f1 * y + f2 * z
-            for k in range(3):
-                R[j, r, k] = f0 * turn[0][k] + f1 * turn[1][k] + f2 * turn[2][k]
-            if arm.prismatic[j]:
-                p[j, r] += a[j, r] * q[j]
-    below = work.below
-    for j in range(n):
-        below[j, 0] = arm.mass[j]
-        for r in range(3):
-            middle = p[j, r] + R[j, r, 0] * arm.com[j, 0] + R[j, r, 1] * arm.com[j, 1] + R[j, r, 2] * arm.com[j, 2]
-            below[j, 1 + r] = arm.mass[j] * middle
-    for j in range(n - 1, -1, -1):
-        i = arm.parent[j]
+        i, u = arm.parent[j], vector(arm.axis, j, 0)
+        R, p = rotation(arm.rotation, j, 0), vector(arm.origin, j, 0)
         if i >= 0:
+            before = rotation(work.R, i, 0)
+            R, p = compose(before, R), transform(vector(work.p, i, 0), before, p)
+        a = rotate(R, u)
+        if arm.prismatic[j]:
+            p = along(p, a, q[j])
+        else:
+            R = turn(R, u, a, math.sin(q[j]), math.cos(q[j]))
+        put_rotation(work.R, j, 0, R)
+        put_vector(work.p, j, 0, p)
+        put_vector(work.a, j, 0, a)
+        below[j, 0] = arm.mass[j]
+        put_vector(below, j, 1, times_number(transform(p, R, vector(arm.com, j, 0)), arm.mass[j]))
+    for j in range(n - 1, -1, -1):
+        if arm.parent[j] >= 0:
             for r in range(4):
-                below[i, r] += below[j, r]
+                below[arm.parent[j], r] += below[j, r]
 
 
 @internal_kernel
-def body_point(work: Work, body, point, out):
-    """A point of a body in W [m]."""
-    R, p = work.R, work.p
-    for r in range(3):
-        out[r] = p[body, r] + R[body, r, 0] * point[0] + R[body, r, 1] * point[1] + R[body, r, 2] * point[2]
+def body_point(work: Work, body, point, i):
+    """Place of point i of a table, on a body, in W [m]."""
+    return transform(vector(work.p, body, 0), rotation(work.R, body, 0), vector(point, i, 0))
 
 
 @internal_kernel
 def rates(arm: Arm, work: Work, body, at, out):
     """Velocity of the material point of a body at a place ``at``, for each unit of rate, (n, 3)."""
-    lever = work.vector[11]
     for j in range(arm.parent.shape[0]):
-        for r in range(3):
-            out[j, r] = 0.0
+        put_vector(out, j, 0, ZERO_VECTOR)
     j = body
     while j >= 0:
-        if arm.prismatic[j]:
-            for r in range(3):
-                out[j, r] = work.a[j, r]
-        else:
-            for r in range(3):
-                lever[r] = at[r] - work.p[j, r]
-            cross(work.a[j], lever, out[j])
+        a = vector(work.a, j, 0)
+        if not arm.prismatic[j]:
+            a = cross(a, along(at, vector(work.p, j, 0), -1.0))
+        put_vector(out, j, 0, a)
         j = arm.parent[j]
+
+
+@internal_kernel
+def put_rows(table, out, row):
+    """A table (n, 3) as three rows of another one, from ``row`` on."""
+    for j in range(table.shape[0]):
+        for r in range(3):
+            out[row + r, j] = table[j, r]
 
 
 @internal_kernel
 def geometry(arm: Arm, points: Points, work: Work, q, k):
     """Of knot k: hand, gaps and their rates; of the braces also what their forces need."""
-    n, c, P = arm.parent.shape[0], points.friction.shape[0], points.body.shape[0]
-    x, lever, jacobian = work.vector[0], work.vector[1], work.turn
+    n, c, hand, jacobian = arm.parent.shape[0], points.friction.shape[0], arm.hand[0], work.turn
     poses(arm, work, q)
-    body_point(work, arm.hand[0], arm.hand_point, x)
-    rates(arm, work, arm.hand[0], x, jacobian)
-    for r in range(3):
-        work.hand[k, r] = x[r]
+    x = body_point(work, hand, arm.hand_point, 0)
+    rates(arm, work, hand, x, jacobian)
+    put_vector(work.hand, k, 0, x)
+    put_rows(jacobian, work.hand_rate[k], 0)
+    # Where an orientation is asked for: the z axis of the hand's body, then its x axis.
+    for row in range(3, work.hand.shape[1], 3):
+        R = rotation(work.R, hand, 0)
+        axis = third_axis(R) if row == 3 else first_axis(R)
         for j in range(n):
-            work.hand_rate[k, r, j] = jacobian[j, r]
-    # Components of the axes of the hand: x, y and z of its z axis, then of its x axis.
-    for r in range(3, work.hand.shape[1]):
-        axis, e = (2 if r < 6 else 0), r % 3
-        for i in range(3):
-            lever[i] = work.R[arm.hand[0], i, axis]
-        work.hand[k, r] = lever[e]
-        for j in range(n):
-            work.hand_rate[k, r, j] = 0.0
-        j = arm.hand[0]
+            put_vector(jacobian, j, 0, ZERO_VECTOR)
+        j = hand
         while j >= 0:
             if not arm.prismatic[j]:
-                cross(work.a[j], lever, x)
-                work.hand_rate[k, r, j] = x[e]
+                put_vector(jacobian, j, 0, cross(vector(work.a, j, 0), axis))
             j = arm.parent[j]
-    for i in range(P):
+        put_vector(work.hand, k, row, axis)
+        put_rows(jacobian, work.hand_rate[k], row)
+    for i in range(points.body.shape[0]):
         body, radius = points.body[i], points.radius[i]
-        body_point(work, body, points.point[i], x)
+        x = body_point(work, body, points.point, i)
         far, nx, ny, nz, xx, xy, xz, yy, yz, zz = distance(arm.shapes, points.surface[i], x[0], x[1], x[2])
+        normal = (nx, ny, nz)
         work.gap[k, i] = far - radius
         rates(arm, work, body, x, jacobian)
         for j in range(n):
-            work.gap_rate[k, i, j] = nx * jacobian[j, 0] + ny * jacobian[j, 1] + nz * jacobian[j, 2]
+            work.gap_rate[k, i, j] = dot_vector(normal, vector(jacobian, j, 0))
         if i >= c:
             continue
-        normal, bend = work.normal[i], work.bend[i]
-        normal[0], normal[1], normal[2] = nx, ny, nz
-        bend[0, 0], bend[0, 1], bend[0, 2], bend[1, 1], bend[1, 2], bend[2, 2] = xx, xy, xz, yy, yz, zz
-        bend[1, 0], bend[2, 0], bend[2, 1] = xy, xz, yz
-        for j in range(n):
-            for r in range(3):
-                work.centre[i, j, r] = jacobian[j, r]
-        for r in range(3):
-            x[r] -= radius * normal[r]
-        rates(arm, work, body, x, work.touch[i])
+        put_vector(work.normal, i, 0, normal)
+        touch, shift, turned = work.touch[i], work.shift[i], work.turned[i]
+        rates(arm, work, body, along(x, normal, -radius), touch)
         # The touching point moves by J_centre − ρ ∂n/∂q, the material there by J_touch.
         for j in range(n):
-            for r in range(3):
-                turned = dot_vector(bend[r], work.centre[i, j])
-                work.shift[i, j, r] = work.centre[i, j, r] - radius * turned - work.touch[i, j, r]
+            centre = vector(jacobian, j, 0)
+            dn = times_inertia((xx, xy, xz, yy, yz, zz), centre)
+            put_vector(turned, j, 0, dn)
+            put_vector(shift, j, 0, along(along(centre, dn, -radius), vector(touch, j, 0), -1.0))
 
 
 @internal_kernel
-def knot_of_first(course: Course, e):
-    """Whether instant e is the first one of its knot in a row."""
-    return e == 0 or course.knot[e] != course.knot[e - 1]
-
-
-@kernel
-def evaluate(arm: Arm, points: Points, course: Course, work: Work, Q, V, F, derivatives):
+def statics(arm: Arm, points: Points, course: Course, work: Work, Q, V, F, derivatives):
     """Torques, and with ``derivatives`` those of them; geometry of all knots. Q: (K, n), V: (E, n), F: (E, c).
 
     ∂τ/∂q_r = H_jr − Σ_c J_cj · ∂F_c/∂q_r − Σ_c (a_j × s_cr) · F_c,
     H_ij = −a_i · M_j (joint i carries joint j, both directions alike), M_j = Σ_k J_kj × w_k over weights and forces;
     zero for a prismatic joint i. s_cr: what the touching point moves by on its body.
     """
-    n, c = arm.parent.shape[0], points.friction.shape[0]
-    vector = work.vector
-    lever, moment, part, u = vector[2], vector[3], vector[4], vector[5]
+    n, c, weight = arm.parent.shape[0], points.friction.shape[0], vector(arm.gravity, 0, 0)
     for e in range(course.knot.shape[0]):
-        if knot_of_first(course, e):
+        if e == 0 or course.knot[e] != course.knot[e - 1]:
             geometry(arm, points, work, Q[course.knot[e]], course.knot[e])
         v = V[e]
         for i in range(c):
-            slip, normal = work.slip[i], work.normal[i]
-            for r in range(3):
-                rate = 0.0
-                for j in range(n):
-                    rate += work.touch[i, j, r] * v[j]
-                slip[4 + r] = rate
-            ahead = dot_vector(normal, slip[4:7])
-            square = SLIP_SCALE * SLIP_SCALE
-            for r in range(3):
-                slip[r] = slip[4 + r] - ahead * normal[r]
-                square += slip[r] * slip[r]
-            slip[3] = math.sqrt(square)
-            for r in range(3):
-                slip[r] /= slip[3]
-                u[r] = normal[r] - points.friction[i] * slip[r]
-                work.force[i, r] = F[e, i] * u[r]
+            normal, w = vector(work.normal, i, 0), ZERO_VECTOR
             for j in range(n):
-                work.by_f[e, j, i] = -dot_vector(work.touch[i, j], u)
+                w = along(w, vector(work.touch[i], j, 0), v[j])
+            slip = along(w, normal, -dot_vector(normal, w))
+            size = math.sqrt(dot_vector(slip, slip) + course.slip_scale[0] ** 2)
+            u = times_number(slip, 1.0 / size)
+            put_vector(work.slip, i, 0, u)
+            put_vector(work.slip, i, 3, w)
+            work.slip[i, 6] = size
+            pull = along(normal, u, -points.friction[i])
+            put_vector(work.force, i, 0, times_number(pull, F[e, i]))
+            for j in range(n):
+                work.by_f[e, j, i] = -dot_vector(vector(work.touch[i], j, 0), pull)
         for j in range(n):
             # Weight and forces on what the joint carries: M_j = Σ J × w.
+            a, mass = vector(work.a, j, 0), work.below[j, 0]
             if arm.prismatic[j]:
-                for r in range(3):
-                    part[r] = work.a[j, r] * work.below[j, 0]
+                lever = times_number(a, mass)
             else:
-                for r in range(3):
-                    lever[r] = work.below[j, 1 + r] - work.below[j, 0] * work.p[j, r]
-                cross(work.a[j], lever, part)
-            torque = arm.losses[j] * v[j] - dot_vector(arm.gravity, part)
+                lever = cross(a, along(vector(work.below, j, 1), vector(work.p, j, 0), -mass))
+            torque = arm.losses[j] * v[j] - dot_vector(weight, lever)
             for i in range(c):
                 torque += work.by_f[e, j, i] * F[e, i]
             work.torque[e, j] = torque
             if not derivatives:
                 continue
-            cross(part, arm.gravity, moment)
+            moment = cross(lever, weight)
             for i in range(c):
-                cross(work.touch[i, j], work.force[i], part)
-                for r in range(3):
-                    moment[r] += part[r]
+                moment = along(moment, cross(vector(work.touch[i], j, 0), vector(work.force, i, 0)), 1.0)
             for i in range(n):
                 work.by_v[e, i, j] = 0.0
                 if i <= j:
@@ -326,12 +303,18 @@ def evaluate(arm: Arm, points: Points, course: Course, work: Work, Q, V, F, deri
             i = j
             while i >= 0:
                 if not arm.prismatic[i]:
-                    bent = -dot_vector(work.a[i], moment)
+                    bent = -dot_vector(vector(work.a, i, 0), moment)
                     work.by_q[e, i, j], work.by_q[e, j, i] = bent, bent
                 i = arm.parent[i]
         if derivatives:
             for i in range(c):
                 force_derivatives(arm, points, work, v, F[e, i], i, e)
+
+
+@kernel
+def evaluate(arm: Arm, points: Points, course: Course, work: Work, Q, V, F, derivatives):
+    """See :func:`statics`: what several kernels call is none of its own."""
+    statics(arm, points, course, work, Q, V, F, derivatives)
 
 
 @internal_kernel
@@ -340,74 +323,59 @@ def force_derivatives(arm: Arm, points: Points, work: Work, v, f, i, e):
 
     ∂F = f (∂n − μ G ∂w), w = v_t, G = (1 − u uᵀ)/s, s = √(|w|² + v_s²), u = w/s.
     """
-    mu, slip, normal, n = points.friction[i], work.slip[i], work.normal[i], arm.parent.shape[0]
-    vector = work.vector
-    carried, before, dw, dn, part, turned = vector[2], vector[3], vector[4], vector[5], vector[6], vector[7]
-    body = points.body[i]
-    whole = vector[8]
-    for r in range(3):
-        whole[r], carried[r] = 0.0, slip[4 + r]
+    touch, shift, turned, body = work.touch[i], work.shift[i], work.turned[i], points.body[i]
+    normal, u, w = vector(work.normal, i, 0), vector(work.slip, i, 0), vector(work.slip, i, 3)
+    blunt, level = points.friction[i] / work.slip[i, 6], dot_vector(normal, w)
+    whole = ZERO_VECTOR
     j = body
     while j >= 0:
         if not arm.prismatic[j]:
-            for r in range(3):
-                whole[r] += work.a[j, r] * v[j]
+            whole = along(whole, vector(work.a, j, 0), v[j])
         j = arm.parent[j]
-    for r in range(n):
-        for t in range(3):
-            work.turn[r, t], work.drift[r, t] = 0.0, 0.0
     # From the tip inwards: carried = Σ J_i v_i of joint j and those it carries, before = Σ a_i v_i of those before it.
-    for t in range(3):
-        before[t], carried[t] = whole[t], 0.0
+    before, carried = whole, ZERO_VECTOR
     j = body
     while j >= 0:
-        rate = work.touch[i, j]
-        for t in range(3):
-            carried[t] += rate[t] * v[j]
-            if not arm.prismatic[j]:
-                before[t] -= work.a[j, t] * v[j]
-        cross(before, rate, dw)
-        if not arm.prismatic[j]:
-            cross(work.a[j], carried, part)
-            for t in range(3):
-                dw[t] += part[t]
+        rate, a, dn = vector(touch, j, 0), vector(work.a, j, 0), vector(turned, j, 0)
+        carried = along(carried, rate, v[j])
         # The material at the touching point changes.
-        cross(whole, work.shift[i, j], part)
-        for t in range(3):
-            dw[t] += part[t]
-            dn[t] = dot_vector(work.bend[i, t], work.centre[i, j])
-        ahead = dot_vector(normal, dw) + dot_vector(dn, slip[4:7])
-        level = dot_vector(normal, slip[4:7])
-        for t in range(3):
-            dw[t] -= normal[t] * ahead + dn[t] * level
-            turned[t] = rate[t] - normal[t] * dot_vector(normal, rate)
-        along, other = dot_vector(slip[0:3], dw), dot_vector(slip[0:3], turned)
-        for t in range(3):
-            work.turn[j, t] = f * (dn[t] - mu * (dw[t] - slip[t] * along) / slip[3])
-            work.drift[j, t] = -f * mu * (turned[t] - slip[t] * other) / slip[3]
+        dw = cross(whole, vector(shift, j, 0))
+        if not arm.prismatic[j]:
+            before = along(before, a, -v[j])
+            dw = along(dw, cross(a, carried), 1.0)
+        dw = along(dw, cross(before, rate), 1.0)
+        dw = along(along(dw, normal, -dot_vector(normal, dw) - dot_vector(dn, w)), dn, -level)
+        across = along(rate, normal, -dot_vector(normal, rate))
+        put_vector(work.turn, j, 0, times_number(along(dn, along(dw, u, -dot_vector(u, dw)), -blunt), f))
+        put_vector(work.drift, j, 0, times_number(along(across, u, -dot_vector(u, across)), -f * blunt))
         j = arm.parent[j]
-    for t in range(3):
-        part[t] = work.force[i, t]
+    force = vector(work.force, i, 0)
     j = body
     while j >= 0:
-        k = body
+        rate, a, k = vector(touch, j, 0), vector(work.a, j, 0), body
         while k >= 0:
-            work.by_q[e, j, k] -= dot_vector(work.touch[i, j], work.turn[k])
-            work.by_v[e, j, k] -= dot_vector(work.touch[i, j], work.drift[k])
+            work.by_q[e, j, k] -= dot_vector(rate, vector(work.turn, k, 0))
+            work.by_v[e, j, k] -= dot_vector(rate, vector(work.drift, k, 0))
             if not arm.prismatic[j]:
-                cross(work.a[j], work.shift[i, k], turned)
-                work.by_q[e, j, k] -= dot_vector(turned, part)
+                work.by_q[e, j, k] -= dot_vector(cross(a, vector(shift, k, 0)), force)
             k = arm.parent[k]
         j = arm.parent[j]
 
 
 @internal_kernel
-def factor(A, n):
-    """Cholesky's L of the leading n × n part of A, in its lower half; pivots that are lost stop moving anything."""
+def factor(A, skyline, n):
+    """Cholesky's L of the leading n × n part of A, in its lower half; pivots that are lost stop moving anything.
+
+    skyline : (n,) int, out: first column of each row that is not zero; left of it L has zeros too
+    """
     for i in range(n):
-        for j in range(i + 1):
+        first = 0
+        while first < i and A[i, first] == 0.0:
+            first += 1
+        skyline[i] = first
+        for j in range(first, i + 1):
             s = A[i, j]
-            for k in range(j):
+            for k in range(max(first, skyline[j]), j):
                 s -= A[i, k] * A[j, k]
             if i == j:
                 A[i, i] = math.sqrt(s) if s > 1e-300 else 1e150
@@ -416,23 +384,22 @@ def factor(A, n):
 
 
 @internal_kernel
-def forward(L, b, n):
+def forward(L, skyline, b, n):
     """b ← L⁻¹ b."""
     for i in range(n):
         s = b[i]
-        for k in range(i):
+        for k in range(skyline[i], i):
             s -= L[i, k] * b[k]
         b[i] = s / L[i, i]
 
 
 @internal_kernel
-def backward(L, b, n):
+def backward(L, skyline, b, n):
     """b ← L⁻ᵀ b."""
     for i in range(n - 1, -1, -1):
-        s = b[i]
-        for k in range(i + 1, n):
-            s -= L[k, i] * b[k]
-        b[i] = s / L[i, i]
+        b[i] /= L[i, i]
+        for k in range(skyline[i], i):
+            b[k] -= L[i, k] * b[i]
 
 
 @internal_kernel
@@ -441,7 +408,7 @@ def nonnegative(work: Work, G, h, x, m):
 
     G: (m, m) positive semidefinite, with room for a little on its diagonal.
     """
-    passive, small, right, index = work.passive, work.small, work.small_right, work.index
+    passive, small, right, index, skyline = work.passive, work.small, work.small_right, work.index, work.small_skyline
     scale = 1e-300
     for i in range(m):
         scale = max(scale, abs(h[i]))
@@ -472,9 +439,9 @@ def nonnegative(work: Work, G, h, x, m):
                 for b in range(a + 1):
                     small[a, b] = G[index[a], index[b]]
                 small[a, a] *= 1.0 + 1e-12
-            factor(small, count)
-            forward(small, right, count)
-            backward(small, right, count)
+            factor(small, skyline, count)
+            forward(small, skyline, right, count)
+            backward(small, skyline, right, count)
             share = 1.0
             for a in range(count):
                 i = index[a]
@@ -494,12 +461,9 @@ def nonnegative(work: Work, G, h, x, m):
                     x[i], passive[i] = 0.0, 0
 
 
-@kernel
-def least_heat(arm: Arm, work: Work, weight, least, F):
-    """Normal forces of least heat of each instant after :func:`evaluate` with forces of zero, at least ``least``.
-
-    weight : (E, n) of the squared torques
-    """
+@internal_kernel
+def least_heat(arm: Arm, work: Work, least, F):
+    """Normal forces of least heat of each instant after :func:`statics` with forces of zero, at least ``least``."""
     n, c = work.by_f.shape[1], work.by_f.shape[2]
     G, h, x = work.dual, work.dual_right, work.multiplier
     for e in range(F.shape[0]):
@@ -507,19 +471,90 @@ def least_heat(arm: Arm, work: Work, weight, least, F):
             for k in range(c):
                 s = 0.0
                 for j in range(n):
-                    s += weight[e, j] * work.by_f[e, j, i] * work.by_f[e, j, k]
+                    s += arm.heat[j] * work.by_f[e, j, i] * work.by_f[e, j, k]
                 G[i, k] = s
             G[i, i] += 1e-12
         for i in range(c):
             s = 0.0
             for j in range(n):
-                s -= weight[e, j] * work.by_f[e, j, i] * work.torque[e, j]
+                s -= arm.heat[j] * work.by_f[e, j, i] * work.torque[e, j]
             for k in range(c):
                 s -= G[i, k] * least
             h[i] = s
         nonnegative(work, G, h, x, c)
         for i in range(c):
             F[e, i] = least + x[i]
+
+
+@internal_kernel
+def equilibrium(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, forces):
+    """Torques and derivatives of postures, with normal forces of least heat where ``forces`` asks for those, in F."""
+    for e in range(F.shape[0]):
+        for i in range(F.shape[1]):
+            F[e, i] = 0.0 if forces else F[e, i]
+        for j in range(Q.shape[1]):
+            z = 0.0
+            for k in range(Q.shape[0]):
+                z += course.chord[e, k] * Q[k, j]
+            work.rate[e, j] = z
+    if forces and F.shape[1] > 0:
+        statics(arm, points, course, work, Q, work.rate, F, False)
+        least_heat(arm, work, least, F)
+    statics(arm, points, course, work, Q, work.rate, F, True)
+
+
+@kernel
+def settle(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, forces):
+    """See :func:`equilibrium`."""
+    equilibrium(arm, points, course, work, Q, F, least, forces)
+
+
+@internal_kernel
+def costs(arm: Arm, course: Course, work: Work, Q, peak):
+    """Cost and heat [W] of the torques in the workspace; weights and pull of the cost's quadratic model.
+
+    Torques near their limits are dear; ``peak`` : cost of the greatest torque [W/(N m)], by a mean of high power.
+    """
+    E, n = work.torque.shape
+    heat, cost, largest, mean = 0.0, 0.0, 0.0, 0.0
+    for e in range(E):
+        for j in range(n):
+            largest = max(largest, abs(work.torque[e, j]))
+    for e in range(E):
+        for j in range(n):
+            torque, w, share = work.torque[e, j], arm.heat[j], course.share[e]
+            heat += share * w * torque * torque
+            work.weight[e, j], work.pull[e, j] = w, w * torque
+            over = abs(torque) - NEAR_LIMIT * arm.greatest[j]
+            if over > 0.0:
+                cost += share * DEAR * w * over * over
+                work.weight[e, j] += DEAR * w
+                work.pull[e, j] += DEAR * w * math.copysign(over, torque)
+            if peak > 0.0 and largest > 0.0:
+                mean += (abs(torque) / largest) ** PEAK_POWER / (E * n)
+    if mean > 0.0:
+        cost += peak * largest * mean ** (1.0 / PEAK_POWER)
+        for e in range(E):
+            for j in range(n):
+                torque = abs(work.torque[e, j])
+                slope = peak * mean ** (1.0 / PEAK_POWER - 1.0) * (torque / largest) ** (PEAK_POWER - 1) / (E * n)
+                slope *= 0.5 / course.share[e]
+                work.pull[e, j] += math.copysign(slope, work.torque[e, j])
+                work.weight[e, j] += (PEAK_POWER - 1) * slope / max(torque, 1e-9)
+    for k in range(Q.shape[0]):
+        for l in range(Q.shape[0]):
+            if course.smooth[k, l] != 0.0:
+                for j in range(n):
+                    cost += course.smooth[k, l] * Q[k, j] * Q[l, j]
+    return cost + heat, heat
+
+
+@internal_kernel
+def copy(a, out):
+    """Entries of a matrix to another one."""
+    for i in range(a.shape[0]):
+        for j in range(a.shape[1]):
+            out[i, j] = a[i, j]
 
 
 @internal_kernel
@@ -535,8 +570,8 @@ def constraint_rows(course: Course, points: Points, work: Work, k):
     return h + c
 
 
-@kernel
-def retract(arm: Arm, points: Points, course: Course, work: Work, Q, steps, tolerance, reach):
+@internal_kernel
+def put_back(arm: Arm, points: Points, course: Course, work: Work, Q, steps, tolerance, reach):
     """Put the postures of all knots onto hand and braces, clear of the rest and within limits: least change.
 
     Damped Gauss–Newton's steps on what is violated. Returns what is left at the worst knot [m].
@@ -547,7 +582,7 @@ def retract(arm: Arm, points: Points, course: Course, work: Work, Q, steps, tole
     worst = 0.0
     for k in range(Q.shape[0]):
         left = math.inf
-        for turn in range(steps + 1):
+        for attempt in range(steps + 1):
             geometry(arm, points, work, Q[k], k)
             m = constraint_rows(course, points, work, k)
             left = 0.0
@@ -574,7 +609,7 @@ def retract(arm: Arm, points: Points, course: Course, work: Work, Q, steps, tole
                     right[m] = over
                     left = max(left, abs(over) - tolerance)
                     m += 1
-            if left <= tolerance or turn == steps or not left < 1e6:
+            if left <= tolerance or attempt == steps or not left < 1e6:
                 break
             far = 0.0
             for r in range(m):
@@ -588,9 +623,9 @@ def retract(arm: Arm, points: Points, course: Course, work: Work, Q, steps, tole
                         z += rows[r, j] * rows[s, j]
                     A[r, s] = z
                 A[r, r] += damping
-            factor(A, m)
-            forward(A, right, m)
-            backward(A, right, m)
+            factor(A, work.small_skyline, m)
+            forward(A, work.small_skyline, right, m)
+            backward(A, work.small_skyline, right, m)
             most = 1e-300
             for j in range(n):
                 z = 0.0
@@ -602,6 +637,12 @@ def retract(arm: Arm, points: Points, course: Course, work: Work, Q, steps, tole
                 Q[k, j] += work.x[j] * min(1.0, reach / most)
         worst = max(worst, left)
     return worst
+
+
+@kernel
+def retract(arm: Arm, points: Points, course: Course, work: Work, Q, steps, tolerance, reach):
+    """See :func:`put_back`."""
+    return put_back(arm, points, course, work, Q, steps, tolerance, reach)
 
 
 @internal_kernel
@@ -660,16 +701,31 @@ CLEAR, LOWER, UPPER, FORCE = 0, 1, 2, 3
 
 
 @internal_kernel
-def add_row(arm: Arm, points: Points, work: Work, m, kind, at, which, bound):
-    """Constraint m of the step: its row over the unknowns, and its bound."""
-    n, N = arm.parent.shape[0], work.start[work.start.shape[0] - 1] + work.by_f.shape[0] * work.by_f.shape[2]
+def unknowns(work: Work):
+    """How many unknowns a step has."""
+    last = work.start.shape[0] - 1
+    N = work.start[last] + work.free[last]
+    for e in range(work.pressed.shape[0]):
+        N = max(N, work.pressed[e] + work.by_f.shape[2])
+    return N
+
+
+@internal_kernel
+def taken_in(arm: Arm, points: Points, work: Work, m, before, kind, at, which, value, bound):
+    """How many constraints the step has with one that it violates: as constraint m its row over the unknowns."""
+    if value >= bound - 1e-9 or m == work.bound.shape[0]:
+        return m
+    for i in range(before):
+        if work.working[i, 0] == kind and work.working[i, 1] == at and work.working[i, 2] == which:
+            return m
+    n, N = arm.parent.shape[0], unknowns(work)
     row = work.normals[m]
     work.working[m, 0], work.working[m, 1], work.working[m, 2], work.bound[m] = kind, at, which, bound
     for i in range(N):
         row[i] = 0.0
     if kind == FORCE:
-        row[work.start[work.start.shape[0] - 1] + at * work.by_f.shape[2] + which] = 1.0
-        return
+        row[work.pressed[at] + which] = 1.0
+        return m + 1
     first = n - work.free[at]
     for d in range(work.free[at]):
         z = 0.0
@@ -679,19 +735,11 @@ def add_row(arm: Arm, points: Points, work: Work, m, kind, at, which, bound):
         else:
             z = work.basis[at, which, first + d] * (1.0 if kind == LOWER else -1.0)
         row[work.start[at] + d] = z
+    return m + 1
 
 
 @internal_kernel
-def known(work: Work, m, kind, at, which):
-    """Whether a constraint is among the first m of the step."""
-    for i in range(m):
-        if work.working[i, 0] == kind and work.working[i, 1] == at and work.working[i, 2] == which:
-            return True
-    return False
-
-
-@internal_kernel
-def along(arm: Arm, work: Work, x, k, j):
+def moved(arm: Arm, work: Work, x, k, j):
     """Change of coordinate j of knot k by a step x of the unknowns."""
     first, z = arm.parent.shape[0] - work.free[k], 0.0
     for d in range(work.free[k]):
@@ -699,22 +747,26 @@ def along(arm: Arm, work: Work, x, k, j):
     return z
 
 
-@kernel
-def prepare(arm: Arm, points: Points, course: Course, work: Work, Q, weight, pull, damping):
+@internal_kernel
+def prepare(arm: Arm, points: Points, course: Course, work: Work, Q, damping):
     """Matrix and gradient of Gauss and Newton's model, over what hand and braces leave free of each knot, and forces.
 
-    weight : (E, n) of the squares of torques; pull : (E, n) half their gradients
     Returns the number of unknowns.
     """
+    weight, pull = work.weight, work.pull
     n, c = arm.parent.shape[0], points.friction.shape[0]
     K, E = Q.shape[0], course.knot.shape[0]
     H, g, B, column, start = work.H, work.g, work.B, work.column, work.start
-    start[0] = 0
+    # Unknowns that meet in the model are near each other, so that its matrix is a band.
+    N, behind = 0, 0
     for k in range(K):
         work.free[k] = split(work, k, constraint_rows(course, points, work, k))
-        start[k + 1] = start[k] + work.free[k]
-    forces = start[K]
-    N = forces + E * c
+        start[k] = N
+        N += work.free[k]
+        while behind < E and course.knot[behind] == k:
+            work.pressed[behind] = N
+            N += c
+            behind += 1
     for i in range(N):
         g[i] = 0.0
         for j in range(N):
@@ -738,7 +790,7 @@ def prepare(arm: Arm, points: Points, course: Course, work: Work, Q, weight, pul
                     B[r, m] = z
                 m += 1
         for i in range(c):
-            column[m] = forces + e * c + i
+            column[m] = work.pressed[e] + i
             for r in range(n):
                 B[r, m] = work.by_f[e, r, i]
             m += 1
@@ -771,30 +823,34 @@ def prepare(arm: Arm, points: Points, course: Course, work: Work, Q, weight, pul
                             z += work.basis[k, j, first + d] * work.basis[l, j, other + b]
                         if start[k] + d >= start[l] + b:
                             H[start[k] + d, start[l] + b] += course.smooth[k, l] * z
-    for i in range(N):
-        H[i, i] += damping if i < forces else 1e-9
+    for k in range(K):
+        for d in range(work.free[k]):
+            H[start[k] + d, start[k] + d] += damping
+    for e in range(E):
+        for i in range(c):
+            H[work.pressed[e] + i, work.pressed[e] + i] += 1e-9
     return N
 
 
-@kernel
-def step(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, N, change, dF):
+@internal_kernel
+def step(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, N):
     """The step of least model value after :func:`prepare`, which keeps clearances, limits and least forces.
 
     The matrix is factored in place. Constraints are taken in when a step violates them: dual problems
-    min ½ λᵀ A H⁻¹ Aᵀ λ − λ·(b − A x_0) of those so far. Returns twice the fall of the model, −g·x − λ·b;
-    change : (K, n), dF : (E, c) of the step.
+    min ½ λᵀ A H⁻¹ Aᵀ λ − λ·(b − A x_0) of those so far. Returns twice the fall of the model, −g·x − λ·b; postures
+    change by ``work.change``.
     """
     n, c, P = arm.parent.shape[0], points.friction.shape[0], points.body.shape[0]
     K, E = Q.shape[0], course.knot.shape[0]
-    H, g, x, forces = work.H, work.g, work.x, work.start[K]
-    factor(H, N)
+    H, g, x, skyline = work.H, work.g, work.x, work.skyline
+    factor(H, skyline, N)
     # x_0 = −H⁻¹ g, kept as L⁻¹ of it.
     for i in range(N):
         x[i] = -g[i]
-    forward(H, x, N)
+    forward(H, skyline, x, N)
     for a in range(work.multiplier.shape[0]):
         work.multiplier[a] = 0.0
-    m, most = 0, work.bound.shape[0]
+    m = 0
     full = work.step
     for _ in range(12):
         # The step L⁻ᵀ (x + Σ λ L⁻¹ a).
@@ -803,14 +859,12 @@ def step(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, N, c
             for a in range(m):
                 if work.multiplier[a] != 0.0:
                     full[i] += work.multiplier[a] * work.normals[a, i]
-        backward(H, full, N)
+        backward(H, skyline, full, N)
         before = m
         for e in range(E):
             for i in range(c):
-                slack = least - F[e, i]
-                if full[forces + e * c + i] < slack - 1e-9 and m < most and not known(work, before, FORCE, e, i):
-                    add_row(arm, points, work, m, FORCE, e, i, slack)
-                    m += 1
+                value, slack = full[work.pressed[e] + i], least - F[e, i]
+                m = taken_in(arm, points, work, m, before, FORCE, e, i, value, slack)
         for k in range(K):
             for i in range(c, P):
                 slack = min(points.margin[i] - work.gap[k, i], 0.0)
@@ -818,23 +872,16 @@ def step(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, N, c
                     continue
                 z = 0.0
                 for j in range(n):
-                    z += work.gap_rate[k, i, j] * along(arm, work, full, k, j)
-                if z < slack - 1e-9 and m < most and not known(work, before, CLEAR, k, i):
-                    add_row(arm, points, work, m, CLEAR, k, i, slack)
-                    m += 1
+                    z += work.gap_rate[k, i, j] * moved(arm, work, full, k, j)
+                m = taken_in(arm, points, work, m, before, CLEAR, k, i, z, slack)
             for j in range(n):
-                z = along(arm, work, full, k, j)
-                low, high = min(arm.lower[j] - Q[k, j], 0.0), max(arm.upper[j] - Q[k, j], 0.0)
-                if z < low - 1e-9 and m < most and not known(work, before, LOWER, k, j):
-                    add_row(arm, points, work, m, LOWER, k, j, low)
-                    m += 1
-                if z > high + 1e-9 and m < most and not known(work, before, UPPER, k, j):
-                    add_row(arm, points, work, m, UPPER, k, j, -high)
-                    m += 1
+                z, low, high = moved(arm, work, full, k, j), arm.lower[j] - Q[k, j], arm.upper[j] - Q[k, j]
+                m = taken_in(arm, points, work, m, before, LOWER, k, j, z, min(low, 0.0))
+                m = taken_in(arm, points, work, m, before, UPPER, k, j, -z, -max(high, 0.0))
         if m == before:
             break
         for a in range(before, m):
-            forward(H, work.normals[a], N)
+            forward(H, skyline, work.normals[a], N)
             z = 0.0
             for i in range(N):
                 z += work.normals[a, i] * x[i]
@@ -853,8 +900,59 @@ def step(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, N, c
         fall -= work.multiplier[a] * work.bound[a]
     for k in range(K):
         for j in range(n):
-            change[k, j] = along(arm, work, full, k, j)
-    for e in range(E):
-        for i in range(c):
-            dF[e, i] = full[forces + e * c + i]
+            work.change[k, j] = moved(arm, work, full, k, j)
     return fall
+
+
+@kernel
+def solve(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, peak, turns, tolerance):
+    """Postures Q, (K, n), and forces F, (E, c), of least cost, in place, from postures near by.
+
+    Returns cost and heat [W] and steps taken; NaN where the start cannot be put onto path and surfaces.
+    """
+    if put_back(arm, points, course, work, Q, 60, ON, 2.0 * REACH / 3.0) > 2.0 * ON:
+        return math.nan, math.nan, 0
+    equilibrium(arm, points, course, work, Q, F, least, True)
+    cost, heat = costs(arm, course, work, Q, peak)
+    damping, quiet, taken, ratio = DAMPING, 0, 0, 0.0
+    scale = max(cost, 0.1)
+    trial, forces = work.trial, work.trial_forces
+    while taken < turns:
+        taken += 1
+        before = cost
+        while damping < DAMPING_MAX:
+            N = prepare(arm, points, course, work, Q, damping * scale + 1e-6)
+            fall = step(arm, points, course, work, Q, F, least, N)
+            if not fall > 0.0 or fall < tolerance * 0.1 * max(cost, 1e-3):
+                break
+            longest = 1e-300
+            for k in range(Q.shape[0]):
+                for j in range(Q.shape[1]):
+                    longest = max(longest, abs(work.change[k, j]))
+            share = min(1.0, REACH / longest)
+            for k in range(Q.shape[0]):
+                for j in range(Q.shape[1]):
+                    trial[k, j] = Q[k, j] + share * work.change[k, j]
+            if put_back(arm, points, course, work, trial, 12, ON, 2.0 * REACH / 3.0) <= 2.0 * ON:
+                equilibrium(arm, points, course, work, trial, forces, least, True)
+                there, warmth = costs(arm, course, work, trial, peak)
+                if there < cost:
+                    ratio = (cost - there) / (fall * share * (2.0 - share))
+                    cost, heat = there, warmth
+                    copy(trial, Q)
+                    copy(forces, F)
+                    break
+            damping *= 8.0
+            equilibrium(arm, points, course, work, Q, F, least, False)
+            costs(arm, course, work, Q, peak)
+        if not cost < before:
+            break
+        if ratio > 0.7:
+            damping = max(damping / 6.0, DAMPING_MIN)
+        elif ratio < 0.25:
+            damping *= 3.0
+        quiet = quiet + 1 if before - cost < tolerance * max(cost, 1e-3) else 0
+        if quiet >= 2:
+            break
+    equilibrium(arm, points, course, work, Q, F, least, False)
+    return cost, heat, taken

@@ -15,17 +15,14 @@ from dynsim.dynamics.contact.braces import tables as kb
 from dynsim.errors import ModelError
 from dynsim.jit.kernel import reals
 from dynsim.model.description import Array, Contact
-from dynsim.planner.local import ON
-from dynsim.planner.problem import Candidate, Task
+from dynsim.planner.compiled import ON
+from dynsim.planner.problem import CHARGED, Candidate, Clear, Task, key
 from dynsim.scenario import build
 
 # Instants of one pass along the path, at least; and the most time between two [s].
 INSTANTS, SPACING = 50, 0.1
 # Slower than this the hand rests [m/s].
 RESTS = 1e-2
-# Slip [m/s] over which the friction that is charged grows to its value: a brace that creeps feels all of it, whatever
-# planned voltages, which must not ring, make of it.
-CHARGED = 1e-3
 # Instants at which links are compared with each other.
 LOOKS = 11
 
@@ -75,7 +72,7 @@ def references(task: Task, braces: tuple[Candidate, ...], knots: Array, Q: Array
         spline = CubicSpline(knots, Q, bc_type="not-a-knot")
     q = reals(spline(half))
     single = task.problem(braces, 1)
-    for k, target in enumerate(task.targets(half)):
+    for k, target in enumerate(task.wanted(half)):
         single.course.target[0] = target
         row = q[k : k + 1]
         if (left := single.retract(row, 20, 0.1 * ON)) > ON:
@@ -148,26 +145,22 @@ def nearest(
     surfaces = build.surfaces(task.scenario)
     if shift is not None and shift.any():
         surfaces = {name: surface.shifted(shift) for name, surface in surfaces.items()}
-    held = {(b.joint, b.surface) for b in braces}
+    braced = {key(b.joint, arm.surfaces.index(b.surface), b.on_joint) for b in braces}
+    leaning = {(joint, surface) for joint, surface, _ in braced}
     whole = arm.coordinates(q)
-    for name in arm.surfaces:
-        index = arm.surfaces.index(name)
-        rows: dict[str, list[tuple[float, str, Array]]] = {}
-        for joint, point, radius, _, label, surface in task.clear:
-            if surface != index or any(
-                b.joint == joint and b.surface == name and np.allclose(b.on_joint, point) for b in braces
-            ):
-                continue
-            children = [k for k in range(arm.n) if arm.tables.parent[k] == joint]
-            if np.any(point) and (joint, name) in held and any((k, name) in held for k in children):
-                continue
-            rows.setdefault(robot.links[arm.links[joint]].name, []).append((radius, label, point))
-        found = gaps(robot, whole, {body: [(surfaces[name], p) for *_, p in held_] for body, held_ in rows.items()})
-        for link, distances in found:
-            for (radius, label, _), distance in zip(rows[link.name], distances, strict=True):
+    for index, name in enumerate(arm.surfaces):
+        free: dict[str, list[Clear]] = {}
+        for at, point in task.clear.items():
+            children = [(k, index) for k in range(arm.n) if arm.tables.parent[k] == point.joint]
+            on_link = np.any(point.point) and (point.joint, index) in leaning and leaning.intersection(children)
+            if point.surface == index and at not in braced and not on_link:
+                free.setdefault(robot.links[arm.links[point.joint]].name, []).append(point)
+        targets = {body: [(surfaces[name], point.point) for point in points] for body, points in free.items()}
+        for link, distances in gaps(robot, whole, targets):
+            for point, distance in zip(free[link.name], distances, strict=True):
                 k = int(np.argmin(distance))
-                if distance[k] - radius < best[0]:
-                    best = (float(distance[k] - radius), label, float(times[k]))
+                if distance[k] - point.radius < best[0]:
+                    best = (float(distance[k] - point.radius), point.label, float(times[k]))
     return best
 
 
@@ -177,44 +170,44 @@ def touching_links(task: Task, times: Array, q: Array) -> str:
     At some instants of the first pass.
     """
     chosen = np.unique(np.linspace(0, np.searchsorted(times, task.span), LOOKS).astype(int))
-    times, q = times[chosen], q[chosen]
-    arm = task.arm
-    robot, ends = arm.model.robot, axis_ends(arm.model.robot)
-    segments = [
-        (k, end, robot.links[i].radius)
-        for k, i in enumerate(arm.links)
-        for end in ends[robot.links[i].name]
-        if np.linalg.norm(end) > 1e-9
-    ]
+    arm, links = task.arm, task.arm.model.robot.links
+    ends = axis_ends(arm.model.robot)
+    segments = [(k, end) for k, i in enumerate(arm.links) for end in ends[links[i].name] if np.linalg.norm(end) > 1e-9]
     if len(segments) < 3:
         return ""
-    parent = arm.tables.parent
-    for t, row in zip(times, arm.coordinates(q), strict=True):
-        lines = []
-        for k, end, radius in segments:
+    lines = np.zeros((len(chosen), len(segments), 2, 3))
+    for t, row in enumerate(arm.coordinates(q[chosen])):
+        for m, (k, end) in enumerate(segments):
             R, p = arm.model.body_pose(arm.links[k], row)
-            lines.append((k, p, p + R @ end, radius))
-        for a, (k, p, pe, r) in enumerate(lines):
-            for j, s, se, rs in lines[a + 1 :]:
-                # Neighbours share a joint, and those over a link without length do.
-                near = min(np.linalg.norm(x - y) for x in (p, pe) for y in (s, se)) < 1e-9
-                if near or parent[j] == k or parent[k] == j:
-                    continue
-                if _segment_distance(p, pe, s, se) < r + rs:
-                    names = robot.links[arm.links[k]].name, robot.links[arm.links[j]].name
-                    return f"{names[0]} and {names[1]} would touch each other at t = {t:.3g} s"
-    return ""
+            lines[t, m] = p, p + R @ end
+    a, b = np.triu_indices(len(segments), 1)
+    first, second = lines[:, a], lines[:, b]
+    # Neighbours share a joint, and those over a link without length do.
+    apart = np.linalg.norm(first[:, :, :, None] - second[:, :, None], axis=-1).min(axis=(0, 2, 3)) > 1e-9
+    joints = np.array([k for k, _ in segments])
+    parents = arm.tables.parent[joints]
+    apart &= (parents[b] != joints[a]) & (parents[a] != joints[b])
+    radii = np.array([links[arm.links[k]].radius for k in joints])
+    touching = apart & (_segment_distances(first, second) < radii[a] + radii[b])
+    if not touching.any():
+        return ""
+    t = int(touching.any(axis=1).argmax())
+    pair = int(touching[t].argmax())
+    names = [links[arm.links[joints[side[pair]]]].name for side in (a, b)]
+    return f"{names[0]} and {names[1]} would touch each other at t = {times[chosen[t]]:.3g} s"
 
 
-def _segment_distance(a: Array, b: Array, c: Array, d: Array) -> float:
-    """Of two segments a–b and c–d [m] (Ericson, Real-Time Collision Detection, 5.1.9)."""
-    u, v, w = b - a, d - c, a - c
-    A, e, f, g, h = (float(x @ y) for x, y in ((u, u), (v, v), (v, w), (u, w), (u, v)))
+def _segment_distances(first: Array, second: Array) -> Array:
+    """Of pairs of segments, (…, 2, 3), [m], (…) (Ericson, Real-Time Collision Detection, 5.1.9)."""
+    u, v, w = (
+        first[..., 1, :] - first[..., 0, :],
+        second[..., 1, :] - second[..., 0, :],
+        first[..., 0, :] - second[..., 0, :],
+    )
+    A, e, f, g, h = (np.sum(x * y, axis=-1) for x, y in ((u, u), (v, v), (v, w), (u, w), (u, v)))
     den = A * e - h * h
-    s = min(max((h * f - g * e) / den, 0.0), 1.0) if den > 1e-12 * A * e else 0.0
+    oblique = den > 1e-12 * A * e
+    s = np.where(oblique, np.clip((h * f - g * e) / np.where(oblique, den, 1.0), 0.0, 1.0), 0.0)
     t = (h * s + f) / e
-    if t < 0.0:
-        t, s = 0.0, min(max(-g / A, 0.0), 1.0)
-    elif t > 1.0:
-        t, s = 1.0, min(max((h - g) / A, 0.0), 1.0)
-    return float(np.linalg.norm(a + s * u - c - t * v))
+    s = np.where(t < 0.0, np.clip(-g / A, 0.0, 1.0), np.where(t > 1.0, np.clip((h - g) / A, 0.0, 1.0), s))
+    return np.asarray(np.linalg.norm(w + u * s[..., None] - v * np.clip(t, 0.0, 1.0)[..., None], axis=-1))

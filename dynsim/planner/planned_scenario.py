@@ -62,10 +62,10 @@ def common(task: Task) -> dict[str, Any]:
     data["name"] = f"{task.scenario.name}_plan"
     data.pop("variant", None)
     controller = dict(data["controller"])
-    hand = controller["hand"]
+    hand = {key: value for key, value in controller["hand"].items() if key in ("path", "orientation")}
     for key in REPLACED:
         controller.pop(key, None)
-    controller["hand"] = {"path": hand["path"], "joints": []}
+    controller["hand"] = hand | {"joints": []}
     data["controller"] = controller
     contacts = dict(data["contacts"])
     for key in BILATERAL_ONLY:

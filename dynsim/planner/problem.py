@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -28,6 +28,9 @@ SMOOTHNESS = 1e-3
 ALONG = (0.33, 0.67)
 # Clearance of those points [m].
 LINK_CLEARANCE = 2e-3
+# Slip [m/s] over which the friction that is charged grows to its value: a brace that creeps feels all of it, whatever
+# planned voltages, which must not ring, make of it. The search begins with a smoother one, for long steps.
+CHARGED, SMOOTHER = 1e-3, 2e-3
 # Targets that differ by less are the same [m].
 SAME = 1e-6
 # Chords at knots of a single pass: how far from its ends the two of a coarse one lie.
@@ -58,7 +61,7 @@ class Candidate:
     surface: str
 
     @property
-    def place(self) -> tuple[str, tuple[float, float, float]]:
+    def location(self) -> tuple[str, tuple[float, float, float]]:
         """The point, whatever it leans on: it can lean on one surface only."""
         return self.body, self.point_m
 
@@ -66,6 +69,26 @@ class Candidate:
     def label(self) -> str:
         """Point and surface."""
         return f"{self.name} on {self.surface}"
+
+
+class Clear(NamedTuple):
+    """A point that stays clear: index of its joint, point [m] in the frame of that joint's link, radius [m], least
+    distance [m], name, index of the surface."""
+
+    joint: int
+    point: Array
+    radius: float
+    margin: float
+    label: str
+    surface: int
+
+
+Key = tuple[int, int, tuple[float, ...]]
+
+
+def key(joint: int, surface: int, point: Array) -> Key:
+    """The same for the same point and surface, by indices of its joint and of the surface."""
+    return joint, surface, tuple(point.round(9).tolist())
 
 
 @dataclass(frozen=True)
@@ -94,7 +117,7 @@ class Options:
     peak: float = 0.0
     clearance_m: float = 0.01
     min_N: float = 0.5
-    starts: int = 6
+    starts: int = 8
     seed: int = 0
     exhaustive: bool = False
 
@@ -112,7 +135,7 @@ class Task:
     friction: float
 
     @cached_property
-    def _courses(self) -> dict[int, tuple[Course, Array]]:
+    def _courses(self) -> dict[int, Course]:
         """Those that were asked for, by their number of knots."""
         return {}
 
@@ -124,6 +147,15 @@ class Task:
     def targets(self, times: Array) -> Array:
         """Of the hand [m], (T, 3)."""
         return np.asarray(self.path.position(np.asarray(times, dtype=np.float64)), dtype=np.float64)
+
+    def wanted(self, times: Array) -> Array:
+        """Of the hand, (T, 3) [m]; with an orientation also the z and the x axis that its link has then, (T, 9)."""
+        targets, hand = self.targets(times), self.scenario.controller.hand
+        if hand.orientation is None:
+            return targets
+        robot = self.arm.model.robot
+        axes = (hand.orientation.matrix() @ robot.attached_axes(robot.hand[0]).T)[:, [2, 0]].T
+        return np.hstack([targets, np.tile(axes.ravel(), (len(targets), 1))])
 
     @property
     def span(self) -> float:
@@ -141,13 +173,10 @@ class Task:
         return np.linspace(0.0, self.span, count)
 
     @cached_property
-    def clear(self) -> list[tuple[int, Array, float, float, str, int]]:
-        """Points that stay clear where they are not braced.
-
-        Joint, point [m], radius [m], margin [m], name, index of the surface; of planes the ends of links are enough.
-        """
+    def clear(self) -> dict[Key, Clear]:
+        """Points that stay clear where they are not braced; of planes the ends of links are enough."""
         robot, arm = self.arm.model.robot, self.arm
-        found: list[tuple[int, Array, float, float, str, int]] = []
+        points: dict[Key, Clear] = {}
         rng = np.random.default_rng(0)
         postures = arm.coordinates(rng.normal(size=(4, arm.n)))
 
@@ -169,8 +198,8 @@ class Task:
             flat = isinstance(surface, Quadric) and surface.drawn.kind == "plane"
             for k, point, radius, least, label in ends if flat else [*ends, *middles]:
                 if moves(arm.links[k], point):
-                    found.append((k, point, radius, least, f"{label} on {name}", index))
-        return found
+                    points[key(k, index, point)] = Clear(k, point, radius, least, f"{label} on {name}", index)
+        return points
 
     def _thickness(self, k: int) -> float:
         """Radius about the beginning of a link: the larger one of those that meet there [m]."""
@@ -180,22 +209,23 @@ class Task:
 
     def points(self, braces: Sequence[Candidate]) -> Points:
         """Tables of braces, then of what stays clear."""
-        names = self.arm.surfaces
-        braced = [(b.joint, b.on_joint, b.radius, 0.0, b.name, names.index(b.surface)) for b in braces]
-        taken = {(b[0], b[5], *b[1].round(9).tolist()) for b in braced}
-        free = [point for point in self.clear if (point[0], point[5], *point[1].round(9).tolist()) not in taken]
-        rows = [*braced, *free]
+        on = [self.arm.surfaces.index(b.surface) for b in braces]
+        braced = {
+            key(b.joint, s, b.on_joint): Clear(b.joint, b.on_joint, b.radius, 0.0, b.name, s)
+            for b, s in zip(braces, on, strict=True)
+        }
+        rows = [*braced.values(), *(point for at, point in self.clear.items() if at not in braced)]
         return Points(
-            body=integers([row[0] for row in rows]),
-            point=reals(np.array([row[1] for row in rows]).reshape(-1, 3)),
-            radius=reals([row[2] for row in rows]),
-            surface=integers([row[5] for row in rows]),
-            margin=reals([row[3] for row in rows]),
+            body=integers([row.joint for row in rows]),
+            point=reals([row.point for row in rows]).reshape(-1, 3),
+            radius=reals([row.radius for row in rows]),
+            surface=integers([row.surface for row in rows]),
+            margin=reals([row.margin for row in rows]),
             friction=reals(np.full(len(braces), self.friction)),
         )
 
-    def course(self, count: int) -> tuple[Course, Array]:
-        """Knots and instants of so many knots, and the smoothness S of their postures.
+    def course(self, count: int) -> Course:
+        """Knots and instants of so many knots.
 
         Velocities are chords between neighbouring knots, never slopes of a spline through them: those an optimiser
         would make vanish exactly at the knots, and slide in between.
@@ -232,23 +262,22 @@ class Task:
             bend = np.roll(np.eye(count), 1, axis=1) - 2.0 * np.eye(count) + np.roll(np.eye(count), -1, axis=1)
         else:
             bend = np.diff(np.eye(count), 2, axis=0)
-        smooth = np.sqrt(SMOOTHNESS) * bend
-        course = Course(
-            target=reals(self.targets(times)),
+        return Course(
+            target=reals(self.wanted(times)),
             knot=integers([k for k, _, _ in instants]),
             chord=reals([row for _, row, _ in instants]),
             share=reals([share for _, _, share in instants]),
-            smooth=reals(smooth.T @ smooth),
+            smooth=reals(SMOOTHNESS * bend.T @ bend),
+            slip_scale=reals([SMOOTHER]),
         )
-        return course, smooth
 
-    def problem(self, braces: Sequence[Candidate], count: int) -> Problem:
+    def problem(self, braces: Sequence[Candidate], count: int, slip_scale: float = SMOOTHER) -> Problem:
         """Of one set of braces at so many knots; its targets are its own."""
         if count not in self._courses:
             self._courses[count] = self.course(count)
-        course, smooth = self._courses[count]
-        course = course._replace(target=course.target.copy())
-        return Problem(self.arm.tables, self.points(braces), course, self.options.min_N, smooth, peak=self.options.peak)
+        course = self._courses[count]
+        course = course._replace(target=course.target.copy(), slip_scale=reals([slip_scale]))
+        return Problem(self.arm.tables, self.points(braces), course, self.options.min_N, self.options.peak)
 
 
 def task(scenario: Scenario, options: Options) -> Task:
@@ -302,11 +331,13 @@ def _candidates(scenario: Scenario, arm: MovingArm, options: Options, surfaces: 
         for end in (first, last):
             if end not in links:
                 raise ModelError(f"plan: no link {end!r} in {text!r}; links: {', '.join(links)}")
+        if links.index(first) > links.index(last):
+            raise ModelError(f"plan: {text!r} begins after its end; write {last}:{first}")
         wanted += links[links.index(first) : links.index(last) + 1]
     if not wanted:
         wanted = [*declared, *links[2:]]
     along = {(k, share): point for k, point, _, share in axis_points(arm, options.along)}
-    found: list[Candidate] = []
+    candidates: list[Candidate] = []
     known: list[tuple[int, Array]] = []
 
     def add(name: str, body: str, point: Array, radius: float, on: Sequence[str]) -> None:
@@ -316,7 +347,7 @@ def _candidates(scenario: Scenario, arm: MovingArm, options: Options, surfaces: 
         known.append((joint, on_joint))
         radius = radius if options.radius_m is None else options.radius_m
         at = tuple(float(x) for x in point)
-        found.extend(Candidate(name, body, at, joint, on_joint, radius, surface) for surface in on)  # type: ignore[arg-type]
+        candidates.extend(Candidate(name, body, at, joint, on_joint, radius, surface) for surface in on)  # type: ignore[arg-type]
 
     for name in wanted:
         if name in declared:
@@ -335,4 +366,4 @@ def _candidates(scenario: Scenario, arm: MovingArm, options: Options, surfaces: 
         for share in options.along:
             if (k, share) in along:
                 add(f"{name}_at_{share:g}", name, along[k, share], radius, surfaces)
-    return found
+    return candidates

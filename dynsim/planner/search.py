@@ -10,23 +10,27 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 
 from dynsim.jit.kernel import reals
 from dynsim.model.description import Array
 from dynsim.planner.dense import Dense, references, touching_links
-from dynsim.planner.local import Local, Problem, solve
-from dynsim.planner.problem import Candidate, Task
+from dynsim.planner.local import Local, solve
+from dynsim.planner.problem import CHARGED, SMOOTHER, Candidate, Task
 
 # Sets of each size that go on from the cheap problem, and from the one with slip.
 BEAM = 5
 # Postures that a round begins with, and random ones that are tried for them.
-POSTURES, DRAWS = 2, 60
+POSTURES, DRAWS = 4, 60
+# Standard deviation of their joints, drawn from so much to so much [rad]; of prismatic ones [m].
+SPREAD, PRISMATIC_SPREAD = (0.3, 1.5), 0.2
 # Sets of each size and round that whole paths are made for, and those that are made finer in the end.
 PATHS, KEPT = 4, 3
-# Costs of one set whose ratio is nearer to 1 are the same posture, which needs no other path.
-SAME_COST = 0.99
+# Costs of one set that differ by less, as a share, are of one path, and paths beyond that ratio to the least are none
+# that could become the best; so many of a set are made finer.
+SAME_COST, NEAR, ALTERNATIVES = 1e-3, 1.1, 3
 # Knots of whole paths: the search's, and the answer's.
 PATH_KNOTS, FINE_KNOTS = 9, (17, 33)
 CLOSED_KNOTS, CLOSED_FINE = 12, (24, 48)
@@ -48,6 +52,13 @@ class Planned:
     def heat(self) -> float:
         """Along the dense references [W]."""
         return self.dense.heat
+
+
+class Path(NamedTuple):
+    """Postures of a set at few knots, by their cost [W], and along the whole path: None, they do not reach."""
+
+    coarse: float
+    local: Local | None
 
 
 @dataclass
@@ -76,7 +87,7 @@ class Search:
     """A search with its problems, which are made once for each set."""
 
     def __init__(self, task: Task, tell: Tell | None = None) -> None:
-        self.task, self.tally = task, Tally()
+        self.task, self.tally, self.kept = task, Tally(), KEPT
         self._tell = tell or (lambda text, share: None)
         self.single_heats: dict[Set, float] = {}
         self._rng = np.random.default_rng(task.options.seed)
@@ -84,158 +95,89 @@ class Search:
         self.path = CLOSED_KNOTS if task.kind == "closed" else PATH_KNOTS
         self.fine = CLOSED_FINE if task.kind == "closed" else FINE_KNOTS
 
-    def solve(self, braces: Set, start: Array, count: int, turns: int = 40) -> Local | None:
+    def solve(
+        self, braces: Set, start: Array, count: int, turns: int = 40, slip_scale: float = SMOOTHER
+    ) -> Local | None:
         """Local optimum from postures at other knots, or from one posture."""
-        problem = self.problem(braces, count)
         self.tally.solves += 1
-        return solve(problem, self.spread(start, count), turns)
-
-    def problem(self, braces: Set, count: int) -> Problem:
-        return self.task.problem(braces, count)
+        return solve(self.task.problem(braces, count, slip_scale), self.spread(start, count), turns)
 
     def spread(self, start: Array, count: int) -> Array:
         """Postures at so many knots, on lines between those given at others; (n,) or (K, n)."""
-        given = np.atleast_2d(start)
-        if len(given) == 1 or count == 1:
-            return reals(np.tile(given[len(given) // 2], (count, 1)))
-        times, at = self.task.times(len(given)), self.task.times(count)
+        known = np.atleast_2d(start)
+        if len(known) == 1 or count == 1:
+            return reals(np.tile(known[len(known) // 2], (count, 1)))
+        times, wanted = self.task.times(len(known)), self.task.times(count)
         if self.task.kind == "closed":
-            times, given = np.append(times, self.task.span), np.vstack([given, given[:1]])
-        return reals(np.stack([_line(at, times, column) for column in given.T], axis=1))
+            times, known = np.append(times, self.task.span), np.vstack([known, known[:1]])
+        return reals(np.stack([_line(wanted, times, column) for column in known.T], axis=1))
 
     def _starts(self, first: bool) -> list[Array]:
         """Random postures with the hand in the middle of the path, clear of all surfaces; the initial one too."""
-        problem, found = self.problem((), 1), list[Array]()
+        problem, postures = self.task.problem((), 1), list[Array]()
         arm = self.task.arm
         initial = arm.model.robot.initial[list(arm.columns)]
         for draw in range(DRAWS):
             Q = reals(initial if first and draw == 0 else self.draw())[None]
             self.tally.drawn += 1
             if problem.retract(Q, 60) <= 1e-7:
-                found.append(Q[0])
+                postures.append(Q[0])
                 self.tally.drawn_on += 1
-                if len(found) == POSTURES:
+                if len(postures) == POSTURES:
                     break
-        return found
+        return postures
 
     def draw(self) -> Array:
-        """A random posture: links forward along the way to the path, each bent from that by some 40°.
-
-        Joints that do not turn about a horizontal axis are near their initial position, those at the root turn towards
-        the target.
-        """
-        arm, rng = self.task.arm, self._rng
-        tables, model = arm.tables, arm.model
-        q = model.robot.initial[list(arm.columns)].copy()
-        target = self.task.targets(np.array([0.5 * self.task.span]))[0]
-        for j in range(arm.n):
-            low, high = tables.lower[j], tables.upper[j]
-            if tables.prismatic[j]:
-                q[j] += 0.2 * rng.normal()
-            else:
-                whole = arm.coordinates(q[None])[0]
-                R, p = model.body_pose(arm.links[j], whole)
-                axis = R @ tables.axis[j]
-                along = self._along(j)
-                way = target - p
-                if along is None or np.linalg.norm(np.cross(axis, way)) < 1e-6:
-                    # A link without length turns what comes after it towards the target.
-                    along = np.array([0.0, 0.0, 1.0])
-                now, there = R @ along, way
-                if abs(axis[2]) > 0.9:
-                    next_axis = self._horizontal_after(j, q)
-                    if next_axis is not None:
-                        # The plane of the joints after it holds the target.
-                        now = np.cross(next_axis, [0.0, 0.0, 1.0])
-                    spread = 0.1
-                else:
-                    spread = 0.7
-                    there = way * np.array([1.0, 1.0, 0.0])
-                if abs(axis[2]) <= 0.9 and abs(np.dot(axis, there)) > 0.7 * np.linalg.norm(there):
-                    q[j] += 0.2 * rng.normal()
-                else:
-                    now, there = now - axis * (axis @ now), there - axis * (axis @ there)
-                    angle = np.arctan2(axis @ np.cross(now, there), now @ there)
-                    q[j] += (
-                        angle
-                        + spread * rng.normal()
-                        - (rng.uniform(0.0, 1.2) * self._up(axis, there) if j < 2 else 0.0)
-                    )
-                    q[j] = (q[j] + np.pi) % (2.0 * np.pi) - np.pi
-            q[j] = min(max(q[j], low), high)
-        return q
-
-    @staticmethod
-    def _up(axis: Array, ahead: Array) -> float:
-        """Which turn about an axis lifts what points ahead: 1, −1, or 0 for an upright axis."""
-        return -float(np.sign(np.cross(axis, ahead)[2])) if abs(axis[2]) < 0.9 else 0.0
-
-    def _along(self, j: int) -> Array | None:
-        """From a joint to the next one or the hand, in its link's frame; None for a link without length."""
-        arm = self.task.arm
-        children = [k for k in range(arm.n) if arm.tables.parent[k] == j]
-        end = arm.tables.place[children[0]] if children else arm.tables.hand_point
-        size = float(np.linalg.norm(end))
-        return end / size if size > 1e-9 else None
-
-    def _horizontal_after(self, j: int, q: Array) -> Array | None:
-        """Axis of the first joint after j that lies level, in W."""
-        arm = self.task.arm
-        whole = arm.coordinates(q[None])[0]
-        for k in range(j + 1, arm.n):
-            R, _ = arm.model.body_pose(arm.links[k], whole)
-            axis = np.asarray(R @ arm.tables.axis[k])
-            if not arm.tables.prismatic[k] and abs(axis[2]) < 0.5:
-                return axis
-        return None
+        """A random posture about the initial one, sometimes near it and sometimes far."""
+        tables, rng = self.task.arm.tables, self._rng
+        initial = self.task.arm.model.robot.initial[list(self.task.arm.columns)]
+        spread = np.where(tables.prismatic, PRISMATIC_SPREAD, rng.uniform(*SPREAD))
+        return np.clip(initial + spread * rng.normal(size=len(spread)), tables.lower, tables.upper)
 
     def run(self) -> dict[int, list[Planned]]:
         """The best sets of each size with whole paths, by heat along their dense references; sizes may be empty.
 
-        Rounds are independent searches, each from two postures of its own: how often they agree is what can be said of
+        Rounds are independent searches, each from postures of its own: how often they agree is what can be said of
         the distance to the optimum.
         """
         least, most = self.task.options.count
-        best: dict[Set, Local] = {}
-        coarse: dict[Set, float] = {}
+        paths: dict[Set, list[Path]] = {}
         rounds = self.task.options.starts
         for number in range(rounds):
             self._tell("searching", number / (rounds + 1))
             for size, ranked in self._round(number, most).items():
-                heats = [math.inf]
-                for cost, braces, Q in ranked[: PATHS if size else 1]:
-                    known = coarse.get(braces, math.inf)
-                    if cost > SAME_COST * known:
-                        # Nothing new: the path that is known already, or a worse posture of its set.
-                        if cost * SAME_COST <= known and braces in best:
-                            heats.append(best[braces].heat)
-                        continue
-                    coarse[braces] = cost
-                    local = self._whole(braces, Q)
-                    if local is None:
-                        self.tally.refused.setdefault(braces, "postures found, but none along the whole path")
-                        continue
-                    heats.append(local.heat)
-                    if braces not in best or local.cost < best[braces].cost:
-                        best[braces] = local
-                        self.tally.refused.pop(braces, None)
-                self.tally.heats.setdefault(size, []).append(min(heats))
+                heats = [self._path(paths.setdefault(item[1], []), *item) for item in ranked[:PATHS]]
+                self.tally.heats.setdefault(size, []).append(min(heats, default=math.inf))
         planned: dict[int, list[Planned]] = {}
         for size in range(least, most + 1):
             self._tell("refining", (rounds + size / (most + 1)) / (rounds + 1))
-            planned[size] = self._refined([(braces, r) for braces, r in best.items() if len(braces) == size])
+            planned[size] = self._refined({braces: some for braces, some in paths.items() if len(braces) == size})
         return planned
+
+    def _path(self, known: list[Path], cost: float, braces: Set, Q: Array) -> float:
+        """Heat of a whole path from postures at few knots [W], which is put among those known of its set.
+
+        Costs of few knots that are nearly the same belong to one path; those that are far from the least to none.
+        """
+        if cost > NEAR * min((path.coarse for path in known), default=math.inf):
+            return math.inf
+        for path in known:
+            if abs(path.coarse - cost) <= SAME_COST * cost:
+                return math.inf if path.local is None else path.local.heat
+        local = self._whole(braces, Q)
+        known.append(Path(cost, local))
+        return math.inf if local is None else local.heat
 
     def _round(self, number: int, most: int) -> dict[int, list[tuple[float, Set, Array]]]:
         """Sets of each size with cost and posture, the best first, from new starts."""
         starts = self._starts(first=number == 0)
-        found: dict[int, list[tuple[float, Set, Array]]] = {}
+        best: dict[int, list[tuple[float, Set, Array]]] = {}
         unbraced = [r for q in starts if (r := self.solve((), q, 1)) is not None]
         if not unbraced:
-            return found
-        hanging = min(unbraced, key=lambda r: r.cost)
-        found[0] = [(hanging.cost, (), hanging.Q)]
-        front: list[tuple[Set, list[Array]]] = [((), [*starts, hanging.Q])]
+            return best
+        unbraced.sort(key=_cost)
+        best[0] = [(r.cost, (), r.Q) for r in unbraced]
+        front: list[tuple[Set, list[Array]]] = [((), [*starts, unbraced[0].Q])]
         for size in range(1, most + 1):
             cheap = self._cheap(self._sets(size, front))
             slipping = self._slipping(cheap, 2 * BEAM)
@@ -244,47 +186,47 @@ class Search:
                 swaps = {grown: [Q] for grown in self._swaps(braces) if grown not in cheap}
                 slipping += self._slipping(self._cheap(swaps), 2)
                 slipping.sort(key=lambda item: item[0])
-            found[size] = slipping[:BEAM]
-            front = [(braces, [Q[len(Q) // 2]]) for _, braces, Q in found[size]]
+            best[size] = slipping[:BEAM]
+            front = [(braces, [Q[len(Q) // 2]]) for _, braces, Q in best[size]]
             if not front:
                 break
-        return found
+        return best
 
     def _cheap(self, sets: Mapping[Set, list[Array]]) -> dict[Set, Local]:
         """Sets at one posture without slip, from postures."""
-        found: dict[Set, Local] = {}
+        reached: dict[Set, Local] = {}
         for braces, postures in sets.items():
             tried = [r for q in postures if (r := self.solve(braces, q, 1, 25)) is not None]
             if tried:
-                found[braces] = min(tried, key=lambda r: r.cost)
+                reached[braces] = min(tried, key=lambda r: r.cost)
                 self.tally.missed.discard(braces)
                 if len(braces) == 1:
-                    self.single_heats[braces] = min(found[braces].heat, self.single_heats.get(braces, math.inf))
+                    self.single_heats[braces] = min(reached[braces].heat, self.single_heats.get(braces, math.inf))
                 self.tally.reached.add(braces)
             elif braces not in self.tally.reached:
                 self.tally.missed.add(braces)
-        return found
+        return reached
 
     def _slipping(self, cheap: Mapping[Set, Local], count: int) -> list[tuple[float, Set, Array]]:
         """The best of them at few knots with slip, the best first."""
         ranked = sorted(cheap.items(), key=lambda item: item[1].cost)[:count]
-        found = [
+        solved = [
             (r.cost, braces, r.Q)
             for braces, local in ranked
             if (r := self.solve(braces, local.Q, self.coarse, 30)) is not None
         ]
-        return sorted(found, key=lambda item: item[0])
+        return sorted(solved, key=lambda item: item[0])
 
     def _swaps(self, braces: Set) -> list[Set]:
         """Sets with one brace exchanged for another candidate."""
-        kept = [tuple(one for one in braces if one != out) for out in braces]
+        kept = [tuple(brace for brace in braces if brace != out) for out in braces]
         grown = [
-            tuple(one for one in self.task.candidates if one in rest or one == new)
-            for rest in kept
+            tuple(brace for brace in self.task.candidates if brace in others or brace == new)
+            for others in kept
             for new in self.task.candidates
             if new not in braces
         ]
-        return [one for one in dict.fromkeys(grown) if _fits(one)]
+        return [braces for braces in dict.fromkeys(grown) if _fits(braces)]
 
     def _sets(self, size: int, front: Sequence[tuple[Set, list[Array]]]) -> dict[Set, list[Array]]:
         """Sets that grow from smaller ones, with postures to start from."""
@@ -297,7 +239,7 @@ class Search:
             return sets
         for braces, postures in front:
             for candidate in candidates:
-                grown = tuple(one for one in candidates if one in braces or one == candidate)
+                grown = tuple(brace for brace in candidates if brace in braces or brace == candidate)
                 if len(grown) == size and _fits(grown):
                     sets.setdefault(grown, []).extend(postures)
         return sets
@@ -307,33 +249,51 @@ class Search:
         local = self.solve(braces, Q, self.path, 30)
         return self._walked(braces, Q, self.path) if local is None else local
 
-    def _refined(self, paths: Sequence[tuple[Set, Local]]) -> list[Planned]:
-        """The best of whole paths at more knots, by the heat of their dense references."""
-        found = []
-        for braces, coarse in sorted(paths, key=lambda item: item[1].cost)[:KEPT]:
-            kept: list[Planned] = []
-            local, why = coarse, ""
-            for count in (self.path, *self.fine):
-                better = local if count == self.path else self.solve(braces, local.Q, count, 20)
-                if better is None:
+    def _refined(self, paths: Mapping[Set, list[Path]]) -> list[Planned]:
+        """The best sets, their best paths at more knots, by the heat of their dense references."""
+        whole = {braces: sorted((p.local for p in some if p.local), key=_cost) for braces, some in paths.items()}
+        reached = {braces: some for braces, some in whole.items() if some}
+        for braces in whole.keys() - reached.keys():
+            self.tally.refused[braces] = "postures found, but none along the whole path"
+        planned = []
+        for braces in sorted(reached, key=lambda braces: reached[braces][0].cost)[: self.kept]:
+            good, near = list[Planned](), math.inf
+            for local in reached[braces][: 2 * ALTERNATIVES]:
+                if len(good) == ALTERNATIVES or local.cost > near:
                     break
-                local = better
-                dense = references(self.task, braces, self.task.times(count), local.Q)
-                why = dense if isinstance(dense, str) else touching_links(self.task, dense.times, dense.q)
-                if not isinstance(dense, str) and not why:
-                    kept.append(Planned(braces, self.task.times(count), local, dense))
-            if kept:
-                found.append(min(kept, key=lambda one: one.heat))
+                plan = self._finest(braces, local)
+                if isinstance(plan, str):
+                    self.tally.refused.setdefault(braces, plan)
+                else:
+                    good.append(plan)
+                    near = min(near, NEAR * local.cost)
+            if good:
+                planned.append(min(good, key=lambda plan: plan.heat))
                 self.tally.refused.pop(braces, None)
-            else:
-                self.tally.refused[braces] = why
-        return sorted(found, key=lambda one: one.heat)
+        return sorted(planned, key=lambda plan: plan.heat)
+
+    def _finest(self, braces: Set, coarse: Local) -> Planned | str:
+        """The better of the two finest paths that keep hand and surfaces between knots; in words why none does."""
+        paths, good, why = [coarse], list[Planned](), ""
+        for count, slip_scale in ((self.fine[0], SMOOTHER), (self.fine[1], SMOOTHER), (self.fine[1], CHARGED)):
+            finer = self.solve(braces, paths[-1].Q, count, 20, slip_scale)
+            if finer is not None:
+                paths.append(finer)
+        for local in reversed(paths):
+            times = self.task.times(len(local.Q))
+            dense = references(self.task, braces, times, local.Q)
+            why = dense if isinstance(dense, str) else touching_links(self.task, dense.times, dense.q)
+            if not isinstance(dense, str) and not why:
+                good.append(Planned(braces, times, local, dense))
+                if len(good) == 2:
+                    break
+        return min(good, key=lambda plan: plan.heat, default=why)
 
     def _walked(self, braces: Set, Q: Array, count: int) -> Local | None:
         """A path from a posture in its middle, knot after knot: where all at once does not reach."""
-        whole = self.problem(braces, count)
+        whole = self.task.problem(braces, count)
         targets, middle = whole.course.target, count // 2
-        single = self.problem(braces, 1)
+        single = self.task.problem(braces, 1)
         out = np.zeros((count, self.task.arm.n))
         for knots in (range(middle, count), range(middle, -1, -1)):
             q = reals(np.atleast_2d(Q)[len(np.atleast_2d(Q)) // 2])[None]
@@ -346,9 +306,13 @@ class Search:
         return solve(whole, out, 30)
 
 
+def _cost(local: Local) -> float:
+    return local.cost
+
+
 def _fits(braces: Sequence[Candidate]) -> bool:
     """Whether each point leans on one surface only."""
-    return len({one.place for one in braces}) == len(braces)
+    return len({brace.location for brace in braces}) == len(braces)
 
 
 def _line(at: Array, times: Array, values: Array) -> Array:

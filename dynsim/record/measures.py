@@ -70,6 +70,20 @@ def hand_error(record: Record, settle: float) -> dict[str, float | None]:
     return dict(zip(names, map(float, values), strict=True))
 
 
+def hand_turn_error(record: Record, settle: float) -> dict[str, float | None]:
+    """Root mean square and maximum of the angle between the hand's orientation and its target [rad].
+
+    Counted from t = ``settle`` on; None when the run is shorter, nothing where no orientation is asked for.
+    """
+    if "hand_turn_error" not in record:
+        return {}
+    names, late = ("hand_turn_error_rms_rad", "hand_turn_error_max_rad"), record.time >= settle
+    angle, time = record["hand_turn_error"][late], record.time[late]
+    if len(time) < 2:
+        return dict.fromkeys(names)
+    return dict(zip(names, (_mean(angle**2, time) ** 0.5, float(angle.max())), strict=True))
+
+
 def least_loads(record: Record, steps: NDArray[np.float64]) -> NDArray[np.float64]:
     """Least loads of wheels and caster, (3,) [N], over the samples and over all steps (``steps``, empty: unknown)."""
     loads = record["wheel_load"].min(axis=0, initial=np.inf)

@@ -62,6 +62,19 @@ def poses_at(scene: Scene, positions: Mapping[str, Mapping[str, float]]) -> Arra
     return np.array([np.concatenate(pose) for pose in poses])
 
 
+def relative_pose(record: Record, body: Body) -> tuple[Array, Array]:
+    """Origin, (3, T) [m], and quaternion, (4, T), of a body in the frame of the body that carries it.
+
+    Raises
+    ------
+    MissingEntry
+        The record does not have the positions of its joint.
+    """
+    columns = _columns(record, body.joint.signal) if body.joint.labels else {}
+    moved = np.array([columns[label] for label in body.joint.labels])
+    return _pose(body, moved, None, (len(record),))
+
+
 def pose_columns(bodies: int) -> int:
     """How many columns of 8 bytes the poses of so many bodies take: seven numbers of 4 bytes each."""
     return -(-7 * bodies // 2)

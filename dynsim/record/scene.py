@@ -168,7 +168,7 @@ class SceneSurface:
             kind, parameters = _simple_kind(Q, b, float(c))
         if not all(np.isfinite(value).all() for value in parameters.values()):
             kind, parameters = "quadric", {}
-        return cls(name, _matrix(Q), vector3(b), float(c), kind, **parameters)
+        return cls(name, (vector3(Q[0]), vector3(Q[1]), vector3(Q[2])), vector3(b), float(c), kind, **parameters)
 
     def value(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """C at points, (…, 3) → (…)."""
@@ -347,10 +347,6 @@ def quaternion(R: ArrayLike) -> Quaternion:
 def _four(values: ArrayLike) -> Quaternion:
     w, x, y, z = np.asarray(values, dtype=np.float64).tolist()
     return w, x, y, z
-
-
-def _matrix(values: NDArray[np.float64]) -> Matrix3:
-    return vector3(values[0]), vector3(values[1]), vector3(values[2])
 
 
 def _simple_kind(Q: NDArray[np.float64], b: NDArray[np.float64], c: float) -> tuple[Any, dict[str, Any]]:

@@ -18,7 +18,7 @@ from dynsim.config.base import BodyPoint
 from dynsim.config.problems import dotted, suggest
 from dynsim.errors import ModelError, ScenarioError, brief
 from dynsim.library import families
-from dynsim.model.description import Array, Contact, Inertia, Load, Robot
+from dynsim.model.description import Array, Contact, Foot, Inertia, Load, Robot
 from dynsim.model.surfaces import SURFACES, Surface
 from dynsim.scenario.candidates import candidates
 from dynsim.scenario.loads import Payload
@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 # A contact point must start this close to its surface [m].
 START_TOLERANCE = 1e-6
+# What gives way may start pressed in by this much [m].
+PRESSED = 5e-3
 
 
 def machine(scenario: Scenario) -> Robot | SnakeDescription:
@@ -69,7 +71,8 @@ def robot_and_contacts(scenario: Scenario) -> tuple[Robot, list[Contact]]:
 def unposed(scenario: Scenario) -> Robot:
     """The robot in the posture of its plant, before ``initial``."""
     config = scenario.config
-    return recall("plant", lambda: _loaded(scenario), config.plant, config.duration_s, config.loads)
+    beside = (config.objects, config.surfaces, config.contacts) if config.objects else ()
+    return recall("plant", lambda: _loaded(scenario), config.plant, config.duration_s, config.loads, *beside)
 
 
 def _loaded(scenario: Scenario) -> Robot:
@@ -85,7 +88,25 @@ def _loaded(scenario: Scenario) -> Robot:
     links = list(bare.links)
     for body, parts in inertias.items():
         links[body] = replace(links[body], inertia=Inertia.merged(parts))
-    return replace(bare, links=tuple(links)) if inertias else bare
+    loaded = replace(bare, links=tuple(links)) if inertias else bare
+    return _with_objects(scenario, loaded) if scenario.config.objects else loaded
+
+
+def _with_objects(scenario: Scenario, built: Robot) -> Robot:
+    """The robot and the objects beside it, each a tree of its own."""
+    objects, surfaces = scenario.config.objects, list(scenario.config.surfaces)
+    taken = {*(link.name for link in built.links), *built.joint_names, *(frame.name for frame in built.frames)}
+    for name in objects:
+        if name in taken:
+            text = f"objects.{name}: the robot has a body, joint or frame of that name"
+            raise ModelError(text, keys=("objects", name))
+    touching = surfaces if scenario.config.contacts.law == "unilateral" else []
+    return replace(
+        built,
+        links=(*built.links, *(link for name, one in objects.items() for link in one.links(name))),
+        q0=np.concatenate([built.initial, *(one.start() for one in objects.values())]),
+        feet=(*built.feet, *(foot for name, one in objects.items() for foot in one.feet(name, touching))),
+    )
 
 
 def _nameable(scenario: Scenario, built: Robot) -> list[Contact]:
@@ -181,7 +202,8 @@ def controller(
     config = scenario.controller
     if config is None:
         raise ModelError("the scenario has no controller; its motors are short-circuited")
-    if scenario.engine != families.member("controller", config.type).ENGINE:
+    # Of a snake at whatever level.
+    if families.member("plant", scenario.plant.type).ENGINE != families.member("controller", config.type).ENGINE:
         raise ModelError(f"controller {config.type!r} cannot drive a {scenario.plant.type!r}")
     if isinstance(machine, Model) and scenario.config.surface_error is not None:
         # What it plans with is not what is there.
@@ -265,7 +287,8 @@ def contacts(scenario: Scenario, described: Robot | None = None) -> list[Contact
     """
     options = scenario.config.contacts
     known = surfaces(scenario)
-    result = []
+    described = robot(scenario) if described is None else described
+    result = [_foot(foot, known, options) for foot in described.feet]
     for name, point in options.points.items():
         if not point.enabled:
             continue
@@ -289,10 +312,21 @@ def contacts(scenario: Scenario, described: Robot | None = None) -> list[Contact
         )
     if options.candidates != "points":
         law = _law(options, ContactPoint(body=""))
-        described = robot(scenario) if described is None else described
         result += [replace(contact, **law) for contact in candidates(options.candidates, described, known, result)]
     error = scenario.config.surface_error
     return result if error is None else [_rubbed(contact, error.friction_factor) for contact in result]
+
+
+def _foot(foot: Foot, known: Mapping[str, Surface], options: Contacts) -> Contact:
+    """The contact of what a robot is made to touch with."""
+    if foot.surface not in known:
+        raise ModelError(f"surfaces: {foot.name} stands on surface {foot.surface!r}, which there is not")
+    law = _law(options, ContactPoint(body=foot.body))
+    if foot.grip_axis is not None:
+        law |= {"grip": 0.0, "grip_axis": foot.grip_axis}
+    return Contact(
+        foot.name, foot.body, foot.point, known[foot.surface], surface_name=foot.surface, radius=foot.radius, **law
+    )
 
 
 def _rubbed(contact: Contact, factor: float) -> Contact:
@@ -383,7 +417,7 @@ def check_start(
             gap = gap_at(model, contact, q)
         except ModelError as error:
             raise ModelError(f"{dotted((*keys, 'body'))}: {error}", keys=(*keys, "body")) from error
-        if scenario.config.contacts.law == "unilateral" and gap > 0.0:
+        if scenario.config.contacts.law == "unilateral" and gap > (-PRESSED if contact.stiffness > 0.0 else 0.0):
             continue
         if not abs(gap) <= START_TOLERANCE:
             off.append((contact, declared, keys, gap))

@@ -8,7 +8,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from dynsim.config.problems import dotted
-from dynsim.library.families import member
+from dynsim.library.families import engine
 
 Keys = tuple[int | str, ...]
 
@@ -39,7 +39,7 @@ def without_effect(scenario: Any, motors: bool = True) -> list[str]:
 
 def idle_keys(config: Any) -> dict[Keys, str]:
     """Keys that change nothing, whether they are set or not, and why."""
-    kinematic = member("plant", config.plant.type).ENGINE == "kinematic"
+    kinematic = engine(config.plant) == "kinematic"
     rules = [_of_kinematics(config)] if kinematic else [_of_integrator(config), _of_contacts(config)]
     return dict(pair for rule in (*rules, _of_controller(config), _of_time(config)) for pair in rule)
 
@@ -63,6 +63,9 @@ def _of_kinematics(config: Any) -> Iterator[tuple[Keys, str]]:
         part = getattr(config, section)
         for key in () if part is None else type(part).model_fields:
             yield (section, key), f"plant {config.plant.type} is kinematic"
+    yield ("sensors",), f"plant {config.plant.type} is kinematic"
+    if hasattr(config.plant, "dynamics"):
+        yield ("plant", "dynamics"), "plant.level is kinematic"
 
 
 def _of_integrator(config: Any) -> Iterator[tuple[Keys, str]]:
@@ -79,7 +82,8 @@ def _of_contacts(config: Any) -> Iterator[tuple[Keys, str]]:
     contacts = config.contacts
     if contacts.law == "unilateral":
         yield ("contacts", "reference_tolerance_m"), "it is of law: bilateral; real braces may leave their surfaces"
-    if not contacts.points and contacts.candidates == "points":
+    has_feet = getattr(config.plant, "level", "") == "dynamic"
+    if not contacts.points and contacts.candidates == "points" and not has_feet:
         for key in type(contacts).model_fields:
             if key not in ("law", "candidates", "points", "reference_tolerance_m"):
                 yield ("contacts", key), "there are no contacts.points, and contacts.candidates are points alone"

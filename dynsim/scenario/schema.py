@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -11,10 +11,12 @@ from pydantic import Field, field_validator, model_validator
 
 from dynsim.config.base import BodyPoint, NonNegative, Positive, StrictConfig, Vector3, error_at
 from dynsim.config.problems import Origin, listed
-from dynsim.library.families import member, union
+from dynsim.library.families import engine, section_defaults, union
 from dynsim.record import notebook
 from dynsim.scenario.effect import idle_keys, is_set
 from dynsim.scenario.loads import LoadConfig
+from dynsim.scenario.objects import SceneObject
+from dynsim.scenario.sensors import Sensors
 
 # Bytes of the name of a folder on common file systems.
 NAME_LIMIT = 255
@@ -250,6 +252,13 @@ class Metrics(StrictConfig):
     settle_s: NonNegative = Field(default=2.0, description="tracking errors count from this time on")
 
 
+def laid_under(defaults: Any, said: Any) -> Any:
+    """``said`` with ``defaults`` where it says nothing; mappings merge."""
+    if not (isinstance(defaults, Mapping) and isinstance(said, Mapping)):
+        return said
+    return {**defaults, **{key: laid_under(defaults.get(key), value) for key, value in said.items()}}
+
+
 class ScenarioConfig(StrictConfig):
     """A dynsim scenario."""
 
@@ -266,9 +275,19 @@ class ScenarioConfig(StrictConfig):
     )
     initial: Initial | None = Field(default=None, description="posture and currents of the start")
     loads: dict[str, LoadConfig] = Field(default={}, description="forces, torques and payloads by name")
+    objects: dict[str, SceneObject] = Field(default={}, description="bodies beside the robot, by name")
+    sensors: Sensors | None = Field(default=None, description="what a sampled controller is told of the robot")
     integrator: Integrator = Integrator()
     record: RecordOptions = RecordOptions()
     metrics: Metrics = Metrics()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_plant(cls, data: Any) -> Any:
+        """Some plants want other defaults in other sections."""
+        if not isinstance(data, Mapping):
+            return data
+        return laid_under(section_defaults(data.get("plant"), data), data)
 
     @model_validator(mode="after")
     def _check_stepped_contacts(self) -> Self:
@@ -396,8 +415,8 @@ class Scenario:
 
     @property
     def engine(self) -> str:
-        """What simulates the plant: the ``ENGINE`` of its module."""
-        return str(member("plant", self.plant.type).ENGINE)
+        """What simulates the plant."""
+        return engine(self.plant)
 
     @property
     def resolved(self) -> dict[str, Any]:
@@ -406,8 +425,9 @@ class Scenario:
         Defaults that change nothing are left out.
         """
         resolved = self.config.model_dump(mode="json", exclude_none=True)
-        if not self.config.loads:
-            del resolved["loads"]
+        for section in ("loads", "objects"):
+            if not getattr(self.config, section):
+                del resolved[section]
         contacts = self.config.contacts
         for part in (resolved["contacts"], *resolved["contacts"]["points"].values()):
             for key in contacts.other_keys:

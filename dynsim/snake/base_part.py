@@ -173,15 +173,20 @@ def base_part(record: Record, pairs: tuple[str, ...]) -> BasePart:
     if missing or len(pairs) < 2:
         raise CheckRefused(f"the record's scene has no wheel pair {', '.join(missing)}; {len(pairs)} are in the record")
     bodies = [scene.bodies[index[name]] for name in pairs]
-    for ahead, body in zip(pairs, bodies[1:], strict=False):
+    # Between a pair and the yaw joint behind it there may be a pitch joint on the axle, with a body of its own.
+    plates = [scene.bodies[body.parent] for body in bodies[1:]]
+    plates = [plate if plate.joint.axis == (0.0, 1.0, 0.0) else None for plate in plates]
+    for ahead, body, plate in zip(pairs, bodies[1:], plates, strict=False):
         joint = body.joint
-        if joint.kind != "revolute" or joint.axis != (0.0, 0.0, 1.0) or body.parent != index[ahead]:
+        parent = body.parent if plate is None else plate.parent
+        if joint.kind != "revolute" or joint.axis != (0.0, 0.0, 1.0) or parent != index[ahead]:
             raise CheckRefused(f"{body.name} is not behind {ahead} on a yaw joint: its wheels cannot be lifted")
     wheels = [wheels_of(scene, name) for name in pairs]
     if bare := [name for name, on_body in zip(pairs, wheels, strict=True) if not on_body]:
         raise CheckRefused(f"the record's scene has no wheels on {bare[0]}")
     axle = np.array([on_body[0].along for on_body in wheels])
     joints = np.array([body.joint.position[0] for body in bodies[1:]])
+    joints += [0.0 if plate is None else plate.joint.position[0] for plate in plates]
     return BasePart(
         pairs=pairs,
         before=axle[:-1] - joints,

@@ -13,7 +13,8 @@ import numpy as np
 from dynsim.snake.controller import ControlWork, new_work
 from dynsim.snake.kinematics import SnakeModel
 
-MEASURED, ESTIMATED, FEEDFORWARD = 0, 1, 2
+# Where beliefs come from; GIVEN: who moves the robot writes them.
+MEASURED, ESTIMATED, FEEDFORWARD, GIVEN = 0, 1, 2, 3
 # Why a command cannot be carried out.
 NO_OBSTACLE, JOINT_LIMIT, RATE_LIMIT, SINGULAR, ATTITUDE = 0, 1, 2, 3, 4
 # State.counts
@@ -40,7 +41,7 @@ class Schedule(NamedTuple):
     period: float  # control period [s]
     midpoint: int  # 1: the held rates are those of the predicted middle of the period; 0: those of its beginning
     substeps: int  # integration steps of the plant in one control period
-    state_source: int  # MEASURED, ESTIMATED or FEEDFORWARD
+    state_source: int  # MEASURED, ESTIMATED, FEEDFORWARD or GIVEN
     null_start_tick: int
 
 

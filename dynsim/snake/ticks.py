@@ -39,6 +39,8 @@ def copy(source, target):
 @internal_kernel
 def believe(model, schedule, state, rig):
     """What the controller takes for w and phi ([T] IV.C.1 and IV.C.2), into ``state.w_hat`` and ``state.phi_hat``."""
+    if schedule.state_source == ss.GIVEN:
+        return
     if schedule.state_source != ss.FEEDFORWARD:
         for j in range(state.phi.shape[0]):
             state.phi_hat[j] = state.phi[j]
@@ -122,8 +124,8 @@ def commanded_rate(velocity, place, done, speed, rate):
 
 
 @internal_kernel
-def tick(model, law, schedule, state, velocity, moving, slows, rig):
-    """One control period: evaluate the controller, hold its rates, move the plant and the controller's beliefs.
+def command(model, law, schedule, state, velocity, moving, slows, rig):
+    """What the controller asks for in one control period: rates of joints and wheels, into ``rig.work.u``.
 
     Rates of the beginning of the period, held, miss the constraints by O(period) at its end and leave a head error of
     that order. Those of its predicted middle (``schedule.midpoint``) make it O(period^2). The prediction is the closed
@@ -143,10 +145,12 @@ def tick(model, law, schedule, state, velocity, moving, slows, rig):
 
     Returns
     -------
-    slip : float
-        Of the plant [m/s]; the applied rates are in ``rig.work.u``.
-    blocked : bool
-        The command was not carried out.
+    reason : int
+        Why the target waits, see :mod:`dynsim.snake.state`; NO_OBSTACLE where it does not.
+    commanded : bool
+        There was something to carry out.
+    speed : float
+        Rows of the commands that are carried out, 0 to 1.
     """
     work, period, mode = rig.work, schedule.period, state.counts[ss.MODE]
     phi, phi_hat, w_hat, w_target = state.phi, state.phi_hat, state.w_hat, state.w_target
@@ -220,14 +224,23 @@ def tick(model, law, schedule, state, velocity, moving, slows, rig):
                 if u[j] > up + 1e-9 or u[j] < down - 1e-9:
                     state.counts[ss.CLAMPED] += 1
                 u[j] = up if u[j] > up else down
-    slip = advance_plant(model, law.grounded[mode], period, schedule.substeps, state, u, rig)
-    for j in range(joints):
-        phi_hat[j] += period * u[j]  # feedforward; overwritten when the joints are read
+    return reason if waits else ss.NO_OBSTACLE, commanded, speed
+
+
+@internal_kernel
+def settle(schedule, state, moving, reason, commanded, speed, rig):
+    """End a control period: beliefs, target, and the place in the commands, after :func:`command` and the plant.
+
+    Returns True when the command was not carried out.
+    """
+    period, u, rate, done = schedule.period, rig.work.u, rig.rate, state.progress[ss.DONE]
+    for j in range(state.phi.shape[0]):
+        state.phi_hat[j] += period * u[j]  # feedforward; overwritten when the joints are read
     for i in range(6):
-        w_target[i] += period * rate[i]
-        w_hat[i] += period * rate[i]  # x, y, gamma of the estimated state; the rest is overwritten
+        state.w_target[i] += period * rate[i]
+        state.w_hat[i] += period * rate[i]  # x, y, gamma of the estimated state; the rest is overwritten
     state.counts[ss.TICKS] += 1
-    blocked = waits and commanded
+    blocked = reason != ss.NO_OBSTACLE and commanded
     if blocked:
         state.counts[ss.WAITED_FOR + reason] += 1
         state.counts[ss.STILL] += 1
@@ -243,7 +256,55 @@ def tick(model, law, schedule, state, velocity, moving, slows, rig):
         state.progress[ss.DONE] = done
     if blocked or not moving:
         state.counts[ss.WAITED] += 1
-    return slip, blocked
+    return blocked
+
+
+@internal_kernel
+def tick(model, law, schedule, state, velocity, moving, slows, rig):
+    """One control period of the kinematic robot: evaluate the controller, hold its rates, move the plant.
+
+    Parameters as of :func:`command`. Returns the slip of the plant [m/s], and whether the command was not carried out.
+    """
+    mode = state.counts[ss.MODE]
+    reason, commanded, speed = command(model, law, schedule, state, velocity, moving, slows, rig)
+    slip = advance_plant(model, law.grounded[mode], schedule.period, schedule.substeps, state, rig.work.u, rig)
+    return slip, settle(schedule, state, moving, reason, commanded, speed, rig)
+
+
+@internal_kernel
+def record_command(schedule, state, rig, r, trace):
+    """Write to row r of the trace what the controller has asked for in the period that has just ended."""
+    copy(rig.work.u, trace.u[r])
+    copy(state.w_hat, trace.w_hat[r])
+    for j in range(state.phi.shape[0]):
+        trace.at_limit[r, j] = rig.work.at_limit[j]
+    # beliefs at the beginning of the period: take back the step that it has added
+    for i in range(6):
+        trace.w_hat[r, i] -= schedule.period * rig.rate[i]
+
+
+@kernel
+def command_tick(model, law, schedule, state, velocity, moving, slows, rig, r, trace):
+    """One control period of a robot that something else moves: joints and wheels of ``state`` are what they are told.
+
+    Parameters as of :func:`command`. What was told and believed at its beginning goes to row r of the trace, if it is
+    not -1.
+    Returns True when the command was not carried out.
+    """
+    if r >= 0:
+        trace.mode[r] = state.counts[ss.MODE]
+        copy(state.w_target, trace.w_target[r])
+        copy(state.phi, trace.phi[r])
+    reason, commanded, speed = command(model, law, schedule, state, velocity, moving, slows, rig)
+    blocked = settle(schedule, state, moving, reason, commanded, speed, rig)
+    if r >= 0:
+        record_command(schedule, state, rig, r, trace)
+    joints = state.phi.shape[0]
+    for j in range(joints):
+        state.phi[j] += schedule.period * rig.work.u[j]
+    for j in range(state.rho.shape[0]):
+        state.rho[j] += schedule.period * rig.work.u[joints + j]
+    return blocked
 
 
 @kernel
@@ -289,7 +350,7 @@ def run_ticks(model, law, schedule, state, velocity, count, moving, stop, stride
     blocked : bool
         The last period was blocked.
     """
-    base, phi, counts, at_limit = state.base, state.phi, state.counts, rig.work.at_limit
+    base, phi, counts = state.base, state.phi, state.counts
     blocked, slows = False, 0 if stop else 1
     for k in range(count):
         now = counts[ss.TICKS]
@@ -299,13 +360,7 @@ def run_ticks(model, law, schedule, state, velocity, count, moving, stop, stride
         slip, blocked = tick(model, law, schedule, state, velocity, moving, slows, rig)
         if r >= 0:
             trace.slip[r] = slip
-            copy(rig.work.u, trace.u[r])
-            copy(state.w_hat, trace.w_hat[r])
-            for j in range(phi.shape[0]):
-                trace.at_limit[r, j] = at_limit[j]
-            # beliefs at the beginning of the period: take back the step that the tick has added
-            for i in range(6):
-                trace.w_hat[r, i] -= schedule.period * rig.rate[i]
+            record_command(schedule, state, rig, r, trace)
         finite = 0.0
         for i in range(3):
             finite += base[i]

@@ -12,6 +12,7 @@ import numpy as np
 from dynsim.compile.control import PLANNED
 from dynsim.compile.references.teleop import BASE, HAND, VELOCITIES
 from dynsim.engine.compilation import kernels_logged
+from dynsim.engine.operator import Operator
 from dynsim.engine.simulation import Simulation
 from dynsim.errors import ScenarioError
 from dynsim.model.base_pose import base_pose
@@ -51,7 +52,7 @@ class ArmSession:
         # Two ticks of another simulation, by which the kernels are loaded, or compiled.
         with kernels_logged(log):
             trial = Simulation(begun, duration=math.inf, operator=self)
-            trial.advance(2.0 / trial.operator.options.rate if trial.operator is not None else 0.0)
+            trial.advance(2.0 / trial.operator.rate if trial.operator is not None else 0.0)
         self.still = trial.record()
         self.still.complete = True
         self._velocity = np.zeros(VELOCITIES)
@@ -108,7 +109,7 @@ class ArmSession:
         """The posture now."""
         simulation, scene = self.simulation, self.still.scene
         robot, operator = simulation.robot, simulation.operator
-        assert operator is not None
+        assert isinstance(operator, Operator)
         assert scene is not None
         q = simulation.state.q
         positions = {"q": dict(zip(robot.position_names, q.tolist(), strict=True))}

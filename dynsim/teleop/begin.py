@@ -7,7 +7,7 @@ from dynsim.errors import ScenarioError
 from dynsim.scenario import Scenario, require_scenario
 from dynsim.teleop.arm import ArmSession
 from dynsim.teleop.session import Session, SpeedLimits
-from dynsim.teleop.snake import SnakeSession
+from dynsim.teleop.snake import DynamicSnakeSession, SnakeSession
 
 
 def begin(scenario: Scenario, *, limits: SpeedLimits | None = None, longest: float = 600.0) -> Session:
@@ -27,5 +27,7 @@ def begin(scenario: Scenario, *, limits: SpeedLimits | None = None, longest: flo
     with named(scenario):
         if scenario.controller is None:
             raise ScenarioError("it has no controller, so there is nothing to drive: a pilot gives its references")
-        session = SnakeSession if scenario.engine == "kinematic" else ArmSession
+        session: type[SnakeSession] | type[ArmSession] = ArmSession
+        if scenario.controller.type == "task_space":
+            session = SnakeSession if scenario.engine == "kinematic" else DynamicSnakeSession
         return session(scenario, limits or SpeedLimits(), longest)

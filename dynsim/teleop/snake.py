@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+import logging
+import math
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from dynsim.compile.scene import snake_scene
+from dynsim.engine.compilation import kernels_logged
 from dynsim.engine.kinematic import prepare
-from dynsim.engine.kinematic_record import OBSTACLES, make_record
+from dynsim.engine.kinematic_record import make_record
+from dynsim.engine.simulation import Simulation
+from dynsim.engine.snake_control import OBSTACLES, SnakeControl
+from dynsim.engine.snake_pilot import SnakePilot
+from dynsim.engine.stepped import Touch
 from dynsim.record import Record
 from dynsim.record.poses import poses_at
+from dynsim.record.scene import Scene
 from dynsim.scenario import Scenario
 from dynsim.snake import state as ss
 from dynsim.snake.description import COORDINATES, FIXING, SWITCHING, CommandBlock, Feedback
 from dynsim.teleop.session import NO_REQUEST, Array, Command, LiveFrame, PilotAxis, SpeedLimits, with_controller
+
+log = logging.getLogger(__name__)
 
 REQUESTS = {SWITCHING: "switching", FIXING: "fixing"}
 
@@ -33,10 +43,7 @@ class SnakeSession:
         self._scenario, self._controller = scenario, controller
         self._command = Command((0.0,) * 6)
         self._commands: list[dict[str, Any]] = []
-        self._run = prepare(with_controller(scenario, longest, controller), self)
-        self._run.load_kernels()
-        self.still = make_record(self._run, scenario, 0.0)
-        self._scene = snake_scene(self._run.description)
+        self._begin(with_controller(scenario, longest, controller))
         group = "gripper" if self._run.description.point_offset > 0.0 else "head"
         self.axes = tuple(
             PilotAxis(name, group, *(("m/s", limits.hand) if k < 3 else ("rad/s", limits.turn)))
@@ -44,6 +51,16 @@ class SnakeSession:
         )
         self.modes = self._run.controller.modes.numbers
         self.period = self._run.controller.schedule.period
+
+    _run: SnakeControl
+
+    def _begin(self, scenario: Scenario) -> None:
+        """The run, its kernels loaded, and a moment of it."""
+        run = self._kinematic = prepare(scenario, self)
+        run.load_kernels()
+        self._run = run
+        self.still = make_record(run, self._scenario, 0.0)
+        self._scene: Scene = snake_scene(run.description)
 
     @property
     def ticks(self) -> int:
@@ -82,20 +99,18 @@ class SnakeSession:
         if self.ticks == 0:
             # What was known when the run was prepared is not what is commanded now.
             self._run.read_commands(waiting=False)
-        self._run.advance()
+        self._advance()
+
+    def _advance(self) -> None:
+        self._kinematic.advance()
 
     def frame(self) -> LiveFrame:
         """The posture now."""
         run, state = self._run, self._run.state
-        signals = {
-            "base_pose": dict(zip(("x", "y", "yaw"), state.base.tolist(), strict=True)),
-            "phi": dict(zip(run.description.joint_names, state.phi.tolist(), strict=True)),
-            "rho": dict(zip(run.description.wheel_names, state.rho.tolist(), strict=True)),
-        }
         row = int(state.counts[ss.MODE])
         return LiveFrame(
             time=self.time,
-            poses=poses_at(self._scene, signals),
+            poses=poses_at(self._scene, self._positions()),
             hand=state.w_target[:3].copy(),
             hindrance=self._hindrance(),
             extra={
@@ -103,8 +118,20 @@ class SnakeSession:
                 "gripper": int(self._command.closed),
                 "mode": run.mode,
             },
-            touching={},
+            touching=self._touching(),
         )
+
+    def _positions(self) -> Mapping[str, Mapping[str, float]]:
+        """Positions of the joints of the scene, by signal and label."""
+        run, state = self._run, self._run.state
+        return {
+            "base_pose": dict(zip(("x", "y", "yaw"), state.base.tolist(), strict=True)),
+            "phi": dict(zip(run.description.joint_names, state.phi.tolist(), strict=True)),
+            "rho": dict(zip(run.description.wheel_names, state.rho.tolist(), strict=True)),
+        }
+
+    def _touching(self) -> Mapping[str, Touch]:
+        return {}
 
     def _hindrance(self) -> str:
         """What the target waits for."""
@@ -123,4 +150,54 @@ class SnakeSession:
         """The record of all ticks so far; its scenario is the script."""
         duration = max(self.ticks, 1) * self.period
         script = with_controller(self._scenario, duration, {**self._controller, "commands": self._commands})
-        return make_record(self._run, script, 0.0)
+        return self._record(script)
+
+    def _record(self, script: Scenario) -> Record:
+        return make_record(self._kinematic, script, 0.0)
+
+
+class DynamicSnakeSession(SnakeSession):
+    """The same of a snake with servos and wheels that can slip: its simulation asks the session at its ticks."""
+
+    def _begin(self, scenario: Scenario) -> None:
+        with kernels_logged(log):
+            trial = Simulation(scenario, duration=math.inf, operator=self)
+            trial.advance(2.0 * self._pilot(trial).period)
+        self.still = trial.record(self._scenario)
+        self.still.complete = True
+        self._simulation = Simulation(scenario, duration=math.inf, operator=self)
+        self._run = self._pilot(self._simulation)
+        assert self.still.scene is not None
+        self._scene = self.still.scene
+
+    @staticmethod
+    def _pilot(simulation: Simulation) -> SnakePilot:
+        assert isinstance(simulation.operator, SnakePilot)
+        return simulation.operator
+
+    @property
+    def time(self) -> float:
+        """Half a tick behind the last one [s]."""
+        return self._simulation.time
+
+    def _advance(self) -> None:
+        self._simulation.advance((self.ticks + 0.5) * self.period)
+
+    def _positions(self) -> Mapping[str, Mapping[str, float]]:
+        q = self._simulation.state.q.tolist()
+        return {"q": dict(zip(self._simulation.robot.position_names, q, strict=True))}
+
+    def _touching(self) -> Mapping[str, Touch]:
+        return self._simulation.touching
+
+    def _record(self, script: Scenario) -> Record:
+        simulation = self._simulation
+        before, longest = simulation.snapshot(), self._run.ticks
+        # As a run that ends here: the command at this tick is yet to come.
+        self._run.ticks = self.ticks
+        simulation.advance(self.ticks * self.period)
+        record = simulation.record(script)
+        self._run.ticks = longest
+        simulation.restore(before)
+        record.complete = "stopped" not in record.provenance
+        return record

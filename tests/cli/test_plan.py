@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
+from support.planner_scenes import scene
 from typer.testing import CliRunner
 
 from dynsim.cli.app import app
-from dynsim.errors import ScenarioError
-from dynsim.planner.scenes import scene
+from dynsim.errors import ModelError, ScenarioError, UnreachableReference
 from dynsim.scenario import load_scenario, to_yaml, variant_names
 
 import dynsim.cli.commands  # noqa: F401  # isort: skip
@@ -53,9 +55,84 @@ def test_a_plan_leaves_its_files_and_a_scenario_that_runs(small: Path, tmp_path:
         (["--weight", "heat=1"], "must look like peak=0.5"),
         (["--gains", "0"], "must be positive numbers"),
         (["--along", "1.5"], "shares of the way along links"),
+        (["--candidates", "link_4:link_3"], "begins after its end"),
+        (["--candidates", ","], "names nothing"),
+        (["--radius", "inf"], "radius_m = inf: must be a finite number"),
+        (["--min-force", "inf"], "min_N = inf: must be a finite number"),
+        (["--surface-error", "inf"], "shift_m = inf: must be a finite number"),
+        (["--seed", "-1"], "seed = -1: must be 0 or more"),
     ],
 )
 def test_options_that_make_no_sense_are_one_error(small: Path, options: list[str], message: str) -> None:
     result = CliRunner().invoke(app, ["plan", str(small), *options])
-    assert isinstance(result.exception, ScenarioError)
+    assert isinstance(result.exception, (ScenarioError, ModelError))
     assert message in str(result.exception)
+
+
+def out_of_reach(data: dict[str, Any]) -> None:
+    points = data["controller"]["hand"]["path"]["points_m"]
+    data["controller"]["hand"]["path"]["points_m"] = [[9.0 + x, y, z] for x, y, z in points]
+
+
+def weak(data: dict[str, Any]) -> None:
+    for link in data["plant"]["chain"]:
+        link["motor"]["voltage_limit_V"] = 0.05
+
+
+def turned_away(data: dict[str, Any]) -> None:
+    data["controller"]["hand"]["orientation"] = {"rpy_deg": [180.0, 0.0, 0.0]}
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (out_of_reach, "could be brought onto the hand's path"),
+        (weak, "no forces within friction cones and limits of the motors carry the motion"),
+        (turned_away, "it may be out of reach, or the orientation that it asks for"),
+    ],
+)
+def test_a_scene_without_an_answer_ends_with_its_reason_and_code_2(
+    tmp_path: Path, change: Callable[[dict[str, Any]], None], reason: str
+) -> None:
+    data = scene(11)
+    change(data)
+    path, out = tmp_path / "scene.yaml", tmp_path / "plan"
+    path.write_text(to_yaml(data), encoding="utf-8")
+    result = CliRunner().invoke(app, ["plan", str(path), "--count", "0:1", "--starts", "1", "--out", str(out)])
+    assert isinstance(result.exception, UnreachableReference)
+    assert result.exception.exit_code == 2
+    assert reason in str(result.exception)
+    sizes = json.loads((out / "plan.json").read_text(encoding="utf-8"))["sizes"]
+    assert [size["survives"] for size in sizes] == [None, None]
+    assert all(reason in size["reason"] for size in sizes)
+    assert not (out / "plan.yaml").exists()
+
+
+def floor_below_reach(data: dict[str, Any]) -> None:
+    data["surfaces"]["floor"]["point_m"] = [0.0, 0.0, -5.0]
+
+
+def floor_that_grips(data: dict[str, Any]) -> None:
+    data["contacts"]["friction"] = 3.0
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (floor_below_reach, "1 brace: no posture was found for any of the 5 sets tried"),
+        (floor_that_grips, "1 brace: refused, friction × 1, surfaces +0 mm: "),
+    ],
+)
+def test_where_no_brace_helps_the_answer_is_none(
+    tmp_path: Path, change: Callable[[dict[str, Any]], None], reason: str
+) -> None:
+    """Nothing in reach to lean on, or dragging dearer than hanging: said in words, and the arm hangs."""
+    data = scene(11)
+    change(data)
+    path, out = tmp_path / "scene.yaml", tmp_path / "plan"
+    path.write_text(to_yaml(data), encoding="utf-8")
+    options = ["--count", "0:1", "--starts", "1", "--no-figures", "--out", str(out)]
+    result = CliRunner().invoke(app, ["plan", str(path), *options])
+    assert result.exit_code == 0, result.output
+    assert reason in " ".join(result.output.split())
+    assert json.loads((out / "plan.json").read_text(encoding="utf-8"))["best"] == 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -360,3 +361,60 @@ def test_a_posture_in_ticks_starts_on_the_floor_and_a_deeper_one_is_refused(capl
 def test_a_map_of_other_joints_is_refused(rig) -> None:
     with pytest.raises(ServoMapError, match="has servos for shoulder, elbow, wheel; the plant's joints are joint_1"):
         simulated_arm(str(SCENARIOS / "elbow_comparison.yaml"), "two_elbows", rig.map, {})
+
+
+def test_servos_that_get_the_goals_of_a_dynamic_snake_go_its_way() -> None:
+    """The plant of `hw virtual --plant`, told every 4 ms what the controller of a run tells its own servos.
+
+    With the servo law of the bridge in both. Goals are held here and lines there, and steps are 2 ms: at 0.3 rad/s the
+    two are a milliradian apart, wheels by what they turn in a period.
+    """
+    servo_map = load_servo_map(SCENARIOS / "hardware" / "snake.yaml")
+    period, law = 0.004, MotorLaw([MX_106, MX_28])
+    joint, wheel = law.servos(["joint", "wheel"], np.ones(2))
+
+    def motor(servo: Servo, stall: float, **gains: Any) -> dict[str, Any]:
+        constant = servo.torque_constant
+        return {
+            "type": "servo",
+            "voltage_V": 12.0,
+            "stall_torque_N_m": stall,
+            "no_load_speed_rad_per_s": 12.0 / constant,
+            "rotor_inertia_kg_m2": servo.armature,
+            **gains,
+        }
+
+    overrides = {
+        "plant.level": "dynamic",
+        "plant.dynamics.start": "released",
+        "plant.dynamics.joint_servo": motor(joint, float(law.stall_torque[0]), k_p_V_per_rad=joint.k_p),
+        "plant.dynamics.wheel_servo": motor(
+            wheel, float(law.stall_torque[1]), mode="velocity", k_v_V_s_per_rad=wheel.k_v
+        ),
+        "controller.modes": {1: []},
+        "controller.switching": {"order": [1]},
+        "controller.period_s": period,
+        "integrator.step_s": 0.002,
+        "record.rate_hz": 1.0 / period,
+        "duration_s": 3.0,
+    }
+    scenario = dynsim.load_scenario(SCENARIOS / "snake_positioning.yaml", "gamma", overrides)
+    record = dynsim.simulate(scenario)
+    plant = SimulatedArm(scenario, servo_map, np.array([*record["phi_command"][0], *np.zeros(5 + 7)]))
+    names = [servo.label for servo in servo_map.servos]
+    told = {name: record["phi_command"][:, k] for k, name in enumerate(record.labels["phi_command"])}
+    rates = {name: record["rho_dot_command"][:, k] for k, name in enumerate(record.labels["rho_dot_command"])}
+    still = np.zeros(len(record))
+    zero = np.array([servo.zero_tick * RAD_PER_TICK for servo in servo_map.servos])
+    sense = np.array([servo.sign for servo in servo_map.servos])
+    in_position = np.array([not name.startswith("rho") for name in names])
+    found = []
+    for k in range(len(record) - 1):
+        positions = zero + sense * np.array([told.get(name, still)[k] for name in names])
+        velocities = sense * np.array([rates.get(name, still)[k] for name in names])
+        found.append(plant.joint_positions[: len(record.labels["phi"])])
+        for _ in range(2):
+            plant.step(PHYSICS_STEP, Drive(np.ones(len(names), dtype=bool), in_position, positions, velocities, 12.0))
+    assert np.abs(record["phi"] - record["phi"][0]).max() > 0.1  # it sags, and it turns its head
+    np.testing.assert_allclose(found, record["phi"][:-1], rtol=0, atol=5e-3)
+    np.testing.assert_allclose(plant.simulation.state.q[:2], record["base_pose"][-1, :2], rtol=0, atol=2e-3)

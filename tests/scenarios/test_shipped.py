@@ -40,10 +40,11 @@ def test_runs_shortened(name):
     assert all(map(math.isfinite, numbers))
 
 
+# Snakes stand on compliant tyres and step in time: test_snake_dynamic has what holds of them.
 REAL = [
     (name, variant)
     for name, variant in CASES
-    if dynsim.load_scenario(name, variant).config.contacts.law == "unilateral"
+    if not name.startswith("snake_") and dynsim.load_scenario(name, variant).config.contacts.law == "unilateral"
 ]
 REAL_FLOOR = "elbow_comparison_floor"
 ON_FLOOR: dict[str, set[int]] = {"elbow_7": {7}, "elbow_4": {4}, "no_elbow": set()}

@@ -84,7 +84,11 @@ def arms() -> dict[str, Scenario]:
         for path in shipped_scenarios()
         for variant in [*variant_names(path)] or (None,)
     }
-    return {name: scenario for name, scenario in found.items() if scenario.engine == "dynamics"}
+    return {
+        name: scenario
+        for name, scenario in found.items()
+        if scenario.engine == "dynamics" and scenario.plant.type != "snake"
+    }
 
 
 def ended(scenario: Scenario) -> Record:

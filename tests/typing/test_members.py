@@ -25,7 +25,7 @@ from dynsim.library.base_paths import arc, hold, straight
 from dynsim.library.base_paths import csv as base_csv
 from dynsim.library.base_paths import waypoints as base_waypoints
 from dynsim.library.controllers import joint_pd, task_space
-from dynsim.library.motors import dc, servo, torque, wang_minami
+from dynsim.library.motors import dc, mx_28, mx_106, servo, torque, wang_minami
 from dynsim.library.paths import circle, csv, line, waypoints
 from dynsim.library.plants import pws_arm, serial_arm, snake, urdf_arm
 from dynsim.library.surfaces import box, cylinder, height_field, plane, sphere
@@ -35,7 +35,7 @@ CONTROLLERS: Sequence[ControllerModule] = (joint_pd, task_space)
 PATHS: Sequence[PathModule] = (circle, csv, line, waypoints)
 BASE_PATHS: Sequence[BasePathModule] = (arc, base_csv, hold, straight, base_waypoints)
 SURFACES: Sequence[SurfaceModule] = (box, cylinder, height_field, plane, sphere)
-MOTORS: Sequence[MotorModule] = (dc, servo, torque, wang_minami)
+MOTORS: Sequence[MotorModule] = (dc, mx_106, mx_28, servo, torque, wang_minami)
 
 FAMILIES: dict[str, Sequence[Member]] = {
     "plant": PLANTS,

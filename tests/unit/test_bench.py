@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 
 from dynsim.scenario import variant_names
-from dynsim.studies.bench import job, precision, programs, run
+from dynsim.studies.bench import job, precision, programs, right_hand_side, run
 from dynsim.studies.bench.table import format_table
 
 pytestmark = pytest.mark.long
@@ -65,3 +65,10 @@ def test_without_mujoco(small: None, monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(rows) == 4
     assert all("–" in row for row in rows)
     assert json.dumps(result)
+
+
+def test_without_pinocchio_its_rows_are_left_out_and_the_reason_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pinocchio", None)
+    assert "not installed" in run._why_no_pinocchio()
+    rows = right_hand_side.measure((10,), 2, 1e-4, with_mujoco=False, with_pinocchio=False)
+    assert {row["program"] for row in rows} == {programs.DYNSIM_FREE, programs.DYNSIM_CONTACTS}

@@ -111,7 +111,7 @@ def test_what_a_page_names_exists(name: str) -> None:
 
 def test_what_the_pages_for_developers_name_exists() -> None:
     pages = sorted((ROOT / "docs" / "dev").glob("*.md"))
-    assert len(pages) == 5
+    assert len(pages) == 7
     assert {path.name: wrong for path in pages if (wrong := missing(path.read_text(encoding="utf-8")))} == {}
 
 

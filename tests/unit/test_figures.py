@@ -633,3 +633,18 @@ def test_the_azimuth_of_the_side_plane_has_no_minus_zero(angle: float, read: str
     turn = np.radians(angle)
     plane = skeleton.SidePlane(np.zeros(3), np.array([np.cos(turn), np.sin(turn), 0.0]))
     assert f"azimuth {read}°" in plane.label
+
+
+def test_a_figure_for_a_paper_has_no_title() -> None:
+    scenario = load_scenario("elbow_comparison", "two_elbows", {"duration_s": 0.1})
+    record = dynsim.simulate(scenario)
+    titled, bare = (dynsim.figure(record, "energy", title=title) for title in (True, False))
+    assert titled.get_suptitle().startswith("elbow_comparison")
+    assert bare.get_suptitle() == ""
+    assert len(bare.axes) == len(titled.axes) > 0
+    both = dynsim.figure({"one": record, "two": record}, "compare_energy", title=False)
+    assert both.axes
+    with pytest.raises(RecordError, match="no figure 'enrgy' of such a record; figures: hand_path, tracking_error"):
+        dynsim.figure(record, "enrgy")
+    with pytest.raises(RecordError, match="no data for the figure 'base'"):
+        dynsim.figure(record, "base")

@@ -20,8 +20,8 @@ import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.colors import to_rgb
-from processes import started, wait_for
-from sweep_work import DEADLY, REFUSED, deaf, hangs, leaves, once_deadly, slow, square, warned
+from support.processes import started, wait_for
+from support.sweep_work import DEADLY, REFUSED, deaf, hangs, leaves, once_deadly, slow, square, warned
 
 import dynsim
 from dynsim.cli import sweep as sweep_command
@@ -390,12 +390,12 @@ def test_resuming_runs_what_is_not_there(tmp_path: Path, monkeypatch: pytest.Mon
     journal.write_text(lines[0] + lost + lines[2][:40])
     ran: list[int] = []
 
-    class Watched(module.Work):
+    class Watched(module.BatchWork):
         def __call__(self, point: Any, look: Any) -> Any:
             ran.append(point.run)
             return super().__call__(point, look)
 
-    monkeypatch.setattr(module, "Work", Watched)
+    monkeypatch.setattr(module, "BatchWork", Watched)
     assert run_sweep(swept, tmp_path, resume=True) == whole
     assert ran == [1, 2, 3, 4]
     assert (tmp_path / "sweep.csv").read_bytes() == table

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.planner_scenes import scene
 
 import dynsim
 from dynsim.compile.hand_posture import turn_error
 from dynsim.errors import ModelError, UnreachableReference
-from dynsim.planner.scenes import scene
 from dynsim.scenario import build
 from dynsim.scenario.reading import scenario_from_resolved
 
@@ -61,3 +61,47 @@ def test_half_a_turn_has_an_axis() -> None:
     for axis in np.eye(3):
         R = 2.0 * np.outer(axis, axis) - np.eye(3)
         assert np.abs(np.abs(turn_error(np.eye(3), R)) - np.pi * axis).max() < 1e-7
+
+
+def turned_arm(rpy_deg: list[float]) -> dynsim.Scenario:
+    """The arm of the tests, whose hand goes along its path and keeps an orientation."""
+    data = scene(7)
+    data["controller"]["hand"]["orientation"] = {"rpy_deg": rpy_deg}
+    posture = [0.1, -40.0, 60.0, 30.0, 20.0, 5.0, 10.0, 5.0, 20.0, 10.0]
+    for link, angle in zip(data["plant"]["chain"], posture, strict=True):
+        link["initial_deg"] = angle
+    data |= {
+        "surfaces": {},
+        "contacts": {"law": "unilateral"},
+        "loads": {},
+        "duration_s": 2.0,
+        "metrics": {"settle_s": 1.0},
+    }
+    data["controller"] |= {"k_p_V_per_rad": 2000.0, "k_d_V_s_per_rad": 60.0, "feed_forward": "dynamics"}
+    start = dynsim.build_model(scenario_from_resolved(data)).point_position(
+        "link_10", [0.0, 0.0, 0.2], np.deg2rad(posture)
+    )
+    path = data["controller"]["hand"]["path"]
+    path["times_s"] = [0.0, 1.0, 2.0]
+    path["points_m"] = [start.tolist(), (start + np.array([0.05, 0.02, -0.05])).tolist(), start.tolist()]
+    return scenario_from_resolved(data)
+
+
+def test_a_hand_path_keeps_the_orientation_that_it_asks_for() -> None:
+    """References by inverse kinematics, and what the run and its summary say of the angle."""
+    record = dynsim.simulate(turned_arm([0.0, 120.0, 10.0]))
+    late = record.time > 1.0
+    assert record["hand_turn_error"][late].max() < 5e-3
+    assert record.summary["hand_turn_error_max_rad"] >= record.summary["hand_turn_error_rms_rad"]
+    # By the poses of the bodies: R = Rz(10°) Ry(120°).
+    y, z = np.deg2rad([120.0, 10.0])
+    x_axis = np.array([np.cos(z) * np.cos(y), np.sin(z) * np.cos(y), -np.sin(y)])
+    hand = record.labels["body_orientation"].index("link_10")
+    w, i, j, k = record["body_orientation"][-1, hand]
+    shown = np.array([1.0 - 2.0 * (j * j + k * k), 2.0 * (i * j + w * k), 2.0 * (i * k - w * j)])
+    assert np.abs(shown - x_axis).max() < 1e-2
+
+
+def test_an_orientation_out_of_reach_says_when() -> None:
+    with pytest.raises(UnreachableReference, match=r"controller\.hand\.orientation says: at t = "):
+        dynsim.simulate(turned_arm([180.0, 0.0, 90.0]))

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.planner_scenes import scene, scene_scenario
 
 import dynsim
 from dynsim.compile.bracing import Brace
@@ -15,10 +16,8 @@ from dynsim.jit.kernel import integers, reals
 from dynsim.model.surfaces import Box, HeightField, Quadric, shape_arrays
 from dynsim.planner import compiled
 from dynsim.planner.compiled import Arm, Course, Points
-from dynsim.planner.dense import CHARGED
 from dynsim.planner.local import Problem
-from dynsim.planner.problem import Options, task
-from dynsim.planner.scenes import scene, scene_scenario
+from dynsim.planner.problem import CHARGED, Options, task
 from dynsim.planner.search import Search
 from dynsim.planner.verify import Tolerances, Verifier
 from dynsim.scenario.reading import scenario_from_resolved
@@ -54,8 +53,8 @@ def tree() -> tuple[Problem, np.ndarray, np.ndarray, np.ndarray]:
     arm = Arm(
         parent=integers([-1, 0, 1, 2, 2, 4, 5]),
         prismatic=integers([0, 0, 1, 0, 0, 1, 0]),
-        rotation=reals([rotation(rng) for _ in range(n)]),
-        place=reals(0.3 * rng.normal(size=(n, 3))),
+        rotation=reals([rotation(rng).ravel() for _ in range(n)]),
+        origin=reals(0.3 * rng.normal(size=(n, 3))),
         axis=reals(axes / np.linalg.norm(axes, axis=1)[:, None]),
         mass=reals(rng.uniform(0.1, 1.0, n)),
         com=reals(0.2 * rng.normal(size=(n, 3))),
@@ -64,9 +63,9 @@ def tree() -> tuple[Problem, np.ndarray, np.ndarray, np.ndarray]:
         greatest=reals(np.full(n, np.inf)),
         lower=reals(np.full(n, -9.0)),
         upper=reals(np.full(n, 9.0)),
-        gravity=reals([0.0, 0.5, -9.81]),
+        gravity=reals([[0.0, 0.5, -9.81]]),
         hand=integers([6]),
-        hand_point=reals([0.1, 0.0, 0.3]),
+        hand_point=reals([[0.1, 0.0, 0.3]]),
         shapes=shape_arrays([(surface, 0.0, np.zeros(3), False) for surface in surfaces]),
     )
     points = Points(
@@ -83,9 +82,10 @@ def tree() -> tuple[Problem, np.ndarray, np.ndarray, np.ndarray]:
         chord=reals(rng.normal(size=(3, 2))),
         share=reals([0.3, 0.3, 0.4]),
         smooth=reals(np.zeros((2, 2))),
+        slip_scale=reals([2e-3]),
     )
     Q, V = rng.normal(size=(2, n)), 0.01 * rng.normal(size=(3, n))
-    return Problem(arm, points, course, 0.5, np.zeros((1, 2))), Q, V, rng.uniform(1.0, 5.0, size=(3, c))
+    return Problem(arm, points, course, 0.5), Q, V, rng.uniform(1.0, 5.0, size=(3, c))
 
 
 def test_derivatives_are_those_of_differences(tree: tuple[Problem, np.ndarray, np.ndarray, np.ndarray]) -> None:
@@ -156,7 +156,6 @@ def heat_at(masses: list[float], link: int, share: float) -> tuple[float, float]
     local = problem.problem((brace,), 1)
     Q = reals(problem.arm.model.robot.initial)[None]
     F = local.forces(Q)
-    local.evaluate(Q, F)
     return local.heat(), float(F[0, 0])
 
 
@@ -181,7 +180,7 @@ def test_two_links_are_best_braced_where_the_moment_vanishes() -> None:
 @pytest.fixture(scope="module")
 def found() -> tuple[Search, dict]:  # type: ignore[type-arg]
     """Plans of a scene with a floor and a joint about a third axis, with slip on the way."""
-    search = Search(task(scene_scenario(11), Options(starts=2)))
+    search = Search(task(scene_scenario(11), Options()))
     return search, search.run()
 
 
@@ -226,6 +225,21 @@ def test_more_seeds_give_the_same_plans() -> None:
         for seed in (0, 1, 2)
     ]
     assert max(heats) < 1.02 * min(heats)
+
+
+def test_the_hand_keeps_the_orientation_that_its_path_asks_for() -> None:
+    """In the references of the plan and in its runs."""
+    data = scene(7)
+    data["controller"]["hand"]["orientation"] = {"rpy_deg": [0.0, 120.0, 0.0]}
+    plan = dynsim.plan_braces(scenario_from_resolved(data), count=(1, 1), starts=2)
+    size = plan.size(1)
+    assert size.survives, size.reason
+    model, dense = plan.task.arm.model, size.planned.dense  # type: ignore[union-attr]
+    wanted = np.array([[-0.5, 0.0, np.sqrt(0.75)], [0.0, 1.0, 0.0], [-np.sqrt(0.75), 0.0, -0.5]])
+    for q in dense.q:
+        assert np.abs(model.body_pose("link_10", q)[0] - wanted).max() < 1e-8
+    corners = size.verdict.corners  # type: ignore[union-attr]
+    assert 0.0 < corners[0].turn_rms_rad < 1e-3 < max(corner.turn_rms_rad for corner in corners) < 0.05
 
 
 def test_a_path_out_of_reach_is_answered_in_words() -> None:

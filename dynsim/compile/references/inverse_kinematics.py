@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.compile.contact_law import format_quantity
+from dynsim.compile.hand_posture import hand_posture
 from dynsim.compile.model import Model
 from dynsim.compile.reaching import path_arrays
 from dynsim.dynamics import inverse_kinematics as ki
@@ -39,6 +40,7 @@ def follow(
     progress: Callable[[float], None] | None = None,
     base: Array | None = None,
     braces: Sequence[Contact] = (),
+    orientation: Array | None = None,
 ) -> Array:
     """Positions of ``joints`` that put the hand on ``targets`` at ``times``; the others stay as in ``q``.
 
@@ -58,6 +60,7 @@ def follow(
     progress : called now and then with the time on the path [s], when it takes longer than a second
     braces : points that stay on their surfaces on the way, as exactly as the hand is on its path
     base : (T, 4) coordinates of the mobile base at ``times``: its wheels [rad], x and y [m]; None: it stays
+    orientation : (3, 3) rotation of the hand in the world, which it keeps all the way; None: any
 
     Returns
     -------
@@ -69,6 +72,10 @@ def follow(
         With the first time at which the hand cannot reach its target, and the distance that is left; or with the joint
         that would pass its limit, when, and by how much.
     """
+    if orientation is not None:
+        _check_start(model, joints, q)
+        args = model, times, targets, joints, q, tolerance, orientation, braces
+        return recall("turned hand", lambda: _turned(*args), model.geometry, *args[1:])
     path, wanted = path_arrays(model, joints, braces, limited=True), reals(targets)
     carried = np.zeros((len(times), 0)) if base is None else reals(base)
     first = 0 if base is None else base_row(model.robot)[0]
@@ -106,6 +113,31 @@ def follow(
     inputs = geometry, path, wanted, carried, first, tolerance, np.asarray(q)
     # Not from masses. The path has room for one step in it, which holds anything afterwards.
     return recall("inverse kinematics", solved, *inputs)
+
+
+def _turned(
+    model: Model,
+    times: Array,
+    targets: Array,
+    joints: Sequence[str],
+    q: Array,
+    tolerance: float,
+    orientation: Array,
+    braces: Sequence[Contact],
+) -> Array:
+    """As :func:`follow`, for a hand that keeps its orientation."""
+    columns = [model.robot.position_index[model.joint_names.index(name)] for name in joints]
+    postures = np.zeros((len(times), len(joints)))
+    for k, target in enumerate(targets):
+        try:
+            q = hand_posture(model, target, q, orientation, braces, tolerance, joints)
+        except UnreachableReference as error:
+            raise UnreachableReference(
+                f"the hand cannot follow its path with {', '.join(joints)}, turned as controller.hand.orientation "
+                f"says: at t = {times[k]:.3f} s {error}"
+            ) from None
+        postures[k] = q[columns]
+    return postures
 
 
 def _check_start(model: Model, joints: Sequence[str], q: Array) -> None:

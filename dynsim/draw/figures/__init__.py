@@ -10,9 +10,13 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
+from typing import TYPE_CHECKING
 
-from dynsim.errors import DynsimError, RecordError
+from dynsim.errors import DynsimError, RecordError, brief
 from dynsim.record import Record
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 MEASURED, SIMULATED = "dynsim.draw.figures.measured", "dynsim.draw.figures.arm"
 # Module with ``draw`` and ``draw_comparison`` → sets of signals, any of which tells its records; the first module that
@@ -61,6 +65,41 @@ def draw_comparison(records: Mapping[str, Record], folder: Path, kind: str = "pn
         raise RecordError("records of different kinds cannot be drawn over each other")
     with _drawable():
         return list(modules.pop().draw_comparison(drawn, Path(folder), kind))
+
+
+def figure(records: Record | Mapping[str, Record], name: str, *, title: bool = True) -> Figure:
+    """Draw one figure of a record, or of variants over each other, as a matplotlib figure in dynsim's look.
+
+    >>> dynsim.figure(record, "contact_forces", title=False).savefig("forces.pdf")
+
+    Parameters
+    ----------
+    records : a record, or several by name
+    name : of the file that ``dynsim plot`` writes, without its ending: "energy", "compare_energy", …
+    title : with the heading above all panels; papers have a caption instead
+
+    Raises
+    ------
+    RecordError
+        No such figure, or the record has no data for it.
+    """
+    several = not isinstance(records, Record)
+    module = _module(next(iter(records.values()))) if isinstance(records, Mapping) else _module(records)
+    # Measured runs are compared by the figures of simulated ones; those of snakes come with tables, by draw alone.
+    home = importlib.import_module(SIMULATED) if several and module.__name__ == MEASURED else module
+    makers = getattr(home, "COMPARISONS" if several else "FIGURES", {})
+    if name not in makers:
+        known = ", ".join(makers) or "none, but dynsim plot draws files"
+        kind = "several records" if several else "such a record"
+        raise RecordError(f"no figure {brief(name)} of {kind}; figures: {known}")
+    style = importlib.import_module("dynsim.draw.figures.style")
+    with _drawable(), style.look():
+        drawn: Figure | None = makers[name](records)
+    if drawn is None:
+        raise RecordError(f"the record has no data for the figure {name!r}")
+    if not title:
+        drawn.suptitle("")
+    return drawn
 
 
 @contextmanager

@@ -48,7 +48,8 @@ def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
     if not names:
         return None
     chosen = _most_interesting(names, runs)
-    note = "" if len(chosen) == len(names) else f", {len(chosen)} of {len(names)} contacts ({_choice(runs)})"
+    kind = "highest" if any(map(is_real, runs)) else "lowest"
+    note = "" if len(chosen) == len(names) else f", {len(chosen)} of {len(names)} contacts ({kind} forces)"
     having = {name: {v: r for v, r in records.items() if _touched(r, name)} for name in chosen}
     # A legend has an entry for each variant and one for the shading.
     more = sum(-(-(len(having[name]) + 1) // 2) - 1 for name in chosen) * style.LEGEND_ROW / 72.0
@@ -64,7 +65,8 @@ def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
                 force, colour = _force(record, name), str(styles[variant]["color"])
                 label = f"{variant or name}: {_share(record, name)}{_within(record, name)}"
                 style.line(axes, record.time, force, label=label, **styles[variant])
-                _draw_extremes(axes, record, name, colour)
+                for value in _extremes(record, name):
+                    axes.axhline(value, color=colour, linestyle=(0, (5, 3)), linewidth=0.7)
                 changes = events.marked(record, [name])
                 events.mark(axes, [e for e in changes if axes is panels[0] or e.time > begun], colour, row=row)
                 if alone and is_real(record):
@@ -136,11 +138,6 @@ def _series(record: Record, name: str) -> list[style.Series]:
     return [(record.time, _force(record, name)), *([(record.time[[0, 0]], extremes)] if extremes.size else [])]
 
 
-def _draw_extremes(axes: Axes, record: Record, name: str, colour: str) -> None:
-    for value in _extremes(record, name):
-        axes.axhline(value, color=colour, linestyle=(0, (5, 3)), linewidth=0.7)
-
-
 def _draw_samples(axes: Axes, record: Record, name: str, colour: str) -> None:
     """A dot at each sample of the transient, while they are few enough to be told apart."""
     inside = record.time <= axes.get_xlim()[1]
@@ -178,10 +175,6 @@ def _most_interesting(names: list[str], records: Sequence[Record]) -> list[str]:
 
     chosen = sorted(names, key=rank)[:ROWS]
     return [name for name in names if name in chosen]
-
-
-def _choice(records: Sequence[Record]) -> str:
-    return "highest forces" if any(map(is_real, records)) else "lowest forces"
 
 
 def mode_bands(record: Record, name: str) -> list[tuple[float, float, int]]:

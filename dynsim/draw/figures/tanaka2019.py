@@ -33,6 +33,7 @@ from dynsim.snake.published import (
     COORDINATES,
     HEAD_ERROR,
     POLICIES,
+    SOURCES,
     TABLE_III,
     displacement,
     mode_sequence,
@@ -51,6 +52,12 @@ def figures(scenario: str, records: Mapping[str, Record]) -> dict[str, Maker]:
     makers: dict[str, Maker] = {}
     if scenario == "snake_positioning" and set(records) & set(TABLE_III):
         makers["table_iii"] = positioning
+    if scenario == "snake_positioning_dynamic":
+        moved = [name for name in TABLE_III if name in records]
+        if moved:
+            makers |= {"table_iii": dynamic_positioning, "wheel_loads": wheel_loads}
+        if {"beta", "beta_measured"} <= set(records):
+            makers["fig_7"] = sag_and_feedback
     if scenario == "snake_joint_limits":
         if "cyclic" in records:
             makers |= {"fig_9": lambda r: head_and_cost(r["cyclic"]), "fig_10": lambda r: joint_angles(r["cyclic"])}
@@ -109,6 +116,70 @@ def positioning(records: Mapping[str, Record]) -> Figure:
         axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     axes[1].set_xticks(range(len(moved)), [f"moving {SYMBOLS.get(m, m)}" for m in moved])
     axes[1].set_xlim(-0.6, len(moved) - 0.4)
+    return figure
+
+
+def dynamic_positioning(records: Mapping[str, Record]) -> Figure:
+    """Table III of [T]: deviation from the target displacement, measured there, and simulated in three ways."""
+    moved = [name for name in TABLE_III if name in records]
+    figure = style.new_figure(6.6, "displacements of the head beside Table III of [T]")
+    axes = figure.subplots(6, 1, sharex=True)
+    marks = {"kinematic": ("|", "black"), "dynamic": ("D", HEAD), "measured": ("o", GROUND)}
+    for i, axis in enumerate(axes):
+        unit, scale = ("mm", 1e3) if i < 3 else ("mrad", 1e3)
+        positions = np.arange(len(moved))
+        off = [scale * (TABLE_III[m].mean[i] - TABLE_III[m].target[i]) for m in moved]
+        spread = [2.0 * scale * TABLE_III[m].deviation[i] for m in moved]
+        axis.bar(positions, off, 0.6, yerr=spread, capsize=2, color=VARIANT_COLOURS[2], alpha=0.5, label="[T], ± 2 SD")
+        for source, (mark, colour) in marks.items():
+            names = [m + SOURCES[source] for m in moved]
+            there = [k for k, name in enumerate(names) if name in records]
+            ours = [scale * (displacement(records[names[k]])[i] - TABLE_III[moved[k]].target[i]) for k in there]
+            axis.plot(positions[there], ours, mark, color=colour, ms=5, label=source)
+        axis.axhline(0.0, color="black", lw=0.6)
+        axis.set_ylabel(f"Δ{SYMBOLS.get(COORDINATES[i], COORDINATES[i])} [{unit}]")
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4)
+    axes[-1].set_xticks(range(len(moved)), [f"moving {SYMBOLS.get(m, m)}" for m in moved])
+    return figure
+
+
+def sag_and_feedback(records: Mapping[str, Record]) -> Figure:
+    """Figs 7(a) and 7(b): the head while β changes, by feedforward, and with the head measured; lines as there."""
+    figure = style.new_figure(7.2, "the head while β changes, as in Fig 7 of [T]")
+    axes = figure.subplots(6, 2, sharex=True, sharey="row")
+    shown = {"beta": "(a) feedforward", "beta_measured": "(b) measured by motion capture"}
+    for column, (name, title) in zip(axes.T, shown.items(), strict=True):
+        record = records[name]
+        for i, axis in enumerate(column):
+            (actual,) = axis.plot(record.time, record["w"][:, i], color=GROUND)
+            (wanted,) = axis.plot(record.time, record["w_target"][:, i], ":", color="red", lw=1.4)
+            style.at_least(axis, 0.02)
+        column[0].set_title(title, fontsize=8)
+        column[-1].set_xlabel("t [s]")
+    for i, axis in enumerate(axes[:, 0]):
+        axis.set_ylabel(f"{SYMBOLS.get(COORDINATES[i], COORDINATES[i])}$_h$ [{'m' if i < 3 else 'rad'}]")
+    figure.legend([actual, wanted], ["simulated", "target"], loc="outside lower center", ncols=2)
+    return figure
+
+
+def wheel_loads(records: Mapping[str, Record]) -> Figure:
+    """Loads of the wheel pairs over time, of every manoeuvre by feedforward."""
+    moved = [name for name in TABLE_III if name in records]
+    figure = style.new_figure(1.25 * len(moved) + 1.2, "loads of the wheel pairs")
+    axes = figure.subplots(len(moved), 1, sharex=True, squeeze=False)[:, 0]
+    for axis, name in zip(axes, moved, strict=True):
+        record = records[name]
+        names = record.labels["contact_normal_force"]
+        for pair in record.labels["grounded"]:
+            sides = [k for k, wheel in enumerate(names) if wheel[:-1] == pair.replace("pair", "wheel")]
+            load = record["contact_normal_force"][:, sides].sum(axis=1)
+            axis.plot(record.time, load, lw=0.9, label=pair.replace("pair", "pair "))
+        axis.set_ylabel(f"moving {SYMBOLS.get(name, name)} [N]")
+        axis.set_ylim(bottom=0.0)
+    axes[-1].set_xlabel("t [s]")
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(handles))
     return figure
 
 
@@ -171,6 +242,8 @@ def joint_angles(record: Record) -> Figure:
         axis.set_visible(False)
     for j, axis in enumerate(axes.ravel()[:count]):
         (actual,) = axis.plot(record.time, phi[:, j], color=GROUND)
+        if "phi_command" in record:
+            (commanded,) = axis.plot(record.time, record["phi_command"][:, j], ":", color="red", lw=1.2)
         for bound in (geometry.lower[j], geometry.upper[j]):
             limit = axis.axhline(bound, color="black", ls="-.", lw=0.8)
         out = record["at_limit"][:, j] > 0
@@ -179,12 +252,10 @@ def joint_angles(record: Record) -> Figure:
         axis.set(ylim=(-reach, reach), ylabel=f"{greek(names[j])} [rad]")
     for axis in axes[-1]:
         axis.set_xlabel("t [s]")
-    figure.legend(
-        [actual, limit, stuck],
-        ["simulated", "joint limit", "out of the allocation at its limit"],
-        loc="outside lower center",
-        ncols=3,
-    )
+    lines, texts = [actual, limit, stuck], ["simulated", "joint limit", "out of the allocation at its limit"]
+    if "phi_command" in record:
+        lines, texts = [*lines, commanded], [*texts, "commanded"]
+    figure.legend(lines, texts, loc="outside lower center", ncols=len(lines))
     return figure
 
 

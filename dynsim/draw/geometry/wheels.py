@@ -48,7 +48,7 @@ def wheel_groups(record: Record, scene: Scene) -> WheelGroups:
 def _of_pair(scene: Scene, pair: int) -> tuple[tuple[int, int], ...]:
     """Wheels on a body: its own beside its middle, and those that turn on it."""
     own = [(pair, k) for k, shape in enumerate(scene.bodies[pair].shapes) if shape.position[1] != 0.0]
-    turning = [k for k, body in enumerate(scene.bodies) if body.parent == pair and body.joint.signal == "rho"]
+    turning = [k for k, body in enumerate(scene.bodies) if body.parent == pair and body.joint.position[1] != 0.0]
     return (*own, *((k, 0) for k in turning))
 
 

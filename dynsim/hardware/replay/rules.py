@@ -164,7 +164,7 @@ class AbortRules:
         self._late = self._late + 1 if cycle.lateness > self._late_after else 0
         safety = self._safety
         return [
-            *self._stall(cycle.silence),
+            *([self.stall(cycle.silence)] if self.stalled(cycle.silence) else ()),
             *(self._alert(cycle) if cycle.alert.any() else ()),
             *(fault for id_, registers in cycle.health.items() for fault in self._health(self._by_id[id_], registers)),
             *self._silent(np.flatnonzero(self._missed >= safety.missed_cycles), cycle),
@@ -183,9 +183,6 @@ class AbortRules:
         """True where the servos heard nothing for so long [s] that their watchdogs have tripped."""
         return silence > self._watchdog
 
-    def _stall(self, silence: float) -> list[Fault]:
-        return [self.stall(silence)] if self.stalled(silence) else []
-
     def stall(self, silence: float) -> Fault:
         """Nobody spoke to the servos for ``silence`` [s]."""
         self._new(Cause.STALL)
@@ -200,9 +197,6 @@ class AbortRules:
         known = (cause, id_) in self._declared
         self._declared.add((cause, id_))
         return not known
-
-    def _in_trouble(self, id_: int) -> bool:
-        return any(who == id_ for _, who in self._declared)
 
     def _alert(self, cycle: Cycle) -> list[Fault]:
         hit = [
@@ -257,7 +251,8 @@ class AbortRules:
         if not over.any():
             return []
         # A servo that is limp or silent is off its goal too: that is no news.
-        hit = [k for k in np.flatnonzero(over) if not self._in_trouble(self._servos[k].id)]
+        in_trouble = {id_ for _, id_ in self._declared}
+        hit = [k for k in np.flatnonzero(over) if self._servos[k].id not in in_trouble]
         if not hit:
             return []
         ids = tuple(self._servos[k].id for k in hit)

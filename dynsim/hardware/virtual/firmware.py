@@ -7,8 +7,7 @@ from typing import NamedTuple
 
 from dynsim.hardware.bus.control_table import BROADCAST_ID, EEPROM_END, RAD_S_PER_UNIT
 from dynsim.hardware.bus.packet import ALERT, STATUS, Instruction, Packet, StatusError, encode, encode_fast
-from dynsim.hardware.virtual.addresses import Hearing
-from dynsim.hardware.virtual.servos import VirtualServos
+from dynsim.hardware.virtual.servos import Hearing, VirtualServos
 
 CLEAR_TURNS = b"\x01\x44\x58\x4c\x22"
 RESET_ALL = 0xFF

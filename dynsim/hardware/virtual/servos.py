@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dynsim.hardware.bus.control_table import (
+    MAX_ID,
     RAD_PER_TICK,
     RAD_S2_PER_UNIT,
     RAD_S_PER_UNIT,
@@ -17,11 +20,12 @@ from dynsim.hardware.bus.control_table import (
     OperatingMode,
 )
 from dynsim.hardware.bus.packet import StatusError
-from dynsim.hardware.virtual.addresses import Hearing, by_bit_rate
 from dynsim.hardware.virtual.faults import AngleFault, Fault, FaultScript, TemperatureRamp, VoltageSag
 from dynsim.hardware.virtual.registers import ServoRegisters
 from dynsim.hardware.virtual.servo_plant import Drive, InertialLoad, ServoPlant
 
+PROTOCOL = 2
+"""That of the line. A servo in which another one is set is silent for good, as nobody speaks it."""
 PHYSICS_STEP = 2e-3
 COMMUNICATION_END = 14
 """IDs, bit rate and protocol stand at lower addresses."""
@@ -42,6 +46,39 @@ SUPPLY, SUPPLY_RESISTANCE = 12.0, 0.05  # V, Ω
 BROWN_OUT = 6.0
 """Below this supply the servos' electronics stop, and start anew when it is back [V] (unverified)."""
 OVERHEATING, OVERLOAD, INPUT_VOLTAGE = 1 << 2, 1 << 5, 1 << 0
+
+
+@dataclass
+class Hearing:
+    """Servos of one bit rate, named by the ID they had at first.
+
+    Attributes
+    ----------
+    by_id : dict of int to list of int
+        By the ID they have now; more than one where they share it.
+    by_shadow : dict of int to list of int
+        By their secondary ID: they obey what is written to it, and do not answer.
+    members : int array
+        Their places in the order of the line.
+    """
+
+    by_id: dict[int, list[int]] = field(default_factory=dict)
+    by_shadow: dict[int, list[int]] = field(default_factory=dict)
+    members: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+
+
+def by_bit_rate(servos: Mapping[int, ServoRegisters]) -> dict[int, Hearing]:
+    """Who understands a packet, by its bit rate [bit/s]; as the registers say now."""
+    hearings: dict[int, Hearing] = {}
+    for index, (first_id, registers) in enumerate(servos.items()):
+        if registers["protocol"] != PROTOCOL:
+            continue
+        hearing = hearings.setdefault(registers.baud, Hearing())
+        hearing.members = np.append(hearing.members, index)
+        hearing.by_id.setdefault(registers["id"], []).append(first_id)
+        if registers["shadow_id"] <= MAX_ID and registers["shadow_id"] != registers["id"]:
+            hearing.by_shadow.setdefault(registers["shadow_id"], []).append(first_id)
+    return hearings
 
 
 class VirtualServos:

@@ -1,8 +1,8 @@
-"""A simulated robot behind the virtual servos: its bodies, gravity, joint stops, and what its elbows are braced on.
+"""A simulated robot behind the virtual servos: its bodies, gravity, joint stops, and what it is braced or stands on.
 
 A :class:`dynsim.Simulation` moves it: the scenario's robot, with servos of the map's models for motors. Contacts are
 those of the engine under the unilateral law, whatever law the scenario has: a real floor does not pull. The integrator
-is the default one, that of events.
+is the default one, that of events; of a snake, which stands on its wheels, time stepping.
 
 What servos tell of a posture is rounded to ticks, so that a braced elbow may seem to be some tenths of a millimetre
 below its floor, or a joint beyond its stop. The arm then starts at the nearest posture that is possible.
@@ -26,6 +26,7 @@ from dynsim.hardware.virtual.servo_plant import Drive, MotorLaw
 
 if TYPE_CHECKING:
     from dynsim.compile.model import Model
+    from dynsim.model.description import Robot
     from dynsim.scenario import Scenario
 
 Array = NDArray[np.float64]
@@ -35,6 +36,8 @@ log = logging.getLogger(__name__)
 START_CHANGE = 5.0 * RAD_PER_TICK
 """At the start joints are moved by this much at most to get off what they are in: ticks and backlash [rad]."""
 GAP = 1e-10  # [m]
+SNAKE_STEP = 2e-3
+"""Of time stepping, that of the servos' physics [s]."""
 SLOW, STEADY = 1e-4, 1e-2
 """Slower [rad/s] and with less acceleration [rad/s²] a limp robot rests."""
 
@@ -51,7 +54,7 @@ class SimulatedArm:
         Whose robot it is, with payloads and contacts; forces that the scenario gives over time are left out.
     servo_map : ServoMap
     posture : array, shape (n,)
-        Where the joints are at first [rad], in the order of the model; see :func:`possible`.
+        Where the joints are at first [rad], in the order of :func:`served_joints`; see :func:`possible`.
 
     Raises
     ------
@@ -66,13 +69,16 @@ class SimulatedArm:
         from dynsim.scenario import build
 
         robot, servos = build.robot(scenario), servo_map.servos
-        labels, joints = [servo.label for servo in servos], list(robot.joint_names)
-        if sorted(labels) != sorted(joints):
+        served, labels = served_joints(robot), [servo.label for servo in servos]
+        if sorted(labels) != sorted(served):
             raise ServoMapError(
-                f"{servo_map.path} has servos for {', '.join(labels)}; the plant's joints are {', '.join(joints)}"
+                f"{servo_map.path} has servos for {', '.join(labels)}; the plant's joints are {', '.join(served)}"
             )
-        self._labels = labels
-        self._order = np.array([joints.index(label) for label in labels])  # servo k moves joint order[k]
+        # Servo k moves the joint labels[k], whose angle is q[order[k]] and whose rate is v[rows[k]].
+        self._labels = labels = [served[label] for label in labels]
+        self._rows = np.array([robot.joint_names.index(joint) for joint in labels])
+        self._order = np.array(robot.position_index)[self._rows]
+        self._places = np.array(robot.position_index)[[robot.joint_names.index(joint) for joint in served.values()]]
         self._scale = np.array([servo.sign * servo.gear for servo in servos])  # servo angle per joint angle
         self._zero = np.array([servo.zero_tick * RAD_PER_TICK for servo in servos])
         self._law = MotorLaw([servo.model for servo in servos])
@@ -84,8 +90,8 @@ class SimulatedArm:
             for mass, point in [masses.get(servo.joint, (0.0, None))]
         ]
         bare = _bare(scenario)
-        q = possible(bare, build.build_model(bare), np.asarray(posture, dtype=np.float64))
-        start = State(0.0, q, np.zeros(len(joints)), np.zeros(0))
+        q = _standing(bare, robot, dict(zip(served.values(), np.asarray(posture).tolist(), strict=True)))
+        start = State(0.0, q, np.zeros(len(robot.links)), np.zeros(0))
         self.simulation = Simulation(bare, state=start, duration=math.inf, trace=0, motors=motors)
         self._on_stand = np.ones(len(servos), dtype=bool)
         self._jammed = np.zeros(len(servos), dtype=bool)
@@ -101,8 +107,8 @@ class SimulatedArm:
 
     @property
     def joint_positions(self) -> Array:
-        """Joint angles [rad], shape (n,), in the order of the model."""
-        return self.simulation.state.q
+        """Joint angles [rad], shape (n,), in the order of :func:`served_joints`."""
+        return self.simulation.state.q[self._places]
 
     def step(self, dt: float, drive: Drive) -> None:
         self._on_stand &= ~drive.enabled
@@ -135,7 +141,29 @@ class SimulatedArm:
     def _shafts(self) -> tuple[Array, Array]:
         """Angles [rad] and speeds [rad/s] of the servos."""
         state = self.simulation.state
-        return self._zero + self._scale * state.q[self._order], self._scale * state.v[self._order]
+        return self._zero + self._scale * state.q[self._order], self._scale * state.v[self._rows]
+
+
+def served_joints(robot: Robot) -> dict[str, str]:
+    """The joints that have servos, by the labels of these: all of an arm; of a snake those with motors."""
+    # Imported here and below: replaying on real servos imports this module's room and nothing of the simulation.
+    from dynsim.compile.snake_tree import SnakeTree
+
+    if not isinstance(robot, SnakeTree):
+        return {joint: joint for joint in robot.joint_names}
+    wheels = dict(zip(robot.description.wheel_names, robot.wheel_joints, strict=True))
+    driven = [motor.joint for motor in robot.motors]
+    return {joint: joint for joint in driven if joint not in wheels.values()} | wheels
+
+
+def _standing(bare: Scenario, robot: Robot, posture: dict[str, float]) -> Array:
+    """Coordinates (nq,) with the joints at these angles [rad]: an arm as near as is possible, a snake on its wheels."""
+    from dynsim.compile.snake_tree import SnakeTree, at_angles
+    from dynsim.scenario import build
+
+    if isinstance(robot, SnakeTree):
+        return at_angles(robot, posture)
+    return possible(bare, build.build_model(bare), np.array(list(posture.values()), dtype=np.float64))
 
 
 def possible(scenario: Scenario, model: Model, posture: Array) -> Array:
@@ -189,6 +217,11 @@ def _bare(scenario: Scenario) -> Scenario:
         "loads": payloads,
         "integrator": type(config.integrator)(method="dopri5"),  # set points change every 2 ms, which ends steps
     }
+    if hasattr(config.plant, "dynamics"):
+        released = config.plant.dynamics.model_copy(update={"start": "released"})
+        changes["plant"] = config.plant.model_copy(update={"dynamics": released})
+        changes["integrator"] = type(config.integrator)(method="time_stepping", step_s=SNAKE_STEP)
+        changes["sensors"] = None
     return replace(scenario, config=config.model_copy(update=changes))
 
 
@@ -213,5 +246,6 @@ def simulated_arm(
 
     scenario = load_scenario(scenario_name, variant=variant)
     robot = build.robot(scenario)
-    start = [posture.get(name, angle) for name, angle in zip(robot.joint_names, robot.initial, strict=True)]
+    initial = dict(zip(robot.joint_names, robot.initial[list(robot.position_index)].tolist(), strict=True))
+    start = [posture.get(label, initial[joint]) for label, joint in served_joints(robot).items()]
     return SimulatedArm(scenario, servo_map, np.array(start))

@@ -290,9 +290,9 @@ def tell_changes(unilateral: UnilateralArrays, s: SteppingArrays, run: Run):
 @internal_kernel
 def sample_moreau(system: System, ws: Workspace, run: Run):
     """Record every sample time within the step, the state linear in between; forces are the means of the step."""
-    t, h, last, clock = run.clock[ki.TIME], run.clock[ki.STEP], run.count[ki.SAMPLE], run.clock
+    t, h, last = run.clock[ki.TIME], run.clock[ki.STEP], run.count[ki.SAMPLE]
     s = run.stepping
-    until = t + h + 1e-12 * max(1.0, clock[ki.END])
+    until = t + h + 1e-12 * max(1.0, t + h)
     while last < run.sample_time.shape[0] and run.sample_time[last] <= until:
         x = min(max((run.sample_time[last] - t) / h, 0.0), 1.0)
         row = run.sample[last]

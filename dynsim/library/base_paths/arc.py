@@ -10,7 +10,7 @@ from pydantic import Field
 
 from dynsim.compile.control import BasePath
 from dynsim.compile.protocols import BuildContext
-from dynsim.compile.references.minimum_jerk import minimum_jerk
+from dynsim.compile.splines import minimum_jerk
 from dynsim.config.base import NonNegative, Positive, StrictConfig
 
 

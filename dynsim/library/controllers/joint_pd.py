@@ -19,7 +19,7 @@ from dynsim.compile.references.inverse_kinematics import follow
 from dynsim.compile.references.teleop import TeleopOptions
 from dynsim.compile.rolling import rolled, wheel_angles
 from dynsim.compile.splines import clamped_cubic, quintic_coefficients
-from dynsim.config.base import NonNegative, Positive, StrictConfig, check_waypoints, error_at
+from dynsim.config.base import NonNegative, Positive, StrictConfig, Vector3, check_waypoints, error_at
 from dynsim.errors import ModelError
 from dynsim.library import families
 from dynsim.library.controllers.operator import OperatorConfig
@@ -39,10 +39,23 @@ SEGMENTS_MAX = 10_000_000
 TURN_MAX = 0.2
 
 
+class Orientation(StrictConfig):
+    """A rotation of a body in the world."""
+
+    rpy_deg: Vector3 = Field(description="about x, y, z of the world, in this order")
+
+    def matrix(self) -> NDArray[np.float64]:
+        """Axes of the body as columns, (3, 3)."""
+        from dynsim.model.urdf.reader import rotation
+
+        return np.asarray(rotation(*np.deg2rad(self.rpy_deg).tolist()))
+
+
 class HandReference(StrictConfig):
     """A path of the hand, turned into references of ``joints`` by inverse kinematics."""
 
     path: PathChoice
+    orientation: Orientation | None = Field(default=None, description="of the hand's body or frame all the way")
     joints: list[str] = Field(
         description="joints that follow the path, the others hold; none: controller.joints lead the hand along it"
     )
@@ -193,7 +206,10 @@ def build(config: Config, context: BuildContext) -> JointControl:
             base = _base_coordinates(robot, positions, times)
             braces = [_contact(context, name, "hand.braces") for name in hand.braces]
             start, tolerance = robot.initial, hand.tolerance_m
-            followed = follow(model, times, targets, hand.joints, start, tolerance, context.progress, base, braces)
+            turned = None if hand.orientation is None else hand.orientation.matrix()
+            followed = follow(
+                model, times, targets, hand.joints, start, tolerance, context.progress, base, braces, turned
+            )
             positions |= dict(zip(hand.joints, followed.T, strict=True))
     control = JointControl.following(
         robot,
@@ -205,6 +221,8 @@ def build(config: Config, context: BuildContext) -> JointControl:
         sample_time=config.sample_time_s,
         voltages=_planned(config, context, times, positions) if planned else None,
     )
+    if config.hand is not None and config.hand.orientation is not None:
+        control = replace(control, orientation=config.hand.orientation.matrix())
     return control if config.operator is None else replace(control, teleop=_teleop(config.operator, context))
 
 

@@ -6,18 +6,26 @@ Transactions on Robotics 35(1), 2019. Values that [T] does not give are marked "
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field
 
 from dynsim.compile.protocols import BuildContext
+from dynsim.compile.snake_tree import GROUND, SnakeTree, lifting_joints, snake_tree
 from dynsim.config.base import NonNegative, Positive, StrictConfig
 from dynsim.errors import ModelError
+from dynsim.library import families
+from dynsim.model.drives import Drive
 from dynsim.snake.description import SnakeDescription
+from dynsim.snake.lifting import Lifts
 
 ENGINE = "kinematic"
 
+# Tyres that give way (assumed): with rigid ones nothing says how left and right share the load of a pair.
+TYRES = {"stiffness_N_per_m": 1e5, "damping_N_s_per_m": 200.0}
+MotorChoice: Any = families.union("motor")
 DrivenSide = Literal["left", "right", "none"]
 
 
@@ -28,11 +36,38 @@ class JointLimits(StrictConfig):
     pitch: Positive = Field(113.0, lt=180, description="[deg]")
 
 
+class Lifting(StrictConfig):
+    """How wheel pairs are lifted."""
+
+    clearance_m: Positive = Field(0.010, description="of the lower wheel above the ground (assumed)")
+    blend_s: Positive = Field(0.25, description="time to lift a pair, and to put it down (assumed)")
+    sag_compensation: bool = Field(True, description="pitch joints are told by so much more as their servos give way")
+
+
+class Dynamics(StrictConfig):
+    """What the plant is beside its lengths where it has forces: ``level: dynamic``."""
+
+    joint_servo: MotorChoice = Field({"type": "mx_106"}, description="of every joint ([T] IV.A)")
+    wheel_servo: MotorChoice = Field({"type": "mx_28"}, description="of every driven wheel ([T] IV.A)")
+    wheel_inertia_kg_m2: Positive = Field(4e-5, description="about its axle, of each wheel without its servo (assumed)")
+    bearing_drag_N_m_s_per_rad: NonNegative = Field(1e-4, description="of each wheel (assumed)")
+    passive_wheels: Literal["bodies", "massless"] = Field(
+        "bodies", description="massless: no friction along their way, instead of bodies that turn"
+    )
+    lifting: Lifting = Field(default_factory=Lifting)
+    start: Literal["soft", "released"] = Field(
+        "soft", description="soft: the head has been raised from below and has settled; released: it is let go at t = 0"
+    )
+
+
 class Config(StrictConfig):
     """The ``plant:`` section of a scenario; SI units where the key names no other."""
 
     type: Literal["snake"] = "snake"
-    level: Literal["kinematic"] = "kinematic"
+    level: Literal["kinematic", "dynamic"] = Field(
+        "kinematic", description="kinematic: wheels do not slip and joints follow exactly; dynamic: a tree of bodies"
+    )
+    dynamics: Dynamics = Field(default_factory=Dynamics, description="level: dynamic only")
     yaw_joints: int = Field(9, ge=2, le=200, description="n: yaw joints of the whole robot")
     head_joints: int = Field(6, ge=0, description="n_h: joints of the raised head part, yaw, pitch, yaw, ..., even")
     link_length_m: Positive = Field(0.0905, description="l [m], between neighbouring joint axes")
@@ -61,7 +96,60 @@ class Config(StrictConfig):
     )
 
 
-def build(config: Config, context: BuildContext) -> SnakeDescription:
+def engine(config: Config) -> str:
+    """What simulates the plant of a configuration."""
+    return "dynamics" if config.level == "dynamic" else ENGINE
+
+
+def section_defaults(plant: Mapping[str, Any], sections: Mapping[str, Any]) -> dict[str, Any]:
+    """What other sections of a scenario say where they do not say otherwise; both as they were read."""
+    if plant.get("level") != "dynamic":
+        return {}
+    defaults: dict[str, Any] = {
+        "surfaces": {GROUND: {"type": "plane"}},
+        "contacts": {"law": "unilateral", "friction": 0.6},
+    }
+    integrator, contacts = sections.get("integrator"), sections.get("contacts")
+    if not isinstance(integrator, Mapping) or integrator.get("method", "time_stepping") == "time_stepping":
+        defaults["integrator"] = {"method": "time_stepping", "step_s": 0.0025}
+        if not isinstance(contacts, Mapping) or contacts.get("stiffness_N_per_m", TYRES) is not None:
+            defaults["contacts"] |= TYRES
+    controller = sections.get("controller")
+    if isinstance(controller, Mapping):
+        defaults["controller"] = {"state": "feedforward"}  # [T] IV.C.2
+        sensor = {"measured": "motion_capture", "estimated": "encoders"}.get(str(controller.get("state")))
+        if sensor is not None:
+            defaults["sensors"] = {sensor: {}}
+    return defaults
+
+
+def build(config: Config, context: BuildContext) -> SnakeDescription | SnakeTree:
+    """The configured robot: its description, or the tree of its bodies; raises what :func:`describe` raises."""
+    description = describe(config)
+    if config.level == "kinematic":
+        return description
+    dynamics = config.dynamics
+    lifting = dynamics.lifting
+
+    def servo(choice: Any, joint: str) -> Drive:
+        return families.build("motor", choice, context.at_joint(joint), Drive)
+
+    return snake_tree(
+        description,
+        lambda joint: servo(dynamics.joint_servo, joint),
+        lambda joint: servo(dynamics.wheel_servo, joint),
+        wheel_inertia=dynamics.wheel_inertia_kg_m2,
+        bearing_drag=dynamics.bearing_drag_N_m_s_per_rad,
+        massless_wheels=dynamics.passive_wheels == "massless",
+        lifts=Lifts(
+            joints=lifting_joints(description), clearance_mm=1e3 * lifting.clearance_m, blend_s=lifting.blend_s
+        ),
+        sag_compensation=lifting.sag_compensation,
+        raised=dynamics.start == "soft",
+    )
+
+
+def describe(config: Config) -> SnakeDescription:
     """Description of the configured robot.
 
     Raises

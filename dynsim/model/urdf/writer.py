@@ -5,18 +5,20 @@ from __future__ import annotations
 import math
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from dynsim.errors import ModelError
-from dynsim.model.description import WORLD, Array, Frame, Link, Robot
+from dynsim.model.description import WORLD, Frame, Link, Robot
 from dynsim.model.urdf.build import HAND, ROWS
 from dynsim.model.urdf.reader import MOVING, UNLIMITED
+from dynsim.record.urdf_text import add_shapes, connect, numbers, xml_text
 
 
 def write_urdf(robot: Robot) -> str:
-    """The bodies and joints of a robot as URDF text; frames, and the hand as one of them, are links without mass.
+    """Write the bodies, joints and shapes of a robot as URDF text.
+
+    Frames, and the hand as one of them, are links without mass.
 
     Numbers are written in full, so that reading the text back gives the same dynamics to rounding.
 
@@ -32,35 +34,37 @@ def write_urdf(robot: Robot) -> str:
     # The root link of the file that the robot came from is its first frame.
     rooted = next((f.name for f in frames if f.body is None and not f.p.any() and np.array_equal(f.R, np.eye(3))), None)
     base = rooted or next(name for name in (WORLD, "base_link", "root_link") if name not in taken)
-    ElementTree.SubElement(root, "link", name=base)
+    add_shapes(ElementTree.SubElement(root, "link", name=base), robot.fixed_shapes)
     for link in links:
-        inertial = ElementTree.SubElement(ElementTree.SubElement(root, "link", name=link.name), "inertial")
-        ElementTree.SubElement(inertial, "origin", xyz=_text(link.inertia.com), rpy="0 0 0")
-        ElementTree.SubElement(inertial, "mass", value=_text(link.inertia.mass))
-        moments = {f"i{'xyz'[i]}{'xyz'[j]}": _text(link.inertia.tensor[i, j]) for i in range(3) for j in range(i, 3)}
+        body = ElementTree.SubElement(root, "link", name=link.name)
+        inertial = ElementTree.SubElement(body, "inertial")
+        ElementTree.SubElement(inertial, "origin", xyz=numbers(link.inertia.com), rpy="0 0 0")
+        ElementTree.SubElement(inertial, "mass", value=numbers(link.inertia.mass))
+        moments = {f"i{'xyz'[i]}{'xyz'[j]}": numbers(link.inertia.tensor[i, j]) for i in range(3) for j in range(i, 3)}
         ElementTree.SubElement(inertial, "inertia", moments)
+        add_shapes(body, link.shapes)
     leads = {coupling.joint: coupling for coupling in robot.couplings}
     for link in links:
         limits = (link.lower, link.upper, link.effort_limit, link.velocity_limit)
         endless = link.kind == "revolute" and math.isinf(link.lower) and math.isinf(link.upper)
         joint = ElementTree.SubElement(root, "joint", name=link.joint, type="continuous" if endless else link.kind)
-        _connect(joint, link.parent or base, link.name, link.p_PJ, link.R_PJ)
+        connect(joint, link.parent or base, link.name, link.p_PJ, link.R_PJ)
         if link.kind != "floating":
-            ElementTree.SubElement(joint, "axis", xyz=_text(link.axis))
+            ElementTree.SubElement(joint, "axis", xyz=numbers(link.axis))
         if link.kind in MOVING.values() and not (endless and all(map(math.isinf, limits))):
             # A continuous joint has no lower and upper.
-            texts = [_text(min(max(limit, -UNLIMITED), UNLIMITED)) for limit in limits]
+            texts = [numbers(min(max(limit, -UNLIMITED), UNLIMITED)) for limit in limits]
             attributes = dict(zip(("lower", "upper", "effort", "velocity"), texts, strict=True))
             ElementTree.SubElement(joint, "limit", dict(list(attributes.items())[2:]) if endless else attributes)
         if link.damping:
-            ElementTree.SubElement(joint, "dynamics", damping=_text(link.damping), friction="0.0")
+            ElementTree.SubElement(joint, "dynamics", damping=numbers(link.damping), friction="0.0")
         if coupling := leads.get(link.joint):
-            law = {"multiplier": _text(coupling.ratio), "offset": _text(coupling.offset)}
+            law = {"multiplier": numbers(coupling.ratio), "offset": numbers(coupling.offset)}
             ElementTree.SubElement(joint, "mimic", {"joint": coupling.leader, **law})
     if HAND not in taken:
-        body, point = robot.hand
-        turned = (f.R for f in robot.frames if f.name == HAND and f.body == body and np.array_equal(f.p, point))
-        frames.append(Frame(HAND, body, next(turned, np.eye(3)), point))
+        carrier, point = robot.hand
+        turned = (f.R for f in robot.frames if f.name == HAND and f.body == carrier and np.array_equal(f.p, point))
+        frames.append(Frame(HAND, carrier, next(turned, np.eye(3)), point))
     joints = {link.joint for link in links}
     for frame in frames:
         if frame.name == base:
@@ -70,9 +74,8 @@ def write_urdf(robot: Robot) -> str:
             name += "_"
         ElementTree.SubElement(root, "link", name=frame.name)
         joint = ElementTree.SubElement(root, "joint", name=name, type="fixed")
-        _connect(joint, frame.body or base, frame.name, frame.p, frame.R)
-    ElementTree.indent(root)
-    return '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
+        connect(joint, frame.body or base, frame.name, frame.p, frame.R)
+    return xml_text(root)
 
 
 def _whole_joints(robot: Robot) -> list[Link]:
@@ -96,26 +99,3 @@ def _whole_joint(name: str, rows: list[Link]) -> Link:
                 raise ModelError(f"{name}: has losses; URDF has no unit for those of a {kind} joint")
             return replace(whole, kind=kind)
     raise ModelError(f"{name}: is made of {', '.join(row.kind for row in rows)}; URDF has no such joint")
-
-
-def _connect(joint: ElementTree.Element, parent: str, child: str, position: Array, rotation: Array) -> None:
-    ElementTree.SubElement(joint, "parent", link=parent)
-    ElementTree.SubElement(joint, "child", link=child)
-    ElementTree.SubElement(joint, "origin", xyz=_text(position), rpy=_text(_roll_pitch_yaw(rotation)))
-
-
-def _roll_pitch_yaw(R: Array) -> Array:
-    """Angles of R = Rz(yaw) Ry(pitch) Rx(roll) [rad], accurate at pitch = ±90° too.
-
-    There roll and yaw are not unique: whatever yaw rounding gives, roll is taken from what is left after undoing it.
-    """
-    yaw = math.atan2(R[1, 0], R[0, 0])
-    c, s = math.cos(yaw), math.sin(yaw)
-    pitch = math.atan2(-R[2, 0], c * R[0, 0] + s * R[1, 0])
-    roll = math.atan2(s * R[0, 2] - c * R[1, 2], c * R[1, 1] - s * R[0, 1])
-    return np.array([roll, pitch, yaw])
-
-
-def _text(values: Any) -> str:
-    """Numbers in their shortest form that reads back to the same double."""
-    return " ".join(repr(float(x)) for x in np.atleast_1d(values))

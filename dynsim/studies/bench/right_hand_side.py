@@ -52,13 +52,15 @@ def repeat_derivative(system: System, y: Array, ws: ka.Workspace, dy: Array, cou
     return total
 
 
-def measure(sizes: Sequence[int], rounds: int, share: float, *, with_mujoco: bool) -> list[dict[str, Any]]:
+def measure(
+    sizes: Sequence[int], rounds: int, share: float, *, with_mujoco: bool, with_pinocchio: bool
+) -> list[dict[str, Any]]:
     """Median microseconds by links and program, of ``rounds`` samples of about ``share`` seconds each."""
     rows, python_call = [], 0.0
     for n in sizes:
         arms = {contacts: prepare(_arm(n, contacts)) for contacts in (False, True)}
         contenders = {DYNSIM_FREE: _derivative_loop(arms[False]), DYNSIM_CONTACTS: _derivative_loop(arms[True])}
-        if n <= PINOCCHIO_LINKS_MAX:
+        if with_pinocchio and n <= PINOCCHIO_LINKS_MAX:
             contenders |= _pinocchio_contenders(arms[True])
         if with_mujoco:
             contenders |= _mujoco_contenders(arms[True])
@@ -66,7 +68,7 @@ def measure(sizes: Sequence[int], rounds: int, share: float, *, with_mujoco: boo
         if n != sizes[0]:
             contenders.pop(_PYTHON_ABA, None)
         seconds = {name: median(samples) for name, samples in take_turns(contenders, rounds, share).items()}
-        if n == sizes[0]:
+        if n == sizes[0] and with_pinocchio:
             python_call = max(0.0, (called := seconds.pop(_PYTHON_ABA)) - seconds.get(ABA, called))
         for name in seconds.keys() & {CONSTRAINT_DYNAMICS, LCABA}:
             seconds[name] -= python_call

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import importlib.util
 import os
 import platform
 from collections.abc import Callable
@@ -34,12 +35,14 @@ def run_bench(quick: bool = False, tell: Callable[[str], object] = lambda text: 
         ``variants`` (time), ``sweeps`` (by number of runs and of processes: wall time), ``precision`` (by shipped
         scenario, method and tolerance: time, error, ledger).
     """
-    mujoco_missing = _why_no_mujoco()
-    with_mujoco = not mujoco_missing
+    missing = {name: why for name, why in (("mujoco", _why_no_mujoco()), ("pinocchio", _why_no_pinocchio())) if why}
+    with_mujoco, with_pinocchio = "mujoco" not in missing, "pinocchio" not in missing
     # Many short samples: the median then leaves out those in which another process had the core.
     rounds, share = (25, 2e-3) if quick else (101, 5e-3)
     tell("right-hand sides")
-    sizes = right_hand_side.measure(SIZES[:3] if quick else SIZES, rounds, share, with_mujoco=with_mujoco)
+    sizes = right_hand_side.measure(
+        SIZES[:3] if quick else SIZES, rounds, share, with_mujoco=with_mujoco, with_pinocchio=with_pinocchio
+    )
     jobs: list[dict[str, Any]] = []
     for case in job.CASES:
         tell(f"10 s job, {case}")
@@ -71,7 +74,7 @@ def run_bench(quick: bool = False, tell: Callable[[str], object] = lambda text: 
         "variants": elbows,
         "sweeps": swept,
         "precision": exact,
-        "unavailable": {"mujoco": mujoco_missing} if mujoco_missing else {},
+        "unavailable": missing,
     }
 
 
@@ -83,6 +86,13 @@ def _why_no_mujoco() -> str:
         return "mujoco is not installed (pip install 'dynsim[bench]')"
     if int(mujoco.__version__.split(".")[0]) < 4:
         return f"mujoco {mujoco.__version__}: its dcmotor takes no position and velocity set-points before 4.0"
+    return ""
+
+
+def _why_no_pinocchio() -> str:
+    """Why Pinocchio cannot take part; empty when it can."""
+    if importlib.util.find_spec("pinocchio") is None:
+        return "pinocchio is not installed (pip install 'dynsim[bench]'; it has no wheels for Windows)"
     return ""
 
 

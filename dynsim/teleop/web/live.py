@@ -182,16 +182,14 @@ class LiveDrive:
     def _is_over(self, until_closed: bool) -> bool:
         if until_closed and self.server.came and not self.server.clients:
             self.end("the last browser was closed")
-        if self.session.finished or (self._over.is_set() and self._may_end()):
+        may_end = self._at_once or self._follower is None or self._follower.steady or self.session.ticks == 0
+        if self.session.finished or (self._over.is_set() and may_end):
             self.report.ended = self._ended or "the longest time is over"
         elif self.server.failure is not None:
             raise DynsimError(f"the server ended: {self.server.failure!r}")
         else:
             return False
         return True
-
-    def _may_end(self) -> bool:
-        return self._at_once or self._follower is None or self._follower.steady or self.session.ticks == 0
 
     def _wait_for_follower(self, until_closed: bool) -> None:
         """Whoever holds the key when a robot has come to its start must let it go first."""

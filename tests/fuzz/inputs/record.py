@@ -127,7 +127,7 @@ def _changed(rng: Random, file: Any) -> str:
     """A change, and what it is; the first of two may leave a file in which HDF5 makes no second one."""
     try:
         return _mutate(rng, file)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RuntimeError) as error:
         return f"a change that HDF5 refuses ({error})"
 
 

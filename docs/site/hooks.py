@@ -1,0 +1,55 @@
+"""What the site does beyond its pages: generated reference, files from outside of docs/, links to them."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+from mkdocs.structure.files import File, Files
+
+SITE = Path(__file__).parent
+ROOT = SITE.parents[1]
+sys.path[:0] = [str(ROOT), str(SITE)]
+
+import gallery  # noqa: E402
+import reference  # noqa: E402
+
+# Pages of the repository's root, and where they are on the site.
+OUTSIDE = {
+    "CHANGELOG.md": "dev/changelog.md",
+    "CONTRIBUTING.md": "dev/contributing.md",
+    "results/README.md": "dev/results.md",
+}
+WORKER = "iframe-worker.js"
+_PICTURE = re.compile(r"\]\((?:\.\./)*(results/[\w/.-]+\.(?:png|gif))\)")
+
+
+def on_files(files: Files, config: Any) -> Files:
+    """Add what is generated, and what pages show of the repository."""
+    files.append(File.generated(config, "reference/scenario-keys.md", content=reference.scenario_page()))
+    files.append(File.generated(config, "reference/commands.md", content=reference.cli_page()))
+    files.append(File.generated(config, WORKER, abs_src_path=str(SITE / WORKER)))
+    files.append(File.generated(config, "gallery.md", content=gallery.page()))
+    for built in sorted(gallery.BUILT.glob("*/*.*")):
+        name = f"gallery/{built.parent.name}/{built.name}"
+        files.append(File.generated(config, name, abs_src_path=str(built)))
+    for source, target in OUTSIDE.items():
+        files.append(File.generated(config, target, content=(ROOT / source).read_text(encoding="utf-8")))
+    pages = [file for file in files if file.src_uri.endswith(".md")]
+    shown = {name for page in pages for name in _PICTURE.findall(page.content_string)}
+    for name in sorted(shown):
+        files.append(File.generated(config, name, abs_src_path=str(ROOT / name)))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
+    """Links to files of the repository as links of the site."""
+    up = "../" * page.file.src_uri.count("/")
+    markdown = _PICTURE.sub(lambda match: f"]({up}{match[1]})", markdown)
+    if page.file.src_uri in OUTSIDE.values():
+        markdown = re.sub(r"\]\((?:\.\./)?docs/", f"]({up}", markdown)
+        for source, target in OUTSIDE.items():
+            markdown = markdown.replace(f"]({source})", f"]({up}{target})")
+    return markdown

@@ -1,0 +1,271 @@
+"""The articulated mobile robot as a tree of bodies: what the plant ``snake`` is with ``level: dynamic``.
+
+    floating ─ pair1 ┬ head_psi3 ─ head_theta3 ─ … ─ head_theta1            head branch, axes with a minus sign
+                     ├ pair2 (theta4) ─ plate2 (psi4) ─ pair3 (theta5) ─ …   tail branch
+                     └ wheel1L, wheel1R on pair1, wheel2L, wheel2R on pair2, …
+
+The root is the body behind the axle of wheel pair 1, at that axle. Going tailward a joint turns by Rz(θ) or Ry(ψ), so a
+joint of the head branch, which turns its head side, has the axis −e_z or −e_y. The angle of a joint is that of
+:mod:`dynsim.snake.kinematics`. Pitch joints on the axles of the base part, ψ4 … ψ8, lift wheel pairs
+(:mod:`dynsim.snake.base_part`).
+
+All wheels are bodies, spheres where they touch: a driven one has a servo in velocity mode, the others turn freely.
+Their masses are part of the links', which are those of the kinematic level; what is their own is the spin inertia.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynsim.compile.model import Model
+from dynsim.compile.scene import BODY_RADIUS, snake_tube, snake_wheel
+from dynsim.errors import ModelError
+from dynsim.model.description import Array, Foot, Inertia, Link, Robot
+from dynsim.model.drives import Drive, Servo
+from dynsim.model.joints.ball import floating
+from dynsim.snake.base_part import BasePart
+from dynsim.snake.description import SnakeDescription
+from dynsim.snake.lifting import Lifts
+
+GROUND = "ground"
+ROOT = "pair1"
+HEAD = "head"
+_X, _Y, _Z = np.eye(3)
+# Of solid boxes as long as a link and so wide and high [m] (assumed).
+BOX_WIDTH = 0.08
+
+
+@dataclass(frozen=True)
+class SnakeTree(Robot):
+    """The tree, and what its controller knows of it.
+
+    Attributes
+    ----------
+    description : of the snake
+    base_part : its base part, as it is folded along its axles
+    lifts : how high and how fast wheel pairs are lifted
+    sag_compensation : of lifted pairs: their pitch joints are told by so much more as their servos give way
+    raised : a run begins with the head raised from below; False: with the head let go in its posture, nothing sags yet
+    """
+
+    description: SnakeDescription = field(kw_only=True)
+    base_part: BasePart = field(kw_only=True)
+    lifts: Lifts = field(kw_only=True)
+    sag_compensation: bool = field(kw_only=True)
+    raised: bool = field(kw_only=True)
+
+    @property
+    def lifting_joints(self) -> tuple[str, ...]:
+        """Pitch joints on the axles of pairs 1, 2, …, all but the last; the first is the last head joint."""
+        return self.lifts.joints
+
+    @property
+    def wheel_joints(self) -> tuple[str, ...]:
+        """Joints of the driven wheels, in the order of ρ."""
+        sides = self.description.driven_side
+        return tuple(wheel_joint(pair, int(side)) for pair, side in enumerate(sides) if side)
+
+
+def wheel_joint(pair: int, side: int) -> str:
+    """Name of the joint of a wheel: pair from 0, side 1 left, −1 right."""
+    return f"wheel{pair + 1}{'L' if side > 0 else 'R'}"
+
+
+def snake_base_part(d: SnakeDescription) -> BasePart:
+    """Lengths of the base part of a snake."""
+    links = np.full(d.base_joints, d.link_length)
+    pairs = tuple(f"pair{k + 1}" for k in range(d.pairs))
+    return BasePart(pairs, links, links, d.half_track, d.wheel_radius, "phi", d.joint_names[d.head_joints :])
+
+
+def lifting_joints(d: SnakeDescription) -> tuple[str, ...]:
+    """Names of the pitch joints on the axles of pairs 1, 2, …, all but the last; that of pair 1 carries the head."""
+    first = d.head_joints // 2
+    return tuple(f"psi{first + k}" for k in range(d.pairs - 1))
+
+
+def snake_tree(
+    d: SnakeDescription,
+    joint_servo: Callable[[str], Drive],
+    wheel_servo: Callable[[str], Drive],
+    *,
+    wheel_inertia: float,
+    bearing_drag: float,
+    massless_wheels: bool,
+    lifts: Lifts,
+    sag_compensation: bool,
+    raised: bool,
+) -> SnakeTree:
+    """The tree of a snake in its initial posture, all wheels on the ground z = 0.
+
+    Parameters
+    ----------
+    joint_servo, wheel_servo : the servo of a joint by its name
+    wheel_inertia : about its axle, of each wheel without its servo [kg m²]
+    bearing_drag : viscous drag of each wheel [N m s/rad]
+    massless_wheels : wheels without servo are no bodies: they have no friction along their way, and no drag
+
+    Raises
+    ------
+    ModelError
+        A servo that does not follow positions (joints) or rates (wheels).
+    """
+    l, n_h = d.link_length, d.head_joints
+    limits = dict(zip(d.joint_names, np.column_stack([d.lower, d.upper]), strict=True))
+    pitch_limit = float(d.upper[1])  # every pitch joint has that of the head's
+    masses = d.link_mass  # head to tail
+    floating_root = Link(
+        ROOT, "base", None, "floating", _X, _link_inertia(masses[n_h], l, -1.0), shapes=(snake_tube(d, -l, 0.0),)
+    )
+    links = list(floating(floating_root))
+
+    def link(name: str, joint: str, parent: str, axis: Array, x: float, mass: float, ahead: float) -> Link:
+        lower, upper = limits.get(joint, (-pitch_limit, pitch_limit))
+        start, end = (0.0, l) if ahead > 0.0 else (-l, 0.0)
+        return Link(
+            name,
+            joint,
+            parent,
+            "revolute",
+            axis,
+            _link_inertia(mass, l, ahead),
+            p_PJ=np.array([x, 0.0, 0.0]),
+            lower=float(lower),
+            upper=float(upper),
+            shapes=(snake_tube(d, start, end),),
+        )
+
+    parent = ROOT
+    for j in reversed(range(n_h)):
+        joint = d.joint_names[j]
+        name = HEAD if j == 0 else f"head_{joint}"
+        links.append(link(name, joint, parent, -_Y if d.pitch[j] else -_Z, 0.0 if j == n_h - 1 else l, masses[j], 1.0))
+        parent = name
+    lifting = lifting_joints(d)
+    parent, axles = ROOT, [(ROOT, 0.0)]
+    for k in range(d.base_joints):
+        pair = f"pair{k + 2}"
+        joint = d.joint_names[n_h + k]
+        links.append(link(pair, joint, parent, _Z, -l, masses[n_h + 2 * k + 1], -1.0))
+        axles.append((pair, -l))
+        if k + 1 < d.base_joints:
+            parent = f"plate{k + 2}"
+            links.append(link(parent, lifting[k + 1], pair, _Y, -l, masses[n_h + 2 * k + 2], -1.0))
+    wheels, feet, driven = [], [], []
+    for pair_index, (body, x) in enumerate(axles):
+        for side in (1, -1):
+            name = wheel_joint(pair_index, side)
+            position = np.array([x, side * float(d.half_track[pair_index]), 0.0])
+            if massless_wheels and side != d.driven_side[pair_index]:
+                feet.append(Foot(name, body, position, d.wheel_radius, GROUND, grip_axis=_X))
+                continue
+            wheels.append(
+                Link(
+                    f"{name}.wheel",
+                    name,
+                    body,
+                    "revolute",
+                    _Y,
+                    Inertia(0.0),
+                    p_PJ=position,
+                    damping=bearing_drag,
+                    armature=wheel_inertia,
+                    shapes=(snake_wheel(d),),
+                )
+            )
+            feet.append(Foot(name, f"{name}.wheel", np.zeros(3), d.wheel_radius, GROUND))
+            if side == d.driven_side[pair_index]:
+                driven.append(name)
+    links += wheels
+    feet.append(Foot(HEAD, HEAD, np.array([l, 0.0, 0.0]), BODY_RADIUS * d.wheel_radius, GROUND))
+    motors = [joint_servo(name) for name in (*d.joint_names, *lifting[1:])]
+    motors += [wheel_servo(name) for name in driven]
+    for motor, velocity_mode in zip(motors, [False] * (len(motors) - len(driven)) + [True] * len(driven), strict=True):
+        if not isinstance(motor, Servo) or motor.velocity_mode != velocity_mode:
+            key, follows = ("wheel_servo", "rates") if velocity_mode else ("joint_servo", "positions")
+            raise ModelError(f"plant.dynamics.{key}: must be a servo that follows {follows}, such as the default")
+    robot = SnakeTree(
+        "snake",
+        tuple(links),
+        tuple(motors),
+        (HEAD, np.array([l + d.point_offset, 0.0, 0.0])),
+        feet=tuple(feet),
+        description=d,
+        base_part=snake_base_part(d),
+        lifts=lifts,
+        sag_compensation=sag_compensation,
+        raised=raised,
+    )
+    return replace(robot, q0=configuration(robot, np.asarray(d.initial_joints), np.zeros(d.pairs)))
+
+
+def configuration(robot: SnakeTree, phi: Array, height: Array) -> Array:
+    """Coordinates (nq,) of the tree on its wheels, at angles phi (n_phi,) [rad], the pairs at heights (pairs,) [m].
+
+    Pair 1 is flat on the ground. The heights are those of thin discs; where a bent base twists, spheres beside them
+    would be lower, and the robot is raised until the lowest one touches.
+    """
+    d = robot.description
+    hinge = robot.base_part.fold(phi[None, d.head_joints :], height[None]).hinge[0]
+    angles = dict(zip(d.joint_names, phi.tolist(), strict=True))
+    for joint, angle in zip(robot.lifting_joints, hinge.tolist(), strict=True):
+        angles[joint] = angles.get(joint, 0.0) + angle
+    return at_angles(robot, angles, float(hinge[0]))
+
+
+def at_angles(robot: SnakeTree, angles: Mapping[str, float], tilt: float = 0.0) -> Array:
+    """Coordinates (nq,) of the tree with its lowest wheel on the ground, the body behind pair 1 tilted tail up [rad].
+
+    ``angles`` : by joint [rad]; others are where they start
+    """
+    d = robot.description
+    q = robot.initial.copy()
+    for joint, k in zip(robot.joint_names, robot.position_index, strict=True):
+        q[k] = angles.get(joint, q[k])
+    x, y, yaw = d.initial_base_pose
+    c, s = np.cos(0.5 * yaw), np.sin(0.5 * yaw)
+    cp, sp = np.cos(0.5 * tilt), np.sin(0.5 * tilt)
+    # Rz(yaw) Ry(hinge)
+    q[:7] = x, y, d.wheel_radius, c * cp, -s * sp, c * sp, s * cp
+    model = Model(robot)
+    own = robot.feet[: 2 * d.pairs + 1]  # before those of objects beside it
+    q[2] -= min(model.point_position(foot.body, foot.point, q)[2] - foot.radius for foot in own)
+    return q
+
+
+def _link_inertia(mass: float, length: float, ahead: float) -> Inertia:
+    """A solid box from the joint on, ahead (1) or behind (−1)."""
+    across = mass * (length**2 + BOX_WIDTH**2) / 12.0
+    tensor = np.diag([mass * BOX_WIDTH**2 / 6.0, across, across])
+    return Inertia(float(mass), np.array([0.5 * ahead * length, 0.0, 0.0]), tensor)
+
+
+def lifted_moments(robot: SnakeTree, lifted: NDArray[np.bool_]) -> Array:
+    """Moments of weight at the pitch joints of lifted pairs, (pairs − 1,) [N m], as if the base part was straight.
+
+    Between two pairs on the ground the base part is taken as simply supported there, behind the last one as a
+    cantilever. Positive ones sink what is behind the joint.
+    """
+    d = robot.description
+    n, l, g = d.pairs, d.link_length, float(-robot.gravity[2])
+    # Weight of the plate behind each axle: the two links between it and the next one.
+    weight = g * np.array(
+        [d.link_mass[d.head_joints + 2 * k] + d.link_mass[d.head_joints + 2 * k + 1] for k in range(n - 1)]
+    )
+    moments = np.zeros(n - 1)
+    down = np.flatnonzero(~lifted)
+    for first, last in zip(down, [*down[1:], n], strict=True):
+        count = last - first
+        if last == n:  # the tail, behind the last pair on the ground
+            for k in range(first, n - 1):
+                moments[k] = sum(weight[i] * l * (2 * (i - k) + 1) for i in range(k, n - 1))
+        elif count > 1:
+            plates = weight[first:last]
+            reaction = sum(plates[i] * (2 * (count - i) - 1) for i in range(count)) / (2 * count)
+            for k in range(1, count):
+                moments[first + k] = -(reaction * 2 * l * k - sum(plates[i] * l * (2 * (k - i) - 1) for i in range(k)))
+    return moments

@@ -1,0 +1,261 @@
+"""The coupled system about a state as linear equations, with its contacts as they are.
+
+    δẋ = A δx + B δu,   δy = C δx + D δu,   x = (q, v, i)
+
+Bodies, motors with their controller, loads and active constraints are one right-hand side; contact modes stay those of
+the instant, so the equations hold until the next event. Constraints are part of A at the level of accelerations: each
+row that is held adds two eigenvalues at zero, along motions off the surface, which the simulation does not make.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynsim.dynamics import state as kst
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.derivative import derivative
+from dynsim.dynamics.drive.law import asked_of
+from dynsim.dynamics.state import block
+from dynsim.dynamics.tree import loads as kl
+from dynsim.engine.attended import copied
+from dynsim.engine.prepare import Prepared
+from dynsim.errors import ScenarioError, brief
+from dynsim.integrators import run as ki
+from dynsim.integrators.output import fill_output
+
+Array = NDArray[np.float64]
+# Steps of the differences [rad, m, rad/s, A, …]: from where rounding is least to below what friction is smoothed over.
+STEPS = tuple(1e-2 / 3.0**k for k in range(9))
+# Rows whose largest entry is below this are zero but for rounding [SI units].
+NOTHING = 1e-6
+MODES = {ka.OPEN: "open", ka.SLIDING: "sliding", ka.STICKING: "sticking"}
+INPUTS = ("command", "reference", "reference_rate", "force", "torque")
+OUTPUTS = (
+    "q", "v", "current", "vdot", "voltage", "motor_torque", "hand_position",
+    "contact_normal_force", "contact_force", "contact_gap",
+)  # fmt: skip
+_AXES = "xyz"
+
+
+@dataclass(frozen=True)
+class Linearization:
+    """Linear equations about a state; ``A, B, C, D = linearization`` takes the matrices.
+
+    Attributes
+    ----------
+    A, B, C, D : (x, x), (x, u), (y, x), (y, u)
+    states, inputs, outputs : names of rows and columns
+    time : [s]
+    x, xdot : (x,) the state, that of a step which ends there, and its rate, which is zero at rest alone
+    modes : of each contact point: open, sliding or sticking; of the bilateral law all slide
+    error : largest difference between two estimates of an entry, in parts of the largest entry of its row
+    """
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    time: float
+    x: Array
+    xdot: Array
+    modes: dict[str, str] = field(default_factory=dict)
+    error: float = 0.0
+
+    def __iter__(self) -> Iterator[Array]:
+        return iter((self.A, self.B, self.C, self.D))
+
+
+def linearized(prepared: Prepared, inputs: Sequence[str], outputs: Sequence[str]) -> Linearization:
+    """Linearize a run at the state and time that it stands at, see :meth:`dynsim.Simulation.linearize`."""
+    frozen = _Frozen(prepared)
+    entries = _chosen("input", inputs, frozen.inputs())
+    columns = _chosen("output", outputs, frozen.outputs())
+    read = np.array(list(columns.values()), dtype=int)
+    n, x = len(frozen.x), frozen.x
+    by_x, error_x = _jacobian(lambda d: frozen.rate_and_output(x + d, read), n)
+    parts = [_jacobian(partial(_along, entry, read), 1) for entry in entries.values()]
+    by_u = np.hstack([np.zeros((n + len(read), 0)), *(part for part, _ in parts)])
+    robot = prepared.model.robot
+    circuits = [m.joint for a, m in enumerate(robot.motors) if prepared.system.drives.table[a, ka.CIRCUIT] >= 0]
+    names = [("q", robot.position_names), ("v", robot.joint_names), ("current", circuits)]
+    return Linearization(
+        A=by_x[:n],
+        B=by_u[:n],
+        C=by_x[n:],
+        D=by_u[n:],
+        states=tuple(f"{kind}.{label}" for kind, labels in names for label in labels),
+        inputs=tuple(entries),
+        outputs=tuple(columns),
+        time=frozen.time,
+        x=x,
+        xdot=frozen.rate_and_output(x, read)[:n],
+        modes={
+            contact.name: MODES[int(prepared.workspace.active[k, ka.MODE])]
+            for k, contact in enumerate(prepared.contacts)
+        },
+        error=max([error_x, *(error for _, error in parts)]),
+    )
+
+
+def _along(entry: Callable[[float, NDArray[Any]], Array], read: NDArray[Any], amount: Array) -> Array:
+    return entry(float(amount[0]), read)
+
+
+class _Frozen:
+    """The right-hand side of a run at its instant, with the modes of its contacts, and its outputs."""
+
+    def __init__(self, prepared: Prepared) -> None:
+        self._prepared = prepared
+        run = prepared.run
+        self.time = float(run.clock[ki.TIME])
+        self._system, self._workspace, self._y = copied(prepared.system), copied(prepared.workspace), run.y.copy()
+        self.x = self._y[: run.layout.tracked].copy()
+        self._evaluate(self.x, self._system)
+        drives, reference = self._system.drives, self._system.reference
+        motors = range(len(drives.table))
+        self._asked = [float(asked_of(drives, reference, self.time, self._latest, a)) for a in motors]
+        self._references = self._latest.motors[:, [ka.Q_REF, ka.V_REF]].copy()
+
+    def rate_and_output(self, x: Array, read: NDArray[Any], system: Any = None) -> Array:
+        """dx/dt, then the recorded columns and states that ``read`` names."""
+        dy = self._evaluate(x, self._system if system is None else system)
+        if not len(read):
+            return dy
+        run = self._prepared.run
+        out = np.zeros(run.columns.size)
+        fill_output(self._system if system is None else system, self._latest, run, out)
+        return np.concatenate([dy, np.concatenate([x, out])[read]])
+
+    def _evaluate(self, x: Array, system: Any) -> Array:
+        y, dy = self._y.copy(), np.zeros(len(self._y))
+        y[: len(x)] = x
+        # Signs of friction, anchors and counts belong to the instant.
+        self._latest = copied(self._workspace)
+        derivative(system, self.time, y, self._latest, dy)
+        return dy[: len(x)]
+
+    def inputs(self) -> dict[str, dict[str, Callable[[float, NDArray[Any]], Array]]]:
+        """What can be moved, by family and label: functions of the amount and of what is read."""
+        joints = [motor.joint for motor in self._prepared.model.robot.motors]
+        bodies = self._prepared.model.robot.bodies
+        first = len(self._prepared.loads) - len(bodies)
+
+        def moved(change: Callable[[Any, float], None]) -> Callable[[float, NDArray[Any]], Array]:
+            def at(amount: float, read: NDArray[Any]) -> Array:
+                system = copied(self._system)
+                change(system, amount)
+                return self.rate_and_output(self.x, read, system)
+
+            return at
+
+        def command(a: int) -> Callable[[Any, float], None]:
+            def change(system: Any, amount: float) -> None:
+                system.drives.table[a, ka.SAMPLED] = ka.GIVEN
+                system.drives.input[a, ka.COMMAND] = self._asked[a] + amount
+
+            return change
+
+        def reference(a: int, rate: int) -> Callable[[Any, float], None]:
+            def change(system: Any, amount: float) -> None:
+                line = self._references[a].copy()
+                line[rate] += amount
+                system.reference.spline[a] = ka.REWRITTEN
+                system.drives.input[a, [ka.LINE_START, ka.LINE_RATE, ka.LINE_SINCE]] = *line, self.time
+
+            return change
+
+        def push(k: int, component: int) -> Callable[[Any, float], None]:
+            def change(system: Any, amount: float) -> None:
+                start = system.loads.table[first + k, kl.DATA]
+                system.loads.data[start + kl.WRENCH + component] += amount
+
+            return change
+
+        motors = list(enumerate(joints))
+        pushes = [(k, body, axis) for k, body in enumerate(bodies) for axis in range(3)]
+        return {
+            "command": {joint: moved(command(a)) for a, joint in motors},
+            "reference": {joint: moved(reference(a, 0)) for a, joint in motors},
+            "reference_rate": {joint: moved(reference(a, 1)) for a, joint in motors},
+            "force": {f"{body}.{_AXES[axis]}": moved(push(k, axis)) for k, body, axis in pushes},
+            "torque": {f"{body}.{_AXES[axis]}": moved(push(k, 3 + axis)) for k, body, axis in pushes},
+        }
+
+    def outputs(self) -> dict[str, dict[str, int]]:
+        """What can be read, by family and label: places among the states and the recorded columns behind them."""
+        run, robot = self._prepared.run, self._prepared.model.robot
+        columns, beyond = run.columns, run.layout.tracked
+        motors = [motor.joint for motor in robot.motors]
+        contacts = [contact.name for contact in self._prepared.contacts]
+
+        def numbered(labels: Sequence[str], first: int) -> dict[str, int]:
+            return {label: first + k for k, label in enumerate(labels)}
+
+        def of_contacts(offset: int) -> dict[str, int]:
+            first = beyond + columns.contact + offset
+            return {name: first + kst.OUTPUTS_PER_CONTACT * k for k, name in enumerate(contacts)}
+
+        force = of_contacts(kst.OUT_VECTOR)
+        return {
+            "q": numbered(robot.position_names, block(run.layout, "q").start),
+            "v": numbered(robot.joint_names, block(run.layout, "v").start),
+            "current": numbered(motors, beyond + columns.current),
+            "vdot": numbered(robot.joint_names, beyond + columns.vdot),
+            "voltage": numbered(motors, beyond + columns.voltage),
+            "motor_torque": numbered(motors, beyond + columns.torque),
+            "hand_position": numbered(_AXES, beyond + columns.hand),
+            "contact_normal_force": of_contacts(kst.OUT_FORCE),
+            "contact_force": {f"{name}.{_AXES[s]}": at + s for name, at in force.items() for s in range(3)},
+            "contact_gap": of_contacts(kst.OUT_GAP),
+        }
+
+
+def _chosen(kind: str, names: Sequence[str], families: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """The entries that names stand for: all of a family, all of a body or point in it, or one."""
+    if isinstance(names, str):
+        names = (names,)
+    chosen: dict[str, Any] = {}
+    every = {f"{family}.{label}": entry for family, labels in families.items() for label, entry in labels.items()}
+    for name in names:
+        meant = {full: entry for full, entry in every.items() if full == name or full.startswith(f"{name}.")}
+        chosen |= meant
+        if not meant and name not in families:
+            near = difflib.get_close_matches(str(name), every, 1)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            raise ScenarioError(
+                f"no {kind} {brief(name)}{hint}; name a family ({', '.join(families)}) or one of it, such as "
+                f"{next(iter(every))!r}"
+            )
+    return chosen
+
+
+def _jacobian(function: Callable[[Array], Array], size: int) -> tuple[Array, float]:
+    """Derivative of a function at zero, (m, size), and how far two estimates of its entries differ.
+
+    Central differences of sixth order at several steps; of each entry the estimate that differs least from that of the
+    step before, as Ridders does. (:mod:`scipy.differentiate` goes on halving until an entry agrees in relative terms,
+    which one that is zero never does, and ends in its rounding.)
+    """
+    estimates = []
+    for step in STEPS:
+        columns = []
+        for direction in step * np.eye(size):
+            ends = [function(k * direction) - function(-k * direction) for k in (1, 2, 3)]
+            columns.append((45.0 * ends[0] - 9.0 * ends[1] + ends[2]) / (60.0 * step))
+        estimates.append(np.stack(columns, axis=1))
+    every = np.stack(estimates)
+    changes = np.abs(np.diff(every, axis=0))
+    best = changes.argmin(axis=0)[None]
+    slope, change = (np.take_along_axis(table, best, axis=0)[0] for table in (every[1:], changes))
+    largest = np.abs(slope).max(axis=1, initial=NOTHING, keepdims=True)
+    return slope, float((change / largest).max(initial=0.0))

@@ -1,0 +1,354 @@
+"""The task-space controller at the dynamic snake: called at its ticks, it tells servos and wheels what to do.
+
+At a tick: what sensors tell, the controller, modes and lifts, references. The servos of joints follow the integrated
+command, q_d(t) = φ + u (t − t_k), whatever the joints do ([T] IV.C); those of wheels the rates. Where the controller
+takes its state from:
+
+    feedforward   its own command, integrated ([T] IV.C.2)
+    estimated     encoders of the joints; x, y, γ of the head integrated ([T] IV.C.1)
+    measured      motion capture of the head ([T] V.A, Fig 7b); joints as commanded
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from dynsim.compile.model import Model
+from dynsim.compile.snake_tree import HEAD, SnakeTree
+from dynsim.engine.operator import Referenced
+from dynsim.engine.sensing import SampledSensor
+from dynsim.engine.snake_control import OBSTACLES, SnakeControl, copy_of
+from dynsim.engine.snake_record import add_task, hold_last, task_summary, task_warnings
+from dynsim.engine.snake_start import STEADY_TICKS, WheelLifter, command_angles
+from dynsim.engine.stepped import State
+from dynsim.errors import SimulationStopped
+from dynsim.model.description import Array
+from dynsim.model.drives import Servo
+from dynsim.record import Record
+from dynsim.scenario.sensors import Sensors
+from dynsim.snake import state as ss
+from dynsim.snake.description import CommandSource, TaskSpaceController
+from dynsim.snake.state import FEEDFORWARD, GIVEN, MEASURED, Schedule, SnakeTrace
+from dynsim.snake.ticks import command_tick, record_row
+
+_ROOT_COORDINATES = 7
+# How often somebody looks whether the head lies on the ground, and how long it does until the run ends [s].
+OVERLOAD_LOOK, LIES_FOR = 0.1, 0.5
+# What a snapshot keeps of the switcher and of the pilot itself: values that are replaced, and never written to.
+_SWITCHER = ("row", "switching", "next_switch", "switches", "_place")
+_OWN = (
+    "block",
+    "block_start",
+    "blocked",
+    "recovering",
+    "switch_due",
+    "_row",
+    "_added",
+    "_added_rate",
+    "_next_look",
+    "_commanded",
+    "_lies_since",
+)
+
+
+class SnakePilot(SnakeControl):
+    """The control of a snake that a simulation moves.
+
+    Parameters
+    ----------
+    model : of a :class:`~dynsim.compile.snake_tree.SnakeTree`
+    source : of the commands, instead of the controller's script
+    ticks : control periods of the run; stride : of those that are recorded
+    sensors : through which the controller sees the robot
+    """
+
+    path = None  # the target is in the record with the rest of what the controller thinks
+
+    def __init__(
+        self,
+        model: Model,
+        controller: TaskSpaceController,
+        ticks: int,
+        stride: int,
+        source: CommandSource | None = None,
+        sensors: Sensors | None = None,
+    ) -> None:
+        robot = model.robot
+        assert isinstance(robot, SnakeTree)
+        believed = controller.schedule.state_source
+        schedule = controller.schedule._replace(state_source=GIVEN if believed == MEASURED else FEEDFORWARD)
+        controller = _with_schedules(controller, schedule)
+        d = robot.description
+        chosen = controller.source if source is None else source
+        super().__init__(d, d.arrays(), controller, chosen, ticks, stride)
+        self.believed, self.tree, self.robot = believed, model, robot
+        self.period, self.rate = schedule.period, 1.0 / schedule.period
+        self._joints = _places(robot, d.joint_names)
+        self._lifter = WheelLifter(robot, controller.law.grounded[controller.fixing_row].astype(np.float64))
+        self._row = controller.fixing_row
+        self._added = self._lifter.angles(0.0, self.state.phi[d.head_joints :])
+        self._added_rate = np.zeros_like(self._added)
+        servos = {motor.joint: motor for motor in robot.motors if isinstance(motor, Servo)}
+        self._volts_per_rad = np.array([servos[joint].k_p for joint in d.joint_names])
+        self._volts = np.array([servos[joint].voltage_limit for joint in d.joint_names])
+        self._overload_ticks = max(1, round(OVERLOAD_LOOK / self.period))
+        self._lies_since: float | None = None
+        self.sensors = self._sensors(sensors or Sensors())
+        self._next_look = self._commanded = 0
+        self._seen: Any = None
+        self.read_commands(waiting=False)
+
+    @property
+    def hindrance(self) -> str:
+        """What the target waits for; empty where it does not."""
+        if self.recovering:
+            return OBSTACLES[-1]
+        return OBSTACLES[int(self.state.counts[ss.STILL_FOR]) - 1] if self.blocked else ""
+
+    def posture(self) -> tuple[Array, Array, Array]:
+        """See :meth:`SnakeControl.posture`: where the robot is, not where the controller takes it to be."""
+        if self._seen is None:
+            return super().posture()
+        q = self._seen.q
+        return self.head_pose(q), base_pose(q), q[self._joints]
+
+    def head_pose(self, q: Array) -> Array:
+        """Pose w of the controlled point at coordinates (nq,), (6,) [m, rad]."""
+        body, point = self.robot.hand
+        R, p = self.tree.body_pose(body, q)
+        return np.concatenate([p + R @ point, roll_pitch_yaw(R)])
+
+    def __call__(self, simulation: Referenced) -> None:
+        """One control period: rewrite the references for the time up to the next tick."""
+        if self.tick >= self.ticks:
+            return
+        self._seen = simulation.state
+        self._refuse_overload(simulation)
+        self._look()
+        self.begin_period()
+        state, row = self.state, self.tick // self.stride if self.tick % self.stride == 0 else -1
+        time, phi = self.time, state.phi.copy()
+        mode = int(state.counts[ss.MODE])
+        if mode != self._row:
+            self._row = mode
+            self._lifter.change(time, self.controller.law.grounded[mode].astype(np.float64))
+        self._commanded = max(self._commanded, row + 1)
+        blocked = command_tick(
+            self.model,
+            self.controller.law,
+            self.controller.schedule,
+            state,
+            self.block.velocity,
+            int(not self.recovering),
+            int(self.controller.when_blocked),
+            self.rig,
+            row,
+            self.trace,
+        )
+        if not math.isfinite(float(state.phi.sum())):
+            raise self.diverged()
+        self.end_period(bool(blocked))
+        self._tell(simulation, time, phi)
+
+    def _refuse_overload(self, simulation: Referenced) -> None:
+        """Stop where the head has come to lie on the ground because a servo can do no more."""
+        if self.tick % self._overload_ticks:
+            return
+        touch, overloaded = simulation.touching.get(HEAD), list[str]()
+        if touch is not None and touch.force > 0.0:
+            off = self._volts_per_rad * (self.state.phi - self._seen.q[self._joints])
+            names = self.description.joint_names
+            overloaded = [names[j] for j in np.flatnonzero(np.abs(off) >= self._volts)]
+        if not overloaded:
+            self._lies_since = None
+        elif self._lies_since is None:
+            self._lies_since = self.time
+        elif self.time - self._lies_since >= LIES_FOR:
+            raise SimulationStopped(
+                f"too_heavy: the head lies on the ground from t = {self._lies_since:g} s on, "
+                f"{', '.join(overloaded)} at the limit of its voltage",
+                time=self.time,
+                state=self.postures(),
+            )
+
+    def _look(self) -> None:
+        """What the controller is told of the robot, into its beliefs."""
+        self.state.base[:] = base_pose(self._seen.q)
+        for sensor in self.sensors:
+            belief = self.state.w_hat if self.believed == ss.MEASURED else self.state.phi_hat
+            belief[:] = sensor.value(self._seen.time)
+
+    def _sensors(self, config: Sensors) -> list[SampledSensor]:
+        """What tells the controller of the robot: nothing under feedforward."""
+
+        def sensor(read: Callable[[State], Array], of: Any, noise: Array, resolution: float) -> SampledSensor:
+            period = self.period if of is None or of.rate_hz is None else 1.0 / of.rate_hz
+            delay = 0.0 if of is None else of.delay_s
+            return SampledSensor(
+                read, period=period, delay=delay, noise=noise, resolution=resolution, seed=[config.seed, self.believed]
+            )
+
+        if self.believed == ss.MEASURED:
+            capture = config.motion_capture
+            noise = np.zeros(6)
+            if capture is not None:
+                noise[:3], noise[3:] = capture.position_noise_m, capture.attitude_noise_rad
+            return [sensor(lambda state: self.head_pose(state.q), capture, noise, 0.0)]
+        if self.believed == ss.ESTIMATED:
+            encoders = config.encoders
+            deg = np.zeros(2) if encoders is None else np.radians([encoders.noise_deg, encoders.resolution_deg])
+            noise = np.full(len(self._joints), deg[0])
+            return [sensor(lambda state: state.q[self._joints], encoders, noise, float(deg[1]))]
+        return []
+
+    def _tell(self, simulation: Referenced, time: float, phi: Array) -> None:
+        """References of joints and wheels from the tick at ``time`` on, at which joints are told ``phi``."""
+        rates, joints = self.rig.work.u, len(phi)
+        self._lift(time)
+        at, rate = (
+            command_angles(self.robot, angles, added)
+            for angles, added in ((phi, self._added), (rates[:joints], self._added_rate))
+        )
+        lines = {joint: (angle, rate[joint]) for joint, angle in at.items()}
+        wheels = zip(self.robot.wheel_joints, rates[joints:].tolist(), strict=True)
+        lines |= {joint: (0.0, turning) for joint, turning in wheels}
+        simulation.set_references(lines)
+        self._added = self._added + self.period * self._added_rate
+
+    def _lift(self, time: float) -> None:
+        """Rates at which lifting moves the pitch joints: every tick while heights change, else now and then."""
+        now = self.tick  # of the tick that has just been commanded
+        if now < self._next_look and not self._lifter.moving(time):
+            return
+        ticks = 1 if self._lifter.moving(time) else STEADY_TICKS
+        span = ticks * self.period
+        # Yaw angles go on at their rates until the next look.
+        head, joints = self.description.head_joints, len(self.state.phi)
+        yaw = self.state.phi[head:] + (span - self.period) * self.rig.work.u[head:joints]
+        try:
+            then = self._lifter.angles(time + span, yaw)
+        except ArithmeticError:
+            raise SimulationStopped(
+                f"too_far: no pitch angles lift the wheel pairs of mode {self.mode} at t = {time:g} s: the base part "
+                "is bent too much",
+                time=time,
+                state=self.postures(),
+            ) from None
+        self._added_rate = (then - self._added) / span
+        self._next_look = now + ticks
+
+    def remembered(self) -> dict[str, Any]:
+        """What the future depends on, and what was recorded."""
+        switcher = self.switcher
+        return {
+            "state": copy_of(self.state),
+            "trace": [array[: self._commanded].copy() for array in self.trace],
+            "gripper": self.gripper.copy(),
+            "lifter": self._lifter.state(),
+            "sensors": [sensor.remembered() for sensor in self.sensors],
+            "switcher": {name: getattr(switcher, name) for name in _SWITCHER} | {"refusals": list(switcher.refusals)},
+            "own": {name: getattr(self, name) for name in _OWN},
+        }
+
+    def restore(self, kept: dict[str, Any]) -> None:
+        """Go back to what :meth:`remembered` gave."""
+        for mine, array in zip(self.state, kept["state"], strict=True):
+            mine[...] = array
+        for mine, array in zip(self.trace, kept["trace"], strict=True):
+            mine[: len(array)] = array
+        self.gripper[...] = kept["gripper"]
+        self._lifter.restore(kept["lifter"])
+        for sensor, part in zip(self.sensors, kept["sensors"], strict=True):
+            sensor.restore(part)
+        for name, value in kept["switcher"].items():
+            setattr(self.switcher, name, list(value) if name == "refusals" else value)
+        for name, value in kept["own"].items():
+            setattr(self, name, value)
+
+    def add_to(self, record: Record) -> None:
+        """Signals and summary of the control, and of the snake as such: joints and wheels by their columns."""
+        rows, q, v = len(record), record["q"], record["v"]
+        if rows == 0:
+            return
+        ticks = np.rint(record.time / self.period).astype(int) // self.stride
+        d, law, model = self.description, self.controller.law, self.model
+        trace = SnakeTrace(*(array[ticks] for array in self.trace))
+        commanded = trace.phi.copy()
+        trace.base[:], trace.phi[:] = base_pose(q), q[:, self._joints]
+        trace.rho[:] = q[:, _places(self.robot, self.robot.wheel_joints)]
+        if ticks[-1] >= self._commanded:
+            trace.mode[-1], trace.w_target[-1] = self.state.counts[ss.MODE], self.state.w_target
+            commanded[-1], trace.w_hat[-1] = self.state.phi, self.state.w_hat
+        hold_last(trace)
+        w, points, shown = np.zeros((rows, 6)), [], copy_of(self.state)
+        for r in range(rows):
+            shown.base[:], shown.phi[:], shown.w_target[:] = trace.base[r], trace.phi[r], trace.w_target[r]
+            shown.rho[:], shown.counts[ss.MODE] = trace.rho[r], trace.mode[r]
+            record_row(model, law, shown, self.rig, r, trace)
+            w[r] = self.head_pose(q[r])
+            points.append(self._polyline(q[r]))
+        slip = np.linalg.norm(record["contact_slip_velocity"], axis=2)
+        trace.slip[:] = np.where(record["contact_normal_force"] > 0.0, slip, 0.0).max(axis=1)
+        rate = dict(zip(record.labels["v"], v.T, strict=True))
+        names, columns, add = d.joint_names, len(d.joint_names), record.add
+        add("phi", trace.phi, "rad", labels=names, description="joint angles, head to tail")
+        add("rho", trace.rho, "rad", labels=d.wheel_names, description="angles of the active wheels")
+        rates = np.stack([rate[joint] for joint in names], axis=1)
+        add("phi_dot", rates, "rad/s", labels=names, description="joint rates")
+        rates = np.stack([rate[joint] for joint in self.robot.wheel_joints], axis=1)
+        add("rho_dot", rates, "rad/s", labels=d.wheel_names, description="rates of the active wheels")
+        text = "joint angles that servos are commanded, without lifting"
+        add("phi_command", commanded, "rad", labels=names, description=text)
+        text = "rates held from this time on, as commanded"
+        add("phi_dot_command", trace.u[:, :columns], "rad/s", labels=names, description=f"joint {text}")
+        add("rho_dot_command", trace.u[:, columns:], "rad/s", labels=d.wheel_names, description=f"wheel {text}")
+        add_task(record, self, trace, w, np.array(points))
+        summary, own = record.summary, task_summary(self, record)
+        record.summary = {**summary, **own, "warnings": [*summary["warnings"], *task_warnings(self, record, own)]}
+
+    def _polyline(self, q: Array) -> Array:
+        """Controlled point, joints and axles to the tail at coordinates (nq,), (points, 3) [m]."""
+        robot, d = self.robot, self.description
+        origins = self.tree.joint_positions(q)
+        index = {link.joint: k for k, link in enumerate(robot.links)}
+        chain = list(d.joint_names[: d.head_joints + 1])
+        for k in range(1, d.base_joints):
+            chain += [robot.lifting_joints[k], d.joint_names[d.head_joints + k]]
+        tail = self.tree.point_position(f"pair{d.pairs}", [-d.link_length, 0.0, 0.0], q)
+        return np.vstack([origins[-1], origins[[index[joint] for joint in chain]], tail])
+
+
+def _with_schedules(controller: TaskSpaceController, schedule: Schedule) -> TaskSpaceController:
+    # A predicted period goes on from what is believed now, as feedforward does.
+    return replace(controller, schedule=schedule, prediction=controller.prediction._replace(state_source=FEEDFORWARD))
+
+
+def _places(robot: SnakeTree, joints: tuple[str, ...]) -> Array:
+    """Where coordinates of joints are in q."""
+    places = dict(zip(robot.joint_names, robot.position_index, strict=True))
+    return np.array([places[joint] for joint in joints])
+
+
+def base_pose(q: Array) -> Array:
+    """x, y [m] of wheel pair 1 and yaw [rad] of the base part at coordinates (…, nq) of the tree, (…, 3)."""
+    w, x, y, z = np.moveaxis(q[..., 3:_ROOT_COORDINATES], -1, 0)
+    # Of the axle, e_y of the root: it stays level where the body behind it is tilted.
+    yaw = np.arctan2(-2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z))
+    return np.stack([q[..., 0], q[..., 1], yaw], axis=-1)
+
+
+def roll_pitch_yaw(R: Array) -> Array:
+    """α, β, γ of R = Rz(γ) Ry(β) Rx(α), (…, 3, 3) → (…, 3) [rad]."""
+    return np.stack(
+        [
+            np.arctan2(R[..., 2, 1], R[..., 2, 2]),
+            np.arctan2(-R[..., 2, 0], np.hypot(R[..., 2, 1], R[..., 2, 2])),
+            np.arctan2(R[..., 1, 0], R[..., 0, 0]),
+        ],
+        axis=-1,
+    )

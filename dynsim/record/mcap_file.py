@@ -1,0 +1,174 @@
+"""A record as an MCAP file of ROS 2 messages, which rosbag2, Foxglove, PlotJuggler and RViz read; needs no ROS.
+
+Topics: ``/joint_states``, ``/tf`` and ``/tf_static`` (each body in the frame of the one that carries it, the root is
+``world``), ``/robot_description`` (see :mod:`dynsim.record.urdf_text`), and ``/contacts/NAME`` for each contact point:
+the force of its surface on it, in a frame ``contact_NAME`` that moves with the point and keeps the axes of the world.
+"""
+
+from __future__ import annotations
+
+import importlib
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynsim._version import __version__
+from dynsim.errors import RecordError
+from dynsim.record.joint_motion import joint_motion
+from dynsim.record.poses import point_positions, relative_pose
+from dynsim.record.record import Record
+from dynsim.record.scene import WORLD
+from dynsim.record.urdf_text import WORLD_LINK, scene_urdf
+from dynsim.system.files import replacing
+
+Array = NDArray[np.float64]
+# Who subscribes later gets the last message too, as ROS 2 has it for descriptions and static frames.
+_LATCHED = (
+    "- history: 1\n  depth: 1\n  reliability: 1\n  durability: 1\n  deadline: {sec: 2147483647, nsec: 4294967295}\n"
+    "  lifespan: {sec: 2147483647, nsec: 4294967295}\n  liveliness: 1\n"
+    "  liveliness_lease_duration: {sec: 2147483647, nsec: 4294967295}\n  avoid_ros_namespace_conventions: false\n"
+)
+
+
+def write_mcap(record: Record, path: Path) -> Path:
+    """Write joint states, frames, contact forces and the robot's description at all samples of a record.
+
+    Time zero is the record's first sample. ``effort`` is the torque at the joint, NaN where there is no motor.
+
+    Raises
+    ------
+    RecordError
+        The packages for it are not installed, no joint motion in the record, or the file cannot be written.
+    """
+    # Optional, and a second to import.
+    try:
+        writer_module = importlib.import_module("mcap.writer")
+        typesys = importlib.import_module("rosbags.typesys")
+    except ImportError as error:
+        raise RecordError(f"MCAP files need mcap and rosbags: pip install 'dynsim[ros]' ({error})") from error
+    with replacing(path) as stream:
+        bag = _Bag(writer_module.Writer(stream), typesys.get_typestore(typesys.Stores.ROS2_JAZZY))
+        bag.writer.start(profile="ros2", library=f"dynsim {__version__}")
+        for time, topic, kind, message in sorted(_messages(record, bag), key=lambda entry: entry[0]):
+            bag.write(time, topic, kind, message)
+        bag.writer.finish()
+    return path
+
+
+class _Bag:
+    """Messages by the names of their types, and the channels that they were written to."""
+
+    def __init__(self, writer: Any, types: Any) -> None:
+        self.writer, self._types = writer, types
+        self._channels: dict[str, int] = {}
+
+    def make(self, kind: str, **fields: Any) -> Any:
+        return self._types.types[kind](**fields)
+
+    def time(self, nanoseconds: int) -> Any:
+        seconds, nanosec = divmod(nanoseconds, 1_000_000_000)
+        return self.make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanosec)
+
+    def header(self, nanoseconds: int, frame: str) -> Any:
+        return self.make("std_msgs/msg/Header", stamp=self.time(nanoseconds), frame_id=frame)
+
+    def write(self, time: int, topic: str, kind: str, message: Any) -> None:
+        if topic not in self._channels:
+            text, _ = self._types.generate_msgdef(kind, ros_version=2)
+            schema = self.writer.register_schema(name=kind, encoding="ros2msg", data=text.encode())
+            latched = {"offered_qos_profiles": _LATCHED} if topic in ("/robot_description", "/tf_static") else {}
+            self._channels[topic] = self.writer.register_channel(
+                topic=topic, message_encoding="cdr", schema_id=schema, metadata=latched
+            )
+        data = bytes(self._types.serialize_cdr(message, kind))
+        self.writer.add_message(channel_id=self._channels[topic], log_time=time, publish_time=time, data=data)
+
+
+def _messages(record: Record, bag: _Bag) -> list[tuple[int, str, str, Any]]:
+    """All messages: time [ns], topic, type, content."""
+    joints, time, position, velocity = joint_motion(record)
+    stamps = np.rint(time * 1e9).astype(np.int64).tolist()
+    effort = np.zeros((len(time), 0))
+    if "torque" in record:
+        torque = dict(zip(record.labels["torque"], record["torque"].T, strict=True))
+        missing = np.full(len(time), np.nan)
+        effort = np.stack([torque.get(joint, missing) for joint in joints], axis=1)
+    kind = "sensor_msgs/msg/JointState"
+    messages: list[tuple[int, str, str, Any]] = []
+    for k, stamp in enumerate(stamps):
+        state = bag.make(
+            kind,
+            header=bag.header(stamp, ""),
+            name=joints,
+            position=np.ascontiguousarray(position[k]),
+            velocity=np.ascontiguousarray(velocity[k]),
+            effort=np.ascontiguousarray(effort[k]),
+        )
+        messages.append((stamp, "/joint_states", kind, state))
+    return messages + _frames(record, bag, stamps) + _forces(record, bag, stamps)
+
+
+def _frames(record: Record, bag: _Bag, stamps: list[int]) -> list[tuple[int, str, str, Any]]:
+    """The description, and frames of bodies and contact points; nothing without a scene."""
+    scene = record.scene
+    if scene is None or not scene.bodies:
+        return []
+    robot = str(record.provenance.get("scenario", {}).get("name", "robot"))
+    text = "std_msgs/msg/String"
+    first = stamps[0]
+    messages = [(first, "/robot_description", text, bag.make(text, data=scene_urdf(scene, robot)))]
+    kind = "tf2_msgs/msg/TFMessage"
+    moving: list[tuple[str, str, Array, Array]] = []
+    fixed = []
+    for body in scene.bodies:
+        parent = WORLD_LINK if body.parent == WORLD else scene.bodies[body.parent].name
+        p, q = relative_pose(record, body)
+        if body.joint.kind == "fixed":
+            fixed.append(_transform(bag, first, parent, body.name, p[:, 0], q[:, 0]))
+        else:
+            moving.append((parent, body.name, p, q))
+    unturned = np.array([1.0, 0.0, 0.0, 0.0])
+    for point in scene.contacts if "body_position" in record else ():
+        at = point_positions(record, point).T
+        turn = np.broadcast_to(unturned[:, None], (4, len(stamps)))
+        moving.append((WORLD_LINK, f"contact_{point.name}", at, turn))
+    if fixed:
+        messages.append((first, "/tf_static", kind, bag.make(kind, transforms=fixed)))
+    for k, stamp in enumerate(stamps):
+        transforms = [_transform(bag, stamp, parent, child, p[:, k], q[:, k]) for parent, child, p, q in moving]
+        messages.append((stamp, "/tf", kind, bag.make(kind, transforms=transforms)))
+    return messages
+
+
+def _transform(bag: _Bag, stamp: int, parent: str, child: str, p: Array, q: Array) -> Any:
+    x, y, z = p.tolist()
+    w, i, j, k = q.tolist()
+    return bag.make(
+        "geometry_msgs/msg/TransformStamped",
+        header=bag.header(stamp, parent),
+        child_frame_id=child,
+        transform=bag.make(
+            "geometry_msgs/msg/Transform",
+            translation=bag.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
+            rotation=bag.make("geometry_msgs/msg/Quaternion", x=i, y=j, z=k, w=w),
+        ),
+    )
+
+
+def _forces(record: Record, bag: _Bag, stamps: list[int]) -> list[tuple[int, str, str, Any]]:
+    """Contact forces as wrenches."""
+    if "contact_force" not in record:
+        return []
+    kind, vector = "geometry_msgs/msg/WrenchStamped", "geometry_msgs/msg/Vector3"
+    nothing = bag.make(vector, x=0.0, y=0.0, z=0.0)
+    messages = []
+    for label, forces in zip(record.labels["contact_force"], record["contact_force"].swapaxes(0, 1), strict=True):
+        topic = f"/contacts/{re.sub(r'[^A-Za-z0-9_]', '_', label)}"
+        for stamp, (x, y, z) in zip(stamps, forces.tolist(), strict=True):
+            wrench = bag.make("geometry_msgs/msg/Wrench", force=bag.make(vector, x=x, y=y, z=z), torque=nothing)
+            message = bag.make(kind, header=bag.header(stamp, f"contact_{label}"), wrench=wrench)
+            messages.append((stamp, topic, kind, message))
+    return messages

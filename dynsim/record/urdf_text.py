@@ -1,0 +1,126 @@
+"""URDF of what a scene shows: links, joints and shapes; and the elements that other writers of URDF share."""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynsim.record.quaternion import rotated
+from dynsim.record.scene import WORLD, Scene, Shape
+
+Array = NDArray[np.float64]
+Element = ElementTree.Element
+WORLD_LINK = "world"
+# URDF has no ball joint; programs that draw place such bodies by their frames.
+_KINDS = {"ball": "floating"}
+# Of a joint without a limit [rad or m, N m or N, rad/s or m/s]: URDF wants numbers.
+_UNLIMITED = 1e9
+
+
+def scene_urdf(scene: Scene, name: str) -> str:
+    """Write the bodies of a scene as URDF text: joints, limits and shapes, without masses.
+
+    Link names are those of the bodies, the root is ``world``. It is what a viewer of ROS draws
+    (``robot_description``); ``dynsim export SCENARIO --format urdf`` writes masses too.
+    """
+    root = Element("robot", name=name)
+    names = [body.name for body in scene.bodies]
+    add_shapes(ElementTree.SubElement(root, "link", name=WORLD_LINK), scene.fixed)
+    for body in scene.bodies:
+        add_shapes(ElementTree.SubElement(root, "link", name=body.name), body.shapes)
+    for body in scene.bodies:
+        joint = body.joint
+        limited = joint.lower is not None and joint.upper is not None
+        kind = _KINDS.get(joint.kind, joint.kind)
+        if kind == "revolute" and not limited:
+            kind = "continuous"
+        element = ElementTree.SubElement(root, "joint", name=joint.name, type=kind)
+        parent = WORLD_LINK if body.parent == WORLD else names[body.parent]
+        connect(element, parent, body.name, joint.position, rotation(joint.orientation))
+        if kind in ("revolute", "continuous", "prismatic", "planar"):
+            ElementTree.SubElement(element, "axis", xyz=numbers(joint.axis))
+        if kind in ("revolute", "prismatic"):
+            lower, upper = (joint.lower, joint.upper) if limited else (-_UNLIMITED, _UNLIMITED)
+            far = numbers(_UNLIMITED)
+            ElementTree.SubElement(
+                element, "limit", lower=numbers(lower), upper=numbers(upper), effort=far, velocity=far
+            )
+    return xml_text(root)
+
+
+def add_shapes(link: Element, shapes: Sequence[Shape]) -> None:
+    """Add the ``visual`` elements of shapes to a link; a capsule is a cylinder and two spheres, as URDF has none."""
+    for shape in _simple(shapes):
+        visual = ElementTree.SubElement(link, "visual")
+        R = rotation(shape.orientation)
+        ElementTree.SubElement(visual, "origin", xyz=numbers(shape.position), rpy=numbers(roll_pitch_yaw(R)))
+        geometry = ElementTree.SubElement(visual, "geometry")
+        match shape.kind:
+            case "box":
+                ElementTree.SubElement(geometry, "box", size=numbers(shape.size))
+            case "sphere":
+                ElementTree.SubElement(geometry, "sphere", radius=numbers(shape.size[0]))
+            case "cylinder":
+                radius, length = shape.size
+                ElementTree.SubElement(geometry, "cylinder", radius=numbers(radius), length=numbers(length))
+            case "mesh":
+                ElementTree.SubElement(geometry, "mesh", filename=shape.file, scale=numbers(shape.size))
+        if shape.colour is not None:
+            material = ElementTree.SubElement(visual, "material", name=f"rgba {numbers(shape.colour)}")
+            ElementTree.SubElement(material, "color", rgba=numbers(shape.colour))
+
+
+def _simple(shapes: Sequence[Shape]) -> list[Shape]:
+    """Shapes with capsules taken apart."""
+    simple: list[Shape] = []
+    for shape in shapes:
+        if shape.kind != "capsule":
+            simple.append(shape)
+            continue
+        radius, length = shape.size
+        ends = [
+            Shape("sphere", (radius,), (0.0, 0.0, end), colour=shape.colour).placed(shape.position, shape.orientation)
+            for end in (-0.5 * length, 0.5 * length)
+        ]
+        simple += [Shape("cylinder", shape.size, shape.position, shape.orientation, colour=shape.colour), *ends]
+    return simple
+
+
+def connect(joint: Element, parent: str, child: str, position: Any, rotation: Array) -> None:
+    """Add parent, child and placement to a joint."""
+    ElementTree.SubElement(joint, "parent", link=parent)
+    ElementTree.SubElement(joint, "child", link=child)
+    ElementTree.SubElement(joint, "origin", xyz=numbers(position), rpy=numbers(roll_pitch_yaw(rotation)))
+
+
+def rotation(orientation: Any) -> Array:
+    """The matrix of a unit quaternion, (3, 3)."""
+    return rotated(np.array(orientation, dtype=np.float64), np.eye(3))
+
+
+def roll_pitch_yaw(R: Array) -> Array:
+    """Angles of R = Rz(yaw) Ry(pitch) Rx(roll) [rad], accurate at pitch = ±90° too.
+
+    There roll and yaw are not unique: whatever yaw rounding gives, roll is taken from what is left after undoing it.
+    """
+    yaw = math.atan2(R[1, 0], R[0, 0])
+    c, s = math.cos(yaw), math.sin(yaw)
+    pitch = math.atan2(-R[2, 0], c * R[0, 0] + s * R[1, 0])
+    roll = math.atan2(s * R[0, 2] - c * R[1, 2], c * R[1, 1] - s * R[0, 1])
+    return np.array([roll, pitch, yaw])
+
+
+def numbers(values: Any) -> str:
+    """Numbers in their shortest form that reads back to the same double."""
+    return " ".join(repr(float(x)) for x in np.atleast_1d(values))
+
+
+def xml_text(root: Element) -> str:
+    """The document of an element, indented."""
+    ElementTree.indent(root)
+    return '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"

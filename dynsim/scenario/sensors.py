@@ -1,0 +1,45 @@
+"""The ``sensors:`` section of a scenario: what a sampled controller is told, how often, how late, how well."""
+
+from __future__ import annotations
+
+import math
+
+from pydantic import Field, StrictInt
+
+from dynsim.config.base import NonNegative, Positive, StrictConfig
+
+# Of the MX series: 4096 positions in a turn (data sheet).
+MX_RESOLUTION = math.degrees(2.0 * math.pi / 4096)
+
+
+class Sensor(StrictConfig):
+    """What all sensors have: the last sample that has arrived is held."""
+
+    rate_hz: Positive | None = Field(None, description="of its samples; default: one at every tick of the controller")
+    delay_s: NonNegative = Field(0.0, description="from a sample to its arrival")
+
+
+class Encoders(Sensor):
+    """Angles of joints."""
+
+    resolution_deg: NonNegative = Field(
+        MX_RESOLUTION, description="angles are rounded to it; default: 4096 positions in a turn, as MX servos have"
+    )
+    noise_deg: NonNegative = Field(0.0, description="standard deviation, before rounding")
+
+
+class MotionCapture(Sensor):
+    """Position and attitude of the controlled point of a snake ([T] V.A)."""
+
+    rate_hz: Positive | None = Field(100.0, description="of its samples (assumed)")
+    delay_s: NonNegative = Field(0.01, description="from a sample to its arrival (assumed)")
+    position_noise_m: NonNegative = Field(2e-4, description="standard deviation of each coordinate (assumed)")
+    attitude_noise_rad: NonNegative = Field(5e-4, description="standard deviation of each angle (assumed)")
+
+
+class Sensors(StrictConfig):
+    """Sensors of the robot; one that is not there tells the truth at once."""
+
+    seed: StrictInt = Field(0, ge=0, description="of all noise: the same seed, the same noise")
+    encoders: Encoders | None = None
+    motion_capture: MotionCapture | None = None

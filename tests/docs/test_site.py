@@ -1,0 +1,122 @@
+"""The site builds without a warning, asks the network for nothing, and looks right to a browser on desk and phone."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote, urlsplit
+
+import pytest
+
+import dynsim
+from dynsim.scenario import ScenarioConfig
+from dynsim.system.shipped import shipped_scenarios
+
+pytest.importorskip("mkdocs")
+pytest.importorskip("material")
+pytest.importorskip("mkdocstrings")
+
+ROOT = Path(__file__).parents[2]
+OPENED = (
+    "index", "gallery", "tutorials/first-arm", "quickstart", "how-to/export", "reference/scenario-keys",
+    "reference/python", "physics", "validation", "notebooks/sweep",
+)  # fmt: skip
+
+pytestmark = pytest.mark.long
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The site as the command builds it; a warning is an error."""
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "-f", "docs/site/mkdocs.yml"]
+    package = str(Path(dynsim.__file__).parents[1])
+    environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1", "PYTHONPATH": package}
+    done = subprocess.run(
+        [*command, "-d", str(folder)],
+        cwd=ROOT, capture_output=True, text=True, timeout=600, check=False, env=environment,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def test_every_link_within_the_site_leads_somewhere(site: Path) -> None:
+    broken = []
+    for page in site.rglob("*.html"):
+        if page.name == "404.html":
+            continue
+        for link in re.findall(r'(?:href|src)="([^"]+)"', page.read_text(encoding="utf-8")):
+            parts = urlsplit(link)
+            if parts.scheme or not parts.path:
+                continue
+            if not (page.parent / unquote(parts.path)).resolve().exists():
+                broken.append((str(page.relative_to(site)), link))
+    assert broken == []
+
+
+def test_the_reference_has_every_command_and_every_key(site: Path) -> None:
+    commands = (site / "reference" / "commands.html").read_text(encoding="utf-8")
+    for name in ("run", "compare", "plan", "sweep", "export", "hw replay", "hw calibrate"):
+        assert f"<code>dynsim {name}</code>" in commands, name
+    keys = (site / "reference" / "scenario-keys.html").read_text(encoding="utf-8")
+    for name in ScenarioConfig.model_fields:
+        assert f"<code>{name}</code>" in keys, name
+    gallery = (site / "gallery.html").read_text(encoding="utf-8")
+    for file in shipped_scenarios():
+        assert f'id="{file.stem}"' in gallery
+
+
+@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
+@pytest.mark.parametrize("size", [(1280, 800), (390, 844)], ids=["desk", "phone"])
+def test_a_browser_without_a_network_shows_pages(browser: Any, site: Path, size: tuple[int, int], dark: bool) -> None:
+    """No error in the console, nothing asked for from elsewhere, no page wider than the screen."""
+    width, height = size
+    context = browser.new_context(
+        viewport={"width": width, "height": height}, offline=True, color_scheme="dark" if dark else "light"
+    )
+    complaints: list[str] = []
+    requests: list[str] = []
+    page = context.new_page()
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
+    page.on("request", lambda request: requests.append(request.url))
+    pictures = os.environ.get("DYNSIM_SCREENSHOTS")
+    for name in OPENED:
+        page.goto((site / f"{name}.html").as_uri())
+        scheme = page.evaluate("document.body.getAttribute('data-md-color-scheme')")
+        assert scheme == ("slate" if dark else "default")
+        assert page.evaluate("document.documentElement.scrollWidth") <= width, name
+        if pictures:
+            page.screenshot(path=str(Path(pictures, f"{name.replace('/', '_')}_{width}_{scheme}.png")))
+    assert complaints == []
+    assert [url for url in requests if not url.startswith(("file:", "data:", "blob:", "about:"))] == []
+    context.close()
+
+
+def test_search_finds_a_page_from_the_disk(browser: Any, site: Path) -> None:
+    context = browser.new_context(viewport={"width": 1280, "height": 800}, offline=True)
+    page = context.new_page()
+    page.goto((site / "index.html").as_uri())
+    page.fill("input.md-search__input", "joint-trajectory")
+    page.wait_for_selector(".md-search-result__link", timeout=60_000)
+    assert page.locator(".md-search-result__link").count() > 0
+    context.close()
+
+
+def test_titles_of_keys_are_those_of_families() -> None:
+    spec = importlib.util.spec_from_file_location("reference", ROOT / "docs" / "site" / "reference.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    text = module.scenario_page()
+    assert "## Plant serial_arm\n" in text
+    assert "| `duration_s` | number > 0 | required |" in text
+    # Every link of the page has its heading.
+    headings = {line[3:].lower().replace(" ", "-") for line in text.splitlines() if line.startswith("## ")}
+    assert set(re.findall(r"\]\(#([^)]+)\)", text)) <= headings

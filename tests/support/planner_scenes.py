@@ -1,0 +1,270 @@
+"""Random scenes for the planner, and the kept study of them.
+
+    PYTHONPATH=tests python -m support.planner_scenes --out results/planner
+    PYTHONPATH=tests python -m support.planner_scenes --study reference --effort 100 --out results/planner
+    PYTHONPATH=tests python -m support.planner_scenes --study gains --out results/planner
+
+The second one takes so many times as long for each search: how far the answers of the first are from the best known.
+The third one runs the best plans, and those of the published arm, on surfaces 5 mm off with gains from stiff to soft.
+
+Arms of 7 to 10 joints whose hand goes there and back along a short way, over a floor, a pipe, a box, or with a joint
+about a third axis. Nobody has tuned anything on a scene: its seed is its number.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import time as clock
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dynsim.planner.answer import plan_braces
+from dynsim.planner.dense import references
+from dynsim.planner.problem import Options, task
+from dynsim.planner.search import Search
+from dynsim.planner.verify import Tolerances, Verifier
+from dynsim.scenario import Scenario, load_scenario
+from dynsim.scenario.reading import scenario_from_resolved
+from dynsim.studies.processes import cores
+from dynsim.system.files import write_json
+
+# Of the random postures of the reference.
+OTHER_SEED = 1000
+# Of the study of gains [V/rad].
+GAINS = (500.0, 200.0, 100.0, 50.0, 20.0)
+KINDS = ("floor", "pipe", "box", "third_axis")
+PERIOD_S = 10.0
+LIMIT_DEG = [-120.0, 120.0]
+MOTOR = {
+    "type": "dc",
+    "torque_constant_N_m_per_A": 0.203,
+    "resistance_ohm": 1.1,
+    "inductance_H": 1.7e-3,
+    "rotor_inertia_kg_m2": 1.64e-4,
+    "gear_damping_N_m_s_per_rad": 0.01,
+}
+
+
+def kind_of(seed: int) -> str:
+    """What a scene has beside its arm."""
+    return KINDS[seed % 4]
+
+
+def along_of(seed: int) -> tuple[float, ...]:
+    """Shares along links that are candidates too: the middle, in every third scene."""
+    return (0.5,) if seed % 3 == 0 else ()
+
+
+def scene(seed: int) -> dict[str, Any]:
+    """The scenario of a scene as plain data."""
+    rng = np.random.default_rng(seed)
+
+    def drawn(low: float, high: float, digits: int = 3) -> float:
+        return round(float(rng.uniform(low, high)), digits)
+
+    kind, pitching = kind_of(seed), int(rng.integers(6, 10))
+    chain = [_link("z", 0.0, 0.1, 5.0)]
+    for i in range(pitching):
+        axis = "x" if kind == "third_axis" and i == pitching // 2 else "y"
+        length = drawn(0.2, 0.34)
+        chain.append(_link(axis, length, drawn(0.08, 0.2), 4.0 if i < 3 else 3.0, LIMIT_DEG))
+    payload = drawn(0.0, 0.15) if rng.random() < 0.6 else 0.0
+    height = drawn(0.0, 0.25)
+    reach, friction = sum(link["length_m"] for link in chain), drawn(0.1, 0.35, 2)
+    distance, up, azimuth = drawn(0.55, 0.8) * reach, drawn(0.25, 0.55), drawn(-0.3, 0.3)
+    way = rng.normal(size=3) * [1.0, 1.0, 0.5]
+    way = way / np.linalg.norm(way) * drawn(0.12, 0.25)
+    start = np.array([distance * np.cos(azimuth), distance * np.sin(azimuth), up])
+    end = start + way
+    if end[2] < 0.15:
+        end[2] = 2.0 * start[2] - end[2]
+    surfaces: dict[str, Any] = {"floor": {"type": "plane", "point_m": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}}
+    x = drawn(0.3, 0.55) * distance
+    if kind == "pipe":
+        point = [round(x, 3), 0.0, drawn(-0.02, 0.12)]
+        surfaces["pipe"] = {
+            "type": "cylinder",
+            "point_m": point,
+            "axis": [0.0, 1.0, 0.0],
+            "radius_m": drawn(0.06, 0.15),
+        }
+    if kind == "box":
+        center = [round(x, 3), 0.0, drawn(0.02, 0.1)]
+        edges = [drawn(0.2, 0.4), 2.0, 0.2]
+        surfaces["box"] = {"type": "box", "center_m": center, "edges_m": edges, "edge_radius_m": 0.02}
+    points = [start.round(4).tolist(), end.round(4).tolist(), start.round(4).tolist()]
+    path = {"type": "waypoints", "times_s": [0.0, 0.5 * PERIOD_S, PERIOD_S], "points_m": points}
+    loads = {}
+    if payload:
+        tip = [0.0, 0.0, chain[-1]["length_m"]]
+        loads["payload"] = {"type": "payload", "body": f"link_{len(chain)}", "point_m": tip, "mass_kg": payload}
+    return {
+        "name": f"scene_{seed}",
+        "duration_s": PERIOD_S,
+        "plant": {"type": "serial_arm", "base": {"position_m": [0.0, 0.0, height]}, "chain": chain},
+        "controller": {
+            "type": "joint_pd",
+            "hand": {"joints": [f"joint_{k + 1}" for k in range(len(chain))], "path": path},
+        },
+        "surfaces": surfaces,
+        "contacts": {"law": "unilateral", "friction": friction},
+        "loads": loads,
+    }
+
+
+def _link(axis: str, length: float, mass: float, gear: float, limit: list[float] | None = None) -> dict[str, Any]:
+    return {
+        "axis": axis,
+        "length_m": length,
+        "mass_kg": mass,
+        "damping_N_m_s_per_rad": 0.3,
+        "motor": MOTOR | {"gear_ratio": gear},
+        **({} if limit is None else {"limit_deg": limit}),
+    }
+
+
+def scene_scenario(seed: int) -> Scenario:
+    """The scene as a scenario."""
+    return scenario_from_resolved(scene(seed))
+
+
+def planned(seed: int, jobs: int) -> dict[str, Any]:
+    """The plan of a scene in numbers: heat, sets, corners, and what it cost."""
+    scenario, started = scene_scenario(seed), clock.perf_counter()
+    cpu = clock.process_time()
+    searched: list[tuple[float, float]] = []
+
+    def tell(text: str, share: float) -> None:
+        if text == "verifying" and not searched:
+            searched.append((clock.process_time() - cpu, clock.perf_counter()))
+
+    plan = plan_braces(scenario, along=along_of(seed), jobs=jobs, tell=tell)
+    ended = clock.perf_counter()
+    rows = []
+    for size in plan.sizes:
+        corners = () if size.verdict is None else size.verdict.corners
+        row = {
+            "count": size.count,
+            "braces": size.label if size.planned else None,
+            "heat_W": size.heat,
+            "least_W": min((heat for _, heat in plan.ranked[size.count]), default=math.inf),
+            "with_4_times_the_instants_W": math.nan,
+            "simulated_W": corners[0].heat_W if corners else math.nan,
+            "k_p_V_per_rad": size.k_p,
+            "survives": size.survives,
+            "reason": size.reason,
+            "rounds_that_found_it": f"{size.agreed}/{size.rounds}",
+        }
+        if size.planned is not None:
+            dense = references(plan.task, size.braces, size.planned.times, size.planned.local.Q, 4)
+            row["with_4_times_the_instants_W"] = math.nan if isinstance(dense, str) else dense.heat
+        rows.append({key: _rounded(value) for key, value in row.items()})
+    return {
+        "seed": seed,
+        "kind": kind_of(seed),
+        "joints": plan.task.arm.n,
+        "candidates": len(plan.task.candidates),
+        "friction": plan.task.friction,
+        "search_cpu_s": round(searched[0][0], 2) if searched else None,
+        "corners_wall_s": round(ended - searched[0][1], 1) if searched else None,
+        "wall_s": round(ended - started, 1),
+        "best": None if plan.best is None else plan.best.count,
+        "sizes": rows,
+    }
+
+
+def _rounded(value: Any) -> Any:
+    """Numbers to five decimals; those that are none as nothing."""
+    return value if not isinstance(value, float) else round(value, 5) if math.isfinite(value) else None
+
+
+def best_known(seed: int, effort: int) -> dict[str, Any]:
+    """Least heat of each number of braces by a search of so many times the rounds, from other random postures."""
+    options = Options(along=along_of(seed), starts=effort * Options.starts, seed=OTHER_SEED)
+    search, cpu = Search(task(scene_scenario(seed), options)), clock.process_time()
+    search.kept = 3 * search.kept
+    found = search.run()
+    sizes = [
+        {
+            "count": count,
+            "braces": ", ".join(b.label for b in ranked[0].braces) if ranked else None,
+            "heat_W": _rounded(ranked[0].heat) if ranked else None,
+        }
+        for count, ranked in found.items()
+    ]
+    return {
+        "seed": seed,
+        "effort": effort,
+        "rounds": options.starts,
+        "cpu_s": round(clock.process_time() - cpu, 1),
+        "sizes": sizes,
+    }
+
+
+def stiffness(scenario: Scenario, counts: Sequence[int], along: tuple[float, ...] = ()) -> list[dict[str, Any]]:
+    """What plans cost on surfaces that are 5 mm off, by the gain k_p of all joints that press braces.
+
+    Of each number of braces, or of the best of them where there are none, the plan of least heat.
+    """
+    plan = plan_braces(scenario, along=along, count=(min(counts, default=1), max(counts, default=3)), verify=False)
+    sizes = [size for size in plan.sizes if size.planned is not None]
+    rows = []
+    for size in sizes if counts else sizes and [min(sizes, key=lambda size: size.heat)]:
+        assert size.planned is not None
+        for k_p in GAINS:
+            tolerances = Tolerances(friction=(1.0,), gains=(k_p,))
+            (verdict,) = Verifier(plan.task, tolerances, cores()).verify([(size.braces, size.planned.dense)])
+            rows.append(
+                {
+                    "scene": scenario.title,
+                    "friction": plan.task.friction,
+                    "count": size.count,
+                    "heat_W": _rounded(size.heat),
+                    "k_p_V_per_rad": k_p,
+                    "times_the_heat": {
+                        f"{1e3 * c.shift_m:+g} mm": _rounded(c.heat_W / size.heat) for c in verdict.corners
+                    },
+                    "survives": verdict.survives,
+                    "reason": verdict.reason,
+                }
+            )
+    return rows
+
+
+def published(friction: float) -> Scenario:
+    """The published arm on its real floor."""
+    return load_scenario("pressing", overrides={"contacts.friction": friction})
+
+
+def main() -> None:
+    """Plan scenes, or search them for long, and write their numbers."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("--out", type=Path, default=Path("results/planner"), metavar="FOLDER")
+    parser.add_argument("--study", choices=("scenes", "reference", "gains"), default="scenes")
+    parser.add_argument("--effort", type=int, default=100, metavar="N", help="of the reference, times the usual rounds")
+    parser.add_argument("--scenes", type=int, nargs=2, default=(1, 20), metavar=("FIRST", "LAST"))
+    chosen = parser.parse_args()
+    first, last = chosen.scenes
+    rows = []
+    if chosen.study == "scenes":
+        # What is compiled, or loaded, is no part of a scene's time.
+        planned(first, 1)
+    for seed in range(first, last + 1):
+        if chosen.study == "gains":
+            rows += stiffness(scene_scenario(seed), (), along_of(seed))
+        else:
+            rows.append(best_known(seed, chosen.effort) if chosen.study == "reference" else planned(seed, cores()))
+        print(json.dumps(rows[-1]), flush=True)
+    if chosen.study == "gains":
+        rows += [row for friction in (0.1, 0.0) for row in stiffness(published(friction), range(1, 5))]
+    chosen.out.mkdir(parents=True, exist_ok=True)
+    write_json(chosen.out / f"{chosen.study}.json", rows)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,248 @@
+"""Linear equations of a simulation: against Pinocchio and closed forms without contacts, against differences of
+equations that are put together here from M, h and point Jacobians in every contact mode."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.linalg import expm
+from support.pinocchio_oracle import Oracle
+
+import dynsim
+from dynsim import DynsimError, Simulation, load_scenario
+from dynsim.model.surfaces import Quadric
+from dynsim.scenario import build
+
+Function = Callable[[np.ndarray], np.ndarray]
+
+
+def parts(simulation: Simulation, table: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Columns of positions, rates and currents."""
+    n = simulation.model.n
+    return table[..., :n], table[..., n : 2 * n], table[..., 2 * n :]
+
+
+def central(function: Function, x: np.ndarray, step: float) -> np.ndarray:
+    """Derivative of a function of x, by central differences of fourth order."""
+    columns = []
+    for e in step * np.eye(len(x)):
+        near, far = (function(x + k * e) - function(x - k * e) for k in (1, 2))
+        columns.append((8.0 * near - far) / (12.0 * step))
+    return np.stack(columns, axis=1)
+
+
+def assert_near(actual: np.ndarray, expected: np.ndarray, bound: float) -> None:
+    np.testing.assert_allclose(actual, expected, rtol=0.0, atol=bound * np.abs(expected).max())
+
+
+def test_a_free_arm_is_that_of_pinocchio_with_its_motors() -> None:
+    """ABA's derivatives with rotors, and L di/dt = k_p (q_d − q) + k_d (v_d − v) − R i − K_m v, to 1e-10."""
+    simulation = Simulation(load_scenario("elbow_comparison", "no_elbow"))
+    state = simulation.advance(0.3)
+    linear = simulation.linearize(["command", "reference", "reference_rate"], ["hand_position", "voltage"])
+    A, B, C, D = linear
+    model, n = simulation.model, simulation.model.n
+    oracle = Oracle(model.robot)
+    oracle.model.armature = oracle.to(model.armature)
+    motors = model.robot.motors
+    K, R, L = (np.array([getattr(m, name) for m in motors]) for name in ("joint_constant", "resistance", "inductance"))
+    tau = K * state.current - model.damping * state.v
+    by_q, by_v, inverse = pin.computeABADerivatives(oracle.model, oracle.data, *map(oracle.to, (state.q, state.v, tau)))
+    inverse = np.triu(inverse) + np.triu(inverse, 1).T
+    by_q, by_v, inverse = (oracle.back(oracle.back(unit).T).T for unit in (by_q, by_v, inverse))
+    positions, rates, currents = parts(simulation, A)
+    zero, unit = np.zeros((n, n)), np.eye(n)
+    options = simulation.scenario.controller
+    k_p, k_d = np.diag(np.full(n, options.k_p_V_per_rad)), np.diag(np.full(n, options.k_d_V_s_per_rad))
+    by_inductance = np.diag(1.0 / L)
+    assert_near(positions, np.vstack([zero, by_q, -by_inductance @ k_p]), 1e-9)
+    assert_near(
+        rates, np.vstack([unit, by_v - inverse @ np.diag(model.damping), -by_inductance @ (k_d + np.diag(K))]), 1e-9
+    )
+    assert_near(currents, np.vstack([zero, inverse @ np.diag(K), -by_inductance @ np.diag(R)]), 1e-9)
+    assert_near(B[2 * n :], by_inductance @ np.hstack([unit, k_p, k_d]), 1e-9)
+    assert not B[: 2 * n].any()
+    _, jacobian = model.point_position_and_jacobian(*model.robot.hand, state.q)
+    assert_near(C[:3, :n], jacobian, 1e-9)
+    assert not C[:3, n:].any()
+    assert_near(C[3:, : 2 * n], -np.hstack([k_p, k_d]), 1e-9)
+    assert_near(D[3:], np.hstack([unit, k_p, k_d]), 1e-9)
+    assert linear.error < 1e-7
+    # Of a step that ends there; the state of advance() is between two.
+    np.testing.assert_allclose(linear.x, np.concatenate([state.q, state.v, state.current]), atol=1e-5)
+
+
+def constrained(simulation: Simulation, modes: dict[str, str], smoothing: float) -> tuple[Function, Function]:
+    """dv/dt and normal forces as functions of (q, v, i), from M, h, point Jacobians and one system of equations.
+
+    M v̇ + h = K i − D v + Σ Jᵀ f,  and of each closed contact  n·(J v̇ + J̇ v) + v·Q v/|∇C| = 0, with f along n and slip
+    where it slides, and J v̇ + J̇ v = 0 where it sticks. Forces that no joint feels are the least ones.
+    """
+    model, scenario = simulation.model, simulation.scenario
+    points = {contact.name: contact for contact in build.contacts(scenario)}
+    closed = [points[name] for name, mode in modes.items() if mode != "open"]
+    q0 = simulation.state.q
+    K = np.zeros((model.n, len(model.robot.motors)))
+    for a, motor in enumerate(model.robot.motors):
+        K[model.joint_names.index(motor.joint), a] = motor.joint_constant
+
+    def geometry(contact: object, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, ...]:
+        at, J = model.point_position_and_jacobian(contact.body, contact.point, q)
+        near, far = (
+            model.point_jacobian(contact.body, contact.point, q + k * 1e-3 * v)
+            - model.point_jacobian(contact.body, contact.point, q - k * 1e-3 * v)
+            for k in (1, 2)
+        )
+        return at, J, (8.0 * near - far) @ v / 12e-3
+
+    def solve(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        q, v, i = parts(simulation, x)
+        rows, forces, right, normals = [], [], [], []
+        for contact in closed:
+            at, J, drift = geometry(contact, q, v)
+            assert isinstance(contact.surface, Quadric)
+            gradient = contact.surface.Q @ at + contact.surface.b
+            slope = np.linalg.norm(gradient)
+            n, speed = gradient / slope, J @ v
+            normals.append(len(rows))
+            if modes[contact.name] == "sticking":
+                # Tangents stay those of the place where it is held; the normal is that of the surface at the point.
+                normal = contact.surface.normal(model.point_position(contact.body, contact.point, q0))
+                base = np.vstack([n, np.linalg.svd(normal[None])[2][1:]])
+                rows += list(base @ J)
+                forces += list(base @ J)
+                right += list(-base @ drift)
+                continue
+            slip = speed - n * (n @ speed)
+            t = slip / np.sqrt(slip @ slip + smoothing**2)
+            rows.append(n @ J)
+            forces.append((n - contact.friction * t) @ J)
+            right.append(-n @ drift - speed @ contact.surface.Q @ speed / slope)
+        m, p = model.n, len(rows)
+        system = np.zeros((m + p, m + p))
+        system[:m, :m] = model.mass_matrix(q) + np.diag(model.armature)
+        if p:
+            system[:m, m:], system[m:, :m] = -np.array(forces).T, np.array(rows)
+        applied = K @ i if len(i) else np.zeros(m)
+        loads = applied - model.damping * v - model.bias_forces(q, v)
+        actual = np.linalg.lstsq(system, np.concatenate([loads, right]), rcond=1e-12)[0]
+        return actual[:m], actual[m:][normals]
+
+    return lambda x: solve(x)[0], lambda x: solve(x)[1]
+
+
+CASES = {
+    "glued, both slide": ("elbow_comparison", "two_elbows", 0.5, {"sliding"}, 1e-3),
+    "glued to a cylinder": ("brace_on_cylinder", "glued", 1.5, {"sliding"}, 1e-3),
+    "real, slides on a cylinder": ("brace_on_cylinder", "real", 1.5, {"sliding"}, 0.0),
+    "real, sticks on a cylinder": ("brace_on_cylinder", "real", 0.5, {"sticking"}, 0.0),
+    "real, one open, one slides": ("elbow_comparison_floor", "two_elbows", 0.2, {"open", "sliding"}, 0.0),
+    "real, one sticks": ("wall_push", None, 0.3, {"sticking"}, 0.0),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_every_contact_mode_against_differences(case: str) -> None:
+    """∂v̇/∂x, and that of the normal forces, to 1e-7 of the largest entry."""
+    name, variant, time, modes, smoothing = CASES[case]
+    simulation = Simulation(load_scenario(name, variant))
+    simulation.advance(time)
+    linear = simulation.linearize([], ["contact_normal_force"])
+    assert set(linear.modes.values()) == modes
+    acceleration, force = constrained(simulation, linear.modes, smoothing)
+    n = simulation.model.n
+    assert_near(linear.xdot[n : 2 * n], acceleration(linear.x), 1e-9)
+    expected = central(acceleration, linear.x, 3e-5)
+    assert_near(linear.A[n : 2 * n], expected, 1e-7)
+    np.testing.assert_allclose(linear.A[:n, n : 2 * n], np.eye(n), atol=1e-12)
+    closed = [k for k, mode in enumerate(linear.modes.values()) if mode != "open"]
+    assert_near(linear.C[closed], central(force, linear.x, 3e-5), 1e-7)
+    away = [k for k, mode in enumerate(linear.modes.values()) if mode == "open"]
+    assert not linear.C[away].any()
+
+
+def test_pushes_and_commands_act_as_they_do_in_the_simulation() -> None:
+    """B of a force on the hand's body and of a voltage: what one more newton and volt change, with contacts closed."""
+    simulation = Simulation(load_scenario("elbow_comparison_floor", "elbow_7"))
+    simulation.advance(0.4)
+    linear = simulation.linearize(["force.link_10.z", "torque.link_10", "command.joint_3"], ["vdot"])
+    assert linear.inputs[:2] == ("force.link_10.z", "torque.link_10.x")
+    model, q = simulation.model, linear.x[: simulation.model.n]
+    n = model.n
+    contact = build.contacts(simulation.scenario)[0]
+    _, J_c = model.point_position_and_jacobian(contact.body, contact.point, q)
+    slip = J_c @ linear.x[n : 2 * n]
+    along = np.array([slip[0], slip[1], 0.0]) / np.hypot(slip[0], slip[1])
+    # M̄ v̇ = Jᵀ F + f (n − μ t)ᵀ J_c and n·J_c v̇ = 0.
+    friction = (np.array([0.0, 0.0, 1.0]) - contact.friction * along) @ J_c
+    M = model.mass_matrix(q) + np.diag(model.armature)
+    system = np.block([[M, -friction[:, None]], [J_c[2:], np.zeros((1, 1))]])
+    J = model.point_jacobian("link_10", np.zeros(3), q)
+    expected = np.linalg.solve(system, np.concatenate([J[2], [0.0]]))[:n]
+    assert_near(linear.B[n : 2 * n, 0], expected, 1e-8)
+    assert_near(linear.D[:, 0], expected, 1e-8)
+    inductance = simulation.robot.motors[2].inductance
+    column = np.zeros(3 * n)
+    column[2 * n + 2] = 1.0 / inductance
+    assert_near(linear.B[:, 4], column, 1e-8)
+
+
+def test_the_simulation_goes_on_as_if_nobody_had_looked() -> None:
+    records = []
+    for looked in (False, True):
+        simulation = Simulation(load_scenario("elbow_comparison_floor", "two_elbows", {"duration_s": 0.5}))
+        if looked:
+            simulation.linearize()
+        simulation.advance(0.123)
+        if looked:
+            simulation.linearize()
+        simulation.advance(0.5)
+        records.append(simulation.record())
+    for name in ("q", "current", "contact_force"):
+        np.testing.assert_array_equal(records[0][name], records[1][name])
+
+
+def test_a_linear_step_is_the_change_of_the_simulation() -> None:
+    """Runs of a wheeled arm from states that differ by δx differ by exp(A t) δx."""
+    scenario = load_scenario("mobile_reach", overrides={"integrator.rtol": 1e-12, "integrator.atol": 1e-13})
+    simulation = Simulation(scenario)
+    simulation.advance(0.2)
+    linear, start = simulation.linearize([], []), simulation.state
+    duration, change = 1e-4, np.zeros(len(linear.x))
+    nq = len(start.q)
+    change[nq : nq + len(start.v)] = 1e-4
+    ends = []
+    for side in (-1.0, 1.0):
+        moved = dynsim.State(start.time, start.q, start.v + side * change[nq : nq + len(start.v)], start.current)
+        other = Simulation(scenario, state=moved)
+        end = other.advance(start.time + duration)
+        ends.append(np.concatenate([end.q, end.v, end.current]))
+    # What A changes by within the time is left.
+    assert_near(0.5 * (ends[1] - ends[0]), expm(duration * linear.A) @ change, 2e-6)
+
+
+@pytest.mark.parametrize(
+    ("inputs", "outputs", "words"),
+    [
+        (["comand.joint_1"], [], "no input 'comand.joint_1'; did you mean 'command.joint_1'"),
+        ([], ["hand"], "no output 'hand'"),
+        ("command", "q", ""),
+    ],
+)
+def test_names_are_families_or_one_of_them(inputs: object, outputs: object, words: str) -> None:
+    simulation = Simulation(load_scenario("elbow_comparison", "no_elbow"))
+    if not words:
+        linear = simulation.linearize(inputs, outputs)
+        assert (linear.B.shape, linear.C.shape) == ((30, 10), (10, 30))
+        return
+    with pytest.raises(DynsimError, match=words):
+        simulation.linearize(inputs, outputs)
+
+
+def test_time_stepping_is_refused_in_words() -> None:
+    simulation = Simulation(load_scenario("elbow_comparison_floor", overrides={"integrator.method": "time_stepping"}))
+    with pytest.raises(DynsimError, match="time_stepping has no modes to linearize with"):
+        simulation.linearize()
