@@ -159,9 +159,9 @@ def snake_tree(
     for pair_index, (body, x) in enumerate(axles):
         for side in (1, -1):
             name = wheel_joint(pair_index, side)
-            place = np.array([x, side * float(d.half_track[pair_index]), 0.0])
+            position = np.array([x, side * float(d.half_track[pair_index]), 0.0])
             if massless_wheels and side != d.driven_side[pair_index]:
-                feet.append(Foot(name, body, place, d.wheel_radius, GROUND, grip_axis=_X))
+                feet.append(Foot(name, body, position, d.wheel_radius, GROUND, grip_axis=_X))
                 continue
             wheels.append(
                 Link(
@@ -171,7 +171,7 @@ def snake_tree(
                     "revolute",
                     _Y,
                     Inertia(0.0),
-                    p_PJ=place,
+                    p_PJ=position,
                     damping=bearing_drag,
                     armature=wheel_inertia,
                     shapes=(snake_wheel(d),),

@@ -59,6 +59,12 @@ class Size:
         return () if self.planned is None else self.planned.braces
 
     @property
+    def dense(self) -> Dense:
+        """References and statics of the plan that there is."""
+        assert self.planned is not None
+        return self.planned.dense
+
+    @property
     def heat(self) -> float:
         """[W]; infinite where nothing was found."""
         return math.inf if self.planned is None else self.planned.heat
@@ -107,10 +113,14 @@ class BracePlan:
         return f"<BracePlan {self.task.scenario.title}: {len(self.sizes)} sizes, {text}>"
 
     @property
+    def answered(self) -> list[Size]:
+        """The sizes for which there is a plan."""
+        return [size for size in self.sizes if size.planned is not None]
+
+    @property
     def best(self) -> Size | None:
         """The least heat of those that survive, else of all; None where nothing was found."""
-        found = [size for size in self.sizes if size.planned is not None]
-        return min(found, key=lambda size: (size.survives is False, size.heat), default=None)
+        return min(self.answered, key=lambda size: (size.survives is False, size.heat), default=None)
 
     def size(self, count: int) -> Size:
         """The answer for a number of braces.
@@ -136,17 +146,16 @@ class BracePlan:
     @property
     def pareto(self) -> list[tuple[int, float]]:
         """Numbers of braces, and heat [W], that no smaller number reaches."""
-        found: list[tuple[int, float]] = []
-        for size in self.sizes:
-            if size.planned is not None and (not found or size.heat < found[-1][1]):
-                found.append((size.count, size.heat))
-        return found
+        points: list[tuple[int, float]] = []
+        for size in self.answered:
+            if not points or size.heat < points[-1][1]:
+                points.append((size.count, size.heat))
+        return points
 
     def scenario(self, count: int) -> Scenario:
         """The plan with so many braces as a scenario that runs."""
         size = self.size(count)
-        assert size.planned is not None
-        return planned_scenario.scenario(self.task, size.braces, size.planned.dense, size.k_p, size.variant)
+        return planned_scenario.scenario(self.task, size.braces, size.dense, size.k_p, size.variant)
 
     def record(self, count: int) -> Record:
         """The run of that scenario."""
@@ -156,12 +165,9 @@ class BracePlan:
     def yaml(self) -> dict[str, Any]:
         """All plans as one scenario with a variant for each size, the best first."""
         best = self.best
-        found = [size for size in self.sizes if size.planned is not None]
-        found.sort(key=lambda size: size is not best)
         variants = {
-            size.variant: planned_scenario.particular(self.task, size.braces, size.planned.dense, size.k_p)
-            for size in found
-            if size.planned is not None
+            size.variant: planned_scenario.particular(self.task, size.braces, size.dense, size.k_p)
+            for size in sorted(self.answered, key=lambda size: size is not best)
         }
         return {**planned_scenario.common(self.task), "variants": variants}
 
@@ -182,8 +188,8 @@ class BracePlan:
                 "postures_drawn": tally.drawn,
                 "postures_on_path": tally.drawn_on,
                 "sets_reached": len(tally.reached),
-                "sets_not_found": sorted(" + ".join(b.label for b in one) for one in tally.missed),
-                "sets_refused": {" + ".join(b.label for b in one): why for one, why in tally.refused.items()},
+                "sets_not_found": sorted(" + ".join(b.label for b in braces) for braces in tally.missed),
+                "sets_refused": {" + ".join(b.label for b in braces): why for braces, why in tally.refused.items()},
                 "single_braces_W": self.singles,
             },
             "sizes": [_size_json(self.task, size) for size in self.sizes],
@@ -197,7 +203,7 @@ def _row(task: Task, size: Size) -> dict[str, Any]:
         return row | {"reason": size.reason}
     dense = size.planned.dense
     nominal = None if size.verdict is None else size.verdict.nominal
-    distance, what, _ = dense.clearance
+    distance, part, _ = dense.clearance
     row |= {
         "heat_W": dense.heat,
         "simulated_W": None if nominal is None else _number(nominal.heat_W),
@@ -206,7 +212,7 @@ def _row(task: Task, size: Size) -> dict[str, Any]:
         "normal_force_min_N": float(dense.forces.min()) if size.count else None,
         "normal_force_max_N": float(dense.forces.max()) if size.count else None,
         "clearance_m": _number(distance),
-        "clearance_of": what,
+        "clearance_of": part,
         "joint_limit_distance": _number(_joint_room(task, dense)),
         "k_p_V_per_rad": size.k_p,
         "found_in_rounds": f"{size.agreed}/{size.rounds}",
@@ -221,16 +227,16 @@ def _row(task: Task, size: Size) -> dict[str, Any]:
 def _size_json(task: Task, size: Size) -> dict[str, Any]:
     """One size in ``plan.json``."""
     braces = [{"body": b.body, "point_m": list(b.point_m), "surface": b.surface, "name": b.name} for b in size.braces]
-    found: dict[str, Any] = {"count": size.count, "braces": braces}
+    entry: dict[str, Any] = {"count": size.count, "braces": braces}
     if size.planned is None:
-        return found | {
+        return entry | {
             "heat_W": None, "times_s": [], "q_rad": [], "forces_N": [], "survives": None, "reason": size.reason,
         }  # fmt: skip
     dense = size.planned.dense
     forces = np.array([np.interp(dense.times, dense.fine, column) for column in dense.forces.T]).T
     corners = () if size.verdict is None else size.verdict.corners
     return {
-        **found,
+        **entry,
         "heat_W": dense.heat,
         "times_s": dense.times.tolist(),
         "q_rad": dense.q.tolist(),
@@ -354,20 +360,20 @@ def plan_braces(
     with named(scenario):
         problem = task(scenario, options)
         search = Search(problem, tell)
-        found = search.run()
-        sizes = [_answered(search, size, found[size]) for size in range(least, most + 1)]
+        ranked = search.run()
+        sizes = [_answered(search, size, ranked[size]) for size in range(least, most + 1)]
         if verify:
-            sizes = _verified(problem, search, sizes, found, tolerances, jobs, explain, tell)
-    singles = {one[0].label: heat for one, heat in search.single_heats.items()}
-    singles = {one.label: singles[one.label] for one in problem.candidates if one.label in singles}
-    ranked = {size.count: _ranked(size, found[size.count]) for size in sizes}
-    return BracePlan(problem, tuple(sizes), search.tally, singles, ranked)
+            sizes = _verified(problem, search, sizes, ranked, tolerances, jobs, explain, tell)
+    known = search.single_heats
+    singles = {brace.label: known[brace,] for brace in problem.candidates if (brace,) in known}
+    heats = {size.count: _ranked(size, ranked[size.count]) for size in sizes}
+    return BracePlan(problem, tuple(sizes), search.tally, singles, heats)
 
 
-def _ranked(size: Size, found: Sequence[Planned]) -> list[tuple[str, float]]:
+def _ranked(size: Size, planned: Sequence[Planned]) -> list[tuple[str, float]]:
     """Sets of a size with their heat, the answer first."""
-    names = [(", ".join(b.label for b in one.braces) or "none", one.heat) for one in found]
-    return sorted(names, key=lambda one: (one[0] != size.label, one[1]))
+    names = [(", ".join(b.label for b in plan.braces) or "none", plan.heat) for plan in planned]
+    return sorted(names, key=lambda item: (item[0] != size.label, item[1]))
 
 
 def _answered(search: Search, count: int, ranked: Sequence[Planned]) -> Size:
@@ -387,13 +393,13 @@ def _why(search: Search, count: int) -> str:
             f"none of {tally.drawn} random postures could be brought onto the hand's path, within joint limits and "
             "clear of the surfaces: it may be out of reach, or the orientation that it asks for"
         )
-    refused = [why for one, why in tally.refused.items() if len(one) == count]
+    refused = [why for braces, why in tally.refused.items() if len(braces) == count]
     if refused:
         return refused[0]
-    if count > len({candidate.place for candidate in search.task.candidates}):
-        return f"there are only {len({candidate.place for candidate in search.task.candidates})} candidates"
-    missed = sum(len(one) == count for one in tally.missed)
-    tried = missed + sum(len(one) == count for one in tally.reached)
+    if count > len({candidate.location for candidate in search.task.candidates}):
+        return f"there are only {len({candidate.location for candidate in search.task.candidates})} candidates"
+    missed = sum(len(braces) == count for braces in tally.missed)
+    tried = missed + sum(len(braces) == count for braces in tally.reached)
     if tried == 0:
         return f"no set of {count - 1} braces was found that it could grow from"
     return (
@@ -406,7 +412,7 @@ def _verified(
     problem: Task,
     search: Search,
     sizes: Sequence[Size],
-    found: dict[int, list[Planned]],
+    ranked: dict[int, list[Planned]],
     tolerances: Tolerances,
     jobs: int,
     explain: bool,
@@ -414,13 +420,13 @@ def _verified(
 ) -> list[Size]:
     """Sizes with their verdicts: where the best set is refused and another one survives, that one."""
     verifier = Verifier(problem, tolerances, jobs)
-    open_ = {size.count: list(found[size.count]) for size in sizes if size.planned is not None}
+    open_ = {size.count: list(ranked[size.count]) for size in sizes if size.planned is not None}
     verdicts: dict[int, list[tuple[Planned, Verdict]]] = {count: [] for count in open_}
     turn = 0
     while open_:
         tell("verifying", min(turn / 3.0, 0.95))
         turn += 1
-        batch = [(count, ranked[0]) for count, ranked in open_.items()]
+        batch = [(count, waiting[0]) for count, waiting in open_.items()]
         judged = verifier.verify([(planned.braces, planned.dense) for _, planned in batch])
         for (count, planned), verdict in zip(batch, judged, strict=True):
             verdicts[count].append((planned, verdict))

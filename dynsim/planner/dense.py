@@ -150,10 +150,10 @@ def nearest(
     whole = arm.coordinates(q)
     for index, name in enumerate(arm.surfaces):
         free: dict[str, list[Clear]] = {}
-        for place, point in task.clear.items():
+        for at, point in task.clear.items():
             children = [(k, index) for k in range(arm.n) if arm.tables.parent[k] == point.joint]
             on_link = np.any(point.point) and (point.joint, index) in leaning and leaning.intersection(children)
-            if point.surface == index and place not in braced and not on_link:
+            if point.surface == index and at not in braced and not on_link:
                 free.setdefault(robot.links[arm.links[point.joint]].name, []).append(point)
         targets = {body: [(surfaces[name], point.point) for point in points] for body, points in free.items()}
         for link, distances in gaps(robot, whole, targets):

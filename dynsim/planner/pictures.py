@@ -35,8 +35,8 @@ def _records(plan: BracePlan) -> dict[str, Record]:
     """Runs of the best and of the unbraced plan, those that come to their ends."""
     shown: dict[str, Record] = {}
     best = plan.best
-    for size in plan.sizes:
-        if size.planned is None or not (size is best or size.count == 0):
+    for size in plan.answered:
+        if not (size is best or size.count == 0):
             continue
         try:
             shown[size.variant] = plan.record(size.count)
@@ -60,18 +60,18 @@ def picture(plan: BracePlan) -> PlanPicture:
     grid = grid.reshape(-1, 3)
     gaps = [surface.gaps(grid) for surface in build.surfaces(task.scenario).values()]
     ground = np.min(gaps, axis=0).reshape(GRID, GRID) if gaps else np.ones((GRID, GRID))
-    found = {size.count: size for size in plan.sizes if size.planned is not None}
+    answered = {size.count: size for size in plan.answered}
     return PlanPicture(
         title=task.scenario.title,
         poses=poses,
         path=path,
         ground=(along, up, ground),
-        sets={count: plan.ranked[count] for count in found},
-        survives={count: size.survives for count, size in found.items()},
+        sets={count: plan.ranked[count] for count in answered},
+        survives={count: size.survives for count, size in answered.items()},
         singles=plan.singles,
         corners={
             count: (size.heat, [(c.label, c.heat_W, 1e3 * c.hand_rms_m) for c in size.verdict.corners])
-            for count, size in found.items()
+            for count, size in answered.items()
             if size.verdict is not None
         },
     )
@@ -92,8 +92,7 @@ def _seen(points: Array, heading: Array) -> Array:
 
 def _poses(task: Task, size: Size, heading: Array) -> list[Pose]:
     """The arm at some instants of the first pass."""
-    assert size.planned is not None
-    arm, model, dense = task.arm, task.arm.model, size.planned.dense
+    arm, model, dense = task.arm, task.arm.model, size.dense
     ends, surfaces = axis_ends(model.robot), build.surfaces(task.scenario)
     poses = []
     last = int(np.searchsorted(dense.times, task.span))

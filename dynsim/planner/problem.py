@@ -61,7 +61,7 @@ class Candidate:
     surface: str
 
     @property
-    def place(self) -> tuple[str, tuple[float, float, float]]:
+    def location(self) -> tuple[str, tuple[float, float, float]]:
         """The point, whatever it leans on: it can lean on one surface only."""
         return self.body, self.point_m
 
@@ -214,7 +214,7 @@ class Task:
             key(b.joint, s, b.on_joint): Clear(b.joint, b.on_joint, b.radius, 0.0, b.name, s)
             for b, s in zip(braces, on, strict=True)
         }
-        rows = [*braced.values(), *(point for place, point in self.clear.items() if place not in braced)]
+        rows = [*braced.values(), *(point for at, point in self.clear.items() if at not in braced)]
         return Points(
             body=integers([row.joint for row in rows]),
             point=reals([row.point for row in rows]).reshape(-1, 3),
@@ -337,7 +337,7 @@ def _candidates(scenario: Scenario, arm: MovingArm, options: Options, surfaces: 
     if not wanted:
         wanted = [*declared, *links[2:]]
     along = {(k, share): point for k, point, _, share in axis_points(arm, options.along)}
-    found: list[Candidate] = []
+    candidates: list[Candidate] = []
     known: list[tuple[int, Array]] = []
 
     def add(name: str, body: str, point: Array, radius: float, on: Sequence[str]) -> None:
@@ -347,7 +347,7 @@ def _candidates(scenario: Scenario, arm: MovingArm, options: Options, surfaces: 
         known.append((joint, on_joint))
         radius = radius if options.radius_m is None else options.radius_m
         at = tuple(float(x) for x in point)
-        found.extend(Candidate(name, body, at, joint, on_joint, radius, surface) for surface in on)  # type: ignore[arg-type]
+        candidates.extend(Candidate(name, body, at, joint, on_joint, radius, surface) for surface in on)  # type: ignore[arg-type]
 
     for name in wanted:
         if name in declared:
@@ -366,4 +366,4 @@ def _candidates(scenario: Scenario, arm: MovingArm, options: Options, surfaces: 
         for share in options.along:
             if (k, share) in along:
                 add(f"{name}_at_{share:g}", name, along[k, share], radius, surfaces)
-    return found
+    return candidates

@@ -23,7 +23,7 @@ from dynsim.planner.problem import CHARGED, SMOOTHER, Candidate, Task
 # Sets of each size that go on from the cheap problem, and from the one with slip.
 BEAM = 5
 # Postures that a round begins with, and random ones that are tried for them.
-POSTURES, DRAWS = 2, 60
+POSTURES, DRAWS = 4, 60
 # Standard deviation of their joints, drawn from so much to so much [rad]; of prismatic ones [m].
 SPREAD, PRISMATIC_SPREAD = (0.3, 1.5), 0.2
 # Sets of each size and round that whole paths are made for, and those that are made finer in the end.
@@ -104,28 +104,28 @@ class Search:
 
     def spread(self, start: Array, count: int) -> Array:
         """Postures at so many knots, on lines between those given at others; (n,) or (K, n)."""
-        given = np.atleast_2d(start)
-        if len(given) == 1 or count == 1:
-            return reals(np.tile(given[len(given) // 2], (count, 1)))
-        times, at = self.task.times(len(given)), self.task.times(count)
+        known = np.atleast_2d(start)
+        if len(known) == 1 or count == 1:
+            return reals(np.tile(known[len(known) // 2], (count, 1)))
+        times, wanted = self.task.times(len(known)), self.task.times(count)
         if self.task.kind == "closed":
-            times, given = np.append(times, self.task.span), np.vstack([given, given[:1]])
-        return reals(np.stack([_line(at, times, column) for column in given.T], axis=1))
+            times, known = np.append(times, self.task.span), np.vstack([known, known[:1]])
+        return reals(np.stack([_line(wanted, times, column) for column in known.T], axis=1))
 
     def _starts(self, first: bool) -> list[Array]:
         """Random postures with the hand in the middle of the path, clear of all surfaces; the initial one too."""
-        problem, found = self.task.problem((), 1), list[Array]()
+        problem, postures = self.task.problem((), 1), list[Array]()
         arm = self.task.arm
         initial = arm.model.robot.initial[list(arm.columns)]
         for draw in range(DRAWS):
             Q = reals(initial if first and draw == 0 else self.draw())[None]
             self.tally.drawn += 1
             if problem.retract(Q, 60) <= 1e-7:
-                found.append(Q[0])
+                postures.append(Q[0])
                 self.tally.drawn_on += 1
-                if len(found) == POSTURES:
+                if len(postures) == POSTURES:
                     break
-        return found
+        return postures
 
     def draw(self) -> Array:
         """A random posture about the initial one, sometimes near it and sometimes far."""
@@ -137,7 +137,7 @@ class Search:
     def run(self) -> dict[int, list[Planned]]:
         """The best sets of each size with whole paths, by heat along their dense references; sizes may be empty.
 
-        Rounds are independent searches, each from two postures of its own: how often they agree is what can be said of
+        Rounds are independent searches, each from postures of its own: how often they agree is what can be said of
         the distance to the optimum.
         """
         least, most = self.task.options.count
@@ -146,7 +146,7 @@ class Search:
         for number in range(rounds):
             self._tell("searching", number / (rounds + 1))
             for size, ranked in self._round(number, most).items():
-                heats = [self._path(paths.setdefault(one[1], []), *one) for one in ranked[: PATHS if size else 1]]
+                heats = [self._path(paths.setdefault(item[1], []), *item) for item in ranked[:PATHS]]
                 self.tally.heats.setdefault(size, []).append(min(heats, default=math.inf))
         planned: dict[int, list[Planned]] = {}
         for size in range(least, most + 1):
@@ -171,13 +171,13 @@ class Search:
     def _round(self, number: int, most: int) -> dict[int, list[tuple[float, Set, Array]]]:
         """Sets of each size with cost and posture, the best first, from new starts."""
         starts = self._starts(first=number == 0)
-        found: dict[int, list[tuple[float, Set, Array]]] = {}
+        best: dict[int, list[tuple[float, Set, Array]]] = {}
         unbraced = [r for q in starts if (r := self.solve((), q, 1)) is not None]
         if not unbraced:
-            return found
-        hanging = min(unbraced, key=lambda r: r.cost)
-        found[0] = [(hanging.cost, (), hanging.Q)]
-        front: list[tuple[Set, list[Array]]] = [((), [*starts, hanging.Q])]
+            return best
+        unbraced.sort(key=_cost)
+        best[0] = [(r.cost, (), r.Q) for r in unbraced]
+        front: list[tuple[Set, list[Array]]] = [((), [*starts, unbraced[0].Q])]
         for size in range(1, most + 1):
             cheap = self._cheap(self._sets(size, front))
             slipping = self._slipping(cheap, 2 * BEAM)
@@ -186,47 +186,47 @@ class Search:
                 swaps = {grown: [Q] for grown in self._swaps(braces) if grown not in cheap}
                 slipping += self._slipping(self._cheap(swaps), 2)
                 slipping.sort(key=lambda item: item[0])
-            found[size] = slipping[:BEAM]
-            front = [(braces, [Q[len(Q) // 2]]) for _, braces, Q in found[size]]
+            best[size] = slipping[:BEAM]
+            front = [(braces, [Q[len(Q) // 2]]) for _, braces, Q in best[size]]
             if not front:
                 break
-        return found
+        return best
 
     def _cheap(self, sets: Mapping[Set, list[Array]]) -> dict[Set, Local]:
         """Sets at one posture without slip, from postures."""
-        found: dict[Set, Local] = {}
+        reached: dict[Set, Local] = {}
         for braces, postures in sets.items():
             tried = [r for q in postures if (r := self.solve(braces, q, 1, 25)) is not None]
             if tried:
-                found[braces] = min(tried, key=lambda r: r.cost)
+                reached[braces] = min(tried, key=lambda r: r.cost)
                 self.tally.missed.discard(braces)
                 if len(braces) == 1:
-                    self.single_heats[braces] = min(found[braces].heat, self.single_heats.get(braces, math.inf))
+                    self.single_heats[braces] = min(reached[braces].heat, self.single_heats.get(braces, math.inf))
                 self.tally.reached.add(braces)
             elif braces not in self.tally.reached:
                 self.tally.missed.add(braces)
-        return found
+        return reached
 
     def _slipping(self, cheap: Mapping[Set, Local], count: int) -> list[tuple[float, Set, Array]]:
         """The best of them at few knots with slip, the best first."""
         ranked = sorted(cheap.items(), key=lambda item: item[1].cost)[:count]
-        found = [
+        solved = [
             (r.cost, braces, r.Q)
             for braces, local in ranked
             if (r := self.solve(braces, local.Q, self.coarse, 30)) is not None
         ]
-        return sorted(found, key=lambda item: item[0])
+        return sorted(solved, key=lambda item: item[0])
 
     def _swaps(self, braces: Set) -> list[Set]:
         """Sets with one brace exchanged for another candidate."""
-        kept = [tuple(one for one in braces if one != out) for out in braces]
+        kept = [tuple(brace for brace in braces if brace != out) for out in braces]
         grown = [
-            tuple(one for one in self.task.candidates if one in rest or one == new)
-            for rest in kept
+            tuple(brace for brace in self.task.candidates if brace in others or brace == new)
+            for others in kept
             for new in self.task.candidates
             if new not in braces
         ]
-        return [one for one in dict.fromkeys(grown) if _fits(one)]
+        return [braces for braces in dict.fromkeys(grown) if _fits(braces)]
 
     def _sets(self, size: int, front: Sequence[tuple[Set, list[Array]]]) -> dict[Set, list[Array]]:
         """Sets that grow from smaller ones, with postures to start from."""
@@ -239,7 +239,7 @@ class Search:
             return sets
         for braces, postures in front:
             for candidate in candidates:
-                grown = tuple(one for one in candidates if one in braces or one == candidate)
+                grown = tuple(brace for brace in candidates if brace in braces or brace == candidate)
                 if len(grown) == size and _fits(grown):
                     sets.setdefault(grown, []).extend(postures)
         return sets
@@ -257,12 +257,19 @@ class Search:
             self.tally.refused[braces] = "postures found, but none along the whole path"
         planned = []
         for braces in sorted(reached, key=lambda braces: reached[braces][0].cost)[: self.kept]:
-            likely = [local for local in reached[braces] if local.cost <= NEAR * reached[braces][0].cost]
-            finest = [self._finest(braces, local) for local in likely[:ALTERNATIVES]]
-            if good := [plan for plan in finest if isinstance(plan, Planned)]:
+            good, near = list[Planned](), math.inf
+            for local in reached[braces][: 2 * ALTERNATIVES]:
+                if len(good) == ALTERNATIVES or local.cost > near:
+                    break
+                plan = self._finest(braces, local)
+                if isinstance(plan, str):
+                    self.tally.refused.setdefault(braces, plan)
+                else:
+                    good.append(plan)
+                    near = min(near, NEAR * local.cost)
+            if good:
                 planned.append(min(good, key=lambda plan: plan.heat))
-            else:
-                self.tally.refused[braces] = str(finest[0])
+                self.tally.refused.pop(braces, None)
         return sorted(planned, key=lambda plan: plan.heat)
 
     def _finest(self, braces: Set, coarse: Local) -> Planned | str:
@@ -305,7 +312,7 @@ def _cost(local: Local) -> float:
 
 def _fits(braces: Sequence[Candidate]) -> bool:
     """Whether each point leans on one surface only."""
-    return len({one.place for one in braces}) == len(braces)
+    return len({brace.location for brace in braces}) == len(braces)
 
 
 def _line(at: Array, times: Array, values: Array) -> Array:

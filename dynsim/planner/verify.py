@@ -124,33 +124,33 @@ class Verifier:
             nominal = self._runs([(*plans[number], k_p, first) for number, k_p in trial.items()])
             verdicts |= {n: Verdict(k_p, (c,)) for (n, k_p), c in zip(trial.items(), nominal, strict=True)}
             sound = [n for n in trial if verdicts[n].survives and plans[n][0]]
-            rest = self._runs([(*plans[n], trial[n], place) for n in sound for place in others])
+            corners_of_all = self._runs([(*plans[n], trial[n], corner) for n in sound for corner in others])
             for k, n in enumerate(sound):
-                corners = rest[k * len(others) : (k + 1) * len(others)]
+                corners = corners_of_all[k * len(others) : (k + 1) * len(others)]
                 verdicts[n] = Verdict(trial[n], (*verdicts[n].corners, *corners))
             # Where the nominal run fails, softer gains move it further away.
             left = {n: tried for n, tried in left.items() if tried and n in sound and not verdicts[n].survives}
         return [verdicts[number] for number in range(len(plans))]
 
     def corners(
-        self, braces: tuple[Candidate, ...], dense: Dense, k_p: float, places: Sequence[tuple[float, float]]
+        self, braces: tuple[Candidate, ...], dense: Dense, k_p: float, corners: Sequence[tuple[float, float]]
     ) -> list[Corner]:
         """Some corners of one plan, (factor of μ, shift [m])."""
-        return self._runs([(braces, dense, k_p, place) for place in places])
+        return self._runs([(braces, dense, k_p, corner) for corner in corners])
 
     def _runs(self, runs: Sequence[tuple[tuple[Candidate, ...], Dense, float, tuple[float, float]]]) -> list[Corner]:
         """Corners of plans, several at once."""
         if not runs:
             return []
-        scenarios = [self.perturbed(braces, dense, k_p, *place) for braces, dense, k_p, place in runs]
+        scenarios = [self.perturbed(braces, dense, k_p, *corner) for braces, dense, k_p, corner in runs]
         results = simulate_batch(scenarios, jobs=min(self.jobs, len(runs)), keep_records="all")
-        found = []
+        corners = []
         for (braces, dense, _, (mu, shift)), result in zip(runs, results, strict=True):
             if result.record is None or not result.ok:
-                found.append(Corner(mu, shift, reason=result.reason))
+                corners.append(Corner(mu, shift, reason=result.reason))
             else:
-                found.append(self._judged(braces, dense, mu, shift, result.record))
-        return found
+                corners.append(self._judged(braces, dense, mu, shift, result.record))
+        return corners
 
     def perturbed(
         self, braces: tuple[Candidate, ...], dense: Dense, k_p: float, friction: float = 1.0, shift: float = 0.0
@@ -203,7 +203,7 @@ class Verifier:
         assert target is not None
         error = np.linalg.norm(record["hand_position"] - target, axis=1)
         rms = float(np.sqrt(np.mean(error**2)))
-        closed = {one["name"]: float(one["closed_fraction"]) for one in record.summary["contacts"]}
+        closed = {contact["name"]: float(contact["closed_fraction"]) for contact in record.summary["contacts"]}
         turn = float("nan")
         if "hand_turn_error" in record:
             turn = float(np.sqrt(np.mean(record["hand_turn_error"] ** 2)))
@@ -234,9 +234,9 @@ class Verifier:
         places = np.array([record.labels["q"].index(joint) for joint in arm.joints])
         q = record["q"][:, places]
         # Surfaces that are up are arms that are down.
-        distance, what, when = nearest(self.task, braces, record.time, q, shift * self._up)
+        distance, part, when = nearest(self.task, braces, record.time, q, shift * self._up)
         if distance < -SUNK:
-            return f"{what}: {-1e3 * distance:.3g} mm deep at t = {when:.3g} s, though no brace"
+            return f"{part}: {-1e3 * distance:.3g} mm deep at t = {when:.3g} s, though no brace"
         return ""
 
     def _limits(self, record: Record) -> str:
@@ -266,17 +266,17 @@ class Verifier:
     def tolerance(self, braces: tuple[Candidate, ...], dense: Dense, k_p: float, steps: int = 5) -> tuple[float, float]:
         """Greatest error of the surfaces [m] and of friction (as a share) that do hold, each by bisection alone."""
 
-        def holds(place: tuple[float, float]) -> bool:
-            other = (2.0 - place[0], -place[1])
-            return not any(c.reason for c in self.corners(braces, dense, k_p, [place, other]))
+        def bears(corner: tuple[float, float]) -> bool:
+            other = (2.0 - corner[0], -corner[1])
+            return not any(c.reason for c in self.corners(braces, dense, k_p, [corner, other]))
 
-        def largest(most: float, place: Callable[[float], tuple[float, float]]) -> float:
+        def largest(most: float, corner: Callable[[float], tuple[float, float]]) -> float:
             low, high = 0.0, most
-            if holds(place(high)):
+            if bears(corner(high)):
                 return high
             for _ in range(steps):
                 middle = 0.5 * (low + high)
-                low, high = (middle, high) if holds(place(middle)) else (low, middle)
+                low, high = (middle, high) if bears(corner(middle)) else (low, middle)
             return low
 
         if self.corners(braces, dense, k_p, [(1.0, 0.0)])[0].reason:
