@@ -497,6 +497,62 @@ def planned_arm() -> str:
     return lines(heads, rows, left=2)
 
 
+def beside_best_known(scene: dict[str, Any]) -> dict[int, float]:
+    """By number of braces, the least heat that a search has found over the least that is known of the scene."""
+    long = next(one for one in data("planner/reference.json") if one["seed"] == scene["seed"])
+    known = {size["count"]: size["heat_W"] for size in long["sizes"]}
+    ratios = {}
+    for size in scene["sizes"]:
+        heats = [heat for heat in (size["least_W"], known.get(size["count"])) if heat is not None]
+        if heats:
+            ratios[size["count"]] = (size["least_W"] or math.inf) / min(heats)
+    return ratios
+
+
+def best_beside_best_known(scene: dict[str, Any]) -> float:
+    """The same of the best number of braces of each."""
+    long = next(one for one in data("planner/reference.json") if one["seed"] == scene["seed"])
+    own = min(size["least_W"] for size in scene["sizes"] if size["least_W"] is not None)
+    return float(own / min(own, *(size["heat_W"] for size in long["sizes"] if size["heat_W"] is not None)))
+
+
+def planned_share(limit: float, each: bool = False) -> str:
+    """How many scenes, or numbers of braces of each, are within a ratio of the best known."""
+    scenes = data("planner/scenes.json")
+    if each:
+        ratios = [ratio for scene in scenes for ratio in beside_best_known(scene).values()]
+    else:
+        ratios = [best_beside_best_known(scene) for scene in scenes]
+    return str(sum(ratio <= limit for ratio in ratios))
+
+
+def planned_answers() -> list[dict[str, Any]]:
+    """The best answer of each scene."""
+    scenes = data("planner/scenes.json")
+    return [size for scene in scenes for size in scene["sizes"] if size["count"] == scene["best"]]
+
+
+def planned_change(other: str) -> float:
+    """Greatest change of the heat of the best answers to another number [%]."""
+    sizes = [size for size in planned_answers() if size[other] is not None]
+    return max(100.0 * abs(size[other] / size["heat_W"] - 1.0) for size in sizes)
+
+
+def planned_gains() -> str:
+    """What plans cost on surfaces that are 5 mm off, by gain."""
+    rows = []
+    for row in data("planner/gains.json"):
+        arm = "published" if row["scene"].startswith("pressing") else row["scene"].replace("_", " ")
+        times = [
+            number(row["times_the_heat"][f"{shift:+g} mm"]) for shift in (0, 5, -5) if len(row["times_the_heat"]) == 3
+        ]
+        verdict = "yes" if row["survives"] else "no"
+        head = (arm, f"{row['friction']:g}", str(row["count"]), f"{row['k_p_V_per_rad']:g}")
+        rows.append((*head, *times, *(NONE,) * (3 - len(times)), verdict))
+    heads = ("arm", "μ", "braces", "k_p [V/rad]", "as planned", "5 mm up", "5 mm down", "survives")
+    return lines(heads, rows)
+
+
 def planned_scenes() -> str:
     """Scenes of the planner: the answer of each."""
     rows = []
@@ -505,13 +561,13 @@ def planned_scenes() -> str:
         best = next((size for size in scene["sizes"] if size["count"] == scene["best"]), None)
         head = (str(scene["seed"]), scene["kind"].replace("_", " "), str(scene["joints"]), f"{scene['friction']:g}")
         if best is None:
-            rows.append((*head, NONE, NONE, NONE, NONE, NONE))
+            rows.append((*head, *(NONE,) * 6))
             continue
         gain, verdict = f"{best['k_p_V_per_rad']:g}", "yes" if best["survives"] else "no"
-        rows.append((*head, number(free), str(best["count"]), number(best["heat_W"]), gain, verdict))
-    return lines(
-        ("scene", "with", "joints", "μ", "unbraced [W]", "braces", "heat [W]", "k_p", "survives"), rows, left=2
-    )
+        near = fixed(best_beside_best_known(scene), 3)
+        rows.append((*head, number(free), str(best["count"]), number(best["heat_W"]), near, gain, verdict))
+    heads = ("scene", "with", "joints", "μ", "unbraced [W]", "braces", "heat [W]", "best known", "k_p", "survives")
+    return lines(heads, rows, left=2)
 
 
 @cache
@@ -543,7 +599,7 @@ TABLES: dict[str, Callable[[], str]] = {
     for one in (
         elbows_in_short, elbows, glued_and_real, overturning_holds, overturning_drives, assumptions, ledger,
         snake_table_iii, time_stepping, endings, right_hand_side, ratios, job, precision, sweeps, comparison, faults,
-        planned_arm, planned_scenes,
+        planned_arm, planned_gains, planned_scenes,
     )
 }  # fmt: skip
 
@@ -673,6 +729,20 @@ NUMBERS |= {
     "planned_1_W": lambda: planned_heat(1),
     "planned_2_W": lambda: planned_heat(2),
     "planned_3_W": lambda: planned_heat(3),
+    "planned_4_W": lambda: planned_heat(4),
+    "planned_within_1": lambda: planned_share(1.01),
+    "planned_within_5": lambda: planned_share(1.05),
+    "planned_each_within_1": lambda: planned_share(1.01, each=True),
+    "planned_each_within_5": lambda: planned_share(1.05, each=True),
+    "planned_each": lambda: planned_share(math.inf, each=True),
+    "planned_effort": lambda: str(data("planner/reference.json")[0]["effort"]),
+    "planned_accepted": lambda: str(sum(bool(size["survives"]) for size in planned_answers())),
+    "planned_cpu_s": lambda: fixed(max(scene["search_cpu_s"] for scene in data("planner/scenes.json")), 1),
+    "planned_floor_cpu_s": lambda: fixed(
+        max(scene["search_cpu_s"] for scene in data("planner/scenes.json") if scene["kind"] == "floor"), 1
+    ),
+    "planned_instants": lambda: fixed(planned_change("with_4_times_the_instants_W"), 1),
+    "planned_nominal": lambda: fixed(planned_change("simulated_W"), 1),
     "pipe_sticks": lambda: fixed(100 * run("brace_on_cylinder real")["contacts"]["elbow"]["sticking_fraction"], 1),
     "pipe_glued_J": lambda: energy("brace_on_cylinder glued"),
     "pipe_free_J": lambda: fixed(run("brace_on_cylinder free")["electrical_energy_J"], 0),
