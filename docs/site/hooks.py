@@ -24,7 +24,6 @@ OUTSIDE = {
 }
 WORKER = "iframe-worker.js"
 _PICTURE = re.compile(r"\]\((?:\.\./)*(results/[\w/.-]+\.(?:png|gif))\)")
-_ROLE = re.compile(r":(?:class|func|meth|mod|data|attr):<code>~?(?:[\w.]+\.)?([\w ]+)</code>")
 
 
 def on_files(files: Files, config: Any) -> Files:
@@ -54,8 +53,3 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
         for source, target in OUTSIDE.items():
             markdown = markdown.replace(f"]({source})", f"]({up}{target})")
     return markdown
-
-
-def on_page_content(html: str, page: Any, config: Any, files: Files) -> str:
-    """Roles of docstrings as what they name."""
-    return _ROLE.sub(r"<code>\1</code>", html)

@@ -86,10 +86,10 @@ class JointControl:
 
         ``targets`` : what motors hold instead, by joint [rad or m]
         """
-        motors, held = len(robot.motors), held_values(robot)
+        motors, values = len(robot.motors), held_values(robot)
         for a, motor in enumerate(robot.motors):
-            held[a] = (targets or {}).get(motor.joint, held[a])
-        return cls(np.zeros(motors), np.zeros(motors), _reference(held), None)
+            values[a] = (targets or {}).get(motor.joint, values[a])
+        return cls(np.zeros(motors), np.zeros(motors), _reference(values), None)
 
     @classmethod
     def following(

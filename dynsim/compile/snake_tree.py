@@ -159,9 +159,9 @@ def snake_tree(
     for pair_index, (body, x) in enumerate(axles):
         for side in (1, -1):
             name = wheel_joint(pair_index, side)
-            place = np.array([x, side * float(d.half_track[pair_index]), 0.0])
+            position = np.array([x, side * float(d.half_track[pair_index]), 0.0])
             if massless_wheels and side != d.driven_side[pair_index]:
-                feet.append(Foot(name, body, place, d.wheel_radius, GROUND, grip_axis=_X))
+                feet.append(Foot(name, body, position, d.wheel_radius, GROUND, grip_axis=_X))
                 continue
             wheels.append(
                 Link(
@@ -171,7 +171,7 @@ def snake_tree(
                     "revolute",
                     _Y,
                     Inertia(0.0),
-                    p_PJ=place,
+                    p_PJ=position,
                     damping=bearing_drag,
                     armature=wheel_inertia,
                     shapes=(snake_wheel(d),),
@@ -220,17 +220,20 @@ def configuration(robot: SnakeTree, phi: Array, height: Array) -> Array:
 def at_angles(robot: SnakeTree, angles: Mapping[str, float], tilt: float = 0.0) -> Array:
     """Coordinates (nq,) of the tree with its lowest wheel on the ground, the body behind pair 1 tilted tail up [rad].
 
-    ``angles`` : by joint [rad]; of others zero
+    ``angles`` : by joint [rad]; others are where they start
     """
     d = robot.description
-    q = robot.configuration(angles)
+    q = robot.initial.copy()
+    for joint, k in zip(robot.joint_names, robot.position_index, strict=True):
+        q[k] = angles.get(joint, q[k])
     x, y, yaw = d.initial_base_pose
     c, s = np.cos(0.5 * yaw), np.sin(0.5 * yaw)
     cp, sp = np.cos(0.5 * tilt), np.sin(0.5 * tilt)
     # Rz(yaw) Ry(hinge)
     q[:7] = x, y, d.wheel_radius, c * cp, -s * sp, c * sp, s * cp
     model = Model(robot)
-    q[2] -= min(*(model.point_position(foot.body, foot.point, q)[2] - foot.radius for foot in robot.feet))
+    own = robot.feet[: 2 * d.pairs + 1]  # before those of objects beside it
+    q[2] -= min(model.point_position(foot.body, foot.point, q)[2] - foot.radius for foot in own)
     return q
 
 

@@ -29,8 +29,9 @@ from dynsim.engine.compilation import kernels_logged
 from dynsim.engine.equilibrium import Balance, balanced, shifted
 from dynsim.engine.method import AUTO, Choice, choose
 from dynsim.engine.outcome import check_size
-from dynsim.engine.snake_start import begun
-from dynsim.errors import ModelError, ScenarioError
+from dynsim.engine.snake_start import Phase, begun
+from dynsim.errors import ModelError, ScenarioError, SimulationStopped
+from dynsim.integrators import driver
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts import events as kev
 from dynsim.integrators.events import TIP_MARGIN
@@ -40,7 +41,7 @@ from dynsim.model.drives import Drive, Motor
 from dynsim.record.poses import pose_columns
 from dynsim.scenario import Scenario, build
 from dynsim.scenario.schema import Integrator
-from dynsim.system.memo import recall
+from dynsim.system.memo import Memo, recall, remembering
 
 log = logging.getLogger(__name__)
 
@@ -49,6 +50,8 @@ log = logging.getLogger(__name__)
 CLEARLY = 10.0
 # Steps that an explicit method may be held to by the electrical poles alone: a quarter of an hour for ten joints.
 STEPS_LIMIT = 2e8
+# More steps than any run takes.
+_EVERY_STEP = 1 << 62
 
 
 @dataclass(frozen=True)
@@ -112,7 +115,7 @@ def prepare(
     described, contacts = build.robot_and_contacts(scenario)
     piloted: JointControl | None = None
     if isinstance(described, SnakeTree):
-        described, piloted = begun(scenario, described)
+        described, piloted = begun(scenario, described, follow_lines)
     if motors is not None:
         described = replace(described, motors=tuple(motors))
     model = recall("model", lambda: Model(described), described)
@@ -220,6 +223,37 @@ def _check_friction(robot: Robot) -> None:
             "or a damping instead",
             keys=("plant",),
         )
+
+
+def follow_lines(scenario: Scenario, q: Array, phases: Sequence[Phase]) -> Array:
+    """Coordinates (nq,) that a robot comes to from rest at q, whose servos follow lines; see :data:`Phase`.
+
+    Raises
+    ------
+    SimulationStopped
+        It diverges.
+    """
+    # Tables that are written to are nobody else's.
+    with remembering(Memo()):
+        prepared = prepare(scenario, times=np.full(1, np.inf), end=phases[-1][0])
+    run, system, since = prepared.run, prepared.system, 0.0
+    run.y[block(run.layout, "q")] = q
+    motors = {motor.joint: a for a, motor in enumerate(prepared.model.robot.motors)}
+    for end, lines in phases:
+        rows = [motors[joint] for joint in lines]
+        system.reference.spline[rows] = ka.REWRITTEN
+        system.drives.input[rows, ka.LINE_START], system.drives.input[rows, ka.LINE_RATE] = np.array(
+            [*lines.values()]
+        ).T
+        system.drives.input[rows, ka.LINE_SINCE], since = since, end
+        run.clock[ki.END] = end
+        run.count[[ki.STATUS, ki.STARTED]] = ki.RUNNING, 0
+        while run.count[ki.STATUS] == ki.RUNNING:
+            driver.advance(system, prepared.workspace, run, _EVERY_STEP)
+            run.count[ki.LOGGED] = 0
+        if run.count[ki.STATUS] != ki.FINISHED:
+            raise SimulationStopped("the robot does not come to rest before the run begins: it diverges")
+    return run.y[block(run.layout, "q")].copy()
 
 
 def _ticks(control: JointControl) -> tuple[np.ndarray, np.ndarray] | None:

@@ -139,8 +139,8 @@ class SnakeControl:
             raise
         except Exception as error:
             # What is no fault of the source's code is said as it is.
-            what = str(error) if isinstance(error, ModelError) else f"{type(self.source).__name__} failed: {error!r}"
-            text = f"command source at t = {feedback.time:g} s: {what}"
+            reason = str(error) if isinstance(error, ModelError) else f"{type(self.source).__name__} failed: {error!r}"
+            text = f"command source at t = {feedback.time:g} s: {reason}"
             if first == 0:
                 raise ModelError(text) from error
             raise SimulationStopped(text, time=feedback.time, state=self.postures()) from error
@@ -220,14 +220,14 @@ class SnakeControl:
         waits = (real.null_start_tick - self.tick) * real.period  # until the null space comes on [s]
         schedule = schedule._replace(null_start_tick=round(waits / schedule.period))
         trial, trace = copy_of(self.state), new_trace(self.model, ticks + 1)
-        place = min(int(trial.counts[ss.PLACE]), len(self.block.velocity) - 1)
-        held = np.tile(self.block.velocity[place], (ticks, 1))
+        row_of_block = min(int(trial.counts[ss.PLACE]), len(self.block.velocity) - 1)
+        lasting = np.tile(self.block.velocity[row_of_block], (ticks, 1))
         trial.counts[ss.MODE], trial.counts[ss.TICKS], trial.counts[ss.PLACE], trial.progress[ss.DONE] = row, 0, 0, 0.0
-        done, _ = run_ticks(self.model, law, schedule, trial, held, ticks, 1, 1, 1, self.rig, trace)
+        done, _ = run_ticks(self.model, law, schedule, trial, lasting, ticks, 1, 1, 1, self.rig, trace)
         if done < 0:
             return np.inf, -np.inf  # no longer finite: no mode to take
         if done < ticks:  # blocked: the target waits for the rest of the period
-            run_ticks(self.model, law, schedule, trial, held, ticks - done, 0, 0, 1, self.rig, trace)
+            run_ticks(self.model, law, schedule, trial, lasting, ticks - done, 0, 0, 1, self.rig, trace)
         record_row(self.model, law, trial, self.rig, ticks, trace)
         return float(trace.cost[-1]), float(trace.margin.min())
 

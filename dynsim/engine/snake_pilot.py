@@ -96,7 +96,8 @@ class SnakePilot(SnakeControl):
         servos = {motor.joint: motor for motor in robot.motors if isinstance(motor, Servo)}
         self._volts_per_rad = np.array([servos[joint].k_p for joint in d.joint_names])
         self._volts = np.array([servos[joint].voltage_limit for joint in d.joint_names])
-        self._overload_ticks, self._lies_since = max(1, round(OVERLOAD_LOOK / self.period)), tuple[float, ...]()
+        self._overload_ticks = max(1, round(OVERLOAD_LOOK / self.period))
+        self._lies_since: float | None = None
         self.sensors = self._sensors(sensors or Sensors())
         self._next_look = self._commanded = 0
         self._seen: Any = None
@@ -158,18 +159,18 @@ class SnakePilot(SnakeControl):
         """Stop where the head has come to lie on the ground because a servo can do no more."""
         if self.tick % self._overload_ticks:
             return
-        touch, overloaded = simulation.touching.get(HEAD), ()
+        touch, overloaded = simulation.touching.get(HEAD), list[str]()
         if touch is not None and touch.force > 0.0:
             off = self._volts_per_rad * (self.state.phi - self._seen.q[self._joints])
             names = self.description.joint_names
-            overloaded = tuple(names[j] for j in np.flatnonzero(np.abs(off) >= self._volts))
-        if overloaded and not self._lies_since:
-            self._lies_since = (self.time,)
-        elif not overloaded:
-            self._lies_since = ()
-        elif self.time - self._lies_since[0] >= LIES_FOR:
+            overloaded = [names[j] for j in np.flatnonzero(np.abs(off) >= self._volts)]
+        if not overloaded:
+            self._lies_since = None
+        elif self._lies_since is None:
+            self._lies_since = self.time
+        elif self.time - self._lies_since >= LIES_FOR:
             raise SimulationStopped(
-                f"too_heavy: the head lies on the ground from t = {self._lies_since[0]:g} s on, "
+                f"too_heavy: the head lies on the ground from t = {self._lies_since:g} s on, "
                 f"{', '.join(overloaded)} at the limit of its voltage",
                 time=self.time,
                 state=self.postures(),

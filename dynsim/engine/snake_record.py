@@ -161,67 +161,69 @@ def task_summary(run: SnakeControl, record: Record) -> dict[str, Any]:
 
 def task_warnings(run: SnakeControl, record: Record, summary: dict[str, Any]) -> list[str]:
     """What a user should know of the control, a line each."""
-    found = []
+    warnings = []
     if summary["waiting_s"] > 0.0:
         share = 100.0 * summary["waiting_s"] / max(summary["duration_s"], 1e-9)
         why = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in summary["waiting_for_s"].items())
-        found.append(f"the target waited for {summary['waiting_s']:.2f} s ({share:.0f} % of the run): {why}")
+        warnings.append(f"the target waited for {summary['waiting_s']:.2f} s ({share:.0f} % of the run): {why}")
     if (gone := summary["out_of_reach"]) is not None:
-        place = ", ".join(f"{value:.3f}" for value in record["w_target"][-1])
-        found.append(
+        target = ", ".join(f"{value:.3f}" for value in record["w_target"][-1])
+        warnings.append(
             f"the path is out of reach from t = {gone['since_s']:.2f} s on ({gone['reason']}): the target waited there "
-            f"to the end of the run, at ({', '.join(COORDINATES)}) = ({place})"
+            f"to the end of the run, at ({', '.join(COORDINATES)}) = ({target})"
         )
     if summary["path_slowed_s"] > 0.0:
-        found.append(
+        warnings.append(
             f"the path is too fast for the joints: the target was slower than commanded for "
             f"{summary['path_slowed_s']:.2f} s and came {summary['path_late_s']:.2f} s late "
             "(controller.rate_limit_rad_s)"
         )
     if summary["slowed_s"] > 0.0:
-        found.append(
+        warnings.append(
             f"feedback and shape points were slowed down for {summary['slowed_s']:.2f} s: they asked for more than the "
             "limits of joints and rates allow"
         )
     if summary["null_space_reduced_s"] > 0.0:
-        found.append(
+        warnings.append(
             f"the null-space motion was reduced for {summary['null_space_reduced_s']:.2f} s to keep the rate limit: "
             "the cost falls slower there (controller.null_gain)"
         )
     if summary["joint_limit_violation_max_rad"] > 1e-9:  # less is rounding
         beyond = np.maximum(record["phi"] - run.description.upper, run.description.lower - record["phi"]).max(axis=0)
         worst = int(beyond.argmax())
-        found.append(
+        warnings.append(
             f"{run.description.joint_names[worst]} passes its limit by {beyond[worst]:.3f} rad; a real one would stop "
             "(controller.limit_policy: allocate)"
         )
     if summary["clamped_joint_ticks"]:
-        found.append(
+        warnings.append(
             f"joints were clamped at their limits in {summary['clamped_joint_ticks']} joint-ticks: the head is off its "
             f"target by up to {1e3 * summary['position_error_max_m']:.3g} mm"
         )
     if summary["tipping"]:
         share = 100.0 * float((record["support_margin"] <= 0.0).mean())
-        found.append(f"the robot tips: its centre of mass is outside the support polygon for {share:.1f} % of the run")
+        warnings.append(
+            f"the robot tips: its centre of mass is outside the support polygon for {share:.1f} % of the run"
+        )
     least, margin = run.controller.least_margin, record["support_margin"]
     if least > 0.0 and not summary["tipping"] and margin.min() <= least:
         worst = int(margin.argmin())
-        found.append(
+        warnings.append(
             f"the support margin falls to {1e3 * margin[worst]:.1f} mm at t = {record.time[worst]:.2f} s, below "
             f"switching.least_margin_m ({1e3 * least:g} mm): it is tested when a mode is chosen, not within it"
         )
-    return found + _refusal_warnings(summary["refusals"], run.controller.least_margin)
+    return warnings + _refusal_warnings(summary["refusals"], run.controller.least_margin)
 
 
 def _refusal_warnings(refusals: list[dict[str, Any]], least_margin: float) -> list[str]:
     """One line for every mode that was refused, and one for every mode that was taken although it tips."""
-    found = []
+    texts = []
     for mode, taken in dict.fromkeys((refusal["mode"], refusal["taken"]) for refusal in refusals):
         same = [refusal for refusal in refusals if (refusal["mode"], refusal["taken"]) == (mode, taken)]
         margin = same[0]["support_margin_m"]
         needed = f"a support margin of more than {1e3 * least_margin:g} mm is needed, it has"
         why = "its prediction diverges" if margin is None else f"{needed} {1e3 * margin:.1f} mm"
-        what = "taken, as no other stands better," if taken else "refused"
+        outcome = "taken, as no other stands better," if taken else "refused"
         times = f" ({len(same)} times in all)" if len(same) > 1 else ""
-        found.append(f"mode {mode} was {what} at t = {same[0]['time_s']:.3f} s{times}: {why}")
-    return found
+        texts.append(f"mode {mode} was {outcome} at t = {same[0]['time_s']:.3f} s{times}: {why}")
+    return texts

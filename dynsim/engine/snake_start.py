@@ -8,6 +8,7 @@ settles, is raised, and settles again.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -107,8 +108,16 @@ def command_angles(robot: SnakeTree, phi: Array, added: Array) -> dict[str, floa
     return angles
 
 
-def begun(scenario: Scenario, robot: SnakeTree) -> tuple[SnakeTree, JointControl]:
+# Until when [s] servos follow lines, position and rate by joint.
+Phase = tuple[float, Mapping[str, tuple[float, float]]]
+# Coordinates that a scenario comes to from others, whose servos go through phases: dynsim.engine.prepare.follow_lines.
+Follow = Callable[[Scenario, Array, Sequence[Phase]], Array]
+
+
+def begun(scenario: Scenario, robot: SnakeTree, follow: Follow) -> tuple[SnakeTree, JointControl]:
     """The robot as a run begins, and what its servos hold until the controller, if there is one, tells them otherwise.
+
+    ``follow`` : simulates the raising of the head
 
     Raises
     ------
@@ -126,7 +135,7 @@ def begun(scenario: Scenario, robot: SnakeTree) -> tuple[SnakeTree, JointControl
     added = lifter.angles(0.0, phi[d.head_joints :])
     if robot.raised:
         known = config.plant, config.contacts, config.integrator, config.surfaces, config.loads, grounded
-        q = recall("raised", lambda: _raised(scenario, robot, height, added), *known)
+        q = recall("raised", lambda: _raised(scenario, robot, height, added, follow), *known)
     else:
         q = configuration(robot, phi, height)
     robot = replace(robot, q0=q)
@@ -145,10 +154,8 @@ def _check_step(integrator: Integrator, period: float) -> None:
         )
 
 
-def _raised(scenario: Scenario, robot: SnakeTree, height: Array, added: Array) -> Array:
+def _raised(scenario: Scenario, robot: SnakeTree, height: Array, added: Array, follow: Follow) -> Array:
     """Coordinates (nq,) after the head was raised into the initial posture."""
-    from dynsim.engine.simulation import Simulation, State
-
     d = robot.description
     lowered = np.zeros(len(d.joint_names))
     pitches = np.flatnonzero(d.pitch)[::-1][: len(LOWERED)]
@@ -162,13 +169,10 @@ def _raised(scenario: Scenario, robot: SnakeTree, height: Array, added: Array) -
         "loads": payloads,
     }
     bare = replace(scenario, config=scenario.config.model_copy(update=changes))
-    robot = replace(robot, q0=configuration(robot, below, height))
-    start = State(0.0, robot.initial, np.zeros(len(robot.links)), np.zeros(0))
-    simulation = Simulation(bare, state=start, duration=math.inf, trace=0)
     first, last = command_angles(robot, below, added), command_angles(robot, d.initial_joints, added)
-    simulation.set_references({joint: (angle, 0.0) for joint, angle in first.items()})
-    simulation.advance(SETTLE)
-    simulation.set_references({joint: (angle, (last[joint] - angle) / RAISE) for joint, angle in first.items()})
-    simulation.advance(SETTLE + RAISE)
-    simulation.set_references({joint: (angle, 0.0) for joint, angle in last.items()})
-    return simulation.advance(SETTLE + RAISE + SETTLE_AGAIN).q
+    phases: list[Phase] = [
+        (SETTLE, {joint: (angle, 0.0) for joint, angle in first.items()}),
+        (SETTLE + RAISE, {joint: (angle, (last[joint] - angle) / RAISE) for joint, angle in first.items()}),
+        (SETTLE + RAISE + SETTLE_AGAIN, {joint: (angle, 0.0) for joint, angle in last.items()}),
+    ]
+    return follow(bare, configuration(robot, below, height), phases)

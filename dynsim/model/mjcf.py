@@ -1,9 +1,9 @@
 """MJCF out: a robot as a file of MuJoCo, with the mass matrix and bias forces that dynsim has.
 
-What MuJoCo's format can state exactly is written: bodies, joints with limits, viscous losses and rotor inertia, gears
-between joints, gravity, the initial posture. Motors become torques on their joints, within what their limit of current
-gives; circuits, gear friction and controllers stay with dynsim. Contact points become sites and surfaces become shapes
-that do not touch: MuJoCo's contacts are soft, dynsim's are not.
+What MuJoCo's format can state exactly is written: bodies, joints with limits, viscous losses, dry friction and rotor
+inertia, gears between joints, gravity, the initial posture. Motors become torques on their joints, within what their
+limit of current gives; circuits, smoothed gear friction and controllers stay with dynsim. Contact points become sites
+and surfaces become shapes that do not touch: MuJoCo's contacts are soft, dynsim's are not.
 """
 
 from __future__ import annotations
@@ -44,8 +44,11 @@ def write_mjcf(
     Raises
     ------
     ModelError
-        A joint of a kind that MJCF does not have.
+        A joint of a kind that MJCF does not have, or ties between bodies.
     """
+    if robot.ties:
+        raise ModelError(f"{robot.ties[0].name}: ties between bodies have no counterpart in MJCF")
+    rubs = _dry_friction(robot)
     root = Element("mujoco", model=robot.name)
     ElementTree.SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
     ElementTree.SubElement(root, "option", timestep="0.001", integrator="implicitfast", gravity=numbers(robot.gravity))
@@ -70,7 +73,7 @@ def write_mjcf(
             body = ElementTree.SubElement(elements[parent], "body", {"name": link.name, **origin})
             elements[link.name] = body
             _add_inertial(body, link)
-            _add_joints(body, group, damping[[row[link.joint] for link in group]], armature[row[link.joint]])
+            _add_joints(body, group, rubs, damping[[row[link.joint] for link in group]], armature[row[link.joint]])
             _add_shapes(body, link.shapes)
             order.extend(group)
             add(link.name)
@@ -107,7 +110,7 @@ def _joints(robot: Robot) -> list[list[Link]]:
     return list(groups.values())
 
 
-def _add_joints(body: Element, group: Sequence[Link], damping: Array, armature: float) -> None:
+def _add_joints(body: Element, group: Sequence[Link], rubs: dict[str, float], damping: Array, armature: float) -> None:
     """Add the joints of a body; three slides and a ball of a body that is free in the world are one free joint."""
     kinds = [link.kind for link in group]
     first = group[0]
@@ -121,9 +124,20 @@ def _add_joints(body: Element, group: Sequence[Link], damping: Array, armature: 
             ElementTree.SubElement(body, "joint", {**common, "type": "ball"})
         elif link.kind in _SIMPLE:
             joint = {**common, "type": _SIMPLE[link.kind], "axis": numbers(link.axis)}
+            if rubs[link.joint] > 0.0:
+                joint["frictionloss"] = numbers(rubs[link.joint])
             if math.isfinite(link.lower) and math.isfinite(link.upper):
                 joint["range"] = numbers([link.lower, link.upper])
             ElementTree.SubElement(body, "joint", joint)
+
+
+def _dry_friction(robot: Robot) -> dict[str, float]:
+    """Friction of bearings and gears that holds at rest, by joint [N m or N]."""
+    rubs = {link.joint: link.friction for link in robot.links}
+    for motor in robot.motors:
+        if not isinstance(motor, TorqueSource):
+            rubs[motor.joint] += motor.dry_friction
+    return rubs
 
 
 def _add_inertial(body: Element, link: Link) -> None:

@@ -71,7 +71,8 @@ def robot_and_contacts(scenario: Scenario) -> tuple[Robot, list[Contact]]:
 def unposed(scenario: Scenario) -> Robot:
     """The robot in the posture of its plant, before ``initial``."""
     config = scenario.config
-    return recall("plant", lambda: _loaded(scenario), config.plant, config.duration_s, config.loads)
+    beside = (config.objects, config.surfaces, config.contacts) if config.objects else ()
+    return recall("plant", lambda: _loaded(scenario), config.plant, config.duration_s, config.loads, *beside)
 
 
 def _loaded(scenario: Scenario) -> Robot:
@@ -87,7 +88,25 @@ def _loaded(scenario: Scenario) -> Robot:
     links = list(bare.links)
     for body, parts in inertias.items():
         links[body] = replace(links[body], inertia=Inertia.merged(parts))
-    return replace(bare, links=tuple(links)) if inertias else bare
+    loaded = replace(bare, links=tuple(links)) if inertias else bare
+    return _with_objects(scenario, loaded) if scenario.config.objects else loaded
+
+
+def _with_objects(scenario: Scenario, built: Robot) -> Robot:
+    """The robot and the objects beside it, each a tree of its own."""
+    objects, surfaces = scenario.config.objects, list(scenario.config.surfaces)
+    taken = {*(link.name for link in built.links), *built.joint_names, *(frame.name for frame in built.frames)}
+    for name in objects:
+        if name in taken:
+            text = f"objects.{name}: the robot has a body, joint or frame of that name"
+            raise ModelError(text, keys=("objects", name))
+    touching = surfaces if scenario.config.contacts.law == "unilateral" else []
+    return replace(
+        built,
+        links=(*built.links, *(link for name, one in objects.items() for link in one.links(name))),
+        q0=np.concatenate([built.initial, *(one.start() for one in objects.values())]),
+        feet=(*built.feet, *(foot for name, one in objects.items() for foot in one.feet(name, touching))),
+    )
 
 
 def _nameable(scenario: Scenario, built: Robot) -> list[Contact]:

@@ -15,6 +15,7 @@ from dynsim.library.families import engine, section_defaults, union
 from dynsim.record import notebook
 from dynsim.scenario.effect import idle_keys, is_set
 from dynsim.scenario.loads import LoadConfig
+from dynsim.scenario.objects import SceneObject
 from dynsim.scenario.sensors import Sensors
 
 # Bytes of the name of a folder on common file systems.
@@ -274,6 +275,7 @@ class ScenarioConfig(StrictConfig):
     )
     initial: Initial | None = Field(default=None, description="posture and currents of the start")
     loads: dict[str, LoadConfig] = Field(default={}, description="forces, torques and payloads by name")
+    objects: dict[str, SceneObject] = Field(default={}, description="bodies beside the robot, by name")
     sensors: Sensors | None = Field(default=None, description="what a sampled controller is told of the robot")
     integrator: Integrator = Integrator()
     record: RecordOptions = RecordOptions()
@@ -423,8 +425,9 @@ class Scenario:
         Defaults that change nothing are left out.
         """
         resolved = self.config.model_dump(mode="json", exclude_none=True)
-        if not self.config.loads:
-            del resolved["loads"]
+        for section in ("loads", "objects"):
+            if not getattr(self.config, section):
+                del resolved[section]
         contacts = self.config.contacts
         for part in (resolved["contacts"], *resolved["contacts"]["points"].values()):
             for key in contacts.other_keys:

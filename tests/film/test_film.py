@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from meshed_robot import meshed_robot
 from PIL import Image, ImageColor, ImageDraw
+from support.meshed_robot import meshed_robot
 
 import dynsim
 from dynsim import cli

@@ -17,7 +17,7 @@ from typing import Any
 import dynamixel_sdk as sdk
 import pytest
 from dynamixel_sdk import COMM_SUCCESS, PortHandler, Protocol2PacketHandler
-from processes import started, wait_for
+from support.processes import started, wait_for
 
 from dynsim.hardware.bus.control_table import BAUD_RATES, MODELS, MX_106, RAD_PER_TICK
 

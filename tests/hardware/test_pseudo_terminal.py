@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from dynamixel_sdk import COMM_SUCCESS, PortHandler, Protocol2PacketHandler
-from processes import Child, started, wait_for
+from support.processes import Child, started, wait_for
 
 from dynsim.hardware.bus.control_table import MX_106
 from dynsim.hardware.bus.dynamixel_bus import DynamixelBus, open_serial_port

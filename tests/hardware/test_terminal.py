@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from processes import wait_for
+from support.processes import wait_for
 
 from dynsim.hardware.replay.output import PART
 from dynsim.hardware.replay.states import ReplayState

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from teleop_clients import Teleop
+from support.teleop_clients import Teleop
 
 
 @pytest.fixture

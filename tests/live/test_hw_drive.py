@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from processes import wait_for
-from teleop_clients import Client, Teleop
+from support.processes import wait_for
+from support.teleop_clients import Client, Teleop
 from websockets.exceptions import ConnectionClosed
 
 from dynsim import Record, load_scenario, simulate

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
-from teleop_clients import PATIENCE_S, Teleop
+from support.teleop_clients import PATIENCE_S, Teleop
 
 pytestmark = pytest.mark.long
 

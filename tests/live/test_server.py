@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from teleop_clients import Client, Teleop
+from support.teleop_clients import Client, Teleop
 
 from dynsim import Record, load_scenario, simulate
 

@@ -14,7 +14,8 @@ import dynsim
 from dynsim import Model
 from dynsim.cli.commands import app
 from dynsim.model.description import WORLD as ROOT
-from dynsim.model.description import Coupling, Inertia, Link, Robot
+from dynsim.model.description import Coupling, Inertia, Link, Robot, Tie
+from dynsim.model.drives import Motor
 from dynsim.model.joints.ball import ball, floating
 from dynsim.model.joints.planar import planar
 from dynsim.record.poses import poses_at
@@ -148,6 +149,20 @@ def test_bodies_without_mass_or_with_a_point_mass_are_read() -> None:
     data.qpos[:] = q = np.array([0.3, 0.4])
     mujoco.mj_forward(peer, data)
     assert_near(mass_matrix(peer, data), model.mass_matrix(q))
+
+
+def test_dry_friction_of_bearing_and_gear_is_that_of_the_joint_in_mujoco() -> None:
+    motor = Motor("turn", 0.1, 1.0, 1e-3, 1e-5, 50.0, dry_friction=0.2)
+    link = Link("rod", "turn", None, "revolute", np.array([0.0, 1.0, 0.0]), BOX, friction=0.3)
+    peer, _ = in_mujoco(Model(Robot("one", (link,), (motor,), ("rod", np.zeros(3)))).to_mjcf())
+    assert peer.dof_frictionloss[0] == pytest.approx(0.5)
+
+
+def test_ties_are_refused_in_words() -> None:
+    robot = tree()
+    tie = Tie("rope", "tip", "plate", np.array([0.0, 0.0, 1.0]), 100.0)
+    with pytest.raises(dynsim.DynsimError, match="rope: ties between bodies have no counterpart in MJCF"):
+        Model(replace(robot, q0=robot.configuration({}), ties=(tie,))).to_mjcf()
 
 
 def test_wheels_that_roll_without_slip_are_refused_in_words() -> None:

@@ -12,7 +12,7 @@ import pinocchio as pin
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from random_robots import bench, random_contacts, random_positions, random_robot_of
+from support.random_robots import bench, random_contacts, random_positions, random_robot_of
 
 from dynsim.compile.model import Model
 from dynsim.dynamics import tables as ka

@@ -6,8 +6,8 @@ import numpy as np
 import pinocchio as pin
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from pinocchio_oracle import Oracle
-from random_robots import bench, random_contacts, random_robot
+from support.pinocchio_oracle import Oracle
+from support.random_robots import bench, random_contacts, random_robot
 
 from dynsim.compile.model import Model
 from dynsim.dynamics import tables as ka

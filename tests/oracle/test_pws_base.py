@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from random_robots import Bench, bench, random_contacts
-from real_wheels import MOTOR, WHEELS, RealWheels, random_base, random_serial, random_urdf
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline, make_interp_spline
+from support.random_robots import Bench, bench, random_contacts
+from support.real_wheels import MOTOR, WHEELS, RealWheels, random_base, random_serial, random_urdf
 
 from dynsim.compile.model import Model
 from dynsim.dynamics import tables as ka

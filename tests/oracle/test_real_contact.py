@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 import pytest
-from pinocchio_oracle import Oracle
-from random_robots import bench, random_contacts, random_positions, random_robot
+from support.pinocchio_oracle import Oracle
+from support.random_robots import bench, random_contacts, random_positions, random_robot
 
 from dynsim.dynamics.state import OUT_FORCE, OUT_VECTOR
 from dynsim.integrators import run as ki

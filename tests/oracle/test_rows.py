@@ -11,8 +11,8 @@ import pinocchio as pin
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from pinocchio_oracle import Oracle
-from random_robots import Bench, bench, random_contacts, random_robot, random_unit
+from support.pinocchio_oracle import Oracle
+from support.random_robots import Bench, bench, random_contacts, random_robot, random_unit
 
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact.rows import force_vectors, set_modes

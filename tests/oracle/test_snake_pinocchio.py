@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_snakes import robots
+from support.random_snakes import robots
 
 from dynsim.jit.kernel import integers, reals
 from dynsim.snake.kinematics import active_rows, constraint_matrices, new_chain, walk_chain

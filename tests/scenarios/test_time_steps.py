@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from stepping_benches import snake
+from support.stepping_benches import snake
 
 import dynsim
 from dynsim.engine.warnings import HALF_STEP_LIMIT, PENETRATION_LIMIT_M, SCHEME_LIMIT, coarse

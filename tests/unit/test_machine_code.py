@@ -88,7 +88,7 @@ import numpy as np
 from contextlib import nullcontext
 from dynsim.jit import compiler, kernel as jit
 from dynsim.dynamics.tree.sweep import kinematics
-from tests.random_robots import bench, random_robot
+from support.random_robots import bench, random_robot
 
 if "numba's" in sys.argv:
     compiler._quick_look_ups = nullcontext

@@ -11,8 +11,8 @@ from types import ModuleType
 from typing import Any
 
 import pytest
-from processes import wait_for
-from sweep_work import pid, says, square, unsendable
+from support.processes import wait_for
+from support.sweep_work import pid, says, square, unsendable
 
 from dynsim.studies import processes
 from dynsim.studies.processes import run_in_processes
@@ -70,7 +70,7 @@ def test_a_notebook_has_its_folder_first_and_workers_do_not(tmp_path: Path):
 
 SCRIPT = """
 import helper
-from sweep_work import named
+from support.sweep_work import named
 from dynsim.studies.processes import run_in_processes
 
 class Here:
@@ -165,7 +165,7 @@ def test_a_worker_that_is_stopped_when_all_is_done_is_not_waited_for():
 
 
 WAITS = """
-from sweep_work import deaf
+from support.sweep_work import deaf
 from dynsim.studies.processes import run_in_processes
 import sys
 run_in_processes(deaf, [(k, sys.argv[1]) for k in range(2)], 2, print)

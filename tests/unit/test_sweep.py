@@ -20,8 +20,8 @@ import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.colors import to_rgb
-from processes import started, wait_for
-from sweep_work import DEADLY, REFUSED, deaf, hangs, leaves, once_deadly, slow, square, warned
+from support.processes import started, wait_for
+from support.sweep_work import DEADLY, REFUSED, deaf, hangs, leaves, once_deadly, slow, square, warned
 
 import dynsim
 from dynsim.cli import sweep as sweep_command

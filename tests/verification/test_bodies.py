@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from random_robots import bench, random_inertia, random_robot, random_unit
+from support.random_robots import bench, random_inertia, random_robot, random_unit
 
 from dynsim.compile.model import Model
 from dynsim.dynamics import tables as ka

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from random_robots import random_robot, random_rotation, random_unit
+from support.random_robots import random_robot, random_rotation, random_unit
 
 import dynsim.engine
 from dynsim.compile.model import Model

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from random_robots import random_positions, random_robot, random_robot_of, random_unit
 from rich.console import Console
+from support.random_robots import random_positions, random_robot, random_robot_of, random_unit
 
 import dynsim
 from dynsim.cli.tables import print_comparison, print_summary

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from random_robots import ADAPTIVE, Bench, bench
 from scipy.special import ellipk
+from support.random_robots import ADAPTIVE, Bench, bench
 
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.state import FRICTION, OUT_FORCE

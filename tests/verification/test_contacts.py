@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from random_robots import bench, random_contacts, random_robot, surface_through
+from support.random_robots import bench, random_contacts, random_robot, surface_through
 
 from dynsim.compile.model import Model
 from dynsim.dynamics import tables as ka

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from random_robots import bench, random_robot
+from support.random_robots import bench, random_robot
 
 from dynsim.compile.model import Model
 from dynsim.dynamics.state import CONSTRAINT

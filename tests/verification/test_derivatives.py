@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 import pytest
-from pinocchio_oracle import Oracle
+from support.pinocchio_oracle import Oracle
 
 import dynsim
 from dynsim import Model

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.optimize import brentq
+from support.random_robots import Bench, bench
 
 from dynsim import load_scenario, simulate
 from dynsim.dynamics import tables as ka
@@ -18,7 +19,6 @@ from dynsim.dynamics.drive.torque import open_torque
 from dynsim.dynamics.state import GEAR
 from dynsim.model.description import Inertia, Link, Robot, vector
 from dynsim.model.drives import Drive, Motor, Servo, TorqueSource
-from tests.random_robots import Bench, bench
 
 INERTIA = 0.3  # of the wheel and of what turns with it [kg m²]
 K_M, R = 1.9, 2.3  # [V s/rad], [Ω]

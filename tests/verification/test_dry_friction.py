@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from random_robots import Bench, bench, random_robot
-from stepping_benches import plane, stepped
+from support.random_robots import Bench, bench, random_robot
+from support.stepping_benches import plane, stepped
 
 from dynsim import load_scenario, simulate
 from dynsim.compile.model import Model

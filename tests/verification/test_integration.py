@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from random_robots import ADAPTIVE, Bench, bench
+from support.random_robots import ADAPTIVE, Bench, bench
 
 from dynsim.dynamics.state import CONSTRAINT, ELECTRICAL, FRICTION, GEAR, JOINT, JOULE, OUT_GAP
 from dynsim.integrators.radau5.step import SHORT, guess_stages, keep_stages, missed, slack

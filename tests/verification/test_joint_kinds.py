@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from random_robots import (
+from scipy.special import ellipj
+from support.random_robots import (
     bench,
     random_contacts,
     random_positions,
@@ -15,7 +16,6 @@ from random_robots import (
     random_rotation,
     without_losses,
 )
-from scipy.special import ellipj
 
 from dynsim.compile.model import Model
 from dynsim.dynamics import tables as ka

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numba import config, types
-from random_robots import bench, random_contacts, random_robot
+from support.random_robots import bench, random_contacts, random_robot
 
 from dynsim.compile.model import Model
 from dynsim.dynamics import derivative as system
@@ -22,7 +22,7 @@ from dynsim.integrators import driver
 PLAIN_PYTHON = """
 import sys
 import numpy as np
-from random_robots import bench, random_contacts, random_robot
+from support.random_robots import bench, random_contacts, random_robot
 
 rng = np.random.default_rng(5)
 robot = random_robot(rng, 4)

@@ -1,6 +1,6 @@
 """The right-hand side is fit for vectors of doubles: branches that look at the state are few, known, and listed here.
 
-``derivative`` runs as Python on numbers of four lanes (``tests/lanes.py``), every line of it. What a lane gets must be
+``derivative`` runs as Python on numbers of four lanes (``tests/support/lanes.py``), each line. What a lane gets must be
 what a run of its own gets, to the bit, and every place that asks lanes for one truth must be in a list below.
 """
 
@@ -9,11 +9,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-import lanes
 import numpy as np
 import pytest
-from lane_cases import CASES, TIMED, Case, held, run
-from lanes import Divergent, Lanes, Notes, Place, select
+from support import lanes
+from support.lane_cases import CASES, TIMED, Case, held, run
+from support.lanes import Divergent, Lanes, Notes, Place, select
 
 from dynsim.dynamics import derivative as system
 from dynsim.dynamics import tables as ka

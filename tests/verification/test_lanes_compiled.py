@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from lane_cases import CASES, TIMED, Case, of, plane
-from lanes import copies
-from random_robots import Bench, bench, braced, random_contacts, random_positions, random_robot
+from support.lane_cases import CASES, TIMED, Case, of, plane
+from support.lanes import copies
+from support.random_robots import Bench, bench, braced, random_contacts, random_positions, random_robot
 
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact.rows import set_modes
@@ -145,7 +145,7 @@ import sys
 samples, tolerance, *folders = sys.argv[1:]
 sys.path[:0] = folders
 import numpy as np
-from lane_cases import CASES
+from support.lane_cases import CASES
 from test_lanes_compiled import compare, short_run, spread
 for name in ("curved", "dissipative", "voltage limits") if float(tolerance) else ():
     case = CASES[name]()

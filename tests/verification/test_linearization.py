@@ -8,8 +8,8 @@ from collections.abc import Callable
 import numpy as np
 import pinocchio as pin
 import pytest
-from pinocchio_oracle import Oracle
 from scipy.linalg import expm
+from support.pinocchio_oracle import Oracle
 
 import dynsim
 from dynsim import DynsimError, Simulation, load_scenario

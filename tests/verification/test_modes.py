@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from random_robots import Bench, bench, random_contacts, random_robot, surface_through
+from support.random_robots import Bench, bench, random_contacts, random_robot, surface_through
 
 from dynsim.compile.model import Model
 from dynsim.dynamics import tables as ka

@@ -21,7 +21,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from random_robots import bench, random_inertia, random_robot_of, random_rotation, without_losses
+from support.random_robots import bench, random_inertia, random_robot_of, random_rotation, without_losses
 
 import dynsim
 from dynsim.compile.clearance import poses

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from random_robots import Bench, bench, random_contacts, random_robot, random_unit
+from support.random_robots import Bench, bench, random_contacts, random_robot, random_unit
 
 import dynsim
 from dynsim.dynamics import tables as ka

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from random_robots import Bench, bench
-from real_wheels import MOTOR
 from scipy.linalg import expm
+from support.random_robots import Bench, bench
+from support.real_wheels import MOTOR
 
 import dynsim
 from dynsim.model.description import Robot

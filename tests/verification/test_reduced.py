@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from lanes import copies
-from random_robots import Bench, bench, random_positions, random_robot, random_robot_of
+from support.lanes import copies
+from support.random_robots import Bench, bench, random_positions, random_robot, random_robot_of
 
 from dynsim.integrators.radau5.linear_systems import factor_both, solve_both
 from dynsim.integrators.radau5.tables import ALPHA_RADAU, BETA_RADAU, GAMMA_RADAU

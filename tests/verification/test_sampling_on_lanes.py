@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from random_robots import Bench, braced
+from support.random_robots import Bench, braced
 
 from dynsim.integrators.run import EVALUATIONS, FINISHED, PROJECTIONS, SAMPLE, STATUS, TIME, Run
 

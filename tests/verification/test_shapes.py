@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from random_robots import Bench, bench, random_robot, random_rotation, random_unit
 from scipy.interpolate import make_interp_spline
 from scipy.optimize import minimize, minimize_scalar
+from support.random_robots import Bench, bench, random_robot, random_rotation, random_unit
 
 from dynsim.compile.model import Model
 from dynsim.compile.shapes import compile_shapes, contact_gap, moves

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_snakes import robots
+from support.random_snakes import robots
 
 from dynsim.compile.protocols import BuildContext
 from dynsim.errors import ModelError

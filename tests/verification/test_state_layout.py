@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from random_robots import ADAPTIVE, Bench, bench, random_contacts, random_robot
+from support.random_robots import ADAPTIVE, Bench, bench, random_contacts, random_robot
 
 import dynsim
 from dynsim.dynamics.derivative import new_workspace
@@ -259,7 +259,7 @@ OWN_STATE = {TESTS / "support" / "rotors.py"}
 def _sources() -> list[Path]:
     files = [*PACKAGE.rglob("*.py"), *TESTS.rglob("*.py")]
     assert PACKAGE / "dynamics" / "derivative.py" in files
-    assert TESTS / "random_robots.py" in files
+    assert TESTS / "support" / "random_robots.py" in files
     return sorted({*files} - OWN_STATE - {PACKAGE / "dynamics" / "state.py"})
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from random_robots import Bench, bench, random_robot
 from scipy.integrate import solve_ivp
-from stepping_benches import plane, snake, stepped
+from support.random_robots import Bench, bench, random_robot
+from support.stepping_benches import plane, snake, stepped
 
 import dynsim
 from dynsim.dynamics import tables as ka

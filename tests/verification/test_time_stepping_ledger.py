@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from random_robots import Bench, bench, random_contacts, random_positions, random_robot, random_robot_of
-from stepping_benches import snake, stepped
+from support.random_robots import Bench, bench, random_contacts, random_positions, random_robot, random_robot_of
+from support.stepping_benches import snake, stepped
 
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.state import CONSTRAINT, ELECTRICAL, FRICTION, GEAR, JOINT, JOULE

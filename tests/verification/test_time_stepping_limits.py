@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from random_robots import Bench, bench
-from stepping_benches import plane, stepped
+from support.random_robots import Bench, bench
+from support.stepping_benches import plane, stepped
 
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.drive.servo import servo_block, servo_block_on, servo_circuit, servo_circuit_on, servo_segment

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from random_robots import Bench, bench
-from stepping_benches import plane, stepped
+from support.random_robots import Bench, bench
+from support.stepping_benches import plane, stepped
 
 from dynsim.dynamics.contact.cone.least_norm import select_least_norm
 from dynsim.dynamics.contact.cone.problem import CONE, CONE_ROOM, TANGENT

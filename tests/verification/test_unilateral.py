@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from random_robots import Bench, bench
+from support.random_robots import Bench, bench
 
 from dynsim import load_scenario, simulate
 from dynsim.compile.contact_law import SETTLE_SPEED

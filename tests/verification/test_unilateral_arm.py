@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from random_robots import Bench, bench
 from scipy.integrate import solve_ivp
-from unilateral_checks import events, ledger_residual
+from support.random_robots import Bench, bench
+from support.unilateral_checks import events, ledger_residual
 
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.state import OUT_FORCE, OUT_GAP, OUT_MODE, OUT_VECTOR

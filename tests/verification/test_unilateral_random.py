@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from unilateral_checks import random_touch, violations
+from support.unilateral_checks import random_touch, violations
 
 from dynsim.integrators import run as ki
 

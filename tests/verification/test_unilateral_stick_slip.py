@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from random_robots import Bench, bench
 from scipy.optimize import brentq
-from unilateral_checks import events, random_touch, violations
+from support.random_robots import Bench, bench
+from support.unilateral_checks import events, random_touch, violations
 
 import dynsim
 from dynsim.dynamics.state import OUT_VECTOR

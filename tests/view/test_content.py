@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from meshed_robot import CORNERS, FACES, dae, meshed_robot, obj, stl, stl_text
 from scipy.spatial import cKDTree
+from support.meshed_robot import CORNERS, FACES, dae, meshed_robot, obj, stl, stl_text
 
 import dynsim
 from dynsim import cli

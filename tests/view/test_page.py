@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from meshed_robot import meshed_robot
 from PIL import Image
+from support.meshed_robot import meshed_robot
 
 import dynsim
 from dynsim.record import Record

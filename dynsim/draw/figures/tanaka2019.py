@@ -127,15 +127,15 @@ def dynamic_positioning(records: Mapping[str, Record]) -> Figure:
     marks = {"kinematic": ("|", "black"), "dynamic": ("D", HEAD), "measured": ("o", GROUND)}
     for i, axis in enumerate(axes):
         unit, scale = ("mm", 1e3) if i < 3 else ("mrad", 1e3)
-        place = np.arange(len(moved))
+        positions = np.arange(len(moved))
         off = [scale * (TABLE_III[m].mean[i] - TABLE_III[m].target[i]) for m in moved]
         spread = [2.0 * scale * TABLE_III[m].deviation[i] for m in moved]
-        axis.bar(place, off, 0.6, yerr=spread, capsize=2, color=VARIANT_COLOURS[2], alpha=0.5, label="[T], ± 2 SD")
+        axis.bar(positions, off, 0.6, yerr=spread, capsize=2, color=VARIANT_COLOURS[2], alpha=0.5, label="[T], ± 2 SD")
         for source, (mark, colour) in marks.items():
             names = [m + SOURCES[source] for m in moved]
             there = [k for k, name in enumerate(names) if name in records]
             ours = [scale * (displacement(records[names[k]])[i] - TABLE_III[moved[k]].target[i]) for k in there]
-            axis.plot(place[there], ours, mark, color=colour, ms=5, label=source)
+            axis.plot(positions[there], ours, mark, color=colour, ms=5, label=source)
         axis.axhline(0.0, color="black", lw=0.6)
         axis.set_ylabel(f"Δ{SYMBOLS.get(COORDINATES[i], COORDINATES[i])} [{unit}]")
     handles, labels = axes[0].get_legend_handles_labels()

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from random_robots import random_inertia, random_robot, random_unit
 
 from dynsim.model.urdf.writer import write_urdf
+from support.random_robots import random_inertia, random_robot, random_unit
 
 Array = np.ndarray
 WHEELS = ("base.left", "base.right")

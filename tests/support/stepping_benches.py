@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from random_robots import Bench, bench
 
 from dynsim.dynamics import tables as ka
 from dynsim.integrators.run import Run
 from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot
 from dynsim.model.drives import Servo
 from dynsim.model.joints.ball import floating
+from support.random_robots import Bench, bench
 
 
 def stepped(b: Bench, y: np.ndarray, times: np.ndarray, step: float, theta: float, law: dict | None = None) -> Run:

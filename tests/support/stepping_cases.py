@@ -7,16 +7,16 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from random_robots import Bench, bench
 from scipy.integrate import solve_ivp
 from scipy.interpolate import make_interp_spline
-from stepping_benches import plane, stepped
 
 from dynsim.dynamics import tables as ka
 from dynsim.integrators.run import Run
 from dynsim.jit.kernel import integers, reals
 from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot
 from dynsim.model.drives import Servo
+from support.random_robots import Bench, bench
+from support.stepping_benches import plane, stepped
 
 G = 9.81
 X, Y, Z = np.eye(3)

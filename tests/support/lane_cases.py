@@ -6,10 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-import lanes
 import numpy as np
 import pytest
-from random_robots import Bench, bench, random_positions, random_robot, random_robot_of, random_unit, surface_through
 
 from dynsim.dynamics import derivative as system
 from dynsim.dynamics import tables as ka
@@ -17,6 +15,16 @@ from dynsim.dynamics.contact.rows import set_modes
 from dynsim.jit.kernel import integers, reals
 from dynsim.model.description import Contact, Coupling, Inertia, Link, Load, Quadric, Robot
 from dynsim.model.drives import Motor, Servo, TorqueSource
+from support import lanes
+from support.random_robots import (
+    Bench,
+    bench,
+    random_positions,
+    random_robot,
+    random_robot_of,
+    random_unit,
+    surface_through,
+)
 
 
 @dataclass

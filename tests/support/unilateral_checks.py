@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from random_robots import Bench, bench, random_contacts, random_positions, random_robot
 
 from dynsim.compile.model import Model
 from dynsim.dynamics import tables as ka
@@ -26,6 +25,7 @@ from dynsim.dynamics.state import (
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts import events as ce
 from dynsim.model.description import Contact, Quadric
+from support.random_robots import Bench, bench, random_contacts, random_positions, random_robot
 
 
 def raised(contact: Contact, height: float) -> Contact:
