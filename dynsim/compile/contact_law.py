@@ -67,7 +67,7 @@ def compile_unilateral(
     ----------
     stops : what joints come up against
     slow : speed below which slip has no direction of its own [m/s]
-    dry : joints that rub; time stepping only
+    dry : joints that rub
     """
     c, s, ties = len(contacts), len(stops), robot.ties
     p = ka.row_limit(c, len(robot.couplings) + s + len(dry) + len(ties))
@@ -80,6 +80,7 @@ def compile_unilateral(
     for k, friction in enumerate(dry):
         dry_table[k, ku.DRY_JOINT] = robot.joint_names.index(friction.joint)
         dry_table[k, ku.DRY_DRIVE] = driven.index(friction.joint) if friction.gear > 0.0 else -1
+        dry_table[k, ku.DRY_HOLDS] = 1
         frictions[k, [ku.OF_GEAR, ku.OF_JOINT]] = friction.gear, friction.bearing
     tie_table, tie = np.zeros((len(ties), ku.TIE_TABLE_SIZE), dtype=np.int64), np.zeros((len(ties), ku.TIE_SIZE))
     for joined, ints, floats in zip(ties, tie_table, tie, strict=True):
@@ -99,10 +100,10 @@ def compile_unilateral(
         dry=reals(frictions),
         tie_table=integers(tie_table),
         tie=reals(tie),
-        place=integers(np.zeros((ku.PLACES, max(p, c + 2)))),
+        place=integers(np.zeros((ku.PLACES, max(p, c + len(dry) + 2)))),
         vector=reals(np.zeros((ku.VECTORS, p))),
         room=reals(np.zeros((ku.ROOM, p, p))),
-        split_room=reals(np.zeros(split_size(3 * c, c))),
+        split_room=reals(np.zeros(split_size(3 * c + len(dry), c + len(dry)))),
         number=reals(number),
     )
 

@@ -17,9 +17,9 @@ from dynsim.dynamics.contact.quadrics import contact_rows, sign_changed
 from dynsim.dynamics.contact.rows import set_modes
 from dynsim.dynamics.contact.shapes import shaped_rows
 from dynsim.dynamics.contact.splits import admissible_forces
-from dynsim.dynamics.contact.unilateral import UnilateralArrays
+from dynsim.dynamics.contact.unilateral import UnilateralArrays, rub
 from dynsim.dynamics.drive.law import drive
-from dynsim.dynamics.ledger import ledger_rates
+from dynsim.dynamics.ledger import dry_losses, ledger_rates
 from dynsim.dynamics.state import StateLayout
 from dynsim.dynamics.tables import (
     ContactArrays,
@@ -115,6 +115,7 @@ def derivative(system: System, t, y, ws: Workspace, dy):
         joints[i, ka.QDD] = 0.0
         joints[i, ka.APPLIED] = -(model.body[i, ka.DAMPING] + model.body[i, ka.GEAR_DAMPING]) * joints[i, ka.QD]
     drive(drives, system.reference, t, y, layout, ws)
+    rub(system.unilateral, ws)
 
     forward_sweep(model, ws, 1.0, 0.0, 1.0)
     if system.loads.table.shape[0] > 0:
@@ -136,3 +137,4 @@ def derivative(system: System, t, y, ws: Workspace, dy):
         if drives.table[a, ka.CIRCUIT] >= 0:
             dy[layout.current + drives.table[a, ka.CIRCUIT]] = motors[a, ka.DIDT]
     ledger_rates(model, drives, ws, dy, layout)
+    dry_losses(system.unilateral, ws, dy, layout.ledger)

@@ -6,7 +6,9 @@ import math
 
 from dynsim.dynamics import state as kst
 from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.rows import joint_rate
+from dynsim.dynamics.contact.unilateral import UnilateralArrays
 from dynsim.dynamics.tables import DriveArrays, ModelArrays, Workspace
 from dynsim.dynamics.tree.spatial import point_velocity, six, vector
 from dynsim.dynamics.tree.sweep import body_inertia
@@ -86,6 +88,19 @@ def ledger_rates(model: ModelArrays, drives: DriveArrays, ws: Workspace, out, la
     out[start + kst.CONSTRAINT] = constraint
     out[start + kst.MECHANICAL] = mechanical
     out[start + kst.SUPPLY] = max(electrical, 0.0)
+
+
+@internal_kernel
+def dry_losses(unilateral: UnilateralArrays | None, ws: Workspace, out, start):
+    """What dry friction of joints that slide takes, onto the losses of gears and joints in the ledger [W]."""
+    if unilateral is None:  # known to the compiler
+        return
+    for k in range(unilateral.dry.shape[0]):
+        if unilateral.dry_table[k, ku.DRY_HOLDS] == 0:
+            speed = unilateral.dry[k, ku.DRY_SIDE] * ws.joints[unilateral.dry_table[k, ku.DRY_JOINT], ka.QD]
+            out[start + kst.GEAR] += unilateral.dry[k, ku.OF_GEAR] * speed
+            out[start + kst.JOINT] += unilateral.dry[k, ku.OF_JOINT] * speed
+            out[start + kst.MECHANICAL] -= unilateral.dry[k, ku.OF_GEAR] * speed
 
 
 @kernel

@@ -129,9 +129,8 @@ def prepare(
     real = scenario.config.contacts.law == "unilateral"
     stops = joint_stops(robot) if real else []
     stepped = scenario.integrator.method == "time_stepping"
-    dry = dry_frictions(robot) if stepped else []
-    if not stepped:
-        _check_friction(robot)
+    dry = dry_frictions(robot) if real else []
+    _check_friction(robot, real, stepped)
     gives = bool(robot.ties) or any(contact.stiffness > 0.0 for contact in contacts)
     sizes = kst.LOSSES if real else 0, 1 if stepped else 0, kst.ELASTIC_SIZE if gives else 0
     layout = state_layout(model.nq, n, robot.circuits, c, len(loads), *sizes)
@@ -151,7 +150,7 @@ def prepare(
         _check_references(scenario, model, contacts, control)
     options, size = scenario.integrator, n + ka.row_limit(c, joint_rows) + robot.circuits
     sampled = control.sample_time is not None
-    drives = compile_drives(robot, k_p=list(control.k_p), k_d=list(control.k_d), sampled=sampled, dry=stepped)
+    drives = compile_drives(robot, k_p=list(control.k_p), k_d=list(control.k_d), sampled=sampled, dry=real)
     choice = recall(
         "choice", lambda: choose(options, model, contacts, control, drives), options, model, control, places, *drives
     )
@@ -203,7 +202,7 @@ def prepare(
         breaks=_breaks(loads, control, method, options),
         # Those who advance a run themselves may give it no end.
         least_progress=ki.PROGRESS * min(scenario.duration_s, end or np.inf),
-        events=guards(robot, contacts if real else (), stops),
+        events=guards(robot, contacts if real else (), stops, dry),
         support=compile_support(robot),
         stepping=stepping,
         lanes=has_forms(system),
@@ -211,16 +210,16 @@ def prepare(
     return Prepared(model, contacts, control, system, run, new_workspace(system), loads, stops, choice, balance, dry)
 
 
-def _check_friction(robot: Robot) -> None:
-    """Refuse friction that holds joints at rest, and ties, where the method has none."""
-    if robot.ties:
+def _check_friction(robot: Robot, real: bool, stepped: bool) -> None:
+    """Refuse friction that holds joints at rest, and ties, where law and method have none."""
+    if robot.ties and not stepped:
         raise ModelError(f"tie {robot.ties[0].name}: only integrator.method: time_stepping has ties", keys=("plant",))
     rubbing = [link.joint for link in robot.links if link.friction > 0.0]
     rubbing += [motor.joint for motor in robot.motors if isinstance(motor, Motor) and motor.dry_friction > 0.0]
-    if rubbing:
+    if rubbing and not real:
         raise ModelError(
-            f"dry friction of {listed(rubbing)}: only time stepping has it; take integrator.method: time_stepping, "
-            "or a damping instead",
+            f"dry friction of {listed(rubbing)}: it needs contacts.law: unilateral, also where nothing touches; "
+            "or take a damping instead",
             keys=("plant",),
         )
 
@@ -266,11 +265,12 @@ def _ticks(control: JointControl) -> tuple[np.ndarray, np.ndarray] | None:
 
 
 def guards(
-    robot: Robot, contacts: Sequence[Contact], stops: Sequence[JointStop]
+    robot: Robot, contacts: Sequence[Contact], stops: Sequence[JointStop], dry: Sequence[DryFriction] = ()
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """The events that a run watches for by itself, and what they do: those of a base, then of the unilateral law.
 
-    Of a mobile base the margin falls through zero; of contacts and stops see dynsim.integrators.contacts.events.
+    Of a mobile base the margin falls through zero; of contacts, stops and dry friction see
+    dynsim.integrators.contacts.events.
     """
     rows = []
     if robot.base is not None:
@@ -278,6 +278,7 @@ def guards(
     for k in range(len(contacts)):
         rows += [(kev.NORMAL_GUARD, k, -1, ki.LOG), (kev.SLIP_GUARD, k, -1, ki.LOG)]
     rows += [(kev.STOP_GUARD, k, -1, ki.LOG) for k in range(len(stops))]
+    rows += [(kev.DRY_GUARD, k, -1, ki.LOG) for k in range(len(dry))]
     if not rows:
         return None
     event = np.zeros((len(rows), ki.EVENT_SIZE))

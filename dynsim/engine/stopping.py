@@ -141,6 +141,9 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
     owner = int(ws.active[worst, ka.OWNER])
     if ws.active[worst, ka.ROW_KIND] == ka.JOINT_ROW:
         couplings = prepared.model.robot.couplings
+        if owner >= len(couplings) + len(prepared.stops):
+            joint = prepared.dry[owner - len(couplings) - len(prepared.stops)].joint
+            return f"{where}: dry friction cannot keep joint {joint} where it is (off by {gaps[worst]:+.2e})"
         if owner >= len(couplings):
             joint = prepared.stops[owner - len(couplings)].joint
             return f"{where}: joint {joint} cannot be kept at its stop (off by {gaps[worst]:+.2e})"

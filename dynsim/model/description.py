@@ -111,7 +111,7 @@ class Link:
     R_PJ, p_PJ : (3, 3), (3,) placement of the joint in the parent's frame [m]
     damping : float
         Viscous loss D of the joint [N m s/rad or N s/m].
-    friction : of its bearing, against any motion and up to which it holds [N m or N]; time stepping only
+    friction : of its bearing, against any motion and up to which it holds [N m or N]; under the unilateral law
     lower, upper, velocity_limit, effort_limit : float
         Limits of the joint [rad or m; rad/s or m/s; N m or N]. Nothing enforces them: a run that passes one warns.
     parameter : what else its kind of joint needs

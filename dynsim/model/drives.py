@@ -22,7 +22,7 @@ class Motor:
     torque_constant : K [N m/A = V s/rad]
     resistance : R [Ω]; inductance : L [H]; rotor_inertia : I_m [kg m²]
     gear_ratio : k; gear_damping : d_m on the motor side [N m s/rad]
-    dry_friction : of the gear, at the joint [N m or N]: it holds at rest; time stepping only
+    dry_friction : of the gear, at the joint [N m or N]: it holds at rest; under the unilateral law
     voltage_limit : [V], inf for none
     current_limit : [A] that its driver keeps, inf for none
     nominal_current : [A] that it stands for ever; nominal_torque : at the joint [N m or N]; inf where not known
@@ -80,7 +80,7 @@ class Servo:
     velocity_mode : the loop follows the rate of the reference, not its position
     armature : J_m [kg m²]; reflected_damping : D_m [N m s/rad]
     coulomb_friction : τ_c [N m]; coulomb_speed : v_s [rad/s], below which it fades
-        None: in time stepping it does not, and holds at rest; elsewhere below SMOOTHING
+        None: under the unilateral law it does not, and holds at rest; else below SMOOTHING
     voltage_limit, current_limit : [V], [A]; torque_limit : of the current, K_m i [N m]; inf for none
     nominal_current, nominal_torque : as of a :class:`Motor`
     free_drag : viscous drag of the gear while the servo is off [N m s/rad]

@@ -58,7 +58,7 @@ class MotorParameters(DriveParameters):
     gear_ratio: Positive = Field(description="motor turns per joint turn; at a prismatic joint rad of the motor per m")
     gear_damping_N_m_s_per_rad: NonNegative = Field(default=0.0, description="on the motor side")
     coulomb_friction_N_m: NonNegative = Field(
-        default=0.0, description="of the gear, at the joint: holds at rest; N at a prismatic joint; time stepping only"
+        default=0.0, description="of the gear, at the joint: holds at rest; N at a prismatic joint; unilateral law"
     )
     voltage_limit_V: Positive | None = None
     nominal_current_A: Positive | None = Field(

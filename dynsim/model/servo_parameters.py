@@ -31,7 +31,7 @@ class ServoParameters(DriveParameters):
     coulomb_friction_N_m: NonNegative = Field(default=0.0, description="of the gear, at the output shaft")
     coulomb_speed_rad_per_s: Positive | None = Field(
         default=None,
-        description="below it the Coulomb friction fades; default: it holds at rest in time stepping, else 0.01",
+        description="below it the Coulomb friction fades; default: 0.01, under the unilateral law it holds at rest",
     )
     current_limit_A: Positive | None = None
     torque_limit_N_m: Positive | None = Field(default=None, description="of the current, without the gear's friction")

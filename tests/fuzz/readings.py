@@ -205,9 +205,13 @@ def csv_rows(data: bytes) -> list[list[float]]:
 
 def urdf_losses(data: bytes, robot: Any) -> list[str]:
     """Masses, inertias, joints and damping of a URDF file that a robot does not have; links are composed as fixed."""
+    # Without namespaces, which readers of URDF do not know: files in use have prefixes that they do not bind.
+    tree, parser = ElementTree.TreeBuilder(), expat.ParserCreate()
+    parser.StartElementHandler, parser.EndElementHandler, parser.CharacterDataHandler = tree.start, tree.end, tree.data
     try:
-        return _urdf_differences(ElementTree.fromstring(data), robot)
-    except (Unreadable, ElementTree.ParseError) as error:
+        parser.Parse(data, True)
+        return _urdf_differences(tree.close(), robot)
+    except (Unreadable, expat.ExpatError) as error:
         return [f"a strict reading refuses the file: {error}"]
 
 

@@ -11,7 +11,9 @@ import pytest
 
 from dynsim.dynamics import derivative as system
 from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.rows import set_modes
+from dynsim.dynamics.derivative import new_workspace
 from dynsim.jit.kernel import integers, reals
 from dynsim.model.description import Contact, Coupling, Inertia, Link, Load, Quadric, Robot
 from dynsim.model.drives import Motor, Servo, TorqueSource
@@ -191,6 +193,21 @@ def servos() -> Case:
     return of(rng, b, 1.0)
 
 
+def rubbing() -> Case:
+    """Joints and gears with dry friction that slide."""
+    rng = np.random.default_rng(9)
+    robot = random_robot_of(rng, ["revolute"] * 4)
+    links = tuple(replace(link, friction=0.1 * k) for k, link in enumerate(robot.links))
+    motor = Motor("joint_2", 0.2, 1.3, 2e-3, 1e-4, 7.0, 1e-3, dry_friction=0.4)
+    b = bench(replace(robot, links=links, motors=(motor,)), real=True, dry=True)
+    unilateral = b.system.unilateral
+    assert unilateral is not None
+    unilateral.dry_table[:, ku.DRY_HOLDS] = 0
+    unilateral.dry[:, ku.DRY_SIDE] = 1.0, -1.0, 1.0
+    b.ws = new_workspace(b.system)
+    return of(rng, b, 1.0)
+
+
 def unmoved() -> Case:
     """A point of a slide along x on a floor: a system of one row that is zero."""
     x, z = np.eye(3)[0], np.eye(3)[2]
@@ -223,6 +240,7 @@ CASES: dict[str, Callable[[], Case]] = {
     "very dependent": lambda: on_planes(2, 6, spread=0.0, twice=True),
     "twice the same point": lambda: on_planes(5, 9, spread=0.0, twice=True),
     "unmoved": unmoved,
+    "rubbing": rubbing,
 }
 TIMED = {
     "times of their own": lambda: driven(0.7, 0.01),

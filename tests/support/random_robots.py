@@ -255,7 +255,7 @@ class Bench:
             na=na,
             c=c,
             couplings=couplings,
-            events=guards(self.robot, self.contacts, self.stops),
+            events=guards(self.robot, self.contacts, self.stops, dry_frictions(self.robot) if dry else ()),
             sample_time=times,
             hand=(n - 1, self.robot.hand[1]),
             end=float(times[-1]),
@@ -303,7 +303,7 @@ def bench(
     """Compile a robot and its contacts, with a voltage PD that holds ``held`` (zero by default).
 
     ``real``: under the unilateral law, with the robot's joint stops; slip below ``slow`` [m/s] keeps its direction.
-    ``dry``: with friction that holds joints at rest, which time stepping alone has.
+    ``dry``: with friction that holds joints at rest, not smoothed.
     """
     na = len(robot.motors)
     contact_arrays = compile_contacts(robot, contacts or [])

@@ -1,4 +1,4 @@
-"""Friction that holds joints at rest, of gears and bearings in time stepping: closed forms and the ledger."""
+"""Friction that holds joints at rest, of gears and bearings: closed forms and the ledger, by steps and by events."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from support.stepping_benches import plane, stepped
 
 from dynsim import load_scenario, simulate
 from dynsim.compile.model import Model
-from dynsim.dynamics.state import ELECTRICAL, GEAR, JOINT, JOULE
+from dynsim.dynamics.state import ELECTRICAL, GEAR, JOINT, JOULE, OUT_MODE
 from dynsim.errors import ModelError
 from dynsim.integrators.stepping.tables import CAPPED
-from dynsim.model.description import Contact, Inertia, Link, Load, Robot, vector
+from dynsim.model.description import Contact, Inertia, Link, Load, Quadric, Robot, vector
 from dynsim.model.drives import Motor, Servo
 
 MASS, FRICTION = 2.0, 3.0
@@ -68,6 +68,18 @@ def oscillator(start: float, friction: float = 0.4) -> tuple[Bench, np.ndarray, 
     return b, b.state(np.array([start]), np.zeros(1)), stiffness, k_m**2 / resistance
 
 
+def rest_of(x: float, stiffness: float, damping: float) -> tuple[float, int]:
+    """Where the oscillator that starts at x comes to rest, and after how many half swings."""
+    band, inertia, swings = 0.4 / stiffness, 0.3, 0
+    rate = damping / (2.0 * inertia)
+    period = np.pi / np.sqrt(stiffness / inertia - rate**2)
+    while abs(x) > band:
+        centre = np.sign(x) * band
+        x = centre - np.exp(-rate * period) * (x - centre)
+        swings += 1
+    return x, swings
+
+
 def test_a_spring_is_held_where_its_force_is_below_the_friction():
     """The bound is exact: just below it nothing moves, just above it does."""
     band = 0.4 / 20.0
@@ -80,13 +92,7 @@ def test_a_spring_is_held_where_its_force_is_below_the_friction():
 def test_a_spring_with_dry_friction_comes_to_rest_in_closed_form():
     """Each half swing is about the place ±τ/k where spring and friction balance; it ends within that band, for ever."""
     b, y, stiffness, damping = oscillator(0.5)
-    band, inertia, x, swings = 0.4 / stiffness, 0.3, 0.5, 0
-    rate = damping / (2.0 * inertia)
-    period = np.pi / np.sqrt(stiffness / inertia - rate**2)
-    while abs(x) > band:
-        centre = np.sign(x) * band
-        x = centre - np.exp(-rate * period) * (x - centre)
-        swings += 1
+    x, swings = rest_of(0.5, stiffness, damping)
     assert swings == 12
     errors = []
     for step in (2e-3, 1e-3):
@@ -99,30 +105,30 @@ def test_a_spring_with_dry_friction_comes_to_rest_in_closed_form():
     assert errors[1] < 0.5 * errors[0]
 
 
-def test_a_wheel_rolls_down_a_slope_against_its_bearing():
-    """(m + I/r²) a = m g sin α − τ/r, if that is positive; the bearing takes τ times the turned angle."""
+def rolling(share: float) -> tuple[Bench, np.ndarray, float, float, float]:
+    """A wheel on a slope whose bearing takes a share of its pull; state, acceleration, drag and radius.
+
+    (m + I/r²) a = m g sin α − τ/r, if that is positive.
+    """
     radius, mass, inertia, slope = 0.05, 1.2, 2e-3, 0.2
     pull = mass * 9.81 * np.sin(slope)
-    for drag in (0.6 * pull * radius, 1.1 * pull * radius):
-        links = (
-            Link("x", "along", None, "prismatic", vector(1, 0, 0), Inertia(0.0)),
-            Link("z", "up", "x", "prismatic", vector(0, 0, 1), Inertia(0.2)),
-            Link(
-                "wheel",
-                "axle",
-                "z",
-                "revolute",
-                vector(0, 1, 0),
-                Inertia(1.0, tensor=inertia * np.eye(3)),
-                friction=drag,
-            ),
-        )
-        gravity = 9.81 * vector(np.sin(slope), 0, -np.cos(slope))
-        robot = Robot("wheel", links, (), ("wheel", np.zeros(3)), gravity=gravity)
-        contact = Contact("tyre", "wheel", np.zeros(3), plane(vector(0, 0, 1)), friction=0.8, radius=radius)
-        b = bench(robot, [contact], real=True, dry=True)
-        run = stepped(b, b.state(np.array([0.0, radius, 0.0]), np.zeros(3)), np.array([0.0, 1.0]), 2.5e-3, 0.5)
-        acceleration = max(pull - drag / radius, 0.0) / (mass + inertia / radius**2)
+    drag, wheel = share * pull * radius, Inertia(1.0, tensor=inertia * np.eye(3))
+    links = (
+        Link("x", "along", None, "prismatic", vector(1, 0, 0), Inertia(0.0)),
+        Link("z", "up", "x", "prismatic", vector(0, 0, 1), Inertia(0.2)),
+        Link("wheel", "axle", "z", "revolute", vector(0, 1, 0), wheel, friction=drag),
+    )
+    gravity = 9.81 * vector(np.sin(slope), 0, -np.cos(slope))
+    contact = Contact("tyre", "wheel", np.zeros(3), plane(vector(0, 0, 1)), friction=0.8, radius=radius)
+    b = bench(Robot("wheel", links, (), ("wheel", np.zeros(3)), gravity=gravity), [contact], real=True, dry=True)
+    acceleration = max(pull - drag / radius, 0.0) / (mass + inertia / radius**2)
+    return b, b.state(np.array([0.0, radius, 0.0]), np.zeros(3)), acceleration, drag, radius
+
+
+def test_a_wheel_rolls_down_a_slope_against_its_bearing():
+    for share in (0.6, 1.1):
+        b, y, acceleration, drag, radius = rolling(share)
+        run = stepped(b, y, np.array([0.0, 1.0]), 2.5e-3, 0.5)
         x, _, angle = run.states("q")[-1]
         assert x == pytest.approx(0.5 * acceleration, rel=1e-9, abs=1e-11)
         assert x == pytest.approx(radius * angle, rel=1e-9, abs=1e-11)
@@ -168,6 +174,14 @@ def test_joint_torques_have_the_friction_of_their_gear_in_them():
     assert abs(torque - 2.5 * run.outputs("current")[-1]).max() > 1e-3
 
 
+def ledger_gap(run) -> np.ndarray:
+    """What the ledger of a system without contacts does not explain, of the largest change of energy or of 1 J."""
+    ledger, stored = run.states("ledger"), run.outputs("energy").sum(axis=1)
+    used = ledger[:, JOULE] + ledger[:, GEAR] + ledger[:, JOINT] + run.states("scheme")[:, 0]
+    change = stored - stored[0]
+    return np.abs(ledger[:, ELECTRICAL] - used - change) / max(1.0, np.abs(change).max())
+
+
 @pytest.mark.parametrize("theta", [0.5, 0.8, 1.0])
 def test_the_ledger_of_random_arms_that_rub(theta):
     rng = np.random.default_rng(3)
@@ -180,12 +194,92 @@ def test_the_ledger_of_random_arms_that_rub(theta):
     assert any(isinstance(motor, Motor) for motor in robot.motors)
     b = bench(robot, real=True, dry=True)
     run = stepped(b, b.state(rng.normal(size=6), rng.normal(size=6)), np.linspace(0.0, 0.5, 6), 2e-3, theta)
-    energy, ledger, scheme = run.outputs("energy"), run.states("ledger"), run.states("scheme")[:, 0]
-    stored = energy.sum(axis=1)
-    used = ledger[:, JOULE] + ledger[:, GEAR] + ledger[:, JOINT] + scheme
-    residual = ledger[:, ELECTRICAL] - used - (stored - stored[0])
-    assert np.abs(residual).max() < 1e-9 * max(1.0, np.abs(stored - stored[0]).max())
+    assert ledger_gap(run).max() < 1e-9
+    ledger = run.states("ledger")
     assert (np.diff(ledger[:, [GEAR, JOINT]], axis=0) > 0.0).all()
+
+
+METHODS = ("dopri5", "radau5")
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_events_find_where_a_push_breaks_a_bearing_loose(method):
+    """As above, and a push that falls again: the slide stops by itself, and stays."""
+    rate = 4.0
+    b = sliding(np.array([0.0, rate]))
+    run = b.simulate(b.state(np.zeros(1), np.zeros(1)), np.array([0.0, 0.7, 1.75]), method, rtol=1e-10, atol=1e-12)
+    q = run.states("q")[:, 0]
+    assert abs(q[1]) < 1e-14
+    assert q[2] == pytest.approx(rate * (1.75 - FRICTION / rate) ** 3 / (6.0 * MASS), rel=1e-8)
+    assert run.states("ledger")[-1, JOINT] == pytest.approx(FRICTION * q[2], rel=1e-9)
+    b = sliding(np.array([2.0 * FRICTION, -FRICTION]))
+    run = b.simulate(b.state(np.zeros(1), np.zeros(1)), np.array([0.0, 3.0, 4.0]), method, rtol=1e-10, atol=1e-12)
+    # m v' = F - F t until v = 0 at t = 2, and then within the friction until the push is -F at t = 3.
+    assert run.states("q")[1, 0] == pytest.approx(2.0 / 3.0 * FRICTION / MASS, rel=1e-8)
+    assert run.states("q")[2, 0] == pytest.approx((2.0 / 3.0 - 1.0 / 6.0) * FRICTION / MASS, rel=1e-8)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_events_bring_a_spring_to_rest_in_closed_form(method):
+    b, y, stiffness, damping = oscillator(0.5)
+    run = b.simulate(y, np.array([0.0, 6.0, 26.0]), method, rtol=1e-10, atol=1e-12)
+    q = run.states("q")[:, 0]
+    assert q[1] == pytest.approx(rest_of(0.5, stiffness, damping)[0], abs=1e-8)
+    assert abs(q[2] - q[1]) < 1e-12
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_events_roll_a_wheel_down_a_slope_against_its_bearing(method):
+    for drag in (0.6, 1.1):
+        b, y, acceleration, drag_torque, _ = rolling(drag)
+        run = b.simulate(y, np.array([0.0, 1.0]), method, rtol=1e-9, atol=1e-11)
+        x, _, angle = run.states("q")[-1]
+        assert x == pytest.approx(0.5 * acceleration, rel=1e-7, abs=1e-11)
+        assert run.states("ledger")[-1, JOINT] == pytest.approx(drag_torque * angle, rel=1e-7, abs=1e-11)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_events_hold_an_arm_and_close_its_ledger(method):
+    """It sags, joint after joint comes to rest, and nothing moves any more; the same place as by time stepping."""
+    q0, places = np.array([1.2, 0.3, 0.0]), []
+    b = bench(arm(0.8), held=q0, real=True, dry=True)
+    run = b.simulate(b.state(q0, np.zeros(3)), np.array([0.0, 1.0, 3.0, 23.0]), method, rtol=1e-8, atol=1e-10)
+    hand = run.outputs("hand")
+    assert np.abs(hand[3] - hand[2]).max() < 1e-10
+    assert ledger_gap(run)[-1] < 1e-6
+    for step in (1e-3, 2.5e-4):
+        places.append(stepped(b, b.state(q0, np.zeros(3)), np.array([0.0, 3.0]), step, 0.5).outputs("hand")[-1])
+    errors = [np.abs(place - hand[2]).max() for place in places]
+    assert errors[1] < 0.5 * errors[0] < 1e-4
+
+
+def leaning(rate: float) -> tuple[Bench, np.ndarray]:
+    """An arm whose joints hold its weight, its tip on a floor and pushed along it by rate t: more rows than motions."""
+    robot, q0, tip = arm(8.0), np.array([1.2, 0.5, 0.4]), vector(0, 0, 0.3)
+    height = float(Model(robot).point_position("link_2", tip, q0)[2])
+    floor = Quadric(np.zeros((3, 3)), vector(0, 0, 1), -height)
+    coefficients = np.zeros((1, 6, 4))
+    coefficients[0, 0, 1] = rate
+    push = Load("push", "link_2", tip, False, np.array([0.0, 100.0]), coefficients, True)
+    b = bench(robot, [Contact("tip", "link_2", tip, floor, friction=0.5)], loads=[push], held=q0, real=True, dry=True)
+    return b, b.state(q0, np.zeros(3))
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(("rate", "modes"), [(200.0, {2, 0}), (-200.0, {2, 1, 0}), (-60.0, {2})])
+def test_joints_and_a_tip_that_hold_together_share_forces_that_are_open(method, rate, modes):
+    """They hold while any split of their forces is within all bounds, and break loose as time stepping has it."""
+    times = np.linspace(0.0, 1.0, 11)
+    b, y = leaning(rate)
+    run = b.simulate(y, times, method, rtol=1e-8, atol=1e-10)
+    b, y = leaning(rate)
+    steps = stepped(b, y, times, 2.5e-4, 0.5)
+    assert set(run.outputs("contact")[:, 0, OUT_MODE].astype(int)) == modes
+    moved = np.abs(run.outputs("hand") - run.outputs("hand")[0]).max(axis=1)
+    assert (moved > 1e-4).sum() == (0 if modes == {2} else 8 if rate > 0.0 else 5)
+    assert moved[moved < 1e-4].max() < 1e-10
+    np.testing.assert_allclose(steps.outputs("hand"), run.outputs("hand"), rtol=0, atol=1e-3 * moved.max() + 1e-12)
+    np.testing.assert_array_equal(steps.outputs("contact")[:, 0, OUT_MODE], run.outputs("contact")[:, 0, OUT_MODE])
 
 
 SCENARIO = """
@@ -209,5 +303,10 @@ def test_scenarios_say_what_rubs(tmp_path: Path):
     record = simulate(load_scenario(file))
     assert np.abs(record["q"][:, 2]).max() < 1e-10  # below its friction
     assert record.summary["energy_residual_relative"] < 1e-9
-    with pytest.raises(ModelError, match=r"dry friction of joint_1, joint_3, joint_2: .*time_stepping"):
-        simulate(load_scenario(file, overrides={"integrator.method": "radau5"}))
+    events = simulate(load_scenario(file, overrides={"integrator.method": "radau5"}))
+    np.testing.assert_allclose(record["q"][-1], events["q"][-1], rtol=0, atol=1e-4)
+    np.testing.assert_allclose(events["joint_friction"][:, 2], record["joint_friction"][:, 2], rtol=0, atol=0.05)
+    assert events.summary["energy_residual_relative"] < 1e-6
+    glued = {"contacts.law": "bilateral", "integrator.method": "radau5"}
+    with pytest.raises(ModelError, match=r"dry friction of joint_1, joint_3, joint_2: .*contacts.law: unilateral"):
+        simulate(load_scenario(file, overrides=glued))

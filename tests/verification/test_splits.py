@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.optimize import minimize, minimize_scalar
+from scipy.optimize import linprog, minimize, minimize_scalar
 
 from dynsim.dynamics.contact.cone.program import cone_program, solve_cone_program
 from dynsim.dynamics.contact.cone.socp import best_split, split_room
@@ -27,7 +27,7 @@ def split(f0, N, first, mu) -> tuple[float, np.ndarray]:
         if table.dtype == np.float64:
             table[:] = np.nan
     out = np.full(len(f0), np.nan)
-    margin = best_split(reals(f0), reals(N), r, integers(first), reals(mu), c, out, room)
+    margin = best_split(reals(f0), reals(N), r, integers(first), reals(mu), c, 0, out, room)
     return margin, out
 
 
@@ -162,3 +162,21 @@ def test_conditions_of_optimality(seed):
         for a, size in zip(np.cumsum([0, *sizes[:-1]]), sizes, strict=True):
             assert u[a] >= np.linalg.norm(u[a + 1 : a + size]) - 1e-10 * scale
     assert abs(s @ z) < 1e-9 * scale
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_joints_that_rub_share_their_forces_as_a_linear_programme_has_it(seed):
+    """max_z min_j (τ_j − |f_j|), some of the bounds so low that no split holds."""
+    rng = np.random.default_rng(seed)
+    p, r = int(rng.integers(2, 8)), int(rng.integers(1, 4))
+    f0, N, bound = rng.normal(size=p), np.linalg.qr(rng.normal(size=(p, r)))[0], rng.uniform(0.05, 2.0, size=p)
+    out = np.full(p, np.nan)
+    margin = best_split(
+        reals(f0), reals(N), N.shape[1], integers(np.arange(p)), reals(bound), 0, p, out, split_room(r, p)
+    )
+    ones = np.ones((p, 1))
+    rows, limits = np.vstack([np.hstack([N, ones]), np.hstack([-N, ones])]), np.hstack([bound - f0, bound + f0])
+    best = linprog(np.append(np.zeros(N.shape[1]), -1.0), rows, limits, bounds=(None, None)).x[-1]
+    assert margin == pytest.approx(best, abs=1e-7)
+    assert (bound - np.abs(out)).min() >= min(best, 0.0) - 1e-7
+    assert np.abs((out - f0) - N @ (N.T @ (out - f0))).max() < 1e-9

@@ -138,6 +138,7 @@ def dynamic_positioning(records: Mapping[str, Record]) -> Figure:
             axis.plot(positions[there], ours, mark, color=colour, ms=5, label=source)
         axis.axhline(0.0, color="black", lw=0.6)
         axis.set_ylabel(f"Δ{SYMBOLS.get(COORDINATES[i], COORDINATES[i])} [{unit}]")
+    axes[-1].set_xlim(-0.6, len(moved) - 0.4)
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4)
     axes[-1].set_xticks(range(len(moved)), [f"moving {SYMBOLS.get(m, m)}" for m in moved])

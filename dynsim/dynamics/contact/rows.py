@@ -85,13 +85,15 @@ def set_modes(
 
 @internal_kernel
 def dry_rows(unilateral: UnilateralArrays, ws: Workspace, p):
-    """A joint row, of one joint, for every joint with dry friction; returns the number of rows then."""
+    """A joint row, of one joint, for every joint that dry friction holds; returns the number of rows then."""
     table, owner = unilateral.dry_table, p + unilateral.stop_table.shape[0]
     for k in range(table.shape[0]):
+        if table[k, ku.DRY_HOLDS] == 0:
+            continue
         joint = table[k, ku.DRY_JOINT]
         new_row(ws, p, ka.JOINT_ROW, owner + k, joint)
         ws.active[p, ka.BODY_B] = joint
-        ws.rows[p, ka.ROW], ws.rows[p, ka.DIRECTION] = 1.0, 1.0
+        ws.rows[p, ka.ROW], ws.rows[p, ka.DIRECTION], ws.rows[p, ka.ROW_OFFSET] = 1.0, 1.0, unilateral.dry[k, ku.DRY_AT]
         table[k, ku.DRY_ROW] = p
         p += 1
     return p

@@ -1,4 +1,4 @@
-"""Forces of points that stick where their rows depend on each other: the split that real friction can carry.
+"""Forces of points and joints that stick where their rows depend on each other: the split that real friction can carry.
 
 Two braces that stick on a planar arm share their lateral row, points along one body their radial one: M v̇ knows the sum
 of their forces only. Such a set holds while any split lies in all cones |f_t| ≤ μ_s f_n. Where that of least norm does
@@ -12,7 +12,7 @@ import math
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.cone.socp import best_split, split_room_in
-from dynsim.dynamics.contact.unilateral import UnilateralArrays, note_stop_forces
+from dynsim.dynamics.contact.unilateral import UnilateralArrays, dry_bound, note_dry_forces, note_stop_forces
 from dynsim.dynamics.tables import ContactArrays, Workspace
 from dynsim.jit.kernel import apart_kernel, internal_kernel
 
@@ -29,28 +29,44 @@ def margin(contacts: ContactArrays, ws: Workspace, k):
 
 
 @internal_kernel
+def dry_margin(unilateral: UnilateralArrays, ws: Workspace, k):
+    """What is left of the dry friction of a joint that it holds [N m or N]."""
+    return dry_bound(unilateral, k) - abs(ws.rows[unilateral.dry_table[k, ku.DRY_ROW], ka.FORCE])
+
+
+@internal_kernel
 def admissible_forces(contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: Workspace):
-    """Replace the forces of dependent rows that stick where they do not lie in their cones; note those of stops.
+    """Replace the forces of dependent rows that stick where they are beyond their bounds; note those of joints.
 
     Accelerations do not change: the rows are their own directions, so what they cannot tell apart moves nothing.
     """
     if unilateral is None:  # known to the compiler
         return
     # Small, because it is merged into the right-hand side.
-    if unilateral.number[ku.REDUNDANT] == 1.0 or unilateral.stop.shape[0] > 0:
+    if unilateral.number[ku.REDUNDANT] == 1.0 or unilateral.stop.shape[0] + unilateral.dry.shape[0] > 0:
         look_at_forces(contacts, unilateral, ws)
 
 
 @apart_kernel
 def look_at_forces(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace):
-    """:func:`admissible_forces` where there are dependent rows or stops."""
+    """:func:`admissible_forces` where there are dependent rows, stops or dry friction."""
     note_stop_forces(unilateral, ws)
     unilateral.number[ku.SPLIT] = 0.0
-    if unilateral.number[ku.REDUNDANT] == 1.0:
-        for k in range(ws.contacts.shape[0]):
-            if ws.active[k, ka.MODE] == ka.STICKING and margin(contacts, ws, k) < 0.0:
-                split_forces(contacts, unilateral, ws)
-                return
+    if unilateral.number[ku.REDUNDANT] == 1.0 and beyond_bounds(contacts, unilateral, ws):
+        split_forces(contacts, unilateral, ws)
+    note_dry_forces(unilateral, ws)
+
+
+@internal_kernel
+def beyond_bounds(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace):
+    """True where a point or a joint that sticks has more force than its friction can have."""
+    for k in range(ws.contacts.shape[0]):
+        if ws.active[k, ka.MODE] == ka.STICKING and margin(contacts, ws, k) < 0.0:
+            return True
+    for k in range(unilateral.dry_table.shape[0]):
+        if unilateral.dry_table[k, ku.DRY_HOLDS] == 1 and dry_margin(unilateral, ws, k) < 0.0:
+            return True
+    return False
 
 
 @apart_kernel
@@ -66,6 +82,12 @@ def split_forces(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Work
                 row[p] = ws.active[k, ka.FIRST_ROW] + s
                 p += 1
             count += 1
+    points = count
+    for k in range(unilateral.dry_table.shape[0]):
+        if unilateral.dry_table[k, ku.DRY_HOLDS] == 1:
+            first[count], mu[count], row[p] = p, dry_bound(unilateral, k), unilateral.dry_table[k, ku.DRY_ROW]
+            p += 1
+            count += 1
     force, out = unilateral.vector[1], unilateral.vector[2]
     for i in range(p):
         force[i] = rows[row[i], ka.FORCE]
@@ -74,7 +96,7 @@ def split_forces(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Work
     width = null_space(room[ku.SPLIT_MATRIX], p, room[ku.NULL_SPACE], place[2])
     unilateral.number[ku.SPLIT] = 1.0
     programs = split_room_in(unilateral.split_room, place[3], width, count)
-    worst = best_split(force[:p], room[ku.NULL_SPACE], width, first, mu, count, out[:p], programs)
+    worst = best_split(force[:p], room[ku.NULL_SPACE], width, first, mu, points, count - points, out[:p], programs)
     unilateral.number[ku.BEST_MARGIN] = worst
     for i in range(p):
         rows[row[i], ka.FORCE] = out[i]

@@ -56,11 +56,15 @@ STOP_SIZE = 6
 DRY_JOINT = 0  # link whose joint rubs
 DRY_ROW = 1
 DRY_DRIVE = 2  # whose gear does, -1 for none
-DRY_TABLE_SIZE = 3
+DRY_HOLDS = 3  # 1: it has a row, bounded in time stepping; 0: it slides, by the event-driven methods
+DRY_NEXT = 4  # scratch of the choice of modes
+DRY_TABLE_SIZE = 5
 # UnilateralArrays.dry: the force of a joint at rest is any up to the sum of both, in motion that against it [N m or N]
 OF_GEAR, OF_JOINT = 0, 1
 DRY_FORCE = 2  # on the joint [N m or N]
-DRY_SIZE = 3
+DRY_SIDE = 3  # sign of the rate at which it slides
+DRY_AT = 4  # where it is held [rad or m]
+DRY_SIZE = 5
 # UnilateralArrays.tie_table, int
 TIE_A, TIE_B = 0, 1  # links
 TIE_TURNS = 2  # 1: about its axis, 0: along it
@@ -110,7 +114,7 @@ class UnilateralArrays(NamedTuple):
     tally: np.ndarray  # (c, TALLY_SIZE)
     stop_table: np.ndarray  # (s, STOP_TABLE_SIZE) int
     stop: np.ndarray  # (s, STOP_SIZE)
-    dry_table: np.ndarray  # (d, DRY_TABLE_SIZE) int; d is zero of methods that smooth such friction
+    dry_table: np.ndarray  # (d, DRY_TABLE_SIZE) int
     dry: np.ndarray  # (d, DRY_SIZE)
     tie_table: np.ndarray  # (e, TIE_TABLE_SIZE) int, of time stepping alone: see dynsim.integrators.stepping.compliance
     tie: np.ndarray  # (e, TIE_SIZE)
@@ -156,6 +160,45 @@ def note_stop_forces(unilateral: UnilateralArrays, ws: Workspace):
     for k in range(table.shape[0]):
         closed = table[k, STOP_CLOSED] == 1
         unilateral.stop[k, STOP_FORCE] = ws.rows[table[k, STOP_ROW], ka.FORCE] if closed else 0.0
+
+
+@internal_kernel
+def dry_bound(unilateral: UnilateralArrays, k):
+    """Dry friction of joint k of those that have it, of gear and bearing together [N m or N]."""
+    return unilateral.dry[k, OF_GEAR] + unilateral.dry[k, OF_JOINT]
+
+
+@internal_kernel
+def dry_rows_held(unilateral: UnilateralArrays):
+    """Rows of joints that dry friction holds."""
+    rows = 0
+    for k in range(unilateral.dry_table.shape[0]):
+        rows += unilateral.dry_table[k, DRY_HOLDS]
+    return rows
+
+
+@internal_kernel
+def rub(unilateral: UnilateralArrays | None, ws: Workspace):
+    """Dry friction of the joints that slide, onto what is applied; its direction is constant within a step."""
+    if unilateral is None:  # known to the compiler
+        return
+    for k in range(unilateral.dry.shape[0]):
+        if unilateral.dry_table[k, DRY_HOLDS] == 0:
+            force = unilateral.dry[k, DRY_SIDE] * dry_bound(unilateral, k)
+            ws.joints[unilateral.dry_table[k, DRY_JOINT], ka.APPLIED] -= force
+
+
+@internal_kernel
+def note_dry_forces(unilateral: UnilateralArrays, ws: Workspace):
+    """Dry friction of all joints that have it, and of gears what it takes from shafts."""
+    table, dry = unilateral.dry_table, unilateral.dry
+    for k in range(table.shape[0]):
+        force, a = -dry[k, DRY_SIDE] * dry_bound(unilateral, k), table[k, DRY_DRIVE]
+        if table[k, DRY_HOLDS] == 1:
+            force = ws.rows[table[k, DRY_ROW], ka.FORCE]
+        dry[k, DRY_FORCE] = force
+        if a >= 0:
+            ws.motors[a, ka.DRY_DRAG] = -force * dry[k, OF_GEAR] / dry_bound(unilateral, k)
 
 
 @internal_kernel

@@ -114,7 +114,7 @@ def admissible_forces_lanes(contacts, unilateral, ws):
     """One by one, where there is something to look at."""
     if unilateral is None:  # known to the compiler
         return
-    if unilateral.number[ku.REDUNDANT] == 1.0 or unilateral.stop.shape[0] > 0:
+    if unilateral.number[ku.REDUNDANT] == 1.0 or unilateral.stop.shape[0] + unilateral.dry.shape[0] > 0:
         for k in range(lane_count(ws)):
             look_at_forces(contacts, unilateral, lane(ws, k))
 

@@ -1,8 +1,8 @@
 """Events of the unilateral law: landing, lift-off, begin and end of slip, joint stops; what each of them changes.
 
-Each candidate has two guards, each stop one. Off its surface the guard is the gap, closed it is the normal force; of a
-point that sticks the second guard is its margin μ_s f_n − |f_t|, of one that slides its speed along the direction that
-it began the step with. All of them fall through zero.
+Each candidate has two guards, each stop and each joint with dry friction one. Off its surface the guard is the gap,
+closed it is the normal force; of a point that sticks the second guard is its margin μ_s f_n − |f_t|, of one that slides
+its speed along the direction that it began the step with; of joints that rub likewise. All of them fall through zero.
 
 Lift-off and the begin of slip leave forces as they are, so that the one candidate is switched by hand: its
 complementarity problem is degenerate there. Everything else, and whatever this leaves inconsistent, is solved anew.
@@ -15,7 +15,7 @@ import math
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.rows import set_modes
-from dynsim.dynamics.contact.splits import margin
+from dynsim.dynamics.contact.splits import dry_margin, margin
 from dynsim.dynamics.contact.unilateral import UnilateralArrays, stop_gap
 from dynsim.dynamics.derivative import System
 from dynsim.dynamics.tables import ContactArrays, Workspace
@@ -26,7 +26,7 @@ from dynsim.integrators.run import Run
 from dynsim.jit.kernel import apart_kernel, internal_kernel
 
 # Kinds of guards, behind those of dynsim.integrators.events.
-NORMAL_GUARD, SLIP_GUARD, STOP_GUARD = 10, 11, 12
+NORMAL_GUARD, SLIP_GUARD, STOP_GUARD, DRY_GUARD = 10, 11, 12, 13
 # What is logged of a candidate, and of a stop.
 LANDING, LIFT_OFF, SLIP_START, SLIP_STOP, BOUNCE, CHATTERS, STOP_HIT, STOP_LEFT = 0, 1, 2, 3, 4, 5, 6, 7
 LOG_KINDS = 8
@@ -59,6 +59,14 @@ def contact_guard(contacts: ContactArrays, unilateral: UnilateralArrays | None, 
         if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
             return unilateral.stop[k, ku.STOP_FORCE]
         return stop_gap(unilateral, ws, k) + ku.DEPTH
+    best = unilateral.number[ku.BEST_MARGIN]
+    if kind == DRY_GUARD:
+        if unilateral.dry_table[k, ku.DRY_HOLDS] == 0:
+            rate = ws.joints[unilateral.dry_table[k, ku.DRY_JOINT], ka.QD]
+            return unilateral.dry[k, ku.DRY_SIDE] * rate + BACKWARD
+        if unilateral.number[ku.SPLIT] == 1.0 and best > 0.0:
+            return best
+        return dry_margin(unilateral, ws, k)
     mode = ws.active[k, ka.MODE]
     if kind == NORMAL_GUARD:
         return (
@@ -69,7 +77,6 @@ def contact_guard(contacts: ContactArrays, unilateral: UnilateralArrays | None, 
     if mode == ka.SLIDING and contacts.law[k, ka.STATIC] > 0.0:
         return unilateral.slide[k, ku.SPEED] + unilateral.slide[k, ku.HEADWAY] + BACKWARD
     if mode == ka.STICKING:
-        best = unilateral.number[ku.BEST_MARGIN]
         # Dependent rows, where the least norm fits no cones: the forces are the least that do, on some cone, and say
         # nothing of what is left. Once none fit, those of the best margin show which contacts give way.
         if unilateral.number[ku.SPLIT] == 1.0 and best > 0.0:
@@ -232,6 +239,10 @@ def consistent(system: System, ws: Workspace):
     for k in range(table.shape[0]):
         if table[k, ku.STOP_CLOSED] == 1 and unilateral.stop[k, ku.STOP_FORCE] < -slack:
             return False
+    for k in range(unilateral.dry_table.shape[0]):
+        holds = unilateral.dry_table[k, ku.DRY_HOLDS] == 1
+        if holds and contact_guard(system.contacts, unilateral, ws, DRY_GUARD, k) < -slack:
+            return False
     for k in range(ws.contacts.shape[0]):
         mode = ws.active[k, ka.MODE]
         if mode != ka.OPEN and ws.contacts[k, ka.NORMAL_FORCE] < -slack:
@@ -333,6 +344,20 @@ def log_changes(system: System, ws: Workspace, run: Run):
             log(run, ki.STOP_LOG + LOG_KINDS * k + (STOP_HIT if hit else STOP_LEFT))
 
 
+@internal_kernel
+def break_loose(unilateral: UnilateralArrays, ws: Workspace, k):
+    """Let joint k, which dry friction does not hold any more, slide against it; False where its slip has ended."""
+    table, split = unilateral.dry_table, unilateral.number[ku.SPLIT] == 1.0
+    if table[k, ku.DRY_HOLDS] == 0:
+        return False
+    force = ws.rows[table[k, ku.DRY_ROW], ka.FORCE]
+    if not split or dry_margin(unilateral, ws, k) <= unilateral.number[ku.BEST_MARGIN] + FORCE_SLACK * (
+        1.0 + abs(force)
+    ):
+        table[k, ku.DRY_HOLDS], unilateral.dry[k, ku.DRY_SIDE] = 0, -1.0 if force > 0.0 else 1.0
+    return True
+
+
 @apart_kernel
 def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Workspace, run: Run):
     """Do what the contact events at the end of the accepted step ask for; the next step starts anew."""
@@ -361,6 +386,8 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
                 log(run, ki.STOP_LOG + LOG_KINDS * k + STOP_LEFT)
             else:
                 by_hand = False
+        elif kind == DRY_GUARD:
+            by_hand = break_loose(unilateral, ws, k) and by_hand
         elif ws.active[k, ka.MODE] == ka.OPEN:
             by_hand = False
         elif kind == NORMAL_GUARD:

@@ -13,7 +13,7 @@ from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.cone import problem as kc
 from dynsim.dynamics.contact.cone.problem import approach, solve_cones
 from dynsim.dynamics.contact.rows import row_errors, set_modes
-from dynsim.dynamics.contact.unilateral import UnilateralArrays, stop_gap
+from dynsim.dynamics.contact.unilateral import UnilateralArrays, dry_rows_held, stop_gap
 from dynsim.dynamics.derivative import System, derivative
 from dynsim.dynamics.tables import Workspace
 from dynsim.dynamics.tree.articulated import accelerate
@@ -118,6 +118,15 @@ def come_down(system: System, ws: Workspace, run: Run):
 
 
 @internal_kernel
+def kind_of_joint_row(system: System, r):
+    """Kind of row r of the contact problem, of a coupling, of dry friction or, behind them, of a joint stop."""
+    couplings = system.couplings.joint.shape[0]
+    if r < couplings:
+        return kc.BOTH_WAYS
+    return kc.BOX if r < couplings + dry_rows_held(system.unilateral) else kc.ONE_WAY
+
+
+@internal_kernel
 def gather(system: System, ws: Workspace, run: Run):
     """Rows along normal and tangents of everything that touches, and their system, into the workspace.
 
@@ -130,9 +139,9 @@ def gather(system: System, ws: Workspace, run: Run):
         mode[k, ku.WANTED] = ka.STICKING if mode[k, ku.TOUCHING] == 1 else ka.OPEN
     set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
     evaluate(system, ws, run)
-    couplings, p = system.couplings.joint.shape[0], ws.counts[ka.ROWS]
+    p = ws.counts[ka.ROWS]
     for r in range(p):
-        place[ku.KINDS, r] = kc.BOTH_WAYS if r < couplings else kc.ONE_WAY
+        place[ku.KINDS, r] = kind_of_joint_row(system, r)
     for k in range(mode.shape[0]):
         if mode[k, ku.WANTED] == ka.STICKING:
             r = ws.active[k, ka.FIRST_ROW]
@@ -169,6 +178,8 @@ def impulses(system: System, ws: Workspace, p, largest, share):
     vector, mode = unilateral.vector, unilateral.mode
     for r in range(p):
         vector[ku.OFFSET, r], vector[ku.SOLUTION, r] = rows[r, ka.ROW_RATE], 0.0
+        # Friction of joints is too weak to take an impulse.
+        vector[ku.CONE_FRICTION, r] = 0.0
     for k in range(mode.shape[0]):
         if mode[k, ku.TOUCHING] == 1:
             r = ws.active[k, ka.FIRST_ROW]
@@ -225,7 +236,7 @@ def impact(system: System, ws: Workspace, run: Run):
             unilateral.tally[k, ku.LOSS] += loss
             y[layout.loss + kst.IMPACT_LOSS] += loss
             y[layout.contact + kst.CONTACT_SIZE * k + kst.IMPULSE] += f[r]
-    r = system.couplings.joint.shape[0]
+    r = system.couplings.joint.shape[0] + dry_rows_held(unilateral)
     for k in range(unilateral.stop_table.shape[0]):
         if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
             unilateral.stop[k, ku.STOP_LOSS] += rows[r, ka.FORCE]

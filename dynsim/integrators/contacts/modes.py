@@ -20,7 +20,7 @@ from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.cone import problem as kc
 from dynsim.dynamics.contact.rows import set_modes
-from dynsim.dynamics.contact.unilateral import UnilateralArrays, slide_direction
+from dynsim.dynamics.contact.unilateral import UnilateralArrays, dry_bound, dry_rows_held, slide_direction
 from dynsim.dynamics.derivative import System
 from dynsim.dynamics.tables import Workspace
 from dynsim.integrators import run as ki
@@ -31,6 +31,7 @@ from dynsim.integrators.contacts.impacts import (
     gather,
     impact,
     keep_touching,
+    kind_of_joint_row,
     slip_speed,
     solve_problem,
 )
@@ -71,6 +72,7 @@ def choose(system: System, ws: Workspace, run: Run):
     """Modes by the accelerations of all that touches; the rates of what is closed are brought to zero."""
     unilateral = system.unilateral
     mode = unilateral.mode
+    hold_slow_joints(unilateral, ws)
     p = gather(system, ws, run)
     largest = 0.0
     for r in range(p):
@@ -111,6 +113,8 @@ def choose(system: System, ws: Workspace, run: Run):
     loss = project_level(system, ws, run.y, 1)
     run.y[system.layout.loss + kst.IMPACT_LOSS] += loss
     evaluate(system, ws, run)
+    for k in range(unilateral.dry_table.shape[0]):
+        unilateral.dry_table[k, ku.DRY_HOLDS] = unilateral.dry_table[k, ku.DRY_NEXT]
     set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
     before = ws.counts[ka.DEPENDENT]
     evaluate(system, ws, run)
@@ -119,6 +123,30 @@ def choose(system: System, ws: Workspace, run: Run):
         mode[k, ku.GIVES_WAY] = 0
         starts = mode[k, ku.WANTED] == ka.SLIDING and mode[k, ku.TOUCHING] == ka.STICKING
         unilateral.slide[k, ku.HEADWAY] = max(0.0, -unilateral.slide[k, ku.SPEED]) if starts else 0.0
+
+
+@internal_kernel
+def hold_slow_joints(unilateral: UnilateralArrays, ws: Workspace):
+    """Dry friction holds the joints that do not move, where they are; the others slide on, as they move."""
+    table, dry = unilateral.dry_table, unilateral.dry
+    for k in range(table.shape[0]):
+        rate = ws.joints[table[k, ku.DRY_JOINT], ka.QD]
+        table[k, ku.DRY_HOLDS] = 1 if abs(rate) <= 2.0 * unilateral.number[ku.SLOW] else 0
+        dry[k, ku.DRY_SIDE], dry[k, ku.DRY_AT] = 1.0 if rate > 0.0 else -1.0, ws.joints[table[k, ku.DRY_JOINT], ka.Q]
+
+
+@internal_kernel
+def let_joints_slide(system: System, size, largest):
+    """Which joints dry friction goes on to hold, into DRY_NEXT, and which ways the others slide."""
+    unilateral, i = system.unilateral, system.couplings.joint.shape[0]
+    table, f = unilateral.dry_table, unilateral.vector[ku.SOLUTION]
+    for k in range(table.shape[0]):
+        table[k, ku.DRY_NEXT] = table[k, ku.DRY_HOLDS]
+        if table[k, ku.DRY_HOLDS] == 1:
+            moves = abs(acceleration(unilateral, i, size)) > SLIP_TOLERANCE * largest
+            if moves and abs(f[i]) >= dry_bound(unilateral, k) * (1.0 - ON_CONE):
+                table[k, ku.DRY_NEXT], unilateral.dry[k, ku.DRY_SIDE] = 0, -1.0 if f[i] > 0.0 else 1.0
+            i += 1
 
 
 @internal_kernel
@@ -158,8 +186,11 @@ def reduce_rows(system: System, ws: Workspace, run: Run, p):
         if mode[k, ku.TOUCHING] == 1:
             first = ws.active[k, ka.FIRST_ROW]
     for r in range(first):
-        place[ku.KINDS, r] = kc.BOTH_WAYS if r < system.couplings.joint.shape[0] else kc.ONE_WAY
+        place[ku.KINDS, r], vector[ku.CONE_FRICTION, r] = kind_of_joint_row(system, r), 0.0
         place[ku.TABLE_ROW, r], vector[ku.FIRST_PART, r], vector[ku.SECOND_PART, r] = r, 0.0, 0.0
+    for k in range(unilateral.dry_table.shape[0]):
+        if unilateral.dry_table[k, ku.DRY_HOLDS] == 1:
+            vector[ku.CONE_FRICTION, unilateral.dry_table[k, ku.DRY_ROW]] = dry_bound(unilateral, k)
     size = first
     for k in range(mode.shape[0]):
         if mode[k, ku.TOUCHING] == 0:
@@ -272,7 +303,8 @@ def take_solution(system: System, ws: Workspace, size, largest):
     strongest = 0.0
     for i in range(size):
         strongest = max(strongest, abs(f[i]))
-    i = system.couplings.joint.shape[0]
+    let_joints_slide(system, size, largest)
+    i = system.couplings.joint.shape[0] + dry_rows_held(unilateral)
     for k in range(unilateral.stop_table.shape[0]):
         if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
             unilateral.stop_table[k, ku.STOP_CLOSED] = 1 if f[i] > FORCE_TOLERANCE * strongest else 0

@@ -43,10 +43,10 @@ def may_wait(unilateral: UnilateralArrays | None, run: Run):
 
 @internal_kernel
 def has_stops(unilateral: UnilateralArrays | None):
-    """True where joints have stops, whose forces are kept for one state alone."""
+    """True where joints have stops or dry friction, whose forces are kept for one state alone."""
     if unilateral is None:  # known to the compiler
         return False
-    return unilateral.stop.shape[0] > 0
+    return unilateral.stop.shape[0] + unilateral.dry.shape[0] > 0
 
 
 @form_of(write_samples, samples_on_lanes)

@@ -40,7 +40,7 @@ class LinkKeys(StrictConfig):
     damping_N_m_s_per_rad: NonNegative = Field(default=0.0, description="viscous loss of a revolute joint")
     damping_N_s_per_m: NonNegative = Field(default=0.0, description="viscous loss of a prismatic joint")
     friction_N_m: NonNegative = Field(
-        default=0.0, description="dry friction of a revolute joint, which holds at rest; time stepping only"
+        default=0.0, description="dry friction of a revolute joint, which holds at rest; unilateral law"
     )
     friction_N: NonNegative = Field(default=0.0, description="the same of a prismatic joint")
     motor: MotorChoice | None = Field(default=None, description="motor of the joint; none: the joint swings free")

@@ -1,4 +1,4 @@
-"""How redundant contacts share their forces: the split that is furthest from slipping, and the least that holds."""
+"""How redundant contacts, and joints that rub, share their forces: furthest from slipping, and the least that holds."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def split_room_in(flat, first, r, count):
 
 
 @kernel
-def best_split(f0, N, r, contact_first, mu, count, out, room: ConeProgram):
+def best_split(f0, N, r, contact_first, mu, contacts, joints, out, room: ConeProgram):
     """Forces f = f0 + N z of redundant sticking contacts: in all cones if any split is, and then the least of those.
 
     The best margin is max_z min_j (μ_j f_n,j − |f_t,j|). Is it negative, no split holds all contacts. A contact without
@@ -48,8 +48,9 @@ def best_split(f0, N, r, contact_first, mu, count, out, room: ConeProgram):
     ----------
     f0 : (p or more,) forces of all rows [N]
     N : (p or more, r or more) directions in which they can be split otherwise; r of them
-    contact_first : (count or more,) int, normal row of each sticking contact; its tangential rows follow
-    mu : (count or more,) static friction
+    contact_first : (contacts + joints or more,) int, normal row of each sticking contact, whose tangential rows follow,
+        then the row of each joint that dry friction holds
+    mu : (contacts + joints or more,) static friction; of joints the bound of their force, whose margin is μ_j − |f_j|
     out : (p or more,) the force of least norm among those in all cones; without one, that of the best margin
     room : see :func:`split_room`
 
@@ -58,7 +59,7 @@ def best_split(f0, N, r, contact_first, mu, count, out, room: ConeProgram):
     float
         The best margin [N], at most ten times the largest force in f0.
     """
-    p = f0.shape[0]
+    p, count = f0.shape[0], contacts + joints
     scale = 0.0
     for i in range(p):
         out[i] = f0[i]
@@ -69,6 +70,9 @@ def best_split(f0, N, r, contact_first, mu, count, out, room: ConeProgram):
     worst = math.inf
     for j in range(count):
         i = contact_first[j]
+        if j >= contacts:
+            worst = min(worst, (mu[j] - abs(f0[i])) / scale)
+            continue
         if mu[j] > 0.0:
             worst = min(worst, (mu[j] * f0[i] - math.hypot(f0[i + 1], f0[i + 2])) / scale)
             continue
@@ -86,7 +90,7 @@ def best_split(f0, N, r, contact_first, mu, count, out, room: ConeProgram):
         return worst * scale
 
     # The margin t is the last unknown.
-    rows = cone_rows(f0, N, r, contact_first, mu, count, scale, room)
+    rows = cone_rows(f0, N, r, contact_first, mu, contacts, joints, scale, room)
     for k in range(r + 1):
         for m in range(r + 1):
             room.H[k, m] = 0.0
@@ -127,10 +131,10 @@ def best_split(f0, N, r, contact_first, mu, count, out, room: ConeProgram):
 
 
 @internal_kernel
-def cone_rows(f0, N, r, contact_first, mu, count, scale, room: ConeProgram):
-    """The cones of the contacts in z and the margin, (μ f_n − t, f_t); returns the number of their rows."""
+def cone_rows(f0, N, r, contact_first, mu, contacts, joints, scale, room: ConeProgram):
+    """The cones in z and the margin, (μ f_n − t, f_t) of contacts, (μ − t, f) of joints; returns how many rows."""
     row = 0
-    for j in range(count):
+    for j in range(contacts):
         i, room.first[j] = contact_first[j], row
         slope = mu[j] if mu[j] > 0.0 else 1.0
         for k in range(r):
@@ -143,5 +147,12 @@ def cone_rows(f0, N, r, contact_first, mu, count, scale, room: ConeProgram):
                     room.G[row, k] = N[i + e, k]
                 room.G[row, r], room.h[row] = 0.0, f0[i + e] / scale
                 row += 1
-    room.first[count] = row
+    for j in range(contacts, contacts + joints):
+        i, room.first[j] = contact_first[j], row
+        for k in range(r):
+            room.G[row, k], room.G[row + 1, k] = 0.0, N[i, k]
+        room.G[row, r], room.h[row] = -1.0, mu[j] / scale
+        room.G[row + 1, r], room.h[row + 1] = 0.0, f0[i] / scale
+        row += 2
+    room.first[contacts + joints] = row
     return row
