@@ -253,8 +253,6 @@ class Search:
         """The best sets, their best paths at more knots, by the heat of their dense references."""
         whole = {braces: sorted((p.local for p in some if p.local), key=_cost) for braces, some in paths.items()}
         reached = {braces: some for braces, some in whole.items() if some}
-        for braces in whole.keys() - reached.keys():
-            self.tally.refused[braces] = "postures found, but none along the whole path"
         planned = []
         for braces in sorted(reached, key=lambda braces: reached[braces][0].cost)[: self.kept]:
             good, near = list[Planned](), math.inf
@@ -270,6 +268,8 @@ class Search:
             if good:
                 planned.append(min(good, key=lambda plan: plan.heat))
                 self.tally.refused.pop(braces, None)
+        for braces in whole.keys() - reached.keys():
+            self.tally.refused[braces] = "postures found, but none along the whole path"
         return sorted(planned, key=lambda plan: plan.heat)
 
     def _finest(self, braces: Set, coarse: Local) -> Planned | str:
