@@ -119,7 +119,8 @@ class _Frozen:
         run = prepared.run
         self.time = float(run.clock[ki.TIME])
         self._system, self._workspace, self._y = copied(prepared.system), copied(prepared.workspace), run.y.copy()
-        self.x = self._y[: run.layout.tracked].copy()
+        self._tracked = run.layout.tracked
+        self.x = self._y[: self._tracked].copy()
         self._evaluate(self.x, self._system)
         drives, reference = self._system.drives, self._system.reference
         motors = range(len(drives.table))
@@ -138,11 +139,11 @@ class _Frozen:
 
     def _evaluate(self, x: Array, system: Any) -> Array:
         y, dy = self._y.copy(), np.zeros(len(self._y))
-        y[: len(x)] = x
+        y[: self._tracked] = x
         # Signs of friction, anchors and counts belong to the instant.
         self._latest = copied(self._workspace)
         derivative(system, self.time, y, self._latest, dy)
-        return dy[: len(x)]
+        return dy[: self._tracked]
 
     def inputs(self) -> dict[str, dict[str, Callable[[float, NDArray[Any]], Array]]]:
         """What can be moved, by family and label: functions of the amount and of what is read."""

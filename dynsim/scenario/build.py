@@ -103,9 +103,9 @@ def _with_objects(scenario: Scenario, built: Robot) -> Robot:
     touching = surfaces if scenario.config.contacts.law == "unilateral" else []
     return replace(
         built,
-        links=(*built.links, *(link for name, one in objects.items() for link in one.links(name))),
-        q0=np.concatenate([built.initial, *(one.start() for one in objects.values())]),
-        feet=(*built.feet, *(foot for name, one in objects.items() for foot in one.feet(name, touching))),
+        links=(*built.links, *(link for name, body in objects.items() for link in body.links(name))),
+        q0=np.concatenate([built.initial, *(body.start() for body in objects.values())]),
+        feet=(*built.feet, *(foot for name, body in objects.items() for foot in body.feet(name, touching))),
     )
 
 

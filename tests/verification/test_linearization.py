@@ -19,10 +19,9 @@ from dynsim.scenario import build
 Function = Callable[[np.ndarray], np.ndarray]
 
 
-def parts(simulation: Simulation, table: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Columns of positions, rates and currents."""
-    n = simulation.model.n
-    return table[..., :n], table[..., n : 2 * n], table[..., 2 * n :]
+def parts(table: np.ndarray, axis: int = -1) -> list[np.ndarray]:
+    """Columns (axis -1) or rows (axis 0) of positions, rates and currents: each joint has its motor."""
+    return np.split(table, 3, axis=axis)
 
 
 def central(function: Function, x: np.ndarray, step: float) -> np.ndarray:
@@ -53,7 +52,7 @@ def test_a_free_arm_is_that_of_pinocchio_with_its_motors() -> None:
     by_q, by_v, inverse = pin.computeABADerivatives(oracle.model, oracle.data, *map(oracle.to, (state.q, state.v, tau)))
     inverse = np.triu(inverse) + np.triu(inverse, 1).T
     by_q, by_v, inverse = (oracle.back(oracle.back(unit).T).T for unit in (by_q, by_v, inverse))
-    positions, rates, currents = parts(simulation, A)
+    positions, rates, currents = parts(A)
     zero, unit = np.zeros((n, n)), np.eye(n)
     options = simulation.scenario.controller
     k_p, k_d = np.diag(np.full(n, options.k_p_V_per_rad)), np.diag(np.full(n, options.k_d_V_s_per_rad))
@@ -63,12 +62,12 @@ def test_a_free_arm_is_that_of_pinocchio_with_its_motors() -> None:
         rates, np.vstack([unit, by_v - inverse @ np.diag(model.damping), -by_inductance @ (k_d + np.diag(K))]), 1e-9
     )
     assert_near(currents, np.vstack([zero, inverse @ np.diag(K), -by_inductance @ np.diag(R)]), 1e-9)
-    assert_near(B[2 * n :], by_inductance @ np.hstack([unit, k_p, k_d]), 1e-9)
-    assert not B[: 2 * n].any()
+    assert_near(parts(B, 0)[2], by_inductance @ np.hstack([unit, k_p, k_d]), 1e-9)
+    assert not np.vstack(parts(B, 0)[:2]).any()
     _, jacobian = model.point_position_and_jacobian(*model.robot.hand, state.q)
     assert_near(C[:3, :n], jacobian, 1e-9)
     assert not C[:3, n:].any()
-    assert_near(C[3:, : 2 * n], -np.hstack([k_p, k_d]), 1e-9)
+    assert_near(np.hstack(parts(C[3:])[:2]), -np.hstack([k_p, k_d]), 1e-9)
     assert_near(D[3:], np.hstack([unit, k_p, k_d]), 1e-9)
     assert linear.error < 1e-7
     # Of a step that ends there; the state of advance() is between two.
@@ -99,7 +98,7 @@ def constrained(simulation: Simulation, modes: dict[str, str], smoothing: float)
         return at, J, (8.0 * near - far) @ v / 12e-3
 
     def solve(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        q, v, i = parts(simulation, x)
+        q, v, i = parts(x)
         rows, forces, right, normals = [], [], [], []
         for contact in closed:
             at, J, drift = geometry(contact, q, v)
@@ -154,10 +153,10 @@ def test_every_contact_mode_against_differences(case: str) -> None:
     assert set(linear.modes.values()) == modes
     acceleration, force = constrained(simulation, linear.modes, smoothing)
     n = simulation.model.n
-    assert_near(linear.xdot[n : 2 * n], acceleration(linear.x), 1e-9)
+    assert_near(parts(linear.xdot)[1], acceleration(linear.x), 1e-9)
     expected = central(acceleration, linear.x, 3e-5)
-    assert_near(linear.A[n : 2 * n], expected, 1e-7)
-    np.testing.assert_allclose(linear.A[:n, n : 2 * n], np.eye(n), atol=1e-12)
+    assert_near(parts(linear.A, 0)[1], expected, 1e-7)
+    np.testing.assert_allclose(parts(parts(linear.A, 0)[0])[1], np.eye(n), atol=1e-12)
     closed = [k for k, mode in enumerate(linear.modes.values()) if mode != "open"]
     assert_near(linear.C[closed], central(force, linear.x, 3e-5), 1e-7)
     away = [k for k, mode in enumerate(linear.modes.values()) if mode == "open"]
@@ -174,7 +173,7 @@ def test_pushes_and_commands_act_as_they_do_in_the_simulation() -> None:
     n = model.n
     contact = build.contacts(simulation.scenario)[0]
     _, J_c = model.point_position_and_jacobian(contact.body, contact.point, q)
-    slip = J_c @ linear.x[n : 2 * n]
+    slip = J_c @ parts(linear.x)[1]
     along = np.array([slip[0], slip[1], 0.0]) / np.hypot(slip[0], slip[1])
     # M̄ v̇ = Jᵀ F + f (n − μ t)ᵀ J_c and n·J_c v̇ = 0.
     friction = (np.array([0.0, 0.0, 1.0]) - contact.friction * along) @ J_c
@@ -182,11 +181,11 @@ def test_pushes_and_commands_act_as_they_do_in_the_simulation() -> None:
     system = np.block([[M, -friction[:, None]], [J_c[2:], np.zeros((1, 1))]])
     J = model.point_jacobian("link_10", np.zeros(3), q)
     expected = np.linalg.solve(system, np.concatenate([J[2], [0.0]]))[:n]
-    assert_near(linear.B[n : 2 * n, 0], expected, 1e-8)
+    assert_near(parts(linear.B, 0)[1][:, 0], expected, 1e-8)
     assert_near(linear.D[:, 0], expected, 1e-8)
     inductance = simulation.robot.motors[2].inductance
     column = np.zeros(3 * n)
-    column[2 * n + 2] = 1.0 / inductance
+    parts(column)[2][2] = 1.0 / inductance
     assert_near(linear.B[:, 4], column, 1e-8)
 
 
