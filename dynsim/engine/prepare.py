@@ -7,6 +7,7 @@ import time as clock
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,7 +16,6 @@ from dynsim.compile.contact_law import DryFriction, JointStop, compile_unilatera
 from dynsim.compile.control import JointControl
 from dynsim.compile.model import Model
 from dynsim.compile.shapes import compile_shapes
-from dynsim.compile.snake_tree import SnakeTree
 from dynsim.compile.tables import compile_contacts, compile_couplings, compile_drives, compile_loads, compile_support
 from dynsim.config.problems import listed
 from dynsim.dynamics import state as kst
@@ -29,7 +29,6 @@ from dynsim.engine.compilation import kernels_logged
 from dynsim.engine.equilibrium import Balance, balanced, shifted
 from dynsim.engine.method import AUTO, Choice, choose
 from dynsim.engine.outcome import check_size
-from dynsim.engine.snake_start import Phase, begun
 from dynsim.errors import ModelError, ScenarioError, SimulationStopped
 from dynsim.integrators import driver
 from dynsim.integrators import run as ki
@@ -42,6 +41,9 @@ from dynsim.record.poses import pose_columns
 from dynsim.scenario import Scenario, build
 from dynsim.scenario.schema import Integrator
 from dynsim.system.memo import Memo, recall, remembering
+
+if TYPE_CHECKING:
+    from dynsim.engine.snake_start import Phase
 
 log = logging.getLogger(__name__)
 
@@ -114,8 +116,13 @@ def prepare(
     """
     described, contacts = build.robot_and_contacts(scenario)
     piloted: JointControl | None = None
-    if isinstance(described, SnakeTree):
-        described, piloted = begun(scenario, described, follow_lines)
+    if type(described) is not Robot:
+        # The snake's modules wait until there is a snake.
+        from dynsim.compile.snake_tree import SnakeTree
+        from dynsim.engine.snake_start import begun
+
+        if isinstance(described, SnakeTree):
+            described, piloted = begun(scenario, described, follow_lines)
     if motors is not None:
         described = replace(described, motors=tuple(motors))
     model = recall("model", lambda: Model(described), described)

@@ -18,9 +18,8 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from dynsim.config.base import NonNegative, Positive, StrictConfig, Vector3, error_at, unit_vector
-from dynsim.model.description import Foot, Inertia, Link
+from dynsim.model.description import Array, Foot, Inertia, Link
 from dynsim.model.joints.ball import floating
-from dynsim.model.urdf.reader import rotation
 from dynsim.record.scene import Shape, quaternion
 
 Edges = Annotated[list[Positive], Field(min_length=3, max_length=3)]
@@ -79,9 +78,15 @@ class SceneObject(StrictConfig):
             return Shape("sphere", (float(self.radius_m or 0.0),))
         return Shape("box", tuple(self.size_m))
 
+    @property
+    def _turn(self) -> Array:
+        # The reader of URDF waits until somebody turns something.
+        from dynsim.model.urdf.reader import rotation
+
+        return rotation(*np.deg2rad(self.rpy_deg))
+
     def links(self, name: str) -> tuple[Link, ...]:
         """Its tree; joint and body have the name of the object."""
-        R = rotation(*np.deg2rad(self.rpy_deg))
         link = Link(name, name, None, "revolute", np.array([0.0, 0.0, 1.0]), self.inertia, shapes=(self.solid,))
         if self.hinge is None:
             return floating(link)
@@ -91,7 +96,7 @@ class SceneObject(StrictConfig):
             replace(
                 link,
                 axis=unit_vector(hinge.axis, "axis"),
-                R_PJ=R,
+                R_PJ=self._turn,
                 p_PJ=np.array(self.position_m),
                 damping=hinge.damping_N_m_s_per_rad,
                 friction=hinge.friction_N_m,
@@ -104,7 +109,7 @@ class SceneObject(StrictConfig):
         """Its coordinates at the start."""
         if self.hinge is not None:
             return [0.0]
-        return [*self.position_m, *quaternion(rotation(*np.deg2rad(self.rpy_deg)))]
+        return [*self.position_m, *quaternion(self._turn)]
 
     def feet(self, name: str, surfaces: list[str]) -> list[Foot]:
         """With what it can touch each of these surfaces."""
