@@ -100,7 +100,7 @@ def compile_unilateral(
         dry=reals(frictions),
         tie_table=integers(tie_table),
         tie=reals(tie),
-        place=integers(np.zeros((ku.PLACES, max(p, c + len(dry) + 2)))),
+        index=integers(np.zeros((ku.INDICES, max(p, c + len(dry) + 2)))),
         vector=reals(np.zeros((ku.VECTORS, p))),
         room=reals(np.zeros((ku.ROOM, p, p))),
         split_room=reals(np.zeros(split_size(3 * c + len(dry), c + len(dry)))),

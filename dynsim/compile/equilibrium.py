@@ -86,7 +86,7 @@ def holding_torques(
         torques, still = np.zeros((1, model.n)), np.zeros((1, model.n))
         arrays, workspace = planner.arrays, planner.workspace
         if brace_statics(model.arrays, workspace, arrays, reals(q[None]), still, still, tables, torques, False) == 1:
-            normal_N = arrays.found[: len(rows), kb.FORCES]
+            normal_N = arrays.results[: len(rows), kb.FORCES]
             normal = normal_N if real else normal_N[::2] - normal_N[1::2]
             names = [contact.name for contact, *_ in touching]
             forces = arrays.forces[: len(rows)] if real else arrays.forces[: len(rows)].reshape(-1, 2, 3).sum(axis=1)
