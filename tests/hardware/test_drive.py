@@ -422,9 +422,8 @@ def test_sample_by_sample_the_limits_are_those_of_the_check(
         time, angle, rate = noisy(seed, 0.03 * (seed / 40) ** 4)
         path = IncrementalPath(Sample(0.0, angle[0], np.zeros(3)), servo_map)
         path._held[:] = held
-        broken = [
-            words for k in range(1, len(time)) if (words := path.append(Sample(time[k], angle[k], rate[k]), keep=0.0))
-        ][:1]
+        appended = (path.append(Sample(time[k], angle[k], rate[k]), keep=0.0) for k in range(1, len(time)))
+        broken = next(filter(None, appended), None)
         straight = np.diff(angle, axis=0) / STEP
         rates = (straight, straight) if held else (rate[:-1], rate[1:])
         margins = list(MotionLimits(servo_map).margins(RobotPath(time, angle, *rates)))

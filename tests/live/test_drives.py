@@ -186,8 +186,9 @@ def test_hand_eases_to_rest_at_its_edge(way: tuple[float, float, float]) -> None
     check_motion(session.record(), load_servo_map("arm"))
 
 
-def test_a_hand_at_its_edge_comes_back() -> None:
-    """For a second in one of twenty directions at random, to the edge and along it, then back to where it began."""
+@pytest.mark.parametrize("directions", [6, pytest.param(20, marks=pytest.mark.long)])
+def test_a_hand_at_its_edge_comes_back(directions: int) -> None:
+    """For a second in one of some directions at random, to the edge and along it, then back to where it began."""
     session = begin(load_scenario("elbow_comparison", "two_elbows"))
     operator, random = session.simulation.operator, np.random.default_rng(3)
     targets, hindered = [operator.target.copy()], 0
@@ -196,7 +197,7 @@ def test_a_hand_at_its_edge_comes_back() -> None:
         session.tick(Command(tuple(way.tolist())))
         targets.append(operator.target.copy())
 
-    for _ in range(20):
+    for _ in range(directions):
         way = random.normal(size=3)
         for _ in range(100):
             goes(0.2 * way / np.linalg.norm(way))
@@ -206,7 +207,7 @@ def test_a_hand_at_its_edge_comes_back() -> None:
             left = targets[0] - targets[-1]
             goes(0.2 * left / max(float(np.linalg.norm(left)), 0.1))
         assert np.linalg.norm(targets[0] - targets[-1]) < max(0.5 * before, 0.02)
-    assert hindered > 3
+    assert hindered >= directions // 5
     acceleration = np.diff(np.array(targets), n=2, axis=0) / session.period**2
     assert np.linalg.norm(acceleration, axis=1).max() < 0.5 + 1e-6
 

@@ -94,8 +94,8 @@ def test_a_pair_is_put_down_before_the_next_is_lifted(tree):
     np.testing.assert_array_equal(heights[:, 5], 0.01)
     np.testing.assert_allclose(heights[-1, [2, 6]], [0.0, 0.01], atol=1e-15)
     yaw = np.zeros(6)
-    angles = np.array([lifter.angles(t, yaw) for t in np.linspace(1.0, 1.6, 6001)])
-    assert np.abs(np.diff(angles, axis=0)).max() < 1e-3  # no jumps: 10 mm in 0.25 s are 0.1 mrad in 0.1 ms
+    angles = np.array([lifter.angles(t, yaw) for t in np.linspace(1.0, 1.6, 1201)])
+    assert np.abs(np.diff(angles, axis=0)).max() < 1e-3  # no jumps: 10 mm in 0.25 s are 0.5 mrad in 0.5 ms
 
 
 def test_wheels_carry_the_weight_and_pair_1_the_most(x_run):
