@@ -196,7 +196,7 @@ class Study:
     """Takes the place of pytest's loop over the tests."""
 
     def __init__(self, out: Path, sample: list[dict[str, Any]]) -> None:
-        self.out, self.sample = out, sample
+        self.out, self.drawn = out, sample
 
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
         reach_file = self.out.with_suffix(".reach.json")
@@ -207,8 +207,8 @@ class Study:
             reach_file.write_text(json.dumps(reach))
         items = {item.nodeid: item for item in session.items}
         results = json.loads(self.out.read_text()) if self.out.exists() else []
-        for k in range(len(results), len(self.sample)):
-            results.append(self.judge(k, self.sample[k], reach, items))
+        for k in range(len(results), len(self.drawn)):
+            results.append(self.judge(k, self.drawn[k], reach, items))
             self.write(results)
         for result in results:
             if not result["noticed"] and "longer" not in result:
@@ -254,7 +254,7 @@ class Study:
             for examples in families.values()
             for k in sorted({round(n * (len(examples) - 1) / (EXAMPLES - 1)) for n in range(EXAMPLES)})
         ]
-        seen = watch(self.sample)
+        seen = watch(self.drawn)
         for count, item in enumerate(items):
             family = item.nodeid.split("[")[0]
             if late.get(family, 0) >= 2:  # its other examples take as long
