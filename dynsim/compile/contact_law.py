@@ -1,4 +1,7 @@
-"""The unilateral law of a robot's contacts and joint stops, compiled to the arrays of the kernels."""
+"""Tables of the unilateral law for the kernels: friction of contacts, joint stops, dry friction, ties.
+
+The law itself is in :mod:`dynsim.dynamics.contact.unilateral` and :mod:`dynsim.integrators.contacts`.
+"""
 
 from __future__ import annotations
 

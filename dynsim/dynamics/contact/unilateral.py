@@ -1,4 +1,4 @@
-"""The unilateral law: tables of candidates and joint stops that only push, of joints that rub, and the way of slip.
+"""The unilateral law of contacts, joint stops and dry friction of joints: its tables, slip direction, sliding friction.
 
 0 ≤ f_n ⟂ gap ≥ 0; a point that slides is driven by n − μ(s) t along t = v_t/|v_t|, one that is at rest is held while
 |f_t| ≤ μ_s f_n. Which candidates are open, slide or stick is constant within a step
