@@ -88,8 +88,6 @@ ROBOTS = {
         lock_deg=FINGERS,
     ),
 }
-# What the files state and nothing simulates.
-pytestmark = pytest.mark.filterwarnings("ignore:.*Coulomb friction of joints is not simulated")
 
 
 @pytest.fixture(params=ROBOTS)
