@@ -54,7 +54,7 @@ def on_files(files: Files, config: Any) -> Files:
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
     """Equations as MathML, which browsers typeset themselves; links to files of the repository as links of the site."""
-    markdown = _EQUATION.sub(lambda match: f'<div class="equation">{convert(match[1], display="block")}</div>', markdown)
+    markdown = _EQUATION.sub(_typeset, markdown)
     markdown = _INDEX.sub(lambda match: match["kept"] or f"{match['letter']}<sub>{match['index']}</sub>", markdown)
     up = "../" * page.file.src_uri.count("/")
     markdown = _PICTURE.sub(lambda match: f"]({up}{match[1]})", markdown)
@@ -63,3 +63,7 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
         for source, target in OUTSIDE.items():
             markdown = markdown.replace(f"]({source})", f"]({up}{target})")
     return markdown
+
+
+def _typeset(equation: re.Match[str]) -> str:
+    return f'<div class="equation">{convert(equation[1], display="block")}</div>'
