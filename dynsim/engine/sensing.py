@@ -110,8 +110,9 @@ class EncodedCommands:
         at = np.array([places[motor.joint] for motor in robot.motors])
         turns = {link.joint: link.units[0] == "rad" for link in robot.links}
         revolute = np.array([turns[motor.joint] for motor in robot.motors])
-        self._joints, self._unit = tuple(motor.joint for motor in robot.motors), " or ".join(
-            unit for unit, there in (("rad", revolute.any()), ("m", not revolute.all())) if there
+        self._joints, self._unit = (
+            tuple(motor.joint for motor in robot.motors),
+            " or ".join(unit for unit, there in (("rad", revolute.any()), ("m", not revolute.all())) if there),
         )
         self.sensor = SampledSensor(
             lambda state: state.q[at],

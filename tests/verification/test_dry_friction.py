@@ -14,6 +14,8 @@ from dynsim import load_scenario, simulate
 from dynsim.compile.model import Model
 from dynsim.dynamics.state import ELECTRICAL, GEAR, JOINT, JOULE, OUT_MODE
 from dynsim.errors import ModelError
+from dynsim.integrators import run as ki
+from dynsim.integrators.contacts.events import SLIP_START, SLIP_STOP
 from dynsim.integrators.stepping.tables import CAPPED
 from dynsim.model.description import Contact, Inertia, Link, Load, Quadric, Robot, vector
 from dynsim.model.drives import Motor, Servo
@@ -219,6 +221,21 @@ def test_events_find_where_a_push_breaks_a_bearing_loose(method):
     assert run.states("q")[2, 0] == pytest.approx((2.0 / 3.0 - 1.0 / 6.0) * FRICTION / MASS, rel=1e-8)
 
 
+@pytest.mark.parametrize(("method", "late"), [("dopri5", 1e-8), ("radau5", 1e-8), ("time_stepping", 1e-3)])
+def test_begin_and_end_of_slip_of_a_joint_are_in_the_log(method, late):
+    """A push 2 F − F t slides the mass off at once, which is no event; it stops at 2 s and is pushed back from 3 s on.
+
+    Time stepping tells it at the ends of the steps that show it, here of 1 ms.
+    """
+    b = sliding(np.array([2.0 * FRICTION, -FRICTION]))
+    y, times = b.state(np.zeros(1), np.zeros(1)), np.array([0.0, 4.0])
+    stepping = method == "time_stepping"
+    run = stepped(b, y, times, 1e-3, 0.5) if stepping else b.simulate(y, times, method, rtol=1e-10, atol=1e-12)
+    logged = int(run.count[ki.LOGGED])
+    assert run.log_event[:logged].tolist() == [ki.DRY_LOG + SLIP_STOP, ki.DRY_LOG + SLIP_START]
+    np.testing.assert_allclose(run.log_time[:logged], [2.0, 3.0], rtol=0, atol=late * (1.0 + 1e-9))
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_events_bring_a_spring_to_rest_in_closed_form(method):
     b, y, stiffness, damping = oscillator(0.5)
@@ -305,6 +322,12 @@ def test_scenarios_say_what_rubs(tmp_path: Path):
     assert record.summary["energy_residual_relative"] < 1e-9
     events = simulate(load_scenario(file, overrides={"integrator.method": "radau5"}))
     np.testing.assert_allclose(record["q"][-1], events["q"][-1], rtol=0, atol=1e-4)
+    for run in (record, events):
+        slips = [event for event in run.events if event.kind in ("slip_start", "slip_stop")]
+        assert {event.name for event in slips} <= {"joint_1", "joint_2"}  # the third never slips
+    first, located = (run.events[0] for run in (record, events))
+    assert (first.kind, first.name) == (located.kind, located.name)
+    assert 0.0 <= first.time - located.time <= 1e-3
     np.testing.assert_allclose(events["joint_friction"][:, 2], record["joint_friction"][:, 2], rtol=0, atol=0.05)
     assert events.summary["energy_residual_relative"] < 1e-6
     glued = {"contacts.law": "bilateral", "integrator.method": "radau5"}
