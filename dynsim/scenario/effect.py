@@ -40,7 +40,9 @@ def without_effect(scenario: Any, motors: bool = True) -> list[str]:
 def idle_keys(config: Any) -> dict[Keys, str]:
     """Keys that change nothing, whether they are set or not, and why."""
     kinematic = engine(config.plant) == "kinematic"
-    rules = [_of_kinematics(config)] if kinematic else [_of_integrator(config), _of_contacts(config), _of_sensors(config)]
+    rules = (
+        [_of_kinematics(config)] if kinematic else [_of_integrator(config), _of_contacts(config), _of_sensors(config)]
+    )
     return dict(pair for rule in (*rules, _of_controller(config), _of_time(config)) for pair in rule)
 
 
@@ -63,7 +65,8 @@ def _of_kinematics(config: Any) -> Iterator[tuple[Keys, str]]:
         part = getattr(config, section)
         for key in () if part is None else type(part).model_fields:
             yield (section, key), f"plant {config.plant.type} is kinematic"
-    yield ("sensors",), f"plant {config.plant.type} is kinematic"
+    for section in ("loads", "objects", "ties", "sensors"):
+        yield (section,), f"plant {config.plant.type} is kinematic"
     if hasattr(config.plant, "dynamics"):
         yield ("plant", "dynamics"), "plant.level is kinematic"
 
