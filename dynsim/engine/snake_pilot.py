@@ -186,7 +186,7 @@ class SnakePilot(SnakeControl):
     def _sensors(self, config: Sensors) -> list[SampledSensor]:
         """What tells the controller of the robot: nothing under feedforward."""
 
-        def sensor(read: Callable[[State], Array], of: Any, noise: Array, resolution: float) -> SampledSensor:
+        def sensor(read: Callable[[State], Array], of: Any, noise: Array, resolution: Array) -> SampledSensor:
             period = self.period if of is None or of.rate_hz is None else 1.0 / of.rate_hz
             delay = 0.0 if of is None else of.delay_s
             return SampledSensor(
@@ -198,12 +198,12 @@ class SnakePilot(SnakeControl):
             noise = np.zeros(6)
             if capture is not None:
                 noise[:3], noise[3:] = capture.position_noise_m, capture.attitude_noise_rad
-            return [sensor(lambda state: self.head_pose(state.q), capture, noise, 0.0)]
+            return [sensor(lambda state: self.head_pose(state.q), capture, noise, np.zeros(6))]
         if self.believed == ss.ESTIMATED:
             encoders = config.encoders
             deg = np.zeros(2) if encoders is None else np.radians([encoders.noise_deg, encoders.resolution_deg])
-            noise = np.full(len(self._joints), deg[0])
-            return [sensor(lambda state: state.q[self._joints], encoders, noise, float(deg[1]))]
+            noise, resolution = np.repeat(deg, len(self._joints)).reshape(2, -1)
+            return [sensor(lambda state: state.q[self._joints], encoders, noise, resolution)]
         return []
 
     def _tell(self, simulation: Referenced, time: float, phi: Array) -> None:
