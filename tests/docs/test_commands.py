@@ -54,13 +54,17 @@ def test_commands_are_those_of_dynsim(path: Path) -> None:
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: path.name)
 def test_every_block_says_what_it_is(path: Path) -> None:
     text = path.read_text(encoding="utf-8")
-    assert {kind for kind, _ in FENCE.findall(re.sub(r"<!-- table:.*?<!-- end -->", "", text, flags=re.DOTALL))} <= LANGUAGES
+    assert {
+        kind for kind, _ in FENCE.findall(re.sub(r"<!-- table:.*?<!-- end -->", "", text, flags=re.DOTALL))
+    } <= LANGUAGES
 
 
 def test_what_is_bash_is_run() -> None:
     from docs.test_pages_run import PAGES as run
 
-    shown = [path for path in PAGES if any(kind == "bash" for kind, _ in FENCE.findall(path.read_text(encoding="utf-8")))]
+    shown = [
+        path for path in PAGES if any(kind == "bash" for kind, _ in FENCE.findall(path.read_text(encoding="utf-8")))
+    ]
     assert {path.relative_to(ROOT).as_posix() for path in shown} <= set(run)
 
 
