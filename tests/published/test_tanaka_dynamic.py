@@ -7,6 +7,7 @@ import csv
 
 import numpy as np
 import pytest
+from support.snake_steps import end_values, fall_errors
 
 from dynsim.draw.figures.snake import draw_comparison
 from dynsim.engine import simulate
@@ -43,6 +44,21 @@ def test_what_is_moved_moves(found):
     for k, (moved, published) in enumerate(TABLE_III.items()):
         if moved != "y":
             assert found[moved][k] == pytest.approx(published.target[k], rel=0.1)
+
+
+def test_end_values_hardly_depend_on_the_step(found):
+    """The run that they do most of all, see results/snake/steps.json (``tests/support/snake_steps.py``)."""
+    values = np.array([end_values("alpha", 1.0), found["alpha"], end_values("alpha", 5.0)])
+    spread = np.ptp(values, axis=0)
+    assert spread[:3].max() < 5e-4
+    assert spread[3:].max() < 1.5e-3
+
+
+def test_a_falling_head_is_stepped_in_second_order_and_with_theta_1_in_first():
+    """While nothing comes to rest; half the step."""
+    for theta, least, most in ((0.5, 3.5, 5.0), (1.0, 1.9, 2.6)):
+        coarse, _, fine = fall_errors(theta)
+        assert least < np.sqrt(coarse / fine) < most  # of two halvings
 
 
 def test_the_table_has_paper_and_all_three_ways(simulated, tmp_path):

@@ -175,9 +175,9 @@ ties:
 @pytest.mark.parametrize(
     ("changes", "line", "says"),
     [
-        ({"METHOD": "radau5"}, 12, r"ties.spring.*needs integrator.method: time_stepping; radau5 has no ties"),
+        ({"METHOD": "radau5"}, 11, r"ties.spring.*needs integrator.method: time_stepping; radau5 has no ties"),
         ({"WHEELS": "wheels: {a: {position_m: [0, 0, 0], radius_m: 1, mass_kg: 1}}"}, 9, "wheels.*are of free objects"),
-        ({"STIFF": "bound_N: 3"}, 12, "stiffness_N_per_m is needed, or damping_N_s_per_m"),
+        ({"STIFF": "bound_N: 3"}, 11, "stiffness_N_per_m: is needed, or damping_N_s_per_m"),
         ({"OTHER": "link_1"}, 12, "other.*a tie has two ends"),
         ({"OTHER": "bax"}, 12, "ties.spring.other: .*'bax'.*box"),
         ({"STIFF": "stiffness_N_per_m: 1, pushes: true, bound_N: 2"}, 12, "bound_N.*is none of a tie that only pushes"),
