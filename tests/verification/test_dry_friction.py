@@ -245,7 +245,7 @@ def test_events_bring_a_spring_to_rest_in_closed_form(method):
     assert abs(q[2] - q[1]) < 1e-12
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", ["radau5", pytest.param("dopri5", marks=pytest.mark.long)])
 def test_events_roll_a_wheel_down_a_slope_against_its_bearing(method):
     for drag in (0.6, 1.1):
         b, y, acceleration, drag_torque, _ = rolling(drag)

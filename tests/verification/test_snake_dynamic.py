@@ -259,6 +259,7 @@ def test_too_heavy_a_load_ends_with_reason_and_time_and_the_head_on_the_ground()
     assert record["w"][-1, 2] == pytest.approx(0.025, abs=1e-3)  # the head's radius
 
 
+@pytest.mark.long  # a program of its own to compile
 def test_steps_converge_and_agree_with_the_event_driven_method():
     """The fall of a head that is let go, on rigid wheels, gear friction smoothed in both, 0.5 s.
 
