@@ -112,7 +112,7 @@ class BasePart:
             for j, (angle, above) in enumerate(zip(yaw[row].tolist(), height[row, 1:].tolist(), strict=True)):
                 cos, sin, half = math.cos(angle), math.sin(angle), half_track[j + 1]
                 x, y = -before[j] - behind[j] * cos, -behind[j] * sin
-                # Coefficients of 1, cos psi and sin psi in up . Ry(psi) vector: the way to the next axle, and that axle.
+                # Coefficients of 1, cos psi, sin psi in up . Ry(psi) vector: the way to the next axle, and that axle.
                 rise, slope = (uy * y, ux * x, -uz * x), (uy * cos, -ux * sin, uz * sin)
                 needed = [self._angle(z - above, rise, slope, lever) for lever in (half, -half)]
                 if any(map(math.isnan, needed)):

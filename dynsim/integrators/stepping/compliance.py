@@ -51,8 +51,8 @@ from dynsim.jit.kernel import internal_kernel
 AT_BOUND = 1e-12
 # Time in which what steps do not resolve comes back, in steps.
 RETURN_STEPS = 2.0
-# ε of the tangents of a contact that gives way, in mobilities of theirs: a spring 1/(h² ε) that no step resolves, 1e9 N/m
-# where it holds a kilogram.
+# ε of the tangents of a contact that gives way, in mobilities of theirs: a spring 1/(h² ε) that no step resolves, some
+# 1e9 N/m where it holds a kilogram.
 TANGENTIAL = 1e-4
 
 
