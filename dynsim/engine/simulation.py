@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import time as clock
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -384,8 +384,7 @@ class Simulation:
         if (balance := self._prepared.balance) is not None:
             values[:, 0] += balance.shift[motors]
         self._follow_lines(motors, values)
-        for joint in lines:
-            self._leave_plan(joint)
+        self._leave_plan(lines)
 
     def _follow_lines(self, motors: list[int], values: Array) -> None:
         """Let motors follow lines from now on, values (motors, 2)."""
@@ -404,11 +403,12 @@ class Simulation:
         drives = self._prepared.system.drives
         drives.table[a, ka.SAMPLED], drives.input[a, ka.COMMAND] = ka.GIVEN, value
         self._restart()
-        self._leave_plan(joint)
+        self._leave_plan([joint])
 
-    def _leave_plan(self, joint: str) -> None:
+    def _leave_plan(self, joints: Iterable[str]) -> None:
         """Remember that a wheel of the base does not do any more what the scenario says."""
-        if self.robot.base is not None and joint in self.robot.base.wheels:
+        base = self.robot.base
+        if base is not None and any(joint in base.wheels for joint in joints):
             self._base_as_planned = False
 
     def set_mode(self, joint: str, mode: str) -> None:

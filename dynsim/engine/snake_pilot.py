@@ -222,10 +222,10 @@ class SnakePilot(SnakeControl):
 
     def _lift(self, time: float) -> None:
         """Rates at which lifting moves the pitch joints: every tick while heights change, else now and then."""
-        now = self.tick  # of the tick that has just been commanded
-        if now < self._next_look and not self._lifter.moving(time):
+        now, moving = self.tick, self._lifter.moving(time)  # of the tick that has just been commanded
+        if now < self._next_look and not moving:
             return
-        ticks = 1 if self._lifter.moving(time) else STEADY_TICKS
+        ticks = 1 if moving else STEADY_TICKS
         span = ticks * self.period
         # Yaw angles go on at their rates until the next look.
         head, joints = self.description.head_joints, len(self.state.phi)
@@ -336,7 +336,7 @@ def _places(robot: SnakeTree, joints: tuple[str, ...]) -> Array:
 
 def base_pose(q: Array) -> Array:
     """x, y [m] of wheel pair 1 and yaw [rad] of the base part at coordinates (…, nq) of the tree, (…, 3)."""
-    w, x, y, z = np.moveaxis(q[..., 3:_ROOT_COORDINATES], -1, 0)
+    w, x, y, z = (q[..., k] for k in range(3, _ROOT_COORDINATES))
     # Of the axle, e_y of the root: it stays level where the body behind it is tilted.
     yaw = np.arctan2(-2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z))
     return np.stack([q[..., 0], q[..., 1], yaw], axis=-1)

@@ -118,6 +118,9 @@ def test_it_rolls_where_it_is_told_to(x_run):
     np.testing.assert_allclose((way[-1] - way[0])[grounded], moved[0], atol=5e-3)
     assert x_run["contact_slip_distance"][-1, [0, 3, 7, 8, 12]].max() < 5e-3  # of the driven wheels on the ground
     assert x_run.summary["energy_residual_relative"] < 1e-10
+    solved = x_run.summary["time_stepping"]
+    assert solved["capped_solves"] == 0
+    assert solved["long_solves"] <= 1e-3 * solved["contact_solves"]
 
 
 def test_the_head_sags_by_its_weight_over_the_stiffness_of_its_servos(x_run, tree):
