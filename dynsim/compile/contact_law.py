@@ -1,4 +1,7 @@
-"""The unilateral law of a robot's contacts and joint stops, compiled to the arrays of the kernels."""
+"""Tables of the unilateral law for the kernels: friction of contacts, joint stops, dry friction, ties.
+
+The law itself is in :mod:`dynsim.dynamics.contact.unilateral` and :mod:`dynsim.integrators.contacts`.
+"""
 
 from __future__ import annotations
 
@@ -100,7 +103,7 @@ def compile_unilateral(
         dry=reals(frictions),
         tie_table=integers(tie_table),
         tie=reals(tie),
-        place=integers(np.zeros((ku.PLACES, max(p, c + len(dry) + 2)))),
+        index=integers(np.zeros((ku.INDICES, max(p, c + len(dry) + 2)))),
         vector=reals(np.zeros((ku.VECTORS, p))),
         room=reals(np.zeros((ku.ROOM, p, p))),
         split_room=reals(np.zeros(split_size(3 * c + len(dry), c + len(dry)))),

@@ -1,4 +1,4 @@
-"""From robots to scenes: what a record keeps of bodies, joints, surfaces and points, to be drawn and placed later."""
+"""The scene of a robot for its record: bodies, joints, surfaces and points, from which pictures are drawn later."""
 
 from __future__ import annotations
 

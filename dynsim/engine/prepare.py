@@ -228,7 +228,7 @@ def _check_friction(robot: Robot, real: bool, stepped: bool) -> None:
     if rubbing and not real:
         raise ModelError(
             f"dry friction of {listed(rubbing)}: it needs contacts.law: unilateral, also where nothing touches; "
-            "or take a damping instead",
+            "or set it to 0 and take a damping instead",
             keys=("plant",),
         )
 

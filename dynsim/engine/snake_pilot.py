@@ -1,4 +1,4 @@
-"""The task-space controller at the dynamic snake: called at its ticks, it tells servos and wheels what to do.
+"""The task-space control of the dynamic snake: at every tick, references for the servos of joints and wheels.
 
 At a tick: what sensors tell, the controller, modes and lifts, references. The servos of joints follow the integrated
 command, q_d(t) = φ + u (t − t_k), whatever the joints do ([T] IV.C); those of wheels the rates. Where the controller

@@ -112,10 +112,10 @@ class Run(NamedTuple):
 
     def outputs(self, name: str) -> np.ndarray:
         """Columns of the samples' outputs by their name; those of contacts are (T, c, OUTPUTS_PER_CONTACT)."""
-        found = self.output[: self.count[SAMPLE], block(self.columns, name)]
+        columns = self.output[: self.count[SAMPLE], block(self.columns, name)]
         if name == "contact":
-            return found.reshape(len(found), found.shape[1] // kst.OUTPUTS_PER_CONTACT, kst.OUTPUTS_PER_CONTACT)
-        return found
+            return columns.reshape(len(columns), columns.shape[1] // kst.OUTPUTS_PER_CONTACT, kst.OUTPUTS_PER_CONTACT)
+        return columns
 
 
 def new_run(

@@ -1,4 +1,4 @@
-"""Keys that a scenario may have and that change nothing in it: accepted, so that a run says that it ignores them."""
+"""Keys of a scenario that have no effect in it: accepted, and a run warns of them."""
 
 from __future__ import annotations
 

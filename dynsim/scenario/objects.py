@@ -48,7 +48,7 @@ class Hinge(StrictConfig):
 
 
 class Wheel(StrictConfig):
-    """A body that turns on an object and rolls on all surfaces: a disc, and a sphere where it touches."""
+    """A body that turns on an object and rolls on surfaces: a sphere where it touches, with the inertia of a disc."""
 
     position_m: Vector3 = Field(description="of its centre, in the object's axes from its centre")
     axis: Vector3 = Field([0.0, 1.0, 0.0], description="in the object's axes")

@@ -32,7 +32,7 @@ LANDING, LIFT_OFF, SLIP_START, SLIP_STOP, BOUNCE, CHATTERS, STOP_HIT, STOP_LEFT 
 LOG_KINDS = 8
 
 # Run.gaps: what a candidate was like at the start of the step.
-GAP_THEN, RATE_THEN, NORMAL_THEN, PLACE_THEN = 0, 1, 2, 5
+GAP_THEN, RATE_THEN, NORMAL_THEN, POSITION_THEN = 0, 1, 2, 5
 
 # A candidate that starts, or comes to rest, this close to its surface touches it [m].
 TOUCH = 1e-9
@@ -93,9 +93,9 @@ def too_long(contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: W
     their rates at both ends, ``gaps``, (c, GAPS_SIZE), at the start. It may have gone through a body: out at its other
     side, and as far as both gaps together. Or a frozen direction of slip has stood for too long.
     """
-    found = 1.0
+    fraction = 1.0
     if unilateral is None:  # known to the compiler
-        return found
+        return fraction
     for k in range(gaps.shape[0]):
         slow = unilateral.number[ku.SLOW]
         if (
@@ -105,9 +105,9 @@ def too_long(contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: W
         ):
             speed = slip_speed(ws, k)
             if speed > 2.0 * slow:
-                found = min(found, max(1.5 * slow / speed, 0.01))
+                fraction = min(fraction, max(1.5 * slow / speed, 0.01))
         if passes_through(ws, gaps, k):
-            found = min(found, 0.5)
+            fraction = min(fraction, 0.5)
         if ws.active[k, ka.MODE] != ka.OPEN or gaps[k, RATE_THEN] >= 0.0 or ws.contacts[k, ka.GAP_RATE] <= 0.0:
             continue
         g0, g1 = gaps[k, GAP_THEN], ws.contacts[k, ka.GAP]
@@ -119,8 +119,8 @@ def too_long(contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: W
             continue
         x = -d0 / (a + math.sqrt(root))
         if 0.0 < x < 1.0 and g0 + x * (d0 + x * (a + x * b)) < -ku.DEPTH:
-            found = min(found, x)
-    return found
+            fraction = min(fraction, x)
+    return fraction
 
 
 @internal_kernel
@@ -137,18 +137,18 @@ def passes_through(ws: Workspace, gaps, k):
     turned, square = 0.0, 0.0
     for s in range(3):
         turned += gaps[k, NORMAL_THEN + s] * state[ka.NORMAL + s]
-        way = state[ka.POSITION + s] - gaps[k, PLACE_THEN + s]
-        square += way * way
+        moved = state[ka.POSITION + s] - gaps[k, POSITION_THEN + s]
+        square += moved * moved
     return turned < 0.0 and 2.5 * square >= (g0 + g1) * (g0 + g1)
 
 
 @internal_kernel
 def note_gaps(ws: Workspace, gaps):
-    """Gaps, their rates, normals and places at the start of a step, for :func:`too_long`."""
+    """Gaps, their rates, normals and positions at the start of a step, for :func:`too_long`."""
     for k in range(gaps.shape[0]):
         gaps[k, GAP_THEN], gaps[k, RATE_THEN] = ws.contacts[k, ka.GAP], ws.contacts[k, ka.GAP_RATE]
         for s in range(3):
-            gaps[k, NORMAL_THEN + s], gaps[k, PLACE_THEN + s] = (
+            gaps[k, NORMAL_THEN + s], gaps[k, POSITION_THEN + s] = (
                 ws.contacts[k, ka.NORMAL + s],
                 ws.contacts[k, ka.POSITION + s],
             )

@@ -1,4 +1,4 @@
-"""One step of time stepping, its ledger, its samples, and the driver; the method is that of ``time_stepping``."""
+"""One step of time stepping, its ledger, samples and driver; equations: :mod:`dynsim.integrators.stepping.tables`."""
 
 from __future__ import annotations
 
