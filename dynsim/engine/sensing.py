@@ -100,8 +100,6 @@ class EncodedCommands:
     period : of the controller [s]
     """
 
-    path = None
-
     def __init__(
         self, encoders: Encoders, seed: int, robot: Robot, period: float, take: Callable[[Array, Array], None]
     ) -> None:
@@ -122,28 +120,28 @@ class EncodedCommands:
             resolution=np.where(revolute, np.radians(encoders.resolution_deg), encoders.resolution_m),
             seed=[seed],
         )
-        self._told: list[tuple[float, Array]] = []
+        self._measured: list[tuple[float, Array]] = []
 
     def __call__(self, simulation: Stateful) -> None:
         """A tick of the controller."""
         time = simulation.state.time
         measured = self.sensor.value(time)
-        self._told.append((time, measured))
+        self._measured.append((time, measured))
         self._take(measured, self.sensor.rate(time))
 
     def remembered(self) -> dict[str, Any]:
         """What the future depends on, and what was told."""
-        return {"sensor": self.sensor.remembered(), "told": list(self._told)}
+        return {"sensor": self.sensor.remembered(), "measured": list(self._measured)}
 
     def restore(self, kept: dict[str, Any]) -> None:
         """Go back to what :meth:`remembered` gave."""
         self.sensor.restore(kept["sensor"])
-        self._told = list(kept["told"])
+        self._measured = list(kept["measured"])
 
     def add_to(self, record: Record) -> None:
         """What the controller was told, held from tick to tick."""
-        times = np.array([time for time, _ in self._told]) - ROUNDING
+        times = np.array([time for time, _ in self._measured]) - ROUNDING
         rows = np.searchsorted(times, record.time, side="right") - 1
-        told = np.array([measured for _, measured in self._told])[rows]
+        measured = np.array([positions for _, positions in self._measured])[rows]
         text = "joints as the controller's encoders tell them"
-        record.add("q_measured", told, self._unit, labels=self._joints, description=text)
+        record.add("q_measured", measured, self._unit, labels=self._joints, description=text)

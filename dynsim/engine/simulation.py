@@ -157,13 +157,13 @@ class Simulation:
         run.clock[[ki.TIME, ki.COUNTED_SINCE]] = start
         run.tick[:, [ki.TICK_NEXT, ki.TICK_PHASE]] = start
         self._refill()
-        self._encoded = self._encoded_commands()
+        encoded = self._encoded_commands()
         self._operator = self._attendant(operator)
         if self._operator is not None:
             self.every(self._operator.period, self._operator)
         elif operator is not None:
             raise ScenarioError("an operator needs a scenario with controller.operator, which says what it moves")
-        self._attendants = [one for one in (self._encoded, self._operator) if one is not None]
+        self._attendants = [attendant for attendant in (encoded, self._operator) if attendant is not None]
 
     def _attendant(self, source: Any) -> Operator | SnakePilot | None:
         """Who rewrites references at the ticks of its own, where the scenario has somebody."""
@@ -542,7 +542,7 @@ class Simulation:
     def snapshot(self) -> Snapshot:
         """What :meth:`restore` needs to go on from here."""
         arrays = {name: array.copy() for name, array in self._arrays().items()}
-        attendants = [one.remembered() for one in self._attendants]
+        attendants = [attendant.remembered() for attendant in self._attendants]
         trace, happened = self._trace.snapshot(), tuple(self._happened)
         return Snapshot(self._token, arrays, self._time, trace, happened, self._frozen, attendants)
 
@@ -565,8 +565,8 @@ class Simulation:
             array[...] = snapshot.arrays[name]
         self._trace.restore(snapshot.trace)
         self._time, self._frozen, self._happened = snapshot.time, snapshot.frozen, list(snapshot.happened)
-        for one, kept in zip(self._attendants, snapshot.attendants, strict=True):
-            one.restore(kept)
+        for attendant, kept in zip(self._attendants, snapshot.attendants, strict=True):
+            attendant.restore(kept)
 
     def record(self, scenario: Scenario | None = None, *, pictured: bool = True) -> Record:
         """Record of the trace so far; of a ring, energies and losses count from its first sample on.
@@ -606,8 +606,8 @@ class Simulation:
             base_as_planned=self._base_as_planned,
             pictured=pictured,
         )
-        for one in self._attendants:
-            one.add_to(record)
+        for attendant in self._attendants:
+            attendant.add_to(record)
         record.complete = self.finished
         if self._failed():
             mark_stopped(stopped(self._scenario, self._prepared), record)

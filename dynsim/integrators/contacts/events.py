@@ -355,9 +355,9 @@ def tell_joints(unilateral: UnilateralArrays, run: Run):
 @internal_kernel
 def tell_joint(unilateral: UnilateralArrays, run: Run, k, holds):
     """Log where joint k of those that rub begins or ends to slip; what it is like at the start is no event."""
-    told = unilateral.dry_table[k, ku.DRY_TOLD]
+    before = unilateral.dry_table[k, ku.DRY_TOLD]
     unilateral.dry_table[k, ku.DRY_TOLD] = holds
-    if told >= 0 and told != holds:
+    if before >= 0 and before != holds:
         log(run, ki.DRY_LOG + LOG_KINDS * k + (SLIP_STOP if holds == 1 else SLIP_START))
 
 
