@@ -35,9 +35,9 @@ def parsed(line: str) -> tuple[str, dict[str, Any]]:
     words, command, name = shlex.split(line, comments=True)[1:], APP, "dynsim"
     while True:
         context = command.context_class(command, info_name=name)
-        given, words, _ = command.make_parser(context).parse_args(list(words))
+        options, words, _ = command.make_parser(context).parse_args(list(words))
         if not hasattr(command, "resolve_command") or not words:
-            return name, given
+            return name, options
         name, command, words = command.resolve_command(context, words)
 
 
