@@ -18,8 +18,8 @@ TerminalError: type[Exception] = OSError if termios is None else termios.error
 """What a serial port raises beside OSError."""
 
 
-def require_posix(what: str) -> None:
-    """Refuse what is read and written as POSIX does it.
+def require_posix(user: str) -> None:
+    """Refuse who reads and writes as POSIX does it, by name.
 
     Raises
     ------
@@ -27,4 +27,4 @@ def require_posix(what: str) -> None:
         This system is another one.
     """
     if termios is None:
-        raise PortError(f"{what}: needs a POSIX system such as Linux or macOS, which this is not")
+        raise PortError(f"{user}: needs a POSIX system such as Linux or macOS, which this is not")

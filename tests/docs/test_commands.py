@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import typer
+from latex2mathml import converter
 
 from docs import test_pages_run
 from dynsim.cli.commands import app
@@ -35,9 +36,9 @@ def parsed(line: str) -> tuple[str, dict[str, Any]]:
     words, command, name = shlex.split(line, comments=True)[1:], APP, "dynsim"
     while True:
         context = command.context_class(command, info_name=name)
-        given, words, _ = command.make_parser(context).parse_args(list(words))
+        options, words, _ = command.make_parser(context).parse_args(list(words))
         if not hasattr(command, "resolve_command") or not words:
-            return name, given
+            return name, options
         name, command, words = command.resolve_command(context, words)
 
 
@@ -58,6 +59,19 @@ def test_every_block_says_what_it_is(path: Path) -> None:
     assert {
         kind for kind, _ in FENCE.findall(re.sub(r"<!-- table:.*?<!-- end -->", "", text, flags=re.DOTALL))
     } <= LANGUAGES
+
+
+def test_equations_keep_their_rows_and_cells_on_the_site() -> None:
+    equations = [
+        text for path in PAGES for kind, text in FENCE.findall(path.read_text(encoding="utf-8")) if kind == "math"
+    ]
+    assert len(equations) > 25
+    for text in equations:
+        converted = converter.convert(text)
+        assert "\\" not in converted, text
+        if r"\begin{array}" in text:
+            rows = text.count(r"\\") + 1
+            assert (converted.count("<mtr>"), converted.count("<mtd")) == (rows, rows + text.count("&")), text
 
 
 def test_what_is_bash_is_run() -> None:

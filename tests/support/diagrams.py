@@ -210,8 +210,8 @@ def mobile_base() -> Figure:
         centre, (1.9, 1.85), fontsize=8.5, color=PULLING,
         arrowprops={"arrowstyle": "-", "color": PULLING, "linewidth": 0.8},
     )  # fmt: skip
-    for k, (letter, way) in enumerate((("x", (1.0, 0.0)), ("y", (0.0, 1.0)))):
-        _arrow(ax, np.zeros(2), 0.45 * np.array(way), AXES[k], letter)
+    for k, (letter, along) in enumerate((("x", (1.0, 0.0)), ("y", (0.0, 1.0)))):
+        _arrow(ax, np.zeros(2), 0.45 * np.array(along), AXES[k], letter)
     ax.text(-0.12, -0.14, "W", fontsize=11, fontweight="bold")
     ax.set(xlim=(-0.3, 3.3), ylim=(-0.25, 2.4), aspect="equal")
     ax.set_axis_off()

@@ -195,6 +195,11 @@ def _label_time(grid: np.ndarray) -> None:
         axes.set_xlabel("time [s]")
 
 
+def figures(record: Record) -> dict[str, Callable[[Record], Figure | None]]:
+    """Makers of the figures of one run by file name; a maker gives None where the record has no data for it."""
+    return FIGURES
+
+
 # File name → figure, None where the record has no data for it.
 FIGURES: dict[str, Callable[[Record], Figure | None]] = {
     "joints": joints,
