@@ -1,62 +1,89 @@
-"""Films, tables and live pages of all shipped scenarios: ``python docs/site/gallery.py [SCENARIO…]``.
+"""Films, tables and live pages of all shipped scenarios: ``python docs/site/gallery.py [--short] [SCENARIO…]``.
 
-Writes to build/gallery/NAME, from where the site takes them; what is there already is kept.
+Writes to build/gallery/NAME, from where the site takes them; what is there already is kept. ``--short``: a still
+instead of a film, of the first variant and its first second alone, for checks.
 """
 
 from __future__ import annotations
 
+import io
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
-from dynsim.scenario import load_scenario, shipped_scenarios, variant_names
+import dynsim
+from dynsim.cli.tables import print_comparison, print_summary
+from dynsim.draw.film.film import Film
+from dynsim.errors import RecordError, SimulationStopped
+from dynsim.scenario import shipped_scenarios, variant_names
+from dynsim.system.terminal import Terminal
 
 BUILT = Path(__file__).parents[2] / "build" / "gallery"
-VIEW, FILM, TABLE = "view.html", "film.gif", "table.txt"
+VIEW, FILM, STILL, TABLE = "view.html", "film.gif", "still.png", "table.txt"
+SIZE, FPS = (480, 300), 8
+SHORT_S = 1.0
 
 
-def build(name: str) -> None:
-    """Run a scenario with all its variants; keep its page, its table and a film."""
+def build(name: str, short: bool) -> None:
+    """Run a scenario, all its variants unless it is to be short; keep its page, its table and a film."""
     folder = BUILT / name
-    if (folder / FILM).exists():
+    if (folder / TABLE).exists() and (short or (folder / FILM).exists()):
         return
-    folder.mkdir(parents=True, exist_ok=True)
-    program = [sys.executable, "-m", "dynsim"]
-    several = len(variant_names(name)) > 1
-    command = ["compare" if several else "run", name, "--out", str(folder / "run")]
-    done = subprocess.run([*program, *command], capture_output=True, text=True, check=False)
-    table = done.stdout.replace(str(folder / "run"), f"results/{name}")
-    (folder / TABLE).write_text(table, encoding="utf-8")
-    if not (folder / "run" / VIEW).exists():
-        return  # a run that is to stop, or has no scene
-    film = ["animate", str(folder / "run"), "--fps", "8", "--size", "480x300", "--out", str(folder / FILM)]
-    subprocess.run([*program, *film], capture_output=True, check=True)
-    shutil.copy(folder / "run" / VIEW, folder / VIEW)
-    shutil.rmtree(folder / "run")
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    variants = variant_names(name)[: 1 if short else None] or [None]
+    records = {variant or name: _run(name, variant, short) for variant in variants}
+    text = io.StringIO()
+    console = Terminal(file=text, width=110)
+    summaries = {variant: record.summary for variant, record in records.items()}
+    if len(records) > 1:
+        print_comparison(console, summaries)
+    else:
+        print_summary(console, next(iter(summaries.values())))
+    try:
+        film = Film(records, size=SIZE, fps=FPS, plot="")
+        film.frame(float(film.times[len(film.times) // 2])).save(folder / STILL)
+        if not short:
+            dynsim.film.write(records, folder / FILM, size=SIZE, fps=FPS)
+        dynsim.view.write(records, folder / VIEW)
+    except RecordError as error:  # nothing to be seen, or a film that is too long
+        print(f"{name}: {error}")
+    (folder / TABLE).write_text(text.getvalue(), encoding="utf-8")
+
+
+def _run(name: str, variant: str | None, short: bool) -> dynsim.Record:
+    scenario = dynsim.load_scenario(name, variant)
+    if short and scenario.duration_s > SHORT_S:
+        scenario = dynsim.load_scenario(name, variant, {"duration_s": SHORT_S})
+    try:
+        return dynsim.simulate(scenario)
+    except SimulationStopped as stop:  # as one that shows how it tips over
+        if stop.record is None:
+            raise
+        return stop.record
 
 
 def page() -> str:
     """The page of the gallery, with what has been built."""
     parts = [
-        "# Gallery\n\nEvery shipped scenario. Films, tables and pages that turn in your hand are built by "
-        "`python docs/site/gallery.py`.\n"
+        "# Gallery\n\nEvery shipped scenario, with the command that runs it. The table has what a run gives, and what "
+        "it takes: the time of the integration, without the start of the program. Films, tables and pages that turn in "
+        "your hand are built by `python docs/site/gallery.py` before the site is.\n"
     ]
     for file in shipped_scenarios():
         name = file.stem
-        scenario = load_scenario(name)
-        parts.append(f"\n## {name}\n\n{scenario.config.description.strip()}\n")
+        parts.append(f"\n## {name}\n\n{dynsim.load_scenario(name).config.description.strip()}\n")
         folder = BUILT / name
-        if (folder / FILM).exists():
-            parts.append(f"\n![{name}](gallery/{name}/{FILM})\n")
+        picture = next((kind for kind in (FILM, STILL) if (folder / kind).exists()), None)
+        if picture is not None:
+            parts.append(f"\n![{name}](gallery/{name}/{picture})\n")
         if (folder / VIEW).exists():
             parts.append(f'\n<a href="gallery/{name}/{VIEW}">See it live</a>\n')
         if (folder / TABLE).exists():
             text = (folder / TABLE).read_text(encoding="utf-8").rstrip()
             parts.append(f'\n??? note "Table"\n\n    ```text\n{_indented(text)}\n    ```\n')
-        names = variant_names(name)
-        command = f"dynsim compare {name}" if len(names) > 1 else f"dynsim run {name}"
-        parts.append(f"\n```sh\n{command}\n```\n")
+        command = "compare" if len(variant_names(name)) > 1 else "run"
+        parts.append(f"\n```sh\ndynsim {command} {name}\n```\n")
     return "".join(parts)
 
 
@@ -65,9 +92,10 @@ def _indented(text: str) -> str:
 
 
 def main() -> None:
-    for name in sys.argv[1:] or [file.stem for file in shipped_scenarios()]:
+    names = [name for name in sys.argv[1:] if name != "--short"]
+    for name in names or [file.stem for file in shipped_scenarios()]:
         print(name, flush=True)
-        build(name)
+        build(name, short="--short" in sys.argv)
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from latex2mathml.converter import convert
 from mkdocs.structure.files import File, Files
 
 SITE = Path(__file__).parent
@@ -23,6 +24,13 @@ OUTSIDE = {
     "results/README.md": "dev/results.md",
 }
 WORKER = "iframe-worker.js"
+_EQUATION = re.compile(r"^```math\n(.*?)^```$", flags=re.MULTILINE | re.DOTALL)
+# A symbol of one letter with an index; before it what is left as it is: code, headings, targets of links, marks.
+_INDEX = re.compile(
+    r"(?P<kept>^```.*?^```$|^ {4}.*?$|^#.*?$|`[^`]*`|\]\([^)]*\)|<[a-z!/][^>]*>)"
+    r"|(?<![\w-])(?P<letter>[^\W\d_][\u0300-\u036f]*)_(?P<index>[^\W_]{1,8})(?![\w*_])",
+    flags=re.MULTILINE | re.DOTALL,
+)
 _PICTURE = re.compile(r"\]\((?:\.\./)*(results/[\w/.-]+\.(?:png|gif))\)")
 
 
@@ -45,7 +53,9 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
-    """Links to files of the repository as links of the site."""
+    """Equations as MathML, which browsers typeset themselves; links to files of the repository as links of the site."""
+    markdown = _EQUATION.sub(_typeset, markdown)
+    markdown = _INDEX.sub(lambda match: match["kept"] or f"{match['letter']}<sub>{match['index']}</sub>", markdown)
     up = "../" * page.file.src_uri.count("/")
     markdown = _PICTURE.sub(lambda match: f"]({up}{match[1]})", markdown)
     if page.file.src_uri in OUTSIDE.values():
@@ -53,3 +63,7 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
         for source, target in OUTSIDE.items():
             markdown = markdown.replace(f"]({source})", f"]({up}{target})")
     return markdown
+
+
+def _typeset(equation: re.Match[str]) -> str:
+    return f'<div class="equation">{convert(equation[1], display="block")}</div>'

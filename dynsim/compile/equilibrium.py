@@ -3,8 +3,8 @@
     τ = h + g − J_wᵀ W − J_cᵀ f,    minimise Σ R i²,  K_m i = τ
 
 with the forces f of the contacts that touch. The bilateral law has no friction at rest, and normal forces of either
-sign. Under the unilateral one f_n ≥ 0 and |f_t| ≤ μ_s f_n: first without friction, so that contacts stick with all they
-have in reserve, and only where nothing holds that way with it.
+sign. Under the unilateral law f_n ≥ 0 and |f_t| ≤ μ_s f_n. There frictionless forces are tried first, which leave all
+friction as a reserve against slip; friction is used only where the posture cannot rest without it.
 """
 
 from __future__ import annotations

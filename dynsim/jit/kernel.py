@@ -127,17 +127,18 @@ def _warn(text: str) -> None:
 def cache_folder() -> Path:
     """Folder of the compiled kernels, named by what would make its content stale; only this user can write to it.
 
-    In NUMBA_CACHE_DIR, else XDG_CACHE_HOME, else ~/.cache; where that cannot be, in the temporary directory; where
-    strangers can write there too, a folder for this process alone. A new one removes those beside it that no process
-    has asked for in :data:`UNUSED_S`: younger ones may belong to a dynsim in another environment.
+    In NUMBA_CACHE_DIR, else XDG_CACHE_HOME, else LOCALAPPDATA (of Windows), else ~/.cache; where that cannot be, in the
+    temporary directory; where strangers can write there too, a folder for this process alone. A new one removes those
+    beside it that no process has asked for in :data:`UNUSED_S`: younger ones may belong to a dynsim in another
+    environment.
     """
     digest = hashlib.sha256(f"{sys.version} {numba.__version__} {llvmlite.__version__} {np.__version__}".encode())
     for source in (file for package in _PACKAGES for file in sorted(package.rglob("*.py"))):
         digest.update(source.read_bytes())
     name = Path("dynsim", digest.hexdigest()[:16])
-    roots = [os.environ.get(variable) for variable in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")]
+    roots = [os.environ.get(variable) for variable in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME", "LOCALAPPDATA")]
     home = os.path.expanduser(next((root for root in roots if root), "~/.cache"))
-    temporary = Path(tempfile.gettempdir(), f"cache-{os.getuid()}")
+    temporary = Path(tempfile.gettempdir(), f"cache-{_USER}")
     # A user without a home keeps the tilde.
     for root in (temporary,) if home.startswith("~") else (Path(home), temporary):
         try:
@@ -157,6 +158,9 @@ def cache_folder() -> Path:
     return folder
 
 
+# None on Windows, whose files have no numbers of owners.
+_USER = os.getuid() if hasattr(os, "getuid") else None
+
 # Kernels that nobody has asked for in so long are removed [s]: 30 days.
 UNUSED_S = 30 * 86400.0
 
@@ -165,11 +169,14 @@ def _make_private(folder: Path) -> None:
     """Make the folder where it is not; raises OSError where others than this user and root can change what is in it.
 
     Loading machine code runs it. Who can write to a folder above can put another one in its place, unless it is sticky.
+    Where users have no number a folder is taken as it is: the mode of a file does not tell who can write to it.
     """
-    trusted = 0, os.getuid()
+    trusted = 0, _USER
     for part in (*reversed(folder.parents), folder):
         with suppress(FileExistsError):
             part.mkdir(mode=0o700)
+        if _USER is None:
+            continue
         status = part.lstat()
         # By a group of the user's own number, or root's, nobody else.
         writable = status.st_mode & (stat.S_IWOTH if status.st_gid in trusted else stat.S_IWOTH | stat.S_IWGRP)

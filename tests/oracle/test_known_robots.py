@@ -88,8 +88,9 @@ ROBOTS = {
         lock_deg=FINGERS,
     ),
 }
-# What the files state and nothing simulates.
-pytestmark = pytest.mark.filterwarnings("ignore:.*Coulomb friction of joints is not simulated")
+
+# Of the files' joints, which contacts.law: unilateral alone has.
+WITHOUT_FRICTION = {"friction_N_m": 0.0, "friction_N": 0.0}
 
 
 @pytest.fixture(params=ROBOTS)
@@ -190,6 +191,7 @@ def test_it_runs_with_a_brace(known: Known, tmp_path: Path) -> None:
             "initial_deg": known.initial_deg,
             "lock_deg": known.lock_deg,
             "lock_m": known.lock_m,
+            **WITHOUT_FRICTION,
             "hand": {"body": known.frame, "point_m": [0.0, 0.0, 0.01]},
             "motor": {
                 "type": "dc",
@@ -298,6 +300,7 @@ def run_free(free: Free, tmp_path: Path, **contacts: Any) -> tuple[Model, Any]:
     }
     pose = {"position_m": [0.1, -0.2, 1.0], "rpy_deg": [10, -20, 120]}
     plant = {"type": "urdf_arm", "file": str(free.path), "motor": motor, "initial_pose": {"root": pose}}
+    plant |= WITHOUT_FRICTION
     control = {"type": "joint_pd", "k_p_V_per_rad": 50, "k_d_V_s_per_rad": 1}
     scenario = {"duration_s": 0.2, "plant": plant, "controller": control, "integrator": {"rtol": 1e-8}, **contacts}
     path = tmp_path / "free.yaml"

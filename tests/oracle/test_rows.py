@@ -125,7 +125,6 @@ def known(file: str) -> Path:
     return next(Path(str(f.locate())) for f in files("example-robot-data") or () if f.name == file)
 
 
-@pytest.mark.filterwarnings("ignore:.*Coulomb friction of joints is not simulated")
 @pytest.mark.parametrize(("file", "couplings"), [("panda.urdf", 1), ("talos_full_v2.urdf", 12)])
 @pytest.mark.parametrize("m_star", [False, True])
 def test_mimic_joints_move_as_those_of_the_reduced_system(file, couplings, m_star):

@@ -648,3 +648,5 @@ def test_a_figure_for_a_paper_has_no_title() -> None:
         dynsim.figure(record, "enrgy")
     with pytest.raises(RecordError, match="no data for the figure 'base'"):
         dynsim.figure(record, "base")
+    with pytest.raises(RecordError, match="no records to draw"):
+        dynsim.figure({}, "compare_energy")

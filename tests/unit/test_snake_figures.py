@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import dynsim
 from dynsim.draw.figures import snake as figures
 from dynsim.draw.figures import snake_view, style, tanaka2019
 from dynsim.engine import simulate
@@ -40,6 +41,14 @@ def test_draw_writes_every_figure_from_a_record_on_disk(record, tmp_path, monkey
             assert len(np.unique(np.asarray(image.convert("L")))) > 10
     with Image.open(written[-1]) as animation:
         assert animation.n_frames == 4
+
+
+def test_figures_as_functions_of_records(record):
+    for name in figures.figures(record):
+        assert dynsim.figure(record, name, title=False).axes
+    assert dynsim.figure({"one": record, "two": record}, "comparison").get_suptitle()
+    with pytest.raises(RecordError, match="no figure 'energy' of such a record; figures: postures, overview"):
+        dynsim.figure(record, "energy")
 
 
 def test_geometry_is_that_of_the_scene(record):

@@ -302,11 +302,13 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
         read_urdf(tmp_path / "scene.xml")
 
 
-def test_coulomb_friction_is_not_dropped_silently(tmp_path: Path) -> None:
+def test_friction_of_a_joint_is_dry_friction_and_is_written_again(tmp_path: Path) -> None:
     path = tmp_path / "rubbing.urdf"
     path.write_text(f'<robot name="r">{BASE}{TIP}{joint("continuous", """<dynamics friction="0.2"/>""")}</robot>')
-    with pytest.warns(UserWarning, match="hinge"):
-        read_urdf(path)
+    robot = read_urdf(path)
+    assert (robot.links[0].friction, robot.links[0].damping) == (0.2, 0.0)
+    path.write_text(write_urdf(robot))
+    assert read_urdf(path).links[0].friction == 0.2
 
 
 def test_frames_behind_fixed_joints_are_names_of_places() -> None:

@@ -43,14 +43,29 @@ def test_joints_start_and_lose_in_the_units_of_their_kind(scenario: Path):
         "initial_m": {"slide": 0.2},
         "damping_N_m_s_per_rad": 0.5,
         "damping_N_s_per_m": 3,
+        "friction_N_m": 0.2,
+        "friction_N": 4,
     }
     overrides = {f"plant.{key}": value for key, value in plant.items()}
     robot = build_model(load_scenario(scenario, overrides=overrides)).robot
     assert robot.initial == pytest.approx([0.2, np.pi / 2])
-    assert [link.damping for link in robot.links] == [3.0, 0.5]
+    assert [(link.damping, link.friction) for link in robot.links] == [(3.0, 4.0), (0.5, 0.2)]
     for key, joint in (("initial_deg", "slide"), ("initial_m", "hinge")):
         with pytest.raises(ScenarioError, match=rf"plant.{key}.{joint} = 1: '{joint}' is"):
             load_scenario(scenario, overrides={f"plant.{key}.{joint}": 1})
+
+
+def test_dry_friction_of_the_file_holds_at_rest(scenario: Path):
+    """Gravity pulls the car of 1 kg and the arm along the rail with 19.62 N."""
+    text = SLIDE.replace("<limit lower", '<dynamics friction="30"/><limit lower')
+    (scenario.parent / "slide.urdf").write_text(text)
+    with pytest.raises(ModelError, match=r"dry friction of slide: it needs contacts.law: unilateral"):
+        run(scenario, {})
+    real = {"contacts.law": "unilateral", "duration_s": 0.4}  # its stop is at 1 m
+    assert np.abs(run(scenario, real)["q"][:, 0]).max() < 1e-12
+    for friction in (0, 10):
+        record = run(scenario, {**real, "plant.friction_N": friction})
+        assert record["q"][-1, 0] == pytest.approx(0.5 * (9.81 - friction / 2) * 0.4**2, rel=1e-6)
 
 
 def test_signals_are_in_the_units_of_both_kinds(scenario: Path):

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MEASURED, SIMULATED = "dynsim.draw.figures.measured", "dynsim.draw.figures.arm"
-# Module with ``draw`` and ``draw_comparison`` → sets of signals, any of which tells its records; the first module that
-# finds one draws.
+# Module with ``draw`` and ``draw_comparison``, and with ``figures`` and ``comparisons``, the makers by name → sets of
+# signals, any of which tells its records; the first module that finds one draws.
 MODULES: dict[str, tuple[set[str], ...]] = {
     "dynsim.draw.figures.snake": ({"posture"}, {"base_pose", "mode"}, {"w", "w_target"}),
     MEASURED: ({"q_goal"}, {"record_time"}, {"torque_estimate"}),
@@ -84,16 +84,19 @@ def figure(records: Record | Mapping[str, Record], name: str, *, title: bool = T
         No such figure, or the record has no data for it.
     """
     several = not isinstance(records, Record)
+    if not several and not len(records):
+        raise RecordError("the record has no samples")
+    if several and not records:
+        raise RecordError("no records to draw")
     module = _module(next(iter(records.values()))) if isinstance(records, Mapping) else _module(records)
-    # Measured runs are compared by the figures of simulated ones; those of snakes come with tables, by draw alone.
+    # Measured runs are compared by the figures of simulated ones.
     home = importlib.import_module(SIMULATED) if several and module.__name__ == MEASURED else module
-    makers = getattr(home, "COMPARISONS" if several else "FIGURES", {})
-    if name not in makers:
-        known = ", ".join(makers) or "none, but dynsim plot draws files"
-        kind = "several records" if several else "such a record"
-        raise RecordError(f"no figure {brief(name)} of {kind}; figures: {known}")
     style = importlib.import_module("dynsim.draw.figures.style")
     with _drawable(), style.look():
+        makers = home.comparisons(records) if several else home.figures(records)
+        if name not in makers:
+            kind = "several records" if several else "such a record"
+            raise RecordError(f"no figure {brief(name)} of {kind}; figures: {', '.join(makers)}")
         drawn: Figure | None = makers[name](records)
     if drawn is None:
         raise RecordError(f"the record has no data for the figure {name!r}")

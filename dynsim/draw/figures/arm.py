@@ -33,6 +33,16 @@ COMPARISONS: dict[str, Callable[[Mapping[str, Record]], Figure | None]] = {
 }
 
 
+def figures(record: Record) -> Mapping[str, Callable[[Record], Figure | None]]:
+    """Makers of the figures of one run by file name; a maker gives None where the record has no data for it."""
+    return FIGURES
+
+
+def comparisons(records: Mapping[str, Record]) -> Mapping[str, Callable[[Mapping[str, Record]], Figure | None]]:
+    """Makers of the figures of several runs by file name."""
+    return COMPARISONS
+
+
 def draw(record: Record, folder: Path, kind: str = "png") -> list[Path]:
     """See :func:`dynsim.draw.figures.draw`."""
     return style.save_all(FIGURES, record, folder, kind)

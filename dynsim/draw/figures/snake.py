@@ -51,7 +51,19 @@ SHADES = LinearSegmentedColormap.from_list("shades", ["#CFCFCF", "#000000"])
 
 def draw(record: Record, folder: Path, kind: str = "png") -> list[Path]:
     """Write all figures of one run and the animation into ``folder``; returns the files."""
-    makers: dict[str, Callable[[Record], Figure]] = {
+    return [*style.save_all(figures(record), record, folder, kind), animate(record, folder / "animation.gif")]
+
+
+def draw_comparison(records: Mapping[str, Record], folder: Path, kind: str = "png") -> list[Path]:
+    """Variants over each other, and figures and tables beside [T] where its experiments were run; returns the files."""
+    scenarios = {record.summary["scenario"] for record in records.values()}
+    written = tanaka2019.write_tables(scenarios.pop(), records, folder) if len(scenarios) == 1 else []
+    return written + style.save_all(comparisons(records), records, folder, kind)
+
+
+def figures(record: Record) -> dict[str, Callable[[Record], Figure]]:
+    """Makers of the figures of one run by file name."""
+    return {
         "postures": postures,
         "overview": overview,
         "tracking": tracking,
@@ -59,21 +71,13 @@ def draw(record: Record, folder: Path, kind: str = "png") -> list[Path]:
         "redundancy": redundancy,
         **tanaka2019.figures_of_run(record),
     }
-    return [*style.save_all(makers, record, folder, kind), animate(record, folder / "animation.gif")]
 
 
-def draw_comparison(records: Mapping[str, Record], folder: Path, kind: str = "png") -> list[Path]:
-    """Variants over each other, and figures and tables beside [T] where its experiments were run; returns the files."""
-    makers: dict[str, Callable[[Mapping[str, Record]], Figure]] = {
-        "comparison": comparison,
-        "postures": strips,
-    }
-    written = []
-    if len(names := {record.summary["scenario"] for record in records.values()}) == 1:
-        scenario = names.pop()
-        makers |= tanaka2019.figures(scenario, records)
-        written = tanaka2019.write_tables(scenario, records, folder)
-    return written + style.save_all(makers, records, folder, kind)
+def comparisons(records: Mapping[str, Record]) -> dict[str, Callable[[Mapping[str, Record]], Figure]]:
+    """Makers of the figures of several runs by file name; those beside [T] where all are of one scenario."""
+    scenarios = {record.summary["scenario"] for record in records.values()}
+    published = tanaka2019.figures(scenarios.pop(), records) if len(scenarios) == 1 else {}
+    return {"comparison": comparison, "postures": strips, **published}
 
 
 def comparison(records: Mapping[str, Record]) -> Figure:

@@ -1,4 +1,4 @@
-"""The table of active rows: which candidates are held, and how; joints that follow others; the forces of candidates.
+"""The table of active constraint rows: of closed candidates by their modes, and of coupled joints; their forces.
 
 A row is one scalar constraint J vdot = target with one force. It has a kind, an owner (a candidate or a coupling) and
 up to two bodies, and is rebuilt only when a mode changes: couplings first, then the candidates in their order; behind

@@ -21,7 +21,6 @@ from __future__ import annotations
 import errno
 import os
 import select
-import termios
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -35,6 +34,7 @@ from dynsim.hardware.bus.control_table import BROADCAST_ID, Field
 from dynsim.hardware.bus.packet import ALERT, HEADER, STATUS, Decoder, Packet, StatusError
 from dynsim.hardware.bus.protocol import BlockRead, NoAnswer, RequestRefused, ServoReply
 from dynsim.hardware.errors import PortError
+from dynsim.hardware.posix import TerminalError, require_posix
 
 WRITE_TIMEOUT = 0.25
 """Longest wait for a port that takes no byte [s]."""
@@ -110,12 +110,14 @@ def open_serial_port(name: str, baud: int, *, exclusive: bool = True) -> SerialP
     Raises
     ------
     PortError
-        No such port, no permission, held by another process, or a baud rate the library refuses.
+        No such port, no permission, held by another process, a baud rate the library refuses, or a system without
+        POSIX.
     """
+    require_posix(name)
     port = SerialPort(name, exclusive=exclusive)
     try:
         opened = port.setBaudRate(baud)
-    except (OSError, termios.error, ValueError) as error:
+    except (OSError, TerminalError, ValueError) as error:
         raise PortError(f"{name}: {_why_not_opened(error)}") from error
     if not opened:
         raise PortError(f"{name}: the client library refuses {baud} bit/s")
@@ -294,7 +296,7 @@ class DynamixelBus:
     def close(self) -> None:
         try:
             self.port.closePort()
-        except (OSError, termios.error):
+        except (OSError, TerminalError):
             # A port that is gone needs no closing.
             return
 
@@ -303,7 +305,7 @@ class DynamixelBus:
         self.port.is_using = False
         try:
             yield
-        except (serial.SerialException, OSError, termios.error, TypeError) as error:
+        except (serial.SerialException, OSError, TerminalError, TypeError) as error:
             # pyserial raises TypeError where its descriptor was closed under it.
             raise PortError(f"{self.name}: the port died ({error})") from error
         finally:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import termios
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -10,6 +9,7 @@ from dynsim.hardware.bus.control_table import MODEL_BY_NUMBER, MX_106
 from dynsim.hardware.bus.dynamixel_bus import DynamixelBus, open_serial_port
 from dynsim.hardware.bus.protocol import NoAnswer, RequestRefused
 from dynsim.hardware.errors import PortError
+from dynsim.hardware.posix import TerminalError
 
 SCAN_BAUD_RATES = (57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000)
 STOP_BAUD_RATES = (3_000_000, 1_000_000, 57_600, 115_200, 2_000_000, 4_000_000)
@@ -130,7 +130,7 @@ def _torque_off(port: str, baud: int) -> None:
         bus.torque_off_all()
         # Closing throws away what the driver has not sent yet.
         bus.port.ser.flush()
-    except (OSError, termios.error) as error:
+    except (OSError, TerminalError) as error:
         raise PortError(f"{port}: the port died ({error})") from error
     finally:
         bus.close()

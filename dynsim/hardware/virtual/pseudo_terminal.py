@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 import select
 import sys
-import termios
 import time
-import tty
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 
 from dynsim.hardware.errors import PortError
+from dynsim.hardware.posix import fcntl, require_posix, termios, tty
 from dynsim.hardware.virtual.line import ADAPTER_LATENCY, VirtualLine
 
 _BAUD_BY_CODE = {
@@ -46,8 +44,10 @@ class PseudoTerminal:
         Raises
         ------
         PortError
-            The link exists as something else, leads to a device that is there, or cannot be made.
+            The link exists as something else, leads to a device that is there, or cannot be made; or a system without
+            pseudo-terminals.
         """
+        require_posix("virtual servos behind a pseudo-terminal")
         self.line = line
         self._master, self._slave = os.openpty()
         # Kept open: without a holder of the slave end the master reads end-of-file between two clients.

@@ -27,7 +27,7 @@ from dynsim.jit.kernel import apart_kernel, internal_kernel
 
 # Kinds of guards, behind those of dynsim.integrators.events.
 NORMAL_GUARD, SLIP_GUARD, STOP_GUARD, DRY_GUARD = 10, 11, 12, 13
-# What is logged of a candidate, and of a stop.
+# What is logged of a candidate, of a stop, and (slip alone) of a joint with dry friction.
 LANDING, LIFT_OFF, SLIP_START, SLIP_STOP, BOUNCE, CHATTERS, STOP_HIT, STOP_LEFT = 0, 1, 2, 3, 4, 5, 6, 7
 LOG_KINDS = 8
 
@@ -261,6 +261,7 @@ def solve_modes(system: System, ws: Workspace, run: Run, first):
     ws.counts[ka.DEPENDENT] = before
     if not first:
         log_changes(system, ws, run)
+    tell_joints(system.unilateral, run)
     rearm(run)
     count_changes(system, run)
 
@@ -345,6 +346,22 @@ def log_changes(system: System, ws: Workspace, run: Run):
 
 
 @internal_kernel
+def tell_joints(unilateral: UnilateralArrays, run: Run):
+    """Log which joints dry friction has begun, or ceased, to hold since the log was last told of them."""
+    for k in range(unilateral.dry_table.shape[0]):
+        tell_joint(unilateral, run, k, unilateral.dry_table[k, ku.DRY_HOLDS])
+
+
+@internal_kernel
+def tell_joint(unilateral: UnilateralArrays, run: Run, k, holds):
+    """Log where joint k of those that rub begins or ends to slip; what it is like at the start is no event."""
+    before = unilateral.dry_table[k, ku.DRY_TOLD]
+    unilateral.dry_table[k, ku.DRY_TOLD] = holds
+    if before >= 0 and before != holds:
+        log(run, ki.DRY_LOG + LOG_KINDS * k + (SLIP_STOP if holds == 1 else SLIP_START))
+
+
+@internal_kernel
 def break_loose(unilateral: UnilateralArrays, ws: Workspace, k):
     """Let joint k, which dry friction does not hold any more, slide against it; False where its slip has ended."""
     table, split = unilateral.dry_table, unilateral.number[ku.SPLIT] == 1.0
@@ -414,6 +431,7 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
             by_hand = slip_on(unilateral, ws, k, 10.0 * unilateral.number[ku.SLOW]) and by_hand
     if by_hand:
         set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
+        tell_joints(unilateral, run)
         rearm(run)
         count_changes(system, run)
     else:

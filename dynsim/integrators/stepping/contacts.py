@@ -305,9 +305,9 @@ def solve_contacts(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Wor
         if ws.active[k, ka.MODE] == ka.STICKING:
             r = ws.active[k, ka.FIRST_ROW]
             s.mu[r] = friction_of(law, s, k, r)
-            turn_rows(law, s, ws, k, h)
             for m in range(ka.MOST_ROWS):
                 s.f[r + m] = s.impulse[3 * k + m]
+            turn_rows(law, s, ws, k, h)
     for _ in range(1 + ws.contacts.shape[0]):
         for k in range(ws.contacts.shape[0]):
             if ws.active[k, ka.MODE] == ka.STICKING:

@@ -44,6 +44,12 @@ class Config(StrictConfig):
     damping_N_s_per_m: NonNegative | None = Field(
         default=None, description="loss of every prismatic joint; default: the URDF's"
     )
+    friction_N_m: NonNegative | None = Field(
+        default=None, description="dry friction of every revolute joint; default: the URDF's"
+    )
+    friction_N: NonNegative | None = Field(
+        default=None, description="dry friction of every prismatic joint; default: the URDF's"
+    )
     initial_deg: dict[str, float] = Field(
         default={}, description="initial angles of revolute joints by name; others 0, or where a leader has them"
     )
@@ -106,12 +112,15 @@ def build(config: Config, context: BuildContext) -> Robot:
     lock = {**{name: float(np.deg2rad(angle)) for name, angle in config.lock_deg.items()}, **config.lock_m}
     robot = read_urdf(Path(config.file), lock)
     initial = {**{name: np.deg2rad(angle) for name, angle in config.initial_deg.items()}, **config.initial_m}
-    damping = {"revolute": config.damping_N_m_s_per_rad, "prismatic": config.damping_N_s_per_m}
+    stated: dict[str, dict[str, Any]] = {
+        "revolute": {"damping": config.damping_N_m_s_per_rad, "friction": config.friction_N_m},
+        "prismatic": {"damping": config.damping_N_s_per_m, "friction": config.friction_N},
+    }
     # Joints with several rates have neither losses nor motors.
     single = [link for link in robot.links if link.joint_of_rows is None]
     links = tuple(
-        dataclasses.replace(link, damping=loss)
-        if link.joint_of_rows is None and (loss := damping[link.kind]) is not None
+        dataclasses.replace(link, **{key: loss for key, loss in stated[link.kind].items() if loss is not None})
+        if link.joint_of_rows is None
         else link
         for link in robot.links
     )

@@ -63,8 +63,8 @@ def read_urdf(path: Path, lock: Mapping[str, float] | None = None) -> Robot:
     Warns
     -----
     UserWarning
-        The file states Coulomb friction of joints, which is not simulated; a link with a shape has no mass; moments of
-        inertia of a link are not those of a body; a joint is locked beyond its limits.
+        A link with a shape has no mass; moments of inertia of a link are not those of a body; a joint is locked beyond
+        its limits.
     """
     tree = read_tree(path)
     locked = _locked(tree, {**_locked_followers(tree, lock or {}), **(lock or {})})
@@ -221,6 +221,7 @@ def _links(tree: UrdfTree, places: Mapping[str, _Place]) -> tuple[Link, ...]:
                 R_PJ=parent.R @ joint.R,
                 p_PJ=parent.p + parent.R @ joint.p,
                 damping=joint.damping,
+                friction=joint.friction,
                 lower=joint.lower,
                 upper=joint.upper,
                 velocity_limit=joint.velocity_limit,
@@ -250,14 +251,11 @@ def _hand(tree: UrdfTree, places: Mapping[str, _Place]) -> tuple[str, Array]:
 
 
 def _warn(tree: UrdfTree, places: Mapping[str, _Place], links: tuple[Link, ...]) -> None:
-    """Refuse bodies that cannot be; warn of masses that are missing and of what is not simulated."""
+    """Refuse bodies that cannot be; warn of masses that are missing."""
     for link in links:
         link.inertia.check(
             f"{tree.path}:{tree.links[link.name].line}: link {link.name!r}, with all that is fixed to it"
         )
-    rubbing = [joint.name for joint in tree.joints.values() if joint.friction != 0.0 and joint.kind != "fixed"]
-    if rubbing:
-        warnings.warn(f"{tree.path}: Coulomb friction of joints is not simulated ({', '.join(rubbing)})", stacklevel=3)
     loaded: set[str | None] = set()
     for link in reversed(links):
         if link.name in loaded or link.inertia.mass > 0.0 or link.inertia.tensor.any():

@@ -18,7 +18,8 @@ from dynsim.record.urdf_text import add_shapes, connect, numbers, xml_text
 def write_urdf(robot: Robot) -> str:
     """Write the bodies, joints and shapes of a robot as URDF text.
 
-    Frames, and the hand as one of them, are links without mass.
+    Frames, and the hand as one of them, are links without mass. Losses of joints are those of their bearings: what a
+    motor takes is its own.
 
     Numbers are written in full, so that reading the text back gives the same dynamics to rounding.
 
@@ -56,8 +57,8 @@ def write_urdf(robot: Robot) -> str:
             texts = [numbers(min(max(limit, -UNLIMITED), UNLIMITED)) for limit in limits]
             attributes = dict(zip(("lower", "upper", "effort", "velocity"), texts, strict=True))
             ElementTree.SubElement(joint, "limit", dict(list(attributes.items())[2:]) if endless else attributes)
-        if link.damping:
-            ElementTree.SubElement(joint, "dynamics", damping=numbers(link.damping), friction="0.0")
+        if link.damping or link.friction:
+            ElementTree.SubElement(joint, "dynamics", damping=numbers(link.damping), friction=numbers(link.friction))
         if coupling := leads.get(link.joint):
             law = {"multiplier": numbers(coupling.ratio), "offset": numbers(coupling.offset)}
             ElementTree.SubElement(joint, "mimic", {"joint": coupling.leader, **law})
@@ -95,7 +96,7 @@ def _whole_joint(name: str, rows: list[Link]) -> Link:
         made = make(whole)
         same = [(row.joint, row.kind) for row in made] == [(row.joint, row.kind) for row in rows]
         if same and all(np.allclose(a.axis, b.axis, rtol=0.0, atol=1e-15) for a, b in zip(made, rows, strict=True)):
-            if any(row.damping for row in rows):
+            if any(row.damping or row.friction for row in rows):
                 raise ModelError(f"{name}: has losses; URDF has no unit for those of a {kind} joint")
             return replace(whole, kind=kind)
     raise ModelError(f"{name}: is made of {', '.join(row.kind for row in rows)}; URDF has no such joint")

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from dynsim.errors import DynsimError
+from dynsim.hardware.posix import require_posix
 from dynsim.hardware.replay.incremental_path import Sample
 from dynsim.hardware.replay.motion import Array
 from dynsim.hardware.servo_map import ServoMap
@@ -125,14 +126,15 @@ class SimulationProcess:
     """
 
     def __init__(self, request: DriveRequest) -> None:
+        """Start it; raises PortError on a system without POSIX's pipes."""
+        require_posix("servos that follow a live drive")
         self._done = False
         context: Any = get_context("spawn")
         self._control, control = context.Pipe()
         samples, there = context.Pipe(duplex=False)
-        if os.name == "posix":
-            # Python's own helper lets signals through again when it is started: not while they are held.
-            with safe_path():
-                resource_tracker.ensure_running()
+        # Python's own helper lets signals through again when it is started: not while they are held.
+        with safe_path():
+            resource_tracker.ensure_running()
         with signals_held(), safe_path():
             heard = context.RawArray("d", [NOT_YET])
             self._process = context.Process(

@@ -1,4 +1,4 @@
-"""What braces and motors are to the program for the forces of braces, what it finds, and its room."""
+"""Tables of the cone program for the forces of braces: braces and motors in, forces out, workspace."""
 
 from __future__ import annotations
 

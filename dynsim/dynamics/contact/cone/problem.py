@@ -1,4 +1,4 @@
-"""Contact problems: forces on one side, Coulomb cones, rows that hold both ways, all at once and without smoothing.
+"""Contact problems: unilateral forces, Coulomb cones and bilateral rows, all at once and without smoothing.
 
 Find f with u = W f + b (forces and accelerations, or impulses and velocities) such that every row or block of rows has
 

@@ -1,0 +1,30 @@
+"""Modules of POSIX behind serial ports and pseudo-terminals: None where the system does not have them, as on Windows.
+
+Servos in memory need none of them.
+"""
+
+from __future__ import annotations
+
+from dynsim.hardware.errors import PortError
+
+try:
+    import fcntl
+    import termios
+    import tty
+except ImportError:
+    fcntl = termios = tty = None  # type: ignore[assignment]
+
+TerminalError: type[Exception] = OSError if termios is None else termios.error
+"""What a serial port raises beside OSError."""
+
+
+def require_posix(user: str) -> None:
+    """Refuse who reads and writes as POSIX does it, by name.
+
+    Raises
+    ------
+    PortError
+        This system is another one.
+    """
+    if termios is None:
+        raise PortError(f"{user}: needs a POSIX system such as Linux or macOS, which this is not")
