@@ -47,7 +47,7 @@ class Hinge(StrictConfig):
         return self
 
 
-class Wheel(StrictConfig):
+class ObjectWheel(StrictConfig):
     """A body that turns on an object and rolls on surfaces: a sphere where it touches, with the inertia of a disc."""
 
     position_m: Vector3 = Field(description="of its centre, in the object's axes from its centre")
@@ -92,7 +92,7 @@ class SceneObject(StrictConfig):
     position_m: Vector3 = Field(description="of its centre at the start, in the world")
     rpy_deg: Vector3 = Field([0.0, 0.0, 0.0], description="attitude at the start, Rz(yaw) Ry(pitch) Rx(roll)")
     hinge: Hinge | None = Field(None, description="default: it is free")
-    wheels: dict[str, Wheel] = Field({}, description="wheels of a free one, by name")
+    wheels: dict[str, ObjectWheel] = Field({}, description="wheels of a free one, by name")
 
     @model_validator(mode="after")
     def _check_size(self) -> Self:
