@@ -588,6 +588,16 @@ def snake_table_iii() -> str:
     return lines(heads, rows, left=2)
 
 
+def steps() -> Any:
+    return data("snake/steps.json")
+
+
+def fall_order(theta: str) -> str:
+    """By what half the step divides the error of the falling head, of two halvings."""
+    coarse, _, fine = steps()["fall_errors_m"][theta]
+    return fixed(math.sqrt(coarse / fine), 1)
+
+
 def sag_error(quantity: str) -> float:
     """Root mean square of what the dynamic snake is off the paper in a quantity, over the six manoeuvres."""
     off = [float(row["dynamic"]) - float(row["paper_mean"]) for row in table_iii() if row["quantity"] == quantity]
@@ -715,6 +725,10 @@ NUMBERS |= {
     "below_landing_s": lambda: fixed(run("floor_below lands")["first_at_s"]["landing"], 3),
     "below_mm": lambda: error("floor_below lands"),
     "snake_dz_mm": lambda: fixed(1e3 * sag_error("dz_m"), 1),
+    "snake_steps_mm": lambda: fixed(steps()["spread_mm"], 2),
+    "snake_steps_mrad": lambda: fixed(steps()["spread_mrad"], 2),
+    "snake_fall_half": lambda: fall_order("theta_0.5"),
+    "snake_fall_one": lambda: fall_order("theta_1"),
     "snake_dbeta_rad": lambda: fixed(sag_error("dbeta_rad"), 3),
     "below_touch_ms": lambda: fixed(1e4 * run("floor_below deep")["contacts"]["joint_7"]["closed_fraction"], 0),
     "wall_slip_s": lambda: fixed(run("wall_push weak_hold")["first_at_s"]["slip_start"], 2),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import signal
 from collections.abc import Callable, Iterator
 from functools import cache
 from typing import Any
@@ -43,3 +44,11 @@ def browser() -> Iterator[Any]:
         )
         yield started
         started.close()
+
+
+@pytest.fixture
+def hang_ups() -> Iterator[None]:
+    """SIGHUP as a shell leaves it, here and for child processes: under ``nohup`` all inherit that it is ignored."""
+    inherited = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, inherited)

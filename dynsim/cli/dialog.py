@@ -1,4 +1,4 @@
-"""What the commands that move a robot ask and show before they do, and after a nudge."""
+"""Questions and tables of the commands that move a robot: before a replay, and after a nudge of one servo."""
 
 from __future__ import annotations
 
@@ -26,14 +26,16 @@ CLEAR = "Is everybody clear of the robot, and the power cut within reach?"
 def confirm_replay(
     console: Console, servo_map: ServoMap, motion: MotionTask, port: str, *, asked: bool, at_most: bool = False
 ) -> None:
-    """Say how far the start is, and ask; about a start beyond ``safety.start_distance`` also where not ``asked``.
+    """Show the distance to the start and ask for consent.
+
+    A start beyond ``safety.start_distance`` needs an answer even where not ``asked``.
 
     ``at_most``: the motion may end sooner.
 
     Raises
     ------
     ReplayInterrupted
-        The user does not agree, or is not there.
+        The user does not agree, or does not answer.
     PortError, VerificationFailed
         The posture cannot be read.
     """

@@ -183,7 +183,7 @@ class PreparedBraces:
             self._model, self._ws, arrays, self._q, self._v, self._vdot, self._tables, self._torques, True
         )
         feasible = solved == 1
-        torques, results, forces = self._torques[0].copy(), arrays.found, arrays.forces.copy()
+        torques, results, forces = self._torques[0].copy(), arrays.results, arrays.forces.copy()
         if not feasible:
             torques[:], results[:], forces[:] = np.nan, np.nan, np.nan
         numbers = results.tolist()

@@ -1,4 +1,4 @@
-"""Distances from surfaces along samples of the joint positions: of points on bodies, and of the bodies' axes."""
+"""Distances from surfaces at samples of the joint positions: of points on bodies, and of the bodies' centre lines."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from dynsim.model.description import Array, Link, Quadric, Robot
 from dynsim.model.surfaces import Surface
 
-# Depth beyond its radius that does not count as passing below a surface [m]: what a contact may be off at the start.
+# By how much a body may lie deeper than its radius without a warning [m]: the tolerance of contacts at the start.
 SLACK = 1e-6
 # Parts into which an axis is cut to find its depth in a box or a height field.
 POINTS = 16

@@ -1,4 +1,7 @@
-"""The unilateral law of a robot's contacts and joint stops, compiled to the arrays of the kernels."""
+"""Tables of the unilateral law for the kernels: friction of contacts, joint stops, dry friction, ties.
+
+The law itself is in :mod:`dynsim.dynamics.contact.unilateral` and :mod:`dynsim.integrators.contacts`.
+"""
 
 from __future__ import annotations
 
@@ -80,7 +83,7 @@ def compile_unilateral(
     for k, friction in enumerate(dry):
         dry_table[k, ku.DRY_JOINT] = robot.joint_names.index(friction.joint)
         dry_table[k, ku.DRY_DRIVE] = driven.index(friction.joint) if friction.gear > 0.0 else -1
-        dry_table[k, ku.DRY_HOLDS] = 1
+        dry_table[k, ku.DRY_HOLDS], dry_table[k, ku.DRY_TOLD] = 1, -1
         frictions[k, [ku.OF_GEAR, ku.OF_JOINT]] = friction.gear, friction.bearing
     tie_table, tie = np.zeros((len(ties), ku.TIE_TABLE_SIZE), dtype=np.int64), np.zeros((len(ties), ku.TIE_SIZE))
     for joined, ints, floats in zip(ties, tie_table, tie, strict=True):
@@ -100,7 +103,7 @@ def compile_unilateral(
         dry=reals(frictions),
         tie_table=integers(tie_table),
         tie=reals(tie),
-        place=integers(np.zeros((ku.PLACES, max(p, c + len(dry) + 2)))),
+        index=integers(np.zeros((ku.INDICES, max(p, c + len(dry) + 2)))),
         vector=reals(np.zeros((ku.VECTORS, p))),
         room=reals(np.zeros((ku.ROOM, p, p))),
         split_room=reals(np.zeros(split_size(3 * c + len(dry), c + len(dry)))),

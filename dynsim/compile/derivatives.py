@@ -1,15 +1,15 @@
 """Derivatives of inverse dynamics in closed form, after Singh, Russo and Wensing (2022).
 
-Of links in a tree, all six-vectors at the world origin, motions before forces (ω, v; n, f). With the composite inertia
-I_c, the composite wrench f_c of link i, and of its joint's axis S, velocity V and acceleration A (less gravity) of the
-body, and V_p, A_p of what the joint is mounted on:
+Six-vectors at the world origin: motions (ω, v), forces (n, f). × is the cross product of motions, ×* that of a motion
+and a force, and (F ×̄*) V = V ×* F. S is the axis of a joint, V and A (less gravity) velocity and acceleration of its
+body, V_p and A_p those of the body that it is mounted on; I_c, f_c and B_c are sums of I, f and B over a subtree:
 
     S' = V_p × S,   S'' = A_p × S + V_p × S',   Ṡ = V × S
-    2 B = (V ×*) I − I (V ×) + (I V) ×̄*,   summed up over the subtree as I is
+    2 B = (V ×*) I − I (V ×) + (I V) ×̄*
 
-    ∂τ_i/∂q_j = S_i · (2 B_c S'_j + I_c S''_j)                    joint j carries i, or is its own
-    ∂τ_j/∂q_i = S_j · (2 B_c S'_i + I_c S''_i + S_i ×* f_c)       joint j carries i
-    ∂τ_i/∂v_j, ∂τ_j/∂v_i = S · (2 B_c S + I_c (S' + Ṡ))           both ways
+    ∂τ_i/∂q_j = S_i · (2 B_c S'_j + I_c S''_j)                    j an ancestor of i, or i
+    ∂τ_j/∂q_i = S_j · (2 B_c S'_i + I_c S''_i + S_i ×* f_c)       j an ancestor of i
+    ∂τ_i/∂v_j, ∂τ_j/∂v_i = S · (2 B_c S + I_c (S' + Ṡ))           likewise; B_c, I_c and f_c are those of link i
 """
 
 from __future__ import annotations

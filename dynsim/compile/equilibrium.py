@@ -3,8 +3,8 @@
     τ = h + g − J_wᵀ W − J_cᵀ f,    minimise Σ R i²,  K_m i = τ
 
 with the forces f of the contacts that touch. The bilateral law has no friction at rest, and normal forces of either
-sign. Under the unilateral one f_n ≥ 0 and |f_t| ≤ μ_s f_n: first without friction, so that contacts stick with all they
-have in reserve, and only where nothing holds that way with it.
+sign. Under the unilateral law f_n ≥ 0 and |f_t| ≤ μ_s f_n. There frictionless forces are tried first, which leave all
+friction as a reserve against slip; friction is used only where the posture cannot rest without it.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def holding_torques(
         torques, still = np.zeros((1, model.n)), np.zeros((1, model.n))
         arrays, workspace = planner.arrays, planner.workspace
         if brace_statics(model.arrays, workspace, arrays, reals(q[None]), still, still, tables, torques, False) == 1:
-            normal_N = arrays.found[: len(rows), kb.FORCES]
+            normal_N = arrays.results[: len(rows), kb.FORCES]
             normal = normal_N if real else normal_N[::2] - normal_N[1::2]
             names = [contact.name for contact, *_ in touching]
             forces = arrays.forces[: len(rows)] if real else arrays.forces[: len(rows)].reshape(-1, 2, 3).sum(axis=1)

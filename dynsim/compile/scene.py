@@ -1,4 +1,4 @@
-"""From robots to scenes: what a record keeps of bodies, joints, surfaces and points, to be drawn and placed later."""
+"""The scene of a robot for its record: bodies, joints, surfaces and points, from which pictures are drawn later."""
 
 from __future__ import annotations
 
@@ -168,11 +168,11 @@ def _rod(link: Link) -> tuple[Shape, ...]:
     length = float(np.linalg.norm(link.tip))
     if not length > 0.0:
         return ()
-    turn = _from_z(link.tip / length)
+    turn = turn_from_z(link.tip / length)
     return (Shape("cylinder", (link.radius, length), vector3(0.5 * link.tip), turn),)
 
 
-def _from_z(direction: Array) -> Quaternion:
+def turn_from_z(direction: Array) -> Quaternion:
     """A turn that takes z to a unit vector."""
     axis = np.cross([0.0, 0.0, 1.0], direction)
     size = float(np.linalg.norm(axis))

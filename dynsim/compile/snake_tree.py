@@ -253,11 +253,10 @@ def lifted_moments(robot: SnakeTree, lifted: NDArray[np.bool_]) -> Array:
     d = robot.description
     n, l, g = d.pairs, d.link_length, float(-robot.gravity[2])
     # Weight of the plate behind each axle: the two links between it and the next one.
-    weight = g * np.array(
-        [d.link_mass[d.head_joints + 2 * k] + d.link_mass[d.head_joints + 2 * k + 1] for k in range(n - 1)]
-    )
+    masses = d.link_mass[d.head_joints :]
+    weight = [g * float(masses[2 * k] + masses[2 * k + 1]) for k in range(n - 1)]
     moments = np.zeros(n - 1)
-    down = np.flatnonzero(~lifted)
+    down = np.flatnonzero(~lifted).tolist()
     for first, last in zip(down, [*down[1:], n], strict=True):
         count = last - first
         if last == n:  # the tail, behind the last pair on the ground

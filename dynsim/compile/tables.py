@@ -1,4 +1,4 @@
-"""Compile descriptions to the arrays of the kernels, checking all that no physics can be made of."""
+"""Robot, drives, contacts and loads compiled to the tables of the kernels; impossible descriptions are refused."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ from dynsim.model.description import Contact, Coupling, Link, Load, Quadric, Rob
 from dynsim.model.drives import Drive, Motor, Servo, TorqueSource
 from dynsim.model.servo import servo_row
 
-# Beyond it the reduction of an angle to a quarter turn leaves too few digits (dynsim.dynamics.tree.sweep.sine_cosine).
+# Largest initial angle [rad]: beyond it the reduction to a quarter turn leaves too few digits
+# (dynsim.dynamics.tree.sweep.sine_cosine).
 ANGLE_LIMIT = 1e6
-# Further than this from its leader [rad or m] the initial position of a joint is another one, and no rounding of it.
+# By how much the initial position of a coupled joint may differ from what its leader wants: rounding [rad or m].
 COUPLING_TOLERANCE = 1e-6
 
 _FRICTION = {"signed": ka.FRICTION_SIGNED, "dissipative": ka.FRICTION_DISSIPATIVE}

@@ -1,4 +1,4 @@
-"""Base of every part of a scenario and of the bridge's files: strict about keys, frozen after validation."""
+"""Base of every part of a scenario and of a servo map: strict about keys, frozen after validation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is wrong with the content of a file, in one line: place, key, value and fix, from what pydantic found.
+"""Error messages of one line for what pydantic refuses in a file: place, key, value and fix.
 
 Scenarios and servo maps share it, so that errors of both read alike.
 """
@@ -21,7 +21,7 @@ from pydantic import BaseModel, ValidationError
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
 
-# Of what messages show: unknown keys, other problems, characters of a value or key.
+# Most unknown keys and other problems in a message, and most characters of a value or key.
 UNKNOWN_SHOWN = 20
 OTHERS_SHOWN = 4
 SHOWN_LIMIT = 80

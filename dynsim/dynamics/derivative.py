@@ -81,15 +81,15 @@ def constrained_acceleration(model: ModelArrays, ws: Workspace):
 
 
 @internal_kernel
-def m_star_acceleration(dense, model: ModelArrays, drives: DriveArrays, ws: Workspace, found):
+def m_star_acceleration(dense, model: ModelArrays, drives: DriveArrays, ws: Workspace, dependent):
     """The same unknowns by the dense M*, where ``dense`` has room for it.
 
-    The articulated solve has run before, because projection uses its factors; its rank findings (``found`` before it)
-    are not counted twice.
+    The articulated solve has run before, because projection uses its factors; the rows that it saw depend on others
+    are not counted twice: ``dependent`` is their number before it.
     """
     if dense is None:  # known to the compiler, which then leaves M* out of the default program
         return
-    ws.counts[ka.DEPENDENT] = found
+    ws.counts[ka.DEPENDENT] = dependent
     passes = 1
     solve_m_star(dense, model, drives, ws)
     while sign_changed(ws, passes):
@@ -122,9 +122,9 @@ def derivative(system: System, t, y, ws: Workspace, dy):
         add_loads(model, system.loads, t, ws, dy, layout.load)
     contact_rows(model, contacts, system.unilateral, ws)
     shaped_rows(system.shapes, system.unilateral, model, contacts, ws)
-    found = ws.counts[ka.DEPENDENT]
+    dependent = ws.counts[ka.DEPENDENT]
     constrained_acceleration(model, ws)
-    m_star_acceleration(system.dense, model, drives, ws, found)
+    m_star_acceleration(system.dense, model, drives, ws, dependent)
     admissible_forces(system.contacts, system.unilateral, ws)
 
     if not plain:

@@ -163,8 +163,8 @@ def gap_and_normal(shapes: ShapeArrays | None, braces: ContactArrays, b, x, y, z
     """Distance of brace b at a point of W from its surface [m], and the normal there (3 numbers)."""
     if shapes is not None:  # noqa: SIM102 (known to the compiler)
         if shapes.kind[b, kd.SURFACE] != kd.AS_POINT:
-            found = distance(shapes, b, x, y, z)
-            return found[0] - shapes.data[b, kd.RADIUS], found[1], found[2], found[3]
+            gap = distance(shapes, b, x, y, z)
+            return gap[0] - shapes.data[b, kd.RADIUS], gap[1], gap[2], gap[3]
     table, s = braces.point, ka.QUADRIC
     qx = table[b, s] * x + table[b, s + 1] * y + table[b, s + 2] * z
     qy = table[b, s + 1] * x + table[b, s + 3] * y + table[b, s + 4] * z

@@ -1,4 +1,4 @@
-"""Where what lies in the state vector and in a row of recorded outputs: the one place that knows.
+"""Layout of the state vector and of a row of recorded outputs; no other file defines it.
 
 State y, all in one vector, blocks in this order:
 

@@ -1,9 +1,10 @@
-"""Compiled code in a thread of its own, while the thread that has called for it listens.
+"""Compiled code in a thread of its own, while the calling thread handles signals and the limit of wall time.
 
-Compiled code neither hears signals nor sees a clock, and one step of it may take a minute where a contact problem has
-no solution. So it runs without the interpreter's lock in another thread. The caller's thread wakes for a signal, and
-looks ten times a second at whatever else may want the run to end. Then the piece is asked to end at its next step.
-Where it does not in time it is left alone: what was recorded until then is in its arrays. So is the compiler.
+Compiled code neither receives signals nor reads a clock, and a single step may take a minute where a contact problem
+has no solution. So it runs without the interpreter's lock in another thread. The calling thread wakes up for a signal,
+and checks ten times a second for other reasons to end the run. Then compiled code is asked to return after its present
+step. If it does not return in time it is left running: the samples so far are in its arrays. The compiler runs in the
+same way.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from dynsim.system import interruption
 
 log = logging.getLogger(__name__)
 
-# Between two looks, and for how long a piece that was asked to end is waited for [s].
+# Interval of the checks, and how long to wait for compiled code that was asked to return [s].
 LOOK_S, PATIENCE_S = 0.1, 0.5
 # After so long in one and the same step it is stuck [s]: the longest that was ever seen, of 24 contacts whose forces no
 # method of the solver finds, took 80.

@@ -27,15 +27,17 @@ log = logging.getLogger(__name__)
 
 # More steps than any run takes.
 _ALL = 1 << 62
-# Ticks of an operator between two looks at Ctrl-C and the progress bar.
+# Ticks between two looks at Ctrl-C and the progress bar.
 TICKS = 10
 
 
 def simulate(scenario: Scenario, progress: Progress | None = None, *, pictured: bool = True) -> Record:
     """See :func:`dynsim.engine.simulate`."""
     prepared = prepare(scenario, progress)
-    if prepared.control.teleop is not None or prepared.control.task_space is not None:
-        return _teleoperated(scenario, progress, pictured)
+    control, sensors = prepared.control, scenario.config.sensors
+    encoded = sensors is not None and sensors.encoders is not None
+    if encoded or control.teleop is not None or control.task_space is not None:
+        return _stepped(scenario, 1.0 / (control.sample_time or 1.0), progress, pictured)
     size = prepared.model.n, len(prepared.contacts), len(prepared.stops)
     # Loading or compiling the kernels is no integration time.
     recall("kernels", partial(attended.load, prepared), prepared.choice.method, *size)
@@ -75,14 +77,17 @@ def simulate(scenario: Scenario, progress: Progress | None = None, *, pictured: 
     return record
 
 
-def _teleoperated(scenario: Scenario, progress: Progress | None, pictured: bool) -> Record:
-    """The script of an operator, or of a snake's, by the public stepper: its record is the session's, bit for bit."""
+def _stepped(scenario: Scenario, rate: float, progress: Progress | None, pictured: bool) -> Record:
+    """A run with ticks of an operator, a snake's script or encoders: by the public stepper, bit for bit its record.
+
+    ``rate`` : of the ticks where there is no operator [Hz]
+    """
     from dynsim.engine.simulation import Simulation
 
     # Without an end, as a session: a step that ends at a tick and one at the end of a run need not be the same.
     simulation = Simulation(scenario, duration=math.inf)
-    assert simulation.operator is not None
-    rate, k = simulation.operator.rate, 0
+    operator, k = simulation.operator, 0
+    rate = rate if operator is None else operator.rate
     stop: SimulationStopped | None = None
     try:
         while simulation.time < scenario.duration_s:

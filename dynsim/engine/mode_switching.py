@@ -85,20 +85,20 @@ class ModeSwitcher:
     def _cyclic(self, tick: int) -> int:
         tipping: dict[int, float] = {}
         for step in range(len(self.order)):
-            place = (self._place + step) % len(self.order)
-            row = self.order[place]
+            position = (self._place + step) % len(self.order)
+            row = self.order[position]
             margin = self.predict(row)[1]
             if margin > self.least_margin:
                 self._refuse(tick, tipping)
-                self._place = (place + 1) % len(self.order)
+                self._place = (position + 1) % len(self.order)
                 return row
             tipping[row] = margin
         return self._least_tipping(tick, tipping)
 
     def _predictive(self, tick: int) -> int:
-        found = {row: self.predict(row) for row in self.order}
-        tipping = {row: margin for row, (_, margin) in found.items() if not margin > self.least_margin}
-        standing = {row: cost for row, (cost, _) in found.items() if row not in tipping}
+        predictions = {row: self.predict(row) for row in self.order}
+        tipping = {row: margin for row, (_, margin) in predictions.items() if not margin > self.least_margin}
+        standing = {row: cost for row, (cost, _) in predictions.items() if row not in tipping}
         if standing:
             self._refuse(tick, tipping)
             return min(standing, key=lambda row: standing[row])

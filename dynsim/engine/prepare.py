@@ -153,6 +153,8 @@ def prepare(
     joint_rows = len(robot.couplings) + len(stops) + len(dry) + len(robot.ties)
     _check_work(scenario, n, c + joint_rows, scenario.integrator.method)
     control = piloted or _control(scenario, model, contacts, progress)
+    if piloted is None:
+        _check_sensors(scenario, control)
     if not real:
         _check_references(scenario, model, contacts, control)
     options, size = scenario.integrator, n + ka.row_limit(c, joint_rows) + robot.circuits
@@ -229,6 +231,27 @@ def _check_friction(robot: Robot, real: bool, stepped: bool) -> None:
             "or set it to 0 and take a damping instead",
             keys=("plant",),
         )
+
+
+def _check_sensors(scenario: Scenario, control: JointControl) -> None:
+    """Refuse sensors that the controller of an arm does not read."""
+    sensors = scenario.config.sensors
+    if sensors is None:
+        return
+    if sensors.motion_capture is not None:
+        raise ModelError(
+            "sensors.motion_capture tells a snake's controller where its head is; arms have sensors.encoders alone; "
+            "remove it",
+            keys=("sensors", "motion_capture"),
+        )
+    if sensors.encoders is None or control.sample_time is not None:
+        return
+    why = "it follows the joints continuously; give controller.sample_time_s, or remove the encoders"
+    raise ModelError(
+        "sensors.encoders are read by a sampled controller: "
+        + ("there is no controller; remove them" if scenario.controller is None else why),
+        keys=("sensors", "encoders"),
+    )
 
 
 def follow_lines(scenario: Scenario, q: Array, phases: Sequence[Phase]) -> Array:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import time as clock
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +23,7 @@ from dynsim.compile.references.teleop import VelocitySource
 from dynsim.compile.tables import check_couplings
 from dynsim.dynamics import state as kst
 from dynsim.dynamics import tables as ka
+from dynsim.dynamics.drive.law import take_measured_commands
 from dynsim.dynamics.state import block
 from dynsim.dynamics.tree import loads as kl
 from dynsim.engine import attended
@@ -31,6 +32,7 @@ from dynsim.engine.operator import Operator
 from dynsim.engine.outcome import mark_stopped, raise_stopped
 from dynsim.engine.prepare import prepare, sample_times
 from dynsim.engine.recording import make_record
+from dynsim.engine.sensing import EncodedCommands
 from dynsim.engine.stepped import GUARDS, Snapshot, State, Touch, event_name, own_guards, take_log
 from dynsim.engine.stopping import stopped
 from dynsim.engine.trace import Trace
@@ -155,11 +157,13 @@ class Simulation:
         run.clock[[ki.TIME, ki.COUNTED_SINCE]] = start
         run.tick[:, [ki.TICK_NEXT, ki.TICK_PHASE]] = start
         self._refill()
+        encoded = self._encoded_commands()
         self._operator = self._attendant(operator)
         if self._operator is not None:
             self.every(self._operator.period, self._operator)
         elif operator is not None:
             raise ScenarioError("an operator needs a scenario with controller.operator, which says what it moves")
+        self._attendants = [attendant for attendant in (encoded, self._operator) if attendant is not None]
 
     def _attendant(self, source: Any) -> Operator | SnakePilot | None:
         """Who rewrites references at the ticks of its own, where the scenario has somebody."""
@@ -178,6 +182,25 @@ class Simulation:
             # Before the controller, where both are due.
             self.every(sensor.period, sensor)
         return pilot
+
+    def _encoded_commands(self) -> EncodedCommands | None:
+        """Who takes commands at the ticks of a sampled controller that has encoders."""
+        sensors, period = self._scenario.config.sensors, self._prepared.control.sample_time
+        if sensors is None or sensors.encoders is None or period is None:
+            return None
+        encoded = EncodedCommands(sensors.encoders, sensors.seed, self.robot, period, self._take_commands)
+        self.every(encoded.sensor.period, encoded.sensor)
+        self.every(period, encoded)
+        return encoded
+
+    def _take_commands(self, position: Array, rate: Array) -> None:
+        """Take the commands of all sampled motors by measured positions and rates of their joints, (na,)."""
+        self._settle_now()
+        system, workspace = self._prepared.system, self._prepared.workspace
+        driven = system.drives.table[:, ka.DRIVEN]
+        workspace.joints[driven, ka.Q], workspace.joints[driven, ka.QD] = position, rate
+        take_measured_commands(system.drives, system.reference, self._time, workspace)
+        self._restart()
 
     @property
     def scenario(self) -> Scenario:
@@ -361,8 +384,7 @@ class Simulation:
         if (balance := self._prepared.balance) is not None:
             values[:, 0] += balance.shift[motors]
         self._follow_lines(motors, values)
-        for joint in lines:
-            self._leave_plan(joint)
+        self._leave_plan(lines)
 
     def _follow_lines(self, motors: list[int], values: Array) -> None:
         """Let motors follow lines from now on, values (motors, 2)."""
@@ -381,11 +403,12 @@ class Simulation:
         drives = self._prepared.system.drives
         drives.table[a, ka.SAMPLED], drives.input[a, ka.COMMAND] = ka.GIVEN, value
         self._restart()
-        self._leave_plan(joint)
+        self._leave_plan([joint])
 
-    def _leave_plan(self, joint: str) -> None:
+    def _leave_plan(self, joints: Iterable[str]) -> None:
         """Remember that a wheel of the base does not do any more what the scenario says."""
-        if self.robot.base is not None and joint in self.robot.base.wheels:
+        base = self.robot.base
+        if base is not None and any(joint in base.wheels for joint in joints):
             self._base_as_planned = False
 
     def set_mode(self, joint: str, mode: str) -> None:
@@ -519,9 +542,9 @@ class Simulation:
     def snapshot(self) -> Snapshot:
         """What :meth:`restore` needs to go on from here."""
         arrays = {name: array.copy() for name, array in self._arrays().items()}
-        operator = None if self._operator is None else self._operator.remembered()
+        attendants = [attendant.remembered() for attendant in self._attendants]
         trace, happened = self._trace.snapshot(), tuple(self._happened)
-        return Snapshot(self._token, arrays, self._time, trace, happened, self._frozen, operator)
+        return Snapshot(self._token, arrays, self._time, trace, happened, self._frozen, attendants)
 
     def restore(self, snapshot: Snapshot) -> None:
         """Go back to a snapshot of this simulation: the same future, bit for bit.
@@ -542,8 +565,8 @@ class Simulation:
             array[...] = snapshot.arrays[name]
         self._trace.restore(snapshot.trace)
         self._time, self._frozen, self._happened = snapshot.time, snapshot.frozen, list(snapshot.happened)
-        if self._operator is not None and snapshot.operator is not None:
-            self._operator.restore(snapshot.operator)
+        for attendant, kept in zip(self._attendants, snapshot.attendants, strict=True):
+            attendant.restore(kept)
 
     def record(self, scenario: Scenario | None = None, *, pictured: bool = True) -> Record:
         """Record of the trace so far; of a ring, energies and losses count from its first sample on.
@@ -583,8 +606,8 @@ class Simulation:
             base_as_planned=self._base_as_planned,
             pictured=pictured,
         )
-        if self._operator is not None:
-            self._operator.add_to(record)
+        for attendant in self._attendants:
+            attendant.add_to(record)
         record.complete = self.finished
         if self._failed():
             mark_stopped(stopped(self._scenario, self._prepared), record)

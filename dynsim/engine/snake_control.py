@@ -1,4 +1,7 @@
-"""The task-space control of one run of a snake, whatever moves it: commands, modes, beliefs, and what is recorded."""
+"""A run of the snake's task-space control, kinematic or dynamic: commands, modes, estimated states, recorded rows.
+
+The control law: :mod:`dynsim.snake.controller`.
+"""
 
 from __future__ import annotations
 

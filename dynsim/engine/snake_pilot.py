@@ -1,4 +1,4 @@
-"""The task-space controller at the dynamic snake: called at its ticks, it tells servos and wheels what to do.
+"""The task-space control of the dynamic snake: at every tick, references for the servos of joints and wheels.
 
 At a tick: what sensors tell, the controller, modes and lifts, references. The servos of joints follow the integrated
 command, q_d(t) = φ + u (t − t_k), whatever the joints do ([T] IV.C); those of wheels the rates. Where the controller
@@ -186,7 +186,7 @@ class SnakePilot(SnakeControl):
     def _sensors(self, config: Sensors) -> list[SampledSensor]:
         """What tells the controller of the robot: nothing under feedforward."""
 
-        def sensor(read: Callable[[State], Array], of: Any, noise: Array, resolution: float) -> SampledSensor:
+        def sensor(read: Callable[[State], Array], of: Any, noise: Array, resolution: Array) -> SampledSensor:
             period = self.period if of is None or of.rate_hz is None else 1.0 / of.rate_hz
             delay = 0.0 if of is None else of.delay_s
             return SampledSensor(
@@ -198,12 +198,12 @@ class SnakePilot(SnakeControl):
             noise = np.zeros(6)
             if capture is not None:
                 noise[:3], noise[3:] = capture.position_noise_m, capture.attitude_noise_rad
-            return [sensor(lambda state: self.head_pose(state.q), capture, noise, 0.0)]
+            return [sensor(lambda state: self.head_pose(state.q), capture, noise, np.zeros(6))]
         if self.believed == ss.ESTIMATED:
             encoders = config.encoders
             deg = np.zeros(2) if encoders is None else np.radians([encoders.noise_deg, encoders.resolution_deg])
-            noise = np.full(len(self._joints), deg[0])
-            return [sensor(lambda state: state.q[self._joints], encoders, noise, float(deg[1]))]
+            noise, resolution = np.repeat(deg, len(self._joints)).reshape(2, -1)
+            return [sensor(lambda state: state.q[self._joints], encoders, noise, resolution)]
         return []
 
     def _tell(self, simulation: Referenced, time: float, phi: Array) -> None:
@@ -222,10 +222,10 @@ class SnakePilot(SnakeControl):
 
     def _lift(self, time: float) -> None:
         """Rates at which lifting moves the pitch joints: every tick while heights change, else now and then."""
-        now = self.tick  # of the tick that has just been commanded
-        if now < self._next_look and not self._lifter.moving(time):
+        now, moving = self.tick, self._lifter.moving(time)  # of the tick that has just been commanded
+        if now < self._next_look and not moving:
             return
-        ticks = 1 if self._lifter.moving(time) else STEADY_TICKS
+        ticks = 1 if moving else STEADY_TICKS
         span = ticks * self.period
         # Yaw angles go on at their rates until the next look.
         head, joints = self.description.head_joints, len(self.state.phi)
@@ -336,7 +336,7 @@ def _places(robot: SnakeTree, joints: tuple[str, ...]) -> Array:
 
 def base_pose(q: Array) -> Array:
     """x, y [m] of wheel pair 1 and yaw [rad] of the base part at coordinates (…, nq) of the tree, (…, 3)."""
-    w, x, y, z = np.moveaxis(q[..., 3:_ROOT_COORDINATES], -1, 0)
+    w, x, y, z = (q[..., k] for k in range(3, _ROOT_COORDINATES))
     # Of the axle, e_y of the root: it stays level where the body behind it is tilted.
     yaw = np.arctan2(-2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z))
     return np.stack([q[..., 0], q[..., 1], yaw], axis=-1)

@@ -1,4 +1,4 @@
-"""What the joints of a dynamic snake are told, and how a run begins.
+"""References of a dynamic snake's joints, and the start of a run.
 
 Gear friction keeps a head that was raised into its posture lower than one that came from above, by about 20 mm and
 0.09 rad. A real robot raises its head, so before t = 0 a run of its own does: the head starts below its posture,

@@ -31,7 +31,7 @@ GUARDS = {
 }
 
 
-# What contacts and joint stops do, by its number in the kernels.
+# What contacts, joint stops and joints with dry friction do, by its number in the kernels.
 CONTACT_EVENTS = {
     contact_events.LANDING: "landing",
     contact_events.LIFT_OFF: "lift_off",
@@ -62,13 +62,14 @@ def own_guards(prepared: Prepared) -> list[tuple[str, str]]:
 
 
 def event_name(prepared: Prepared, number: int) -> tuple[str, str] | None:
-    """Kind and subject of a logged event of a contact or a joint stop; None for the number of a guard."""
+    """Kind and subject of a logged event of a contact, a joint stop or a joint that rubs; None for that of a guard."""
     if number < ki.CONTACT_LOG:
         return None
-    first = ki.STOP_LOG if number >= ki.STOP_LOG else ki.CONTACT_LOG
+    first = max(log for log in (ki.CONTACT_LOG, ki.STOP_LOG, ki.DRY_LOG) if log <= number)
     k, kind = divmod(number - first, contact_events.LOG_KINDS)
-    subject = prepared.stops[k].joint if first == ki.STOP_LOG else prepared.contacts[k].name
-    return CONTACT_EVENTS[kind], subject
+    if first == ki.CONTACT_LOG:
+        return CONTACT_EVENTS[kind], prepared.contacts[k].name
+    return CONTACT_EVENTS[kind], (prepared.stops if first == ki.STOP_LOG else prepared.dry)[k].joint
 
 
 @dataclass(frozen=True)
@@ -124,4 +125,4 @@ class Snapshot:
     trace: tuple[tuple[Rows, ...], int]
     happened: tuple[Event, ...]
     frozen: bool
-    operator: dict[str, Any] | None = None
+    attendants: list[dict[str, Any]]

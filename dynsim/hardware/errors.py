@@ -1,4 +1,4 @@
-"""Why the hardware bridge refuses or stops: one class per cause, each with its exit code."""
+"""Why replays and other commands on hardware refuse or stop: one class per cause, each with its exit code."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Of a servo map what is not about single servos: the serial line, and when and how a run is aborted."""
+"""What a servo map says of all servos: serial line, supply, and limits at which a run is aborted.
+
+The rules that apply these limits: :mod:`dynsim.hardware.replay.rules`.
+"""
 
 from __future__ import annotations
 

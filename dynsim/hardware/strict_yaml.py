@@ -1,4 +1,4 @@
-"""YAML files of the bridge (maps, fault scripts, gates) as pydantic models; errors name file, line and key."""
+"""YAML files for hardware (servo maps, fault scripts, gates) as pydantic models; errors name file, line and key."""
 
 from __future__ import annotations
 

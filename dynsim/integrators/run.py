@@ -64,8 +64,9 @@ TICK_TABLE_SIZE = 2
 TAKE_COMMANDS, CALLER = 1, 2
 LOG_LENGTH = 1024
 GAPS_SIZE = 8
-# Entries of Run.log_event from these numbers on are of contacts and of joint stops, see contact_events.
-CONTACT_LOG, STOP_LOG = 1 << 20, 1 << 40
+# Entries of Run.log_event from these numbers on are of contacts, of joint stops, and of joints with dry friction, see
+# contact_events.
+CONTACT_LOG, STOP_LOG, DRY_LOG = 1 << 20, 1 << 40, 1 << 50
 # Run.extremes, per contact
 FORCE_MIN, FORCE_MAX, DRIFT_MAX = 0, 1, 2
 PULLING, LAST_FORCE = 3, 4  # time with a negative normal force [s]; normal force at the last accepted step [N]
@@ -111,10 +112,10 @@ class Run(NamedTuple):
 
     def outputs(self, name: str) -> np.ndarray:
         """Columns of the samples' outputs by their name; those of contacts are (T, c, OUTPUTS_PER_CONTACT)."""
-        found = self.output[: self.count[SAMPLE], block(self.columns, name)]
+        columns = self.output[: self.count[SAMPLE], block(self.columns, name)]
         if name == "contact":
-            return found.reshape(len(found), found.shape[1] // kst.OUTPUTS_PER_CONTACT, kst.OUTPUTS_PER_CONTACT)
-        return found
+            return columns.reshape(len(columns), columns.shape[1] // kst.OUTPUTS_PER_CONTACT, kst.OUTPUTS_PER_CONTACT)
+        return columns
 
 
 def new_run(

@@ -76,8 +76,8 @@ class _OwnCallees(JITCodeLibrary):
         self._ensure_finalized()
         module, inside = self._final_module, (Linkage.internal, Linkage.private)
         functions, variables = (
-            [one.name for one in ones if not one.is_declaration and one.linkage not in inside]
-            for ones in (module.functions, module.global_variables)
+            [symbol.name for symbol in symbols if not symbol.is_declaration and symbol.linkage not in inside]
+            for symbols in (module.functions, module.global_variables)
         )
         lines = [f'define void @"{name}"() {{ ret void }}' for name in functions]
         lines += [f'@"{name}" = common global i8 0' for name in variables]
@@ -91,8 +91,8 @@ class _LeanCompiler(Compiler):
 
     def define_pipelines(self) -> list[PassManager]:
         passes = PassManager("kernel")
-        for one in _PASSES:
-            passes.add_pass(one, one.__name__)
+        for step in _PASSES:
+            passes.add_pass(step, step.__name__)
         passes.finalize()
         return [passes]
 
@@ -157,18 +157,18 @@ def _remembered() -> Callable[..., Any]:
 
     Only those found among numba's own: what is compiled on demand (``max``) depends on the options of its caller.
     """
-    look_up, found = BaseFunction.get_call_type, {}
+    look_up, signatures = BaseFunction.get_call_type, {}
 
     def get_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
         if kws:
             return look_up(self, context, args, kws)
         key = self, context, *args
-        if key not in found:
+        if key not in signatures:
             signature = look_up(self, context, args, kws)
             if self._impl_keys[signature.args] is not self.typing_key:
                 return signature
-            found[key] = signature
-        return found[key]
+            signatures[key] = signature
+        return signatures[key]
 
     return get_call_type
 
@@ -185,8 +185,8 @@ def _variables(self: Any, value: Any) -> list[ir.Var]:
         return []
     return [
         variable
-        for one in value
-        for variable in ((one,) if type(one) is ir.Var else () if type(one) in _PLAIN else _variables(self, one))
+        for part in value
+        for variable in ((part,) if type(part) is ir.Var else () if type(part) in _PLAIN else _variables(self, part))
     ]
 
 

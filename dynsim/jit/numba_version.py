@@ -55,8 +55,8 @@ REPLACED = {
 def source_hash(name: str) -> str:
     """32 digits of the SHA-256 of the source of a function, or getter, of numba; empty where there is none."""
     try:
-        found = pkgutil.resolve_name(name)
-        source = inspect.getsource(getattr(found, "fget", found))
+        function = pkgutil.resolve_name(name)
+        source = inspect.getsource(getattr(function, "fget", function))
     except (ImportError, AttributeError, OSError, TypeError):
         return ""
     return hashlib.sha256(source.encode()).hexdigest()[:32]
@@ -80,5 +80,5 @@ if numba.__version__.split(".")[:2] != SUPPORTED.split(".")[:2]:
     raise _refused()
 
 if __name__ == "__main__":
-    for one in REPLACED:
-        print(f'    "{one}": "{source_hash(one)}",')
+    for name in REPLACED:
+        print(f'    "{name}": "{source_hash(name)}",')

@@ -85,13 +85,13 @@ def _cast(context: Any, builder: Any, kind: Any, to: Lanes, value: Any) -> Any:
 def lanes_of(*kinds: Any) -> int:
     """How many lanes the first of these types has that has any; tuples and arrays have those of their parts."""
     for kind in kinds:
-        found = getattr(kind, "lanes", 0)
-        if not found and isinstance(kind, types.Array):
-            found = lanes_of(kind.dtype)
-        elif not found and isinstance(kind, types.BaseTuple):
-            found = lanes_of(*kind)
-        if found:
-            return int(found)
+        lanes = getattr(kind, "lanes", 0)
+        if not lanes and isinstance(kind, types.Array):
+            lanes = lanes_of(kind.dtype)
+        elif not lanes and isinstance(kind, types.BaseTuple):
+            lanes = lanes_of(*kind)
+        if lanes:
+            return int(lanes)
     return 0
 
 

@@ -232,7 +232,7 @@ def made(context: Any, builder: Any, kind: Tables, values: Sequence[Any]) -> Any
 @lower_builtin(_TablesClass, types.VarArg(types.Any))
 def _constructed(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     kind = sig.return_type
-    values = [context.cast(builder, *one) for one in zip(args, sig.args, kind, strict=True)]
+    values = [context.cast(builder, *conversion) for conversion in zip(args, sig.args, kind, strict=True)]
     return impl_ret_borrowed(context, builder, kind, made(context, builder, kind, values))
 
 
@@ -247,7 +247,7 @@ class _Lower(Lower):  # type: ignore[misc]
     @cached_property
     def _again(self) -> set[str]:
         """Names of those."""
-        assigned = (one.target.name for block in self.blocks.values() for one in block.find_insts(numba_ir.Assign))
+        assigned = (store.target.name for block in self.blocks.values() for store in block.find_insts(numba_ir.Assign))
         return {
             name for name, times in Counter(assigned).items() if times > 1 and isinstance(self.typeof(name), Tables)
         }
@@ -308,8 +308,8 @@ def _unboxed(typ: Any, obj: Any, c: Any) -> Any:
             cleanups.append(native.cleanup)
 
     def cleanup() -> None:
-        for one in reversed(cleanups):
-            one()
+        for clean in reversed(cleanups):
+            clean()
 
     return NativeValue(block, cleanup=cleanup if cleanups else None, is_error=c.builder.load(is_error))
 

@@ -11,10 +11,12 @@ from __future__ import annotations
 import importlib
 import inspect
 import pkgutil
+import traceback
 import typing
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from types import ModuleType, UnionType
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, cast
 
@@ -23,7 +25,7 @@ from pydantic_core import PydanticKnownError, SchemaValidator, core_schema
 
 from dynsim.compile.protocols import BuildContext
 from dynsim.config.base import StrictConfig, error_at
-from dynsim.errors import ModelError, PluginError, brief
+from dynsim.errors import DynsimError, ModelError, PluginError, brief
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -151,13 +153,28 @@ def build(family: str, config: Any, context: BuildContext, expected: type[T] | U
     Raises
     ------
     ModelError
-        The member says so, or gives something else.
+        The member says so, or gives something else; the build of a plug-in fails.
     """
-    result = member(family, config.type).build(config, context)
+    module = member(family, config.type)
+    try:
+        result = module.build(config, context)
+    except (DynsimError, MemoryError):
+        raise
+    except Exception as error:
+        if is_shipped(family, config.type):
+            raise
+        text = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+        raise ModelError(f"{family} {config.type!r}: its build fails with {text}{_line(error, module)}") from error
     if not isinstance(result, expected):
         wanted = " or ".join(kind.__name__ for kind in typing.get_args(expected) or (expected,))
         raise ModelError(f"{family} {config.type!r}: its build must return a {wanted}, not {brief(result)}")
     return cast(T, result)
+
+
+def _line(error: Exception, module: ModuleType) -> str:
+    """Where in a module an exception comes from, " (file:line)"; "" when not from there."""
+    lines = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename == module.__file__]
+    return f" ({Path(lines[-1].filename).name}:{lines[-1].lineno})" if lines else ""
 
 
 def engine(plant: Any) -> str:

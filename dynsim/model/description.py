@@ -1,4 +1,6 @@
-"""Bodies, joints, surfaces and contacts as plain frozen data in SI units; drives: :mod:`dynsim.model.drives`.
+"""Bodies, joints, contacts and loads as plain frozen data in SI units.
+
+Drives: :mod:`dynsim.model.drives`, surfaces: :mod:`dynsim.model.surfaces`.
 
 A :class:`Robot` is a tree of :class:`Link`; each link is one joint and the body it carries. Frames: the body's frame B
 moves with the joint; at q = 0 it is the joint frame J, placed in the parent's body frame by ``R_PJ`` and ``p_PJ``.

@@ -43,11 +43,19 @@ class Surface(Protocol):
 
 @dataclass(frozen=True)
 class Quadric:
-    """A surface C(r) = r·Q r/2 + b·r + c = 0; C > 0 is outside, where ∇C points."""
+    """A surface C(r) = r·Q r/2 + b·r + c = 0, Q (3, 3) symmetric, b (3,); C > 0 is outside, where ∇C points."""
 
     Q: Array
     b: Array
     c: float
+
+    def __post_init__(self) -> None:
+        shapes = np.shape(self.Q), np.shape(self.b)
+        if shapes != ((3, 3), (3,)):
+            raise ModelError(f"a quadric takes Q of shape (3, 3) and b of shape (3,), not {shapes[0]} and {shapes[1]}")
+        rounding = 1e-9 * float(np.abs(self.Q).max())
+        if not np.allclose(self.Q, np.transpose(self.Q), rtol=0.0, atol=rounding, equal_nan=True):
+            raise ModelError("Q of a quadric must be symmetric; (Q + Qᵀ)/2 is the same surface")
 
     def gap(self, position: Array) -> float:
         """Signed distance [m] of a point along the normal; exact for plane, sphere and cylinder."""

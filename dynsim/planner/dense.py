@@ -125,7 +125,7 @@ def statics(task: Task, braces: tuple[Candidate, ...], times: Array, q: Array, r
         torques[row], solved = planner.torques(whole[row], rates[row], accelerations[row], tables[row])
         if solved < 1:
             return f"at t = {fine[t]:.3g} s no forces within friction cones and limits of the motors carry the motion"
-        forces[t] = planner.arrays.found[:, kb.FORCES]
+        forces[t] = planner.arrays.results[:, kb.FORCES]
     weights = planner.arrays.motors[:, kb.HEAT]
     heat = float(np.trapezoid(torques**2 @ weights, fine) / task.duration)
     moved = torques[:, list(arm.links)]

@@ -72,7 +72,8 @@ def unposed(scenario: Scenario) -> Robot:
     """The robot in the posture of its plant, before ``initial``."""
     config = scenario.config
     beside = (config.objects, config.surfaces, config.contacts) if config.objects else ()
-    return recall("plant", lambda: _loaded(scenario), config.plant, config.duration_s, config.loads, *beside)
+    known = config.plant, config.duration_s, config.loads, config.ties, *beside
+    return recall("plant", lambda: _loaded(scenario), *known)
 
 
 def _loaded(scenario: Scenario) -> Robot:
@@ -89,7 +90,8 @@ def _loaded(scenario: Scenario) -> Robot:
     for body, parts in inertias.items():
         links[body] = replace(links[body], inertia=Inertia.merged(parts))
     loaded = replace(bare, links=tuple(links)) if inertias else bare
-    return _with_objects(scenario, loaded) if scenario.config.objects else loaded
+    complete = _with_objects(scenario, loaded) if scenario.config.objects else loaded
+    return _tied(scenario, complete) if scenario.config.ties else complete
 
 
 def _with_objects(scenario: Scenario, built: Robot) -> Robot:
@@ -100,13 +102,28 @@ def _with_objects(scenario: Scenario, built: Robot) -> Robot:
         if name in taken:
             text = f"objects.{name}: the robot has a body, joint or frame of that name"
             raise ModelError(text, keys=("objects", name))
+    context = BuildContext(scenario.duration_s)
     touching = surfaces if scenario.config.contacts.law == "unilateral" else []
     return replace(
         built,
         links=(*built.links, *(link for name, body in objects.items() for link in body.links(name))),
+        motors=(*built.motors, *(motor for name, body in objects.items() for motor in body.motors(name, context))),
         q0=np.concatenate([built.initial, *(body.start() for body in objects.values())]),
         feet=(*built.feet, *(foot for name, body in objects.items() for foot in body.feet(name, touching))),
     )
+
+
+def _tied(scenario: Scenario, built: Robot) -> Robot:
+    """The robot and objects with the ties between them."""
+    ties = {name: config.tie(name) for name, config in scenario.config.ties.items()}
+    for name, tie in ties.items():
+        for key, body in (("body", tie.body), ("other", tie.other)):
+            try:
+                built.attach(body, tie.point)
+            except ModelError as error:
+                keys = ("ties", name, key)
+                raise ModelError(f"{dotted(keys)}: {error}", keys=keys) from error
+    return replace(built, ties=(*built.ties, *ties.values()))
 
 
 def _nameable(scenario: Scenario, built: Robot) -> list[Contact]:

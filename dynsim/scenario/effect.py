@@ -1,4 +1,4 @@
-"""Keys that a scenario may have and that change nothing in it: accepted, so that a run says that it ignores them."""
+"""Keys of a scenario that have no effect in it: accepted, and a run warns of them."""
 
 from __future__ import annotations
 
@@ -40,7 +40,9 @@ def without_effect(scenario: Any, motors: bool = True) -> list[str]:
 def idle_keys(config: Any) -> dict[Keys, str]:
     """Keys that change nothing, whether they are set or not, and why."""
     kinematic = engine(config.plant) == "kinematic"
-    rules = [_of_kinematics(config)] if kinematic else [_of_integrator(config), _of_contacts(config)]
+    rules = (
+        [_of_kinematics(config)] if kinematic else [_of_integrator(config), _of_contacts(config), _of_sensors(config)]
+    )
     return dict(pair for rule in (*rules, _of_controller(config), _of_time(config)) for pair in rule)
 
 
@@ -63,7 +65,8 @@ def _of_kinematics(config: Any) -> Iterator[tuple[Keys, str]]:
         part = getattr(config, section)
         for key in () if part is None else type(part).model_fields:
             yield (section, key), f"plant {config.plant.type} is kinematic"
-    yield ("sensors",), f"plant {config.plant.type} is kinematic"
+    for section in ("loads", "objects", "ties", "sensors"):
+        yield (section,), f"plant {config.plant.type} is kinematic"
     if hasattr(config.plant, "dynamics"):
         yield ("plant", "dynamics"), "plant.level is kinematic"
 
@@ -101,6 +104,17 @@ def _of_controller(config: Any) -> Iterator[tuple[Keys, str]]:
     moves = any(getattr(controller, key) for key in MOVING) or controller.feed_forward != "none"
     if not moves:
         yield ("controller", "knot_spacing_s"), "no reference moves"
+
+
+def _of_sensors(config: Any) -> Iterator[tuple[Keys, str]]:
+    """A snake's controller reads one sensor at most."""
+    state = getattr(config.controller, "state", None)
+    if config.sensors is None or state is None:
+        return
+    read = {"estimated": "encoders", "measured": "motion_capture"}.get(state)
+    for sensor in ("encoders", "motion_capture"):
+        if sensor != read:
+            yield ("sensors", sensor), f"controller.state is {state}"
 
 
 def _of_time(config: Any) -> Iterator[tuple[Keys, str]]:

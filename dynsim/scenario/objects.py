@@ -4,8 +4,8 @@
       box: {mass_kg: 0.3, size_m: [0.06, 0.06, 0.06], position_m: [0.4, 0.0, 0.03]}
       valve: {mass_kg: 1.0, shape: sphere, radius_m: 0.1, position_m: [0.5, 0, 0.4], hinge: {friction_N_m: 0.5}}
 
-A free one can touch all surfaces, with its corners or as a sphere; one on a hinge turns about its centre and touches
-nothing. Bodies do not touch each other.
+A free one can touch all surfaces, with its corners or as a sphere, and roll on wheels; one on a hinge turns about its
+centre and touches nothing. Bodies do not touch each other.
 """
 
 from __future__ import annotations
@@ -17,8 +17,12 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
+from dynsim.compile.protocols import BuildContext
+from dynsim.compile.scene import WHEEL_WIDTH, turn_from_z
 from dynsim.config.base import NonNegative, Positive, StrictConfig, Vector3, error_at, unit_vector
+from dynsim.library.families import build, union
 from dynsim.model.description import Array, Foot, Inertia, Link
+from dynsim.model.drives import Drive
 from dynsim.model.joints.ball import floating
 from dynsim.record.scene import Shape, quaternion
 
@@ -43,6 +47,41 @@ class Hinge(StrictConfig):
         return self
 
 
+class Wheel(StrictConfig):
+    """A body that turns on an object and rolls on surfaces: a sphere where it touches, with the inertia of a disc."""
+
+    position_m: Vector3 = Field(description="of its centre, in the object's axes from its centre")
+    axis: Vector3 = Field([0.0, 1.0, 0.0], description="in the object's axes")
+    radius_m: Positive
+    mass_kg: Positive
+    friction_N_m: NonNegative = Field(0.0, description="of its bearing, that holds it at rest; unilateral law")
+    damping_N_m_s_per_rad: NonNegative = 0.0
+    motor: union("motor") | None = Field(None, description="default: it turns freely")  # type: ignore[valid-type]
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        unit_vector(self.axis, "axis")
+        return self
+
+    def link(self, name: str, carrier: str) -> Link:
+        """Its body and joint, on the object's body; the disc has I = m r²/2 about its axis, half of that across."""
+        axis, across = unit_vector(self.axis, "axis"), 0.25 * self.mass_kg * self.radius_m**2
+        inertia = Inertia(self.mass_kg, np.zeros(3), across * (np.eye(3) + np.outer(axis, axis)))
+        width = (self.radius_m, WHEEL_WIDTH * self.radius_m)
+        return Link(
+            name,
+            name,
+            carrier,
+            "revolute",
+            axis,
+            inertia,
+            p_PJ=np.array(self.position_m),
+            damping=self.damping_N_m_s_per_rad,
+            friction=self.friction_N_m,
+            shapes=(Shape("cylinder", width, orientation=turn_from_z(axis)),),
+        )
+
+
 class SceneObject(StrictConfig):
     """A solid box or sphere."""
 
@@ -53,9 +92,12 @@ class SceneObject(StrictConfig):
     position_m: Vector3 = Field(description="of its centre at the start, in the world")
     rpy_deg: Vector3 = Field([0.0, 0.0, 0.0], description="attitude at the start, Rz(yaw) Ry(pitch) Rx(roll)")
     hinge: Hinge | None = Field(None, description="default: it is free")
+    wheels: dict[str, Wheel] = Field({}, description="wheels of a free one, by name")
 
     @model_validator(mode="after")
     def _check_size(self) -> Self:
+        if self.hinge is not None and self.wheels:
+            raise error_at("wheels", "are of free objects, this one is on a hinge; remove one of the two")
         needed, other = ("size_m", "radius_m") if self.shape == "box" else ("radius_m", "size_m")
         if getattr(self, needed) is None:
             raise error_at(needed, f"is needed for a {self.shape}")
@@ -89,7 +131,7 @@ class SceneObject(StrictConfig):
         """Its tree; joint and body have the name of the object."""
         link = Link(name, name, None, "revolute", np.array([0.0, 0.0, 1.0]), self.inertia, shapes=(self.solid,))
         if self.hinge is None:
-            return floating(link)
+            return (*floating(link), *(wheel.link(f"{name}.{own}", name) for own, wheel in self.wheels.items()))
         hinge = self.hinge
         lower, upper = np.deg2rad(hinge.limits_deg).tolist() if hinge.limits_deg else (-math.inf, math.inf)
         return (
@@ -109,7 +151,12 @@ class SceneObject(StrictConfig):
         """Its coordinates at the start."""
         if self.hinge is not None:
             return [0.0]
-        return [*self.position_m, *quaternion(self._turn)]
+        return [*self.position_m, *quaternion(self._turn), *(0.0 for _ in self.wheels)]
+
+    def motors(self, name: str, context: BuildContext) -> list[Drive]:
+        """Those of its wheels."""
+        joints = {f"{name}.{own}": wheel.motor for own, wheel in self.wheels.items() if wheel.motor is not None}
+        return [build("motor", motor, context.at_joint(joint), Drive) for joint, motor in joints.items()]
 
     def feet(self, name: str, surfaces: list[str]) -> list[Foot]:
         """With what it can touch each of these surfaces."""
@@ -121,8 +168,13 @@ class SceneObject(StrictConfig):
             signs = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
             points, radius = signs * self.size_m, 0.0
         several = len(points) > 1
-        return [
+        feet = [
             Foot(f"{name}{k + 1 if several else ''}.{surface}", name, point, radius, surface)
             for surface in surfaces
             for k, point in enumerate(points)
+        ]
+        return feet + [
+            Foot(f"{name}.{own}.{surface}", f"{name}.{own}", np.zeros(3), wheel.radius_m, surface)
+            for own, wheel in self.wheels.items()
+            for surface in surfaces
         ]

@@ -17,6 +17,7 @@ from dynsim.scenario.effect import idle_keys, is_set
 from dynsim.scenario.loads import LoadConfig
 from dynsim.scenario.objects import SceneObject
 from dynsim.scenario.sensors import Sensors
+from dynsim.scenario.ties import TieChoice
 
 # Bytes of the name of a folder on common file systems.
 NAME_LIMIT = 255
@@ -276,6 +277,7 @@ class ScenarioConfig(StrictConfig):
     initial: Initial | None = Field(default=None, description="posture and currents of the start")
     loads: dict[str, LoadConfig] = Field(default={}, description="forces, torques and payloads by name")
     objects: dict[str, SceneObject] = Field(default={}, description="bodies beside the robot, by name")
+    ties: dict[str, TieChoice] = Field(default={}, description="springs and dampers between two bodies, by name")
     sensors: Sensors | None = Field(default=None, description="what a sampled controller is told of the robot")
     integrator: Integrator = Integrator()
     record: RecordOptions = RecordOptions()
@@ -309,7 +311,12 @@ class ScenarioConfig(StrictConfig):
 
     @model_validator(mode="after")
     def _check_stiffness(self) -> Self:
-        """The event-driven methods know rigid contacts only."""
+        """The event-driven methods know rigid contacts only, and no ties."""
+        for name in self.ties:
+            if self.integrator.method != "time_stepping":
+                raise error_at(
+                    f"ties.{name}", f"needs integrator.method: time_stepping; {self.integrator.method} has no ties"
+                )
         configs: dict[str, Contacts | ContactPoint] = {"contacts": self.contacts}
         configs |= {f"contacts.points.{name}": point for name, point in self.contacts.points.items()}
         for where, config in configs.items():
@@ -425,7 +432,7 @@ class Scenario:
         Defaults that change nothing are left out.
         """
         resolved = self.config.model_dump(mode="json", exclude_none=True)
-        for section in ("loads", "objects"):
+        for section in ("loads", "objects", "ties"):
             if not getattr(self.config, section):
                 del resolved[section]
         contacts = self.config.contacts

@@ -20,12 +20,14 @@ class Sensor(StrictConfig):
 
 
 class Encoders(Sensor):
-    """Angles of joints."""
+    """Positions of joints; their rates are differences of samples."""
 
     resolution_deg: NonNegative = Field(
         MX_RESOLUTION, description="angles are rounded to it; default: 4096 positions in a turn, as MX servos have"
     )
     noise_deg: NonNegative = Field(0.0, description="standard deviation, before rounding")
+    resolution_m: NonNegative = Field(0.0, description="the same of prismatic joints")
+    noise_m: NonNegative = Field(0.0, description="the same of prismatic joints")
 
 
 class MotionCapture(Sensor):

@@ -24,6 +24,7 @@ pair stays above the floor by :attr:`Fold.tilt`, whatever the pitch angles.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,7 +35,10 @@ from dynsim.record import Record
 from dynsim.snake.geometry import wheels_of
 
 Array = NDArray[np.float64]
+Coefficients = tuple[float, float, float]
 NEWTON_STEPS = 12
+FLAT = 1e-12
+"""A height that changes by less with a pitch angle cannot be reached by it [m]."""
 CONVERGED = 1e-9
 """Last Newton step of a pitch angle [rad]; a wheel is then at its height to 2e-10 m."""
 
@@ -100,61 +104,47 @@ class BasePart:
         ArithmeticError
             No angle brings a pair to its height; the arguments are the instant's index and the pair's.
         """
-        count = len(yaw)
         hinge, lower, tilt = np.zeros_like(yaw), np.zeros_like(height), np.zeros_like(height)
-        up = np.tile([0.0, 0.0, 1.0], (count, 1))  # e_z in the frame of the plate
-        z = np.full(count, self.radius)
-        for j in range(len(self.pairs) - 1):
-            cos, sin, zero = np.cos(yaw[:, j]), np.sin(yaw[:, j]), np.zeros(count)
-            reach = np.column_stack([-self.before[j] - self.behind[j] * cos, -self.behind[j] * sin, zero])
-            axle = np.column_stack([-sin, cos, zero])
-            rise, slope, half = _turned(up, reach), _turned(up, axle), self.half_track[j + 1]
-            needed = self._angle(z - height[:, j + 1], rise, slope, np.array([[half], [-half]]))
-            hinge[:, j] = psi = needed.max(axis=0)
-            if not np.isfinite(psi).all():
-                raise ArithmeticError(int(np.flatnonzero(~np.isfinite(psi))[0]), j + 1)
-            z = z + _at(rise, psi)
-            incline = _at(slope, psi)
-            tilt[:, j + 1] = 2.0 * half * np.abs(incline)
-            lower[:, j + 1] = z - 0.5 * tilt[:, j + 1] - self.radius * np.sqrt(1.0 - incline**2)
-            c, s = np.cos(psi), np.sin(psi)
-            x, y, up_z = c * up[:, 0] - s * up[:, 2], up[:, 1], s * up[:, 0] + c * up[:, 2]  # Ry(psi)^T up
-            up = np.column_stack([cos * x + sin * y, cos * y - sin * x, up_z])  # Rz(theta)^T
+        before, behind, half_track = self.before.tolist(), self.behind.tolist(), self.half_track.tolist()
+        for row in range(len(yaw)):
+            ux, uy, uz = 0.0, 0.0, 1.0  # e_z in the frame of the plate
+            z = self.radius
+            for j, (angle, above) in enumerate(zip(yaw[row].tolist(), height[row, 1:].tolist(), strict=True)):
+                cos, sin, half = math.cos(angle), math.sin(angle), half_track[j + 1]
+                x, y = -before[j] - behind[j] * cos, -behind[j] * sin
+                # Coefficients of 1, cos psi, sin psi in up . Ry(psi) vector: the way to the next axle, and that axle.
+                rise, slope = (uy * y, ux * x, -uz * x), (uy * cos, -ux * sin, uz * sin)
+                needed = [self._angle(z - above, rise, slope, lever) for lever in (half, -half)]
+                if any(map(math.isnan, needed)):
+                    raise ArithmeticError(row, j + 1)
+                psi = max(needed)
+                c, s = math.cos(psi), math.sin(psi)
+                z += rise[0] + rise[1] * c + rise[2] * s
+                incline = slope[0] + slope[1] * c + slope[2] * s
+                hinge[row, j], tilt[row, j + 1] = psi, 2.0 * half * abs(incline)
+                lower[row, j + 1] = z - half * abs(incline) - self.radius * math.sqrt(1.0 - incline**2)
+                x, uz = c * ux - s * uz, s * ux + c * uz  # Ry(psi)^T up, then Rz(theta)^T of it
+                ux, uy = cos * x + sin * uy, cos * uy - sin * x
         return Fold(hinge, lower, tilt)
 
-    def _angle(self, above: Array, rise: tuple[Array, ...], slope: tuple[Array, ...], lever: Array) -> Array:
-        """psi where above + rise + lever slope - r sqrt(1 - slope^2) = 0, by Newton's method; NaN where it is lost.
-
-        For several levers, shape (M, 1): shape (M, T).
-        """
-        psi = np.zeros((len(lever), len(above)))
-        with np.errstate(all="ignore"):
-            for _ in range(NEWTON_STEPS):
-                incline, rate = _at(slope, psi), _rate(slope, psi)
-                disc = np.sqrt(1.0 - incline**2)
-                value = above + _at(rise, psi) + lever * incline - self.radius * disc
-                step = value / (_rate(rise, psi) + lever * rate + self.radius * incline * rate / disc)
-                psi = psi - step
-                # The next one would be of its square.
-                if (np.abs(step) < CONVERGED).all():
-                    break
-        return np.where(np.abs(step) < CONVERGED, psi, np.nan)
-
-
-def _turned(up: Array, vector: Array) -> tuple[Array, ...]:
-    """Coefficients of 1, cos psi and sin psi in up . Ry(psi) vector."""
-    (ux, uy, uz), (x, y, z) = up.T, vector.T
-    return uy * y, ux * x + uz * z, ux * z - uz * x
-
-
-def _at(coefficients: tuple[Array, ...], psi: Array) -> Array:
-    constant, cosine, sine = coefficients
-    return constant + cosine * np.cos(psi) + sine * np.sin(psi)
-
-
-def _rate(coefficients: tuple[Array, ...], psi: Array) -> Array:
-    _, cosine, sine = coefficients
-    return sine * np.cos(psi) - cosine * np.sin(psi)
+    def _angle(self, above: float, rise: Coefficients, slope: Coefficients, lever: float) -> float:
+        """psi where above + rise + lever slope - r sqrt(1 - slope^2) = 0, by Newton's method; NaN where it is lost."""
+        psi = 0.0
+        for _ in range(NEWTON_STEPS):
+            c, s = math.cos(psi), math.sin(psi)
+            incline, rate = slope[0] + slope[1] * c + slope[2] * s, slope[2] * c - slope[1] * s
+            if not abs(incline) < 1.0:
+                break
+            disc = math.sqrt(1.0 - incline**2)
+            change = rise[2] * c - rise[1] * s + lever * rate + self.radius * incline * rate / disc
+            if not abs(change) > FLAT:
+                break
+            step = (above + rise[0] + rise[1] * c + rise[2] * s + lever * incline - self.radius * disc) / change
+            psi -= step
+            # The next one would be of its square.
+            if abs(step) < CONVERGED:
+                return psi
+        return math.nan
 
 
 def base_part(record: Record, pairs: tuple[str, ...]) -> BasePart:

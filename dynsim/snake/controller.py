@@ -1,4 +1,4 @@
-"""Task-space controller with weighted redundancy resolution ([T] eqs 9-17).
+"""The snake's task-space control law, compiled: weighted redundancy resolution ([T] eqs 9-17).
 
 With M = B~ W^(-1/2) and its factorisation M = L Q^T (Householder reflections of the rows, one row at a time), the
 weighted pseudo inverse is B~^(W+) v = W^(-1/2) Q L^-1 v, and I - Q Q^T projects on the null space. Rows can be added

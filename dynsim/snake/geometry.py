@@ -71,4 +71,4 @@ def wheels_of(scene: Scene, pair: str) -> list[Wheel]:
     index = {body.name: k for k, body in enumerate(scene.bodies)}[pair]
     places = [(shape.position, shape) for shape in scene.bodies[index].shapes]
     places += [(body.joint.position, body.shapes[0]) for body in scene.bodies if body.parent == index and body.shapes]
-    return [Wheel(place[0], abs(place[1]), shape.size[0]) for place, shape in places if place[1] != 0.0]
+    return [Wheel(position[0], abs(position[1]), shape.size[0]) for position, shape in places if position[1] != 0.0]

@@ -75,10 +75,10 @@ def lifted(record: Record, lifts: Lifts) -> Fold:
         return Fold(np.zeros_like(height[:, 1:]), height, np.zeros_like(height))
     refuse_long_steps(lifts, float(np.diff(time).max()))
     part = base_part(record, pairs)
-    return folded(part, part.yaw_angles(record), height, lifts, time)
+    return fold_to_heights(part, part.yaw_angles(record), height, lifts, time)
 
 
-def folded(part: BasePart, yaw: Array, height: Array, lifts: Lifts, time: Array) -> Fold:
+def fold_to_heights(part: BasePart, yaw: Array, height: Array, lifts: Lifts, time: Array) -> Fold:
     """The base part with its pairs at heights above the floor.
 
     Parameters

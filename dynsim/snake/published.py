@@ -251,8 +251,8 @@ JOINT_LIMITS: tuple[Statement, ...] = (
     Statement("V.E, Fig 15", "smallest support margin [mm]", "hardly falls", "cyclic",
               lambda r: f"{1e3 * r['support_margin'].min():.1f}"),
     *(
-        Statement("V.E, Fig 16", f"{what}, end", published, variant, take)
-        for what, reference, published_20, take in (
+        Statement("V.E, Fig 16", f"{quantity}, end", published, variant, take)
+        for quantity, reference, published_20, take in (
             ("rms |theta| of the base part [rad]", "straight (Fig 8)", "not straight", _rms_base_angle),
             ("area of the support polygon [m^2]", "(Fig 8)", "greater than in Fig 8",
              _summary("support_area_final_m2", ".4f")),
@@ -264,8 +264,8 @@ JOINT_LIMITS: tuple[Statement, ...] = (
 
 # [T] V.D.3, Fig 14.
 DOOR: tuple[Statement, ...] = tuple(
-    Statement("V.D.3, Fig 14", what, published, variant, take)
-    for what, take, texts in (
+    Statement("V.D.3, Fig 14", quantity, published, variant, take)
+    for quantity, take, texts in (
         ("opened to [deg]", lambda r: f"{abs(np.rad2deg(r['w'][-1, 5] - r['w'][0, 5])):.2f}",
          ("(d), (f): the robot could not move backward", "(e), (g): able to resume moving backward", "")),
         ("largest yaw angle in parts of its limit", lambda r: f"{used_limit(r).max():.4f}",
@@ -310,24 +310,24 @@ def policies(records: Mapping[str, Record]) -> Table:
         ("modes", lambda r: " ".join(str(m) for _, m in mode_sequence(r))),
         ("wall time [s]", _summary("integration_wall_s", ".3f")),
     )
-    return [["", *shown], *([what, *(take(record) for record in shown.values())] for what, take in lines)]
+    return [["", *shown], *([quantity, *(take(record) for record in shown.values())] for quantity, take in lines)]
 
 
 def tables(scenario: str, records: Mapping[str, Record]) -> dict[str, Table]:
     """Tables beside [T] for the variants of a shipped scenario, by file name; empty where [T] has nothing to say."""
     if scenario == "snake_positioning":
-        found = {"table_iii": table_iii(records)}
+        results = {"table_iii": table_iii(records)}
     elif scenario == "snake_positioning_dynamic":
-        found = {
+        results = {
             "table_iii": table_iii_dynamic(records),
             "wheels": wheel_table(records),
             "energy": energy_table(records),
         }
     elif scenario == "snake_joint_limits":
-        found = {"joint_limits": statements(JOINT_LIMITS, records), "policies": policies(records)}
+        results = {"joint_limits": statements(JOINT_LIMITS, records), "policies": policies(records)}
     elif scenario == "snake_door_arc":
-        found = {"door": statements(DOOR, records)}
+        results = {"door": statements(DOOR, records)}
     else:
-        found = {}
+        results = {}
     # a head line alone: none of its variants was run
-    return {name: rows for name, rows in found.items() if len(rows) > 1 and len(rows[0]) > 1}
+    return {name: rows for name, rows in results.items() if len(rows) > 1 and len(rows[0]) > 1}

@@ -55,13 +55,13 @@ def obstacle(law, work, joints):
     """Why ``work.u`` cannot be carried out: SINGULAR, JOINT_LIMIT, RATE_LIMIT or NO_OBSTACLE."""
     if work.withheld[0] > WITHHELD:
         return ss.SINGULAR
-    found = ss.NO_OBSTACLE
+    reason = ss.NO_OBSTACLE
     for j in range(joints):
         if work.at_limit[j] == 2:
             return ss.JOINT_LIMIT
         if abs(work.u[j]) > law.rate_limit:
-            found = ss.RATE_LIMIT
-    return found
+            reason = ss.RATE_LIMIT
+    return reason
 
 
 @internal_kernel
@@ -83,14 +83,14 @@ def slow_down(model, law, u, phi):
 
 
 @internal_kernel
-def is_too_fast(model, law, work, found, phi):
+def is_too_fast(model, law, work, reason, phi):
     """A slower target would pass: joints are too fast, and what comes too fast to a limit is not at it yet."""
     for j in range(phi.shape[0]):
         if work.at_limit[j] == 2:
             left = model.upper[j] - phi[j] if work.u[j] > 0.0 else phi[j] - model.lower[j]
             if left < AT_LIMIT and abs(work.u[j]) <= law.rate_limit:
                 return False
-    return found in (ss.RATE_LIMIT, ss.JOINT_LIMIT)
+    return reason in (ss.RATE_LIMIT, ss.JOINT_LIMIT)
 
 
 @internal_kernel
@@ -108,7 +108,7 @@ def fitting_part(model, law, work, phi):
 
 
 @internal_kernel
-def commanded_rate(velocity, place, done, speed, rate):
+def commanded_rate(velocity, row, done, speed, rate):
     """Mean rate of the target in a period in which ``speed`` rows of the commands are carried out, 0 to 1.
 
     The first ``done`` of row ``place`` is carried out already; after the last row the rate is zero. The path is that of
@@ -118,9 +118,9 @@ def commanded_rate(velocity, place, done, speed, rate):
     first = min(speed, 1.0 - done)
     second = speed - first
     for i in range(6):
-        rate[i] = first * velocity[place, i] if place < rows else 0.0
-        if second > 0.0 and place + 1 < rows:
-            rate[i] += second * velocity[place + 1, i]
+        rate[i] = first * velocity[row, i] if row < rows else 0.0
+        if second > 0.0 and row + 1 < rows:
+            rate[i] += second * velocity[row + 1, i]
 
 
 @internal_kernel
@@ -161,12 +161,12 @@ def command(model, law, schedule, state, velocity, moving, slows, rig):
     allocate = law.limit_policy == sc.LIMITS_ALLOCATE
     believe(model, schedule, state, rig)
     reason, waits, reductions, slowed = ss.NO_OBSTACLE, False, 0, False
-    place, done, speed, tries = state.counts[ss.PLACE], state.progress[ss.DONE], 1.0, 0
+    row, done, speed, tries = state.counts[ss.PLACE], state.progress[ss.DONE], 1.0, 0
     commanded = False
     for i in range(6):
         rate[i] = 0.0
     if moving:
-        commanded_rate(velocity, place, done, speed, rate)
+        commanded_rate(velocity, row, done, speed, rate)
     for i in range(6):
         commanded = commanded or rate[i] != 0.0
     beta = wrap_angle(w_target[4])
@@ -188,24 +188,24 @@ def command(model, law, schedule, state, velocity, moving, slows, rig):
             control_input(model, law, work, pose, joints_ahead, target, rate, mode, null_gain)
         if not allocate:
             break
-        found = obstacle(law, work, joints)
-        if found == ss.NO_OBSTACLE:
+        hindrance = obstacle(law, work, joints)
+        if hindrance == ss.NO_OBSTACLE:
             break
         fastest = 0.0
         for j in range(joints):
             fastest = max(fastest, abs(u[j]))
-        if found == ss.RATE_LIMIT and reductions < NULL_REDUCTIONS and null_gain != 0.0:
+        if hindrance == ss.RATE_LIMIT and reductions < NULL_REDUCTIONS and null_gain != 0.0:
             reductions += 1
             null_gain *= 0.0 if reductions == NULL_REDUCTIONS else 0.9 * law.rate_limit / fastest
-        elif slows and commanded and tries < SLOW_DOWNS and not waits and is_too_fast(model, law, work, found, phi):
+        elif slows and commanded and tries < SLOW_DOWNS and not waits and is_too_fast(model, law, work, hindrance, phi):
             tries += 1
             speed *= fitting_part(model, law, work, phi)
             if speed < LEAST_SPEED:
                 tries = SLOW_DOWNS
             else:
-                commanded_rate(velocity, place, done, speed, rate)
+                commanded_rate(velocity, row, done, speed, rate)
         elif not waits:
-            reason, waits, null_gain, reductions = found, True, full_gain, 0
+            reason, waits, null_gain, reductions = hindrance, True, full_gain, 0
             for i in range(6):
                 rate[i] = 0.0
         elif null_gain != 0.0:

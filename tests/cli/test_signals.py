@@ -15,7 +15,7 @@ import pytest
 
 from dynsim.record import Record
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.usefixtures("hang_ups")]
 
 # Nothing here takes this long; a test that waits for it fails.
 DEADLINE_S = 240.0

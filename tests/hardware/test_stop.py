@@ -110,6 +110,7 @@ BROKEN = {"SIGSEGV", "SIGBUS", "SIGILL", "SIGFPE", "SIGABRT", "SIGTRAP", "SIGSYS
     [one for one in signal.Signals if one.name not in {"SIGINT", "SIGRTMIN", "SIGRTMAX"} | UNHEEDED | BROKEN],
     ids=lambda number: number.name,
 )
+@pytest.mark.usefixtures("hang_ups")
 def test_other_signals_stop_like_ctrl_c(rig, number: int) -> None:
     run = interrupted(rig, ReplayState.REPLAY, [number], after=30)
     assert run.result.fault.cause == Cause.INTERRUPTED

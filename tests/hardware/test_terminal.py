@@ -21,7 +21,7 @@ from dynsim.record import Record
 
 from .test_pseudo_terminal import Servos, command, virtual_servos
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.usefixtures("hang_ups")]
 
 
 @pytest.fixture

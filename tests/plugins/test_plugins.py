@@ -220,6 +220,16 @@ def test_a_part_that_does_not_work_is_named_with_its_distribution_and_harms_nobo
     assert (run.returncode, run.stderr) == (0, "")
 
 
+def test_a_build_that_fails_is_named_with_its_line(tmp_path: Path) -> None:
+    (tmp_path / "fails.py").write_text(GOOD.replace("NAME", "fails").replace('return "nothing"', "return 1 / 0"))
+    (tmp_path / "fails.yaml").write_text("duration_s: 1\nplant: {type: fails}\n", encoding="utf-8")
+    distribution(tmp_path, "broken-parts", {"dynsim.plants": {"fails": "fails"}})
+    answer = dynsim(tmp_path, "check", "fails.yaml")
+    expected = "plant 'fails': its build fails with ZeroDivisionError: division by zero (fails.py:7)"
+    assert answer.returncode == 2
+    assert answer.stderr == f"error: fails.yaml: {expected}\n"
+
+
 def test_a_scenario_of_the_packages_own_members_looks_for_no_others(tmp_path: Path) -> None:
     code = (
         "import importlib.metadata as metadata\n"

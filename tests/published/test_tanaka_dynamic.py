@@ -7,6 +7,7 @@ import csv
 
 import numpy as np
 import pytest
+from support.snake_steps import end_values, fall_errors
 
 from dynsim.draw.figures.snake import draw_comparison
 from dynsim.engine import simulate
@@ -45,6 +46,21 @@ def test_what_is_moved_moves(found):
             assert found[moved][k] == pytest.approx(published.target[k], rel=0.1)
 
 
+def test_end_values_hardly_depend_on_the_step(found):
+    """The run that they do most of all, see results/snake/steps.json (``tests/support/snake_steps.py``)."""
+    values = np.array([end_values("alpha", 1.0), found["alpha"], end_values("alpha", 5.0)])
+    spread = np.ptp(values, axis=0)
+    assert spread[:3].max() < 5e-4
+    assert spread[3:].max() < 1.5e-3
+
+
+def test_a_falling_head_is_stepped_in_second_order_and_with_theta_1_in_first():
+    """While nothing comes to rest; half the step."""
+    for theta, least, most in ((0.5, 3.5, 5.0), (1.0, 1.9, 2.6)):
+        coarse, _, fine = fall_errors(theta)
+        assert least < np.sqrt(coarse / fine) < most  # of two halvings
+
+
 def test_the_table_has_paper_and_all_three_ways(simulated, tmp_path):
     records = {name: simulated(SCENARIO, name) for name in ("x", "x_kinematic")}
     draw_comparison(records, tmp_path)
@@ -60,9 +76,14 @@ def test_the_table_has_paper_and_all_three_ways(simulated, tmp_path):
     assert table_iii_dynamic({}) == [list(rows[0])]
 
 
-def test_mode_switching_shakes_the_head():
+@pytest.fixture(scope="module")
+def switched():
+    return simulate(load_scenario("snake_joint_limits", "cyclic", {"plant.level": "dynamic", "duration_s": 12.0}))
+
+
+def test_mode_switching_shakes_the_head(switched):
     """[T] V.B, Figs 9, 10: "position error and attitude error were about 30 mm and 0.1 rad"."""
-    record = simulate(load_scenario("snake_joint_limits", "cyclic", {"plant.level": "dynamic", "duration_s": 12.0}))
+    record = switched
     switching = record.time >= 2.0
     off = record["w"][switching] - record["w"][switching][0]
     position, attitude = np.linalg.norm(off[:, :3], axis=1).max(), np.linalg.norm(off[:, 3:], axis=1).max()
@@ -71,3 +92,15 @@ def test_mode_switching_shakes_the_head():
     assert record.summary["mode_switches"] == 10
     told = record["phi_command"][:, 6:]
     assert np.abs(told[-1]).max() < 0.7 * np.abs(told[0]).max()  # the base straightens, as in Fig 10
+
+
+def test_lifted_wheels_carry_nothing_once_they_are_lifted(switched):
+    """In all modes of Table II; what goes down takes 0.25 s, what rises after it as long."""
+    mode, time = switched["mode"], switched.time
+    begun = np.maximum.accumulate(np.where(np.diff(mode, prepend=mode[0]) != 0.0, time, 0.0))
+    settled = time - begun > 0.6
+    assert set(mode[settled]) == {1, 2, 3, 4, 5, 6}
+    lifted = (switched["grounded"] == 0.0) & settled[:, None]
+    load, gap = (switched[name][:, :14].reshape(-1, 7, 2) for name in ("contact_normal_force", "contact_gap"))
+    assert load[lifted].max() == 0.0
+    assert gap[lifted].min() > 2e-3

@@ -18,10 +18,10 @@ from dynsim.record import FORMAT
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "dynsim"
 PAGES = ("architecture.md", "extending.md")
-# What the reader of an example makes.
 # How texts are made plain, known to Python by that name.
 NO_MODULES = {"dynsim.plain"}
-MADE = {"dynsim/surfaces/ellipsoid.py", "dynsim/model/joints/screw.py"}
+# What the reader of an example makes.
+MADE = {"dynsim/library/surfaces/ellipsoid.py", "dynsim/model/joints/screw.py"}
 
 
 def page(name: str) -> str:

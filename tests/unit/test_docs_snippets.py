@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from dynsim import Record, load_scenario, simulate
+from dynsim.draw.figures import arm, draw
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -73,3 +74,16 @@ def test_a_measured_record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     record = Record.load("measured.h5")
     assert record["hand_position"].shape == (401, 3)
     assert record.labels["winding"] == ("joint_9",)
+
+
+def test_a_figure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(arm, "FIGURES", dict(arm.FIGURES))
+    folder = tmp_path / "results" / "elbow_comparison" / "two_elbows"
+    folder.mkdir(parents=True)
+    record = simulate(load_scenario("elbow_comparison", "two_elbows", {"duration_s": 0.1}))
+    record.save(folder / "record.h5")
+    script("extending.md", "A figure")
+    assert (tmp_path / "power.pdf").stat().st_size > 0
+    # With the figures of dynsim, for every run.
+    assert tmp_path / "power.png" in draw(record, tmp_path)

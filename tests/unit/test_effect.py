@@ -39,6 +39,12 @@ PUSH = {"type": "samples", "body": "link_4", "times_s": [3, 4], "force_N": [[1, 
             "controller.knot_spacing_s",
             "no reference moves",
         ),
+        (
+            "snake_positioning",
+            {"plant.level": "dynamic", "sensors.encoders.delay_s": 0.01},
+            "sensors.encoders",
+            "controller.state is feedforward",
+        ),
         ("snake_circle", {"integrator.rtol": 1e-8}, "integrator.rtol", "plant snake is kinematic"),
     ],
 )

@@ -29,11 +29,13 @@ def scene(objects, duration=0.5, **changes):
     return Scenario("scene", "", ScenarioConfig.model_validate(config | changes))
 
 
+# A point with a radius, far above the floor: beside bodies with corners it makes the scene one of the snake's program.
+WITH_A_TIP = {"law": "unilateral", "friction": 0.3, "points": {"tip": {"body": "link_1", "radius_m": 0.01}}}
 BOX = {"mass_kg": 0.3, "size_m": [0.06, 0.08, 0.1], "position_m": [1.0, 0.0, -0.95]}
 
 
 def test_a_box_at_rest_presses_with_its_weight_and_stays():
-    record = dynsim.simulate(scene({"box": BOX}))
+    record = dynsim.simulate(scene({"box": BOX}, contacts=WITH_A_TIP))
     assert record["contact_normal_force"][-1].sum() == pytest.approx(0.3 * G, rel=1e-9)
     columns = [record.labels["q"].index(f"box.{axis}") for axis in "xyz"]
     np.testing.assert_allclose(record["q"][-1, columns], BOX["position_m"], atol=1e-9)
@@ -42,9 +44,8 @@ def test_a_box_at_rest_presses_with_its_weight_and_stays():
 def test_a_box_that_is_pulled_slides_as_a_block_does():
     """a = F/m − μ g, from rest."""
     pull = {"type": "constant", "body": "box", "force_N": [1.5, 0.0, 0.0]}
-    record = dynsim.simulate(
-        scene({"box": BOX | {"size_m": [0.2, 0.2, 0.02], "position_m": [1, 0, -0.99]}}, loads={"pull": pull})
-    )
+    box = BOX | {"size_m": [0.2, 0.2, 0.02], "position_m": [1, 0, -0.99]}
+    record = dynsim.simulate(scene({"box": box}, loads={"pull": pull}, contacts=WITH_A_TIP))
     way = record["q"][-1, record.labels["q"].index("box.x")] - 1.0
     assert way == pytest.approx(0.5 * (1.5 / 0.3 - 0.3 * G) * 0.5**2, rel=2e-3)
 

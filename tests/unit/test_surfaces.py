@@ -30,6 +30,19 @@ plant:
 """
 
 
+@pytest.mark.parametrize(
+    ("Q", "b", "words"),
+    [
+        (np.eye(2), np.zeros(3), r"Q of shape \(3, 3\).*not \(2, 2\) and \(3,\)"),
+        (np.eye(3), np.zeros((3, 1)), r"not \(3, 3\) and \(3, 1\)"),
+        (np.eye(3, k=1), np.zeros(3), "must be symmetric"),
+    ],
+)
+def test_a_quadric_of_a_wrong_shape_is_refused(Q: Any, b: Any, words: str) -> None:
+    with pytest.raises(ModelError, match=words):
+        Quadric(Q, b, 0.0)
+
+
 def config(kind: Any, **keys: Any) -> Any:
     return kind.Config(type=kind.__name__.rpartition(".")[2], **keys)
 

@@ -181,23 +181,57 @@ def lacking(record: Record, name: str) -> Record:
     return result
 
 
+class Asked(dict[str, Any]):
+    """Signals that note which of them were asked for."""
+
+    def __init__(self, signals: dict[str, Any], names: set[str]) -> None:
+        super().__init__(signals)
+        self.names = names
+
+    def __getitem__(self, name: str) -> Any:
+        self.names.add(name)
+        return super().__getitem__(name)
+
+    def __contains__(self, name: object) -> bool:
+        self.names.add(str(name))
+        return super().__contains__(name)
+
+
 @pytest.mark.parametrize("scenario", ["elbow_comparison", "snake_joint_limits"])
 def test_a_record_that_lacks_a_signal_is_drawn_without_or_refused(scenario: str, tmp_path: Path, monkeypatch) -> None:
-    # What is drawn counts here, not the pictures.
-    monkeypatch.setattr(style, "save", lambda figure, path: path)
-    monkeypatch.setattr(snake_figures, "FRAMES", 2)
+    # What is drawn counts here, not the pictures; and a figure that does not ask for a signal is drawn without it.
+    asks: dict[Any, set[str]] = {}
+    animate = snake_figures.animate
+
+    def drawn(make: Any, record: Record, *arguments: Any) -> Any:
+        if make not in asks:
+            asked = copy.copy(record)
+            asked.signals = Asked(record.signals, asks.setdefault(make, set()))
+            return make(asked, *arguments)
+        return make(record, *arguments) if asks[make] & (full.keys() - record.keys()) else make
+
+    def save_all(makers: Any, record: Record, *_: Any) -> list[Any]:
+        with style.look():
+            return [figure for make in makers.values() if (figure := drawn(make, record)) is not None]
+
     short = {"duration_s": 0.2, "record.rate_hz": 50, "metrics.settle_s": 0.0}
-    record = dynsim.simulate(load_scenario(scenario, overrides=short))
-    outcomes = set()
-    for name in record:
-        try:
-            outcomes.add(bool(figures.draw(lacking(record, name), tmp_path)))
-        except RecordError as error:
-            outcomes.add(repr(name) in str(error) and "refused")
-    assert outcomes == {True, "refused"}
+    full = dynsim.simulate(load_scenario(scenario, overrides=short))
+    monkeypatch.setattr(snake_figures, "FRAMES", 2)
+    with monkeypatch.context() as patch:
+        patch.setattr(style, "save_all", save_all)
+        patch.setattr(snake_figures, "animate", lambda *arguments: drawn(animate, *arguments))
+        assert figures.draw(full, tmp_path)
+        outcomes = set()
+        for name in full:
+            try:
+                outcomes.add(bool(figures.draw(lacking(full, name), tmp_path)))
+            except RecordError as error:
+                outcomes.add(repr(name) in str(error) and "refused")
+        assert outcomes == {True, "refused"}
+    monkeypatch.setattr(style, "save", lambda figure, path: path)
     # Who made it does not count.
     for odd in ({}, {"engine": ["?"], "robot": "x"}):
-        other = copy.copy(record)
+        other = copy.copy(full)
         other.provenance = odd
         assert figures.draw(other, tmp_path)
         assert figures.draw_comparison({"a": other}, tmp_path)

@@ -14,6 +14,8 @@ from dynsim import load_scenario, simulate
 from dynsim.compile.model import Model
 from dynsim.dynamics.state import ELECTRICAL, GEAR, JOINT, JOULE, OUT_MODE
 from dynsim.errors import ModelError
+from dynsim.integrators import run as ki
+from dynsim.integrators.contacts.events import SLIP_START, SLIP_STOP
 from dynsim.integrators.stepping.tables import CAPPED
 from dynsim.model.description import Contact, Inertia, Link, Load, Quadric, Robot, vector
 from dynsim.model.drives import Motor, Servo
@@ -219,6 +221,21 @@ def test_events_find_where_a_push_breaks_a_bearing_loose(method):
     assert run.states("q")[2, 0] == pytest.approx((2.0 / 3.0 - 1.0 / 6.0) * FRICTION / MASS, rel=1e-8)
 
 
+@pytest.mark.parametrize(("method", "late"), [("dopri5", 1e-8), ("radau5", 1e-8), ("time_stepping", 1e-3)])
+def test_begin_and_end_of_slip_of_a_joint_are_in_the_log(method, late):
+    """A push 2 F − F t slides the mass off at once, which is no event; it stops at 2 s and is pushed back from 3 s on.
+
+    Time stepping tells it at the ends of the steps that show it, here of 1 ms.
+    """
+    b = sliding(np.array([2.0 * FRICTION, -FRICTION]))
+    y, times = b.state(np.zeros(1), np.zeros(1)), np.array([0.0, 4.0])
+    stepping = method == "time_stepping"
+    run = stepped(b, y, times, 1e-3, 0.5) if stepping else b.simulate(y, times, method, rtol=1e-10, atol=1e-12)
+    logged = int(run.count[ki.LOGGED])
+    assert run.log_event[:logged].tolist() == [ki.DRY_LOG + SLIP_STOP, ki.DRY_LOG + SLIP_START]
+    np.testing.assert_allclose(run.log_time[:logged], [2.0, 3.0], rtol=0, atol=late * (1.0 + 1e-9))
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_events_bring_a_spring_to_rest_in_closed_form(method):
     b, y, stiffness, damping = oscillator(0.5)
@@ -228,7 +245,7 @@ def test_events_bring_a_spring_to_rest_in_closed_form(method):
     assert abs(q[2] - q[1]) < 1e-12
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", ["radau5", pytest.param("dopri5", marks=pytest.mark.long)])
 def test_events_roll_a_wheel_down_a_slope_against_its_bearing(method):
     for drag in (0.6, 1.1):
         b, y, acceleration, drag_torque, _ = rolling(drag)
@@ -310,3 +327,18 @@ def test_scenarios_say_what_rubs(tmp_path: Path):
     glued = {"contacts.law": "bilateral", "integrator.method": "radau5"}
     with pytest.raises(ModelError, match=r"dry friction of joint_1, joint_3, joint_2: .*contacts.law: unilateral"):
         simulate(load_scenario(file, overrides=glued))
+
+
+def test_slip_of_joints_is_among_the_events_of_a_run(tmp_path: Path):
+    """The first joint swings back, holds for an instant, and comes to rest; the third never moves."""
+    file = tmp_path / "rubbing.yaml"
+    file.write_text(SCENARIO)
+    times = []
+    for method in ("time_stepping", "dopri5"):
+        changes = {"integrator.method": method, "duration_s": 2.0, "plant.chain.0.friction_N_m": 0.6}
+        slips = simulate(load_scenario(file, overrides=changes)).events
+        assert {event.name for event in slips} == {"joint_1", "joint_2"}
+        own = [event for event in slips if event.name == "joint_1"]
+        assert [event.kind for event in own] == ["slip_stop", "slip_start", "slip_stop"]
+        times.append([event.time for event in own])
+    np.testing.assert_allclose(times[0], times[1], rtol=0, atol=2e-3)  # steps of 1 ms

@@ -89,7 +89,7 @@ def test_every_public_kernel_has_one_compiled_signature():
     # Every one was called above, from Python: none at all would mean that this test looks at the wrong function.
     assert len(default_programs(system.derivative)) == 2  # one program per solver
     for kernel in (driver.advance_dopri5, driver.advance_radau5):
-        assert 1 <= len(default_programs(kernel)) <= 2, kernel  # for m_star in slow tests only
+        assert 1 <= len(default_programs(kernel)) <= 2, kernel  # for m_star in long tests only
     for kernel in (
         sweep.newton_euler,
         sweep.mass_matrix,

@@ -70,6 +70,7 @@ def test_disabled_points_put_braced_and_free_in_one_posture(arm):
     assert not build.contacts(load_scenario(arm, overrides=free))
 
 
+@pytest.mark.long  # a program of its own to compile
 def test_a_glued_sphere_stays_a_radius_up(arm):
     glued = {
         "contacts.law": "bilateral",

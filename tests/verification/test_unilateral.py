@@ -142,7 +142,7 @@ def test_two_feet_that_bounce_at_one_instant(e):
     assert run.states("loss")[-1, 0] == pytest.approx(0.5 * G * height, rel=1e-9)
 
 
-@pytest.mark.parametrize("method", ["dopri5", pytest.param("radau5", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("method", ["radau5", pytest.param("dopri5", marks=pytest.mark.long)])
 @pytest.mark.parametrize("thickness", [0.2, 0.005])
 def test_nothing_falls_through_a_body_within_one_step(method, thickness):
     """Falling freely steps are as long as the run; a plate's other side is as far from a point as its own."""

@@ -1,4 +1,4 @@
-"""Figures of a measured run: joints beside their goals, servos, and what their angles say of the arm."""
+"""Figures of a measured run: joints beside their goals, servos, and hand path and posture by the measured angles."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from dynsim.draw.figures import hand, posture, style
 from dynsim.draw.figures.style import Array
 from dynsim.record import TIME, Record
 
-# More joints than this do not fit a page; those with the largest error are drawn.
+# Most joints on a page; of more, those with the largest error are drawn.
 JOINTS = 24
-# Lines of one panel that are told apart.
+# Most lines in one panel.
 LINES = 12
 MILLI = 1e3
 

@@ -26,7 +26,6 @@ T = TypeVar("T")
 Array = NDArray[np.float64]
 # A quantity over time, (T,) and (T,) or (T, k).
 Series = tuple[Array, Array]
-# Which figures of a record are drawn: every ``many``-th from ``first`` on, (first, many).
 
 # Okabe and Ito's colours, which colour-blind readers tell apart; yellow is too faint on white.
 BLUE, ORANGE, GREEN, PURPLE, SKY, BLACK = "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#000000"

@@ -212,10 +212,10 @@ def spline_weights(x, per, count):
 
     ``per``: 1 / spacing. Beyond the first and last of ``count`` grid points the weights go on straight.
     """
-    held = min(max(x, 0.0), count - 1.0)
+    clamped = min(max(x, 0.0), count - 1.0)
     # NaN as an integer is anything.
-    i = max(min(int(held), count - 2), 0)
-    t, beyond = held - i, x - held
+    i = max(min(int(clamped), count - 2), 0)
+    t, beyond = clamped - i, x - clamped
     s = 1.0 - t
     d0, d1, d2, d3 = -0.5 * s * s, (1.5 * t - 2.0) * t, (1.0 - 1.5 * t) * t + 0.5, 0.5 * t * t
     w0, w1 = s * s * s / 6.0 + beyond * d0, (0.5 * t - 1.0) * t * t + 2.0 / 3.0 + beyond * d1
@@ -298,8 +298,8 @@ def nearest_to_box(shapes: ShapeArrays, k, x, y, z, dx, dy, dz):
 def surface_distances(shapes: ShapeArrays, points, gaps, normals):
     """φ [m] and n of the surface of candidate 0 at points, (T, 3), into ``gaps``, (T,), and ``normals``, (T, 3)."""
     for t in range(points.shape[0]):
-        found = distance(shapes, 0, points[t, 0], points[t, 1], points[t, 2])
-        gaps[t], normals[t, 0], normals[t, 1], normals[t, 2] = found[0], found[1], found[2], found[3]
+        gap = distance(shapes, 0, points[t, 0], points[t, 1], points[t, 2])
+        gaps[t], normals[t, 0], normals[t, 1], normals[t, 2] = gap[0], gap[1], gap[2], gap[3]
 
 
 @kernel

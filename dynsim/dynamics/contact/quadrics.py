@@ -1,4 +1,4 @@
-"""Points held to surfaces: geometry of the candidates, slip direction, and constraint rows of the active ones."""
+"""Contact points on quadrics: geometry, slip direction, constraint rows, and the friction of the bilateral law."""
 
 from __future__ import annotations
 

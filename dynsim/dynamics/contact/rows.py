@@ -1,4 +1,4 @@
-"""The table of active rows: which candidates are held, and how; joints that follow others; the forces of candidates.
+"""The table of active constraint rows: of closed candidates by their modes, and of coupled joints; their forces.
 
 A row is one scalar constraint J vdot = target with one force. It has a kind, an owner (a candidate or a coupling) and
 up to two bodies, and is rebuilt only when a mode changes: couplings first, then the candidates in their order; behind
@@ -43,7 +43,7 @@ def set_modes(
     what is left of it the next projection takes away, unseen by the ledger.
     """
     active, rows = ws.active, ws.rows
-    p, held = couplings.joint.shape[0], 0
+    p, sticking = couplings.joint.shape[0], 0
     for k in range(p):
         new_row(ws, k, ka.JOINT_ROW, k, couplings.joint[k, ka.FOLLOWER])
         active[k, ka.BODY_B] = couplings.joint[k, ka.LEADER]
@@ -65,13 +65,13 @@ def set_modes(
             rows[p, ka.ROW_MU] = contacts.law[k, ka.MU]
             p += 1
         elif modes[k] == ka.STICKING:
-            held += 1
+            sticking += 1
             for _ in range(ka.MOST_ROWS):
                 new_row(ws, p, ka.STICKING_ROW, k, i)
                 p += 1
     if unilateral is not None:
         p = tie_rows(unilateral, ws, p)
-    ws.counts[ka.ROWS], ws.counts[ka.COUPLED], ws.counts[ka.HELD] = p, joint_rows, held
+    ws.counts[ka.ROWS], ws.counts[ka.COUPLED], ws.counts[ka.HELD] = p, joint_rows, sticking
     for k in range(contacts.link.shape[0]):
         if modes[k] == ka.OPEN:
             active[k, ka.FIRST_ROW] = p

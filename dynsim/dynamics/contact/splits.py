@@ -72,8 +72,8 @@ def beyond_bounds(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Wor
 @apart_kernel
 def split_forces(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace):
     """The best split of the forces of all that sticks, into FORCE of its rows; its worst margin into BEST_MARGIN."""
-    room, place, mu, rows = unilateral.room, unilateral.place, unilateral.vector[0], ws.rows
-    first, row = place[0], place[1]
+    room, index, mu, rows = unilateral.room, unilateral.index, unilateral.vector[0], ws.rows
+    first, row = index[0], index[1]
     count, p = 0, 0
     for k in range(ws.contacts.shape[0]):
         if ws.active[k, ka.MODE] == ka.STICKING:
@@ -93,9 +93,9 @@ def split_forces(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Work
         force[i] = rows[row[i], ka.FORCE]
         for j in range(p):
             room[ku.SPLIT_MATRIX, i, j] = ws.small[0, row[i], row[j]]
-    width = null_space(room[ku.SPLIT_MATRIX], p, room[ku.NULL_SPACE], place[2])
+    width = null_space(room[ku.SPLIT_MATRIX], p, room[ku.NULL_SPACE], index[2])
     unilateral.number[ku.SPLIT] = 1.0
-    programs = split_room_in(unilateral.split_room, place[3], width, count)
+    programs = split_room_in(unilateral.split_room, index[3], width, count)
     worst = best_split(force[:p], room[ku.NULL_SPACE], width, first, mu, points, count - points, out[:p], programs)
     unilateral.number[ku.BEST_MARGIN] = worst
     for i in range(p):

@@ -1,4 +1,4 @@
-"""The unilateral law: tables of candidates and joint stops that only push, of joints that rub, and the way of slip.
+"""The unilateral law of contacts, joint stops and dry friction of joints: its tables, slip direction, sliding friction.
 
 0 ≤ f_n ⟂ gap ≥ 0; a point that slides is driven by n − μ(s) t along t = v_t/|v_t|, one that is at rest is held while
 |f_t| ≤ μ_s f_n. Which candidates are open, slide or stick is constant within a step
@@ -58,7 +58,8 @@ DRY_ROW = 1
 DRY_DRIVE = 2  # whose gear does, -1 for none
 DRY_HOLDS = 3  # 1: it has a row, bounded in time stepping; 0: it slides, by the event-driven methods
 DRY_NEXT = 4  # scratch of the choice of modes
-DRY_TABLE_SIZE = 5
+DRY_TOLD = 5  # 1, 0: as the log was last told of it, held or sliding; -1: of nothing yet
+DRY_TABLE_SIZE = 6
 # UnilateralArrays.dry: the force of a joint at rest is any up to the sum of both, in motion that against it [N m or N]
 OF_GEAR, OF_JOINT = 0, 1
 DRY_FORCE = 2  # on the joint [N m or N]
@@ -91,9 +92,9 @@ MODE_SIZE = 5
 # UnilateralArrays.vector: three of the splits of forces, then those of the problem that chooses modes
 OFFSET, SOLUTION, CONE_FRICTION, FIRST_PART, SECOND_PART = 3, 4, 5, 6, 7
 VECTORS = 8
-# UnilateralArrays.place, int: four of the splits of forces; kinds of the problem's rows, and which of the table's
+# UnilateralArrays.index, int: four of the splits of forces; kinds of the problem's rows, and which of the table's
 KINDS, TABLE_ROW = 4, 5
-PLACES = 6
+INDICES = 6
 # UnilateralArrays.room
 SPLIT_MATRIX, NULL_SPACE, PROBLEM, SCRATCH = 0, 1, 2, 3
 ROOM = SCRATCH + kc.CONE_ROOM
@@ -118,7 +119,7 @@ class UnilateralArrays(NamedTuple):
     dry: np.ndarray  # (d, DRY_SIZE)
     tie_table: np.ndarray  # (e, TIE_TABLE_SIZE) int, of time stepping alone: see dynsim.integrators.stepping.compliance
     tie: np.ndarray  # (e, TIE_SIZE)
-    place: np.ndarray  # (PLACES, p or c + 2) int
+    index: np.ndarray  # (INDICES, p or c + 2) int
     vector: np.ndarray  # (VECTORS, p)
     room: np.ndarray  # (ROOM, p, p) two matrices of the splits, one of the problem that chooses modes, its scratch
     split_room: np.ndarray  # scratch of the splits

@@ -62,12 +62,12 @@ def dominant(ws: Workspace, room):
             return False
     split_matrix(ws, room)
     for k in range(p):
-        rest = 0.0
+        others = 0.0
         for m in range(p):
-            rest += abs(room[FRICTION, k, m])
+            others += abs(room[FRICTION, k, m])
             if m != k:
-                rest += abs(room[FRICTIONLESS, k, m])
-        if not room[FRICTIONLESS, k, k] > rest:
+                others += abs(room[FRICTIONLESS, k, m])
+        if not room[FRICTIONLESS, k, k] > others:
             return False
     return True
 

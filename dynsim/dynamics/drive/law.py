@@ -22,7 +22,7 @@ from dynsim.dynamics.drive.servo import (
 from dynsim.dynamics.drive.torque import open_torque
 from dynsim.dynamics.state import StateLayout
 from dynsim.dynamics.tables import DriveArrays, ReferenceArrays, Workspace
-from dynsim.jit.kernel import apart_kernel, internal_kernel, merged_kernel
+from dynsim.jit.kernel import apart_kernel, internal_kernel, kernel, merged_kernel
 
 for _law in (at_current_limit, clipped, dc_balance, dc_block, dc_command, dc_torque, open_torque):
     internal_kernel(_law)
@@ -139,6 +139,12 @@ def take_commands(drives: DriveArrays, reference: ReferenceArrays, t, ws: Worksp
         if drives.table[a, ka.SAMPLED] == ka.AT_TICKS:
             asked = command(drives, ws, a)
             drives.input[a, ka.COMMAND] = fed_forward(reference.voltage, reference.grid, t, a, asked)
+
+
+@kernel
+def take_measured_commands(drives: DriveArrays, reference: ReferenceArrays, t, ws: Workspace):
+    """:func:`take_commands` for a caller that has put into ``ws.joints`` what sensors tell of the joints."""
+    take_commands(drives, reference, t, ws)
 
 
 @internal_kernel

@@ -32,10 +32,10 @@ def lane_workspace(ws: Workspace) -> Workspace:
     """A workspace whose lanes are all what ``ws`` is; ``trig`` unpadded, as sines are computed a lane at a time."""
     unpadded = ws._replace(trig=ws.trig[:, : len(ws.joints)])
     tables = {name: getattr(unpadded, name)[..., None] for name in WITH_LANES}
-    found = {name: aligned(*table.shape[:-1], WIDTH) for name, table in tables.items()}
-    for name, table in found.items():
+    lanes = {name: aligned(*table.shape[:-1], WIDTH) for name, table in tables.items()}
+    for name, table in lanes.items():
         table[...] = tables[name]
-    return ws._replace(active=ws.active.copy(), counts=ws.counts.copy(), **found)
+    return ws._replace(active=ws.active.copy(), counts=ws.counts.copy(), **lanes)
 
 
 @intrinsic

@@ -58,8 +58,8 @@ def segment_start(loads: LoadArrays, k, t):
 def load_wrench(loads: LoadArrays, k, t, ws: Workspace):
     """Moment about the world origin and force of load k at time t in W [N m, N], after ``forward_sweep``."""
     links, table, data = ws.links, loads.table, loads.data
-    i, place = table[k, LINK], table[k, DATA]
-    force, moment = segment_vector(data, place + WRENCH), segment_vector(data, place + WRENCH + 3)
+    i, start = table[k, LINK], table[k, DATA]
+    force, moment = segment_vector(data, start + WRENCH), segment_vector(data, start + WRENCH + 3)
     segment, at = segment_start(loads, k, t)
     if segment >= 0:
         x, c = at - data[segment], segment + 1
@@ -76,7 +76,7 @@ def load_wrench(loads: LoadArrays, k, t, ws: Workspace):
     R = rotation(links, i, ka.R)
     if table[k, IN_BODY] != 0:
         force, moment = rotate(R, force), rotate(R, moment)
-    return wrench_at(transform(vector(links, i, ka.P), R, segment_vector(data, place + POINT)), force, moment)
+    return wrench_at(transform(vector(links, i, ka.P), R, segment_vector(data, start + POINT)), force, moment)
 
 
 @internal_kernel

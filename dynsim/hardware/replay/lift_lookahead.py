@@ -19,7 +19,7 @@ from dynsim.record import Record
 from dynsim.snake.base_part import base_part
 from dynsim.snake.lifting import (
     ROUNDING,
-    folded,
+    fold_to_heights,
     height_of,
     refuse_long_steps,
     refuse_other_joints,
@@ -174,7 +174,7 @@ class LiftLookahead:
         sample = entry.sample
         time = np.array([sample.time])
         height = np.where(np.isnan(entry.up), 0.0, height_of(time, entry.up, entry.down, self._lifts))[None]
-        fold = folded(self._part, entry.yaw[None], height, self._lifts, time)
+        fold = fold_to_heights(self._part, entry.yaw[None], height, self._lifts, time)
         lift = np.zeros(len(sample.position))
         lift[self._joints] = fold.hinge[0]
         return sample._replace(lift=lift)

@@ -213,6 +213,7 @@ def _bare(scenario: Scenario) -> Scenario:
     keys = config.contacts.model_dump(exclude_unset=True, exclude=set(BILATERAL_KEYS))
     changes = {
         "controller": None,
+        "sensors": None,
         "contacts": Contacts(**{**keys, "law": "unilateral"}),
         "loads": payloads,
         "integrator": type(config.integrator)(method="dopri5"),  # set points change every 2 ms, which ends steps
@@ -221,7 +222,6 @@ def _bare(scenario: Scenario) -> Scenario:
         released = config.plant.dynamics.model_copy(update={"start": "released"})
         changes["plant"] = config.plant.model_copy(update={"dynamics": released})
         changes["integrator"] = type(config.integrator)(method="time_stepping", step_s=SNAKE_STEP)
-        changes["sensors"] = None
     return replace(scenario, config=config.model_copy(update=changes))
 
 

@@ -27,12 +27,12 @@ from dynsim.jit.kernel import apart_kernel, internal_kernel
 
 # Kinds of guards, behind those of dynsim.integrators.events.
 NORMAL_GUARD, SLIP_GUARD, STOP_GUARD, DRY_GUARD = 10, 11, 12, 13
-# What is logged of a candidate, and of a stop.
+# What is logged of a candidate, of a stop, and (slip alone) of a joint with dry friction.
 LANDING, LIFT_OFF, SLIP_START, SLIP_STOP, BOUNCE, CHATTERS, STOP_HIT, STOP_LEFT = 0, 1, 2, 3, 4, 5, 6, 7
 LOG_KINDS = 8
 
 # Run.gaps: what a candidate was like at the start of the step.
-GAP_THEN, RATE_THEN, NORMAL_THEN, PLACE_THEN = 0, 1, 2, 5
+GAP_THEN, RATE_THEN, NORMAL_THEN, POSITION_THEN = 0, 1, 2, 5
 
 # A candidate that starts, or comes to rest, this close to its surface touches it [m].
 TOUCH = 1e-9
@@ -93,9 +93,9 @@ def too_long(contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: W
     their rates at both ends, ``gaps``, (c, GAPS_SIZE), at the start. It may have gone through a body: out at its other
     side, and as far as both gaps together. Or a frozen direction of slip has stood for too long.
     """
-    found = 1.0
+    fraction = 1.0
     if unilateral is None:  # known to the compiler
-        return found
+        return fraction
     for k in range(gaps.shape[0]):
         slow = unilateral.number[ku.SLOW]
         if (
@@ -105,9 +105,9 @@ def too_long(contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: W
         ):
             speed = slip_speed(ws, k)
             if speed > 2.0 * slow:
-                found = min(found, max(1.5 * slow / speed, 0.01))
+                fraction = min(fraction, max(1.5 * slow / speed, 0.01))
         if passes_through(ws, gaps, k):
-            found = min(found, 0.5)
+            fraction = min(fraction, 0.5)
         if ws.active[k, ka.MODE] != ka.OPEN or gaps[k, RATE_THEN] >= 0.0 or ws.contacts[k, ka.GAP_RATE] <= 0.0:
             continue
         g0, g1 = gaps[k, GAP_THEN], ws.contacts[k, ka.GAP]
@@ -119,8 +119,8 @@ def too_long(contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: W
             continue
         x = -d0 / (a + math.sqrt(root))
         if 0.0 < x < 1.0 and g0 + x * (d0 + x * (a + x * b)) < -ku.DEPTH:
-            found = min(found, x)
-    return found
+            fraction = min(fraction, x)
+    return fraction
 
 
 @internal_kernel
@@ -137,18 +137,18 @@ def passes_through(ws: Workspace, gaps, k):
     turned, square = 0.0, 0.0
     for s in range(3):
         turned += gaps[k, NORMAL_THEN + s] * state[ka.NORMAL + s]
-        way = state[ka.POSITION + s] - gaps[k, PLACE_THEN + s]
-        square += way * way
+        moved = state[ka.POSITION + s] - gaps[k, POSITION_THEN + s]
+        square += moved * moved
     return turned < 0.0 and 2.5 * square >= (g0 + g1) * (g0 + g1)
 
 
 @internal_kernel
 def note_gaps(ws: Workspace, gaps):
-    """Gaps, their rates, normals and places at the start of a step, for :func:`too_long`."""
+    """Gaps, their rates, normals and positions at the start of a step, for :func:`too_long`."""
     for k in range(gaps.shape[0]):
         gaps[k, GAP_THEN], gaps[k, RATE_THEN] = ws.contacts[k, ka.GAP], ws.contacts[k, ka.GAP_RATE]
         for s in range(3):
-            gaps[k, NORMAL_THEN + s], gaps[k, PLACE_THEN + s] = (
+            gaps[k, NORMAL_THEN + s], gaps[k, POSITION_THEN + s] = (
                 ws.contacts[k, ka.NORMAL + s],
                 ws.contacts[k, ka.POSITION + s],
             )
@@ -261,6 +261,7 @@ def solve_modes(system: System, ws: Workspace, run: Run, first):
     ws.counts[ka.DEPENDENT] = before
     if not first:
         log_changes(system, ws, run)
+    tell_joints(system.unilateral, run)
     rearm(run)
     count_changes(system, run)
 
@@ -345,6 +346,22 @@ def log_changes(system: System, ws: Workspace, run: Run):
 
 
 @internal_kernel
+def tell_joints(unilateral: UnilateralArrays, run: Run):
+    """Log which joints dry friction has begun, or ceased, to hold since the log was last told of them."""
+    for k in range(unilateral.dry_table.shape[0]):
+        tell_joint(unilateral, run, k, unilateral.dry_table[k, ku.DRY_HOLDS])
+
+
+@internal_kernel
+def tell_joint(unilateral: UnilateralArrays, run: Run, k, holds):
+    """Log where joint k of those that rub begins or ends to slip; what it is like at the start is no event."""
+    before = unilateral.dry_table[k, ku.DRY_TOLD]
+    unilateral.dry_table[k, ku.DRY_TOLD] = holds
+    if before >= 0 and before != holds:
+        log(run, ki.DRY_LOG + LOG_KINDS * k + (SLIP_STOP if holds == 1 else SLIP_START))
+
+
+@internal_kernel
 def break_loose(unilateral: UnilateralArrays, ws: Workspace, k):
     """Let joint k, which dry friction does not hold any more, slide against it; False where its slip has ended."""
     table, split = unilateral.dry_table, unilateral.number[ku.SPLIT] == 1.0
@@ -414,6 +431,7 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
             by_hand = slip_on(unilateral, ws, k, 10.0 * unilateral.number[ku.SLOW]) and by_hand
     if by_hand:
         set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
+        tell_joints(unilateral, run)
         rearm(run)
         count_changes(system, run)
     else:

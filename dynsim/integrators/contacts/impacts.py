@@ -102,9 +102,9 @@ def come_down(system: System, ws: Workspace, run: Run):
     for k in range(mode.shape[0]):
         fast = mode[k, ku.STRUCK] == 1 and ws.contacts[k, ka.GAP_RATE] < -unilateral.tally[k, ku.SETTLE]
         bounces = fast and mode[k, ku.BEFORE] == ka.OPEN and system.contacts.law[k, ka.RESTITUTION] > 0.0
-        held = mode[k, ku.TOUCHING] == 1 and not bounces
+        stays = mode[k, ku.TOUCHING] == 1 and not bounces
         mode[k, ku.WANTED] = (
-            ka.OPEN if not held else ka.STICKING if ws.active[k, ka.MODE] == ka.STICKING else ka.SLIDING
+            ka.OPEN if not stays else ka.STICKING if ws.active[k, ka.MODE] == ka.STICKING else ka.SLIDING
         )
     set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
     for _ in range(kp.PROJECTION_LIMIT):
@@ -130,10 +130,10 @@ def kind_of_joint_row(system: System, r):
 def gather(system: System, ws: Workspace, run: Run):
     """Rows along normal and tangents of everything that touches, and their system, into the workspace.
 
-    Kinds and table rows of the rows into ``unilateral.place``; returns how many there are.
+    Kinds and table rows of the rows into ``unilateral.index``; returns how many there are.
     """
     unilateral = system.unilateral
-    mode, place = unilateral.mode, unilateral.place
+    mode, index = unilateral.mode, unilateral.index
     come_down(system, ws, run)
     for k in range(mode.shape[0]):
         mode[k, ku.WANTED] = ka.STICKING if mode[k, ku.TOUCHING] == 1 else ka.OPEN
@@ -141,11 +141,11 @@ def gather(system: System, ws: Workspace, run: Run):
     evaluate(system, ws, run)
     p = ws.counts[ka.ROWS]
     for r in range(p):
-        place[ku.KINDS, r] = kind_of_joint_row(system, r)
+        index[ku.KINDS, r] = kind_of_joint_row(system, r)
     for k in range(mode.shape[0]):
         if mode[k, ku.WANTED] == ka.STICKING:
             r = ws.active[k, ka.FIRST_ROW]
-            place[ku.KINDS, r], place[ku.KINDS, r + 1], place[ku.KINDS, r + 2] = kc.CONE, kc.TANGENT, kc.TANGENT
+            index[ku.KINDS, r], index[ku.KINDS, r + 1], index[ku.KINDS, r + 2] = kc.CONE, kc.TANGENT, kc.TANGENT
     return p
 
 
@@ -158,7 +158,7 @@ def solve_problem(unilateral: UnilateralArrays, W, size, largest, starts):
     largest : of the rates or accelerations that it is to bring to zero
     starts : of Newton's method, before a problem that may well have no solution is given up; 0: as many as it takes
     """
-    vector, room, kind = unilateral.vector, unilateral.room[ku.SCRATCH :], unilateral.place[ku.KINDS]
+    vector, room, kind = unilateral.vector, unilateral.room[ku.SCRATCH :], unilateral.index[ku.KINDS]
     b, mu, f, good = vector[ku.OFFSET], vector[ku.CONE_FRICTION], vector[ku.SOLUTION], 1e-2 * CONE_TOLERANCE
     good *= max(largest, IMMOBILE)
     if starts > 0:

@@ -180,14 +180,14 @@ def reduce_rows(system: System, ws: Workspace, run: Run, p):
     Column of such a row: W (n − μ t). One whose own force would accelerate it against itself sets STATUS (Painlevé).
     """
     unilateral, W = system.unilateral, ws.small[0]
-    place, vector, mode, state = unilateral.place, unilateral.vector, unilateral.mode, ws.contacts
+    index, vector, mode, state = unilateral.index, unilateral.vector, unilateral.mode, ws.contacts
     size, first = 0, p
     for k in range(mode.shape[0] - 1, -1, -1):
         if mode[k, ku.TOUCHING] == 1:
             first = ws.active[k, ka.FIRST_ROW]
     for r in range(first):
-        place[ku.KINDS, r], vector[ku.CONE_FRICTION, r] = kind_of_joint_row(system, r), 0.0
-        place[ku.TABLE_ROW, r], vector[ku.FIRST_PART, r], vector[ku.SECOND_PART, r] = r, 0.0, 0.0
+        index[ku.KINDS, r], vector[ku.CONE_FRICTION, r] = kind_of_joint_row(system, r), 0.0
+        index[ku.TABLE_ROW, r], vector[ku.FIRST_PART, r], vector[ku.SECOND_PART, r] = r, 0.0, 0.0
     for k in range(unilateral.dry_table.shape[0]):
         if unilateral.dry_table[k, ku.DRY_HOLDS] == 1:
             vector[ku.CONE_FRICTION, unilateral.dry_table[k, ku.DRY_ROW]] = dry_bound(unilateral, k)
@@ -196,31 +196,31 @@ def reduce_rows(system: System, ws: Workspace, run: Run, p):
         if mode[k, ku.TOUCHING] == 0:
             continue
         r = ws.active[k, ka.FIRST_ROW]
-        place[ku.TABLE_ROW, size], vector[ku.FIRST_PART, size], vector[ku.SECOND_PART, size] = r, 0.0, 0.0
+        index[ku.TABLE_ROW, size], vector[ku.FIRST_PART, size], vector[ku.SECOND_PART, size] = r, 0.0, 0.0
         if mode[k, ku.WANTED] == ka.SLIDING:
             x, y, z = state[k, ka.SLIP_VELOCITY], state[k, ka.SLIP_VELOCITY + 1], state[k, ka.SLIP_VELOCITY + 2]
             tx, ty, tz, mu = slide_direction(unilateral, system.contacts, k, x, y, z)
             a, b = ka.FIRST_TANGENT, ka.SECOND_TANGENT
             vector[ku.FIRST_PART, size] = -mu * (tx * state[k, a] + ty * state[k, a + 1] + tz * state[k, a + 2])
             vector[ku.SECOND_PART, size] = -mu * (tx * state[k, b] + ty * state[k, b + 1] + tz * state[k, b + 2])
-            place[ku.KINDS, size] = kc.ONE_WAY
+            index[ku.KINDS, size] = kc.ONE_WAY
             size += 1
         else:
             vector[ku.CONE_FRICTION, size] = friction_at_rest(system, k)
             for s in range(3):
-                place[ku.KINDS, size] = kc.CONE if s == 0 else kc.TANGENT
-                place[ku.TABLE_ROW, size], vector[ku.FIRST_PART, size], vector[ku.SECOND_PART, size] = r + s, 0.0, 0.0
+                index[ku.KINDS, size] = kc.CONE if s == 0 else kc.TANGENT
+                index[ku.TABLE_ROW, size], vector[ku.FIRST_PART, size], vector[ku.SECOND_PART, size] = r + s, 0.0, 0.0
                 size += 1
     for i in range(size):
-        a = place[ku.TABLE_ROW, i]
+        a = index[ku.TABLE_ROW, i]
         vector[ku.OFFSET, i], vector[ku.SOLUTION, i] = -ws.rows[a, ka.RHS], 0.0
         for j in range(size):
-            b = place[ku.TABLE_ROW, j]
+            b = index[ku.TABLE_ROW, j]
             value = W[a, b]
             if vector[ku.FIRST_PART, j] != 0.0 or vector[ku.SECOND_PART, j] != 0.0:
                 value += vector[ku.FIRST_PART, j] * W[a, b + 1] + vector[ku.SECOND_PART, j] * W[a, b + 2]
             unilateral.room[ku.PROBLEM, i, j] = value
-        if place[ku.KINDS, i] == kc.ONE_WAY and W[a, a] > 0.0 and unilateral.room[ku.PROBLEM, i, i] <= 1e-12 * W[a, a]:
+        if index[ku.KINDS, i] == kc.ONE_WAY and W[a, a] > 0.0 and unilateral.room[ku.PROBLEM, i, i] <= 1e-12 * W[a, a]:
             run.count[ki.STATUS] = ki.FORCES_REVERSED
     return size
 
@@ -281,12 +281,12 @@ def give_way(system: System, ws: Workspace, size, largest):
     the same in all directions.
     """
     unilateral = system.unilateral
-    place, mode, f = unilateral.place, unilateral.mode, unilateral.vector[ku.SOLUTION]
+    index, mode, f = unilateral.index, unilateral.mode, unilateral.vector[ku.SOLUTION]
     changed, i = False, 0
     for k in range(mode.shape[0]):
         if mode[k, ku.TOUCHING] == 0:
             continue
-        while place[ku.TABLE_ROW, i] != ws.active[k, ka.FIRST_ROW]:
+        while index[ku.TABLE_ROW, i] != ws.active[k, ka.FIRST_ROW]:
             i += 1
         holds = mode[k, ku.WANTED] == ka.STICKING and mode[k, ku.GIVES_WAY] == 0 and f[i] > 0.0
         if holds and drops(system, k) and slips(system, i, size, largest, system.contacts.law[k, ka.STATIC]):
@@ -299,7 +299,7 @@ def give_way(system: System, ws: Workspace, size, largest):
 def take_solution(system: System, ws: Workspace, size, largest):
     """Modes from the forces of the reduced problem, into WANTED; stops that carry nothing open."""
     unilateral = system.unilateral
-    place, mode, f = unilateral.place, unilateral.mode, unilateral.vector[ku.SOLUTION]
+    index, mode, f = unilateral.index, unilateral.mode, unilateral.vector[ku.SOLUTION]
     strongest = 0.0
     for i in range(size):
         strongest = max(strongest, abs(f[i]))
@@ -313,7 +313,7 @@ def take_solution(system: System, ws: Workspace, size, largest):
         if mode[k, ku.TOUCHING] == 0:
             mode[k, ku.WANTED] = ka.OPEN
             continue
-        while place[ku.TABLE_ROW, i] != ws.active[k, ka.FIRST_ROW]:
+        while index[ku.TABLE_ROW, i] != ws.active[k, ka.FIRST_ROW]:
             i += 1
         if not f[i] > FORCE_TOLERANCE * strongest:
             # It touches without a force, maybe a little below its surface: only if it goes on does it land.

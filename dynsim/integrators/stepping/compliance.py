@@ -51,6 +51,9 @@ from dynsim.jit.kernel import internal_kernel
 AT_BOUND = 1e-12
 # Time in which what steps do not resolve comes back, in steps.
 RETURN_STEPS = 2.0
+# ε of the tangents of a contact that gives way, in mobilities of theirs: a spring 1/(h² ε) that no step resolves, some
+# 1e9 N/m where it holds a kilogram.
+TANGENTIAL = 1e-4
 
 
 @internal_kernel
@@ -64,7 +67,11 @@ def give_way(k, c, w, x, u, h, theta):
 
 @internal_kernel
 def soften_contact(law, s: SteppingArrays, ws: Workspace, k, h):
-    """Let the normal row of candidate k, which is listed, give way, if it does; into W and ``s.turn``."""
+    """Let the rows of candidate k, which is listed, give way, if they do; into W, ``s.b`` and ``s.turn``.
+
+    Tangents against the impulses of the last step, ``s.f``: u' + a + ε (p − p_last) = 0 where it sticks. Rigid, nearly
+    straight chains of wheels would wedge themselves in: lateral forces of hundreds of newtons from rates of 1e-8 m/s.
+    """
     stiffness, damping = law[k, ka.CONTACT_STIFFNESS], law[k, ka.CONTACT_DAMPING]
     if stiffness == 0.0:
         return
@@ -73,6 +80,10 @@ def soften_contact(law, s: SteppingArrays, ws: Workspace, k, h):
     phi, more, added = give_way(stiffness, damping, W[r, r], turn[kt.PRESSED_IN], s.rate[0, r], h, s.theta)
     W[r, r] += more
     turn[kt.IMPLICIT], turn[kt.ADDED] = phi, added
+    for i in range(r + 1, r + ka.MOST_ROWS):
+        more = TANGENTIAL * W[i, i]
+        W[i, i] += more
+        s.b[i] -= more * s.f[i]
 
 
 @internal_kernel

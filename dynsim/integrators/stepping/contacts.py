@@ -151,9 +151,9 @@ def place_goes_on(shapes, last, state, V, k, h):
     if shapes.kind[k, kd.MOVES] == 0:
         return True
     at = centre(shapes, state, k)
-    way = (at[0] - last[kt.CENTRE]) ** 2 + (at[1] - last[kt.CENTRE + 1]) ** 2 + (at[2] - last[kt.CENTRE + 2]) ** 2
+    square = (at[0] - last[kt.CENTRE]) ** 2 + (at[1] - last[kt.CENTRE + 1]) ** 2 + (at[2] - last[kt.CENTRE + 2]) ** 2
     v = point_velocity(V, at)
-    return math.sqrt(way) <= SAME_PLACE * h * math.sqrt(dot_vector(v, v)) + SHORT_WAY
+    return math.sqrt(square) <= SAME_PLACE * h * math.sqrt(dot_vector(v, v)) + SHORT_WAY
 
 
 @internal_kernel
@@ -305,9 +305,9 @@ def solve_contacts(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Wor
         if ws.active[k, ka.MODE] == ka.STICKING:
             r = ws.active[k, ka.FIRST_ROW]
             s.mu[r] = friction_of(law, s, k, r)
-            turn_rows(law, s, ws, k, h)
             for m in range(ka.MOST_ROWS):
                 s.f[r + m] = s.impulse[3 * k + m]
+            turn_rows(law, s, ws, k, h)
     for _ in range(1 + ws.contacts.shape[0]):
         for k in range(ws.contacts.shape[0]):
             if ws.active[k, ka.MODE] == ka.STICKING:

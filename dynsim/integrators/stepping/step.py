@@ -1,4 +1,4 @@
-"""One step of time stepping, its ledger, its samples, and the driver; the method is that of ``time_stepping``."""
+"""One step of time stepping, its ledger, samples and driver; equations: :mod:`dynsim.integrators.stepping.tables`."""
 
 from __future__ import annotations
 
@@ -284,7 +284,11 @@ def tell_changes(unilateral: UnilateralArrays, s: SteppingArrays, run: Run):
             stop[k, ku.HITS] += 1.0 if closed else 0.0
             kev.log(run, ki.STOP_LOG + kev.LOG_KINDS * k + (kev.STOP_HIT if closed else kev.STOP_LEFT))
         table[k, ku.STOP_BEFORE] = table[k, ku.STOP_CLOSED]
-    return run.count[ki.LOGGED] + s.told.shape[0] + table.shape[0] > run.log_time.shape[0]
+    rubbing = unilateral.dry_table
+    for k in range(rubbing.shape[0]):
+        kev.tell_joint(unilateral, run, k, 0 if abs(s.w[rubbing[k, ku.DRY_ROW]]) > kt.BAD else 1)
+    most = s.told.shape[0] + table.shape[0] + rubbing.shape[0]
+    return run.count[ki.LOGGED] + most > run.log_time.shape[0]
 
 
 @internal_kernel

@@ -1,5 +1,7 @@
 """Task-space controller of the articulated mobile robot (Tanaka et al. 2019, III.B, IV.C).
 
+Keys and defaults; the control law is in :mod:`dynsim.snake.controller`.
+
 [T]: M. Tanaka et al., "Task-Space Control of Articulated Mobile Robots With a Soft Gripper for Operations", IEEE
 Transactions on Robotics 35(1), 2019. Values that [T] does not give are marked "assumed".
 """

@@ -1,1 +1,1 @@
-"""Contact surfaces, one file each: ``Config`` for the scenario and ``build(config, context) -> Quadric``."""
+"""Contact surfaces, one file each: ``Config``, and ``build``, which gives a ``Quadric``, ``Box`` or ``HeightField``."""

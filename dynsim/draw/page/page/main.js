@@ -1,5 +1,5 @@
 "use strict";
-// The player. `dynsim` is what a test, a film or a live drive may use of the page:
+// The program of the page begins here: the player. `dynsim` is what a test, a film or a live drive may use of the page:
 //   dynsim.ready           a promise that holds when everything is there
 //   dynsim.seek(t)         show an instant [s] and draw it
 //   dynsim.state()         what is shown: time, poses of all bodies, arrows, wheels, support

@@ -116,7 +116,7 @@ def torque_limits(braces: BraceArrays, ws: Workspace):
 @internal_kernel
 def least_heat_forces(model: ModelArrays, ws: Workspace, braces: BraceArrays, intervals):
     """Torques, forces and intervals of one instant into ``braces``; False, and a certificate, where there are none."""
-    found, table, motors = braces.found, braces.table, braces.motors
+    results, table, motors = braces.results, braces.table, braces.motors
     c, n, first, x = braces.link.shape[0], braces.free.shape[0], braces.first, braces.program.x
     scale = brace_rows(model, ws, braces)
     unknowns = first[c]
@@ -153,16 +153,16 @@ def least_heat_forces(model: ModelArrays, ws: Workspace, braces: BraceArrays, in
         for k in range(c):
             for end in range(2):
                 if table[k, kb.COMMANDED] == table[k, kb.COMMANDED]:
-                    found[k, kb.LOW + end] = table[k, kb.COMMANDED]
+                    results[k, kb.LOW + end] = table[k, kb.COMMANDED]
                 elif inside <= SLACK:
-                    found[k, kb.LOW + end] = found[k, kb.FORCES]
+                    results[k, kb.LOW + end] = results[k, kb.FORCES]
                 elif intervals:
-                    found[k, kb.LOW + end] = extreme_force(braces, unknowns, equations, cones, k, end, scale)
+                    results[k, kb.LOW + end] = extreme_force(braces, unknowns, equations, cones, k, end, scale)
         return True
     for k in range(c):
         commanded = table[k, kb.COMMANDED] == table[k, kb.COMMANDED]
-        found[k, kb.LOW] = table[k, kb.COMMANDED] if commanded else table[k, kb.LEAST]
-        found[k, kb.HIGH] = table[k, kb.COMMANDED] if commanded else math.inf
+        results[k, kb.LOW] = table[k, kb.COMMANDED] if commanded else table[k, kb.LEAST]
+        results[k, kb.HIGH] = table[k, kb.COMMANDED] if commanded else math.inf
     return True
 
 
@@ -181,20 +181,20 @@ def keep(braces: BraceArrays, scale):
 @internal_kernel
 def brace_forces(braces: BraceArrays, k, scale):
     """The force of brace k from the unknowns, along its axes and in the world."""
-    table, found, x, at = braces.table, braces.found, braces.program.x, braces.first[k]
+    table, results, x, at = braces.table, braces.results, braces.program.x, braces.first[k]
     normal = table[k, kb.COMMANDED]
     if normal != normal:
         normal, at = scale * x[at], at + 1
-    found[k, kb.FORCES] = normal
+    results[k, kb.FORCES] = normal
     for e in range(2):
         directed = at == braces.first[k + 1]
-        found[k, kb.FORCES + 1 + e] = (
+        results[k, kb.FORCES + 1 + e] = (
             -table[k, kb.FRICTION] * normal * table[k, kb.SLIP + e] if directed else scale * x[at + e]
         )
     for i in range(3):
         braces.forces[k, i] = 0.0
         for e in range(ka.MOST_ROWS):
-            braces.forces[k, i] += found[k, kb.FORCES + e] * table[k, kb.AXES + 3 * e + i]
+            braces.forces[k, i] += results[k, kb.FORCES + e] * table[k, kb.AXES + 3 * e + i]
 
 
 @internal_kernel
@@ -257,12 +257,12 @@ def brace_rows(model: ModelArrays, ws: Workspace, braces: BraceArrays):
         first[k + 1] = tangents + (0 if directed else 2)
         for j in range(n):
             rate = along(table, jacobian, k, j, 0)
-            one, other = along(table, jacobian, k, j, 1), along(table, jacobian, k, j, 2)
-            lever = max(lever, abs(rate), abs(one), abs(other))
+            first_tangent, second_tangent = along(table, jacobian, k, j, 1), along(table, jacobian, k, j, 2)
+            lever = max(lever, abs(rate), abs(first_tangent), abs(second_tangent))
             if directed:
-                rate -= mu * (table[k, kb.SLIP] * one + table[k, kb.SLIP + 1] * other)
+                rate -= mu * (table[k, kb.SLIP] * first_tangent + table[k, kb.SLIP + 1] * second_tangent)
             else:
-                B[tangents, j], B[tangents + 1, j] = one, other
+                B[tangents, j], B[tangents + 1, j] = first_tangent, second_tangent
             if commanded:
                 braces.free[j] -= table[k, kb.COMMANDED] * rate
             else:
@@ -399,13 +399,13 @@ def extreme_force(braces: BraceArrays, unknowns, equations, cones, j, end, scale
 @internal_kernel
 def holds_with_least(braces: BraceArrays, j):
     """Whether the forces found stay possible when that of brace j is shortened to the least that it may be."""
-    found, k, least = braces.found, braces.first[j], braces.table[j, kb.LEAST]
-    shorter = found[j, kb.FORCES] - least
-    share = shorter / found[j, kb.FORCES] if shorter > 0.0 else 0.0
+    results, k, least = braces.results, braces.first[j], braces.table[j, kb.LEAST]
+    shorter = results[j, kb.FORCES] - least
+    share = shorter / results[j, kb.FORCES] if shorter > 0.0 else 0.0
     for i in range(braces.free.shape[0]):
         torque = braces.torques[i] + shorter * braces.B[k, i]
         for e in range(k + 1, braces.first[j + 1]):
-            torque += share * found[j, kb.FORCES + e - k] * braces.B[e, i]
+            torque += share * results[j, kb.FORCES + e - k] * braces.B[e, i]
         if not braces.motors[i, kb.LOWER] <= torque <= braces.motors[i, kb.UPPER]:
             return False
     return True

@@ -1,4 +1,4 @@
-"""What braces and motors are to the program for the forces of braces, what it finds, and its room."""
+"""Tables of the cone program for the forces of braces: braces and motors in, forces out, workspace."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ LOWER = 1  # torque limits at the rate of the moment [N m], infinite for none; b
 UPPER = 2
 CONSTANT, RESISTANCE, VOLTAGE_LIMIT, CURRENT_LIMIT = 3, 4, 5, 6  # K_m [N m/A], R [Ω], U [V], I [A]
 MOTOR_SIZE = 7
-# BraceArrays.found: normal and tangential forces, then the ends of the interval of the normal force
+# BraceArrays.results: normal and tangential forces, then the ends of the interval of the normal force
 FORCES, LOW, HIGH = 0, 3, 4
-FOUND_SIZE = 5
+RESULT_SIZE = 5
 
 
 class BraceArrays(NamedTuple):
-    """Braces, motors, what is found, and the room for it."""
+    """Braces, motors, what results, and the room for it."""
 
     link: np.ndarray  # (c,) int
     table: np.ndarray  # (c, BRACE_SIZE)
@@ -38,7 +38,7 @@ class BraceArrays(NamedTuple):
     first: np.ndarray  # (c + 1,) int: the first unknown of each brace, and their number
     free: np.ndarray  # (n,) torques without the unknown forces [N m]
     torques: np.ndarray  # (n,) [N m]
-    found: np.ndarray  # (c, FOUND_SIZE) [N]
+    results: np.ndarray  # (c, RESULT_SIZE) [N]
     forces: np.ndarray  # (c, 3) on the arm in W [N]
     certificate: np.ndarray  # (n,) see brace_statics
     B: np.ndarray  # (3 c, n) a row for each unknown
@@ -59,7 +59,7 @@ def brace_arrays(link: np.ndarray, motors: np.ndarray) -> BraceArrays:
         first=integers(np.zeros(c + 1)),
         free=reals(np.zeros(n)),
         torques=reals(np.zeros(n)),
-        found=reals(np.zeros((c, FOUND_SIZE))),
+        results=reals(np.zeros((c, RESULT_SIZE))),
         forces=reals(np.zeros((c, 3))),
         certificate=reals(np.zeros(n)),
         B=reals(np.zeros((forces, n))),

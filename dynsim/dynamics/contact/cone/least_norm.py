@@ -19,7 +19,7 @@ from dynsim.dynamics.contact.cone.steps import block_size
 from dynsim.jit.kernel import internal_kernel
 
 # Rooms: G, its factor, the columns S (their coefficients along the rows of their block), vectors in first rows.
-MATRIX, FACTOR, COLUMNS, NOW, GOAL, RIGHT, PIVOT, PLACE, SIZE = 0, 1, 2, 3, 4, 5, 6, 7, 8
+MATRIX, FACTOR, COLUMNS, NOW, GOAL, RIGHT, PIVOT, ROW, SIZE = 0, 1, 2, 3, 4, 5, 6, 7, 8
 # A row that leaves faster than this has no force, and slower slip has no direction [m/s].
 STILL = 1e-9
 # A pivot below this times the mean of the diagonal: G is singular. The projection shifts by this times that mean, and
@@ -38,15 +38,15 @@ def select_least_norm(W, w, kind, mu, p, f, room):
     n = changeable(w, kind, mu, p, room)
     if n < 2:
         return
-    G, L, S, place, size = room[MATRIX], room[FACTOR], room[COLUMNS], room[PLACE, 0], room[SIZE, 0]
+    G, L, S, row, size = room[MATRIX], room[FACTOR], room[COLUMNS], room[ROW, 0], room[SIZE, 0]
     now, goal, right = room[NOW, 0], room[GOAL, 0], room[RIGHT, 0]
     trace = 0.0
     for i in range(n):
-        a, now[i] = int(place[i]), 0.0
+        a, now[i] = int(row[i]), 0.0
         for k in range(int(size[i])):
             now[i] += S[i, k] * f[a + k]
         for j in range(i + 1):
-            b, total = int(place[j]), 0.0
+            b, total = int(row[j]), 0.0
             for k in range(int(size[i])):
                 for m in range(int(size[j])):
                     total += S[i, k] * W[a + k, b + m] * S[j, m]
@@ -81,7 +81,7 @@ def select_least_norm(W, w, kind, mu, p, f, room):
                 high = share
         share = low
     for i in range(n):
-        a = int(place[i])
+        a = int(row[i])
         for k in range(int(size[i])):
             f[a + k] += share * (goal[i] - now[i]) * S[i, k]
 
@@ -89,22 +89,22 @@ def select_least_norm(W, w, kind, mu, p, f, room):
 @internal_kernel
 def changeable(w, kind, mu, p, room):
     """The columns S of the rows whose forces may change: coefficients, first row and size; returns their number."""
-    S, place, size = room[COLUMNS], room[PLACE, 0], room[SIZE, 0]
+    S, row, size = room[COLUMNS], room[ROW, 0], room[SIZE, 0]
     n, k = 0, 0
     while k < p:
         if kind[k] == kc.CONE and w[k] <= STILL:
             slip = math.sqrt(w[k + 1] * w[k + 1] + w[k + 2] * w[k + 2])
             if mu[k] > 0.0 and slip > STILL:
                 scale = 1.0 / math.sqrt(1.0 + mu[k] * mu[k])
-                place[n], size[n], S[n, 0] = k, 3.0, scale
+                row[n], size[n], S[n, 0] = k, 3.0, scale
                 S[n, 1], S[n, 2] = -scale * mu[k] * w[k + 1] / slip, -scale * mu[k] * w[k + 2] / slip
                 n += 1
             else:
                 for m in range(3 if mu[k] > 0.0 else 1):
-                    place[n], size[n], S[n, 0] = k + m, 1.0, 1.0
+                    row[n], size[n], S[n, 0] = k + m, 1.0, 1.0
                     n += 1
         elif kind[k] == kc.ONE_WAY and w[k] <= STILL:
-            place[n], size[n], S[n, 0] = k, 1.0, 1.0
+            row[n], size[n], S[n, 0] = k, 1.0, 1.0
             n += 1
         k += block_size(kind, k)
     return n
@@ -143,18 +143,18 @@ def substitute(L, pivot, x, n):
 @internal_kernel
 def inside(mu, n, room, share, slack):
     """True when the forces ``share`` of the way from NOW to GOAL lie in their cones."""
-    now, goal, place, size = room[NOW, 0], room[GOAL, 0], room[PLACE, 0], room[SIZE, 0]
+    now, goal, row, size = room[NOW, 0], room[GOAL, 0], room[ROW, 0], room[SIZE, 0]
     i = 0
     while i < n:
         normal = now[i] + share * (goal[i] - now[i])
         if normal < -slack:
             return False
         # Three columns of one row each, in a row: a point that sticks.
-        sticks = size[i] == 1.0 and i + 2 < n and place[i + 1] == place[i] + 1.0 and mu[int(place[i])] > 0.0
+        sticks = size[i] == 1.0 and i + 2 < n and row[i + 1] == row[i] + 1.0 and mu[int(row[i])] > 0.0
         if sticks:
             x = now[i + 1] + share * (goal[i + 1] - now[i + 1])
             y = now[i + 2] + share * (goal[i + 2] - now[i + 2])
-            if math.sqrt(x * x + y * y) > mu[int(place[i])] * normal + slack:
+            if math.sqrt(x * x + y * y) > mu[int(row[i])] * normal + slack:
                 return False
             i += 2
         i += 1

@@ -1,4 +1,4 @@
-"""Contact problems: forces on one side, Coulomb cones, rows that hold both ways, all at once and without smoothing.
+"""Contact problems: unilateral forces, Coulomb cones and bilateral rows, all at once and without smoothing.
 
 Find f with u = W f + b (forces and accelerations, or impulses and velocities) such that every row or block of rows has
 
@@ -217,8 +217,8 @@ def follow_path(W, b, kind, mu, p, f, room, tolerance, attempt):
     for _ in range(PATH_STEPS):
         mobilities(W, kind, p, room)
         shift(W, b, p, room, epsilon)
-        found = approach(shifted, right, kind, mu, p, f, room, max(tolerance, 1e-9 * scale), PATH_ROUNDS)
-        if found <= 1e-6 * scale:
+        shifted_residual = approach(shifted, right, kind, mu, p, f, room, max(tolerance, 1e-9 * scale), PATH_ROUNDS)
+        if shifted_residual <= 1e-6 * scale:
             for k in range(p):
                 last[k] = f[k]
             if epsilon <= 1e-11:

@@ -177,14 +177,14 @@ def solve_cone_program(program: ConeProgram, n, m, cones):
 def keep(program: ConeProgram, n, m, cones, store):
     """Store the present unknowns, or take back those that were stored."""
     kept, rows = program.kept, program.first[cones]
-    place = 0
+    position = 0
     for table, size in ((program.x, n), (program.y, m), (program.s, rows), (program.z, rows)):
         for i in range(size):
             if store:
-                kept[place] = table[i]
+                kept[position] = table[i]
             else:
-                table[i] = kept[place]
-            place += 1
+                table[i] = kept[position]
+            position += 1
 
 
 @internal_kernel

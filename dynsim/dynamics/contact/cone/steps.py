@@ -13,11 +13,11 @@ BOTH_WAYS, ONE_WAY, CONE, TANGENT, BOX = 0, 1, 2, 3, 4
 
 # Blocks of the scratch: two matrices, then vectors in first rows.
 MATRIX, SHIFTED = 0, 1
-MOTION, MOBILITY, RIGHT, PLACE, FIRST, SECOND, BETA = 2, 3, 4, 5, 6, 7, 8
+MOTION, MOBILITY, RIGHT, STATUS, FIRST, SECOND, BETA = 2, 3, 4, 5, 6, 7, 8
 BEST, SWEPT, START, GOAL = 9, 10, 11, 12
 SHIFTED_RIGHT, KEPT, LAST, ANCHOR, PROOF, NO_FRICTION, KNOWN = 13, 14, 15, 16, 17, 18, 19
 CONE_ROOM = 20
-# PLACE of a block at its first row: no force, u = 0, slides, at the bound FIRST.
+# STATUS of a block at its first row: no force, u = 0, slides, at the bound FIRST.
 OFF, HOLDS, SLIDES, CLAMPED = 0.0, 1.0, 2.0, 3.0
 # The proximal term is this times the relative residual, but no less than what keeps elimination far from rounding.
 PROXIMAL_FACTOR, LEAST_PROXIMAL = 1e3, 1e-11
@@ -101,26 +101,26 @@ def newton_step(W, b, kind, mu, p, f, room, relative, most):
     ``relative`` residual.
     """
     mobility, A, x = room[MOBILITY, 0], room[MATRIX], room[RIGHT, 0]
-    place, first, second, beta = room[PLACE, 0], room[FIRST, 0], room[SECOND, 0], room[BETA, 0]
+    status, first, second, beta = room[STATUS, 0], room[FIRST, 0], room[SECOND, 0], room[BETA, 0]
     near = min(max(PROXIMAL_FACTOR * most * relative, LEAST_PROXIMAL), most)
-    find_places(kind, mu, p, f, room)
+    find_statuses(kind, mu, p, f, room)
     known = room[KNOWN, 0]
     for k in range(p):
         known[k] = b[k]
     for m in range(p):
-        if place[m] == CLAMPED:
+        if status[m] == CLAMPED:
             for k in range(p):
                 known[k] += W[k, m] * first[m]
     r, k = 0, 0
     while k < p:
         more = near * mobility[k]
-        if place[k] == HOLDS:
+        if status[k] == HOLDS:
             for i in range(k, k + block_size(kind, k)):
                 fill_row(W, kind, mu, p, i, i, 1.0, 0.0, room, r)
                 A[r, r] += more
                 x[r] = more * f[i] - known[i]
                 r += 1
-        elif place[k] == SLIDES:
+        elif status[k] == SLIDES:
             fill_row(W, kind, mu, p, k, k, 1.0, 0.0, room, r)
             A[r, r] += more
             x[r] = more * f[k] - known[k]
@@ -135,7 +135,7 @@ def newton_step(W, b, kind, mu, p, f, room, relative, most):
     eliminate(A, x, r)
     r, k = 0, 0
     while k < p:
-        if place[k] == SLIDES:
+        if status[k] == SLIDES:
             normal, across = x[r], 0.0
             r += 1
             if beta[k] > 0.0:
@@ -147,33 +147,33 @@ def newton_step(W, b, kind, mu, p, f, room, relative, most):
         else:
             for i in range(k, k + block_size(kind, k)):
                 f[i] = 0.0
-                if place[k] == HOLDS:
+                if status[k] == HOLDS:
                     f[i] = x[r]
                     r += 1
-                elif place[k] == CLAMPED:
+                elif status[k] == CLAMPED:
                     f[i] = first[k]
         k += block_size(kind, k)
 
 
 @internal_kernel
-def find_places(kind, mu, p, f, room):
-    """PLACE of each block, of those that slide FIRST, SECOND = d and BETA, of those at a bound FIRST."""
+def find_statuses(kind, mu, p, f, room):
+    """STATUS of each block, of those that slide FIRST, SECOND = d and BETA, of those at a bound FIRST."""
     u, mobility = room[MOTION, 0], room[MOBILITY, 0]
-    place, first, second, beta = room[PLACE, 0], room[FIRST, 0], room[SECOND, 0], room[BETA, 0]
+    status, first, second, beta = room[STATUS, 0], room[FIRST, 0], room[SECOND, 0], room[BETA, 0]
     k = 0
     while k < p:
         w = mobility[k]
         normal = w * f[k] - u[k]
-        place[k] = HOLDS if kind[k] == BOTH_WAYS or normal > 0.0 else OFF
+        status[k] = HOLDS if kind[k] == BOTH_WAYS or normal > 0.0 else OFF
         if kind[k] == BOX:
-            place[k] = HOLDS
+            status[k] = HOLDS
             if abs(normal) >= w * mu[k]:
-                place[k], first[k] = CLAMPED, mu[k] if normal > 0.0 else -mu[k]
+                status[k], first[k] = CLAMPED, mu[k] if normal > 0.0 else -mu[k]
         if kind[k] == CONE and normal > 0.0:
             x, y = w * f[k + 1] - u[k + 1], w * f[k + 2] - u[k + 2]
             length = math.sqrt(x * x + y * y)
             if length > mu[k] * normal:
-                place[k] = SLIDES
+                status[k] = SLIDES
                 first[k], second[k], beta[k] = x / length, y / length, mu[k] * normal / length
         k += block_size(kind, k)
 
@@ -181,14 +181,14 @@ def find_places(kind, mu, p, f, room):
 @internal_kernel
 def fill_row(W, kind, mu, p, i, j, alpha, gamma, room, r):
     """Row r of Newton's matrix: the motion alpha u_i + gamma u_j over the unknowns."""
-    A, place, first, second, beta = room[MATRIX], room[PLACE, 0], room[FIRST, 0], room[SECOND, 0], room[BETA, 0]
+    A, status, first, second, beta = room[MATRIX], room[STATUS, 0], room[FIRST, 0], room[SECOND, 0], room[BETA, 0]
     c, m = 0, 0
     while m < p:
-        if place[m] == HOLDS:
+        if status[m] == HOLDS:
             for s in range(m, m + block_size(kind, m)):
                 A[r, c] = alpha * W[i, s] + gamma * W[j, s]
                 c += 1
-        elif place[m] == SLIDES:
+        elif status[m] == SLIDES:
             normal = alpha * W[i, m] + gamma * W[j, m]
             x = alpha * W[i, m + 1] + gamma * W[j, m + 1]
             y = alpha * W[i, m + 2] + gamma * W[j, m + 2]

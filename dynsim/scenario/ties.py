@@ -1,0 +1,104 @@
+"""The ``ties:`` section of a scenario: springs, dampers and bounds between two bodies, of the robot or of objects.
+
+ties:
+  spring: {type: linear, body: link_3, other: box, axis: [0, 0, 1], stiffness_N_per_m: 500, damping_N_s_per_m: 2}
+  twist: {type: torsion, body: link_3, other: box, axis: [0, 0, 1], stiffness_N_m_per_rad: 4, bound_N_m: 0.8}
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from dynsim.config.base import NonNegative, Positive, StrictConfig, Vector3, error_at, unit_vector
+from dynsim.model.description import Tie
+
+
+class TieConfig(StrictConfig):
+    """What it ties, and in which direction."""
+
+    body: str = Field(description="name of a body, or of a frame fixed on one")
+    other: str = Field(description="the same, of the other end")
+    axis: Vector3 = Field(description="in the axes of body")
+    pushes: bool = Field(default=False, description="it only pushes body along the axis, away from other")
+
+    @model_validator(mode="after")
+    def _check_ends(self) -> Self:
+        unit_vector(self.axis, "axis")
+        if self.body == self.other:
+            raise error_at("other", f"is {self.body!r}, as body is; a tie has two ends")
+        return self
+
+
+class Linear(TieConfig):
+    """Along the axis: f = −k (x − x_0) − c dx/dt on body, x = axis · (point − other point)."""
+
+    type: Literal["linear"]
+    point_m: Vector3 = Field(default=[0.0, 0.0, 0.0], description="in body's axes, from its origin")
+    other_point_m: Vector3 = Field(default=[0.0, 0.0, 0.0], description="in those of other")
+    stiffness_N_per_m: NonNegative = 0.0
+    damping_N_s_per_m: NonNegative = 0.0
+    bound_N: Positive | None = Field(default=None, description="beyond it x_0 moves; default: none")
+    rest_m: float | None = Field(default=None, description="x_0; default: x at the start")
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if not self.stiffness_N_per_m + self.damping_N_s_per_m > 0.0:
+            raise error_at("stiffness_N_per_m", "is needed, or damping_N_s_per_m")
+        if self.pushes and self.bound_N is not None:
+            raise error_at("bound_N", "is none of a tie that only pushes; remove it")
+        return self
+
+    def tie(self, name: str) -> Tie:
+        """The tie of that name."""
+        return Tie(
+            name,
+            self.body,
+            self.other,
+            np.array(self.axis),
+            self.stiffness_N_per_m,
+            self.damping_N_s_per_m,
+            math.inf if self.bound_N is None else self.bound_N,
+            point=np.array(self.point_m),
+            other_point=np.array(self.other_point_m),
+            pushes=self.pushes,
+            rest=math.nan if self.rest_m is None else self.rest_m,
+        )
+
+
+class Torsion(TieConfig):
+    """About the axis: the same of the rotation of body against other."""
+
+    type: Literal["torsion"]
+    stiffness_N_m_per_rad: NonNegative = 0.0
+    damping_N_m_s_per_rad: NonNegative = 0.0
+    bound_N_m: Positive | None = Field(default=None, description="beyond it x_0 moves; default: none")
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if not self.stiffness_N_m_per_rad + self.damping_N_m_s_per_rad > 0.0:
+            raise error_at("stiffness_N_m_per_rad", "is needed, or damping_N_m_s_per_rad")
+        if self.pushes and self.bound_N_m is not None:
+            raise error_at("bound_N_m", "is none of a tie that only pushes; remove it")
+        return self
+
+    def tie(self, name: str) -> Tie:
+        """The tie of that name."""
+        return Tie(
+            name,
+            self.body,
+            self.other,
+            np.array(self.axis),
+            self.stiffness_N_m_per_rad,
+            self.damping_N_m_s_per_rad,
+            math.inf if self.bound_N_m is None else self.bound_N_m,
+            turns=True,
+            pushes=self.pushes,
+            rest=math.nan,
+        )
+
+
+TieChoice = Annotated[Linear | Torsion, Field(discriminator="type")]

@@ -1,0 +1,57 @@
+"""What the length of a step changes in Table III of the dynamic snake, and of which order time stepping is there.
+
+``PYTHONPATH=tests python -m support.snake_steps`` writes results/snake/steps.json, which docs/snake.md quotes, in a
+minute or two.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dynsim._version import __version__
+from dynsim.engine import simulate
+from dynsim.scenario import load_scenario
+from dynsim.snake.published import TABLE_III, displacement
+from dynsim.system.files import write_json
+
+SCENARIO, FILE = "snake_positioning_dynamic", Path("results/snake/steps.json")
+STEPS_MS = (1.0, 2.5, 5.0)
+# Of the head that is let go, where nothing comes to rest: the last is what the others are measured by.
+FALL_MS, FALL_S = (5.0, 2.5, 1.25, 0.3125), 0.15
+
+
+def end_values(moved: str, step_ms: float) -> np.ndarray:
+    """Displacement of the head as Table III takes it, (6,) [m, rad]."""
+    return displacement(simulate(load_scenario(SCENARIO, moved, {"integrator.step_s": 1e-3 * step_ms})))
+
+
+def fall_errors(theta: float) -> list[float]:
+    """Largest error of the head's place while it falls, by step [m]."""
+    settings = {"plant.dynamics.start": "released", "duration_s": FALL_S, "integrator.theta": theta}
+    falls = [
+        simulate(load_scenario(SCENARIO, "x", {**settings, "integrator.step_s": 1e-3 * step}))["w"] for step in FALL_MS
+    ]
+    return [float(np.abs(fall - falls[-1])[:, :3].max()) for fall in falls[:-1]]
+
+
+def study() -> dict[str, Any]:
+    """All of it."""
+    ends = {moved: [end_values(moved, step).tolist() for step in STEPS_MS] for moved in TABLE_III}
+    spread = np.array([np.ptp(values, axis=0) for values in ends.values()])
+    return {
+        "dynsim_version": __version__,
+        "steps_ms": STEPS_MS,
+        "end_values": ends,
+        "spread_mm": 1e3 * float(spread[:, :3].max()),
+        "spread_mrad": 1e3 * float(spread[:, 3:].max()),
+        "fall_steps_ms": FALL_MS[:-1],
+        "fall_errors_m": {f"theta_{theta:g}": fall_errors(theta) for theta in (0.5, 1.0)},
+    }
+
+
+if __name__ == "__main__":
+    FILE.parent.mkdir(parents=True, exist_ok=True)
+    write_json(FILE, study())
