@@ -157,7 +157,7 @@ def _print_columns(console: Console, summaries: Mapping[str, Summary], names: Se
         table.add_row("energy, times the least", *(f"{ratio:.3g}" for ratio in ratios))
     contacts = list(dict.fromkeys(c["name"] for s in summaries.values() for c in s.get("contacts", ())))
     for contact in contacts:
-        by_variant = [next((c for c in s["contacts"] if c["name"] == contact), None) for s in shown]
+        by_variant = [next((c for c in s.get("contacts", ()) if c["name"] == contact), None) for s in shown]
         for heading, cells in _contact_rows(contact, by_variant):
             table.add_row(heading, *cells)
     everything = list(summaries.values())

@@ -63,6 +63,13 @@ def test_a_reference_beyond_a_stop_is_told(beyond: Record, tmp_path: Path) -> No
     assert not any("reference" in text for text in within.summary["warnings"])
 
 
+def test_variants_without_contacts_stand_beside_those_with_some() -> None:
+    """As the kinematic snake beside the dynamic one."""
+    forces = {"normal_force_mean_N": 2.0, "normal_force_min_N": 1.0, "normal_force_max_N": 3.0, "pulling_fraction": 0.0}
+    touching = {"scenario": "snake", "contacts": [{"name": "head", "closed_fraction": 1.0, **forces}]}
+    assert re.search(r"head: force, mean.* 2\.00 +–", shown({"dynamic": touching, "kinematic": {"scenario": "snake"}}))
+
+
 def test_zeros_print_as_zeros() -> None:
     summary = {
         "scenario": "arm", "variant": "", "energy_turnover_J": 100.0, "electrical_energy_J": 3e-11,
