@@ -119,13 +119,9 @@ def statics(task: Task, braces: tuple[Candidate, ...], times: Array, q: Array, r
         planner, tables = pressing(model, fine, whole, rates, placed, task.options.min_N, CHARGED)
     except ModelError as error:
         return f"between knots the postures jump: {error}"
-    torques, forces = np.zeros((len(fine), model.n)), np.zeros((len(fine), len(braces)))
-    for t in range(len(fine)):
-        row = slice(t, t + 1)
-        torques[row], solved = planner.torques(whole[row], rates[row], accelerations[row], tables[row])
-        if solved < 1:
-            return f"at t = {fine[t]:.3g} s no forces within friction cones and limits of the motors carry the motion"
-        forces[t] = planner.arrays.found[:, kb.FORCES]
+    torques, forces, solved = planner.least_heat(whole, rates, accelerations, tables)
+    if solved < len(fine):
+        return f"at t = {fine[solved]:.3g} s no forces within friction cones and limits of the motors carry the motion"
     weights = planner.arrays.motors[:, kb.HEAT]
     heat = float(np.trapezoid(torques**2 @ weights, fine) / task.duration)
     moved = torques[:, list(arm.links)]

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeVar, cast
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from dynsim.model.description import Array
 from dynsim.model.surfaces import Quadric
 from dynsim.planner.arm import MovingArm, axis_points, moving_arm
 from dynsim.planner.compiled import Course, Points
-from dynsim.planner.local import Problem
+from dynsim.planner.local import Problem, workspace
 from dynsim.scenario import Scenario, build
 
 # Weight of the bend of the postures along the path [W/rad²]: for uniqueness; no part of the cost that is reported.
@@ -37,6 +37,7 @@ SAME = 1e-6
 INSET = 0.2
 
 Kind = Literal["there_and_back", "closed", "open"]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -135,9 +136,15 @@ class Task:
     friction: float
 
     @cached_property
-    def _courses(self) -> dict[int, Course]:
-        """Those that were asked for, by their number of knots."""
+    def _known(self) -> dict[Any, Any]:
+        """Courses by their number of knots, points by their braces, and rooms by these numbers."""
         return {}
+
+    def _once(self, key: Any, make: Callable[[], T]) -> T:
+        """What is made when it is asked for first."""
+        if key not in self._known:
+            self._known[key] = make()
+        return cast("T", self._known[key])
 
     @property
     def duration(self) -> float:
@@ -272,12 +279,12 @@ class Task:
         )
 
     def problem(self, braces: Sequence[Candidate], count: int, slip_scale: float = SMOOTHER) -> Problem:
-        """Of one set of braces at so many knots; its targets are its own."""
-        if count not in self._courses:
-            self._courses[count] = self.course(count)
-        course = self._courses[count]
+        """Of one set of braces at so many knots; its targets are its own, its room that of all with as many braces."""
+        course = self._once(count, lambda: self.course(count))
+        points = self._once(tuple(braces), lambda: self.points(braces))
+        room = self._once((len(braces), len(points.body), count), lambda: workspace(self.arm.n, points, course))
         course = course._replace(target=course.target.copy(), slip_scale=reals([slip_scale]))
-        return Problem(self.arm.tables, self.points(braces), course, self.options.min_N, self.options.peak)
+        return Problem(self.arm.tables, points, course, room, self.options.min_N, self.options.peak)
 
 
 def task(scenario: Scenario, options: Options) -> Task:
