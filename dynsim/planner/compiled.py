@@ -5,8 +5,8 @@ Of an arm whose joints each have one coordinate, on a base that stands, with bra
     F_c = f_c (n − μ v_t / √(|v_t|² + v_s²)),    τ = g(q) + (D + D_m) v − Σ_c J_cᵀ F_c
 
 n: normal of the surface at the brace, v_t: velocity of the touching point along it. Postures q_k belong to knots;
-instants e belong to a knot each and have velocities v_e = Σ_k chord_ek q_k, so that back and forth along one path are
-two instants of one knot.
+instants e lie between knots, at q_e = Σ_k blend_ek q_k with velocities v_e = Σ_k chord_ek q_k, so that back and forth
+along one path are two instants of one posture.
 
 Everything is in one file: the cache of compiled code asks whether the file of a function has changed.
 """
@@ -49,6 +49,8 @@ DAMPING, DAMPING_MIN, DAMPING_MAX = 1e-3, 1e-7, 1e6
 REACH = 0.6
 # Points that are so much further from a surface than they must be are left out of a step [m].
 NEARBY = 0.5
+# Steps back onto the manifold within which what is left must be halved, or the search for it ends.
+PATIENCE = 12
 # Torques beyond this part of their limits cost extra, so many times what they cost as heat.
 NEAR_LIMIT, DEAR = 0.98, 100.0
 # Exponent of the mean that stands for the peak of the torques.
@@ -90,10 +92,11 @@ class Points(NamedTuple):
 
 
 class Course(NamedTuple):
-    """Knots k with targets of the hand and instants e."""
+    """Knots k with targets of the hand and instants e; instants of one posture follow each other."""
 
     target: np.ndarray  # (K, h) position of the hand [m], with the two directions' components if they are asked for
-    knot: np.ndarray  # (E,) int
+    knot: np.ndarray  # (E,) int, the last one before the instant
+    blend: np.ndarray  # (E, K)
     chord: np.ndarray  # (E, K) [1/s]
     share: np.ndarray  # (E,) of the time; their sum is 1
     smooth: np.ndarray  # (K, K) SᵀS of the smoothness S q
@@ -107,10 +110,10 @@ class Work(NamedTuple):
     by_q: np.ndarray  # (E, n, n) ∂τ/∂q at fixed v and f
     by_v: np.ndarray  # (E, n, n)
     by_f: np.ndarray  # (E, n, c)
-    gap: np.ndarray  # (K, P) distance from the surface less radius
-    gap_rate: np.ndarray  # (K, P, n), of those that are near by
-    hand: np.ndarray  # (K, h)
-    hand_rate: np.ndarray  # (K, h, n)
+    gap: np.ndarray  # (K + 1, P) distance from the surface less radius; the last row is of an instant
+    gap_rate: np.ndarray  # (K + 1, P, n), of those that are near by
+    hand: np.ndarray  # (K + 1, h)
+    hand_rate: np.ndarray  # (K + 1, h, n)
     R: np.ndarray  # (n, 9)
     p: np.ndarray  # (n, 3)
     a: np.ndarray  # (n, 3) joint axes in W
@@ -149,7 +152,8 @@ class Work(NamedTuple):
     small_right: np.ndarray  # (W,)
     index: np.ndarray  # (W,) int
     small_skyline: np.ndarray  # (W,) int
-    rate: np.ndarray  # (E, n) velocities of the instants
+    between: np.ndarray  # (n,) posture of an instant
+    rate: np.ndarray  # (n,) velocity of an instant
     weight: np.ndarray  # (E, n) of the squares of torques in the model of the cost
     pull: np.ndarray  # (E, n) half the gradient of the cost by torques, over the share of time
     change: np.ndarray  # (K, n) of postures in a step
@@ -212,8 +216,8 @@ def put_rows(table, out, row):
 
 
 @internal_kernel
-def geometry(arm: Arm, points: Points, work: Work, q, k):
-    """Of knot k: hand, gaps and their rates; of the braces also what their forces need."""
+def geometry(arm: Arm, points: Points, work: Work, q, k, count):
+    """Into row k: hand, gaps and their rates, of the first ``count`` points; of the braces what their forces need too."""
     n, c, hand, jacobian = arm.parent.shape[0], points.friction.shape[0], arm.hand[0], work.turn
     poses(arm, work, q)
     x = body_point(work, hand, arm.hand_point, 0)
@@ -233,7 +237,7 @@ def geometry(arm: Arm, points: Points, work: Work, q, k):
             j = arm.parent[j]
         put_vector(work.hand, k, row, axis)
         put_rows(jacobian, work.hand_rate[k], row)
-    for i in range(points.body.shape[0]):
+    for i in range(count):
         body, radius = points.body[i], points.radius[i]
         x = body_point(work, body, points.point, i)
         far, nx, ny, nz, xx, xy, xz, yy, yz, zz = distance(arm.shapes, points.surface[i], x[0], x[1], x[2])
@@ -258,8 +262,8 @@ def geometry(arm: Arm, points: Points, work: Work, q, k):
 
 
 @internal_kernel
-def statics(arm: Arm, points: Points, course: Course, work: Work, Q, V, F, least, forces):
-    """Torques, their derivatives, and geometry of all knots. Q: (K, n), V: (E, n), F: (E, c).
+def statics(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, forces):
+    """Torques of the instants with their derivatives, and geometry of all knots. Q: (K, n), F: (E, c).
 
     ∂τ/∂q_r = H_jr − Σ_c J_cj · ∂F_c/∂q_r − Σ_c (a_j × s_cr) · F_c,
     H_ij = −a_i · M_j (joint i carries joint j, both directions alike), M_j = Σ_k J_kj × w_k over weights and forces;
@@ -268,10 +272,17 @@ def statics(arm: Arm, points: Points, course: Course, work: Work, Q, V, F, least
     forces : whether those of least heat, at least ``least`` [N], are put into F first
     """
     n, c, weight = arm.parent.shape[0], points.friction.shape[0], vector(arm.gravity, 0, 0)
+    K, v = Q.shape[0], work.rate
+    for k in range(K):
+        geometry(arm, points, work, Q[k], k, points.body.shape[0])
     for e in range(course.knot.shape[0]):
+        for j in range(n):
+            v[j], work.between[j] = 0.0, 0.0
+            for k in range(K):
+                v[j] += course.chord[e, k] * Q[k, j]
+                work.between[j] += course.blend[e, k] * Q[k, j]
         if e == 0 or course.knot[e] != course.knot[e - 1]:
-            geometry(arm, points, work, Q[course.knot[e]], course.knot[e])
-        v = V[e]
+            geometry(arm, points, work, work.between, K, c)
         for j in range(n):
             a, mass = vector(work.a, j, 0), work.below[j, 0]
             if arm.prismatic[j]:
@@ -489,22 +500,10 @@ def least_heat(arm: Arm, work: Work, least, f, e):
         f[i] = least + x[i]
 
 
-@internal_kernel
-def equilibrium(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, forces):
-    """See :func:`statics`, with the rates that follow from the postures."""
-    for e in range(F.shape[0]):
-        for j in range(Q.shape[1]):
-            z = 0.0
-            for k in range(Q.shape[0]):
-                z += course.chord[e, k] * Q[k, j]
-            work.rate[e, j] = z
-    statics(arm, points, course, work, Q, work.rate, F, least, forces)
-
-
 @kernel
 def settle(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, forces):
-    """See :func:`equilibrium`."""
-    equilibrium(arm, points, course, work, Q, F, least, forces)
+    """See :func:`statics`."""
+    statics(arm, points, course, work, Q, F, least, forces)
 
 
 @internal_kernel
@@ -572,16 +571,16 @@ def constraint_rows(course: Course, points: Points, work: Work, k):
 def put_back(arm: Arm, points: Points, course: Course, work: Work, Q, steps, tolerance, reach):
     """Put the postures of all knots onto hand and braces, clear of the rest and within limits: least change.
 
-    Damped Gauss–Newton's steps on what is violated. Returns what is left at the worst knot [m].
+    Damped Gauss–Newton's steps on what is violated. Returns what is left at the worst knot [m], of those up to the first that fails.
     ``reach`` : greatest step of a coordinate
     """
     n, c, P, h = arm.parent.shape[0], points.friction.shape[0], points.body.shape[0], work.hand.shape[1]
     rows, A, right = work.rows, work.normal_matrix, work.right
     worst = 0.0
     for k in range(Q.shape[0]):
-        left = math.inf
+        left, halved = math.inf, math.inf
         for attempt in range(steps + 1):
-            geometry(arm, points, work, Q[k], k)
+            geometry(arm, points, work, Q[k], k, P)
             m = constraint_rows(course, points, work, k)
             left = 0.0
             for r in range(h):
@@ -609,6 +608,10 @@ def put_back(arm: Arm, points: Points, course: Course, work: Work, Q, steps, tol
                     m += 1
             if left <= tolerance or attempt == steps or not left < 1e6:
                 break
+            if attempt % PATIENCE == PATIENCE - 1:
+                if left > 0.5 * halved:
+                    break
+                halved = left
             far = 0.0
             for r in range(m):
                 far = max(far, abs(right[r]))
@@ -634,6 +637,8 @@ def put_back(arm: Arm, points: Points, course: Course, work: Work, Q, steps, tol
             for j in range(n):
                 Q[k, j] += work.x[j] * min(1.0, reach / most)
         worst = max(worst, left)
+        if worst > 2.0 * tolerance:
+            break
     return worst
 
 
@@ -772,8 +777,7 @@ def prepare(arm: Arm, points: Points, course: Course, work: Work, Q, damping):
     for e in range(E):
         m = 0
         for k in range(K):
-            here = course.knot[e] == k
-            if not here and course.chord[e, k] == 0.0:
+            if course.blend[e, k] == 0.0 and course.chord[e, k] == 0.0:
                 continue
             first = n - work.free[k]
             for d in range(work.free[k]):
@@ -781,9 +785,7 @@ def prepare(arm: Arm, points: Points, course: Course, work: Work, Q, damping):
                 for r in range(n):
                     z = 0.0
                     for j in range(n):
-                        slope = course.chord[e, k] * work.by_v[e, r, j]
-                        if here:
-                            slope += work.by_q[e, r, j]
+                        slope = course.chord[e, k] * work.by_v[e, r, j] + course.blend[e, k] * work.by_q[e, r, j]
                         z += slope * work.basis[k, j, first + d]
                     B[r, m] = z
                 m += 1
@@ -926,7 +928,7 @@ def solve(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, pea
     """
     if put_back(arm, points, course, work, Q, 60, ON, 2.0 * REACH / 3.0) > 2.0 * ON:
         return math.nan, math.nan, 0
-    equilibrium(arm, points, course, work, Q, F, least, True)
+    statics(arm, points, course, work, Q, F, least, True)
     cost, heat = costs(arm, course, work, Q, peak)
     damping, quiet, taken, ratio = DAMPING, 0, 0, 0.0
     scale = max(cost, 0.1)
@@ -948,7 +950,7 @@ def solve(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, pea
                 for j in range(Q.shape[1]):
                     trial[k, j] = Q[k, j] + share * work.change[k, j]
             if put_back(arm, points, course, work, trial, 12, ON, 2.0 * REACH / 3.0) <= 2.0 * ON:
-                equilibrium(arm, points, course, work, trial, forces, least, True)
+                statics(arm, points, course, work, trial, forces, least, True)
                 there, warmth = costs(arm, course, work, trial, peak)
                 if there < cost:
                     ratio = (cost - there) / (fall * share * (2.0 - share))
@@ -957,7 +959,7 @@ def solve(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, pea
                     copy(forces, F)
                     break
             damping *= 8.0
-            equilibrium(arm, points, course, work, Q, F, least, False)
+            statics(arm, points, course, work, Q, F, least, False)
             costs(arm, course, work, Q, peak)
         if not cost < before:
             break
@@ -968,5 +970,5 @@ def solve(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, pea
         quiet = quiet + 1 if before - cost < tolerance * max(cost, 1e-3) else 0
         if quiet >= 2:
             break
-    equilibrium(arm, points, course, work, Q, F, least, False)
+    statics(arm, points, course, work, Q, F, least, False)
     return cost, heat, taken

@@ -38,7 +38,6 @@ class Dense:
     fine : (M,) times at which the statics hold [s]
     torques : (M, n) of the moved joints [N m]; forces: (M, c) normal ones [N]
     heat : mean of all motors [W]; peak: greatest torque [N m]
-    clearance : least distance of what is not braced from a surface [m], what, and when [s]
     """
 
     times: Array
@@ -49,7 +48,6 @@ class Dense:
     forces: Array
     heat: float
     peak: float
-    clearance: tuple[float, str, float]
 
 
 def references(task: Task, braces: tuple[Candidate, ...], knots: Array, Q: Array, factor: int = 1) -> Dense | str:
@@ -125,8 +123,7 @@ def statics(task: Task, braces: tuple[Candidate, ...], times: Array, q: Array, r
     weights = planner.arrays.motors[:, kb.HEAT]
     heat = float(np.trapezoid(torques**2 @ weights, fine) / task.duration)
     moved = torques[:, list(arm.links)]
-    clear = nearest(task, braces, fine, whole[:, list(arm.columns)])
-    return Dense(times, q, rests, fine, moved, forces, heat, float(np.abs(moved).max()), clear)
+    return Dense(times, q, rests, fine, moved, forces, heat, float(np.abs(moved).max()))
 
 
 def nearest(

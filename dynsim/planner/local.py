@@ -84,8 +84,8 @@ def workspace(n: int, points: Points, course: Course) -> Work:
         return integers(np.zeros(shape))
 
     return Work(
-        torque=zeros(E, n), by_q=zeros(E, n, n), by_v=zeros(E, n, n), by_f=zeros(E, n, c), gap=zeros(K, P),
-        gap_rate=zeros(K, P, n), hand=zeros(K, h), hand_rate=zeros(K, h, n), R=zeros(n, 9), p=zeros(n, 3),
+        torque=zeros(E, n), by_q=zeros(E, n, n), by_v=zeros(E, n, n), by_f=zeros(E, n, c), gap=zeros(K + 1, P),
+        gap_rate=zeros(K + 1, P, n), hand=zeros(K + 1, h), hand_rate=zeros(K + 1, h, n), R=zeros(n, 9), p=zeros(n, 3),
         a=zeros(n, 3), below=zeros(n, 4), moment=zeros(n, 3), touch=zeros(c, n, 3), turned=zeros(c, n, 3),
         normal=zeros(c, 3), shift=zeros(c, n, 3), slip=zeros(c, 7), force=zeros(c, 3), turn=zeros(n, 3),
         drift=zeros(n, 3), basis=zeros(K, n, n), free=ints(K), rows=zeros(R, n),
@@ -94,7 +94,7 @@ def workspace(n: int, points: Points, course: Course) -> Work:
         working=ints(W, 3), bound=zeros(W),
         normals=zeros(N, W), dual=zeros(W, W), dual_right=zeros(W), multiplier=zeros(W), passive=ints(W),
         small=zeros(W, W), small_right=zeros(W), index=ints(W), small_skyline=ints(max(W, R)),
-        rate=zeros(E, n), weight=zeros(E, n), pull=zeros(E, n), change=zeros(K, n), trial=zeros(K, n),
+        between=zeros(n), rate=zeros(n), weight=zeros(E, n), pull=zeros(E, n), change=zeros(K, n), trial=zeros(K, n),
         trial_forces=zeros(E, c),
     )  # fmt: skip
 

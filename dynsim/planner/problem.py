@@ -33,8 +33,6 @@ LINK_CLEARANCE = 2e-3
 CHARGED, SMOOTHER = 1e-3, 2e-3
 # Targets that differ by less are the same [m].
 SAME = 1e-6
-# Chords at knots of a single pass: how far from its ends the two of a coarse one lie.
-INSET = 0.2
 
 Kind = Literal["there_and_back", "closed", "open"]
 T = TypeVar("T")
@@ -175,8 +173,6 @@ class Task:
             return np.array([0.5 * self.span])
         if self.kind == "closed":
             return np.linspace(0.0, self.span, count, endpoint=False)
-        if count == 2:
-            return np.array([INSET, 1.0 - INSET]) * self.span
         return np.linspace(0.0, self.span, count)
 
     @cached_property
@@ -232,48 +228,32 @@ class Task:
         )
 
     def course(self, count: int) -> Course:
-        """Knots and instants of so many knots.
+        """Knots and instants of so many knots: halfway between neighbours, with the chord for a velocity.
 
-        Velocities are chords between neighbouring knots, never slopes of a spline through them: those an optimiser
-        would make vanish exactly at the knots, and slide in between.
+        So both are right to second order in the distance of knots. Slopes of a spline through the knots an optimiser
+        would make vanish there, and slide in between; chords with the posture of a knot let it save much of the
+        friction that there is, by joints that turn against each other.
         """
-        times, span = self.times(count), self.span
-        instants: list[tuple[int, Array, float]] = []
-
-        def chord(a: int, b: int, time: float) -> Array:
-            row = np.zeros(count)
-            row[a] -= 1.0 / time
-            row[b] += 1.0 / time
-            return row
-
-        both = self.kind == "there_and_back"
-        if count == 1:
-            instants.append((0, np.zeros(1), 1.0))
-        elif count == 2 and self.kind != "closed":
-            ahead = chord(0, 1, span)
-            for k in range(2):
-                instants += [(k, ahead, 0.25), (k, -ahead, 0.25)] if both else [(k, ahead, 0.5)]
-        elif self.kind == "closed":
-            instants += [(k, chord(k, (k + 1) % count, span / count), 1.0 / count) for k in range(count)]
-        else:
-            spacing, share = span / (count - 1), 0.5 / (count - 1)
-            for k in range(count):
-                if k < count - 1:
-                    instants.append((k, chord(k, k + 1, spacing), share))
-                if k > 0:
-                    back = chord(k, k - 1, spacing)
-                    instants.append((k, back if both else -back, share))
+        times, closed = self.times(count), self.kind == "closed"
+        pairs = [(k, (k + 1) % count) for k in range(count if closed else count - 1)] if count > 1 else []
+        spacing = self.span / max(len(pairs), 1)
+        ways = (1.0, -1.0) if self.kind == "there_and_back" else (1.0,)
+        instants = [(first, np.eye(count)[[first, second]], way) for first, second in pairs for way in ways]
+        knot = [first for first, _, _ in instants] or [0]
+        blend = [0.5 * ends.sum(axis=0) for _, ends, _ in instants] or [np.ones(1)]
+        chord = [way / spacing * (ends[1] - ends[0]) for _, ends, way in instants] or [np.zeros(1)]
         if count < 3:
             bend = np.diff(np.eye(count), axis=0)
-        elif self.kind == "closed":
+        elif closed:
             bend = np.roll(np.eye(count), 1, axis=1) - 2.0 * np.eye(count) + np.roll(np.eye(count), -1, axis=1)
         else:
             bend = np.diff(np.eye(count), 2, axis=0)
         return Course(
             target=reals(self.wanted(times)),
-            knot=integers([k for k, _, _ in instants]),
-            chord=reals([row for _, row, _ in instants]),
-            share=reals([share for _, _, share in instants]),
+            knot=integers(knot),
+            blend=reals(blend),
+            chord=reals(chord),
+            share=reals(np.full(len(knot), 1.0 / len(knot))),
             smooth=reals(SMOOTHNESS * bend.T @ bend),
             slip_scale=reals([SMOOTHER]),
         )

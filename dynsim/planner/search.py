@@ -28,6 +28,7 @@ POSTURES, DRAWS = 4, 60
 SPREAD, PRISMATIC_SPREAD = (0.3, 1.5), 0.2
 # Sets of each size and round that whole paths are made for, and those that are made finer in the end.
 PATHS, KEPT = 4, 3
+NEIGHBOURS = 1
 # Costs of one set that differ by less, as a share, are of one path, and paths beyond that ratio to the least are none
 # that could become the best; so many of a set are made finer.
 SAME_COST, NEAR, ALTERNATIVES = 1e-3, 1.1, 3
@@ -91,7 +92,7 @@ class Search:
         self._tell = tell or (lambda text, share: None)
         self.single_heats: dict[Set, float] = {}
         self._rng = np.random.default_rng(task.options.seed)
-        self.coarse = 4 if task.kind == "closed" else 2
+        self.coarse = 4 if task.kind == "closed" else 3
         self.path = CLOSED_KNOTS if task.kind == "closed" else PATH_KNOTS
         self.fine = CLOSED_FINE if task.kind == "closed" else FINE_KNOTS
 
@@ -110,7 +111,7 @@ class Search:
         times, wanted = self.task.times(len(known)), self.task.times(count)
         if self.task.kind == "closed":
             times, known = np.append(times, self.task.span), np.vstack([known, known[:1]])
-        return reals(np.stack([_line(wanted, times, column) for column in known.T], axis=1))
+        return reals(np.stack([np.interp(wanted, times, column) for column in known.T], axis=1))
 
     def _starts(self, first: bool) -> list[Array]:
         """Random postures with the hand in the middle of the path, clear of all surfaces; the initial one too."""
@@ -148,6 +149,7 @@ class Search:
             for size, ranked in self._round(number, most).items():
                 heats = [self._path(paths.setdefault(item[1], []), *item) for item in ranked[:PATHS]]
                 self.tally.heats.setdefault(size, []).append(min(heats, default=math.inf))
+        self._exchange(paths, most)
         planned: dict[int, list[Planned]] = {}
         for size in range(least, most + 1):
             self._tell("refining", (rounds + size / (most + 1)) / (rounds + 1))
@@ -167,6 +169,24 @@ class Search:
         local = self._whole(braces, Q)
         known.append(Path(cost, local))
         return math.inf if local is None else local.heat
+
+    def _exchange(self, paths: dict[Set, list[Path]], most: int) -> None:
+        """Whole paths of the sets that the best become by a brace less, and then by one more, from their postures.
+
+        Along the path sets rank otherwise than at few knots, and their postures are those that no single posture
+        leads to.
+        """
+        smaller = [(size, lambda braces: [braces[:k] + braces[k + 1 :] for k in range(len(braces))]) for size in range(most, 1, -1)]
+        larger = [(size, lambda braces: list(self._sets(len(braces) + 1, [(braces, [])]))) for size in range(most)]
+        for size, others in [*smaller, *larger]:
+            ranked = [(p.local.cost, braces, p.local) for braces, some in paths.items() if len(braces) == size for p in some if p.local]
+            for _, braces, local in sorted(ranked, key=lambda item: item[0])[:NEIGHBOURS]:
+                for other in others(braces):
+                    there = self.solve(other, local.Q, self.path, 30)
+                    if there is not None:
+                        known = paths.setdefault(other, [])
+                        if all(p.local is None or abs(p.local.cost - there.cost) > SAME_COST * there.cost for p in known):
+                            known.append(Path(there.cost, there))
 
     def _round(self, number: int, most: int) -> dict[int, list[tuple[float, Set, Array]]]:
         """Sets of each size with cost and posture, the best first, from new starts."""
@@ -313,14 +333,3 @@ def _cost(local: Local) -> float:
 def _fits(braces: Sequence[Candidate]) -> bool:
     """Whether each point leans on one surface only."""
     return len({brace.location for brace in braces}) == len(braces)
-
-
-def _line(at: Array, times: Array, values: Array) -> Array:
-    """Linear between times, and straight on beyond them."""
-    out = np.interp(at, times, values)
-    before, after = at < times[0], at > times[-1]
-    first = (values[1] - values[0]) / (times[1] - times[0])
-    last = (values[-1] - values[-2]) / (times[-1] - times[-2])
-    out[before] = values[0] + first * (at[before] - times[0])
-    out[after] = values[-1] + last * (at[after] - times[-1])
-    return out

@@ -78,6 +78,7 @@ def tree() -> tuple[Problem, np.ndarray, np.ndarray]:
     course = Course(
         target=reals(np.zeros((2, 9))),
         knot=integers([0, 1, 1]),
+        blend=reals([[0.6, 0.0], [0.0, 0.7], [0.0, 0.7]]),
         chord=reals(0.01 * rng.normal(size=(3, 2))),
         share=reals([0.3, 0.3, 0.4]),
         smooth=reals(np.zeros((2, 2))),
@@ -90,7 +91,7 @@ def tree() -> tuple[Problem, np.ndarray, np.ndarray]:
 def test_derivatives_are_those_of_differences(tree: tuple[Problem, np.ndarray, np.ndarray]) -> None:
     """Of torques by posture, rate and force, of gaps and of the hand: all surfaces, revolute and prismatic joints.
 
-    A knot moves its instants by ∂τ/∂q and by chord · ∂τ/∂v, the other ones by the second alone.
+    A knot moves instants by blend · ∂τ/∂q and by chord · ∂τ/∂v, some by the second alone.
     """
     problem, Q, F = tree
     work, course = problem.work, problem.course
@@ -111,10 +112,10 @@ def test_derivatives_are_those_of_differences(tree: tuple[Problem, np.ndarray, n
         for k in range(2):
             step = np.zeros_like(Q)
             step[k, j] = 1.0
-            exact = course.chord[:, k, None] * by_v[:, :, j] + (course.knot == k)[:, None] * by_q[:, :, j]
+            exact = course.chord[:, k, None] * by_v[:, :, j] + course.blend[:, k, None] * by_q[:, :, j]
             torques = slope(lambda h, step=step: evaluated(Q + h * step, F)[0], 1e-4)
             assert np.abs(torques - exact).max() < 1e-8 * np.abs(by_q).max()
-            alone = course.knot != k
+            alone = course.blend[:, k] == 0.0
             rates = slope(lambda h, step=step: evaluated(Q + h * step, F)[0], 1e-3)[alone]
             assert np.abs(rates - exact[alone]).max() < 1e-8 * np.abs(0.01 * by_v).max()
             for index, rate in ((1, gap), (2, hand)):
