@@ -217,7 +217,7 @@ def put_rows(table, out, row):
 
 @internal_kernel
 def geometry(arm: Arm, points: Points, work: Work, q, k, count):
-    """Into row k: hand, gaps and their rates, of the first ``count`` points; of the braces what their forces need too."""
+    """Into row k: hand, gaps and rates of the first ``count`` points; of the braces what their forces need too."""
     n, c, hand, jacobian = arm.parent.shape[0], points.friction.shape[0], arm.hand[0], work.turn
     poses(arm, work, q)
     x = body_point(work, hand, arm.hand_point, 0)
@@ -571,7 +571,8 @@ def constraint_rows(course: Course, points: Points, work: Work, k):
 def put_back(arm: Arm, points: Points, course: Course, work: Work, Q, steps, tolerance, reach):
     """Put the postures of all knots onto hand and braces, clear of the rest and within limits: least change.
 
-    Damped Gauss–Newton's steps on what is violated. Returns what is left at the worst knot [m], of those up to the first that fails.
+    Damped Gauss–Newton's steps on what is violated. Returns what is left at the worst knot [m], up to the first
+    that fails.
     ``reach`` : greatest step of a coordinate
     """
     n, c, P, h = arm.parent.shape[0], points.friction.shape[0], points.body.shape[0], work.hand.shape[1]

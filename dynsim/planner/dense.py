@@ -19,7 +19,7 @@ from dynsim.planner.compiled import ON
 from dynsim.planner.problem import CHARGED, Candidate, Clear, Task, key
 from dynsim.scenario import build
 
-# Instants of one pass along the path, at least; and the most time between two [s].
+# Instants of one pass along the path, at least, beside two for each knot; and the most time between two [s].
 INSTANTS, SPACING = 50, 0.1
 # Slower than this the hand rests [m/s].
 RESTS = 1e-2
@@ -58,7 +58,7 @@ def references(task: Task, braces: tuple[Candidate, ...], knots: Array, Q: Array
     the friction that a creeping brace feels. ``factor`` : so many times as many instants
     """
     span = task.span
-    count = factor * max(INSTANTS, int(np.ceil(span / SPACING)))
+    count = factor * max(INSTANTS, int(np.ceil(span / SPACING)), 2 * (len(knots) - 1))
     half = np.linspace(0.0, span, count + 1)
     start, end = (np.linalg.norm(np.diff(task.targets(np.array(pair)), axis=0)) for pair in _ends(task.duration))
     rests = bool(max(start, end) / 1e-4 < RESTS)

@@ -28,13 +28,14 @@ POSTURES, DRAWS = 4, 60
 SPREAD, PRISMATIC_SPREAD = (0.3, 1.5), 0.2
 # Sets of each size and round that whole paths are made for, and those that are made finer in the end.
 PATHS, KEPT = 4, 3
-NEIGHBOURS = 1
 # Costs of one set that differ by less, as a share, are of one path, and paths beyond that ratio to the least are none
 # that could become the best; so many of a set are made finer.
 SAME_COST, NEAR, ALTERNATIVES = 1e-3, 1.1, 3
-# Knots of whole paths: the search's, and the answer's.
-PATH_KNOTS, FINE_KNOTS = 9, (17, 33)
-CLOSED_KNOTS, CLOSED_FINE = 12, (24, 48)
+# Knots of whole paths: the search's, and the answer's first; the answer's are doubled, to so many at most, until dense
+# references cost as much as the knots but for this factor.
+PATH_KNOTS, FINE_KNOTS = 9, 17
+CLOSED_KNOTS, CLOSED_FINE = 12, 24
+MOST_KNOTS, CONVERGED = 60, 1.01
 
 Set = tuple[Candidate, ...]
 Tell = Callable[[str, float], None]
@@ -164,29 +165,33 @@ class Search:
         if cost > NEAR * min((path.coarse for path in known), default=math.inf):
             return math.inf
         for path in known:
-            if abs(path.coarse - cost) <= SAME_COST * cost:
+            if _same(path.coarse, cost):
                 return math.inf if path.local is None else path.local.heat
         local = self._whole(braces, Q)
         known.append(Path(cost, local))
         return math.inf if local is None else local.heat
 
     def _exchange(self, paths: dict[Set, list[Path]], most: int) -> None:
-        """Whole paths of the sets that the best become by a brace less, and then by one more, from their postures.
+        """Whole paths of the sets that the best ones become by a brace less, and then by one more.
 
-        Along the path sets rank otherwise than at few knots, and their postures are those that no single posture
-        leads to.
+        Along the path sets rank otherwise than at few knots, and few of them are near a posture that was drawn.
         """
-        smaller = [(size, lambda braces: [braces[:k] + braces[k + 1 :] for k in range(len(braces))]) for size in range(most, 1, -1)]
-        larger = [(size, lambda braces: list(self._sets(len(braces) + 1, [(braces, [])]))) for size in range(most)]
-        for size, others in [*smaller, *larger]:
-            ranked = [(p.local.cost, braces, p.local) for braces, some in paths.items() if len(braces) == size for p in some if p.local]
-            for _, braces, local in sorted(ranked, key=lambda item: item[0])[:NEIGHBOURS]:
-                for other in others(braces):
-                    there = self.solve(other, local.Q, self.path, 30)
-                    if there is not None:
-                        known = paths.setdefault(other, [])
-                        if all(p.local is None or abs(p.local.cost - there.cost) > SAME_COST * there.cost for p in known):
-                            known.append(Path(there.cost, there))
+        for size, change in [*((size, -1) for size in range(most, 1, -1)), *((size, 1) for size in range(most))]:
+            reached = [
+                (path.local, braces)
+                for braces, some in paths.items()
+                if len(braces) == size
+                for path in some
+                if path.local is not None
+            ]
+            if not reached:
+                continue
+            best, braces = min(reached, key=lambda item: item[0].cost)
+            for other in self._grown(braces) if change > 0 else combinations(braces, size - 1):
+                local = self.solve(other, best.Q, self.path, 30)
+                known = paths.setdefault(other, [])
+                if local is not None and not any(_same(path.coarse, local.cost) for path in known):
+                    known.append(Path(local.cost, local))
 
     def _round(self, number: int, most: int) -> dict[int, list[tuple[float, Set, Array]]]:
         """Sets of each size with cost and posture, the best first, from new starts."""
@@ -237,31 +242,31 @@ class Search:
         ]
         return sorted(solved, key=lambda item: item[0])
 
-    def _swaps(self, braces: Set) -> list[Set]:
-        """Sets with one brace exchanged for another candidate."""
-        kept = [tuple(brace for brace in braces if brace != out) for out in braces]
-        grown = [
-            tuple(brace for brace in self.task.candidates if brace in others or brace == new)
-            for others in kept
+    def _grown(self, braces: Set) -> list[Set]:
+        """Sets with one brace more."""
+        sets = [
+            tuple(brace for brace in self.task.candidates if brace in braces or brace == new)
             for new in self.task.candidates
             if new not in braces
         ]
-        return [braces for braces in dict.fromkeys(grown) if _fits(braces)]
+        return [grown for grown in sets if _fits(grown)]
+
+    def _swaps(self, braces: Set) -> list[Set]:
+        """Sets with one brace exchanged for another candidate."""
+        left = combinations(braces, len(braces) - 1)
+        return list(dict.fromkeys(grown for some in left for grown in self._grown(some) if grown != braces))
 
     def _sets(self, size: int, front: Sequence[tuple[Set, list[Array]]]) -> dict[Set, list[Array]]:
         """Sets that grow from smaller ones, with postures to start from."""
-        candidates = self.task.candidates
         sets: dict[Set, list[Array]] = {}
         if self.task.options.exhaustive:
-            for chosen in combinations(candidates, size):
+            for chosen in combinations(self.task.candidates, size):
                 if _fits(chosen):
                     sets[chosen] = [Q for _, postures in front for Q in postures][: 2 * BEAM]
             return sets
         for braces, postures in front:
-            for candidate in candidates:
-                grown = tuple(brace for brace in candidates if brace in braces or brace == candidate)
-                if len(grown) == size and _fits(grown):
-                    sets.setdefault(grown, []).extend(postures)
+            for grown in self._grown(braces):
+                sets.setdefault(grown, []).extend(postures)
         return sets
 
     def _whole(self, braces: Set, Q: Array) -> Local | None:
@@ -279,35 +284,36 @@ class Search:
             for local in reached[braces][: 2 * ALTERNATIVES]:
                 if len(good) == ALTERNATIVES or local.cost > near:
                     break
-                plan = self._finest(braces, local)
+                plan = self._finer(braces, local, self.fine)
                 if isinstance(plan, str):
                     self.tally.refused.setdefault(braces, plan)
                 else:
                     good.append(plan)
                     near = min(near, NEAR * local.cost)
             if good:
-                planned.append(min(good, key=lambda plan: plan.heat))
+                planned.append(self._finest(min(good, key=lambda plan: plan.heat)))
                 self.tally.refused.pop(braces, None)
         for braces in whole.keys() - reached.keys():
             self.tally.refused[braces] = "postures found, but none along the whole path"
         return sorted(planned, key=lambda plan: plan.heat)
 
-    def _finest(self, braces: Set, coarse: Local) -> Planned | str:
-        """The better of the two finest paths that keep hand and surfaces between knots; in words why none does."""
-        paths, good, why = [coarse], list[Planned](), ""
-        for count, slip_scale in ((self.fine[0], SMOOTHER), (self.fine[1], SMOOTHER), (self.fine[1], CHARGED)):
-            finer = self.solve(braces, paths[-1].Q, count, 20, slip_scale)
-            if finer is not None:
-                paths.append(finer)
-        for local in reversed(paths):
-            times = self.task.times(len(local.Q))
-            dense = references(self.task, braces, times, local.Q)
-            why = dense if isinstance(dense, str) else touching_links(self.task, dense.times, dense.q)
-            if not isinstance(dense, str) and not why:
-                good.append(Planned(braces, times, local, dense))
-                if len(good) == 2:
-                    break
-        return min(good, key=lambda plan: plan.heat, default=why)
+    def _finer(self, braces: Set, coarse: Local, count: int) -> Planned | str:
+        """A path at more knots with its dense references; in words why hand and surfaces are not kept between them."""
+        local = self.solve(braces, coarse.Q, count, 20, CHARGED) or coarse
+        times = self.task.times(len(local.Q))
+        dense = references(self.task, braces, times, local.Q)
+        if isinstance(dense, str):
+            return dense
+        return touching_links(self.task, dense.times, dense.q) or Planned(braces, times, local, dense)
+
+    def _finest(self, plan: Planned) -> Planned:
+        """Twice the knots until the dense references cost what the knots do."""
+        while plan.heat > CONVERGED * plan.local.heat and len(plan.times) < MOST_KNOTS:
+            finer = self._finer(plan.braces, plan.local, 2 * len(plan.times) - (self.task.kind != "closed"))
+            if isinstance(finer, str) or finer.heat >= plan.heat:
+                break
+            plan = finer
+        return plan
 
     def _walked(self, braces: Set, Q: Array, count: int) -> Local | None:
         """A path from a posture in its middle, knot after knot: where all at once does not reach."""
@@ -333,3 +339,8 @@ def _cost(local: Local) -> float:
 def _fits(braces: Sequence[Candidate]) -> bool:
     """Whether each point leans on one surface only."""
     return len({brace.location for brace in braces}) == len(braces)
+
+
+def _same(cost: float, other: float) -> bool:
+    """Whether two paths of one set are the same, by their costs."""
+    return abs(cost - other) <= SAME_COST * other
