@@ -188,10 +188,11 @@ class Search:
                 continue
             best, braces = min(reached, key=lambda item: item[0].cost)
             for other in self._grown(braces) if change > 0 else combinations(braces, size - 1):
-                local = self.solve(other, best.Q, self.path, 30)
-                known = paths.setdefault(other, [])
-                if local is not None and not any(_same(path.coarse, local.cost) for path in known):
-                    known.append(Path(local.cost, local))
+                local = self._whole(other, best.Q)
+                if local is not None and not any(
+                    p.local and _same(p.local.cost, local.cost) for p in paths.get(other, [])
+                ):
+                    paths.setdefault(other, []).append(Path(local.cost, local))
 
     def _round(self, number: int, most: int) -> dict[int, list[tuple[float, Set, Array]]]:
         """Sets of each size with cost and posture, the best first, from new starts."""
@@ -204,26 +205,28 @@ class Search:
         best[0] = [(r.cost, (), r.Q) for r in unbraced]
         front: list[tuple[Set, list[Array]]] = [((), [*starts, unbraced[0].Q])]
         for size in range(1, most + 1):
-            cheap = self._cheap(self._sets(size, front))
+            cheap = self._cheap(self._sets(size, front), number % 2 == 0)
             slipping = self._slipping(cheap, 2 * BEAM)
             if slipping and not self.task.options.exhaustive:
                 _, braces, Q = slipping[0]
                 swaps = {grown: [Q] for grown in self._swaps(braces) if grown not in cheap}
-                slipping += self._slipping(self._cheap(swaps), 2)
+                slipping += self._slipping(self._cheap(swaps, True), 2)
                 slipping.sort(key=lambda item: item[0])
             best[size] = slipping[:BEAM]
-            front = [(braces, [Q[len(Q) // 2]]) for _, braces, Q in best[size]]
-            if not front:
-                break
+            # Sets that a brace more leads along the path may have none there of their own.
+            front = [(braces, [Q[len(Q) // 2]]) for _, braces, Q in best[size]] or [
+                (braces, [cheap[braces].Q]) for braces in sorted(cheap, key=lambda braces: cheap[braces].cost)[:BEAM]
+            ]
         return best
 
-    def _cheap(self, sets: Mapping[Set, list[Array]]) -> dict[Set, Local]:
-        """Sets at one posture without slip, from postures."""
+    def _cheap(self, sets: Mapping[Set, list[Array]], best: bool) -> dict[Set, Local]:
+        """Sets at one posture without slip, from postures: the best that these lead to, or any."""
         reached: dict[Set, Local] = {}
         for braces, postures in sets.items():
             tried = [r for q in postures if (r := self.solve(braces, q, 1, 25)) is not None]
             if tried:
-                reached[braces] = min(tried, key=lambda r: r.cost)
+                chosen = min(tried, key=_cost) if best else tried[self._rng.integers(len(tried))]
+                reached[braces] = chosen
                 self.tally.missed.discard(braces)
                 if len(braces) == 1:
                     self.single_heats[braces] = min(reached[braces].heat, self.single_heats.get(braces, math.inf))
@@ -270,9 +273,12 @@ class Search:
         return sets
 
     def _whole(self, braces: Set, Q: Array) -> Local | None:
-        """A whole path from postures at few knots."""
-        local = self.solve(braces, Q, self.path, 30)
-        return self._walked(braces, Q, self.path) if local is None else local
+        """A whole path from postures at few knots, judged with one more between any two of it.
+
+        Far apart, knots may have a posture halfway between them that is none of the arm's on its path.
+        """
+        local = self.solve(braces, Q, self.path, 30) or self._walked(braces, Q, self.path)
+        return None if local is None else self.solve(braces, local.Q, self.fine, 0)
 
     def _refined(self, paths: Mapping[Set, list[Path]]) -> list[Planned]:
         """The best sets, their best paths at more knots, by the heat of their dense references."""
@@ -289,7 +295,7 @@ class Search:
                     self.tally.refused.setdefault(braces, plan)
                 else:
                     good.append(plan)
-                    near = min(near, NEAR * local.cost)
+                    near = min(near, NEAR * plan.heat)
             if good:
                 planned.append(self._finest(min(good, key=lambda plan: plan.heat)))
                 self.tally.refused.pop(braces, None)
