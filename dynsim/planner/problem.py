@@ -29,8 +29,9 @@ ALONG = (0.33, 0.67)
 # Clearance of those points [m].
 LINK_CLEARANCE = 2e-3
 # Slip [m/s] over which the friction that is charged grows to its value: a brace that creeps feels all of it, whatever
-# planned voltages, which must not ring, make of it. The search begins with a smoother one, for long steps.
-CHARGED, SMOOTHER = 1e-3, 2e-3
+# planned voltages, which must not ring, make of it. The search begins with smoother ones, for long steps and few local
+# optima.
+CHARGED, SHARPER, SMOOTHER = 1e-3, 3e-3, 1e-2
 # Targets that differ by less are the same [m].
 SAME = 1e-6
 

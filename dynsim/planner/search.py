@@ -18,7 +18,7 @@ from dynsim.jit.kernel import reals
 from dynsim.model.description import Array
 from dynsim.planner.dense import Dense, references, touching_links
 from dynsim.planner.local import Local, solve
-from dynsim.planner.problem import CHARGED, SMOOTHER, Candidate, Task
+from dynsim.planner.problem import CHARGED, SHARPER, SMOOTHER, Candidate, Task
 
 # Sets of each size that go on from the cheap problem, and from the one with slip.
 BEAM = 5
@@ -28,14 +28,14 @@ POSTURES, DRAWS = 4, 60
 SPREAD, PRISMATIC_SPREAD = (0.3, 1.5), 0.2
 # Sets of each size and round that whole paths are made for, and those that are made finer in the end.
 PATHS, KEPT = 4, 3
+# Sets of each size whose neighbours are tried along the whole path.
+NEIGHBOURS = 3
 # Costs of one set that differ by less, as a share, are of one path, and paths beyond that ratio to the least are none
 # that could become the best; so many of a set are made finer.
 SAME_COST, NEAR, ALTERNATIVES = 1e-3, 1.1, 3
-# Knots of whole paths: the search's, and the answer's first; the answer's are doubled, to so many at most, until dense
-# references cost as much as the knots but for this factor.
-PATH_KNOTS, FINE_KNOTS = 9, 17
-CLOSED_KNOTS, CLOSED_FINE = 12, 24
-MOST_KNOTS, CONVERGED = 60, 1.01
+# Knots of whole paths, of closed ones and others; those of answers are doubled, up to so many, until dense references
+# cost as much as the knots but for this factor.
+CLOSED_KNOTS, PATH_KNOTS, MOST_KNOTS, CONVERGED = 24, 17, 60, 1.01
 
 Set = tuple[Candidate, ...]
 Tell = Callable[[str, float], None]
@@ -95,7 +95,6 @@ class Search:
         self._rng = np.random.default_rng(task.options.seed)
         self.coarse = 4 if task.kind == "closed" else 3
         self.path = CLOSED_KNOTS if task.kind == "closed" else PATH_KNOTS
-        self.fine = CLOSED_FINE if task.kind == "closed" else FINE_KNOTS
 
     def solve(
         self, braces: Set, start: Array, count: int, turns: int = 40, slip_scale: float = SMOOTHER
@@ -177,22 +176,16 @@ class Search:
         Along the path sets rank otherwise than at few knots, and few of them are near a posture that was drawn.
         """
         for size, change in [*((size, -1) for size in range(most, 1, -1)), *((size, 1) for size in range(most))]:
-            reached = [
-                (path.local, braces)
+            best = [
+                (min((path.local for path in some if path.local is not None), key=_cost), braces)
                 for braces, some in paths.items()
-                if len(braces) == size
-                for path in some
-                if path.local is not None
+                if len(braces) == size and any(path.local is not None for path in some)
             ]
-            if not reached:
-                continue
-            best, braces = min(reached, key=lambda item: item[0].cost)
-            for other in self._grown(braces) if change > 0 else combinations(braces, size - 1):
-                local = self._whole(other, best.Q)
-                if local is not None and not any(
-                    p.local and _same(p.local.cost, local.cost) for p in paths.get(other, [])
-                ):
-                    paths.setdefault(other, []).append(Path(local.cost, local))
+            for near, braces in sorted(best, key=lambda item: item[0].cost)[:NEIGHBOURS]:
+                for other in self._grown(braces) if change > 0 else combinations(braces, size - 1):
+                    local, known = self._whole(other, near.Q), paths.setdefault(other, [])
+                    if local is not None and not any(_same(path.coarse, local.cost) for path in known):
+                        known.append(Path(local.cost, local))
 
     def _round(self, number: int, most: int) -> dict[int, list[tuple[float, Set, Array]]]:
         """Sets of each size with cost and posture, the best first, from new starts."""
@@ -273,12 +266,9 @@ class Search:
         return sets
 
     def _whole(self, braces: Set, Q: Array) -> Local | None:
-        """A whole path from postures at few knots, judged with one more between any two of it.
-
-        Far apart, knots may have a posture halfway between them that is none of the arm's on its path.
-        """
+        """A whole path from postures at few knots, first with blunt friction: past what sharp friction would stop at."""
         local = self.solve(braces, Q, self.path, 30) or self._walked(braces, Q, self.path)
-        return None if local is None else self.solve(braces, local.Q, self.fine, 0)
+        return None if local is None else self.solve(braces, local.Q, self.path, 30, SHARPER) or local
 
     def _refined(self, paths: Mapping[Set, list[Path]]) -> list[Planned]:
         """The best sets, their best paths at more knots, by the heat of their dense references."""
@@ -290,7 +280,7 @@ class Search:
             for local in reached[braces][: 2 * ALTERNATIVES]:
                 if len(good) == ALTERNATIVES or local.cost > near:
                     break
-                plan = self._finer(braces, local, self.fine)
+                plan = self._finer(braces, local, self.path)
                 if isinstance(plan, str):
                     self.tally.refused.setdefault(braces, plan)
                 else:
@@ -299,7 +289,7 @@ class Search:
             if good:
                 planned.append(self._finest(min(good, key=lambda plan: plan.heat)))
                 self.tally.refused.pop(braces, None)
-        for braces in whole.keys() - reached.keys():
+        for braces in (braces for braces, some in paths.items() if some and braces not in reached):
             self.tally.refused[braces] = "postures found, but none along the whole path"
         return sorted(planned, key=lambda plan: plan.heat)
 
