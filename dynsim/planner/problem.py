@@ -117,7 +117,7 @@ class Options:
     peak: float = 0.0
     clearance_m: float = 0.01
     min_N: float = 0.5
-    starts: int = 8
+    starts: int = 6
     seed: int = 0
     exhaustive: bool = False
 

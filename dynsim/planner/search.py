@@ -27,15 +27,15 @@ POSTURES, DRAWS = 4, 60
 # Standard deviation of their joints, drawn from so much to so much [rad]; of prismatic ones [m].
 SPREAD, PRISMATIC_SPREAD = (0.3, 1.5), 0.2
 # Sets of each size and round that whole paths are made for, and those that are made finer in the end.
-PATHS, KEPT = 4, 3
+PATHS, KEPT = 3, 3
 # Sets of each size whose neighbours are tried along the whole path.
 NEIGHBOURS = 3
 # Costs of one set that differ by less, as a share, are of one path, and paths beyond that ratio to the least are none
 # that could become the best; so many of a set are made finer.
 SAME_COST, NEAR, ALTERNATIVES = 1e-3, 1.1, 3
-# Knots of whole paths, of closed ones and others; those of answers are doubled, up to so many, until dense references
-# cost as much as the knots but for this factor.
-CLOSED_KNOTS, PATH_KNOTS, MOST_KNOTS, CONVERGED = 24, 17, 60, 1.01
+# Knots of whole paths, of closed ones and others; those of sets that are kept, and of the best, are doubled until there
+# are about so many, or dense references cost as much as the knots but for this factor.
+CLOSED_KNOTS, PATH_KNOTS, FINE_KNOTS, MOST_KNOTS, CONVERGED = 24, 17, 30, 60, 1.01
 
 Set = tuple[Candidate, ...]
 Tell = Callable[[str, float], None]
@@ -266,7 +266,7 @@ class Search:
         return sets
 
     def _whole(self, braces: Set, Q: Array) -> Local | None:
-        """A whole path from postures at few knots, first with blunt friction: past what sharp friction would stop at."""
+        """A whole path from postures at few knots, first with blunt friction, past where sharp friction would stop."""
         local = self.solve(braces, Q, self.path, 30) or self._walked(braces, Q, self.path)
         return None if local is None else self.solve(braces, local.Q, self.path, 30, SHARPER) or local
 
@@ -287,11 +287,12 @@ class Search:
                     good.append(plan)
                     near = min(near, NEAR * plan.heat)
             if good:
-                planned.append(self._finest(min(good, key=lambda plan: plan.heat)))
+                planned.append(self._finest(min(good, key=lambda plan: plan.heat), FINE_KNOTS))
                 self.tally.refused.pop(braces, None)
         for braces in (braces for braces, some in paths.items() if some and braces not in reached):
             self.tally.refused[braces] = "postures found, but none along the whole path"
-        return sorted(planned, key=lambda plan: plan.heat)
+        planned.sort(key=lambda plan: plan.heat)
+        return [self._finest(plan, MOST_KNOTS) for plan in planned[:1]] + planned[1:]
 
     def _finer(self, braces: Set, coarse: Local, count: int) -> Planned | str:
         """A path at more knots with its dense references; in words why hand and surfaces are not kept between them."""
@@ -302,9 +303,9 @@ class Search:
             return dense
         return touching_links(self.task, dense.times, dense.q) or Planned(braces, times, local, dense)
 
-    def _finest(self, plan: Planned) -> Planned:
-        """Twice the knots until the dense references cost what the knots do."""
-        while plan.heat > CONVERGED * plan.local.heat and len(plan.times) < MOST_KNOTS:
+    def _finest(self, plan: Planned, most: int) -> Planned:
+        """Twice the knots until the dense references cost what the knots do, or there are ``most`` of them."""
+        while plan.heat > CONVERGED * plan.local.heat and len(plan.times) < most:
             finer = self._finer(plan.braces, plan.local, 2 * len(plan.times) - (self.task.kind != "closed"))
             if isinstance(finer, str) or finer.heat >= plan.heat:
                 break
