@@ -71,7 +71,7 @@ def plan(
     exhaustive: Annotated[
         bool, typer.Option("--exhaustive", help="Try all sets of candidates, not only those that grow from the best.")
     ] = False,
-    starts: Annotated[int, typer.Option(metavar="N", min=1, help="Independent rounds of the search.")] = 6,
+    starts: Annotated[int, typer.Option(metavar="N", min=1, help="Independent rounds of the search.")] = 8,
     seed: Annotated[int, typer.Option(metavar="S", help="Of its random postures.")] = 0,
     explain: Annotated[
         bool, typer.Option("--explain", help="Find the errors of the scene that refused plans do bear.")

@@ -303,7 +303,7 @@ def plan_braces(
     verify: bool = True,
     explain: bool = False,
     exhaustive: bool = False,
-    starts: int = 6,
+    starts: int = 8,
     seed: int = 0,
     jobs: int = 1,
     tolerances: Tolerances | None = None,

@@ -117,7 +117,7 @@ class Options:
     peak: float = 0.0
     clearance_m: float = 0.01
     min_N: float = 0.5
-    starts: int = 6
+    starts: int = 8
     seed: int = 0
     exhaustive: bool = False
 
@@ -238,11 +238,11 @@ class Task:
         times, closed = self.times(count), self.kind == "closed"
         pairs = [(k, (k + 1) % count) for k in range(count if closed else count - 1)] if count > 1 else []
         spacing = self.span / max(len(pairs), 1)
-        ways = (1.0, -1.0) if self.kind == "there_and_back" else (1.0,)
-        instants = [(first, np.eye(count)[[first, second]], way) for first, second in pairs for way in ways]
+        signs = (1.0, -1.0) if self.kind == "there_and_back" else (1.0,)
+        instants = [(first, np.eye(count)[[first, second]], sign) for first, second in pairs for sign in signs]
         knot = [first for first, _, _ in instants] or [0]
         blend = [0.5 * ends.sum(axis=0) for _, ends, _ in instants] or [np.ones(1)]
-        chord = [way / spacing * (ends[1] - ends[0]) for _, ends, way in instants] or [np.zeros(1)]
+        chord = [sign / spacing * (ends[1] - ends[0]) for _, ends, sign in instants] or [np.zeros(1)]
         if count < 3:
             bend = np.diff(np.eye(count), axis=0)
         elif closed:

@@ -27,7 +27,7 @@ POSTURES, DRAWS = 4, 60
 # Standard deviation of their joints, drawn from so much to so much [rad]; of prismatic ones [m].
 SPREAD, PRISMATIC_SPREAD = (0.3, 1.5), 0.2
 # Sets of each size and round that whole paths are made for, and those that are made finer in the end.
-PATHS, KEPT = 3, 3
+PATHS, KEPT = 4, 3
 # Sets of each size whose neighbours are tried along the whole path.
 NEIGHBOURS = 3
 # Costs of one set that differ by less, as a share, are of one path, and paths beyond that ratio to the least are none
@@ -56,7 +56,7 @@ class Planned:
         return self.dense.heat
 
 
-class Path(NamedTuple):
+class KnownPath(NamedTuple):
     """Postures of a set at few knots, by their cost [W], and along the whole path: None, they do not reach."""
 
     coarse: float
@@ -142,7 +142,7 @@ class Search:
         the distance to the optimum.
         """
         least, most = self.task.options.count
-        paths: dict[Set, list[Path]] = {}
+        paths: dict[Set, list[KnownPath]] = {}
         rounds = self.task.options.starts
         for number in range(rounds):
             self._tell("searching", number / (rounds + 1))
@@ -156,7 +156,7 @@ class Search:
             planned[size] = self._refined({braces: some for braces, some in paths.items() if len(braces) == size})
         return planned
 
-    def _path(self, known: list[Path], cost: float, braces: Set, Q: Array) -> float:
+    def _path(self, known: list[KnownPath], cost: float, braces: Set, Q: Array) -> float:
         """Heat of a whole path from postures at few knots [W], which is put among those known of its set.
 
         Costs of few knots that are nearly the same belong to one path; those that are far from the least to none.
@@ -167,10 +167,10 @@ class Search:
             if _same(path.coarse, cost):
                 return math.inf if path.local is None else path.local.heat
         local = self._whole(braces, Q)
-        known.append(Path(cost, local))
+        known.append(KnownPath(cost, local))
         return math.inf if local is None else local.heat
 
-    def _exchange(self, paths: dict[Set, list[Path]], most: int) -> None:
+    def _exchange(self, paths: dict[Set, list[KnownPath]], most: int) -> None:
         """Whole paths of the sets that the best ones become by a brace less, and then by one more.
 
         Along the path sets rank otherwise than at few knots, and few of them are near a posture that was drawn.
@@ -185,7 +185,7 @@ class Search:
                 for other in self._grown(braces) if change > 0 else combinations(braces, size - 1):
                     local, known = self._whole(other, near.Q), paths.setdefault(other, [])
                     if local is not None and not any(_same(path.coarse, local.cost) for path in known):
-                        known.append(Path(local.cost, local))
+                        known.append(KnownPath(local.cost, local))
 
     def _round(self, number: int, most: int) -> dict[int, list[tuple[float, Set, Array]]]:
         """Sets of each size with cost and posture, the best first, from new starts."""
@@ -267,10 +267,11 @@ class Search:
 
     def _whole(self, braces: Set, Q: Array) -> Local | None:
         """A whole path from postures at few knots, first with blunt friction, past where sharp friction would stop."""
-        local = self.solve(braces, Q, self.path, 30) or self._walked(braces, Q, self.path)
+        half = (self.path + 1) // 2
+        local = self.solve(braces, Q, half, 30) or self._walked(braces, Q, half)
         return None if local is None else self.solve(braces, local.Q, self.path, 30, SHARPER) or local
 
-    def _refined(self, paths: Mapping[Set, list[Path]]) -> list[Planned]:
+    def _refined(self, paths: Mapping[Set, list[KnownPath]]) -> list[Planned]:
         """The best sets, their best paths at more knots, by the heat of their dense references."""
         whole = {braces: sorted((p.local for p in some if p.local), key=_cost) for braces, some in paths.items()}
         reached = {braces: some for braces, some in whole.items() if some}
