@@ -207,8 +207,10 @@ def best_known(seed: int, effort: int) -> dict[str, Any]:
 
 
 def least_of(row: dict[str, Any], before: dict[str, Any]) -> dict[str, Any]:
-    """A reference with the lesser heat of each number of braces, of its own and of one before: all are of paths that are
-    kept to within a nanometre, whatever search led to them."""
+    """A reference with the lesser heat of each number of braces, its own or that of one before.
+
+    Both are of dense references on hand path and surfaces, whatever search led to them.
+    """
     known = {size["count"]: size for size in before["sizes"] if size["heat_W"] is not None}
     sizes = [
         min(size, known.get(size["count"], size), key=lambda one: math.inf if one["heat_W"] is None else one["heat_W"])
