@@ -128,11 +128,6 @@ class BracePlanner:
         motors = np.array([_motor_row(drives.get(joint)) for joint in robot.joint_names])
         self.arrays = kb.brace_arrays(integers(links), reals(motors))
 
-    @property
-    def workspace(self) -> ka.Workspace:
-        """Room for the kernels."""
-        return self._ws
-
     def motion(self, points: Array, q: Array, v: Array) -> tuple[Array, Array]:
         """Positions and velocities of points of the braces' bodies, (c, 3) [m], along a motion, both (T, c, 3)."""
         positions, velocities = np.zeros((2, len(q), len(points), 3))
@@ -140,16 +135,16 @@ class BracePlanner:
         brace_motion(self._model, self._ws, self.arrays, reals(q), reals(v), positions, velocities)
         return positions, velocities
 
-    def torques(self, q: Array, v: Array, vdot: Array, tables: Array) -> tuple[Array, int]:
-        """Torques of least heat along a motion, (T, n) [N m], and at how many instants there are some.
+    def least_heat(self, q: Array, v: Array, vdot: Array, tables: Array) -> tuple[Array, Array, int]:
+        """Torques (T, n) [N m] and normal forces (T, c) [N] of least heat along a motion, and at how many instants.
 
         ``tables`` : (T, c, BRACE_SIZE) of :func:`brace_rows`
         """
-        torques = np.zeros(v.shape)
+        torques, normal = np.zeros(v.shape), np.zeros(tables.shape[:2])
         solved = brace_statics(
-            self._model, self._ws, self.arrays, reals(q), reals(v), reals(vdot), tables, torques, False
+            self._model, self._ws, self.arrays, reals(q), reals(v), reals(vdot), tables, torques, normal, False
         )
-        return torques, int(solved)
+        return torques, normal, int(solved)
 
 
 class PreparedBraces:
@@ -169,7 +164,7 @@ class PreparedBraces:
             )
         n = len(robot.links)
         self._q, self._v, self._vdot = np.zeros((1, robot.nq)), np.zeros((1, n)), np.zeros((1, n))
-        self._torques = np.zeros((1, n))
+        self._torques, self._normal = np.zeros((1, n)), np.zeros((1, len(braces)))
 
     def are(self, braces: Mapping[str, Brace]) -> bool:
         """Whether these are the same objects under the same names, so that nothing of them can have changed."""
@@ -180,7 +175,7 @@ class PreparedBraces:
         arrays = self._arrays
         self._q[0], self._v[0], self._vdot[0] = q, v, vdot
         solved = brace_statics(
-            self._model, self._ws, arrays, self._q, self._v, self._vdot, self._tables, self._torques, True
+            self._model, self._ws, arrays, self._q, self._v, self._vdot, self._tables, self._torques, self._normal, True
         )
         feasible = solved == 1
         torques, results, forces = self._torques[0].copy(), arrays.results, arrays.forces.copy()

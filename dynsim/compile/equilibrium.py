@@ -18,9 +18,7 @@ from dynsim.compile.bracing import MIN_N, BracePlanner, brace_rows
 from dynsim.compile.model import Model
 from dynsim.compile.shapes import share_of_axis
 from dynsim.dynamics.contact.braces import tables as kb
-from dynsim.dynamics.contact.braces.statics import brace_statics
 from dynsim.errors import ModelError
-from dynsim.jit.kernel import reals
 from dynsim.model.description import Array, Contact, Load
 from dynsim.model.drives import Servo
 
@@ -83,11 +81,11 @@ def holding_torques(
                 rows.append(_row(link, point, -normal, 0.0, 0.0))
         planner = BracePlanner(driven, model.arrays, [link for link, _ in (*rows, *pushes)])
         tables = np.array([table for _, table in (*rows, *pushes)]).reshape(1, -1, kb.BRACE_SIZE)
-        torques, still = np.zeros((1, model.n)), np.zeros((1, model.n))
-        arrays, workspace = planner.arrays, planner.workspace
-        if brace_statics(model.arrays, workspace, arrays, reals(q[None]), still, still, tables, torques, False) == 1:
-            normal_N = arrays.results[: len(rows), kb.FORCES]
-            normal = normal_N if real else normal_N[::2] - normal_N[1::2]
+        still, arrays = np.zeros((1, model.n)), planner.arrays
+        torques, normal_N, solved = planner.least_heat(q[None], still, still, tables)
+        if solved == 1:
+            pressed = normal_N[0, : len(rows)]
+            normal = pressed if real else pressed[::2] - pressed[1::2]
             names = [contact.name for contact, *_ in touching]
             forces = arrays.forces[: len(rows)] if real else arrays.forces[: len(rows)].reshape(-1, 2, 3).sum(axis=1)
             places = [(link, point, force) for (_, link, point, *_), force in zip(touching, forces, strict=True)]

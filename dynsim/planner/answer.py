@@ -13,7 +13,7 @@ import numpy as np
 from dynsim.engine import named, simulate
 from dynsim.errors import ScenarioError
 from dynsim.planner import planned_scenario
-from dynsim.planner.dense import Dense
+from dynsim.planner.dense import Dense, nearest
 from dynsim.planner.problem import Candidate, Options, Task, task
 from dynsim.planner.search import Planned, Search, Tally
 from dynsim.planner.verify import Corner, Tolerances, Verdict, Verifier
@@ -203,7 +203,7 @@ def _row(task: Task, size: Size) -> dict[str, Any]:
         return row | {"reason": size.reason}
     dense = size.planned.dense
     nominal = None if size.verdict is None else size.verdict.nominal
-    distance, part, _ = dense.clearance
+    distance, part, _ = nearest(task, size.braces, dense.times, dense.q)
     row |= {
         "heat_W": dense.heat,
         "simulated_W": None if nominal is None else _number(nominal.heat_W),
@@ -235,6 +235,7 @@ def _size_json(task: Task, size: Size) -> dict[str, Any]:
     dense = size.planned.dense
     forces = np.array([np.interp(dense.times, dense.fine, column) for column in dense.forces.T]).T
     corners = () if size.verdict is None else size.verdict.corners
+    distance, part, when = nearest(task, size.braces, dense.times, dense.q)
     return {
         **entry,
         "heat_W": dense.heat,
@@ -247,7 +248,7 @@ def _size_json(task: Task, size: Size) -> dict[str, Any]:
         "k_p_V_per_rad": size.k_p,
         "heat_at_knots_W": size.planned.local.heat,
         "peak_torque_N_m": dense.peak,
-        "clearance": {"distance_m": _number(dense.clearance[0]), "of": dense.clearance[1], "at_s": dense.clearance[2]},
+        "clearance": {"distance_m": _number(distance), "of": part, "at_s": when},
         "rounds": size.rounds,
         "rounds_that_found_it": size.agreed,
         "cheaper_refused": [{"braces": label, "reason": why} for label, why in size.cheaper],

@@ -5,8 +5,8 @@ Of an arm whose joints each have one coordinate, on a base that stands, with bra
     F_c = f_c (n − μ v_t / √(|v_t|² + v_s²)),    τ = g(q) + (D + D_m) v − Σ_c J_cᵀ F_c
 
 n: normal of the surface at the brace, v_t: velocity of the touching point along it. Postures q_k belong to knots;
-instants e belong to a knot each and have velocities v_e = Σ_k chord_ek q_k, so that back and forth along one path are
-two instants of one knot.
+instants e lie between knots, at q_e = Σ_k blend_ek q_k with velocities v_e = Σ_k chord_ek q_k, so that back and forth
+along one path are two instants of one posture.
 
 Everything is in one file: the cache of compiled code asks whether the file of a function has changed.
 """
@@ -47,6 +47,10 @@ ON = 1e-9
 DAMPING, DAMPING_MIN, DAMPING_MAX = 1e-3, 1e-7, 1e6
 # Longest step of a coordinate in one turn [rad or m].
 REACH = 0.6
+# Points that are so much further from a surface than they must be are left out of a step [m].
+NEARBY = 0.5
+# Steps back onto the manifold within which what is left must be halved, or the search for it ends.
+PATIENCE = 12
 # Torques beyond this part of their limits cost extra, so many times what they cost as heat.
 NEAR_LIMIT, DEAR = 0.98, 100.0
 # Exponent of the mean that stands for the peak of the torques.
@@ -88,10 +92,11 @@ class Points(NamedTuple):
 
 
 class Course(NamedTuple):
-    """Knots k with targets of the hand and instants e."""
+    """Knots k with targets of the hand and instants e; instants of one posture follow each other."""
 
     target: np.ndarray  # (K, h) position of the hand [m], with the two directions' components if they are asked for
-    knot: np.ndarray  # (E,) int
+    knot: np.ndarray  # (E,) int, the last one before the instant
+    blend: np.ndarray  # (E, K)
     chord: np.ndarray  # (E, K) [1/s]
     share: np.ndarray  # (E,) of the time; their sum is 1
     smooth: np.ndarray  # (K, K) SᵀS of the smoothness S q
@@ -105,14 +110,15 @@ class Work(NamedTuple):
     by_q: np.ndarray  # (E, n, n) ∂τ/∂q at fixed v and f
     by_v: np.ndarray  # (E, n, n)
     by_f: np.ndarray  # (E, n, c)
-    gap: np.ndarray  # (K, P) distance from the surface less radius
-    gap_rate: np.ndarray  # (K, P, n)
-    hand: np.ndarray  # (K, h)
-    hand_rate: np.ndarray  # (K, h, n)
+    gap: np.ndarray  # (K + 1, P) distance from the surface less radius; the last row is of an instant
+    gap_rate: np.ndarray  # (K + 1, P, n), of those that are near by
+    hand: np.ndarray  # (K + 1, h)
+    hand_rate: np.ndarray  # (K + 1, h, n)
     R: np.ndarray  # (n, 9)
     p: np.ndarray  # (n, 3)
     a: np.ndarray  # (n, 3) joint axes in W
     below: np.ndarray  # (n, 4) mass and first moment of what a joint carries
+    moment: np.ndarray  # (n, 3) of the weight that a joint carries, about it, turned by each
     touch: np.ndarray  # (c, n, 3) velocity of the touching point by each rate
     turned: np.ndarray  # (c, n, 3) ∂n/∂q: what the normal at the brace turns by
     normal: np.ndarray  # (c, 3)
@@ -137,7 +143,7 @@ class Work(NamedTuple):
     skyline: np.ndarray  # (N,) int, first column of each row of H that is not zero
     working: np.ndarray  # (W, 3) int: constraints of the step that have been violated: kind, knot or instant, which
     bound: np.ndarray  # (W,)
-    normals: np.ndarray  # (W, N) their rows, then L⁻¹ times them
+    normals: np.ndarray  # (N, W) their normals as columns, then L⁻¹ times them
     dual: np.ndarray  # (W, W)
     dual_right: np.ndarray  # (W,)
     multiplier: np.ndarray  # (W,)
@@ -146,7 +152,8 @@ class Work(NamedTuple):
     small_right: np.ndarray  # (W,)
     index: np.ndarray  # (W,) int
     small_skyline: np.ndarray  # (W,) int
-    rate: np.ndarray  # (E, n) velocities of the instants
+    between: np.ndarray  # (n,) posture of an instant
+    rate: np.ndarray  # (n,) velocity of an instant
     weight: np.ndarray  # (E, n) of the squares of torques in the model of the cost
     pull: np.ndarray  # (E, n) half the gradient of the cost by torques, over the share of time
     change: np.ndarray  # (K, n) of postures in a step
@@ -209,8 +216,8 @@ def put_rows(table, out, row):
 
 
 @internal_kernel
-def geometry(arm: Arm, points: Points, work: Work, q, k):
-    """Of knot k: hand, gaps and their rates; of the braces also what their forces need."""
+def geometry(arm: Arm, points: Points, work: Work, q, k, count):
+    """Into row k: hand, gaps and rates of the first ``count`` points; of the braces what their forces need too."""
     n, c, hand, jacobian = arm.parent.shape[0], points.friction.shape[0], arm.hand[0], work.turn
     poses(arm, work, q)
     x = body_point(work, hand, arm.hand_point, 0)
@@ -230,12 +237,14 @@ def geometry(arm: Arm, points: Points, work: Work, q, k):
             j = arm.parent[j]
         put_vector(work.hand, k, row, axis)
         put_rows(jacobian, work.hand_rate[k], row)
-    for i in range(points.body.shape[0]):
+    for i in range(count):
         body, radius = points.body[i], points.radius[i]
         x = body_point(work, body, points.point, i)
         far, nx, ny, nz, xx, xy, xz, yy, yz, zz = distance(arm.shapes, points.surface[i], x[0], x[1], x[2])
         normal = (nx, ny, nz)
         work.gap[k, i] = far - radius
+        if i >= c and far - radius > points.margin[i] + NEARBY:
+            continue
         rates(arm, work, body, x, jacobian)
         for j in range(n):
             work.gap_rate[k, i, j] = dot_vector(normal, vector(jacobian, j, 0))
@@ -253,18 +262,35 @@ def geometry(arm: Arm, points: Points, work: Work, q, k):
 
 
 @internal_kernel
-def statics(arm: Arm, points: Points, course: Course, work: Work, Q, V, F, derivatives):
-    """Torques, and with ``derivatives`` those of them; geometry of all knots. Q: (K, n), V: (E, n), F: (E, c).
+def statics(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, forces):
+    """Torques of the instants with their derivatives, and geometry of all knots. Q: (K, n), F: (E, c).
 
     ∂τ/∂q_r = H_jr − Σ_c J_cj · ∂F_c/∂q_r − Σ_c (a_j × s_cr) · F_c,
     H_ij = −a_i · M_j (joint i carries joint j, both directions alike), M_j = Σ_k J_kj × w_k over weights and forces;
     zero for a prismatic joint i. s_cr: what the touching point moves by on its body.
+
+    forces : whether those of least heat, at least ``least`` [N], are put into F first
     """
     n, c, weight = arm.parent.shape[0], points.friction.shape[0], vector(arm.gravity, 0, 0)
+    K, v = Q.shape[0], work.rate
+    for k in range(K):
+        geometry(arm, points, work, Q[k], k, points.body.shape[0])
     for e in range(course.knot.shape[0]):
+        for j in range(n):
+            v[j], work.between[j] = 0.0, 0.0
+            for k in range(K):
+                v[j] += course.chord[e, k] * Q[k, j]
+                work.between[j] += course.blend[e, k] * Q[k, j]
         if e == 0 or course.knot[e] != course.knot[e - 1]:
-            geometry(arm, points, work, Q[course.knot[e]], course.knot[e])
-        v = V[e]
+            geometry(arm, points, work, work.between, K, c)
+        for j in range(n):
+            a, mass = vector(work.a, j, 0), work.below[j, 0]
+            if arm.prismatic[j]:
+                lever = times_number(a, mass)
+            else:
+                lever = cross(a, along(vector(work.below, j, 1), vector(work.p, j, 0), -mass))
+            work.torque[e, j] = arm.losses[j] * v[j] - dot_vector(weight, lever)
+            put_vector(work.moment, j, 0, cross(lever, weight))
         for i in range(c):
             normal, w = vector(work.normal, i, 0), ZERO_VECTOR
             for j in range(n):
@@ -276,24 +302,17 @@ def statics(arm: Arm, points: Points, course: Course, work: Work, Q, V, F, deriv
             put_vector(work.slip, i, 3, w)
             work.slip[i, 6] = size
             pull = along(normal, u, -points.friction[i])
-            put_vector(work.force, i, 0, times_number(pull, F[e, i]))
+            put_vector(work.force, i, 0, pull)
             for j in range(n):
                 work.by_f[e, j, i] = -dot_vector(vector(work.touch[i], j, 0), pull)
+        if forces:
+            least_heat(arm, work, least, F[e], e)
+        for i in range(c):
+            put_vector(work.force, i, 0, times_number(vector(work.force, i, 0), F[e, i]))
         for j in range(n):
-            # Weight and forces on what the joint carries: M_j = Σ J × w.
-            a, mass = vector(work.a, j, 0), work.below[j, 0]
-            if arm.prismatic[j]:
-                lever = times_number(a, mass)
-            else:
-                lever = cross(a, along(vector(work.below, j, 1), vector(work.p, j, 0), -mass))
-            torque = arm.losses[j] * v[j] - dot_vector(weight, lever)
+            moment = vector(work.moment, j, 0)
             for i in range(c):
-                torque += work.by_f[e, j, i] * F[e, i]
-            work.torque[e, j] = torque
-            if not derivatives:
-                continue
-            moment = cross(lever, weight)
-            for i in range(c):
+                work.torque[e, j] += work.by_f[e, j, i] * F[e, i]
                 moment = along(moment, cross(vector(work.touch[i], j, 0), vector(work.force, i, 0)), 1.0)
             for i in range(n):
                 work.by_v[e, i, j] = 0.0
@@ -306,15 +325,8 @@ def statics(arm: Arm, points: Points, course: Course, work: Work, Q, V, F, deriv
                     bent = -dot_vector(vector(work.a, i, 0), moment)
                     work.by_q[e, i, j], work.by_q[e, j, i] = bent, bent
                 i = arm.parent[i]
-        if derivatives:
-            for i in range(c):
-                force_derivatives(arm, points, work, v, F[e, i], i, e)
-
-
-@kernel
-def evaluate(arm: Arm, points: Points, course: Course, work: Work, Q, V, F, derivatives):
-    """See :func:`statics`: what several kernels call is none of its own."""
-    statics(arm, points, course, work, Q, V, F, derivatives)
+        for i in range(c):
+            force_derivatives(arm, points, work, v, F[e, i], i, e)
 
 
 @internal_kernel
@@ -363,12 +375,13 @@ def force_derivatives(arm: Arm, points: Points, work: Work, v, f, i, e):
 
 
 @internal_kernel
-def factor(A, skyline, n):
+def factor(A, skyline, done, n):
     """Cholesky's L of the leading n × n part of A, in its lower half; pivots that are lost stop moving anything.
 
     skyline : (n,) int, out: first column of each row that is not zero; left of it L has zeros too
+    done : so many rows are those of L already
     """
-    for i in range(n):
+    for i in range(done, n):
         first = 0
         while first < i and A[i, first] == 0.0:
             first += 1
@@ -403,110 +416,94 @@ def backward(L, skyline, b, n):
 
 
 @internal_kernel
-def nonnegative(work: Work, G, h, x, m):
-    """x ≥ 0 that minimises ½ xᵀGx − hᵀx, by Lawson and Hanson's active sets, from the passive ones marked in ``work``.
+def nonnegative(work: Work, G, h, x, known, m):
+    """x ≥ 0 that minimises ½ xᵀGx − hᵀx, by Lawson and Hanson's active sets.
 
     G: (m, m) positive semidefinite, with room for a little on its diagonal.
+    known : the first so many are the solution without the others, and those above zero are marked in ``work.passive``
     """
     passive, small, right, index, skyline = work.passive, work.small, work.small_right, work.index, work.small_skyline
-    scale = 1e-300
+    scale, count, done = 1e-300, 0, 0
     for i in range(m):
         scale = max(scale, abs(h[i]))
-        x[i], passive[i] = 0.0, 0
+        if i >= known:
+            x[i], passive[i] = 0.0, 0
+        elif passive[i]:
+            index[count] = i
+            count += 1
     for _ in range(3 * m + 10):
         best, most = -1, NO_GAIN * scale
         for i in range(m):
             if passive[i] == 0:
                 gain = h[i]
-                for k in range(m):
-                    if passive[k]:
-                        gain -= G[i, k] * x[k]
+                for a in range(count):
+                    gain -= G[i, index[a]] * x[index[a]]
                 if gain > most:
                     best, most = i, gain
         if best < 0:
             return
-        passive[best] = 1
-        for _inner in range(m + 1):
-            count = 0
-            for i in range(m):
-                if passive[i]:
-                    index[count] = i
-                    count += 1
-            if count == 0:
-                break
-            for a in range(count):
-                right[a] = h[index[a]]
+        passive[best], index[count] = 1, best
+        count += 1
+        while count > 0:
+            for a in range(done, count):
                 for b in range(a + 1):
                     small[a, b] = G[index[a], index[b]]
                 small[a, a] *= 1.0 + 1e-12
-            factor(small, skyline, count)
+            factor(small, skyline, done, count)
+            done = count
+            for a in range(count):
+                right[a] = h[index[a]]
             forward(small, skyline, right, count)
             backward(small, skyline, right, count)
-            share = 1.0
+            share, first = 1.0, -1
             for a in range(count):
                 i = index[a]
                 if right[a] <= 0.0:
-                    share = min(share, x[i] / (x[i] - right[a]) if x[i] > right[a] else 0.0)
+                    reached = x[i] / (x[i] - right[a]) if x[i] > right[a] else 0.0
+                    if reached < share:
+                        share, first = reached, a
+            left = 0
             for a in range(count):
                 i = index[a]
                 x[i] += share * (right[a] - x[i])
-                if share < 1.0 and right[a] <= 0.0 and x[i] <= 1e-13 * scale + 1e-300:
-                    x[i], passive[i] = 0.0, 0
-            if share == 1.0:
+                if a == first or (first >= 0 and right[a] <= 0.0 and x[i] <= 1e-13 * scale):
+                    x[i], passive[i], done = 0.0, 0, min(done, a)
+                else:
+                    index[left] = i
+                    left += 1
+            count = left
+            if first < 0:
                 break
-            # What held the step leaves in any case.
-            for a in range(count):
-                i = index[a]
-                if passive[i] and right[a] <= 0.0 and x[i] <= 0.0:
-                    x[i], passive[i] = 0.0, 0
 
 
 @internal_kernel
-def least_heat(arm: Arm, work: Work, least, F):
-    """Normal forces of least heat of each instant after :func:`statics` with forces of zero, at least ``least``."""
+def least_heat(arm: Arm, work: Work, least, f, e):
+    """Normal forces of least heat of instant e, (c,), at least ``least``; its torques are those without forces."""
     n, c = work.by_f.shape[1], work.by_f.shape[2]
     G, h, x = work.dual, work.dual_right, work.multiplier
-    for e in range(F.shape[0]):
-        for i in range(c):
-            for k in range(c):
-                s = 0.0
-                for j in range(n):
-                    s += arm.heat[j] * work.by_f[e, j, i] * work.by_f[e, j, k]
-                G[i, k] = s
-            G[i, i] += 1e-12
-        for i in range(c):
+    for i in range(c):
+        for k in range(c):
             s = 0.0
             for j in range(n):
-                s -= arm.heat[j] * work.by_f[e, j, i] * work.torque[e, j]
-            for k in range(c):
-                s -= G[i, k] * least
-            h[i] = s
-        nonnegative(work, G, h, x, c)
-        for i in range(c):
-            F[e, i] = least + x[i]
-
-
-@internal_kernel
-def equilibrium(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, forces):
-    """Torques and derivatives of postures, with normal forces of least heat where ``forces`` asks for those, in F."""
-    for e in range(F.shape[0]):
-        for i in range(F.shape[1]):
-            F[e, i] = 0.0 if forces else F[e, i]
-        for j in range(Q.shape[1]):
-            z = 0.0
-            for k in range(Q.shape[0]):
-                z += course.chord[e, k] * Q[k, j]
-            work.rate[e, j] = z
-    if forces and F.shape[1] > 0:
-        statics(arm, points, course, work, Q, work.rate, F, False)
-        least_heat(arm, work, least, F)
-    statics(arm, points, course, work, Q, work.rate, F, True)
+                s += arm.heat[j] * work.by_f[e, j, i] * work.by_f[e, j, k]
+            G[i, k] = s
+        G[i, i] += 1e-12
+    for i in range(c):
+        s = 0.0
+        for j in range(n):
+            s -= arm.heat[j] * work.by_f[e, j, i] * work.torque[e, j]
+        for k in range(c):
+            s -= G[i, k] * least
+        h[i] = s
+    nonnegative(work, G, h, x, 0, c)
+    for i in range(c):
+        f[i] = least + x[i]
 
 
 @kernel
 def settle(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, forces):
-    """See :func:`equilibrium`."""
-    equilibrium(arm, points, course, work, Q, F, least, forces)
+    """See :func:`statics`."""
+    statics(arm, points, course, work, Q, F, least, forces)
 
 
 @internal_kernel
@@ -574,16 +571,17 @@ def constraint_rows(course: Course, points: Points, work: Work, k):
 def put_back(arm: Arm, points: Points, course: Course, work: Work, Q, steps, tolerance, reach):
     """Put the postures of all knots onto hand and braces, clear of the rest and within limits: least change.
 
-    Damped Gauss–Newton's steps on what is violated. Returns what is left at the worst knot [m].
+    Damped Gauss–Newton's steps on what is violated. Returns what is left at the worst knot [m], up to the first
+    that fails.
     ``reach`` : greatest step of a coordinate
     """
     n, c, P, h = arm.parent.shape[0], points.friction.shape[0], points.body.shape[0], work.hand.shape[1]
     rows, A, right = work.rows, work.normal_matrix, work.right
     worst = 0.0
     for k in range(Q.shape[0]):
-        left = math.inf
+        left, halved = math.inf, math.inf
         for attempt in range(steps + 1):
-            geometry(arm, points, work, Q[k], k)
+            geometry(arm, points, work, Q[k], k, P)
             m = constraint_rows(course, points, work, k)
             left = 0.0
             for r in range(h):
@@ -611,6 +609,10 @@ def put_back(arm: Arm, points: Points, course: Course, work: Work, Q, steps, tol
                     m += 1
             if left <= tolerance or attempt == steps or not left < 1e6:
                 break
+            if attempt % PATIENCE == PATIENCE - 1:
+                if left > 0.5 * halved:
+                    break
+                halved = left
             far = 0.0
             for r in range(m):
                 far = max(far, abs(right[r]))
@@ -623,7 +625,7 @@ def put_back(arm: Arm, points: Points, course: Course, work: Work, Q, steps, tol
                         z += rows[r, j] * rows[s, j]
                     A[r, s] = z
                 A[r, r] += damping
-            factor(A, work.small_skyline, m)
+            factor(A, work.small_skyline, 0, m)
             forward(A, work.small_skyline, right, m)
             backward(A, work.small_skyline, right, m)
             most = 1e-300
@@ -636,6 +638,8 @@ def put_back(arm: Arm, points: Points, course: Course, work: Work, Q, steps, tol
             for j in range(n):
                 Q[k, j] += work.x[j] * min(1.0, reach / most)
         worst = max(worst, left)
+        if worst > 2.0 * tolerance:
+            break
     return worst
 
 
@@ -712,19 +716,19 @@ def unknowns(work: Work):
 
 @internal_kernel
 def taken_in(arm: Arm, points: Points, work: Work, m, before, kind, at, which, value, bound):
-    """How many constraints the step has with one that it violates: as constraint m its row over the unknowns."""
+    """How many constraints the step has with one that it violates: as column m its normal over the unknowns."""
     if value >= bound - 1e-9 or m == work.bound.shape[0]:
         return m
     for i in range(before):
         if work.working[i, 0] == kind and work.working[i, 1] == at and work.working[i, 2] == which:
             return m
     n, N = arm.parent.shape[0], unknowns(work)
-    row = work.normals[m]
+    normals = work.normals
     work.working[m, 0], work.working[m, 1], work.working[m, 2], work.bound[m] = kind, at, which, bound
     for i in range(N):
-        row[i] = 0.0
+        normals[i, m] = 0.0
     if kind == FORCE:
-        row[work.pressed[at] + which] = 1.0
+        normals[work.pressed[at] + which, m] = 1.0
         return m + 1
     first = n - work.free[at]
     for d in range(work.free[at]):
@@ -734,7 +738,7 @@ def taken_in(arm: Arm, points: Points, work: Work, m, before, kind, at, which, v
                 z += work.gap_rate[at, which, j] * work.basis[at, j, first + d]
         else:
             z = work.basis[at, which, first + d] * (1.0 if kind == LOWER else -1.0)
-        row[work.start[at] + d] = z
+        normals[work.start[at] + d, m] = z
     return m + 1
 
 
@@ -774,8 +778,7 @@ def prepare(arm: Arm, points: Points, course: Course, work: Work, Q, damping):
     for e in range(E):
         m = 0
         for k in range(K):
-            here = course.knot[e] == k
-            if not here and course.chord[e, k] == 0.0:
+            if course.blend[e, k] == 0.0 and course.chord[e, k] == 0.0:
                 continue
             first = n - work.free[k]
             for d in range(work.free[k]):
@@ -783,9 +786,7 @@ def prepare(arm: Arm, points: Points, course: Course, work: Work, Q, damping):
                 for r in range(n):
                     z = 0.0
                     for j in range(n):
-                        slope = course.chord[e, k] * work.by_v[e, r, j]
-                        if here:
-                            slope += work.by_q[e, r, j]
+                        slope = course.chord[e, k] * work.by_v[e, r, j] + course.blend[e, k] * work.by_q[e, r, j]
                         z += slope * work.basis[k, j, first + d]
                     B[r, m] = z
                 m += 1
@@ -833,6 +834,33 @@ def prepare(arm: Arm, points: Points, course: Course, work: Work, Q, damping):
 
 
 @internal_kernel
+def taken_along(work: Work, N, before, m):
+    """The dual problem's rows of constraints from ``before`` on, of m, whose normals become L⁻¹ times them.
+
+    By rows of the normals, whose ends the compiler takes several at once of; most of their beginnings are zero.
+    """
+    L, normals, dual, right = work.H, work.normals, work.dual, work.dual_right
+    for a in range(before, m):
+        right[a] = work.bound[a]
+        for b in range(a + 1):
+            dual[a, b] = 1e-14 if a == b else 0.0
+    for i in range(N):
+        for k in range(work.skyline[i], i):
+            for a in range(before, m):
+                normals[i, a] -= L[i, k] * normals[k, a]
+        for a in range(before, m):
+            normals[i, a] /= L[i, i]
+            z = normals[i, a]
+            if z != 0.0:
+                right[a] -= z * work.x[i]
+                for b in range(a + 1):
+                    dual[a, b] += z * normals[i, b]
+    for a in range(before, m):
+        for b in range(a):
+            dual[b, a] = dual[a, b]
+
+
+@internal_kernel
 def step(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, N):
     """The step of least model value after :func:`prepare`, which keeps clearances, limits and least forces.
 
@@ -843,7 +871,7 @@ def step(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, N):
     n, c, P = arm.parent.shape[0], points.friction.shape[0], points.body.shape[0]
     K, E = Q.shape[0], course.knot.shape[0]
     H, g, x, skyline = work.H, work.g, work.x, work.skyline
-    factor(H, skyline, N)
+    factor(H, skyline, 0, N)
     # x_0 = −H⁻¹ g, kept as L⁻¹ of it.
     for i in range(N):
         x[i] = -g[i]
@@ -858,8 +886,11 @@ def step(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, N):
             full[i] = x[i]
             for a in range(m):
                 if work.multiplier[a] != 0.0:
-                    full[i] += work.multiplier[a] * work.normals[a, i]
+                    full[i] += work.multiplier[a] * work.normals[i, a]
         backward(H, skyline, full, N)
+        for k in range(K):
+            for j in range(n):
+                work.change[k, j] = moved(arm, work, full, k, j)
         before = m
         for e in range(E):
             for i in range(c):
@@ -868,39 +899,25 @@ def step(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, N):
         for k in range(K):
             for i in range(c, P):
                 slack = min(points.margin[i] - work.gap[k, i], 0.0)
-                if slack < -1.0:
+                if slack < -NEARBY:
                     continue
                 z = 0.0
                 for j in range(n):
-                    z += work.gap_rate[k, i, j] * moved(arm, work, full, k, j)
+                    z += work.gap_rate[k, i, j] * work.change[k, j]
                 m = taken_in(arm, points, work, m, before, CLEAR, k, i, z, slack)
             for j in range(n):
-                z, low, high = moved(arm, work, full, k, j), arm.lower[j] - Q[k, j], arm.upper[j] - Q[k, j]
+                z, low, high = work.change[k, j], arm.lower[j] - Q[k, j], arm.upper[j] - Q[k, j]
                 m = taken_in(arm, points, work, m, before, LOWER, k, j, z, min(low, 0.0))
                 m = taken_in(arm, points, work, m, before, UPPER, k, j, -z, -max(high, 0.0))
         if m == before:
             break
-        for a in range(before, m):
-            forward(H, skyline, work.normals[a], N)
-            z = 0.0
-            for i in range(N):
-                z += work.normals[a, i] * x[i]
-            work.dual_right[a] = work.bound[a] - z
-            for b in range(a + 1):
-                z = 0.0
-                for i in range(N):
-                    z += work.normals[a, i] * work.normals[b, i]
-                work.dual[a, b], work.dual[b, a] = z, z
-            work.dual[a, a] += 1e-14
-        nonnegative(work, work.dual, work.dual_right, work.multiplier, m)
+        taken_along(work, N, before, m)
+        nonnegative(work, work.dual, work.dual_right, work.multiplier, before, m)
     fall = 0.0
     for i in range(N):
         fall -= g[i] * full[i]
     for a in range(m):
         fall -= work.multiplier[a] * work.bound[a]
-    for k in range(K):
-        for j in range(n):
-            work.change[k, j] = moved(arm, work, full, k, j)
     return fall
 
 
@@ -912,7 +929,7 @@ def solve(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, pea
     """
     if put_back(arm, points, course, work, Q, 60, ON, 2.0 * REACH / 3.0) > 2.0 * ON:
         return math.nan, math.nan, 0
-    equilibrium(arm, points, course, work, Q, F, least, True)
+    statics(arm, points, course, work, Q, F, least, True)
     cost, heat = costs(arm, course, work, Q, peak)
     damping, quiet, taken, ratio = DAMPING, 0, 0, 0.0
     scale = max(cost, 0.1)
@@ -934,7 +951,7 @@ def solve(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, pea
                 for j in range(Q.shape[1]):
                     trial[k, j] = Q[k, j] + share * work.change[k, j]
             if put_back(arm, points, course, work, trial, 12, ON, 2.0 * REACH / 3.0) <= 2.0 * ON:
-                equilibrium(arm, points, course, work, trial, forces, least, True)
+                statics(arm, points, course, work, trial, forces, least, True)
                 there, warmth = costs(arm, course, work, trial, peak)
                 if there < cost:
                     ratio = (cost - there) / (fall * share * (2.0 - share))
@@ -943,7 +960,7 @@ def solve(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, pea
                     copy(forces, F)
                     break
             damping *= 8.0
-            equilibrium(arm, points, course, work, Q, F, least, False)
+            statics(arm, points, course, work, Q, F, least, False)
             costs(arm, course, work, Q, peak)
         if not cost < before:
             break
@@ -954,5 +971,5 @@ def solve(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, pea
         quiet = quiet + 1 if before - cost < tolerance * max(cost, 1e-3) else 0
         if quiet >= 2:
             break
-    equilibrium(arm, points, course, work, Q, F, least, False)
+    statics(arm, points, course, work, Q, F, least, False)
     return cost, heat, taken

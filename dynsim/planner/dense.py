@@ -19,7 +19,7 @@ from dynsim.planner.compiled import ON
 from dynsim.planner.problem import CHARGED, Candidate, Clear, Task, key
 from dynsim.scenario import build
 
-# Instants of one pass along the path, at least; and the most time between two [s].
+# Instants of one pass along the path, at least, beside two for each knot; and the most time between two [s].
 INSTANTS, SPACING = 50, 0.1
 # Slower than this the hand rests [m/s].
 RESTS = 1e-2
@@ -38,7 +38,6 @@ class Dense:
     fine : (M,) times at which the statics hold [s]
     torques : (M, n) of the moved joints [N m]; forces: (M, c) normal ones [N]
     heat : mean of all motors [W]; peak: greatest torque [N m]
-    clearance : least distance of what is not braced from a surface [m], what, and when [s]
     """
 
     times: Array
@@ -49,7 +48,6 @@ class Dense:
     forces: Array
     heat: float
     peak: float
-    clearance: tuple[float, str, float]
 
 
 def references(task: Task, braces: tuple[Candidate, ...], knots: Array, Q: Array, factor: int = 1) -> Dense | str:
@@ -60,7 +58,7 @@ def references(task: Task, braces: tuple[Candidate, ...], knots: Array, Q: Array
     the friction that a creeping brace feels. ``factor`` : so many times as many instants
     """
     span = task.span
-    count = factor * max(INSTANTS, int(np.ceil(span / SPACING)))
+    count = factor * max(INSTANTS, int(np.ceil(span / SPACING)), 2 * (len(knots) - 1))
     half = np.linspace(0.0, span, count + 1)
     start, end = (np.linalg.norm(np.diff(task.targets(np.array(pair)), axis=0)) for pair in _ends(task.duration))
     rests = bool(max(start, end) / 1e-4 < RESTS)
@@ -119,18 +117,13 @@ def statics(task: Task, braces: tuple[Candidate, ...], times: Array, q: Array, r
         planner, tables = pressing(model, fine, whole, rates, placed, task.options.min_N, CHARGED)
     except ModelError as error:
         return f"between knots the postures jump: {error}"
-    torques, forces = np.zeros((len(fine), model.n)), np.zeros((len(fine), len(braces)))
-    for t in range(len(fine)):
-        row = slice(t, t + 1)
-        torques[row], solved = planner.torques(whole[row], rates[row], accelerations[row], tables[row])
-        if solved < 1:
-            return f"at t = {fine[t]:.3g} s no forces within friction cones and limits of the motors carry the motion"
-        forces[t] = planner.arrays.results[:, kb.FORCES]
+    torques, forces, solved = planner.least_heat(whole, rates, accelerations, tables)
+    if solved < len(fine):
+        return f"at t = {fine[solved]:.3g} s no forces within friction cones and limits of the motors carry the motion"
     weights = planner.arrays.motors[:, kb.HEAT]
     heat = float(np.trapezoid(torques**2 @ weights, fine) / task.duration)
     moved = torques[:, list(arm.links)]
-    clear = nearest(task, braces, fine, whole[:, list(arm.columns)])
-    return Dense(times, q, rests, fine, moved, forces, heat, float(np.abs(moved).max()), clear)
+    return Dense(times, q, rests, fine, moved, forces, heat, float(np.abs(moved).max()))
 
 
 def nearest(

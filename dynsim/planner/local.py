@@ -10,7 +10,7 @@ least heat of each instant anew. So every iterate is feasible, and the heat alon
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -29,20 +29,16 @@ class Problem:
 
     Attributes
     ----------
+    work : results, until another problem with the same room is evaluated
     peak : cost of the greatest torque [W/(N m)]
     """
 
     arm: Arm
     points: Points
     course: Course
+    work: Work
     least: float
     peak: float = 0.0
-    work: Work = field(init=False)
-
-    def __post_init__(self) -> None:
-        K, E = len(self.course.smooth), len(self.course.knot)
-        n, c, P = len(self.arm.parent), len(self.points.friction), len(self.points.body)
-        self.work = workspace(n, c, P, K, E, self.course.target.shape[1])
 
     def evaluate(self, Q: Array, F: Array) -> None:
         """Torques, geometry and derivatives into the workspace."""
@@ -75,8 +71,9 @@ class Local:
     steps: int
 
 
-def workspace(n: int, c: int, P: int, K: int, E: int, h: int) -> Work:
-    """Allocate a :class:`Work`."""
+def workspace(n: int, points: Points, course: Course) -> Work:
+    """Allocate a :class:`Work` for n joints."""
+    (K, h), E, c, P = course.target.shape, len(course.knot), len(points.friction), len(points.body)
     N, R = K * n + E * c, h + P + n
     W = max(min(WORKING_SETS, K * (P + 2 * n) + E * c), c)
 
@@ -87,17 +84,17 @@ def workspace(n: int, c: int, P: int, K: int, E: int, h: int) -> Work:
         return integers(np.zeros(shape))
 
     return Work(
-        torque=zeros(E, n), by_q=zeros(E, n, n), by_v=zeros(E, n, n), by_f=zeros(E, n, c), gap=zeros(K, P),
-        gap_rate=zeros(K, P, n), hand=zeros(K, h), hand_rate=zeros(K, h, n), R=zeros(n, 9), p=zeros(n, 3),
-        a=zeros(n, 3), below=zeros(n, 4), touch=zeros(c, n, 3), turned=zeros(c, n, 3), normal=zeros(c, 3),
-        shift=zeros(c, n, 3), slip=zeros(c, 7), force=zeros(c, 3), turn=zeros(n, 3),
+        torque=zeros(E, n), by_q=zeros(E, n, n), by_v=zeros(E, n, n), by_f=zeros(E, n, c), gap=zeros(K + 1, P),
+        gap_rate=zeros(K + 1, P, n), hand=zeros(K + 1, h), hand_rate=zeros(K + 1, h, n), R=zeros(n, 9), p=zeros(n, 3),
+        a=zeros(n, 3), below=zeros(n, 4), moment=zeros(n, 3), touch=zeros(c, n, 3), turned=zeros(c, n, 3),
+        normal=zeros(c, 3), shift=zeros(c, n, 3), slip=zeros(c, 7), force=zeros(c, 3), turn=zeros(n, 3),
         drift=zeros(n, 3), basis=zeros(K, n, n), free=ints(K), rows=zeros(R, n),
         normal_matrix=zeros(R, R), right=zeros(R), H=zeros(N, N), g=zeros(N), x=zeros(max(N, n)), step=zeros(N),
         B=zeros(n, K * n + c), column=ints(K * n + c), start=ints(K), pressed=ints(E), skyline=ints(N),
         working=ints(W, 3), bound=zeros(W),
-        normals=zeros(W, N), dual=zeros(W, W), dual_right=zeros(W), multiplier=zeros(W), passive=ints(W),
+        normals=zeros(N, W), dual=zeros(W, W), dual_right=zeros(W), multiplier=zeros(W), passive=ints(W),
         small=zeros(W, W), small_right=zeros(W), index=ints(W), small_skyline=ints(max(W, R)),
-        rate=zeros(E, n), weight=zeros(E, n), pull=zeros(E, n), change=zeros(K, n), trial=zeros(K, n),
+        between=zeros(n), rate=zeros(n), weight=zeros(E, n), pull=zeros(E, n), change=zeros(K, n), trial=zeros(K, n),
         trial_forces=zeros(E, c),
     )  # fmt: skip
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeVar, cast
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from dynsim.model.description import Array
 from dynsim.model.surfaces import Quadric
 from dynsim.planner.arm import MovingArm, axis_points, moving_arm
 from dynsim.planner.compiled import Course, Points
-from dynsim.planner.local import Problem
+from dynsim.planner.local import Problem, workspace
 from dynsim.scenario import Scenario, build
 
 # Weight of the bend of the postures along the path [W/rad²]: for uniqueness; no part of the cost that is reported.
@@ -29,14 +29,14 @@ ALONG = (0.33, 0.67)
 # Clearance of those points [m].
 LINK_CLEARANCE = 2e-3
 # Slip [m/s] over which the friction that is charged grows to its value: a brace that creeps feels all of it, whatever
-# planned voltages, which must not ring, make of it. The search begins with a smoother one, for long steps.
-CHARGED, SMOOTHER = 1e-3, 2e-3
+# planned voltages, which must not ring, make of it. The search begins with smoother ones, for long steps and few local
+# optima.
+CHARGED, SHARPER, SMOOTHER = 1e-3, 3e-3, 1e-2
 # Targets that differ by less are the same [m].
 SAME = 1e-6
-# Chords at knots of a single pass: how far from its ends the two of a coarse one lie.
-INSET = 0.2
 
 Kind = Literal["there_and_back", "closed", "open"]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -135,9 +135,15 @@ class Task:
     friction: float
 
     @cached_property
-    def _courses(self) -> dict[int, Course]:
-        """Those that were asked for, by their number of knots."""
+    def _known(self) -> dict[Any, Any]:
+        """Courses by their number of knots, points by their braces, and rooms by these numbers."""
         return {}
+
+    def _once(self, key: Any, make: Callable[[], T]) -> T:
+        """What is made when it is asked for first."""
+        if key not in self._known:
+            self._known[key] = make()
+        return cast("T", self._known[key])
 
     @property
     def duration(self) -> float:
@@ -168,8 +174,6 @@ class Task:
             return np.array([0.5 * self.span])
         if self.kind == "closed":
             return np.linspace(0.0, self.span, count, endpoint=False)
-        if count == 2:
-            return np.array([INSET, 1.0 - INSET]) * self.span
         return np.linspace(0.0, self.span, count)
 
     @cached_property
@@ -225,59 +229,43 @@ class Task:
         )
 
     def course(self, count: int) -> Course:
-        """Knots and instants of so many knots.
+        """Knots and instants of so many knots: halfway between neighbours, with the chord for a velocity.
 
-        Velocities are chords between neighbouring knots, never slopes of a spline through them: those an optimiser
-        would make vanish exactly at the knots, and slide in between.
+        So both are right to second order in the distance of knots. Slopes of a spline through the knots an optimiser
+        would make vanish there, and slide in between; chords with the posture of a knot let it save much of the
+        friction that there is, by joints that turn against each other.
         """
-        times, span = self.times(count), self.span
-        instants: list[tuple[int, Array, float]] = []
-
-        def chord(a: int, b: int, time: float) -> Array:
-            row = np.zeros(count)
-            row[a] -= 1.0 / time
-            row[b] += 1.0 / time
-            return row
-
-        both = self.kind == "there_and_back"
-        if count == 1:
-            instants.append((0, np.zeros(1), 1.0))
-        elif count == 2 and self.kind != "closed":
-            ahead = chord(0, 1, span)
-            for k in range(2):
-                instants += [(k, ahead, 0.25), (k, -ahead, 0.25)] if both else [(k, ahead, 0.5)]
-        elif self.kind == "closed":
-            instants += [(k, chord(k, (k + 1) % count, span / count), 1.0 / count) for k in range(count)]
-        else:
-            spacing, share = span / (count - 1), 0.5 / (count - 1)
-            for k in range(count):
-                if k < count - 1:
-                    instants.append((k, chord(k, k + 1, spacing), share))
-                if k > 0:
-                    back = chord(k, k - 1, spacing)
-                    instants.append((k, back if both else -back, share))
+        times, closed = self.times(count), self.kind == "closed"
+        pairs = [(k, (k + 1) % count) for k in range(count if closed else count - 1)] if count > 1 else []
+        spacing = self.span / max(len(pairs), 1)
+        signs = (1.0, -1.0) if self.kind == "there_and_back" else (1.0,)
+        instants = [(first, np.eye(count)[[first, second]], sign) for first, second in pairs for sign in signs]
+        knot = [first for first, _, _ in instants] or [0]
+        blend = [0.5 * ends.sum(axis=0) for _, ends, _ in instants] or [np.ones(1)]
+        chord = [sign / spacing * (ends[1] - ends[0]) for _, ends, sign in instants] or [np.zeros(1)]
         if count < 3:
             bend = np.diff(np.eye(count), axis=0)
-        elif self.kind == "closed":
+        elif closed:
             bend = np.roll(np.eye(count), 1, axis=1) - 2.0 * np.eye(count) + np.roll(np.eye(count), -1, axis=1)
         else:
             bend = np.diff(np.eye(count), 2, axis=0)
         return Course(
             target=reals(self.wanted(times)),
-            knot=integers([k for k, _, _ in instants]),
-            chord=reals([row for _, row, _ in instants]),
-            share=reals([share for _, _, share in instants]),
+            knot=integers(knot),
+            blend=reals(blend),
+            chord=reals(chord),
+            share=reals(np.full(len(knot), 1.0 / len(knot))),
             smooth=reals(SMOOTHNESS * bend.T @ bend),
             slip_scale=reals([SMOOTHER]),
         )
 
     def problem(self, braces: Sequence[Candidate], count: int, slip_scale: float = SMOOTHER) -> Problem:
-        """Of one set of braces at so many knots; its targets are its own."""
-        if count not in self._courses:
-            self._courses[count] = self.course(count)
-        course = self._courses[count]
+        """Of one set of braces at so many knots; its targets are its own, its room that of all with as many braces."""
+        course = self._once(count, lambda: self.course(count))
+        points = self._once(tuple(braces), lambda: self.points(braces))
+        room = self._once((len(braces), len(points.body), count), lambda: workspace(self.arm.n, points, course))
         course = course._replace(target=course.target.copy(), slip_scale=reals([slip_scale]))
-        return Problem(self.arm.tables, self.points(braces), course, self.options.min_N, self.options.peak)
+        return Problem(self.arm.tables, points, course, room, self.options.min_N, self.options.peak)
 
 
 def task(scenario: Scenario, options: Options) -> Task:

@@ -18,7 +18,7 @@ from dynsim.jit.kernel import reals
 from dynsim.model.description import Array
 from dynsim.planner.dense import Dense, references, touching_links
 from dynsim.planner.local import Local, solve
-from dynsim.planner.problem import CHARGED, SMOOTHER, Candidate, Task
+from dynsim.planner.problem import CHARGED, SHARPER, SMOOTHER, Candidate, Task
 
 # Sets of each size that go on from the cheap problem, and from the one with slip.
 BEAM = 5
@@ -28,12 +28,14 @@ POSTURES, DRAWS = 4, 60
 SPREAD, PRISMATIC_SPREAD = (0.3, 1.5), 0.2
 # Sets of each size and round that whole paths are made for, and those that are made finer in the end.
 PATHS, KEPT = 4, 3
+# Sets of each size whose neighbours are tried along the whole path.
+NEIGHBOURS = 3
 # Costs of one set that differ by less, as a share, are of one path, and paths beyond that ratio to the least are none
 # that could become the best; so many of a set are made finer.
 SAME_COST, NEAR, ALTERNATIVES = 1e-3, 1.1, 3
-# Knots of whole paths: the search's, and the answer's.
-PATH_KNOTS, FINE_KNOTS = 9, (17, 33)
-CLOSED_KNOTS, CLOSED_FINE = 12, (24, 48)
+# Knots of whole paths, of closed ones and others; those of sets that are kept, and of the best, are doubled until there
+# are about so many, or dense references cost as much as the knots but for this factor.
+CLOSED_KNOTS, PATH_KNOTS, FINE_KNOTS, MOST_KNOTS, CONVERGED = 24, 17, 30, 60, 1.01
 
 Set = tuple[Candidate, ...]
 Tell = Callable[[str, float], None]
@@ -54,7 +56,7 @@ class Planned:
         return self.dense.heat
 
 
-class Path(NamedTuple):
+class KnownPath(NamedTuple):
     """Postures of a set at few knots, by their cost [W], and along the whole path: None, they do not reach."""
 
     coarse: float
@@ -91,9 +93,8 @@ class Search:
         self._tell = tell or (lambda text, share: None)
         self.single_heats: dict[Set, float] = {}
         self._rng = np.random.default_rng(task.options.seed)
-        self.coarse = 4 if task.kind == "closed" else 2
+        self.coarse = 4 if task.kind == "closed" else 3
         self.path = CLOSED_KNOTS if task.kind == "closed" else PATH_KNOTS
-        self.fine = CLOSED_FINE if task.kind == "closed" else FINE_KNOTS
 
     def solve(
         self, braces: Set, start: Array, count: int, turns: int = 40, slip_scale: float = SMOOTHER
@@ -110,7 +111,7 @@ class Search:
         times, wanted = self.task.times(len(known)), self.task.times(count)
         if self.task.kind == "closed":
             times, known = np.append(times, self.task.span), np.vstack([known, known[:1]])
-        return reals(np.stack([_line(wanted, times, column) for column in known.T], axis=1))
+        return reals(np.stack([np.interp(wanted, times, column) for column in known.T], axis=1))
 
     def _starts(self, first: bool) -> list[Array]:
         """Random postures with the hand in the middle of the path, clear of all surfaces; the initial one too."""
@@ -141,20 +142,21 @@ class Search:
         the distance to the optimum.
         """
         least, most = self.task.options.count
-        paths: dict[Set, list[Path]] = {}
+        paths: dict[Set, list[KnownPath]] = {}
         rounds = self.task.options.starts
         for number in range(rounds):
             self._tell("searching", number / (rounds + 1))
             for size, ranked in self._round(number, most).items():
                 heats = [self._path(paths.setdefault(item[1], []), *item) for item in ranked[:PATHS]]
                 self.tally.heats.setdefault(size, []).append(min(heats, default=math.inf))
+        self._exchange(paths, most)
         planned: dict[int, list[Planned]] = {}
         for size in range(least, most + 1):
             self._tell("refining", (rounds + size / (most + 1)) / (rounds + 1))
             planned[size] = self._refined({braces: some for braces, some in paths.items() if len(braces) == size})
         return planned
 
-    def _path(self, known: list[Path], cost: float, braces: Set, Q: Array) -> float:
+    def _path(self, known: list[KnownPath], cost: float, braces: Set, Q: Array) -> float:
         """Heat of a whole path from postures at few knots [W], which is put among those known of its set.
 
         Costs of few knots that are nearly the same belong to one path; those that are far from the least to none.
@@ -162,11 +164,28 @@ class Search:
         if cost > NEAR * min((path.coarse for path in known), default=math.inf):
             return math.inf
         for path in known:
-            if abs(path.coarse - cost) <= SAME_COST * cost:
+            if _same(path.coarse, cost):
                 return math.inf if path.local is None else path.local.heat
         local = self._whole(braces, Q)
-        known.append(Path(cost, local))
+        known.append(KnownPath(cost, local))
         return math.inf if local is None else local.heat
+
+    def _exchange(self, paths: dict[Set, list[KnownPath]], most: int) -> None:
+        """Whole paths of the sets that the best ones become by a brace less, and then by one more.
+
+        Along the path sets rank otherwise than at few knots, and few of them are near a posture that was drawn.
+        """
+        for size, change in [*((size, -1) for size in range(most, 1, -1)), *((size, 1) for size in range(most))]:
+            best = [
+                (min((path.local for path in some if path.local is not None), key=_cost), braces)
+                for braces, some in paths.items()
+                if len(braces) == size and any(path.local is not None for path in some)
+            ]
+            for near, braces in sorted(best, key=lambda item: item[0].cost)[:NEIGHBOURS]:
+                for other in self._grown(braces) if change > 0 else combinations(braces, size - 1):
+                    local, known = self._whole(other, near.Q), paths.setdefault(other, [])
+                    if local is not None and not any(_same(path.coarse, local.cost) for path in known):
+                        known.append(KnownPath(local.cost, local))
 
     def _round(self, number: int, most: int) -> dict[int, list[tuple[float, Set, Array]]]:
         """Sets of each size with cost and posture, the best first, from new starts."""
@@ -179,26 +198,28 @@ class Search:
         best[0] = [(r.cost, (), r.Q) for r in unbraced]
         front: list[tuple[Set, list[Array]]] = [((), [*starts, unbraced[0].Q])]
         for size in range(1, most + 1):
-            cheap = self._cheap(self._sets(size, front))
+            cheap = self._cheap(self._sets(size, front), number % 2 == 0)
             slipping = self._slipping(cheap, 2 * BEAM)
             if slipping and not self.task.options.exhaustive:
                 _, braces, Q = slipping[0]
                 swaps = {grown: [Q] for grown in self._swaps(braces) if grown not in cheap}
-                slipping += self._slipping(self._cheap(swaps), 2)
+                slipping += self._slipping(self._cheap(swaps, True), 2)
                 slipping.sort(key=lambda item: item[0])
             best[size] = slipping[:BEAM]
-            front = [(braces, [Q[len(Q) // 2]]) for _, braces, Q in best[size]]
-            if not front:
-                break
+            # Sets that a brace more leads along the path may have none there of their own.
+            front = [(braces, [Q[len(Q) // 2]]) for _, braces, Q in best[size]] or [
+                (braces, [cheap[braces].Q]) for braces in sorted(cheap, key=lambda braces: cheap[braces].cost)[:BEAM]
+            ]
         return best
 
-    def _cheap(self, sets: Mapping[Set, list[Array]]) -> dict[Set, Local]:
-        """Sets at one posture without slip, from postures."""
+    def _cheap(self, sets: Mapping[Set, list[Array]], best: bool) -> dict[Set, Local]:
+        """Sets at one posture without slip, from postures: the best that these lead to, or any."""
         reached: dict[Set, Local] = {}
         for braces, postures in sets.items():
             tried = [r for q in postures if (r := self.solve(braces, q, 1, 25)) is not None]
             if tried:
-                reached[braces] = min(tried, key=lambda r: r.cost)
+                chosen = min(tried, key=_cost) if best else tried[self._rng.integers(len(tried))]
+                reached[braces] = chosen
                 self.tally.missed.discard(braces)
                 if len(braces) == 1:
                     self.single_heats[braces] = min(reached[braces].heat, self.single_heats.get(braces, math.inf))
@@ -217,39 +238,40 @@ class Search:
         ]
         return sorted(solved, key=lambda item: item[0])
 
-    def _swaps(self, braces: Set) -> list[Set]:
-        """Sets with one brace exchanged for another candidate."""
-        kept = [tuple(brace for brace in braces if brace != out) for out in braces]
-        grown = [
-            tuple(brace for brace in self.task.candidates if brace in others or brace == new)
-            for others in kept
+    def _grown(self, braces: Set) -> list[Set]:
+        """Sets with one brace more."""
+        sets = [
+            tuple(brace for brace in self.task.candidates if brace in braces or brace == new)
             for new in self.task.candidates
             if new not in braces
         ]
-        return [braces for braces in dict.fromkeys(grown) if _fits(braces)]
+        return [grown for grown in sets if _fits(grown)]
+
+    def _swaps(self, braces: Set) -> list[Set]:
+        """Sets with one brace exchanged for another candidate."""
+        left = combinations(braces, len(braces) - 1)
+        return list(dict.fromkeys(grown for some in left for grown in self._grown(some) if grown != braces))
 
     def _sets(self, size: int, front: Sequence[tuple[Set, list[Array]]]) -> dict[Set, list[Array]]:
         """Sets that grow from smaller ones, with postures to start from."""
-        candidates = self.task.candidates
         sets: dict[Set, list[Array]] = {}
         if self.task.options.exhaustive:
-            for chosen in combinations(candidates, size):
+            for chosen in combinations(self.task.candidates, size):
                 if _fits(chosen):
                     sets[chosen] = [Q for _, postures in front for Q in postures][: 2 * BEAM]
             return sets
         for braces, postures in front:
-            for candidate in candidates:
-                grown = tuple(brace for brace in candidates if brace in braces or brace == candidate)
-                if len(grown) == size and _fits(grown):
-                    sets.setdefault(grown, []).extend(postures)
+            for grown in self._grown(braces):
+                sets.setdefault(grown, []).extend(postures)
         return sets
 
     def _whole(self, braces: Set, Q: Array) -> Local | None:
-        """A whole path from postures at few knots."""
-        local = self.solve(braces, Q, self.path, 30)
-        return self._walked(braces, Q, self.path) if local is None else local
+        """A whole path from postures at few knots, first with blunt friction, past where sharp friction would stop."""
+        half = (self.path + 1) // 2
+        local = self.solve(braces, Q, half, 30) or self._walked(braces, Q, half)
+        return None if local is None else self.solve(braces, local.Q, self.path, 30, SHARPER) or local
 
-    def _refined(self, paths: Mapping[Set, list[Path]]) -> list[Planned]:
+    def _refined(self, paths: Mapping[Set, list[KnownPath]]) -> list[Planned]:
         """The best sets, their best paths at more knots, by the heat of their dense references."""
         whole = {braces: sorted((p.local for p in some if p.local), key=_cost) for braces, some in paths.items()}
         reached = {braces: some for braces, some in whole.items() if some}
@@ -259,35 +281,37 @@ class Search:
             for local in reached[braces][: 2 * ALTERNATIVES]:
                 if len(good) == ALTERNATIVES or local.cost > near:
                     break
-                plan = self._finest(braces, local)
+                plan = self._finer(braces, local, self.path)
                 if isinstance(plan, str):
                     self.tally.refused.setdefault(braces, plan)
                 else:
                     good.append(plan)
-                    near = min(near, NEAR * local.cost)
+                    near = min(near, NEAR * plan.heat)
             if good:
-                planned.append(min(good, key=lambda plan: plan.heat))
+                planned.append(self._finest(min(good, key=lambda plan: plan.heat), FINE_KNOTS))
                 self.tally.refused.pop(braces, None)
-        for braces in whole.keys() - reached.keys():
+        for braces in (braces for braces, some in paths.items() if some and braces not in reached):
             self.tally.refused[braces] = "postures found, but none along the whole path"
-        return sorted(planned, key=lambda plan: plan.heat)
+        planned.sort(key=lambda plan: plan.heat)
+        return [self._finest(plan, MOST_KNOTS) for plan in planned[:1]] + planned[1:]
 
-    def _finest(self, braces: Set, coarse: Local) -> Planned | str:
-        """The better of the two finest paths that keep hand and surfaces between knots; in words why none does."""
-        paths, good, why = [coarse], list[Planned](), ""
-        for count, slip_scale in ((self.fine[0], SMOOTHER), (self.fine[1], SMOOTHER), (self.fine[1], CHARGED)):
-            finer = self.solve(braces, paths[-1].Q, count, 20, slip_scale)
-            if finer is not None:
-                paths.append(finer)
-        for local in reversed(paths):
-            times = self.task.times(len(local.Q))
-            dense = references(self.task, braces, times, local.Q)
-            why = dense if isinstance(dense, str) else touching_links(self.task, dense.times, dense.q)
-            if not isinstance(dense, str) and not why:
-                good.append(Planned(braces, times, local, dense))
-                if len(good) == 2:
-                    break
-        return min(good, key=lambda plan: plan.heat, default=why)
+    def _finer(self, braces: Set, coarse: Local, count: int) -> Planned | str:
+        """A path at more knots with its dense references; in words why hand and surfaces are not kept between them."""
+        local = self.solve(braces, coarse.Q, count, 20, CHARGED) or coarse
+        times = self.task.times(len(local.Q))
+        dense = references(self.task, braces, times, local.Q)
+        if isinstance(dense, str):
+            return dense
+        return touching_links(self.task, dense.times, dense.q) or Planned(braces, times, local, dense)
+
+    def _finest(self, plan: Planned, most: int) -> Planned:
+        """Twice the knots until the dense references cost what the knots do, or there are ``most`` of them."""
+        while plan.heat > CONVERGED * plan.local.heat and len(plan.times) < most:
+            finer = self._finer(plan.braces, plan.local, 2 * len(plan.times) - (self.task.kind != "closed"))
+            if isinstance(finer, str) or finer.heat >= plan.heat:
+                break
+            plan = finer
+        return plan
 
     def _walked(self, braces: Set, Q: Array, count: int) -> Local | None:
         """A path from a posture in its middle, knot after knot: where all at once does not reach."""
@@ -315,12 +339,6 @@ def _fits(braces: Sequence[Candidate]) -> bool:
     return len({brace.location for brace in braces}) == len(braces)
 
 
-def _line(at: Array, times: Array, values: Array) -> Array:
-    """Linear between times, and straight on beyond them."""
-    out = np.interp(at, times, values)
-    before, after = at < times[0], at > times[-1]
-    first = (values[1] - values[0]) / (times[1] - times[0])
-    last = (values[-1] - values[-2]) / (times[-1] - times[-2])
-    out[before] = values[0] + first * (at[before] - times[0])
-    out[after] = values[-1] + last * (at[after] - times[-1])
-    return out
+def _same(cost: float, other: float) -> bool:
+    """Whether two paths of one set are the same, by their costs."""
+    return abs(cost - other) <= SAME_COST * other

@@ -318,7 +318,7 @@ def test_a_motion_in_one_call_is_its_instants(arm, seed):
         ],
         axis=1,
     )
-    torques, solved = planner.torques(q, v, vdot, tables)
+    torques, _, solved = planner.least_heat(q, v, vdot, tables)
     single = [model.brace_statics(q[t], v[t], vdot[t], braces) for t in range(6)]
     feasible = [found.feasible for found in single]
     assert solved == (feasible.index(False) if False in feasible else 6)

@@ -14,9 +14,8 @@ from dynsim.compile.splines import clamped_cubic, quintic_rates
 from dynsim.errors import ModelError, ScenarioError
 from dynsim.jit.kernel import integers, reals
 from dynsim.model.surfaces import Box, HeightField, Quadric, shape_arrays
-from dynsim.planner import compiled
 from dynsim.planner.compiled import Arm, Course, Points
-from dynsim.planner.local import Problem
+from dynsim.planner.local import Problem, workspace
 from dynsim.planner.problem import CHARGED, Options, task
 from dynsim.planner.search import Search
 from dynsim.planner.verify import Tolerances, Verifier
@@ -38,7 +37,7 @@ def rotation(rng: np.random.Generator) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def tree() -> tuple[Problem, np.ndarray, np.ndarray, np.ndarray]:
+def tree() -> tuple[Problem, np.ndarray, np.ndarray]:
     """A branched arm with both kinds of joints, whose spheres lean on one surface of each kind."""
     rng, n, c = np.random.default_rng(1), 7, 5
     axes = rng.normal(size=(n, 3))
@@ -79,29 +78,33 @@ def tree() -> tuple[Problem, np.ndarray, np.ndarray, np.ndarray]:
     course = Course(
         target=reals(np.zeros((2, 9))),
         knot=integers([0, 1, 1]),
-        chord=reals(rng.normal(size=(3, 2))),
+        blend=reals([[0.6, 0.0], [0.0, 0.7], [0.0, 0.7]]),
+        chord=reals(0.01 * rng.normal(size=(3, 2))),
         share=reals([0.3, 0.3, 0.4]),
         smooth=reals(np.zeros((2, 2))),
         slip_scale=reals([2e-3]),
     )
-    Q, V = rng.normal(size=(2, n)), 0.01 * rng.normal(size=(3, n))
-    return Problem(arm, points, course, 0.5), Q, V, rng.uniform(1.0, 5.0, size=(3, c))
+    Q, F = rng.normal(size=(2, n)), rng.uniform(1.0, 5.0, size=(3, c))
+    return Problem(arm, points, course, workspace(n, points, course), 0.5), Q, F
 
 
-def test_derivatives_are_those_of_differences(tree: tuple[Problem, np.ndarray, np.ndarray, np.ndarray]) -> None:
-    """Of torques by posture, rate and force, of gaps and of the hand: all surfaces, revolute and prismatic joints."""
-    problem, Q, V, F = tree
+def test_derivatives_are_those_of_differences(tree: tuple[Problem, np.ndarray, np.ndarray]) -> None:
+    """Of torques by posture, rate and force, of gaps and of the hand: all surfaces, revolute and prismatic joints.
+
+    A knot moves instants by blend · ∂τ/∂q and by chord · ∂τ/∂v, some by the second alone.
+    """
+    problem, Q, F = tree
     work, course = problem.work, problem.course
 
-    def evaluated(Q: np.ndarray, V: np.ndarray, F: np.ndarray) -> tuple[np.ndarray, ...]:
-        compiled.evaluate(problem.arm, problem.points, course, work, Q, V, F, False)
+    def evaluated(Q: np.ndarray, F: np.ndarray) -> tuple[np.ndarray, ...]:
+        problem.evaluate(Q, F)
         return work.torque.copy(), work.gap.copy(), work.hand.copy()
 
     def slope(at, h: float) -> np.ndarray:  # type: ignore[no-untyped-def]
         # Fourth order: 1e-9 of rounding and truncation together.
         return (8.0 * (at(h) - at(-h)) - (at(2.0 * h) - at(-2.0 * h))) / (12.0 * h)
 
-    compiled.evaluate(problem.arm, problem.points, course, work, Q, V, F, True)
+    problem.evaluate(Q, F)
     by_q, by_v, by_f, gap, hand = (
         one.copy() for one in (work.by_q, work.by_v, work.by_f, work.gap_rate, work.hand_rate)
     )
@@ -109,17 +112,16 @@ def test_derivatives_are_those_of_differences(tree: tuple[Problem, np.ndarray, n
         for k in range(2):
             step = np.zeros_like(Q)
             step[k, j] = 1.0
-            torques = slope(lambda h, step=step: evaluated(Q + h * step, V, F)[0], 1e-4)
-            here = course.knot == k
-            assert np.abs(torques[here] - by_q[here, :, j]).max() < 1e-8 * np.abs(by_q).max()
-            for index, exact in ((1, gap), (2, hand)):
-                found = slope(lambda h, step=step, index=index: evaluated(Q + h * step, V, F)[index], 1e-3)
-                assert np.abs(found[k] - exact[k, :, j]).max() < 1e-8
-        rate = np.zeros_like(V)
-        rate[:, j] = 1.0
-        found = slope(lambda h, rate=rate: evaluated(Q, V + h * rate, F)[0], 1e-5)
-        assert np.abs(found - by_v[:, :, j]).max() < 1e-8 * np.abs(by_v).max()
-    difference = evaluated(Q, V, F)[0] - evaluated(Q, V, 0.0 * F)[0]
+            exact = course.chord[:, k, None] * by_v[:, :, j] + course.blend[:, k, None] * by_q[:, :, j]
+            torques = slope(lambda h, step=step: evaluated(Q + h * step, F)[0], 1e-4)
+            assert np.abs(torques - exact).max() < 1e-8 * np.abs(by_q).max()
+            alone = course.blend[:, k] == 0.0
+            rates = slope(lambda h, step=step: evaluated(Q + h * step, F)[0], 1e-3)[alone]
+            assert np.abs(rates - exact[alone]).max() < 1e-8 * np.abs(0.01 * by_v).max()
+            for index, rate in ((1, gap), (2, hand)):
+                differences = slope(lambda h, step=step, index=index: evaluated(Q + h * step, F)[index], 1e-3)
+                assert np.abs(differences[k] - rate[k, :, j]).max() < 1e-8
+    difference = evaluated(Q, F)[0] - evaluated(Q, 0.0 * F)[0]
     assert np.abs(difference - np.einsum("ejc,ec->ej", by_f, F)).max() < 1e-12 * np.abs(difference).max()
 
 

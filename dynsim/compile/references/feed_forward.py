@@ -129,7 +129,7 @@ def _pressing_torques(
 ) -> Array:
     """Torques of the motors along the references, (T, n), with braces that press."""
     planner, tables = pressing(model, times, q, v, braces, min_N)
-    torques, solved = planner.torques(q, v, vdot, tables)
+    torques, _, solved = planner.least_heat(q, v, vdot, tables)
     if solved < len(times):
         raise ModelError(
             f"controller.brace: at t = {times[solved]:.3f} s no forces of {', '.join(braces)} carry the motion within "

@@ -58,7 +58,9 @@ def brace_motion(model: ModelArrays, ws: Workspace, braces: BraceArrays, q, v, p
 
 
 @kernel
-def brace_statics(model: ModelArrays, ws: Workspace, braces: BraceArrays, q, v, vdot, tables, torques, intervals):
+def brace_statics(
+    model: ModelArrays, ws: Workspace, braces: BraceArrays, q, v, vdot, tables, torques, normal, intervals
+):
     """Least-heat forces along a motion; the last instant's forces, and intervals if they are wanted, into ``braces``.
 
     Returns the number of instants with a solution: it ends where nothing fulfils all constraints. Then ``certificate``
@@ -69,7 +71,7 @@ def brace_statics(model: ModelArrays, ws: Workspace, braces: BraceArrays, q, v, 
     ----------
     q, v, vdot : (T, nq), (T, n), (T, n)
     tables : (T, c, BRACE_SIZE), the braces at each instant
-    torques : (T, n) of the motors [N m], overwritten
+    torques, normal : (T, n) of the motors [N m] and (T, c) normal forces [N], overwritten
     """
     for t in range(q.shape[0]):
         for k in range(braces.link.shape[0]):
@@ -81,6 +83,8 @@ def brace_statics(model: ModelArrays, ws: Workspace, braces: BraceArrays, q, v, 
             return t
         for j in range(torques.shape[1]):
             torques[t, j] = braces.torques[j]
+        for k in range(normal.shape[1]):
+            normal[t, k] = braces.found[k, kb.FORCES]
     return q.shape[0]
 
 
