@@ -54,7 +54,7 @@ class Planned:
         return self.dense.heat
 
 
-class Path(NamedTuple):
+class PosturePath(NamedTuple):
     """Postures of a set at few knots, by their cost [W], and along the whole path: None, they do not reach."""
 
     coarse: float
@@ -141,7 +141,7 @@ class Search:
         the distance to the optimum.
         """
         least, most = self.task.options.count
-        paths: dict[Set, list[Path]] = {}
+        paths: dict[Set, list[PosturePath]] = {}
         rounds = self.task.options.starts
         for number in range(rounds):
             self._tell("searching", number / (rounds + 1))
@@ -154,7 +154,7 @@ class Search:
             planned[size] = self._refined({braces: some for braces, some in paths.items() if len(braces) == size})
         return planned
 
-    def _path(self, known: list[Path], cost: float, braces: Set, Q: Array) -> float:
+    def _path(self, known: list[PosturePath], cost: float, braces: Set, Q: Array) -> float:
         """Heat of a whole path from postures at few knots [W], which is put among those known of its set.
 
         Costs of few knots that are nearly the same belong to one path; those that are far from the least to none.
@@ -165,7 +165,7 @@ class Search:
             if abs(path.coarse - cost) <= SAME_COST * cost:
                 return math.inf if path.local is None else path.local.heat
         local = self._whole(braces, Q)
-        known.append(Path(cost, local))
+        known.append(PosturePath(cost, local))
         return math.inf if local is None else local.heat
 
     def _round(self, number: int, most: int) -> dict[int, list[tuple[float, Set, Array]]]:
@@ -249,7 +249,7 @@ class Search:
         local = self.solve(braces, Q, self.path, 30)
         return self._walked(braces, Q, self.path) if local is None else local
 
-    def _refined(self, paths: Mapping[Set, list[Path]]) -> list[Planned]:
+    def _refined(self, paths: Mapping[Set, list[PosturePath]]) -> list[Planned]:
         """The best sets, their best paths at more knots, by the heat of their dense references."""
         whole = {braces: sorted((p.local for p in some if p.local), key=_cost) for braces, some in paths.items()}
         reached = {braces: some for braces, some in whole.items() if some}
