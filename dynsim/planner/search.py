@@ -56,7 +56,7 @@ class Planned:
         return self.dense.heat
 
 
-class KnownPath(NamedTuple):
+class PosturePath(NamedTuple):
     """Postures of a set at few knots, by their cost [W], and along the whole path: None, they do not reach."""
 
     coarse: float
@@ -142,7 +142,7 @@ class Search:
         the distance to the optimum.
         """
         least, most = self.task.options.count
-        paths: dict[Set, list[KnownPath]] = {}
+        paths: dict[Set, list[PosturePath]] = {}
         rounds = self.task.options.starts
         for number in range(rounds):
             self._tell("searching", number / (rounds + 1))
@@ -156,7 +156,7 @@ class Search:
             planned[size] = self._refined({braces: some for braces, some in paths.items() if len(braces) == size})
         return planned
 
-    def _path(self, known: list[KnownPath], cost: float, braces: Set, Q: Array) -> float:
+    def _path(self, known: list[PosturePath], cost: float, braces: Set, Q: Array) -> float:
         """Heat of a whole path from postures at few knots [W], which is put among those known of its set.
 
         Costs of few knots that are nearly the same belong to one path; those that are far from the least to none.
@@ -167,10 +167,10 @@ class Search:
             if _same(path.coarse, cost):
                 return math.inf if path.local is None else path.local.heat
         local = self._whole(braces, Q)
-        known.append(KnownPath(cost, local))
+        known.append(PosturePath(cost, local))
         return math.inf if local is None else local.heat
 
-    def _exchange(self, paths: dict[Set, list[KnownPath]], most: int) -> None:
+    def _exchange(self, paths: dict[Set, list[PosturePath]], most: int) -> None:
         """Whole paths of the sets that the best ones become by a brace less, and then by one more.
 
         Along the path sets rank otherwise than at few knots, and few of them are near a posture that was drawn.
@@ -185,7 +185,7 @@ class Search:
                 for other in self._grown(braces) if change > 0 else combinations(braces, size - 1):
                     local, known = self._whole(other, near.Q), paths.setdefault(other, [])
                     if local is not None and not any(_same(path.coarse, local.cost) for path in known):
-                        known.append(KnownPath(local.cost, local))
+                        known.append(PosturePath(local.cost, local))
 
     def _round(self, number: int, most: int) -> dict[int, list[tuple[float, Set, Array]]]:
         """Sets of each size with cost and posture, the best first, from new starts."""
@@ -271,7 +271,7 @@ class Search:
         local = self.solve(braces, Q, half, 30) or self._walked(braces, Q, half)
         return None if local is None else self.solve(braces, local.Q, self.path, 30, SHARPER) or local
 
-    def _refined(self, paths: Mapping[Set, list[KnownPath]]) -> list[Planned]:
+    def _refined(self, paths: Mapping[Set, list[PosturePath]]) -> list[Planned]:
         """The best sets, their best paths at more knots, by the heat of their dense references."""
         whole = {braces: sorted((p.local for p in some if p.local), key=_cost) for braces, some in paths.items()}
         reached = {braces: some for braces, some in whole.items() if some}

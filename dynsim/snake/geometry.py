@@ -58,7 +58,7 @@ def snake_geometry(record: Record) -> SnakeGeometry:
     )
 
 
-class Wheel(NamedTuple):
+class WheelOfPair(NamedTuple):
     """Of a wheel pair: where along its body the axle is, how far beside the middle of the body it is, radius [m]."""
 
     along: float
@@ -66,9 +66,11 @@ class Wheel(NamedTuple):
     radius: float
 
 
-def wheels_of(scene: Scene, pair: str) -> list[Wheel]:
+def wheels_of(scene: Scene, pair: str) -> list[WheelOfPair]:
     """Wheels on a body: shapes of its own, and bodies that turn on it."""
     index = {body.name: k for k, body in enumerate(scene.bodies)}[pair]
     places = [(shape.position, shape) for shape in scene.bodies[index].shapes]
     places += [(body.joint.position, body.shapes[0]) for body in scene.bodies if body.parent == index and body.shapes]
-    return [Wheel(position[0], abs(position[1]), shape.size[0]) for position, shape in places if position[1] != 0.0]
+    return [
+        WheelOfPair(position[0], abs(position[1]), shape.size[0]) for position, shape in places if position[1] != 0.0
+    ]

@@ -20,6 +20,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from types import CodeType
 from typing import Any
@@ -230,13 +231,15 @@ class Study:
         told: list[str] = []
         for name in sorted(families.values(), key=lambda name: -sum(word in name for word in words))[:LATE]:
 
-            def work(tell: Callable[[Any], None], name: str = name) -> None:
-                make(result)
+            def work(tell: Callable[[Any], None], name: str = name, mistaken: bool = True) -> None:
+                if mistaken:
+                    make(result)
                 limit(LATE_S, lambda: tell("late"))
                 tell(outcome(items[name], None))
 
             told.append((in_a_child(work) or ["broken"])[-1])
-            if told[-1] == "failed":
+            # Some fail as Python anyway.
+            if told[-1] == "failed" and in_a_child(partial(work, mistaken=False)) == ["passed"]:
                 result["noticed"] = [name, "fails"]
                 break
         return told
