@@ -84,7 +84,7 @@ def brace_statics(
         for j in range(torques.shape[1]):
             torques[t, j] = braces.torques[j]
         for k in range(normal.shape[1]):
-            normal[t, k] = braces.found[k, kb.FORCES]
+            normal[t, k] = braces.results[k, kb.FORCES]
     return q.shape[0]
 
 
