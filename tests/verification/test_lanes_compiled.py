@@ -29,6 +29,7 @@ pytestmark = pytest.mark.long
 
 # Of cases whose matrices are ill-conditioned, where one rounding more or less is seen by as much.
 ROUNDING, FORCES = 1e-15, 1e-11
+ROUNDINGS = 4.0  # within a right-hand side there are more of them than in its state
 AMPLIFIED = {"every joint": 1e-11, "sliding, held, held": 1e-9}
 
 
@@ -43,6 +44,21 @@ def alone(b: Bench, system: System, t: float, y: np.ndarray, kept: ka.Workspace)
     ws, dy = copies(kept), np.zeros(len(y))
     derivative(system, t, reals(y), ws, dy)
     return dy, ws
+
+
+def rounded(b: Bench, y: np.ndarray, t: float) -> float:
+    """What roundings of the state in its last bit change at most, of the largest rate: how ill-conditioned the tree is.
+
+    Machine code of lanes contracts other products than that of one run where the processor has no 512-bit registers.
+    """
+    kept, worst = copies(b.ws), 0.0
+    for k in range(WIDTH):
+        rates, _ = alone(b, b.system, t, y[:, k], kept)
+        for seed in range(8):
+            bits = np.random.default_rng(seed).choice([-1.0, 1.0], len(y)) * np.finfo(float).eps
+            other, _ = alone(b, b.system, t, y[:, k] * (1.0 + bits), kept)
+            worst = max(worst, float(np.nanmax(np.abs(other - rates)) / np.nanmax(np.abs(rates))))
+    return worst
 
 
 @kernel
@@ -97,7 +113,7 @@ def test_random_trees(seed):
     for k in range(WIDTH):
         y[:, k] = b.state(random_positions(rng, robot), rng.normal(size=n))
         b.part(y[:, k], "current")[:] = rng.normal(size=len(robot.motors))
-    compare(b, y, 0.3, ROUNDING)
+    compare(b, y, 0.3, max(ROUNDING, ROUNDINGS * rounded(b, y, 0.3)))
 
 
 def test_the_cases_have_lanes_that_differ():
