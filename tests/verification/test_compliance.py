@@ -114,7 +114,7 @@ def test_four_feet_on_a_floor_that_gives_way_share_the_load():
     assert np.abs(run.states("v")[-1]).max() < 1e-9
     assert np.abs(balance(run)).max() < 1e-9
     # Feet that stick, and come nearer to each other as the box tilts, slip by 1e-5 m/s: the hardest of problems.
-    assert run.stepping.found[WORST] < 1e-6
+    assert run.stepping.statistics[WORST] < 1e-6
 
 
 def pair(ties: tuple[Tie, ...], *, mass: float = 1.0, loads: Sequence[Load] = ()) -> tuple[Bench, np.ndarray]:
@@ -179,7 +179,7 @@ def test_six_ties_hold_a_body_as_one_and_slide_at_their_bounds():
         tie, down = b.system.unilateral.tie, -run.states("q")[:, 9]
         work = run.states("load")[:, 0]
         assert np.abs(balance(run) - work).max() < 1e-9
-        assert run.stepping.found[CAPPED] == 0
+        assert run.stepping.statistics[CAPPED] == 0
         assert tie[2, ku.TIE_FORCE] == pytest.approx(-min(3.0 * G, bound), rel=1e-6)
         if bound > 3.0 * G:
             assert down[-1] == pytest.approx(3.0 * G / 5e3, rel=1e-4)

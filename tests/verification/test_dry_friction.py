@@ -102,7 +102,7 @@ def test_a_spring_with_dry_friction_comes_to_rest_in_closed_form():
         q = run.states("q")[:, 0]
         errors.append(abs(q[1] - x))
         assert abs(q[2] - q[1]) < 1e-10
-        assert run.stepping.found[CAPPED] == 0
+        assert run.stepping.statistics[CAPPED] == 0
     assert errors[0] < 1e-4
     assert errors[1] < 0.5 * errors[0]
 
@@ -162,7 +162,7 @@ def test_a_held_arm_does_not_creep():
         run = stepped(b, b.state(np.array([1.2, 0.3, 0.0]), np.zeros(3)), times, 2.5e-3, 0.5)
         hand = run.outputs("hand")
         moved.append(np.abs(hand[2] - hand[1]).max())
-        assert run.stepping.found[CAPPED] == 0
+        assert run.stepping.statistics[CAPPED] == 0
     assert moved[0] < 1e-8
     assert moved[1] > 1e-4
 

@@ -47,7 +47,7 @@ def test_a_block_sticks_on_a_slope_or_slides_down_it(slope, theta):
     distance = 0.5 * acceleration * 2.0 * (2.0 + (1e-2 if theta == 1.0 else 0.0))
     np.testing.assert_allclose(np.linalg.norm(run.states("q")[-1]), distance, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(run.outputs("contact")[-1, 0, OUT_FORCE], 2.0 * G * np.cos(slope), rtol=1e-9)
-    assert run.stepping.found[PENETRATION] < 1e-9
+    assert run.stepping.statistics[PENETRATION] < 1e-9
 
 
 @pytest.mark.parametrize(("theta", "order"), [(0.5, 2), (1.0, 1)])
@@ -79,7 +79,7 @@ def test_a_block_lands_and_bounces(restitution):
         lost = run.states("loss")[-1, IMPACT_LOSS]
         np.testing.assert_allclose(energy - 2.0 * G * height, -lost, atol=1e-9)
         np.testing.assert_allclose(run.states("ledger")[-1, CONSTRAINT], 0.0, atol=1e-9)
-        assert run.stepping.found[PENETRATION] <= h * G * fall
+        assert run.stepping.statistics[PENETRATION] <= h * G * fall
     # A landing within a step is off by up to the whole step, one at its midpoint by nothing.
     assert restitution == 0.0 or errors[-1] < 0.5 * errors[0]
 
