@@ -85,14 +85,6 @@ def test_a_block_lands_and_bounces(restitution):
     assert restitution == 0.0 or errors[-1] < 0.5 * errors[0]
 
 
-def test_what_starts_below_its_surface_is_reported_as_deep_as_it_is():
-    depth = 1e-4
-    b = block(0.4)
-    run = stepped(b, b.state([0.0, 0.0, -depth], np.zeros(3)), np.array([0.0, 5e-3]), 1e-3, 0.5)
-    # That of the first step's midpoint: it comes out slowly.
-    assert run.stepping.found[PENETRATION] == pytest.approx(depth, rel=0.01)
-
-
 def test_a_rod_that_falls_on_its_stop_loses_there_what_it_has():
     """All of m g l (cos α − cos q)/2: a loss of the stop, no error of constraints; it is closed from then on."""
     mass, length, start = 0.8, 0.5, 1.2
