@@ -21,7 +21,7 @@ from dynsim.planner.local import Local, solve
 from dynsim.planner.problem import CHARGED, SHARPER, SMOOTHER, Candidate, Task
 
 # Sets of each size that go on from the cheap problem, and from the one with slip.
-BEAM = 5
+BEAM = 3
 # Postures that a round begins with, and random ones that are tried for them.
 POSTURES, DRAWS = 4, 60
 # Standard deviation of their joints, drawn from so much to so much [rad]; of prismatic ones [m].
@@ -29,7 +29,9 @@ SPREAD, PRISMATIC_SPREAD = (0.3, 1.5), 0.2
 # Sets of each size and round that whole paths are made for, and those that are made finer in the end.
 PATHS, KEPT = 4, 3
 # Sets of each size whose neighbours are tried along the whole path.
-NEIGHBOURS = 3
+NEIGHBOURS = 5
+# Beyond that ratio to the least cost of its size a neighbour is not followed.
+PROMISING = 1.25
 # Costs of one set that differ by less, as a share, are of one path, and paths beyond that ratio to the least are none
 # that could become the best; so many of a set are made finer.
 SAME_COST, NEAR, ALTERNATIVES = 1e-3, 1.1, 3
@@ -171,21 +173,39 @@ class Search:
         return math.inf if local is None else local.heat
 
     def _exchange(self, paths: dict[Set, list[PosturePath]], most: int) -> None:
-        """Whole paths of the sets that the best ones become by a brace less, and then by one more.
+        """Whole paths of the sets that the best ones become by a brace less, or by one more, until these are known.
 
         Along the path sets rank otherwise than at few knots, and few of them are near a posture that was drawn.
         """
-        for size, change in [*((size, -1) for size in range(most, 1, -1)), *((size, 1) for size in range(most))]:
-            best = [
-                (min((path.local for path in some if path.local is not None), key=_cost), braces)
-                for braces, some in paths.items()
-                if len(braces) == size and any(path.local is not None for path in some)
-            ]
-            for near, braces in sorted(best, key=lambda item: item[0].cost)[:NEIGHBOURS]:
-                for other in self._grown(braces) if change > 0 else combinations(braces, size - 1):
-                    local, known = self._whole(other, near.Q), paths.setdefault(other, [])
-                    if local is not None and not any(_same(path.coarse, local.cost) for path in known):
-                        known.append(PosturePath(local.cost, local))
+        changes = [*((size, -1) for size in range(most, 1, -1)), *((size, 1) for size in range(most))]
+        changed, going_on = set[tuple[Set, int, float]](), True
+        while going_on:
+            going_on = False
+            for size, change in changes:
+                least = self._least(paths, size + change)
+                for near, braces in self._best(paths, size)[:NEIGHBOURS]:
+                    if (braces, change, near.cost) in changed:
+                        continue
+                    changed.add((braces, change, near.cost))
+                    going_on = True
+                    for other in self._grown(braces) if change > 0 else combinations(braces, size - 1):
+                        local, known = self._whole(other, near.Q, PROMISING * least), paths.setdefault(other, [])
+                        if local is not None and not any(_same(path.coarse, local.cost) for path in known):
+                            known.append(PosturePath(local.cost, local))
+                            least = min(least, local.cost)
+
+    def _best(self, paths: Mapping[Set, list[PosturePath]], size: int) -> list[tuple[Local, Set]]:
+        """The best path of each set of a size, the best first."""
+        best = [
+            (min((path.local for path in some if path.local is not None), key=_cost), braces)
+            for braces, some in paths.items()
+            if len(braces) == size and any(path.local is not None for path in some)
+        ]
+        return sorted(best, key=lambda item: item[0].cost)
+
+    def _least(self, paths: Mapping[Set, list[PosturePath]], size: int) -> float:
+        """Least cost of a size, of those that have whole paths."""
+        return min((local.cost for local, _ in self._best(paths, size)), default=math.inf)
 
     def _round(self, number: int, most: int) -> dict[int, list[tuple[float, Set, Array]]]:
         """Sets of each size with cost and posture, the best first, from new starts."""
@@ -265,11 +285,16 @@ class Search:
                 sets.setdefault(grown, []).extend(postures)
         return sets
 
-    def _whole(self, braces: Set, Q: Array) -> Local | None:
-        """A whole path from postures at few knots, first with blunt friction, past where sharp friction would stop."""
+    def _whole(self, braces: Set, Q: Array, most: float = math.inf) -> Local | None:
+        """A whole path from postures at few knots, first with blunt friction, past where sharp friction would stop.
+
+        None too where it costs more than ``most`` there [W].
+        """
         half = (self.path + 1) // 2
         local = self.solve(braces, Q, half, 30) or self._walked(braces, Q, half)
-        return None if local is None else self.solve(braces, local.Q, self.path, 30, SHARPER) or local
+        if local is None or local.cost > most:
+            return None
+        return self.solve(braces, local.Q, self.path, 30, SHARPER) or local
 
     def _refined(self, paths: Mapping[Set, list[PosturePath]]) -> list[Planned]:
         """The best sets, their best paths at more knots, by the heat of their dense references."""
