@@ -301,8 +301,10 @@ def solve_contacts(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Wor
     for k in range(unilateral.dry.shape[0]):
         s.mu[unilateral.dry_table[k, ku.DRY_ROW]] = h * (unilateral.dry[k, ku.OF_GEAR] + unilateral.dry[k, ku.OF_JOINT])
     soften_ties(unilateral, s, ws, h)
+    rigid = False
     for k in range(ws.contacts.shape[0]):
         if ws.active[k, ka.MODE] == ka.STICKING:
+            rigid = rigid or law[k, ka.CONTACT_STIFFNESS] == 0.0
             r = ws.active[k, ka.FIRST_ROW]
             s.mu[r] = friction_of(law, s, k, r)
             for m in range(ka.MOST_ROWS):
@@ -314,7 +316,7 @@ def solve_contacts(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Wor
                 for m in range(ka.MOST_ROWS):
                     r = ws.active[k, ka.FIRST_ROW] + m
                     s.right[r] = s.b[r] + s.turn[k, kt.ADDED + m]
-        solve_problem(s, ws.small[0], p)
+        solve_problem(s, ws.small[0], p, rigid)
         if not slip_ends(s, ws):
             break
     for r in range(p):
@@ -328,8 +330,11 @@ def solve_contacts(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Wor
 
 
 @internal_kernel
-def solve_problem(s: SteppingArrays, W, p):
-    """Impulses f and law rates w of the problem W f + ``s.right``; where f is not unique, that of least norm."""
+def solve_problem(s: SteppingArrays, W, p, rigid):
+    """Impulses f and law rates w of the problem W f + ``s.right``; where f is not unique, that of least norm.
+
+    rigid : False where all contacts give way, which makes W regular, and f unique
+    """
     residual = approach(W, s.right, s.kind, s.mu, p, s.f, s.room, kt.GOOD, kt.QUICK_ROUNDS)
     s.found[kt.SOLVES] += 1.0
     if not residual <= kt.BAD:
@@ -342,7 +347,7 @@ def solve_problem(s: SteppingArrays, W, p):
         s.w[r] = s.right[r]
         for m in range(p):
             s.w[r] += W[r, m] * s.f[m]
-    if residual <= kt.BAD:
+    if rigid and residual <= kt.BAD:
         select_least_norm(W, s.w, s.kind, s.mu, p, s.f, s.room)
 
 

@@ -216,8 +216,10 @@ def eliminate(A, x, size):
         for i in range(k + 1, size):
             factor = A[i, k] * inverse
             if factor != 0.0:
-                for j in range(k + 1, size):
-                    A[i, j] -= factor * A[k, j]
+                # Slices, whose indices begin at zero: only such loops take several numbers at once.
+                row, pivot = A[i, k + 1 : size], A[k, k + 1 : size]
+                for j in range(row.shape[0]):
+                    row[j] -= factor * pivot[j]
                 x[i] -= factor * x[k]
     for i in range(size - 1, -1, -1):
         total = x[i]
