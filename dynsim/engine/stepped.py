@@ -47,6 +47,8 @@ CONTACT_EVENTS = {
 def take_log(run: ki.Run) -> list[tuple[float, int]]:
     """Empty the log of the kernels: times [s] and numbers of what has happened."""
     logged = int(run.count[ki.LOGGED])
+    if logged == 0:
+        return []
     run.count[ki.LOGGED] = 0
     return list(zip(run.log_time[:logged].tolist(), run.log_event[:logged].tolist(), strict=True))
 
