@@ -177,7 +177,11 @@ def advance(
 ) -> tuple[Prepared, BaseException | None]:
     """One piece of up to ``limit`` steps, see :func:`dynsim.integrators.driver.advance`.
 
-    STATUS may be OUT_OF_TIME or STUCK besides what the kernels make of it. ``kernel`` : :func:`dynsim.integrators.driver.direct`
+    STATUS may be OUT_OF_TIME or STUCK besides what the kernels make of it.
+
+    Parameters
+    ----------
+    kernel : what takes the steps, of :func:`dynsim.integrators.driver.direct`; default: that of the driver
 
     Returns
     -------
