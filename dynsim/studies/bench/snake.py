@@ -14,9 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.dynamics import tables as ka
+from dynsim.engine.dynamics import Prepared
 from dynsim.engine.simulation import Simulation
 from dynsim.engine.snake_pilot import roll_pitch_yaw
 from dynsim.integrators import run as ki
+from dynsim.model.description import Robot
 from dynsim.record import Record
 from dynsim.scenario import Scenario, load_scenario
 from dynsim.snake.description import COORDINATES
@@ -33,7 +35,7 @@ SNAKES = (DYNSIM, *MUJOCO)
 Z, BETA = 2, 4
 
 
-class Outcome(NamedTuple):
+class Manoeuvre(NamedTuple):
     """CPU seconds of a run, its steps, and the displacement of the head, (6,) [m, rad]."""
 
     seconds: float
@@ -41,17 +43,17 @@ class Outcome(NamedTuple):
     displacement: Array
 
 
-class Led(NamedTuple):
-    """A run of dynsim, its coordinates at the start, and lines of all motors from each tick on, (T, na, 2)."""
+class Commands(NamedTuple):
+    """What dynsim has run, coordinates at its start, and lines of all motors from each tick on, (T, na, 2)."""
 
-    simulation: Simulation
+    prepared: Prepared
     q: Array
     period: float
     lines: Array
 
 
-def build_snake(simulation: Simulation, step: float, stiff: bool = False) -> Any:
-    """The robot of a simulation as a ``mujoco.MjModel``, with servos and a floor.
+def build_snake(prepared: Prepared, step: float, stiff: bool = False) -> Any:
+    """A compiled scenario of the dynamic snake as a ``mujoco.MjModel``, with servos and a floor.
 
     A servo's torque is K/R (u − K v) with u = k_p (q_d − q), or u = k_v (v_d − v) + K v, within ±U. Here K²/R is the
     damping of the joint, and the rest an actuator whose force is within ±K U/R: the same law, all of it implicit.
@@ -60,8 +62,8 @@ def build_snake(simulation: Simulation, step: float, stiff: bool = False) -> Any
     """
     import mujoco
 
-    robot, drives = simulation.robot, simulation._prepared.system.drives
-    spec = mujoco.MjSpec.from_string(simulation.model.to_mjcf())
+    robot, drives = prepared.model.robot, prepared.system.drives
+    spec = mujoco.MjSpec.from_string(prepared.model.to_mjcf())
     spec.option.timestep, spec.option.integrator = step, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     for actuator in list(spec.actuators):
@@ -82,7 +84,7 @@ def build_snake(simulation: Simulation, step: float, stiff: bool = False) -> Any
     touch = {"contype": 0, "conaffinity": 0}
     spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[10, 10, 1], **touch)
     for k, foot in enumerate(robot.feet):
-        mu = simulation._prepared.system.contacts.law[k, ka.MU]
+        mu = prepared.system.contacts.law[k, ka.MU]
         name, sphere = f"foot_{foot.name}", mujoco.mjtGeom.mjGEOM_SPHERE
         spec.body(foot.body).add_geom(
             name=name, type=sphere, size=[foot.radius, 0, 0], pos=foot.point, mass=0.0, **touch
@@ -92,11 +94,11 @@ def build_snake(simulation: Simulation, step: float, stiff: bool = False) -> Any
     return spec.compile()
 
 
-def positions(model: Any, simulation: Simulation, q: Array) -> Array:
+def positions(model: Any, robot: Robot, q: Array) -> Array:
     """MuJoCo's coordinates of dynsim's (nq,): joints in the order of its tree."""
     own = np.zeros(model.nq)
     own[:7] = q[:7]
-    for joint, at in zip(simulation.robot.joint_names[6:], simulation.robot.position_index[6:], strict=True):
+    for joint, at in zip(robot.joint_names[6:], robot.position_index[6:], strict=True):
         own[model.joint(joint).qposadr[0]] = q[at]
     return own
 
@@ -110,16 +112,16 @@ def measure(rounds: int, *, with_mujoco: bool) -> list[dict[str, Any]]:
         ``program``, ``us_per_step`` and ``times_real_time`` (least CPU time of the rounds), ``z_rms_m`` and
         ``beta_rms_rad`` (rms of what Δz and Δβ of the head are off from the paper's means), ``displacements`` (6, 6)
     """
-    outcomes: dict[str, list[Outcome]] = {}
+    outcomes: dict[str, list[Manoeuvre]] = {}
     duration = 0.0
     for name in TABLE_III:
         scenario = load_scenario(SCENARIO, name)
-        led, own = _lead(scenario, rounds)
+        commands, own = _command(scenario, rounds)
         duration += scenario.duration_s
         outcomes.setdefault(DYNSIM, []).append(own)
         for program, (step, stiff) in MUJOCO.items() if with_mujoco else ():
-            model = build_snake(led.simulation, step, stiff)
-            outcomes.setdefault(program, []).append(_run_mujoco(model, led, scenario.duration_s, rounds))
+            model = build_snake(commands.prepared, step, stiff)
+            outcomes.setdefault(program, []).append(_run_mujoco(model, commands, scenario.duration_s, rounds))
     published = np.array([moved.mean for moved in TABLE_III.values()])
     rows = []
     for program, runs in outcomes.items():
@@ -138,8 +140,8 @@ def measure(rounds: int, *, with_mujoco: bool) -> list[dict[str, Any]]:
     return rows
 
 
-def _lead(scenario: Scenario, rounds: int) -> tuple[Led, Outcome]:
-    """A run by dynsim that MuJoCo can follow, and its time when nobody looks at it."""
+def _command(scenario: Scenario, rounds: int) -> tuple[Commands, Manoeuvre]:
+    """A run by dynsim, timed in runs of their own, and what it commands."""
     simulation, seconds = Simulation(scenario, duration=math.inf), math.inf
     assert simulation.operator is not None
     q, lines, period = simulation.state.q, [], simulation.operator.period
@@ -153,22 +155,22 @@ def _lead(scenario: Scenario, rounds: int) -> tuple[Led, Outcome]:
         alone.advance(scenario.duration_s)
         seconds = min(seconds, time.thread_time() - started)
     steps = int(simulation._prepared.run.count[ki.STEPS])
-    own = Outcome(seconds, steps, displacement(simulation.record(scenario, pictured=False)))
-    return Led(simulation, q, period, np.array(lines)), own
+    own = Manoeuvre(seconds, steps, displacement(simulation.record(scenario, pictured=False)))
+    return Commands(simulation._prepared, q, period, np.array(lines)), own
 
 
-def _run_mujoco(model: Any, led: Led, duration: float, rounds: int) -> Outcome:
-    """The same lines, from the same posture at rest."""
+def _run_mujoco(model: Any, commands: Commands, duration: float, rounds: int) -> Manoeuvre:
+    """The same commands, from the same posture at rest."""
     import mujoco
 
     step = model.opt.timestep
     # In the middle of each step, as dynsim takes them.
     at = (np.arange(round(duration / step)) + 0.5) * step
-    k = (at / led.period).astype(int)
-    controls = led.lines[k, :, 0] + led.lines[k, :, 1] * (at - k * led.period)[:, None]
-    rates = led.simulation._prepared.system.drives.table[:, ka.SERVO_MODE] == ka.VELOCITY_MODE
-    controls[:, rates] = led.lines[k][:, rates, 1]
-    data, start = mujoco.MjData(model), state_of(model, positions(model, led.simulation, led.q))
+    k = (at / commands.period).astype(int)
+    controls = commands.lines[k, :, 0] + commands.lines[k, :, 1] * (at - k * commands.period)[:, None]
+    rates = commands.prepared.system.drives.table[:, ka.SERVO_MODE] == ka.VELOCITY_MODE
+    controls[:, rates] = commands.lines[k][:, rates, 1]
+    data, start = mujoco.MjData(model), state_of(model, positions(model, commands.prepared.model.robot, commands.q))
     seconds = math.inf
     for _ in range(rounds):
         started = time.thread_time()
@@ -182,4 +184,4 @@ def _run_mujoco(model: Any, led: Led, duration: float, rounds: int) -> Outcome:
         row[:3], row[3:] = hand.xpos, roll_pitch_yaw(hand.xmat.reshape(3, 3))
     record = Record((np.arange(len(path)) + 1) * step)
     record.add("w", w, "m, rad", labels=COORDINATES)
-    return Outcome(seconds, len(path), displacement(record))
+    return Manoeuvre(seconds, len(path), displacement(record))
