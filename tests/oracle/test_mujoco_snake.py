@@ -13,7 +13,7 @@ from dynsim.dynamics import tables as ka  # noqa: E402
 from dynsim.dynamics.drive.servo import servo_command, servo_torque  # noqa: E402
 from dynsim.engine.dynamics import Prepared, prepare  # noqa: E402
 from dynsim.scenario import load_scenario  # noqa: E402
-from dynsim.studies.bench.snake import SCENARIO, build_snake, positions  # noqa: E402
+from dynsim.studies.bench.snake import BETA, SCENARIO, Z, build_snake, positions, run_dynsim, run_mujoco  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -64,3 +64,16 @@ def test_torques_of_servos(snake: tuple[Prepared, Any], seed: int) -> None:
     mujoco.mj_forward(peer, data)
     assert 3 <= limited <= 21
     np.testing.assert_allclose((data.qfrc_actuator + data.qfrc_passive)[dofs], expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.long
+def test_a_manoeuvre() -> None:
+    """Sag and friction of the raised head that nods by 30 degrees: MuJoCo's friction is soft, but hardly so here."""
+    scenario = load_scenario(SCENARIO, "beta")
+    commands, own = run_dynsim(scenario, 0)
+    peer = run_mujoco(build_snake(commands.prepared, 1e-3, stiff=True), commands, scenario.duration_s, 1)
+    off = np.abs(peer.displacement - own.displacement)
+    assert off[Z] < 0.5e-3
+    assert off[BETA] < 2e-3
+    soft = run_mujoco(build_snake(commands.prepared, 1e-3), commands, scenario.duration_s, 1)
+    assert abs(soft.displacement[Z] - own.displacement[Z]) > 5e-3

@@ -29,8 +29,12 @@ Array = NDArray[np.float64]
 
 SCENARIO = "snake_positioning_dynamic"
 DYNSIM = "dynsim 2.5 ms, with its controller"
-# Step [s], and whether dry friction is as stiff as MuJoCo accepts, which at dynsim's step does not stay calm.
-MUJOCO = {"MuJoCo 2.5 ms": (2.5e-3, False), "MuJoCo 1 ms, stiff friction": (1e-3, True)}
+# Step [s], and whether dry friction is as stiff as MuJoCo accepts; at 2.5 ms that does not stay calm.
+MUJOCO = {
+    "MuJoCo 2.5 ms": (2.5e-3, False),
+    "MuJoCo 2 ms, stiff friction": (2e-3, True),
+    "MuJoCo 1 ms, stiff friction": (1e-3, True),
+}
 SNAKES = (DYNSIM, *MUJOCO)
 Z, BETA = 2, 4
 
@@ -116,12 +120,12 @@ def measure(rounds: int, *, with_mujoco: bool) -> list[dict[str, Any]]:
     duration = 0.0
     for name in TABLE_III:
         scenario = load_scenario(SCENARIO, name)
-        commands, own = _command(scenario, rounds)
+        commands, own = run_dynsim(scenario, rounds)
         duration += scenario.duration_s
         outcomes.setdefault(DYNSIM, []).append(own)
         for program, (step, stiff) in MUJOCO.items() if with_mujoco else ():
             model = build_snake(commands.prepared, step, stiff)
-            outcomes.setdefault(program, []).append(_run_mujoco(model, commands, scenario.duration_s, rounds))
+            outcomes.setdefault(program, []).append(run_mujoco(model, commands, scenario.duration_s, rounds))
     published = np.array([moved.mean for moved in TABLE_III.values()])
     rows = []
     for program, runs in outcomes.items():
@@ -140,13 +144,14 @@ def measure(rounds: int, *, with_mujoco: bool) -> list[dict[str, Any]]:
     return rows
 
 
-def _command(scenario: Scenario, rounds: int) -> tuple[Commands, Manoeuvre]:
+def run_dynsim(scenario: Scenario, rounds: int) -> tuple[Commands, Manoeuvre]:
     """A run by dynsim, timed in runs of their own, and what it commands."""
     simulation, seconds = Simulation(scenario, duration=math.inf), math.inf
     assert simulation.operator is not None
     q, lines, period = simulation.state.q, [], simulation.operator.period
     for k in range(round(scenario.duration_s / period)):
-        simulation.advance(k * period)
+        # Past the tick; steps are not cut there.
+        simulation.advance((k + 0.5) * period)
         lines.append(simulation._prepared.system.drives.input[:, ka.LINE_START : ka.LINE_RATE + 1].copy())
     simulation.advance(scenario.duration_s)
     for _ in range(rounds):
@@ -159,7 +164,7 @@ def _command(scenario: Scenario, rounds: int) -> tuple[Commands, Manoeuvre]:
     return Commands(simulation._prepared, q, period, np.array(lines)), own
 
 
-def _run_mujoco(model: Any, commands: Commands, duration: float, rounds: int) -> Manoeuvre:
+def run_mujoco(model: Any, commands: Commands, duration: float, rounds: int) -> Manoeuvre:
     """The same commands, from the same posture at rest."""
     import mujoco
 
