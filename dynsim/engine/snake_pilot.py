@@ -290,11 +290,11 @@ class SnakePilot(SnakeControl):
             trace.mode[-1], trace.w_target[-1] = self.state.counts[ss.MODE], self.state.w_target
             commanded[-1], trace.w_hat[-1] = self.state.phi, self.state.w_hat
         hold_last(trace)
-        w, points, shown = np.zeros((rows, 6)), [], copy_of(self.state)
+        w, points, shown, write_row = np.zeros((rows, 6)), [], copy_of(self.state), Direct(record_row)
         for r in range(rows):
             shown.base[:], shown.phi[:], shown.w_target[:] = trace.base[r], trace.phi[r], trace.w_target[r]
             shown.rho[:], shown.counts[ss.MODE] = trace.rho[r], trace.mode[r]
-            record_row(model, law, shown, self.rig, r, trace)
+            write_row(model, law, shown, self.rig, r, trace)
             w[r] = self.head_pose(q[r])
             points.append(self._polyline(q[r]))
         slip = np.linalg.norm(record["contact_slip_velocity"], axis=2)
@@ -319,13 +319,13 @@ class SnakePilot(SnakeControl):
     def _polyline(self, q: Array) -> Array:
         """Controlled point, joints and axles to the tail at coordinates (nq,), (points, 3) [m]."""
         robot, d = self.robot, self.description
-        origins = self.tree.joint_positions(q)
+        tail = f"pair{d.pairs}", [-d.link_length, 0.0, 0.0]
+        *origins, hand, end = self.tree.joint_positions(q, tail)
         index = {link.joint: k for k, link in enumerate(robot.links)}
         chain = list(d.joint_names[: d.head_joints + 1])
         for k in range(1, d.base_joints):
             chain += [robot.lifting_joints[k], d.joint_names[d.head_joints + k]]
-        tail = self.tree.point_position(f"pair{d.pairs}", [-d.link_length, 0.0, 0.0], q)
-        return np.vstack([origins[-1], origins[[index[joint] for joint in chain]], tail])
+        return np.vstack([hand, *(origins[index[joint]] for joint in chain), end])
 
 
 def _with_schedules(controller: TaskSpaceController, schedule: Schedule) -> TaskSpaceController:
