@@ -96,6 +96,13 @@ class SnakePilot(SnakeControl):
         self._motors = np.array([motors.index(joint) for joint in (*joints, *robot.wheel_joints)])
         self._lifting = np.array([joints.index(joint) for joint in robot.lifting_joints])
         self._command = Direct(command_tick)
+        # Of the line that the robot is drawn as: rows of joint_positions, whose last are the hand and the tail's axle.
+        chain = list(d.joint_names[: d.head_joints + 1])
+        for k in range(1, d.base_joints):
+            chain += [robot.lifting_joints[k], d.joint_names[d.head_joints + k]]
+        rows = [link.joint for link in robot.links]
+        self._line = [len(rows), *map(rows.index, chain), len(rows) + 1]
+        self._tail = model.body_index(f"pair{d.pairs}"), np.array([-d.link_length, 0.0, 0.0])
         self._lifter = WheelLifter(robot, controller.law.grounded[controller.fixing_row].astype(np.float64))
         self._row = controller.fixing_row
         self._added = self._lifter.angles(0.0, self.state.phi[d.head_joints :])
@@ -318,14 +325,7 @@ class SnakePilot(SnakeControl):
 
     def _polyline(self, q: Array) -> Array:
         """Controlled point, joints and axles to the tail at coordinates (nq,), (points, 3) [m]."""
-        robot, d = self.robot, self.description
-        tail = f"pair{d.pairs}", [-d.link_length, 0.0, 0.0]
-        *origins, hand, end = self.tree.joint_positions(q, tail)
-        index = {link.joint: k for k, link in enumerate(robot.links)}
-        chain = list(d.joint_names[: d.head_joints + 1])
-        for k in range(1, d.base_joints):
-            chain += [robot.lifting_joints[k], d.joint_names[d.head_joints + k]]
-        return np.vstack([hand, *(origins[index[joint]] for joint in chain), end])
+        return self.tree.joint_positions(q, self._tail)[self._line]
 
 
 def _with_schedules(controller: TaskSpaceController, schedule: Schedule) -> TaskSpaceController:
