@@ -187,7 +187,7 @@ ROWS = 0  # active rows p
 DEPENDENT = 1  # right-hand sides whose constraint forces were not unique
 CONTRADICTORY = 2  # right-hand sides for which no signs of the forces agreed with friction
 COUPLED = 3  # joint rows, the first of the active ones
-HELD = 4  # candidates that stick
+STUCK = 4  # candidates that stick
 COUNTS_SIZE = 5
 
 

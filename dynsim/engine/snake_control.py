@@ -149,7 +149,7 @@ class SnakeControl:
             raise SimulationStopped(text, time=feedback.time, state=self.postures()) from error
         self.block, self.block_start = block, first
         self.gripper[first : first + len(block.request)] = block.gripper
-        state.counts[ss.PLACE], state.progress[ss.DONE] = 0, 0.0
+        state.counts[ss.CARRIED_OUT], state.progress[ss.DONE] = 0, 0.0
 
     def _checked(self, block: CommandBlock, left: int) -> CommandBlock:
         """The commands as arrays; raises ModelError for what the controller cannot be asked."""
@@ -227,9 +227,14 @@ class SnakeControl:
         waits = (real.null_start_tick - self.tick) * real.period  # until the null space comes on [s]
         schedule = schedule._replace(null_start_tick=round(waits / schedule.period))
         trial, trace = copy_of(self.state), new_trace(self.model, ticks + 1)
-        row_of_block = min(int(trial.counts[ss.PLACE]), len(self.block.velocity) - 1)
+        row_of_block = min(int(trial.counts[ss.CARRIED_OUT]), len(self.block.velocity) - 1)
         lasting = np.tile(self.block.velocity[row_of_block], (ticks, 1))
-        trial.counts[ss.MODE], trial.counts[ss.TICKS], trial.counts[ss.PLACE], trial.progress[ss.DONE] = row, 0, 0, 0.0
+        trial.counts[ss.MODE], trial.counts[ss.TICKS], trial.counts[ss.CARRIED_OUT], trial.progress[ss.DONE] = (
+            row,
+            0,
+            0,
+            0.0,
+        )
         done, _ = run_ticks(self.model, law, schedule, trial, lasting, ticks, 1, 1, 1, self.rig, trace)
         if done < 0:
             return np.inf, -np.inf  # no longer finite: no mode to take

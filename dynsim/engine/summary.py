@@ -259,7 +259,7 @@ def _joint_stops(record: Record, prepared: Prepared, duration: float) -> list[di
 def _time_stepping(run: ki.Run) -> dict[str, Any]:
     """How well time stepping has solved its contact problems, and how deep points came to lie."""
     assert run.stepping is not None
-    results = run.stepping.found
+    results = run.stepping.statistics
     return {
         "step_s": float(run.clock[ki.STEP]),
         "contact_solves": int(results[kt.SOLVES]),

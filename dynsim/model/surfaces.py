@@ -234,7 +234,7 @@ def shape_arrays(entries: Sequence[tuple[Surface | None, float, Array, bool]]) -
         data[k, kd.RADIUS], data[k, kd.D : kd.D + 3], kind[k, kd.MOVES] = radius, along, moving
         if isinstance(surface, Box):
             kind[k, kd.SURFACE] = kd.BOX
-            data[k, kd.PLACE : kd.PLACE + 3] = surface.centre
+            data[k, kd.POSITION : kd.POSITION + 3] = surface.centre
             data[k, kd.AXES : kd.AXES + 9] = np.asarray(surface.axes).ravel()
             data[k, kd.SIZE : kd.SIZE + 3] = 0.5 * np.asarray(surface.edges) - surface.edge_radius
             data[k, kd.EDGE] = surface.edge_radius
@@ -245,11 +245,11 @@ def shape_arrays(entries: Sequence[tuple[Surface | None, float, Array, bool]]) -
                 fields.append(surface.coefficients.ravel())
             kind[k, kd.FIELD], ny, nx = starts[id(surface)], *surface.heights.shape
             kind[k, kd.COUNT : kd.COUNT + 2] = nx, ny
-            data[k, kd.PLACE : kd.PLACE + 2], data[k, kd.SIZE : kd.SIZE + 2] = surface.origin, surface.spacing
+            data[k, kd.POSITION : kd.POSITION + 2], data[k, kd.SIZE : kd.SIZE + 2] = surface.origin, surface.spacing
         elif isinstance(surface, Quadric):
             drawn = surface.drawn
             kind[k, kd.SURFACE] = simple[drawn.kind]
-            data[k, kd.PLACE : kd.PLACE + 3] = drawn.position
+            data[k, kd.POSITION : kd.POSITION + 3] = drawn.position
             if drawn.direction is not None:
                 data[k, kd.AXES : kd.AXES + 3] = drawn.direction
             data[k, kd.SIZE] = drawn.radius or 0.0

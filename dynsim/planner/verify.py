@@ -159,7 +159,7 @@ class Verifier:
         more: dict[str, Any] = {}
         if friction != 1.0 or shift != 0.0:
             more["surface_error"] = {"shift_m": (shift * self._up).tolist(), "friction_factor": friction}
-        more["integrator"] = {"method": "auto", "wall_limit_s": self.tolerances.wall_s}
+        more["integrator"] = {"method": planned_scenario.METHOD, "wall_limit_s": self.tolerances.wall_s}
         more["record"] = {"rate_hz": 100.0}
         return planned_scenario.scenario(self.task, braces, dense, k_p, more=more)
 

@@ -161,7 +161,7 @@ def command(model, law, schedule, state, velocity, moving, slows, rig):
     allocate = law.limit_policy == sc.LIMITS_ALLOCATE
     believe(model, schedule, state, rig)
     reason, waits, reductions, slowed = ss.NO_OBSTACLE, False, 0, False
-    row, done, speed, tries = state.counts[ss.PLACE], state.progress[ss.DONE], 1.0, 0
+    row, done, speed, tries = state.counts[ss.CARRIED_OUT], state.progress[ss.DONE], 1.0, 0
     commanded = False
     for i in range(6):
         rate[i] = 0.0
@@ -251,7 +251,7 @@ def settle(schedule, state, moving, reason, commanded, speed, rig):
         state.progress[ss.LATE] += 1.0 - speed
         done += speed
         if done >= 1.0 - 1e-12:
-            state.counts[ss.PLACE] += 1
+            state.counts[ss.CARRIED_OUT] += 1
             done = max(done - 1.0, 0.0)
         state.progress[ss.DONE] = done
     if blocked or not moving:
@@ -336,7 +336,7 @@ def run_ticks(model, law, schedule, state, velocity, count, moving, stop, stride
     Parameters
     ----------
     velocity : (T, 6) commanded rates of the target, a block of one row per period; zero after its end. The next row is
-        taken only when the last one was carried out (``state.counts[PLACE]`` is the place, ``state.progress[DONE]``
+        taken only when the last one was carried out (``state.counts[CARRIED_OUT]`` is its row, ``state.progress[DONE]``
         the part of that row that is carried out already).
     count : int, control periods to run.
     moving : int, 1: follow the script; 0: the target waits.

@@ -46,6 +46,17 @@ def test_what_is_moved_moves(found):
             assert found[moved][k] == pytest.approx(published.target[k], rel=0.1)
 
 
+@pytest.mark.parametrize("moved", TABLE_III)
+def test_whole_runs_close_their_ledger_and_solve_their_contacts(simulated, moved):
+    """What all energies miss, over the supplied one; at most a thousandth of the contact problems is given up."""
+    summary = simulated(SCENARIO, moved).summary
+    solved = summary["time_stepping"]
+    assert abs(summary["energy_residual_relative"]) <= 1e-5
+    assert summary["electrical_energy_supply_J"] > 10.0
+    assert solved["contact_solves"] >= 4000
+    assert solved["capped_solves"] <= 1e-3 * solved["contact_solves"]
+
+
 def test_end_values_hardly_depend_on_the_step(found):
     """The run that they do most of all, see results/snake/steps.json (``tests/support/snake_steps.py``)."""
     values = np.array([end_values("alpha", 1.0), found["alpha"], end_values("alpha", 5.0)])

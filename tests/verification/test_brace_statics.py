@@ -12,8 +12,10 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 
 import dynsim
-from dynsim.compile.bracing import Brace, BracePlanner, BraceStatics, brace_rows
+from dynsim.compile.bracing import Brace, BracePlanner, BraceStatics, PreparedBraces, brace_rows
 from dynsim.compile.model import Model
+from dynsim.dynamics.contact.braces import statics
+from dynsim.dynamics.contact.braces import tables as kb
 from dynsim.errors import ModelError
 
 seeds = st.integers(0, 2**32 - 1)
@@ -182,6 +184,64 @@ def test_limited_and_missing_motors_give_forces_or_a_certificate(arm, seed):
         assert answer.feasible == feasible
         if not feasible:
             check_impossible(model, q, v, vdot, asked, answer.certificate)
+
+
+def prepared(arm: Model, seed: int):
+    """A random limited case as the tables of the kernels, and its answer."""
+    model, q, v, vdot, braces = random_case(np.random.default_rng(seed), arm, limited=True)
+    tables = PreparedBraces(model.robot, model.arrays, braces)
+    return model, (q, v, vdot), braces, tables, tables.solve(q, v, vdot)
+
+
+def test_what_programs_leave_behind_changes_nothing(arm):
+    """An answer takes programs of several sizes: again, in tables that are full of NaN."""
+    for seed in range(40):
+        _, motion, _, tables, first = prepared(arm, seed)
+        for table in (tables._arrays.inside, *tables._arrays.program):
+            if table.dtype == np.float64:
+                table[:] = np.nan
+        again = tables.solve(*motion)
+        np.testing.assert_array_equal(again.torques, first.torques)
+        np.testing.assert_equal(again.certificate, first.certificate)
+        np.testing.assert_equal(again.intervals, first.intervals)
+
+
+def test_passive_joints_as_equations_give_a_certificate_too(arm):
+    """Where braces could carry the passive joints, and limits forbid it; as a rule these are in cones first."""
+    proofs = 0
+    for seed in range(30):
+        model, (q, v, vdot), braces, tables, answer = prepared(arm, seed)
+        arrays, passive = tables._arrays, model.n - len(model.robot.motors)
+        if answer.feasible or not 0 < passive < arrays.first[-1]:
+            continue
+        scale = statics.brace_rows(model.arrays, tables._ws, arrays)
+        equations, cones = statics.constraints(arrays, scale, True, False)
+        assert equations == passive
+        assert statics.largest_margin(arrays, equations, cones, scale) < -statics.SLACK
+        statics.contradiction(arrays, equations, cones, False)
+        check_impossible(model, q, v, vdot, braces, arrays.certificate.copy())
+        proofs += 1
+    assert proofs >= 5
+
+
+def test_a_brace_is_shortened_with_its_friction(arm):
+    """Limits around the torques with all of its force scaled to the least: they hold there, and not beside it."""
+    shortenings = 0
+    for seed in range(40):
+        model, motion, braces, tables, answer = prepared(arm, seed)
+        name, brace = next(iter(braces.items()))
+        if not answer.feasible or brace.normal_force is not None or answer.normal_forces[name] <= brace.min_N + 1e-6:
+            continue
+        arrays = tables._arrays
+        J = model.point_jacobian(brace.body, brace.point, motion[0])
+        shortened = answer.torques + (1.0 - brace.min_N / answer.normal_forces[name]) * J.T @ answer.forces[name]
+        room = 1e-8 * (1.0 + np.abs(shortened))
+        arrays.motors[:, kb.LOWER], arrays.motors[:, kb.UPPER] = shortened - room, shortened + room
+        assert statics.holds_with_least(arrays, 0)
+        arrays.motors[:, kb.LOWER] += 2.0 * room
+        assert not statics.holds_with_least(arrays, 0)
+        shortenings += brace.friction > 0.0
+    assert shortenings >= 5
 
 
 def test_published_posture_against_slsqp(arm):

@@ -12,10 +12,12 @@ from support.stepping_benches import plane, stepped
 
 from dynsim import load_scenario, simulate
 from dynsim.compile.model import Model
+from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.state import ELECTRICAL, GEAR, JOINT, JOULE, OUT_MODE
 from dynsim.errors import ModelError
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts.events import SLIP_START, SLIP_STOP
+from dynsim.integrators.contacts.modes import let_joints_slide
 from dynsim.integrators.stepping.tables import CAPPED
 from dynsim.model.description import Contact, Inertia, Link, Load, Quadric, Robot, vector
 from dynsim.model.drives import Motor, Servo
@@ -102,7 +104,7 @@ def test_a_spring_with_dry_friction_comes_to_rest_in_closed_form():
         q = run.states("q")[:, 0]
         errors.append(abs(q[1] - x))
         assert abs(q[2] - q[1]) < 1e-10
-        assert run.stepping.found[CAPPED] == 0
+        assert run.stepping.statistics[CAPPED] == 0
     assert errors[0] < 1e-4
     assert errors[1] < 0.5 * errors[0]
 
@@ -162,7 +164,7 @@ def test_a_held_arm_does_not_creep():
         run = stepped(b, b.state(np.array([1.2, 0.3, 0.0]), np.zeros(3)), times, 2.5e-3, 0.5)
         hand = run.outputs("hand")
         moved.append(np.abs(hand[2] - hand[1]).max())
-        assert run.stepping.found[CAPPED] == 0
+        assert run.stepping.statistics[CAPPED] == 0
     assert moved[0] < 1e-8
     assert moved[1] > 1e-4
 
@@ -297,6 +299,24 @@ def test_joints_and_a_tip_that_hold_together_share_forces_that_are_open(method, 
     assert moved[moved < 1e-4].max() < 1e-10
     np.testing.assert_allclose(steps.outputs("hand"), run.outputs("hand"), rtol=0, atol=1e-3 * moved.max() + 1e-12)
     np.testing.assert_array_equal(steps.outputs("contact")[:, 0, OUT_MODE], run.outputs("contact")[:, 0, OUT_MODE])
+
+
+def test_each_joint_is_held_or_slides_by_its_own_force():
+    """Of those that are held, which are the rows of the problem: the one at its bound that is accelerated slides."""
+    b = bench(arm(0.8), real=True, dry=True)
+    table, dry, vector = b.system.unilateral.dry_table, b.system.unilateral.dry, b.system.unilateral.vector
+    for holds in ((1, 1, 1), (1, 0, 1), (0, 1, 1)):
+        rows = [k for k in range(3) if holds[k] == 1]
+        for at_bound in rows:
+            table[:, ku.DRY_HOLDS] = holds
+            # Along every row the same, so that bounds alone decide; and no joint is at its own but that.
+            vector[ku.OFFSET], b.system.unilateral.room[ku.PROBLEM] = 1.0, 0.0
+            for i, k in enumerate(rows):
+                vector[ku.SOLUTION, i] = 0.8 if k == at_bound else -0.3
+            let_joints_slide(b.system, len(rows), 1.0)
+            expected = [int(k in rows and k != at_bound) for k in range(3)]
+            assert table[:, ku.DRY_NEXT].tolist() == expected
+            assert dry[at_bound, ku.DRY_SIDE] == -1.0
 
 
 SCENARIO = """

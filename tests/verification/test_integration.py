@@ -9,9 +9,30 @@ import pytest
 from support.random_robots import ADAPTIVE, Bench, bench
 
 from dynsim.dynamics.state import CONSTRAINT, ELECTRICAL, FRICTION, GEAR, JOINT, JOULE, OUT_GAP
-from dynsim.integrators.radau5.step import SHORT, guess_stages, keep_stages, missed, slack
+from dynsim.integrators.radau5.step import (
+    SHORT,
+    energy_error,
+    estimate,
+    guess_stages,
+    keep_stages,
+    missed,
+    slack,
+    step_radau5,
+)
 from dynsim.integrators.radau5.tables import ERROR_RADAU, GAMMA_RADAU, ITERATIONS, NODE_RADAU
-from dynsim.integrators.run import DRIFT_MAX, FINISHED, METHODS, REJECTED, STATUS, STEP, STEP_MAX, STEPS, Run
+from dynsim.integrators.run import (
+    DRIFT_MAX,
+    EVALUATIONS,
+    FINISHED,
+    METHODS,
+    PROJECTIONS,
+    REJECTED,
+    STATUS,
+    STEP,
+    STEP_MAX,
+    STEPS,
+    Run,
+)
 from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot
 from dynsim.model.drives import Motor
 
@@ -240,6 +261,32 @@ def test_the_first_guess_is_right_but_for_the_fifth_power_of_the_step(ratio, bra
     orders = np.log2(np.array(found[:-1]) / found[1:])
     # Without the error of the last step they are right but for the fourth.
     assert orders.min() >= 4.6, (found, orders)
+
+
+def test_a_step_that_would_be_rejected_is_judged_by_the_error_from_where_it_leads():
+    """(γ/h − J)⁻¹ (f(y + e) + Σ e_s Z_s / h) with e the first estimate, which says too much of what decays."""
+    b, y = arm()
+    h = 2e-2  # ten times what currents take
+    run = b.advance(b.new_run(y, np.array([1.0]), "radau5", step=h), 0)
+    error = step_radau5(b.system, b.ws, run)
+    first = estimate(b.system, b.ws, run, h, run.stage[0])
+    slope = b.derivative(y + run.stage[7])
+    second = estimate(b.system, b.ws, run, h, slope)
+    assert energy_error(b.system, run, h) < second < 0.2 * first
+    assert error == pytest.approx(second, rel=1e-9)
+
+
+def test_every_evaluation_is_counted():
+    """Six of a step of dopri5, one of a sample, one of the start; and one after each projection."""
+    b, y = arm()
+    run = b.simulate(y, np.linspace(1e-3, 5e-3, 3), "dopri5", step=1e-3, fixed=True)
+    assert run.count[STEPS] == 5
+    assert run.count[EVALUATIONS] == 6 * 5 + 3 + 1
+    b, y = arm(braced=True)
+    b.part(y, "q")[1] += 1e-4
+    run = b.advance(b.new_run(y, np.array([1.0]), "dopri5"), 0)
+    assert run.count[PROJECTIONS] >= 1
+    assert run.count[EVALUATIONS] == 1 + run.count[PROJECTIONS]
 
 
 def test_most_steps_take_one_iteration():

@@ -20,7 +20,7 @@ from support.random_robots import (
 from dynsim.compile.model import Model
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.state import CONSTRAINT, FRICTION, JOINT
-from dynsim.dynamics.tree.joints import position_error
+from dynsim.dynamics.tree.joints import position_error, positions_along, rates_across
 from dynsim.errors import ModelError
 from dynsim.integrators.run import DRIFT_MAX, PROJECTIONS, REJECTED, STEPS
 from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot
@@ -213,6 +213,22 @@ def test_quaternions_of_all_rotations(angle):
             q = np.array(scene_quaternion(R))
             np.testing.assert_allclose(Model(robot).body_pose("body", q)[0], R, rtol=0, atol=1e-15 * 4)
             assert q[0] >= 0.0
+
+
+def test_positions_along_rates_and_rates_across_them():
+    """N(q) u of joints behind each other, as of the state's derivative, and N⁺ N = 1; complex rates pass."""
+    rng = np.random.default_rng(8)
+    for kinds in (("floating", "revolute", "ball"), ("rolling", "ball"), ("wheeled", "prismatic")):
+        robot = random_robot_of(rng, kinds)
+        q, u = random_positions(rng, robot), rng.normal(size=len(robot.links)) + 1j * rng.normal(size=len(robot.links))
+        b = bench(robot)
+        compound, model = b.system.model.compound, b.system.model
+        y, out, back = np.r_[0.0, q], np.zeros(1 + robot.nq, dtype=complex), np.zeros(len(u), dtype=complex)
+        positions_along(compound, model, y, 1, u, out)
+        for part, whole in ((u.real, out.real), (u.imag, out.imag)):
+            np.testing.assert_allclose(whole[1:], b.part(b.derivative(b.state(q, part)), "q"), rtol=0, atol=1e-14)
+        rates_across(compound, model, y, 1, out, back)
+        np.testing.assert_allclose(back, u, rtol=0, atol=1e-14)
 
 
 # ---- error control

@@ -220,6 +220,19 @@ def test_plans_run_as_planned_and_bear_errors_of_the_scene(found) -> None:  # ty
     assert len(verdict.corners) == 9
 
 
+def test_both_treatments_of_contacts_see_the_same_run_of_a_plan(found) -> None:  # type: ignore[no-untyped-def]
+    """Steps of one length, which verify plans, and events that are located: heat to 1e-4, hand to a micrometre."""
+    search, planned = found
+    plan, corner = planned[1][0], (1.2, 0.005)
+    scenario = Verifier(search.task, Tolerances()).perturbed(plan.braces, plan.dense, 200.0, *corner)
+    stepped = dynsim.simulate(scenario)
+    located = dynsim.simulate(scenario_from_resolved({**scenario.resolved, "integrator": {"method": "radau5"}}))
+    assert stepped.summary["method"] == "time_stepping"
+    heats = [record.summary["joule_heat_J"] for record in (stepped, located)]
+    assert heats[0] == pytest.approx(heats[1], rel=1e-4)
+    assert np.abs(stepped["hand_position"] - located["hand_position"]).max() < 1e-6
+
+
 def test_more_seeds_give_the_same_plans() -> None:
     """Three seeds within 2 % of each other: what a search that finds the optimum does."""
     heats = [

@@ -10,9 +10,11 @@ from dynsim.errors import ModelError
 from dynsim.jit.kernel import reals
 from dynsim.library.controllers import task_space
 from dynsim.library.plants import snake
+from dynsim.snake import state as ss
 from dynsim.snake.controller import control_input, new_work, sigma_min
 from dynsim.snake.description import conditioning
 from dynsim.snake.kinematics import constraint_matrices, new_chain, pose_of_point, walk_chain
+from dynsim.snake.ticks import AT_LIMIT, is_too_fast
 
 seeds = st.integers(0, 2**32 - 1)
 forms = st.sampled_from(["safe", "paper"])
@@ -205,6 +207,20 @@ def test_allocation_keeps_joints_within_limits_without_head_error(seed, row):
     A, B, _, _ = dense(model, controller.law, phi, w, row)
     rate = np.append(velocity, -2.0 * (phi[5] - controller.law.shape_target[0]))
     np.testing.assert_allclose(B @ work.u, A @ rate, atol=1e-9)
+
+
+@pytest.mark.parametrize("joint", range(12))
+def test_a_slower_target_helps_but_against_a_joint_that_is_at_its_limit(joint):
+    """Every joint is looked at: the last one too may be the one that no speed of the target moves on."""
+    model, controller, phi = case(np.random.default_rng(0), limit_policy="allocate")
+    law, work, side = controller.law, new_work(model), 1.0 if joint % 2 else -1.0
+    limit = model.upper[joint] if side > 0.0 else model.lower[joint]
+    work.at_limit[joint], work.u[joint] = 2, 0.5 * side * law.rate_limit
+    phi[joint] = limit - 2.0 * AT_LIMIT * side
+    assert is_too_fast(model, law, work, ss.JOINT_LIMIT, phi)
+    assert not is_too_fast(model, law, work, ss.SINGULAR, phi)
+    phi[joint] = limit - 0.5 * AT_LIMIT * side
+    assert not is_too_fast(model, law, work, ss.JOINT_LIMIT, phi)
 
 
 @pytest.mark.parametrize(

@@ -141,6 +141,19 @@ def test_the_target_waits_instead_of_breaking_a_limit():
     assert without["joint_limit_violation_max_rad"] > 0.1
 
 
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_a_saturated_tail_stops_at_its_limit(side):
+    """The last joint starts there, and driving backward would bend it on: it stays where it is."""
+    limit = np.deg2rad(65.0)
+    back = {"type": "ramp", "start_s": 0.1, "duration_s": 1.0, "displacement": [-0.2, 0, 0, 0, 0, 0]}
+    bent = {"initial_joints_rad": [0, -0.8, 0, -1.1, 0, 1.9] + [0.0] * 5 + [side * limit]}
+    saturated = run(1.0, paths=[back], plant=bent, limit_policy="saturate")
+    assert saturated.summary["clamped_joint_ticks"] > 100
+    assert np.abs(saturated["phi"][:, 11]).max() <= limit * (1.0 + 1e-12)
+    free = run(1.0, paths=[back], plant=bent, limit_policy="none")
+    assert (side * free["phi"][-1, 11]) > limit + 0.1
+
+
 # Head stretched out to the left, base curled to the left: lifting its middle leaves the centre of mass outside.
 CURLED = {"initial_joints_rad": [0.6, -0.2, 0.6, -0.2, 0.9, 0.4] + [1.1] * 6}
 HELD = {"shape_points_rad": {"psi3": 0.4}, "null_gain": 0.0}

@@ -10,6 +10,7 @@ from scipy.optimize import linprog, minimize, minimize_scalar
 
 from dynsim.dynamics.contact.cone.program import cone_program, solve_cone_program
 from dynsim.dynamics.contact.cone.socp import best_split, split_room
+from dynsim.dynamics.contact.splits import null_space
 from dynsim.jit.kernel import integers, reals
 
 seeds = st.integers(0, 2**32 - 1)
@@ -43,6 +44,23 @@ def random_split(rng: np.random.Generator, r: int, c: int, feasible: bool):
             f[i] = rng.uniform(1.05, 3.0) * np.hypot(f[i + 1], f[i + 2]) / m
     scale = 10.0 ** rng.uniform(-3, 4)
     return scale * (f + N @ rng.normal(size=r)), N, first, mu
+
+
+@given(seeds)
+def test_null_spaces_are_orthonormal_and_whole(seed):
+    """Of B Bᵀ with B (p, rank): p − rank columns that W takes to zero; in a room that is too large."""
+    rng = np.random.default_rng(seed)
+    p = int(rng.integers(1, 9))
+    rank = int(rng.integers(0, p + 1))
+    B = rng.normal(size=(p, rank))
+    W, N, order = np.zeros((9, 9)), np.full((9, 9), np.nan), np.zeros(9, dtype=int)
+    W[:p, :p] = B @ B.T
+    width = null_space(W, p, N, order)
+    assert width == p - rank
+    N = N[:p, :width]
+    np.testing.assert_allclose(N.T @ N, np.eye(width), atol=1e-14)
+    # Squares of rows that are nearly dependent, among some hundred examples, are lost to rounding.
+    np.testing.assert_allclose(B.T @ N, 0.0, atol=1e-6)
 
 
 @given(seeds)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
+from scipy.integrate import quad, solve_ivp
 from support.random_robots import Bench, bench, random_robot
 from support.stepping_benches import plane, snake, stepped
 
 import dynsim
 from dynsim.dynamics import tables as ka
-from dynsim.dynamics.state import CONSTRAINT, FRICTION, IMPACT_LOSS, OUT_FORCE
+from dynsim.dynamics.contact import unilateral as ku
+from dynsim.dynamics.state import CONSTRAINT, FRICTION, IMPACT_LOSS, JOINT_STOP_LOSS, OUT_FORCE
 from dynsim.integrators.run import FINISHED, STATUS, Run
 from dynsim.integrators.stepping.tables import PENETRATION
 from dynsim.model.description import Contact, Inertia, Link, Robot
@@ -47,7 +48,7 @@ def test_a_block_sticks_on_a_slope_or_slides_down_it(slope, theta):
     distance = 0.5 * acceleration * 2.0 * (2.0 + (1e-2 if theta == 1.0 else 0.0))
     np.testing.assert_allclose(np.linalg.norm(run.states("q")[-1]), distance, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(run.outputs("contact")[-1, 0, OUT_FORCE], 2.0 * G * np.cos(slope), rtol=1e-9)
-    assert run.stepping.found[PENETRATION] < 1e-9
+    assert run.stepping.statistics[PENETRATION] < 1e-9
 
 
 @pytest.mark.parametrize(("theta", "order"), [(0.5, 2), (1.0, 1)])
@@ -79,9 +80,27 @@ def test_a_block_lands_and_bounces(restitution):
         lost = run.states("loss")[-1, IMPACT_LOSS]
         np.testing.assert_allclose(energy - 2.0 * G * height, -lost, atol=1e-9)
         np.testing.assert_allclose(run.states("ledger")[-1, CONSTRAINT], 0.0, atol=1e-9)
-        assert run.stepping.found[PENETRATION] <= h * G * fall
+        assert run.stepping.statistics[PENETRATION] <= h * G * fall
     # A landing within a step is off by up to the whole step, one at its midpoint by nothing.
     assert restitution == 0.0 or errors[-1] < 0.5 * errors[0]
+
+
+def test_a_rod_that_falls_on_its_stop_loses_there_what_it_has():
+    """All of m g l (cos α − cos q)/2: a loss of the stop, no error of constraints; it is closed from then on."""
+    mass, length, start = 0.8, 0.5, 1.2
+    rod = Inertia(mass, 0.5 * length * np.eye(3)[2], mass * length**2 / 12.0 * np.diag([1.0, 1.0, 0.0]))
+    link = Link("rod", "hinge", None, "revolute", np.eye(3)[1], rod, upper=0.5 * np.pi)
+    b = bench(Robot("rod", (link,), (), ("rod", length * np.eye(3)[2])), real=True)
+    run = stepped(b, b.state([start], np.zeros(1)), np.array([0.0, 0.5]), 2e-3, 0.5)
+    q, (stop,) = run.states("q")[-1, 0], b.system.unilateral.stop
+    # It is at rest where it was found to be beyond: 5.5 rad/s for less than a step.
+    assert 0.0 <= q - 0.5 * np.pi < 0.011
+    fallen = mass * G * 0.5 * length * (np.cos(start) - np.cos(q))
+    assert run.states("loss")[-1, JOINT_STOP_LOSS] == pytest.approx(fallen, rel=1e-4)
+    assert stop[ku.STOP_LOSS] == run.states("loss")[-1, JOINT_STOP_LOSS]
+    assert abs(run.states("ledger")[-1, CONSTRAINT]) < 1e-12
+    fall = quad(lambda q: 1.0 / np.sqrt(3.0 * G / length * (np.cos(start) - np.cos(q))), start, 0.5 * np.pi)[0]
+    assert stop[ku.CLOSED_TIME] == pytest.approx(0.5 - fall, abs=3e-3)
 
 
 def test_what_slides_comes_to_rest_where_it_should():

@@ -49,7 +49,7 @@ def test_a_stiff_velocity_loop_rolls(gain, theta):
     assert 0.196 < x < 0.2
     np.testing.assert_allclose(x, RADIUS * turned, atol=1e-9)
     assert run.states("contact")[-1, SLIP] < 1e-9
-    assert run.stepping.found[UNSETTLED] == 0
+    assert run.stepping.statistics[UNSETTLED] == 0
 
 
 def stiff_arm(limit: float, current: float = np.inf) -> tuple[Bench, np.ndarray]:
@@ -87,7 +87,7 @@ def test_a_stiff_arm_at_its_voltage_limit_ends_where_radau5_does(limit):
     errors, energies = [], []
     for step in (2e-3, 1e-3, 5e-4):
         run = stepped(b, y, times, step, 0.5)
-        assert run.stepping.found[UNSETTLED] == 0
+        assert run.stepping.statistics[UNSETTLED] == 0
         errors.append(np.abs(run.states("q") - exact.states("q")).max(axis=1)[1:])
         energies.append(run.states("ledger")[-1, ELECTRICAL] / exact.states("ledger")[-1, ELECTRICAL] - 1.0)
     # On its way, where it comes off its limit, and at rest.
@@ -106,7 +106,7 @@ def test_a_driver_that_limits_the_current_does_so_at_the_end_of_a_step():
     errors = [np.abs(run.states("q") - exact).max() for run in runs]
     assert errors[2] < 1e-3
     assert errors[2] < 0.2 * errors[0]
-    assert all(run.stepping.found[UNSETTLED] == 0 for run in runs)
+    assert all(run.stepping.statistics[UNSETTLED] == 0 for run in runs)
 
 
 def test_servos_with_limits_of_current_and_open_torques_end_where_radau5_does():

@@ -99,4 +99,4 @@ def test_times_are_counted_not_summed():
     run = stepped(b, b.state(np.zeros(3), np.zeros(3)), np.array([0.0, 400.0]), 1e-3, 0.5)
     assert run.clock[TIME] == 400.0
     np.testing.assert_allclose(run.outputs("contact")[-1, 0, OUT_FORCE], G, rtol=1e-9)
-    assert run.stepping.found[3] == 400_000
+    assert run.stepping.statistics[3] == 400_000

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from support.random_robots import Bench, bench
@@ -9,9 +11,11 @@ from support.random_robots import Bench, bench
 from dynsim import load_scenario, simulate
 from dynsim.compile.contact_law import SETTLE_SPEED
 from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.state import FRICTION, OUT_FORCE, OUT_GAP, OUT_MODE
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts import events as ce
+from dynsim.integrators.contacts.events import consistent
 from dynsim.model.description import Contact, Inertia, Link, Load, Quadric, Robot, vector
 from dynsim.model.surfaces import Box
 
@@ -272,6 +276,22 @@ def test_a_joint_stop_takes_the_momentum_of_a_falling_rod():
     (code,) = run.log_event[: run.count[ki.LOGGED]]
     assert code == ki.STOP_LOG + ce.STOP_HIT
     assert residual(b, run) < 1e-8
+
+
+def test_a_closed_stop_that_pulls_disagrees_with_its_mode():
+    """Each of two stops alone, and none that is open."""
+    link = replace(pendulum().links[0], lower=-1.0, upper=1.0)
+    b = bench(replace(pendulum(), links=(link,)), [], real=True)
+    table, stop = b.system.unilateral.stop_table, b.system.unilateral.stop
+    assert len(table) == 2
+    table[:, ku.STOP_CLOSED], stop[:, ku.STOP_FORCE] = 1, 2.0
+    assert consistent(b.system, b.ws)
+    for k in range(2):
+        stop[k, ku.STOP_FORCE] = -2.0
+        assert not consistent(b.system, b.ws)
+        table[k, ku.STOP_CLOSED] = 0
+        assert consistent(b.system, b.ws)
+        table[k, ku.STOP_CLOSED], stop[k, ku.STOP_FORCE] = 1, 2.0
 
 
 def rod(mu: float, phi: float, **law: float) -> tuple[Bench, float, float]:

@@ -295,7 +295,7 @@ def test_a_mesh_is_packed_once(robot: Record) -> None:
     meshes.of_robot(robot)
     file = "package://wedges/meshes/wedge.stl"
     assert meshes.index(file) == meshes.index(file) == 0
-    assert len(meshes.found) == 1
+    assert len(meshes.unique) == 1
 
 
 def test_the_page_is_one_file_without_a_network(braced: Record, tmp_path: Path) -> None:

@@ -99,7 +99,7 @@ class Painter:
         meshes.of_robot(record)
         shapes = body_shapes(robot.scene, robot.reach, meshes)
         self._fixed = [shown for shape in robot.scene.fixed if (shown := drawn_shape(shape, meshes)) is not None]
-        self._meshes = simplified(meshes.found, TRIANGLES)
+        self._meshes = simplified(meshes.unique, TRIANGLES)
         self._wheels = wheel_groups(record, robot.scene)
         # The body that has a gripper.
         hand = robot.scene.hand

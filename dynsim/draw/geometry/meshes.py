@@ -31,7 +31,7 @@ class Meshes:
     """Meshes, each once; those of a record are looked for where its robot's file is."""
 
     def __init__(self) -> None:
-        self.found: list[Mesh] = []
+        self.unique: list[Mesh] = []
         self._folders: tuple[Path, ...] = ()
         self._known: dict[Path, int | None] = {}
         self._missing: dict[str, None] = {}
@@ -79,10 +79,10 @@ class Meshes:
         try:
             if not path.is_file():
                 return None
-            self.found.append(welded(read_mesh(path)))
+            self.unique.append(welded(read_mesh(path)))
         except (RecordError, OSError, ValueError):
             return None
-        return len(self.found) - 1
+        return len(self.unique) - 1
 
 
 def welded(mesh: Mesh, near: float = _WELD) -> Mesh:

@@ -61,7 +61,7 @@ def packed(records: Mapping[str, Record], *, ghost: bool = False) -> str:
         "azimuth": turn,
         "box": [corner.tolist() for corner in bounds(every, view_axes("top", turn))],
         "records": parts,
-        "meshes": [packed_mesh(mesh, blocks) for mesh in simplified(meshes.found)],
+        "meshes": [packed_mesh(mesh, blocks) for mesh in simplified(meshes.unique)],
         "notes": meshes.notes(),
     }
     return blocks.packed(head)

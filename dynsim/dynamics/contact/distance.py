@@ -25,7 +25,7 @@ AS_POINT, PLANE, SPHERE, CYLINDER, BOX, HEIGHT_FIELD = 0, 1, 2, 3, 4, 5
 # ShapeArrays.data
 RADIUS = 0  # ρ [m]
 D = 1  # 3: axis from its beginning to its end, in the body's frame [m]
-PLACE = 4  # 3: a point of a plane or an axis, a centre, the first point of a grid (without height) [m]
+POSITION = 4  # 3: a point of a plane or an axis, a centre, the first point of a grid (without height) [m]
 AXES = 7  # 9: normal of a plane, axis of a cylinder; axes of a box in W, one after the other
 SIZE = 16  # 3: radius, negative where inside is free; half edges of a box without its rounding; spacing of a grid [m]
 EDGE = 19  # radius of the edges of a box [m]
@@ -53,7 +53,7 @@ def distance(shapes: ShapeArrays, k, x, y, z):
     kind, data = shapes.kind[k, SURFACE], shapes.data
     if kind == HEIGHT_FIELD:
         return field_distance(shapes, k, x, y, z)
-    x, y, z = x - data[k, PLACE], y - data[k, PLACE + 1], z - data[k, PLACE + 2]
+    x, y, z = x - data[k, POSITION], y - data[k, POSITION + 1], z - data[k, POSITION + 2]
     nx, ny, nz = data[k, AXES], data[k, AXES + 1], data[k, AXES + 2]
     if kind == PLANE:
         return nx * x + ny * y + nz * z, nx, ny, nz, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -186,10 +186,10 @@ def field_height(shapes: ShapeArrays, k, x, y):
     fields, data, kind = shapes.fields, shapes.data, shapes.kind
     nx, ny = kind[k, COUNT], kind[k, COUNT + 1]
     i, x0, x1, x2, x3, dx0, dx1, dx2, dx3, ex0, ex1, ex2, ex3 = spline_weights(
-        (x - data[k, PLACE]) / data[k, SIZE], 1.0 / data[k, SIZE], nx
+        (x - data[k, POSITION]) / data[k, SIZE], 1.0 / data[k, SIZE], nx
     )
     j, y0, y1, y2, y3, dy0, dy1, dy2, dy3, ey0, ey1, ey2, ey3 = spline_weights(
-        (y - data[k, PLACE + 1]) / data[k, SIZE + 1], 1.0 / data[k, SIZE + 1], ny
+        (y - data[k, POSITION + 1]) / data[k, SIZE + 1], 1.0 / data[k, SIZE + 1], ny
     )
     h, p, q, a, b, c = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for s in range(4):
@@ -248,7 +248,7 @@ def nearest(shapes: ShapeArrays, k, x, y, z, dx, dy, dz):
     kind, data = shapes.kind[k, SURFACE], shapes.data
     if kind == BOX:
         return nearest_to_box(shapes, k, x, y, z, dx, dy, dz)
-    x, y, z = data[k, PLACE] - x, data[k, PLACE + 1] - y, data[k, PLACE + 2] - z
+    x, y, z = data[k, POSITION] - x, data[k, POSITION + 1] - y, data[k, POSITION + 2] - z
     length = dx * dx + dy * dy + dz * dz
     if kind == CYLINDER:
         nx, ny, nz = data[k, AXES], data[k, AXES + 1], data[k, AXES + 2]

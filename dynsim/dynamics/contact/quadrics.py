@@ -106,7 +106,7 @@ def contact_rows(model: ModelArrays, contacts: ContactArrays, unilateral: Unilat
         put_vector(state, k, ka.TANGENT, t)
         point_row(rows, m, at, n)
         unit_force(rows, m, mu, at, n, t)
-    if ws.counts[ka.HELD] == 0:
+    if ws.counts[ka.STUCK] == 0:
         return
     for k in range(contacts.link.shape[0]):
         if ws.active[k, ka.MODE] == ka.STICKING:

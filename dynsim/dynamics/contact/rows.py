@@ -71,7 +71,7 @@ def set_modes(
                 p += 1
     if unilateral is not None:
         p = tie_rows(unilateral, ws, p)
-    ws.counts[ka.ROWS], ws.counts[ka.COUPLED], ws.counts[ka.HELD] = p, joint_rows, sticking
+    ws.counts[ka.ROWS], ws.counts[ka.COUPLED], ws.counts[ka.STUCK] = p, joint_rows, sticking
     for k in range(contacts.link.shape[0]):
         if modes[k] == ka.OPEN:
             active[k, ka.FIRST_ROW] = p

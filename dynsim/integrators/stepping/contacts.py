@@ -107,7 +107,7 @@ def remember(unilateral: UnilateralArrays, s: SteppingArrays, y, first, h):
         for m in range(kt.MEMORY_SIZE):
             s.memory[kt.LAST, k, m] = s.memory[kt.NOW, k, m]
     if s.grid[kt.LENGTH_LAST] > 0.0:
-        s.found[kt.HALF_STEP] += 0.5 * h * abs(s.grid[kt.POWER_NOW] - s.grid[kt.POWER_LAST])
+        s.statistics[kt.HALF_STEP] += 0.5 * h * abs(s.grid[kt.POWER_NOW] - s.grid[kt.POWER_LAST])
     s.grid[kt.LENGTH_LAST], s.grid[kt.POWER_LAST] = h, s.grid[kt.POWER_NOW]
 
 
@@ -336,13 +336,13 @@ def solve_problem(s: SteppingArrays, W, p, rigid):
     rigid : False where all contacts give way, which makes W regular, and f unique
     """
     residual = approach(W, s.right, s.kind, s.mu, p, s.f, s.room, kt.GOOD, kt.QUICK_ROUNDS)
-    s.found[kt.SOLVES] += 1.0
+    s.statistics[kt.SOLVES] += 1.0
     if not residual <= kt.BAD:
-        s.found[kt.LONG_SOLVES] += 1.0
+        s.statistics[kt.LONG_SOLVES] += 1.0
         residual = approach(W, s.right, s.kind, s.mu, p, s.f, s.room, kt.GOOD, kt.LAST_ROUNDS)
     if not residual <= kt.BAD:
-        s.found[kt.CAPPED] += 1.0
-    s.found[kt.WORST] = max(s.found[kt.WORST], residual)
+        s.statistics[kt.CAPPED] += 1.0
+    s.statistics[kt.WORST] = max(s.statistics[kt.WORST], residual)
     for r in range(p):
         s.w[r] = s.right[r]
         for m in range(p):

@@ -62,7 +62,7 @@ def step_moreau(system: System, ws: Workspace, run: Run):
         if limits_agree(system, ws, run, tries):
             break
         if tries == MOST_TRIES:
-            s.found[kt.UNSETTLED] += 1.0
+            s.statistics[kt.UNSETTLED] += 1.0
     note_contacts(system, s, ws)
     book(system, ws, run)
 
@@ -162,8 +162,8 @@ def book(system: System, ws: Workspace, run: Run):
     book_contacts(system, s, ws, y_new, h)
     stored_energy(system, ws, y_new, s.energy[kt.STOP])
     y_new[layout.scheme] -= stored + (s.energy[kt.STOP, kt.MECHANICAL] - s.energy[kt.START, kt.MECHANICAL])
-    if abs(y_new[layout.scheme]) > abs(s.found[kt.TAKEN]):
-        s.found[kt.TAKEN] = y_new[layout.scheme]
+    if abs(y_new[layout.scheme]) > abs(s.statistics[kt.TAKEN]):
+        s.statistics[kt.TAKEN] = y_new[layout.scheme]
 
 
 @internal_kernel
@@ -251,7 +251,7 @@ def count_step(unilateral: UnilateralArrays, law, s: SteppingArrays, ws: Workspa
             tally[ku.LOSS] += s.turn[k, kt.STRUCK]
             tally[ku.DEEPEST] = max(tally[ku.DEEPEST], -ws.contacts[k, ka.GAP])
             if law[k, ka.CONTACT_STIFFNESS] == 0.0:
-                s.found[kt.PENETRATION] = max(s.found[kt.PENETRATION], -ws.contacts[k, ka.GAP])
+                s.statistics[kt.PENETRATION] = max(s.statistics[kt.PENETRATION], -ws.contacts[k, ka.GAP])
 
 
 @internal_kernel

@@ -60,11 +60,12 @@ KNOWN = 8  # 1: its rows are those of the last step, turned
 STRUCK = 9  # what the step books as its impact loss [J]
 PRESSED_IN, IMPLICIT = 10, 11  # of what gives way: gap at the start [m], and φ of its law
 TURN_SIZE = 12
-# SteppingArrays.found: largest residual [m/s], solves above BAD, largest penetration [m]; solves, and those that took
-# more than the quick rounds; most of what steps have taken of the energy, or made (negative), at any time [J]; steps
-# whose limits of drives contradict each other; energy that would be another one if all came half a step later [J].
+# SteppingArrays.statistics: largest residual [m/s], solves above BAD, largest penetration [m]; solves, and those that
+# took more than the quick rounds; most of what steps have taken of the energy, or made (negative), at any time [J];
+# steps whose limits of drives contradict each other; energy that would be another one if all came half a step later
+# [J].
 WORST, CAPPED, PENETRATION, SOLVES, LONG_SOLVES, TAKEN, UNSETTLED, HALF_STEP = 0, 1, 2, 3, 4, 5, 6, 7
-FOUND_SIZE = 8
+STATISTICS_SIZE = 8
 # SteppingArrays.before: rates at the start; rates of the velocity products; acceleration of the last step, and then of
 # this one; what is applied at the start, without loads; rates at the end of the last accepted step.
 V_START, V_BIAS, ACCELERATION, APPLIED_THEN, V_LAST = 0, 1, 2, 3, 4
@@ -104,7 +105,7 @@ class SteppingArrays(NamedTuple):
     memory: np.ndarray  # (2, c, MEMORY_SIZE) LAST and NOW
     turn: np.ndarray  # (c, TURN_SIZE)
     room: np.ndarray  # (CONE_ROOM, p, p)
-    found: np.ndarray  # (FOUND_SIZE,)
+    statistics: np.ndarray  # (STATISTICS_SIZE,)
     grid: np.ndarray  # (GRID_SIZE,)
 
 
@@ -140,7 +141,7 @@ def stepping_arrays(
         memory=np.zeros((2, c, MEMORY_SIZE)),
         turn=np.zeros((c, TURN_SIZE)),
         room=np.zeros((kc.CONE_ROOM, p, p)),
-        found=np.zeros(FOUND_SIZE),
+        statistics=np.zeros(STATISTICS_SIZE),
         grid=np.zeros(GRID_SIZE),
     )
 
