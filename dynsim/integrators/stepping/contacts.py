@@ -24,6 +24,7 @@ from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.cone import problem as kc
 from dynsim.dynamics.contact.cone.least_norm import select_least_norm
 from dynsim.dynamics.contact.cone.problem import approach
+from dynsim.dynamics.contact.cone.steps import motion
 from dynsim.dynamics.contact.rows import point_row, set_modes
 from dynsim.dynamics.contact.unilateral import UnilateralArrays, sliding_friction, stop_gap
 from dynsim.dynamics.tables import Workspace
@@ -343,10 +344,7 @@ def solve_problem(s: SteppingArrays, W, p, rigid):
     if not residual <= kt.BAD:
         s.statistics[kt.CAPPED] += 1.0
     s.statistics[kt.WORST] = max(s.statistics[kt.WORST], residual)
-    for r in range(p):
-        s.w[r] = s.right[r]
-        for m in range(p):
-            s.w[r] += W[r, m] * s.f[m]
+    motion(W, s.right, p, s.f, s.w)
     if rigid and residual <= kt.BAD:
         select_least_norm(W, s.w, s.kind, s.mu, p, s.f, s.room)
 
