@@ -67,7 +67,7 @@ def event_name(prepared: Prepared, number: int) -> tuple[str, str] | None:
     """Kind and subject of a logged event of a contact, a joint stop or a joint that rubs; None for that of a guard."""
     if number < ki.CONTACT_LOG:
         return None
-    first = max(log for log in (ki.CONTACT_LOG, ki.STOP_LOG, ki.DRY_LOG) if log <= number)
+    first = ki.DRY_LOG if number >= ki.DRY_LOG else ki.STOP_LOG if number >= ki.STOP_LOG else ki.CONTACT_LOG
     k, kind = divmod(number - first, contact_events.LOG_KINDS)
     if first == ki.CONTACT_LOG:
         return CONTACT_EVENTS[kind], prepared.contacts[k].name
