@@ -272,14 +272,14 @@ def exact_kernel(function: F) -> F:
 
 
 class Direct:
-    """A kernel that is called again and again with arguments of the same types: those of the first call.
+    """A kernel that is called again and again with arguments of the same types, those of the first call.
 
     Numba looks at the types of all arguments in each call; in some hundred tables that takes as long as what many a
-    kernel does.
+    kernel does. Nobody looks here: an array of another type would be misread.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
-        self._function, self._entry = function, None if not config.DISABLE_JIT else function
+        self._function, self._entry = function, function if config.DISABLE_JIT else None
 
     def __call__(self, *arguments: Any) -> Any:
         if self._entry is None:
