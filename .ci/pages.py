@@ -36,6 +36,7 @@ from dynsim.studies.bench.programs import (
     MUJOCO_IMPLICIT,
     SAME_TASK,
 )  # fmt: skip
+from dynsim.studies.bench.snake import BETA, Z
 from dynsim.system.terminal import Terminal
 
 ROOT = Path(__file__).parents[1]
@@ -454,6 +455,32 @@ def sweeps() -> str:
     return lines(["runs", "one process", "two processes"], rows)
 
 
+def snake_bench() -> str:
+    rows = [
+        [
+            row["program"],
+            number(row["us_per_step"], 3),
+            number(row["times_real_time"], 2),
+            number(1e3 * row["z_rms_m"], 2),
+            number(1e3 * row["beta_rms_rad"], 2),
+        ]
+        for row in bench()["snake"]
+    ]
+    return lines(["program, step", "µs a step", "times real time", "Δz off, rms mm", "Δβ off, rms mrad"], rows)
+
+
+def of_snake(key: str, k: int) -> float:
+    """Of program k over that of dynsim, which is the first."""
+    own, peer = bench()["snake"][0], bench()["snake"][k]
+    return float(peer[key] / own[key])
+
+
+def between_snakes(k: int, coordinate: int) -> float:
+    """Rms of what displacements of the head differ by, of program k from dynsim's."""
+    own, peer = (bench()["snake"][n]["displacements"] for n in (0, k))
+    return math.hypot(*(a[coordinate] - b[coordinate] for a, b in zip(own, peer, strict=True))) / math.sqrt(len(own))
+
+
 def comparison() -> str:
     """What `dynsim compare elbow_comparison` prints, less some rows."""
     output = io.StringIO()
@@ -608,8 +635,8 @@ TABLES: dict[str, Callable[[], str]] = {
     one.__name__: one
     for one in (
         elbows_in_short, elbows, glued_and_real, overturning_holds, overturning_drives, assumptions, ledger,
-        snake_table_iii, time_stepping, endings, right_hand_side, ratios, job, precision, sweeps, comparison, faults,
-        planned_arm, planned_gains, planned_scenes,
+        snake_table_iii, time_stepping, endings, right_hand_side, ratios, job, precision, sweeps, snake_bench,
+        comparison, faults, planned_arm, planned_gains, planned_scenes,
     )
 }  # fmt: skip
 
@@ -690,6 +717,11 @@ NUMBERS: dict[str, Callable[[], str]] = {
     "job_held_ratio_implicit": lambda: against_mujoco(HELD_CASE, MUJOCO_IMPLICIT),
     "job_free_ratio": lambda: against_mujoco("free arm", MUJOCO_EULER),
     "job_free_ratio_implicit": lambda: against_mujoco("free arm", MUJOCO_IMPLICIT),
+    "snake_slower": lambda: fixed(1.0 / of_snake("us_per_step", 1), 1),
+    "snake_faster_stiff": lambda: fixed(of_snake("times_real_time", 2), 1),
+    "snake_farther": lambda: fixed(of_snake("z_rms_m", 1), 1),
+    "snake_apart_mm": lambda: fixed(1e3 * between_snakes(3, Z), 1),
+    "snake_apart_mrad": lambda: fixed(1e3 * between_snakes(3, BETA), 1),
     "rhs_us": lambda: number(by_links()[1][10, DYNSIM_CONTACTS], 2),
     "cold_wall_s": lambda: number(start_up()["radau5"]["cold"]["wall_s"], 2),
     "cold_cpu_s": lambda: number(start_up()["radau5"]["cold"]["cpu_s"], 2),

@@ -287,10 +287,17 @@ class Model:
         row = self._workspace.links[self.body_index(body)]
         return row[ka.R : ka.R + 9].reshape(3, 3).copy(), row[ka.P : ka.P + 3].copy()
 
-    def joint_positions(self, q: ArrayLike) -> Array:
-        """World origins of all bodies, then the hand, (n + 1, 3) [m]: what a posture is drawn from."""
-        hand = self.point_position(*self.robot.hand, q)
-        return np.vstack([self._workspace.links[:, ka.P : ka.P + 3], hand])
+    def joint_positions(self, q: ArrayLike, *further: tuple[str | int, ArrayLike]) -> Array:
+        """World origins of all bodies, then the hand, (n + 1, 3) [m]: what a posture is drawn from.
+
+        ``further`` : more points on bodies, after the hand
+        """
+        self._sweep(q)
+        attached = [self._attached(body, point) for body, point in (self.robot.hand, *further)]
+        out = np.vstack([self._workspace.links[:, ka.P : ka.P + 3], np.zeros((len(attached), 3))])
+        for row, (index, on_body) in zip(out[self.n :], attached, strict=True):
+            points.point_position(self._workspace, index, on_body, row)
+        return out
 
     def kinetic_energy(self, q: ArrayLike, v: ArrayLike) -> float:
         """½ vᵀ M v [J]; rotors not included."""

@@ -169,18 +169,26 @@ def _short_steps(prepared: Prepared) -> int:
 
 
 def advance(
-    prepared: Prepared, limit: int, watch: WallWatch, look: Callable[[], None]
+    prepared: Prepared,
+    limit: int,
+    watch: WallWatch,
+    look: Callable[[], None],
+    kernel: Callable[..., None] | None = None,
 ) -> tuple[Prepared, BaseException | None]:
     """One piece of up to ``limit`` steps, see :func:`dynsim.integrators.driver.advance`.
 
     STATUS may be OUT_OF_TIME or STUCK besides what the kernels make of it.
+
+    Parameters
+    ----------
+    kernel : what takes the steps, of :func:`dynsim.integrators.driver.direct`; default: that of the driver
 
     Returns
     -------
     prepared : the same, or a copy where the piece was left alone; that one cannot go on
     raised : what ``look`` has raised, or a signal
     """
-    run, few = prepared.run, min(_short_steps(prepared), limit)
+    run, few, kernel = prepared.run, min(_short_steps(prepared), limit), kernel or driver.advance
     ended, raised = True, None
 
     def ask() -> None:
@@ -193,11 +201,12 @@ def advance(
     watch.begin()
     due = few == 0
     if not due:
-        driver.advance(prepared.system, prepared.workspace, run, few)
+        kernel(prepared.system, prepared.workspace, run, few)
         # Not where it has come to what its caller is to look at. (A pending step at the begin is to be accepted.)
-        due = run.count[ki.STATUS] == ki.RUNNING and not run.count[[ki.PENDING, ki.TICKED, ki.LOGGED]].any()
+        count = run.count
+        due = count[ki.STATUS] == ki.RUNNING and count[ki.PENDING] == count[ki.TICKED] == count[ki.LOGGED] == 0
     if due and limit > few:
-        remainder = partial(driver.advance, prepared.system, prepared.workspace, run, limit - few)
+        remainder = partial(kernel, prepared.system, prepared.workspace, run, limit - few)
         ended, raised = attend(remainder, ask, both)
     watch.spend()
     if not ended:

@@ -9,15 +9,16 @@ from functools import partial
 
 from dynsim.engine import SIMULATION, Progress, attended
 from dynsim.engine.outcome import interrupted, raise_stopped
-from dynsim.engine.prepare import Prepared, prepare
+from dynsim.engine.prepare import Prepared, prepare, sample_times
 from dynsim.engine.recording import make_record
 from dynsim.engine.start import check
 from dynsim.engine.stepped import event_name, own_guards, take_log
 from dynsim.engine.stopping import last_state, stopped
 from dynsim.errors import SimulationStopped
 from dynsim.integrators import run as ki
+from dynsim.model.description import Robot
 from dynsim.record import Event, Record
-from dynsim.scenario import Scenario
+from dynsim.scenario import Scenario, build
 from dynsim.system import interruption
 from dynsim.system.memo import recall
 
@@ -33,11 +34,13 @@ TICKS = 10
 
 def simulate(scenario: Scenario, progress: Progress | None = None, *, pictured: bool = True) -> Record:
     """See :func:`dynsim.engine.simulate`."""
+    if scenario.controller is not None and type(build.robot_and_contacts(scenario)[0]) is not Robot:
+        # A snake, whose head is raised where it is prepared.
+        return _stepped(scenario, progress, pictured)
     prepared = prepare(scenario, progress)
-    control, sensors = prepared.control, scenario.config.sensors
-    encoded = sensors is not None and sensors.encoders is not None
-    if encoded or control.teleop is not None or control.task_space is not None:
-        return _stepped(scenario, 1.0 / (control.sample_time or 1.0), progress, pictured)
+    sensors = scenario.config.sensors
+    if prepared.control.teleop is not None or (sensors is not None and sensors.encoders is not None):
+        return _stepped(scenario, progress, pictured)
     size = prepared.model.n, len(prepared.contacts), len(prepared.stops)
     # Loading or compiling the kernels is no integration time.
     recall("kernels", partial(attended.load, prepared), prepared.choice.method, *size)
@@ -77,17 +80,15 @@ def simulate(scenario: Scenario, progress: Progress | None = None, *, pictured: 
     return record
 
 
-def _stepped(scenario: Scenario, rate: float, progress: Progress | None, pictured: bool) -> Record:
-    """A run with ticks of an operator, a snake's script or encoders: by the public stepper, bit for bit its record.
-
-    ``rate`` : of the ticks where there is no operator [Hz]
-    """
+def _stepped(scenario: Scenario, progress: Progress | None, pictured: bool) -> Record:
+    """A run with ticks of an operator, a snake's script or encoders: by the public stepper, bit for bit its record."""
     from dynsim.engine.simulation import Simulation
 
     # Without an end, as a session: a step that ends at a tick and one at the end of a run need not be the same.
     simulation = Simulation(scenario, duration=math.inf)
-    operator, k = simulation.operator, 0
-    rate = rate if operator is None else operator.rate
+    prepared, operator, k = simulation._prepared, simulation.operator, 0
+    sample_times(scenario, prepared.run.layout, prepared.run.columns, len(prepared.model.robot.links))
+    rate = operator.rate if operator is not None else 1.0 / (prepared.control.sample_time or 1.0)
     stop: SimulationStopped | None = None
     try:
         while simulation.time < scenario.duration_s:

@@ -27,7 +27,8 @@ class SnakeRun(SnakeControl):
         SimulationStopped
             The state is no longer finite, or the source failed.
         """
-        periods = min(self.begin_period(), CHUNK)
+        self.begin_period()
+        periods = min(self.periods(), CHUNK)
         done, blocked = run_ticks(
             self.model,
             self.controller.law,

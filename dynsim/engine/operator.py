@@ -48,6 +48,9 @@ class Referenced(Protocol):
     def set_references(self, lines: Mapping[str, tuple[float, float]]) -> None:
         """See :meth:`dynsim.engine.simulation.Simulation.set_references`."""
 
+    def set_lines(self, motors: NDArray[np.int64], lines: Array) -> None:
+        """See :meth:`dynsim.engine.simulation.Simulation.set_lines`."""
+
 
 class OperatorPath:
     """Where the hand was asked to be: straight lines between the ticks."""

@@ -123,12 +123,13 @@ class Simulation:
         # Tables that callers may change are nobody else's.
         with remembering(Memo()):
             self._prepared = prepare(scenario, pushable=True, times=np.full(1, np.inf), end=self._end, motors=motors)
-        self._time, self._wall, self._loaded = start, 0.0, False
+        self._time, self._wall = start, 0.0
         # Of a ring, and of a run that goes on from another, the ledger counts from the first sample on.
         self._relative = trace is not None or state is not None
         self._happened: list[Event] = []
         self._calling, self._token = False, object()
         self._loaded, self._watch = False, attended.WallWatch(scenario.integrator.wall_limit_s)
+        self._kernel = driver.direct(self._prepared.run)
         self._guards: list[tuple[str, str, Callable[[Simulation], None] | None]] = []
         self._calls: list[Callable[[Simulation], None]] = []
         robot = self.robot
@@ -263,7 +264,7 @@ class Simulation:
         y = run.y.copy()
         if run.count[ki.PENDING] == 1 and self._time > run.clock[ki.TIME]:
             state_within(run, self._time, y)
-        q, v, current = (y[block(run.layout, name)].copy() for name in ("q", "v", "current"))
+        q, v, current = (y[block(run.layout, name)] for name in ("q", "v", "current"))
         return State(self._time, q, v, current)
 
     def advance(self, until: float) -> State:
@@ -379,19 +380,22 @@ class Simulation:
         """:meth:`set_reference` of several joints at once: (position, rate) by joint."""
         if not lines:
             return
-        motors = [self._motor(joint) for joint in lines]
-        values = _finite("reference", list(lines.values()))
+        self.set_lines(np.array([self._motor(joint) for joint in lines]), list(lines.values()))
+
+    def set_lines(self, motors: NDArray[np.int64], lines: ArrayLike) -> None:
+        """:meth:`set_references` by numbers of motors in ``robot.motors``, (m,): position and rate of each, (m, 2)."""
+        values = _finite("reference", lines)
         if (balance := self._prepared.balance) is not None:
             values[:, 0] += balance.shift[motors]
         self._follow_lines(motors, values)
-        self._leave_plan(lines)
+        self._leave_plan(self.robot.motors[a].joint for a in motors)
 
-    def _follow_lines(self, motors: list[int], values: Array) -> None:
+    def _follow_lines(self, motors: NDArray[np.int64], values: Array) -> None:
         """Let motors follow lines from now on, values (motors, 2)."""
         self._settle_now()
         drives, reference = self._prepared.system.drives, self._prepared.system.reference
         reference.spline[motors], drives.table[motors, ka.SAMPLED] = ka.REWRITTEN, self._sampled[motors]
-        drives.input[motors, ka.LINE_START], drives.input[motors, ka.LINE_RATE] = values.T
+        drives.input[motors, ka.LINE_START : ka.LINE_RATE + 1] = values
         drives.input[motors, ka.LINE_SINCE] = self._time
         self._restart()
 
@@ -686,7 +690,7 @@ class Simulation:
         if not self._loaded:
             attended.load(self._prepared)
             self._loaded = True
-        self._prepared, raised = attended.advance(self._prepared, limit, self._watch, look)
+        self._prepared, raised = attended.advance(self._prepared, limit, self._watch, look, self._kernel)
         return raised
 
     def _call(self, call: Callable[[Simulation], None]) -> None:
@@ -779,7 +783,7 @@ class Simulation:
         reference = self._prepared.system.reference
         powers = reference.grid[1] ** np.arange(6)
         end = float(reference.coefficients[-1, self._splines[self._motors[joint]]] @ powers)
-        self._follow_lines([self._motors[joint]], np.array([[end, 0.0]]))
+        self._follow_lines(np.array([self._motors[joint]]), np.array([[end, 0.0]]))
 
     def _refill(self, until: float = -np.inf) -> None:
         """Move what was sampled to the trace, and give the buffer the times from there on, at least up to ``until``."""
@@ -821,7 +825,7 @@ def _index(choices: dict[str, int], name: str, family: str) -> int:
     return choices[name]
 
 
-def _finite(quantity: str, values: Sequence[Any] | Array) -> Array:
+def _finite(quantity: str, values: ArrayLike) -> Array:
     try:
         array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):

@@ -169,8 +169,8 @@ class SnakeControl:
             self.controller.modes.row(number, "controller.commands: mode")
         return block
 
-    def begin_period(self) -> int:
-        """Take commands and mode of the period that begins; how many periods nothing else can change, at least one.
+    def begin_period(self) -> None:
+        """Take commands and mode of the period that begins.
 
         Raises
         ------
@@ -183,15 +183,19 @@ class SnakeControl:
             state.counts[ss.MODE] = switcher.at_tick(now, SWITCHING)
         if now == self.block_start + len(self.block.request):
             self.read_commands(waiting=self.blocked or self.recovering)
-        ahead = self.block.request[now - self.block_start :]
-        request = int(ahead[0])
+        request = int(self.block.request[now - self.block_start])
         # At the ends of switching periods only, so that every recovery has at least one.
         if self.recovering and now >= (switcher.next_event() or 0) and self._is_released():
             self.recovering, request = False, FIXING
         state.counts[ss.MODE] = switcher.at_tick(now, request)
+
+    def periods(self) -> int:
+        """Periods from the present one on in which commands and mode cannot change, at least one."""
+        now = self.tick
+        ahead = self.block.request[now - self.block_start :]
         later = 1 + np.flatnonzero(ahead[1:] != NO_REQUEST)
         ends = [now + len(ahead), *(now + later[:1])]
-        if (event := switcher.next_event()) is not None:
+        if (event := self.switcher.next_event()) is not None:
             ends.append(event)
         return int(min(ends)) - now
 

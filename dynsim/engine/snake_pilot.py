@@ -24,9 +24,10 @@ from dynsim.engine.operator import Referenced
 from dynsim.engine.sensing import SampledSensor
 from dynsim.engine.snake_control import OBSTACLES, SnakeControl, copy_of
 from dynsim.engine.snake_record import add_task, hold_last, task_summary, task_warnings
-from dynsim.engine.snake_start import STEADY_TICKS, WheelLifter, command_angles
+from dynsim.engine.snake_start import STEADY_TICKS, WheelLifter
 from dynsim.engine.stepped import State
 from dynsim.errors import SimulationStopped
+from dynsim.jit.kernel import Direct
 from dynsim.model.description import Array
 from dynsim.model.drives import Servo
 from dynsim.record import Record
@@ -89,6 +90,19 @@ class SnakePilot(SnakeControl):
         self.believed, self.tree, self.robot = believed, model, robot
         self.period, self.rate = schedule.period, 1.0 / schedule.period
         self._joints = _places(robot, d.joint_names)
+        # Motors that are told lines: of joints, of the pitch joints that only lift, and of wheels.
+        joints = (*d.joint_names, *robot.lifting_joints[1:])
+        motors = [motor.joint for motor in robot.motors]
+        self._motors = np.array([motors.index(joint) for joint in (*joints, *robot.wheel_joints)])
+        self._lifting = np.array([joints.index(joint) for joint in robot.lifting_joints])
+        self._command = Direct(command_tick)
+        # Of the line that the robot is drawn as: rows of joint_positions, whose last are the hand and the tail's axle.
+        chain = list(d.joint_names[: d.head_joints + 1])
+        for k in range(1, d.base_joints):
+            chain += [robot.lifting_joints[k], d.joint_names[d.head_joints + k]]
+        rows = [link.joint for link in robot.links]
+        self._line = [len(rows), *map(rows.index, chain), len(rows) + 1]
+        self._tail = model.body_index(f"pair{d.pairs}"), np.array([-d.link_length, 0.0, 0.0])
         self._lifter = WheelLifter(robot, controller.law.grounded[controller.fixing_row].astype(np.float64))
         self._row = controller.fixing_row
         self._added = self._lifter.angles(0.0, self.state.phi[d.head_joints :])
@@ -135,10 +149,10 @@ class SnakePilot(SnakeControl):
         time, phi = self.time, state.phi.copy()
         mode = int(state.counts[ss.MODE])
         if mode != self._row:
-            self._row = mode
+            self._row, self._next_look = mode, 0
             self._lifter.change(time, self.controller.law.grounded[mode].astype(np.float64))
         self._commanded = max(self._commanded, row + 1)
-        blocked = command_tick(
+        blocked = self._command(
             self.model,
             self.controller.law,
             self.controller.schedule,
@@ -178,7 +192,8 @@ class SnakePilot(SnakeControl):
 
     def _look(self) -> None:
         """What the controller is told of the robot, into its beliefs."""
-        self.state.base[:] = base_pose(self._seen.q)
+        q, base = self._seen.q, self.state.base
+        base[:2], base[2] = q[:2], base_yaw(q)
         for sensor in self.sensors:
             belief = self.state.w_hat if self.believed == ss.MEASURED else self.state.phi_hat
             belief[:] = sensor.value(self._seen.time)
@@ -208,24 +223,21 @@ class SnakePilot(SnakeControl):
 
     def _tell(self, simulation: Referenced, time: float, phi: Array) -> None:
         """References of joints and wheels from the tick at ``time`` on, at which joints are told ``phi``."""
-        rates, joints = self.rig.work.u, len(phi)
+        rates, joints, lines = self.rig.work.u, len(phi), np.zeros((len(self._motors), 2))
         self._lift(time)
-        at, rate = (
-            command_angles(self.robot, angles, added)
-            for angles, added in ((phi, self._added), (rates[:joints], self._added_rate))
-        )
-        lines = {joint: (angle, rate[joint]) for joint, angle in at.items()}
-        wheels = zip(self.robot.wheel_joints, rates[joints:].tolist(), strict=True)
-        lines |= {joint: (0.0, turning) for joint, turning in wheels}
-        simulation.set_references(lines)
+        lines[:joints, 0], lines[:joints, 1] = phi, rates[:joints]
+        lines[self._lifting, 0] += self._added
+        lines[self._lifting, 1] += self._added_rate
+        lines[joints + len(self._lifting) - 1 :, 1] = rates[joints:]
+        simulation.set_lines(self._motors, lines)
         self._added = self._added + self.period * self._added_rate
 
     def _lift(self, time: float) -> None:
         """Rates at which lifting moves the pitch joints: every tick while heights change, else now and then."""
-        now, moving = self.tick, self._lifter.moving(time)  # of the tick that has just been commanded
-        if now < self._next_look and not moving:
+        now = self.tick  # of the tick that has just been commanded
+        if now < self._next_look:
             return
-        ticks = 1 if moving else STEADY_TICKS
+        ticks = 1 if self._lifter.moving(time) else STEADY_TICKS
         span = ticks * self.period
         # Yaw angles go on at their rates until the next look.
         head, joints = self.description.head_joints, len(self.state.phi)
@@ -285,11 +297,11 @@ class SnakePilot(SnakeControl):
             trace.mode[-1], trace.w_target[-1] = self.state.counts[ss.MODE], self.state.w_target
             commanded[-1], trace.w_hat[-1] = self.state.phi, self.state.w_hat
         hold_last(trace)
-        w, points, shown = np.zeros((rows, 6)), [], copy_of(self.state)
+        w, points, shown, write_row = np.zeros((rows, 6)), [], copy_of(self.state), Direct(record_row)
         for r in range(rows):
             shown.base[:], shown.phi[:], shown.w_target[:] = trace.base[r], trace.phi[r], trace.w_target[r]
             shown.rho[:], shown.counts[ss.MODE] = trace.rho[r], trace.mode[r]
-            record_row(model, law, shown, self.rig, r, trace)
+            write_row(model, law, shown, self.rig, r, trace)
             w[r] = self.head_pose(q[r])
             points.append(self._polyline(q[r]))
         slip = np.linalg.norm(record["contact_slip_velocity"], axis=2)
@@ -313,14 +325,7 @@ class SnakePilot(SnakeControl):
 
     def _polyline(self, q: Array) -> Array:
         """Controlled point, joints and axles to the tail at coordinates (nq,), (points, 3) [m]."""
-        robot, d = self.robot, self.description
-        origins = self.tree.joint_positions(q)
-        index = {link.joint: k for k, link in enumerate(robot.links)}
-        chain = list(d.joint_names[: d.head_joints + 1])
-        for k in range(1, d.base_joints):
-            chain += [robot.lifting_joints[k], d.joint_names[d.head_joints + k]]
-        tail = self.tree.point_position(f"pair{d.pairs}", [-d.link_length, 0.0, 0.0], q)
-        return np.vstack([origins[-1], origins[[index[joint] for joint in chain]], tail])
+        return self.tree.joint_positions(q, self._tail)[self._line]
 
 
 def _with_schedules(controller: TaskSpaceController, schedule: Schedule) -> TaskSpaceController:
@@ -336,10 +341,14 @@ def _places(robot: SnakeTree, joints: tuple[str, ...]) -> Array:
 
 def base_pose(q: Array) -> Array:
     """x, y [m] of wheel pair 1 and yaw [rad] of the base part at coordinates (…, nq) of the tree, (…, 3)."""
+    return np.stack([q[..., 0], q[..., 1], base_yaw(q)], axis=-1)
+
+
+def base_yaw(q: Array) -> Any:
+    """Yaw of the base part at coordinates (…, nq) of the tree, (…) [rad]."""
     w, x, y, z = (q[..., k] for k in range(3, _ROOT_COORDINATES))
     # Of the axle, e_y of the root: it stays level where the body behind it is tilted.
-    yaw = np.arctan2(-2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z))
-    return np.stack([q[..., 0], q[..., 1], yaw], axis=-1)
+    return np.arctan2(-2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z))
 
 
 def roll_pitch_yaw(R: Array) -> Array:

@@ -15,6 +15,8 @@ After each accepted step q and v are projected onto the active rows when they ha
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact.unilateral import UnilateralArrays
 from dynsim.dynamics.derivative import System
@@ -35,7 +37,7 @@ from dynsim.integrators.run import Run
 from dynsim.integrators.stepping.step import advance_moreau
 from dynsim.integrators.steps import choose_step, finished, finite, first_step, next_step, rejected, stalled
 from dynsim.integrators.watch import forces_unique, watch
-from dynsim.jit.kernel import apart_kernel, free_kernel, internal_kernel, merged_kernel
+from dynsim.jit.kernel import Direct, apart_kernel, free_kernel, internal_kernel, merged_kernel
 
 
 @internal_kernel
@@ -225,5 +227,12 @@ def advance(system: System, ws: Workspace, run: Run, limit: int) -> None:
 
     Three compiled functions behind one name, so that each is only compiled when it is used.
     """
-    methods = {ki.DOPRI5: advance_dopri5, ki.RADAU5: advance_radau5, ki.TIME_STEPPING: advance_moreau}
-    methods[run.method](system, ws, run, limit)
+    _METHODS[run.method](system, ws, run, limit)
+
+
+def direct(run: Run) -> Callable[[System, Workspace, Run, int], None]:
+    """:func:`advance` for a run in many short pieces, whose tables keep the types that they have in the first."""
+    return Direct(_METHODS[run.method])
+
+
+_METHODS = {ki.DOPRI5: advance_dopri5, ki.RADAU5: advance_radau5, ki.TIME_STEPPING: advance_moreau}

@@ -271,6 +271,23 @@ def exact_kernel(function: F) -> F:
     return register_part(function, PartCompiler, {**_OPTIONS, "fastmath": False, "forceinline": True})
 
 
+class Direct:
+    """A kernel that is called again and again with arguments of the same types, those of the first call.
+
+    Numba looks at the types of all arguments in each call; in some hundred tables that takes as long as what many a
+    kernel does. Nobody looks here: an array of another type would be misread.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function, self._entry = function, function if config.DISABLE_JIT else None
+
+    def __call__(self, *arguments: Any) -> Any:
+        if self._entry is None:
+            function: Any = self._function
+            self._entry = function.compile(tuple(map(function.typeof_pyval, arguments)))
+        return self._entry(*arguments)
+
+
 def _compile(function: F, **options: Any) -> F:
     compiled = numba.njit(pipeline_class=KernelCompiler, no_cfunc_wrapper=True, **_OPTIONS, **options)(function)
     if not config.DISABLE_JIT:

@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 
 from dynsim.scenario import variant_names
-from dynsim.studies.bench import job, precision, programs, right_hand_side, run
+from dynsim.studies.bench import job, precision, programs, right_hand_side, run, snake
 from dynsim.studies.bench.table import format_table
 
 pytestmark = pytest.mark.long
@@ -49,8 +49,12 @@ def test_quick_run(small: None) -> None:
     assert [row["error"] for row in exact] == sorted((row["error"] for row in exact), reverse=True)
     times = [row["median_us"] for row in result["right_hand_side"]]
     times += [row["cpu_median_s"] for row in result["job"]] + [row["cpu_minimum_s"] for row in result["variants"]]
+    times += [row["us_per_step"] for row in result["snake"]]
     assert all(math.isfinite(time) and time > 0.0 for time in times)
     assert "–" not in text(result)
+    snakes = {row["program"]: row for row in result["snake"]}
+    assert tuple(snakes) == snake.SNAKES
+    assert snakes[snake.DYNSIM]["z_rms_m"] < 8e-3
     assert [row["failed"] for row in result["sweeps"]] == [0] * len(result["sweeps"])
     assert {row["runs"] for row in result["sweeps"]} == {25, 50, 100}
     assert [row["variant"] for row in result["variants"]] == variant_names(programs.SCENARIO)
@@ -61,8 +65,8 @@ def test_without_mujoco(small: None, monkeypatch: pytest.MonkeyPatch) -> None:
     result = run.run_bench(quick=True)
     assert "not installed" in result["unavailable"]["mujoco"]
     rows = [line for line in text(result).splitlines() if "MuJoCo " in line and "step), median" not in line]
-    # Two each: times, the job of the one case.
-    assert len(rows) == 4
+    # Two each: times, the job of the one case; three: the snake.
+    assert len(rows) == 7
     assert all("–" in row for row in rows)
     assert json.dumps(result)
 

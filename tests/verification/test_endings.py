@@ -241,6 +241,7 @@ class Stands:
         self.inside, self.released, self.left = threading.Event(), threading.Event(), after
         self.advance = driver.advance
         monkeypatch.setattr(driver, "advance", self)
+        monkeypatch.setattr(driver, "direct", lambda run: self)
 
     def __call__(self, system: Any, ws: Any, run: Any, limit: int) -> None:
         if limit < 0:
@@ -327,7 +328,7 @@ def test_a_simulation_goes_on_after_ctrl_c_as_if_nothing_had_been(monkeypatch: p
                 time.sleep(0.01)
         advance(system, ws, run, limit)
 
-    monkeypatch.setattr(driver, "advance", interrupted)
+    monkeypatch.setattr(driver, "direct", lambda run: interrupted)
     simulation = dynsim.Simulation(scenario)
     interrupt_when(begun)
     with pytest.raises(KeyboardInterrupt):

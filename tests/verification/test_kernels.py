@@ -17,7 +17,8 @@ from dynsim.compile.model import Model
 from dynsim.dynamics import derivative as system
 from dynsim.dynamics import ledger
 from dynsim.dynamics.tree import articulated, points, sweep
-from dynsim.integrators import driver
+from dynsim.integrators import driver, steps
+from dynsim.jit.kernel import Direct, reals
 
 PLAIN_PYTHON = """
 import sys
@@ -102,6 +103,13 @@ def test_every_public_kernel_has_one_compiled_signature():
         # Other tests of the process bring robots with joints of several velocities.
         plain = [signature for signature in kernel.signatures if not has_compound_joints(signature[0])]
         assert len(plain) == 1, kernel
+
+
+def test_a_direct_kernel_is_the_kernel():
+    """Also with other arrays than those of the first call."""
+    direct = Direct(steps.finite)
+    for values in ([1.0, 2.0], [1.0, np.nan, 3.0], []):
+        assert direct(reals(values)) == steps.finite(reals(values)) == bool(np.isfinite(values).all())
 
 
 def test_kernels_run_as_plain_python(tmp_path):

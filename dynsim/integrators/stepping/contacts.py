@@ -24,6 +24,7 @@ from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.cone import problem as kc
 from dynsim.dynamics.contact.cone.least_norm import select_least_norm
 from dynsim.dynamics.contact.cone.problem import approach
+from dynsim.dynamics.contact.cone.steps import motion
 from dynsim.dynamics.contact.rows import point_row, set_modes
 from dynsim.dynamics.contact.unilateral import UnilateralArrays, sliding_friction, stop_gap
 from dynsim.dynamics.tables import Workspace
@@ -301,8 +302,10 @@ def solve_contacts(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Wor
     for k in range(unilateral.dry.shape[0]):
         s.mu[unilateral.dry_table[k, ku.DRY_ROW]] = h * (unilateral.dry[k, ku.OF_GEAR] + unilateral.dry[k, ku.OF_JOINT])
     soften_ties(unilateral, s, ws, h)
+    rigid = False
     for k in range(ws.contacts.shape[0]):
         if ws.active[k, ka.MODE] == ka.STICKING:
+            rigid = rigid or law[k, ka.CONTACT_STIFFNESS] == 0.0
             r = ws.active[k, ka.FIRST_ROW]
             s.mu[r] = friction_of(law, s, k, r)
             for m in range(ka.MOST_ROWS):
@@ -314,7 +317,7 @@ def solve_contacts(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Wor
                 for m in range(ka.MOST_ROWS):
                     r = ws.active[k, ka.FIRST_ROW] + m
                     s.right[r] = s.b[r] + s.turn[k, kt.ADDED + m]
-        solve_problem(s, ws.small[0], p)
+        solve_problem(s, ws.small[0], p, rigid)
         if not slip_ends(s, ws):
             break
     for r in range(p):
@@ -328,8 +331,11 @@ def solve_contacts(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Wor
 
 
 @internal_kernel
-def solve_problem(s: SteppingArrays, W, p):
-    """Impulses f and law rates w of the problem W f + ``s.right``; where f is not unique, that of least norm."""
+def solve_problem(s: SteppingArrays, W, p, rigid):
+    """Impulses f and law rates w of the problem W f + ``s.right``; where f is not unique, that of least norm.
+
+    rigid : False where all contacts give way, which makes W regular, and f unique
+    """
     residual = approach(W, s.right, s.kind, s.mu, p, s.f, s.room, kt.GOOD, kt.QUICK_ROUNDS)
     s.statistics[kt.SOLVES] += 1.0
     if not residual <= kt.BAD:
@@ -338,11 +344,8 @@ def solve_problem(s: SteppingArrays, W, p):
     if not residual <= kt.BAD:
         s.statistics[kt.CAPPED] += 1.0
     s.statistics[kt.WORST] = max(s.statistics[kt.WORST], residual)
-    for r in range(p):
-        s.w[r] = s.right[r]
-        for m in range(p):
-            s.w[r] += W[r, m] * s.f[m]
-    if residual <= kt.BAD:
+    motion(W, s.right, p, s.f, s.w)
+    if rigid and residual <= kt.BAD:
         select_least_norm(W, s.w, s.kind, s.mu, p, s.f, s.room)
 
 

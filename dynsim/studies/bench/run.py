@@ -13,7 +13,7 @@ from typing import Any
 
 from dynsim._version import __version__
 from dynsim.engine.provenance import commit
-from dynsim.studies.bench import job, precision, right_hand_side, sweeps
+from dynsim.studies.bench import job, precision, right_hand_side, snake, sweeps
 from dynsim.studies.bench.programs import SCENARIO, STEP
 
 SIZES = (10, 30, 100, 300, 1000)
@@ -32,8 +32,8 @@ def run_bench(quick: bool = False, tell: Callable[[str], object] = lambda text: 
     dict, ready for JSON
         ``machine``, ``versions``, ``method`` (how it was measured), ``unavailable`` (what is missing and why), and
         lists of dicts: ``right_hand_side`` (by links and program), ``job`` (by case and program: time and errors),
-        ``variants`` (time), ``sweeps`` (by number of runs and of processes: wall time), ``precision`` (by shipped
-        scenario, method and tolerance: time, error, ledger).
+        ``variants`` (time), ``snake`` (by program: time, distance from the paper), ``sweeps`` (by number of runs and of
+        processes: wall time), ``precision`` (by shipped scenario, method and tolerance: time, error, ledger).
     """
     missing = {name: why for name, why in (("mujoco", _why_no_mujoco()), ("pinocchio", _why_no_pinocchio())) if why}
     with_mujoco, with_pinocchio = "mujoco" not in missing, "pinocchio" not in missing
@@ -49,6 +49,8 @@ def run_bench(quick: bool = False, tell: Callable[[str], object] = lambda text: 
         jobs += job.measure(case, 3 if quick else 21, with_mujoco=with_mujoco)
     tell("variants")
     elbows = job.measure_variants(3 if quick else 9)
+    tell("snake")
+    snakes = snake.measure(1 if quick else 5, with_mujoco=with_mujoco)
     tell("sweeps")
     swept = sweeps.measure(quick)
     exact: list[dict[str, Any]] = []
@@ -72,6 +74,7 @@ def run_bench(quick: bool = False, tell: Callable[[str], object] = lambda text: 
         "right_hand_side": sizes,
         "job": jobs,
         "variants": elbows,
+        "snake": snakes,
         "sweeps": swept,
         "precision": exact,
         "unavailable": missing,

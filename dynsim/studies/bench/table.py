@@ -8,11 +8,17 @@ from typing import Any
 from rich import box
 from rich.table import Table
 
-from dynsim.studies.bench import job, precision
+from dynsim.studies.bench import job, precision, snake
 from dynsim.studies.bench.programs import JOBS, RIGHT_HAND_SIDES
 
 Row = Mapping[str, Any]
 
+SNAKE_COLUMNS = {
+    "µs/step": ("us_per_step", 1.0),
+    "× real time": ("times_real_time", 1.0),
+    "Δz mm": ("z_rms_m", 1e3),
+    "Δβ mrad": ("beta_rms_rad", 1e3),
+}
 # As many tolerances as fit; all are in the JSON.
 _RTOLS = precision.RTOLS[::2]
 
@@ -49,6 +55,16 @@ def format_table(result: dict[str, Any]) -> list[Table]:
         _table(
             "10 s of all variants, radau5",
             {(row["variant"], "least CPU ms"): _number(row["cpu_minimum_s"], 1e3) for row in result["variants"]},
+        ),
+        _table(
+            "The dynamic snake, six runs of 10 s; rms from the paper's Table III",
+            {
+                (row["program"], head): _number(row[key], scale)
+                for row in result["snake"]
+                for head, (key, scale) in SNAKE_COLUMNS.items()
+            },
+            down=snake.SNAKES,
+            across=SNAKE_COLUMNS,
         ),
         _table(
             "Sweeps of 10 s of two elbows, wall s, by processes",

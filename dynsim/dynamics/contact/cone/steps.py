@@ -51,14 +51,31 @@ def mobilities(W, kind, p, room):
 
 
 @internal_kernel
+def motion(W, b, p, f, u):
+    """u = W f + b. Four rows at a time, because every sum waits for its last term."""
+    k = 0
+    while k + 4 <= p:
+        row, second, third, fourth = W[k], W[k + 1], W[k + 2], W[k + 3]
+        x, y, z, w = b[k], b[k + 1], b[k + 2], b[k + 3]
+        for m in range(p):
+            x += row[m] * f[m]
+            y += second[m] * f[m]
+            z += third[m] * f[m]
+            w += fourth[m] * f[m]
+        u[k], u[k + 1], u[k + 2], u[k + 3] = x, y, z, w
+        k += 4
+    for r in range(k, p):
+        x = b[r]
+        for m in range(p):
+            x += W[r, m] * f[m]
+        u[r] = x
+
+
+@internal_kernel
 def measure(W, b, kind, mu, p, f, room):
     """u = W f + b into ``room[MOTION, 0]``; returns the residual, and the sum of the errors' squares / mobility."""
     u, mobility = room[MOTION, 0], room[MOBILITY, 0]
-    for k in range(p):
-        total = b[k]
-        for m in range(p):
-            total += W[k, m] * f[m]
-        u[k] = total
+    motion(W, b, p, f, u)
     residual, merit, k = 0.0, 0.0, 0
     while k < p:
         w = mobility[k]
@@ -204,10 +221,10 @@ def fill_row(W, kind, mu, p, i, j, alpha, gamma, room, r):
 def eliminate(A, x, size):
     """Solve the leading ``size`` rows of A y = x in place, with partial pivoting."""
     for k in range(size):
-        best = k
+        best, largest = k, abs(A[k, k])
         for i in range(k + 1, size):
-            if abs(A[i, k]) > abs(A[best, k]):
-                best = i
+            if abs(A[i, k]) > largest:
+                best, largest = i, abs(A[i, k])
         if best != k:
             x[k], x[best] = x[best], x[k]
             for j in range(k, size):
@@ -216,8 +233,10 @@ def eliminate(A, x, size):
         for i in range(k + 1, size):
             factor = A[i, k] * inverse
             if factor != 0.0:
-                for j in range(k + 1, size):
-                    A[i, j] -= factor * A[k, j]
+                # Slices, whose indices begin at zero: only such loops take several numbers at once.
+                row, pivot = A[i, k + 1 : size], A[k, k + 1 : size]
+                for j in range(row.shape[0]):
+                    row[j] -= factor * pivot[j]
                 x[i] -= factor * x[k]
     for i in range(size - 1, -1, -1):
         total = x[i]

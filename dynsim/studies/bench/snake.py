@@ -1,0 +1,192 @@
+"""The dynamic snake beside the same robot in MuJoCo: time, and how near both come to Table III of the paper.
+
+MuJoCo gets the tree of bodies as it is exported, the voltage laws of the servos, and the lines that the controller of
+dynsim's run tells them: what it is asked to do is the same, forces, friction and contacts are its own.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynsim.dynamics import tables as ka
+from dynsim.engine.dynamics import Prepared
+from dynsim.engine.simulation import Simulation
+from dynsim.engine.snake_pilot import roll_pitch_yaw
+from dynsim.integrators import run as ki
+from dynsim.model.description import Robot
+from dynsim.record import Record
+from dynsim.scenario import Scenario, load_scenario
+from dynsim.snake.description import COORDINATES
+from dynsim.snake.published import TABLE_III, displacement
+from dynsim.studies.bench.mujoco_peer import STIFFEST, roll_out, state_of
+
+Array = NDArray[np.float64]
+
+SCENARIO = "snake_positioning_dynamic"
+DYNSIM = "dynsim 2.5 ms, with its controller"
+# Step [s], and whether dry friction is as stiff as MuJoCo accepts; at 2.5 ms that does not stay calm.
+MUJOCO = {
+    "MuJoCo 2.5 ms": (2.5e-3, False),
+    "MuJoCo 2 ms, stiff friction": (2e-3, True),
+    "MuJoCo 1 ms, stiff friction": (1e-3, True),
+}
+SNAKES = (DYNSIM, *MUJOCO)
+Z, BETA = 2, 4
+
+
+class Manoeuvre(NamedTuple):
+    """CPU seconds of a run, its steps, and the displacement of the head, (6,) [m, rad]."""
+
+    seconds: float
+    steps: int
+    displacement: Array
+
+
+class Commands(NamedTuple):
+    """What dynsim has run, coordinates at its start, and lines of all motors from each tick on, (T, na, 2)."""
+
+    prepared: Prepared
+    q: Array
+    period: float
+    lines: Array
+
+
+def build_snake(prepared: Prepared, step: float, stiff: bool = False) -> Any:
+    """A compiled scenario of the dynamic snake as a ``mujoco.MjModel``, with servos and a floor.
+
+    A servo's torque is K/R (u − K v) with u = k_p (q_d − q), or u = k_v (v_d − v) + K v, within ±U. Here K²/R is the
+    damping of the joint, and the rest an actuator whose force is within ±K U/R: the same law, all of it implicit.
+    Friction of gears is MuJoCo's ``frictionloss``, which is soft, and less so with ``stiff``; wheels touch the floor as
+    stiffly as the step allows.
+    """
+    import mujoco
+
+    robot, drives = prepared.model.robot, prepared.system.drives
+    spec = mujoco.MjSpec.from_string(prepared.model.to_mjcf())
+    spec.option.timestep, spec.option.integrator = step, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    for actuator in list(spec.actuators):
+        spec.delete(actuator)
+    for a, motor in enumerate(robot.motors):
+        k_m, k_p, k_v = drives.motor[a, [ka.K_M, ka.K_P, ka.K_V]]
+        per_volt = k_m / drives.motor[a, ka.RESISTANCE]
+        joint = spec.joint(motor.joint)
+        joint.damping[0] += per_volt * k_m
+        if stiff:
+            joint.solref_friction, joint.solimp_friction = [2.0 * step, 1.0], STIFFEST
+        actuator = spec.add_actuator(name=motor.joint, target=motor.joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
+        rates = drives.table[a, ka.SERVO_MODE] == ka.VELOCITY_MODE
+        actuator.gainprm[0] = per_volt * (k_v if rates else k_p)
+        actuator.biasprm[1], actuator.biasprm[2] = (0.0, -per_volt * (k_v - k_m)) if rates else (-per_volt * k_p, 0.0)
+        actuator.forcelimited, actuator.forcerange = True, per_volt * drives.motor[a, ka.U_MAX] * np.array([-1.0, 1.0])
+    touch = {"contype": 0, "conaffinity": 0}
+    spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[10, 10, 1], **touch)
+    for k, foot in enumerate(robot.feet):
+        mu = prepared.system.contacts.law[k, ka.MU]
+        name, sphere = f"foot_{foot.name}", mujoco.mjtGeom.mjGEOM_SPHERE
+        spec.body(foot.body).add_geom(
+            name=name, type=sphere, size=[foot.radius, 0, 0], pos=foot.point, mass=0.0, **touch
+        )
+        pair = spec.add_pair(geomname1="floor", geomname2=name, condim=3, solref=[2.0 * step, 1.0])
+        pair.friction = [mu, mu, 0.0, 0.0, 0.0]
+    return spec.compile()
+
+
+def positions(model: Any, robot: Robot, q: Array) -> Array:
+    """MuJoCo's coordinates of dynsim's (nq,): joints in the order of its tree."""
+    own = np.zeros(model.nq)
+    own[:7] = q[:7]
+    for joint, at in zip(robot.joint_names[6:], robot.position_index[6:], strict=True):
+        own[model.joint(joint).qposadr[0]] = q[at]
+    return own
+
+
+def measure(rounds: int, *, with_mujoco: bool) -> list[dict[str, Any]]:
+    """Time and distance from the paper by program, over the six manoeuvres of Table III.
+
+    Returns
+    -------
+    list of dict
+        ``program``, ``us_per_step`` and ``times_real_time`` (least CPU time of the rounds), ``z_rms_m`` and
+        ``beta_rms_rad`` (rms of what Δz and Δβ of the head are off from the paper's means), ``displacements`` (6, 6)
+    """
+    outcomes: dict[str, list[Manoeuvre]] = {}
+    duration = 0.0
+    for name in TABLE_III:
+        scenario = load_scenario(SCENARIO, name)
+        commands, own = run_dynsim(scenario, rounds)
+        duration += scenario.duration_s
+        outcomes.setdefault(DYNSIM, []).append(own)
+        for program, (step, stiff) in MUJOCO.items() if with_mujoco else ():
+            model = build_snake(commands.prepared, step, stiff)
+            outcomes.setdefault(program, []).append(run_mujoco(model, commands, scenario.duration_s, rounds))
+    published = np.array([moved.mean for moved in TABLE_III.values()])
+    rows = []
+    for program, runs in outcomes.items():
+        seconds, moves = sum(run.seconds for run in runs), np.array([run.displacement for run in runs])
+        off = np.sqrt(np.mean((moves - published) ** 2, axis=0))
+        rows.append(
+            {
+                "program": program,
+                "us_per_step": 1e6 * seconds / sum(run.steps for run in runs),
+                "times_real_time": duration / seconds,
+                "z_rms_m": float(off[Z]),
+                "beta_rms_rad": float(off[BETA]),
+                "displacements": moves.tolist(),
+            }
+        )
+    return rows
+
+
+def run_dynsim(scenario: Scenario, rounds: int) -> tuple[Commands, Manoeuvre]:
+    """A run by dynsim, timed in runs of their own, and what it commands."""
+    simulation, seconds = Simulation(scenario, duration=math.inf), math.inf
+    assert simulation.operator is not None
+    q, lines, period = simulation.state.q, [], simulation.operator.period
+    for k in range(round(scenario.duration_s / period)):
+        # Past the tick; steps are not cut there.
+        simulation.advance((k + 0.5) * period)
+        lines.append(simulation._prepared.system.drives.input[:, ka.LINE_START : ka.LINE_RATE + 1].copy())
+    simulation.advance(scenario.duration_s)
+    for _ in range(rounds):
+        alone = Simulation(scenario, duration=math.inf)
+        started = time.thread_time()
+        alone.advance(scenario.duration_s)
+        seconds = min(seconds, time.thread_time() - started)
+    steps = int(simulation._prepared.run.count[ki.STEPS])
+    own = Manoeuvre(seconds, steps, displacement(simulation.record(scenario, pictured=False)))
+    return Commands(simulation._prepared, q, period, np.array(lines)), own
+
+
+def run_mujoco(model: Any, commands: Commands, duration: float, rounds: int) -> Manoeuvre:
+    """The same commands, from the same posture at rest."""
+    import mujoco
+
+    step = model.opt.timestep
+    # In the middle of each step, as dynsim takes them.
+    at = (np.arange(round(duration / step)) + 0.5) * step
+    k = (at / commands.period).astype(int)
+    controls = commands.lines[k, :, 0] + commands.lines[k, :, 1] * (at - k * commands.period)[:, None]
+    rates = commands.prepared.system.drives.table[:, ka.SERVO_MODE] == ka.VELOCITY_MODE
+    controls[:, rates] = commands.lines[k][:, rates, 1]
+    data, start = mujoco.MjData(model), state_of(model, positions(model, commands.prepared.model.robot, commands.q))
+    seconds = math.inf
+    for _ in range(rounds):
+        started = time.thread_time()
+        path, _, _ = roll_out(model, data, start, controls)
+        seconds = min(seconds, time.thread_time() - started)
+    w = np.zeros((len(path), 6))
+    for q, row in zip(path, w, strict=True):
+        data.qpos[:] = q
+        mujoco.mj_kinematics(model, data)
+        hand = data.site("hand")
+        row[:3], row[3:] = hand.xpos, roll_pitch_yaw(hand.xmat.reshape(3, 3))
+    record = Record((np.arange(len(path)) + 1) * step)
+    record.add("w", w, "m, rad", labels=COORDINATES)
+    return Manoeuvre(seconds, len(path), displacement(record))
