@@ -536,20 +536,20 @@ def beside_best_known(scene: dict[str, Any]) -> dict[int, float]:
     return ratios
 
 
-def best_beside_best_known(scene: dict[str, Any]) -> float:
-    """The same of the best number of braces of each."""
+def best_beside_best_known(scene: dict[str, Any], known: str = "heat_W") -> float:
+    """The same of the best number of braces of each; ``searched_W``: over what the long search has found."""
     long = next(one for one in data("planner/reference.json") if one["seed"] == scene["seed"])
     own = min(size["least_W"] for size in scene["sizes"] if size["least_W"] is not None)
-    return float(own / min(own, *(size["heat_W"] for size in long["sizes"] if size["heat_W"] is not None)))
+    return float(own / min(own, *(size[known] for size in long["sizes"] if size[known] is not None)))
 
 
-def planned_share(limit: float, each: bool = False) -> str:
+def planned_share(limit: float, each: bool = False, known: str = "heat_W") -> str:
     """How many scenes, or numbers of braces of each, are within a ratio of the best known."""
     scenes = data("planner/scenes.json")
     if each:
         ratios = [ratio for scene in scenes for ratio in beside_best_known(scene).values()]
     else:
-        ratios = [best_beside_best_known(scene) for scene in scenes]
+        ratios = [best_beside_best_known(scene, known) for scene in scenes]
     return str(sum(ratio <= limit for ratio in ratios))
 
 
@@ -778,6 +778,8 @@ NUMBERS |= {
     "planned_4_W": lambda: planned_heat(4),
     "planned_within_1": lambda: planned_share(1.01),
     "planned_within_5": lambda: planned_share(1.05),
+    "planned_searched_1": lambda: planned_share(1.01, known="searched_W"),
+    "planned_searched_5": lambda: planned_share(1.05, known="searched_W"),
     "planned_each_within_1": lambda: planned_share(1.01, each=True),
     "planned_each_within_5": lambda: planned_share(1.05, each=True),
     "planned_each": lambda: planned_share(math.inf, each=True),

@@ -8,7 +8,7 @@ The second one takes so many times as long for each search: how far the answers 
 The third one runs the best plans, and those of the published arm, on surfaces 5 mm off with gains from stiff to soft.
 
 Arms of 7 to 10 joints whose hand goes there and back along a short way, over a floor, a pipe, a box, or with a joint
-about a third axis. Nobody has tuned anything on a scene: its seed is its number.
+about a third axis. The seed of a scene is its number; the constants of the search were chosen on the first twenty.
 """
 
 from __future__ import annotations
@@ -194,6 +194,7 @@ def best_known(seed: int, effort: int) -> dict[str, Any]:
             "count": count,
             "braces": ", ".join(b.label for b in ranked[0].braces) if ranked else None,
             "heat_W": _rounded(ranked[0].heat) if ranked else None,
+            "searched_W": _rounded(ranked[0].heat) if ranked else None,
         }
         for count, ranked in found.items()
     ]
@@ -209,11 +210,12 @@ def best_known(seed: int, effort: int) -> dict[str, Any]:
 def least_of(row: dict[str, Any], before: dict[str, Any]) -> dict[str, Any]:
     """A reference with the lesser heat of each number of braces, its own or that of one before.
 
-    Both are of dense references on hand path and surfaces, whatever search led to them.
+    Both are of dense references on hand path and surfaces, whatever search led to them; ``searched_W`` is its own.
     """
     known = {size["count"]: size for size in before["sizes"] if size["heat_W"] is not None}
     sizes = [
         min(size, known.get(size["count"], size), key=lambda one: math.inf if one["heat_W"] is None else one["heat_W"])
+        | {"searched_W": size["searched_W"]}
         for size in row["sizes"]
     ]
     return row | {"sizes": sizes}
