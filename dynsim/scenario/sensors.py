@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from typing import Annotated
 
 from pydantic import Field, StrictInt
 
-from dynsim.config.base import NonNegative, Positive, StrictConfig
+from dynsim.config.base import NonNegative, StrictConfig
 
+# Of a sensor: each sample is a call of Python [Hz].
+Rate = Annotated[float, Field(gt=0.0, le=1e5)]
 # Of the MX series: 4096 positions in a turn (data sheet).
 MX_RESOLUTION = math.degrees(2.0 * math.pi / 4096)
 
@@ -15,7 +18,7 @@ MX_RESOLUTION = math.degrees(2.0 * math.pi / 4096)
 class Sensor(StrictConfig):
     """What all sensors have: the last sample that has arrived is held."""
 
-    rate_hz: Positive | None = Field(None, description="of its samples; default: one at every tick of the controller")
+    rate_hz: Rate | None = Field(None, description="of its samples; default: one at every tick of the controller")
     delay_s: NonNegative = Field(0.0, description="from a sample to its arrival")
 
 
@@ -33,7 +36,7 @@ class Encoders(Sensor):
 class MotionCapture(Sensor):
     """Position and attitude of the controlled point of a snake ([T] V.A)."""
 
-    rate_hz: Positive | None = Field(100.0, description="of its samples (assumed)")
+    rate_hz: Rate | None = Field(100.0, description="of its samples (assumed)")
     delay_s: NonNegative = Field(0.01, description="from a sample to its arrival (assumed)")
     position_noise_m: NonNegative = Field(2e-4, description="standard deviation of each coordinate (assumed)")
     attitude_noise_rad: NonNegative = Field(5e-4, description="standard deviation of each angle (assumed)")
