@@ -294,10 +294,10 @@ class Model:
         """
         self._sweep(q)
         attached = [self._attached(body, point) for body, point in (self.robot.hand, *further)]
-        out = np.vstack([self._workspace.links[:, ka.P : ka.P + 3], np.zeros((len(attached), 3))])
-        for row, (index, on_body) in zip(out[self.n :], attached, strict=True):
+        on_bodies = np.zeros((len(attached), 3))
+        for row, (index, on_body) in zip(on_bodies, attached, strict=True):
             points.point_position(self._workspace, index, on_body, row)
-        return out
+        return np.vstack([self._workspace.links[:, ka.P : ka.P + 3], on_bodies])
 
     def kinetic_energy(self, q: ArrayLike, v: ArrayLike) -> float:
         """½ vᵀ M v [J]; rotors not included."""

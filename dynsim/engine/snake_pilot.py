@@ -320,8 +320,8 @@ class SnakePilot(SnakeControl):
         add("phi_dot_command", trace.u[:, :columns], "rad/s", labels=names, description=f"joint {text}")
         add("rho_dot_command", trace.u[:, columns:], "rad/s", labels=d.wheel_names, description=f"wheel {text}")
         add_task(record, self, trace, w, np.array(points))
-        summary, own = record.summary, task_summary(self, record)
-        record.summary = {**summary, **own, "warnings": [*summary["warnings"], *task_warnings(self, record, own)]}
+        summary = {**record.summary, **task_summary(self, record)}
+        record.summary = {**summary, "warnings": [*summary["warnings"], *task_warnings(self, record, summary)]}
 
     def _polyline(self, q: Array) -> Array:
         """Controlled point, joints and axles to the tail at coordinates (nq,), (points, 3) [m]."""

@@ -360,6 +360,8 @@ def plan_braces(
     tell = tell or (lambda text, share: None)
     with named(scenario):
         problem = task(scenario, options)
+        if not np.any(problem.arm.model.robot.gravity):
+            raise ScenarioError("plant.gravity_m_s2 = [0, 0, 0]: without gravity an arm needs no braces")
         search = Search(problem, tell)
         ranked = search.run()
         sizes = [_answered(search, size, ranked[size]) for size in range(least, most + 1)]
@@ -381,7 +383,7 @@ def _answered(search: Search, count: int, ranked: Sequence[Planned]) -> Size:
     """The best of a size, before verification; in words why there is none."""
     heats = search.tally.heats.get(count, [])
     if ranked:
-        best = min(heats, default=math.inf)
+        best = min([*heats, search.least.get(count, math.inf)])
         return Size(count, ranked[0], None, sum(heat <= best * (1.0 + AGREE) for heat in heats), len(heats))
     return Size(count, None, reason=_why(search, count), rounds=search.task.options.starts)
 

@@ -31,10 +31,16 @@ REPLACED = (
     "k_p_V_per_rad",
     "k_d_V_s_per_rad",
 )
-# Braces that stick at the turning points of a path, several at once, may open and close without end where events are
-# located; heats of both methods agree to 1e-4.
-METHOD = "time_stepping"
 BILATERAL_ONLY = ("slip_smoothing_m_s", "pulling_friction")
+
+
+def method(task: Task) -> str:
+    """How plans are integrated.
+
+    Braces that stick at the turning points of a path, several at once, may open and close without end where events are
+    located; heats of both methods agree to 1e-4. A base that tips is an event.
+    """
+    return "time_stepping" if task.arm.model.robot.base is None else "auto"
 
 
 def damping_gain(k_p: float) -> float:
@@ -75,7 +81,7 @@ def common(task: Task) -> dict[str, Any]:
         contacts.pop(key, None)
     contacts.pop("reference_tolerance_m", None)
     data["contacts"] = contacts | {"law": "unilateral", "candidates": "points", "points": {}}
-    data["integrator"] = {"method": METHOD}
+    data["integrator"] = {"method": method(task)}
     data.pop("initial", None)
     return data
 

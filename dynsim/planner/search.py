@@ -34,7 +34,7 @@ NEIGHBOURS = 5
 PROMISING = 1.25
 # Costs of one set that differ by less, as a share, are of one path, and paths beyond that ratio to the least are none
 # that could become the best; so many of a set are made finer.
-SAME_COST, NEAR, ALTERNATIVES = 1e-3, 1.1, 3
+SAME_COST, NEAR, ALTERNATIVES = 1e-3, 1.1, 6
 # Knots of whole paths, of closed ones and others; those of sets that are kept, and of the best, are doubled until there
 # are about so many, or dense references cost as much as the knots but for this factor.
 CLOSED_KNOTS, PATH_KNOTS, FINE_KNOTS, MOST_KNOTS, CONVERGED = 24, 17, 30, 60, 1.01
@@ -94,6 +94,8 @@ class Search:
         self.task, self.tally, self.kept = task, Tally(), KEPT
         self._tell = tell or (lambda text, share: None)
         self.single_heats: dict[Set, float] = {}
+        # By size, the least heat of a whole path by its knots [W], of rounds and exchanges.
+        self.least: dict[int, float] = {}
         self._rng = np.random.default_rng(task.options.seed)
         self.coarse = 4 if task.kind == "closed" else 3
         self.path = CLOSED_KNOTS if task.kind == "closed" else PATH_KNOTS
@@ -152,6 +154,8 @@ class Search:
                 heats = [self._path(paths.setdefault(item[1], []), *item) for item in ranked[:PATHS]]
                 self.tally.heats.setdefault(size, []).append(min(heats, default=math.inf))
         self._exchange(paths, most)
+        for size in range(most + 1):
+            self.least[size] = min((local.heat for local, _ in self._best(paths, size)), default=math.inf)
         planned: dict[int, list[Planned]] = {}
         for size in range(least, most + 1):
             self._tell("refining", (rounds + size / (most + 1)) / (rounds + 1))

@@ -123,7 +123,7 @@ class Verifier:
             trial = {number: tried.pop(0) for number, tried in left.items()}
             nominal = self._runs([(*plans[number], k_p, first) for number, k_p in trial.items()])
             verdicts |= {n: Verdict(k_p, (c,)) for (n, k_p), c in zip(trial.items(), nominal, strict=True)}
-            sound = [n for n in trial if verdicts[n].survives and plans[n][0]]
+            sound = [n for n in trial if verdicts[n].survives]
             corners_of_all = self._runs([(*plans[n], trial[n], corner) for n in sound for corner in others])
             for k, n in enumerate(sound):
                 corners = corners_of_all[k * len(others) : (k + 1) * len(others)]
@@ -159,7 +159,7 @@ class Verifier:
         more: dict[str, Any] = {}
         if friction != 1.0 or shift != 0.0:
             more["surface_error"] = {"shift_m": (shift * self._up).tolist(), "friction_factor": friction}
-        more["integrator"] = {"method": planned_scenario.METHOD, "wall_limit_s": self.tolerances.wall_s}
+        more["integrator"] = {"method": planned_scenario.method(self.task), "wall_limit_s": self.tolerances.wall_s}
         more["record"] = {"rate_hz": 100.0}
         return planned_scenario.scenario(self.task, braces, dense, k_p, more=more)
 

@@ -280,3 +280,27 @@ def test_what_cannot_be_planned_is_refused_with_its_reason() -> None:
     bare = replace(scenario, config=scenario.config.model_copy(update={"controller": None}))
     with pytest.raises(ModelError, match=r"controller\.hand\.path"):
         dynsim.plan_braces(bare, verify=False)
+    weightless = scene(4)
+    weightless["plant"]["gravity_m_s2"] = [0.0, 0.0, 0.0]
+    with pytest.raises(ScenarioError, match="without gravity"):
+        dynsim.plan_braces(scenario_from_resolved(weightless))
+
+
+def test_an_arm_without_braces_is_run_at_all_corners(found) -> None:  # type: ignore[no-untyped-def]
+    """Surfaces that rise further than it is clear of them refuse it."""
+    search, planned = found
+    plan = planned[0][0]
+    near, far = (Verifier(search.task, Tolerances(friction=(1.0,), shift_m=(0.0, shift))) for shift in (0.005, 0.5))
+    assert [len(v.verify([(plan.braces, plan.dense)])[0].corners) for v in (near, far)] == [2, 2]
+    assert near.verify([(plan.braces, plan.dense)])[0].survives
+    assert "deep at t = " in far.verify([(plan.braces, plan.dense)])[0].reason
+
+
+def test_a_base_that_stands_is_planned_with_events_that_see_it_tip() -> None:
+    """Time stepping locates no events; the arm of the mobile comparison with its whole chain free."""
+    data = dynsim.load_scenario("mobile_elbow_comparison", "no_elbow").resolved
+    data["contacts"] = {"law": "unilateral", "friction": 0.1}
+    data["controller"]["hand"]["joints"] = [f"joint_{k}" for k in range(1, 11)]
+    plan = dynsim.plan_braces(scenario_from_resolved(data), candidates=["link_6", "link_8"], count=(1, 1), starts=1)
+    assert plan.yaml["integrator"]["method"] == "auto"
+    assert plan.size(1).verdict.nominal.heat_W == pytest.approx(plan.size(1).heat, rel=0.05)  # type: ignore[union-attr]

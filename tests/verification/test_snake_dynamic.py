@@ -177,6 +177,14 @@ def test_measured_feedback_brings_the_head_to_its_target(variant, delay):
     assert np.abs(off[:, 3:]).max() < 5e-3
 
 
+def test_a_target_that_waits_is_told_of():
+    """Five metres a second are more than any joint can follow."""
+    commands = [{"at_s": 0.05, "velocity": [0, 0, 5, 0, 0, 0]}]
+    record = simulate(dynamic(None, "snake_operator", duration_s=0.3, controller__commands=commands))
+    assert record.summary["waiting_s"] > 0.0
+    assert any(text.startswith("the target waited for ") for text in record.summary["warnings"])
+
+
 def test_noise_comes_from_the_seed():
     settings = {"controller.state": "measured", "duration_s": 0.2}
     records = [

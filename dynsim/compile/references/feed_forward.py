@@ -50,18 +50,20 @@ def planned_voltages(
     Raises
     ------
     ModelError
-        Joints without DC motors, a brace that is no point or that the references take off its surface, or no forces
-        that carry the motion.
+        Joints without DC motors, a mobile base that is to move, a brace that is no point or that the references take
+        off its surface, or no forces that carry the motion.
     """
     robot = model.robot
     driven = [motor.joint for motor in robot.motors]
     if sorted(driven) != sorted(robot.joint_names) or not all(isinstance(m, Motor) for m in robot.motors):
         raise ModelError("controller: planned voltages need a DC motor on every joint", keys=("controller",))
-    q = np.tile(robot.initial, (len(times), 1))
+    q, places = np.tile(robot.initial, (len(times), 1)), list(robot.position_index)
     for name, values in positions.items():
-        q[:, model.joint_names.index(name)] = values
+        if robot.base is not None and name in robot.base.wheels and np.ptp(values) > 0.0:
+            raise ModelError("controller: planned voltages need a mobile base that stands", keys=("controller",))
+        q[:, places[model.joint_names.index(name)]] = values
     spacing = float(times[1] - times[0])
-    v, vdot = quintic_rates(spacing, q)
+    v, vdot = quintic_rates(spacing, q[:, places])
     if whole:
         torques = _pressing_torques(model, times, q, v, vdot, braces, min_N)
     else:
