@@ -8,11 +8,25 @@ from dynsim.cli.display import console, say
 from dynsim.planner.answer import BracePlan, Size
 from dynsim.system.terminal import escaped
 
+# A brace that touches for less of the time has lifted off.
+LIFTED = 0.999
+
 
 def print_plan(plan: BracePlan) -> None:
     """A row for each number of braces, then what refused plans and what was not found."""
     table = Table(title=f"{escaped(plan.task.scenario.title)}: braces", title_justify="left")
-    for head in ("braces", "on", "heat [W]", "simulated [W]", "k_p [V/rad]", "forces [N]", "found", "survives"):
+    heads = (
+        "braces",
+        "on",
+        "heat [W]",
+        "simulated [W]",
+        "all energy [J]",
+        "k_p [V/rad]",
+        "forces [N]",
+        "found",
+        "survives",
+    )
+    for head in heads:
         table.add_column(head, justify="left" if head in ("on", "survives") else "right")
     for size in plan.sizes:
         table.add_row(*_cells(size))
@@ -30,7 +44,7 @@ def print_plan(plan: BracePlan) -> None:
 
 def _cells(size: Size) -> tuple[str, ...]:
     if size.planned is None:
-        return str(size.count), "not found", "–", "–", "–", "–", f"0/{size.rounds}", "–"
+        return str(size.count), "not found", "–", "–", "–", "–", "–", f"0/{size.rounds}", "–"
     dense, nominal = size.planned.dense, None if size.verdict is None else size.verdict.nominal
     forces = f"{dense.forces.min():.3g} … {dense.forces.max():.3g}" if size.count else "–"
     survives = {True: "yes", False: "no", None: "not verified"}[size.survives]
@@ -39,6 +53,7 @@ def _cells(size: Size) -> tuple[str, ...]:
         escaped(size.label),
         f"{size.heat:.4g}",
         "–" if nominal is None else f"{nominal.heat_W:.4g}",
+        "–" if nominal is None else f"{nominal.electrical_J:.4g}",
         f"{size.k_p:g}",
         forces,
         f"{size.agreed}/{size.rounds}",
@@ -50,6 +65,10 @@ def _notes(size: Size) -> list[str]:
     notes = [f"refused, {size.reason}"] if size.planned is not None and size.reason else []
     if size.planned is None:
         notes.append(size.reason)
+    if size.verdict is not None and size.verdict.nominal is not None:
+        for brace, share in size.verdict.nominal.closed.items():
+            if share < LIFTED:
+                notes.append(f"{brace} lifts off, for {100.0 * (1.0 - share):.2g} % of the time of the run as planned")
     if size.tolerance is not None:
         notes.append(
             f"bears {1e3 * size.tolerance[0]:.2g} mm of surface, and {100 * size.tolerance[1]:.2g} % of friction"

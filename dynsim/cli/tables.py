@@ -215,6 +215,9 @@ def print_starts(console: Console, starts: Mapping[str, Start]) -> None:
             if start.tip_margin_braced is not None:
                 braced = f", {start.tip_margin_braced:.4g} with braces of least heat"
             values["tip margin"] = f"{start.tip_margin:.4g} at rest{braced} (1: safest, 0: tips)"
+        if start.off_path is not None:
+            away = "where the hand is" if start.off_path < 1e-9 else f"{start.off_path:.4g} m from the hand"
+            values["hand's path"] = f"begins {away}"
         width = max(map(len, values))
         lines = [f"  {variant}{', ' if variant else ''}at the start [m]:"]
         lines += [f"    {name:<{width}}  {value}" for name, value in values.items()]

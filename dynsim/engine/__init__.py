@@ -51,6 +51,7 @@ class Start:
     tip_margin_braced : the same with the contacts that touch, whose forces cost the motors least heat; None: there are
         none, or they do not hold the arm
     warnings : keys of the scenario that change nothing
+    off_path : how far the hand is from where its path begins [m]; None: it has none
     """
 
     hand: NDArray[np.float64]
@@ -61,6 +62,7 @@ class Start:
     tip_margin: float | None = None
     tip_margin_braced: float | None = None
     warnings: Sequence[str] = ()
+    off_path: float | None = None
 
 
 def simulate(scenario: Scenario, progress: Progress | None = None, *, pictured: bool = True) -> Record:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -25,7 +26,11 @@ def check(scenario: Scenario, started: Callable[[Start], None]) -> Start:
     """See :func:`dynsim.engine.check`."""
     start = start_of(scenario)
     started(start)
-    prepare(scenario)
+    control = prepare(scenario).control
+    if control.path is not None and control.teleop is None:
+        begin = control.path.position(np.zeros(1))[0]
+        start = replace(start, off_path=float(np.linalg.norm(begin - start.hand)))
+        started(start)
     return start
 
 

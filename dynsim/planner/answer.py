@@ -207,6 +207,9 @@ def _row(task: Task, size: Size) -> dict[str, Any]:
     row |= {
         "heat_W": dense.heat,
         "simulated_W": None if nominal is None else _number(nominal.heat_W),
+        "electrical_energy_J": None if nominal is None else _number(nominal.electrical_J),
+        "joint_rate_max": None if nominal is None else _number(nominal.rate_max),
+        "closed_least": None if nominal is None or not nominal.closed else min(nominal.closed.values()),
         "peak_torque_N_m": dense.peak,
         "torque_share": _torque_share(task, dense),
         "normal_force_min_N": float(dense.forces.min()) if size.count else None,
@@ -265,6 +268,8 @@ def _corner_json(corner: Corner) -> dict[str, Any]:
         "surface_shift_m": corner.shift_m,
         "heat_W": _number(corner.heat_W),
         "hand_rms_m": _number(corner.hand_rms_m),
+        "electrical_energy_J": _number(corner.electrical_J),
+        "joint_rate_max": _number(corner.rate_max),
         "hand_turn_rms_rad": _number(corner.turn_rms_rad),
         "closed_fraction": corner.closed,
         "reason": corner.reason,

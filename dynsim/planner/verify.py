@@ -60,6 +60,7 @@ class Corner:
     Attributes
     ----------
     heat_W : mean; hand_rms_m: of the hand's error; NaN where the run ended early
+    electrical_J : energy that the motors take in the run; rate_max: greatest of a joint [rad/s, m/s]
     turn_rms_rad : of the hand's orientation; NaN where any will do
     closed : share of the time that each brace touches
     reason : why it is refused, with time and quantity; empty: it survives
@@ -69,6 +70,8 @@ class Corner:
     shift_m: float
     heat_W: float = float("nan")
     hand_rms_m: float = float("nan")
+    electrical_J: float = float("nan")
+    rate_max: float = float("nan")
     turn_rms_rad: float = float("nan")
     closed: dict[str, float] = field(default_factory=dict)
     reason: str = ""
@@ -226,7 +229,10 @@ class Verifier:
             reason = f"hand turned by {turn:.3g} rad rms (allowed {tolerances.turn_rad:g}), most at t = {time[k]:.3g} s"
         else:
             reason = self._touches(braces, record, shift) or self._limits(record)
-        return Corner(mu, shift, heat, rms, turn, closed, reason)
+        joints = self.task.arm.joints
+        rates = record["v"][:, [record.labels["v"].index(joint) for joint in joints]]
+        energy, rate = float(record.summary["electrical_energy_J"]), float(np.abs(rates).max())
+        return Corner(mu, shift, heat, rms, energy, rate, turn, closed, reason)
 
     def _touches(self, braces: tuple[Candidate, ...], record: Record, shift: float) -> str:
         """What is not declared and would touch."""

@@ -186,7 +186,10 @@ class Initial(StrictConfig):
     @model_validator(mode="after")
     def _check_effect(self) -> Self:
         if not self.on_surface and not self.equilibrium and not self.on_references:
-            raise error_at("on_surface", "names no contact point; name some, or set equilibrium: true")
+            raise error_at(
+                "on_surface",
+                "names no contact point; name some, set equilibrium or on_references: true, or leave initial out",
+            )
         if self.keep and not self.on_surface:
             raise error_at("keep", "has no effect without on_surface, for which joints move; remove it")
         return self

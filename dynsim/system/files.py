@@ -216,8 +216,8 @@ class _Draft:
             existing = self._existing()
             # The name is nobody else's: made anew or not at all, and a link that lies there is not followed.
             self._temporary = self._target.with_name(f".dynsim-{os.urandom(8).hex()}.tmp")
-            self.stream: BinaryIO = self._temporary.open("x+b")
             try:
+                self.stream: BinaryIO = self._temporary.open("x+b")
                 self._take_over(existing)
             except BaseException:
                 self._discard()
@@ -240,7 +240,8 @@ class _Draft:
             raise RecordError(f"cannot write {self.path}: {_reason(error)}; nothing was changed there") from error
 
     def _discard(self) -> None:
-        with suppress(OSError):
+        # A signal may have come before the stream was known.
+        with suppress(OSError, AttributeError):
             self.stream.close()
         with suppress(OSError):
             self._temporary.unlink()

@@ -18,7 +18,7 @@ from dynsim.hardware.servo_map import load_servo_map
 from dynsim.hardware.virtual.line import VirtualLine, line_for_map
 from dynsim.hardware.virtual.servo_plant import Drive, InertialLoad, MotorLaw
 from dynsim.hardware.virtual.servos import PHYSICS_STEP
-from dynsim.hardware.virtual.simulated_plant import START_CHANGE, SimulatedArm, simulated_arm
+from dynsim.hardware.virtual.simulated_plant import START_CHANGE, SimulatedArm, _bare, simulated_arm
 from dynsim.model.drives import Servo
 
 pytestmark = pytest.mark.long
@@ -72,6 +72,14 @@ def test_braced_elbows_rest_on_the_floor_and_unload_the_servos() -> None:
     assert min(heights) == pytest.approx(0.0, abs=1e-9)
     assert max(heights) < 5e-3
     assert np.abs(braced.torque).max() < 0.6 * np.abs(free.torque).max()
+
+
+def test_the_plant_of_a_plan_starts_where_its_servos_are() -> None:
+    """References, which plans start on, are none of the plant's: ticks say where it stands."""
+    initial = {"initial": {"on_references": True}, "controller.hand": None}
+    waypoints = {"controller.joints": {"joint_2": {"times_s": [0.0, 1.0], "angles_deg": [60.0, 61.0]}}}
+    scenario = dynsim.load_scenario(ARM, variant="no_elbow", overrides=initial | waypoints)
+    assert _bare(scenario).config.initial is None
 
 
 def test_a_limp_arm_falls_and_stays_above_the_floor_with_its_elbows() -> None:

@@ -218,6 +218,10 @@ def test_plans_run_as_planned_and_bear_errors_of_the_scene(found) -> None:  # ty
     assert nominal.hand_rms_m < 1e-3
     assert verdict.survives, verdict.reason
     assert len(verdict.corners) == 9
+    # All of the energy is at least the heat of the run, and braces that stick bear all the time.
+    assert nominal.electrical_J >= 0.99 * nominal.heat_W * search.task.span
+    assert 0.0 < nominal.rate_max < 2.0
+    assert min(nominal.closed.values()) == pytest.approx(1.0, abs=1e-6)
 
 
 def test_both_treatments_of_contacts_see_the_same_run_of_a_plan(found) -> None:  # type: ignore[no-untyped-def]

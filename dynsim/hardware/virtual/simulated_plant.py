@@ -218,6 +218,9 @@ def _bare(scenario: Scenario) -> Scenario:
         "loads": payloads,
         "integrator": type(config.integrator)(method="dopri5"),  # set points change every 2 ms, which ends steps
     }
+    if config.initial is not None and config.initial.on_references:
+        # The servos' ticks say where it stands.
+        changes["initial"] = None
     if hasattr(config.plant, "dynamics"):
         released = config.plant.dynamics.model_copy(update={"start": "released"})
         changes["plant"] = config.plant.model_copy(update={"dynamics": released})
