@@ -33,8 +33,8 @@ UNITS = {"m", "s", "rad", "N", "A", "V", "W", "J", "kg", "per"}
 _BARS, _BINS = 12, 40
 # Values whose ratio is larger are of very different size.
 _WIDE = 8.0
-# Height of a panel, of a bar of a tornado, of what is about them, and of a bar of colours [inch].
-_PANEL, _BAR, _ROOM = 2.1, 0.22, 0.9
+# Height and width of a panel, height of a bar of a tornado, of what is about them, and of a bar of colours [inch].
+_PANEL, _ACROSS, _BAR, _ROOM = 2.1, 3.5, 0.22, 0.9
 _COLOURS = 0.5
 # A label of an axis, the title of a panel and a part of the figure's are not longer [characters].
 _LABEL, _HEAD, _PART = 34, 58, 70
@@ -261,6 +261,8 @@ def samples(sweep: Sweep) -> Figure | None:
     figure = style.new_figure(
         _PANEL * len(variants) * len(shown) + _ROOM,
         f"{sweep.name}: {len(sweep.rows)} runs by the law of their parameters{sweep.failed}{note}",
+        # A title of two numbers with their intervals is as wide as a panel.
+        width=max(style.WIDTH, _ACROSS * len(metrics)),
     )
     rows = [(variant, grid_place) for variant in variants for grid_place in shown]
     ends = [key.split(".")[-1] for key in sweep.grid]
@@ -284,8 +286,11 @@ def _distribution(axes: Axes, values: Array, head: str, colour: str) -> None:
     if len(values) < 2:
         axes.set_title(f"{head}too few runs with numbers: {len(values)}", fontsize=7.5)
         return
-    # Freedman and Diaconis: as narrow as the number of samples allows.
-    bins = min(_BINS, len(np.histogram_bin_edges(values, "fd")) - 1)
+    if np.ptp(values) == 0.0:
+        axes.set_title(f"{head}{len(values)} runs, all {style.number(values[0])}", fontsize=7.5)
+        return
+    # As narrow as the number of samples allows: Freedman and Diaconis, or Sturges where they are few.
+    bins = min(_BINS, len(np.histogram_bin_edges(values, "auto")) - 1)
     axes.hist(values, bins=bins, color=colour, alpha=0.7)
     statistics = spread(values)
     axes.axvline(statistics.mean, color=style.BLACK, linewidth=1.0)
