@@ -134,7 +134,10 @@ def named(scenario: Scenario) -> Iterator[None]:
         yield
     except ModelError as error:
         raise ModelError(f"{scenario.location(error.keys, variant)}: {error}") from error
-    except (ScenarioError, UnreachableReference) as error:
+    except UnreachableReference as error:
+        place = scenario.location(("controller", "hand", "path"), variant)
+        raise UnreachableReference(f"{place}: controller.hand.path: {error}") from error
+    except ScenarioError as error:
         raise type(error)(f"{name}: {error}") from error
     except (ArithmeticError, np.linalg.LinAlgError) as error:
         raise ModelError(f"{name}: numbers of very different size, no result can be computed ({error})") from error
