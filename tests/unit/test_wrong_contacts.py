@@ -190,7 +190,7 @@ def test_time_stepping(tmp_path: Path, law: str, integrator: str, said: str) -> 
 @pytest.mark.parametrize(
     ("initial", "said"),
     [
-        ("{on_surface: []}", "on_surface: names no contact point; name some, set equilibrium or on_references: true, or leave initial out"),
+        ("{on_surface: []}", "on_surface: names no contact point; name some, set equilibrium or on_references: true"),
         ("{equilibrium: true, keep: [hand]}", "keep: has no effect without on_surface"),
         ("{on_surface: elbow}", "on_surface = 'elbow': must be a list, such as [a, b]"),
         ("{on_surface: [elbo]}", "on_surface: no contact 'elbo'; those are: elbow"),
