@@ -135,8 +135,8 @@ def named(scenario: Scenario) -> Iterator[None]:
     except ModelError as error:
         raise ModelError(f"{scenario.location(error.keys, variant)}: {error}") from error
     except UnreachableReference as error:
-        place = scenario.location(("controller", "hand", "path"), variant)
-        raise UnreachableReference(f"{place}: controller.hand.path: {error}") from error
+        path_line = scenario.location(("controller", "hand", "path"), variant)
+        raise UnreachableReference(f"{path_line}: controller.hand.path: {error}") from error
     except ScenarioError as error:
         raise type(error)(f"{name}: {error}") from error
     except (ArithmeticError, np.linalg.LinAlgError) as error:
