@@ -40,7 +40,15 @@ class ModelError(DynsimError):
 
 
 class UnreachableReference(DynsimError):
-    """A reference path that the named joints cannot follow (time and distance are in the message)."""
+    """A reference path that the named joints cannot follow (time and distance are in the message).
+
+    Attributes
+    ----------
+    keys : tuple
+        Those of the path in a scenario, as of a :class:`ModelError`.
+    """
+
+    keys: ClassVar[tuple[int | str, ...]] = ("controller", "hand", "path")
 
 
 class CheckRefused(DynsimError):

@@ -194,7 +194,8 @@ def check(
                 task = f"checking {escaped(name)} {escaped(variant or '')}"
                 with console.status(task) as status, watched(partial(told_in, status, task)):
                     loaded = load_scenario(name, variant, parsed_overrides(overrides))
-                    check_scenario(loaded, partial(starts.__setitem__, variant or ""))
+                    # Known before it is refused, and then all of it.
+                    starts[variant or ""] = check_scenario(loaded, partial(starts.__setitem__, variant or ""))
         except SimulationInterrupted:
             raise
         except DynsimError as error:

@@ -16,16 +16,8 @@ def print_plan(plan: BracePlan) -> None:
     """A row for each number of braces, then what refused plans and what was not found."""
     table = Table(title=f"{escaped(plan.task.scenario.title)}: braces", title_justify="left")
     heads = (
-        "braces",
-        "on",
-        "heat [W]",
-        "simulated [W]",
-        "all energy [J]",
-        "k_p [V/rad]",
-        "forces [N]",
-        "found",
-        "survives",
-    )
+        "braces", "on", "heat [W]", "simulated [W]", "all energy [J]", "k_p [V/rad]", "forces [N]", "found", "survives",
+    )  # fmt: skip
     for head in heads:
         table.add_column(head, justify="left" if head in ("on", "survives") else "right")
     for size in plan.sizes:
@@ -45,7 +37,7 @@ def print_plan(plan: BracePlan) -> None:
 def _cells(size: Size) -> tuple[str, ...]:
     if size.planned is None:
         return str(size.count), "not found", "–", "–", "–", "–", "–", f"0/{size.rounds}", "–"
-    dense, nominal = size.planned.dense, None if size.verdict is None else size.verdict.nominal
+    dense, nominal = size.planned.dense, size.nominal
     forces = f"{dense.forces.min():.3g} … {dense.forces.max():.3g}" if size.count else "–"
     survives = {True: "yes", False: "no", None: "not verified"}[size.survives]
     return (
@@ -65,10 +57,9 @@ def _notes(size: Size) -> list[str]:
     notes = [f"refused, {size.reason}"] if size.planned is not None and size.reason else []
     if size.planned is None:
         notes.append(size.reason)
-    if size.verdict is not None and size.verdict.nominal is not None:
-        for brace, share in size.verdict.nominal.closed.items():
-            if share < LIFTED:
-                notes.append(f"{brace} lifts off, for {100.0 * (1.0 - share):.2g} % of the time of the run as planned")
+    for brace, share in ({} if size.nominal is None else size.nominal.closed).items():
+        if share < LIFTED:
+            notes.append(f"{brace} lifts off, for {100.0 * (1.0 - share):.2g} % of the time of the run as planned")
     if size.tolerance is not None:
         notes.append(
             f"bears {1e3 * size.tolerance[0]:.2g} mm of surface, and {100 * size.tolerance[1]:.2g} % of friction"

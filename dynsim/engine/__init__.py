@@ -108,7 +108,7 @@ def note_warnings(scenario: Scenario, record: Record | None) -> None:
 def check(scenario: Scenario, started: Callable[[Start], None] | None = None) -> Start:
     """Do everything that comes before the first step: model, contacts at the start, references, size of the record.
 
-    ``started`` : called with what is returned as soon as that is known, before contacts and references are looked at
+    ``started`` : called with what is returned, but for ``off_path``, before contacts and references are looked at
 
     Returns
     -------
@@ -132,11 +132,8 @@ def named(scenario: Scenario) -> Iterator[None]:
     name = scenario.location(variant=variant)
     try:
         yield
-    except ModelError as error:
-        raise ModelError(f"{scenario.location(error.keys, variant)}: {error}") from error
-    except UnreachableReference as error:
-        path_line = scenario.location(("controller", "hand", "path"), variant)
-        raise UnreachableReference(f"{path_line}: controller.hand.path: {error}") from error
+    except (ModelError, UnreachableReference) as error:
+        raise type(error)(f"{scenario.location(error.keys, variant)}: {error}") from error
     except ScenarioError as error:
         raise type(error)(f"{name}: {error}") from error
     except (ArithmeticError, np.linalg.LinAlgError) as error:

@@ -16,9 +16,8 @@ from dynsim.engine.stepped import event_name, own_guards, take_log
 from dynsim.engine.stopping import last_state, stopped
 from dynsim.errors import SimulationStopped
 from dynsim.integrators import run as ki
-from dynsim.model.description import Robot
 from dynsim.record import Event, Record
-from dynsim.scenario import Scenario, build
+from dynsim.scenario import Scenario
 from dynsim.system import interruption
 from dynsim.system.memo import recall
 
@@ -34,8 +33,8 @@ TICKS = 10
 
 def simulate(scenario: Scenario, progress: Progress | None = None, *, pictured: bool = True) -> Record:
     """See :func:`dynsim.engine.simulate`."""
-    if scenario.controller is not None and type(build.robot_and_contacts(scenario)[0]) is not Robot:
-        # A snake, whose head is raised where it is prepared.
+    if scenario.controller is not None and scenario.controller.type == "task_space":
+        # Not prepared twice: that raises the head of a snake.
         return _stepped(scenario, progress, pictured)
     prepared = prepare(scenario, progress)
     sensors = scenario.config.sensors
@@ -87,6 +86,7 @@ def _stepped(scenario: Scenario, progress: Progress | None, pictured: bool) -> R
     # Without an end, as a session: a step that ends at a tick and one at the end of a run need not be the same.
     simulation = Simulation(scenario, duration=math.inf)
     prepared, operator, k = simulation._prepared, simulation.operator, 0
+    # It has times of its own; a record that is too large is refused before it begins.
     sample_times(scenario, prepared.run.layout, prepared.run.columns, len(prepared.model.robot.links))
     rate = operator.rate if operator is not None else 1.0 / (prepared.control.sample_time or 1.0)
     stop: SimulationStopped | None = None

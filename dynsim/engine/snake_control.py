@@ -229,12 +229,7 @@ class SnakeControl:
         trial, trace = copy_of(self.state), new_trace(self.model, ticks + 1)
         row_of_block = min(int(trial.counts[ss.CARRIED_OUT]), len(self.block.velocity) - 1)
         lasting = np.tile(self.block.velocity[row_of_block], (ticks, 1))
-        trial.counts[ss.MODE], trial.counts[ss.TICKS], trial.counts[ss.CARRIED_OUT], trial.progress[ss.DONE] = (
-            row,
-            0,
-            0,
-            0.0,
-        )
+        trial.counts[[ss.MODE, ss.TICKS, ss.CARRIED_OUT]], trial.progress[ss.DONE] = (row, 0, 0), 0.0
         done, _ = run_ticks(self.model, law, schedule, trial, lasting, ticks, 1, 1, 1, self.rig, trace)
         if done < 0:
             return np.inf, -np.inf  # no longer finite: no mode to take

@@ -192,8 +192,7 @@ class SnakePilot(SnakeControl):
 
     def _look(self) -> None:
         """What the controller is told of the robot, into its beliefs."""
-        q, base = self._seen.q, self.state.base
-        base[:2], base[2] = q[:2], base_yaw(q)
+        self.state.base[:] = base_pose(self._seen.q)
         for sensor in self.sensors:
             belief = self.state.w_hat if self.believed == ss.MEASURED else self.state.phi_hat
             belief[:] = sensor.value(self._seen.time)
@@ -341,14 +340,10 @@ def _places(robot: SnakeTree, joints: tuple[str, ...]) -> Array:
 
 def base_pose(q: Array) -> Array:
     """x, y [m] of wheel pair 1 and yaw [rad] of the base part at coordinates (…, nq) of the tree, (…, 3)."""
-    return np.stack([q[..., 0], q[..., 1], base_yaw(q)], axis=-1)
-
-
-def base_yaw(q: Array) -> Any:
-    """Yaw of the base part at coordinates (…, nq) of the tree, (…) [rad]."""
     w, x, y, z = (q[..., k] for k in range(3, _ROOT_COORDINATES))
     # Of the axle, e_y of the root: it stays level where the body behind it is tilted.
-    return np.arctan2(-2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z))
+    yaw = np.arctan2(-2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z))
+    return np.stack([q[..., 0], q[..., 1], yaw], axis=-1)
 
 
 def roll_pitch_yaw(R: Array) -> Array:

@@ -94,7 +94,7 @@ def angles_of_heights(robot: SnakeTree, height: Array, yaw: Array, stiffness: Ar
         return hinge
     # Moments of what is higher than s, averaged over s from zero to the clearance: they change without a jump.
     share, below = height / (1e-3 * robot.lifts.clearance_mm), 0.0
-    for level in sorted(set(share[share > 0.0].tolist())):
+    for level in np.unique(share[share > 0.0]).tolist():
         hinge = hinge + (level - below) * lifted_moments(robot, share >= level) / stiffness
         below = level
     return hinge

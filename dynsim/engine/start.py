@@ -30,7 +30,6 @@ def check(scenario: Scenario, started: Callable[[Start], None]) -> Start:
     if control.path is not None and control.teleop is None:
         begin = control.path.position(np.zeros(1))[0]
         start = replace(start, off_path=float(np.linalg.norm(begin - start.hand)))
-        started(start)
     return start
 
 

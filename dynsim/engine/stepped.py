@@ -47,8 +47,6 @@ CONTACT_EVENTS = {
 def take_log(run: ki.Run) -> list[tuple[float, int]]:
     """Empty the log of the kernels: times [s] and numbers of what has happened."""
     logged = int(run.count[ki.LOGGED])
-    if logged == 0:
-        return []
     run.count[ki.LOGGED] = 0
     return list(zip(run.log_time[:logged].tolist(), run.log_event[:logged].tolist(), strict=True))
 
@@ -67,7 +65,7 @@ def event_name(prepared: Prepared, number: int) -> tuple[str, str] | None:
     """Kind and subject of a logged event of a contact, a joint stop or a joint that rubs; None for that of a guard."""
     if number < ki.CONTACT_LOG:
         return None
-    first = ki.DRY_LOG if number >= ki.DRY_LOG else ki.STOP_LOG if number >= ki.STOP_LOG else ki.CONTACT_LOG
+    first = max(log for log in (ki.CONTACT_LOG, ki.STOP_LOG, ki.DRY_LOG) if log <= number)
     k, kind = divmod(number - first, contact_events.LOG_KINDS)
     if first == ki.CONTACT_LOG:
         return CONTACT_EVENTS[kind], prepared.contacts[k].name

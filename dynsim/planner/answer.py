@@ -70,6 +70,11 @@ class Size:
         return math.inf if self.planned is None else self.planned.heat
 
     @property
+    def nominal(self) -> Corner | None:
+        """The run as planned; None where nothing was verified."""
+        return None if self.verdict is None else self.verdict.nominal
+
+    @property
     def survives(self) -> bool | None:
         """Whether all corners hold; None where nothing was verified."""
         return None if self.verdict is None else self.verdict.survives
@@ -202,14 +207,14 @@ def _row(task: Task, size: Size) -> dict[str, Any]:
     if size.planned is None:
         return row | {"reason": size.reason}
     dense = size.planned.dense
-    nominal = None if size.verdict is None else size.verdict.nominal
+    nominal = size.nominal or Corner(1.0, 0.0)
     distance, part, _ = nearest(task, size.braces, dense.times, dense.q)
     row |= {
         "heat_W": dense.heat,
-        "simulated_W": None if nominal is None else _number(nominal.heat_W),
-        "electrical_energy_J": None if nominal is None else _number(nominal.electrical_J),
-        "joint_rate_max": None if nominal is None else _number(nominal.rate_max),
-        "closed_least": None if nominal is None or not nominal.closed else min(nominal.closed.values()),
+        "simulated_W": _number(nominal.heat_W),
+        "electrical_energy_J": _number(nominal.electrical_J),
+        "joint_rate_max": _number(nominal.rate_max),
+        "closed_least": min(nominal.closed.values(), default=None),
         "peak_torque_N_m": dense.peak,
         "torque_share": _torque_share(task, dense),
         "normal_force_min_N": float(dense.forces.min()) if size.count else None,

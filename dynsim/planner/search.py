@@ -186,7 +186,7 @@ class Search:
         while going_on:
             going_on = False
             for size, change in changes:
-                least = self._least(paths, size + change)
+                least = min((local.cost for local, _ in self._best(paths, size + change)), default=math.inf)
                 for near, braces in self._best(paths, size)[:NEIGHBOURS]:
                     if (braces, change, near.cost) in changed:
                         continue
@@ -206,10 +206,6 @@ class Search:
             if len(braces) == size and any(path.local is not None for path in some)
         ]
         return sorted(best, key=lambda item: item[0].cost)
-
-    def _least(self, paths: Mapping[Set, list[PosturePath]], size: int) -> float:
-        """Least cost of a size, of those that have whole paths."""
-        return min((local.cost for local, _ in self._best(paths, size)), default=math.inf)
 
     def _round(self, number: int, most: int) -> dict[int, list[tuple[float, Set, Array]]]:
         """Sets of each size with cost and posture, the best first, from new starts."""

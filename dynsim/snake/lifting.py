@@ -176,7 +176,7 @@ def height_of(time: Array, up: Array | float, down: Array | float, lifts: Lifts)
 
 
 def _smooth(u: Array) -> Array:
-    u = np.minimum(np.maximum(u, 0.0), 1.0)
+    u = np.clip(u, 0.0, 1.0)
     return u**3 * (10.0 + u * (-15.0 + 6.0 * u))
 
 

@@ -219,6 +219,8 @@ class _Draft:
             try:
                 self.stream: BinaryIO = self._temporary.open("x+b")
                 self._take_over(existing)
+            except FileExistsError:  # somebody else's
+                raise
             except BaseException:
                 self._discard()
                 raise

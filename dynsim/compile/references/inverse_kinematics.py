@@ -99,11 +99,13 @@ def follow(
                 )
                 if reached > k and (passed := _passed_limits(model, joints, times, result[:reached])):
                     raise UnreachableReference(
+                        "controller.hand.path: "
                         f"the hand cannot follow its path with {', '.join(joints)} within their limits: {passed}; move "
                         "the path, let more joints follow it, or change the limit"
                     )
                 target = wanted[k]
                 raise UnreachableReference(
+                    "controller.hand.path: "
                     f"the hand cannot follow its path with {', '.join(joints)}: at t = {times[k]:.3f} s it stays "
                     f"{left:.4g} m from ({target[0]:.4g}, {target[1]:.4g}, {target[2]:.4g}) m; "
                     "move the path, or let more joints follow it"
@@ -133,6 +135,7 @@ def _turned(
             q = hand_posture(model, target, q, orientation, braces, tolerance, joints)
         except UnreachableReference as error:
             raise UnreachableReference(
+                "controller.hand.path: "
                 f"the hand cannot follow its path with {', '.join(joints)}, turned as controller.hand.orientation "
                 f"says: at t = {times[k]:.3f} s {error}"
             ) from None
@@ -148,6 +151,7 @@ def _check_start(model: Model, joints: Sequence[str], q: Array) -> None:
         for which, limit, beyond in (("lower", link.lower, link.lower - at), ("upper", link.upper, at - link.upper)):
             if beyond > LIMIT_SLACK:
                 raise UnreachableReference(
+                    "controller.hand.path: "
                     f"{name} follows the hand's path, but starts at {format_quantity(at, link.units[0])}, beyond "
                     f"its {which} limit of {format_quantity(limit, link.units[0])}; change its initial "
                     "position or its limit"
