@@ -52,23 +52,12 @@ def mobilities(W, kind, p, room):
 
 @internal_kernel
 def motion(W, b, p, f, u):
-    """u = W f + b. Four rows at a time, because every sum waits for its last term."""
-    k = 0
-    while k + 4 <= p:
-        row, second, third, fourth = W[k], W[k + 1], W[k + 2], W[k + 3]
-        x, y, z, w = b[k], b[k + 1], b[k + 2], b[k + 3]
+    """u = W f + b."""
+    for k in range(p):
+        total = b[k]
         for m in range(p):
-            x += row[m] * f[m]
-            y += second[m] * f[m]
-            z += third[m] * f[m]
-            w += fourth[m] * f[m]
-        u[k], u[k + 1], u[k + 2], u[k + 3] = x, y, z, w
-        k += 4
-    for r in range(k, p):
-        x = b[r]
-        for m in range(p):
-            x += W[r, m] * f[m]
-        u[r] = x
+            total += W[k, m] * f[m]
+        u[k] = total
 
 
 @internal_kernel
