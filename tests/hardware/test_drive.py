@@ -362,7 +362,10 @@ STRUCK = [case for case in CASES if case.scripted_onset]
 
 @pytest.mark.parametrize(
     ("case", "policy"),
-    [(case, ("decelerate", "hold", "off")[number % 3]) for number, case in enumerate(STRUCK)],
+    [
+        pytest.param(case, ("decelerate", "hold", "off")[number % 3], marks=() if number % 4 == 0 else pytest.mark.long)
+        for number, case in enumerate(STRUCK)
+    ],
     ids=lambda one: getattr(one, "name", one),
 )
 def test_faults_of_servos_end_a_drive_as_they_end_a_replay(rig: Rig, case: Case, policy: str) -> None:

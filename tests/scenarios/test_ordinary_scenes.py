@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import pytest
 from support import endings
@@ -20,18 +21,27 @@ def terrains(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     return write_terrains(tmp_path_factory.mktemp("terrains"))
 
 
-def test_ordinary_scenes_end(terrains: list[str]):
-    found = [end(number, terrains) for number in range(200)]
-    counted = Counter(one.status for one in found)
+def in_a_program_of_its_own(data: dict[str, Any]) -> bool:
+    """Explicit steps where more than points touch quadrics: no other default test compiles these."""
+    (surface,) = data["surfaces"]
+    touching = surface in ("box", "height_field") or data["contacts"]["candidates"] == "links"
+    return touching and data["integrator"]["method"] == "dopri5"
+
+
+@pytest.mark.parametrize("own", [False, pytest.param(True, marks=pytest.mark.long)])
+def test_ordinary_scenes_end(terrains: list[str], own: bool):
+    numbers = [number for number in range(200) if in_a_program_of_its_own(scene(number, terrains)) is own]
+    ends = [end(number, terrains) for number in numbers]
+    counted = Counter(one.status for one in ends)
     assert set(counted) <= {FINISHED, REFUSED, *KINDS.values()} - UNEXPLAINED, [
-        one for one in found if one.status in UNEXPLAINED
+        one for one in ends if one.status in UNEXPLAINED
     ]
     # What is refused is so for its hand path or its start; of 10 000 scenes nine stopped on their way.
-    assert counted[FINISHED] >= 195
-    assert {one.method for one in found} == set(METHODS)
-    assert {one.surface for one in found} == set(SURFACES)
-    counts = account(found)
-    assert sum(counts["by_status"].values()) == sum(sum(one.values()) for one in counts["by_surface"].values()) == 200
+    assert counted[FINISHED] >= len(numbers) - 5
+    assert {one.method for one in ends} == ({"dopri5"} if own else set(METHODS))
+    assert own or {one.surface for one in ends} == set(SURFACES)
+    counts = account(ends)
+    assert sum(counts["by_status"].values()) == sum(sum(one.values()) for one in counts["by_surface"].values())
 
 
 def test_a_scene_is_the_same_whenever_it_is_drawn(terrains: list[str]):

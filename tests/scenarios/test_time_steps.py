@@ -109,7 +109,6 @@ def test_grips_that_cannot_be(change, says):
         dynsim.load_scenario("block_on_slope", "slides", overrides={**STEPS, **grip, **change})
 
 
-@pytest.mark.slow  # a program of its own to compile
 def test_a_snake_on_wheels(tmp_path: Path):
     """A free root, twelve servos and fourteen wheels, all from a scenario: it sets out along its wheels."""
     bench, _ = snake()

@@ -12,6 +12,7 @@ import numpy as np
 from dynsim.compile.contact_law import JointStop, compile_unilateral, dry_frictions, joint_stops
 from dynsim.compile.model import Model
 from dynsim.compile.shapes import compile_shapes
+from dynsim.compile.stepping import with_every_part
 from dynsim.compile.tables import compile_contacts, compile_couplings, compile_drives, compile_loads, compile_model
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.derivative import System, derivative, new_workspace
@@ -276,9 +277,14 @@ class Bench:
         advance(self.system, self.ws, run, limit)
         return run
 
+    def with_every_part(self) -> Bench:
+        """As scenarios are that are stepped in time: all run one program."""
+        return replace(self, system=with_every_part(self.system, self.robot))
+
     def simulate(self, y: np.ndarray, times: np.ndarray, method: str = "dopri5", **options: Any) -> Run:
         """Integrate to the last of ``times``, which must be reached; ``options`` are those of :meth:`new_run`."""
-        return self.finish(self.new_run(y, times, method, **options))
+        b = self.with_every_part() if METHODS[method] == TIME_STEPPING else self
+        return b.finish(b.new_run(y, times, method, **options))
 
     def finish(self, run: Run) -> Run:
         """Advance a run to its end, which must be reached."""

@@ -2,40 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from dynsim.dynamics import tables as ka
 from dynsim.integrators.run import Run
-from dynsim.jit.kernel import integers
 from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot
 from dynsim.model.drives import Servo
 from dynsim.model.joints.ball import floating
-from dynsim.model.surfaces import shape_arrays
 from support.random_robots import Bench, bench
-
-
-def whole(b: Bench) -> Bench:
-    """A bench with shapes or joints of several rates gets the tables of both, so that all of these run one program.
-
-    It is that of the dynamic snake, which takes half a minute to compile; benches with neither run that of plain arms.
-    """
-    model, shapes, joints = b.system.model, b.system.shapes, len(b.robot.links)
-    if model.compound is None and shapes is None:
-        return b
-    if model.compound is None:
-        compound = np.zeros((joints, ka.COMPOUND_SIZE))
-        compound[:, ka.POSITION_INDEX] = b.robot.position_index
-        model = model._replace(compound=integers(compound))
-    if shapes is None:
-        shapes = shape_arrays([(None, 0.0, np.zeros(3), False)] * len(b.system.contacts.link))
-    return replace(b, system=b.system._replace(model=model, shapes=shapes))
 
 
 def stepped(b: Bench, y: np.ndarray, times: np.ndarray, step: float, theta: float, law: dict | None = None) -> Run:
     """A run by time stepping, tangents along x of the bodies; law: columns of the contacts' law."""
-    b = whole(b)
+    b = b.with_every_part()
     run = b.new_run(y, times, "time_stepping", step=step, theta=theta)
     b.system.contacts.law[:, ka.GRIP_AXIS : ka.GRIP_AXIS + 3] = 1.0, 0.0, 0.0
     for column, value in (law or {}).items():

@@ -300,6 +300,7 @@ def test_an_arm_without_braces_is_run_at_all_corners(found) -> None:  # type: ig
     assert "deep at t = " in far.verify([(plan.braces, plan.dense)])[0].reason
 
 
+@pytest.mark.long  # a program of its own to compile
 def test_a_base_that_stands_is_planned_with_events_that_see_it_tip() -> None:
     """Time stepping locates no events; the arm of the mobile comparison with its whole chain free."""
     data = dynsim.load_scenario("mobile_elbow_comparison", "no_elbow").resolved

@@ -133,7 +133,6 @@ def slide(b: Bench, speed: float, until: float, h: float) -> Run:
     return b.simulate(b.state(np.zeros(3), [speed, 0.0, 0.0]), np.array([0.0, until]), "time_stepping", step=h)
 
 
-@pytest.mark.slow  # a program of its own to compile
 def test_static_friction_holds_more_than_it_gives_once_it_slides():
     """tan(slope) between both coefficients: at rest it stays; pushed, it slides at μ_k; stopped by μ_k, it stays."""
     slope, kinetic, static = np.arctan(0.4), 0.3, 0.5
@@ -183,10 +182,10 @@ def test_friction_within_an_impact_may_give_what_the_impact_takes(tmp_path):
     assert not [text for text in summary["warnings"] if "friction has put" in text]
 
 
-@pytest.mark.slow  # a program of its own to compile
 def test_a_run_in_pieces_is_the_same_run():
     b, y = snake()
     whole = stepped(b, y, np.array([0.05]), 1e-3, 0.5)
+    b = b.with_every_part()
     run = b.new_run(y, np.array([0.05]), "time_stepping", step=1e-3)
     while run.count[STATUS] != FINISHED:
         b.advance(run, 7)

@@ -90,7 +90,6 @@ def test_servos_and_torque_sources(seed):
     assert unexplained(run) < 1e-9
 
 
-@pytest.mark.slow  # a program of its own to compile
 @pytest.mark.parametrize("kinds", [("floating", "revolute", "ball"), ("rolling", "prismatic"), ("wheeled", "planar")])
 def test_bodies_that_are_free(kinds):
     """Joints of several rates: attitudes, rolling and wheeled bases, whose positions are no integrals of rates."""

@@ -25,7 +25,7 @@ def body(points: list[np.ndarray], friction: float = 0.6) -> Bench:
     inertia = Inertia(MASS, np.zeros(3), np.diag([0.3, 0.4, 0.6]))
     links = tuple(floating(Link("body", "root", None, "floating", np.eye(3)[0], inertia)))
     contacts = [Contact(f"foot_{k}", "body", p, plane(Z), friction=friction) for k, p in enumerate(points)]
-    return bench(Robot("body", links, (), ("body", np.zeros(3))), contacts, real=True)
+    return bench(Robot("body", links, (), ("body", np.zeros(3))), contacts, real=True).with_every_part()
 
 
 def rest(b: Bench, seconds: float, samples: int = 201, first: float = 0.0):
@@ -47,7 +47,6 @@ def stays(run) -> np.ndarray:
     return force[-1]
 
 
-@pytest.mark.long  # a program of its own to compile
 @pytest.mark.parametrize("seconds", [20.0, pytest.param(1000.0, marks=pytest.mark.slow)])
 def test_a_table_stands_evenly_on_four_legs(seconds):
     """Also where the solution was begun from a corner of what is admissible: 0, 24.5, 0, 24.5 N."""
@@ -55,7 +54,6 @@ def test_a_table_stands_evenly_on_four_legs(seconds):
     np.testing.assert_allclose(stays(run), MASS * G / 4.0, atol=1e-6)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("seconds", [20.0, pytest.param(1000.0, marks=pytest.mark.slow)])
 def test_a_box_stands_on_eight_points(seconds):
     """Corners and the middles of edges, the weight off their centre: forces that are linear in the place."""
@@ -68,7 +66,6 @@ def test_a_box_stands_on_eight_points(seconds):
     np.testing.assert_allclose(force, np.linalg.pinv(balance) @ [MASS * G, 0.0, 0.0], atol=1e-6)
 
 
-@pytest.mark.long
 def test_a_table_that_is_dropped_rocks_to_rest():
     tilt = np.r_[np.cos(0.02), 0.8 * np.sin(0.02), 0.6 * np.sin(0.02), 0.0]
     b = body(LEGS)
