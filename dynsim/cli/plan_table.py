@@ -16,13 +16,16 @@ def print_plan(plan: BracePlan) -> None:
     """A row for each number of braces, then what refused plans and what was not found."""
     table = Table(title=f"{escaped(plan.task.scenario.title)}: braces", title_justify="left")
     heads = (
-        "braces", "on", "heat [W]", "simulated [W]", "all energy [J]", "k_p [V/rad]", "forces [N]", "found", "survives",
+        "braces", "on", "heat [W]", "simulated [W]", "all energy [J]", "k_p [V/rad]", "forces [N]", "rounds",
+        "survives",
     )  # fmt: skip
     for head in heads:
         table.add_column(head, justify="left" if head in ("on", "survives") else "right")
     for size in plan.sizes:
         table.add_row(*_cells(size))
     console.print(table)
+    if any(size.planned is not None and size.agreed == 0 for size in plan.sizes):
+        say("rounds: how many of the search found that heat by themselves; none, where exchanging braces found it")
     best = plan.best
     if best is not None:
         say(f"best: {escaped(best.label)}{', though it is refused' if best.survives is False else ''}")

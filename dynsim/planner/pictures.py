@@ -53,7 +53,7 @@ def picture(plan: BracePlan) -> PlanPicture:
     heading = _heading(task)
     poses = _poses(task, best, heading)
     path = _seen(task.targets(np.linspace(0.0, task.duration, 200)), heading)
-    points = np.vstack([path, *(line for pose in poses for line in pose.lines)])
+    points = np.vstack([path, *(line for pose in poses for line in pose.lines)])[:, [0, 2]]
     low, high = points.min(axis=0) - BEYOND, points.max(axis=0) + BEYOND
     along, up = np.linspace(low[0], high[0], GRID), np.linspace(low[1], high[1], GRID)
     grid = along[None, :, None] * heading + up[:, None, None] * np.array([0.0, 0.0, 1.0])
@@ -65,6 +65,7 @@ def picture(plan: BracePlan) -> PlanPicture:
         title=task.scenario.title,
         poses=poses,
         path=path,
+        braces=[brace.label for brace in best.braces],
         ground=(along, up, ground),
         sets={count: plan.ranked[count] for count in answered},
         survives={count: size.survives for count, size in answered.items()},
@@ -86,8 +87,9 @@ def _heading(task: Task) -> Array:
 
 
 def _seen(points: Array, heading: Array) -> Array:
-    """Points from the side: along the heading, and up; (T, 3) → (T, 2)."""
-    return np.stack([points @ heading, points[..., 2]], axis=-1)
+    """Points (T, 3) along the heading, to the left of it, and up."""
+    left = np.array([-heading[1], heading[0], 0.0])
+    return np.stack([points @ heading, points @ left, points[..., 2]], axis=-1)
 
 
 def _poses(task: Task, size: Size, heading: Array) -> list[Pose]:

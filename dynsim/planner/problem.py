@@ -293,6 +293,9 @@ def task(scenario: Scenario, options: Options) -> Task:
     candidates = _candidates(scenario, arm, options, chosen)
     if not candidates and options.count[1] > 0:
         raise ModelError("plan: no candidates for braces; name links or contact points with --candidates")
+    points = len({candidate.location for candidate in candidates})
+    if options.count[0] > points:
+        raise ModelError(f"plan: {options.count[0]} braces, but there are {points} points to brace; ask for fewer")
     kind = _kind(path, scenario.duration_s)
     return Task(scenario, options, arm, path, kind, tuple(candidates), scenario.config.contacts.friction)
 

@@ -52,6 +52,7 @@ def test_a_plan_leaves_its_files_and_a_scenario_that_runs(small: Path, tmp_path:
     ("options", "message"),
     [
         (["--count", "two"], "must look like 0:3"),
+        (["--count", "99"], "plan: 99 braces, but there are 5 points to brace; ask for fewer"),
         (["--weight", "heat=1"], "must look like peak=0.5"),
         (["--gains", "0"], "must be positive numbers"),
         (["--along", "1.5"], "shares of the way along links"),

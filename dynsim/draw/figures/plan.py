@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from dynsim.draw.figures.style import (
@@ -22,19 +23,23 @@ from dynsim.draw.figures.style import (
     save_all,
 )
 
-# Length of an arrow of the greatest force, over the height of what is seen.
+# Length of an arrow of the greatest force, over the height of what is seen, at most.
 ARROW = 0.35
+# An arm that leaves its plane by less of its length is not drawn from above.
+FLAT = 0.02
+# Room to either side of an arm from above [m].
+MARGIN = 0.1
 
 
 @dataclass(frozen=True)
 class Pose:
-    """The arm at one instant, seen from the side: along its heading and up [m].
+    """The arm at one instant: along its heading, to the left of it, and up [m].
 
     Attributes
     ----------
     time : [s]
-    lines : of each link both ends, (2, 2)
-    points, forces : of the braces, (c, 2) [m] and [N]
+    lines : of each link both ends, (2, 3)
+    points, forces : of the braces, (c, 3) [m] and [N]
     """
 
     time: float
@@ -50,7 +55,8 @@ class PlanPicture:
     Attributes
     ----------
     title : of the scenario
-    poses : of the best plan; path: of the hand, (T, 2) [m]
+    poses : of the best plan; path: of the hand, (T, 3) [m], as those of the poses
+    braces : names of the best plan's, in the order of their points
     ground : distance from the nearest surface on a grid: along, up, and (up, along) [m]
     sets : label and heat [W] by number of braces; the first of each is the answer
     survives : of the answers
@@ -61,6 +67,7 @@ class PlanPicture:
     title: str
     poses: Sequence[Pose]
     path: Array
+    braces: Sequence[str]
     ground: tuple[Array, Array, Array]
     sets: Mapping[int, Sequence[tuple[str, float]]]
     survives: Mapping[int, bool | None]
@@ -69,31 +76,54 @@ class PlanPicture:
 
 
 def posture(picture: PlanPicture) -> Figure | None:
-    """The best plan from the side at some instants, with the forces of its braces."""
+    """The best plan at some instants with the forces of its braces, from above too where it leaves its plane."""
     if not picture.poses:
         return None
     along, up, gap = picture.ground
-    shape = float(np.ptp(up) / np.ptp(along))
-    figure = new_figure(min(1.2 + 6.6 * shape, 6.0), f"{picture.title}: posture and forces of the best plan")
-    axes = figure.subplots()
-    axes.contourf(along, up, gap, levels=[-1e9, 0.0], colors=["#D9D9D9"])
-    axes.contour(along, up, gap, levels=[0.0], colors=[GREY], linewidths=0.8)
+    aside = np.concatenate([picture.path[:, 1], *(line[:, 1] for pose in picture.poses for line in pose.lines)])
+    width = float(np.ptp(aside)) + 2.0 * MARGIN
+    flat = np.ptp(aside) < FLAT * np.ptp(along)
+    shapes = [float(np.ptp(up) / np.ptp(along)), *([] if flat else [width / float(np.ptp(along))])]
+    height = min(1.2 + 6.6 * sum(shapes), 9.0)
+    figure = new_figure(height, f"{picture.title}: posture and forces of the best plan")
+    views = figure.subplots(len(shapes), 1, squeeze=False, sharex=True, height_ratios=shapes)[:, 0]
+    side = views[0]
+    side.contourf(along, up, gap, levels=[-1e9, 0.0], colors=["#D9D9D9"])
+    side.contour(along, up, gap, levels=[0.0], colors=[GREY], linewidths=0.8)
+    # Arrows come from below most braces, and stay within.
+    lowest = min((pose.points[:, 2].min(initial=up[-1]) for pose in picture.poses), default=up[-1])
+    length = min(ARROW * float(np.ptp(up)), float(lowest - up[0]))
     largest = max((float(np.linalg.norm(pose.forces, axis=1).max(initial=0.0)) for pose in picture.poses), default=0.0)
+    for axes, row, name in zip(views, (2, 1), ("up [m]", "left [m]"), strict=False):
+        seen = [0, row]
+        _draw_poses(axes, picture, seen, largest, length)
+        axes.plot(*picture.path[:, seen].T, color=GREEN, linewidth=2.0, label="path of the hand")
+        axes.set(ylabel=name, aspect="equal")
+    if largest > 0.0:
+        side.plot([], [], color=PULLING, label=f"forces on braces, at most {number(largest, 3)} N")
+    if not flat:
+        views[1].set_ylim(aside.min() - MARGIN, aside.max() + MARGIN)
+    views[-1].set_xlabel("along the heading [m]")
+    side.legend(loc="best")
+    return figure
+
+
+def _draw_poses(axes: Axes, picture: PlanPicture, seen: list[int], largest: float, length: float) -> None:
+    """Links, forces, and names of braces beside their places in the last pose."""
     for k, pose in enumerate(picture.poses):
         shade = 0.25 + 0.75 * (k + 1) / len(picture.poses)
         for line in pose.lines:
-            axes.plot(*line.T, color=BLUE, alpha=shade, marker="o", markersize=2.5, linewidth=1.6)
-        for point, force in zip(pose.points, pose.forces, strict=True):
-            if largest > 0.0:
-                tip = force / largest * ARROW * np.ptp(up)
-                arrow = {"arrowstyle": "-|>", "color": PULLING, "alpha": shade, "shrinkA": 0.0, "shrinkB": 0.0}
-                axes.annotate("", xy=point, xytext=point - tip, arrowprops=arrow)
-    axes.plot(*picture.path.T, color=GREEN, linewidth=2.0, label="path of the hand")
-    if largest > 0.0:
-        axes.plot([], [], color=PULLING, label=f"forces on braces, at most {number(largest, 3)} N")
-    axes.set(xlabel="along the heading [m]", ylabel="up [m]", aspect="equal")
-    axes.legend(loc="upper right")
-    return figure
+            axes.plot(*line[:, seen].T, color=BLUE, alpha=shade, marker="o", markersize=2.5, linewidth=1.6)
+        if largest == 0.0:
+            continue
+        for point, force in zip(pose.points[:, seen], pose.forces[:, seen] / largest * length, strict=True):
+            arrow = {"arrowstyle": "-|>", "color": PULLING, "alpha": shade, "shrinkA": 0.0, "shrinkB": 0.0}
+            if np.linalg.norm(force) > 0.02 * length:
+                axes.annotate("", xy=point, xytext=point - force, arrowprops=arrow)
+            else:
+                axes.plot(*point, color=PULLING, alpha=shade, marker="o", markersize=4.0)
+    for name, point in zip(picture.braces, picture.poses[-1].points[:, seen], strict=True):
+        axes.annotate(name, point, xytext=(5.0, -9.0), textcoords="offset points", fontsize=7.0, color=PULLING)
 
 
 def heat_by_set(picture: PlanPicture) -> Figure | None:
