@@ -324,6 +324,6 @@ def test_with_friction_the_split_of_rigid_wheels_is_what_steps_and_events_differ
     assert np.abs(steps["w"] - exact["w"])[:, :3].max() < 4e-4
     later = steps.time > 0.05
     loads = [run["contact_normal_force"][later][:, :14].reshape(-1, 7, 2) for run in (exact, steps)]
-    # 0.2 to 0.6 N by how the machine rounds: the head goes with the split.
+    # 0.55 N on one processor, less than 0.5 on another: the head goes with the split.
     assert np.abs(loads[0].sum(axis=2) - loads[1].sum(axis=2)).max() < 1.0
     assert np.abs(loads[0] - loads[1]).max() > 2.0
