@@ -9,11 +9,11 @@ from matplotlib.figure import Figure
 from dynsim.draw.figures.plan import PlanPicture, Pose, posture
 
 
-def picture(aside: float, force: float = 4.0) -> PlanPicture:
+def picture(aside: float) -> PlanPicture:
     """An arm of two links whose elbow leans on the floor and goes so far aside [m]."""
     bend = np.array([1.0, aside, 0.0])
     lines = [np.array([[0.0, 0.0, 0.5], bend]), np.array([bend, [2.0, 0.0, 0.4]])]
-    pose = Pose(0.0, lines, bend[None], np.array([[0.0, 0.0, force]]))
+    pose = Pose(0.0, lines, bend[None], np.array([[0.0, 0.0, 4.0]]))
     along, up = np.linspace(-0.2, 2.2, 5), np.linspace(-0.2, 0.7, 4)
     return PlanPicture(
         "arm", [pose, pose], np.array([[2.0, 0.0, 0.4], [2.1, 0.0, 0.4]]), ["elbow on floor"],
