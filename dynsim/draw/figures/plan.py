@@ -91,9 +91,9 @@ def posture(picture: PlanPicture) -> Figure | None:
     side.contourf(along, up, gap, levels=[-1e9, 0.0], colors=["#D9D9D9"])
     side.contour(along, up, gap, levels=[0.0], colors=[GREY], linewidths=0.8)
     # Arrows come from below most braces, and stay within.
-    lowest = min((pose.points[:, 2].min(initial=up[-1]) for pose in picture.poses))
+    lowest = min(pose.points[:, 2].min(initial=up[-1]) for pose in picture.poses)
     length = min(ARROW * float(np.ptp(up)), float(lowest - up[0]))
-    largest = max((float(np.linalg.norm(pose.forces, axis=1).max(initial=0.0)) for pose in picture.poses))
+    largest = max(float(np.linalg.norm(pose.forces, axis=1).max(initial=0.0)) for pose in picture.poses)
     for axes, row, name in zip(views, (2, 1), ("up [m]", "left [m]"), strict=False):
         seen = [0, row]
         _draw_poses(axes, picture, seen, largest, length)
