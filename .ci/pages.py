@@ -47,6 +47,9 @@ PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
 NUMBER = re.compile(r"[−+-]?\d[\d.,]*(?:e[−+-]?\d+)?(?=<!-- = (\w+) -->)")
 TABLE = re.compile(r"(?<=<!-- table: )(\w+)( -->\n).*?(?=<!-- end -->)", re.DOTALL)
 
+# Mean error of the paper's manoeuvres in the coordinate that moves (Tanaka et al. 2019, Table III).
+PAPER_ERROR_PERCENT = {"x": 1.0, "y": 34, "z": 1.5, "alpha": 1.9, "beta": 6.0, "gamma": 0.4}
+
 VARIANTS = ("two_elbows", "elbow_7", "elbow_4", "no_elbow")
 HEADS = ("two elbows", "elbow 7", "elbow 4", "no elbow")
 NONE = "–"
@@ -619,6 +622,103 @@ def steps() -> Any:
     return data("snake/steps.json")
 
 
+def kinematic() -> Any:
+    return data("snake/kinematic.json")
+
+
+def of_kinematic(name: str, variant: str = "") -> dict[str, Any]:
+    """A run of the kinematic snake in numbers."""
+    one: dict[str, Any] = kinematic()["runs"][name][variant]
+    return one
+
+
+def both(run: dict[str, Any], first: str, second: str) -> str:
+    return f"{small(run[first])}, {small(run[second])}"
+
+
+def snake_positioning() -> str:
+    """What is left of the way in each direction, beside what the paper measured."""
+    symbols = {"alpha": "α", "beta": "β", "gamma": "γ"}
+    rows = [
+        (
+            symbols.get(moved, moved),
+            small(run["final_position_error_m"]),
+            small(run["final_attitude_error_rad"]),
+            both(run, "position_error_max_m", "attitude_error_max_rad"),
+            f"{PAPER_ERROR_PERCENT[moved]:g} %",
+        )
+        for moved, run in kinematic()["runs"]["snake_positioning"].items()
+    ]
+    heads = ("moved", "end error, position [m]", "attitude [rad]", "largest during the run [m], [rad]", "[T]")
+    return lines(heads, rows, left=1)
+
+
+def snake_limits() -> str:
+    """Policies of modes and limits, and the costs."""
+    rows = [
+        (
+            f"`{variant}`",
+            f"{number(run['cost_initial'])} → {number(run['cost_final'])}",
+            number(run["joint_limit_violation_max_rad"], 3),
+            both(run, "position_error_max_m", "attitude_error_max_rad"),
+            str(run["mode_switches"]),
+        )
+        for variant, run in kinematic()["runs"]["snake_joint_limits"].items()
+    ]
+    heads = ("variant", "V start → end", "limit passed by [rad]", "head error, max [m], [rad]", "switches")
+    return lines(heads, rows, left=1)
+
+
+def snake_ways() -> str:
+    """Forward and backward: how long the target waited."""
+    rows = []
+    for name in ("snake_circle", "snake_circle_backward", "snake_door_arc"):
+        for variant, run in kinematic()["runs"][name].items():
+            waited = f"{fixed(run['waiting_s'], 2)} of {run['duration_s']:g}" if run["waiting_s"] else "0"
+            title = f"`{name}` `{variant}`" if variant else f"`{name}`"
+            rows.append((title, waited, str(run["mode_switches"]), small(run["position_error_max_m"])))
+    return lines(("scenario, variant", "target waited [s]", "switches", "largest head error [m]"), rows, left=1)
+
+
+def snake_circles() -> str:
+    """The circle backward with less time or another least margin."""
+    rows = [
+        (f"{one['path_s']:g} s", f"{1e3 * one['least_margin_m']:g} mm", f"{fixed(abs(one['turned_deg']), 1)}°")
+        for one in kinematic()["circles"]
+    ]
+    return lines(("duration", "least margin", "ends at"), rows, left=0)
+
+
+def snake_order() -> str:
+    """In which order the joints of the base come below half of their first angle."""
+    rows = []
+    for one in kinematic()["order"]:
+        times = sorted((time, name) for name, time in one["halved_s"].items() if time is not None)
+        order = ", ".join(f"{name.replace('theta', 'θ')} ({time:.1f} s)" for time, name in times)
+        rows.append((f"{one['null_gain']:g}", order, fixed(one["null_space_reduced_s"], 1)))
+    return lines(("k_η", "joints in their order", "null-space motion reduced [s]"), rows, left=3)
+
+
+def snake_areas() -> str:
+    """Support area and straightness that the costs lead to."""
+    names = {"cyclic": "eq 19", "eq20": "eq 20 as printed", "eq20_min": "1/min d"}
+    rows = []
+    for variant, title in names.items():
+        run = of_kinematic("snake_joint_limits", variant)
+        rows.append((title, number(run["support_area_final_m2"]), number(run["base_rms_rad"], 3)))
+    return lines(("cost, cyclic switching", "support area [m²]", "base part, rms angle [rad]"), rows, left=1)
+
+
+def backward_circle() -> dict[str, Any]:
+    """The circle backward that is completed."""
+    return of_kinematic("snake_circle_backward")
+
+
+def turned(name: str, variant: str, digits: int = 1) -> str:
+    """Yaw of the head from start to end [deg]."""
+    return fixed(abs(of_kinematic(name, variant)["turned_deg"]), digits)
+
+
 def fall_order(theta: str) -> str:
     """By what half the step divides the error of the falling head, of two halvings."""
     coarse, _, fine = steps()["fall_errors_m"][theta]
@@ -636,7 +736,8 @@ TABLES: dict[str, Callable[[], str]] = {
     for one in (
         elbows_in_short, elbows, glued_and_real, overturning_holds, overturning_drives, assumptions, ledger,
         snake_table_iii, time_stepping, endings, right_hand_side, ratios, job, precision, sweeps, snake_bench,
-        comparison, faults, planned_arm, planned_gains, planned_scenes,
+        comparison, faults, planned_arm, planned_gains, planned_scenes, snake_positioning, snake_limits, snake_ways,
+        snake_circles, snake_order, snake_areas,
     )
 }  # fmt: skip
 
@@ -756,6 +857,16 @@ NUMBERS |= {
     "fall_rebounds": lambda: str(run("falling_arm")["events"]["bounce"]),
     "below_landing_s": lambda: fixed(run("floor_below lands")["first_at_s"]["landing"], 3),
     "below_mm": lambda: error("floor_below lands"),
+    "snake_pull_deg": lambda: turned("snake_door_arc", "pull"),
+    "snake_circle_deg": lambda: turned("snake_circle", "backward_switching"),
+    "snake_singular_s": lambda: fixed(backward_circle()["waiting_for_s"]["singular posture"], 1),
+    "snake_refused": lambda: str(backward_circle()["modes_refused"]),
+    "snake_margin_mm": lambda: fixed(1e3 * backward_circle()["support_margin_min_m"], 1),
+    "snake_operator_m": lambda: small(of_kinematic("snake_operator")["final_position_error_m"]),
+    "snake_operator_rad": lambda: small(of_kinematic("snake_operator")["final_attitude_error_rad"]),
+    "snake_operator_switches": lambda: str(of_kinematic("snake_operator")["mode_switches"]),
+    "snake_eq20_jump": lambda: small(kinematic()["eq20_predictive"]["cost_rise_max_within_a_mode"]),
+    "snake_min_rise": lambda: small(of_kinematic("snake_joint_limits", "eq20_min")["cost_rise_max_within_a_mode"]),
     "snake_dz_mm": lambda: fixed(1e3 * sag_error("dz_m"), 1),
     "snake_steps_mm": lambda: fixed(steps()["spread_mm"], 2),
     "snake_steps_mrad": lambda: fixed(steps()["spread_mrad"], 2),

@@ -402,6 +402,11 @@ def _why(search: Search, count: int) -> str:
     """Why no plan of a size was found."""
     tally, options = search.tally, search.task.options
     if not tally.drawn_on:
+        if within := search.never_clear():
+            return (
+                f"none of {tally.drawn} random postures could be brought onto the hand's path: {within[0]} is never "
+                "clear of that surface; the base may stand too near to it, or within it"
+            )
         return (
             f"none of {tally.drawn} random postures could be brought onto the hand's path, within joint limits and "
             "clear of the surfaces: it may be out of reach, or the orientation that it asks for"

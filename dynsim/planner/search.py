@@ -139,6 +139,15 @@ class Search:
         spread = np.where(tables.prismatic, PRISMATIC_SPREAD, rng.uniform(*SPREAD))
         return np.clip(initial + spread * rng.normal(size=len(spread)), tables.lower, tables.upper)
 
+    def never_clear(self) -> list[str]:
+        """Points that come nearer to a surface than their clearance in each of some random postures."""
+        problem, greatest = self.task.problem((), 1), np.full(len(self.task.clear), -np.inf)
+        for _ in range(DRAWS):
+            problem.evaluate(reals(self.draw())[None], np.zeros((1, 0)))
+            greatest = np.maximum(greatest, problem.work.gap[0])
+        points = self.task.clear.values()
+        return [point.label for point, gap in zip(points, greatest, strict=True) if gap < point.margin]
+
     def run(self) -> dict[int, list[Planned]]:
         """The best sets of each size with whole paths, by heat along their dense references; sizes may be empty.
 

@@ -84,9 +84,14 @@ def turned_away(data: dict[str, Any]) -> None:
     data["controller"]["hand"]["orientation"] = {"rpy_deg": [180.0, 0.0, 0.0]}
 
 
+def walled_in(data: dict[str, Any]) -> None:
+    data["surfaces"]["box"] = {"type": "box", "center_m": [0.0, 0.0, 0.2], "edges_m": [1.0, 1.0, 1.0]}
+
+
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
+        (walled_in, "on box is never clear of that surface; the base may stand too near to it, or within it"),
         (out_of_reach, "could be brought onto the hand's path"),
         (weak, "no forces within friction cones and limits of the motors carry the motion"),
         (turned_away, "it may be out of reach, or the orientation that it asks for"),

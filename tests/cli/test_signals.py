@@ -259,6 +259,8 @@ import os, signal, sys
 import dynsim.{module} as module
 from dynsim.cli import main
 
+# Not as it is inherited: a shell starts what it runs in the background with SIGINT ignored.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 begin = {target}
 
 def signalled(*arguments, **options):

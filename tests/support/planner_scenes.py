@@ -5,6 +5,7 @@
     PYTHONPATH=tests python -m support.planner_scenes --study gains --out results/planner
 
 The second one takes so many times as long for each search: how far the answers of the first are from the best known.
+It keeps what its file says of scenes that are not asked for.
 The third one runs the best plans, and those of the published arm, on surfaces 5 mm off with gains from stiff to soft.
 
 Arms of 7 to 10 joints whose hand goes there and back along a short way, over a floor, a pipe, a box, or with a joint
@@ -280,6 +281,8 @@ def main() -> None:
         else:
             rows.append(planned(seed, cores()))
         print(json.dumps(rows[-1]), flush=True)
+    if chosen.study == "reference":
+        rows = [row for _, row in sorted((before | {row["seed"]: row for row in rows}).items())]
     if chosen.study == "gains":
         rows += [row for friction in (0.1, 0.0) for row in stiffness(published(friction), range(1, 5))]
     chosen.out.mkdir(parents=True, exist_ok=True)

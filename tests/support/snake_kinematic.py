@@ -1,0 +1,119 @@
+"""What the shipped scenarios of the kinematic snake come to, and how far that depends on their settings.
+
+``PYTHONPATH=tests python -m support.snake_kinematic`` writes results/snake/kinematic.json, which docs/snake.md quotes,
+in half a minute with compiled kernels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dynsim._version import __version__
+from dynsim.engine import simulate
+from dynsim.record import Record
+from dynsim.scenario import load_scenario
+from dynsim.snake.published import TABLE_III
+from dynsim.system.files import write_json
+
+FILE = Path("results/snake/kinematic.json")
+RUNS: dict[str, tuple[str | None, ...]] = {
+    "snake_positioning": tuple(TABLE_III),
+    "snake_joint_limits": ("fixed", "cyclic", "predictive", "saturate", "unlimited", "eq20", "eq20_min"),
+    "snake_circle": ("forward", "backward", "backward_switching", "vertical"),
+    "snake_circle_backward": (None,),
+    "snake_door_arc": ("push", "pull", "pull_switching", "pull_predictive"),
+    "snake_operator": (None,),
+}
+KEPT = (
+    "final_position_error_m",
+    "final_attitude_error_rad",
+    "position_error_max_m",
+    "attitude_error_max_rad",
+    "joint_limit_violation_max_rad",
+    "waiting_s",
+    "waiting_for_s",
+    "null_space_reduced_s",
+    "cost_initial",
+    "cost_final",
+    "mode_switches",
+    "modes_refused",
+    "support_margin_min_m",
+    "support_area_final_m2",
+    "tipping",
+)
+# The circle backward with less time, or with a larger least margin: duration of the path [s], margin [m].
+CIRCLES = ((400.0, 0.01), (400.0, 0.02), (200.0, 0.01), (200.0, 0.02))
+# Of the redundancy, for the order in which the joints of the base become straight.
+NULL_GAINS = (0.1, 0.3, 1.0)
+
+
+def simulated(name: str, variant: str | None, overrides: Mapping[str, Any] | None = None) -> Record:
+    """The record of a shipped scenario with other settings."""
+    return simulate(load_scenario(name, variant, overrides))
+
+
+def outcome(record: Record) -> dict[str, Any]:
+    """A run in numbers."""
+    summary, rise = record.summary, np.diff(record["cost"])
+    same = np.diff(record["mode"]) == 0
+    return {
+        **{key: summary[key] for key in KEPT},
+        "duration_s": float(record.time[-1]),
+        "turned_deg": float(np.rad2deg(record["w"][-1, 5] - record["w"][0, 5])),
+        "base_rms_rad": float(np.sqrt(np.mean(record["phi"][-1, 6:] ** 2))),
+        "cost_rise_max": float(rise.max()),
+        "cost_rise_max_within_a_mode": float(rise[same].max()),
+    }
+
+
+def halved(record: Record) -> dict[str, float | None]:
+    """When joints of the base part come below half of their first angle for good [s]; None: not within the run."""
+    times: dict[str, float | None] = {}
+    names = record.labels["phi"]
+    for j in range(6, record["phi"].shape[1]):
+        above = np.flatnonzero(np.abs(record["phi"][:, j]) >= 0.5 * np.abs(record["phi"][0, j]))[-1]
+        times[names[j]] = float(record.time[above + 1]) if above + 1 < len(record.time) else None
+    return times
+
+
+def circle(duration: float, margin: float) -> dict[str, Any]:
+    """The circle backward, with another duration of its path and another least margin."""
+    path = load_scenario("snake_circle_backward").resolved["controller"]["paths"][0]
+    settings = {
+        "controller.paths": [path | {"duration_s": duration}],
+        "controller.switching.least_margin_m": margin,
+        "duration_s": duration + 80.0,
+    }
+    return {"path_s": duration, "least_margin_m": margin} | outcome(simulated("snake_circle_backward", None, settings))
+
+
+def order(null_gain: float) -> dict[str, Any]:
+    """When the joints of the base become straight, with modes in turn and a gain of the redundancy."""
+    record = simulated("snake_joint_limits", "cyclic", {"controller.null_gain": null_gain})
+    reduced = record.summary["null_space_reduced_s"]
+    return {"null_gain": null_gain, "halved_s": halved(record), "null_space_reduced_s": reduced}
+
+
+def study() -> dict[str, Any]:
+    """All of it."""
+    return {
+        "dynsim_version": __version__,
+        "runs": {
+            name: {variant or "": outcome(simulated(name, variant)) for variant in variants}
+            for name, variants in RUNS.items()
+        },
+        "circles": [circle(duration, margin) for duration, margin in CIRCLES],
+        "order": [order(gain) for gain in NULL_GAINS],
+        "eq20_predictive": outcome(
+            simulated("snake_joint_limits", "eq20", {"controller.switching.policy": "predictive"})
+        ),
+    }
+
+
+if __name__ == "__main__":
+    FILE.parent.mkdir(parents=True, exist_ok=True)
+    write_json(FILE, study())
