@@ -44,7 +44,7 @@ def inverse_dynamics_derivatives(arrays: ModelArrays, links: Array) -> InverseDy
     """Derivatives at the state that a sweep with rates, accelerations and gravity has left in ``links``."""
     n = len(arrays.tree)
     parent = arrays.tree[:, ka.PARENT]
-    base = parent if arrays.compound is None else arrays.compound[:, ka.BASE]
+    base = arrays.tree[:, ka.BASE]
     S, V, A = (links[:, first : first + 6] for first in (ka.S, ka.V, ka.A))
     body = _joint_bodies(parent, base)
     root = np.concatenate([np.zeros(3), -arrays.gravity])

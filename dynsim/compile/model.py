@@ -343,7 +343,7 @@ class Model:
             self._workspace.joints[:, ka.Q] = positions
         else:
             self._q[:] = positions
-            joints.read_positions(self.arrays.compound, self.arrays, self._q, 0, self._workspace)
+            joints.read_positions(self.arrays, self._q, 0, self._workspace)
         self._workspace.joints[:, ka.QD] = 0.0 if v is None else self._vector(v, "v", self.joint_names)
 
     def _vector(self, values: ArrayLike, name: str, labels: tuple[str, ...]) -> Array:

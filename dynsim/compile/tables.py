@@ -46,7 +46,6 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
     joints: dict[str, int] = {}
     tree = np.zeros((len(links), ka.TREE_SIZE), dtype=np.int64)
     body = np.zeros((len(links), ka.BODY_SIZE))
-    compound = np.zeros((len(links), ka.COMPOUND_SIZE), dtype=np.int64)
     for i, link in enumerate(links):
         if link.kind == "revolute" and abs(initial[position[i]]) > ANGLE_LIMIT:
             raise ModelError(
@@ -76,9 +75,9 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
         index[link.name], joints[link.joint] = i, i
         tree[i, ka.PARENT] = parent
         tree[i, ka.KIND] = _joint_kind(link)
-        compound[i, ka.POSITION_INDEX] = position[i]
+        tree[i, ka.POSITION_INDEX] = position[i]
         # Later rows of a joint are mounted where its first one is.
-        compound[i, ka.BASE] = parent if link.row.neutral else compound[parent, ka.BASE]
+        tree[i, ka.BASE] = parent if link.row.neutral else tree[parent, ka.BASE]
         tree[i, ka.TURNED] = int(turned)
         if parent >= 0 and parent != i - 1:
             tree[parent, ka.BRANCHES] += 1
@@ -114,7 +113,6 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
         tree=integers(tree),
         body=reals(body),
         gravity=reals(robot.gravity),
-        compound=integers(compound) if (tree[:, ka.KIND] > ka.PRISMATIC).any() else None,
     )
 
 

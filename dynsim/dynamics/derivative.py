@@ -106,7 +106,7 @@ def derivative(system: System, t, y, ws: Workspace, dy):
     # Most robots have a position for each rate; the others read and write their positions by kind of joint.
     plain = layout.extra == 0
     if not plain:
-        read_positions(model.compound, model, y, layout.q, ws)
+        read_positions(model, y, layout.q, ws)
     for i in range(n):
         if plain:
             joints[i, ka.Q] = y[layout.q + i]
@@ -128,7 +128,7 @@ def derivative(system: System, t, y, ws: Workspace, dy):
     admissible_forces(system.contacts, system.unilateral, ws)
 
     if not plain:
-        position_rates(model.compound, model, ws, dy, layout.q)
+        position_rates(model, ws, dy, layout.q)
     for i in range(n):
         if plain:
             dy[layout.q + i] = joints[i, ka.QD]

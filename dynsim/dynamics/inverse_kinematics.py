@@ -128,11 +128,7 @@ def cut_off(path: PathArrays, q):
 @internal_kernel
 def errors(model: ModelArrays, ws: Workspace, path: PathArrays, target, q):
     """What is missing to the target and the surfaces, and how the joints change it; returns its length [m]."""
-    if model.compound is None:  # known to the compiler
-        for j in range(ws.joints.shape[0]):
-            ws.joints[j, ka.Q] = q[j]
-    else:
-        read_positions(model.compound, model, q, 0, ws)
+    read_positions(model, q, 0, ws)
     for j in range(ws.joints.shape[0]):
         ws.joints[j, ka.QD] = 0.0
     kinematics(model, ws)

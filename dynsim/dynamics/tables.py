@@ -30,11 +30,9 @@ PARENT = 0  # index of the parent link, -1 for the world
 KIND = 1  # joint kind
 TURNED = 2  # 0 when R_PJ is the identity, so that one product can be skipped
 BRANCHES = 3  # number of children other than link i + 1
-TREE_SIZE = 4
-# ModelArrays.compound, int
-POSITION_INDEX = 0  # where the row's coordinates begin in the block of positions
-BASE = 1  # index of the link that the row's joint is mounted on: that of its first row's parent, -1 for the world
-COMPOUND_SIZE = 2
+POSITION_INDEX = 4  # where the row's coordinates begin in the block of positions
+BASE = 5  # index of the link that the row's joint is mounted on: that of its first row's parent, -1 for the world
+TREE_SIZE = 6
 # ModelArrays.body
 R_PJ = 0  # 9: rotation of the joint frame at q = 0 in the parent's frame, row-major
 P_PJ = 9  # 3: origin of the joint frame in the parent's frame [m]
@@ -197,9 +195,6 @@ class ModelArrays(NamedTuple):
     tree: np.ndarray  # (n, TREE_SIZE) int
     body: np.ndarray  # (n, BODY_SIZE)
     gravity: np.ndarray  # (3,) in W [m/s^2]
-    # (n, COMPOUND_SIZE) int: of robots with a joint beyond one angle or one sliding distance, see
-    # dynsim.dynamics.tree.joints. None for the others, whose programs are compiled without what such joints need.
-    compound: np.ndarray | None = None
 
 
 class DriveArrays(NamedTuple):

@@ -16,7 +16,7 @@ from dynsim.compile.contact_law import DryFriction, JointStop, compile_unilatera
 from dynsim.compile.control import JointControl
 from dynsim.compile.model import Model
 from dynsim.compile.shapes import compile_shapes
-from dynsim.compile.stepping import with_every_part
+from dynsim.compile.stepping import with_shapes
 from dynsim.compile.tables import compile_contacts, compile_couplings, compile_drives, compile_loads, compile_support
 from dynsim.config.problems import listed
 from dynsim.dynamics import state as kst
@@ -82,7 +82,6 @@ class Prepared:
             parts.append("contacts that are glued" if system.unilateral is None else "contacts that open and close")
         extras = {
             "spheres, boxes or height fields": system.shapes is not None and not stepped,
-            "joints of several rates": system.model.compound is not None and not stepped,
             "the dense system": system.dense is not None,
         }
         return f"arms by {', '.join([*parts, *(name for name, there in extras.items() if there)])}"
@@ -186,7 +185,7 @@ def prepare(
     )
     stepping = None
     if method == ki.TIME_STEPPING and system.unilateral is not None:
-        system = with_every_part(system, robot)
+        system = with_shapes(system)
         stepping = stepping_arrays(model.arrays, system.contacts, na, joint_rows, options.theta)
     y = np.zeros(layout.size)
     y[block(layout, "q")] = robot.initial

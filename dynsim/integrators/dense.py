@@ -82,7 +82,7 @@ def sample_step(system: System, ws: Workspace, run: Run):
     while last < run.sample_time.shape[0] and run.sample_time[last] <= until:
         interpolate(run, run.sample_time[last], run.sample[last])
         if system.layout.extra > 0:
-            normalise(system.model.compound, system.model, run.sample[last], system.layout.q)
+            normalise(system.model, run.sample[last], system.layout.q)
         last += 1
     write_samples(run.newton, system, ws, run, last - first)
 

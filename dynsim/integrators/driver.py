@@ -83,7 +83,7 @@ def accept(system: System, ws: Workspace, run: Run):
     if run.event.shape[0] > 0:
         watch_support(run.support)
     if system.layout.extra > 0:
-        normalise(system.model.compound, system.model, run.y_new, system.layout.q)
+        normalise(system.model, run.y_new, system.layout.q)
     sample_step(system, ws, run)
     take_directions(system.unilateral, ws, run)
     for j in range(run.y.shape[0]):

@@ -48,7 +48,7 @@ def guard(system: System, t, ws: Workspace, run: Run, e):
     elif kind == CONTACT_GAP:
         value = ws.contacts[k, ka.GAP]
     elif kind == TIP_MARGIN:
-        value = tip_margin(system.model.compound, system.model, system.loads, t, ws, run.support)
+        value = tip_margin(system.model, system.loads, t, ws, run.support)
     elif kind >= kev.NORMAL_GUARD:
         value = contact_guard(system.contacts, system.unilateral, ws, kind, k)
     else:

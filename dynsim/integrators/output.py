@@ -21,7 +21,7 @@ from dynsim.jit.kernel import internal_kernel
 def write_output(system: System, ws: Workspace, run: Run, row):
     """Everything worth recording that is not a state, after ``derivative``, into the columns of OutputLayout."""
     fill_output(system, ws, run, run.output[row])
-    write_support(system.model.compound, system, ws, run, row)
+    write_support(system, ws, run, row)
 
 
 @internal_kernel
@@ -72,10 +72,8 @@ def row_forces(unilateral: UnilateralArrays | None, stop, dry, tie):
 
 
 @internal_kernel
-def write_support(compound, system: System, ws: Workspace, run: Run, row):
+def write_support(system: System, ws: Workspace, run: Run, row):
     """What the ground carries of a mobile base, into the columns ``support``."""
-    if compound is None:  # known to the compiler: the wheels of a base share rates
-        return
     if run.support.index.shape[0] == 0:
         return
     ground_reaction(system.model, system.loads, run.sample_time[row], ws, run.support)

@@ -76,7 +76,7 @@ def project_level(system: System, ws: Workspace, y, level):
             column[i, 0] -= state[k, ka.FORCE] * column[i, 1 + 2 * k]
     accelerate(system.model, ws)
     if level == 0 and system.layout.extra > 0:
-        displace(system.model.compound, system.model, ws, y, start)
+        displace(system.model, ws, y, start)
     else:
         for i in range(n):
             y[start + i] += ws.joints[i, ka.QDD]

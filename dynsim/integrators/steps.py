@@ -25,7 +25,7 @@ def error_norm(system: System, ws: Workspace, run: Run, error, slack):
     beyond, loose = layout.q + ws.joints.shape[0] + layout.extra, slack * atol
     if layout.extra > 0:
         model = system.model
-        total, size = position_error(model.compound, model, y, y_new, error, layout.q, rtol, atol)
+        total, size = position_error(model, y, y_new, error, layout.q, rtol, atol)
         size += layout.tracked - (beyond - layout.q)
     for j in range(layout.tracked):
         position = layout.q <= j < beyond

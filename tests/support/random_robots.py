@@ -12,7 +12,7 @@ import numpy as np
 from dynsim.compile.contact_law import JointStop, compile_unilateral, dry_frictions, joint_stops
 from dynsim.compile.model import Model
 from dynsim.compile.shapes import compile_shapes
-from dynsim.compile.stepping import with_every_part
+from dynsim.compile.stepping import with_shapes
 from dynsim.compile.tables import compile_contacts, compile_couplings, compile_drives, compile_loads, compile_model
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.derivative import System, derivative, new_workspace
@@ -277,13 +277,13 @@ class Bench:
         advance(self.system, self.ws, run, limit)
         return run
 
-    def with_every_part(self) -> Bench:
+    def with_shapes(self) -> Bench:
         """As scenarios are that are stepped in time: all run one program."""
-        return replace(self, system=with_every_part(self.system, self.robot))
+        return replace(self, system=with_shapes(self.system))
 
     def simulate(self, y: np.ndarray, times: np.ndarray, method: str = "dopri5", **options: Any) -> Run:
         """Integrate to the last of ``times``, which must be reached; ``options`` are those of :meth:`new_run`."""
-        b = self.with_every_part() if METHODS[method] == TIME_STEPPING else self
+        b = self.with_shapes() if METHODS[method] == TIME_STEPPING else self
         return b.finish(b.new_run(y, times, method, **options))
 
     def finish(self, run: Run) -> Run:

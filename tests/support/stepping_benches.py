@@ -14,7 +14,7 @@ from support.random_robots import Bench, bench
 
 def stepped(b: Bench, y: np.ndarray, times: np.ndarray, step: float, theta: float, law: dict | None = None) -> Run:
     """A run by time stepping, tangents along x of the bodies; law: columns of the contacts' law."""
-    b = b.with_every_part()
+    b = b.with_shapes()
     run = b.new_run(y, times, "time_stepping", step=step, theta=theta)
     b.system.contacts.law[:, ka.GRIP_AXIS : ka.GRIP_AXIS + 3] = 1.0, 0.0, 0.0
     for column, value in (law or {}).items():

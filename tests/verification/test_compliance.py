@@ -220,7 +220,7 @@ def test_a_one_sided_tie_pushes_and_does_not_pull():
 def test_a_tie_that_ends_loses_what_it_has_stored():
     """All of it goes to the damper, and the bodies go on as they are."""
     b, q = pair((Tie("spring", "one", "two", vector(1, 0, 0), 300.0, rest=-0.25),))
-    b = b.with_every_part()
+    b = b.with_shapes()
     run = b.new_run(b.state(q, np.zeros(12)), np.array([0.0, 0.1, 0.5]), "time_stepping", step=1e-3)
     b.advance(run, 101)
     b.system.unilateral.tie_table[0, ku.TIE_KIND] = -1

@@ -54,7 +54,7 @@ def difference(model: Model, q: np.ndarray, v: np.ndarray, vdot: np.ndarray, alo
     """∂tau/∂q along rates, by central differences of fourth order."""
     slope, step = np.zeros(model.nq), 1e-3
     model.inverse_dynamics(q, along, np.zeros(model.n))
-    position_rates(model.arrays.compound, model.arrays, model._workspace, slope, 0)
+    position_rates(model.arrays, model._workspace, slope, 0)
 
     def at(h: float) -> np.ndarray:
         return model.inverse_dynamics(q + h * slope, v, vdot)

@@ -222,12 +222,12 @@ def test_positions_along_rates_and_rates_across_them():
         robot = random_robot_of(rng, kinds)
         q, u = random_positions(rng, robot), rng.normal(size=len(robot.links)) + 1j * rng.normal(size=len(robot.links))
         b = bench(robot)
-        compound, model = b.system.model.compound, b.system.model
+        model = b.system.model
         y, out, back = np.r_[0.0, q], np.zeros(1 + robot.nq, dtype=complex), np.zeros(len(u), dtype=complex)
-        positions_along(compound, model, y, 1, u, out)
+        positions_along(model, y, 1, u, out)
         for part, whole in ((u.real, out.real), (u.imag, out.imag)):
             np.testing.assert_allclose(whole[1:], b.part(b.derivative(b.state(q, part)), "q"), rtol=0, atol=1e-14)
-        rates_across(compound, model, y, 1, out, back)
+        rates_across(model, y, 1, out, back)
         np.testing.assert_allclose(back, u, rtol=0, atol=1e-14)
 
 
@@ -267,7 +267,7 @@ def test_the_error_of_an_attitude_is_the_angle():
         angle = 1e-5 * rng.normal(size=3)
         turned = q + displacement(q, angle) + 1e-3 * q
         # ``q`` is off by what leads to ``turned``, whatever that adds to its length.
-        total, count = position_error(b.system.model.compound, b.system.model, q, q, turned - q, 0, rtol, atol)
+        total, count = position_error(b.system.model, q, q, turned - q, 0, rtol, atol)
         model = Model(robot)
         actual = angle_between(model.body_pose("body", q)[0], model.body_pose("body", turned)[0])
         assert count == 3
@@ -285,7 +285,7 @@ def test_the_error_of_a_rolling_base_counts_both_distances():
     robot = robot_of(rolling(body("body")))
     b = bench(robot)
     y, error = np.array([3.0, -0.5, 10.0]), np.array([1e-3, 2e-3, 5e-3])
-    total, count = position_error(b.system.model.compound, b.system.model, y, y, error, 0, 0.1, 1.0)
+    total, count = position_error(b.system.model, y, y, error, 0, 0.1, 1.0)
     assert count == 3
     assert total == pytest.approx(np.sum((error / (1.0 + 0.1 * np.abs(y))) ** 2), rel=1e-14)
 

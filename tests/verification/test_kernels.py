@@ -68,20 +68,13 @@ def default_programs(kernel: Any) -> list[Any]:
     for signature in kernel.signatures:
         system_type = signature[0]
         part = dict(zip(system_type.fields, system_type.types, strict=True))
-        part |= dict(zip(part["model"].fields, part["model"].types, strict=True))
-        absent = [part[name] for name in ("compound", "shapes", "unilateral")]
+        absent = [part[name] for name in ("shapes", "unilateral")]
         for other in signature[1:]:
             run = dict(zip(getattr(other, "fields", ()), getattr(other, "types", ()), strict=True))
             absent += [run[name] for name in ("stepping",) if name in run]
         if all(kind == types.none for kind in absent):
             found.append(signature)
     return found
-
-
-def has_compound_joints(model: Any) -> bool:
-    """True for the type of tables of a model that has joints with several velocities."""
-    part = dict(zip(getattr(model, "fields", ()), getattr(model, "types", ()), strict=True))
-    return part.get("compound", types.none) != types.none
 
 
 @pytest.mark.skipif(config.DISABLE_JIT, reason="nothing is compiled")
@@ -100,9 +93,7 @@ def test_every_public_kernel_has_one_compiled_signature():
         ledger.kinetic_energy,
         ledger.potential_energy,
     ):
-        # Other tests of the process bring robots with joints of several velocities.
-        plain = [signature for signature in kernel.signatures if not has_compound_joints(signature[0])]
-        assert len(plain) == 1, kernel
+        assert len(kernel.signatures) == 1, kernel
 
 
 def test_a_direct_kernel_is_the_kernel():

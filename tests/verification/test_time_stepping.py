@@ -185,7 +185,7 @@ def test_friction_within_an_impact_may_give_what_the_impact_takes(tmp_path):
 def test_a_run_in_pieces_is_the_same_run():
     b, y = snake()
     whole = stepped(b, y, np.array([0.05]), 1e-3, 0.5)
-    b = b.with_every_part()
+    b = b.with_shapes()
     run = b.new_run(y, np.array([0.05]), "time_stepping", step=1e-3)
     while run.count[STATUS] != FINISHED:
         b.advance(run, 7)

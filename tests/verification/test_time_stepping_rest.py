@@ -25,7 +25,7 @@ def body(points: list[np.ndarray], friction: float = 0.6) -> Bench:
     inertia = Inertia(MASS, np.zeros(3), np.diag([0.3, 0.4, 0.6]))
     links = tuple(floating(Link("body", "root", None, "floating", np.eye(3)[0], inertia)))
     contacts = [Contact(f"foot_{k}", "body", p, plane(Z), friction=friction) for k, p in enumerate(points)]
-    return bench(Robot("body", links, (), ("body", np.zeros(3))), contacts, real=True).with_every_part()
+    return bench(Robot("body", links, (), ("body", np.zeros(3))), contacts, real=True).with_shapes()
 
 
 def rest(b: Bench, seconds: float, samples: int = 201, first: float = 0.0):

@@ -116,12 +116,12 @@ def turned(w, x, y, z):
 
 
 @internal_kernel
-def row_rates(compound, model: ModelArrays, ws: Workspace, i, v, vdot, gx, gy, gz):
+def row_rates(model: ModelArrays, ws: Workspace, i, v, vdot, gx, gy, gz):
     """V and A of link i from its axis S, for every kind of joint: V = V_p + S v, A = A_p + V_b × S v + S vdot.
 
     p is the parent, b what the joint is mounted on. ``forward_sweep`` writes this out for joints of one row.
     """
-    links, j, m = ws.links, model.tree[i, ka.PARENT], compound[i, ka.BASE]
+    links, j, m = ws.links, model.tree[i, ka.PARENT], model.tree[i, ka.BASE]
     bias = cross_motion(six(links, m, ka.V), six(links, i, ka.S)) if m >= 0 else ZERO_SIX
     # The world's acceleration is −g.
     root = (0.0, 0.0, 0.0, -gx, -gy, -gz)
@@ -131,13 +131,11 @@ def row_rates(compound, model: ModelArrays, ws: Workspace, i, v, vdot, gx, gy, g
 
 
 @apart_kernel
-def sweep_row(compound, model: ModelArrays, ws: Workspace, i, v, vdot, gx, gy, gz):
+def sweep_row(model: ModelArrays, ws: Workspace, i, v, vdot, gx, gy, gz):
     """R, p, S, V and A of row i into ``ws.links``: what ``forward_sweep`` does for a link (dynsim.dynamics.tree.sweep).
 
     v, vdot : rate and acceleration of the row with the sweep's factors; g : gravity likewise
     """
-    if compound is None:  # known to the compiler
-        return
     body, links, j = model.body, ws.links, model.tree[i, ka.PARENT]
     B, p = rotation(body, i, ka.R_PJ), vector(body, i, ka.P_PJ)
     if j >= 0:
@@ -147,17 +145,15 @@ def sweep_row(compound, model: ModelArrays, ws: Workspace, i, v, vdot, gx, gy, g
     put_rotation(links, i, ka.R, B)
     put_vector(links, i, ka.P, p)
     put_six(links, i, ka.S, S)
-    row_rates(compound, model, ws, i, v, vdot, gx, gy, gz)
+    row_rates(model, ws, i, v, vdot, gx, gy, gz)
 
 
 @kernel
-def read_positions(compound, model: ModelArrays, y, start, ws: Workspace):
+def read_positions(model: ModelArrays, y, start, ws: Workspace):
     """Coordinates of all joints from y[start:] into the workspace."""
-    if compound is None:  # known to the compiler
-        return
     tree, joints = model.tree, ws.joints
     for i in range(tree.shape[0]):
-        k = start + compound[i, ka.POSITION_INDEX]
+        k = start + tree[i, ka.POSITION_INDEX]
         joints[i, ka.Q] = y[k]
         if tree[i, ka.KIND] == ka.BALL_X or tree[i, ka.KIND] == ka.ROLL:
             joints[i, ka.EXTRA] = y[k + 1]
@@ -179,16 +175,14 @@ def quaternion_turn(w, x, y, z, dw, dx, dy, dz):
 
 
 @apart_kernel
-def position_rates(compound, model: ModelArrays, ws: Workspace, dy, start):
+def position_rates(model: ModelArrays, ws: Workspace, dy, start):
     """q̇ = N(q) v into dy[start:]. Ball: ½ q ∘ (0, ω) with ω in the body; rolling: V (cos ψ, sin ψ), ω.
 
     Wheels: their own rates, and V = (r/2)(left + right) along the heading as of a rolling base.
     """
-    if compound is None:  # known to the compiler
-        return
     tree, joints = model.tree, ws.joints
     for i in range(tree.shape[0]):
-        k, kind = start + compound[i, ka.POSITION_INDEX], tree[i, ka.KIND]
+        k, kind = start + tree[i, ka.POSITION_INDEX], tree[i, ka.KIND]
         if kind == ka.BALL_X:
             w, x, y, z = joints[i, ka.Q], joints[i, ka.EXTRA], joints[i + 1, ka.Q], joints[i + 2, ka.Q]
             rate = quaternion_rate(w, x, y, z, joints[i, ka.QD], joints[i + 1, ka.QD], joints[i + 2, ka.QD])
@@ -208,13 +202,11 @@ def position_rates(compound, model: ModelArrays, ws: Workspace, dy, start):
 
 
 @internal_kernel
-def displace(compound, model: ModelArrays, ws: Workspace, y, start):
+def displace(model: ModelArrays, ws: Workspace, y, start):
     """Move the positions y[start:] by the small displacement in the QDD column, taken as velocities for a unit time."""
-    if compound is None:  # known to the compiler
-        return
     tree, joints = model.tree, ws.joints
     for i in range(tree.shape[0]):
-        k, kind = start + compound[i, ka.POSITION_INDEX], tree[i, ka.KIND]
+        k, kind = start + tree[i, ka.POSITION_INDEX], tree[i, ka.KIND]
         if kind == ka.BALL_X:
             w, x, y0, z = y[k], y[k + 1], y[k + 2], y[k + 3]
             change = quaternion_rate(w, x, y0, z, joints[i, ka.QDD], joints[i + 1, ka.QDD], joints[i + 2, ka.QDD])
@@ -238,31 +230,27 @@ def displace(compound, model: ModelArrays, ws: Workspace, y, start):
 
 
 @internal_kernel
-def normalise(compound, model: ModelArrays, y, start):
+def normalise(model: ModelArrays, y, start):
     """Give every quaternion in y[start:] unit length."""
-    if compound is None:  # known to the compiler
-        return
     tree = model.tree
     for i in range(tree.shape[0]):
         if tree[i, ka.KIND] == ka.BALL_X:
-            k = start + compound[i, ka.POSITION_INDEX]
+            k = start + tree[i, ka.POSITION_INDEX]
             scale = 1.0 / math.sqrt(y[k] * y[k] + y[k + 1] * y[k + 1] + y[k + 2] * y[k + 2] + y[k + 3] * y[k + 3])
             for s in range(4):
                 y[k + s] *= scale
 
 
 @internal_kernel
-def position_error(compound, model: ModelArrays, y, y_new, error, start, rtol, atol):
+def position_error(model: ModelArrays, y, y_new, error, start, rtol, atol):
     """Sum of squares of the errors of the positions, each per its tolerance, and their number: for the step control.
 
     The error of a quaternion counts as the three angles 2 vec(q̄ ∘ δq) of the rotation that undoes it, against
     atol + rtol [rad]: what a revolute joint one radian from zero is held to.
     """
-    if compound is None:  # known to the compiler
-        return 0.0, 0
     tree, total, count = model.tree, 0.0, 0
     for i in range(tree.shape[0]):
-        k, kind = start + compound[i, ka.POSITION_INDEX], tree[i, ka.KIND]
+        k, kind = start + tree[i, ka.POSITION_INDEX], tree[i, ka.KIND]
         if kind == ka.BALL_X:
             w, x, y0, z = y_new[k], y_new[k + 1], y_new[k + 2], y_new[k + 3]
             dw, dx, dy, dz = error[k], error[k + 1], error[k + 2], error[k + 3]
@@ -280,19 +268,17 @@ def position_error(compound, model: ModelArrays, y, y_new, error, start, rtol, a
 
 
 @internal_kernel
-def positions_along(compound, model: ModelArrays, y, start, u, out):
+def positions_along(model: ModelArrays, y, start, u, out):
     """out[start:] ← out[start:] + N(q) u, positions of y[start:], rates u (n,); both may be complex."""
-    if compound is None:  # known to the compiler
-        return
     tree = model.tree
     for i in range(tree.shape[0]):
-        k, kind = start + compound[i, ka.POSITION_INDEX], tree[i, ka.KIND]
+        k, kind = start + tree[i, ka.POSITION_INDEX], tree[i, ka.KIND]
         if kind == ka.BALL_X:
             change = quaternion_rate(y[k], y[k + 1], y[k + 2], y[k + 3], u[i], u[i + 1], u[i + 2])
             for s in range(4):
                 out[k + s] += change[s]
         elif kind == ka.ROLL:
-            s, c = sine_cosine_of(y[start + compound[i + 1, ka.POSITION_INDEX]])
+            s, c = sine_cosine_of(y[start + tree[i + 1, ka.POSITION_INDEX]])
             out[k] += c * u[i]
             out[k + 1] += s * u[i]
         elif kind == ka.LEFT_WHEEL:
@@ -307,19 +293,17 @@ def positions_along(compound, model: ModelArrays, y, start, u, out):
 
 
 @internal_kernel
-def rates_across(compound, model: ModelArrays, y, start, d, out):
+def rates_across(model: ModelArrays, y, start, d, out):
     """Rates out (n,) whose positions change as d[start:] does, as far as rates can: N⁺ d; both may be complex."""
-    if compound is None:  # known to the compiler
-        return
     tree = model.tree
     for i in range(tree.shape[0]):
-        k, kind = start + compound[i, ka.POSITION_INDEX], tree[i, ka.KIND]
+        k, kind = start + tree[i, ka.POSITION_INDEX], tree[i, ka.KIND]
         if kind == ka.BALL_X:
             turn = quaternion_turn(y[k], y[k + 1], y[k + 2], y[k + 3], d[k], d[k + 1], d[k + 2], d[k + 3])
             for s in range(3):
                 out[i + s] = 2.0 * turn[s]
         elif kind == ka.ROLL:
-            s, c = sine_cosine_of(y[start + compound[i + 1, ka.POSITION_INDEX]])
+            s, c = sine_cosine_of(y[start + tree[i + 1, ka.POSITION_INDEX]])
             out[i] = c * d[k] + s * d[k + 1]
         elif kind != ka.BALL_Y and kind != ka.BALL_Z:
             out[i] = d[k]

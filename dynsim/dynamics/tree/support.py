@@ -88,7 +88,7 @@ def ground_reaction(model: ModelArrays, loads: LoadArrays, t, ws: Workspace, sup
     index, base, state = support.index, support.base, support.state
     W = ZERO_SIX
     for i in range(joints.shape[0]):
-        row_rates(model.compound, model, ws, i, joints[i, ka.QD], joints[i, ka.QDD], gravity[0], gravity[1], gravity[2])
+        row_rates(model, ws, i, joints[i, ka.QD], joints[i, ka.QDD], gravity[0], gravity[1], gravity[2])
         mass, centre, inertia = body_inertia(model, ws, i)
         W = plus(W, inertial_wrench(ws, i, mass, centre, inertia))
     for k in range(ws.counts[ka.ROWS]):
@@ -143,10 +143,8 @@ def ground_reaction(model: ModelArrays, loads: LoadArrays, t, ws: Workspace, sup
 
 
 @internal_kernel
-def tip_margin(compound, model: ModelArrays, loads: LoadArrays, t, ws: Workspace, support: SupportArrays):
+def tip_margin(model: ModelArrays, loads: LoadArrays, t, ws: Workspace, support: SupportArrays):
     """The tip margin by :func:`ground_reaction`; a robot without a mobile base does not tip."""
-    if compound is None:  # known to the compiler: the wheels of a base share rates
-        return math.inf
     if support.index.shape[0] == 0:
         return math.inf
     ground_reaction(model, loads, t, ws, support)

@@ -102,7 +102,7 @@ def forward_sweep(model: ModelArrays, ws: Workspace, velocity, acceleration, gra
             put_six(links, i, ka.A, (S[0] * ai, S[1] * ai, S[2] * ai, S[3] * ai - gx, S[4] * ai - gy, S[5] * ai - gz))
         if k > ka.PRISMATIC:
             # Apart from the rest, which keeps its values in registers.
-            sweep_row(model.compound, model, ws, i, vi, ai, gx, gy, gz)
+            sweep_row(model, ws, i, vi, ai, gx, gy, gz)
 
 
 @internal_kernel

@@ -55,7 +55,7 @@ def solve_newton(system: System, y, r: NewtonArrays, g, inverse, x):
     first = 2 * n - layout.current  # of the rows of circuits
     angle, solved = x[q : q + n].copy(), x.copy()
     if layout.extra > 0:
-        rates_across(system.model.compound, system.model, y, q, x, angle)
+        rates_across(system.model, y, q, x, angle)
     angle /= g
     u = x[v : v + n] + angle @ along[:n]
     circuits = [
@@ -71,7 +71,7 @@ def solve_newton(system: System, y, r: NewtonArrays, g, inverse, x):
         solved[e] = (x[e] + pull) / (g - row[ka.RATE_I])
     solved[v : v + n] = u
     if layout.extra > 0:
-        positions_along(system.model.compound, system.model, y, q, u, solved)
+        positions_along(system.model, y, q, u, solved)
         solved[q : q + n + layout.extra] /= g
     else:
         solved[q : q + n] = angle + u / g
@@ -159,7 +159,7 @@ def multiply_on_lanes(system, ws, y, r, h):
     for j in range(x.shape[0]):
         x[j] = four(r.one[j], r.two[j].real, r.two[j].imag, 0.0)
     if layout.extra > 0:
-        rates_across(system.model.compound, system.model, y, q, x, angle)
+        rates_across(system.model, y, q, x, angle)
     for i in range(n):
         e = angle[i] if layout.extra > 0 else x[q + i]
         angle[i] = e * op + turned(e) * om
@@ -197,7 +197,7 @@ def multiply_on_lanes(system, ws, y, r, h):
     else:
         for i in range(n):
             u[i] = x[v + i]
-        positions_along(system.model.compound, system.model, y, q, u, x)
+        positions_along(system.model, y, q, u, x)
         for j in range(q, q + n + layout.extra):
             e = x[j]
             x[j] = e * op + turned(e) * om

@@ -85,7 +85,7 @@ def displaced(system: System, ws: Workspace, y, s, x):
     if s < n and layout.extra > 0:
         for i in range(n):
             ws.joints[i, ka.QDD] = 1e-7 if i == s else 0.0
-        displace(system.model.compound, system.model, ws, x, layout.q)
+        displace(system.model, ws, x, layout.q)
         return 1e-7
     j = layout.q + s if s < n else layout.v + s - n if s < 2 * n else layout.current + s - 2 * n
     delta = 1e-3 if s >= 2 * n else 1e-8 * max(abs(y[j]), 0.1) if s >= n else 1e-7 * max(abs(y[j]), 1.0)

@@ -43,7 +43,7 @@ def step_moreau(system: System, ws: Workspace, run: Run):
     """One step from y to y_new; mean accelerations and forces stay in the workspace."""
     s, y, layout = run.stepping, run.y, system.layout
     v0, v_bias, last = s.before[kt.V_START], s.before[kt.V_BIAS], s.before[kt.ACCELERATION]
-    model = ModelArrays(system.model.tree, s.body, system.model.gravity, system.model.compound)
+    model = ModelArrays(system.model.tree, s.body, system.model.gravity)
     begin_energy(system, ws, run)
     recall(system, s, ws, y)
     for i in range(ws.joints.shape[0]):
@@ -303,7 +303,7 @@ def sample_moreau(system: System, ws: Workspace, run: Run):
         for j in range(row.shape[0]):
             row[j] = run.y[j] + x * (run.y_new[j] - run.y[j])
         if system.layout.extra > 0:
-            normalise(system.model.compound, system.model, row, system.layout.q)
+            normalise(system.model, row, system.layout.q)
         place_joints(system, ws, row)
         for i in range(ws.joints.shape[0]):
             ws.joints[i, ka.QD], ws.joints[i, ka.APPLIED] = row[system.layout.v + i], 0.0

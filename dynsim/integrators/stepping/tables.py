@@ -158,8 +158,8 @@ def moved(system, ws: Workspace, y, scale, out):
         for i in range(ws.joints.shape[0]):
             out[layout.q + i] += ws.joints[i, ka.QDD]
     else:
-        displace(system.model.compound, system.model, ws, out, layout.q)
-        normalise(system.model.compound, system.model, out, layout.q)
+        displace(system.model, ws, out, layout.q)
+        normalise(system.model, out, layout.q)
 
 
 @internal_kernel
@@ -167,7 +167,7 @@ def place_joints(system, ws: Workspace, y):
     """Positions of y into ``ws.joints``."""
     layout = system.layout
     if layout.extra > 0:
-        read_positions(system.model.compound, system.model, y, layout.q, ws)
+        read_positions(system.model, y, layout.q, ws)
         return
     for i in range(ws.joints.shape[0]):
         ws.joints[i, ka.Q] = y[layout.q + i]

@@ -91,11 +91,7 @@ def brace_statics(
 @internal_kernel
 def set_motion(model: ModelArrays, ws: Workspace, q, v, vdot):
     """Coordinates, rates and accelerations into the workspace."""
-    if model.compound is None:  # known to the compiler
-        for j in range(v.shape[0]):
-            ws.joints[j, ka.Q] = q[j]
-    else:
-        read_positions(model.compound, model, q, 0, ws)
+    read_positions(model, q, 0, ws)
     for j in range(v.shape[0]):
         ws.joints[j, ka.QD], ws.joints[j, ka.QDD] = v[j], vdot[j]
 
