@@ -72,7 +72,6 @@ TIME = {
 }
 # Lines that no state comes to, as far as is known; they do not branch.
 AGAIN = "M* begins with the signs that the articulated solve has found: only rounding could turn one"
-COMPOUND = "for the compiler: systems whose joints are all single rows do not call it"
 # Real contact has forms of its own, which test_lanes_compiled runs; bodies that are more than points have no lanes.
 WITHOUT_LANES = (admissible_forces, slide_direction, shaped_rows)
 UNILATERAL = "the cases here are of the bilateral law"
@@ -84,9 +83,6 @@ NEVER = {
     ): UNILATERAL,
     Place("contact/quadrics.py", "contact_rows", "t = x, y, z"): UNILATERAL,
     Place("contact/quadrics.py", "contact_rows", "rows[m, ka.ROW_MU] = mu"): UNILATERAL,
-    Place("tree/joints.py", "read_positions", "return"): COMPOUND,
-    Place("tree/joints.py", "position_rates", "return"): COMPOUND,
-    Place("tree/joints.py", "sweep_row", "return"): COMPOUND,
     Place("derivative.py", "m_star_acceleration", "passes += 1"): AGAIN,
     Place("derivative.py", "m_star_acceleration", "solve_m_star(dense, model, drives, ws)"): AGAIN,
 }

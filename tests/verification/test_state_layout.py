@@ -116,6 +116,7 @@ def random_pair(seed: int, *, gap: int = 2, m_star: bool = False, real: bool = F
     contacts = random_contacts(rng, robot, q, 2)
     standard = bench(robot, contacts, m_star=m_star, held=q[: len(robot.motors)] + 0.3, real=real)
     assert standard.sizes[1] >= 2
+    standard = standard.with_shapes() if real else standard
     y = standard.state(q + rng.normal(scale=1e-4, size=6), rng.normal(size=6), rng.normal(size=len(robot.motors)))
     # Integrals need not begin at zero.
     standard.part(y, "ledger")[:] = rng.normal(size=width(standard.system.layout, "ledger"))
