@@ -458,6 +458,49 @@ def sweeps() -> str:
     return lines(["runs", "one process", "two processes"], rows)
 
 
+@cache
+def swept(name: str) -> dict[tuple[str, float], dict[str, str]]:
+    """Rows of a sweep over one key, by variant and value."""
+    with (ROOT / "results" / "sweeps" / name / "sweep.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    key = list(rows[0])[2]
+    return {(row["variant"], float(row[key])): row for row in rows}
+
+
+def over_friction(variant: str, column: str, which: Callable[[list[float]], float]) -> float:
+    """Least or largest number of a configuration over all frictions."""
+    return which([float(row[column]) for (name, _), row in swept("friction").items() if name == variant])
+
+
+def energy_share(friction: float) -> str:
+    """Energy of the arm on two elbows over that of the free one [%]."""
+    two, free = (float(swept("friction")[name, friction]["electrical_energy_J"]) for name in ("two_elbows", "no_elbow"))
+    return fixed(100 * two / free, 1)
+
+
+def voltage_needed(*variants: str) -> int:
+    """Least whole voltage from which on the hand is off by at most 2 % more than at 24 V."""
+    error = {place: float(row["hand_error_rms_m"]) for place, row in swept("voltage").items() if place[0] in variants}
+    enough = {(name, volt) for (name, volt), off in error.items() if off <= 1.02 * error[name, 24.0]}
+    return min(
+        volt for volt in range(1, 25) if all((name, float(v)) in enough for name in variants for v in range(volt, 25))
+    )
+
+
+def of_masses(number: str, key: str, scale: float = 1.0) -> float:
+    """Statistics of a number of the summary over random masses of links."""
+    found = data("sweeps/tolerance/statistics.json")[0]["numbers"][number]
+    return scale * float(found["mean_high"] - found["mean"] if key == "interval" else found[key])
+
+
+def last_link_effect() -> float:
+    """What one standard deviation of the last link's mass does, which is the most that any link does [J]."""
+    effect: dict[str, float] = data("sweeps/tolerance/statistics.json")[0]["numbers"]["electrical_energy_J"]["effect"]
+    largest = max(effect, key=lambda key: abs(effect[key]))
+    assert largest == "plant.chain.9.mass_kg", largest
+    return effect[largest]
+
+
 def snake_bench() -> str:
     rows = [
         [
@@ -709,6 +752,30 @@ def snake_areas() -> str:
     return lines(("cost, cyclic switching", "support area [m²]", "base part, rms angle [rad]"), rows, left=1)
 
 
+def snake_on_servos() -> str:
+    """What the check before a replay says of the kinematic records, with the shipped map and with a wider one."""
+    rows: dict[tuple[str, ...], list[str]] = {}
+    for name, variants in kinematic()["servos"].items():
+        for variant, said in variants.items():
+            title = f"`{variant}`" if variant else ""
+            rows.setdefault((f"`{name}`", reason(said["shipped"]), reason(said["wider"])), []).append(title)
+    shown = [(f"{name} {', '.join(titles)}".strip(), *said) for (name, *said), titles in rows.items()]
+    return lines(("record", "shipped map", "wider map"), shown, left=3)
+
+
+def reason(refusal: str) -> str:
+    """In short why a replay is refused."""
+    if not refusal:
+        return "passes"
+    first, *entries = refusal.splitlines()
+    if not entries:
+        return re.split(r"[:;(]", first)[0].strip()
+    violated = [entry.partition(", margin")[0].strip() for entry in entries if "margin" in entry]
+    more = f", and {len(violated) - 1} more" if len(violated) > 1 else ""
+    way = f"; `{entries[-1].split(' would')[0].strip()}` passes" if "would pass" in entries[-1] else ""
+    return f"{violated[0]}{more}{way}"
+
+
 def backward_circle() -> dict[str, Any]:
     """The circle backward that is completed."""
     return of_kinematic("snake_circle_backward")
@@ -737,7 +804,7 @@ TABLES: dict[str, Callable[[], str]] = {
         elbows_in_short, elbows, glued_and_real, overturning_holds, overturning_drives, assumptions, ledger,
         snake_table_iii, time_stepping, endings, right_hand_side, ratios, job, precision, sweeps, snake_bench,
         comparison, faults, planned_arm, planned_gains, planned_scenes, snake_positioning, snake_limits, snake_ways,
-        snake_circles, snake_order, snake_areas,
+        snake_circles, snake_order, snake_areas, snake_on_servos,
     )
 }  # fmt: skip
 
@@ -902,6 +969,28 @@ NUMBERS |= {
     ),
     "planned_instants": lambda: fixed(planned_change("with_4_times_the_instants_W"), 1),
     "planned_nominal": lambda: fixed(planned_change("simulated_W"), 1),
+    "friction_share_low": lambda: energy_share(0.0),
+    "friction_share_high": lambda: energy_share(0.5),
+    "friction_two_low": lambda: fixed(over_friction("two_elbows", "electrical_energy_J", min), 0),
+    "friction_two_high": lambda: fixed(over_friction("two_elbows", "electrical_energy_J", max), 0),
+    "friction_free": lambda: fixed(over_friction("no_elbow", "electrical_energy_J", max), 0),
+    "friction_mm_low": lambda: fixed(1e3 * over_friction("two_elbows", "hand_error_rms_m", min), 0),
+    "friction_mm_high": lambda: fixed(1e3 * over_friction("two_elbows", "hand_error_rms_m", max), 0),
+    "friction_mm_free": lambda: fixed(1e3 * over_friction("no_elbow", "hand_error_rms_m", max), 0),
+    "volts_braced": lambda: str(voltage_needed("two_elbows", "elbow_7")),
+    "volts_4": lambda: str(voltage_needed("elbow_4")),
+    "volts_free": lambda: str(voltage_needed("no_elbow")),
+    "volts_off_m": lambda: fixed(float(swept("voltage")["two_elbows", 3.0]["hand_error_rms_m"]), 2),
+    "masses_J": lambda: fixed(of_masses("electrical_energy_J", "mean"), 3),
+    "masses_J_interval": lambda: fixed(of_masses("electrical_energy_J", "interval"), 3),
+    "masses_J_low": lambda: fixed(of_masses("electrical_energy_J", "low"), 1),
+    "masses_J_high": lambda: fixed(of_masses("electrical_energy_J", "high"), 1),
+    "masses_mm": lambda: fixed(of_masses("hand_error_rms_m", "mean", 1e3), 3),
+    "masses_mm_interval": lambda: fixed(of_masses("hand_error_rms_m", "interval", 1e3), 3),
+    "masses_mm_low": lambda: fixed(of_masses("hand_error_rms_m", "low", 1e3), 1),
+    "masses_mm_high": lambda: fixed(of_masses("hand_error_rms_m", "high", 1e3), 1),
+    "masses_explained": lambda: fixed(of_masses("electrical_energy_J", "explained", 100.0), 2),
+    "masses_last_J": lambda: fixed(last_link_effect(), 2),
     "pipe_sticks": lambda: fixed(100 * run("brace_on_cylinder real")["contacts"]["elbow"]["sticking_fraction"], 1),
     "pipe_glued_J": lambda: energy("brace_on_cylinder glued"),
     "pipe_free_J": lambda: fixed(run("brace_on_cylinder free")["electrical_energy_J"], 0),

@@ -6,14 +6,19 @@ in half a minute with compiled kernels.
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 from dynsim._version import __version__
 from dynsim.engine import simulate
+from dynsim.errors import CheckRefused
+from dynsim.hardware.replay.check import check_motion
+from dynsim.hardware.servo_map import SHIPPED, ServoMap, load_servo_map
 from dynsim.record import Record
 from dynsim.scenario import load_scenario, variant_names
 from dynsim.system.files import write_json
@@ -44,6 +49,8 @@ KEPT = (
 )
 # The circle backward with less time, or with a larger least margin: duration of the path [s], margin [m].
 CIRCLES = ((400.0, 0.02), (200.0, 0.01), (200.0, 0.02))
+# Of a servo map: height of a wheel on the ground that is allowed [mm], acceleration up to a motion's start [rad/s²].
+TILT_MM, RUN_UP = 18.0, 10.0
 # Of the redundancy, for the order in which the joints of the base become straight.
 NULL_GAINS = (0.1, 0.3, 1.0)
 
@@ -64,6 +71,25 @@ def outcome(record: Record) -> dict[str, Any]:
         "base_rms_rad": float(np.sqrt(np.mean(record["phi"][-1, 6:] ** 2))),
         "cost_rise_max_within_a_mode": float(rise[same].max()),
     }
+
+
+def wider_map() -> ServoMap:
+    """The shipped servo map, for a robot whose grounded wheels may rise and whose joints may start fast."""
+    content = yaml.safe_load((SHIPPED / "snake.yaml").read_text(encoding="utf-8"))
+    content["lifts"]["tilt_mm"], content["safety"]["run_up"] = TILT_MM, RUN_UP
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder, "snake.yaml")
+        file.write_text(yaml.safe_dump(content), encoding="utf-8")
+        return load_servo_map(file)
+
+
+def verdict(record: Record, servo_map: ServoMap) -> str:
+    """What ``dynsim hw check`` says of a record at its own speed: its first reason to refuse it, or nothing."""
+    try:
+        check_motion(record, servo_map)
+    except CheckRefused as refused:
+        return str(refused)
+    return ""
 
 
 def halved(record: Record) -> dict[str, float | None]:
@@ -96,17 +122,23 @@ def order(null_gain: float) -> dict[str, Any]:
 
 def study() -> dict[str, Any]:
     """All of it."""
+    maps = {"shipped": load_servo_map("snake"), "wider": wider_map()}
+    runs: dict[str, dict[str, Any]] = {}
+    servos: dict[str, dict[str, Any]] = {}
+    for name in NAMES:
+        runs[name], servos[name] = {}, {}
+        for variant in variant_names(name) or [None]:
+            record = simulated(name, variant)
+            runs[name][variant or ""] = outcome(record)
+            servos[name][variant or ""] = {kind: verdict(record, one) for kind, one in maps.items()}
+    predictive = simulated("snake_joint_limits", "eq20", {"controller.switching.policy": "predictive"})
     return {
         "dynsim_version": __version__,
-        "runs": {
-            name: {variant or "": outcome(simulated(name, variant)) for variant in variant_names(name) or [None]}
-            for name in NAMES
-        },
+        "runs": runs,
+        "servos": servos,
         "circles": [circle(duration, margin) for duration, margin in CIRCLES],
         "order": [order(gain) for gain in NULL_GAINS],
-        "eq20_predictive": outcome(
-            simulated("snake_joint_limits", "eq20", {"controller.switching.policy": "predictive"})
-        ),
+        "eq20_predictive": outcome(predictive),
     }
 
 
