@@ -895,6 +895,8 @@ NUMBERS: dict[str, Callable[[], str]] = {
     "cold_cpu_s": lambda: number(start_up()["radau5"]["cold"]["cpu_s"], 2),
     "warm_wall_s": lambda: number(start_up()["radau5"]["warm"]["wall_s"], 2),
     "warm_cpu_s": lambda: number(start_up()["radau5"]["warm"]["cpu_s"], 2),
+    "compare_wall_s": lambda: number(start_up()["radau5"]["compare"]["wall_s"], 2),
+    "compare_cpu_s": lambda: number(start_up()["radau5"]["compare"]["cpu_s"], 2),
     "cold_explicit_cpu_s": lambda: number(start_up()["dopri5"]["cold"]["cpu_s"], 2),
     "rotor_disc_J": lambda: fixed(validation()["electrical_energy_by_rotor_model_J"]["spinning"], 2),
     "rotor_armature_J": lambda: fixed(validation()["electrical_energy_by_rotor_model_J"]["armature"], 2),

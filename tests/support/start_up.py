@@ -24,14 +24,22 @@ METHODS = ("radau5", "dopri5")
 
 
 def measure(method: str) -> dict[str, dict[str, float]]:
-    """Wall time and processor time of all processes [s] of a run with an empty kernel cache, and of the next one."""
+    """A run with an empty kernel cache and the next one; a comparison of all variants with figures and page, twice.
+
+    The first one makes matplotlib's list of fonts.
+    """
+    run = ["run", SCENARIO, "--no-figures", "--set", f"integrator.method={method}"]
+    compare = ["compare", SCENARIO, "--set", f"integrator.method={method}"]
     with tempfile.TemporaryDirectory() as folder:
-        return {kind: _run(method, Path(folder)) for kind in ("cold", "warm")}
+        return {
+            kind: _timed(command, Path(folder))
+            for kind, command in (("cold", run), ("warm", run), ("first_compare", compare), ("compare", compare))
+        }
 
 
-def _run(method: str, folder: Path) -> dict[str, float]:
-    command = [sys.executable, "-m", "dynsim", "run", SCENARIO, "--no-figures", "--quiet"]
-    command += ["--set", f"integrator.method={method}", "--out", str(folder / "out")]
+def _timed(arguments: list[str], folder: Path) -> dict[str, float]:
+    """Wall time and processor time of all processes [s]."""
+    command = [sys.executable, "-m", "dynsim", *arguments, "--quiet", "--out", str(folder / arguments[0])]
     before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
     subprocess.run(command, check=True, env={**os.environ, "XDG_CACHE_HOME": str(folder / "cache")})
     wall, after = time.monotonic() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
