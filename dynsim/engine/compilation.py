@@ -19,12 +19,12 @@ from pathlib import Path
 
 from dynsim.jit.kernel import cache_folder, told_of_compilation
 
-# Beside the folders of kernels: how long the last compilation took.
-LAST = "compiled_in_s"
+# Beside the folders of kernels: how long the last compilation took, by what was compiled [s].
+LAST = "compiled_in_s.json"
 # Of a file that says what a process compiles.
 MARK = ".compiling"
 # Without a compilation to go by [s].
-USUAL = "30 to 160 s on two cores"
+USUAL = "seconds to two minutes on two cores"
 # Between two looks of a display [s].
 LOOK_S = 0.5
 
@@ -40,7 +40,7 @@ class Compilation:
     ----------
     text : what, why and how long
     since : time of the clock at its beginning [s]
-    expected : how long the last one took [s]; None: there was none
+    expected : how long the last one of this kind took [s]; None: there was none
     """
 
     text: str
@@ -82,11 +82,19 @@ def kernels_logged(log: logging.Logger, kind: str = "", loads: bool = True) -> I
     taken = clock.perf_counter() - started
     if compiling:
         with suppress(OSError):
-            (cache_folder().parent / LAST).write_text(f"{taken:.0f}")
+            (cache_folder().parent / LAST).write_text(json.dumps(_durations() | {kind: round(taken)}))
         if on_terminal:
             print(f"dynsim: compiled the kernels in {taken:.0f} s", file=sys.stderr, flush=True)
     if compiling or loads:
         log.info("%s the kernels in %.1f s", "compiled" if compiling else "loaded", taken)
+
+
+def _durations() -> dict[str, float]:
+    """How long the last compilation of each kind took [s]; of a file that cannot be read none."""
+    with suppress(OSError, ValueError, TypeError, AttributeError):
+        known = json.loads((cache_folder().parent / LAST).read_text())
+        return {kind: float(seconds) for kind, seconds in known.items()}
+    return {}
 
 
 def _beginning(kind: str) -> Compilation:
@@ -97,9 +105,7 @@ def _beginning(kind: str) -> Compilation:
         if others
         else "the first since dynsim, numba or numpy were installed, updated or edited"
     )
-    expected = None
-    with suppress(OSError, ValueError):
-        expected = float((folder.parent / LAST).read_text())
+    expected = _durations().get(kind)
     last = USUAL if expected is None else f"the last time took {expected:.0f} s"
     purpose = f" for {kind}" if kind else ""
     return Compilation(f"compiling the kernels{purpose}, {why}: {last}, later runs load them", clock.time(), expected)

@@ -46,14 +46,31 @@ def test_the_log_says_what_why_and_how_long(folder: Path, caplog: pytest.LogCapt
             assert _double() == 6
     first, done, loaded = [entry.getMessage() for entry in caplog.records]
     assert first.startswith("compiling the kernels for arms by radau5, the first since dynsim, numba or numpy were")
-    assert "30 to 160 s" in first
+    assert "seconds to two minutes" in first
     assert done.startswith("compiled the kernels in ")
     assert loaded.startswith("loaded the kernels in ")
-    # Another kind, with a time to go by.
+    # Again, with a time of this kind to go by; that of another kind says nothing, nor does a file that is damaged.
+    lost = folder / "other.kernel"
+    for content, told in (
+        ('{"wheels": 43, "arms by radau5": 2}', "the last time took 43 s"),
+        ('{"arms by radau5": 43}', "seconds to two minutes"),
+        ('["wheels"]', "seconds to two minutes"),
+        ("43", "seconds to two minutes"),
+        ("", "seconds to two minutes"),
+    ):
+        caplog.clear()
+        (folder.parent / compilation.LAST).write_text(content)
+        for kernel in folder.glob("*.kernel"):
+            kernel.rename(lost)
+        with compilation.kernels_logged(log, "wheels", loads=False):
+            _double()
+        assert told in caplog.records[0].getMessage()
+    known = json.loads((folder.parent / compilation.LAST).read_text())
+    assert known.keys() == {"wheels"}
     caplog.clear()
-    (folder.parent / compilation.LAST).write_text("43")
     for kernel in folder.glob("*.kernel"):
-        kernel.rename(folder / "other.kernel")
+        kernel.rename(lost)
+    (folder.parent / compilation.LAST).write_text('{"": 43}')
     with compilation.kernels_logged(log, loads=False):
         _double()
     text = caplog.records[0].getMessage()
