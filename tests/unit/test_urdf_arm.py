@@ -55,6 +55,12 @@ def test_joints_start_and_lose_in_the_units_of_their_kind(scenario: Path):
             load_scenario(scenario, overrides={f"plant.{key}.{joint}": 1})
 
 
+def test_a_missing_file_is_told_with_its_line(scenario: Path):
+    scenario.write_text(SCENARIO.replace("slide.urdf", "slde.urdf"))
+    with pytest.raises(ScenarioError, match=r"case.yaml:2: plant.file = '.*slde.urdf': no such file"):
+        load_scenario(scenario)
+
+
 def test_dry_friction_of_the_file_holds_at_rest(scenario: Path):
     """Gravity pulls the car of 1 kg and the arm along the rail with 19.62 N."""
     text = SLIDE.replace("<limit lower", '<dynamics friction="30"/><limit lower')

@@ -15,6 +15,7 @@ from dynsim.errors import ModelError
 from dynsim.library import families
 from dynsim.model.description import Array, Robot
 from dynsim.model.drives import Drive
+from dynsim.system.inputs import is_file
 
 ENGINE = "dynamics"
 
@@ -69,6 +70,8 @@ class Config(StrictConfig):
         from dynsim.model.urdf.reader import MOVING, SEVERAL, read_tree, suggestion
 
         try:
+            if not is_file(self.file, ModelError):
+                raise error_at("file", "no such file")
             joints = read_tree(Path(self.file)).joints
         except ModelError:
             return self
