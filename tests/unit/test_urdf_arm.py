@@ -57,7 +57,7 @@ def test_joints_start_and_lose_in_the_units_of_their_kind(scenario: Path):
 
 def test_a_missing_file_is_told_with_its_line(scenario: Path):
     scenario.write_text(SCENARIO.replace("slide.urdf", "slde.urdf"))
-    with pytest.raises(ScenarioError, match=r"case.yaml:2: plant.file = '.*slde.urdf': no such file"):
+    with pytest.raises(ScenarioError, match=r"case.yaml:2: plant.file = .*: no such file"):
         load_scenario(scenario)
 
 
