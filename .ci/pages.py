@@ -860,6 +860,50 @@ def brush() -> dict[str, Any]:
     return found
 
 
+def of_each(key: str) -> list[float]:
+    """A number of the four configurations."""
+    return [float(one[key]) for one in validation()["elbows"].values()]
+
+
+def at_the_start(key: str) -> float:
+    """Of the glued elbows, and when they pull."""
+    return float(validation()["forces_with_two_elbows"][key])
+
+
+def apart(which: str, key: str) -> float:
+    """How far two runs differ."""
+    return float(validation()["differences"][which][key])
+
+
+def assumed(case: str) -> dict[str, float]:
+    """Two elbows with one assumption changed."""
+    found: dict[str, float] = data("reference/assumptions.json")["cases"][case]["two_elbows"]
+    return found
+
+
+def dissipative_energy() -> float:
+    return assumed("friction μ |f_n|")["electrical_energy_J"]
+
+
+def on_floor(first: str, second: str, key: str) -> float:
+    """Ratio of two configurations on a real floor."""
+    return float(contact()["elbow_comparison_floor"][first][key] / contact()["elbow_comparison_floor"][second][key])
+
+
+def real_less_glued(variant: str, key: str) -> float:
+    return float(contact()["elbow_comparison_floor"][variant][key] - contact()["elbow_comparison"][variant][key])
+
+
+def longest_below_zero_ms() -> float:
+    """How long the tip margin of a base that is braced is below zero at the start."""
+    spans = [
+        one["margin_below_zero_s"][0]
+        for variant, one in overturning()["mobile_elbow_comparison"].items()
+        if variant != "no_elbow"
+    ]
+    return 1e3 * max(end - begin for begin, end in spans)
+
+
 HELD_CASE = "two elbows held, no friction"
 NUMBERS: dict[str, Callable[[], str]] = {
     "saving": lambda: fixed(ratio_of_energies("elbow_comparison no_elbow", "elbow_comparison two_elbows"), 0),
@@ -993,6 +1037,67 @@ NUMBERS |= {
     "masses_mm_high": lambda: fixed(of_masses("hand_error_rms_m", "high", 1e3), 1),
     "masses_explained": lambda: fixed(of_masses("electrical_energy_J", "explained", 100.0), 2),
     "masses_last_J": lambda: fixed(last_link_effect(), 2),
+    "work_two": lambda: fixed(validation()["elbows"]["two_elbows"]["mechanical_work_J"], 2),
+    "work_none": lambda: fixed(validation()["elbows"]["no_elbow"]["mechanical_work_J"], 2),
+    "exchanged_low": lambda: fixed(min(of_each("sum_of_absolute_power_J")), 1),
+    "exchanged_high": lambda: fixed(max(of_each("sum_of_absolute_power_J")), 1),
+    "seven_more": lambda: fixed(
+        100 * (ratio_of_energies("elbow_comparison elbow_7", "elbow_comparison two_elbows") - 1), 0
+    ),
+    "late_4_low": lambda: _depth("elbow_4", "joint_depth_from_2_s_min_m"),
+    "late_4_high": lambda: _depth("elbow_4", "joint_depth_from_2_s_max_m"),
+    "late_none_low": lambda: _depth("no_elbow", "joint_depth_from_2_s_min_m"),
+    "late_none_high": lambda: _depth("no_elbow", "joint_depth_from_2_s_max_m"),
+    "depth_7": lambda: fixed(1e3 * validation()["elbows"]["elbow_7"]["joint_depth_max_m"], 1),
+    "push_ms": lambda: fixed(1e3 * at_the_start("pushes_until_s"), 0),
+    "push_N": lambda: fixed(at_the_start("push_max_N"), 1),
+    "pull_N": lambda: fixed(at_the_start("pull_max_N"), 1),
+    "pull_then_N": lambda: fixed(-at_the_start("at_0.1_s_N"), 1),
+    "pull_low_N": lambda: fixed(at_the_start("pull_from_0.17_s_min_N"), 1),
+    "pull_high_N": lambda: fixed(at_the_start("pull_from_0.17_s_max_N"), 1),
+    "pull_7_from_ms": lambda: fixed(1e3 * at_the_start("elbow_7_pulls_from_s"), 1),
+    "pull_7_until_ms": lambda: fixed(1e3 * at_the_start("elbow_7_pulls_until_s"), 1),
+    "hand_off_mm": lambda: fixed(1e3 * at_the_start("hand_starts_off_m"), 0),
+    "dissipative_more": lambda: fixed(
+        100 * (dissipative_energy() / assumed("as shipped")["electrical_energy_J"] - 1), 1
+    ),
+    "real_two_seven": lambda: fixed(100 * abs(on_floor("two_elbows", "elbow_7", "electrical_energy_J") - 1), 2),
+    "glue_J": lambda: fixed(real_less_glued("two_elbows", "electrical_energy_J"), 1),
+    "glue_percent": lambda: fixed(
+        100
+        * real_less_glued("two_elbows", "electrical_energy_J")
+        / contact()["elbow_comparison"]["two_elbows"]["electrical_energy_J"],
+        1,
+    ),
+    "glue_mm": lambda: fixed(1e3 * real_less_glued("two_elbows", "hand_error_rms_m"), 1),
+    "stops_1_s": lambda: fixed(event("two_elbows", "slip_stop", 0), 1),
+    "stops_2_s": lambda: fixed(event("two_elbows", "slip_stop", 1), 1),
+    "stick_percent": lambda: fixed(
+        100
+        * real_less_glued("elbow_7", "electrical_energy_J")
+        / contact()["elbow_comparison"]["elbow_7"]["electrical_energy_J"],
+        1,
+    ),
+    "stick_mm": lambda: fixed(1e3 * real_less_glued("elbow_7", "hand_error_rms_m"), 2),
+    "brush_times": lambda: fixed(
+        brush()["electrical_energy_J"] / contact()["elbow_comparison_links"]["two_elbows"]["electrical_energy_J"], 0
+    ),
+    "soft_J": lambda: fixed(contact()["elbow_comparison_links"]["soft"]["electrical_energy_J"], 1),
+    "below_zero_ms": lambda: fixed(longest_below_zero_ms(), 1),
+    "ledger_dopri5": lambda: small(validation()["ledger_residual_of_two_elbows"]["dopri5, rtol 1e-6, 10 s"]),
+    "ledger_second_dopri5": lambda: small(validation()["ledger_residual_of_two_elbows"]["dopri5, rtol 1e-6, 1 s"]),
+    "ledger_second_dopri5_tight": lambda: small(
+        validation()["ledger_residual_of_two_elbows"]["dopri5, rtol 1e-8, 1 s"]
+    ),
+    "ledger_second_radau5": lambda: small(validation()["ledger_residual_of_two_elbows"]["radau5, rtol 1e-6, 1 s"]),
+    "ledger_second_radau5_tight": lambda: small(
+        validation()["ledger_residual_of_two_elbows"]["radau5, rtol 1e-8, 1 s"]
+    ),
+    "halved_energy": lambda: small(apart("half of rtol and atol, all variants, relative", "electrical_energy_J")),
+    "halved_work": lambda: small(apart("half of rtol and atol, all variants, relative", "mechanical_work_J")),
+    "off_dopri5_rad": lambda: small(apart("dopri5 against dopri5 at rtol 1e-11", "q_rad")),
+    "off_radau5_rad": lambda: small(apart("radau5 against dopri5 at rtol 1e-11", "q_rad")),
+    "off_m_star_rad": lambda: small(apart("m_star against articulated", "q_rad")),
     "pipe_sticks": lambda: fixed(100 * run("brace_on_cylinder real")["contacts"]["elbow"]["sticking_fraction"], 1),
     "pipe_glued_J": lambda: energy("brace_on_cylinder glued"),
     "pipe_free_J": lambda: fixed(run("brace_on_cylinder free")["electrical_energy_J"], 0),
