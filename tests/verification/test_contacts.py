@@ -16,6 +16,7 @@ from dynsim.dynamics.state import FRICTION
 from dynsim.engine import check
 from dynsim.errors import ScenarioError
 from dynsim.model.description import Contact, Quadric, Robot
+from dynsim.model.drives import TorqueSource
 from dynsim.scenario import load_scenario
 
 seeds = st.integers(0, 2**32 - 1)
@@ -56,6 +57,16 @@ def test_articulated_and_m_star_agree(seed):
     assert np.abs(fa - fb).max() <= 1e-10 * (1.0 + np.abs(fb).max())
     assert (fast.ws.counts[ka.DEPENDENT :] == 0).all()
     assert (dense.ws.counts[ka.DEPENDENT :] == 0).all()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_both_solvers_agree_on_torques_that_have_no_circuit(seed):
+    robot, contacts, q, v, _ = random_case(seed)
+    robot = replace(robot, motors=tuple(TorqueSource(motor.joint) for motor in robot.motors))
+    fast, dense = bench(robot, contacts), bench(robot, contacts, m_star=True)
+    y = fast.state(q, v)
+    a, b = fast.derivative(y), dense.derivative(y)
+    assert np.abs(a - b).max() <= 1e-9 * (1.0 + np.abs(b).max())
 
 
 @given(seeds)

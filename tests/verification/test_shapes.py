@@ -222,6 +222,29 @@ def test_tangential_rows_of_what_sticks_roll(kind, shape):
             assert abs(row - tangents[r - 1] @ change) <= 2e-6 * (1.0 + np.abs(v).max() ** 2 + np.abs(a).max()) ** 2
 
 
+def test_a_capsule_that_meets_with_an_end_has_the_rows_of_a_sphere_there():
+    for seed in range(6):
+        b, capsule, q, v, _ = random_case("sphere", "capsule", seed)
+        assert capsule.tip is not None
+        for end, other in ((capsule.tip, capsule.point), (capsule.point, capsule.tip)):
+            place, behind = (Model(b.robot).point_position("body_5", point, q) for point in (end, other))
+            ahead = (place - behind) / np.linalg.norm(place - behind)
+            beside = np.cross(ahead, np.eye(3)[np.argmin(np.abs(ahead))])
+            # A ball ahead of the end and to the side, which nothing of the capsule is nearer to than this end.
+            ball = round_surface(place + 0.5 * ahead + 0.3 * beside, 0.5)
+            rows, states = [], []
+            for contact in (
+                replace(capsule, surface=ball),
+                replace(capsule, surface=ball, point=end, tip=None),
+            ):
+                one = bench(b.robot, [contact])
+                one.derivative(one.state(q, v))
+                rows.append(one.ws.rows.copy())
+                states.append(one.ws.contacts.copy())
+            np.testing.assert_allclose(rows[0], rows[1], rtol=0, atol=1e-11 * (1.0 + np.abs(rows[1]).max()))
+            np.testing.assert_allclose(states[0], states[1], rtol=0, atol=1e-11 * (1.0 + np.abs(states[1]).max()))
+
+
 @pytest.mark.parametrize(("kind", "radius"), [("sphere", 0.06), ("cylinder", 0.06), ("plane", 0.06)])
 def test_a_sphere_is_a_point_on_the_surface_that_lies_a_radius_further_out(kind, radius):
     """Without friction: plane c − ρ, sphere and cylinder R + ρ."""
