@@ -10,6 +10,7 @@ import pytest
 
 import dynsim
 from dynsim.compile.contact_law import SETTLE_SPEED
+from dynsim.dynamics.tables import SLIDING, STICKING
 from dynsim.engine import check
 from dynsim.scenario import shipped_scenarios, variant_names
 
@@ -72,6 +73,10 @@ def test_real_contact_keeps_its_laws(run, name, variant):
     assert np.abs(np.minimum(force, gap)).max(initial=0.0) <= 1e-9
     assert not force[mode == 0.0].any()
     assert all(contact["penetration_max_m"] <= 1e-9 for contact in record.summary["contacts"])
+    # Shares of the time, by steps, are those of the samples.
+    for k, contact in enumerate(record.summary["contacts"]):
+        shares = [np.mean(mode[:, k] == kind) for kind in (SLIDING, STICKING)]
+        assert [contact["sliding_fraction"], contact["sticking_fraction"]] == pytest.approx(shares, abs=0.02)
     total = np.linalg.norm(record["contact_force"], axis=2)
     friction = np.sqrt(np.maximum(total**2 - force**2, 0.0))
     slope = contacts.friction if contacts.static_friction is None else contacts.static_friction

@@ -14,6 +14,7 @@ from dynsim.dynamics.contact.cone.problem import (
     TANGENT,
     solve_cones,
 )
+from dynsim.dynamics.contact.cone.steps import solve_block
 
 BLOCK = [CONE, TANGENT, TANGENT]
 
@@ -89,6 +90,34 @@ def test_normal_and_tangent_that_are_coupled():
     residual, f = solve(W, [-1.0, 1.0, 0.0], BLOCK, mu=mu)
     assert residual <= 1e-12
     np.testing.assert_allclose(f, [1 / (2 - mu), -mu / (2 - mu), 0.0], rtol=1e-12, atol=1e-15)
+
+
+@pytest.mark.parametrize("mu", [0.0, 0.3, 2.0])
+def test_one_block_alone_has_the_forces_of_its_law(mu):
+    """Off, or no normal motion; sticks within the cone, else on its edge, against the slip."""
+    rng, outcomes = np.random.default_rng(5), set()
+    for _ in range(60):
+        half = rng.normal(size=(3, 3))
+        W, free, f = half @ half.T + 0.3 * np.eye(3), rng.normal(size=3), np.zeros(3)
+        W[0, 1:] *= 0.3
+        W[1:, 0] = W[0, 1:]
+        solve_block(W, 0, *free, mu, f, 1e-14)
+        motion, edge = W @ f + free, mu * f[0]
+        if free[0] >= 0.0:
+            outcomes.add("off")
+            assert not f.any()
+            continue
+        assert f[0] > 0.0
+        assert abs(motion[0]) <= 1e-12
+        size, slip = np.hypot(*f[1:]), np.hypot(*motion[1:])
+        if size < edge * (1.0 - 1e-9):
+            outcomes.add("sticks")
+            assert slip <= 1e-12
+        else:
+            outcomes.add("slides")
+            assert size == pytest.approx(edge, rel=1e-9, abs=1e-15)
+            assert f[1:] @ motion[1:] == pytest.approx(-size * slip, rel=1e-7, abs=1e-12)
+    assert outcomes == {"off", "slides"} | ({"sticks"} if mu else set())
 
 
 def test_directed_friction_makes_a_problem_of_one_way_rows_that_every_start_solves():
