@@ -60,7 +60,7 @@ servos:""",
 
 
 @pytest.fixture(scope="module", autouse=True)
-def nothing() -> None:
+def compiled() -> None:
     """The kernels are compiled before anyone waits for them."""
     simulate(load_scenario("six_axis_arm", None, {"duration_s": 0.1}))
 

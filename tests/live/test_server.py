@@ -19,12 +19,12 @@ SNAKE, ARM = ("snake_operator",), ("six_axis_arm",)
 
 
 @pytest.fixture(scope="module")
-def nothing() -> None:
+def compiled() -> None:
     """The kernels of these drives are compiled before anyone waits for them."""
     simulate(load_scenario("snake_operator", None, {"duration_s": 0.1}))
 
 
-def test_only_the_page_gets_in(teleop: Callable[..., Teleop], nothing: None) -> None:
+def test_only_the_page_gets_in(teleop: Callable[..., Teleop], compiled: None) -> None:
     one = teleop(*SNAKE)
     host = {"Host": f"127.0.0.1:{one.port}"}
     drive, wrong = f"{one.path}drive", f"/{'x' * 32}/"
@@ -55,7 +55,7 @@ def test_only_the_page_gets_in(teleop: Callable[..., Teleop], nothing: None) -> 
     assert one.interrupt() == 0
 
 
-def test_it_listens_on_loopback_only(teleop: Callable[..., Teleop], nothing: None) -> None:
+def test_it_listens_on_loopback_only(teleop: Callable[..., Teleop], compiled: None) -> None:
     one = teleop(*SNAKE)
     with open("/proc/net/tcp", encoding="utf-8") as table:
         listening = [line.split()[1] for line in table if line.split()[3] == "0A"]
@@ -63,7 +63,7 @@ def test_it_listens_on_loopback_only(teleop: Callable[..., Teleop], nothing: Non
     assert one.interrupt() == 0
 
 
-def test_one_drives_and_others_watch(teleop: Callable[..., Teleop], nothing: None) -> None:
+def test_one_drives_and_others_watch(teleop: Callable[..., Teleop], compiled: None) -> None:
     one = teleop(*SNAKE)
     first, second = one.connect(), one.connect()
     first.take()
@@ -86,7 +86,7 @@ def test_one_drives_and_others_watch(teleop: Callable[..., Teleop], nothing: Non
     assert (np.diff(record["w_target"][:, 0]) >= 0.0).all(), "who watches moves nothing"
 
 
-def test_silence_stops_the_robot(teleop: Callable[..., Teleop], nothing: None) -> None:
+def test_silence_stops_the_robot(teleop: Callable[..., Teleop], compiled: None) -> None:
     one = teleop(*ARM)
     client = one.connect()
     client.take()
@@ -122,7 +122,7 @@ def test_silence_stops_the_robot(teleop: Callable[..., Teleop], nothing: None) -
     ],
 )
 def test_what_is_no_wish_is_refused_by_name(
-    teleop: Callable[..., Teleop], nothing: None, text: str, reason: str
+    teleop: Callable[..., Teleop], compiled: None, text: str, reason: str
 ) -> None:
     one = teleop(*ARM)
     client = one.connect()
@@ -134,7 +134,7 @@ def test_what_is_no_wish_is_refused_by_name(
     assert one.interrupt() == 0
 
 
-def test_long_many_and_senseless_messages_end_a_connection(teleop: Callable[..., Teleop], nothing: None) -> None:
+def test_long_many_and_senseless_messages_end_a_connection(teleop: Callable[..., Teleop], compiled: None) -> None:
     from websockets.exceptions import ConnectionClosed
 
     one = teleop(*ARM)
@@ -161,7 +161,7 @@ def test_long_many_and_senseless_messages_end_a_connection(teleop: Callable[...,
 
 @pytest.mark.parametrize("scenario", [SNAKE, ("mobile_path",), ("elbow_comparison_floor",)])
 def test_a_drive_leaves_its_record_and_a_script_that_repeats_it(
-    teleop: Callable[..., Teleop], scenario: tuple[str, ...], nothing: None
+    teleop: Callable[..., Teleop], scenario: tuple[str, ...], compiled: None
 ) -> None:
     one = teleop(*scenario)
     client = one.connect()
@@ -187,7 +187,7 @@ def test_a_drive_leaves_its_record_and_a_script_that_repeats_it(
         assert np.array_equal(record[name], again[name], equal_nan=True), name
 
 
-def test_nobody_left_ends_a_drive_that_is_told_so(teleop: Callable[..., Teleop], nothing: None) -> None:
+def test_nobody_left_ends_a_drive_that_is_told_so(teleop: Callable[..., Teleop], compiled: None) -> None:
     one = teleop(*SNAKE, "--until-closed")
     client = one.connect()
     client.take()
@@ -198,7 +198,7 @@ def test_nobody_left_ends_a_drive_that_is_told_so(teleop: Callable[..., Teleop],
     assert one.group_is_gone()
 
 
-def test_a_port_that_is_taken_is_an_error(teleop: Callable[..., Teleop], nothing: None) -> None:
+def test_a_port_that_is_taken_is_an_error(teleop: Callable[..., Teleop], compiled: None) -> None:
     one = teleop(*SNAKE)
     command = [sys.executable, "-m", "dynsim", "teleop", *SNAKE, "--no-open", "--http-port", str(one.port)]
     other = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=one.folder.parent, check=False)
