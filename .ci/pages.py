@@ -904,6 +904,22 @@ def longest_below_zero_ms() -> float:
     return 1e3 * max(end - begin for begin, end in spans)
 
 
+def explicit_over_implicit() -> list[float]:
+    """Time of dopri5 over that of radau5 at each tolerance, for the published arm."""
+    time = {
+        (row["method"], row["rtol"]): row["cpu_minimum_s"]
+        for row in bench()["precision"]
+        if row["scenario"] == "elbow_comparison"
+    }
+    return [time["dopri5", rtol] / time["radau5", rtol] for method, rtol in time if method == "radau5"]
+
+
+def battery(column: str) -> list[float]:
+    """What the dynamic snake draws, by manoeuvre."""
+    with (ROOT / "results" / "snake" / "energy.csv").open(encoding="utf-8") as file:
+        return [float(row[column]) for row in csv.DictReader(file)]
+
+
 HELD_CASE = "two elbows held, no friction"
 NUMBERS: dict[str, Callable[[], str]] = {
     "saving": lambda: fixed(ratio_of_energies("elbow_comparison no_elbow", "elbow_comparison two_elbows"), 0),
@@ -1098,6 +1114,14 @@ NUMBERS |= {
     "off_dopri5_rad": lambda: small(apart("dopri5 against dopri5 at rtol 1e-11", "q_rad")),
     "off_radau5_rad": lambda: small(apart("radau5 against dopri5 at rtol 1e-11", "q_rad")),
     "off_m_star_rad": lambda: small(apart("m_star against articulated", "q_rad")),
+    "explicit_least": lambda: fixed(min(explicit_over_implicit()), 0),
+    "explicit_most": lambda: fixed(max(explicit_over_implicit()), 0),
+    "snake_least_W": lambda: fixed(min(battery("mean_power_W")), 0),
+    "snake_most_W": lambda: fixed(max(battery("mean_power_W")), 0),
+    "snake_least_Wh": lambda: fixed(min(battery("battery_80_min_Wh")), 0),
+    "snake_most_Wh": lambda: fixed(max(battery("battery_80_min_Wh")), 0),
+    "snake_least_sheet_Wh": lambda: fixed(min(battery("battery_80_min_Wh_data_sheet_current")), 0),
+    "snake_most_sheet_Wh": lambda: fixed(max(battery("battery_80_min_Wh_data_sheet_current")), 0),
     "pipe_sticks": lambda: fixed(100 * run("brace_on_cylinder real")["contacts"]["elbow"]["sticking_fraction"], 1),
     "pipe_glued_J": lambda: energy("brace_on_cylinder glued"),
     "pipe_free_J": lambda: fixed(run("brace_on_cylinder free")["electrical_energy_J"], 0),
