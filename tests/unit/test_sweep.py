@@ -609,9 +609,14 @@ def test_a_killed_worker_costs_nothing_but_time(tmp_path: Path, whole: bytes):
 
 
 def workers_of(pid: int) -> list[int]:
-    """Worker processes of a parent."""
+    """Worker processes of a parent, the one that has done most first: others may be loading still."""
+
+    def ticks(child: int) -> int:
+        return sum(map(int, Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()[11:13]))
+
     children = map(int, Path(f"/proc/{pid}/task/{pid}/children").read_text().split())
-    return [child for child in children if "dynsim.studies.worker" in Path(f"/proc/{child}/cmdline").read_text()]
+    found = [child for child in children if "dynsim.studies.worker" in Path(f"/proc/{child}/cmdline").read_text()]
+    return sorted(found, key=ticks, reverse=True)
 
 
 def _hears() -> None:
