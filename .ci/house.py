@@ -30,16 +30,18 @@ def code_lines(source: str) -> int:
 
 def imports(modules: dict[str, Path]) -> dict[str, set[str]]:
     """Modules of the package that each one imports, within functions and for types too."""
-    found: dict[str, set[str]] = {name: set() for name in modules}
+    imported: dict[str, set[str]] = {name: set() for name in modules}
     for name, path in modules.items():
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.ImportFrom) and node.module:
                 names = [f"{node.module}.{alias.name}" for alias in node.names]
-                found[name] |= {one if one in modules else node.module for one in names}
+                imported[name] |= {
+                    imported_name if imported_name in modules else node.module for imported_name in names
+                }
             elif isinstance(node, ast.Import):
-                found[name] |= {alias.name for alias in node.names}
-        found[name] &= modules.keys() - {name}
-    return found
+                imported[name] |= {alias.name for alias in node.names}
+        imported[name] &= modules.keys() - {name}
+    return imported
 
 
 def circles(graph: dict[str, set[str]]) -> list[list[str]]:
@@ -67,16 +69,16 @@ def main() -> None:
     layers = settings["tool"]["importlinter"]["contracts"][0]["layers"]
     height = {room.strip(): k for k, layer in enumerate(layers) for room in layer.split("|")}
     upward = [
-        (one, other)
-        for one, others in graph.items()
+        (module, other)
+        for module, others in graph.items()
         for other in others
-        if one != "dynsim" and other != "dynsim" and height.get(_room(one), -1) > height.get(_room(other), 99)
+        if module != "dynsim" and other != "dynsim" and height.get(_room(module), -1) > height.get(_room(other), 99)
     ]
     loose = [path.name for path in PACKAGE.glob("*.py")]
     print(f"{sum(lines.values())} lines of code in {len(modules)} modules, {len(loose)} beside the rooms")
     print(f"{len(circles(graph))} circles of imports, {len(upward)} imports upwards")
-    for one in (*circles(graph), *upward):
-        print(f"  {' '.join(one)}")
+    for module in (*circles(graph), *upward):
+        print(f"  {' '.join(module)}")
     for room in sorted({_room(name) for name in modules} - {"dynsim"}):
         size = sum(count for name, count in lines.items() if _room(name) == room)
         print(f"  {room.removeprefix('dynsim.'):12} {size:6}")

@@ -130,7 +130,9 @@ def held(scenario: str, show: Callable[[dict[str, Any]], str]) -> list[str]:
     cells = []
     for name in VARIANTS:
         touching = contact()[scenario][name]["contacts"]
-        cells.append(" / ".join(show(touching[one]) if one in touching else NONE for one in ("elbow_4", "elbow_7")))
+        cells.append(
+            " / ".join(show(touching[elbow]) if elbow in touching else NONE for elbow in ("elbow_4", "elbow_7"))
+        )
     return [NONE if cell == "– / –" else cell for cell in cells]
 
 
@@ -249,8 +251,8 @@ def overturning_holds() -> str:
     def of(key: str, show: Callable[[Any], str]) -> list[str]:
         return [show(row[key]) for row in rows]
 
-    def loads(one: dict[str, float]) -> str:
-        return ", ".join(fixed(one[which], 1) for which in ("left", "right", "caster"))
+    def loads(case: dict[str, float]) -> str:
+        return ", ".join(fixed(case[which], 1) for which in ("left", "right", "caster"))
 
     return lines(
         ["the base holds", *HEADS],
@@ -328,8 +330,10 @@ def ledger() -> str:
         return ", ".join(small(runs[name]["energy_residual_relative"]) for name in names)
 
     def between(scenario: str) -> str:
-        found = [one["energy_residual_relative"] for name, one in runs.items() if name.split()[0] == scenario]
-        return f"{small(min(found))} to {small(max(found))}"
+        residuals = [
+            summary["energy_residual_relative"] for name, summary in runs.items() if name.split()[0] == scenario
+        ]
+        return f"{small(min(residuals))} to {small(max(residuals))}"
 
     left = [
         (f"`{s}` {label}", of(s, *v))
@@ -353,12 +357,14 @@ def ledger() -> str:
 
 def time_stepping() -> str:
     rows = []
-    for name, one in validation()["time_stepping"].items():
-        scenario, rest = (name if " " in name else f"{name} ").split(" ", 1)
-        taken = one["taken_by_steps_relative"]
+    for name, case in validation()["time_stepping"].items():
+        scenario, variant = (name if " " in name else f"{name} ").split(" ", 1)
+        taken = case["taken_by_steps_relative"]
         shown = small(taken) if abs(taken) < 1e-3 else f"{fixed(100 * taken, 2)} %"
-        depth = number(1e3 * one["penetration_max_m"], 2)
-        rows.append([f"`{scenario}` {rest}".strip(), small(one["energy_residual_relative"], 0), shown, f"{depth} mm"])
+        depth = number(1e3 * case["penetration_max_m"], 2)
+        rows.append(
+            [f"`{scenario}` {variant}".strip(), small(case["energy_residual_relative"], 0), shown, f"{depth} mm"]
+        )
     return lines(["", "residual", "taken by the steps, of the turnover", "sinks in by"], rows)
 
 
@@ -425,23 +431,23 @@ def job() -> str:
         ("MuJoCo, implicitfast 1 ms", MUJOCO_IMPLICIT),
     )  # fmt: skip
     rows: list[list[str]] = []
-    for case in dict.fromkeys(one["case"] for one in bench()["job"]):
-        by_program = {one["program"]: one for one in bench()["job"] if one["case"] == case}
+    for case in dict.fromkeys(entry["case"] for entry in bench()["job"]):
+        by_program = {entry["program"]: entry for entry in bench()["job"] if entry["case"] == case}
         for k, (label, program) in enumerate(programs):
-            one = by_program[program]
-            errors = [1e3 * one["hand_error_max_m"], 1e3 * one["hand_error_rms_m"], one["current_error_max_A"]]
-            cells = [f"{x:.2g}" if one["same_physics"] else f"({x:.2g})" for x in errors]
-            rows.append([case if k == 0 else "", label, f"{1e3 * one['cpu_median_s']:.3g}", *cells])
+            entry = by_program[program]
+            errors = [1e3 * entry["hand_error_max_m"], 1e3 * entry["hand_error_rms_m"], entry["current_error_max_A"]]
+            cells = [f"{x:.2g}" if entry["same_physics"] else f"({x:.2g})" for x in errors]
+            rows.append([case if k == 0 else "", label, f"{1e3 * entry['cpu_median_s']:.3g}", *cells])
     return lines(["case", "program", "CPU ms", "hand, max mm", "hand, rms mm", "current, max A"], rows, left=2)
 
 
 def precision() -> str:
-    found = bench()["precision"]
-    rtols = sorted({row["rtol"] for row in found}, reverse=True)
+    measured = bench()["precision"]
+    rtols = sorted({row["rtol"] for row in measured}, reverse=True)
     rows: list[list[str]] = []
-    for scenario in dict.fromkeys(row["scenario"] for row in found):
-        for k, method in enumerate(dict.fromkeys(row["method"] for row in found)):
-            by = {row["rtol"]: row for row in found if (row["scenario"], row["method"]) == (scenario, method)}
+    for scenario in dict.fromkeys(row["scenario"] for row in measured):
+        for k, method in enumerate(dict.fromkeys(row["method"] for row in measured)):
+            by = {row["rtol"]: row for row in measured if (row["scenario"], row["method"]) == (scenario, method)}
             cells = [f"{1e3 * by[r]['cpu_minimum_s']:.3g} / {_error(by[r]['error'])}" for r in rtols]
             rows.append([f"`{scenario}`" if k == 0 else "", method, *cells])
     return lines(["scenario", "method", *(small(r, 0) for r in rtols)], rows, left=2)
@@ -480,7 +486,7 @@ def energy_share(friction: float) -> str:
 
 def voltage_needed(*variants: str) -> int:
     """Least whole voltage from which on the hand is off by at most 2 % more than at 24 V."""
-    error = {place: float(row["hand_error_rms_m"]) for place, row in swept("voltage").items() if place[0] in variants}
+    error = {point: float(row["hand_error_rms_m"]) for point, row in swept("voltage").items() if point[0] in variants}
     enough = {(name, volt) for (name, volt), off in error.items() if off <= 1.02 * error[name, 24.0]}
     return min(
         volt for volt in range(1, 25) if all((name, float(v)) in enough for name in variants for v in range(volt, 25))
@@ -489,8 +495,8 @@ def voltage_needed(*variants: str) -> int:
 
 def of_masses(number: str, key: str, scale: float = 1.0) -> float:
     """Statistics of a number of the summary over random masses of links."""
-    found = data("sweeps/tolerance/statistics.json")[0]["numbers"][number]
-    return scale * float(found["mean_high"] - found["mean"] if key == "interval" else found[key])
+    statistics = data("sweeps/tolerance/statistics.json")[0]["numbers"][number]
+    return scale * float(statistics["mean_high"] - statistics["mean"] if key == "interval" else statistics[key])
 
 
 def last_link_effect() -> float:
@@ -537,21 +543,37 @@ def comparison() -> str:
         "───",
     )  # fmt: skip
     text = [line[1:].rstrip() for line in output.getvalue().split("warning: ")[0].splitlines()]
-    rows = [row for row in text if any(one in row for one in kept) and "times the least" not in row]
+    rows = [row for row in text if any(label in row for label in kept) and "times the least" not in row]
     # Of two elbows the first one's share of pulling.
     shown = rows[: next(k for k, row in enumerate(rows) if "pulling" in row) + 1]
-    warned = {name: one["warnings"] for name, one in summaries.items()}
-    told = [f"warning: {name}: {warned[name][0]}" for name in ("two_elbows", "elbow_4")]
-    return "```\n" + "\n".join([*shown, "", *told]) + "\n```\n"
+    warned = {name: summary["warnings"] for name, summary in summaries.items()}
+    notes = [f"warning: {name}: {warned[name][0]}" for name in ("two_elbows", "elbow_4")]
+    return "```\n" + "\n".join([*shown, "", *notes]) + "\n```\n"
 
 
 def faults() -> str:
     return "\n" + markdown(data("reference/bridge_faults.json")["cells"]).strip("\n") + "\n\n"
 
 
+def planned_sizes(file: str) -> dict[int, float]:
+    """Heat of the published arm by number of braces [W]."""
+    return {size["count"]: size["heat_W"] for size in data(f"planner/{file}.json")}
+
+
 def planned_heat(count: int) -> str:
     """Of the published arm with so many braces [W]."""
-    return fixed(next(size["heat_W"] for size in data("planner/published.json") if size["count"] == count), 2)
+    return fixed(planned_sizes("published")[count], 2)
+
+
+def planned_saving(count: int) -> str:
+    """What a brace more saves of the heat of the published arm with one less [%]."""
+    heat = planned_sizes("published")
+    return fixed(100.0 * (1.0 - heat[count] / heat[count - 1]), 0)
+
+
+def posture_heat(friction: float) -> float:
+    """Least heat of the published posture at rest, with both elbows pressed [W]."""
+    return next(row["heat_W"] for row in data("planner/posture.json") if row["friction"] == friction)
 
 
 def planned_arm() -> str:
@@ -559,20 +581,20 @@ def planned_arm() -> str:
     rows = []
     for friction, file in (("0.1", "published"), ("0", "frictionless")):
         for size in data(f"planner/{file}.json"):
-            place = size["braces"].replace(" on floor", "")
+            braces = size["braces"].replace(" on floor", "")
             forces = NONE
             if size["normal_force_min_N"] is not None:
                 forces = f"{fixed(size['normal_force_min_N'], 1)} … {fixed(size['normal_force_max_N'], 1)}"
             heat, simulated = number(size["heat_W"]), number(size["simulated_W"])
             verdict = "yes" if size["survives"] else "no"
-            rows.append((friction, place, heat, simulated, forces, f"{size['k_p_V_per_rad']:g}", verdict))
+            rows.append((friction, braces, heat, simulated, forces, f"{size['k_p_V_per_rad']:g}", verdict))
     heads = ("μ", "braces", "heat [W]", "simulated [W]", "forces [N]", "k_p [V/rad]", "survives")
     return lines(heads, rows, left=2)
 
 
 def beside_best_known(scene: dict[str, Any]) -> dict[int, float]:
     """By number of braces, the least heat that a search has found over the least that is known of the scene."""
-    long = next(one for one in data("planner/reference.json") if one["seed"] == scene["seed"])
+    long = next(entry for entry in data("planner/reference.json") if entry["seed"] == scene["seed"])
     known = {size["count"]: size["heat_W"] for size in long["sizes"]}
     ratios = {}
     for size in scene["sizes"]:
@@ -584,7 +606,7 @@ def beside_best_known(scene: dict[str, Any]) -> dict[int, float]:
 
 def best_beside_best_known(scene: dict[str, Any], known: str = "heat_W") -> float:
     """The same of the best number of braces of each; ``searched_W``: over what the long search has found."""
-    long = next(one for one in data("planner/reference.json") if one["seed"] == scene["seed"])
+    long = next(entry for entry in data("planner/reference.json") if entry["seed"] == scene["seed"])
     own = min(size["least_W"] for size in scene["sizes"] if size["least_W"] is not None)
     return float(own / min(own, *(size[known] for size in long["sizes"] if size[known] is not None)))
 
@@ -671,8 +693,8 @@ def kinematic() -> Any:
 
 def of_kinematic(name: str, variant: str = "") -> dict[str, Any]:
     """A run of the kinematic snake in numbers."""
-    one: dict[str, Any] = kinematic()["runs"][name][variant]
-    return one
+    numbers: dict[str, Any] = kinematic()["runs"][name][variant]
+    return numbers
 
 
 def both(run: dict[str, Any], first: str, second: str) -> str:
@@ -726,8 +748,8 @@ def snake_ways() -> str:
 def snake_circles() -> str:
     """The circle backward with less time or another least margin."""
     rows = [
-        (f"{one['path_s']:g} s", f"{1e3 * one['least_margin_m']:g} mm", f"{fixed(abs(one['turned_deg']), 1)}°")
-        for one in kinematic()["circles"]
+        (f"{circle['path_s']:g} s", f"{1e3 * circle['least_margin_m']:g} mm", f"{fixed(abs(circle['turned_deg']), 1)}°")
+        for circle in kinematic()["circles"]
     ]
     return lines(("duration", "least margin", "ends at"), rows, left=0)
 
@@ -735,10 +757,10 @@ def snake_circles() -> str:
 def snake_order() -> str:
     """In which order the joints of the base come below half of their first angle."""
     rows = []
-    for one in kinematic()["order"]:
-        times = sorted((time, name) for name, time in one["halved_s"].items() if time is not None)
+    for entry in kinematic()["order"]:
+        times = sorted((time, name) for name, time in entry["halved_s"].items() if time is not None)
         order = ", ".join(f"{name.replace('theta', 'θ')} ({time:.1f} s)" for time, name in times)
-        rows.append((f"{one['null_gain']:g}", order, fixed(one["null_space_reduced_s"], 1)))
+        rows.append((f"{entry['null_gain']:g}", order, fixed(entry["null_space_reduced_s"], 1)))
     return lines(("k_η", "joints in their order", "null-space motion reduced [s]"), rows, left=3)
 
 
@@ -772,8 +794,8 @@ def reason(refusal: str) -> str:
         return re.split(r"[:;(]", first)[0].strip()
     violated = [entry.partition(", margin")[0].strip() for entry in entries if "margin" in entry]
     more = f", and {len(violated) - 1} more" if len(violated) > 1 else ""
-    way = f"; `{entries[-1].split(' would')[0].strip()}` passes" if "would pass" in entries[-1] else ""
-    return f"{violated[0]}{more}{way}"
+    hint = f"; `{entries[-1].split(' would')[0].strip()}` passes" if "would pass" in entries[-1] else ""
+    return f"{violated[0]}{more}{hint}"
 
 
 def backward_circle() -> dict[str, Any]:
@@ -799,8 +821,8 @@ def sag_error(quantity: str) -> float:
 
 
 TABLES: dict[str, Callable[[], str]] = {
-    one.__name__: one
-    for one in (
+    table.__name__: table
+    for table in (
         elbows_in_short, elbows, glued_and_real, overturning_holds, overturning_drives, assumptions, ledger,
         snake_table_iii, time_stepping, endings, right_hand_side, ratios, job, precision, sweeps, snake_bench,
         comparison, faults, planned_arm, planned_gains, planned_scenes, snake_positioning, snake_limits, snake_ways,
@@ -810,8 +832,8 @@ TABLES: dict[str, Callable[[], str]] = {
 
 
 def run(name: str) -> dict[str, Any]:
-    found: dict[str, Any] = validation()["runs"][name]
-    return found
+    numbers: dict[str, Any] = validation()["runs"][name]
+    return numbers
 
 
 def residual(name: str) -> str:
@@ -831,7 +853,7 @@ def ratio_of_energies(first: str, second: str) -> float:
 
 
 def of_job(case: str, program: str) -> dict[str, Any]:
-    return next(one for one in bench()["job"] if (one["case"], one["program"]) == (case, program))
+    return next(entry for entry in bench()["job"] if (entry["case"], entry["program"]) == (case, program))
 
 
 def against_mujoco(case: str, program: str) -> str:
@@ -839,12 +861,14 @@ def against_mujoco(case: str, program: str) -> str:
 
 
 def of_contact(scenario: str, variant: str, name: str) -> dict[str, Any]:
-    found: dict[str, Any] = contact()[scenario][variant]["contacts"][name]
-    return found
+    numbers: dict[str, Any] = contact()[scenario][variant]["contacts"][name]
+    return numbers
 
 
 def event(variant: str, kind: str, which: int = 0) -> float:
-    times = [time for time, one, _ in contact()["elbow_comparison_floor"][variant]["events"] if one == kind]
+    times = [
+        time for time, event_kind, _ in contact()["elbow_comparison_floor"][variant]["events"] if event_kind == kind
+    ]
     return float(times[which])
 
 
@@ -856,13 +880,13 @@ def stuck(which: int) -> float:
 
 def brush() -> dict[str, Any]:
     """The run of an arm without elbows whose links may touch."""
-    found: dict[str, Any] = contact()["elbow_comparison_links"]["no_elbow"]
-    return found
+    numbers: dict[str, Any] = contact()["elbow_comparison_links"]["no_elbow"]
+    return numbers
 
 
 def of_each(key: str) -> list[float]:
     """A number of the four configurations."""
-    return [float(one[key]) for one in validation()["elbows"].values()]
+    return [float(summary[key]) for summary in validation()["elbows"].values()]
 
 
 def at_the_start(key: str) -> float:
@@ -877,8 +901,8 @@ def apart(which: str, key: str) -> float:
 
 def assumed(case: str) -> dict[str, float]:
     """Two elbows with one assumption changed."""
-    found: dict[str, float] = data("reference/assumptions.json")["cases"][case]["two_elbows"]
-    return found
+    numbers: dict[str, float] = data("reference/assumptions.json")["cases"][case]["two_elbows"]
+    return numbers
 
 
 def dissipative_energy() -> float:
@@ -897,8 +921,8 @@ def real_less_glued(variant: str, key: str) -> float:
 def longest_below_zero_ms() -> float:
     """How long the tip margin of a base that is braced is below zero at the start."""
     spans = [
-        one["margin_below_zero_s"][0]
-        for variant, one in overturning()["mobile_elbow_comparison"].items()
+        summary["margin_below_zero_s"][0]
+        for variant, summary in overturning()["mobile_elbow_comparison"].items()
         if variant != "no_elbow"
     ]
     return 1e3 * max(end - begin for begin, end in spans)
@@ -1016,6 +1040,11 @@ NUMBERS |= {
     "planned_2_W": lambda: planned_heat(2),
     "planned_3_W": lambda: planned_heat(3),
     "planned_4_W": lambda: planned_heat(4),
+    "posture_0_W": lambda: fixed(posture_heat(0.0), 1),
+    "posture_W": lambda: fixed(posture_heat(0.1), 1),
+    "posture_times": lambda: fixed(posture_heat(0.0) / planned_sizes("frictionless")[2], 0),
+    "planned_3_saves": lambda: planned_saving(3),
+    "planned_4_saves": lambda: planned_saving(4),
     "planned_within_1": lambda: planned_share(1.01),
     "planned_within_5": lambda: planned_share(1.05),
     "planned_searched_1": lambda: planned_share(1.01, known="searched_W"),
@@ -1136,30 +1165,30 @@ def written(page: str) -> str:
     KeyError
         It has a mark of a number or table that is not known.
     """
-    page = TABLE.sub(lambda found: f"{found[1]}{found[2]}{TABLES[found[1]]()}", page)
-    return NUMBER.sub(lambda found: NUMBERS[found[1]](), page)
+    page = TABLE.sub(lambda match: f"{match[1]}{match[2]}{TABLES[match[1]]()}", page)
+    return NUMBER.sub(lambda match: NUMBERS[match[1]](), page)
 
 
 def stale() -> dict[str, list[str]]:
     """Lines that should be otherwise, by page, as they should be."""
-    found = {}
+    changed = {}
     for path in PAGES:
         before = path.read_text(encoding="utf-8")
         after = written(before)
         if before != after:
             there = set(before.splitlines())
-            found[path.name] = [line for line in after.splitlines() if line not in there]
-    return found
+            changed[path.name] = [line for line in after.splitlines() if line not in there]
+    return changed
 
 
 def main(arguments: Sequence[str]) -> int:
-    found = stale()
-    for page, rows in found.items():
+    pages = stale()
+    for page, rows in pages.items():
         print(page, *rows, sep="\n  ")
     if "--check" in arguments:
-        return 1 if found else 0
+        return 1 if pages else 0
     for path in PAGES:
-        if path.name in found:
+        if path.name in pages:
             path.write_text(written(path.read_text(encoding="utf-8")), encoding="utf-8")
     return 0
 

@@ -16,24 +16,24 @@ TIMINGS = ("integration_wall_s", "real_time_factor")
 def differences(first: Path, second: Path) -> list[str]:
     """What differs between two records, in words."""
     a, b = Record.load(first), Record.load(second)
-    found = [f"signals {sorted(set(a) ^ set(b))} are in one only"] if set(a) != set(b) else []
+    unequal = [f"signals {sorted(set(a) ^ set(b))} are in one only"] if set(a) != set(b) else []
     if a.time.tobytes() != b.time.tobytes():
-        found.append("time")
-    found += [name for name in a if name in b and a[name].tobytes() != b[name].tobytes()]
+        unequal.append("time")
+    unequal += [name for name in a if name in b and a[name].tobytes() != b[name].tobytes()]
     keys = (a.summary.keys() | b.summary.keys()) - set(TIMINGS)
-    return found + [f"summary.{key}" for key in sorted(keys) if a.summary.get(key) != b.summary.get(key)]
+    return unequal + [f"summary.{key}" for key in sorted(keys) if a.summary.get(key) != b.summary.get(key)]
 
 
 def main(first: Path, second: Path) -> int:
     """Print what differs; 1 when something does, or when there is nothing to compare."""
     records = [path.relative_to(first) for path in sorted(first.rglob("record.h5"))]
     missing = {path.relative_to(second) for path in second.rglob("record.h5")} ^ set(records)
-    found = {record: differences(first / record, second / record) for record in records if record not in missing}
-    for record, names in found.items():
+    unequal = {record: differences(first / record, second / record) for record in records if record not in missing}
+    for record, names in unequal.items():
         print(f"{record}: {'differs in ' + ', '.join(names) if names else 'the same, bit for bit'}")
     for record in sorted(missing):
         print(f"{record}: in one folder only")
-    return 0 if records and not missing and not any(found.values()) else 1
+    return 0 if records and not missing and not any(unequal.values()) else 1
 
 
 if __name__ == "__main__":

@@ -205,11 +205,11 @@ def test_plot_writes_nothing_outside_of_its_folder_and_shows_names_as_they_are(t
     assert "\x1b" not in result.stdout + result.stderr
 
 
-@pytest.mark.parametrize("what", ["posture", "q"])
-def test_a_record_that_lacks_what_a_figure_needs_is_one_line(tmp_path: Path, what: str):
+@pytest.mark.parametrize("missing", ["posture", "q"])
+def test_a_record_that_lacks_what_a_figure_needs_is_one_line(tmp_path: Path, missing: str):
     # [link] and [red] would be taken for markup.
     record = Record([0.0, 1.0], provenance={"engine": "kinematic", "scenario": {"name": "[red]x\x1b[0m"}})
-    record.add(what, [0.0, 0.0], "m")
+    record.add(missing, [0.0, 0.0], "m")
     record.save(tmp_path / "[red]\x1b[0m" / "record.h5")
     result = dynsim("plot", "[red]\x1b[0m/record.h5", folder=tmp_path)
     assert result.returncode == 2

@@ -33,12 +33,12 @@ def test_a_plan_leaves_its_files_and_a_scenario_that_runs(small: Path, tmp_path:
     assert result.exit_code == 0, result.output
     assert "link_6 on floor" in result.output
     plan = json.loads((out / "plan.json").read_text(encoding="utf-8"))
-    none, one = plan["sizes"]
-    assert (none["count"], none["braces"], one["count"]) == (0, [], 1)
-    assert set(one["braces"][0]) >= {"body", "point_m", "surface"}
-    assert set(one) >= {"count", "braces", "heat_W", "times_s", "q_rad", "forces_N", "survives", "reason"}
-    assert len(one["times_s"]) == len(one["q_rad"]) == len(one["forces_N"]) >= 101
-    assert one["heat_W"] < 0.1 * none["heat_W"]
+    none, single = plan["sizes"]
+    assert (none["count"], none["braces"], single["count"]) == (0, [], 1)
+    assert set(single["braces"][0]) >= {"body", "point_m", "surface"}
+    assert set(single) >= {"count", "braces", "heat_W", "times_s", "q_rad", "forces_N", "survives", "reason"}
+    assert len(single["times_s"]) == len(single["q_rad"]) == len(single["forces_N"]) >= 101
+    assert single["heat_W"] < 0.1 * none["heat_W"]
     assert variant_names(out / "plan.yaml") == ["braces_1", "braces_0"]
     record = load_scenario(out / "plan.yaml").duration_s
     assert record == 10.0

@@ -92,9 +92,9 @@ def wait_until(condition: Callable[[], bool], process: subprocess.Popen[str] | N
         time.sleep(0.05)
 
 
-def pids(folder: Path, what: str) -> list[int]:
+def pids(folder: Path, pattern: str) -> list[int]:
     """Processes that have come to ``what``."""
-    return [int(path.name.rpartition("_")[2]) for path in folder.glob(f"{what}_*")]
+    return [int(path.name.rpartition("_")[2]) for path in folder.glob(f"{pattern}_*")]
 
 
 def is_running(pid: int) -> bool:

@@ -118,9 +118,9 @@ def test_the_hand_is_where_the_model_has_it(braced: Record, view: str) -> None:
         where = model.point_position(braced.scene.bodies[hand.body].name, hand.position, q)
         right, up = camera.axes[:2] @ (where - camera.centre)
         expected = (camera.middle + camera.scale * np.array([right, -up])) / FINER
-        found = pixels(painter.frame(float(instant)), MARK)
-        assert len(found) > 15
-        np.testing.assert_allclose(found.mean(axis=0), expected, atol=2.0)
+        marks = pixels(painter.frame(float(instant)), MARK)
+        assert len(marks) > 15
+        np.testing.assert_allclose(marks.mean(axis=0), expected, atol=2.0)
         assert painter.hand(float(instant)) == pytest.approx(tuple(expected), abs=0.1)
 
 
@@ -162,8 +162,8 @@ def test_a_hub_is_not_covered_by_a_rod_that_leans_to_the_viewer(braced: Record) 
     image = Image.new("RGB", (1280, 960))
     every = np.concatenate([faces, other + len(corners)])
     painter._paint_faces(ImageDraw.Draw(image), np.concatenate([corners, more]), every, colours)
-    for place, hidden in ((-1.0, True), (-0.5, True), (0.1, True), (1.0, False), (3.0, False)):
-        x, y, _ = painter.camera.project(place * r * right)
+    for depth, hidden in ((-1.0, True), (-0.5, True), (0.1, True), (1.0, False), (3.0, False)):
+        x, y, _ = painter.camera.project(depth * r * right)
         red, _, blue = image.getpixel((round(x), round(y)))
         assert (red > blue) == hidden
 
@@ -186,9 +186,9 @@ def test_a_snake_has_fingers_that_close(robots: dict[str, Record]) -> None:
         fingers = solids.body == robot.scene.hand.body
         fingers &= np.abs(solids.aside).max(axis=(0, 2)) > 0.0
         assert fingers.sum() == 16
-        place = (solids.corners + solids.aside[int(closed)])[fingers] - robot.scene.hand.position
-        apart.append(2.0 * np.abs(place[:, 1]).min())
-        assert place[:, 0].min() < 0.0 < place[:, 0].max()
+        tips = (solids.corners + solids.aside[int(closed)])[fingers] - robot.scene.hand.position
+        apart.append(2.0 * np.abs(tips[:, 1]).min())
+        assert tips[:, 0].min() < 0.0 < tips[:, 0].max()
         # They are lit: the tint is darkened.
         shown = np.asarray(painter.frame(0.0)).astype(int)
         tinted = np.argwhere((shown[..., 0] - shown[..., 1] > 60) & (shown[..., 2] - shown[..., 1] > 60))[:, ::-1]
@@ -206,12 +206,12 @@ def test_labels_lie_on_paper_beside_each_other_and_within_the_picture() -> None:
     """Each sign is seen: no two overlap, though all are wanted at one place, on an image that has their colour."""
     image = Image.new("RGB", (300, 200), "#D55E00")
     places = np.array([[150.0, 100.0], [152.0, 98.0], [2.0, 4.0], [299.0, 200.0]])
-    texts = [("−1.23 N", place, "#D55E00") for place in places]
-    found = labels(ImageDraw.Draw(image), texts, font(26), image.size, "#FFFFFF")
-    for k, (left, top, right, bottom) in enumerate(found):
+    texts = [("−1.23 N", anchor, "#D55E00") for anchor in places]
+    boxes = labels(ImageDraw.Draw(image), texts, font(26), image.size, "#FFFFFF")
+    for k, (left, top, right, bottom) in enumerate(boxes):
         assert 0.0 <= left < right <= 300.0
         assert 0.0 <= top < bottom <= 200.0
-        assert all(left >= b[2] or right <= b[0] or top >= b[3] or bottom <= b[1] for b in found[:k])
+        assert all(left >= b[2] or right <= b[0] or top >= b[3] or bottom <= b[1] for b in boxes[:k])
         part = np.asarray(image)[round(top) + 1 : round(bottom), round(left) + 1 : round(right)]
         minus = pixels(Image.fromarray(part[:, : round(0.25 * (right - left))]), "#D55E00")
         # A bar: wider than high, with white about it.
@@ -272,8 +272,8 @@ def test_arrows_have_the_colour_of_their_sign(braced: Record) -> None:
             force = braced["contact_normal_force"][row, k]
             if abs(force) < 0.05:
                 continue
-            place = point_positions(braced, point, row)
-            x, y = painter.camera.project(place)[:2] / FINER
+            position = point_positions(braced, point, row)
+            x, y = painter.camera.project(position)[:2] / FINER
             shown = {}
             for colour in (BLUE, PULLING):
                 at = pixels(image, colour)
@@ -289,11 +289,11 @@ def test_joints_below_the_floor_are_ringed() -> None:
     record = short("elbow_comparison", "no_elbow")
     painter = Film({"one": record}, view="side", plot="", size=(800, 500)).painters["one"]
     assert len(pixels(painter.frame(0.0), DEEP)) == 0
-    found = pixels(painter.frame(1.0), DEEP)
+    ringed = pixels(painter.frame(1.0), DEEP)
     depth = record[POSITION][-1, :, 2]
     x, y = painter.camera.project(record[POSITION][-1, depth.argmin()].astype(float))[:2] / FINER
     assert depth.min() < -0.05
-    assert np.sum(np.hypot(found[:, 0] - x, found[:, 1] - y) < 9) > 20
+    assert np.sum(np.hypot(ringed[:, 0] - x, ringed[:, 1] - y) < 9) > 20
 
 
 def test_the_force_with_friction_has_its_own_direction() -> None:
@@ -304,14 +304,14 @@ def test_the_force_with_friction_has_its_own_direction() -> None:
     force = record["contact_force"][row, 0]
     (point,) = record.scene.contacts
     x, y = painter.camera.project(point_positions(record, point, row))[:2] / FINER
-    found = pixels(painter.frame(float(record.time[row])), FRICTION)
-    assert len(found) > 20
+    arrow = pixels(painter.frame(float(record.time[row])), FRICTION)
+    assert len(arrow) > 20
     right, up = painter.camera.axes[:2] @ force
     # Tilted by the angle of the slope against the normal arrow, which covers its beginning.
     along = np.array([right, -up]) / np.hypot(right, up)
-    across = (found - [x, y]) @ [along[1], -along[0]]
+    across = (arrow - [x, y]) @ [along[1], -along[0]]
     assert np.abs(across).mean() < 5.0
-    assert np.all((found - [x, y]) @ along > 0.0)
+    assert np.all((arrow - [x, y]) @ along > 0.0)
 
 
 @pytest.mark.parametrize("kind", ["arm", "mobile", "snake", "urdf"])
@@ -360,11 +360,11 @@ def test_the_cursor_is_at_the_time(braced: Record) -> None:
     strip = film._strip
     assert strip is not None
     bare = np.asarray(strip._image).astype(int)
-    found = []
+    columns = []
     for instant in (0.0, 0.25, 0.5, 1.0):
         changed = np.abs(np.asarray(strip.frame(instant)).astype(int) - bare).max(axis=2) > 0
-        found.append(np.nonzero(changed)[1].mean())
-    steps = np.diff(found)
+        columns.append(np.nonzero(changed)[1].mean())
+    steps = np.diff(columns)
     np.testing.assert_allclose(steps, [steps.sum() / 4, steps.sum() / 4, steps.sum() / 2], atol=1.5)
     assert steps.sum() > 400
 

@@ -120,19 +120,19 @@ class Worker:
         places = [line.strip() for line in main_thread.splitlines() if line.lstrip().startswith("File ")]
         ours = next((line for line in places if f"{os.sep}dynsim{os.sep}" in line and "site-packages" not in line), "")
         # 'File "…/dynsim/record.py", line 144 in load' → 'dynsim/record.py:load'
-        place = (
+        location = (
             ":".join(ours.partition(f"{ROOT}{os.sep}")[2].replace('"', "").split(", line ")[:1] + ours.split()[-1:])
             if ours
             else ""
         )
         if "Timeout (" in log:
-            return Outcome(HANG, "heeds no Ctrl-C", place, log[-1500:])
+            return Outcome(HANG, "heeds no Ctrl-C", location, log[-1500:])
         code = process.returncode
         if code == 130:
             # Ctrl-C in the compiler, which cannot be ended but with its process.
             return Outcome(INTERRUPTED, detail=log[-1500:])
         end = signal.Signals(-code).name if code < 0 else f"exit code {code}"
-        return Outcome(CRASH, f"the process ended: {end}", place, log[-1500:])
+        return Outcome(CRASH, f"the process ended: {end}", location, log[-1500:])
 
     def _read_log(self) -> str:
         self._log.seek(0)

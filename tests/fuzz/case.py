@@ -50,8 +50,8 @@ def draw(kind: str, seed: int, index: int, records: Path) -> Draft:
     rng = Random(f"{seed}/{kind}/{index}")
     case: Draft = importlib.import_module(f"fuzz.inputs.{kind}").draw(rng, records)
     if rng.random() < NO_FILE_SHARE:
-        case.files[MAIN[kind]] = what = rng.choice(NO_FILES)
-        case.what = f"{what} as {MAIN[kind]}"
+        case.files[MAIN[kind]] = mutation = rng.choice(NO_FILES)
+        case.what = f"{mutation} as {MAIN[kind]}"
     return case
 
 

@@ -205,11 +205,11 @@ def mutate_bytes(rng: Random, data: bytes) -> tuple[bytes, str]:
         "a stretch doubled": lambda: out.__setitem__(slice(where, where), out[where : where + 200]),
         "bytes appended": lambda: out.extend(rng.randbytes(16)),
     }
-    way = rng.choice(list(ways))
+    kind = rng.choice(list(ways))
     if not out:
         return bytes(out), "empty"
-    ways[way]()
-    return bytes(out), f"{way} at {where}"
+    ways[kind]()
+    return bytes(out), f"{kind} at {where}"
 
 
 def mutate_text(rng: Random, text: str) -> tuple[bytes, str]:
@@ -265,8 +265,8 @@ def mutate_text(rng: Random, text: str) -> tuple[bytes, str]:
         end = rng.choice(("\r\n", "\r", "\n\n", "\x85", "\u2028"))
         return text.replace("\n", end).encode(), f"lines end with {end!r}"
     elif choice == 13:
-        data, what = mutate_bytes(rng, text.encode())
-        return data, what
+        data, mutation = mutate_bytes(rng, text.encode())
+        return data, mutation
     else:
         return (text + rng.choice(("\n---\n", "\n...\n", "\n%YAML 1.1\n---\n", "\x00", text))).encode(
             "utf-8", "replace"

@@ -35,35 +35,35 @@ FOUND = {
 
 
 @pytest.fixture(scope="module")
-def found(records: Path) -> list[campaign.Result]:
+def results(records: Path) -> list[campaign.Result]:
     """Cases run with broken loaders."""
     cases = [("servo_map", index) for index in range(len(WAYS))] + [("scenario", index) for index in range(15)]
     return campaign.run(cases, records=records, broken=True, limit=2.0, seed=1)
 
 
-@pytest.mark.parametrize(("number", "way"), list(enumerate(WAYS)))
-def test_a_broken_loader_is_found(number: int, way: str, found: list[campaign.Result]) -> None:
+@pytest.mark.parametrize(("number", "defect"), list(enumerate(WAYS)))
+def test_a_broken_loader_is_found(number: int, defect: str, results: list[campaign.Result]) -> None:
     """Also those after one that ended its worker: "refuses" is the last and ran in a new one."""
-    result = next(result for result in found if (result.kind, result.index) == ("servo_map", number))
-    outcome, what, place = FOUND[way]
+    result = next(result for result in results if (result.kind, result.index) == ("servo_map", number))
+    outcome, message, location = FOUND[defect]
     assert result.ended.outcome == outcome, result
-    assert what in result.ended.what
-    assert place in result.ended.place
+    assert message in result.ended.what
+    assert location in result.ended.place
     assert result.case
     if result.failed:
-        assert f"--repeat servo_map {number}" in campaign.failures(found)
-    if way == "takes all memory":
+        assert f"--repeat servo_map {number}" in campaign.failures(results)
+    if defect == "takes all memory":
         assert "not enough memory" in result.ended.detail
 
 
-def test_lost_masses_are_found(found: list[campaign.Result]) -> None:
-    lost = [result for result in found if result.ended.outcome == LOSS and "masses" in result.ended.detail]
+def test_lost_masses_are_found(results: list[campaign.Result]) -> None:
+    lost = [result for result in results if result.ended.outcome == LOSS and "masses" in result.ended.detail]
     assert {result.kind for result in lost} == {"scenario"}
 
 
-def test_the_table_counts_every_case(found: list[campaign.Result]) -> None:
-    total = campaign.table(found).splitlines()[-2].split()
-    assert int(total[1]) == len(found) == sum(map(int, total[3:]))
+def test_the_table_counts_every_case(results: list[campaign.Result]) -> None:
+    total = campaign.table(results).splitlines()[-2].split()
+    assert int(total[1]) == len(results) == sum(map(int, total[3:]))
 
 
 @pytest.mark.parametrize(
@@ -96,7 +96,7 @@ def test_the_shipped_arm_is_read_alike_twice(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "what"),
+    ("change", "loss"),
     [
         (('<mass value="8.5" />', ""), "0 <mass>"),
         (('<mass value="8.5" />', '<mass value="1_9.2" />'), "is not a number"),
@@ -108,11 +108,11 @@ def test_the_shipped_arm_is_read_alike_twice(tmp_path: Path) -> None:
     ],
 )
 def test_what_a_urdf_file_says_and_the_robot_does_not_is_a_loss(
-    change: tuple[str, str], what: str, tmp_path: Path
+    change: tuple[str, str], loss: str, tmp_path: Path
 ) -> None:
     (tmp_path / "arm.urdf").write_bytes(arm_with(("", "")))
     robot = read_urdf(tmp_path / "arm.urdf")
-    assert what in "; ".join(urdf_losses(arm_with(change), robot))
+    assert loss in "; ".join(urdf_losses(arm_with(change), robot))
 
 
 def test_masses_behind_fixed_joints_are_composed_as_they_are_merged(tmp_path: Path) -> None:

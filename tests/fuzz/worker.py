@@ -222,10 +222,10 @@ def _place(stack: traceback.StackSummary) -> str:
         if f"{os.sep}dynsim{os.sep}" in frame.filename and "site-packages" not in frame.filename
     ]
     inner = stack[-1] if stack else None
-    place = f"{_short(ours[-1].filename)}:{ours[-1].name}" if ours else "outside of dynsim"
+    location = f"{_short(ours[-1].filename)}:{ours[-1].name}" if ours else "outside of dynsim"
     if inner is not None and (not ours or inner is not ours[-1]):
-        place += f" → {_short(inner.filename)}:{inner.name}"
-    return place
+        location += f" → {_short(inner.filename)}:{inner.name}"
+    return location
 
 
 def _short(filename: str) -> str:

@@ -63,7 +63,7 @@ class Outputs:
     _owner: threading.Thread = field(default_factory=threading.current_thread)
     _inside: threading.local = field(default_factory=threading.local)
 
-    def passed(self, what: str) -> None:
+    def passed(self, operation: str) -> None:
         """A call is about to be made."""
         frame = sys._getframe(1)
         while frame is not None and not frame.f_code.co_filename.startswith(PACKAGE):
@@ -71,13 +71,13 @@ class Outputs:
         if frame is None:
             return
         code = frame.f_code
-        place = f"{Path(code.co_filename).name}:{code.co_qualname if sys.version_info >= (3, 11) else code.co_name}"
-        call = Call(what, place, self.state, threading.current_thread() is self._owner)
+        location = f"{Path(code.co_filename).name}:{code.co_qualname if sys.version_info >= (3, 11) else code.co_name}"
+        call = Call(operation, location, self.state, threading.current_thread() is self._owner)
         self.seen[call] = None
         wanted = self.failing
-        if wanted and (what, place) == (wanted.what, wanted.place) and (self.failed or call == wanted):
+        if wanted and (operation, location) == (wanted.what, wanted.place) and (self.failed or call == wanted):
             self.failed += 1
-            raise ERRORS.get(what, OSError(28, "No space left on device"))
+            raise ERRORS.get(operation, OSError(28, "No space left on device"))
 
 
 class Stream:
@@ -133,9 +133,9 @@ def watched(outputs: Outputs) -> Iterator[Console]:
         yield Console(file=Stream(outputs, io.StringIO()), force_terminal=True, width=100)  # type: ignore[arg-type]
 
 
-def _watched(outputs: Outputs, what: str, call: Any, *, wrap: bool = False) -> Any:
+def _watched(outputs: Outputs, operation: str, call: Any, *, wrap: bool = False) -> Any:
     def passed(*arguments: Any, **options: Any) -> Any:
-        outputs.passed(what)
+        outputs.passed(operation)
         result = call(*arguments, **options)
         return Stream(outputs, result) if wrap else result
 

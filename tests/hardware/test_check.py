@@ -152,11 +152,11 @@ def test_extremes_of_the_acceleration_are_those_of_the_interpolant() -> None:
         times = np.linspace(left + 1e-9, right - 1e-9, 401)
         rates = np.array([path.at(t)[1] for t in times])
         accelerations = np.diff(rates, axis=0) / np.diff(times)[:, None]
-        found = extremes.acceleration[:2, interval]
+        computed = extremes.acceleration[:2, interval]
         # Differences lie half a step inside the interval.
-        inside = 1 / 400 * np.abs(found[1] - found[0])
-        assert np.all(np.abs(found.max(axis=0) - accelerations.max(axis=0)) <= inside)
-        assert np.all(np.abs(found.min(axis=0) - accelerations.min(axis=0)) <= inside)
+        inside = 1 / 400 * np.abs(computed[1] - computed[0])
+        assert np.all(np.abs(computed.max(axis=0) - accelerations.max(axis=0)) <= inside)
+        assert np.all(np.abs(computed.min(axis=0) - accelerations.min(axis=0)) <= inside)
 
 
 def test_a_held_rate_that_steps_is_an_acceleration_over_the_time_it_stands_for() -> None:
@@ -257,8 +257,8 @@ def test_shaking_of_a_smooth_path_is_the_velocity_it_gains_and_loses() -> None:
     for window, expected in ((0.5, 2.0), (1.0, 4.0), (0.248, 2 * (1 - math.cos(2 * math.pi * 0.124)))):
         assert path.shaking(window)[0][0] == pytest.approx(expected, rel=1e-4)
     # The cubic between three knots turns on the way: v = 1 − 3s + 3s², so 1 to ¼ and back to 1 within an interval.
-    one = Path(np.array([0.0, 1.0]), np.array([[0.0], [0.5]]), np.array([[1.0]]), np.array([[1.0]]))
-    assert one.shaking(1.0)[0][0] == pytest.approx(0.75)
+    single = Path(np.array([0.0, 1.0]), np.array([[0.0], [0.5]]), np.array([[1.0]]), np.array([[1.0]]))
+    assert single.shaking(1.0)[0][0] == pytest.approx(0.75)
 
 
 def test_a_single_jump_of_the_rate_is_bounded_by_the_acceleration(write_map) -> None:

@@ -68,8 +68,8 @@ def test_check_replay_compare_on_virtual_servos(call, files: Path) -> None:
     code, _, _ = call("hw", "compare", record, files / "out" / "measured.h5", "--joint", names[-1])
     assert code == 0
     assert (files / "out" / "comparison.png").read_bytes() != worst
-    code, told, error = call("hw", "compare", record, files / "out" / "measured.h5", "--joint", "knee")
-    assert told == ""
+    code, output, error = call("hw", "compare", record, files / "out" / "measured.h5", "--joint", "knee")
+    assert output == ""
     assert code == 2
     assert error.startswith(f"error: no joint 'knee' was compared; there are: {', '.join(names)}")
     (files / "gate.yaml").write_text("rms_rad: 0.001\n", encoding="utf-8")

@@ -241,9 +241,9 @@ def test_wheels_are_compared_in_rate_and_in_how_far_they_turned(speed: float) ->
     assert wheel.turned == pytest.approx(8 - np.cos(4) + 1, abs=1e-6)
     assert (wheel.angle_max, wheel.angle_end) == pytest.approx((0.04 / speed, 0.04 / speed), abs=1e-6)
     assert [joint.joint for joint in comparison.joints] == ["a"]
-    found = comparison.summary()
-    assert found["wheels"]["rho1"]["angle_end_rad"] == wheel.angle_end
-    assert found["wheel_rate_rms_rad_s"] == wheel.rate_rms
+    summary = comparison.summary()
+    assert summary["wheels"]["rho1"]["angle_end_rad"] == wheel.angle_end
+    assert summary["wheel_rate_rms_rad_s"] == wheel.rate_rms
 
 
 def test_missed_answers_of_a_wheel_are_left_out() -> None:

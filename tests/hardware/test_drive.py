@@ -73,15 +73,15 @@ class Simulated:
         return (self.sent + 1) * self.step > self.until
 
     def take(self, most: int) -> list[Sample]:
-        now, found = self.clock.now(), []
+        now, due = self.clock.now(), []
         if self.sent * self.step >= self.dies_at:
             self.fault = "the process of the simulation is gone"
-        while len(found) < most and not self.over and not self.fault and self._may_go_on(now):
+        while len(due) < most and not self.over and not self.fault and self._may_go_on(now):
             self.sent += 1
-            found.append(Sample(self.sent * self.step, *self.posture(self.sent * self.step)))
+            due.append(Sample(self.sent * self.step, *self.posture(self.sent * self.step)))
             # As live.pace does: what is lost beyond a period is lost.
             self._due = max(self._due + self.step, now - self.step)
-        return found
+        return due
 
     def _may_go_on(self, now: float) -> bool:
         if not self.told:
@@ -221,7 +221,7 @@ def test_a_loop_that_is_late_makes_no_burst(rig: Rig) -> None:
     assert feed.sent * STEP == 2.0
 
 
-def beyond(what: str) -> Posture:
+def beyond(limit: str) -> Posture:
     """As swinging, and from 1 s on something that no map allows."""
 
     def posture(time: float) -> tuple[Array, Array]:
@@ -229,20 +229,20 @@ def beyond(what: str) -> Posture:
         since = time - 1.0
         if since <= 0.0:
             return position, rate
-        if what == "position":  # 1.05 rad are allowed
+        if limit == "position":  # 1.05 rad are allowed
             position[0] += 0.4 * since**2
             rate[0] += 0.8 * since
-        elif what == "velocity":
+        elif limit == "velocity":
             position[1] += 4.0 * since**2
             rate[1] += 8.0 * since
-        elif what == "acceleration":
+        elif limit == "acceleration":
             rate[0] += 5.5 * (since < 2 * STEP)
-        elif what == "shaking":
+        elif limit == "shaking":
             position[0] += 0.012 * (round(since / STEP / 2) % 2)
-        elif what == "wheel":
+        elif limit == "wheel":
             position[2] += 4.0 * since**2
             rate[2] += 8.0 * since
-        elif what == "no number":
+        elif limit == "no number":
             position[0] = math.nan
         return position, rate
 
@@ -259,12 +259,12 @@ WORDS = {
 }
 
 
-@pytest.mark.parametrize("what", WORDS)
-def test_what_is_beyond_a_limit_is_never_followed(rig: Rig, what: str) -> None:
-    run = drive(rig, posture=beyond(what), until=4.0)
+@pytest.mark.parametrize("limit", WORDS)
+def test_what_is_beyond_a_limit_is_never_followed(rig: Rig, limit: str) -> None:
+    run = drive(rig, posture=beyond(limit), until=4.0)
     assert run.result.fault is not None
     assert run.result.fault.cause == Cause.LIMIT
-    assert WORDS[what] in run.result.fault.text
+    assert WORDS[limit] in run.result.fault.text
     assert run.result.fault_state == ReplayState.REPLAY
     assert run.result.end_state == "holding"
     check_goals_within_limits(run)
@@ -366,7 +366,7 @@ STRUCK = [case for case in CASES if case.scripted_onset]
         pytest.param(case, ("decelerate", "hold", "off")[number % 3], marks=() if number % 4 == 0 else pytest.mark.long)
         for number, case in enumerate(STRUCK)
     ],
-    ids=lambda one: getattr(one, "name", one),
+    ids=lambda value: getattr(value, "name", value),
 )
 def test_faults_of_servos_end_a_drive_as_they_end_a_replay(rig: Rig, case: Case, policy: str) -> None:
     fault = {**case.entry, "at": 0.9} | ({"id": case.ids[0]} if case.ids else {})

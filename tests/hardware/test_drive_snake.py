@@ -210,18 +210,18 @@ def postures(duration: int, requests: Mapping[int, int]) -> tuple[list[Sample], 
     servo_map = snake_map()
     feed = SimulatedSnake(servo_map)
     columns = Columns(feed.session, servo_map)
-    found = []
+    lifted = []
     for tick in range(duration):
         feed.session.tick(command(tick, requests))
-        found += feed.follower.lookahead.add(columns.sample(), *columns.base(feed.follower.lookahead.yaw))
-    return [feed.follower.first, *found, *feed.follower.lookahead.remaining()], feed.session.record()
+        lifted += feed.follower.lookahead.add(columns.sample(), *columns.base(feed.follower.lookahead.yaw))
+    return [feed.follower.first, *lifted, *feed.follower.lookahead.remaining()], feed.session.record()
 
 
 @pytest.mark.parametrize("ticks", [1, 2, 30, 61, 63, 230, 270])
 def test_a_drive_may_end_at_any_tick(ticks: int) -> None:
     """Also where less has passed than postures are held back. Not while a pair rises: no record may end there."""
     samples, simulated = postures(ticks, {150: 4})
-    assert [one.time for one in samples] == pytest.approx(simulated.time)
+    assert [lifted.time for lifted in samples] == pytest.approx(simulated.time)
     path = check_motion(simulated, snake_map()).path
     growing = IncrementalPath(samples[0], snake_map())
     for sample in samples[1:]:
@@ -236,7 +236,7 @@ def test_what_rises_at_the_end_is_left_on_its_way() -> None:
         check_motion(simulated, snake_map())
     assert samples[-1].time == pytest.approx(0.9)
     growing = IncrementalPath(samples[0], snake_map())
-    assert [words for one in samples[1:] if (words := growing.append(one, keep=0.0))] == []
+    assert [words for sample in samples[1:] if (words := growing.append(sample, keep=0.0))] == []
 
 
 @pytest.mark.parametrize(

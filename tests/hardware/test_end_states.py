@@ -107,7 +107,7 @@ def test_a_pause_shorter_than_the_watchdogs_is_no_stall(rig) -> None:
 def largest_steps(run: Run) -> dict[int, int]:
     """The largest step from goal to goal of every servo in position mode, by ID [ticks]."""
     ids = [servo.id for servo in run.map.servos if servo.in_position_mode]
-    return {id_: max(abs(np.diff([value for _, one, value in run.goals() if one == id_]))) for id_ in ids}
+    return {id_: max(abs(np.diff([value for _, goal_id, value in run.goals() if goal_id == id_]))) for id_ in ids}
 
 
 @pytest.mark.parametrize("pause", [0.05, 0.1, 0.17])
@@ -198,10 +198,10 @@ def test_a_second_fault_on_the_way_is_named_and_shows(rig, onset: float, kind: s
     assert {id_ for fault in result.faults for id_ in fault.ids} == {1, 2}
     if policy == "decelerate":
         # It was told to stop when it was found, once, and not to slow down with the others any more.
-        found = (
+        named_at = (
             next(fault for fault in result.faults if 2 in fault.ids).time if kind == "drop_off" else result.fault_time
         )
-        later = [time for time, id_, _ in result.policy_goals if id_ == 2 and time > found]
+        later = [time for time, id_, _ in result.policy_goals if id_ == 2 and time > named_at]
         wheel = [time for time, id_, _ in result.policy_goals if id_ == 7]
         assert max(later) < max(wheel)
 

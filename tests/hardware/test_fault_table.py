@@ -25,13 +25,13 @@ def cell_of(fault: str, state: str, policy: str) -> dict:
 def test_fresh_runs_of_every_cell(case, runs):
     """Seeds that the kept table does not have."""
     for cell in cells(runs, [case], first=1000):
-        found, kept = cell.as_dict(), cell_of(cell.case, cell.state, cell.policy)
-        assert found["broken"] == [], cell
+        fresh, kept = cell.as_dict(), cell_of(cell.case, cell.state, cell.policy)
+        assert fresh["broken"] == [], cell
         # What is rarer than one run in a hundred may be new; what the table says always happens must happen.
         if len(kept["ends"]) == 1:
-            assert found["ends"].keys() == kept["ends"].keys()
-        if kept["cycles_max"] is not None and found["cycles_max"] is not None:
-            assert found["cycles_max"] <= 2 * kept["cycles_max"] + 2
+            assert fresh["ends"].keys() == kept["ends"].keys()
+        if kept["cycles_max"] is not None and fresh["cycles_max"] is not None:
+            assert fresh["cycles_max"] <= 2 * kept["cycles_max"] + 2
 
 
 def test_the_kept_table_is_whole_and_has_no_broken_promise():

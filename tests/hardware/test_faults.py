@@ -53,20 +53,20 @@ def check_case(rig, case: Case, seed: int) -> None:
         entry["at"] = onset
     run = rig.run(entry, seed=seed, policy=policy)
     result = run.result
-    what = f"{case.name}, seed {seed}, {policy}: {result.fault_text}, {result.end_state}"
+    description = f"{case.name}, seed {seed}, {policy}: {result.fault_text}, {result.end_state}"
     check_goals_within_limits(run)
     if not case.causes:
-        assert result.fault is None, what
+        assert result.fault is None, description
         assert result.end_state == "off"
         assert not any(servo["torque_enable"] for servo in run.line.servos.registers.values())
         return
-    assert result.fault is not None, what
-    assert result.fault.cause in case.causes, what
+    assert result.fault is not None, description
+    assert result.fault.cause in case.causes, description
     check_nothing_but_the_policy_after(run)
-    check_end_state(run, policy, entry, what)
+    check_end_state(run, policy, entry, description)
     if case.scripted_onset:
         # A fault strikes at the first physics step after its onset.
-        check_reaction(run, run.line.servos.torque_since + onset + PHYSICS_STEP, case, what)
+        check_reaction(run, run.line.servos.torque_since + onset + PHYSICS_STEP, case, description)
 
 
 def check_nothing_but_the_policy_after(run) -> None:
@@ -100,15 +100,15 @@ def check_comes_to_rest(run) -> None:
     assert last - run.result.fault_time <= run.map.safety.stop_time + 10 / run.map.bus.rate
 
 
-def check_end_state(run, policy: str, entry: dict[str, Any], what: str) -> None:
+def check_end_state(run, policy: str, entry: dict[str, Any], description: str) -> None:
     end, line = run.result.end_state, run.line
     if run.result.fault.cause == Cause.VERIFICATION:
-        assert end == "not armed", what
+        assert end == "not armed", description
         assert not any(servo["torque_enable"] for servo in line.servos.registers.values())
         assert not run.goals()
         return
     if run.result.fault.cause == Cause.PORT:
-        assert end == "unreachable", what
+        assert end == "unreachable", description
         line.advance(line.time + 2.0)
         # Nobody can be told anything: the servos' own watchdogs stop them.
         assert all(servo["bus_watchdog"] == -1 for servo in line.servos.registers.values())
@@ -116,57 +116,59 @@ def check_end_state(run, policy: str, entry: dict[str, Any], what: str) -> None:
         return
     silent = {entry["id"]} if entry["kind"] in SILENCING else set()
     asked = "limp: off" if policy == "off" or entry["kind"] == "supply_loss" else "holding"
-    check_what_was_read(run, silent, what)
+    check_what_was_read(run, silent, description)
     for servo in run.result.servos:
         if servo.id != entry.get("id"):
-            assert servo.doing == asked, what
+            assert servo.doing == asked, description
         elif silent:
-            assert servo.doing == "does not answer", what
+            assert servo.doing == "does not answer", description
         elif entry["kind"] not in DISABLING:
-            assert servo.doing == asked, what
+            assert servo.doing == asked, description
     doings = {servo.doing for servo in run.result.servos}
-    assert end == ({"holding": "holding", "limp: off": "off"}[asked] if doings == {asked} else end), what
-    assert end.startswith("mixed: 2 ") == (len(doings) > 1), what
+    assert end == ({"holding": "holding", "limp: off": "off"}[asked] if doings == {asked} else end), description
+    assert end.startswith("mixed: 2 ") == (len(doings) > 1), description
     if asked == "limp: off":
         alive = [id_ for id_ in line.servos.ids if line.servos.registers[id_]["torque_enable"]]
         # The torque was taken from those too who cannot say so.
-        assert not alive, what
-        assert set(run.result.torque_still_on) == silent, what
+        assert not alive, description
+        assert set(run.result.torque_still_on) == silent, description
         return
     line.advance(line.time + 2.0)
-    assert np.abs(line.servos.plant.velocity).max() < 1e-2, what
+    assert np.abs(line.servos.plant.velocity).max() < 1e-2, description
     for id_, servo in line.servos.registers.items():
         if id_ == entry.get("id") and entry["kind"] in (*DISABLING, "drop_off"):
             continue
-        assert servo["torque_enable"], what
-        assert servo["bus_watchdog"] == 0, what
+        assert servo["torque_enable"], description
+        assert servo["bus_watchdog"] == 0, description
 
 
-def check_what_was_read(run, silent: set[int], what: str) -> None:
+def check_what_was_read(run, silent: set[int], description: str) -> None:
     """The servos reported are the servos there are; that they are as reported is one of the kept promises."""
     servos = run.line.servos
     for servo, end in zip(run.map.servos, run.result.servos, strict=True):
         assert (end.joint, end.id) == (servo.joint, servo.id)
         if servo.id in silent:
-            assert (end.torque, end.error, end.position, end.doing) == (None, None, None, "does not answer"), what
+            assert (end.torque, end.error, end.position, end.doing) == (None, None, None, "does not answer"), (
+                description
+            )
             continue
         index = servos.ids.index(servo.id)
-        assert end.torque == (end.doing in ("holding", "moving", "watchdog tripped")), what
+        assert end.torque == (end.doing in ("holding", "moving", "watchdog tripped")), description
         speed = servo.sign * servos.plant.velocity[index]
         # Who is limp coasts to a halt while it is asked.
-        assert not end.torque or abs(end.velocity - speed) < 0.05, what
+        assert not end.torque or abs(end.velocity - speed) < 0.05, description
         if end.doing == "holding":
-            assert abs(speed) < 0.15, what
+            assert abs(speed) < 0.15, description
         if end.error and not end.torque:
             names = {1: "input voltage", 4: "overheating", 32: "overload"}
-            assert end.doing == f"limp: {names[end.error]}", what
+            assert end.doing == f"limp: {names[end.error]}", description
 
 
-def check_reaction(run, onset: float, case: Case, what: str) -> None:
+def check_reaction(run, onset: float, case: Case, description: str) -> None:
     """Cycles from the first that can show the fault to the one that declared it."""
     if run.result.fault.cause == Cause.PORT:
         # The transaction in which the port dies declares it.
-        assert run.result.fault_time - onset <= 1.5 / run.map.bus.rate, what
+        assert run.result.fault_time - onset <= 1.5 / run.map.bus.rate, description
         return
     record, plan = run.result.record, run.replay.motion.plan
     bound = reaction_bound(run.result.fault.cause, run.map, plan)
@@ -174,15 +176,15 @@ def check_reaction(run, onset: float, case: Case, what: str) -> None:
     if run.result.fault.cause in (Cause.FOLLOWING_ERROR, Cause.TORQUE):
         over = over_the_threshold(run)[before]
         run_length = len(over) if over.all() else int(np.argmin(over[::-1]))
-        assert run_length == bound, f"{what}: {run_length} cycles, bound {bound}"
+        assert run_length == bound, f"{description}: {run_length} cycles, bound {bound}"
         return
     starts = (record.time + run.replay.loop.path_started)[before] if run.replay.loop.path_started else None
     if starts is None:
         starts = (record.time + run.replay.loop.origin)[before]
     cycles = int((starts >= onset + case.visible_after).sum())
-    assert cycles <= bound, f"{what}: {cycles} cycles, bound {bound}"
+    assert cycles <= bound, f"{description}: {cycles} cycles, bound {bound}"
     # No cycle at all only where the fault struck within the one that declared it: the clock says so too.
-    assert onset <= run.result.fault_time <= onset + case.visible_after + (bound + 1) / run.map.bus.rate, what
+    assert onset <= run.result.fault_time <= onset + case.visible_after + (bound + 1) / run.map.bus.rate, description
 
 
 def over_the_threshold(run) -> np.ndarray:

@@ -41,11 +41,11 @@ class Oracle:
 
     def __init__(self) -> None:
         self.model = pin.Model()
-        parent, place = 0, pin.SE3.Identity()
+        parent, placement = 0, pin.SE3.Identity()
         for name in JOINTS:
             kind = pin.JointModelRZ() if name.startswith("theta") else pin.JointModelRY()
-            place = pin.SE3(np.eye(3), np.array([-LINK, 0.0, 0.0]))
-            parent = self.model.addJoint(parent, kind, place, name)
+            placement = pin.SE3(np.eye(3), np.array([-LINK, 0.0, 0.0]))
+            parent = self.model.addJoint(parent, kind, placement, name)
         self.data = self.model.createData()
         self.axle = [self.model.getJointId(name) for name in PITCH] + [parent]
         self.tail = pin.SE3(np.eye(3), np.array([-LINK, 0.0, 0.0]))
@@ -104,8 +104,8 @@ def posed(record: Record, servo_map: ServoMap) -> Posed:
     columns = [servo_map.joints.index(name) for name in JOINTS]
     first = int(np.searchsorted(path.time, 0.0))
     angles = path.position[first : first + len(record), columns]
-    found = [oracle.from_head(w, head_offset(record), q) for w, q in zip(record["w"], angles, strict=True)]
-    return Posed(record, *(np.array(part) for part in zip(*found, strict=True)))
+    poses = [oracle.from_head(w, head_offset(record), q) for w, q in zip(record["w"], angles, strict=True)]
+    return Posed(record, *(np.array(part) for part in zip(*poses, strict=True)))
 
 
 Find = Callable[[str, "str | None"], Posed]
@@ -125,26 +125,26 @@ def operator(posed_run: Find) -> Posed:
 def settled(record: Record) -> np.ndarray:
     """Where a pair has been lifted for the blend time, and stays so for as long."""
     away, time = record["grounded"] == 0, record.time
-    found = np.zeros_like(away)
+    angles = np.zeros_like(away)
     for pair in range(away.shape[1]):
         for row in np.flatnonzero(away[:, pair]):
             near = np.abs(time - time[row]) < BLEND + 1e-9
-            found[row, pair] = away[near, pair].all()
-    return found
+            angles[row, pair] = away[near, pair].all()
+    return angles
 
 
 @pytest.mark.parametrize(("scenario", "variant"), PASSING)
 def test_lifted_wheels_clear_the_floor_and_grounded_pairs_touch_it(posed_run, scenario, variant) -> None:
     """At every sample of the records, blends and all; both wheels of what is lifted, the lower one of the others."""
-    found = posed_run(scenario, variant)
-    record, up = found.record, settled(found.record)
+    poses = posed_run(scenario, variant)
+    record, up = poses.record, settled(poses.record)
     assert (record["grounded"] == 0).any()
     assert up.sum() > 0.9 * (record["grounded"] == 0).sum()
-    np.testing.assert_allclose(found.lower[up], CLEARANCE, atol=1e-8)
-    assert found.wheel[up].min() > CLEARANCE - 1e-8
+    np.testing.assert_allclose(poses.lower[up], CLEARANCE, atol=1e-8)
+    assert poses.wheel[up].min() > CLEARANCE - 1e-8
     # Far within the 0.1 mm: nothing is left but rounding, and nothing is pushed into the floor, in no blend either.
-    np.testing.assert_allclose(found.lower[found.grounded], 0.0, atol=1e-8)
-    assert found.wheel.min() > -1e-8
+    np.testing.assert_allclose(poses.lower[poses.grounded], 0.0, atol=1e-8)
+    assert poses.wheel.min() > -1e-8
 
 
 def test_the_operator_lifts_in_all_samples_and_every_mode(operator) -> None:
@@ -156,12 +156,12 @@ def test_the_operator_lifts_in_all_samples_and_every_mode(operator) -> None:
 @pytest.mark.parametrize(("scenario", "variant"), PASSING)
 def test_the_head_stays_where_the_record_has_it(posed_run, scenario, variant) -> None:
     """From the recorded head down the chain pair 1 is met at its recorded place, flat on the floor."""
-    found = posed_run(scenario, variant)
-    base = found.record["base_pose"]
-    np.testing.assert_allclose(found.middle[:, 0, :2], base[:, :2], atol=1e-8)
-    np.testing.assert_allclose(found.wheel[:, 0], 0.0, atol=1e-8)
+    poses = posed_run(scenario, variant)
+    base = poses.record["base_pose"]
+    np.testing.assert_allclose(poses.middle[:, 0, :2], base[:, :2], atol=1e-8)
+    np.testing.assert_allclose(poses.wheel[:, 0], 0.0, atol=1e-8)
     left = np.column_stack([-np.sin(base[:, 2]), np.cos(base[:, 2])])
-    np.testing.assert_allclose(found.axle[:, 0, :2], left, atol=1e-8)
+    np.testing.assert_allclose(poses.axle[:, 0, :2], left, atol=1e-8)
 
 
 def test_no_wheel_is_pushed_into_the_floor_between_two_samples(operator) -> None:
@@ -231,9 +231,9 @@ def with_lifts(servo_map: ServoMap, **changes: object) -> ServoMap:
 
 def test_clearance_and_blend_can_be_set(simulated) -> None:
     record = simulated("snake_positioning", "z")
-    found = posed(record, with_lifts(snake_map(), clearance_mm=12, blend_s=0.5))
-    np.testing.assert_allclose(found.lower[~found.grounded], 12e-3, atol=1e-8)
-    np.testing.assert_allclose(found.lower[found.grounded], 0.0, atol=1e-8)
+    poses = posed(record, with_lifts(snake_map(), clearance_mm=12, blend_s=0.5))
+    np.testing.assert_allclose(poses.lower[~poses.grounded], 12e-3, atol=1e-8)
+    np.testing.assert_allclose(poses.lower[poses.grounded], 0.0, atol=1e-8)
 
 
 def a_snake(yaw: np.ndarray, grounded: np.ndarray, simulated, rate: float = 200.0) -> Record:
@@ -301,8 +301,8 @@ def best_deviation(yaw: np.ndarray, away: set[int]) -> float:
             else:
                 rows += [[*lift, -1.0], [*(-np.array(lift)), -1.0]]
                 bounds += [0.0, 0.0]
-    found = linprog([*[0.0] * 6, 1.0], A_ub=rows, b_ub=bounds, bounds=[(None, None)] * 6 + [(0.0, None)])
-    return float(found.x[-1])
+    optimum = linprog([*[0.0] * 6, 1.0], A_ub=rows, b_ub=bounds, bounds=[(None, None)] * 6 + [(0.0, None)])
+    return float(optimum.x[-1])
 
 
 def test_what_stays_of_the_twist_no_pitch_angles_could_remove(operator) -> None:

@@ -74,7 +74,7 @@ def port(device: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[PortHandler]:
 
 def patiently(answers: Callable[[], bool]) -> None:
     """Until a servo that starts anew answers again."""
-    wait_for(answers, what="it never answered again")
+    wait_for(answers, failure="it never answered again")
 
 
 def test_every_instruction_of_the_makers_library(port: PortHandler) -> None:
@@ -111,8 +111,8 @@ def test_every_instruction_of_the_makers_library(port: PortHandler) -> None:
         for id_ in MODEL_OF:
             sync_read.addParam(id_)
         assert getattr(sync_read, exchange)() == COMM_SUCCESS, exchange
-        found = [sync_read.getData(id_, F["profile_acceleration"].address, 4) for id_ in MODEL_OF]
-        assert found == list(MODEL_OF), exchange
+        accelerations = [sync_read.getData(id_, F["profile_acceleration"].address, 4) for id_ in MODEL_OF]
+        assert accelerations == list(MODEL_OF), exchange
     bulk_write = sdk.GroupBulkWrite(port, library)
     bulk_write.addParam(1, F["led"].address, 1, [0])
     bulk_write.addParam(2, F["profile_velocity"].address, 4, [99, 0, 0, 0])
@@ -275,9 +275,9 @@ def test_the_servos_see_a_client_that_is_stopped(device: str, port: PortHandler,
         assert read("torque_enable") == 1
         assert abs(read("present_velocity")) <= 1
         at = read("present_position")
-        told = client.stderr.count("told")
+        messages = client.stderr.count("told")
         os.kill(client.process.pid, signal.SIGCONT)
-        client.wait_for("told", count=told + 20)
+        client.wait_for("told", count=messages + 20)
         # It throws away what waits to be read, before each request.
         os.kill(client.process.pid, signal.SIGSTOP)
         assert abs(read("present_position") - at) <= 1, "goals are read-only until the watchdog is cleared"

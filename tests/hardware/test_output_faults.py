@@ -132,8 +132,8 @@ def check(rig: Rig, ending: str, expected: Case, call: Call, folder: Path) -> No
     else:
         assert type(case.error) is type(expected.error)
     if not call.looping:
-        told = " ".join(map(str, [case.error, *case.warnings]))
-        assert " failed: " in told, "told to nobody"
+        messages = " ".join(map(str, [case.error, *case.warnings]))
+        assert " failed: " in messages, "told to nobody"
         if call.place.startswith("display.py"):
             summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
             assert "progress bar" in summary["outputs_failed"]

@@ -135,9 +135,9 @@ def replaying(servos: Servos) -> Iterator[Child]:
 def test_the_stock_client_library_finds_the_servos(servos: Servos) -> None:
     port, library = PortHandler(str(servos.device)), Protocol2PacketHandler()
     assert port.setBaudRate(1_000_000)
-    found, result = library.broadcastPing(port)
+    answered, result = library.broadcastPing(port)
     assert result == COMM_SUCCESS
-    assert found == {1: [321, 45], 2: [321, 45], 7: [30, 45]}
+    assert answered == {1: [321, 45], 2: [321, 45], 7: [30, 45]}
     port.setBaudRate(57_600)
     assert library.ping(port, 1)[1] != COMM_SUCCESS, "another bit rate is noise to the servos"
     port.closePort()

@@ -43,10 +43,10 @@ def streamed(rig: Rig, tmp_path_factory: pytest.TempPathFactory) -> tuple[Record
     return result.record, (folder / PART).read_bytes()
 
 
-def same(one: Record, other: Record, count: int) -> None:
-    assert set(one.signals) == set(other.signals)
-    np.testing.assert_array_equal(one.time[:count], other.time)
-    for name, signal in one.signals.items():
+def same(record: Record, other: Record, count: int) -> None:
+    assert set(record.signals) == set(other.signals)
+    np.testing.assert_array_equal(record.time[:count], other.time)
+    for name, signal in record.signals.items():
         np.testing.assert_array_equal(signal.data[:count], other[name], strict=True)
         assert (signal.unit, signal.labels) == (other.units[name], other.labels[name])
 
@@ -240,15 +240,15 @@ def test_the_end_that_a_replay_has_told_is_kept(rig: Rig, tmp_path: Path, monkey
         patch.setattr(measured, "replace_together", refuse)
         with pytest.raises(ReplayAborted, match="measured record failed"):
             replay(rig, tmp_path, faults=[{"kind": "overload", "id": 2, "at": 1.7}])
-    told = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
+    kept = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
     recovered = recover(tmp_path)
     summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
     assert summary["end_state"] == "mixed: 2 holding; elbow limp: overload"
-    assert told["outputs_failed"].keys() == {"measured record"}
-    assert {name: summary[name] for name in told} == told
+    assert kept["outputs_failed"].keys() == {"measured record"}
+    assert {name: summary[name] for name in kept} == kept
     assert summary["recovered"]
     assert summary["timing"]["cycles"] == len(recovered)
-    assert Record.load(tmp_path / "measured.h5").summary["servos"] == told["servos"]
+    assert Record.load(tmp_path / "measured.h5").summary["servos"] == kept["servos"]
 
 
 def test_a_complete_record_is_not_called_failed(rig: Rig, tmp_path: Path, monkeypatch) -> None:

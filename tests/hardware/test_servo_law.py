@@ -25,5 +25,5 @@ def test_torque_is_stiffness_within_the_stall_torque_less_back_emf(voltage):
         )
         driven = np.clip(wanted, -available, available) - law.damping * v
         expected = np.where(enabled, driven, -FREE_DAMPING * law.damping * v)
-        found = law.torque(q, v, Drive(enabled, in_position_mode, q_set, v_set, voltage))
-        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+        torque = law.torque(q, v, Drive(enabled, in_position_mode, q_set, v_set, voltage))
+        np.testing.assert_allclose(torque, expected, rtol=0, atol=1e-12)

@@ -117,7 +117,7 @@ def test_it_is_the_simulation_of_the_same_arm_with_position_servos() -> None:
     ]
     tight = bare.config.integrator.model_copy(update={"method": "dopri5", "rtol": 1e-12, "atol": 1e-12})
     exact = replace(bare, config=bare.config.model_copy(update={"integrator": tight}))
-    same, best = (dynsim.Simulation(one, duration=10.0, trace=0, motors=motors) for one in (bare, exact))
+    same, best = (dynsim.Simulation(variant, duration=10.0, trace=0, motors=motors) for variant in (bare, exact))
     # It has stood on its brakes first, which has let the steps grow.
     for mode, closed, until in (("off", True, 0.0), ("position", False, 1e-3)):
         same.advance(until)
@@ -184,10 +184,10 @@ servos:
     first = [plant.joint_positions[0], plant.velocity[0] / scale]
     for _ in range(150):
         plant.step(PHYSICS_STEP, drive)
-    found = solve_ivp(rates, (0.0, 150 * PHYSICS_STEP), first, rtol=1e-10, atol=1e-12)["y"][:, -1]
-    assert plant.joint_positions[0] == pytest.approx(found[0], abs=1e-6)
-    assert plant.velocity[0] == pytest.approx(scale * found[1], abs=1e-5)
-    assert abs(found[0] - first[0]) > 0.05
+    solution = solve_ivp(rates, (0.0, 150 * PHYSICS_STEP), first, rtol=1e-10, atol=1e-12)["y"][:, -1]
+    assert plant.joint_positions[0] == pytest.approx(solution[0], abs=1e-6)
+    assert plant.velocity[0] == pytest.approx(scale * solution[1], abs=1e-5)
+    assert abs(solution[0] - first[0]) > 0.05
 
 
 def test_joints_stay_on_their_stand_until_they_are_switched_on() -> None:
@@ -242,9 +242,9 @@ def floor_forces(model: dynsim.Model, q: np.ndarray, torque: np.ndarray) -> tupl
     bodies = [body for body, there in zip(("link_4", "link_7"), touching, strict=True) if there]
     J = np.vstack([model.point_position_and_jacobian(body, np.zeros(3), q)[1] for body in bodies])
     needed = model.bias_forces(q, np.zeros(10)) - torque
-    found = np.linalg.lstsq(J.T, needed, rcond=1e-9)[0]
-    forces[touching] = found.reshape(-1, 3)
-    return forces, float(np.abs(J.T @ found - needed).max())
+    solved = np.linalg.lstsq(J.T, needed, rcond=1e-9)[0]
+    forces[touching] = solved.reshape(-1, 3)
+    return forces, float(np.abs(J.T @ solved - needed).max())
 
 
 def test_a_braced_arm_at_rest_stands_on_the_floor_and_not_in_it() -> None:
@@ -410,19 +410,19 @@ def test_servos_that_get_the_goals_of_a_dynamic_snake_go_its_way() -> None:
     record = dynsim.simulate(scenario)
     plant = SimulatedArm(scenario, servo_map, np.array([*record["phi_command"][0], *np.zeros(5 + 7)]))
     names = [servo.label for servo in servo_map.servos]
-    told = {name: record["phi_command"][:, k] for k, name in enumerate(record.labels["phi_command"])}
+    commands = {name: record["phi_command"][:, k] for k, name in enumerate(record.labels["phi_command"])}
     rates = {name: record["rho_dot_command"][:, k] for k, name in enumerate(record.labels["rho_dot_command"])}
     still = np.zeros(len(record))
     zero = np.array([servo.zero_tick * RAD_PER_TICK for servo in servo_map.servos])
     sense = np.array([servo.sign for servo in servo_map.servos])
     in_position = np.array([not name.startswith("rho") for name in names])
-    found = []
+    reached = []
     for k in range(len(record) - 1):
-        positions = zero + sense * np.array([told.get(name, still)[k] for name in names])
+        positions = zero + sense * np.array([commands.get(name, still)[k] for name in names])
         velocities = sense * np.array([rates.get(name, still)[k] for name in names])
-        found.append(plant.joint_positions[: len(record.labels["phi"])])
+        reached.append(plant.joint_positions[: len(record.labels["phi"])])
         for _ in range(2):
             plant.step(PHYSICS_STEP, Drive(np.ones(len(names), dtype=bool), in_position, positions, velocities, 12.0))
     assert np.abs(record["phi"] - record["phi"][0]).max() > 0.1  # it sags, and it turns its head
-    np.testing.assert_allclose(found, record["phi"][:-1], rtol=0, atol=5e-3)
+    np.testing.assert_allclose(reached, record["phi"][:-1], rtol=0, atol=5e-3)
     np.testing.assert_allclose(plant.simulation.state.q[:2], record["base_pose"][-1, :2], rtol=0, atol=2e-3)

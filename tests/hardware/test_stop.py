@@ -107,7 +107,7 @@ BROKEN = {"SIGSEGV", "SIGBUS", "SIGILL", "SIGFPE", "SIGABRT", "SIGTRAP", "SIGSYS
 
 @pytest.mark.parametrize(
     "number",
-    [one for one in signal.Signals if one.name not in {"SIGINT", "SIGRTMIN", "SIGRTMAX"} | UNHEEDED | BROKEN],
+    [number for number in signal.Signals if number.name not in {"SIGINT", "SIGRTMIN", "SIGRTMAX"} | UNHEEDED | BROKEN],
     ids=lambda number: number.name,
 )
 @pytest.mark.usefixtures("hang_ups")

@@ -110,7 +110,7 @@ def test_a_terminal_that_is_held_does_not_delay_the_motion(servos: Servos) -> No
 
 @pytest.mark.parametrize("closed", ["<&- >&- 2>&-", "</dev/null >/dev/full 2>/dev/full"])
 def test_standard_streams_that_are_closed_or_full(servos: Servos, closed: str) -> None:
-    arguments = " ".join(f"'{one}'" for one in servos.replay("--live", "--yes"))
+    arguments = " ".join(f"'{argument}'" for argument in servos.replay("--live", "--yes"))
     ended = subprocess.run(["/bin/sh", "-c", f"exec {arguments} {closed}"], timeout=120, check=False)
     if "full" in closed:
         # The motion went well, and what it had to tell was lost: told where it can be, and by the exit code.

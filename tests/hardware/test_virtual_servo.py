@@ -283,12 +283,12 @@ def test_a_late_status_is_the_answer_to_an_earlier_request(periods: int) -> None
     write(line, 2, "goal_velocity", 100)
     line.advance(0.5)
     port = VirtualPort(line, VirtualClock(), baud=1_000_000)
-    told, true = [], []
+    reported, true = [], []
     for cycle in range(10):
         port.clock.sleep_until(1.0 + 0.01 * cycle)
         # One that has missed no answer: after that it knows those to earlier requests.
         reply = DynamixelBus(port).sync_read((1, 2), 132, 4).replies.get(2)
-        told.append(reply and F["present_position"].decode(reply.data))
+        reported.append(reply and F["present_position"].decode(reply.data))
         true.append(line.servos.registers[2]["present_position"])
-    assert told[:periods] == [None] * periods
-    assert told[periods:] == true[:-periods]
+    assert reported[:periods] == [None] * periods
+    assert reported[periods:] == true[:-periods]

@@ -16,14 +16,14 @@ def teleop(tmp_path: Path) -> Iterator[Callable[..., Teleop]]:
     started: list[Teleop] = []
 
     def starts(*arguments: str) -> Teleop:
-        one = Teleop(tmp_path / f"drive_{len(started)}", *arguments)
-        started.append(one)
-        return one
+        drive = Teleop(tmp_path / f"drive_{len(started)}", *arguments)
+        started.append(drive)
+        return drive
 
     yield starts
-    for one in started:
-        if one.process.poll() is None:
-            one.process.kill()
-            one.process.wait()
-        if one.process.stdout is not None:
-            one.process.stdout.close()
+    for drive in started:
+        if drive.process.poll() is None:
+            drive.process.kill()
+            drive.process.wait()
+        if drive.process.stdout is not None:
+            drive.process.stdout.close()

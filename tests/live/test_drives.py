@@ -105,8 +105,8 @@ def test_hand_goes_as_fast_as_it_is_asked_to() -> None:
     for k in range(100):
         session.tick(Command(tuple(velocity.tolist()) if k < 50 else still))
     # What it loses while it speeds up it makes up for while it slows down; sums of ticks, so to rounding.
-    way = 0.5 * velocity
-    assert session.frame().hand - start == pytest.approx(way, abs=1e-3 * 0.025)
+    distance = 0.5 * velocity
+    assert session.frame().hand - start == pytest.approx(distance, abs=1e-3 * 0.025)
     record = session.record()
     assert record["target_position"][-1] == pytest.approx(session.frame().hand, abs=1e-12)
     speed = np.linalg.norm(np.diff(record["target_position"], axis=0), axis=1) / np.diff(record.time)
@@ -162,14 +162,14 @@ WAYS = [
 ]
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_hand_eases_to_rest_at_its_edge(way: tuple[float, float, float]) -> None:
+@pytest.mark.parametrize("direction", WAYS)
+def test_hand_eases_to_rest_at_its_edge(direction: tuple[float, float, float]) -> None:
     """At 0.1 m/s for 3 s: its target speeds up and slows down at 0.5 m/s² at most, and servos may follow the drive."""
     session = begin(load_scenario("elbow_comparison", "two_elbows"))
     operator = session.simulation.operator
     targets, hindered = [operator.target.copy()], set()
     for _ in range(300):
-        session.tick(Command(tuple(0.1 * part for part in way)))
+        session.tick(Command(tuple(0.1 * part for part in direction)))
         targets.append(operator.target.copy())
         hindered.add(session.frame().hindrance)
     velocity = np.diff(np.array([targets[0], *targets]), axis=0) / session.period
@@ -193,14 +193,14 @@ def test_a_hand_at_its_edge_comes_back(directions: int) -> None:
     operator, random = session.simulation.operator, np.random.default_rng(3)
     targets, hindered = [operator.target.copy()], 0
 
-    def goes(way: np.ndarray[Any, Any]) -> None:
-        session.tick(Command(tuple(way.tolist())))
+    def goes(direction: np.ndarray[Any, Any]) -> None:
+        session.tick(Command(tuple(direction.tolist())))
         targets.append(operator.target.copy())
 
     for _ in range(directions):
-        way = random.normal(size=3)
+        direction = random.normal(size=3)
         for _ in range(100):
-            goes(0.2 * way / np.linalg.norm(way))
+            goes(0.2 * direction / np.linalg.norm(direction))
         hindered += bool(session.frame().hindrance)
         before = np.linalg.norm(targets[0] - targets[-1])
         for _ in range(150):

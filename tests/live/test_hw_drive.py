@@ -79,8 +79,8 @@ class Drive(Teleop):
             for pid in Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text().split()
             if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()
         ]
-        (found,) = map(int, own)
-        return found
+        (simulation_pid,) = map(int, own)
+        return simulation_pid
 
     def begin(self) -> Client:
         """A pilot, once the robot is where it begins."""
@@ -97,7 +97,7 @@ class Drive(Teleop):
     def ended(self, code: int) -> None:
         assert self.finish() == code, self.said
         # What multiprocessing has beside it ends when it sees that this one has.
-        wait_for(self.group_is_gone, what="a process is left")
+        wait_for(self.group_is_gone, failure="a process is left")
 
 
 @pytest.fixture
@@ -107,21 +107,21 @@ def drives(tmp_path: Path) -> Iterator[Callable[..., Drive]]:
 
     def starts(*arguments: str, text: str = MAP, port: str = "virtual", scenario: str = "six_axis_arm") -> Drive:
         (tmp_path / "six.yaml").write_text(text, encoding="utf-8")
-        given = (scenario, "--map", str(tmp_path / "six.yaml"), "--port", port, *arguments)
-        one = Drive(tmp_path / "drive", *given, command=("hw", "drive"))
-        started.append(one)
-        return one
+        words = (scenario, "--map", str(tmp_path / "six.yaml"), "--port", port, *arguments)
+        drive = Drive(tmp_path / "drive", *words, command=("hw", "drive"))
+        started.append(drive)
+        return drive
 
     yield starts
-    for one in started:
-        if one.process.poll() is None:
-            os.killpg(one.process.pid, signal.SIGKILL)
-            one.process.wait()
-        if one.process.stdout is not None:
-            one.process.stdout.close()
+    for drive in started:
+        if drive.process.poll() is None:
+            os.killpg(drive.process.pid, signal.SIGKILL)
+            drive.process.wait()
+        if drive.process.stdout is not None:
+            drive.process.stdout.close()
 
 
-def pull(client: Client, axes: dict[str, float], way: float) -> None:
+def pull(client: Client, axes: dict[str, float], distance: float) -> None:
     """Drive until the hand has gone so far [m]; a busy machine may seem to be silent on the way."""
     begun, state = None, ""
     while True:
@@ -129,7 +129,7 @@ def pull(client: Client, axes: dict[str, float], way: float) -> None:
         frame = client.until("hand")
         hand, state = np.array(frame["hand"]), frame["state"]
         begun = hand if begun is None else begun
-        if np.abs(hand - begun).max() > way:
+        if np.abs(hand - begun).max() > distance:
             return
 
 
@@ -146,9 +146,9 @@ def followed(record: Record) -> tuple[np.ndarray, np.ndarray]:
     return time, goals
 
 
-def check_against_the_simulation(one: Drive, *, in_trouble: bool = False) -> Record:
+def check_against_the_simulation(drive: Drive, *, in_trouble: bool = False) -> Record:
     """The goals are where the simulation was, until servos are in trouble; its script gives it again."""
-    simulated, (measured, _) = Record.load(one.folder / "record.h5"), one.measured()
+    simulated, (measured, _) = Record.load(drive.folder / "record.h5"), drive.measured()
     time, goals = followed(measured)
     expected = np.column_stack([np.interp(time, simulated.time, column) for column in simulated["q"].T])
     if in_trouble:
@@ -156,32 +156,32 @@ def check_against_the_simulation(one: Drive, *, in_trouble: bool = False) -> Rec
         goals, expected = goals[well], expected[well]
     # Of a chord over 5 ms at the 6.5 rad/s² with which the arm sags at first: 2.0e-5 rad; a tick is 1.5e-3.
     assert goals == pytest.approx(expected, abs=5e-5)
-    again = simulate(load_scenario(one.folder / "scenario.yaml"))
+    again = simulate(load_scenario(drive.folder / "scenario.yaml"))
     for name in simulated:
         assert np.array_equal(simulated[name], again[name], equal_nan=True), name
     return simulated
 
 
 def test_servos_follow_a_pilot_and_leave_a_run(drives: Callable[..., Drive]) -> None:
-    one = drives()
-    client = one.begin()
+    drive = drives()
+    client = drive.begin()
     pull(client, {"y": 1.0}, 0.05)
     pull(client, {"z": -1.0}, 0.02)
     client.say(do="end")
-    one.ended(0)
-    simulated = check_against_the_simulation(one)
-    measured, summary = one.measured()
+    drive.ended(0)
+    simulated = check_against_the_simulation(drive)
+    measured, summary = drive.measured()
     assert summary["end_state"] == "holding"
     assert measured.complete
     assert measured["state"][-1] == ReplayState.SETTLE
     assert followed(measured)[0][-1] == pytest.approx(simulated.time[-1], abs=0.006)
     assert np.ptp(measured["q"], axis=0).max() > 0.05
-    assert b"measured" in (one.folder / "view.html").read_bytes()
-    compared = dynsim("hw", "compare", one.folder / "record.h5", one.servos / "measured.h5")
+    assert b"measured" in (drive.folder / "view.html").read_bytes()
+    compared = dynsim("hw", "compare", drive.folder / "record.h5", drive.servos / "measured.h5")
     assert compared.returncode == 0, compared.stderr
-    comparison = json.loads((one.servos / "comparison.json").read_text(encoding="utf-8"))
+    comparison = json.loads((drive.servos / "comparison.json").read_text(encoding="utf-8"))
     assert 0.02 < comparison["delay_s"] < 0.08  # 43.5 ms by the law of the motors
-    assert "hw compare" in one.said
+    assert "hw compare" in drive.said
 
 
 def dynsim(*arguments: object) -> subprocess.CompletedProcess[str]:
@@ -191,12 +191,12 @@ def dynsim(*arguments: object) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.parametrize("how", ["silent", "gone"])
 def test_a_pilot_who_says_nothing_stops_the_servos(drives: Callable[..., Drive], how: str) -> None:
-    one = drives()
-    client = one.begin()
+    drive = drives()
+    client = drive.begin()
     pull(client, {"y": 1.0}, 0.03)
     if how == "gone":
         client.close()
-        client = one.connect()
+        client = drive.connect()
     else:
         client.until("state", lambda state: state == "silent")
     # It comes to rest in 0.2 s, and stays there.
@@ -208,9 +208,9 @@ def test_a_pilot_who_says_nothing_stops_the_servos(drives: Callable[..., Drive],
         client.wish({}, held=False)
     pull(client, {"y": -1.0}, 0.02)
     client.say(do="end")
-    one.ended(0)
-    check_against_the_simulation(one)
-    time, goals = followed(one.measured()[0])
+    drive.ended(0)
+    check_against_the_simulation(drive)
+    time, goals = followed(drive.measured()[0])
     still = (time > at + 0.3) & (time < at + 1.1)
     assert still.sum() > 20
     # What its gravity and its controller still do.
@@ -219,31 +219,31 @@ def test_a_pilot_who_says_nothing_stops_the_servos(drives: Callable[..., Drive],
 
 
 def test_a_pilot_cannot_leave_the_limits_of_the_map(drives: Callable[..., Drive]) -> None:
-    one = drives(text=NARROW)
-    client = one.begin()
+    drive = drives(text=NARROW)
+    client = drive.begin()
     with pytest.raises(ConnectionClosed):
         pull(client, {"y": 1.0}, np.inf)
     # The pilot looks at the page, not at the terminal.
     assert "the servos have stopped: limit" in client.over
     assert "base_yaw: position" in client.over
-    one.ended(4)
-    assert "base_yaw: position" in " ".join(one.said.split())
-    record, summary = one.measured()
+    drive.ended(4)
+    assert "base_yaw: position" in " ".join(drive.said.split())
+    record, summary = drive.measured()
     assert summary["fault"] == "limit"
     assert summary["end_state"] == "holding"
     goals = followed(record)[1][:, 0]
     assert 0.8 * np.radians(2.0) < np.abs(goals).max() <= np.radians(2.0)
-    check_against_the_simulation(one)
+    check_against_the_simulation(drive)
 
 
 def test_ctrl_c_stops_and_a_second_one_releases(drives: Callable[..., Drive], tmp_path: Path) -> None:
-    one = drives()
-    client = one.begin()
+    drive = drives()
+    client = drive.begin()
     client.drive({"y": 1.0}, 0.6)
-    one.process.send_signal(signal.SIGINT)
-    one.ended(130)
-    assert one.measured()[1]["end_state"] == "holding"
-    check_against_the_simulation(one)
+    drive.process.send_signal(signal.SIGINT)
+    drive.ended(130)
+    assert drive.measured()[1]["end_state"] == "holding"
+    check_against_the_simulation(drive)
     (tmp_path / "drive").rename(tmp_path / "first")
     two = drives()
     two.begin().drive({"y": 1.0}, 0.3)
@@ -256,19 +256,19 @@ def test_ctrl_c_stops_and_a_second_one_releases(drives: Callable[..., Drive], tm
 
 
 def test_a_terminal_sends_its_ctrl_c_to_all_processes(drives: Callable[..., Drive]) -> None:
-    one = drives()
-    one.begin().drive({"y": 1.0}, 0.4)
-    os.killpg(one.process.pid, signal.SIGINT)
-    one.ended(130)
-    assert one.measured()[1]["end_state"] == "holding"
-    check_against_the_simulation(one)
+    drive = drives()
+    drive.begin().drive({"y": 1.0}, 0.4)
+    os.killpg(drive.process.pid, signal.SIGINT)
+    drive.ended(130)
+    assert drive.measured()[1]["end_state"] == "holding"
+    check_against_the_simulation(drive)
 
 
 def test_a_simulation_that_stands_still_makes_no_burst(drives: Callable[..., Drive]) -> None:
-    one = drives()
-    client = one.begin()
+    drive = drives()
+    client = drive.begin()
     pull(client, {"y": 1.0}, 0.03)
-    simulation, log = one.simulation(), one.servos / "replay.log"
+    simulation, log = drive.simulation(), drive.servos / "replay.log"
     os.kill(simulation, signal.SIGSTOP)
     lines = len(log.read_text().splitlines())
     # A line in every second.
@@ -276,34 +276,34 @@ def test_a_simulation_that_stands_still_makes_no_burst(drives: Callable[..., Dri
     os.kill(simulation, signal.SIGCONT)
     pull(client, {"y": 1.0}, 0.02)
     client.say(do="end")
-    one.ended(0)
-    check_against_the_simulation(one)
-    measured, _ = one.measured()
+    drive.ended(0)
+    check_against_the_simulation(drive)
+    measured, _ = drive.measured()
     time, _ = followed(measured)
     assert (np.diff(time) < 1e-9).sum() > 50, "it has stood still"
 
 
 def test_a_simulation_that_is_killed_ends_the_drive_by_the_policy(drives: Callable[..., Drive]) -> None:
-    one = drives()
-    one.begin().drive({"y": 1.0}, 0.4)
-    os.kill(one.simulation(), signal.SIGKILL)
-    one.ended(4)
-    said = " ".join(one.said.split())
+    drive = drives()
+    drive.begin().drive({"y": 1.0}, 0.4)
+    os.kill(drive.simulation(), signal.SIGKILL)
+    drive.ended(4)
+    said = " ".join(drive.said.split())
     assert "the process of the simulation is gone" in said
     assert "not saved" in said
-    record, summary = one.measured()
+    record, summary = drive.measured()
     assert summary["fault"] == "simulation"
     assert summary["end_state"] == "holding"
     followed(record)
 
 
 def test_servos_that_are_gone_end_the_simulation(drives: Callable[..., Drive]) -> None:
-    one = drives()
-    one.begin().drive({"y": 1.0}, 0.4)
-    one.process.kill()
-    one.process.wait()
-    wait_for(one.group_is_gone, what="the simulation goes on")
-    assert Record.load(one.folder / "record.h5").time[-1] > 0.2
+    drive = drives()
+    drive.begin().drive({"y": 1.0}, 0.4)
+    drive.process.kill()
+    drive.process.wait()
+    wait_for(drive.group_is_gone, failure="the simulation goes on")
+    assert Record.load(drive.folder / "record.h5").time[-1] > 0.2
 
 
 @pytest.mark.parametrize(("policy", "end"), [("decelerate", "mixed: 5 holding; elbow_pitch limp"), ("off", "")])
@@ -312,16 +312,16 @@ def test_a_fault_of_a_servo_ends_the_drive_by_the_policy(
 ) -> None:
     faults = tmp_path / "faults.yaml"
     faults.write_text("faults:\n  - {kind: overload, id: 3, at: 3.0}\n", encoding="utf-8")
-    one = drives("--faults", str(faults), "--policy", policy)
-    client = one.begin()
+    drive = drives("--faults", str(faults), "--policy", policy)
+    client = drive.begin()
     with pytest.raises(ConnectionClosed):
         pull(client, {"y": 0.3}, np.inf)
-    one.ended(4)
-    _, summary = one.measured()
+    drive.ended(4)
+    _, summary = drive.measured()
     assert summary["fault"] == "hardware alert"
     assert summary["end_state"].startswith(end)
     assert all(servo["torque"] == (policy != "off" and servo["id"] != 3) for servo in summary["servos"])
-    check_against_the_simulation(one, in_trouble=True)
+    check_against_the_simulation(drive, in_trouble=True)
 
 
 def test_hw_stop_releases_a_robot_that_is_driven(drives: Callable[..., Drive], tmp_path: Path) -> None:
@@ -333,8 +333,8 @@ def test_hw_stop_releases_a_robot_that_is_driven(drives: Callable[..., Drive], t
         try:
             assert virtual.stdout is not None
             assert "6 virtual servos" in virtual.stdout.readline()
-            one = drives("--live", "--yes", port=str(device))
-            client = one.connect()
+            drive = drives("--live", "--yes", port=str(device))
+            client = drive.connect()
             client.take()
             states: list[str] = []
             while "key released" not in states:
@@ -347,12 +347,12 @@ def test_hw_stop_releases_a_robot_that_is_driven(drives: Callable[..., Drive], t
             client.until("state", lambda state: state == "driving")
             stopped = dynsim("hw", "stop", "--port", device, "--map", table)
             assert "torque off" in stopped.stdout + stopped.stderr
-            one.ended(4)
+            drive.ended(4)
         finally:
             virtual.kill()
     # By which rule it was noticed depends on who got whose answers.
-    assert one.measured()[1]["end_state"] == "off"
-    check_against_the_simulation(one, in_trouble=True)
+    assert drive.measured()[1]["end_state"] == "off"
+    check_against_the_simulation(drive, in_trouble=True)
 
 
 def test_a_real_port_is_a_dry_run_without_live(drives: Callable[..., Drive], tmp_path: Path) -> None:
@@ -363,8 +363,8 @@ def test_a_real_port_is_a_dry_run_without_live(drives: Callable[..., Drive], tmp
         try:
             assert virtual.stdout is not None
             assert "6 virtual servos" in virtual.stdout.readline()
-            given = ("six_axis_arm", "--map", table, "--port", device, "--out", tmp_path / "out")
-            dry = dynsim("hw", "drive", *given)
+            arguments = ("six_axis_arm", "--map", table, "--port", device, "--out", tmp_path / "out")
+            dry = dynsim("hw", "drive", *arguments)
             assert dry.returncode == 0, dry.stderr
             assert "nothing was moved; --live moves" in dry.stdout
             assert not (tmp_path / "out" / "record.h5").exists()
@@ -394,27 +394,27 @@ def keep_driving(client: Client, axes: dict[str, float], until_mode: int) -> Non
 
 def test_a_snake_changes_its_modes(drives: Callable[..., Drive]) -> None:
     """Keys that follow too soon wait, and so does the end: the record is one that can be replayed."""
-    one = drives(text=SNAKE, scenario="snake_operator")
-    client = one.begin()
+    drive = drives(text=SNAKE, scenario="snake_operator")
+    client = drive.begin()
     client.drive({"x": 1.0}, 0.4)
     client.drive({"x": 1.0}, 0.04, mode=4)
     client.drive({"x": 1.0}, 0.04, mode=2)
     keep_driving(client, {"gamma": 1.0}, until_mode=2)
     client.drive({"x": 1.0}, 0.04, mode=3)
     client.say(do="end")
-    one.ended(0)
-    simulated = Record.load(one.folder / "record.h5")
+    drive.ended(0)
+    simulated = Record.load(drive.folder / "record.h5")
     assert set(simulated["mode"].tolist()) >= {1, 2, 4}
-    servo_map = load_servo_map(one.folder.parent / "six.yaml")
+    servo_map = load_servo_map(drive.folder.parent / "six.yaml")
     path = check_motion(simulated, servo_map).path
-    measured, summary = one.measured()
+    measured, summary = drive.measured()
     assert summary["end_state"] == "holding"
     rows = np.isfinite(measured["record_time"])
     time, goals = measured["record_time"][rows], measured["phi_goal"][rows]
     joints = [servo_map.joints.index(name) for name in measured.labels["phi_goal"]]
     np.testing.assert_allclose(goals, np.array([path.at(t)[0][joints] for t in time]), rtol=0, atol=1e-12)
     assert time[-1] == pytest.approx(simulated.time[-1])
-    compared = dynsim("hw", "compare", one.folder / "record.h5", one.servos / "measured.h5")
+    compared = dynsim("hw", "compare", drive.folder / "record.h5", drive.servos / "measured.h5")
     assert compared.returncode == 0, compared.stderr
 
 

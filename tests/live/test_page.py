@@ -62,11 +62,11 @@ class Pilot:
         self.page.wait_for_timeout(100)
         self.js("pad.buttons[5].pressed = true")
 
-    def moved(self, axis: int, way: float, anew: Callable[[], None]) -> None:
+    def moved(self, axis: int, direction: float, anew: Callable[[], None]) -> None:
         """Wait until the hand has moved along an axis."""
         before = self.hand()[axis]
-        sign = 1 if way > 0 else -1
-        self.until(f"{sign} * (dynsim.drive.last.hand[{axis}] - {before}) > {abs(way)}", anew)
+        sign = 1 if direction > 0 else -1
+        self.until(f"{sign} * (dynsim.drive.last.hand[{axis}] - {before}) > {abs(direction)}", anew)
 
     def rests(self) -> None:
         """Wait until nothing is asked for, and the hand has come to rest."""
@@ -81,113 +81,113 @@ class Pilot:
 @pytest.fixture
 def pilot(browser: Any) -> Iterator[Callable[..., Pilot]]:
     """Opens the page of a drive; at the end it has asked for nothing else and complained of nothing."""
-    found: list[tuple[Pilot, Teleop]] = []
+    pilots: list[tuple[Pilot, Teleop]] = []
     contexts: list[Any] = []
 
     def opens(teleop: Teleop, **screen: Any) -> Pilot:
         context = browser.new_context(**{"viewport": {"width": 700, "height": 500}} | screen)
         context.set_default_timeout(1e3 * PATIENCE_S)
         contexts.append(context)
-        one = Pilot(context.new_page(), teleop)
-        found.append((one, teleop))
-        return one
+        opened = Pilot(context.new_page(), teleop)
+        pilots.append((opened, teleop))
+        return opened
 
     yield opens
-    for one, teleop in found:
-        asked = [url for url in one.requests if not url.startswith(("data:", "blob:", "ws:"))]
+    for opened, teleop in pilots:
+        asked = [url for url in opened.requests if not url.startswith(("data:", "blob:", "ws:"))]
         assert [url for url in asked if not url.endswith("/favicon.ico")] == [teleop.address]
-        assert one.complaints == []
+        assert opened.complaints == []
     for context in contexts:
         context.close()
 
 
 def test_keys_gamepad_and_sticks_drive_a_snake(teleop: Callable[..., Teleop], pilot: Callable[[Teleop], Pilot]) -> None:
     drive = teleop("snake_operator", "--speed", "0.2")
-    one = pilot(drive)
-    keyboard = one.page.keyboard
-    assert [one.page.locator(f"kbd:text-is('{key}')").count() for key in "GMN"] == [1, 1, 1]
+    user = pilot(drive)
+    keyboard = user.page.keyboard
+    assert [user.page.locator(f"kbd:text-is('{key}')").count() for key in "GMN"] == [1, 1, 1]
     # Keys of axes alone do nothing, with space they drive.
     keyboard.down("w")
-    before = one.hand()
-    one.page.wait_for_timeout(500)
-    assert one.hand() == pytest.approx(before, abs=1e-6)
-    one.space()
-    one.moved(0, 0.02, one.space)
+    before = user.hand()
+    user.page.wait_for_timeout(500)
+    assert user.hand() == pytest.approx(before, abs=1e-6)
+    user.space()
+    user.moved(0, 0.02, user.space)
     keyboard.up(" ")
-    one.rests()
+    user.rests()
     keyboard.up("w")
     # The page's own keys are still: w drives, and space plays nothing.
-    assert one.js("dynsim.state().playing") is False
+    assert user.js("dynsim.state().playing") is False
 
-    one.js("pad.axes[3] = 1")
-    one.page.wait_for_timeout(300)
-    one.rests()
-    one.button()
-    one.moved(2, -0.01, one.button)
-    one.js("pad.buttons[0].pressed = true")
-    one.until("dynsim.drive.last.gripper === 1", one.button)
-    one.js("pad.buttons[5].pressed = false; pad.buttons[0].pressed = false; pad.axes[3] = 0")
-    one.rests()
+    user.js("pad.axes[3] = 1")
+    user.page.wait_for_timeout(300)
+    user.rests()
+    user.button()
+    user.moved(2, -0.01, user.button)
+    user.js("pad.buttons[0].pressed = true")
+    user.until("dynsim.drive.last.gripper === 1", user.button)
+    user.js("pad.buttons[5].pressed = false; pad.buttons[0].pressed = false; pad.axes[3] = 0")
+    user.rests()
 
-    box = one.page.locator(".stick").first.bounding_box()
+    box = user.page.locator(".stick").first.bounding_box()
     middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
 
     def stick() -> None:
-        one.page.mouse.up()
-        one.page.mouse.move(*middle)
-        one.page.mouse.down()
-        one.page.mouse.move(middle[0] - 40, middle[1])
+        user.page.mouse.up()
+        user.page.mouse.move(*middle)
+        user.page.mouse.down()
+        user.page.mouse.move(middle[0] - 40, middle[1])
 
     stick()
-    one.moved(1, 0.01, stick)
-    one.page.mouse.up()
-    one.rests()
+    user.moved(1, 0.01, stick)
+    user.page.mouse.up()
+    user.rests()
 
     # A mode is taken with the key held.
-    one.page.select_option("#mode", "3")
-    one.page.wait_for_timeout(200)
-    assert one.js("dynsim.drive.last.mode") == 1
-    one.space()
-    one.until("dynsim.drive.last.mode === 3", one.space)
+    user.page.select_option("#mode", "3")
+    user.page.wait_for_timeout(200)
+    assert user.js("dynsim.drive.last.mode") == 1
+    user.space()
+    user.until("dynsim.drive.last.mode === 3", user.space)
     keyboard.up(" ")
-    one.page.click("#end")
+    user.page.click("#end")
     assert drive.finish() == 0
     assert "ended by the pilot" in drive.said
-    one.until("dynsim.drive.ended")
-    assert one.page.inner_text(".state") == "the drive is over: ended by the pilot"
-    assert not any(one.page.locator(part).is_visible() for part in ("#end", "#hold", "#role", ".stick >> nth=0"))
+    user.until("dynsim.drive.ended")
+    assert user.page.inner_text(".state") == "the drive is over: ended by the pilot"
+    assert not any(user.page.locator(part).is_visible() for part in ("#end", "#hold", "#role", ".stick >> nth=0"))
 
 
 def test_the_page_says_what_is_in_the_way(teleop: Callable[..., Teleop], pilot: Callable[[Teleop], Pilot]) -> None:
     """The edge of reach, which is not driving as usual; silence, until the key is let go; the end."""
     drive = teleop("elbow_comparison", "--variant", "two_elbows")
-    one = pilot(drive)
-    one.page.keyboard.down("r")
-    one.space()
-    one.until("document.querySelector('.state.hindered')?.textContent.includes('joint_10 would speed up')", one.space)
+    user = pilot(drive)
+    user.page.keyboard.down("r")
+    user.space()
+    user.until("document.querySelector('.state.hindered')?.textContent.includes('joint_10 would speed up')", user.space)
     # The page is too busy to say a word.
-    one.js("dynsim.drive.say = (said) => { dynsim.drive.unsaid = said; }")
-    one.until("document.querySelector('.state.silent')?.textContent.includes('let the key go once')")
+    user.js("dynsim.drive.say = (said) => { dynsim.drive.unsaid = said; }")
+    user.until("document.querySelector('.state.silent')?.textContent.includes('let the key go once')")
     assert drive.interrupt() == 0
-    one.until("document.querySelector('.state.over')?.textContent.includes('interrupted')")
+    user.until("document.querySelector('.state.over')?.textContent.includes('interrupted')")
 
 
 def test_focus_that_is_lost_lets_everything_go(teleop: Callable[..., Teleop], pilot: Callable[[Teleop], Pilot]) -> None:
     drive = teleop("mobile_path")
-    one = pilot(drive)
-    keyboard = one.page.keyboard
-    one.space()
+    user = pilot(drive)
+    keyboard = user.page.keyboard
+    user.space()
     keyboard.down("ArrowUp")
-    one.until("dynsim.drive.last.state === 'driving' && dynsim.drive.wish.axes[3] === 1", one.space)
-    begun = one.js("dynsim.drive.last.poses[0]")
-    one.until(f"dynsim.drive.last.poses[0] > {begun} + 0.02", one.space)
-    one.js("window.dispatchEvent(new Event('blur'))")
+    user.until("dynsim.drive.last.state === 'driving' && dynsim.drive.wish.axes[3] === 1", user.space)
+    begun = user.js("dynsim.drive.last.poses[0]")
+    user.until(f"dynsim.drive.last.poses[0] > {begun} + 0.02", user.space)
+    user.js("window.dispatchEvent(new Event('blur'))")
     # Keys are still down: they count only when they are pressed anew.
-    one.until("dynsim.drive.wish.held === false")
-    one.rests()
+    user.until("dynsim.drive.wish.held === false")
+    user.rests()
     # What is drawn is what the simulation has.
-    drawn = one.js("Object.values(dynsim.state().records[0].bodies).flatMap((body) => [...body.p, ...body.q])")
-    assert drawn == pytest.approx(one.js("dynsim.drive.last.poses"), abs=1e-4)
+    drawn = user.js("Object.values(dynsim.state().records[0].bodies).flatMap((body) => [...body.p, ...body.q])")
+    assert drawn == pytest.approx(user.js("dynsim.drive.last.poses"), abs=1e-4)
     keyboard.up("ArrowUp")
     keyboard.up(" ")
     assert drive.interrupt() == 0
@@ -200,23 +200,23 @@ PHONE = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobil
 def test_a_phone_has_all_axes_beside_the_scene(teleop: Callable[..., Teleop], pilot: Callable[..., Pilot]) -> None:
     """Sticks for all six axes of a gripper within 390 pixels, below the scene; one drives what had none."""
     drive = teleop("snake_operator", "--speed", "0.2")
-    one = pilot(drive, **PHONE)
-    one.until("document.querySelector('.state').textContent === 'hold a stick to drive'")
-    axes = one.js("[...dynsim.drive.sticks.values()].flatMap((s) => [s.across, s.up]).filter(Boolean)")
-    assert sorted(axes) == sorted(one.js("dynsim.drive.names"))
+    user = pilot(drive, **PHONE)
+    user.until("document.querySelector('.state').textContent === 'hold a stick to drive'")
+    axes = user.js("[...dynsim.drive.sticks.values()].flatMap((s) => [s.across, s.up]).filter(Boolean)")
+    assert sorted(axes) == sorted(user.js("dynsim.drive.names"))
     assert len(axes) == 6
-    assert one.js("[document.documentElement.scrollWidth, document.documentElement.scrollHeight]") == [390, 844]
-    view = one.page.locator("#view").bounding_box()
+    assert user.js("[document.documentElement.scrollWidth, document.documentElement.scrollHeight]") == [390, 844]
+    view = user.page.locator("#view").bounding_box()
     assert view["height"] > 300
     for part in (".stick >> nth=0", ".stick >> nth=2", "#end", "#role", ".state"):
-        box = one.page.locator(part).bounding_box()
+        box = user.page.locator(part).bounding_box()
         assert box["y"] >= view["y"] + view["height"]
         assert box["x"] >= 0
         assert box["x"] + box["width"] <= 390
         assert box["y"] + box["height"] <= 844
-    box = one.page.locator(".stick[data-name=beta]").bounding_box()
+    box = user.page.locator(".stick[data-name=beta]").bounding_box()
     middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-    touch = one.page.context.new_cdp_session(one.page)
+    touch = user.page.context.new_cdp_session(user.page)
 
     def finger(kind: str, *points: tuple[float, float]) -> None:
         touches = [{"x": x, "y": y} for x, y in points]
@@ -228,15 +228,15 @@ def test_a_phone_has_all_axes_beside_the_scene(teleop: Callable[..., Teleop], pi
 
     def anew() -> None:
         finger("touchEnd")
-        one.page.wait_for_timeout(100)
+        user.page.wait_for_timeout(100)
         turn()
 
     turn()
-    beta = one.js("dynsim.drive.names.indexOf('beta')")
+    beta = user.js("dynsim.drive.names.indexOf('beta')")
     asked = f"dynsim.drive.wish.held && dynsim.drive.wish.axes[{beta}] > 0.8"
-    one.until(f"{asked} && dynsim.drive.last.state === 'driving'", anew)
+    user.until(f"{asked} && dynsim.drive.last.state === 'driving'", anew)
     finger("touchEnd")
-    one.until("dynsim.drive.wish.held === false")
+    user.until("dynsim.drive.wish.held === false")
     assert drive.interrupt() == 0
 
 
@@ -244,14 +244,14 @@ def test_a_watcher_is_told_nothing_that_the_pilot_is_to_do(
     teleop: Callable[..., Teleop], pilot: Callable[..., Pilot], browser: Any
 ) -> None:
     drive = teleop("elbow_comparison", "--variant", "two_elbows")
-    one = pilot(drive)
+    user = pilot(drive)
     context = browser.new_context(**PHONE)
     watcher = context.new_page()
     watcher.goto(drive.address)
     watcher.evaluate("dynsim.ready")
-    one.space()
-    one.until("dynsim.drive.last.state === 'driving'", one.space)
-    one.js("dynsim.drive.say = () => {}")
+    user.space()
+    user.until("dynsim.drive.last.state === 'driving'", user.space)
+    user.js("dynsim.drive.say = () => {}")
     end = time.monotonic() + PATIENCE_S
     while watcher.evaluate("dynsim.drive?.last?.state") != "silent":
         assert time.monotonic() < end
@@ -259,6 +259,6 @@ def test_a_watcher_is_told_nothing_that_the_pilot_is_to_do(
     assert watcher.evaluate("dynsim.drive.role") == "watching"
     assert watcher.inner_text(".state") == "the pilot is silent"
     assert not any(watcher.locator(part).is_visible() for part in (".stick >> nth=0", "#hold", "#end"))
-    one.until("document.querySelector('.state.silent')?.textContent.includes('let the key go once')")
+    user.until("document.querySelector('.state.silent')?.textContent.includes('let the key go once')")
     context.close()
     assert drive.interrupt() == 0

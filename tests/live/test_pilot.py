@@ -29,8 +29,8 @@ def said(**changes: object) -> str:
 
 
 def test_parse_takes_a_command() -> None:
-    found = parse(said(axes=[0.5, -2.0], held=True, mode="switching", closed=True), 2, (1, 2))
-    assert found == PilotCommand(1, (0.5, -1.0), True, SWITCHING, True)
+    command = parse(said(axes=[0.5, -2.0], held=True, mode="switching", closed=True), 2, (1, 2))
+    assert command == PilotCommand(1, (0.5, -1.0), True, SWITCHING, True)
     assert parse(said(mode=2), 2, (1, 2)) == PilotCommand(1, (0.0, 0.0), False, 2)
     assert parse('{"do": "take"}', 2, ()) == "take"
 
@@ -67,9 +67,9 @@ def test_parse_refuses(text: str | bytes, reason: str) -> None:
 
 
 def test_whole_numbers_beyond_all_bounds_are_full_speed() -> None:
-    found = parse('{"n": 1, "axes": [' + "9" * 3900 + ', 0], "held": true}', 2, ())
-    assert isinstance(found, PilotCommand)
-    assert found.axes == (1.0, 0.0)
+    command = parse('{"n": 1, "axes": [' + "9" * 3900 + ', 0], "held": true}', 2, ())
+    assert isinstance(command, PilotCommand)
+    assert command.axes == (1.0, 0.0)
 
 
 def test_deadman_needs_the_key_heard_released_first() -> None:

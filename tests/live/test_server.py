@@ -25,47 +25,49 @@ def compiled() -> None:
 
 
 def test_only_the_page_gets_in(teleop: Callable[..., Teleop], compiled: None) -> None:
-    one = teleop(*SNAKE)
-    host = {"Host": f"127.0.0.1:{one.port}"}
-    drive, wrong = f"{one.path}drive", f"/{'x' * 32}/"
-    status, body = one.ask(one.path, host)
+    server = teleop(*SNAKE)
+    host = {"Host": f"127.0.0.1:{server.port}"}
+    drive, wrong = f"{server.path}drive", f"/{'x' * 32}/"
+    status, body = server.ask(server.path, host)
     assert (status, b"<!DOCTYPE html>" in body) == (200, True)
-    assert one.ask(one.path, {"Host": f"localhost:{one.port}"})[0] == 200
+    assert server.ask(server.path, {"Host": f"localhost:{server.port}"})[0] == 200
     refused = [
         (wrong, host),
         ("/", host),
-        (one.path[:-1] + "x/", host),
-        (one.path, {"Host": f"example.org:{one.port}"}),
-        (one.path, {"Host": "127.0.0.1"}),
-        (one.path, {}),
-        (f"{wrong}drive", one.upgrade()),
-        (drive, one.upgrade(Origin="http://example.org")),
-        (drive, one.upgrade(Origin=f"https://127.0.0.1:{one.port}")),
-        (drive, one.upgrade(Origin="null")),
-        (drive, one.upgrade(Origin=None)),
-        (drive, one.upgrade(Host=f"example.org:{one.port}")),
-        (drive, one.upgrade(Host=f"example.org:{one.port}", Origin=f"http://example.org:{one.port}")),
+        (server.path[:-1] + "x/", host),
+        (server.path, {"Host": f"example.org:{server.port}"}),
+        (server.path, {"Host": "127.0.0.1"}),
+        (server.path, {}),
+        (f"{wrong}drive", server.upgrade()),
+        (drive, server.upgrade(Origin="http://example.org")),
+        (drive, server.upgrade(Origin=f"https://127.0.0.1:{server.port}")),
+        (drive, server.upgrade(Origin="null")),
+        (drive, server.upgrade(Origin=None)),
+        (drive, server.upgrade(Host=f"example.org:{server.port}")),
+        (drive, server.upgrade(Host=f"example.org:{server.port}", Origin=f"http://example.org:{server.port}")),
     ]
     for path, headers in refused:
-        status, body = one.ask(path, headers)
+        status, body = server.ask(path, headers)
         # What has no Host is no request at all.
         assert status == 403 or (status == 400 and not headers), (path, headers)
         assert b"dynsim" not in body
-    assert one.ask(drive, one.upgrade())[0] == 101
-    assert one.interrupt() == 0
+    assert server.ask(drive, server.upgrade())[0] == 101
+    assert server.interrupt() == 0
 
 
 def test_it_listens_on_loopback_only(teleop: Callable[..., Teleop], compiled: None) -> None:
-    one = teleop(*SNAKE)
+    server = teleop(*SNAKE)
     with open("/proc/net/tcp", encoding="utf-8") as table:
         listening = [line.split()[1] for line in table if line.split()[3] == "0A"]
-    assert [entry for entry in listening if int(entry.split(":")[1], 16) == one.port] == [f"0100007F:{one.port:04X}"]
-    assert one.interrupt() == 0
+    assert [entry for entry in listening if int(entry.split(":")[1], 16) == server.port] == [
+        f"0100007F:{server.port:04X}"
+    ]
+    assert server.interrupt() == 0
 
 
 def test_one_drives_and_others_watch(teleop: Callable[..., Teleop], compiled: None) -> None:
-    one = teleop(*SNAKE)
-    first, second = one.connect(), one.connect()
+    server = teleop(*SNAKE)
+    first, second = server.connect(), server.connect()
     first.take()
     second.say(do="take")
     second.wish({}, held=False)
@@ -81,14 +83,14 @@ def test_one_drives_and_others_watch(teleop: Callable[..., Teleop], compiled: No
     second.drive({"z": 1.0}, 0.3)
     second.until("state", lambda state: state == "driving")
     second.say(do="end")
-    assert one.finish() == 0
-    record = Record.load(one.folder / "record.h5")
+    assert server.finish() == 0
+    record = Record.load(server.folder / "record.h5")
     assert (np.diff(record["w_target"][:, 0]) >= 0.0).all(), "who watches moves nothing"
 
 
 def test_silence_stops_the_robot(teleop: Callable[..., Teleop], compiled: None) -> None:
-    one = teleop(*ARM)
-    client = one.connect()
+    server = teleop(*ARM)
+    client = server.connect()
     client.take()
     client.drive({"y": 1.0}, 0.5)
     client.until("state", lambda state: state == "silent")
@@ -103,8 +105,8 @@ def test_silence_stops_the_robot(teleop: Callable[..., Teleop], compiled: None) 
     client.wish({}, held=False)
     client.drive({"y": 1.0}, 0.3)
     client.until("state", lambda state: state == "driving")
-    assert one.interrupt() == 0
-    commands = load_scenario(one.folder / "scenario.yaml").controller.operator.commands
+    assert server.interrupt() == 0
+    commands = load_scenario(server.folder / "scenario.yaml").controller.operator.commands
     begin, end = commands[0], commands[1]
     assert begin.hand == [0.0, 0.1, 0.0]
     assert end.hand == [0.0, 0.0, 0.0]
@@ -124,23 +126,23 @@ def test_silence_stops_the_robot(teleop: Callable[..., Teleop], compiled: None) 
 def test_what_is_no_wish_is_refused_by_name(
     teleop: Callable[..., Teleop], compiled: None, text: str, reason: str
 ) -> None:
-    one = teleop(*ARM)
-    client = one.connect()
+    server = teleop(*ARM)
+    client = server.connect()
     client.take()
     client.socket.send(text)
     assert reason in client.until("refused")["refused"]
     client.drive({"x": 1.0}, 0.2)
     client.until("state", lambda state: state == "driving")
-    assert one.interrupt() == 0
+    assert server.interrupt() == 0
 
 
 def test_long_many_and_senseless_messages_end_a_connection(teleop: Callable[..., Teleop], compiled: None) -> None:
     from websockets.exceptions import ConnectionClosed
 
-    one = teleop(*ARM)
+    server = teleop(*ARM)
 
     def code_after(send: Callable[[Client], None]) -> int:
-        client = one.connect()
+        client = server.connect()
         with pytest.raises(ConnectionClosed) as closed:  # noqa: PT012 (whichever of them meets it)
             send(client)
             while True:
@@ -152,35 +154,35 @@ def test_long_many_and_senseless_messages_end_a_connection(teleop: Callable[...,
     assert code_after(lambda client: [client.socket.send("{") for _ in range(30)] and None) == 1008
     assert code_after(lambda client: [client.wish({}) for _ in range(1000)] and None) == 1008
     # Others drive on.
-    client = one.connect()
+    client = server.connect()
     client.take()
     client.drive({"x": 1.0}, 0.2)
     client.until("state", lambda state: state == "driving")
-    assert one.interrupt() == 0
+    assert server.interrupt() == 0
 
 
 @pytest.mark.parametrize("scenario", [SNAKE, ("mobile_path",), ("elbow_comparison_floor",)])
 def test_a_drive_leaves_its_record_and_a_script_that_repeats_it(
     teleop: Callable[..., Teleop], scenario: tuple[str, ...], compiled: None
 ) -> None:
-    one = teleop(*scenario)
-    client = one.connect()
+    server = teleop(*scenario)
+    client = server.connect()
     client.take()
     names = [axis["name"] for axis in client.hello["axes"]]
     client.drive(dict.fromkeys(names, 0.5), 0.6)
     client.drive({names[0]: -0.33}, 0.4, closed=True)
     client.until("state", lambda state: state == "driving")
-    assert one.interrupt() == 0
-    assert "Written to" in one.said
-    assert "dynsim run" in one.said
-    assert one.group_is_gone()
-    assert sorted(file.name for file in one.folder.iterdir()) == [
+    assert server.interrupt() == 0
+    assert "Written to" in server.said
+    assert "dynsim run" in server.said
+    assert server.group_is_gone()
+    assert sorted(file.name for file in server.folder.iterdir()) == [
         "record.h5",
         "scenario.yaml",
         "summary.json",
         "view.html",
     ]
-    record, again = Record.load(one.folder / "record.h5"), simulate(load_scenario(one.folder / "scenario.yaml"))
+    record, again = Record.load(server.folder / "record.h5"), simulate(load_scenario(server.folder / "scenario.yaml"))
     assert record.complete
     assert set(record) == set(again)
     for name in record:
@@ -188,22 +190,22 @@ def test_a_drive_leaves_its_record_and_a_script_that_repeats_it(
 
 
 def test_nobody_left_ends_a_drive_that_is_told_so(teleop: Callable[..., Teleop], compiled: None) -> None:
-    one = teleop(*SNAKE, "--until-closed")
-    client = one.connect()
+    server = teleop(*SNAKE, "--until-closed")
+    client = server.connect()
     client.take()
     client.drive({"x": 1.0}, 0.2)
     client.close()
-    assert one.finish() == 0
-    assert "the last browser was closed" in one.said
-    assert one.group_is_gone()
+    assert server.finish() == 0
+    assert "the last browser was closed" in server.said
+    assert server.group_is_gone()
 
 
 def test_a_port_that_is_taken_is_an_error(teleop: Callable[..., Teleop], compiled: None) -> None:
-    one = teleop(*SNAKE)
-    command = [sys.executable, "-m", "dynsim", "teleop", *SNAKE, "--no-open", "--http-port", str(one.port)]
-    other = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=one.folder.parent, check=False)
+    server = teleop(*SNAKE)
+    command = [sys.executable, "-m", "dynsim", "teleop", *SNAKE, "--no-open", "--http-port", str(server.port)]
+    other = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=server.folder.parent, check=False)
     assert other.returncode == 2
     assert "choose another --http-port" in " ".join(other.stderr.split())
     begun = time.monotonic()
-    assert one.interrupt() == 0
+    assert server.interrupt() == 0
     assert time.monotonic() - begun < 60

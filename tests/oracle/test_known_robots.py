@@ -345,8 +345,8 @@ def test_a_free_robot_with_its_feet_on_slopes(free: Free, tmp_path: Path) -> Non
     start, _ = run_free(free, tmp_path)
     surfaces, points = {}, {}
     for k, foot in enumerate(free.feet):
-        place = start.point_position(foot, np.zeros(3), start.robot.initial)
-        surfaces[f"slope_{k}"] = {"type": "plane", "point_m": place.tolist(), "normal": [0.1 * k - 0.1, 0.2, 1.0]}
+        position = start.point_position(foot, np.zeros(3), start.robot.initial)
+        surfaces[f"slope_{k}"] = {"type": "plane", "point_m": position.tolist(), "normal": [0.1 * k - 0.1, 0.2, 1.0]}
         points[f"foot_{k}"] = {"body": foot, "surface": f"slope_{k}"}
     model, record = run_free(free, tmp_path, surfaces=surfaces, contacts={"points": points, "friction": 0.2})
     check_motion(free, model, record, {name: point["body"] for name, point in points.items()})

@@ -66,14 +66,16 @@ def test_accelerations(arm, folder, seed):
     np.testing.assert_allclose(A @ rates, 0.0, rtol=0, atol=1e-13)
     expected, _, K = oracle.accelerations(full, rates, torques(robot, oracle, current))
     expected, condition = expected[oracle.index], np.linalg.cond(K)
-    found: list[np.ndarray] = []
+    accelerations: list[np.ndarray] = []
     for m_star in (False, True):
         b: Bench = bench(robot, m_star=m_star)
-        found.append(b.part(b.derivative(b.state(q, v, current)), "v"))
-        np.testing.assert_allclose(found[-1], expected, rtol=0, atol=1e-9 * (1.0 + np.abs(expected).max()))
+        accelerations.append(b.part(b.derivative(b.state(q, v, current)), "v"))
+        np.testing.assert_allclose(accelerations[-1], expected, rtol=0, atol=1e-9 * (1.0 + np.abs(expected).max()))
         # As near as the dense system that the expected values come from can be solved.
-        np.testing.assert_allclose(found[-1], expected, rtol=0, atol=1e-14 * condition * (1.0 + np.abs(expected).max()))
-    np.testing.assert_allclose(found[0], found[1], rtol=0, atol=1e-10 * (1.0 + np.abs(expected).max()))
+        np.testing.assert_allclose(
+            accelerations[-1], expected, rtol=0, atol=1e-14 * condition * (1.0 + np.abs(expected).max())
+        )
+    np.testing.assert_allclose(accelerations[0], accelerations[1], rtol=0, atol=1e-10 * (1.0 + np.abs(expected).max()))
 
 
 @pytest.mark.parametrize("m_star", [False, True], ids=["articulated", "m_star"])
@@ -83,26 +85,26 @@ def test_braced_on_surfaces(arm, m_star, folder, seed):
     """One or two points of base or arm held to curved surfaces, so that what braces the arm reacts on the wheels."""
     robot, oracle, q, v, current = case(seed, arm, folder)
     rng = np.random.default_rng(seed + 2)
-    contacts = [replace(one, friction=0.0) for one in random_contacts(rng, robot, q, int(rng.integers(1, 3)))]
+    contacts = [replace(contact, friction=0.0) for contact in random_contacts(rng, robot, q, int(rng.integers(1, 3)))]
     full, rates = oracle.configuration(q), oracle.rates(q, v)
-    T = np.column_stack([oracle.rates(q, one) for one in np.eye(len(v))])
+    T = np.column_stack([oracle.rates(q, unit) for unit in np.eye(len(v))])
     J, target = np.zeros((len(contacts), oracle.model.nv)), np.zeros(len(contacts))
     model, joints = Model(robot), {link.name: link.joint for link in robot.links} | {"base": "heading"}
-    for k, one in enumerate(contacts):
-        place = model.point_position(one.body, one.point, q)
-        Jp, velocity, drift = oracle.point(joints[one.body], one.point, full, rates)
-        gradient = one.surface.Q @ place + one.surface.b
+    for k, contact in enumerate(contacts):
+        position = model.point_position(contact.body, contact.point, q)
+        Jp, velocity, drift = oracle.point(joints[contact.body], contact.point, full, rates)
+        gradient = contact.surface.Q @ position + contact.surface.b
         slope = np.linalg.norm(gradient)
         J[k] = gradient / slope @ Jp
-        target[k] = -(gradient @ drift + velocity @ one.surface.Q @ velocity) / slope
+        target[k] = -(gradient @ drift + velocity @ contact.surface.Q @ velocity) / slope
     # Rows that depend on each other, or feel no joint, have no single solution.
     if np.linalg.svd(J @ T)[1].min() < 1e-3:
         return
     expected, multipliers, K = oracle.accelerations(full, rates, torques(robot, oracle, current), J, target)
     b = bench(robot, contacts, m_star=m_star)
-    found = b.part(b.derivative(b.state(q, v, current)), "v")
+    vdot = b.part(b.derivative(b.state(q, v, current)), "v")
     scale = 1e-14 * np.linalg.cond(K) * (1.0 + max(np.abs(expected).max(), np.abs(multipliers).max()))
-    np.testing.assert_allclose(found, expected[oracle.index], rtol=0, atol=scale)
+    np.testing.assert_allclose(vdot, expected[oracle.index], rtol=0, atol=scale)
     np.testing.assert_allclose(b.ws.contacts[:, ka.FORCE], multipliers[3:], rtol=0, atol=scale)
 
 
@@ -124,7 +126,7 @@ def test_mass_matrix_and_energy(arm, folder, seed):
     """Of the rates of wheels and arm: Tᵀ M T of the real wheels, v = T v_wheels."""
     robot, oracle, q, v, _ = case(seed, arm, folder)
     model, full = Model(robot), oracle.configuration(q)
-    T = np.column_stack([oracle.rates(q, one) for one in np.eye(model.n)])
+    T = np.column_stack([oracle.rates(q, unit) for unit in np.eye(model.n)])
     expected = T.T @ oracle.mass_matrix(full) @ T
     ours = model.mass_matrix(q) + np.diag(model.armature)
     np.testing.assert_allclose(ours, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
@@ -142,15 +144,15 @@ def test_points_and_their_rates(arm, folder, seed):
     robot, oracle, q, v, _ = case(seed, arm, folder)
     model, full = Model(robot), oracle.configuration(q)
     point, h = np.random.default_rng(seed).normal(size=3), 1e-5
-    T = np.column_stack([oracle.rates(q, one) for one in np.eye(model.n)])
+    T = np.column_stack([oracle.rates(q, unit) for unit in np.eye(model.n)])
     b = bench(robot)
     qdot = b.part(b.derivative(b.state(q, v)), "q")
     joints = {"base": "heading"} | {link.name: link.joint for link in robot.links[2:]}
     for name, joint in joints.items():
         J, velocity, _ = oracle.point(joint, point, full, oracle.rates(q, v))
-        place = oracle.data.oMi[oracle.model.getJointId(joint)]
+        placement = oracle.data.oMi[oracle.model.getJointId(joint)]
         position, ours = model.point_position_and_jacobian(name, point, q)
-        np.testing.assert_allclose(position, place.act(point), rtol=0, atol=1e-12)
+        np.testing.assert_allclose(position, placement.act(point), rtol=0, atol=1e-12)
         np.testing.assert_allclose(ours, J @ T, rtol=0, atol=1e-12)
         np.testing.assert_allclose(ours @ v, velocity, rtol=0, atol=1e-11)
         ends = [model.point_position(name, point, q + sign * h * qdot) for sign in (1.0, -1.0)]
@@ -241,13 +243,13 @@ class Driven:
             else np.full(len(grid), start[i])
             for name, i in zip(self.joints, self.index, strict=True)
         ]
-        columns += [through(one["times_s"], one["torques_N_m"]) for one in torques.values()]
+        columns += [through(command["times_s"], command["torques_N_m"]) for command in torques.values()]
         self.pushed = self.oracle.index[[WHEELS.index(name) for name in torques]]
         self.wanted = make_interp_spline(grid, np.stack(columns, axis=1), k=5)
         self.slope = self.wanted.derivative()
         of = [self.oracle.motor[name] for name in self.joints]
-        self.R, self.L = (np.array([one[key] for one in of]) for key in ("resistance_ohm", "inductance_H"))
-        self.K = np.array([one["torque_constant_N_m_per_A"] * one["gear_ratio"] for one in of])
+        self.R, self.L = (np.array([motor[key] for motor in of]) for key in ("resistance_ohm", "inductance_H"))
+        self.K = np.array([motor["torque_constant_N_m_per_A"] * motor["gear_ratio"] for motor in of])
 
     def __call__(self, t: float, y: np.ndarray) -> np.ndarray:
         nv = self.oracle.model.nv
@@ -264,16 +266,18 @@ class Driven:
 @pytest.mark.parametrize("duration", [0.25, pytest.param(10.0, marks=pytest.mark.slow)])
 def test_a_run_is_that_of_real_wheels(drive, duration, tmp_path):
     """Base, arm and currents to 1e-8 over 10 s, both at rtol 1e-12, by another method and another formulation."""
-    given = scenario_of(drive, duration)
-    (tmp_path / "case.yaml").write_text(json.dumps(given))
+    scenario = scenario_of(drive, duration)
+    (tmp_path / "case.yaml").write_text(json.dumps(scenario))
     record = simulate(load_scenario(tmp_path / "case.yaml"))
-    driven = Driven(given, record["q"][0])
-    found = solve_ivp(driven, (0.0, duration), driven.start, "DOP853", t_eval=record.time, rtol=1e-12, atol=1e-13).y.T
+    driven = Driven(scenario, record["q"][0])
+    expected = solve_ivp(
+        driven, (0.0, duration), driven.start, "DOP853", t_eval=record.time, rtol=1e-12, atol=1e-13
+    ).y.T
     nv, index = driven.oracle.model.nv, driven.oracle.index
     pose = [driven.oracle.x, driven.oracle.y, driven.oracle.heading]
-    np.testing.assert_allclose(record["base_pose"], found[:, pose], rtol=0, atol=1e-8)
-    np.testing.assert_allclose(record["q"][:, [0, 1, *range(4, 8)]], found[:, index], rtol=0, atol=1e-8)
-    np.testing.assert_allclose(record["v"], found[:, nv + index], rtol=0, atol=1e-8)
-    np.testing.assert_allclose(record["current"][:, -len(driven.joints) :], found[:, 2 * nv :], rtol=0, atol=1e-7)
+    np.testing.assert_allclose(record["base_pose"], expected[:, pose], rtol=0, atol=1e-8)
+    np.testing.assert_allclose(record["q"][:, [0, 1, *range(4, 8)]], expected[:, index], rtol=0, atol=1e-8)
+    np.testing.assert_allclose(record["v"], expected[:, nv + index], rtol=0, atol=1e-8)
+    np.testing.assert_allclose(record["current"][:, -len(driven.joints) :], expected[:, 2 * nv :], rtol=0, atol=1e-7)
     # It went somewhere.
     assert np.ptp(record["base_pose"], axis=0).min() > (0.1 if duration == 10.0 else 1e-4)

@@ -61,8 +61,8 @@ def test_accelerations_from_rest_agree_with_admm():
         M, rows, turn = oracle.mass_matrix(q), [], []
         for contact in contacts:
             body = robot.bodies.index(contact.body)
-            place, J, _, _ = oracle.point(body, contact.point, q, np.zeros(n))
-            normal = contact.surface.normal(place)
+            position, J, _, _ = oracle.point(body, contact.point, q, np.zeros(n))
+            normal = contact.surface.normal(position)
             first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
             first /= np.linalg.norm(first)
             turn.append(np.array([first, np.cross(normal, first), normal]))
@@ -136,10 +136,10 @@ def ours_on_slope(alpha: float, mu: float, duration: float) -> tuple[float, np.n
 def test_mujoco_slides_down_a_slope_as_fast():
     """Above the cone both slide with g (sin α − μ cos α): MuJoCo to the order of its step and its softness."""
     alpha, mu, duration = 0.5, 0.3, 0.5
-    way, _, _ = ours_on_slope(alpha, mu, duration)
-    assert way == pytest.approx(0.5 * G * (np.sin(alpha) - mu * np.cos(alpha)) * duration**2, rel=1e-9)
+    distance, _, _ = ours_on_slope(alpha, mu, duration)
+    assert distance == pytest.approx(0.5 * G * (np.sin(alpha) - mu * np.cos(alpha)) * duration**2, rel=1e-9)
     peer, data = mujoco_slope(alpha, mu, 1e-4)
-    assert slide(peer, data, duration)[0] == pytest.approx(way, rel=5e-3)
+    assert slide(peer, data, duration)[0] == pytest.approx(distance, rel=5e-3)
     mean, wrench = np.zeros(2), np.zeros(6)
     for _ in range(2000):
         mujoco.mj_step(peer, data)
@@ -153,8 +153,8 @@ def test_mujoco_slides_down_a_slope_as_fast():
 def test_mujoco_creeps_inside_its_cone_and_dynsim_does_not():
     """The same friction force, m g sin α; MuJoCo's needs a speed to be made, dynsim's is that of a constraint."""
     alpha, mu = 0.3, 0.5
-    way, force, f_n = ours_on_slope(alpha, mu, 20.0)
-    assert abs(way) <= 1e-12
+    distance, force, f_n = ours_on_slope(alpha, mu, 20.0)
+    assert abs(distance) <= 1e-12
     np.testing.assert_allclose(force, 3.0 * G * vector(-np.sin(alpha), 0.0, np.cos(alpha)), rtol=1e-9, atol=1e-9)
     assert abs(force[0]) < mu * f_n
     peer, data = mujoco_slope(alpha, mu, 1e-3)

@@ -98,8 +98,8 @@ def test_rows_between_bodies_and_between_joints(seed, m_star):
     target[1] = b.ws.rows[1, ka.TARGET]
     for r in (2, 3):
         first, second = (int(k) for k in rng.permutation(n)[:2])
-        d, place = random_unit(rng), rng.normal(size=3)
-        wrench = np.concatenate([np.cross(place, d), d])
+        d, anchor = random_unit(rng), rng.normal(size=3)
+        wrench = np.concatenate([np.cross(anchor, d), d])
         b.ws.rows[r, ka.ROW : ka.ROW + 6] = wrench
         b.ws.rows[r, ka.DIRECTION : ka.DIRECTION + 6] = wrench
         b.ws.rows[r, ka.TARGET] = target[r] = rng.normal()
@@ -107,7 +107,7 @@ def test_rows_between_bodies_and_between_joints(seed, m_star):
         b.ws.active[r, [ka.ROW_KIND, ka.BODY_A, ka.BODY_B]] = ka.BODY_ROW, first, second
         for body, sign in ((first, 1.0), (second, -1.0)):
             position, R = b.ws.links[body, ka.P : ka.P + 3], b.ws.links[body, ka.R : ka.R + 9].reshape(3, 3)
-            J[r] += sign * d @ oracle.point(body, R.T @ (place - position), q, v)[1]
+            J[r] += sign * d @ oracle.point(body, R.T @ (anchor - position), q, v)[1]
         F[r] = J[r]
     assume(np.linalg.svd(J)[1][-1] > 1e-2)
     b.ws.counts[ka.ROWS] = 4

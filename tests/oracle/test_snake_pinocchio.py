@@ -43,11 +43,11 @@ def jacobians(robot, w, phi):
     pin.computeJointJacobians(model, data, q)
     pin.updateFramePlacements(model, data)
     order = [0, 1, 2, 5, 4, 3, *range(6, 6 + len(phi))]
-    found = []
+    blocks = []
     for frame in frames:
         J = pin.getFrameJacobian(model, data, frame, LOCAL_ALIGNED)[:, order]
-        found.append((J, data.oMf[frame].rotation, data.oMf[frame].translation))
-    return found
+        blocks.append((J, data.oMf[frame].rotation, data.oMf[frame].translation))
+    return blocks
 
 
 @given(robots(), st.integers(0, 2**32 - 1))

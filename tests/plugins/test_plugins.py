@@ -192,8 +192,8 @@ def test_a_part_that_does_not_work_is_named_with_its_distribution_and_harms_nobo
     assert "Traceback" not in checked.stderr
     said, lines = checked.stderr.splitlines(), {}
     for line in said:
-        if line.startswith("error: ") and (found := re.match(r"error: (?:.*/)?(\w+)\.yaml", line)):
-            lines[found[1]] = line
+        if line.startswith("error: ") and (match := re.match(r"error: (?:.*/)?(\w+)\.yaml", line)):
+            lines[match[1]] = line
     for name, (_, reason) in BROKEN.items():
         title = f"plant.type = '{name}': plant '{name}' of broken-parts 0.1 cannot be used: "
         assert f"{name}.yaml:3: {title}{reason}" in lines[name]

@@ -41,11 +41,13 @@ def test_spells_below_zero(margin: list[float], expected: list) -> None:
 
 
 def test_elbows_keep_the_published_arm_from_overturning() -> None:
-    found = {name: study.configuration(study.SCENARIO, name) for name in variant_names(study.SCENARIO)}
-    settled = [found[name]["tip_margin_min_settled"] for name in ("two_elbows", "elbow_7", "elbow_4", "no_elbow")]
+    configurations = {name: study.configuration(study.SCENARIO, name) for name in variant_names(study.SCENARIO)}
+    settled = [
+        configurations[name]["tip_margin_min_settled"] for name in ("two_elbows", "elbow_7", "elbow_4", "no_elbow")
+    ]
     assert settled == sorted(settled, reverse=True)
     assert settled[2] > 0.0 > settled[3]
-    for name, row in found.items():
+    for name, row in configurations.items():
         # With every elbow configuration the jump of the references tips the base within a blink ...
         first, *later = row["margin_below_zero_s"]
         assert first[0] == pytest.approx(row["overturns_at_s"], abs=2.0 / study.START["record.rate_hz"])

@@ -45,10 +45,10 @@ def test_dimensions():
     assert (model.base_joints + 4 + model.wheels, 6) == (17, 6)
     assert len(law.root_weight_inverse) == 19
     for row, number in enumerate(controller.modes.numbers):
-        found = conditioning(model, law, row, np.zeros(3), plant.initial_joints)
+        indices = conditioning(model, law, row, np.zeros(3), plant.initial_joints)
         lifted = len(TABLE_II[number])
-        assert found.rows == 13 + 1
-        assert found.redundancy == 6 + lifted + lifted - 4 - 1
+        assert indices.rows == 13 + 1
+        assert indices.redundancy == 6 + lifted + lifted - 4 - 1
 
 
 def test_straight_length():

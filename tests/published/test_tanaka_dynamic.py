@@ -19,31 +19,31 @@ Z, BETA = 2, 4
 
 
 @pytest.fixture(scope="module")
-def found(simulated):
+def ends(simulated):
     return {moved: displacement(simulated(SCENARIO, moved)) for moved in TABLE_III}
 
 
-def test_sag_of_table_iii(found):
+def test_sag_of_table_iii(ends):
     """What the servos' stiffness explains: rms of the twelve Δz, Δβ."""
-    off = np.array([found[moved] - published.mean for moved, published in TABLE_III.items()])
+    off = np.array([ends[moved] - published.mean for moved, published in TABLE_III.items()])
     assert np.sqrt(np.mean(off[:, Z] ** 2)) <= 8e-3
     assert np.sqrt(np.mean(off[:, BETA] ** 2)) <= 0.025
 
 
 @pytest.mark.parametrize("moved", TABLE_III)
-def test_signs_of_sag_are_as_measured(found, moved):
+def test_signs_of_sag_are_as_measured(ends, moved):
     """Where a mean is more than two standard deviations from zero; Δz of the β-run is 6 mm there and nothing here."""
     published = TABLE_III[moved]
     for i in (Z, BETA):
         if abs(published.mean[i]) > 2.0 * published.deviation[i] and (moved, i) != ("beta", Z):
-            assert np.sign(found[moved][i]) == np.sign(published.mean[i])
+            assert np.sign(ends[moved][i]) == np.sign(published.mean[i])
 
 
-def test_what_is_moved_moves(found):
+def test_what_is_moved_moves(ends):
     """Within a tenth of the target, but for the y-run, of which the paper has 66 mm."""
     for k, (moved, published) in enumerate(TABLE_III.items()):
         if moved != "y":
-            assert found[moved][k] == pytest.approx(published.target[k], rel=0.1)
+            assert ends[moved][k] == pytest.approx(published.target[k], rel=0.1)
 
 
 @pytest.mark.parametrize("moved", TABLE_III)
@@ -57,9 +57,9 @@ def test_whole_runs_close_their_ledger_and_solve_their_contacts(simulated, moved
     assert solved["capped_solves"] <= 1e-3 * solved["contact_solves"]
 
 
-def test_end_values_hardly_depend_on_the_step(found):
+def test_end_values_hardly_depend_on_the_step(ends):
     """The run that they do most of all, see results/snake/steps.json (``tests/support/snake_steps.py``)."""
-    values = np.array([end_values("alpha", 1.0), found["alpha"], end_values("alpha", 5.0)])
+    values = np.array([end_values("alpha", 1.0), ends["alpha"], end_values("alpha", 5.0)])
     spread = np.ptp(values, axis=0)
     assert spread[:3].max() < 5e-4
     assert spread[3:].max() < 1.5e-3
@@ -101,8 +101,8 @@ def test_mode_switching_shakes_the_head(switched):
     assert 0.010 <= position <= 0.045
     assert 0.04 <= attitude <= 0.13
     assert record.summary["mode_switches"] == 10
-    told = record["phi_command"][:, 6:]
-    assert np.abs(told[-1]).max() < 0.7 * np.abs(told[0]).max()  # the base straightens, as in Fig 10
+    commanded = record["phi_command"][:, 6:]
+    assert np.abs(commanded[-1]).max() < 0.7 * np.abs(commanded[0]).max()  # the base straightens, as in Fig 10
 
 
 def test_lifted_wheels_carry_nothing_once_they_are_lifted(switched):

@@ -63,12 +63,12 @@ def test_the_floor_pulls_at_elbow_4(records):
 
 def test_the_forces_at_elbow_4_are_those_of_the_documentation():
     """docs/validation.md: pushed for 33 ms with up to 9.9 N, −4.0 N at 0.1 s, pulled with 1.1 to 1.8 N from 0.17 s."""
-    found = elbow_forces(dynsim.simulate(dynsim.load_scenario("elbow_comparison", overrides={"record.rate_hz": 2000})))
-    assert found["pushes_until_s"] == pytest.approx(0.033, abs=0.001)
-    assert found["push_max_N"] == pytest.approx(9.9, abs=0.1)
-    assert found["at_0.1_s_N"] == pytest.approx(-4.0, abs=0.1)
-    assert found["pull_from_0.17_s_min_N"] == pytest.approx(1.1, abs=0.05)
-    assert found["pull_from_0.17_s_max_N"] == pytest.approx(1.8, abs=0.05)
+    forces = elbow_forces(dynsim.simulate(dynsim.load_scenario("elbow_comparison", overrides={"record.rate_hz": 2000})))
+    assert forces["pushes_until_s"] == pytest.approx(0.033, abs=0.001)
+    assert forces["push_max_N"] == pytest.approx(9.9, abs=0.1)
+    assert forces["at_0.1_s_N"] == pytest.approx(-4.0, abs=0.1)
+    assert forces["pull_from_0.17_s_min_N"] == pytest.approx(1.1, abs=0.05)
+    assert forces["pull_from_0.17_s_max_N"] == pytest.approx(1.8, abs=0.05)
 
 
 def test_the_same_work_of_figure_7_is_not_reproduced(records):
@@ -126,10 +126,10 @@ def test_other_solver_and_method_give_the_same_answer(records, settings):
 
 def test_pulling_does_not_depend_on_how_often_it_is_recorded():
     """Pulling times and forces are those of all steps: a brace that pulls between samples is reported."""
-    found = []
+    shares = []
     for rate in (20.0, 1000.0):
         scenario = dynsim.load_scenario("elbow_comparison_vertical", "elbow_4", overrides={"record.rate_hz": rate})
         summary = dynsim.simulate(scenario).summary
         assert any("pulls on this brace" in warning for warning in summary["warnings"])
-        found.append(summary["contacts"][0]["pulling_fraction"])
-    assert 0.0 < found[0] == found[1] < 0.01
+        shares.append(summary["contacts"][0]["pulling_fraction"])
+    assert 0.0 < shares[0] == shares[1] < 0.01

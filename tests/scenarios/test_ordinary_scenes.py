@@ -32,16 +32,18 @@ def in_a_program_of_its_own(data: dict[str, Any]) -> bool:
 def test_ordinary_scenes_end(terrains: list[str], own: bool):
     numbers = [number for number in range(200) if in_a_program_of_its_own(scene(number, terrains)) is own]
     ends = [end(number, terrains) for number in numbers]
-    counted = Counter(one.status for one in ends)
+    counted = Counter(ending.status for ending in ends)
     assert set(counted) <= {FINISHED, REFUSED, *KINDS.values()} - UNEXPLAINED, [
-        one for one in ends if one.status in UNEXPLAINED
+        ending for ending in ends if ending.status in UNEXPLAINED
     ]
     # What is refused is so for its hand path or its start; of 10 000 scenes nine stopped on their way.
     assert counted[FINISHED] >= len(numbers) - 5
-    assert {one.method for one in ends} == ({"dopri5"} if own else set(METHODS))
-    assert own or {one.surface for one in ends} == set(SURFACES)
+    assert {ending.method for ending in ends} == ({"dopri5"} if own else set(METHODS))
+    assert own or {ending.surface for ending in ends} == set(SURFACES)
     counts = account(ends)
-    assert sum(counts["by_status"].values()) == sum(sum(one.values()) for one in counts["by_surface"].values())
+    assert sum(counts["by_status"].values()) == sum(
+        sum(statuses.values()) for statuses in counts["by_surface"].values()
+    )
 
 
 def test_a_scene_is_the_same_whenever_it_is_drawn(terrains: list[str]):

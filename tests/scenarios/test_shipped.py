@@ -66,7 +66,7 @@ def test_real_contact_keeps_its_laws(run, name, variant):
     # Samples of the block that is pulled lie between steps of 0.1 s.
     assert record.summary["energy_residual_relative"] <= (1e-7 if record["current"].size else 1e-6)
     contacts = scenario.config.contacts
-    force, gap, mode = (record[f"contact_{what}"] for what in ("normal_force", "gap", "mode"))
+    force, gap, mode = (record[f"contact_{column}"] for column in ("normal_force", "gap", "mode"))
     assert force.min(initial=0.0) >= -1e-9
     assert gap.min(initial=0.0) >= -1e-9
     # The natural map: a closed contact has no gap, an open one no force.
@@ -149,8 +149,8 @@ def test_a_block_on_a_slope_in_closed_form(run):
     sine, cosine, weight = 2 / math.sqrt(29), 5 / math.sqrt(29), 3 * 9.81
     assert np.abs(run("block_on_slope", "rests")["q"]).max() <= 1e-12
     slides = run("block_on_slope", "slides")
-    way = 0.5 * 9.81 * (sine - 0.3 * cosine) * slides.time**2
-    np.testing.assert_allclose(slides["q"], np.outer(way, [cosine, 0.0, -sine]), rtol=0, atol=1e-6)
+    distance = 0.5 * 9.81 * (sine - 0.3 * cosine) * slides.time**2
+    np.testing.assert_allclose(slides["q"], np.outer(distance, [cosine, 0.0, -sine]), rtol=0, atol=1e-6)
     (onset,) = run("block_on_slope", "pulled").events
     pull = weight * math.sqrt((0.5 * cosine) ** 2 - sine**2)
     # The pull grows by 8 N/s.
@@ -198,10 +198,10 @@ def test_the_real_floor_differs_from_the_glued_one_as_told():
 
 def test_two_elbows_on_a_real_floor_are_one(run):
     """Energy and error as with elbow 7 alone; more than glued, where the floor pulls for nothing."""
-    both, one = (run(REAL_FLOOR, variant).summary for variant in ("two_elbows", "elbow_7"))
+    both, single = (run(REAL_FLOOR, variant).summary for variant in ("two_elbows", "elbow_7"))
     glued = run("elbow_comparison", "two_elbows").summary
-    assert both["electrical_energy_J"] == pytest.approx(one["electrical_energy_J"], rel=1e-3)
-    assert both["hand_error_rms_m"] == pytest.approx(one["hand_error_rms_m"], rel=1e-4)
+    assert both["electrical_energy_J"] == pytest.approx(single["electrical_energy_J"], rel=1e-3)
+    assert both["hand_error_rms_m"] == pytest.approx(single["hand_error_rms_m"], rel=1e-4)
     assert both["electrical_energy_J"] > 1.02 * glued["electrical_energy_J"]
     # Events and modes cost the implicit method Jacobians: 1.4 times the evaluations; an explicit one a tenth more.
     assert both["rhs_evaluations"] < 1.5 * glued["rhs_evaluations"]

@@ -36,9 +36,9 @@ def stepping(step: float, theta: float) -> dict[str, object]:
     return {"integrator.method": "time_stepping", "integrator.step_s": step, "integrator.theta": theta}
 
 
-def errors(found: Record, exact: Record) -> np.ndarray:
+def errors(record: Record, exact: Record) -> np.ndarray:
     """Of the hand's position at the samples [m]."""
-    return np.linalg.norm(found["hand_position"] - exact["hand_position"], axis=1)
+    return np.linalg.norm(record["hand_position"] - exact["hand_position"], axis=1)
 
 
 def energy_lost(record: Record) -> float:
@@ -53,16 +53,16 @@ def test_an_arm_that_falls_on_a_floor_lands_as_events_have_it(falling: Path, the
     exact = dynsim.simulate(dynsim.load_scenario(falling, overrides=EXACT))
     assert [event.kind for event in exact.events].count("landing") == 2
     for step in (1e-3, 5e-4, 2.5e-4, 1.25e-4):
-        found = dynsim.simulate(dynsim.load_scenario(falling, overrides=stepping(step, theta)))
-        assert errors(found, exact).max() <= 2.5 * step
-        assert abs(energy_lost(found) - energy_lost(exact)) <= 10.0 * step
-        solved = found.summary["time_stepping"]
+        record = dynsim.simulate(dynsim.load_scenario(falling, overrides=stepping(step, theta)))
+        assert errors(record, exact).max() <= 2.5 * step
+        assert abs(energy_lost(record) - energy_lost(exact)) <= 10.0 * step
+        solved = record.summary["time_stepping"]
         assert solved["contact_solves"] > 0.3 / step
         assert solved["capped_solves"] == 0
         assert solved["residual_max_m_s"] <= 1e-8
         assert 0.0 < solved["penetration_max_m"] <= 4.0 * step
-        assert set(np.unique(found["contact_mode"])) <= {0.0, 1.0, 2.0}
-        for contact in found.summary["contacts"]:
+        assert set(np.unique(record["contact_mode"])) <= {0.0, 1.0, 2.0}
+        for contact in record.summary["contacts"]:
             assert contact["landings"] - contact["lift_offs"] == 1
             closed = contact["sticking_fraction"] + contact["sliding_fraction"]
             np.testing.assert_allclose(contact["closed_fraction"], closed)
@@ -78,9 +78,9 @@ def test_the_published_arm_on_a_real_floor_is_approached_at_first_order():
     assert {event.kind for event in exact.events} >= {"slip_start", "lift_off", "landing"}
     mean = []
     for step in (2e-3, 1e-3, 5e-4, 2.5e-4):
-        found = dynsim.simulate(load(stepping(step, 1.0)))
-        mean.append(np.sqrt(np.mean(errors(found, exact) ** 2)))
-        assert found.summary["time_stepping"]["capped_solves"] == 0
+        record = dynsim.simulate(load(stepping(step, 1.0)))
+        mean.append(np.sqrt(np.mean(errors(record, exact) ** 2)))
+        assert record.summary["time_stepping"]["capped_solves"] == 0
     rates = np.log2(np.divide(mean[:-1], mean[1:]))
     assert (rates > 0.8).all(), (mean, rates)
     assert (rates < 1.2).all(), (mean, rates)
@@ -114,8 +114,8 @@ def test_joint_stops_are_counted(falling: Path):
     """A joint that falls on its limit: one hit, the energy of it, and closed from then on."""
     limited = {"plant.chain.0.limit_deg": [-90.0, 70.0], "surfaces.floor.point_m": [0, 0, -5.0], **EXACT}
     exact = dynsim.simulate(dynsim.load_scenario(falling, overrides=limited)).summary
-    found = dynsim.simulate(dynsim.load_scenario(falling, overrides=limited | stepping(1e-4, 0.5))).summary
-    (wanted,), (stop,) = exact["joint_stops"], found["joint_stops"]
+    summary = dynsim.simulate(dynsim.load_scenario(falling, overrides=limited | stepping(1e-4, 0.5))).summary
+    (wanted,), (stop,) = exact["joint_stops"], summary["joint_stops"]
     assert stop["hits"] == wanted["hits"]
     np.testing.assert_allclose(stop["closed_fraction"], wanted["closed_fraction"], atol=2e-3)
     np.testing.assert_allclose(stop["impact_loss_J"], wanted["impact_loss_J"], rtol=0.01)

@@ -68,8 +68,8 @@ def test_a_stop_is_hit_and_left(tmp_path: Path):
         dynsim.load_scenario(path, overrides={"integrator.method": "dopri5", "integrator.step_s": None})
     )
     assert exact.events
-    found = [(event.kind, event.name) for event in stepped.events]
-    assert found == [(event.kind, event.name) for event in exact.events]
+    events = [(event.kind, event.name) for event in stepped.events]
+    assert events == [(event.kind, event.name) for event in exact.events]
     # It is left once the joint is out again of what it sank in, h times the speed of the blow.
     late = np.subtract([event.time for event in stepped.events], [event.time for event in exact.events])
     assert (late >= 0.0).all()
@@ -136,8 +136,8 @@ def test_a_snake_on_wheels(tmp_path: Path):
     assert summary["time_stepping"]["capped_solves"] == 0
     # 13 bodies of 0.3 kg, pulled by 2 N along the wheels against 0.05 · 0.6 of their weight.
     mass = 13 * 0.3
-    way = 0.5 * (2.0 - 0.03 * mass * G) / mass * 0.2**2
-    np.testing.assert_allclose(record["hand_position"][-1, 0] - record["hand_position"][0, 0], way, rtol=0.02)
+    distance = 0.5 * (2.0 - 0.03 * mass * G) / mass * 0.2**2
+    np.testing.assert_allclose(record["hand_position"][-1, 0] - record["hand_position"][0, 0], distance, rtol=0.02)
     assert np.abs(record["hand_position"][:, 1]).max() < 1e-6
 
 
@@ -167,12 +167,12 @@ def test_the_energy_of_a_run_is_known_to_what_half_a_step_of_its_power_says():
     """A hand is pushed up a wall until it slips; at 1 ms nothing of it is an impact, and it never leaves the wall."""
     exact = dynsim.simulate(dynsim.load_scenario("wall_push", "weak_hold"))
     known = exact.summary["electrical_energy_J"]
-    for step, told in ((1e-3, False), (5e-2, True)):
+    for step, warned in ((1e-3, False), (5e-2, True)):
         record = with_steps("wall_push", "weak_hold", **{"integrator.step_s": step})
         error = abs(record.summary["electrical_energy_J"] - known)
         blurred = record.summary["time_stepping"]["half_step_energy_J"]
         assert error <= blurred <= 4.0 * error
-        assert any("known to" in text for text in record.summary["warnings"]) is told
+        assert any("known to" in text for text in record.summary["warnings"]) is warned
     record = with_steps("wall_push", "weak_hold")
     (contact,), (other,) = record.summary["contacts"], exact.summary["contacts"]
     assert record.summary["electrical_energy_J"] == pytest.approx(known, rel=5e-4)

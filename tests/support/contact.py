@@ -53,15 +53,15 @@ def side_by_side(glued: dict[str, Record], real: dict[str, Record]) -> dict[str,
     }
 
 
-def table(found: dict[str, dict[str, Any]]) -> str:
+def table(numbers_of: dict[str, dict[str, Any]]) -> str:
     """Numbers of all runs, for the terminal."""
     lines = [f"{'':40}{'energy [J]':>11}{'error [mm]':>11}{'residual':>10}  contacts: mean N, closed %, sticking %"]
-    for scenario, variants in found.items():
+    for scenario, variants in numbers_of.items():
         for variant, row in variants.items():
             touching = "; ".join(
-                f"{name} {one['normal_force_mean_N']:.2f}, {100 * one['closed_fraction']:.1f}, "
-                f"{100 * one.get('sticking_fraction', 0.0):.1f}"
-                for name, one in row["contacts"].items()
+                f"{name} {contact['normal_force_mean_N']:.2f}, {100 * contact['closed_fraction']:.1f}, "
+                f"{100 * contact.get('sticking_fraction', 0.0):.1f}"
+                for name, contact in row["contacts"].items()
             )
             lines.append(
                 f"{scenario + ' ' + variant:40}{row['electrical_energy_J']:11.5g}{1e3 * row['hand_error_rms_m']:11.4g}"
@@ -73,7 +73,7 @@ def table(found: dict[str, dict[str, Any]]) -> str:
 if __name__ == "__main__":
     FOLDER.mkdir(parents=True, exist_ok=True)
     runs = {scenario: compare(scenario) for scenario in SCENARIOS}
-    rows = {scenario: {name: numbers(one) for name, one in records.items()} for scenario, records in runs.items()}
+    rows = {scenario: {name: numbers(record) for name, record in records.items()} for scenario, records in runs.items()}
     write_json(FOLDER / "comparison.json", {"dynsim_version": __version__, **rows})
     print(table(rows))
     both = side_by_side(runs[GLUED], runs[REAL])

@@ -33,8 +33,8 @@ def arm() -> Model:
     axes = [np.array([0.0, 0.0, 1.0]), *[np.array([0.0, 1.0, 0.0])] * 3]
     places = [MOUNT, *(np.array([0.0, 0.0, length]) for length in lengths[:-1])]
     links = tuple(
-        Link(f"link_{i + 1}", f"joint_{i + 1}", f"link_{i}" if i else None, "revolute", axis, body, p_PJ=place)
-        for i, (axis, place) in enumerate(zip(axes, places, strict=True))
+        Link(f"link_{i + 1}", f"joint_{i + 1}", f"link_{i}" if i else None, "revolute", axis, body, p_PJ=end)
+        for i, (axis, end) in enumerate(zip(axes, places, strict=True))
     )
     return Model(Robot("arm", links, (), ("link_4", np.array([0.0, 0.0, lengths[-1]]))))
 

@@ -101,7 +101,7 @@ def scene(number: int, terrains: Sequence[str]) -> dict[str, Any]:
             contacts["stribeck_m_s"] = float(random.choice((0.01, 0.1)))
     if random.random() < 0.15:
         contacts["restitution"] = float(random.uniform(0.1, 0.8))
-    found: dict[str, Any] = {
+    settings: dict[str, Any] = {
         "name": f"scene_{number}",
         "duration_s": duration,
         "plant": {"type": "serial_arm", "link": _link(random, radius), "chain": chain},
@@ -113,10 +113,10 @@ def scene(number: int, terrains: Sequence[str]) -> dict[str, Any]:
         "metrics": {"settle_s": 0.0},
     }
     if braced and "elbow" in points:
-        found["initial"] = {"on_surface": ["elbow"]}
+        settings["initial"] = {"on_surface": ["elbow"]}
     if loads := _loads(random, chain, duration):
-        found["loads"] = loads
-    return found
+        settings["loads"] = loads
+    return settings
 
 
 def _chain(random: Generator) -> tuple[list[dict[str, Any]], int]:
@@ -142,15 +142,15 @@ def _chain(random: Generator) -> tuple[list[dict[str, Any]], int]:
 
 def _places(chain: Sequence[Mapping[str, Any]]) -> Array:
     """Where joints and hand are at the start, (n + 1, 3) [m]."""
-    rotation, place, found = np.eye(3), np.zeros(3), []
+    rotation, position, positions = np.eye(3), np.zeros(3), []
     for link in chain:
-        found.append(place)
+        positions.append(position)
         angle = math.radians(link["initial_deg"])
         c, s = math.cos(angle), math.sin(angle)
         turn = [[c, 0, s], [0, 1, 0], [-s, 0, c]] if link["axis"] == "y" else [[c, -s, 0], [s, c, 0], [0, 0, 1]]
         rotation = rotation @ np.array(turn)
-        place = place + link["length_m"] * rotation[:, 2]
-    return np.array([*found, place])
+        position = position + link["length_m"] * rotation[:, 2]
+    return np.array([*positions, position])
 
 
 def _link(random: Generator, radius: float) -> dict[str, Any]:
@@ -177,21 +177,21 @@ def _controller(
 ) -> dict[str, Any]:
     """Gains from soft to stiff; the arm holds, or moves some joints, or its hand."""
     gain = float(10.0 ** random.uniform(1.0, 3.3))
-    found: dict[str, Any] = {"type": "joint_pd", "k_p_V_per_rad": gain, "k_d_V_s_per_rad": gain * 0.04}
+    settings: dict[str, Any] = {"type": "joint_pd", "k_p_V_per_rad": gain, "k_d_V_s_per_rad": gain * 0.04}
     moves = random.random()
     if moves < 0.35:
         for k in random.choice(len(chain), size=min(3, len(chain)), replace=False).tolist():
             start = chain[k]["initial_deg"]
             angles = [start, start + float(random.uniform(-40, 40)), start + float(random.uniform(-40, 40))]
             times = [0.0, 0.5 * duration, duration]
-            found.setdefault("joints", {})[f"joint_{k + 1}"] = {"times_s": times, "angles_deg": angles}
+            settings.setdefault("joints", {})[f"joint_{k + 1}"] = {"times_s": times, "angles_deg": angles}
     elif moves < 0.55:
         there = joints[-1] + random.uniform(-0.05, 0.05, size=3)
         if all(link["axis"] == "y" for link in chain):
             there[1] = 0.0
         path = {"type": "line", "from_m": joints[-1].tolist(), "to_m": there.tolist(), "duration_s": duration}
-        found["hand"] = {"joints": [f"joint_{k + 1}" for k in range(len(chain))], "path": path}
-    return found
+        settings["hand"] = {"joints": [f"joint_{k + 1}" for k in range(len(chain))], "path": path}
+    return settings
 
 
 def _surface(random: Generator, kind: str, below: Array, terrains: Sequence[str]) -> dict[str, Any]:
@@ -218,18 +218,18 @@ def _surface(random: Generator, kind: str, below: Array, terrains: Sequence[str]
 
 def _loads(random: Generator, chain: Sequence[Mapping[str, Any]], duration: float) -> dict[str, Any]:
     """A payload, a steady force, a push."""
-    last, found = f"link_{len(chain)}", dict[str, Any]()
+    last, loads = f"link_{len(chain)}", dict[str, Any]()
     if random.random() < 0.3:
         tip = [0.0, 0.0, chain[-1]["length_m"]]
         mass, size = float(random.uniform(0.1, 1.0)), 0.03
-        found["tool"] = {"type": "payload", "body": last, "point_m": tip, "mass_kg": mass, "radius_m": size}
+        loads["tool"] = {"type": "payload", "body": last, "point_m": tip, "mass_kg": mass, "radius_m": size}
     if random.random() < 0.15:
-        found["wind"] = {"type": "constant", "body": last, "force_N": random.uniform(-3, 3, size=3).tolist()}
+        loads["wind"] = {"type": "constant", "body": last, "force_N": random.uniform(-3, 3, size=3).tolist()}
     if random.random() < 0.15:
         times = (np.array([0.2, 0.4, 0.6]) * duration).tolist()
         force = [[0.0] * 3, random.uniform(-20, 20, size=3).tolist(), [0.0] * 3]
-        found["push"] = {"type": "samples", "body": last, "times_s": times, "force_N": force}
-    return found
+        loads["push"] = {"type": "samples", "body": last, "times_s": times, "force_N": force}
+    return loads
 
 
 def write_terrains(folder: Path) -> list[str]:
@@ -277,7 +277,7 @@ def endings(
     numbers: Iterable[int], jobs: int, terrains: Sequence[str], take: Callable[[Ending], None]
 ) -> tuple[list[Ending], bool]:
     """How scenes end, in the order of their numbers, and whether Ctrl-C came before all had; ``take`` gets each."""
-    found: list[Ending] = []
+    ended: list[Ending] = []
 
     def take_late(number: int, result: Callable[[], Ending | None]) -> None:
         try:
@@ -289,11 +289,11 @@ def endings(
         except SimulationInterrupted:
             return
         if ending is not None:
-            found.append(ending)
+            ended.append(ending)
             take(ending)
 
     interrupted = run_in_processes(_Work(terrains), numbers, jobs, take_late)
-    return sorted(found, key=lambda ending: ending.scene), interrupted
+    return sorted(ended, key=lambda ending: ending.scene), interrupted
 
 
 class _Work:
@@ -306,28 +306,30 @@ class _Work:
         return end(number, self._terrains, look)
 
 
-def account(found: Sequence[Ending]) -> dict[str, Any]:
+def account(ended: Sequence[Ending]) -> dict[str, Any]:
     """How many ended how, by method and surface; wall times; the first scene of each kind of stop or refusal."""
-    kinds = sorted({one.status for one in found})
+    kinds = sorted({ending.status for ending in ended})
     walls = {
-        method: [one.wall_s for one in found if one.method == method and one.status != REFUSED]
+        method: [ending.wall_s for ending in ended if ending.method == method and ending.status != REFUSED]
         for method in sorted(set(METHODS))
     }
-    longest = max(found, key=lambda one: one.wall_s)
+    longest = max(ended, key=lambda ending: ending.wall_s)
     return {
-        "scenes": len(found),
-        "by_status": dict(Counter(one.status for one in found).most_common()),
-        "by_method": {name: _counted(one.status for one in found if one.method == name) for name in walls},
-        "by_surface": {name: _counted(one.status for one in found if one.surface == name) for name in SURFACES},
+        "scenes": len(ended),
+        "by_status": dict(Counter(ending.status for ending in ended).most_common()),
+        "by_method": {name: _counted(ending.status for ending in ended if ending.method == name) for name in walls},
+        "by_surface": {
+            name: _counted(ending.status for ending in ended if ending.surface == name) for name in SURFACES
+        },
         "wall_s": {name: {"median": float(np.median(w)), "longest": max(w)} for name, w in walls.items() if w},
         "longest": {"scene": longest.scene, "wall_s": longest.wall_s, "status": longest.status},
         "examples": {
             kind: {"scene": first.scene, "method": first.method, "reason": _short(first.reason)}
             for kind in kinds
             if kind != FINISHED
-            for first in [next(one for one in found if one.status == kind)]
+            for first in [next(candidate for candidate in ended if candidate.status == kind)]
         },
-        "refused_because": _counted(_why(one.reason) for one in found if one.status == REFUSED),
+        "refused_because": _counted(_why(ending.reason) for ending in ended if ending.status == REFUSED),
     }
 
 
@@ -363,28 +365,30 @@ def note(journal: Path, ending: Ending) -> None:
 
 def noted(journal: Path | None) -> list[Ending]:
     """What a journal has; a process that was killed may have left a line unfinished."""
-    found: list[Ending] = []
+    ended: list[Ending] = []
     if journal is not None and journal.exists():
         for line in journal.read_text("utf-8").splitlines():
             with suppress(ValueError, TypeError):
-                found.append(Ending(**json.loads(line)))
-    return found
+                ended.append(Ending(**json.loads(line)))
+    return ended
 
 
 def main() -> None:
     """Run the scenes, print what became of them, and keep it."""
-    given = _options()
-    wanted = range(given.first, given.first + given.count)
-    earlier = [one for one in noted(given.journal) if one.scene in wanted]
-    left = sorted(set(wanted) - {one.scene for one in earlier})
-    keep: Callable[[Ending], None] = partial(note, given.journal) if given.journal is not None else lambda ending: None
+    options = _options()
+    wanted = range(options.first, options.first + options.count)
+    earlier = [ended_scene for ended_scene in noted(options.journal) if ended_scene.scene in wanted]
+    left = sorted(set(wanted) - {ended_scene.scene for ended_scene in earlier})
+    keep: Callable[[Ending], None] = (
+        partial(note, options.journal) if options.journal is not None else lambda ending: None
+    )
     with tempfile.TemporaryDirectory() as temporary:
-        ended, stopped = endings(left, given.jobs, write_terrains(Path(temporary)), keep)
-    result = account(sorted([*earlier, *ended], key=lambda one: one.scene))
+        ended, stopped = endings(left, options.jobs, write_terrains(Path(temporary)), keep)
+    result = account(sorted([*earlier, *ended], key=lambda entry: entry.scene))
     print(json.dumps(result, indent=2, ensure_ascii=False))
     if not stopped:
-        given.out.parent.mkdir(parents=True, exist_ok=True)
-        write_json(given.out, {"dynsim_version": __version__, "seed": SEED, **result})
+        options.out.parent.mkdir(parents=True, exist_ok=True)
+        write_json(options.out, {"dynsim_version": __version__, "seed": SEED, **result})
 
 
 if __name__ == "__main__":

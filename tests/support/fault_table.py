@@ -265,11 +265,11 @@ def spans() -> dict[str, tuple[float, float]]:
     run = rig().run()
     since = run.result.record.time + run.started() - run.line.servos.torque_since
     states = run.result.record["state"]
-    found = {}
+    ranges = {}
     for name in (ReplayState.MOVE_TO_START.name, ReplayState.REPLAY.name):
         times = since[states == ReplayState[name]]
-        found[name] = float(times[0]), float(times[-1])
-    return found
+        ranges[name] = float(times[0]), float(times[-1])
+    return ranges
 
 
 def strike(case: Case, state: str, policy: FaultPolicy, seed: int) -> Outcome:
@@ -423,10 +423,10 @@ def main() -> None:
     table = []
     with ProcessPoolExecutor(arguments.jobs) as pool:
         jobs = [(case, arguments.runs) for case in CASES]
-        for done, found in enumerate(pool.map(_cells_of, jobs), start=1):
-            table += found
+        for done, row in enumerate(pool.map(_cells_of, jobs), start=1):
+            table += row
             print(f"{done} of {len(CASES)} faults: {CASES[done - 1].name}", file=sys.stderr, flush=True)
-            for cell in found:
+            for cell in row:
                 for text in cell["broken"]:
                     print(f"BROKEN: {cell['fault']} in {cell['state']}, {cell['policy']}: {text}")
     if arguments.out:

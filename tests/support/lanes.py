@@ -42,7 +42,7 @@ class Line(NamedTuple):
     function: str
     number: int
 
-    def place(self) -> Place:
+    def location(self) -> Place:
         """Its text, which stays when lines before it come and go."""
         text = linecache.getline(self.path, self.number).strip()
         return Place(Path(self.path).relative_to(KERNELS).as_posix(), self.function, text)
@@ -51,9 +51,9 @@ class Line(NamedTuple):
 class Divergent(Exception):
     """Lanes took different branches."""
 
-    def __init__(self, place: Place) -> None:
-        super().__init__(str(place))
-        self.place = place
+    def __init__(self, location: Place) -> None:
+        super().__init__(str(location))
+        self.place = location
 
 
 class Notes:
@@ -96,7 +96,7 @@ def _place() -> Place:
     while frame is not None and not frame.f_code.co_filename.startswith(KERNELS):
         frame = frame.f_back
     assert frame is not None, "lanes were asked outside the kernels"
-    return _line(frame).place()
+    return _line(frame).location()
 
 
 def _line(frame: FrameType) -> Line:
@@ -105,10 +105,10 @@ def _line(frame: FrameType) -> Line:
 
 def _agreed(values: tuple) -> Any:
     """The value of all lanes, for a place that can do with one only."""
-    place = _place()
-    _notes.asked.add(place)
+    location = _place()
+    _notes.asked.add(location)
     if any(value != values[0] for value in values):
-        raise Divergent(place)
+        raise Divergent(location)
     return values[0]
 
 
@@ -227,18 +227,18 @@ def plain(function: Any) -> FunctionType:
 def reached(root: Any, without: Sequence[Any] = ()) -> list[FunctionType]:
     """The function and all kernels that it calls, directly or not, and not through one of ``without`` alone."""
     left_out = {plain(function).__code__ for function in without}
-    found: dict[CodeType, FunctionType] = {}
+    functions: dict[CodeType, FunctionType] = {}
     waiting = [plain(root)]
     while waiting:
         function = waiting.pop()
-        if function.__code__ in found or function.__code__ in left_out:
+        if function.__code__ in functions or function.__code__ in left_out:
             continue
-        found[function.__code__] = function
+        functions[function.__code__] = function
         for name in function.__code__.co_names:
             called = plain(function.__globals__.get(name))
             if isfunction(called) and called.__code__.co_filename.startswith(KERNELS):
                 waiting.append(called)
-    return list(found.values())
+    return list(functions.values())
 
 
 def lines(function: FunctionType) -> set[Line]:
@@ -278,8 +278,8 @@ def mapped(value: Any, real: Callable[[np.ndarray], Any], integer: Callable[[np.
 def objects(table: np.ndarray, make: Callable[[Any], Any]) -> np.ndarray:
     """A table of objects, made of each number."""
     result = np.empty(table.shape, dtype=object)
-    for place in np.ndindex(table.shape):
-        result[place] = make(table[place])
+    for index in np.ndindex(table.shape):
+        result[index] = make(table[index])
     return result
 
 

@@ -75,9 +75,9 @@ def stl_text() -> str:
 def obj() -> str:
     """The wedge as OBJ, with indices from either end."""
     corners = "".join(f"v {x:g} {y:g} {z:g}\n" for x, y, z in CORNERS)
-    first, *rest = FACES
+    first, *others = FACES
     faces = "f " + " ".join(f"{k - len(CORNERS)}" for k in first) + "\n"
-    return corners + faces + "".join("f " + " ".join(f"{k + 1}/1/1" for k in face) + "\n" for face in rest)
+    return corners + faces + "".join("f " + " ".join(f"{k + 1}/1/1" for k in face) + "\n" for face in others)
 
 
 def dae() -> str:

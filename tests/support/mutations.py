@@ -162,9 +162,9 @@ def in_a_child(work: Callable[[Callable[[Any], None]], None]) -> list[Any]:
             os._exit(0)
     os.close(send)
     with os.fdopen(receive) as lines:
-        told = [json.loads(line) for line in lines]
+        messages = [json.loads(line) for line in lines]
     os.waitpid(child, 0)
-    return told
+    return messages
 
 
 def limit(seconds: float, tell: Callable[[], None]) -> None:
@@ -228,7 +228,7 @@ class Study:
         families: dict[str, str] = {}
         for name in result["late"]:
             families.setdefault(name.split("[")[0], name)
-        told: list[str] = []
+        messages: list[str] = []
         for name in sorted(families.values(), key=lambda name: -sum(word in name for word in words))[:LATE]:
 
             def work(tell: Callable[[Any], None], name: str = name, mistaken: bool = True) -> None:
@@ -237,12 +237,12 @@ class Study:
                 limit(LATE_S, lambda: tell("late"))
                 tell(outcome(items[name], None))
 
-            told.append((in_a_child(work) or ["broken"])[-1])
+            messages.append((in_a_child(work) or ["broken"])[-1])
             # Some fail as Python anyway.
-            if told[-1] == "failed" and in_a_child(partial(work, mistaken=False)) == ["passed"]:
+            if messages[-1] == "failed" and in_a_child(partial(work, mistaken=False)) == ["passed"]:
                 result["noticed"] = [name, "fails"]
                 break
-        return told
+        return messages
 
     def reach(self, items: list[pytest.Item]) -> dict[str, dict[str, Any]]:
         """Of each test the lines of the sample that it reaches, its processor time [s] and outcome."""
@@ -269,8 +269,8 @@ class Study:
                 ended = outcome(item, None)
                 tell([ended, used_s() - start, sorted(seen)])
 
-            told = in_a_child(work)
-            ended, seconds, reached = told[0] if told else ("broken", 0.0, [])
+            messages = in_a_child(work)
+            ended, seconds, reached = messages[0] if messages else ("broken", 0.0, [])
             late[family] = late.get(family, 0) + (ended == "late")
             reach[item.nodeid] = {"outcome": ended, "s": seconds, "lines": reached}
             if count % 20 == 0:
@@ -300,18 +300,18 @@ class Study:
                     return
                 tell(["passed", name])
 
-        told = in_a_child(work)
-        noticed = next((line for line in told if line[0] == "noticed"), None)
-        if not noticed and (not told or not any(line[0] == "made" for line in told)):
+        messages = in_a_child(work)
+        noticed = next((line for line in messages if line[0] == "noticed"), None)
+        if not noticed and (not messages or not any(line[0] == "made" for line in messages)):
             noticed = ["noticed", "", "cannot be made"]
-        made = next((line for line in told if line[0] == "made"), ["", "", ""])
+        made = next((line for line in messages if line[0] == "made"), ["", "", ""])
         late = [name for name, test in reach.items() if test["outcome"] == "late" and k in test["lines"]]
         return {
             **mistake,
             "was": made[1],
             "is": made[2],
             "tests": len(tests),
-            "passed": sum(line[0] == "passed" for line in told),
+            "passed": sum(line[0] == "passed" for line in messages),
             "noticed": noticed and noticed[1:],
             "late": late,
         }

@@ -123,8 +123,8 @@ def point(mass: float, track: float, caster: float, variant: str) -> Row:
         ).summary
     except DynsimError as error:
         return row | {"reason": " ".join(str(error).split())}
-    found = {key: summary["base"][key] for key in ("tip_margin_min_settled", "tip_margin_min", "overturns_at_s")}
-    return row | found | {"stands": found["tip_margin_min_settled"] > 0.0, "reason": ""}
+    numbers = {key: summary["base"][key] for key in ("tip_margin_min_settled", "tip_margin_min", "overturns_at_s")}
+    return row | numbers | {"stands": numbers["tip_margin_min_settled"] > 0.0, "reason": ""}
 
 
 def points() -> list[tuple[float, float, float]]:
@@ -132,12 +132,12 @@ def points() -> list[tuple[float, float, float]]:
     base = shipped_base()
     shipped = (base["mass_kg"], base["track_m"], base["caster_m"][0])
     grid = product(MASSES_KG, TRACKS_M, CASTERS_M)
-    return [place for place in grid if any(at == value for at, value in zip(place, shipped, strict=True))]
+    return [point for point in grid if any(at == value for at, value in zip(point, shipped, strict=True))]
 
 
 def sweep(progress: Callable[[int, int], None]) -> list[Row]:
     """All points with all variants; calls ``progress`` with how many runs of how many are done."""
-    cases = [(*place, variant) for place in points() for variant in variant_names(SCENARIO)]
+    cases = [(*at, variant) for at in points() for variant in variant_names(SCENARIO)]
     rows = []
     for case in cases:
         rows.append(point(*case))
@@ -227,11 +227,11 @@ def _report(done: int, of: int) -> None:
 
 if __name__ == "__main__":
     FOLDER.mkdir(parents=True, exist_ok=True)
-    found: dict[str, Any] = {"dynsim_version": __version__}
+    result: dict[str, Any] = {"dynsim_version": __version__}
     for scenario in SCENARIOS:
-        found[scenario] = {variant: configuration(scenario, variant) for variant in variant_names(scenario)}
-        print(f"{scenario}\n{table(found[scenario])}")
-    write_json(FOLDER / "configurations.json", found)
+        result[scenario] = {variant: configuration(scenario, variant) for variant in variant_names(scenario)}
+        print(f"{scenario}\n{table(result[scenario])}")
+    write_json(FOLDER / "configurations.json", result)
     runs = sweep(_report)
     write_text(FOLDER / "sweep.csv", _as_csv(runs))
     with look():

@@ -3,10 +3,12 @@
     PYTHONPATH=tests python -m support.planner_scenes --out results/planner
     PYTHONPATH=tests python -m support.planner_scenes --study reference --effort 100 --out results/planner
     PYTHONPATH=tests python -m support.planner_scenes --study gains --out results/planner
+    PYTHONPATH=tests python -m support.planner_scenes --study posture --out results/planner
 
 The second one takes so many times as long for each search: how far the answers of the first are from the best known.
 It keeps what its file says of scenes that are not asked for.
 The third one runs the best plans, and those of the published arm, on surfaces 5 mm off with gains from stiff to soft.
+The fourth one is of the published posture, which no plan has chosen: the least heat that forces at its elbows leave.
 
 Arms of 7 to 10 joints whose hand goes there and back along a short way, over a floor, a pipe, a box, or with a joint
 about a third axis. The seed of a scene is its number; the constants of the search were chosen on the first twenty.
@@ -24,6 +26,8 @@ from typing import Any
 
 import numpy as np
 
+from dynsim.compile.bracing import Brace
+from dynsim.engine.dynamics import prepare
 from dynsim.planner.answer import plan_braces
 from dynsim.planner.dense import references
 from dynsim.planner.problem import Options, task
@@ -78,10 +82,10 @@ def scene(seed: int) -> dict[str, Any]:
     height = drawn(0.0, 0.25)
     reach, friction = sum(link["length_m"] for link in chain), drawn(0.1, 0.35, 2)
     distance, up, azimuth = drawn(0.55, 0.8) * reach, drawn(0.25, 0.55), drawn(-0.3, 0.3)
-    way = rng.normal(size=3) * [1.0, 1.0, 0.5]
-    way = way / np.linalg.norm(way) * drawn(0.12, 0.25)
+    step = rng.normal(size=3) * [1.0, 1.0, 0.5]
+    step = step / np.linalg.norm(step) * drawn(0.12, 0.25)
     start = np.array([distance * np.cos(azimuth), distance * np.sin(azimuth), up])
-    end = start + way
+    end = start + step
     if end[2] < 0.15:
         end[2] = 2.0 * start[2] - end[2]
     surfaces: dict[str, Any] = {"floor": {"type": "plane", "point_m": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}}
@@ -189,7 +193,7 @@ def best_known(seed: int, effort: int) -> dict[str, Any]:
     options = Options(along=along_of(seed), starts=effort * Options.starts, seed=OTHER_SEED)
     search, cpu = Search(task(scene_scenario(seed), options)), clock.process_time()
     search.kept = 3 * search.kept
-    found = search.run()
+    plans = search.run()
     sizes = [
         {
             "count": count,
@@ -197,7 +201,7 @@ def best_known(seed: int, effort: int) -> dict[str, Any]:
             "heat_W": _rounded(ranked[0].heat) if ranked else None,
             "searched_W": _rounded(ranked[0].heat) if ranked else None,
         }
-        for count, ranked in found.items()
+        for count, ranked in plans.items()
     ]
     return {
         "seed": seed,
@@ -215,7 +219,11 @@ def least_of(row: dict[str, Any], before: dict[str, Any]) -> dict[str, Any]:
     """
     known = {size["count"]: size for size in before["sizes"] if size["heat_W"] is not None}
     sizes = [
-        min(size, known.get(size["count"], size), key=lambda one: math.inf if one["heat_W"] is None else one["heat_W"])
+        min(
+            size,
+            known.get(size["count"], size),
+            key=lambda entry: math.inf if entry["heat_W"] is None else entry["heat_W"],
+        )
         | {"searched_W": size["searched_W"]}
         for size in row["sizes"]
     ]
@@ -257,11 +265,30 @@ def published(friction: float) -> Scenario:
     return load_scenario("pressing", overrides={"contacts.friction": friction})
 
 
+def posture_heat(friction: float, instants: int = 200) -> dict[str, Any]:
+    """Least heat of the published posture, which stands still at instants of its circle: the mean over them.
+
+    Of all forces at both elbows that press at least 0.5 N: ``Model.brace_statics``.
+    """
+    prepared = prepare(published(friction))
+    model, up = prepared.model, np.array([0.0, 0.0, 1.0])
+    pieces = list(prepared.control.positions(model.robot))
+    times, references = (np.concatenate(parts) for parts in zip(*pieces, strict=True))
+    braces = {
+        name: Brace(f"link_{k}", np.zeros(3), up, friction=friction, min_N=0.5)
+        for name, k in (("elbow_4", 4), ("elbow_7", 7))
+    }
+    at, still = np.linspace(0.0, PERIOD_S, instants, endpoint=False), np.zeros(model.n)
+    postures = np.stack([np.interp(at, times, column) for column in references.T], axis=1)
+    heat = [model.brace_statics(q, still, still, braces).heat for q in postures]
+    return {"friction": friction, "heat_W": _rounded(float(np.mean(heat)))}
+
+
 def main() -> None:
     """Plan scenes, or search them for long, and write their numbers."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--out", type=Path, default=Path("results/planner"), metavar="FOLDER")
-    parser.add_argument("--study", choices=("scenes", "reference", "gains"), default="scenes")
+    parser.add_argument("--study", choices=("scenes", "reference", "gains", "posture"), default="scenes")
     parser.add_argument("--effort", type=int, default=100, metavar="N", help="of the reference, times the usual rounds")
     parser.add_argument("--scenes", type=int, nargs=2, default=(1, 20), metavar=("FIRST", "LAST"))
     chosen = parser.parse_args()
@@ -272,7 +299,7 @@ def main() -> None:
     if chosen.study == "scenes":
         # What is compiled, or loaded, is no part of a scene's time.
         planned(first, 1)
-    for seed in range(first, last + 1):
+    for seed in range(first, last + 1) if chosen.study != "posture" else ():
         if chosen.study == "gains":
             rows += stiffness(scene_scenario(seed), (), along_of(seed))
         elif chosen.study == "reference":
@@ -285,6 +312,8 @@ def main() -> None:
         rows = [row for _, row in sorted((before | {row["seed"]: row for row in rows}).items())]
     if chosen.study == "gains":
         rows += [row for friction in (0.1, 0.0) for row in stiffness(published(friction), range(1, 5))]
+    if chosen.study == "posture":
+        rows = [posture_heat(friction) for friction in (0.0, 0.1)]
     chosen.out.mkdir(parents=True, exist_ok=True)
     write_json(chosen.out / f"{chosen.study}.json", rows)
 

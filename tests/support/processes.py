@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any
 
 
-def wait_for(condition: Callable[[], bool], timeout: float = 120.0, what: str = "nothing happened") -> None:
+def wait_for(condition: Callable[[], bool], timeout: float = 120.0, failure: str = "nothing happened") -> None:
     """Return as soon as the condition holds; fail after ``timeout`` [s], long enough for a busy machine."""
     end = time.monotonic() + timeout
     while not condition():
-        assert time.monotonic() < end, what
+        assert time.monotonic() < end, failure
         time.sleep(0.02)
 
 
@@ -44,7 +44,7 @@ class Child:
             assert not ended, self.stderr
             return False
 
-        wait_for(written, what=f"no {text!r} in {self.stderr!r}")
+        wait_for(written, failure=f"no {text!r} in {self.stderr!r}")
 
     def end(self, timeout: float = 120.0) -> int:
         """Exit code of a child that ends by itself."""

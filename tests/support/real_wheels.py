@@ -154,9 +154,9 @@ class RealWheels:
         axle = wheel.get("inertia_axle_kg_m2", disc)
         across = wheel.get("inertia_across_kg_m2", 0.5 * disc)
         for name, side in zip(WHEELS, (0.5, -0.5), strict=True):
-            place = pin.SE3(np.eye(3), np.array([0.0, side * self.track, self.r]))
+            placement = pin.SE3(np.eye(3), np.array([0.0, side * self.track, self.r]))
             # About +y: its top goes ahead.
-            turning = self.model.addJoint(joint, pin.JointModelRY(), place, name)
+            turning = self.model.addJoint(joint, pin.JointModelRY(), placement, name)
             rotor = pin.Inertia(float(wheel["mass_kg"]), np.zeros(3), np.diag([across, axle, across]))
             self.model.appendBodyToJoint(turning, rotor, here)
         mount = pin.SE3(about_z(np.deg2rad(base["mount"]["yaw_deg"])), np.array(base["mount"]["position_m"]))
@@ -186,7 +186,7 @@ class RealWheels:
                 self.armature[i] = motor["rotor_inertia_kg_m2"] * square
                 self.loss[i] += motor.get("gear_damping_N_m_s_per_rad", 0.0) * square
 
-    def _serial(self, arm: dict[str, Any], place: pin.SE3) -> list[str]:
+    def _serial(self, arm: dict[str, Any], placement: pin.SE3) -> list[str]:
         joint, names = self.body, []
         entries = [{**arm.get("link", {}), **entry} for entry in arm["chain"] for _ in range(entry.get("count", 1))]
         for number, entry in enumerate(entries, 1):
@@ -194,7 +194,7 @@ class RealWheels:
             slides = entry.get("kind") == "prismatic"
             kind = pin.JointModelPrismaticUnaligned if slides else pin.JointModelRevoluteUnaligned
             names.append(f"joint_{number}")
-            joint = self.model.addJoint(joint, kind(np.array(axis, dtype=float)), place, names[-1])
+            joint = self.model.addJoint(joint, kind(np.array(axis, dtype=float)), placement, names[-1])
             mass, length = entry["mass_kg"], entry["length_m"]
             com, tensor = np.array([0.0, 0.0, 0.5 * length]), entry.get("inertia_kg_m2")
             if tensor is None:
@@ -203,26 +203,26 @@ class RealWheels:
                 tensor = [side, 0.0, 0.0, side, 0.0, 0.5 * mass * square]
             body = pin.Inertia(mass, np.array(entry.get("com_m", com)), symmetric(tensor))
             self.model.appendBodyToJoint(joint, body, pin.SE3.Identity())
-            place = pin.SE3(np.eye(3), np.array([0.0, 0.0, length]))
+            placement = pin.SE3(np.eye(3), np.array([0.0, 0.0, length]))
             self.motor[names[-1]] = entry.get("motor")
             self.damping[names[-1]] = entry.get("damping_N_s_per_m" if slides else "damping_N_m_s_per_rad", 0.0)
         return names
 
-    def _urdf(self, arm: dict[str, Any], place: pin.SE3) -> list[str]:
+    def _urdf(self, arm: dict[str, Any], placement: pin.SE3) -> list[str]:
         """Pinocchio reads the file itself, but lets go of what is fixed to the root."""
         read = pin.buildModelFromUrdf(arm["file"])
-        joints = {one.attrib["name"]: one for one in ElementTree.parse(arm["file"]).getroot().iter("joint")}
+        joints = {joint.attrib["name"]: joint for joint in ElementTree.parse(arm["file"]).getroot().iter("joint")}
         # A fixed base as a floating one: then the root's inertia is that of its first joint.
         floating = pin.buildModelFromUrdf(arm["file"], pin.JointModelFreeFlyer())
-        self.model.appendBodyToJoint(self.body, floating.inertias[1], place)
+        self.model.appendBodyToJoint(self.body, floating.inertias[1], placement)
         universe = read.inertias[0]
         read.inertias[0] = pin.Inertia.Zero()
         assert universe.mass in (0.0, floating.inertias[1].mass)
         body = self.model.addFrame(
             pin.Frame("mount", self.body, 0, pin.SE3.Identity(), pin.FrameType.OP_FRAME), append_inertia=False
         )
-        self.model = pin.appendModel(self.model, read, body, place)
-        names = [name for name, one in joints.items() if one.attrib["type"] != "fixed"]
+        self.model = pin.appendModel(self.model, read, body, placement)
+        names = [name for name, joint in joints.items() if joint.attrib["type"] != "fixed"]
         for name in names:
             loss = joints[name].find("dynamics")
             self.damping[name] = 0.0 if loss is None else float(loss.attrib["damping"])

@@ -130,7 +130,7 @@ def study() -> dict[str, Any]:
         for variant in variant_names(name) or [None]:
             record = simulated(name, variant)
             runs[name][variant or ""] = outcome(record)
-            servos[name][variant or ""] = {kind: verdict(record, one) for kind, one in maps.items()}
+            servos[name][variant or ""] = {kind: verdict(record, servo_map) for kind, servo_map in maps.items()}
     predictive = simulated("snake_joint_limits", "eq20", {"controller.switching.policy": "predictive"})
     return {
         "dynsim_version": __version__,

@@ -75,8 +75,8 @@ def bead(friction: float = 0.0) -> Case:
     """Around a great circle without weight; with friction the speed falls as v₀/(1 + μ v₀ t/R)."""
     radius, speed, until = 0.4, 1.7, 1.0
     rate = friction / radius
-    way = speed * until if friction == 0.0 else np.log(1.0 + rate * speed * until) / rate
-    end = radius * np.array([np.sin(way / radius), 0.0, 1.0 - np.cos(way / radius)])
+    distance = speed * until if friction == 0.0 else np.log(1.0 + rate * speed * until) / rate
+    end = radius * np.array([np.sin(distance / radius), 0.0, 1.0 - np.cos(distance / radius)])
     return Case(bowl(friction, gravity=0.0), np.zeros(3), speed * X, until, end)
 
 
@@ -103,14 +103,14 @@ def hump() -> Case:
         return G * np.cos(y[0]) - radius * y[1] ** 2
 
     leaves.terminal = True  # type: ignore[attr-defined]
-    way = solve_ivp(
+    slide = solve_ivp(
         lambda _, y: [y[1], G / radius * np.sin(y[0])], (0.0, 2.0), [0.0, speed / radius], "DOP853",
         rtol=1e-12, atol=1e-13, events=leaves,
     )  # fmt: skip
-    (angle, rate), rest = way["y"][:, -1], until - way["t"][-1]
+    (angle, rate), flight = slide["y"][:, -1], until - slide["t"][-1]
     left = radius * np.array([np.sin(angle), 0.0, np.cos(angle) - 1.0])
     speeds = radius * rate * np.array([np.cos(angle), 0.0, -np.sin(angle)])
-    end = left + rest * speeds - 0.5 * G * rest**2 * Z
+    end = left + flight * speeds - 0.5 * G * flight**2 * Z
     surface = sphere(-radius * Z, radius, 1.0)
     return Case(point(Contact("bead", "z", np.zeros(3), surface), 0.3), np.zeros(3), speed * X, until, end)
 
@@ -155,11 +155,11 @@ def incline(until: float = 0.6) -> Case:
         return float(np.hypot(y[2], y[3])) - 1e-6
 
     rests.terminal = True  # type: ignore[attr-defined]
-    way = solve_ivp(law, (0.0, until), np.r_[0.0, 0.0, start], "DOP853", rtol=1e-12, atol=1e-13, events=rests)
+    solution = solve_ivp(law, (0.0, until), np.r_[0.0, 0.0, start], "DOP853", rtol=1e-12, atol=1e-13, events=rests)
     # The plane is level here and gravity leans.
     b = point(Contact("foot", "z", np.zeros(3), plane(Z), friction=friction), 1.0)
     b.system.model.gravity[:] = G * np.array([0.0, -np.sin(slope), -np.cos(slope)])
-    return Case(b, np.zeros(3), np.r_[start, 0.0], until, np.r_[way["y"][:2, -1], 0.0])
+    return Case(b, np.zeros(3), np.r_[start, 0.0], until, np.r_[solution["y"][:2, -1], 0.0])
 
 
 LENGTH, MASS, FLOOR = np.array([0.3, 0.25, 0.2]), np.array([0.5, 0.4, 0.3]), -0.1
@@ -212,8 +212,8 @@ def arm(friction: float, reference: Callable | None = None, until: float = 0.0) 
     links = []
     for k in range(3):
         rod = Inertia(MASS[k], 0.5 * LENGTH[k] * X, MASS[k] * LENGTH[k] ** 2 / 12.0 * np.eye(3))
-        place = LENGTH[k - 1] * X if k else np.zeros(3)
-        links.append(Link(f"rod_{k}", f"j{k}", f"rod_{k - 1}" if k else None, "revolute", -Y, rod, p_PJ=place))
+        position = LENGTH[k - 1] * X if k else np.zeros(3)
+        links.append(Link(f"rod_{k}", f"j{k}", f"rod_{k - 1}" if k else None, "revolute", -Y, rod, p_PJ=position))
     # τ = K_m/R (k_p e − K_m v) is 200 e − 2 v.
     servos = [Servo(f"j{k}", np.sqrt(DRAG), 1.0, STIFF / np.sqrt(DRAG)) for k in range(3 if reference else 0)]
     robot = Robot("arm", tuple(links), tuple(servos), ("rod_2", LENGTH[2] * X))

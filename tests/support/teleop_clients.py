@@ -41,11 +41,11 @@ class Teleop:
         )
         assert self.process.stdout is not None
         self.said = ""
-        while not (found := re.search(r"http://\S+", self.said)):
+        while not (match := re.search(r"http://\S+", self.said)):
             line = self.process.stdout.readline()
             assert line, self.said
             self.said += line
-        self.address = found[0]
+        self.address = match[0]
         parts = urlsplit(self.address)
         assert parts.hostname == "127.0.0.1"
         self.port, self.path = int(parts.port or 0), parts.path

@@ -116,15 +116,15 @@ def violations(b: Bench, run: ki.Run) -> dict[str, float]:
 
 
 def _normal(b: Bench, contact: Contact, q: np.ndarray) -> np.ndarray:
-    place = Model(b.robot).point_position(contact.body, contact.point, q)
-    slope = contact.surface.Q @ place + contact.surface.b
+    position = Model(b.robot).point_position(contact.body, contact.point, q)
+    slope = contact.surface.Q @ position + contact.surface.b
     return slope / np.linalg.norm(slope)
 
 
 def events(run: ki.Run) -> list[tuple[float, int, int]]:
     """Time, contact and kind of the logged events of contacts."""
-    found = []
+    events_seen = []
     for t, code in zip(run.log_time, run.log_event[: run.count[ki.LOGGED]], strict=False):
         k, kind = divmod(int(code) - ki.CONTACT_LOG, ce.LOG_KINDS)
-        found.append((float(t), k, kind))
-    return found
+        events_seen.append((float(t), k, kind))
+    return events_seen

@@ -79,14 +79,14 @@ def free_scenario(name: str) -> Scenario:
 
 def arms() -> dict[str, Scenario]:
     """Variants of the shipped scenarios that are integrated, by "scenario variant"."""
-    found = {
+    scenarios = {
         f"{path.stem} {variant or ''}".strip(): load_scenario(path, variant)
         for path in shipped_scenarios()
         for variant in [*variant_names(path)] or (None,)
     }
     return {
         name: scenario
-        for name, scenario in found.items()
+        for name, scenario in scenarios.items()
         if scenario.engine == "dynamics" and scenario.plant.type != "snake"
     }
 
@@ -105,10 +105,10 @@ def row(record: Record) -> dict[str, Any]:
     """What is quoted of any run: energy, error, ledger, work, contacts and how often what happened."""
     summary = record.summary
     keys = ("method", "electrical_energy_J", "hand_error_rms_m", "energy_residual_relative", "rhs_evaluations")
-    found = {key: summary[key] for key in keys}
-    found["events"] = dict(Counter(event.kind for event in record.events))
-    found["first_at_s"] = {event.kind: event.time for event in reversed(record.events)}
-    found["contacts"] = {
+    numbers = {key: summary[key] for key in keys}
+    numbers["events"] = dict(Counter(event.kind for event in record.events))
+    numbers["first_at_s"] = {event.kind: event.time for event in reversed(record.events)}
+    numbers["contacts"] = {
         contact["name"]: {
             key: contact[key]
             for key in ("normal_force_mean_N", "normal_force_max_N", "closed_fraction", "sticking_fraction")
@@ -117,7 +117,7 @@ def row(record: Record) -> dict[str, Any]:
         for contact in summary["contacts"]
         if contact["closed_fraction"] > 0.0
     }
-    return found
+    return numbers
 
 
 def time_stepping() -> dict[str, dict[str, float]]:
@@ -128,24 +128,24 @@ def time_stepping() -> dict[str, dict[str, float]]:
         "bouncing_link half": ("bouncing_link", "half", {}),
         **{f"falling_arm {step:g} ms": ("falling_arm", None, {"step_s": 1e-3 * step}) for step in (1, 0.5, 0.25)},
     }
-    found = {}
+    results = {}
     for name, (scenario, variant, changes) in cases.items():
         method = {"method": "time_stepping", "step_s": changes.get("step_s", 1e-3)}
         overrides = {"integrator": method} | ({"duration_s": 2} if "duration_s" in changes else {})
         summary = simulate(load_scenario(scenario, variant, overrides)).summary
-        found[name] = {
+        results[name] = {
             "energy_residual_relative": summary["energy_residual_relative"],
             "taken_by_steps_relative": summary["scheme_loss_J"] / summary["energy_turnover_J"],
             "penetration_max_m": summary["time_stepping"]["penetration_max_m"],
         }
-    return found
+    return results
 
 
 def knock() -> dict[str, float]:
     """The largest that the check of the bridge sees in the record of two elbows: acceleration, jerk, shaking."""
     motion = check_motion(_elbows(), load_servo_map("arm"))
     keys = ("acceleration", "jerk", "shaking")
-    return {key: max(abs(one.value) for one in motion.margins if one.quantity == key) for key in keys}
+    return {key: max(abs(margin.value) for margin in motion.margins if margin.quantity == key) for key in keys}
 
 
 def _elbows(variant: str = "two_elbows", **integrator: Any) -> Record:
@@ -169,37 +169,37 @@ def residuals_by_tolerance() -> dict[str, float]:
 def differences() -> dict[str, dict[str, float]]:
     """What other tolerances, methods and solvers change in the run with two elbows, and half the tolerance in all."""
     reference = _elbows(method="dopri5", rtol=1e-11, atol=1e-13)
-    found: dict[str, dict[str, float]] = {}
+    results: dict[str, dict[str, float]] = {}
     cases: dict[str, dict[str, Any]] = {
         "dopri5": {"method": "dopri5"},
         "radau5": {"method": "radau5"},
     }
     for name, case in cases.items():
         record = _elbows(**case)
-        found[f"{name} against dopri5 at rtol 1e-11"] = {
+        results[f"{name} against dopri5 at rtol 1e-11"] = {
             "q_rad": float(np.abs(record["q"] - reference["q"]).max()),
             "hand_m": float(np.abs(record["hand_position"] - reference["hand_position"]).max()),
         }
-    one, other = _elbows(), _elbows(solver="m_star")
-    found["m_star against articulated"] = {"q_rad": float(np.abs(one["q"] - other["q"]).max())}
+    first, other = _elbows(), _elbows(solver="m_star")
+    results["m_star against articulated"] = {"q_rad": float(np.abs(first["q"] - other["q"]).max())}
     keys = ("electrical_energy_J", "mechanical_work_J")
     relative = dict.fromkeys(keys, 0.0)
     for variant in variant_names(ELBOWS):
         coarse, fine = _elbows(variant).summary, _elbows(variant, rtol=5e-7, atol=5e-9).summary
         for key in keys:
             relative[key] = max(relative[key], abs(coarse[key] / fine[key] - 1.0))
-    found["half of rtol and atol, all variants, relative"] = relative
-    return found
+    results["half of rtol and atol, all variants, relative"] = relative
+    return results
 
 
 def validation() -> dict[str, Any]:
     """All of it, by topic."""
     fine = compare(ELBOWS, overrides={"record.rate_hz": RATE_HZ})
-    found = {name: ended(scenario) for name, scenario in arms().items()}
+    results = {name: ended(scenario) for name, scenario in arms().items()}
     free = {name: simulate(free_scenario(name)) for name in FREE}
-    elbows = {name: found[f"{ELBOWS} {name}"] for name in variant_names(ELBOWS)}
+    elbows = {name: results[f"{ELBOWS} {name}"] for name in variant_names(ELBOWS)}
     return {
-        "runs": {name: row(record) for name, record in found.items()},
+        "runs": {name: row(record) for name, record in results.items()},
         "ledger_residual_of_free_motion": {
             name: record.summary["energy_residual_relative"] for name, record in free.items()
         },

@@ -219,12 +219,12 @@ def test_reference_of_an_arc_is_the_arc(turning: Record) -> None:
     u = np.clip((turning.time - 0.05) / 0.4, 0.0, 1.0)
     turn = math.radians(50.0) * u**3 * (10.0 - 15.0 * u + 6.0 * u**2)
     x, y, start = 0.4 * np.sin(turn), 0.4 * (1.0 - np.cos(turn)), math.radians(45.0)
-    place = [x * np.cos(start) - y * np.sin(start), x * np.sin(start) + y * np.cos(start), start + turn]
+    expected = [x * np.cos(start) - y * np.sin(start), x * np.sin(start) + y * np.cos(start), start + turn]
     # The reference is a spline with knots at 20 ms, of which the jerk jumps twice.
-    np.testing.assert_allclose(turning["base_target"], np.stack(place, axis=1), atol=1e-4)
+    np.testing.assert_allclose(turning["base_target"], np.stack(expected, axis=1), atol=1e-4)
     knot = np.isclose(turning.time % 0.02, 0.0, atol=1e-9) | np.isclose(turning.time % 0.02, 0.02, atol=1e-9)
     assert knot.sum() > 3
-    np.testing.assert_allclose(turning["base_target"][knot, 2], place[2][knot], atol=1e-12)
+    np.testing.assert_allclose(turning["base_target"][knot, 2], expected[2][knot], atol=1e-12)
 
 
 def test_reference_between_the_knots_is_where_the_wheels_would_roll(turning: Record) -> None:
@@ -248,8 +248,8 @@ def test_reference_between_the_knots_is_where_the_wheels_would_roll(turning: Rec
         value = speed * wave(target[:, 2])
         # Simpson's rule over pairs of intervals.
         h = t[1] - t[0]
-        way = np.cumsum(h / 3.0 * (value[:-2:2] + 4.0 * value[1:-1:2] + value[2::2]))
-        np.testing.assert_allclose(target[2::2, column], way, atol=1e-9)
+        distance = np.cumsum(h / 3.0 * (value[:-2:2] + 4.0 * value[1:-1:2] + value[2::2]))
+        np.testing.assert_allclose(target[2::2, column], distance, atol=1e-9)
 
 
 def test_no_reference_without_motors_that_follow() -> None:

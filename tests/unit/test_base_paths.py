@@ -107,15 +107,15 @@ def test_waypoints_are_met_on_time_with_the_heading_along_the_curve(model: Model
     times, pose = poses(model, following(model, path))
     # The end of a segment is the begin of the next.
     once = np.append(np.diff(times) > 1e-9, True)
-    times, place = times[once], seen(pose)[once]
+    times, pose_seen = times[once], seen(pose)[once]
     for t, point in zip(S_CURVE["times_s"], S_CURVE["points_m"], strict=True):
         # Where the curvature bends, at the points, the spline through the knots does not: tens of nanometres.
-        assert place[np.abs(times - t).argmin(), :2] == pytest.approx(point, abs=5e-8)
-    rest = (times < 0.45) | (times > 9.05)
-    assert np.abs(np.diff(place[rest & (times < 5)], axis=0)).max() < 1e-7
-    speed = np.gradient(place[:, 0], times), np.gradient(place[:, 1], times)
+        assert pose_seen[np.abs(times - t).argmin(), :2] == pytest.approx(point, abs=5e-8)
+    standing = (times < 0.45) | (times > 9.05)
+    assert np.abs(np.diff(pose_seen[standing & (times < 5)], axis=0)).max() < 1e-7
+    speed = np.gradient(pose_seen[:, 0], times), np.gradient(pose_seen[:, 1], times)
     moving = np.hypot(*speed) > 0.02
-    off = np.arctan2(speed[1], speed[0]) - place[:, 2]
+    off = np.arctan2(speed[1], speed[0]) - pose_seen[:, 2]
     assert np.abs(off[moving]).max() < 1e-2
 
 
@@ -144,8 +144,8 @@ def test_wheel_angles_integrate_back_to_the_path(model: Model, path: dict[str, A
 
     def rates(t: float) -> np.ndarray:
         k = min(int(t / h), len(reference.coefficients) - 1)
-        one = reference.coefficients[k, columns]
-        return one[:, 1:] * np.arange(1, 6) @ (t - k * h) ** np.arange(5)
+        cubic = reference.coefficients[k, columns]
+        return cubic[:, 1:] * np.arange(1, 6) @ (t - k * h) ** np.arange(5)
 
     def pose_rates(t: float, pose: np.ndarray) -> list[float]:
         left, right = rates(t)
@@ -220,11 +220,11 @@ def test_places_of_a_file_are_gone_through_with_their_timing(model: Model, tmp_p
 def test_a_corner_in_a_file_is_refused_with_its_place(model: Model, tmp_path: Path, frame: str) -> None:
     u = np.linspace(0.0, 1.0, 101)
     points = np.stack([np.minimum(u, 0.6), np.maximum(u - 0.6, 0.0)], axis=1)
-    given = in_world(points) if frame == "world" else points
-    file = csv(tmp_path, "t_s,x_m,y_m", np.column_stack([9 * u, given]))
+    written = in_world(points) if frame == "world" else points
+    file = csv(tmp_path, "t_s,x_m,y_m", np.column_stack([9 * u, written]))
     with pytest.raises(ModelError) as refused:
         following(model, {"type": "csv", "file": file, "frame": frame})
-    x, y = given[60]
+    x, y = written[60]
     assert f"a corner at row 61 ({x:g}, {y:g}) m, t = 5.4 s: the heading would have to turn by 90°" in str(
         refused.value
     )
@@ -355,8 +355,8 @@ def test_a_base_that_holds_has_no_moving_references() -> None:
     model = build.build_model(scenario)
     held = build.controller(scenario, model).reference
     none = load_scenario("mobile_elbow_comparison", overrides={"controller.base": None})
-    for one, other in zip(held, build.controller(none, model).reference, strict=True):
-        assert np.array_equal(one, other)
+    for table, other in zip(held, build.controller(none, model).reference, strict=True):
+        assert np.array_equal(table, other)
 
 
 @pytest.mark.parametrize(
@@ -373,7 +373,7 @@ def test_the_hand_stays_on_its_path_in_the_world_while_the_base_drives(path: dic
     control = build.controller(scenario, model)
     times, q = (np.concatenate(pieces) for pieces in zip(*control.positions(model.robot), strict=True))
     body, point = model.robot.hand
-    hand = np.array([model.point_position(body, point, one) for one in q])
+    hand = np.array([model.point_position(body, point, posture) for posture in q])
     target = control.target(times)
     assert target is not None
     knots = np.isclose(times / 0.02, np.round(times / 0.02))
@@ -399,7 +399,7 @@ def test_contacts_of_the_references_move_with_the_base() -> None:
     model = build.build_model(scenario)
     control = build.controller(scenario, model)
     _, q = (np.concatenate(pieces) for pieces in zip(*control.positions(model.robot), strict=True))
-    elbow = np.array([model.point_position("link_4", np.zeros(3), one) for one in q[::50]])
+    elbow = np.array([model.point_position("link_4", np.zeros(3), posture) for posture in q[::50]])
     ahead = (elbow - elbow[0]) @ np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0])
     # Joint 1 turns the arm to the hand's circle; the elbow goes on with the base.
     assert ahead[-1] == pytest.approx(0.2, abs=0.02)
@@ -418,6 +418,6 @@ def test_references_that_drive_an_elbow_off_its_surface_are_refused_with_time_an
     off = fine[np.argmax(0.2 * jerk_law(fine, 0.0, DURATION) > far)]
     with pytest.raises(ModelError, match=r"contact elbow_4: the references of the joints take its point") as refused:
         prepare(scenario)
-    found = re.search(r"from t = ([\d.]+) s on", str(refused.value))
-    assert found is not None
-    assert float(found[1]) == pytest.approx(off, abs=0.006)
+    match = re.search(r"from t = ([\d.]+) s on", str(refused.value))
+    assert match is not None
+    assert float(match[1]) == pytest.approx(off, abs=0.006)

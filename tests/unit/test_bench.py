@@ -35,9 +35,9 @@ def text(result: dict) -> str:
 
 def test_quick_run(small: None) -> None:
     pytest.importorskip("mujoco", minversion="4.0")
-    told: list[str] = []
-    result = json.loads(json.dumps(run.run_bench(quick=True, tell=told.append)))
-    assert "10 s job, free arm" in told
+    messages: list[str] = []
+    result = json.loads(json.dumps(run.run_bench(quick=True, tell=messages.append)))
+    assert "10 s job, free arm" in messages
     assert {row["program"] for row in result["right_hand_side"]} == set(programs.RIGHT_HAND_SIDES)
     assert result["machine"]["cpu"]
     assert result["versions"]["mujoco"]

@@ -42,12 +42,12 @@ Inner.__module__ = Outer.__module__ = "dynsim.dynamics.example"
 @internal_kernel
 def look(outer, table):
     """Every field, of tuples within tuples too."""
-    found = outer.count + 10.0 * outer.pair[1] + outer.pair[0] + (100.0 if outer.flag else 0.0)
+    total = outer.count + 10.0 * outer.pair[1] + outer.pair[0] + (100.0 if outer.flag else 0.0)
     if outer.nothing is None:
-        found += 1e3
+        total += 1e3
     if outer.inner.flag:
-        found += 1e4
-    return found + outer.inner.table[1] + outer.inner.number.imag + outer.matrix[1, 0] + table[0]
+        total += 1e4
+    return total + outer.inner.table[1] + outer.inner.number.imag + outer.matrix[1, 0] + table[0]
 
 
 @internal_kernel
@@ -63,7 +63,7 @@ def example() -> Outer:
 
 
 @kernel
-def told(outer, table):
+def noted(outer, table):
     return look(outer, table)
 
 
@@ -87,14 +87,14 @@ def of_elsewhere(two):
 
 def test_fields() -> None:
     table = np.array([0.0625, 8.0])
-    assert told(example(), table) == look(example(), table) == 3 + 20 + 0.75 + 1e3 + 1e4 + 0.25 + 0.125 + 7e5 + 0.0625
+    assert noted(example(), table) == look(example(), table) == 3 + 20 + 0.75 + 1e3 + 1e4 + 0.25 + 0.125 + 7e5 + 0.0625
 
 
 def test_tuples_that_are_made() -> None:
     table = np.array([0.0625, 8.0])
     first = changed(example(), table)
     second = changed(first, example().inner.table)
-    assert made_and_told(example(), table) == tuple(look(one, table) for one in (first, second, example()))
+    assert made_and_told(example(), table) == tuple(look(outer, table) for outer in (first, second, example()))
 
 
 @kernel
@@ -102,12 +102,12 @@ def kept(outer, table):
     """One of the turns of a loop, and two that change places in each."""
     chosen, last, other = outer, outer, changed(outer, table)
     for k in range(5):
-        one = Outer(k, False, outer.inner, outer.nothing, outer.pair, outer.matrix)
+        counted = Outer(k, False, outer.inner, outer.nothing, outer.pair, outer.matrix)
         if k == 1:
-            chosen = one
+            chosen = counted
         last, other = other, last
         if k == 3:
-            last = one
+            last = counted
     return chosen.count, last.count, other.count
 
 
@@ -125,29 +125,34 @@ def test_in_functions_that_count_references(upper: float) -> None:
     @numba.njit
     def chosen(outer, upper):
         if outer.pair[0] > upper:
-            found = Outer(1, True, outer.inner, outer.nothing, outer.pair, outer.matrix)
+            returned = Outer(1, True, outer.inner, outer.nothing, outer.pair, outer.matrix)
         else:
-            found = Outer(2, True, outer.inner, outer.nothing, outer.pair, outer.matrix)
-        return found.count, found[0], found[-1][1, 0]
+            returned = Outer(2, True, outer.inner, outer.nothing, outer.pair, outer.matrix)
+        return returned.count, returned[0], returned[-1][1, 0]
 
     assert chosen(example(), upper) == ((1, 1, 7e5) if upper == 0.0 else (2, 2, 7e5))
 
 
 def test_back_to_python() -> None:
     table = np.array([0.0625, 8.0])
-    found, wanted = given_back(example(), table), changed(example(), table)
+    returned, wanted = given_back(example(), table), changed(example(), table)
     # From the cache it is a copy of the class, because pytest's modules cannot be imported by name.
-    assert (type(found).__name__, type(found.inner).__name__) == ("Outer", "Inner")
-    assert found.inner.table is table
-    assert (found.count, found.flag, found.nothing, found.pair) == (wanted.count, wanted.flag, None, wanted.pair)
-    assert found.inner[1:] == wanted.inner[1:]
+    assert (type(returned).__name__, type(returned.inner).__name__) == ("Outer", "Inner")
+    assert returned.inner.table is table
+    assert (returned.count, returned.flag, returned.nothing, returned.pair) == (
+        wanted.count,
+        wanted.flag,
+        None,
+        wanted.pair,
+    )
+    assert returned.inner[1:] == wanted.inner[1:]
 
 
 def test_writing_through_a_tuple_is_seen() -> None:
     """The block is constant, the tables that it leads to are not."""
-    one = example()
-    add_up(one, 5)
-    assert one.inner.table[0] == 0.5 + 1 + 2 + 3 + 4
+    outer = example()
+    add_up(outer, 5)
+    assert outer.inner.table[0] == 0.5 + 1 + 2 + 3 + 4
 
 
 @kernel
@@ -180,7 +185,7 @@ sys.stdout.buffer.write(pickle.dumps(numba.typeof(workspace(3, 3, 2))))
 """
     here = numba.typeof(workspace(3, 3, 2))
     there = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout
-    found = pickle.loads(there)
+    loaded = pickle.loads(there)
     assert here.instance_class is Workspace
-    assert hash(found) == hash(here)
-    assert {here: 1}[found] == 1
+    assert hash(loaded) == hash(here)
+    assert {here: 1}[loaded] == 1

@@ -51,7 +51,7 @@ def test_the_log_says_what_why_and_how_long(folder: Path, caplog: pytest.LogCapt
     assert loaded.startswith("loaded the kernels in ")
     # Again, with a time of this kind to go by; that of another kind says nothing, nor does a file that is damaged.
     lost = folder / "other.kernel"
-    for content, told in (
+    for content, message in (
         ('{"wheels": 43, "arms by radau5": 2}', "the last time took 43 s"),
         ('{"arms by radau5": 43}', "seconds to two minutes"),
         ('["wheels"]', "seconds to two minutes"),
@@ -64,7 +64,7 @@ def test_the_log_says_what_why_and_how_long(folder: Path, caplog: pytest.LogCapt
             kernel.rename(lost)
         with compilation.kernels_logged(log, "wheels", loads=False):
             _double()
-        assert told in caplog.records[0].getMessage()
+        assert message in caplog.records[0].getMessage()
     known = json.loads((folder.parent / compilation.LAST).read_text())
     assert known.keys() == {"wheels"}
     caplog.clear()
@@ -105,13 +105,13 @@ def test_a_display_sees_what_other_processes_compile(folder: Path, monkeypatch: 
     monkeypatch.setattr(compilation, "LOOK_S", 0.01)
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as worker:
         seen, over = threading.Event(), threading.Event()
-        found: list[compilation.Compilation] = []
+        compiled: list[compilation.Compilation] = []
 
         def show(now: compilation.Compilation | None) -> None:
             if now is None:
                 over.set()
             else:
-                found.append(now)
+                compiled.append(now)
                 seen.set()
 
         mark = folder / f"{worker.pid}{compilation.MARK}"
@@ -125,5 +125,5 @@ def test_a_display_sees_what_other_processes_compile(folder: Path, monkeypatch: 
             mark.unlink()
             assert over.wait(20)
         worker.communicate(b"\n")
-    assert found[0].text == "compiling the kernels for wheels"
-    assert found[0].elapsed > 1.0
+    assert compiled[0].text == "compiling the kernels for wheels"
+    assert compiled[0].elapsed > 1.0

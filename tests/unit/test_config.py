@@ -24,8 +24,8 @@ def test_a_scenario_takes_neither_texts_nor_flags_for_numbers(key: str, value: A
 
 
 def test_numbers_of_numpy_are_numbers() -> None:
-    given = {"plant.link.mass_kg": np.float32(0.5), "plant.chain.1.count": np.int64(9), "plant.link.radius_m": 1}
-    plant = load_scenario("elbow_comparison", overrides=given).plant
+    overrides = {"plant.link.mass_kg": np.float32(0.5), "plant.chain.1.count": np.int64(9), "plant.link.radius_m": 1}
+    plant = load_scenario("elbow_comparison", overrides=overrides).plant
     assert [plant.chain[1].mass_kg, plant.chain[1].count, plant.chain[1].radius_m] == [0.5, 9, 1.0]
 
 

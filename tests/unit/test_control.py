@@ -26,8 +26,8 @@ def test_samples_and_functions_are_the_same_references_and_the_other_joints_hold
     motion = lambda t: start + 0.1 * np.sin(3.0 * t)  # noqa: E731
     first = JointControl.following(robot, 500.0, 20.0, TIMES, {"joint_3": motion(TIMES)})
     second = JointControl.following(robot, 500.0, 20.0, TIMES, {"joint_3": motion})
-    for one, other in zip(first.reference, second.reference, strict=True):
-        assert np.array_equal(one, other)
+    for sampled, other in zip(first.reference, second.reference, strict=True):
+        assert np.array_equal(sampled, other)
     times, q = (np.concatenate(pieces) for pieces in zip(*first.positions(robot), strict=True))
     # A quintic spline errs by some h⁶ max|f⁽⁶⁾| = 0.02⁶ · 0.1 · 3⁶, more towards its ends.
     assert np.allclose(q[:, 2], motion(times), rtol=0.0, atol=1e-7)
@@ -62,9 +62,9 @@ def test_without_positions_every_motor_holds(robot: Robot) -> None:
     ],
 )
 def test_references_that_do_not_fit_are_refused(robot: Robot, change: dict, expected: str) -> None:
-    given = {"k_p": 1.0, "k_d": 1.0, "times": TIMES, "positions": {"joint_1": TIMES}} | change
+    arguments = {"k_p": 1.0, "k_d": 1.0, "times": TIMES, "positions": {"joint_1": TIMES}} | change
     with pytest.raises(ModelError, match=expected):
-        JointControl.following(robot, **given)
+        JointControl.following(robot, **arguments)
 
 
 def test_references_that_end_before_the_run_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -45,46 +45,46 @@ def paths(text: str) -> set[str]:
 def claims(text: str) -> set[tuple[str, str]]:
     """(file, name) where a page says that a name is in a file: `a.py` (`f`), `a.py`, `f`, and `f`, `g` in `a.py`."""
     text, file = " ".join(prose(text).split()), r"`((?:\w+/)*\w+\.py)`"
-    found = re.findall(rf"{file} \(([^()]*)\)", text) + re.findall(rf"{file}, (`\w+`)", text)
+    pairs = re.findall(rf"{file} \(([^()]*)\)", text) + re.findall(rf"{file}, (`\w+`)", text)
     backwards = re.findall(rf"((?:`\w+`(?:, | and )?)+) (?:in|of) {file}", text)
-    found += [(path, names) for names, path in backwards]
-    return {(path, name) for path, names in found for name in re.findall(r"`(\w+)`", names)}
+    pairs += [(path, names) for names, path in backwards]
+    return {(path, name) for path, names in pairs for name in re.findall(r"`(\w+)`", names)}
 
 
 @cache
 def defined(path: Path) -> frozenset[str]:
     """Functions, classes, methods, and what modules and classes assign."""
-    found: set[str] = set()
+    names: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
-            found.add(node.name)
+            names.add(node.name)
         elif isinstance(node, ast.Assign | ast.AnnAssign):
             targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-            found |= {name.id for target in targets for name in ast.walk(target) if isinstance(name, ast.Name)}
-    return frozenset(found)
+            names |= {name.id for target in targets for name in ast.walk(target) if isinstance(name, ast.Name)}
+    return frozenset(names)
 
 
 def dotted(text: str) -> set[str]:
     """Dotted names that begin with dynsim, one of its modules or a name that it exports; no groups of entry points."""
     roots = {"dynsim", *dynsim.__all__, *(path.stem for path in PACKAGE.iterdir())}
-    found = re.findall(r"`([A-Za-z_]\w*(?:\.\w+)+)(?:\([^`]*\))?`", prose(text))
+    names = re.findall(r"`([A-Za-z_]\w*(?:\.\w+)+)(?:\([^`]*\))?`", prose(text))
     groups = {family.group for family in FAMILIES.values()}
-    return {name for name in found if name.split(".")[0] in roots and not name.endswith(".py")} - groups
+    return {name for name in names if name.split(".")[0] in roots and not name.endswith(".py")} - groups
 
 
 def resolves(name: str) -> bool:
     """Whether a dotted name, with or without ``dynsim.``, is a module or an attribute of one."""
     parts = name.removeprefix("dynsim.").split(".")
-    thing, place = dynsim, "dynsim"
+    thing, path = dynsim, "dynsim"
     for part in parts:
-        place = f"{place}.{part}"
+        path = f"{path}.{part}"
         if hasattr(thing, part):
             thing = getattr(thing, part)
             continue
         if part in getattr(thing, "__dataclass_fields__", ()):
             continue
         try:
-            thing = importlib.import_module(place)
+            thing = importlib.import_module(path)
         except ImportError:
             return False
     return True
@@ -92,12 +92,12 @@ def resolves(name: str) -> bool:
 
 def missing(text: str) -> list[str]:
     """What a page names and there is not."""
-    found = [path for path in paths(text) if file_named(path) is None]
+    absent = [path for path in paths(text) if file_named(path) is None]
     for path, name in claims(text):
         file = file_named(path)
         if file is not None and name not in defined(file):
-            found.append(f"{path}: {name}")
-    return sorted(found + [name for name in dotted(text) if not resolves(name)])
+            absent.append(f"{path}: {name}")
+    return sorted(absent + [name for name in dotted(text) if not resolves(name)])
 
 
 @pytest.mark.parametrize("name", PAGES)

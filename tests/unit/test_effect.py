@@ -58,7 +58,7 @@ def test_a_key_without_effect_is_said(name: str, overrides: dict[str, Any], key:
     assert "overrides" in line  # its place
     # What it is made from says it again.
     again = scenario_from_resolved(scenario.resolved)
-    assert [one.partition(" (")[0] for one in without_effect(again, motors)] == [line.partition(" (")[0]]
+    assert [message.partition(" (")[0] for message in without_effect(again, motors)] == [line.partition(" (")[0]]
 
 
 @pytest.mark.parametrize("path", shipped_scenarios(), ids=lambda path: path.stem)

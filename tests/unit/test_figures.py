@@ -365,8 +365,8 @@ def test_labels_of_postures_lie_on_nothing() -> None:
     lines = [path for lines in side.collections if isinstance(lines, LineCollection) for path in lines.get_segments()]
     lines += [line.get_xydata() for line in side.get_lines() if len(line.get_xydata()) > 1]
     points = [
-        np.column_stack([np.interp(np.linspace(0, len(one) - 1, 400), np.arange(len(one)), c) for c in one.T])
-        for one in lines
+        np.column_stack([np.interp(np.linspace(0, len(curve) - 1, 400), np.arange(len(curve)), c) for c in curve.T])
+        for curve in lines
     ]
     pixels = side.transData.transform(np.concatenate(points))
     for box in written:
@@ -451,7 +451,7 @@ def test_real_contacts_have_bands_that_end_at_their_events(real: Record) -> None
         bands = contacts.mode_bands(real, contact["name"])
         assert bands[0][0] == 0.0
         assert bands[-1][1] == real.time[-1]
-        assert all(one[1] == following[0] for one, following in itertools.pairwise(bands))
+        assert all(band[1] == following[0] for band, following in itertools.pairwise(bands))
         times = {event.time for event in real.events if event.name == contact["name"]}
         assert {begin for begin, _, _ in bands[1:]} <= times
         open_for = sum(end - begin for begin, end, mode in bands if mode == 0)
@@ -515,8 +515,8 @@ def test_comparisons_mark_the_events_of_every_run_in_its_colour(real: Record, br
             bottom = axes.get_window_extent().y1
             rows = [{line.get_window_extent().y0 for line in shown[name]} for name in ("real", "other")]
             assert all(len(row) == 1 for row in rows)
-            (one,), (next_one,) = rows
-            assert bottom < one < next_one
+            (first_mark,), (next_one,) = rows
+            assert bottom < first_mark < next_one
         explained = " ".join(axes.get_xlabel() for axes in figure.axes)
         landings = sum(event.kind == "landing" for record in records.values() for event in record.events)
         assert f"landing ({landings})" in explained
@@ -544,8 +544,8 @@ def test_the_marks_are_explained_beside_nothing_else(real: Record) -> None:
 
 def test_shares_near_none_and_all_are_told_from_them() -> None:
     shares = (0.0, 3e-4, 2e-6, 0.0314, 0.5, 0.9996, 1.0 - 1e-6, 1.0)
-    told = [measures.percent(share) for share in shares]
-    assert told == ["0.0 %", "0.03 %", "0.0002 %", "3.1 %", "50.0 %", "99.96 %", "99.9999 %", "100.0 %"]
+    texts = [measures.percent(share) for share in shares]
+    assert texts == ["0.0 %", "0.03 %", "0.0002 %", "3.1 %", "50.0 %", "99.96 %", "99.9999 %", "100.0 %"]
 
 
 def test_many_events_are_marks_without_lines(pendulum: Record) -> None:
@@ -619,11 +619,11 @@ def test_what_lies_below_a_surface_is_marked(braced: Record) -> None:
     sunk.signals["body_position"] = dataclasses.replace(braced.signals["body_position"], data=moved)
     body, _ = skeleton.skeleton(sunk)
     assert body is not None
-    found = robot.penetrations(sunk, body.scene, np.array([len(sunk) - 1]))
+    marked = robot.penetrations(sunk, body.scene, np.array([len(sunk) - 1]))
     # Of a horizontal floor at zero the depth is the height of the lowest point.
     lowest = -body.segments(len(sunk) - 1)[..., 2].min()
-    assert max(one.depth.max() for one in found) == pytest.approx(lowest, rel=1e-12)
-    assert {one.surface for one in found} == {"floor"}
+    assert max(penetration.depth.max() for penetration in marked) == pytest.approx(lowest, rel=1e-12)
+    assert {penetration.surface for penetration in marked} == {"floor"}
     assert "below floor, up to" in texts(drawn(posture.posture(sunk)))
     assert "below" not in texts(drawn(posture.posture(braced)))
 

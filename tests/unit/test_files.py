@@ -109,8 +109,8 @@ def test_modes_follow_the_umask_and_those_of_existing_files_are_kept(tmp_path: P
 
 
 def test_writers_of_the_same_file_do_not_share_a_temporary_name(tmp_path: Path):
-    with replacing(tmp_path / "file") as one, replacing(tmp_path / "file") as other:
-        one.write(b"one")
+    with replacing(tmp_path / "file") as first, replacing(tmp_path / "file") as other:
+        first.write(b"one")
         other.write(b"other")
         assert len(list(tmp_path.iterdir())) == 2
     assert contents(tmp_path) == {"file": b"one"}
@@ -230,9 +230,9 @@ def test_two_runs_that_save_to_one_folder_do_not_mix(tmp_path: Path):
         for child in children:
             child.kill()
             child.wait()
-    found = contents(tmp_path)
-    assert set(found) == {"a", "b", "c"}
-    assert len(set(found.values())) == 1
+    saved = contents(tmp_path)
+    assert set(saved) == {"a", "b", "c"}
+    assert len(set(saved.values())) == 1
 
 
 def test_what_is_called_like_the_mark_but_is_none_stays(tmp_path: Path):

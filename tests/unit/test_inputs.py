@@ -41,9 +41,9 @@ def parse(text: str):
     ],
 )  # fmt: skip
 def test_yaml_becomes_plain_values(text: str, value: object):
-    found = parse(text)
-    assert found == value
-    assert repr(found) == repr(value)  # 1 == 1.0 == True
+    parsed = parse(text)
+    assert parsed == value
+    assert repr(parsed) == repr(value)  # 1 == 1.0 == True
 
 
 @pytest.mark.parametrize(

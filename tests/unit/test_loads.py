@@ -50,11 +50,13 @@ def test_a_constant_load_has_no_end(tmp_path: Path) -> None:
     assert np.array_equal(load.components(np.array([-1.0, 0.0, 1.3, 2.0, 9.0])), np.tile([1, 2, 3, 0, 0, 0], (5, 1)))
 
 
-@pytest.mark.parametrize("hold", [True, False])
+@pytest.mark.parametrize("keeps_last", [True, False])
 @pytest.mark.parametrize("interpolation", ["spline", "linear"])
-def test_samples_are_met_and_interpolated_as_scipy_and_numpy_do(tmp_path: Path, interpolation: str, hold: bool) -> None:
+def test_samples_are_met_and_interpolated_as_scipy_and_numpy_do(
+    tmp_path: Path, interpolation: str, keeps_last: bool
+) -> None:
     text = f"  push: {{type: samples, body: link_3, times_s: {TIMES}, torque_N_m: {FORCES}, "
-    load = the_load(read(tmp_path, f"{text}interpolation: {interpolation}, hold: {str(hold).lower()}}}\n"))
+    load = the_load(read(tmp_path, f"{text}interpolation: {interpolation}, hold: {str(keeps_last).lower()}}}\n"))
     t = np.linspace(TIMES[0], TIMES[-1], 301)
     columns = np.array(FORCES)
     expected = CubicSpline(TIMES, columns)(t)
@@ -65,7 +67,7 @@ def test_samples_are_met_and_interpolated_as_scipy_and_numpy_do(tmp_path: Path, 
     assert np.allclose(load.components(np.array(TIMES))[:, 3:], columns, rtol=0.0, atol=1e-13)
     assert not load.components(t)[:, :3].any()
     before, after = load.components(np.array([TIMES[0] - 1e-9, TIMES[-1] + 1e-9]))[:, 3:]
-    assert np.allclose([before, after], [columns[0], columns[-1]] if hold else 0.0, rtol=0.0, atol=1e-13)
+    assert np.allclose([before, after], [columns[0], columns[-1]] if keeps_last else 0.0, rtol=0.0, atol=1e-13)
 
 
 @pytest.mark.parametrize("torques", [True, False])

@@ -25,13 +25,13 @@ def test_a_run_logs_what_takes_long_and_its_warnings(caplog: pytest.LogCaptureFi
         "dynsim.engine.prepare",
         "dynsim.engine.dynamics",
     }
-    told = [entry.getMessage() for entry in caplog.records if entry.levelno == logging.INFO]
+    messages = [entry.getMessage() for entry in caplog.records if entry.levelno == logging.INFO]
     title = "elbow_comparison (two_elbows): "
-    assert told[:2] == [f"{title}planning references over 0.3 s", told[1]]
-    assert told[1].startswith(f"{title}planned references in 0.")
-    assert told[-3].split(" in ")[0] in ("loaded the kernels", "compiled the kernels")
-    assert told[-2] == f"{title}integrating 0.3 s by radau5"
-    assert told[-1].startswith(f"{title}integrated 0.3 s in {record.summary['steps']} steps, ")
+    assert messages[:2] == [f"{title}planning references over 0.3 s", messages[1]]
+    assert messages[1].startswith(f"{title}planned references in 0.")
+    assert messages[-3].split(" in ")[0] in ("loaded the kernels", "compiled the kernels")
+    assert messages[-2] == f"{title}integrating 0.3 s by radau5"
+    assert messages[-1].startswith(f"{title}integrated 0.3 s in {record.summary['steps']} steps, ")
     warned = [entry.getMessage() for entry in caplog.records if entry.levelno == logging.WARNING]
     assert warned == [title + warning for warning in record.summary["warnings"]]
     assert warned
@@ -40,9 +40,9 @@ def test_a_run_logs_what_takes_long_and_its_warnings(caplog: pytest.LogCaptureFi
 def test_the_snake_logs_too(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "dynsim")
     dynsim.simulate(load_scenario("snake_operator", overrides={"duration_s": 0.05}))
-    told = [entry.getMessage() for entry in caplog.records if entry.name == "dynsim.engine.kinematic"]
-    assert told[-2] == "snake_operator: integrating 0.05 s in 10 control periods"
-    assert told[-1].startswith("snake_operator: integrated 10 control periods in ")
+    messages = [entry.getMessage() for entry in caplog.records if entry.name == "dynsim.engine.kinematic"]
+    assert messages[-2] == "snake_operator: integrating 0.05 s in 10 control periods"
+    assert messages[-1].startswith("snake_operator: integrated 10 control periods in ")
 
 
 def test_a_run_that_stops_logs_why(caplog: pytest.LogCaptureFixture) -> None:
@@ -54,12 +54,12 @@ def test_a_run_that_stops_logs_why(caplog: pytest.LogCaptureFixture) -> None:
 def test_workers_log_in_their_parent(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "dynsim")
     records = dynsim.compare("elbow_comparison", overrides=SHORT, jobs=2)
-    told = [entry.getMessage() for entry in caplog.records]
+    messages = [entry.getMessage() for entry in caplog.records]
     for variant, record in records.items():
         title = f"elbow_comparison ({variant}): "
-        assert f"{title}integrating 0.3 s by radau5" in told
+        assert f"{title}integrating 0.3 s by radau5" in messages
         for warning in record.summary["warnings"]:
-            assert title + warning in told
+            assert title + warning in messages
 
 
 def test_a_script_that_asks_for_nothing_is_told_nothing() -> None:

@@ -152,17 +152,17 @@ def test_damaged_machine_code_is_compiled_anew(kernel_files: Path, damage: str) 
 
 
 def test_who_asks_is_told_once_that_a_kernel_is_compiled(kernel_files: Path) -> None:
-    told: list[str] = []
-    with jit.told_of_compilation(lambda: told.append("before")):
+    messages: list[str] = []
+    with jit.told_of_compilation(lambda: messages.append("before")):
         _double()
-    assert told == ["before"]
-    with jit.told_of_compilation(lambda: told.append("from the cache")):
+    assert messages == ["before"]
+    with jit.told_of_compilation(lambda: messages.append("from the cache")):
         _double()
-    assert told == ["before"]
+    assert messages == ["before"]
     (file,) = kernel_files.iterdir()
     file.unlink()
     _double()
-    assert told == ["before"]
+    assert messages == ["before"]
 
 
 def test_machine_code_that_cannot_be_kept_costs_no_run(kernel_files: Path, monkeypatch) -> None:
@@ -184,13 +184,13 @@ def roots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path]:
     return tmp_path / "above" / "first", tmp_path / "second"
 
 
-def _given_to(monkeypatch: pytest.MonkeyPatch, place: Path) -> None:
+def _given_to(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
     """As if another user owned a folder."""
     lstat = Path.lstat
 
     def changed(path: Path) -> os.stat_result:
         status = lstat(path)
-        if path != place:
+        if path != folder:
             return status
         return os.stat_result((*status[:4], os.getuid() + 12345, *status[5:]))
 
@@ -207,12 +207,12 @@ def test_a_folder_is_not_used_where_others_can_write(
     folder = find()
     assert folder.is_relative_to(roots[0])
     assert folder.stat().st_mode & 0o777 == 0o700
-    place = (folder, *folder.parents)[level]
+    ancestor = (folder, *folder.parents)[level]
     if danger == "writable":
-        place.chmod(0o777)
+        ancestor.chmod(0o777)
     else:
-        _given_to(monkeypatch, place)
-    with pytest.warns(UserWarning, match=f"{folder}: not used .* others own {place} or can write to it"):
+        _given_to(monkeypatch, ancestor)
+    with pytest.warns(UserWarning, match=f"{folder}: not used .* others own {ancestor} or can write to it"):
         assert find().is_relative_to(roots[1])
 
 
@@ -261,7 +261,7 @@ def test_a_new_folder_removes_those_that_are_unused(roots: tuple[Path, Path]) ->
         (beside / name / "a.kernel").touch()
         os.utime(beside / name, times=(now - age * 86400,) * 2)
     folder = jit.cache_folder.__wrapped__()
-    assert {one.name for one in beside.iterdir()} == {"1" * 16, "notes", "2" * 15, folder.name}
+    assert {entry.name for entry in beside.iterdir()} == {"1" * 16, "notes", "2" * 15, folder.name}
     # Use is a touch.
     os.utime(folder, times=(0, 0))
     assert jit.cache_folder.__wrapped__() == folder

@@ -40,8 +40,8 @@ def test_results_are_known_by_the_bits_of_their_inputs():
     ]
     assert len({of(*inputs) for inputs in others}) == len(others)
     # Of what cannot be told from its bits only the same object is the same.
-    one, other = object(), object()
-    assert of(one) == of(one) != of(other)
+    thing, other = object(), object()
+    assert of(thing) == of(thing) != of(other)
 
 
 def test_only_the_last_results_are_kept_and_no_errors():

@@ -48,8 +48,8 @@ def test_the_fastest_rate_is_that_of_the_right_hand_side(variant: str) -> None:
         y[k] += h
         columns.append((high - low)[places] / (2 * h))
     rate = np.abs(np.linalg.eigvals(np.array(columns).T)).max()
-    found = fastest_rate(prepared.model, prepared.contacts, prepared.system.drives)
-    assert found == pytest.approx(rate, rel=0.003)
+    estimate = fastest_rate(prepared.model, prepared.contacts, prepared.system.drives)
+    assert estimate == pytest.approx(rate, rel=0.003)
 
 
 def test_motors_are_integrated_implicitly_and_the_summary_says_why() -> None:

@@ -218,7 +218,7 @@ def test_what_is_replaced_is_put_back_when_a_kernel_cannot_be_compiled() -> None
     with pytest.raises(numba.TypingError):
         _cannot_be_compiled(1.0)
     assert before == (BaseFunction.get_call_type, ir.Inst._rec_list_vars)
-    assert all(one.__module__.startswith("numba.") for one in before)
+    assert all(function.__module__.startswith("numba.") for function in before)
 
 
 NAME = "numba.core.codegen:CPUCodeLibrary.finalize"

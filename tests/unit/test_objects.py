@@ -46,8 +46,8 @@ def test_a_box_that_is_pulled_slides_as_a_block_does():
     pull = {"type": "constant", "body": "box", "force_N": [1.5, 0.0, 0.0]}
     box = BOX | {"size_m": [0.2, 0.2, 0.02], "position_m": [1, 0, -0.99]}
     record = dynsim.simulate(scene({"box": box}, loads={"pull": pull}, contacts=WITH_A_TIP))
-    way = record["q"][-1, record.labels["q"].index("box.x")] - 1.0
-    assert way == pytest.approx(0.5 * (1.5 / 0.3 - 0.3 * G) * 0.5**2, rel=2e-3)
+    distance = record["q"][-1, record.labels["q"].index("box.x")] - 1.0
+    assert distance == pytest.approx(0.5 * (1.5 / 0.3 - 0.3 * G) * 0.5**2, rel=2e-3)
 
 
 @pytest.mark.parametrize("torque", [0.4, 0.9])

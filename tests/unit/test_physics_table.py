@@ -19,10 +19,10 @@ def rows() -> list[tuple[str, str]]:
 
 
 def equations(cell: str) -> set[int]:
-    found: set[int] = set()
+    numbers: set[int] = set()
     for first, last in re.findall(r"(\d+)(?:–(\d+))?", cell):
-        found |= set(range(int(first), int(last or first) + 1))
-    return found
+        numbers |= set(range(int(first), int(last or first) + 1))
+    return numbers
 
 
 def test_every_equation_of_the_paper_is_named():

@@ -134,8 +134,8 @@ def test_run_and_compare_write_records_and_figures(case, monkeypatch):
     assert [body.name for body in scene.bodies][-2:] == ["base.left.wheel", "base.right.wheel"]
     # Bodies stand where the record says the base is.
     pose = record["base_pose"]
-    place = record["body_position"][:, [body.name for body in scene.bodies].index("base")]
-    np.testing.assert_allclose(place[:, :2], pose[:, :2], rtol=0, atol=1e-6)
+    base_position = record["body_position"][:, [body.name for body in scene.bodies].index("base")]
+    np.testing.assert_allclose(base_position[:, :2], pose[:, :2], rtol=0, atol=1e-6)
     hub = record["body_position"][:, -2]
     aside = 0.15 * np.stack([-np.sin(pose[:, 2]), np.cos(pose[:, 2])], axis=1)
     np.testing.assert_allclose(hub[:, :2], pose[:, :2] + aside, rtol=0, atol=1e-6)

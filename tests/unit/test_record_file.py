@@ -46,7 +46,7 @@ SCENE = Scene(
 )
 
 
-def told() -> Record:
+def telling() -> Record:
     """The sample with all that a record can hold beside signals."""
     record = sample()
     record.add_axis("camera", [0.1, 0.2])
@@ -57,23 +57,23 @@ def told() -> Record:
     return record
 
 
-def same(one: Record, other: Record) -> bool:
+def same(record: Record, other: Record) -> bool:
     """Whether two records hold the same, descriptions aside."""
     return (
-        np.array_equal(one.time, other.time)
-        and sorted(one) == sorted(other)
-        and all(np.array_equal(one[name], other[name]) for name in one)
-        and one.axes.keys() == other.axes.keys()
-        and all(np.array_equal(one.times(name), other.times(name)) for name in one)
-        and (one.events, one.scene) == (other.events, other.scene)
-        and (one.units, one.labels) == (other.units, other.labels)
-        and (one.summary, one.provenance, one.complete) == (other.summary, other.provenance, other.complete)
+        np.array_equal(record.time, other.time)
+        and sorted(record) == sorted(other)
+        and all(np.array_equal(record[name], other[name]) for name in record)
+        and record.axes.keys() == other.axes.keys()
+        and all(np.array_equal(record.times(name), other.times(name)) for name in record)
+        and (record.events, record.scene) == (other.events, other.scene)
+        and (record.units, record.labels) == (other.units, other.labels)
+        and (record.summary, record.provenance, record.complete) == (other.summary, other.provenance, other.complete)
     )
 
 
 def test_axes_events_and_scene_come_back(tmp_path: Path):
-    again = Record.load(told().save(tmp_path / "record.h5"))
-    assert same(again, told())
+    again = Record.load(telling().save(tmp_path / "record.h5"))
+    assert same(again, telling())
     assert again.times("marker").tolist() == [0.1, 0.2]
     assert [(event.time, event.kind, event.value) for event in again.events] == [
         (0.2, "contact closes", None),
@@ -94,12 +94,12 @@ def test_large_signals_are_packed_and_unpacked(tmp_path: Path):
 def test_one_changed_byte_is_found(tmp_path: Path):
     path = sample().save(tmp_path / "record.h5")
     whole = path.read_bytes()
-    place = whole.index(np.array([7.0, 8.0]).tobytes())
-    path.write_bytes(whole[:place] + b"\x01" + whole[place + 1 :])
+    offset = whole.index(np.array([7.0, 8.0]).tobytes())
+    path.write_bytes(whole[:offset] + b"\x01" + whole[offset + 1 :])
     with pytest.raises(RecordError, match=r"record.h5: damaged, or changed since .* its digest .*--trust reads it"):
         Record.load(path)
-    place = whole.index(b"dynsim-record")
-    path.write_bytes(whole[:place] + b"D" + whole[place + 1 :])
+    offset = whole.index(b"dynsim-record")
+    path.write_bytes(whole[:offset] + b"D" + whole[offset + 1 :])
     with pytest.raises(RecordError, match="do not agree with its digest"):
         Record.load(path)
 
@@ -201,8 +201,8 @@ def bomb(file: h5py.File, _: Path) -> None:
 
 
 def no_gzip(file: h5py.File, _: Path) -> None:
-    one = file.create_dataset("signals/s", (5,), "f8", chunks=(5,), compression="gzip")
-    one.id.write_direct_chunk((0,), b"this is no gzip")
+    dataset = file.create_dataset("signals/s", (5,), "f8", chunks=(5,), compression="gzip")
+    dataset.id.write_direct_chunk((0,), b"this is no gzip")
 
 
 def huge_contiguous(file: h5py.File, _: Path) -> None:
@@ -306,7 +306,7 @@ TOLD: list[tuple[Change, str]] = [
 
 @pytest.mark.parametrize(("change", "expected"), TOLD, ids=itertools.count())
 def test_axes_events_and_scenes_that_are_none_are_refused(tmp_path: Path, change: Change, expected: str):
-    path = told().save(tmp_path / "record.h5")
+    path = telling().save(tmp_path / "record.h5")
     with h5py.File(path, "r+") as file:
         change(file, tmp_path)
     with pytest.raises(RecordError, match=expected) as error:
@@ -382,7 +382,7 @@ def mangled(whole: bytes, seed: int) -> bytes:
     return bytes(data)
 
 
-def load_all(folder: Path, contents: list[bytes], written: str = "told") -> list[str]:
+def load_all(folder: Path, contents: list[bytes], written: str = "telling") -> list[str]:
     """Load files in a child; gives "same" (as ``written()``), "refused" or what else came of it, for each."""
     for number, content in enumerate(contents):
         (folder / f"{number}.h5").write_bytes(content)
@@ -402,7 +402,7 @@ def load_all(folder: Path, contents: list[bytes], written: str = "told") -> list
 
 
 def test_damage_is_found_or_does_no_harm(tmp_path: Path):
-    whole = bytes(told().to_hdf5())
+    whole = bytes(telling().to_hdf5())
     contents = [flipped(whole[:-80], seed) + whole[-80:] for seed in range(400)]
     contents += [whole[:-80] + flipped(whole[-80:], seed) for seed in range(40)]
     contents += [mangled(whole, seed) for seed in range(80)]

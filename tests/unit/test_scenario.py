@@ -187,8 +187,8 @@ def test_the_schema_is_about_the_type_that_is_named():
     scenario["plant"]["bas"] = 1
     scenario["surfaces"]["floor"]["type"] = "plan"
     scenario["controller"]["hand"]["path"]["radius"] = 1
-    found = {(".".join(map(str, error.path)), error.message) for error in validator.iter_errors(scenario)}
-    assert found == {
+    errors = {(".".join(map(str, error.path)), error.message) for error in validator.iter_errors(scenario)}
+    assert errors == {
         ("plant", "Additional properties are not allowed ('bas' was unexpected)"),
         ("surfaces.floor.type", "'plan' is not one of ['box', 'cylinder', 'height_field', 'plane', 'sphere']"),
         ("controller.hand.path", "Additional properties are not allowed ('radius' was unexpected)"),

@@ -46,25 +46,25 @@ def test_bodies_come_after_their_parents():
 
 
 def test_planes_spheres_and_cylinders_are_recognised():
-    found = surface(plane.build(plane.Config(type="plane", point_m=[1.0, 2.0, 3.0], normal=[0.0, 0.6, 0.8]), CONTEXT))
-    assert (found.kind, found.radius) == ("plane", None)
-    np.testing.assert_allclose(found.direction, [0.0, 0.6, 0.8], atol=1e-15)
-    np.testing.assert_allclose(found.position, 3.6 * np.array([0.0, 0.6, 0.8]), atol=1e-15)
+    shape = surface(plane.build(plane.Config(type="plane", point_m=[1.0, 2.0, 3.0], normal=[0.0, 0.6, 0.8]), CONTEXT))
+    assert (shape.kind, shape.radius) == ("plane", None)
+    np.testing.assert_allclose(shape.direction, [0.0, 0.6, 0.8], atol=1e-15)
+    np.testing.assert_allclose(shape.position, 3.6 * np.array([0.0, 0.6, 0.8]), atol=1e-15)
     for inside, sign in ((False, 1.0), (True, -1.0)):
-        found = surface(
+        shape = surface(
             sphere.build(sphere.Config(type="sphere", center_m=[1.0, -2.0, 0.5], radius_m=0.7, inside=inside), CONTEXT)
         )
-        assert found.kind == "sphere"
-        np.testing.assert_allclose(found.position, [1.0, -2.0, 0.5], atol=1e-13)
-        assert found.radius == pytest.approx(sign * 0.7, rel=1e-12)
+        assert shape.kind == "sphere"
+        np.testing.assert_allclose(shape.position, [1.0, -2.0, 0.5], atol=1e-13)
+        assert shape.radius == pytest.approx(sign * 0.7, rel=1e-12)
         made = cylinder.Config(
             type="cylinder", point_m=[1.0, 0.0, 2.0], axis=[1.0, 1.0, 0.0], radius_m=0.3, inside=inside
         )
-        found = surface(cylinder.build(made, CONTEXT))
-        assert (found.kind, found.radius) == ("cylinder", pytest.approx(sign * 0.3, rel=1e-12))
-        axis = np.array(found.direction)
+        shape = surface(cylinder.build(made, CONTEXT))
+        assert (shape.kind, shape.radius) == ("cylinder", pytest.approx(sign * 0.3, rel=1e-12))
+        axis = np.array(shape.direction)
         np.testing.assert_allclose(np.abs(axis), [0.5**0.5, 0.5**0.5, 0.0], atol=1e-12)
-        off = np.array(found.position) - [1.0, 0.0, 2.0]
+        off = np.array(shape.position) - [1.0, 0.0, 2.0]
         np.testing.assert_allclose(off - axis * (axis @ off), 0.0, atol=1e-12)
     cone = SceneSurface.of_quadric("s", np.diag([1.0, 1.0, -1.0]), np.zeros(3), 0.0)
     assert (cone.kind, cone.position) == ("quadric", None)

@@ -95,9 +95,9 @@ def touching(arm: Model, kind: str) -> Contact:
 def test_hand_on_its_path_and_braces_on_their_surfaces(arm: Model, kind: str | None) -> None:
     times, targets = path_of(arm)
     contacts = [] if kind is None else [touching(arm, kind)]
-    found = follow(arm, times, targets, arm.joint_names, arm.robot.initial, 1e-6, braces=contacts)
-    assert np.abs(np.diff(found, axis=0)).max() > 1e-3
-    for q, target in zip(found, targets, strict=True):
+    motion = follow(arm, times, targets, arm.joint_names, arm.robot.initial, 1e-6, braces=contacts)
+    assert np.abs(np.diff(motion, axis=0)).max() > 1e-3
+    for q, target in zip(motion, targets, strict=True):
         assert arm.point_position(*arm.robot.hand, q) == pytest.approx(target, abs=1e-9)
         for contact in contacts:
             position = arm.point_position(contact.body, contact.point, q)

@@ -131,7 +131,10 @@ def test_candidates_need_the_unilateral_law(tmp_path):
 
 
 def names(folder: Path, kind: str, **keys: Any) -> list[str]:
-    return [one.name for one in build.contacts(scenario_of(folder, f"{{law: unilateral, candidates: {kind}}}", **keys))]
+    return [
+        contact.name
+        for contact in build.contacts(scenario_of(folder, f"{{law: unilateral, candidates: {kind}}}", **keys))
+    ]
 
 
 def test_joints_touch_each_surface_but_those_that_cannot_move_along_its_normal(tmp_path, caplog):
@@ -141,18 +144,18 @@ def test_joints_touch_each_surface_but_those_that_cannot_move_along_its_normal(t
     assert "contacts.candidates: left out, because nothing moves them along the normal: joint_1" in caplog.text
     two = "{floor: {type: plane, point_m: [0, 0, -2]}, ball: {type: sphere, center_m: [3, 0, 0], radius_m: 1}}"
     assert names(tmp_path, "joints", surfaces=two) == [
-        f"{one}_{surface}" for surface in ("floor", "ball") for one in ("joint_3", "joint_4", "hand")
+        f"{body}_{surface}" for surface in ("floor", "ball") for body in ("joint_3", "joint_4", "hand")
     ]
 
 
 def test_declared_points_are_not_candidates_once_more(tmp_path, caplog):
     declared = "{law: unilateral, candidates: joints, points: {elbow: {body: link_3}}}"
-    found = build.contacts(scenario_of(tmp_path, declared))
-    assert [one.name for one in found] == ["elbow", "joint_4", "hand"]
+    contacts = build.contacts(scenario_of(tmp_path, declared))
+    assert [contact.name for contact in contacts] == ["elbow", "joint_4", "hand"]
     assert "instead of the link" not in caplog.text
     # A sphere about it would start a radius deep where the point starts on the floor.
-    found = build.contacts(scenario_of(tmp_path, declared.replace("joints", "links")))
-    assert [(one.name, one.radius) for one in found] == [
+    contacts = build.contacts(scenario_of(tmp_path, declared.replace("joints", "links")))
+    assert [(contact.name, contact.radius) for contact in contacts] == [
         ("elbow", 0.0),
         ("joint_4", 0.02),
         ("link_4_end", 0.02),
@@ -181,8 +184,8 @@ def test_links_are_spheres_on_flat_surfaces_and_capsules_too_on_round_ones(tmp_p
 def test_links_do_not_touch_quadrics_of_other_kinds(tmp_path):
     robot = build.robot(scenario_of(tmp_path, "{}"))
     ellipsoid = Quadric(np.diag([1.0, 2.0, 3.0]), np.zeros(3), -1.0)
-    found = build.candidates("joints", robot, {"egg": ellipsoid}, [])
-    assert compile_shapes(robot, found) is None
+    contacts = build.candidates("joints", robot, {"egg": ellipsoid}, [])
+    assert compile_shapes(robot, contacts) is None
     with pytest.raises(ModelError, match="'egg' is a quadric of another kind, which only points can touch"):
         compile_shapes(robot, build.candidates("links", robot, {"egg": ellipsoid}, []))
 
@@ -196,7 +199,7 @@ def test_scenes_keep_boxes_and_fields_and_figures_draw_them(tmp_path, monkeypatc
     scene = robot_scene(robot, [], surfaces)
     assert scene is not None
     assert Scene.from_json(scene.to_json()) == scene
-    drawn = {one.name: one for one in scene.surfaces}
+    drawn = {drawn_surface.name: drawn_surface for drawn_surface in scene.surfaces}
     assert len(drawn["hills"].heights[0]) == GRID_LINES
     points = np.random.default_rng(3).uniform([0.0, -1.0, -0.5], [2.0, 1.0, 0.8], size=(200, 3))
     np.testing.assert_allclose(drawn["box"].value(points), surfaces["box"].gaps(points), atol=1e-12)
@@ -224,13 +227,16 @@ def test_links_that_sink_into_a_box_or_a_field_are_found(tmp_path):
     model = build.build_model(scenario_of(tmp_path, "{}"))
     robot = model.robot
     q = robot.initial[None]
-    place = model.point_position(*robot.hand, robot.initial)
-    cube = Box(place - vector(0.0, 0.0, 0.4), np.eye(3), np.array([1.0, 1.0, 1.0]), 0.01)
-    flat = HeightField(place[:2] - 2.0, np.array([1.0, 1.0]), np.full((5, 5), place[2] + 0.05))
-    found = {(one.body, one.surface): one.depth for one in sinking(robot, {"cube": cube, "flat": flat}, q)}
+    position = model.point_position(*robot.hand, robot.initial)
+    cube = Box(position - vector(0.0, 0.0, 0.4), np.eye(3), np.array([1.0, 1.0, 1.0]), 0.01)
+    flat = HeightField(position[:2] - 2.0, np.array([1.0, 1.0]), np.full((5, 5), position[2] + 0.05))
+    depths = {
+        (penetration.body, penetration.surface): penetration.depth
+        for penetration in sinking(robot, {"cube": cube, "flat": flat}, q)
+    }
     last = robot.hand[0]
-    assert found[last, "cube"] >= 0.1 - 1e-9
-    assert found[last, "flat"] >= 0.05 - 1e-9
+    assert depths[last, "cube"] >= 0.1 - 1e-9
+    assert depths[last, "flat"] >= 0.05 - 1e-9
 
 
 def test_a_carriage_without_mass_and_length_is_no_body_of_its_own(tmp_path):
@@ -238,11 +244,11 @@ def test_a_carriage_without_mass_and_length_is_no_body_of_its_own(tmp_path):
     base = "duration_s: 1\nplant:\n  type: serial_arm\n  chain:\n"
     carriage = "    - {kind: prismatic, axis: z, length_m: 0, mass_kg: MASS, radius_m: 0.3}\n"
     rod = "    - {axis: y, initial_deg: 90, length_m: 0.4, radius_m: 0.02, mass_kg: 0.5}\n"
-    rest = "surfaces: {floor: {type: plane, point_m: [0, 0, -2]}}\ncontacts: {law: unilateral, candidates: links}\n"
+    floor = "surfaces: {floor: {type: plane, point_m: [0, 0, -2]}}\ncontacts: {law: unilateral, candidates: links}\n"
     file = tmp_path / "s.yaml"
     for mass, expected in (
         (0, [("joint_2", 0.02), ("link_2_end", 0.02)]),
         (1, [("joint_1", 0.3), ("link_2_end", 0.02)]),
     ):
-        file.write_text(base + carriage.replace("MASS", str(mass)) + rod + rest)
-        assert [(one.name, one.radius) for one in build.contacts(dynsim.load_scenario(file))] == expected
+        file.write_text(base + carriage.replace("MASS", str(mass)) + rod + floor)
+        assert [(contact.name, contact.radius) for contact in build.contacts(dynsim.load_scenario(file))] == expected

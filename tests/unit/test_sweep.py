@@ -163,7 +163,7 @@ def test_a_star_is_every_entry():
     point = list(swept.points())[3]
     config = swept.scenario(point).config
     assert list(config.surfaces["floor"].normal) == [0, 0, 2]
-    frictions = [one.friction for one in config.contacts.points.values()]
+    frictions = [contact.friction for contact in config.contacts.points.values()]
     assert frictions == [point.values[key] for key in keys]
     assert frictions[0] != frictions[1]
 
@@ -189,9 +189,9 @@ def test_intervals_are_those_of_linear_regression():
     assert fit.effect[0] == pytest.approx(reference.slope * x.std(ddof=1), rel=1e-12)
     assert fit.half_width[0] == pytest.approx(half, rel=1e-12)
     assert fit.explained == pytest.approx(reference.rvalue**2, rel=1e-12)
-    one = spread(y)
+    interval = spread(y)
     expected = scipy.stats.t.interval(0.95, 24, loc=y.mean(), scale=scipy.stats.sem(y))
-    assert (one.mean_low, one.mean_high) == pytest.approx(expected, rel=1e-12)
+    assert (interval.mean_low, interval.mean_high) == pytest.approx(expected, rel=1e-12)
 
 
 def test_no_line_where_there_is_none():
@@ -204,10 +204,12 @@ def test_no_line_where_there_is_none():
 
 @given(st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), min_size=1))
 def test_the_pareto_front_is_what_no_run_beats(points: list[tuple[int, int]]):
-    def beaten(one: tuple[int, int]) -> bool:
-        return any(x <= one[0] and y <= one[1] and (x, y) != one for x, y in points)
+    def beaten(point: tuple[int, int]) -> bool:
+        return any(x <= point[0] and y <= point[1] and (x, y) != point for x, y in points)
 
-    assert {tuple(point) for point in pictures.best(points)} == {one for one in points if not beaten(one)}
+    assert {tuple(point) for point in pictures.best(points)} == {
+        candidate for candidate in points if not beaten(candidate)
+    }
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
@@ -353,8 +355,8 @@ def test_workers_make_messages_only_for_who_listens(listens: bool, monkeypatch: 
 
 def test_the_table_has_every_run_whatever_the_jobs(tmp_path: Path):
     swept = plan(Axis.parse(f"{LENGTH}=0.5:1:3"), MASSES)
-    one = run_sweep(swept, tmp_path / "one")
-    assert run_sweep(swept, tmp_path / "two", jobs=2) == one
+    serial = run_sweep(swept, tmp_path / "one")
+    assert run_sweep(swept, tmp_path / "two", jobs=2) == serial
     for name in module.TABLES[: 1 + module.has_parquet()]:
         assert (tmp_path / "two" / name).read_bytes() == (tmp_path / "one" / name).read_bytes()
     with (tmp_path / "one" / "sweep.csv").open() as file:
@@ -488,11 +490,11 @@ def noisy(places: int, draws: int) -> pictures.Sweep:
         {
             "plant.a": float(a),
             "m": m,
-            "electrical_energy_J": 100.0 * (a + 1) + m + 0.1 * rest,
-            "hand_error_rms_m": 1e-3 * rest,
+            "electrical_energy_J": 100.0 * (a + 1) + m + 0.1 * damping,
+            "hand_error_rms_m": 1e-3 * damping,
         }
         for a in range(places)
-        for m, rest in drawn
+        for m, damping in drawn
     ]
     return pictures.Sweep("test", rows, ["plant.a"], ["m"])
 
@@ -501,9 +503,9 @@ def test_more_places_of_the_grid_are_no_more_draws():
     few, many = (pictures.tornado(noisy(places, draws=12)) for places in (1, 50))
     assert few is not None
     assert many is not None
-    for one, other in zip(few.axes, many.axes, strict=True):
-        assert one.get_title() == other.get_title()
-        bars = [axes.collections[0].get_segments()[0] for axes in (one, other)]
+    for axis, other in zip(few.axes, many.axes, strict=True):
+        assert axis.get_title() == other.get_title()
+        bars = [axes.collections[0].get_segments()[0] for axes in (axis, other)]
         np.testing.assert_allclose(bars[0], bars[1], rtol=1e-9)
 
 
@@ -513,8 +515,8 @@ def test_distributions_are_those_of_one_place():
     assert figure is not None
     energies = figure.axes[::2]
     assert [axes.get_title().split("\n")[0] for axes in energies] == ["a = 0", "a = 1", "a = 2"]
-    for place, axes in enumerate(energies):
-        here = spread(np.array([row["electrical_energy_J"] for row in sweep.rows if row["plant.a"] == place]))
+    for index, axes in enumerate(energies):
+        here = spread(np.array([row["electrical_energy_J"] for row in sweep.rows if row["plant.a"] == index]))
         assert axes.lines[0].get_xdata()[0] == pytest.approx(here.mean)
         assert f"20 runs: mean {here.mean:.2f} ± {here.mean - here.mean_low:.2f}" in axes.get_title()
         assert sum(bar.get_height() for bar in axes.patches) == 20
@@ -615,8 +617,8 @@ def workers_of(pid: int) -> list[int]:
         return sum(map(int, Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()[11:13]))
 
     children = map(int, Path(f"/proc/{pid}/task/{pid}/children").read_text().split())
-    found = [child for child in children if "dynsim.studies.worker" in Path(f"/proc/{child}/cmdline").read_text()]
-    return sorted(found, key=ticks, reverse=True)
+    workers = [child for child in children if "dynsim.studies.worker" in Path(f"/proc/{child}/cmdline").read_text()]
+    return sorted(workers, key=ticks, reverse=True)
 
 
 def _hears() -> None:
@@ -635,12 +637,12 @@ def test_a_cluster_gives_the_same_and_outlives_a_worker(tmp_path: Path, whole: b
     with started([*scheduler, "--scheduler-file", str(file)], tmp_path / "scheduler") as first:
         wait_for(lambda: file.exists() and file.stat().st_size > 0)
         address = json.loads(file.read_text())["address"]
-        with started(worker, tmp_path / "w1") as one, started(worker, tmp_path / "w2"):
+        with started(worker, tmp_path / "w1") as worker_1, started(worker, tmp_path / "w2"):
             first.wait_for("Register worker", 2)
             arguments = ["sweep", *GRID, *LONG[:-2], "--out", str(out), "--scheduler", address]
             with started([*dask, "dynsim", *arguments], tmp_path / "errors") as child:
                 wait_for(lambda: done(out) >= 2)
-                one.process.kill()
+                worker_1.process.kill()
                 assert child.end() == 0, child.stderr
     assert (out / "sweep.csv").read_bytes() == whole
 
@@ -684,7 +686,7 @@ def test_runs_that_failed_are_counted_and_not_drawn(monkeypatch: pytest.MonkeyPa
     """A base that tips after 5 s has taken a tenth of the energy: beside whole runs it looked like the best of all."""
     numbers = {pictures.ENERGY: 1.0, "hand_error_rms_m": 0.1}
     status = ["ok", "failed", "ok"]
-    rows = [SweepRow(k, None, {"duration_s": k + 1}, one, "", numbers, "") for k, one in enumerate(status)]
+    rows = [SweepRow(k, None, {"duration_s": k + 1}, state, "", numbers, "") for k, state in enumerate(status)]
     seen: list[pictures.Sweep] = []
     monkeypatch.setattr(pictures, "draw", lambda sweep, *_: seen.append(sweep))
     sweep_command._draw("tipping", rows, plan(Axis("duration_s", (1, 2, 3))), tmp_path, True, "png")

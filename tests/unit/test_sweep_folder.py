@@ -152,7 +152,9 @@ DAMAGES: list[tuple[str, Callable[[Path], None], str, str]] = [
 ]
 
 
-@pytest.mark.parametrize(("damage", "file", "said"), [one[1:] for one in DAMAGES], ids=[one[0] for one in DAMAGES])
+@pytest.mark.parametrize(
+    ("damage", "file", "said"), [damage[1:] for damage in DAMAGES], ids=[damage[0] for damage in DAMAGES]
+)
 def test_a_damaged_folder_is_one_error(folder: Path, damage: Callable[[Path], None], file: str, said: str):
     damage(folder)
     before = contents(folder)

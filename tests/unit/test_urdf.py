@@ -126,8 +126,8 @@ def test_locked_joints_are_pinocchios_reduced_model(
     q, v, a = rng.uniform(-2, 2, (3, ours.n))
     (q_, _), (_, v_), (_, a_) = (at(theirs, dict(zip(ours.joint_names, x, strict=True))) for x in (q, v, a))
     tau = pinocchio.rnea(theirs, theirs.createData(), q_, v_, a_)[order]
-    found = ours.inverse_dynamics(q, v, a)
-    np.testing.assert_allclose(found, tau, rtol=0, atol=ROUNDING * max(1.0, abs(tau).max()))
+    torques = ours.inverse_dynamics(q, v, a)
+    np.testing.assert_allclose(torques, tau, rtol=0, atol=ROUNDING * max(1.0, abs(tau).max()))
     # The links of locked joints are frames of what carries them, at the same place as in the free arm.
     free_q = [lock.get(name, dict(zip(ours.joint_names, q, strict=True)).get(name, 0.0)) for name in robot.joint_names]
     for link in robot.links:

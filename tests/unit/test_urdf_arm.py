@@ -105,11 +105,11 @@ def test_passed_effort_is_warned_of(scenario: Path):
 
 
 def test_within_limits_and_at_a_rounded_limit_nothing_is_said(scenario: Path):
-    rest = {"plant.gravity_m_s2": [0.0, 0, 0]}
-    assert run(scenario, rest).summary["warnings"] == []
+    weightless = {"plant.gravity_m_s2": [0.0, 0, 0]}
+    assert run(scenario, weightless).summary["warnings"] == []
     text = SLIDE.replace('upper="1"', 'upper="0.1999999"')
     (scenario.parent / "slide.urdf").write_text(text)
-    assert run(scenario, {**rest, "plant.initial_m": {"slide": 0.2}}).summary["warnings"] == []
+    assert run(scenario, {**weightless, "plant.initial_m": {"slide": 0.2}}).summary["warnings"] == []
 
 
 def test_zero_velocity_and_effort_mean_no_limit(scenario: Path):
@@ -176,12 +176,12 @@ def test_joints_of_the_scenario_are_checked_with_their_lines(bracket: Path, keys
 
 def test_contacts_and_hand_may_be_in_frames(bracket: Path):
     """A point of the bracket is held to a wall as the same point of the arm is; the hand is there too."""
-    rest = {"plant.lock_deg": {"flap_hinge": 0}, "surfaces.wall": {"type": "plane", "point_m": [0, 0, 0.2]}}
+    common = {"plant.lock_deg": {"flap_hinge": 0}, "surfaces.wall": {"type": "plane", "point_m": [0, 0, 0.2]}}
     records = []
     # The bracket's x is the arm's −z, its z the arm's x: (0.1, 0, 0.4) there is (0.4, 0, 0.2) on the arm.
     for body, point in (("bracket", [0.1, 0, 0.4]), ("arm", [0.4, 0, 0.2])):
         at = {"body": body, "point_m": point}
-        overrides = {**rest, "plant.hand": at, "contacts.points.brace": {**at, "surface": "wall"}}
+        overrides = {**common, "plant.hand": at, "contacts.points.brace": {**at, "surface": "wall"}}
         records.append(run(bracket, overrides))
     first, second = records
     assert first.summary["constraint_drift_max_m"] < 1e-9

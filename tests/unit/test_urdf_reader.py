@@ -408,17 +408,19 @@ def test_mutations_are_refused_or_read_in_full(tmp_path: Path) -> None:
         read += 1
         assert_pinocchio_reads_the_same(path)
         total, joints = counted(text)
-        found, at_rest = np.zeros(13), np.zeros(model.n)
+        inertia, at_rest = np.zeros(13), np.zeros(model.n)
         for link in model.robot.links:
             R, p = model.body_pose(link.name, at_rest)
-            found += stored(link.inertia.mass, link.inertia.com, link.inertia.tensor, R, p)
+            inertia += stored(link.inertia.mass, link.inertia.com, link.inertia.tensor, R, p)
             limits = [link.lower, link.upper, link.effort_limit, link.velocity_limit]
             # No limit: of position for 1e9, of the others for zero.
             limits = [0.0 if np.isinf(limit) else limit for limit in limits]
             np.testing.assert_allclose([*link.axis, *limits], joints.pop(link.joint), rtol=1e-12, atol=1e-12)
         assert not joints, k
         # Sums of three bodies within a metre.
-        np.testing.assert_allclose(found, total, rtol=1e-12, atol=1e-12 * np.abs(total).max(), err_msg=f"{k}:\n{text}")
+        np.testing.assert_allclose(
+            inertia, total, rtol=1e-12, atol=1e-12 * np.abs(total).max(), err_msg=f"{k}:\n{text}"
+        )
     assert all(message.isprintable() for message in refusals)
     # Both ways are met often.
     assert 0.2 * MUTATIONS < read < 0.8 * MUTATIONS

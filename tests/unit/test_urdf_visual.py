@@ -56,9 +56,9 @@ def test_shapes_of_all_kinds(tmp_path: Path) -> None:
 
 
 def test_shapes_are_placed_on_the_body_that_carries_their_link(tmp_path: Path) -> None:
-    found = scene(tmp_path, base=BOX.format(""), arm=BOX.format(""), tool=BOX.format(""))
-    (stand,) = found.fixed
-    own, fixed_on = found.bodies[0].shapes
+    drawn = scene(tmp_path, base=BOX.format(""), arm=BOX.format(""), tool=BOX.format(""))
+    (stand,) = drawn.fixed
+    own, fixed_on = drawn.bodies[0].shapes
     for shape, position, x in (
         (stand, [1.0, 2.0, 3.0], [0.0, 1.0, 0.0]),
         (own, [1.0, 2.0, 3.0], [0.0, 1.0, 0.0]),
@@ -107,10 +107,10 @@ def test_what_cannot_be_drawn_is_passed_over(tmp_path: Path, visual: str) -> Non
 
 def test_shipped_arm_has_shapes_and_limits() -> None:
     robot = read_urdf(Path(__file__).parents[2] / "scenarios" / "robots" / "six_axis_arm.urdf")
-    found = robot_scene(robot, [], {})
-    assert [body.joint.name for body in found.bodies] == list(robot.joint_names)
-    assert all(body.joint.signal == "q" for body in found.bodies)
-    assert all(shape.kind in ("box", "cylinder", "sphere") for body in found.bodies for shape in body.shapes)
-    assert sum(len(body.shapes) for body in found.bodies) + len(found.fixed) == 8
-    assert Scene.from_json(found.to_json()) == found
-    assert found.bodies[0].joint.upper == pytest.approx(robot.links[0].upper)
+    drawn = robot_scene(robot, [], {})
+    assert [body.joint.name for body in drawn.bodies] == list(robot.joint_names)
+    assert all(body.joint.signal == "q" for body in drawn.bodies)
+    assert all(shape.kind in ("box", "cylinder", "sphere") for body in drawn.bodies for shape in body.shapes)
+    assert sum(len(body.shapes) for body in drawn.bodies) + len(drawn.fixed) == 8
+    assert Scene.from_json(drawn.to_json()) == drawn
+    assert drawn.bodies[0].joint.upper == pytest.approx(robot.links[0].upper)

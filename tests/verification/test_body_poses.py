@@ -64,8 +64,8 @@ def test_poses_of_joints_with_several_rows_are_those_of_the_model(joint, mounted
     rng = np.random.default_rng(5)
 
     def link(name: str, parent: str | None) -> Link:
-        place, axis = random_rotation(rng), random_unit(rng)
-        return Link(name, f"to {name}", parent, "revolute", axis, Inertia(1.0), R_PJ=place, p_PJ=rng.normal(size=3))
+        rotation, axis = random_rotation(rng), random_unit(rng)
+        return Link(name, f"to {name}", parent, "revolute", axis, Inertia(1.0), R_PJ=rotation, p_PJ=rng.normal(size=3))
 
     first = (link("carrier", None),) if mounted else ()
     moving = joint(link("base", "carrier" if mounted else None))
@@ -105,16 +105,16 @@ def test_signs_of_quaternions_do_not_jump():
     """A joint that turns three times, and the same joint as a servo would report it, within one turn."""
     joint = Joint("j", "revolute", (0.0, 0.0, 1.0), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), "q", ("j",))
     angle = np.linspace(2.0, 2.0 + 6.0 * np.pi, 300)
-    found = []
+    quaternions = []
     for q in (angle, (angle + np.pi) % (2.0 * np.pi) - np.pi):
         record = Record(np.arange(300.0))
         record.add("q", q[:, None], "rad", labels=("j",))
         record.scene = Scene((Body("b", -1, joint),))
         assert add_body_poses(record)
-        found.append(record["body_orientation"][:, 0])
-        assert np.abs(np.diff(found[-1], axis=0)).max() < 0.05
-    np.testing.assert_allclose(found[0], found[1], atol=SINGLE)
-    assert found[0][0, 0] > 0.0
+        quaternions.append(record["body_orientation"][:, 0])
+        assert np.abs(np.diff(quaternions[-1], axis=0)).max() < 0.05
+    np.testing.assert_allclose(quaternions[0], quaternions[1], atol=SINGLE)
+    assert quaternions[0][0, 0] > 0.0
 
 
 def test_a_joint_that_was_not_recorded_leaves_no_poses():
@@ -152,7 +152,7 @@ def test_record_of_a_braced_arm_places_hand_and_contacts():
     assert [point.name for point in scene.contacts] == list(record.labels["contact_gap"])
     for point in scene.contacts:
         surface = scene.surface(point.surface)
-        assert max(abs(surface.gap(place)) for place in point_positions(record, point)) < 1e-6
+        assert max(abs(surface.gap(position)) for position in point_positions(record, point)) < 1e-6
     rod = scene.bodies[3].shapes[0]
     assert (rod.kind, rod.size, rod.position) == ("cylinder", (0.01, 0.3), (0.0, 0.0, 0.15))
 

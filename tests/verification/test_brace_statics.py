@@ -85,29 +85,29 @@ def check_allowed(brace: Brace, f: np.ndarray, tolerance: float) -> None:
         assert f_t == pytest.approx(-brace.friction * f_n * along / np.linalg.norm(along), abs=tolerance)
 
 
-def check_optimal(model: Model, q, v, vdot, braces, found: BraceStatics) -> None:
+def check_optimal(model: Model, q, v, vdot, braces, answer: BraceStatics) -> None:
     """Equation of motion and constraints; and the duality gap: no allowed forces heat less, to first order."""
     free = free_torques(model, q, v, vdot)
     J = {name: model.point_jacobian(b.body, b.point, q) for name, b in braces.items()}
     scale = 1.0 + np.abs(free).max()
-    balance = found.torques + sum(J[name].T @ f for name, f in found.forces.items()) - free
+    balance = answer.torques + sum(J[name].T @ f for name, f in answer.forces.items()) - free
     assert np.abs(balance).max() <= 1e-11 * scale
     low, high = limits(model, v)
-    assert (found.torques >= low - 1e-8 * scale).all()
-    assert (found.torques <= high + 1e-8 * scale).all()
+    assert (answer.torques >= low - 1e-8 * scale).all()
+    assert (answer.torques <= high + 1e-8 * scale).all()
     for name, brace in braces.items():
-        check_allowed(brace, found.forces[name], 1e-8 * scale)
+        check_allowed(brace, answer.forces[name], 1e-8 * scale)
     weights = heat_weights(model)
-    assert found.heat == pytest.approx(weights @ found.torques**2, rel=1e-12)
+    assert answer.heat == pytest.approx(weights @ answer.torques**2, rel=1e-12)
     if not np.isinf(high).all():
         return
     gap = 0.0
     for name, brace in braces.items():
-        gradient = -2.0 * J[name] @ (weights * found.torques) / (1.0 + found.heat)
-        gap += gradient @ found.forces[name] - least_work(brace, gradient)
+        gradient = -2.0 * J[name] @ (weights * answer.torques) / (1.0 + answer.heat)
+        gap += gradient @ answer.forces[name] - least_work(brace, gradient)
     # Heat is convex: this is the part of it that could be saved at most.
     # Braces close to the base take thousands of newtons to save the last bit: their rounding.
-    largest = max(float(np.linalg.norm(f)) for f in found.forces.values())
+    largest = max(float(np.linalg.norm(f)) for f in answer.forces.values())
     assert abs(gap) <= 1e-9 * (1.0 + (largest / 500.0) ** 2)
 
 
@@ -150,13 +150,13 @@ def random_case(rng: np.random.Generator, model: Model, limited: bool):
 def test_least_heat_of_any_braces(arm, seed):
     rng = np.random.default_rng(seed)
     model, q, v, vdot, braces = random_case(rng, arm, limited=False)
-    found = model.brace_statics(q, v, vdot, braces)
-    assert found.feasible
-    assert found.certificate is None
-    check_optimal(model, q, v, vdot, braces, found)
+    answer = model.brace_statics(q, v, vdot, braces)
+    assert answer.feasible
+    assert answer.certificate is None
+    check_optimal(model, q, v, vdot, braces, answer)
     for name, brace in braces.items():
         force = brace.normal_force
-        assert found.intervals[name] == ((brace.min_N, math.inf) if force is None else (force, force))
+        assert answer.intervals[name] == ((brace.min_N, math.inf) if force is None else (force, force))
 
 
 @settings(max_examples=60)
@@ -164,14 +164,14 @@ def test_least_heat_of_any_braces(arm, seed):
 def test_limited_and_missing_motors_give_forces_or_a_certificate(arm, seed):
     rng = np.random.default_rng(seed)
     model, q, v, vdot, braces = random_case(rng, arm, limited=True)
-    found = model.brace_statics(q, v, vdot, braces)
-    if not found.feasible:
-        check_impossible(model, q, v, vdot, braces, found.certificate)
+    answer = model.brace_statics(q, v, vdot, braces)
+    if not answer.feasible:
+        check_impossible(model, q, v, vdot, braces, answer.certificate)
         return
-    check_optimal(model, q, v, vdot, braces, found)
+    check_optimal(model, q, v, vdot, braces, answer)
     name, brace = next(iter(braces.items()))
-    low, high = found.intervals[name]
-    assert low - 1e-6 <= found.normal_forces[name] <= high + 1e-6
+    low, high = answer.intervals[name]
+    assert low - 1e-6 <= answer.normal_forces[name] <= high + 1e-6
     if brace.normal_force is not None or high - low < 1e-3:
         return
     # Just inside of the ends it works, just outside there is a proof that it does not.
@@ -246,11 +246,11 @@ def test_a_brace_is_shortened_with_its_friction(arm):
 
 def test_published_posture_against_slsqp(arm):
     """The optimum without a least force leaves elbow 4 grazing; with one it has exactly that."""
-    q, rest = arm.robot.initial, np.zeros(arm.n)
+    q, zeros = arm.robot.initial, np.zeros(arm.n)
     J = np.vstack([arm.point_jacobian(f"link_{k}", np.zeros(3), q) for k in (4, 7)])
-    free, weights = free_torques(arm, q, rest, rest), heat_weights(arm)
+    free, weights = free_torques(arm, q, zeros, zeros), heat_weights(arm)
     for least in (0.0, 0.5):
-        found = arm.brace_statics(q, rest, rest, elbows(min_N=least))
+        answer = arm.brace_statics(q, zeros, zeros, elbows(min_N=least))
         result = minimize(
             lambda f: weights @ (free - J.T @ f) ** 2,
             np.array([0.0, 0.0, 3.0, 0.0, 0.0, 8.0]),
@@ -267,20 +267,20 @@ def test_published_posture_against_slsqp(arm):
             method="SLSQP",
             options={"ftol": 1e-16, "maxiter": 500},
         )
-        assert found.heat == pytest.approx(result.fun, rel=1e-8)
-        assert found.normal_forces["elbow_4"] == pytest.approx(least, abs=1e-8)
+        assert answer.heat == pytest.approx(result.fun, rel=1e-8)
+        assert answer.normal_forces["elbow_4"] == pytest.approx(least, abs=1e-8)
     commanded = {**elbows(), "elbow_4": replace(elbows()["elbow_4"], normal_force=3.0)}
-    assert arm.brace_statics(q, rest, rest, commanded).heat > found.heat
+    assert arm.brace_statics(q, zeros, zeros, commanded).heat > answer.heat
 
 
 @pytest.mark.parametrize("joint", ["joint_2", "joint_4", "joint_6"])
 def test_limits_that_hold_and_limits_that_bind(arm, joint):
     """Wide limits change nothing but give intervals; one that binds gives SLSQP's optimum, and costs heat."""
-    q, rest = arm.robot.initial, np.zeros(arm.n)
-    free_of_limits = arm.brace_statics(q, rest, rest, elbows())
+    q, zeros = arm.robot.initial, np.zeros(arm.n)
+    free_of_limits = arm.brace_statics(q, zeros, zeros, elbows())
     j = arm.joint_names.index(joint)
     J = np.vstack([arm.point_jacobian(f"link_{k}", np.zeros(3), q) for k in (4, 7)])
-    free, weights = free_torques(arm, q, rest, rest), heat_weights(arm)
+    free, weights = free_torques(arm, q, zeros, zeros), heat_weights(arm)
 
     def limited(at_joint: float) -> Model:
         """Voltages that allow 50 N m, and less at one joint."""
@@ -290,16 +290,16 @@ def test_limits_that_hold_and_limits_that_bind(arm, joint):
             motors.append(replace(motor, voltage_limit=torque * motor.resistance / motor.joint_constant))
         return Model(replace(arm.robot, motors=tuple(motors)))
 
-    wide = limited(50.0).brace_statics(q, rest, rest, elbows())
+    wide = limited(50.0).brace_statics(q, zeros, zeros, elbows())
     assert np.array_equal(wide.torques, free_of_limits.torques)
     assert all(low == 0.5 and 0.5 < high < math.inf for low, high in wide.intervals.values())
     bound = 0.95 * abs(free_of_limits.torques[j])
-    found = limited(bound).brace_statics(q, rest, rest, elbows())
-    assert found.feasible
-    assert abs(found.torques[j]) == pytest.approx(bound, rel=1e-8)
+    answer = limited(bound).brace_statics(q, zeros, zeros, elbows())
+    assert answer.feasible
+    assert abs(answer.torques[j]) == pytest.approx(bound, rel=1e-8)
     result = minimize(
         lambda f: weights @ (free - J.T @ f) ** 2,
-        np.concatenate([found.forces["elbow_4"], found.forces["elbow_7"]]) + 0.1,
+        np.concatenate([answer.forces["elbow_4"], answer.forces["elbow_7"]]) + 0.1,
         jac=lambda f: -2.0 * J @ (weights * (free - J.T @ f)),
         constraints=[
             {
@@ -314,34 +314,34 @@ def test_limits_that_hold_and_limits_that_bind(arm, joint):
         method="SLSQP",
         options={"ftol": 1e-16, "maxiter": 500},
     )
-    assert found.heat == pytest.approx(result.fun, rel=1e-8)
-    assert found.heat > free_of_limits.heat
+    assert answer.heat == pytest.approx(result.fun, rel=1e-8)
+    assert answer.heat > free_of_limits.heat
 
 
 def test_one_brace_by_hand():
     """A level beam of two links, massless but for a tip: one support without friction takes what makes least heat."""
     arm = dynsim.build_model(dynsim.load_scenario("single_pendulum"))
-    q, rest = np.array([math.radians(60.0)]), np.zeros(1)
+    q, zeros = np.array([math.radians(60.0)]), np.zeros(1)
     position = arm.point_position(*arm.robot.hand, q)
     brace = {"tip": Brace(arm.robot.hand[0], arm.robot.hand[1], UP, friction=0.0, min_N=0.0)}
-    found = arm.brace_statics(q, rest, rest, brace)
-    gravity = arm.bias_forces(q, rest)[0]
+    answer = arm.brace_statics(q, zeros, zeros, brace)
+    gravity = arm.bias_forces(q, zeros)[0]
     lever = arm.point_jacobian(*arm.robot.hand, q)[2, 0]
     if gravity / lever > 0.0:  # the support can carry all of it
-        assert found.normal_forces["tip"] == pytest.approx(gravity / lever, rel=1e-8)
+        assert answer.normal_forces["tip"] == pytest.approx(gravity / lever, rel=1e-8)
     assert np.isfinite(position).all()
 
 
 def test_prepared_braces_are_those_of_the_call(arm):
     """What is kept from one call to the next is kept for the same objects alone, and these cannot change."""
-    q, rest = arm.robot.initial, np.zeros(arm.n)
+    q, zeros = arm.robot.initial, np.zeros(arm.n)
     braces = elbows()
-    first = arm.brace_statics(q, rest, rest, braces)
+    first = arm.brace_statics(q, zeros, zeros, braces)
     braces["elbow_7"] = replace(braces["elbow_7"], normal_force=20.0)
-    assert arm.brace_statics(q, rest, rest, braces).normal_forces["elbow_7"] == pytest.approx(20.0, abs=1e-12)
-    fewer = arm.brace_statics(q, rest, rest, {"elbow_4": braces["elbow_4"]})
+    assert arm.brace_statics(q, zeros, zeros, braces).normal_forces["elbow_7"] == pytest.approx(20.0, abs=1e-12)
+    fewer = arm.brace_statics(q, zeros, zeros, {"elbow_4": braces["elbow_4"]})
     assert list(fewer.forces) == ["elbow_4"]
-    again = arm.brace_statics(q, rest, rest, elbows())
+    again = arm.brace_statics(q, zeros, zeros, elbows())
     assert np.array_equal(again.torques, first.torques)
     assert first.heat < fewer.heat
     with pytest.raises(ValueError, match="read-only"):
@@ -361,8 +361,8 @@ def test_a_motion_in_one_call_is_its_instants(arm, seed):
     positions, velocities = planner.motion(points, q, v)
     for k, brace in enumerate(braces.values()):
         for t in range(6):
-            place, jacobian = model.point_position_and_jacobian(brace.body, brace.point, q[t])
-            assert positions[t, k] == pytest.approx(place, abs=1e-12)
+            position, jacobian = model.point_position_and_jacobian(brace.body, brace.point, q[t])
+            assert positions[t, k] == pytest.approx(position, abs=1e-12)
             assert velocities[t, k] == pytest.approx(jacobian @ v[t], abs=1e-12)
     tables = np.stack(
         [
@@ -380,7 +380,7 @@ def test_a_motion_in_one_call_is_its_instants(arm, seed):
     )
     torques, _, solved = planner.least_heat(q, v, vdot, tables)
     single = [model.brace_statics(q[t], v[t], vdot[t], braces) for t in range(6)]
-    feasible = [found.feasible for found in single]
+    feasible = [answer.feasible for answer in single]
     assert solved == (feasible.index(False) if False in feasible else 6)
     for t in range(solved):
         assert torques[t] == pytest.approx(single[t].torques, rel=1e-12, abs=1e-12)

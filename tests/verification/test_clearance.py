@@ -76,9 +76,9 @@ def surface(kind: str, inside: bool = False, scale: float = 1.0) -> Quadric:
         "sphere": {"center_m": [0.1, 0, 0.2], "radius_m": 0.3},
         "cylinder": {"point_m": [0.1, 0, 0.2], "axis": [1, 1, 0], "radius_m": 0.3},
     }[kind]
-    given = {"type": kind, **shape, **({} if kind == "plane" else {"inside": inside})}
+    keys = {"type": kind, **shape, **({} if kind == "plane" else {"inside": inside})}
     scenario = scenario_from_resolved(
-        {"name": "", "duration_s": 1, "plant": {"type": "serial_arm", "chain": [{}]}, "surfaces": {"s": given}}
+        {"name": "", "duration_s": 1, "plant": {"type": "serial_arm", "chain": [{}]}, "surfaces": {"s": keys}}
     )
     plain = build.surfaces(scenario)["s"]
     return Quadric(scale * plain.Q, scale * plain.b, scale * plain.c)
@@ -112,12 +112,12 @@ def test_depth_of_a_link_is_that_of_its_deepest_point(kind, inside):
         )
         robot = Robot("rod", (link,), (), ("rod", np.zeros(3)))
         depth = -min(s.gap(start + x * along) for x in np.linspace(0.0, 1.0, 2001))
-        found = sinking(robot, {"s": s}, np.zeros((1, 1)))
-        assert bool(found) == (depth > 0.02)
-        if found:
+        penetration = sinking(robot, {"s": s}, np.zeros((1, 1)))
+        assert bool(penetration) == (depth > 0.02)
+        if penetration:
             deep += 1
-            assert found[0].depth == pytest.approx(depth, abs=2e-4)
-            assert found[0].depth >= depth - 1e-12
+            assert penetration[0].depth == pytest.approx(depth, abs=2e-4)
+            assert penetration[0].depth >= depth - 1e-12
     assert deep > 3
     # Outside the pipe and beyond the bowl is nearly everything.
     assert inside or deep < 40
@@ -156,9 +156,9 @@ def test_sinking_stands_in_the_tables(simulated):
     (row,) = (line for line in text.getvalue().splitlines() if "deepest below a surface" in line)
     assert row.split()[-2:] == ["–", "42.3"]
     assert "pass below floor" in text.getvalue()
-    one = io.StringIO()
-    print_summary(Console(file=one, width=100), summaries["elbow_4"])
-    assert "42.3" in one.getvalue()
+    output = io.StringIO()
+    print_summary(Console(file=output, width=100), summaries["elbow_4"])
+    assert "42.3" in output.getvalue()
     none = io.StringIO()
     print_summary(Console(file=none, width=100), summaries["two_elbows"])
     assert "deepest" not in none.getvalue()
@@ -199,10 +199,10 @@ def test_a_run_that_diverged_has_finite_depths():
         }
     )
     q = np.array([[0.0], [-3.0], [-1e200], [1e308], [-np.inf], [np.nan]])
-    found = {s.surface: s for s in sinking(build.robot(scenario), build.surfaces(scenario), q)}
-    assert set(found) == {"floor"}
-    assert found["floor"].sample == 1
-    assert found["floor"].depth == pytest.approx(1e200 / np.sqrt(3.0))
+    penetrations = {s.surface: s for s in sinking(build.robot(scenario), build.surfaces(scenario), q)}
+    assert set(penetrations) == {"floor"}
+    assert penetrations["floor"].sample == 1
+    assert penetrations["floor"].depth == pytest.approx(1e200 / np.sqrt(3.0))
 
 
 TEARING = {"controller.joints": {"joint_3": {"times_s": [0, 2], "angles_deg": [90, 80]}}}
@@ -222,14 +222,14 @@ def test_references_that_tear_a_brace_off_are_refused():
         with pytest.raises(ModelError) as caught:
             refuse(scenario)
         text = str(caught.value)
-        found = re.search(
+        match = re.search(
             r"contact elbow_7: the references of the joints take its point \+([\d.]+) m off surface 'floor' at "
             r"t = ([\d.]+) s, at \(([\d.]+), ([\d.]+), ([\d.]+)\) m, and beyond "
             r"contacts.reference_tolerance_m = 0.002 m from t = ([\d.]+) s on \(also elbow_4\); let the joints",
             text,
         )
-        assert found, text
-        depth, time, _, _, z, first = map(float, found.groups())
+        assert match, text
+        depth, time, _, _, z, first = map(float, match.groups())
         # The quintic through the knots rings by some micrometres where the waypoints begin to hold.
         assert depth == pytest.approx(height(2.0), rel=1e-3)
         assert z == pytest.approx(depth, rel=1e-3)

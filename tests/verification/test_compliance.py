@@ -67,11 +67,14 @@ def test_it_rests_as_deep_as_its_weight_presses():
 def test_a_drop_is_caught_and_leaves_again():
     """m x'' = −k x − c x' − m g from touch at speed u on, until the force is zero: the floor never pulls."""
     b, height, decay = soft(damping=20.0), 0.05, 20.0 / (2.0 * MASS)
-    pulsation, rest, u = np.sqrt(STIFFNESS / MASS - decay**2), -MASS * G / STIFFNESS, np.sqrt(2.0 * G * height)
+    pulsation, static_gap, u = np.sqrt(STIFFNESS / MASS - decay**2), -MASS * G / STIFFNESS, np.sqrt(2.0 * G * height)
     t = np.linspace(0.0, 0.05, 500001)
     e, c, s = np.exp(-decay * t), np.cos(pulsation * t), np.sin(pulsation * t)
-    sine = (-u - decay * rest) / pulsation
-    x, v = rest + e * (-rest * c + sine * s), e * (-decay * (-rest * c + sine * s) + pulsation * (rest * s + sine * c))
+    sine = (-u - decay * static_gap) / pulsation
+    x, v = (
+        static_gap + e * (-static_gap * c + sine * s),
+        e * (-decay * (-static_gap * c + sine * s) + pulsation * (static_gap * s + sine * c)),
+    )
     leaves = np.argmax((STIFFNESS * x + 20.0 * v >= 0.0) & (t > 0.01))
     top = x[leaves] + v[leaves] ** 2 / (2.0 * G)
     errors = []

@@ -152,8 +152,8 @@ def random_contacts(seed):
         J *= random.random(J.shape) < 0.4
     first = np.flatnonzero(kind == CONE)
     if random.random() < 0.3 and len(first) > 1:  # the same point twice
-        one, other = random.choice(first, 2, replace=False)
-        J[other : other + 3] = J[one : one + 3]
+        index, other = random.choice(first, 2, replace=False)
+        J[other : other + 3] = J[index : index + 3]
     mu = np.where(kind == CONE, random.choice([0.0, 0.05, 0.3, 0.8, 1.5, 2.0], size=p), 0.0)
     return J, inverse_mass, random.normal(size=n), kind, mu
 

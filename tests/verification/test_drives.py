@@ -271,8 +271,8 @@ def test_the_ledger_closes_with_all_kinds_of_drives(mixed, integrator):
 @pytest.mark.parametrize("integrator", [{"method": "radau5"}, M_STAR])
 def test_all_methods_and_solvers_move_all_kinds_of_drives_alike(mixed, integrator):
     tight = {"rtol": 1e-10, "atol": 1e-12}
-    one, other = (
+    first, other = (
         simulate(load_scenario(mixed, overrides={f"integrator.{key}": value for key, value in options.items()}))["q"]
         for options in ({**tight, "method": "dopri5"}, tight | integrator)
     )
-    np.testing.assert_allclose(other, one, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(other, first, rtol=0, atol=1e-7)

@@ -268,7 +268,7 @@ def test_events_hold_an_arm_and_close_its_ledger(method):
     assert ledger_gap(run)[-1] < 1e-6
     for step in (1e-3, 2.5e-4):
         places.append(stepped(b, b.state(q0, np.zeros(3)), np.array([0.0, 3.0]), step, 0.5).outputs("hand")[-1])
-    errors = [np.abs(place - hand[2]).max() for place in places]
+    errors = [np.abs(position - hand[2]).max() for position in places]
     assert errors[1] < 0.5 * errors[0] < 1e-4
 
 

@@ -152,8 +152,8 @@ def test_steps_that_come_nowhere_end_a_run(method: str):
     stop = raised.value
     assert stop.kind == "no_progress"
     assert stop.time < 1e-8
-    told = "no progress, the last 10000 steps came no further than 1.0e-05 s, the last of 1.0e-13 s; elbow_4 s"
-    assert told in str(stop)
+    message = "no progress, the last 10000 steps came no further than 1.0e-05 s, the last of 1.0e-13 s; elbow_4 s"
+    assert message in str(stop)
     # Contact and mode; what a step of time stepping begins with is its own.
     assert method == "time_stepping" or "; elbow_4 slides, elbow_7 sticks; " in str(stop)
     assert stop.record is not None

@@ -162,11 +162,11 @@ def test_an_operator_takes_over_from_the_start_at_rest():
     record = simulate(load_scenario("elbow_comparison", "two_elbows", overrides))
     before = record.time <= 0.1
     assert np.abs(record["vdot"][before]).max() < STILL
-    way = record["hand_position"] - record["hand_position"][0]
+    displacement = record["hand_position"] - record["hand_position"][0]
     # Eased in at 0.5 m/s², the way of 0.5 s at 10 mm/s is 5 mm less 0.1.
-    assert way[-1, 2] == pytest.approx(0.005, abs=0.6e-3)
-    assert np.abs(way[:, :2]).max() < 0.5e-3
-    assert way[:, 2].min() > -1e-5
+    assert displacement[-1, 2] == pytest.approx(0.005, abs=0.6e-3)
+    assert np.abs(displacement[:, :2]).max() < 0.5e-3
+    assert displacement[:, 2].min() > -1e-5
 
 
 MOBILE = {"duration_s": 0.6, "controller.hand": None, "metrics.settle_s": 0.4}

@@ -40,8 +40,8 @@ def test_braces_stay_on_their_surfaces_within_limits(arm) -> None:  # type: igno
     start = np.array([0.0, 0.9, 0.5, 0.6, -0.3, -0.4, -0.3, 0.0, 0.5, 0.2])
     target = np.array([1.4, 0.1, 0.3])
     q = model.inverse_kinematics(target, start, braces=braces)
-    place = model.point_position("link_5", [0.0, 0.0, 0.0], q)
-    assert abs(place[2] - 0.01) < 1e-9
+    position = model.point_position("link_5", [0.0, 0.0, 0.0], q)
+    assert abs(position[2] - 0.01) < 1e-9
     assert np.abs(model.point_position(*model.robot.hand, q) - target).max() < 1e-9
     stops = np.array([(link.lower, link.upper) for link in model.robot.links])
     assert (q >= stops[:, 0]).all()

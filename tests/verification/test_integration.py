@@ -95,9 +95,9 @@ def slopes(values: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("braced", [False, True])
 def test_order_by_halving_the_step(method, order, steps, braced):
     b, y = arm(braced=braced)
-    found = slopes(errors(b, y, method, steps, np.array([0.08])))
+    orders = slopes(errors(b, y, method, steps, np.array([0.08])))
     # Asymptotic only as h → 0, and single errors may pass through zero: the mean slope, with half an order of slack.
-    assert found.mean() >= order - 0.5, found
+    assert orders.mean() >= order - 0.5, orders
 
 
 def test_radau5_is_of_its_stage_order_at_least_when_the_inductance_vanishes():
@@ -110,8 +110,8 @@ def test_radau5_is_of_its_stage_order_at_least_when_the_inductance_vanishes():
     b.part(y, "current")[:] = 40.0 * (b.system.reference.held - b.part(y, "q")) / 1.1
     times = np.array([0.08])
     runs = [motion(b.simulate(y, times, "radau5", step=h, fixed=True)) for h in (4e-3, 2e-3, 1e-3, 1e-4)]
-    found = slopes(np.array([np.abs(r - runs[-1]).max() for r in runs[:-1]]))
-    assert found.min() >= 3.5, found
+    orders = slopes(np.array([np.abs(r - runs[-1]).max() for r in runs[:-1]]))
+    assert orders.min() >= 3.5, orders
 
 
 @pytest.mark.parametrize(
@@ -123,8 +123,8 @@ def test_order_of_the_dense_output(method, order, steps):
     b, y = arm()
     # Fractions of the largest step that are no grid points of either.
     times = steps[0] * (np.arange(40, 100) + 0.37)
-    found = slopes(errors(b, y, method, steps, times))
-    assert found.min() >= order - 0.5, found
+    orders = slopes(errors(b, y, method, steps, times))
+    assert orders.min() >= order - 0.5, orders
 
 
 def test_every_method_is_in_these_tests():
@@ -139,8 +139,8 @@ def test_adaptive_runs_meet_their_tolerance(method, rtol):
     reference, run = b.simulate(y, times, rtol=1e-12), b.simulate(y, times, method, rtol=rtol)
     # Local control: the sum of all local errors, damped by the motors, stays within 20 tolerances of unit-sized states.
     assert np.abs(run.states("q") - reference.states("q")).max() <= 20.0 * rtol
-    expected, found = (np.hstack([r.states("v"), r.states("current")]) for r in (reference, run))
-    assert np.abs(found - expected).max() <= 20.0 * rtol * np.abs(expected).max()
+    expected, computed = (np.hstack([r.states("v"), r.states("current")]) for r in (reference, run))
+    assert np.abs(computed - expected).max() <= 20.0 * rtol * np.abs(expected).max()
 
 
 def double_pendulum() -> Bench:
@@ -217,8 +217,8 @@ def test_energy_ledger_closes_at_the_order_of_the_method():
     b, y = arm()
     times = np.array([0.0, 0.2])
     runs = [b.simulate(y, times, "dopri5", step=h, fixed=True) for h in (8e-4, 4e-4, 2e-4)]
-    found = slopes(np.array([abs(ledger_residual(run)) for run in runs]))
-    assert found.min() >= 4.5, found
+    orders = slopes(np.array([abs(ledger_residual(run)) for run in runs]))
+    assert orders.min() >= 4.5, orders
 
 
 @pytest.mark.parametrize("method", ADAPTIVE)
@@ -247,7 +247,7 @@ def test_what_collocation_misses():
 @pytest.mark.parametrize("braced", [False, True])
 def test_the_first_guess_is_right_but_for_the_fifth_power_of_the_step(ratio, braced):
     b, y = arm(braced=braced)
-    found = []
+    errors_of_guess = []
     for h in (1e-3, 5e-4, 2.5e-4):
         run = b.new_run(y, np.array([1.0]), "radau5", step=h, fixed=True)
         b.advance(run, int(0.02 / h))
@@ -257,10 +257,10 @@ def test_the_first_guess_is_right_but_for_the_fifth_power_of_the_step(ratio, bra
         run.clock[STEP] = run.clock[STEP_MAX] = ratio * h
         b.advance(run, 1)
         solved = run.newton.z[:, : guess.shape[1]]
-        found.append(np.abs(guess - solved).max() / np.abs(solved).max() * h)
-    orders = np.log2(np.array(found[:-1]) / found[1:])
+        errors_of_guess.append(np.abs(guess - solved).max() / np.abs(solved).max() * h)
+    orders = np.log2(np.array(errors_of_guess[:-1]) / errors_of_guess[1:])
     # Without the error of the last step they are right but for the fourth.
-    assert orders.min() >= 4.6, (found, orders)
+    assert orders.min() >= 4.6, (errors_of_guess, orders)
 
 
 def test_a_step_that_would_be_rejected_is_judged_by_the_error_from_where_it_leads():

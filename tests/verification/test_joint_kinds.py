@@ -123,13 +123,13 @@ def euler_top(moments: np.ndarray, w: np.ndarray, times: np.ndarray) -> tuple[np
     angle = [0.0]
     for a, b in itertools.pairwise(times):
         angle.append(angle[-1] + 0.5 * (b - a) * float(weights @ turning(0.5 * (a + b) + 0.5 * (b - a) * nodes)))
-    found = rates(times)
-    L = moments * found / np.sqrt(square)
+    solution = rates(times)
+    L = moments * solution / np.sqrt(square)
     attitudes = [
         about(2, psi) @ about(0, np.arctan2(np.hypot(x, y), z)) @ about(2, np.arctan2(x, y))
         for psi, (x, y, z) in zip(angle, L, strict=True)
     ]
-    return found, np.array(attitudes)
+    return solution, np.array(attitudes)
 
 
 @pytest.mark.parametrize("method", ["dopri5", "radau5"])
@@ -176,9 +176,9 @@ def test_momentum_and_energy_of_a_free_robot(method):
     linear, angular = momenta(model, q, v)
     energy = model.kinetic_energy(q, v)
     for q, v in zip(run.states("q"), run.states("v"), strict=True):
-        found = momenta(model, q, v)
-        np.testing.assert_allclose(found[0], linear, rtol=0, atol=1e-9 * np.linalg.norm(linear))
-        np.testing.assert_allclose(found[1], angular, rtol=0, atol=1e-9 * np.linalg.norm(angular))
+        momentum = momenta(model, q, v)
+        np.testing.assert_allclose(momentum[0], linear, rtol=0, atol=1e-9 * np.linalg.norm(linear))
+        np.testing.assert_allclose(momentum[1], angular, rtol=0, atol=1e-9 * np.linalg.norm(angular))
         assert model.kinetic_energy(q, v) == pytest.approx(energy, rel=1e-9)
 
 

@@ -64,7 +64,7 @@ def default_programs(kernel: Any) -> list[Any]:
 
     Other tests of the same process bring systems with these, each with a program of its own.
     """
-    found = []
+    programs = []
     for signature in kernel.signatures:
         system_type = signature[0]
         part = dict(zip(system_type.fields, system_type.types, strict=True))
@@ -73,8 +73,8 @@ def default_programs(kernel: Any) -> list[Any]:
             run = dict(zip(getattr(other, "fields", ()), getattr(other, "types", ()), strict=True))
             absent += [run[name] for name in ("stepping",) if name in run]
         if all(kind == types.none for kind in absent):
-            found.append(signature)
-    return found
+            programs.append(signature)
+    return programs
 
 
 @pytest.mark.skipif(config.DISABLE_JIT, reason="nothing is compiled")

@@ -122,12 +122,12 @@ def spread(case: Case, rng: np.random.Generator) -> list[np.ndarray]:
 @pytest.fixture(scope="module")
 def notes() -> dict[str, Notes]:
     """What each case asks of lanes, which are equal here, and the lines that it runs."""
-    found = {}
+    noted = {}
     for name, make in {**CASES, **TIMED}.items():
         case = make()
-        with lanes.noted() as found[name]:
+        with lanes.noted() as noted[name]:
             run(case, [case.y] * N, Lanes([case.t] * N) if name in TIMED else case.t)
-    return found
+    return noted
 
 
 def union(sets: Iterable[set[Any]]) -> set[Any]:
@@ -155,7 +155,7 @@ def test_every_line_of_the_right_hand_side_runs(notes):
     ran = union(note.lines for note in notes.values())
     reached = union(lanes.lines(function) for function in lanes.reached(system.derivative, WITHOUT_LANES))
     assert len(reached) > 500
-    assert {line.place() for line in reached - ran} == {*NEVER}
+    assert {line.location() for line in reached - ran} == {*NEVER}
 
 
 def test_branches_on_the_state_are_known(notes):
@@ -177,28 +177,28 @@ def test_lanes_that_disagree_are_seen(name, places):
     """At a listed place, not by a wrong number."""
     case = held([ka.STICKING, ka.SLIDING]) if name == "held" else CASES[name]()
     case.spread = 1.0
-    found = []
+    divergences = []
     for seed in range(20):
         try:
             run(case, spread(case, np.random.default_rng(seed)), case.t)
         except Divergent as divergent:
-            found.append(divergent.place)
-    assert found
-    assert {*found} <= {*places}
+            divergences.append(divergent.place)
+    assert divergences
+    assert {*divergences} <= {*places}
 
 
 def test_integers_are_apart_from_reals(notes):
     """Tables of integers hold nothing else, tables of reals no integers, and nothing takes a real for one."""
     assert union(note.kinds for note in notes.values()) == set()
-    found = set()
+    kinds = set()
     for make in CASES.values():
         case = make()
         _, ws = run(case, [case.y] * N, case.t)
         for name, table in ws._asdict().items():
             expected = getattr(case.bench.ws, name).dtype
             assert {type(x) is int for x in table.flat} <= {expected == np.int64}, name
-            found.add((name, expected == np.int64))
-    assert {name for name, integer in found if integer} == {"active", "counts"}
+            kinds.add((name, expected == np.int64))
+    assert {name for name, integer in kinds if integer} == {"active", "counts"}
 
 
 def test_lanes_are_no_index():

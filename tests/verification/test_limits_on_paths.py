@@ -46,7 +46,7 @@ def references(scenario):
     prepared = prepare(scenario)
     pieces = list(prepared.control.positions(prepared.model.robot))
     times, q = (np.concatenate(parts) for parts in zip(*pieces, strict=True))
-    hand = np.array([prepared.model.point_position(*prepared.model.robot.hand, one) for one in q])
+    hand = np.array([prepared.model.point_position(*prepared.model.robot.hand, posture) for posture in q])
     return times, q, np.abs(hand - prepared.control.path.position(times)).max()
 
 

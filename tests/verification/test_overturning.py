@@ -206,15 +206,15 @@ def incentre() -> np.ndarray:
 
 def outside_of(scenario: dynsim.Scenario, robot: Robot, record: dynsim.Record, k: int) -> list[tuple[Any, ...]]:
     """Contact forces of the record and loads of the scenario at a sample."""
-    found = []
+    wrenches = []
     for contact, force in zip(build.contacts(scenario), record["contact_force"][k], strict=True):
-        found.append((contact.body, contact.point, force, np.zeros(3)))
+        wrenches.append((contact.body, contact.point, force, np.zeros(3)))
     turned = {link.name: R[..., 0] for link, R, _ in poses(robot, record["q"][k : k + 1])}
     for load in build.loads(scenario, robot):
         values = load.components(record.time[k : k + 1])[0]
         R = turned[load.body] if load.in_body else np.eye(3)
-        found.append((load.body, load.point, R @ values[:3], R @ values[3:]))
-    return found
+        wrenches.append((load.body, load.point, R @ values[:3], R @ values[3:]))
+    return wrenches
 
 
 def expected_at(scenario: dynsim.Scenario, record: dynsim.Record, k: int, **more: Any) -> dict[str, Any]:
@@ -225,27 +225,27 @@ def expected_at(scenario: dynsim.Scenario, record: dynsim.Record, k: int, **more
 
 def assert_same_support(scenario: dynsim.Scenario, record: dynsim.Record, k: int, **more: Any) -> dict[str, Any]:
     """Sample k of the record agrees with the independent computation, and the wheels' own balances of spin."""
-    found = expected_at(scenario, record, k, **more)
-    loads, scale = found["loads"], 1.0 + np.abs(found["loads"]).max()
+    expected = expected_at(scenario, record, k, **more)
+    loads, scale = expected["loads"], 1.0 + np.abs(expected["loads"]).max()
     np.testing.assert_allclose(record["wheel_load"][k], loads, rtol=0.0, atol=1e-8 * scale)
-    assert record["tip_margin"][k] == pytest.approx(found["margin"], rel=1e-7, abs=1e-7)
+    assert record["tip_margin"][k] == pytest.approx(expected["margin"], rel=1e-7, abs=1e-7)
     # I φ̈ = τ − D φ̇ − r F_x, with τ what the motors give; rolling is what F_x serves.
     spin = record["torque"][k, :2] - 0.05 * record["v"][k, :2] - AXLE * record["vdot"][k, :2]
     along = spin / RADIUS
-    np.testing.assert_allclose(along, found["along"], rtol=0.0, atol=1e-8 * scale)
+    np.testing.assert_allclose(along, expected["along"], rtol=0.0, atol=1e-8 * scale)
     carried = np.maximum(loads[:2], 0.0)
     for side in range(2):
         if loads[side] > 0.0:
-            across = found["across"] * loads[side] / carried.sum()
+            across = expected["across"] * loads[side] / carried.sum()
             demand = np.hypot(along[side], across) / (MU * loads[side])
             assert record["traction_demand"][k, side] == pytest.approx(demand, rel=1e-6)
         else:
             assert np.isnan(record["traction_demand"][k, side])
     if loads.sum() > 0.0:
-        np.testing.assert_allclose(record["center_of_pressure"][k], found["pressure"], rtol=1e-7, atol=1e-8)
+        np.testing.assert_allclose(record["center_of_pressure"][k], expected["pressure"], rtol=1e-7, atol=1e-8)
     else:
         assert np.isnan(record["center_of_pressure"][k]).all()
-    return found
+    return expected
 
 
 # M* of wheels and a support polygon is a program of its own to compile.
@@ -265,8 +265,8 @@ def test_loads_at_random_states_are_those_of_explicit_wheels_and_differenced_mom
         simulation.set_wrench("link_4", force, torque, point=point)
         simulation.advance(1e-6)
         wrenches = [("base", np.zeros(3), lift, np.zeros(3)), ("link_4", point, force, torque)]
-        found = assert_same_support(scenario, simulation.record(), 0, outside=wrenches)
-        kinds.add("stands" if found["margin"] > 0.0 else "lifted" if found["loads"].sum() <= 0.0 else "tips")
+        support = assert_same_support(scenario, simulation.record(), 0, outside=wrenches)
+        kinds.add("stands" if support["margin"] > 0.0 else "lifted" if support["loads"].sum() <= 0.0 else "tips")
     assert kinds == {"stands", "tips", "lifted"}
 
 
@@ -294,9 +294,9 @@ def test_a_robot_at_rest_stands_by_its_levers(tmp_path):
     c, s = np.cos(heading), np.sin(heading)
     a, b = np.array([[c, s], [-s, c]]) @ (first / total - [x, y])
     caster = total * 9.81 * a / CASTER[0]
-    rest = total * 9.81 - caster
-    left = 0.5 * rest + (total * 9.81 * b - caster * CASTER[1]) / TRACK
-    np.testing.assert_allclose(record["wheel_load"][-1], [left, rest - left, caster], rtol=1e-7)
+    others = total * 9.81 - caster
+    left = 0.5 * others + (total * 9.81 * b - caster * CASTER[1]) / TRACK
+    np.testing.assert_allclose(record["wheel_load"][-1], [left, others - left, caster], rtol=1e-7)
     base = record.summary["base"]
     assert list(base["wheel_load_final_N"].values()) == record["wheel_load"][-1].tolist()
     # Of all steps, which do not end at samples.
@@ -308,9 +308,9 @@ def test_a_robot_at_rest_stands_by_its_levers(tmp_path):
 def pressed(scenario: dynsim.Scenario, point: np.ndarray, extra: float) -> dynsim.Record:
     """One sample at the start, with a weight put on the base so that the pressure's centre is there (base's frame)."""
 
-    def sample(force: float, place: np.ndarray) -> dynsim.Record:
+    def sample(force: float, at: np.ndarray) -> dynsim.Record:
         simulation = dynsim.Simulation(scenario)
-        simulation.set_wrench("base", [0.0, 0.0, -force], point=np.r_[place, 0.0])
+        simulation.set_wrench("base", [0.0, 0.0, -force], point=np.r_[at, 0.0])
         simulation.advance(1e-7)
         return simulation.record()
 

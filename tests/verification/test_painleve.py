@@ -68,9 +68,9 @@ def test_a_signed_rod_is_stopped_where_its_diagonal_vanishes(method, rtol, turn)
     """The floor pulls, leans the rod towards the critical angle, and would carry it through with ±∞."""
     b, contacts = rod("signed")
     run = started(b, rod_state(b, 0.1, turn), method, rtol=rtol)
-    found = paradox(b.system, new_workspace(b.system), run, contacts)
-    assert found is not None, run.count
-    t, y, words = found
+    paradox_seen = paradox(b.system, new_workspace(b.system), run, contacts)
+    assert paradox_seen is not None, run.count
+    t, y, words = paradox_seen
     assert "Painlevé's paradox at tip" in words
     assert "lower contacts.friction" in words
     assert run.clock[ki.TIME] <= t
@@ -132,7 +132,7 @@ def random_case(seed: int, friction: float, most: int = 3) -> tuple[Bench, np.nd
 
 def test_the_compiled_watch_agrees_with_its_definition():
     """Verdict of the kernel at the start against determinants and solutions by numpy, both laws mixed."""
-    found = {"unique": 0, "stopped": 0, "diagonal": 0}
+    counts = {"unique": 0, "stopped": 0, "diagonal": 0}
     for seed in range(200):
         b, y = random_case(seed, friction=4.0)
         dy = b.derivative(y)
@@ -150,10 +150,10 @@ def test_the_compiled_watch_agrees_with_its_definition():
         assert stopped == (not matrices.unique()), seed
         marked = np.isfinite(run.extremes[:, ki.LOCAL_SINCE])
         np.testing.assert_array_equal(marked, matrices.reversed())
-        found["stopped" if stopped else "unique"] += 1
-        found["diagonal"] += marked.any() and not stopped
-    assert min(found.values()) >= 1, found
-    assert found["stopped"] >= 20
+        counts["stopped" if stopped else "unique"] += 1
+        counts["diagonal"] += marked.any() and not stopped
+    assert min(counts.values()) >= 1, counts
+    assert counts["stopped"] >= 20
 
 
 def test_a_right_hand_side_does_not_depend_on_earlier_calls():

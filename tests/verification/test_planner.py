@@ -106,7 +106,7 @@ def test_derivatives_are_those_of_differences(tree: tuple[Problem, np.ndarray, n
 
     problem.evaluate(Q, F)
     by_q, by_v, by_f, gap, hand = (
-        one.copy() for one in (work.by_q, work.by_v, work.by_f, work.gap_rate, work.hand_rate)
+        table.copy() for table in (work.by_q, work.by_v, work.by_f, work.gap_rate, work.hand_rate)
     )
     for j in range(Q.shape[1]):
         for k in range(2):
@@ -154,7 +154,7 @@ def heat_at(masses: list[float], link: int, share: float) -> tuple[float, float]
     scenario = level_arm(masses, share)
     options = Options(candidates=(f"link_{link}",), along=(share,), radius_m=0.05, count=(1, 1), clearance_m=0.0)
     problem = task(scenario, options)
-    brace = next(one for one in problem.candidates if one.name.endswith(f"_at_{share:g}"))
+    brace = next(candidate for candidate in problem.candidates if candidate.name.endswith(f"_at_{share:g}"))
     local = problem.problem((brace,), 1)
     Q = reals(problem.arm.model.robot.initial)[None]
     F = local.forces(Q)
@@ -180,15 +180,15 @@ def test_two_links_are_best_braced_where_the_moment_vanishes() -> None:
 
 
 @pytest.fixture(scope="module")
-def found() -> tuple[Search, dict]:  # type: ignore[type-arg]
+def searched() -> tuple[Search, dict]:  # type: ignore[type-arg]
     """Plans of a scene with a floor and a joint about a third axis, with slip on the way."""
     search = Search(task(scene_scenario(11), Options()))
     return search, search.run()
 
 
-def test_heat_is_that_of_brace_statics_along_the_references(found) -> None:  # type: ignore[no-untyped-def]
+def test_heat_is_that_of_brace_statics_along_the_references(searched) -> None:  # type: ignore[no-untyped-def]
     """The public statics at each instant, with friction against the slip as braces that creep feel it."""
-    search, planned = found
+    search, planned = searched
     plan = planned[1][0]
     arm, dense, brace = search.task.arm, plan.dense, plan.braces[0]
     model = arm.model
@@ -206,9 +206,9 @@ def test_heat_is_that_of_brace_statics_along_the_references(found) -> None:  # t
     assert dense.heat == pytest.approx(float(np.trapezoid(heat, dense.fine) / dense.fine[-1]), rel=1e-3)
 
 
-def test_plans_run_as_planned_and_bear_errors_of_the_scene(found) -> None:  # type: ignore[no-untyped-def]
+def test_plans_run_as_planned_and_bear_errors_of_the_scene(searched) -> None:  # type: ignore[no-untyped-def]
     """The nominal run takes the planned heat; gains that are chosen bear 5 mm and a fifth of friction."""
-    search, planned = found
+    search, planned = searched
     plan = planned[1][0]
     verdict = Verifier(search.task, Tolerances()).verify([(plan.braces, plan.dense)])[0]
     nominal = verdict.nominal
@@ -224,9 +224,9 @@ def test_plans_run_as_planned_and_bear_errors_of_the_scene(found) -> None:  # ty
     assert min(nominal.closed.values()) == pytest.approx(1.0, abs=1e-6)
 
 
-def test_both_treatments_of_contacts_see_the_same_run_of_a_plan(found) -> None:  # type: ignore[no-untyped-def]
+def test_both_treatments_of_contacts_see_the_same_run_of_a_plan(searched) -> None:  # type: ignore[no-untyped-def]
     """Steps of one length, which verify plans, and events that are located: heat to 1e-4, hand to a micrometre."""
-    search, planned = found
+    search, planned = searched
     plan, corner = planned[1][0], (1.2, 0.005)
     scenario = Verifier(search.task, Tolerances()).perturbed(plan.braces, plan.dense, 200.0, *corner)
     stepped = dynsim.simulate(scenario)
@@ -290,9 +290,9 @@ def test_what_cannot_be_planned_is_refused_with_its_reason() -> None:
         dynsim.plan_braces(scenario_from_resolved(weightless))
 
 
-def test_an_arm_without_braces_is_run_at_all_corners(found) -> None:  # type: ignore[no-untyped-def]
+def test_an_arm_without_braces_is_run_at_all_corners(searched) -> None:  # type: ignore[no-untyped-def]
     """Surfaces that rise further than it is clear of them refuse it."""
-    search, planned = found
+    search, planned = searched
     plan = planned[0][0]
     near, far = (Verifier(search.task, Tolerances(friction=(1.0,), shift_m=(0.0, shift))) for shift in (0.005, 0.5))
     assert [len(v.verify([(plan.braces, plan.dense)])[0].corners) for v in (near, far)] == [2, 2]

@@ -150,8 +150,8 @@ def test_least_heat_keeps_both_elbows_on_the_real_floor(tmp_path):
             )
             for i, c in enumerate(build.contacts(case))
         }
-        found = model.brace_statics(best["q"][k], best["v"][k], best["vdot"][k], braces)
-        assert found.heat > heat * (1.0 - 1e-3)
+        statics = model.brace_statics(best["q"][k], best["v"][k], best["vdot"][k], braces)
+        assert statics.heat > heat * (1.0 - 1e-3)
 
 
 @pytest.mark.parametrize(

@@ -71,13 +71,13 @@ def go(b: Bench, speed: float, turn: float, times: np.ndarray) -> tuple[np.ndarr
 def test_a_base_coasts_on_an_arc(speed, turn):
     """Mass above the axle's middle, no losses: constant V and ω, a circle of radius V/ω."""
     times = np.linspace(0.0, 10.0, 41)
-    V, w, place, heading = go(bench(robot()), speed, turn, times)
+    V, w, position, heading = go(bench(robot()), speed, turn, times)
     np.testing.assert_allclose(V, speed, rtol=1e-12)
     np.testing.assert_allclose(w, turn, rtol=1e-12)
     angle = HEADING + turn * times
     np.testing.assert_allclose(heading, angle, rtol=0, atol=1e-11)
     arc = speed / turn * np.stack([np.sin(angle) - np.sin(HEADING), np.cos(HEADING) - np.cos(angle)], axis=1)
-    np.testing.assert_allclose(place, START + arc, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(position, START + arc, rtol=0, atol=1e-10)
 
 
 def test_losses_of_the_wheels_slow_it_down_exponentially():
@@ -117,12 +117,12 @@ def test_a_base_rolls_down_a_slope(off):
     slope, times = 0.2, np.linspace(0.0, 3.0, 13)
     down = 9.81 * np.sin(slope) * np.array([np.cos(HEADING + off), np.sin(HEADING + off)])
     b = bench(robot(gravity=(*down, -9.81 * np.cos(slope))))
-    V, w, place, heading = go(b, 0.0, 0.0, times)
+    V, w, position, heading = go(b, 0.0, 0.0, times)
     rate = TOTAL * 9.81 * np.sin(slope) * np.cos(off) / ROLLING_MASS
     np.testing.assert_allclose(V, rate * times, rtol=0, atol=1e-11)
     np.testing.assert_allclose(w, 0.0, rtol=0, atol=1e-11)
-    way = 0.5 * rate * times[:, None] ** 2 * [np.cos(HEADING), np.sin(HEADING)]
-    np.testing.assert_allclose(place, START + way, rtol=0, atol=1e-11)
+    distance = 0.5 * rate * times[:, None] ** 2 * [np.cos(HEADING), np.sin(HEADING)]
+    np.testing.assert_allclose(position, START + distance, rtol=0, atol=1e-11)
     np.testing.assert_allclose(heading, HEADING, rtol=0, atol=1e-11)
 
 
@@ -157,8 +157,8 @@ def test_motors_turn_the_wheels_to_their_angles(sign):
     K, k, L = 0.203 * 3.0, 3.0, 0.0017
     J, D = per_wheel(sign, 1.64e-4 * k**2), loss + 0.01 * k**2
     A = np.array([[0.0, 1.0, 0.0], [0.0, -D / J, K / J], [-k_p / L, -(k_d + K) / L, -1.1 / L]])
-    rest = np.array([goal, 0.0, 0.0])
-    expected = np.array([rest - expm(A * t) @ rest for t in times])
+    final = np.array([goal, 0.0, 0.0])
+    expected = np.array([final - expm(A * t) @ final for t in times])
     for name, column in (("q", 0), ("v", 1), ("current", 2)):
         both = np.stack([sign * expected[:, column], expected[:, column]], axis=1)
         np.testing.assert_allclose(run.states(name)[:, :2], both, rtol=0, atol=1e-8)
@@ -246,9 +246,9 @@ def test_the_ledger_closes(method, solver):
 def test_both_solvers_are_one():
     """O(n) and M* over a run."""
     exact = {"method": "dopri5", "rtol": 1e-12, "atol": 1e-13}
-    one, other = (dynsim.simulate(mobile(integrator={**exact, "solver": s})) for s in ("articulated", "m_star"))
+    first, other = (dynsim.simulate(mobile(integrator={**exact, "solver": s})) for s in ("articulated", "m_star"))
     for name in ("q", "v", "base_pose"):
-        np.testing.assert_allclose(one[name], other[name], rtol=0, atol=1e-10)
+        np.testing.assert_allclose(first[name], other[name], rtol=0, atol=1e-10)
 
 
 # ---- in pieces
@@ -280,5 +280,5 @@ def test_going_on_from_a_record_is_going_on():
     exact = {"method": "dopri5", "rtol": 1e-12, "atol": 1e-13}
     scenario = mobile(integrator=exact)
     whole = dynsim.simulate(scenario)
-    rest = dynsim.Simulation(scenario, state=dynsim.State.of(whole, len(whole) // 2))
-    np.testing.assert_allclose(rest.advance(1.0).q, whole["q"][-1], rtol=0, atol=1e-9)
+    continued = dynsim.Simulation(scenario, state=dynsim.State.of(whole, len(whole) // 2))
+    np.testing.assert_allclose(continued.advance(1.0).q, whole["q"][-1], rtol=0, atol=1e-9)

@@ -41,8 +41,8 @@ def test_lanes_solve_what_the_two_systems_are(make, h):
     factor_both(b.system, two, h)  # as Python
     solve_both(b.system, b.ws, run.y, two, h)
     solve_compiled(b.system, b.ws, run.y, lanes, h)
-    for expected, found in ((two.one, lanes.one), (two.two, lanes.two)):
-        assert np.abs(found - expected).max() <= 1e-9 * np.abs(expected).max()
+    for expected, solved in ((two.one, lanes.one), (two.two, lanes.two)):
+        assert np.abs(solved - expected).max() <= 1e-9 * np.abs(expected).max()
 
 
 def test_they_are_the_whole_systems():
@@ -58,12 +58,15 @@ def test_they_are_the_whole_systems():
         row = J[layout.current + circuit]
         row[layout.q + driven_joint], row[layout.v + driven_joint] = r.linear[a, 3], r.linear[a, 4]
         row[layout.current + circuit] = r.linear[a, 5]
-    one, two = rng.normal(size=layout.tracked), rng.normal(size=layout.tracked) + 1j * rng.normal(size=layout.tracked)
-    r.one[:], r.two[:] = one, two
+    real_part, two = (
+        rng.normal(size=layout.tracked),
+        rng.normal(size=layout.tracked) + 1j * rng.normal(size=layout.tracked),
+    )
+    r.one[:], r.two[:] = real_part, two
     solve_compiled(b.system, b.ws, run.y, r, h)
-    for g, right, found in (
-        (GAMMA_RADAU / h, one, r.one),
+    for g, right, solved in (
+        (GAMMA_RADAU / h, real_part, r.one),
         (complex(ALPHA_RADAU / h, BETA_RADAU / h), two, r.two),
     ):
         expected = np.linalg.solve(g * np.eye(layout.tracked) - J, right)
-        assert np.abs(found - expected).max() <= 1e-9 * np.abs(expected).max()
+        assert np.abs(solved - expected).max() <= 1e-9 * np.abs(expected).max()

@@ -30,9 +30,9 @@ def test_samples_together_are_samples_alone():
     assert together.count[EVALUATIONS] - alone.count[EVALUATIONS] >= 150
     assert together.count[PROJECTIONS] > alone.count[PROJECTIONS]
     np.testing.assert_array_equal(together.y, alone.y)
-    for found, expected in ((together.sample, alone.sample), (together.output, alone.output)):
+    for computed, expected in ((together.sample, alone.sample), (together.output, alone.output)):
         scale = np.abs(expected).max(axis=0)
-        assert np.all(np.abs(found[3:175:7] - expected[:25]) <= 1e-9 * np.maximum(scale, scale.max() * 1e-3))
+        assert np.all(np.abs(computed[3:175:7] - expected[:25]) <= 1e-9 * np.maximum(scale, scale.max() * 1e-3))
 
 
 def test_samples_wait_for_each_other_whatever_ends_a_piece():
@@ -52,7 +52,7 @@ def test_samples_wait_for_each_other_whatever_ends_a_piece():
     assert whole.count[SAMPLE] == len(times)
     np.testing.assert_array_equal(pieces.output, whole.output)
     np.testing.assert_array_equal(pieces.sample, whole.sample)
-    one = unwaiting(b, y, times[[7, -1]])
+    single = unwaiting(b, y, times[[7, -1]])
     for name in ("vdot", "torque", "contact"):
-        found, expected = whole.outputs(name), one.outputs(name)
-        assert np.abs(found[7] - expected[0]).max() <= 1e-12 * np.abs(found).max()
+        computed, expected = whole.outputs(name), single.outputs(name)
+        assert np.abs(computed[7] - expected[0]).max() <= 1e-12 * np.abs(computed).max()

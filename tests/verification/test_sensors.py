@@ -60,10 +60,10 @@ def test_encoders_that_tell_all_at_once_change_nothing(run):
 
 def test_what_is_told_is_rounded_to_the_resolution(run):
     record = run({"resolution_m": 1e-3})
-    told, true = record["q_measured"], record["q"]
+    measured, true = record["q_measured"], record["q"]
     for joint, step in enumerate((RESOLUTION, RESOLUTION, 1e-3)):
-        np.testing.assert_allclose(told[:, joint] / step, np.rint(told[:, joint] / step), atol=1e-9)
-        error = np.abs(told[:-1, joint] - true[:-1, joint])
+        np.testing.assert_allclose(measured[:, joint] / step, np.rint(measured[:, joint] / step), atol=1e-9)
+        error = np.abs(measured[:-1, joint] - true[:-1, joint])
         assert 0.3 * step < error.max() <= 0.5 * step * (1.0 + 1e-9)
 
 
@@ -102,9 +102,9 @@ def test_rates_are_differences_of_samples(run):
     push = {"type": "samples", "body": "link_3", "times_s": [0, 0.6], "force_N": [[0, 0, 0], [5, 0, 0]]}
     still = {"controller__k_p_V_per_rad": 0, "controller__joints": {}}
     pushed = run({"rate_hz": 250}, loads__push=push, **still)
-    told = pushed["q_measured"]
-    sampled = np.arange(len(told)) // 2 * 2  # every second tick
-    rate = (told[sampled] - told[np.maximum(sampled - 2, 0)]) / (2 * PERIOD)
+    measured = pushed["q_measured"]
+    sampled = np.arange(len(measured)) // 2 * 2  # every second tick
+    rate = (measured[sampled] - measured[np.maximum(sampled - 2, 0)]) / (2 * PERIOD)
     assert np.abs(rate).max() > 0.1
     # A sample at the time of a tick is recorded before the tick.
     np.testing.assert_allclose(pushed["voltage"][1:-1], -2.0 * rate[:-2], atol=1e-9)

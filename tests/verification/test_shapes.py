@@ -25,8 +25,8 @@ KINDS = ("plane", "sphere", "bowl", "cylinder", "pipe", "box", "height_field")
 BENT = ("sphere", "cylinder", "box")
 
 
-def plane(normal: np.ndarray, place: np.ndarray) -> Quadric:
-    return Quadric(np.zeros((3, 3)), normal, -float(normal @ place))
+def plane(normal: np.ndarray, point: np.ndarray) -> Quadric:
+    return Quadric(np.zeros((3, 3)), normal, -float(normal @ point))
 
 
 def round_surface(centre: np.ndarray, radius: float, axis: np.ndarray | None = None, sign: float = 1.0) -> Quadric:
@@ -35,33 +35,33 @@ def round_surface(centre: np.ndarray, radius: float, axis: np.ndarray | None = N
     return Quadric(Q, -Q @ centre, 0.5 * float(centre @ Q @ centre) - 0.5 * sign * radius)
 
 
-def hills(rng: np.random.Generator, place: np.ndarray) -> HeightField:
+def hills(rng: np.random.Generator, point: np.ndarray) -> HeightField:
     """A field whose radius of curvature is some 0.3 m or more, 4 m wide, roughly through a place."""
     x, y = np.arange(-2.0, 2.01, 0.1), np.arange(-2.0, 2.01, 0.125)
     a, b = rng.uniform(0.0, 6.0, size=2)
     heights = 0.08 * np.sin(3.0 * x + a) * np.cos(4.0 * y[:, None] + b) + 0.3 * x - 0.2 * y[:, None] ** 2
     heights += rng.normal(scale=2e-4, size=heights.shape)
-    return HeightField(place[:2] - 2.0, np.array([0.1, 0.125]), heights + place[2])
+    return HeightField(point[:2] - 2.0, np.array([0.1, 0.125]), heights + point[2])
 
 
-def surface_near(rng: np.random.Generator, kind: str, place: np.ndarray, axis: np.ndarray) -> Surface:
+def surface_near(rng: np.random.Generator, kind: str, point: np.ndarray, axis: np.ndarray) -> Surface:
     """A surface of a kind at some 0.2 m from a place in the middle of an axis that runs across."""
     normal = np.cross(axis, random_unit(rng))
     normal /= np.linalg.norm(normal)
     side = np.cross(axis, normal) + 0.7 * axis
     side /= np.linalg.norm(side)
     if kind == "plane":
-        return plane(normal, place - 0.2 * normal)
+        return plane(normal, point - 0.2 * normal)
     if kind == "box":
         turn = random_rotation(rng)
         edge = turn.T @ np.array([0.25, 0.2, 0.1])
-        return Box(place - 0.2 * normal - edge * np.sign(edge @ normal), turn, np.array([0.6, 0.5, 0.4]), 0.05)
+        return Box(point - 0.2 * normal - edge * np.sign(edge @ normal), turn, np.array([0.6, 0.5, 0.4]), 0.05)
     if kind == "height_field":
-        return hills(rng, place - vector(0, 0, 0.1))
+        return hills(rng, point - vector(0, 0, 0.1))
     across = side if kind in ("cylinder", "pipe") else None
     if kind in ("bowl", "pipe"):
-        return round_surface(place + 0.8 * normal, 1.5, across, -1.0)
-    return round_surface(place - 0.7 * normal, 0.5, across)
+        return round_surface(point + 0.8 * normal, 1.5, across, -1.0)
+    return round_surface(point - 0.7 * normal, 0.5, across)
 
 
 def brute_distance(surface: Surface, point: np.ndarray) -> float:
@@ -80,25 +80,25 @@ def brute_distance(surface: Surface, point: np.ndarray) -> float:
     def height(at: np.ndarray) -> float:
         return float(make_interp_spline(x, along_y(at[1]), k=3)(at[0]))
 
-    found = minimize(
+    minimum = minimize(
         lambda at: (at[0] - point[0]) ** 2 + (at[1] - point[1]) ** 2 + (height(at) - point[2]) ** 2,
         point[:2],
         method="Nelder-Mead",
         options={"xatol": 1e-9, "fatol": 1e-18, "maxiter": 2000},
     )
-    return float(np.sqrt(found.fun) * np.sign(point[2] - height(point[:2])))
+    return float(np.sqrt(minimum.fun) * np.sign(point[2] - height(point[:2])))
 
 
 def brute_gap(contact: Contact, start: np.ndarray, end: np.ndarray) -> float:
     if not moves(contact):
         return brute_distance(contact.surface, start) - contact.radius
-    found = minimize_scalar(
+    minimum = minimize_scalar(
         lambda u: brute_distance(contact.surface, start + u * (end - start)),
         bounds=(0.0, 1.0),
         method="bounded",
         options={"xatol": 1e-10},
     )
-    return float(found.fun) - contact.radius
+    return float(minimum.fun) - contact.radius
 
 
 def random_case(kind: str, shape: str, seed: int) -> tuple[Bench, Contact, np.ndarray, np.ndarray, np.ndarray]:
@@ -110,13 +110,13 @@ def random_case(kind: str, shape: str, seed: int) -> tuple[Bench, Contact, np.nd
     end = start + 0.5 * (end - start) / np.linalg.norm(end - start)
     model = Model(robot)
     places = [model.point_position("body_5", point, q) for point in (start, end)]
-    place = places[0] if shape != "capsule" else 0.5 * (places[0] + places[1])
+    position = places[0] if shape != "capsule" else 0.5 * (places[0] + places[1])
     axis = (places[1] - places[0]) / np.linalg.norm(places[1] - places[0])
     contact = Contact(
         "c",
         "body_5",
         start,
-        surface_near(rng, kind, place, axis),
+        surface_near(rng, kind, position, axis),
         friction=0.3,
         radius=0.0 if shape == "point" else 0.06,
         tip=end if shape == "capsule" else None,
@@ -227,20 +227,20 @@ def test_a_capsule_that_meets_with_an_end_has_the_rows_of_a_sphere_there():
         b, capsule, q, v, _ = random_case("sphere", "capsule", seed)
         assert capsule.tip is not None
         for end, other in ((capsule.tip, capsule.point), (capsule.point, capsule.tip)):
-            place, behind = (Model(b.robot).point_position("body_5", point, q) for point in (end, other))
-            ahead = (place - behind) / np.linalg.norm(place - behind)
+            position, behind = (Model(b.robot).point_position("body_5", point, q) for point in (end, other))
+            ahead = (position - behind) / np.linalg.norm(position - behind)
             beside = np.cross(ahead, np.eye(3)[np.argmin(np.abs(ahead))])
             # A ball ahead of the end and to the side, which nothing of the capsule is nearer to than this end.
-            ball = round_surface(place + 0.5 * ahead + 0.3 * beside, 0.5)
+            ball = round_surface(position + 0.5 * ahead + 0.3 * beside, 0.5)
             rows, states = [], []
             for contact in (
                 replace(capsule, surface=ball),
                 replace(capsule, surface=ball, point=end, tip=None),
             ):
-                one = bench(b.robot, [contact])
-                one.derivative(one.state(q, v))
-                rows.append(one.ws.rows.copy())
-                states.append(one.ws.contacts.copy())
+                with_capsule = bench(b.robot, [contact])
+                with_capsule.derivative(with_capsule.state(q, v))
+                rows.append(with_capsule.ws.rows.copy())
+                states.append(with_capsule.ws.contacts.copy())
             np.testing.assert_allclose(rows[0], rows[1], rtol=0, atol=1e-11 * (1.0 + np.abs(rows[1]).max()))
             np.testing.assert_allclose(states[0], states[1], rtol=0, atol=1e-11 * (1.0 + np.abs(states[1]).max()))
 
@@ -253,15 +253,15 @@ def test_a_sphere_is_a_point_on_the_surface_that_lies_a_radius_further_out(kind,
         robot = random_robot(rng, 6, motors=False)
         q, v = rng.normal(size=(2, 6))
         point = rng.normal(scale=0.3, size=3)
-        place = Model(robot).point_position("body_5", point, q)
+        position = Model(robot).point_position("body_5", point, q)
         normal, axis = random_unit(rng), None
         if kind == "cylinder":
             axis = np.cross(normal, random_unit(rng))
             axis /= np.linalg.norm(axis)
         if kind == "plane":
-            inner, outer = plane(normal, place - radius * normal), plane(normal, place)
+            inner, outer = plane(normal, position - radius * normal), plane(normal, position)
         else:
-            inner, outer = (round_surface(place - 0.7 * normal, r, axis) for r in (0.7 - radius, 0.7))
+            inner, outer = (round_surface(position - 0.7 * normal, r, axis) for r in (0.7 - radius, 0.7))
         J = normal @ Model(robot).point_jacobian("body_5", point, q)
         v = v - J * (J @ v) / (J @ J)
         sphere, lone = (
@@ -277,9 +277,9 @@ def free_body(inertia: Inertia) -> Robot:
     return Robot("free", floating(Link("body", "root", None, "", vector(0, 0, 1), inertia)), (), ("body", np.zeros(3)))
 
 
-def pose(robot: Robot, place: np.ndarray) -> np.ndarray:
+def pose(robot: Robot, position: np.ndarray) -> np.ndarray:
     q = robot.initial.copy()
-    q[:3] = place
+    q[:3] = position
     return q
 
 
@@ -325,13 +325,13 @@ def test_a_ball_rolls_over_a_sphere():
     b.derivative(y)
     set_modes(b.system.contacts, b.system.couplings, None, b.ws, integers([ka.STICKING]))
     run = b.simulate(y, np.linspace(0.0, 0.8, 9), rtol=1e-10)
-    place, v = run.states("q")[:, :3], run.states("v")
-    theta = np.arctan2(place[:, 0], place[:, 2])
+    position, v = run.states("q")[:, :3], run.states("v")
+    theta = np.arctan2(position[:, 0], position[:, 2])
     assert theta[-1] > 1.2
-    np.testing.assert_allclose(np.linalg.norm(place, axis=1), R + r, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(position, axis=1), R + r, atol=1e-9)
     square = np.sum(v[:, :3] ** 2, axis=1)
     assert square[-1] > 1.0
-    np.testing.assert_allclose(0.7 * square, G * (place[0, 2] - place[:, 2]), atol=1e-8)
+    np.testing.assert_allclose(0.7 * square, G * (position[0, 2] - position[:, 2]), atol=1e-8)
 
 
 def test_a_field_of_cubics_is_kept_exactly_and_goes_on_straight():

@@ -302,20 +302,20 @@ def test_a_sampled_controller_is_its_closed_form(tmp_path):
     step = expm(0.005 * block)
     control = dynsim.scenario.build.controller(scenario, model)
     coefficients, spacing = control.reference.coefficients[:, 0], control.reference.grid[1]
-    x, found = np.array([model.robot.initial[0], 0.0, 0.0]), []
+    x, computed = np.array([model.robot.initial[0], 0.0, 0.0]), []
     for sample in range(101):
-        found.append(x)
+        computed.append(x)
         t = 0.005 * sample
         segment = min(int(t / spacing), len(coefficients) - 1)
         c = np.polynomial.Polynomial(coefficients[segment])
         u = 20.0 * (c(t - segment * spacing) - x[0]) + 1.0 * (c.deriv()(t - segment * spacing) - x[1])
         x = step[:3, :3] @ x + step[:3, 3] * u
-    found = np.array(found)
+    computed = np.array(computed)
     signals = np.stack([record["q"][:, 0], record["v"][:, 0], record["current"][:, 0]], axis=1)
     # A hundred tolerances of the integration, per size of the state.
-    assert np.abs(signals - found).max() < 1e-9 * np.abs(found).max()
+    assert np.abs(signals - computed).max() < 1e-9 * np.abs(computed).max()
     continuous = dynsim.simulate(read(tmp_path, WHEEL.replace("SAMPLED", "")))
-    assert np.abs(continuous["q"][:, 0] - found[:, 0]).max() > 1e-4
+    assert np.abs(continuous["q"][:, 0] - computed[:, 0]).max() > 1e-4
 
     # The same law in Python, at the ticks of the caller.
     def law(simulation: dynsim.Simulation) -> None:
@@ -328,7 +328,7 @@ def test_a_sampled_controller_is_its_closed_form(tmp_path):
     simulation = dynsim.Simulation(read(tmp_path, WHEEL.replace("SAMPLED", "")))
     simulation.every(0.005, law)
     simulation.advance(0.5)
-    np.testing.assert_allclose(simulation.record()["q"][:, 0], found[:, 0], rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(simulation.record()["q"][:, 0], computed[:, 0], rtol=0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize("method", ["dopri5", "radau5"])
@@ -352,13 +352,13 @@ def test_the_time_of_an_event_is_that_of_the_closed_form(tmp_path, method):
         simulation.watch("joint_position", "joint_1", level)
     simulation.watch("joint_rate", "joint_1", 0.0, direction=-1)
     simulation.advance(1.2)
-    found = {(one.kind, k): one.time for k, one in enumerate(simulation.happened)}
-    times = [one.time for one in simulation.happened]
+    event_times = {(occurrence.kind, k): occurrence.time for k, occurrence in enumerate(simulation.happened)}
+    times = [occurrence.time for occurrence in simulation.happened]
     assert times == sorted(times)
     assert times[0] == pytest.approx(time_of(math.pi - 2.5), abs=1e-10)
     assert times[1] == pytest.approx(time_of(0.0), abs=1e-10)
     # At rest on the other side after half a period, where the rate falls through zero; then down again.
-    turned = next(time for (kind, _), time in found.items() if kind == "joint_rate")
+    turned = next(time for (kind, _), time in event_times.items() if kind == "joint_rate")
     assert turned == pytest.approx(2.0 * time_of(0.0), abs=1e-9)
     record = simulation.record()
     assert [event.time for event in record.events] == times
@@ -564,14 +564,14 @@ def test_a_brake_that_closes_throws_a_point_off_the_floor_and_not_into_it(tmp_pa
     after = simulation.advance(0.23 + 1e-9)
     # e_j and the normals that press, by trying all sets.
     M = model.mass_matrix(before.q) + np.diag(armature)
-    found = None
+    velocity = None
     for mask in range(1 << len(contacts)):
         rows = [k for k in range(len(contacts)) if mask >> k & 1]
         A = np.vstack([np.eye(10)[4], *J[rows]])
         impulse = np.linalg.solve(A @ np.linalg.solve(M, A.T), -A @ before.v)
         v = before.v + np.linalg.solve(M, A.T @ impulse)
         if (impulse[1:] >= -1e-12).all() and (J @ v >= -1e-9).all():
-            found = v
+            velocity = v
             break
     assert abs(before.v[4]) > 1e-3
-    np.testing.assert_allclose(after.v, found, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(after.v, velocity, rtol=0, atol=1e-5)

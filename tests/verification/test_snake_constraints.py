@@ -31,15 +31,15 @@ def pairs_of(robot, w, phi):
     """(R, p) of every wheel pair, by products of transforms from the controlled point tailward."""
     R = rotation("z", w[5]) @ rotation("y", w[4]) @ rotation("x", w[3])
     p = w[:3] - R[:, 0] * robot.point_offset
-    found = []
+    pairs = []
     for j, angle in enumerate(phi):
         p = p - robot.link_length * R[:, 0]
         R = R @ rotation("y" if robot.pitch[j] else "z", angle)
         if j >= robot.head_joints:
             p = p - robot.link_length * R[:, 0]
         if j >= robot.head_joints - 1:
-            found.append((R, p))
-    return found
+            pairs.append((R, p))
+    return pairs
 
 
 def matrices(robot, w, phi):
@@ -62,7 +62,7 @@ def test_rows_are_the_velocities_they_claim_to_be(robot, seed):
     phi, w_dot = random.uniform(-1.5, 1.5, n_phi), random.normal(size=6)
     phi_dot, rho_dot = random.normal(size=n_phi), random.normal(size=robot.active_wheels)
     A, B = matrices(robot, w, phi)
-    found = A @ w_dot - B @ np.concatenate([phi_dot, rho_dot])
+    velocities = A @ w_dot - B @ np.concatenate([phi_dot, rho_dot])
 
     h = 1e-5  # central difference: truncation h^2 = 1e-10, rounding 1e-16 / h = 1e-11, times lengths and rates < 100
     plus, minus = (pairs_of(robot, w + s * w_dot, phi + s * phi_dot) for s in (h, -h))
@@ -82,7 +82,7 @@ def test_rows_are_the_velocities_they_claim_to_be(robot, seed):
             rolling = R[:, 0] @ (centre[0] - centre[1]) / (2 * h)
             expected.append(rolling - robot.wheel_radius * rho_dot[wheel])
             wheel += 1
-    np.testing.assert_allclose(found, expected, atol=1e-7)
+    np.testing.assert_allclose(velocities, expected, atol=1e-7)
 
 
 @given(robots(), seeds)

@@ -137,11 +137,11 @@ def test_ranks_at_random_postures(seed, row):
     random = np.random.default_rng(seed)
     model, controller, phi = case(random)
     law = controller.law
-    found = conditioning(model, law, row, np.zeros(3), phi)
-    assert (found.rank_A, found.rank_B, found.redundancy) == (7, found.rows, 19 - found.rows)
+    indices = conditioning(model, law, row, np.zeros(3), phi)
+    assert (indices.rank_A, indices.rank_B, indices.redundancy) == (7, indices.rows, 19 - indices.rows)
     _, work = evaluate(model, law, phi, np.zeros(3), np.zeros(6), np.zeros(6), row, 0.0)
     # inverse iteration stops at a relative change of 1e-6; clustered values leave a mixture, not an error
-    assert sigma_min(model, law, work, law.grounded[row]) == pytest.approx(found.sigma_min_B, rel=1e-3)
+    assert sigma_min(model, law, work, law.grounded[row]) == pytest.approx(indices.sigma_min_B, rel=1e-3)
 
 
 def test_smallest_singular_value_of_every_sample(simulated):
@@ -165,11 +165,11 @@ def test_singularity_is_of_B_where_psi2_and_psi3_make_a_right_angle():
     law, model = task_space.build(task_space.Config(), BuildContext(1.0, plant)).law, plant.arrays()
     phi = plant.initial_joints.copy()
     phi[3] = np.pi / 2 - phi[5]
-    found = conditioning(model, law, 0, np.zeros(3), phi)
-    assert found.sigma_min_B < 1e-12
-    assert found.rank_B == found.rows - 1
-    assert found.sigma_min_A > 0.4  # 0.67 at the initial posture
-    assert found.rank_A == 7
+    indices = conditioning(model, law, 0, np.zeros(3), phi)
+    assert indices.sigma_min_B < 1e-12
+    assert indices.rank_B == indices.rows - 1
+    assert indices.sigma_min_A > 0.4  # 0.67 at the initial posture
+    assert indices.rank_A == 7
 
 
 def test_damping_keeps_rates_finite_at_the_singularity_and_leaves_the_null_space_alone():

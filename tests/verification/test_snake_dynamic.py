@@ -111,11 +111,11 @@ def test_wheels_carry_the_weight_and_pair_1_the_most(x_run):
 
 def test_it_rolls_where_it_is_told_to(x_run):
     """The wheels' own way, the base's and the target's; the stiff wheel loops lag by a millimetre."""
-    base, way = x_run["base_pose"], 0.05 * x_run["rho"]
+    base, distance = x_run["base_pose"], 0.05 * x_run["rho"]
     moved = base[-1] - base[0]
     np.testing.assert_allclose(moved, [0.2, 0.0, 0.0], atol=5e-3)
     grounded = [0, 1, 3, 4, 6]
-    np.testing.assert_allclose((way[-1] - way[0])[grounded], moved[0], atol=5e-3)
+    np.testing.assert_allclose((distance[-1] - distance[0])[grounded], moved[0], atol=5e-3)
     assert x_run["contact_slip_distance"][-1, [0, 3, 7, 8, 12]].max() < 5e-3  # of the driven wheels on the ground
     assert x_run.summary["energy_residual_relative"] < 1e-10
     solved = x_run.summary["time_stepping"]

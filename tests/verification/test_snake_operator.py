@@ -22,8 +22,8 @@ def scenario(duration: float, paths=(), commands=(), **changes):
 
 def ramp(duration: float, **displacement: float) -> dict:
     names = ("x", "y", "z", "alpha", "beta", "gamma")
-    way = [displacement.get(name, 0.0) for name in names]
-    return {"type": "ramp", "start_s": 0.5, "duration_s": duration, "displacement": way, "profile": "smooth"}
+    displacements = [displacement.get(name, 0.0) for name in names]
+    return {"type": "ramp", "start_s": 0.5, "duration_s": duration, "displacement": displacements, "profile": "smooth"}
 
 
 class Live:
@@ -35,10 +35,10 @@ class Live:
     def read(self, first, count, period, feedback):
         if feedback.time >= 1.0 - 1e-9:
             return self.then()
-        return one([0.05, 0, 0, 0, 0, 0])
+        return step([0.05, 0, 0, 0, 0, 0])
 
 
-def one(velocity, request=NO_REQUEST):
+def step(velocity, request=NO_REQUEST):
     return CommandBlock(np.array([velocity], dtype=float), np.array([request]), np.array([0]))
 
 
@@ -52,10 +52,10 @@ def raises(error):
 @pytest.mark.parametrize(
     ("then", "words"),
     [
-        (lambda: one([0, np.nan, 0, 0, 0, 0]), "the velocity of y in period 0 of 1 is nan"),
-        (lambda: one([0, 0, 0, 0, 0, -np.inf]), "the velocity of gamma in period 0 of 1 is -inf"),
-        (lambda: one([0] * 6, request=9), "no mode 9"),
-        (lambda: one([0] * 3), r"velocity \(1, 3\)"),
+        (lambda: step([0, np.nan, 0, 0, 0, 0]), "the velocity of y in period 0 of 1 is nan"),
+        (lambda: step([0, 0, 0, 0, 0, -np.inf]), "the velocity of gamma in period 0 of 1 is -inf"),
+        (lambda: step([0] * 6, request=9), "no mode 9"),
+        (lambda: step([0] * 3), r"velocity \(1, 3\)"),
         (lambda: None, "Live failed: AttributeError"),
         (raises(OSError("joystick unplugged")), r"Live failed: OSError\('joystick unplugged'\)"),
     ],
@@ -90,13 +90,13 @@ def test_ctrl_c_within_a_source_is_no_failure_of_it() -> None:
 def test_a_source_that_fails_at_once_has_nothing_to_keep() -> None:
     class Broken:
         def read(self, first, count, period, feedback):
-            return one([np.nan] * 6)
+            return step([np.nan] * 6)
 
     with pytest.raises(ModelError, match="command source at t = 0 s: the velocity of x"):
         kinematic.simulate(scenario(5.0), source=Broken())
 
 
-def way(record: Record) -> np.ndarray:
+def displacement(record: Record) -> np.ndarray:
     return np.array(record.summary["target_displacement"])
 
 
@@ -112,20 +112,20 @@ def test_a_path_that_is_too_fast_is_followed_slower_to_its_end(path, slow) -> No
     """It takes longer, keeps the rate limit, and is the same path: where the slow one leads, with all six in step."""
     fast, patient = kinematic.simulate(scenario(8.0, [path])), kinematic.simulate(scenario(8.0, [slow]))
     assert patient.summary["path_slowed_s"] == patient.summary["path_late_s"] == 0.0
-    found = fast.summary
-    assert found["waiting_s"] == 0.0
-    assert found["path_slowed_s"] > found["path_late_s"] > 0.0
-    assert found["out_of_reach"] is None
-    np.testing.assert_allclose(way(fast), path["displacement"], atol=1e-12)
-    assert found["joint_rate_max_rad_s"] <= 4.7
-    assert found["final_position_error_m"] < 1e-6
-    assert any("too fast for the joints" in line for line in found["warnings"])
+    summary = fast.summary
+    assert summary["waiting_s"] == 0.0
+    assert summary["path_slowed_s"] > summary["path_late_s"] > 0.0
+    assert summary["out_of_reach"] is None
+    np.testing.assert_allclose(displacement(fast), path["displacement"], atol=1e-12)
+    assert summary["joint_rate_max_rad_s"] <= 4.7
+    assert summary["final_position_error_m"] < 1e-6
+    assert any("too fast for the joints" in line for line in summary["warnings"])
     moved = fast["w_target"] - fast["w_target"][0]
     along = moved @ np.array(path["displacement"]) / np.dot(path["displacement"], path["displacement"])
     np.testing.assert_allclose(moved, np.outer(along, path["displacement"]), atol=1e-12)
     assert (np.diff(along) >= -1e-12).all()
     # Late by what it was slower: it stands still at the end from then on.
-    end = 0.5 + path["duration_s"] + found["path_late_s"]
+    end = 0.5 + path["duration_s"] + summary["path_late_s"]
     moving = np.flatnonzero(np.diff(along) > 1e-12)
     assert fast.time[moving[-1] + 1] == pytest.approx(end, abs=2 * PERIOD + 1 / 200)
 
@@ -144,7 +144,7 @@ def test_a_curved_path_that_is_too_fast_is_not_cut() -> None:
     off = np.linalg.norm(target[:, None] - nearest, axis=2).min(axis=1)
     # A period that passes a corner ends on the next side, and none of them ends off the sides.
     assert off.max() < 1e-12
-    np.testing.assert_allclose(way(record), 0.0, atol=1e-12)
+    np.testing.assert_allclose(displacement(record), 0.0, atol=1e-12)
 
 
 def smooth(s: np.ndarray) -> np.ndarray:
@@ -157,12 +157,12 @@ def test_a_live_operator_that_asks_too_much_gets_what_is_possible() -> None:
 
         def read(self, first, count, period, feedback):
             self.waited += feedback.waiting
-            return one([0, 2.0 if 0.5 <= feedback.time < 0.55 else 0.0, 0, 0, 0, 0])
+            return step([0, 2.0 if 0.5 <= feedback.time < 0.55 else 0.0, 0, 0, 0, 0])
 
     source = Fast()
     record = kinematic.simulate(scenario(2.0), source=source)
     assert source.waited == 0
-    moved = way(record)[1]
+    moved = displacement(record)[1]
     # What a slower target has not done in its period is lost: a joystick says anew what it wants.
     assert 0.0 < moved < 0.1
     assert moved == pytest.approx(2.0 * (0.05 - record.summary["path_late_s"]), abs=1e-12)
@@ -175,7 +175,7 @@ def test_a_path_out_of_reach_is_called_that_however_fast(duration) -> None:
     gone = record.summary["out_of_reach"]
     assert gone["reason"] == "singular posture"
     assert gone["since_s"] < 0.5 + duration + 1.0
-    assert 0.045 < way(record)[2] < 0.051
+    assert 0.045 < displacement(record)[2] < 0.051
     assert np.ptp(record["w_target"][record.time > gone["since_s"] + 0.01], axis=0).max() == 0.0
     assert any(f"out of reach from t = {gone['since_s']:.2f} s" in line for line in record.summary["warnings"])
 
@@ -185,7 +185,7 @@ def test_a_target_that_waits_for_a_while_only_is_not_out_of_reach() -> None:
 
     class UpAndDown:
         def read(self, first, count, period, feedback):
-            return one([0, 0, 0.05 if feedback.time < 3.0 else -0.05 if feedback.time < 3.5 else 0.0, 0, 0, 0])
+            return step([0, 0, 0.05 if feedback.time < 3.0 else -0.05 if feedback.time < 3.5 else 0.0, 0, 0, 0])
 
     record = kinematic.simulate(scenario(5.0), source=UpAndDown())
     assert record.summary["waiting_s"] > 1.0

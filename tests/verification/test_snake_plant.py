@@ -87,9 +87,9 @@ def test_motion_does_not_depend_on_wheel_side_or_track_as_wheel_weights_vanish()
 
 def test_substeps_of_the_plant_change_nothing_but_rounding_of_the_base():
     """Runge-Kutta 4 over 5 ms is already converged: its error is far below that of the held rates."""
-    one, four = (run(paths=[GAMMA], plant_substeps=n) for n in (1, 4))
-    np.testing.assert_allclose(one["base_pose"], four["base_pose"], atol=1e-9)
-    assert np.any(one["base_pose"] != four["base_pose"])  # the option does something
+    single, four = (run(paths=[GAMMA], plant_substeps=n) for n in (1, 4))
+    np.testing.assert_allclose(single["base_pose"], four["base_pose"], atol=1e-9)
+    assert np.any(single["base_pose"] != four["base_pose"])  # the option does something
 
 
 @pytest.mark.parametrize("state", ["measured", "estimated", "feedforward"])

@@ -89,16 +89,16 @@ def hull_of(phi, grounded):
 def test_smoothed_margin_is_near_the_margin_and_has_no_jump_where_a_corner_joins(seed, row):
     """margin <= smoothed <= margin + s ln(L / L_nearest); walking through postures, corners come and go."""
     random, s, grounded = np.random.default_rng(seed), 1e-3, MODES.grounded[row]
-    start, way = random.uniform(-1.0, 1.0, (2, 12))
-    support, found = new_support(MODEL), []
+    start, direction = random.uniform(-1.0, 1.0, (2, 12))
+    support, differences = new_support(MODEL), []
     for step in np.linspace(0.0, 0.2, 201):
-        sides, margin = support_polygon(MODEL, posture(start + step * way), grounded, support)
+        sides, margin = support_polygon(MODEL, posture(start + step * direction), grounded, support)
         smooth, _, perimeter = smooth_margin(support, sides, s, margin)
         nearest = support.distance[:sides].argmin()
         assert -1e-15 <= smooth - margin <= s * np.log(perimeter / support.length[nearest]) + 1e-15
-        found.append(smooth)
+        differences.append(smooth)
     # second differences: (change of d in a step of 1e-3 rad)^2 / s = 1e-4 m; a jump would be s ln 2 = 7e-4 m
-    assert np.abs(np.diff(found, 2)).max() < 3e-4
+    assert np.abs(np.diff(differences, 2)).max() < 3e-4
 
 
 def test_fewer_than_three_contacts_cannot_stand():

@@ -93,8 +93,8 @@ def test_margin_has_a_certificate_and_the_force_is_the_least(seed):
     f0, N, first, mu = random_split(rng, r, c, bool(rng.integers(2)))
     margin, out = split(f0, N, first, mu)
     largest = np.abs(f0).max()
-    found = margins(out, first, mu)
-    assert found.min() >= min(margin, 0.0) - 1e-9 * largest
+    results = margins(out, first, mu)
+    assert results.min() >= min(margin, 0.0) - 1e-9 * largest
     if margin <= 1e-6 * largest:
         return
     # SLSQP from the point found must not get to a smaller norm, from another feasible one neither.

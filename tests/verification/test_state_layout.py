@@ -33,8 +33,8 @@ def scatter(layout: Any, order: tuple[str, ...], gap: int, **more: int) -> Any:
 
 def width(standard: StateLayout | OutputLayout, name: str) -> int:
     """Entries of a block, from the layout that ``block`` describes."""
-    found = block(standard, name)
-    return found.stop - found.start
+    columns = block(standard, name)
+    return columns.stop - columns.start
 
 
 def scattered_state(standard: StateLayout, gap: int) -> StateLayout:
@@ -83,29 +83,29 @@ class Pair:
 
     def runs(self, y: np.ndarray, times: np.ndarray, method: str, limit: int, **options) -> tuple[Run, Run]:
         """A run of each; the other one has other columns of outputs too."""
-        one = self.standard.advance(self.standard.new_run(y, times, method, **options), limit)
-        two = self.other.new_run(self.moved(y), times, method, **options)
-        columns = scattered_outputs(one.columns, self.gap)
-        two = two._replace(columns=columns, output=np.zeros((len(times), columns.size)))
-        if two.newton is not None and two.newton.lanes is not None:
-            lanes = two.newton.lanes._replace(output=aligned(columns.size, 4))
-            two = two._replace(newton=two.newton._replace(lanes=lanes))
-        return one, self.other.advance(two, limit)
+        first = self.standard.advance(self.standard.new_run(y, times, method, **options), limit)
+        second = self.other.new_run(self.moved(y), times, method, **options)
+        columns = scattered_outputs(first.columns, self.gap)
+        second = second._replace(columns=columns, output=np.zeros((len(times), columns.size)))
+        if second.newton is not None and second.newton.lanes is not None:
+            lanes = second.newton.lanes._replace(output=aligned(columns.size, 4))
+            second = second._replace(newton=second.newton._replace(lanes=lanes))
+        return first, self.other.advance(second, limit)
 
-    def assert_same_states(self, one: np.ndarray, two: np.ndarray, rtol: float = 0.0) -> None:
+    def assert_same_states(self, first: np.ndarray, second: np.ndarray, rtol: float = 0.0) -> None:
         """All blocks agree, per unit of the block's largest value, and what belongs to no block is zero."""
-        assert_same(one, two, BLOCKS, self.standard.system.layout, self.layout, rtol)
+        assert_same(first, second, BLOCKS, self.standard.system.layout, self.layout, rtol)
 
 
-def assert_same(one: np.ndarray, two: np.ndarray, names, standard, layout, rtol: float) -> None:
+def assert_same(first: np.ndarray, second: np.ndarray, names, standard, layout, rtol: float) -> None:
     """See :meth:`Pair.assert_same_states`."""
     used = np.zeros(layout.size, dtype=bool)
     for name in names:
-        expected, found = part(one, name, standard), part(two, name, standard, layout)
+        expected, computed = part(first, name, standard), part(second, name, standard, layout)
         scale = np.abs(expected).max(initial=0.0)
-        np.testing.assert_allclose(found, expected, rtol=0, atol=rtol * scale, err_msg=name)
+        np.testing.assert_allclose(computed, expected, rtol=0, atol=rtol * scale, err_msg=name)
         part(used, name, standard, layout)[:] = True
-    assert not two[..., ~used].any()
+    assert not second[..., ~used].any()
 
 
 def random_pair(seed: int, *, gap: int = 2, m_star: bool = False, real: bool = False) -> tuple[Pair, np.ndarray]:
@@ -151,19 +151,19 @@ def test_right_hand_side(seed, m_star):
 @pytest.mark.parametrize("seed", SEEDS)
 def test_projection(seed):
     pair, y = random_pair(seed)
-    one, two = pair.runs(y, np.array([1.0]), "dopri5", 0, step=1e-3)
-    assert one.count[PROJECTIONS] >= 1
-    np.testing.assert_array_equal(one.count, two.count)
-    assert np.abs(pair.standard.part(one.y - y, "q")).max() > 1e-6
-    assert np.abs(pair.standard.part(one.y - y, "v")).max() > 1e-3
-    pair.assert_same_states(one.y, two.y)
+    first, second = pair.runs(y, np.array([1.0]), "dopri5", 0, step=1e-3)
+    assert first.count[PROJECTIONS] >= 1
+    np.testing.assert_array_equal(first.count, second.count)
+    assert np.abs(pair.standard.part(first.y - y, "q")).max() > 1e-6
+    assert np.abs(pair.standard.part(first.y - y, "v")).max() > 1e-3
+    pair.assert_same_states(first.y, second.y)
 
 
-def assert_same_runs(pair: Pair, one: Run, two: Run, rtol: float) -> None:
-    pair.assert_same_states(one.y, two.y, rtol)
-    pair.assert_same_states(one.sample, two.sample, rtol)
-    assert_same(one.output, two.output, COLUMNS, one.columns, two.columns, rtol)
-    np.testing.assert_allclose(two.extremes, one.extremes, rtol=rtol, atol=rtol)
+def assert_same_runs(pair: Pair, first: Run, second: Run, rtol: float) -> None:
+    pair.assert_same_states(first.y, second.y, rtol)
+    pair.assert_same_states(first.sample, second.sample, rtol)
+    assert_same(first.output, second.output, COLUMNS, first.columns, second.columns, rtol)
+    np.testing.assert_allclose(second.extremes, first.extremes, rtol=rtol, atol=rtol)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -171,12 +171,12 @@ def assert_same_runs(pair: Pair, one: Run, two: Run, rtol: float) -> None:
 def test_runs_at_fixed_steps(seed, method):
     pair, y = random_pair(seed, real=method == "time_stepping")
     times = np.array([0.0, 0.00505, 0.02])
-    one, two = pair.runs(y, times, method, 10**4, step=2e-4, fixed=True)
-    assert one.count[STEPS] >= 100
-    assert one.count[STATUS] == two.count[STATUS] == FINISHED
-    np.testing.assert_array_equal(one.count[[STEPS, PROJECTIONS]], two.count[[STEPS, PROJECTIONS]])
+    first, second = pair.runs(y, times, method, 10**4, step=2e-4, fixed=True)
+    assert first.count[STEPS] >= 100
+    assert first.count[STATUS] == second.count[STATUS] == FINISHED
+    np.testing.assert_array_equal(first.count[[STEPS, PROJECTIONS]], second.count[[STEPS, PROJECTIONS]])
     # Rounding: sums over the state are taken in another order. It may also end Newton's method an iteration sooner.
-    assert_same_runs(pair, one, two, 1e-10 if method == "radau5" else 1e-11)
+    assert_same_runs(pair, first, second, 1e-10 if method == "radau5" else 1e-11)
 
 
 @pytest.mark.parametrize("method", ADAPTIVE)
@@ -184,12 +184,12 @@ def test_runs_at_fixed_steps(seed, method):
 def test_runs_with_error_control(seed, method):
     """Without gaps, over which the error norm would take its mean too: the same steps, sized by the same entries."""
     pair, y = random_pair(seed, gap=0)
-    one, two = pair.runs(y, np.linspace(0.0, 0.1, 5), method, 10**4, rtol=1e-7)
-    assert one.count[STATUS] == two.count[STATUS] == FINISHED
-    assert two.count[STEPS] == pytest.approx(one.count[STEPS], rel=0.02)
+    first, second = pair.runs(y, np.linspace(0.0, 0.1, 5), method, 10**4, rtol=1e-7)
+    assert first.count[STATUS] == second.count[STATUS] == FINISHED
+    assert second.count[STEPS] == pytest.approx(first.count[STEPS], rel=0.02)
     # Rounding of the norm changes the steps by as much; the finite differences in the Jacobian of radau5 magnify
     # that into where its iterations end, and so into its steps.
-    assert_same_runs(pair, one, two, 1e-4 if method == "radau5" else 1e-9)
+    assert_same_runs(pair, first, second, 1e-4 if method == "radau5" else 1e-9)
 
 
 # Sizes of blocks. An index made of them knows what lies before the block it reaches.
@@ -221,13 +221,13 @@ def _counts_blocks(index: ast.expr) -> bool:
 
 def knows_the_layout(source: str) -> list[str]:
     """Subscripts that find a block by the sizes of others: any of multiples of a size, and those of states by sizes."""
-    found = []
+    lines = []
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Subscript):
             by_size = _name(node.value) in STATES and any(map(_is_size, ast.walk(node.slice)))
             if by_size or _counts_blocks(node.slice):
-                found.append(f"{node.lineno}: {ast.unparse(node)}")
-    return found
+                lines.append(f"{node.lineno}: {ast.unparse(node)}")
+    return lines
 
 
 @pytest.mark.parametrize(
@@ -265,15 +265,15 @@ def _sources() -> list[Path]:
 
 
 def test_no_source_file_computes_where_a_block_lies():
-    found = {str(path): knows_the_layout(path.read_text(encoding="utf-8")) for path in _sources()}
-    assert {path: lines for path, lines in found.items() if lines} == {}
+    offsets = {str(path): knows_the_layout(path.read_text(encoding="utf-8")) for path in _sources()}
+    assert {path: lines for path, lines in offsets.items() if lines} == {}
     for path in OWN_STATE:
         assert knows_the_layout(path.read_text(encoding="utf-8")), f"{path} needs no exception any more"
 
 
 def test_tests_read_runs_by_name():
     """Not run.sample[...], run.output[...] or run.y[...], which need to know what lies where."""
-    found = [
+    lines = [
         f"{path}:{node.lineno}"
         for path in _sources()
         if path.is_relative_to(TESTS)
@@ -282,4 +282,4 @@ def test_tests_read_runs_by_name():
         and isinstance(node.value, ast.Attribute)
         and node.value.attr in ("sample", "output", "y")
     ]
-    assert found == []
+    assert lines == []

@@ -138,8 +138,8 @@ def test_static_friction_holds_more_than_it_gives_once_it_slides():
     slope, kinetic, static = np.arctan(0.4), 0.3, 0.5
     down = np.array([np.cos(slope), 0.0, -np.sin(slope)])
     b = block(kinetic, slope, static_friction=static)
-    rest = b.simulate(b.state(np.zeros(3), np.zeros(3)), np.array([2.0]), "time_stepping", step=1e-2)
-    assert np.abs(rest.states("q")).max() < 1e-12
+    still = b.simulate(b.state(np.zeros(3), np.zeros(3)), np.array([2.0]), "time_stepping", step=1e-2)
+    assert np.abs(still.states("q")).max() < 1e-12
     acceleration = G * np.cos(slope) * (0.4 - kinetic)
     pushed = b.simulate(b.state(np.zeros(3), 0.2 * down), np.array([1.0]), "time_stepping", step=1e-2)
     np.testing.assert_allclose(pushed.states("v")[-1] @ down, 0.2 + acceleration, rtol=1e-9)

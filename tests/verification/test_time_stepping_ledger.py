@@ -21,13 +21,13 @@ def unexplained(run: Run) -> float:
     """Largest error of the balance at any sample, per the energy that changed hands."""
     ledger, stored = run.states("ledger"), run.outputs("energy").sum(axis=1)
     loads = run.states("load")
-    given = ledger[:, ELECTRICAL] + ledger[:, CONSTRAINT] + loads.sum(axis=1)
+    supplied = ledger[:, ELECTRICAL] + ledger[:, CONSTRAINT] + loads.sum(axis=1)
     spent = ledger[:, SPENT].sum(axis=1) + run.states("loss").sum(axis=1) + run.states("scheme")[:, 0]
     change = stored - stored[0]
     terms = np.abs(ledger[:, [ELECTRICAL, CONSTRAINT, *SPENT]]).sum(axis=1) + np.abs(loads).sum(axis=1)
     turnover = 0.5 * (terms + np.abs(change)).max()
     assert turnover > 1e-3
-    return float(np.abs(given - spent - change).max() / turnover)
+    return float(np.abs(supplied - spent - change).max() / turnover)
 
 
 def push(robot: Robot, rng: np.random.Generator) -> Load:
@@ -104,11 +104,11 @@ def test_bodies_that_are_free(kinds):
 def test_a_scene_of_the_snakes_size_keeps_its_cones_and_its_ledger():
     b, y = snake()
     run = stepped(b, y, np.linspace(0.0, 0.5, 101), 1e-3, 0.5, {ka.GRIP: 0.05, ka.GRIP_AXIS: 1.0})
-    found, ledger = run.stepping.statistics, run.states("ledger")[-1]
+    statistics, ledger = run.stepping.statistics, run.states("ledger")[-1]
     assert run.count[STEPS] == 500
-    assert found[CAPPED] == 0
-    assert found[WORST] <= BAD
-    assert found[PENETRATION] < 1e-3
+    assert statistics[CAPPED] == 0
+    assert statistics[WORST] <= BAD
+    assert statistics[PENETRATION] < 1e-3
     assert ledger[FRICTION] >= 0.0
     assert unexplained(run) < 1e-9
     # Steps of 1 ms take about a thousandth of what the motors give.

@@ -28,7 +28,7 @@ def body(points: list[np.ndarray], friction: float = 0.6) -> Bench:
     return bench(Robot("body", links, (), ("body", np.zeros(3))), contacts, real=True).with_shapes()
 
 
-def rest(b: Bench, seconds: float, samples: int = 201, first: float = 0.0):
+def released(b: Bench, seconds: float, samples: int = 201, first: float = 0.0):
     """From rest at HEIGHT; ``first``: all weight on legs 1 and 3 as a start of the contact problem [N]."""
     y = b.state(np.r_[0.0, 0.0, HEIGHT, 1.0, 0.0, 0.0, 0.0], np.zeros(6))
     run = b.new_run(y, np.linspace(0.0, seconds, samples), "time_stepping", step=1e-3)
@@ -50,7 +50,7 @@ def stays(run) -> np.ndarray:
 @pytest.mark.parametrize("seconds", [20.0, pytest.param(1000.0, marks=pytest.mark.slow)])
 def test_a_table_stands_evenly_on_four_legs(seconds):
     """Also where the solution was begun from a corner of what is admissible: 0, 24.5, 0, 24.5 N."""
-    run = rest(body(LEGS), seconds, first=24.525)
+    run = released(body(LEGS), seconds, first=24.525)
     np.testing.assert_allclose(stays(run), MASS * G / 4.0, atol=1e-6)
 
 
@@ -59,7 +59,7 @@ def test_a_box_stands_on_eight_points(seconds):
     """Corners and the middles of edges, the weight off their centre: forces that are linear in the place."""
     grid = [(x, y) for x in (-0.45, -0.05, 0.35) for y in (-0.32, -0.02, 0.28)]
     points = [np.array([x, y, -HEIGHT]) for x, y in grid if (x, y) != (-0.05, -0.02)]
-    force = stays(rest(body(points), seconds))
+    force = stays(released(body(points), seconds))
     xy = np.array(points)[:, :2]
     # Least norm of f with Σ f = m g and Σ f x = Σ f y = 0.
     balance = np.vstack([np.ones(len(xy)), xy.T])

@@ -38,11 +38,11 @@ def block(mass: float) -> Robot:
 
 def happened(run: ki.Run) -> list[tuple[float, int, int]]:
     """Time, contact and kind of the logged events of contacts."""
-    found = []
+    events = []
     for t, code in zip(run.log_time, run.log_event[: run.count[ki.LOGGED]], strict=False):
         k, kind = divmod(int(code) - ki.CONTACT_LOG, ce.LOG_KINDS)
-        found.append((float(t), k, kind))
-    return found
+        events.append((float(t), k, kind))
+    return events
 
 
 def residual(b: Bench, run: ki.Run) -> float:
@@ -79,8 +79,8 @@ def test_a_block_on_a_slope_rests_or_slides(method, mu):
     run = b.simulate(b.state(np.zeros(3), np.zeros(3)), np.linspace(0.0, 2.0, 5), method)
     a = max(0.0, G * (np.sin(alpha) - mu * np.cos(alpha)))
     downhill = np.array([np.cos(alpha), 0.0, -np.sin(alpha)])
-    way = 0.5 * a * run.sample_time[:, None] ** 2 * downhill
-    np.testing.assert_allclose(run.states("q"), way, rtol=0, atol=1e-9)
+    distance = 0.5 * a * run.sample_time[:, None] ** 2 * downhill
+    np.testing.assert_allclose(run.states("q"), distance, rtol=0, atol=1e-9)
     touch = run.outputs("contact")[:, 0]
     np.testing.assert_allclose(touch[:, OUT_FORCE], 3.0 * G * np.cos(alpha), rtol=1e-9)
     assert (touch[:, OUT_MODE] == (ka.SLIDING if mu < 0.4 else ka.STICKING)).all()
@@ -113,15 +113,15 @@ def test_a_bouncing_ball():
     y = b.state(vector(0.0, 0.0, height), np.zeros(3))
     first = np.sqrt(2.0 * height / G)
     run = b.simulate(y, np.linspace(0.0, 3.0, 31), "dopri5")
-    found = happened(run)
-    times = np.array([t for t, _, _ in found])
+    events = happened(run)
+    times = np.array([t for t, _, _ in events])
     flights = 2.0 * first * e ** np.arange(1, 11)
     np.testing.assert_allclose(times[:10], first + np.concatenate([[0.0], np.cumsum(flights)[:9]]), rtol=0, atol=1e-8)
     # Slower bounces are let settle.
     end = first * (1.0 + e) / (1.0 - e)
-    assert found[-1][2] == ce.LANDING
+    assert events[-1][2] == ce.LANDING
     assert times[-1] == pytest.approx(end, abs=2.0 * SETTLE_SPEED / G / (1.0 - e))
-    assert all(kind == ce.BOUNCE for _, _, kind in found[:-1])
+    assert all(kind == ce.BOUNCE for _, _, kind in events[:-1])
     assert np.abs(run.states("q")[-1]).max() <= 1e-9
     assert run.states("loss")[-1, 0] == pytest.approx(0.7 * G * height, rel=1e-9)
     assert residual(b, run) < 1e-8
@@ -181,10 +181,10 @@ def test_a_block_thrown_up_a_slope_stops_and_stays_or_comes_back():
         b = sloped(alpha, mu)
         run = b.simulate(b.state(np.zeros(3), speed * uphill), np.linspace(0.0, 1.0, 11), "dopri5")
         up, down = G * (np.sin(alpha) + mu * np.cos(alpha)), G * (np.sin(alpha) - mu * np.cos(alpha))
-        stop, way = speed / up, 0.5 * speed**2 / up
+        stop, distance = speed / up, 0.5 * speed**2 / up
         t = run.sample_time
         back = 0.5 * max(down, 0.0) * np.maximum(t - stop, 0.0) ** 2
-        along = np.where(t < stop, speed * t - 0.5 * up * t**2, way - back)
+        along = np.where(t < stop, speed * t - 0.5 * up * t**2, distance - back)
         np.testing.assert_allclose(run.states("q"), along[:, None] * uphill, rtol=0, atol=1e-9)
         if mu > np.tan(alpha):
             ((when, _, kind),) = happened(run)
@@ -223,11 +223,11 @@ def test_slip_starts_where_a_pull_reaches_static_friction():
     contact = Contact("foot", "z", np.zeros(3), plane(normal), friction=mu, pulling_friction="signed")
     b = bench(block(mass), [contact], loads=[pull], real=True)
     run = b.simulate(b.state(np.zeros(3), np.zeros(3)), np.linspace(0.0, 5.0, 501), "dopri5")
-    weight, hold = mass * G * np.sin(alpha), mu * mass * G * np.cos(alpha)
-    onset = np.sqrt(hold**2 - weight**2) / rate
-    (when, _, kind), *rest = happened(run)
+    weight, friction_limit = mass * G * np.sin(alpha), mu * mass * G * np.cos(alpha)
+    onset = np.sqrt(friction_limit**2 - weight**2) / rate
+    (when, _, kind), *later = happened(run)
     assert kind == ce.SLIP_START
-    assert not rest
+    assert not later
     assert when == pytest.approx(onset, abs=1e-10)
     downhill = np.array([np.cos(alpha), 0.0, -np.sin(alpha)])
     sum_ = weight * downhill + rate * onset * np.array([0.0, 1.0, 0.0])

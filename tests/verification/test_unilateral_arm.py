@@ -68,7 +68,7 @@ def arm_equations(s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return M, h
 
 
-def elbow(s: np.ndarray, mode: str, way: float) -> tuple[np.ndarray, float, float]:
+def elbow(s: np.ndarray, mode: str, direction: float) -> tuple[np.ndarray, float, float]:
     """Accelerations, normal and tangential force of the elbow: z = −L cos α, x + L sin α."""
     a, va = s[1], s[4]
     M, h = arm_equations(s)
@@ -77,53 +77,53 @@ def elbow(s: np.ndarray, mode: str, way: float) -> tuple[np.ndarray, float, floa
     if mode == "free":
         return np.linalg.solve(M, h), 0.0, 0.0
     rows = np.array([normal, along]) if mode == "stick" else normal[None]
-    forces = rows.T if mode == "stick" else (normal - MU * way * along)[:, None]
+    forces = rows.T if mode == "stick" else (normal - MU * direction * along)[:, None]
     K = np.block([[M, -forces], [rows, np.zeros((len(rows), len(rows)))]])
     x = np.linalg.solve(K, np.concatenate([h, -bends[: len(rows)]]))
-    return x[:3], x[3], x[4] if mode == "stick" else -MU * way * x[3]
+    return x[:3], x[3], x[4] if mode == "stick" else -MU * direction * x[3]
 
 
 @pytest.mark.parametrize("swing", [9.0, 14.0])
 def test_an_arm_with_one_elbow_on_the_floor_sticks_slips_and_lifts_off(swing):
     """The forearm swings under a resting elbow: onset of slip and lift-off at the times of equations made by hand."""
     start = np.array([-L * np.sin(A), A, 0.0, 0.0, 0.0, swing])
-    end, t, s, mode, way = 0.35, 0.0, start, "stick", 1.0
+    end, t, s, mode, direction = 0.35, 0.0, start, "stick", 1.0
     expected, path = [], []
-    _, f_n, f_t = elbow(s, "stick", way)
+    _, f_n, f_t = elbow(s, "stick", direction)
     assert f_n > 0.0
     assert abs(f_t) < STATIC * f_n
     while t < end and mode != "free":
 
-        def rate(_: float, s: np.ndarray, mode: str = mode, way: float = way) -> np.ndarray:
-            return np.concatenate([s[3:], elbow(s, mode, way)[0]])
+        def rate(_: float, s: np.ndarray, mode: str = mode, direction: float = direction) -> np.ndarray:
+            return np.concatenate([s[3:], elbow(s, mode, direction)[0]])
 
-        def lift(_: float, s: np.ndarray, mode: str = mode, way: float = way) -> float:
-            return elbow(s, mode, way)[1]
+        def lift(_: float, s: np.ndarray, mode: str = mode, direction: float = direction) -> float:
+            return elbow(s, mode, direction)[1]
 
-        def slip(_: float, s: np.ndarray, mode: str = mode, way: float = way) -> float:
+        def slip(_: float, s: np.ndarray, mode: str = mode, direction: float = direction) -> float:
             if mode == "stick":
-                _, f_n, f_t = elbow(s, mode, way)
+                _, f_n, f_t = elbow(s, mode, direction)
                 return STATIC * f_n - abs(f_t)
-            return way * (s[3] + L * np.cos(s[1]) * s[4]) + 1e-12
+            return direction * (s[3] + L * np.cos(s[1]) * s[4]) + 1e-12
 
         lift.terminal, lift.direction = True, -1.0  # type: ignore[attr-defined]
         slip.terminal, slip.direction = True, -1.0  # type: ignore[attr-defined]
-        found = solve_ivp(rate, (t, end), s, "DOP853", rtol=1e-13, atol=1e-15, events=(lift, slip), dense_output=True)
-        path.append((t, found.sol))
-        t, s = found.t[-1], found["y"][:, -1]
-        if found.status == 0:
+        piece = solve_ivp(rate, (t, end), s, "DOP853", rtol=1e-13, atol=1e-15, events=(lift, slip), dense_output=True)
+        path.append((t, piece.sol))
+        t, s = piece.t[-1], piece["y"][:, -1]
+        if piece.status == 0:
             break
-        if found.t_events[0].size:
+        if piece.t_events[0].size:
             expected.append((t, ce.LIFT_OFF))
             mode = "free"
         elif mode == "stick":
-            way = -np.sign(elbow(s, mode, way)[2])
+            direction = -np.sign(elbow(s, mode, direction)[2])
             expected.append((t, ce.SLIP_START))
             mode = "slip"
         else:
             expected.append((t, ce.SLIP_STOP))
             mode = "stick"
-            _, f_n, f_t = elbow(s, mode, way)
+            _, f_n, f_t = elbow(s, mode, direction)
             if abs(f_t) > STATIC * f_n:
                 raise AssertionError("choose another swing: this reversal passes")
     b = arm()

@@ -29,8 +29,8 @@ def free_body(inertia: Inertia, contacts: list[Contact], loads: list[Load] | Non
     return bench(Robot("body", links, (), ("body", np.zeros(3))), contacts, loads=loads, real=True)
 
 
-def placed(b: Bench, place: np.ndarray, velocity: np.ndarray, turning: np.ndarray) -> np.ndarray:
-    return b.state(np.concatenate([place, [1.0, 0.0, 0.0, 0.0]]), np.concatenate([velocity, turning]))
+def placed(b: Bench, position: np.ndarray, velocity: np.ndarray, turning: np.ndarray) -> np.ndarray:
+    return b.state(np.concatenate([position, [1.0, 0.0, 0.0, 0.0]]), np.concatenate([velocity, turning]))
 
 
 @pytest.mark.slow  # a program of its own, which takes half a minute to compile
@@ -121,11 +121,13 @@ def test_a_ball_slides_and_then_rolls(spin):
     assert kind == ce.SLIP_STOP
     assert when == pytest.approx(stop, abs=1e-10)
     t = np.minimum(run.sample_time, stop)[:, None]
-    rest = np.maximum(run.sample_time - stop, 0.0)[:, None]
+    rolling_time = np.maximum(run.sample_time - stop, 0.0)[:, None]
     brake = -mu * G * slip / np.linalg.norm(slip)
     np.testing.assert_allclose(run.states("v")[:, :3], v0 + brake * t, rtol=0, atol=1e-8)
     np.testing.assert_allclose(
-        run.states("q")[:, :3] - radius * Z, v0 * t + 0.5 * brake * t**2 + (v0 - 2.0 / 7.0 * slip) * rest, atol=1e-8
+        run.states("q")[:, :3] - radius * Z,
+        v0 * t + 0.5 * brake * t**2 + (v0 - 2.0 / 7.0 * slip) * rolling_time,
+        atol=1e-8,
     )
     if not spin.any():
         np.testing.assert_allclose(run.states("v")[-1, :3], 5.0 / 7.0 * v0, rtol=1e-8, atol=1e-12)
@@ -162,13 +164,13 @@ def test_a_point_that_only_just_reaches_its_surface_is_seen():
         b = bench(robot, [touching("z", np.zeros(3))], real=True)
         speed = np.sqrt(2.0 * G * (1.0 + depth))
         run = b.simulate(b.state(np.ones(1), np.array([-speed])), np.array([0.0, 2.0]), "dopri5", rtol=1e-10)
-        found = events(run)
+        happened = events(run)
         if depth < 0.0:
-            assert not found
+            assert not happened
             continue
         first = (speed - np.sqrt(2.0 * G * depth)) / G
         # Landing 2e-10 m deep is later by that over the speed.
-        assert found[0][0] == pytest.approx(first, abs=3e-10 / np.sqrt(2.0 * G * depth))
+        assert happened[0][0] == pytest.approx(first, abs=3e-10 / np.sqrt(2.0 * G * depth))
         assert run.states("loss")[-1, 0] == pytest.approx(G * depth, rel=1e-2)
 
 
@@ -220,11 +222,11 @@ def test_a_bead_in_a_bowl_reverses_or_sticks(law):
             return float(s[1])
 
         turn.terminal, turn.direction = True, -sign  # type: ignore[attr-defined]
-        found = solve_ivp(
+        solution = solve_ivp(
             rate, (t, t + 10.0), [phi, 0.0], "DOP853", rtol=1e-13, atol=1e-15, events=turn, dense_output=True
         )
-        path.append(found.sol)
-        t, phi, sign = found.t[-1], found["y"][0, -1], -sign
+        path.append(solution.sol)
+        t, phi, sign = solution.t[-1], solution["y"][0, -1], -sign
         reversals.append(t)
     y = b.state(radius * vector(np.sin(start), 1.0 - np.cos(start), 0.0)[:2], np.zeros(2))
     run = b.simulate(y, np.linspace(0.0, t + 0.5, 201), "dopri5", **TIGHT)
@@ -260,10 +262,10 @@ def test_four_feet_hold_as_long_as_any_split_of_their_forces_does(direction):
     run = b.simulate(
         placed(b, height * Z, np.zeros(3), np.zeros(3)), np.linspace(0.0, 1.2 * onset, 61), "dopri5", **TIGHT
     )
-    found = events(run)
+    happened = events(run)
     # Rounding may let one foot go, and be caught by the others, before all do at that instant.
-    np.testing.assert_allclose([t for t, _, _ in found], onset, rtol=0, atol=1e-10)
-    assert {k: kind for _, k, kind in found} == dict.fromkeys(range(4), ce.SLIP_START)
+    np.testing.assert_allclose([t for t, _, _ in happened], onset, rtol=0, atol=1e-10)
+    assert {k: kind for _, k, kind in happened} == dict.fromkeys(range(4), ce.SLIP_START)
     touch = run.outputs("contact")
     before = run.sample_time < onset
     force = touch[before][:, :, OUT_VECTOR : OUT_VECTOR + 3]

@@ -68,11 +68,11 @@ def test_a_block_dragged_through_a_spring_sticks_and_slips():
     slip = 2.0 / omega * (np.pi - np.arctan(swing * omega / speed))
     first = STATIC * MASS * G / (stiffness * speed)
     run = b.simulate(b.state(np.zeros(2), np.zeros(2)), np.linspace(0.0, 3.6, 3601), rtol=1e-10)
-    found = events(run)
-    assert [kind for _, _, kind in found] == [ce.SLIP_START, ce.SLIP_STOP] * (len(found) // 2)
-    assert len(found) >= 8
-    cycle = np.arange(len(found) // 2)
-    times = np.array([t for t, _, _ in found]).reshape(-1, 2)
+    happened = events(run)
+    assert [kind for _, _, kind in happened] == [ce.SLIP_START, ce.SLIP_STOP] * (len(happened) // 2)
+    assert len(happened) >= 8
+    cycle = np.arange(len(happened) // 2)
+    times = np.array([t for t, _, _ in happened]).reshape(-1, 2)
     np.testing.assert_allclose(times[:, 0], first + cycle * (stick + slip), rtol=0.0, atol=1e-7)
     np.testing.assert_allclose(times[:, 1], times[:, 0] + slip, rtol=0.0, atol=1e-7)
     # Where it rests the spring is as long as it was about to slip, less 2 A.
@@ -93,8 +93,8 @@ def test_a_block_dragged_through_a_spring_sticks_and_slips():
 @pytest.mark.parametrize("grows", [False, True])
 def test_slip_begins_in_the_direction_of_kinetic_friction(grows):
     """Heavier along x than along y: the acceleration (F − μ_k N t)/M is along t, and t is not that of the pull."""
-    way = np.array([np.cos(0.8), np.sin(0.8), 0.0])
-    least = STATIC * MASS * G * way
+    direction = np.array([np.cos(0.8), np.sin(0.8), 0.0])
+    least = STATIC * MASS * G * direction
     b = sledge(np.zeros(3), 2.0 * least) if grows else sledge(1.2 * least, np.zeros(3))
     onset = 0.5 if grows else 0.0
     force, friction = (least if grows else 1.2 * least), KINETIC * MASS * G

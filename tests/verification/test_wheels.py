@@ -20,8 +20,8 @@ MASS, MOVED = BODY + 4 * WHEEL, BODY + 4 * 1.5 * WHEEL
 
 def cart(height: float = RADIUS, **wheel: Any) -> dict[str, Any]:
     wheels = {
-        name: {"position_m": [*place, -0.02], "radius_m": RADIUS, "mass_kg": WHEEL, **wheel}
-        for name, place in PLACES.items()
+        name: {"position_m": [*position, -0.02], "radius_m": RADIUS, "mass_kg": WHEEL, **wheel}
+        for name, position in PLACES.items()
     }
     return {"mass_kg": BODY, "size_m": [0.5, 0.2, 0.04], "position_m": [0, 0, height + 0.02], "wheels": wheels}
 

@@ -49,7 +49,7 @@ class Opened:
 @pytest.fixture
 def opened(browser: Any, tmp_path: Path) -> Iterator[Callable[..., Opened]]:
     """Opens the page of records, the network being off; at the end nothing was asked for but the file itself."""
-    found: list[Opened] = []
+    pages: list[Opened] = []
     contexts: list[Any] = []
 
     def opens(
@@ -62,29 +62,29 @@ def opened(browser: Any, tmp_path: Path) -> Iterator[Callable[..., Opened]]:
         if isinstance(records, Path):
             path = records
         else:
-            path = write(records, tmp_path / f"page_{len(found)}.html", ghost=ghost)
+            path = write(records, tmp_path / f"page_{len(pages)}.html", ghost=ghost)
         context = browser.new_context(
             viewport={"width": size[0], "height": size[1]}, offline=True, color_scheme="dark" if dark else "light"
         )
         context.set_default_timeout(PATIENCE_MS)
         contexts.append(context)
         page = context.new_page()
-        one = Opened(page, path.resolve().as_uri())
-        found.append(one)
-        page.on("request", lambda request: one.requests.append(request.url))
-        page.on("pageerror", lambda error: one.complaints.append(str(error)))
-        page.on("dialog", lambda dialog: one.complaints.append(f"dialog: {dialog.message}"))
+        entry = Opened(page, path.resolve().as_uri())
+        pages.append(entry)
+        page.on("request", lambda request: entry.requests.append(request.url))
+        page.on("pageerror", lambda error: entry.complaints.append(str(error)))
+        page.on("dialog", lambda dialog: entry.complaints.append(f"dialog: {dialog.message}"))
         page.on(
             "console",
-            lambda message: one.complaints.append(message.text) if message.type == "error" else None,
+            lambda message: entry.complaints.append(message.text) if message.type == "error" else None,
         )
-        page.goto(one.address)
+        page.goto(entry.address)
         page.evaluate("dynsim.ready")
-        return one
+        return entry
 
     yield opens
-    for one in found:
-        assert [url for url in one.requests if not url.startswith(("data:", "blob:"))] == [one.address]
-        assert one.complaints == []
+    for entry in pages:
+        assert [url for url in entry.requests if not url.startswith(("data:", "blob:"))] == [entry.address]
+        assert entry.complaints == []
     for context in contexts:
         context.close()

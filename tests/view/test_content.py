@@ -54,9 +54,9 @@ def unpacked(text: str) -> tuple[dict[str, Any], bytes]:
 
 
 def data_of(text: str) -> tuple[dict[str, Any], bytes]:
-    found = re.search(r'<script id="data"[^>]*>([^<]*)</script>', text)
-    assert found is not None
-    return unpacked(found[1])
+    match = re.search(r'<script id="data"[^>]*>([^<]*)</script>', text)
+    assert match is not None
+    return unpacked(match[1])
 
 
 def values(block: dict[str, Any], content: bytes) -> np.ndarray:
@@ -78,9 +78,9 @@ def test_blocks_come_back(rows: list[list[float]]) -> None:
     _, content = unpacked(blocks.packed({}))
     spans = [np.ptp(column[np.isfinite(column)]) if np.isfinite(column).any() else 0.0 for column in data.T]
     for block, error in ((coarse, 0.51 * np.array(spans) / 65534 + 1e-9), (fine, np.full(3, 1e-3))):
-        found = values(block, content)
-        assert (np.isnan(found) == np.isnan(data)).all()
-        assert (np.nan_to_num(np.abs(found - data)) <= error).all()
+        decoded = values(block, content)
+        assert (np.isnan(decoded) == np.isnan(data)).all()
+        assert (np.nan_to_num(np.abs(decoded - data)) <= error).all()
     assert np.nan_to_num(np.abs(values(fine, content) - data)).max() <= max(1e-6, 1e-9 * max(spans))
 
 
@@ -122,8 +122,8 @@ def test_mesh_files(name: str, text: bytes | str, tmp_path: Path) -> None:
     (tmp_path / name).write_bytes(text if isinstance(text, bytes) else text.encode())
     corners, triangles, _ = read_mesh(tmp_path / name)
     wanted = {tuple(map(tuple, np.round(CORNERS[face], 6))) for face in FACES}
-    found = {tuple(map(tuple, np.round(corners[face], 6) + 0.0)) for face in triangles}
-    assert found == wanted
+    faces = {tuple(map(tuple, np.round(corners[face], 6) + 0.0)) for face in triangles}
+    assert faces == wanted
 
 
 @pytest.mark.parametrize(
@@ -147,7 +147,7 @@ def test_broken_meshes_are_refused(name: str, text: str, tmp_path: Path) -> None
 
 def painted(text: str) -> str:
     """The wedge in COLLADA with a red effect on its first two triangles, through a symbol of the instance."""
-    first, rest = '<polylist count="4">', "<vcount>3 3 3 3</vcount>"
+    first, remainder = '<polylist count="4">', "<vcount>3 3 3 3</vcount>"
     index = re.search(r"<p>([^<]*)</p>", text)
     assert index is not None
     words = index[1].split()
@@ -158,7 +158,7 @@ def painted(text: str) -> str:
         for symbol, part in (("coat", words[:12]), ("bare", words[12:]))
     )
     assert first in text
-    assert rest in text
+    assert remainder in text
     text = re.sub(r"<polylist.*</polylist>", halves, text, flags=re.DOTALL)
     library = (
         '<library_effects><effect id="e"><profile_COMMON><technique sid="c"><phong><diffuse>'
@@ -199,12 +199,14 @@ def test_colours_of_collada_files(tmp_path: Path) -> None:
 
 def test_colours_of_a_published_robot() -> None:
     """The foot of Franka's Panda is of light and dark parts."""
-    places = [Path(str(one.locate())) for one in metadata.files("example-robot-data") or () if one.name == "link0.dae"]
+    places = [
+        Path(str(file.locate())) for file in metadata.files("example-robot-data") or () if file.name == "link0.dae"
+    ]
     mesh = read_mesh(next(path for path in places if "panda_description" in path.parts))
     assert mesh.colours is not None
     assert np.isfinite(mesh.colours).all()
-    found = {tuple(row) for row in np.round(mesh.colours, 3)}
-    assert {(0.902, 0.922, 0.929), (0.251, 0.251, 0.251)} <= found
+    colours = {tuple(row) for row in np.round(mesh.colours, 3)}
+    assert {(0.902, 0.922, 0.929), (0.251, 0.251, 0.251)} <= colours
 
 
 def ball() -> Mesh:
@@ -229,26 +231,28 @@ def edges(mesh: Mesh) -> tuple[int, int]:
 def test_meshes_are_simplified_together() -> None:
     """The largest come down, to solids of the same size without a hole; small ones stay as they are."""
     large, small = welded(ball()), welded(Mesh(CORNERS, FACES))
-    assert [len(one.triangles) for one in simplified([large, small], 100_000)] == [88_800, 4]
+    assert [len(mesh.triangles) for mesh in simplified([large, small], 100_000)] == [88_800, 4]
     few, same = simplified([large, small], 3000)
     assert same is small
     assert 2000 < len(few.triangles) <= 2996
     assert edges(few) == edges(large) == (0, 0)
-    volume = [np.linalg.det(one.corners[one.triangles]).sum() / 6.0 for one in (few, large)]
+    volume = [np.linalg.det(mesh.corners[mesh.triangles]).sum() / 6.0 for mesh in (few, large)]
     assert volume[0] == pytest.approx(volume[1], rel=5e-3)
 
 
 @pytest.mark.parametrize("file", ["panda_description/meshes/visual/link5.dae", "ur5/visual/shoulder.dae"])
 def test_simplified_links_of_published_robots_are_not_torn(file: str) -> None:
     """To a seventh: nowhere further from what they were than a hundredth of their size, and with no new open edge."""
-    places = [Path(str(one.locate())) for one in metadata.files("example-robot-data") or () if str(one).endswith(file)]
+    places = [
+        Path(str(path.locate())) for path in metadata.files("example-robot-data") or () if str(path).endswith(file)
+    ]
     whole = welded(read_mesh(places[0]))
     (few,) = simplified([whole], len(whole.triangles) // 7)
     assert len(few.triangles) < len(whole.triangles) / 4.5
     assert edges(few)[0] <= edges(whole)[0]
     size = np.ptp(whole.corners, axis=0).max()
-    for one, other in ((whole, few), (few, whole)):
-        distance, _ = cKDTree(sampled(other)).query(one.corners)
+    for first, other in ((whole, few), (few, whole)):
+        distance, _ = cKDTree(sampled(other)).query(first.corners)
         assert distance.max() < 0.01 * size
     assert whole.colours is not None
     assert few.colours is not None
@@ -257,8 +261,8 @@ def test_simplified_links_of_published_robots_are_not_torn(file: str) -> None:
 
 @pytest.mark.parametrize("part", ["panda_description/meshes/visual/", "ur_description/meshes/ur5/visual/"])
 def test_a_published_robot_is_a_page_of_less_than_two_megabytes(part: str) -> None:
-    files = [one for one in metadata.files("example-robot-data") or () if part in str(one) and one.suffix == ".dae"]
-    meshes = [welded(read_mesh(Path(str(one.locate())))) for one in files]
+    files = [path for path in metadata.files("example-robot-data") or () if part in str(path) and path.suffix == ".dae"]
+    meshes = [welded(read_mesh(Path(str(path.locate())))) for path in files]
     assert len(meshes) >= 7
     few = simplified(meshes)
     triangles = [sum(len(mesh.triangles) for mesh in some) for some in (meshes, few)]
@@ -302,9 +306,9 @@ def test_the_page_is_one_file_without_a_network(braced: Record, tmp_path: Path) 
     text = page({"one": braced})
     assert "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:" in text
     assert "connect-src" not in text
-    rest = text.replace(three().replace("</script", "<\\/script"), "")
-    assert len(rest) < len(text)
-    assert not re.search(r"https?://|\bsrc=|href=\"|@import|url\(", rest)
+    own_text = text.replace(three().replace("</script", "<\\/script"), "")
+    assert len(own_text) < len(text)
+    assert not re.search(r"https?://|\bsrc=|href=\"|@import|url\(", own_text)
     # Each script that begins ends, and none earlier than meant.
     assert len(re.findall(r"<script", text)) == len(re.findall(r"</script>", text)) == 3
     assert page({"one": braced}) == text
@@ -388,9 +392,9 @@ def test_commands_write_pages(
 def test_notebooks(braced: Record, tmp_path: Path) -> None:
     shown = braced.view(braced, ghost=True, height=400)
     frame = shown._repr_html_()
-    found = re.search(r'srcdoc="([^"]*)"', frame)
-    assert found is not None
-    assert html.unescape(found[1]) == shown.page
+    match = re.search(r'srcdoc="([^"]*)"', frame)
+    assert match is not None
+    assert html.unescape(match[1]) == shown.page
     assert 'sandbox="allow-scripts allow-downloads"' in frame
     assert "height:400px" in frame
     assert [part["name"] for part in data_of(shown.page)[0]["records"]] == ["two_elbows", "two_elbows 2"]

@@ -59,9 +59,9 @@ def test_bodies_are_where_the_record_has_them(kind: str, request: pytest.Fixture
         (shown,) = state["records"]
         assert state["time"] == pytest.approx(record.time[row], abs=1e-9)
         assert list(shown["bodies"]) == list(record.labels[POSITION])
-        place = np.array([body["p"] for body in shown["bodies"].values()])
+        positions = np.array([body["p"] for body in shown["bodies"].values()])
         turn = np.array([body["q"] for body in shown["bodies"].values()])
-        np.testing.assert_allclose(place, record[POSITION][row], atol=NEAR)
+        np.testing.assert_allclose(positions, record[POSITION][row], atol=NEAR)
         np.testing.assert_allclose(np.abs((turn * record[ORIENTATION][row]).sum(axis=1)), 1.0, atol=1e-8)
         # That of the kernels, not of the scene.
         hand = record["w"][row, :3] if kind == "snake" else record["hand_position"][row]
@@ -219,9 +219,9 @@ def test_centre_of_pressure_of_a_mobile_base(mobile: Record, opened: Opens) -> N
     page = opened({"one": mobile})
     (shown,) = page.seek(0.5)["records"]
     assert shown["support"] == {"corners": 3, "inside": True}
-    place = page.js("dynsim.app.actors[0].support.dot.position.toArray()")
+    position = page.js("dynsim.app.actors[0].support.dot.position.toArray()")
     row = int(np.searchsorted(mobile.time, 0.5))
-    np.testing.assert_allclose(place[:2], mobile["center_of_pressure"][row], atol=NEAR)
+    np.testing.assert_allclose(position[:2], mobile["center_of_pressure"][row], atol=NEAR)
 
 
 def test_play_slider_and_keys(braced: Record, opened: Opens) -> None:
@@ -336,9 +336,9 @@ def test_the_key_says_what_a_ball_below_the_floor_is(opened: Opens) -> None:
     assert "wheel on the ground" not in signs
 
 
-def contrast(one: list[float], other: list[float]) -> float:
+def contrast(first: list[float], other: list[float]) -> float:
     """Of two colours (sRGB, 0 to 1), as WCAG 2 has it."""
-    light = [float(np.dot([0.2126, 0.7152, 0.0722], np.power(c, 2.2))) for c in (one, other)]
+    light = [float(np.dot([0.2126, 0.7152, 0.0722], np.power(c, 2.2))) for c in (first, other)]
     return (max(light) + 0.05) / (min(light) + 0.05)
 
 
@@ -454,8 +454,8 @@ def test_a_measured_record_beside_the_simulated_one(braced: Record, opened: Open
     assert "measured" in page.page.locator("#variants .chip").nth(1).locator("em").inner_text()
     row = 30
     _, shown = page.seek(float(measured.time[row]))["records"]
-    place = [body["p"] for body in shown["bodies"].values()]
-    np.testing.assert_allclose(place, measured[POSITION][row], atol=NEAR)
+    positions = [body["p"] for body in shown["bodies"].values()]
+    np.testing.assert_allclose(positions, measured[POSITION][row], atol=NEAR)
 
 
 def test_frames_from_elsewhere(braced: Record, opened: Opens) -> None:
@@ -463,8 +463,8 @@ def test_frames_from_elsewhere(braced: Record, opened: Opens) -> None:
     page = opened({"one": braced})
     poses = np.concatenate([braced[POSITION][50] + 0.25, braced[ORIENTATION][50]], axis=1)
     state = page.js("f => { dynsim.frame(f); return dynsim.state(); }", {"time": 77.0, "poses": poses.ravel().tolist()})
-    place = [body["p"] for body in state["records"][0]["bodies"].values()]
-    np.testing.assert_allclose(place, braced[POSITION][50] + 0.25, atol=1e-6)
+    positions = [body["p"] for body in state["records"][0]["bodies"].values()]
+    np.testing.assert_allclose(positions, braced[POSITION][50] + 0.25, atol=1e-6)
     assert state["time"] == 77.0
     seen = "(a => [a.grown.count, a.grown.line.visible, a.paths[0].path.whole.visible])(dynsim.app.actors[0])"
     assert page.js(seen) == [1, True, False]

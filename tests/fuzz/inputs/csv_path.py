@@ -43,7 +43,7 @@ def draw(rng: Random, records: Path) -> Draft:
     whats = []
     for _ in range(rng.choice((1, 1, 1, 2))):
         row = rng.randrange(len(rows)) if rng.random() < 0.2 else rng.randrange(1, len(rows))
-        way = rng.choice(
+        kind = rng.choice(
             (
                 "cell",
                 "cell",
@@ -60,31 +60,31 @@ def draw(rng: Random, records: Path) -> Draft:
                 "nothing",
             )
         )
-        whats.append(f"{way} (row {row})")
-        if way == "cell" and rows[row]:
+        whats.append(f"{kind} (row {row})")
+        if kind == "cell" and rows[row]:
             column = rng.randrange(len(rows[row]))
             rows[row][column] = rng.choice(CELLS)
             whats[-1] = f"row {row}, column {column} = {rows[row][column][:40]!r}"
-        elif way == "cell added":
+        elif kind == "cell added":
             rows[row].append(rng.choice(CELLS))
-        elif way == "cell removed":
+        elif kind == "cell removed":
             del rows[row][-1:]
-        elif way == "row removed" and len(rows) > 2:
+        elif kind == "row removed" and len(rows) > 2:
             del rows[row]
-        elif way == "row doubled":
+        elif kind == "row doubled":
             rows.insert(row, list(rows[row]))
-        elif way == "rows swapped":
+        elif kind == "rows swapped":
             rows[row], rows[-1] = rows[-1], rows[row]
-        elif way == "separator":
+        elif kind == "separator":
             separator = rng.choice((";", "\t", " ", ", ", ",,"))
-        elif way == "end":
+        elif kind == "end":
             end = rng.choice(("\r\n", "\r", "\n\n", "\x85", "\u2028", "\x0b", "\x0c", " # a comment\n"))
-        elif way == "blank":
+        elif kind == "blank":
             rows.insert(row, [rng.choice(("", " ", "# comment", "#", "\x0c", "\x00"))])
     data = (end.join(separator.join(row) for row in rows) + end).encode()
     if rng.random() < 0.35:
-        data, what = mutate_bytes(rng, data) if rng.random() < 0.5 else mutate_text(rng, data.decode())
-        whats.append(what)
+        data, mutation = mutate_bytes(rng, data) if rng.random() < 0.5 else mutate_text(rng, data.decode())
+        whats.append(mutation)
     return Draft("; ".join(whats), {"scenario.yaml": SCENARIO, "path.csv": data}, [["check", "scenario.yaml"]], losses)
 
 
@@ -100,10 +100,10 @@ def losses() -> list[str]:
     times = np.array([row[0] for row in rows])
     said, taken = np.array([row[1:] for row in rows]), path.position(times)
     beyond = path.position(np.array([times[0] - 1.0, times[-1] + 1.0]))
-    found = []
+    lost = []
     with np.errstate(all="ignore"):
         if not np.allclose(said, taken, rtol=1e-9, atol=1e-12):
-            found.append("the path does not go through the rows")
+            lost.append("the path does not go through the rows")
         if not np.allclose(said[[0, -1]], beyond, rtol=1e-9, atol=1e-12):
-            found.append("the path does not begin and end with the table")
-    return found
+            lost.append("the path does not begin and end with the table")
+    return lost

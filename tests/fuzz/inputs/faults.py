@@ -36,14 +36,14 @@ def draw(rng: Random, records: Path) -> Draft:
     tree = yaml_tree(SCRIPT)
     tree["faults"] = rng.sample(tree["faults"], rng.choice((1, 2, 4)))
     if rng.random() < 0.7:
-        what = "; ".join(mutate_tree(rng, tree) for _ in range(rng.choice((1, 1, 2))))
+        mutation = "; ".join(mutate_tree(rng, tree) for _ in range(rng.choice((1, 1, 2))))
         data = yaml_text(tree).encode("utf-8", "surrogatepass")
     else:
-        data, what = mutate_text(rng, yaml_text(tree))
+        data, mutation = mutate_text(rng, yaml_text(tree))
     files = {"faults.yaml": data, "rig.h5": (records / "rig.h5").read_bytes()}
     files["rig.yaml"] = (records / "rig.yaml").read_bytes()
     command = ["hw", "replay", "rig.h5", "--map", "rig.yaml", "--port", "virtual", "--faults", "faults.yaml", "--quiet"]
-    return Draft(what, files, [[*command, "--out", "out"]], losses)
+    return Draft(mutation, files, [[*command, "--out", "out"]], losses)
 
 
 def losses() -> list[str]:

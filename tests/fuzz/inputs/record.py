@@ -50,15 +50,15 @@ def draw(rng: Random, records: Path) -> Draft:
     if structural:
         image = io.BytesIO(sound)
         with h5py.File(image, "r+") as file:
-            what = "; ".join(_changed(rng, file) for _ in range(rng.choice((1, 1, 1, 2))))
+            mutation = "; ".join(_changed(rng, file) for _ in range(rng.choice((1, 1, 1, 2))))
         data = image.getvalue()
         if rng.random() < 0.7:
             # Without the digest in its last line, as another program leaves it.
             data = re.sub(rb"\n[\w-]+:[0-9a-f]{64}\n\Z", b"", data)
     else:
-        data, what = sound, ""
+        data, mutation = sound, ""
         for _ in range(rng.choice((1, 1, 1, 4, 20))):
-            data, what = mutate_bytes(rng, data)
+            data, mutation = mutate_bytes(rng, data)
     files = {"record.h5": data, "out.txt": b"an older export"}
     command = rng.choice(
         (
@@ -83,7 +83,7 @@ def draw(rng: Random, records: Path) -> Draft:
     else:
         # Damage on the way: what is not refused must be what was saved.
         files["sound.h5"] = sound
-    return Draft(f"{name}: {what}", files, [command], losses)
+    return Draft(f"{name}: {mutation}", files, [command], losses)
 
 
 def losses() -> list[str]:
@@ -198,9 +198,9 @@ def _mutate(rng: Random, file: h5py.File) -> str:
         ),
         "nan": lambda: _spoil(rng, file[path]),
     }
-    way = rng.choice(list(ways))
-    ways[way]()
-    return f"{path}: {way}"
+    kind = rng.choice(list(ways))
+    ways[kind]()
+    return f"{path}: {kind}"
 
 
 _DATA: tuple[Callable[[], Any], ...] = (

@@ -42,24 +42,24 @@ def draw(rng: Random, records: Path) -> Draft:
             # One variant is as good as four, and four times as fast.
             kept = rng.choice(list(tree["variants"]))
             tree["variants"] = {kept: tree["variants"][kept]}
-        what = "; ".join(mutate_tree(rng, tree) for _ in range(rng.choice((1, 1, 1, 2, 3))))
+        mutation = "; ".join(mutate_tree(rng, tree) for _ in range(rng.choice((1, 1, 1, 2, 3))))
         data = yaml_text(tree).encode("utf-8", "surrogatepass")
     else:
-        data, what = mutate_text(rng, text)
+        data, mutation = mutate_text(rng, text)
         if rng.random() < 0.2:
             data, more = mutate_text(rng, data.decode("utf-8", "replace"))
-            what = f"{what}; {more}"
-    return reading(f"{name}: {what}", data, run=rng.random() < 0.3)
+            mutation = f"{mutation}; {more}"
+    return reading(f"{name}: {mutation}", data, run=rng.random() < 0.3)
 
 
-def reading(what: str, data: bytes, run: bool, overrides: tuple[str, ...] = ()) -> Draft:
+def reading(mutation: str, data: bytes, run: bool, overrides: tuple[str, ...] = ()) -> Draft:
     """A case of one scenario file: check it, and if ``run`` also simulate a hundredth of a second over older files."""
-    given = [word for text in overrides for word in ("--set", text)]
-    commands = [["check", "scenario.yaml", *given]]
+    arguments = [word for text in overrides for word in ("--set", text)]
+    commands = [["check", "scenario.yaml", *arguments]]
     if run:
         short = [word for text in SHORT for word in ("--set", text)]
-        commands.append(["run", "scenario.yaml", "--no-figures", "--quiet", "--out", "out", *given, *short])
-    return Draft(what, {"scenario.yaml": data, **(OLD if run else {})}, commands, losses)
+        commands.append(["run", "scenario.yaml", "--no-figures", "--quiet", "--out", "out", *arguments, *short])
+    return Draft(mutation, {"scenario.yaml": data, **(OLD if run else {})}, commands, losses)
 
 
 def losses() -> list[str]:
@@ -70,7 +70,7 @@ def losses() -> list[str]:
     loaded = [load_scenario("scenario.yaml", name) for name in names]
     tree = yaml_tree(Path("scenario.yaml").read_text(encoding="utf-8"))
     variants = tree.get("variants") or {}
-    found = []
+    lost = []
     for name, scenario in zip(names, loaded, strict=True):
-        found += scenario_losses(merged(tree, variants.get(name) or {}), scenario)
-    return found
+        lost += scenario_losses(merged(tree, variants.get(name) or {}), scenario)
+    return lost

@@ -15,10 +15,10 @@ def draw(rng: Random, records: Path) -> Draft:
     text = (SHIPPED / "hardware" / f"{name}.yaml").read_text(encoding="utf-8")
     if rng.random() < 0.65:
         tree = yaml_tree(text)
-        what = "; ".join(mutate_tree(rng, tree) for _ in range(rng.choice((1, 1, 1, 2, 3))))
+        mutation = "; ".join(mutate_tree(rng, tree) for _ in range(rng.choice((1, 1, 1, 2, 3))))
         data = yaml_text(tree).encode("utf-8", "surrogatepass")
     else:
-        data, what = mutate_text(rng, text)
+        data, mutation = mutate_text(rng, text)
     command = ["hw", "check", "record.h5", "--map", "map.yaml"]
     if rng.random() < 0.15:
         option, texts = rng.choice(
@@ -28,9 +28,9 @@ def draw(rng: Random, records: Path) -> Draft:
             )
         )
         command += [option, rng.choice(texts)]
-        what += f" {' '.join(command[-2:])}"
+        mutation += f" {' '.join(command[-2:])}"
     files = {"map.yaml": data, "record.h5": (records / f"{name}.h5").read_bytes()}
-    return Draft(f"{name}: {what}", files, [command], losses)
+    return Draft(f"{name}: {mutation}", files, [command], losses)
 
 
 def losses() -> list[str]:

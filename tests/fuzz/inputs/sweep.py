@@ -51,18 +51,18 @@ def draw(rng: Random, records: Path) -> Draft:
     if choice < 0.5:
         lines: list[Any] = [json.loads(line) for line in ([data] if name.endswith(PLAN) else data.splitlines())]
         row = rng.randrange(len(lines))
-        what = mutate_tree(rng, lines[row])
+        mutation = mutate_tree(rng, lines[row])
         data = "".join(f"{json.dumps(line, default=str)}\n" for line in lines).encode("utf-8", "surrogatepass")
     elif choice < 0.75:
-        data, what = mutate_text(rng, data.decode())
+        data, mutation = mutate_text(rng, data.decode())
     else:
-        data, what = mutate_bytes(rng, data)
+        data, mutation = mutate_bytes(rng, data)
     files[name] = data
     if rng.random() < 0.1:
         gone = rng.choice(sorted(files))
         del files[gone]
-        what += f"; without {gone}"
-    return Draft(f"{name}: {what}", files, [[*COMMAND, "--resume"]], losses)
+        mutation += f"; without {gone}"
+    return Draft(f"{name}: {mutation}", files, [[*COMMAND, "--resume"]], losses)
 
 
 def losses() -> list[str]:
@@ -75,7 +75,7 @@ def losses() -> list[str]:
     csv.field_size_limit(1 << 30)  # a key of the journal names a column, however long it is
     with table.open(encoding="utf-8", newline="") as stream:
         rows = list(csv.DictReader(stream))
-    found = [] if len(rows) == 4 else [f"{len(rows)} runs of 4 are in the table"]
+    lost = [] if len(rows) == 4 else [f"{len(rows)} runs of 4 are in the table"]
     for row in rows:
         for column, cell in row.items():
             if column in TEXTS:
@@ -85,5 +85,5 @@ def losses() -> list[str]:
             except (TypeError, ValueError):
                 continue
             if not math.isfinite(value):
-                found.append(f"column {column} of a run is not finite")
-    return found
+                lost.append(f"column {column} of a run is not finite")
+    return lost

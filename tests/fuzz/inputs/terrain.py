@@ -31,26 +31,26 @@ def draw(rng: Random, records: Path) -> Draft:
     whats = []
     for _ in range(rng.choice((1, 1, 2))):
         row = rng.randrange(len(rows))
-        way = rng.choice(("cell", "cell", "cell", "cell added", "cell removed", "row removed", "row doubled", "blank"))
-        whats.append(f"{way} (row {row})")
-        if way == "cell" and rows[row]:
+        kind = rng.choice(("cell", "cell", "cell", "cell added", "cell removed", "row removed", "row doubled", "blank"))
+        whats.append(f"{kind} (row {row})")
+        if kind == "cell" and rows[row]:
             column = rng.randrange(len(rows[row]))
             rows[row][column] = rng.choice(CELLS)
             whats[-1] = f"row {row}, column {column} = {rows[row][column][:40]!r}"
-        elif way == "cell added":
+        elif kind == "cell added":
             rows[row].append(rng.choice(CELLS))
-        elif way == "cell removed":
+        elif kind == "cell removed":
             del rows[row][-1:]
-        elif way == "row removed":
+        elif kind == "row removed":
             del rows[row]
-        elif way == "row doubled":
+        elif kind == "row doubled":
             rows.insert(row, list(rows[row]))
-        elif way == "blank":
+        elif kind == "blank":
             rows.insert(row, [rng.choice(("", " ", "# comment", "#", "\x0c", "\x00"))])
     data = ("\n".join(",".join(row) for row in rows) + "\n").encode()
     if rng.random() < 0.35:
-        data, what = mutate_bytes(rng, data) if rng.random() < 0.5 else mutate_text(rng, data.decode())
-        whats.append(what)
+        data, mutation = mutate_bytes(rng, data) if rng.random() < 0.5 else mutate_text(rng, data.decode())
+        whats.append(mutation)
     commands = [["check", "scenario.yaml"]]
     if rng.random() < 0.3:
         commands.append(["run", "scenario.yaml", "--out", "out", "--no-figures", "--quiet"])

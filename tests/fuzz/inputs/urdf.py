@@ -59,14 +59,14 @@ def draw(rng: Random, records: Path) -> Draft:
     choice = rng.random()
     if choice < 0.7:
         root = ElementTree.fromstring(text)
-        what = "; ".join(_mutate(rng, root) for _ in range(rng.choice((1, 1, 1, 2, 3))))
+        mutation = "; ".join(_mutate(rng, root) for _ in range(rng.choice((1, 1, 1, 2, 3))))
         data = ElementTree.tostring(
             root, encoding=rng.choice(("utf-8",) * 6 + ("us-ascii", "utf-16", "latin-1")), xml_declaration=True
         )
     elif choice < 0.85:
-        data, what = mutate_text(rng, text)
+        data, mutation = mutate_text(rng, text)
     else:
-        data, what = mutate_bytes(rng, text.encode())
+        data, mutation = mutate_bytes(rng, text.encode())
     commands = [["check", "scenario.yaml"]]
     files = {"scenario.yaml": SCENARIO, "robot.urdf": data}
     if rng.random() < 0.3:
@@ -82,7 +82,7 @@ def draw(rng: Random, records: Path) -> Draft:
                 *(word for text in SHORT for word in ("--set", text)),
             ]
         )
-    return Draft(what, files, commands, losses)
+    return Draft(mutation, files, commands, losses)
 
 
 def _mutate(rng: Random, root: ElementTree.Element) -> str:
@@ -107,9 +107,9 @@ def _mutate(rng: Random, root: ElementTree.Element) -> str:
             new = rng.choice(TYPES)
         else:
             words = old.split()
-            place = rng.randrange(max(1, len(words)))
-            near = _near(rng, words[place]) if words else ""
-            changed = [*words[:place], rng.choice((rng.choice(NUMBERS), near)), *words[place + 1 :]]
+            index = rng.randrange(max(1, len(words)))
+            near = _near(rng, words[index]) if words else ""
+            changed = [*words[:index], rng.choice((rng.choice(NUMBERS), near)), *words[index + 1 :]]
             new = rng.choice((" ".join(changed), " ".join(changed), rng.choice(NUMBERS), f"{old} 1"))
         element.set(key, new)
         return f"{where}: {key}={new[:40]!r}"
