@@ -691,6 +691,10 @@ def kinematic() -> Any:
     return data("snake/kinematic.json")
 
 
+def lifted_wheels() -> Any:
+    return data("snake/lifted_wheels.json")
+
+
 def of_kinematic(name: str, variant: str = "") -> dict[str, Any]:
     """A run of the kinematic snake in numbers."""
     numbers: dict[str, Any] = kinematic()["runs"][name][variant]
@@ -1036,6 +1040,18 @@ NUMBERS |= {
     "pressing_3_mm": lambda: fixed(1e3 * run("pressing commanded")["hand_error_rms_m"], 2),
     "pressing_4_mm": lambda: fixed(1e3 * run("pressing optimal")["hand_error_rms_m"], 2),
     "published_W": lambda: fixed(0.1 * run("pressing plain")["electrical_energy_J"], 1),
+    "tilted_yaw_operator": lambda: fixed(lifted_wheels()["records"]["snake_operator"]["yaw_deg"], 0),
+    "tilted_operator_mm": lambda: number(lifted_wheels()["records"]["snake_operator"]["other_wheel_mm"], 2),
+    "tilted_yaw_positioning": lambda: fixed(lifted_wheels()["records"]["snake_positioning"]["yaw_deg"], 0),
+    "tilted_positioning_mm": lambda: number(lifted_wheels()["records"]["snake_positioning"]["other_wheel_mm"], 2),
+    "tilted_yaw_limits": lambda: fixed(lifted_wheels()["records"]["snake_joint_limits"]["yaw_deg"], 0),
+    "tilted_limits_mm": lambda: number(lifted_wheels()["records"]["snake_joint_limits"]["other_wheel_mm"], 2),
+    "least_deviation_mm": lambda: number(lifted_wheels()["least_deviation_mm"], 2),
+    "axle_off_mm": lambda: number(lifted_wheels()["grounded_axle_off_mm"], 2),
+    "axle_off_mrad": lambda: number(lifted_wheels()["grounded_axle_off_mrad"], 1),
+    "ticks_rms_mm": lambda: number(lifted_wheels()["in_ticks"]["off_rms_mm"], 2),
+    "ticks_max_mm": lambda: number(lifted_wheels()["in_ticks"]["off_max_mm"], 2),
+    "ticks_clear_mm": lambda: number(lifted_wheels()["in_ticks"]["clear_mm"], 2),
     "planned_1_W": lambda: planned_heat(1),
     "planned_2_W": lambda: planned_heat(2),
     "planned_3_W": lambda: planned_heat(3),

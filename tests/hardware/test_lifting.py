@@ -7,13 +7,25 @@ base part: that pair 1 comes to lie on the floor at the recorded place shows tha
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-import pinocchio as pin
 import pytest
-from scipy.optimize import linprog
+from support.lifted_wheels import (
+    BLEND,
+    CLEARANCE,
+    JOINTS,
+    LINK,
+    PITCH,
+    Oracle,
+    Posed,
+    best_deviation,
+    posed,
+    second_order,
+    settled,
+    snake_map,
+    with_lifts,
+)
 
 from dynsim.errors import CheckRefused, RecordError
 from dynsim.hardware.errors import ServoMapError
@@ -22,90 +34,13 @@ from dynsim.hardware.replay.check import check_motion
 from dynsim.hardware.replay.compare import compare_records
 from dynsim.hardware.replay.machine import Replay
 from dynsim.hardware.replay.trajectory import path_of_record
-from dynsim.hardware.servo_map import SHIPPED, ServoMap, load_servo_map
+from dynsim.hardware.servo_map import SHIPPED, load_servo_map
 from dynsim.record import Record
 from dynsim.snake.base_part import Fold, base_part
 from dynsim.snake.lifting import Lifts, lifted
 
-LINK, RADIUS, GRIPPER = 0.0905, 0.05, 0.09  # [T] Table I, IV.B
-HALF_TRACK = np.array([0.075, 0.06, 0.075, 0.06, 0.075, 0.06, 0.06])
-CLEARANCE, BLEND = 5e-3, 0.3  # the shipped map's
-JOINTS = [f"{kind}{k}" for k in range(1, 10) for kind in ("theta", "psi")][:-1]  # theta1, psi1 ... psi8, theta9
-PITCH = tuple(f"psi{k}" for k in range(3, 9))
 MODES = {1: (3, 6), 2: (6, 7), 3: (5, 6), 4: (4, 5), 5: (3, 4), 6: (2, 3)}  # [T] Table II
 PASSING = [("snake_operator", None), ("snake_positioning", "x"), ("snake_positioning", "y"), ("snake_door_arc", "push")]
-
-
-class Oracle:
-    """The chain of all 18 joints, a revolute one in each, neighbours one link apart."""
-
-    def __init__(self) -> None:
-        self.model = pin.Model()
-        parent, placement = 0, pin.SE3.Identity()
-        for name in JOINTS:
-            kind = pin.JointModelRZ() if name.startswith("theta") else pin.JointModelRY()
-            placement = pin.SE3(np.eye(3), np.array([-LINK, 0.0, 0.0]))
-            parent = self.model.addJoint(parent, kind, placement, name)
-        self.data = self.model.createData()
-        self.axle = [self.model.getJointId(name) for name in PITCH] + [parent]
-        self.tail = pin.SE3(np.eye(3), np.array([-LINK, 0.0, 0.0]))
-
-    def from_head(self, w: np.ndarray, offset: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Axle middles (7, 3), axle directions (7, 3) and heights of the wheels' lowest points (7, 2) [m]."""
-        head = pin.SE3(pin.rpy.rpyToMatrix(*w[3:]), w[:3]) * pin.SE3(np.eye(3), np.array([-offset, 0.0, 0.0]))
-        return self._seen(head, q)
-
-    def from_pair_1(self, psi_3: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The same with pair 1 flat on the floor at the origin; ``psi_3`` is the record's angle, without lifting."""
-        pin.forwardKinematics(self.model, self.data, q)
-        lifting = pin.SE3(pin.rpy.rpyToMatrix(0.0, q[JOINTS.index("psi3")] - psi_3, 0.0), np.zeros(3))
-        floor = self.data.oMi[self.axle[0]] * lifting.inverse()
-        return self._seen(pin.SE3(np.eye(3), np.array([0.0, 0.0, RADIUS])) * floor.inverse(), q)
-
-    def _seen(self, head: pin.SE3, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        pin.forwardKinematics(self.model, self.data, q)
-        poses = [head * self.data.oMi[joint] for joint in self.axle]
-        poses[-1] = poses[-1] * self.tail
-        middle = np.array([pose.translation for pose in poses])
-        axle = np.array([pose.rotation[:, 1] for pose in poses])
-        bottom = middle[:, 2] - RADIUS * np.sqrt(1.0 - axle[:, 2] ** 2)
-        beside = HALF_TRACK * axle[:, 2]
-        return middle, axle, np.column_stack([bottom + beside, bottom - beside])
-
-
-@dataclass
-class Posed:
-    """A record on the oracle at all its samples."""
-
-    record: Record
-    middle: np.ndarray  # (T, 7, 3)
-    axle: np.ndarray  # (T, 7, 3)
-    wheel: np.ndarray  # (T, 7, 2)
-
-    @property
-    def grounded(self) -> np.ndarray:
-        return self.record["grounded"] == 1
-
-    @property
-    def lower(self) -> np.ndarray:
-        return self.wheel.min(axis=2)
-
-
-def snake_map() -> ServoMap:
-    return load_servo_map(SHIPPED / "snake.yaml")
-
-
-def head_offset(record: Record) -> float:
-    return record.scene.hand.position[0] - LINK
-
-
-def posed(record: Record, servo_map: ServoMap) -> Posed:
-    oracle, path = Oracle(), path_of_record(record, servo_map)
-    columns = [servo_map.joints.index(name) for name in JOINTS]
-    first = int(np.searchsorted(path.time, 0.0))
-    angles = path.position[first : first + len(record), columns]
-    poses = [oracle.from_head(w, head_offset(record), q) for w, q in zip(record["w"], angles, strict=True)]
-    return Posed(record, *(np.array(part) for part in zip(*poses, strict=True)))
 
 
 Find = Callable[[str, "str | None"], Posed]
@@ -120,17 +55,6 @@ def posed_run(simulated: Callable[[str, str | None], Record]) -> Find:
 @pytest.fixture(scope="module")
 def operator(posed_run: Find) -> Posed:
     return posed_run("snake_operator", None)
-
-
-def settled(record: Record) -> np.ndarray:
-    """Where a pair has been lifted for the blend time, and stays so for as long."""
-    away, time = record["grounded"] == 0, record.time
-    angles = np.zeros_like(away)
-    for pair in range(away.shape[1]):
-        for row in np.flatnonzero(away[:, pair]):
-            near = np.abs(time - time[row]) < BLEND + 1e-9
-            angles[row, pair] = away[near, pair].all()
-    return angles
 
 
 @pytest.mark.parametrize(("scenario", "variant"), PASSING)
@@ -211,22 +135,11 @@ def test_rates_and_accelerations_are_those_of_the_blend(operator) -> None:
 
 def test_the_grounded_part_keeps_its_kinematics_to_second_order(operator) -> None:
     """Axles that are on the ground are where the flat base of the record has them, up to clearance^2."""
-    record = operator.record
-    flat = record["posture"][:, 6::2, :2]  # after the controlled point and five joints
-    grounded = operator.grounded
-    off = np.linalg.norm(operator.middle[..., :2] - flat, axis=2)[grounded].max()
+    off, heading = second_order(operator)
     assert off < 0.3e-3
-    yaw = np.cumsum(np.column_stack([record["base_pose"][:, 2], record["phi"][:, 6:]]), axis=1)
-    along = np.cos(yaw) * operator.axle[..., 0] + np.sin(yaw) * operator.axle[..., 1]  # sine of the axles' error in yaw
-    assert np.abs(along[grounded]).max() < 0.05e-3
-    lower = posed(record, with_lifts(snake_map(), clearance_mm=2.5))
-    half = np.linalg.norm(lower.middle[..., :2] - flat, axis=2)[grounded].max()
+    assert heading < 0.05e-3
+    half, _ = second_order(posed(operator.record, with_lifts(snake_map(), clearance_mm=2.5)))
     assert half == pytest.approx(off / 4, rel=0.05)
-
-
-def with_lifts(servo_map: ServoMap, **changes: object) -> ServoMap:
-    servo_map.lifts = Lifts.model_validate(servo_map.lifts.model_dump() | changes)
-    return servo_map
 
 
 def test_clearance_and_blend_can_be_set(simulated) -> None:
@@ -275,34 +188,6 @@ def test_a_base_bent_in_an_arc_folds_without_a_twist(away, simulated) -> None:
     grounded = ~np.isin(np.arange(1, 8), away)
     assert arc.tilt[0, grounded].max() < 0.02e-3
     assert zigzag.tilt[0, grounded].max() > 1e-3
-
-
-def best_deviation(yaw: np.ndarray, away: set[int]) -> float:
-    """Smallest possible largest distance of a grounded wheel from the floor [m], to first order, over all pitch angles.
-
-    A linear programme: pitch joint j lifts what is behind it by its distance from axle j; lifted wheels are at the
-    clearance or above, pair 1 is flat.
-    """
-    middle, axle, heading = [np.zeros(2)], [np.array([0.0, 1.0])], 0.0
-    for angle in yaw:
-        ahead = np.array([np.cos(heading), np.sin(heading)])
-        heading += angle
-        behind = np.array([np.cos(heading), np.sin(heading)])
-        middle.append(middle[-1] - LINK * ahead - LINK * behind)
-        axle.append(np.array([-behind[1], behind[0]]))
-    rows, bounds = [], []
-    for i in range(1, 7):
-        for side in (1, -1):
-            wheel = middle[i] + side * HALF_TRACK[i] * axle[i]
-            lift = [(middle[j] - wheel) @ [axle[j][1], -axle[j][0]] if j < i else 0.0 for j in range(6)]
-            if i + 1 in away:
-                rows.append([*(-np.array(lift)), 0.0])
-                bounds.append(-CLEARANCE)
-            else:
-                rows += [[*lift, -1.0], [*(-np.array(lift)), -1.0]]
-                bounds += [0.0, 0.0]
-    optimum = linprog([*[0.0] * 6, 1.0], A_ub=rows, b_ub=bounds, bounds=[(None, None)] * 6 + [(0.0, None)])
-    return float(optimum.x[-1])
 
 
 def test_what_stays_of_the_twist_no_pitch_angles_could_remove(operator) -> None:

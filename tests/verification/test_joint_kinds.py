@@ -26,7 +26,7 @@ from dynsim.integrators.run import DRIFT_MAX, PROJECTIONS, REJECTED, STEPS
 from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot
 from dynsim.model.drives import Motor
 from dynsim.model.joints.ball import ball, floating
-from dynsim.model.joints.planar import rolling
+from dynsim.model.joints.planar import planar, rolling
 from dynsim.record.scene import quaternion as scene_quaternion
 
 DOWN = np.array([0.0, 0.0, -9.81])
@@ -180,6 +180,15 @@ def test_momentum_and_energy_of_a_free_robot(method):
         np.testing.assert_allclose(momentum[0], linear, rtol=0, atol=1e-9 * np.linalg.norm(linear))
         np.testing.assert_allclose(momentum[1], angular, rtol=0, atol=1e-9 * np.linalg.norm(angular))
         assert model.kinetic_energy(q, v) == pytest.approx(energy, rel=1e-9)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 1e-17, 1e-15, 1e-12, 1e-9, 1e-6, 1e-4, 1e-2, 1.0, 1.6])
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_axes_of_a_plane_are_orthonormal_for_every_normal(side, tilt):
+    normal = np.array([0.6 * np.sin(tilt), 0.8 * np.sin(tilt), side * np.cos(tilt)])
+    axes = np.stack([link.axis for link in planar(replace(body("plate"), axis=normal))])
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(np.cross(axes[0], axes[1]), normal, rtol=0, atol=1e-15)
 
 
 def test_a_start_that_is_no_attitude_is_refused():

@@ -31,13 +31,14 @@ def planar(link: Link) -> tuple[Link, ...]:
     normal = np.asarray(link.axis, dtype=np.float64)
     # The plane's axes: those of x and y turned the shortest way to the normal, x and y themselves for +z.
     z = np.array([0.0, 0.0, 1.0])
-    cosine = float(normal[2])
-    if cosine > -1.0 + 1e-12:
-        v = np.cross(z, normal)
-        K = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
-        R = np.eye(3) + K + K @ K / (1.0 + cosine)
-    else:
+    cosine, v = float(normal[2]), np.cross(z, normal)
+    square = float(v @ v)
+    if cosine < 0.0 and square < 1e-30:
         R = np.diag([1.0, -1.0, -1.0])
+    else:
+        K = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+        # 1 / (1 + cosine), which near -z would be a difference of equal numbers.
+        R = np.eye(3) + K + K @ K * ((1.0 - cosine) / square if cosine < 0.0 else 1.0 / (1.0 + cosine))
     return in_rows(link, [("x", "prismatic", R[:, 0]), ("y", "prismatic", R[:, 1]), ("angle", "revolute", normal)])
 
 
