@@ -25,7 +25,7 @@ from dynsim.cli.app import (
     parsed_overrides,
 )
 from dynsim.cli.display import console, errors, labelled, progress, record_files, say, say_written, told_in
-from dynsim.cli.drawing import Figures, Page, draw, draw_all
+from dynsim.cli.drawing import Figures, Page, draw, draw_all, saved_before
 from dynsim.cli.export import export
 from dynsim.cli.hardware import hw
 from dynsim.cli.hw_drive import EXAMPLE, hw_drive
@@ -36,7 +36,6 @@ from dynsim.cli.teleop import teleop
 from dynsim.cli.view import open_page, tell_of_view, view
 from dynsim.config import completion
 from dynsim.errors import DynsimError, RecordError, SimulationInterrupted, SimulationStopped
-from dynsim.system import interruption
 from dynsim.system.terminal import escaped
 
 if TYPE_CHECKING:
@@ -77,14 +76,13 @@ def run(
             errors.print(f"what was simulated until then is in {escaped(folder)}, marked incomplete")
         raise
     save_run(record, folder)
-    interruption.heed()
-    interruption.check()
     shown = Page({loaded.variant or loaded.name: record}, folder)
     page = None
-    if not no_figures:
-        page = draw_all([Figures({loaded.variant: record}, folder / "figures", format_)], shown, quiet)
-    elif view:
-        page = shown.draw()
+    with saved_before(folder):
+        if not no_figures:
+            page = draw_all([Figures({loaded.variant: record}, folder / "figures", format_)], shown, quiet)
+        elif view:
+            page = shown.draw()
     if not quiet:
         from dynsim.cli.tables import print_summary
 
@@ -146,12 +144,13 @@ def compare(
     records = {s.variant: records[s.variant] for s in loaded if s.variant in records}
     if records:
         save_comparison(records, folder)
-        interruption.heed()
-        interruption.check()
-        if not no_figures:
-            wanted = [Figures({name: record}, folder / name / "figures", format_) for name, record in records.items()]
-            together = Figures(records, folder, format_, together=True)
-            page = draw_all([together, *wanted], Page(records, folder), quiet)
+        with saved_before(folder):
+            if not no_figures:
+                wanted = [
+                    Figures({name: record}, folder / name / "figures", format_) for name, record in records.items()
+                ]
+                together = Figures(records, folder, format_, together=True)
+                page = draw_all([together, *wanted], Page(records, folder), quiet)
         if not quiet:
             from dynsim.cli.tables import print_comparison
 

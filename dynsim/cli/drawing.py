@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dynsim.cli.display import drawing
+from dynsim.cli.display import drawing, errors
 from dynsim.errors import RecordError
+from dynsim.system import interruption
+from dynsim.system.terminal import escaped
 
 if TYPE_CHECKING:
     from dynsim.record import Record
@@ -50,6 +53,18 @@ class Page:
         return write(shown, self.folder / VIEW) if shown else None
 
 
+@contextmanager
+def saved_before(folder: Path) -> Iterator[None]:
+    """Within, signals are heeded again, and one is answered with where the results are."""
+    interruption.heed()
+    try:
+        interruption.check()
+        yield
+    except KeyboardInterrupt:
+        errors.print(f"interrupted; all results are in {escaped(folder)}, not all figures and pages")
+        raise
+
+
 def draw(figures: Figures, quiet: bool) -> None:
     """Draw here, and say so."""
     with drawing(figures.folder, quiet):
@@ -63,14 +78,18 @@ def draw_all(wanted: Sequence[Figures], page: Page, quiet: bool) -> Path | None:
     ------
     RecordError
         See :func:`dynsim.draw.figures.draw`; or a process was ended from outside.
+    KeyboardInterrupt
+        After Ctrl-C, which costs what was not drawn yet.
     """
-    from dynsim.studies.processes import WorkerLost, cores, run_in_processes
+    from dynsim.studies.processes import WorkerInterrupted, WorkerLost, cores, run_in_processes
 
     pages: list[Path | None] = []
 
     def take(task: Figures | Page, result: Callable[[], Path | None]) -> None:
         try:
             done = result()
+        except WorkerInterrupted:
+            return
         except WorkerLost as lost:
             raise RecordError(f"{task.folder}: could not be drawn: {lost}") from lost
         if isinstance(task, Page):

@@ -140,7 +140,9 @@ def named(scenario: Scenario) -> Iterator[None]:
         raise ModelError(f"{name}: numbers of very different size, no result can be computed ({error})") from error
     except MemoryError as error:
         reason = f"not enough memory ({error})" if str(error) else "not enough memory"
-        raise ScenarioError(f"{name}: {reason}; a lower record.rate_hz or duration_s needs less") from error
+        raise ScenarioError(
+            f"{name}: {reason}; fewer joints, a lower record.rate_hz or duration_s need less"
+        ) from error
     except KeyboardInterrupt:
         interruption.answered()
         raise SimulationInterrupted(f"{name}: interrupted before there was anything to save") from None

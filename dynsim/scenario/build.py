@@ -18,7 +18,7 @@ from dynsim.config.base import BodyPoint
 from dynsim.config.problems import dotted, suggest
 from dynsim.errors import ModelError, ScenarioError, brief
 from dynsim.library import families
-from dynsim.model.description import Array, Contact, Foot, Inertia, Load, Robot
+from dynsim.model.description import WORLD, Array, Contact, Foot, Inertia, Load, Robot
 from dynsim.model.surfaces import SURFACES, Surface
 from dynsim.scenario.candidates import candidates
 from dynsim.scenario.loads import Payload
@@ -99,6 +99,10 @@ def _with_objects(scenario: Scenario, built: Robot) -> Robot:
     objects, surfaces = scenario.config.objects, list(scenario.config.surfaces)
     taken = {*(link.name for link in built.links), *built.joint_names, *(frame.name for frame in built.frames)}
     for name in objects:
+        if not name or name == WORLD:
+            raise ModelError(
+                f"objects: {name!r} cannot be the name of an object; choose another", keys=("objects", name)
+            )
         if name in taken:
             text = f"objects.{name}: the robot has a body, joint or frame of that name"
             raise ModelError(text, keys=("objects", name))

@@ -93,7 +93,7 @@ def wait_until(condition: Callable[[], bool], process: subprocess.Popen[str] | N
 
 
 def pids(folder: Path, pattern: str) -> list[int]:
-    """Processes that have come to ``what``."""
+    """Processes that have come to what leaves files of this name."""
     return [int(path.name.rpartition("_")[2]) for path in folder.glob(f"{pattern}_*")]
 
 
@@ -301,9 +301,22 @@ def test_a_signal_after_the_last_step_loses_nothing(
     assert done.returncode == 128 + number, done.stderr
     assert Record.load(next((tmp_path / "out").rglob("record.h5"))).complete
     assert "Traceback" not in done.stderr
+    if command == "run":
+        assert "interrupted; all results are in out, not all figures and pages" in done.stderr
     if command == "compare":
         assert [path.name for path in (tmp_path / "out").iterdir()] == ["two_elbows"]
         assert "interrupted before elbow_4, no_elbow were started" in done.stderr
+
+
+def test_a_signal_while_figures_are_drawn_is_no_error_of_theirs(tmp_path: Path):
+    with started(tmp_path, "run", "elbow_comparison", "--set", "duration_s=0.05", "--out", "out") as process:
+        wait_until((tmp_path / "out" / "summary.json").exists, process)
+        time.sleep(0.3)
+        process.send_signal(signal.SIGINT)
+        _, stderr = communicate(process)
+    assert process.returncode == 128 + signal.SIGINT, stderr
+    assert "interrupted; all results are in out, not all figures and pages" in stderr
+    assert "error" not in stderr
 
 
 # A signal whose KeyboardInterrupt Python drops, because it comes while a callback of the garbage collector runs.

@@ -84,6 +84,20 @@ def test_defaults_that_change_nothing_are_not_resolved() -> None:
     assert not is_set(fixed.config, ("integrator", "rtol"))
 
 
+def test_friction_of_free_objects_has_an_effect(tmp_path) -> None:
+    path = tmp_path / "push.yaml"
+    hinge = ", hinge: {}"
+    text = (
+        "duration_s: 0.1\nplant: {type: serial_arm, chain: [{axis: y, mass_kg: 1}]}\nsurfaces: {s: {type: plane}}\n"
+        "objects: {b: {mass_kg: 1, size_m: [0.2, 0.2, 0.1], position_m: [3, 0, 0.05]HINGE}}\n"
+        "contacts: {law: unilateral, friction: 0.3}\n"
+    )
+    for change, idle in (("", []), (hinge, ["contacts.friction"])):
+        path.write_text(text.replace("HINGE", change))
+        said = without_effect(load_scenario(path), None)
+        assert [line.partition(" ")[0] for line in said] == idle
+
+
 def test_check_says_it_too() -> None:
     start = check(load_scenario("single_pendulum", overrides={"contacts": {"friction": 0.3}}))
     assert len(start.warnings) == 1

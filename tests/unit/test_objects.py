@@ -91,6 +91,9 @@ def test_a_box_beside_a_snake():
 def test_names_and_sizes_are_checked():
     with pytest.raises(ModelError, match=r"objects.link_1: the robot has a body, joint or frame of that name"):
         dynsim.simulate(scene({"link_1": BOX}))
+    for name in ("", "world"):
+        with pytest.raises(ModelError, match=f"{name!r} cannot be the name of an object"):
+            dynsim.simulate(scene({name: BOX}))
     for change, says in (({"radius_m": 0.1}, "radius_m"), ({"size_m": None}, "size_m"), ({"mass_kg": 0.0}, "mass_kg")):
         with pytest.raises((ScenarioError, ValueError), match=says):
             scene({"box": BOX | change})

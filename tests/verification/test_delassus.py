@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from dynsim.dynamics import tables as ka
@@ -31,7 +31,10 @@ def random_rank(rng: np.random.Generator, p: int, rank: int, spread: float) -> n
     return (left * 10.0 ** rng.uniform(-spread, 0.0, size=rank)) @ right.T
 
 
+# Examples: pivots that are the largest of their columns alone, which cost up to ten digits of a null space.
 @given(seeds)
+@example(12374)
+@example(12685)
 def test_least_norm_least_squares_of_any_rank(seed):
     """Neither symmetric nor consistent systems; residual and null-space part are those of the pseudo-inverse."""
     rng = np.random.default_rng(seed)
@@ -40,11 +43,13 @@ def test_least_norm_least_squares_of_any_rank(seed):
     x, dependent = solve(A, b, room=int(rng.integers(0, 3)))
     expected, _, rank, _ = np.linalg.lstsq(A, b, rcond=1e-10)
     assert dependent == (rank < p)
-    # Singular values down to 1e-3 and normal equations of null spaces of size one: some 1e6 roundings.
-    assert np.abs(x - expected).max() <= 1e-9 * (1e-12 + np.abs(expected).max())
+    # Singular values down to 1e-3: some 1e5 roundings.
+    assert np.abs(x - expected).max() <= 1e-10 * (1e-12 + np.abs(expected).max())
 
 
 @given(seeds)
+@example(16964)
+@example(16028)
 def test_contacts_given_twice_and_nearly_twice(seed):
     """J M⁻¹ F of more rows than joints, with friction; the first two rows all but one, where a first pivot is poor."""
     rng = np.random.default_rng(seed)

@@ -44,11 +44,6 @@ FALLBACK = {
     Place("contact/delassus.py", "eliminate", "if abs(small[1, best, k]) <= RANK_TOLERANCE * largest:"): DEPENDENT,
     Place(
         "contact/delassus.py",
-        "eliminate",
-        "least_norm(small, state, active, p, k if least > POOR_PIVOT * largest else 0, largest)",
-    ): DEPENDENT,
-    Place(
-        "contact/delassus.py",
         "eliminate_to_rank",
         "while last > k and abs(matrix[largest_in_column(matrix, last, k, p), last]) <= RANK_TOLERANCE * largest:",
     ): DEPENDENT,

@@ -15,17 +15,14 @@ from dynsim.jit.kernel import apart_kernel, internal_kernel
 # A pivot below this fraction of the largest entry counts as a dependent row: far above rounding (1e-16 times a few
 # dozen operations), far below what independent elbows give (> 1e-6).
 RANK_TOLERANCE = 1e-11
-# Pivots below this fraction of the largest entry were ill chosen when rows turn out to depend on each other: null
-# spaces built on them lose as many digits, and the elimination begins anew.
-POOR_PIVOT = 1e-4
 
 
 @internal_kernel
 def solve_small(small, state, active, p):
     """Solve the leading p×p of ``small[0]`` f = RHS for the constraint forces f, into the FORCE column of ``state``.
 
-    Gaussian elimination with partial pivoting; where a pivot vanishes :func:`least_norm` goes on from there. Its
-    solution is the split of forces among dependent rows. Returns 1 in that case, else 0.
+    Gaussian elimination with partial pivoting; where a pivot vanishes :func:`least_norm` begins anew. Its solution is
+    the split of forces among dependent rows. Returns 1 in that case, else 0.
 
     Parameters
     ----------
@@ -50,7 +47,7 @@ def solve_small(small, state, active, p):
 @apart_kernel
 def eliminate(small, state, active, p):
     """:func:`solve_small` for any number of rows, without the closed forms."""
-    largest, least = 0.0, math.inf
+    largest = 0.0
     for i in range(p):
         state[i, ka.FORCE] = state[i, ka.RHS]
         for j in range(p):
@@ -63,9 +60,8 @@ def eliminate(small, state, active, p):
                 best = i
         # Written so that NaN falls through to the plain elimination and is seen by the integrator.
         if abs(small[1, best, k]) <= RANK_TOLERANCE * largest:
-            least_norm(small, state, active, p, k if least > POOR_PIVOT * largest else 0, largest)
+            least_norm(small, state, active, p, largest)
             return 1
-        least = min(least, abs(small[1, best, k]))
         if best != k:
             for j in range(p):
                 small[1, k, j], small[1, best, j] = small[1, best, j], small[1, k, j]
@@ -86,23 +82,23 @@ def eliminate(small, state, active, p):
 
 
 @internal_kernel
-def least_norm(small, state, active, p, start, largest):
-    """Least-squares solution of least norm, from an elimination of which ``start`` columns are done.
+def least_norm(small, state, active, p, largest):
+    """Least-squares solution of least norm.
 
-    The elimination goes on with rook pivoting (the largest entry of its row and of its column) and leaves
-    P A Q = [L1; L2] [U1, U2] of rank r. With W = L2 L1⁻¹ and Z = U1⁻¹ U2, whose entries such pivots keep small,
+    Elimination with rook pivoting (the largest entry of its row and of its column) leaves P A Q = [L1; L2] [U1, U2] of
+    rank r. With W = L2 L1⁻¹ and Z = U1⁻¹ U2, whose entries such pivots keep small, where those of :func:`eliminate` do
+    not,
 
         [L1; L2]⁺ b = L1⁻¹ (b1 + N(Wᵀ) (b2 − W b1)),    [U1, U2]⁺ c = (x1, Zᵀ x1),  x1 = s − N(Z) Zᵀ s,  s = U1⁻¹ c
 
     with N(X) = X (1 + Xᵀ X)⁻¹, and x = Q [U1, U2]⁺ [L1; L2]⁺ P b. Of b elimination leaves L1⁻¹ b1 and b2 − W b1.
     """
     matrix, wide, part = small[1], small[2], small[3, p - 1]
-    if start == 0:
-        for i in range(p):
-            state[i, ka.FORCE] = state[i, ka.RHS]
-            for j in range(p):
-                matrix[i, j] = small[0, i, j]
-    r = eliminate_to_rank(small, state, active, p, start, largest)
+    for i in range(p):
+        state[i, ka.FORCE] = state[i, ka.RHS]
+        for j in range(p):
+            matrix[i, j] = small[0, i, j]
+    r = eliminate_to_rank(small, state, active, p, largest)
     d = p - r
     # Wᵀ = L1⁻ᵀ L2ᵀ, (r, d).
     for k in range(r - 1, -1, -1):
@@ -144,8 +140,8 @@ def least_norm(small, state, active, p, start, largest):
 
 
 @internal_kernel
-def eliminate_to_rank(small, state, active, p, start, largest):
-    """Rank of ``small[1]`` by its elimination from column ``start`` on; multipliers stay below the diagonal.
+def eliminate_to_rank(small, state, active, p, largest):
+    """Rank of ``small[1]`` by its elimination; multipliers stay below the diagonal.
 
     ``largest``: of the entries of ``small[0]``.
 
@@ -154,7 +150,7 @@ def eliminate_to_rank(small, state, active, p, start, largest):
     matrix = small[1]
     for i in range(p):
         active[i, ka.ORDER] = i
-    k, last = start, p
+    k, last = 0, p
     while k < last:
         column, row = k, largest_in_column(matrix, k, k, p)
         if abs(matrix[row, column]) <= RANK_TOLERANCE * largest:
