@@ -197,7 +197,7 @@ class Asked(dict[str, Any]):
         return super().__contains__(name)
 
 
-@pytest.mark.parametrize("scenario", ["elbow_comparison", "snake_joint_limits"])
+@pytest.mark.parametrize("scenario", [pytest.param("elbow_comparison", marks=pytest.mark.long), "snake_joint_limits"])
 def test_a_record_that_lacks_a_signal_is_drawn_without_or_refused(scenario: str, tmp_path: Path, monkeypatch) -> None:
     # What is drawn counts here, not the pictures; and a figure that does not ask for a signal is drawn without it.
     asks: dict[Any, set[str]] = {}
