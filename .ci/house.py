@@ -1,4 +1,4 @@
-"""Size and shape of the package, printed: lines of code, loose modules, circles of imports, imports upwards."""
+"""Size and shape of the package, printed: lines of code, loose modules, import cycles, imports against the layers."""
 
 from __future__ import annotations
 

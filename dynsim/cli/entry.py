@@ -1,4 +1,4 @@
-"""From the arguments to an exit code: errors become one line, warnings too, and lost output is noticed."""
+"""Entry point of the command line: errors and warnings as one line, and the exit code, also of output that is lost."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""References of a dynamic snake's joints, and the start of a run.
+"""Joint references of a dynamic snake, and its start: a preliminary run that raises the head to its posture.
 
 Gear friction keeps a head that was raised into its posture lower than one that came from above, by about 20 mm and
-0.09 rad. A real robot raises its head, so before t = 0 a run of its own does: the head starts below its posture,
+0.09 rad. A real robot raises its head, so a preliminary run does, before t = 0: the head starts below its posture,
 settles, is raised, and settles again.
 """
 

@@ -1,4 +1,4 @@
-"""What is left of a replay whose process died, and of the one before it."""
+"""Recovery of measured data when the process of a replay died; the results of an earlier replay are kept apart."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A number of several lanes in plain Python, and the right-hand side run with it: which branches look at the state?
+"""The right-hand side on several states at once, in plain Python: which of its branches depend on the state?
 
 ``Lanes`` are N doubles that are computed with as one. A comparison gives N truths; asked for one, as ``if`` does, they
 must agree, and the place in the kernels that asks is noted. So a run with lanes says what a compiler for vectors of

@@ -1,4 +1,4 @@
-"""Numbers of scenarios and servo maps are numbers in the file: neither texts nor true and false."""
+"""Numbers in scenarios and servo maps must be numbers: strings and booleans are refused."""
 
 from __future__ import annotations
 

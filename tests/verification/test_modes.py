@@ -1,4 +1,4 @@
-"""Candidates that stick, slide and leave: what holds a point at rest, and what a change of mode keeps."""
+"""Contacts between sticking, sliding and open: rows that hold a point at rest, and runs across changes of mode."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Ratings of motors: a limit that the current keeps, and what runs say of nominal currents and torques."""
+"""Ratings of motors: the peak current limits the current; runs warn where rms values exceed the nominal ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Constraint rows: the small dense systems of their forces, also when rows depend on each other.
+"""Small dense (Delassus) systems for the forces of constraint rows, also when rows are linearly dependent.
 
 One row format for every constraint: up to two links, ROW (the constrained motion is ROW · V), TARGET (what J vdot must
 be) and DIRECTION (the wrench of a unit force). Row and direction differ under sliding friction, so the p×p matrix is

@@ -1,4 +1,4 @@
-"""What a replay goes through and how it ends: its states, what it shows of itself, the user's stop, the result."""
+"""States of a replay, its progress as it is shown, the stop by the user, and its result."""
 
 from __future__ import annotations
 
