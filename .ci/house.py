@@ -1,4 +1,4 @@
-"""Size and shape of the package, printed: lines of code, loose modules, import cycles, imports against the layers."""
+"""Size and shape of the package: lines of code, modules outside folders, import cycles, layer violations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Two folders of results hold the same numbers, bit for bit: ``python .ci/same_numbers.py FIRST SECOND``.
+"""Comparison of two result folders, bit for bit: ``python .ci/same_numbers.py FIRST SECOND``.
 
 Every signal of every record, and every summary but its wall times.
 """

@@ -1,4 +1,4 @@
-"""``python -m dynsim``."""
+"""Entry point of ``python -m dynsim``."""
 
 from dynsim.cli import main
 

@@ -1,4 +1,4 @@
-"""Every way dynsim refuses or stops: one exception class per cause, each with the exit code the CLI uses."""
+"""Exceptions of dynsim: one class per cause, each with the exit code of the command line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What all tests share: seeded examples, and records that are simulated once."""
+"""Fixtures of all tests: seeded random examples, and records that are simulated once per session."""
 
 from __future__ import annotations
 

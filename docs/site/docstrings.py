@@ -1,4 +1,4 @@
-"""Docstrings as the site shows them: an extension of Griffe, which reads them."""
+"""Griffe extension that converts docstrings for the site."""
 
 from __future__ import annotations
 

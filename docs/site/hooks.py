@@ -1,4 +1,4 @@
-"""What the site does beyond its pages: generated reference, files from outside of docs/, links to them."""
+"""MkDocs hooks: generated reference, files from outside of docs/, and links to them."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ def main() -> None:
     atexit.register(gc.freeze)
     from dynsim.system import interruption
 
-    with interruption.heeded() as received:
+    with interruption.handled() as received:
         try:
             from dynsim.cli.entry import main
         except KeyboardInterrupt:

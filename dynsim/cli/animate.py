@@ -1,4 +1,4 @@
-"""``dynsim animate``: films of records."""
+"""Command ``dynsim animate``: writes films of records."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The application, the options of all commands, and those that several share."""
+"""The Typer application, and the options that several commands share."""
 
 from __future__ import annotations
 

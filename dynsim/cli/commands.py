@@ -1,4 +1,4 @@
-"""The commands; what they need is imported when they are called, so that ``--help`` waits for nothing."""
+"""Commands run, compare, check, list, plot, bench and schema; heavy imports wait until a command is called."""
 
 from __future__ import annotations
 

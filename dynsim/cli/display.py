@@ -1,4 +1,4 @@
-"""What the commands show: console, progress bars, and that figures are being drawn."""
+"""Console, progress bars and the message that figures are being drawn."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Figures and pages of runs: here, or of several runs by as many processes as there are cores."""
+"""Drawing of figures and pages after runs, in this process or, for several runs, in one process per core."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Page:
 
 @contextmanager
 def saved_before(folder: Path) -> Iterator[None]:
-    """Within, signals are heeded again, and one is answered with where the results are."""
+    """Within, signals are handled again, and one is answered with where the results are."""
     interruption.heed()
     try:
         interruption.check()

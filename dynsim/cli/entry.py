@@ -1,4 +1,4 @@
-"""Entry point of the command line: errors and warnings as one line, and the exit code, also of output that is lost."""
+"""Entry point of the command line: prints errors and warnings as one line each and sets the exit code."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from dynsim.system.terminal import escaped
 def main(received: Sequence[int]) -> None:
     """Errors become one line and an exit code. Ctrl-C where nothing can be saved is typer's: 130.
 
-    ``received`` : what :func:`dynsim.system.interruption.heeded` gives, within which this runs
+    ``received`` : what :func:`dynsim.system.interruption.handled` gives, within which this runs
     """
     with lenient_streams() as output, _plain_warnings():
         code = _exit_code()

@@ -1,4 +1,4 @@
-"""`dynsim export`: records and robots for other programs."""
+"""Command ``dynsim export``: converts records and robots to the formats of other programs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`dynsim hw …`. Serial and servo modules are imported by the commands that need them."""
+"""Commands ``dynsim hw …``: replay, checks and service of real and virtual servos."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``dynsim hw drive``: a live drive that servos follow."""
+"""Command ``dynsim hw drive``: a pilot drives a simulation in real time and servos follow it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``dynsim plan``: which points of an arm to brace, where, in what posture, with what force."""
+"""Command ``dynsim plan``: finds which points of an arm to brace, where, in what posture and with what force."""
 
 from __future__ import annotations
 

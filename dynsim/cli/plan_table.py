@@ -1,4 +1,4 @@
-"""A plan of braces for the terminal."""
+"""Table of a brace plan for the terminal."""
 
 from __future__ import annotations
 

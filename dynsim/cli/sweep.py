@@ -1,4 +1,4 @@
-"""``dynsim sweep``: many runs of one scenario, a table and figures of them."""
+"""Command ``dynsim sweep``: many runs of one scenario, with a table and figures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``dynsim teleop``: a scenario driven in real time from a browser."""
+"""Command ``dynsim teleop``: drives a scenario in real time from a browser."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pages to look at records: ``dynsim view``, and what ``run`` and ``compare`` write."""
+"""Command ``dynsim view``, and the pages that ``run`` and ``compare`` write."""
 
 from __future__ import annotations
 

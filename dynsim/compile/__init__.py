@@ -1,1 +1,1 @@
-"""From a description to tables: model, contacts, references, surfaces."""
+"""Compilation of a description to tables of numbers: model, contacts, references, surfaces."""

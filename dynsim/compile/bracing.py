@@ -1,4 +1,4 @@
-"""Statics and dynamics of a braced arm: the forces of its braces that realise a motion with the least heat."""
+"""Statics and dynamics of a braced arm: brace forces that realise a motion with the least motor heat."""
 
 from __future__ import annotations
 

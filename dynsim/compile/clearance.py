@@ -1,4 +1,4 @@
-"""Distances from surfaces at samples of the joint positions: of points on bodies, and of the bodies' centre lines."""
+"""Distances of points and link axes from surfaces, at samples of the joint positions."""
 
 from __future__ import annotations
 

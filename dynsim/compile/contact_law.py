@@ -1,4 +1,4 @@
-"""Tables of the unilateral law for the kernels: friction of contacts, joint stops, dry friction, ties.
+"""Tables of the unilateral law for the kernels: contact friction, joint stops, dry friction, ties.
 
 The law itself is in :mod:`dynsim.dynamics.contact.unilateral` and :mod:`dynsim.integrators.contacts`.
 """

@@ -1,4 +1,4 @@
-"""What a joint controller hands to the simulation."""
+"""Data that a joint controller hands to the simulation: references, feed-forward voltages, gains."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Torques of the motors that hold a posture at rest against weight, loads and braces, with the least heat.
+"""Motor torques that hold a posture at rest against weight, loads and braces, with the least heat.
 
     τ = h + g − J_wᵀ W − J_cᵀ f,    minimise Σ R i²,  K_m i = τ
 

@@ -1,4 +1,4 @@
-"""Postures that put the hand somewhere, turned as asked for, with points on their surfaces and joints within limits."""
+"""Inverse kinematics of one posture: hand position and orientation, points on surfaces, joint limits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Postures that put points of an arm on their surfaces."""
+"""Postures that put points of an arm on their surfaces (closure of the contact constraints)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the members of the families give: a module with ``Config`` and one ``build(config, context)`` for all of them.
+"""Interfaces of the families: a member is a module with ``Config`` and ``build(config, context)``.
 
 A scenario names a member by ``type``. Its section is validated by the member's ``Config``; ``build`` makes of it what
 the engines work with.

@@ -1,4 +1,4 @@
-"""What the inverse kinematics of a hand work on."""
+"""Arrays of the inverse kinematics of a hand: targets, limits, weights and results."""
 
 from __future__ import annotations
 

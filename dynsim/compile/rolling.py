@@ -1,4 +1,4 @@
-"""A base on two driven wheels: from the way it is to go to angles of its wheels, and from these to where it is.
+"""Kinematics of a base on two driven wheels: wheel angles from its path, and its pose from wheel angles.
 
 V = r (φ̇_left + φ̇_right)/2, ω = r (φ̇_right − φ̇_left)/T, ẋ = V cos ψ, ẏ = V sin ψ: it cannot move sideways.
 """

@@ -1,4 +1,4 @@
-"""The scene of a robot for its record: bodies, joints, surfaces and points, from which pictures are drawn later."""
+"""The scene of a robot for its record: bodies, joints, surfaces and points, from which pictures are drawn."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Candidates with a shape as the tables of the kernels, and their distances at a configuration."""
+"""Kernel tables of contact candidates with a shape (spheres, capsules), and their distances."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The articulated mobile robot as a tree of bodies: what the plant ``snake`` is with ``level: dynamic``.
+"""The articulated mobile robot as a tree of bodies: plant ``snake`` with ``level: dynamic``.
 
     floating ─ pair1 ┬ head_psi3 ─ head_theta3 ─ … ─ head_theta1            head branch, axes with a minus sign
                      ├ pair2 (theta4) ─ plate2 (psi4) ─ pair3 (theta5) ─ …   tail branch

@@ -1,4 +1,4 @@
-"""Splines through samples, by B-splines on their knots, and the way from rest to rest of least jerk.
+"""B-spline interpolation of samples, and the minimum-jerk motion from rest to rest.
 
 scipy has splines too, but costs a run 0.3 s to import.
 """

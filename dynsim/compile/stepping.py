@@ -1,4 +1,4 @@
-"""The system as time stepping takes it: always with tables of shapes, so that one program does for all scenes."""
+"""Tables of the system for time stepping; shape tables are always present, so one program fits all scenes."""
 
 from __future__ import annotations
 

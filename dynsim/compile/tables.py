@@ -1,4 +1,4 @@
-"""Robot, drives, contacts and loads compiled to the tables of the kernels; impossible descriptions are refused."""
+"""Kernel tables of robot, drives, contacts and loads; impossible descriptions are refused here."""
 
 from __future__ import annotations
 
@@ -262,7 +262,7 @@ def compile_support(robot: Robot) -> ks.SupportArrays:
 
 
 def _check_couplings(robot: Robot) -> None:
-    """Refuse couplings of unknown joints, two of one joint, circles, and numbers that are none."""
+    """Refuse couplings of unknown joints, two of one joint, cycles, and numbers that are none."""
     joints = {link.joint: link for link in robot.links}
     leads: dict[str, Coupling] = {}
     for coupling in robot.couplings:

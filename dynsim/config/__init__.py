@@ -1,1 +1,1 @@
-"""Base of configurations, and their problems in words."""
+"""Base class of configurations, and the wording of validation errors."""

@@ -1,4 +1,4 @@
-"""Base of every part of a scenario and of a servo map: strict about keys, frozen after validation."""
+"""Base class of all parts of scenarios and servo maps: unknown keys refused, frozen after validation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the shell offers for a scenario and its variant; loads nothing heavy, since it runs at every tab."""
+"""Shell completion of scenario and variant names; imports nothing heavy, as it runs at every Tab key."""
 
 from __future__ import annotations
 

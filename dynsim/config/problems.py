@@ -1,4 +1,4 @@
-"""Error messages of one line for what pydantic refuses in a file: place, key, value and fix.
+"""One-line error messages from pydantic's validation errors: file, line, key, value and fix.
 
 Scenarios and servo maps share it, so that errors of both read alike.
 """

@@ -1,4 +1,4 @@
-"""What the kernels read and write: a few flat tables per concept, in SI units and the world frame W.
+"""Input and output tables of the kernels: a few flat arrays per concept, in SI units and the world frame W.
 
 n links (one velocity each), na drives (motors), c contact points, p constraint rows. A link is one joint and the body
 it carries; links are ordered so that a parent comes before its children. Spatial vectors are (angular, linear) at the

@@ -1,4 +1,4 @@
-"""Run a scenario: the plant's engine turns it into a record."""
+"""Simulation of a scenario: the plant's engine turns it into a record."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Compiled code in a thread of its own, while the calling thread handles signals and the limit of wall time.
+"""Compiled code run in a thread, while the calling thread handles signals and the wall-time limit.
 
 Compiled code neither receives signals nor reads a clock, and a single step may take a minute where a contact problem
 has no solution. So it runs without the interpreter's lock in another thread. The calling thread wakes up for a signal,

@@ -1,4 +1,4 @@
-"""What is said while kernels are compiled: which, why anew, and how long it takes.
+"""Messages about the compilation of kernels: which, why again, and how long it takes.
 
 One line in the log. On a terminal, where nobody else shows it, a line on stderr as it begins and as it ends. Commands
 show it in their bars: also what their worker processes compile, of which a file beside the kernels says so.

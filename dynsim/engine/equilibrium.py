@@ -1,4 +1,4 @@
-"""The start of ``initial.equilibrium``: currents that hold the posture, and commands that keep them.
+"""Equilibrium start (``initial.equilibrium``): currents that hold the posture, and commands that keep them.
 
 At rest u = R i, so a controller that follows the posture without any error has to give R i. Where it plans voltages,
 they are that; else the references of all motors are moved by a constant for the whole run,

@@ -1,4 +1,4 @@
-"""Where contacts do not determine their forces: Painlevé's paradox, dependent rows, contacts that share forces.
+"""Warnings and stops where contact forces are not determined: Painlevé's paradox, dependent rows.
 
 The watch itself is compiled (dynsim.dynamics.contact.uniqueness); here its finding is located and put into words,
 and the motion that dependent frictional rows leave open is measured. docs/physics.md derives the criteria.

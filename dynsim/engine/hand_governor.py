@@ -1,4 +1,4 @@
-"""What a hand may be asked for without ever having to stop faster than it can: a reference governor.
+"""Reference governor of the hand: limits its commanded velocity so that the joints can always stop in time.
 
 The state is the target p_d of the hand, its velocity v and the joints that have it there. v is admissible where the
 hand can come to rest from it: the points of a straight way, slowed by a h in each tick of length h,
@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from dynsim.compile.model import Model
 from dynsim.compile.reaching import path_arrays
 from dynsim.compile.references.teleop import TeleopOptions
-from dynsim.dynamics import inverse_kinematics as ki
+from dynsim.dynamics import inverse_kinematics as kik
 from dynsim.dynamics.tables import workspace
 from dynsim.jit.kernel import reals
 
@@ -167,7 +167,7 @@ class HandGovernor:
         targets = self.target + np.cumsum(velocities @ self._axes.T, axis=0) / options.rate
         q, joints, count = self._q.copy(), np.zeros((len(targets), len(self.joints))), len(targets)
         q[self._arrays.place] = self.joints
-        ended, _ = ki.follow_path(
+        ended, _ = kik.follow_path(
             self._model.arrays,
             self._workspace,
             self._arrays,

@@ -1,4 +1,4 @@
-"""From a run of the kinematic snake to its record: signals, summary, warnings."""
+"""The record of a run of the kinematic snake: signals, summary, warnings."""
 
 from __future__ import annotations
 
@@ -33,14 +33,12 @@ def make_record(run: SnakeRun, scenario: Scenario, wall: float, pictured: bool =
     model, period, ticks = run.model, run.controller.schedule.period, run.tick
     rows = -(-ticks // run.stride) + 1
     trace = SnakeTrace(*(array[:rows] for array in run.trace))
-    record_row(model, law, state, run.rig, rows - 1, trace)
+    record_row(model, law, state, run.ws, rows - 1, trace)
     hold_last(trace)
     trace.w_hat[-1] = state.w_hat
     time = np.append(np.arange(rows - 1) * run.stride, ticks) * period
     points = np.zeros((rows, 1 + model.head_joints + 2 * model.base_joints, 3))
-    posture_points(
-        model, reals(trace.base), reals(trace.phi), run.rig.work.frame, new_chain(model), np.zeros(6), points
-    )
+    posture_points(model, reals(trace.base), reals(trace.phi), run.ws.work.frame, new_chain(model), np.zeros(6), points)
     names, wheels, joints = description.joint_names, description.wheel_names, len(description.joint_names)
     record = Record(time, provenance=provenance(scenario))
     add = record.add

@@ -1,4 +1,4 @@
-"""One simulation of the kinematic snake: ticks between switching times are compiled, mode switching is not."""
+"""One simulation of the kinematic snake: compiled ticks between mode switches in Python."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ class SnakeRun(SnakeControl):
         """Compile or load the kernels: that is no simulation time."""
         law, schedule, trial = self.controller.law, self.controller.schedule, copy_of(self.state)
         trace = new_trace(self.model, 1)
-        run_ticks(self.model, law, schedule, trial, self.block.velocity, 0, 1, 1, 1, self.rig, trace)
-        record_row(self.model, law, trial, self.rig, 0, trace)
+        run_ticks(self.model, law, schedule, trial, self.block.velocity, 0, 1, 1, 1, self.ws, trace)
+        record_row(self.model, law, trial, self.ws, 0, trace)
 
     def advance(self) -> None:
         """Run the control periods up to the next one in which something may change: one, of a source that knows one.
@@ -39,7 +39,7 @@ class SnakeRun(SnakeControl):
             int(not self.recovering),
             int(self.controller.when_blocked),
             self.stride,
-            self.rig,
+            self.ws,
             self.trace,
         )
         if done < 0:

@@ -1,4 +1,4 @@
-"""The coupled system about a state as linear equations, with its contacts as they are.
+"""Linearisation of the coupled system about a state, with its contact modes kept fixed.
 
     δẋ = A δx + B δu,   δy = C δx + D δu,   x = (q, v, i)
 

@@ -1,4 +1,4 @@
-"""Which method integrates a system: its fastest rate at the start against the pace of its motion.
+"""Choice of the integration method (``method: auto``) from the fastest rate of the system at its start.
 
 DOPRI5 is stable while h |λ| is below about 3.3, however smooth the motion; RADAU5 is held to its accuracy only. Of the
 spectrum of ∂(v, v̇, di/dt)/∂(q, v, i) at the start the part that can hold steps counts, that of drives and losses,

@@ -1,4 +1,4 @@
-"""Fixing and switching states of the robot, and the choice of the next mode ([T] IV.C.5, V.E)."""
+"""Mode changes of the snake: which wheel pairs are lifted next, and when ([T] IV.C.5, V.E)."""
 
 from __future__ import annotations
 

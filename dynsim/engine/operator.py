@@ -1,4 +1,4 @@
-"""An operator at a stepped simulation: velocities of hand and base become references, rewritten at every tick.
+"""Operator of a stepped simulation: commanded velocities of hand and base become references at every tick.
 
 The hand's target p_d moves with the velocity v that is asked for, in axes of the world; on a mobile base in those of
 the base, which carries it. Each tick of length h takes the joints to where the hand is at p_d + h v, at constant rates

@@ -1,4 +1,4 @@
-"""What both engines say about a run: a record too large to be made, or not complete."""
+"""Size check of a record, and exceptions of incomplete runs, common to both engines."""
 
 from __future__ import annotations
 

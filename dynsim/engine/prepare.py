@@ -1,4 +1,4 @@
-"""A scenario compiled to the arrays of the kernels, after everything that can be refused before the first step."""
+"""Preparation of a run: the scenario compiled to kernel arrays, with every refusal before the first step."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from dynsim.engine.outcome import check_size
 from dynsim.errors import ModelError, ScenarioError, SimulationStopped
 from dynsim.integrators import driver
 from dynsim.integrators import run as ki
-from dynsim.integrators.contacts import events as kev
+from dynsim.integrators.contacts import events as ke
 from dynsim.integrators.events import TIP_MARGIN
 from dynsim.integrators.stepping.tables import stepping_arrays
 from dynsim.model.description import Array, Contact, Load, Robot
@@ -307,9 +307,9 @@ def guards(
     if robot.base is not None:
         rows.append((TIP_MARGIN, 0, -1, ki.STOP if robot.base.stop_on_overturn else ki.LOG))
     for k in range(len(contacts)):
-        rows += [(kev.NORMAL_GUARD, k, -1, ki.LOG), (kev.SLIP_GUARD, k, -1, ki.LOG)]
-    rows += [(kev.STOP_GUARD, k, -1, ki.LOG) for k in range(len(stops))]
-    rows += [(kev.DRY_GUARD, k, -1, ki.LOG) for k in range(len(dry))]
+        rows += [(ke.NORMAL_GUARD, k, -1, ki.LOG), (ke.SLIP_GUARD, k, -1, ki.LOG)]
+    rows += [(ke.STOP_GUARD, k, -1, ki.LOG) for k in range(len(stops))]
+    rows += [(ke.DRY_GUARD, k, -1, ki.LOG) for k in range(len(dry))]
     if not rows:
         return None
     event = np.zeros((len(rows), ki.EVENT_SIZE))

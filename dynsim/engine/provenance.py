@@ -1,4 +1,4 @@
-"""What made a record: scenario, version, commit, libraries."""
+"""Provenance of a record: scenario, version, commit, libraries."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The record of a run: columns that the kernels have written, by their names."""
+"""The record of a run from the columns that the kernels wrote."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files of a run: complete or not there at all."""
+"""Writing the files of a run, all of them or none."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sensors between a simulation and a sampled controller: samples at a rate, with noise, that come late and are held."""
+"""Sensors of a sampled controller: sampling, noise, resolution, delay and hold."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A simulation in the hands of its caller: advance, look, rewrite references and wrenches, go back.
+"""Simulation under the caller's control: advance, read, rewrite references and wrenches, restore a snapshot.
 
 Steps are those of :func:`dynsim.simulate`, bit for bit, as long as nothing is rewritten: ``advance`` does not cut them.
 The step that would pass the time asked for is kept back, and the state there is taken from its dense output. Only when

@@ -27,7 +27,7 @@ from dynsim.snake.description import (
     TaskSpaceController,
 )
 from dynsim.snake.kinematics import SnakeModel, pose_of_point
-from dynsim.snake.state import Rig, SnakeState, SnakeTrace, new_rig, new_state, new_trace
+from dynsim.snake.state import SnakeState, SnakeTrace, TickWorkspace, new_state, new_tick_workspace, new_trace
 from dynsim.snake.ticks import record_row, run_ticks
 
 Array = NDArray[np.float64]
@@ -68,12 +68,12 @@ class SnakeControl:
     def __post_init__(self) -> None:
         model, description, controller = self.model, self.description, self.controller
         self.state: SnakeState = new_state(model)
-        self.rig: Rig = new_rig(model)
+        self.ws: TickWorkspace = new_tick_workspace(model)
         self.trace: SnakeTrace = new_trace(model, -(-self.ticks // self.stride) + 1)
         self.gripper: NDArray[np.int64] = np.zeros(self.ticks, dtype=np.int64)
         state = self.state
         state.base[:], state.phi[:] = description.initial_base_pose, description.initial_joints
-        pose_of_point(model, state.base, state.phi, self.rig.work.frame, state.w_target)
+        pose_of_point(model, state.base, state.phi, self.ws.work.frame, state.w_target)
         state.phi_hat[:], state.w_hat[:] = state.phi, state.w_target
         state.counts[ss.MODE] = controller.fixing_row
         self.switcher = ModeSwitcher(
@@ -108,7 +108,7 @@ class SnakeControl:
     def posture(self) -> tuple[Array, Array, Array]:
         """Pose of the controlled point (6,), base pose (3,) and joints (n_phi,) as an operator sees them."""
         state, w = self.state, np.zeros(6)
-        pose_of_point(self.model, state.base, state.phi, self.rig.work.frame, w)
+        pose_of_point(self.model, state.base, state.phi, self.ws.work.frame, w)
         return w, state.base.copy(), state.phi.copy()
 
     def read_commands(self, waiting: bool) -> None:
@@ -230,12 +230,12 @@ class SnakeControl:
         row_of_block = min(int(trial.counts[ss.CARRIED_OUT]), len(self.block.velocity) - 1)
         lasting = np.tile(self.block.velocity[row_of_block], (ticks, 1))
         trial.counts[[ss.MODE, ss.TICKS, ss.CARRIED_OUT]], trial.progress[ss.DONE] = (row, 0, 0), 0.0
-        done, _ = run_ticks(self.model, law, schedule, trial, lasting, ticks, 1, 1, 1, self.rig, trace)
+        done, _ = run_ticks(self.model, law, schedule, trial, lasting, ticks, 1, 1, 1, self.ws, trace)
         if done < 0:
             return np.inf, -np.inf  # no longer finite: no mode to take
         if done < ticks:  # blocked: the target waits for the rest of the period
-            run_ticks(self.model, law, schedule, trial, lasting, ticks - done, 0, 0, 1, self.rig, trace)
-        record_row(self.model, law, trial, self.rig, ticks, trace)
+            run_ticks(self.model, law, schedule, trial, lasting, ticks - done, 0, 0, 1, self.ws, trace)
+        record_row(self.model, law, trial, self.ws, ticks, trace)
         return float(trace.cost[-1]), float(trace.margin.min())
 
 

@@ -27,7 +27,7 @@ from dynsim.engine.snake_record import add_task, hold_last, task_summary, task_w
 from dynsim.engine.snake_start import STEADY_TICKS, WheelLifter
 from dynsim.engine.stepped import State
 from dynsim.errors import SimulationStopped
-from dynsim.jit.kernel import Direct
+from dynsim.jit.kernel import FixedSignature
 from dynsim.model.description import Array
 from dynsim.model.drives import Servo
 from dynsim.record import Record
@@ -95,7 +95,7 @@ class SnakePilot(SnakeControl):
         motors = [motor.joint for motor in robot.motors]
         self._motors = np.array([motors.index(joint) for joint in (*joints, *robot.wheel_joints)])
         self._lifting = np.array([joints.index(joint) for joint in robot.lifting_joints])
-        self._command = Direct(command_tick)
+        self._command = FixedSignature(command_tick)
         # Of the line that the robot is drawn as: rows of joint_positions, whose last are the hand and the tail's axle.
         chain = list(d.joint_names[: d.head_joints + 1])
         for k in range(1, d.base_joints):
@@ -160,7 +160,7 @@ class SnakePilot(SnakeControl):
             self.block.velocity,
             int(not self.recovering),
             int(self.controller.when_blocked),
-            self.rig,
+            self.ws,
             row,
             self.trace,
         )
@@ -222,7 +222,7 @@ class SnakePilot(SnakeControl):
 
     def _tell(self, simulation: Referenced, time: float, phi: Array) -> None:
         """References of joints and wheels from the tick at ``time`` on, at which joints are told ``phi``."""
-        rates, joints, lines = self.rig.work.u, len(phi), np.zeros((len(self._motors), 2))
+        rates, joints, lines = self.ws.work.u, len(phi), np.zeros((len(self._motors), 2))
         self._lift(time)
         lines[:joints, 0], lines[:joints, 1] = phi, rates[:joints]
         lines[self._lifting, 0] += self._added
@@ -240,7 +240,7 @@ class SnakePilot(SnakeControl):
         span = ticks * self.period
         # Yaw angles go on at their rates until the next look.
         head, joints = self.description.head_joints, len(self.state.phi)
-        yaw = self.state.phi[head:] + (span - self.period) * self.rig.work.u[head:joints]
+        yaw = self.state.phi[head:] + (span - self.period) * self.ws.work.u[head:joints]
         try:
             then = self._lifter.angles(time + span, yaw)
         except ArithmeticError:
@@ -296,11 +296,11 @@ class SnakePilot(SnakeControl):
             trace.mode[-1], trace.w_target[-1] = self.state.counts[ss.MODE], self.state.w_target
             commanded[-1], trace.w_hat[-1] = self.state.phi, self.state.w_hat
         hold_last(trace)
-        w, points, shown, write_row = np.zeros((rows, 6)), [], copy_of(self.state), Direct(record_row)
+        w, points, shown, write_row = np.zeros((rows, 6)), [], copy_of(self.state), FixedSignature(record_row)
         for r in range(rows):
             shown.base[:], shown.phi[:], shown.w_target[:] = trace.base[r], trace.phi[r], trace.w_target[r]
             shown.rho[:], shown.counts[ss.MODE] = trace.rho[r], trace.mode[r]
-            write_row(model, law, shown, self.rig, r, trace)
+            write_row(model, law, shown, self.ws, r, trace)
             w[r] = self.head_pose(q[r])
             points.append(self._polyline(q[r]))
         slip = np.linalg.norm(record["contact_slip_velocity"], axis=2)

@@ -1,4 +1,4 @@
-"""What the task-space control of a snake leaves in a record, whatever moved the snake: signals, summary, warnings."""
+"""Signals, summary and warnings of the snake's task-space control, for both snake plants."""
 
 from __future__ import annotations
 

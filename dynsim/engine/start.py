@@ -1,4 +1,4 @@
-"""Where a scenario of a plant with dynamics starts, and whether everything before its first step can be done."""
+"""Start of a dynamic run: initial posture and state, and the checks before the first step."""
 
 from __future__ import annotations
 

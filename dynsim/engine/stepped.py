@@ -1,4 +1,4 @@
-"""What goes in and out of a stepped simulation: states, events, snapshots."""
+"""Data types of a stepped simulation: states, events, snapshots."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Why an integration has stopped before its end, in words."""
+"""Messages for an integration that stopped before its end."""
 
 from __future__ import annotations
 

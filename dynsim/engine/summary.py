@@ -1,4 +1,4 @@
-"""From a run to the numbers of its summary: energies, tracking errors, contact forces, loads of the motors."""
+"""Summary of a run: energies, tracking errors, contact forces, motor loads."""
 
 from __future__ import annotations
 

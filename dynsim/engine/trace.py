@@ -1,4 +1,4 @@
-"""What a stepped simulation samples: blocks of sample times for the kernels, and the rows that are kept."""
+"""Sampling of a stepped simulation: blocks of sample times for the kernels, and the rows that are kept."""
 
 from __future__ import annotations
 

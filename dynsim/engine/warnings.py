@@ -1,4 +1,4 @@
-"""What a run warns of: sentences with the place, the number, and what to do about it."""
+"""Warnings of a run: sentences with the location, the number, and what to do about it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from dynsim.dynamics.contact import unilateral as ku
 from dynsim.engine.force_indeterminacy import motion_spread, sharing
 from dynsim.engine.prepare import Prepared
 from dynsim.integrators import run as ki
-from dynsim.integrators.contacts import events as kev
+from dynsim.integrators.contacts import events as ke
 from dynsim.integrators.stepping import tables as kt
 from dynsim.model.description import Robot
 from dynsim.model.drives import Drive, Motor, Servo, TorqueSource
@@ -87,7 +87,7 @@ def _contact_warnings(record: Record, scenario: Scenario, prepared: Prepared, su
         for contact, tally in zip(contacts, unilateral.tally, strict=True):
             if tally[ku.CHATTERED]:
                 warnings.append(
-                    f"{contact.name}: chatter, more than {kev.MOST_EVENTS} contact events within {kev.WINDOW:g} s; "
+                    f"{contact.name}: chatter, more than {ke.MOST_EVENTS} contact events within {ke.WINDOW:g} s; "
                     f"what left more slowly than {tally[ku.SETTLE]:.0e} m/s was kept on the surface"
                 )
     for contact in summary["contacts"]:

@@ -1,4 +1,4 @@
-"""Zero ticks: put the robot into its zero posture by hand, and write what the servos read into the map."""
+"""Calibration of zero ticks: the robot is put into its zero posture by hand, and its readings go to the map."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Why replays and other commands on hardware refuse or stop: one class per cause, each with its exit code."""
+"""Exceptions of replays and hardware commands: one class per cause, each with its exit code."""
 
 from __future__ import annotations
 

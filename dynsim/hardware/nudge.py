@@ -1,4 +1,4 @@
-"""Sense of rotation: turn each joint a little way and back, and see whether it moves as the map says.
+"""Check of the sense of rotation: turns each joint a little and back, and compares with the servo map.
 
 A nudge is a replay of one servo, with all its checks, rules and its end: verified, armed where it stands, 3° and back
 at 0.1 rad/s at most, torque off. All other servos of the map stay limp.

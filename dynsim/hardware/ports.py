@@ -1,4 +1,4 @@
-"""The bus behind the name of a port."""
+"""Opening of a bus by the name of its port, real or virtual."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Modules of POSIX behind serial ports and pseudo-terminals: None where the system does not have them, as on Windows.
+"""POSIX modules for serial ports and pseudo-terminals; None where the system lacks them, as on Windows.
 
 Servos in memory need none of them.
 """

@@ -1,4 +1,4 @@
-"""What a servo map says of all servos: serial line, supply, and limits at which a run is aborted.
+"""Sections of a servo map that concern all servos: serial line, supply, and abort limits.
 
 The rules that apply these limits: :mod:`dynsim.hardware.replay.rules`.
 """

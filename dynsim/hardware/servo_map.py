@@ -1,4 +1,4 @@
-"""The servo map: which servo follows which column of a record, and what that joint may do.
+"""The servo map: which servo follows which column of a record, and the limits of that joint.
 
 Joint angle and servo position are tied by
 

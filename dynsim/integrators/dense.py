@@ -11,7 +11,7 @@ from dynsim.integrators.project import settle
 from dynsim.integrators.radau5 import tables as kn
 from dynsim.integrators.radau5.tables import NODE_RADAU, NewtonArrays
 from dynsim.integrators.run import Run
-from dynsim.jit.kernel import internal_kernel, kernel, merged_kernel
+from dynsim.jit.kernel import inline_kernel, internal_kernel, kernel
 
 
 @internal_kernel
@@ -65,7 +65,7 @@ def state_within(run: Run, t, out):
     interpolate(run, t, out)
 
 
-@merged_kernel
+@inline_kernel
 def sample_step(system: System, ws: Workspace, run: Run):
     """Record every sample time within the step from TIME to TIME + STEP, from the dense output.
 

@@ -9,7 +9,7 @@ from dynsim.dynamics.tables import Workspace
 from dynsim.integrators import run as ki
 from dynsim.integrators.run import Run
 from dynsim.integrators.steps import error_norm
-from dynsim.jit.kernel import internal_kernel, merged_kernel
+from dynsim.jit.kernel import inline_kernel, internal_kernel
 
 # Stage rows a_ij, with the solution as the last row, whose derivative is the next step's first stage.
 A_DOPRI5 = np.array(
@@ -39,7 +39,7 @@ def combine(y, h, row, stages, k, y_new):
                 y_new[j] += w * k[s, j]
 
 
-@merged_kernel
+@inline_kernel
 def step_dopri5(system: System, ws: Workspace, run: Run):
     """One step of Dormand and Prince's method; returns the error norm.
 

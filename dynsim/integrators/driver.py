@@ -37,7 +37,7 @@ from dynsim.integrators.run import Run
 from dynsim.integrators.stepping.step import advance_moreau
 from dynsim.integrators.steps import choose_step, finished, finite, first_step, next_step, rejected, stalled
 from dynsim.integrators.watch import forces_unique, watch
-from dynsim.jit.kernel import Direct, apart_kernel, free_kernel, internal_kernel, merged_kernel
+from dynsim.jit.kernel import FixedSignature, free_kernel, inline_kernel, internal_kernel, noinline_kernel
 
 
 @internal_kernel
@@ -72,7 +72,7 @@ def start_contacts(unilateral: UnilateralArrays | None, system: System, ws: Work
     return run.count[ki.STATUS] == ki.RUNNING and settle(system, run.clock[ki.TIME], run.y, ws, run.stage[0], run)
 
 
-@merged_kernel
+@inline_kernel
 def accept(system: System, ws: Workspace, run: Run):
     """Project y_new, record, and make it the new y. Sets STATUS when contacts cannot be met or forces not be known."""
     t, h = run.clock[ki.TIME], run.clock[ki.STEP]
@@ -93,7 +93,7 @@ def accept(system: System, ws: Workspace, run: Run):
     run.count[ki.STEPS] += 1
 
 
-@merged_kernel
+@inline_kernel
 def take_step(system: System, ws: Workspace, run: Run, error):
     """What becomes of a step that has been taken: True when it is accepted by error control, events and HOLD."""
     clock, count = run.clock, run.count
@@ -143,7 +143,7 @@ def ready(system: System, ws: Workspace, run: Run):
     return count[ki.TICKED] == 0
 
 
-@merged_kernel
+@inline_kernel
 def waiting(system: System, ws: Workspace, run: Run):
     """True when a step can be taken; False when the caller is to look first."""
     # Most runs have nothing to do between two steps.
@@ -151,7 +151,7 @@ def waiting(system: System, ws: Workspace, run: Run):
     return idle or ready(system, ws, run)
 
 
-@merged_kernel
+@inline_kernel
 def conclude(system: System, ws: Workspace, run: Run, error, order):
     """Accept or refuse the step just taken, or that was kept back; True when the caller is to look."""
     count = run.count
@@ -186,7 +186,7 @@ def advance_dopri5(system: System, ws: Workspace, run: Run, limit):
             return
 
 
-@apart_kernel
+@noinline_kernel
 def conclude_apart(system: System, ws: Workspace, run: Run, error, order):
     """:func:`conclude`, compiled apart: what a step of RADAU5 calls takes long, and functions as small as this compile
     in less than half the time of one that has them all."""
@@ -232,7 +232,7 @@ def advance(system: System, ws: Workspace, run: Run, limit: int) -> None:
 
 def direct(run: Run) -> Callable[[System, Workspace, Run, int], None]:
     """:func:`advance` for a run in many short pieces, whose tables keep the types that they have in the first."""
-    return Direct(_METHODS[run.method])
+    return FixedSignature(_METHODS[run.method])
 
 
 _METHODS = {ki.DOPRI5: advance_dopri5, ki.RADAU5: advance_radau5, ki.TIME_STEPPING: advance_moreau}

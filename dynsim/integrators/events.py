@@ -1,4 +1,4 @@
-"""Events: a step is cut where a guard passes zero, and the next one starts there. Ticks: steps end at given times.
+"""Event location: a step ends where a guard function crosses zero; ticks end steps at given times.
 
 The event table has a guard for each event, its value at the last accepted step and the side of zero it was on. After a
 step that error control has accepted the guards are evaluated from what the right-hand side has left in the workspace;
@@ -15,7 +15,7 @@ from dynsim.dynamics.tables import Workspace
 from dynsim.dynamics.tree.points import point_position
 from dynsim.dynamics.tree.support import tip_margin
 from dynsim.integrators import run as ki
-from dynsim.integrators.contacts import events as kev
+from dynsim.integrators.contacts import events as ke
 from dynsim.integrators.contacts.events import contact_guard, note_gaps, too_long
 from dynsim.integrators.run import Run
 from dynsim.jit.kernel import internal_kernel
@@ -49,7 +49,7 @@ def guard(system: System, t, ws: Workspace, run: Run, e):
         value = ws.contacts[k, ka.GAP]
     elif kind == TIP_MARGIN:
         value = tip_margin(system.model, system.loads, t, ws, run.support)
-    elif kind >= kev.NORMAL_GUARD:
+    elif kind >= ke.NORMAL_GUARD:
         value = contact_guard(system.contacts, system.unilateral, ws, kind, k)
     else:
         point_position(ws, run.hand_link, run.hand_point, run.hand)

@@ -1,4 +1,4 @@
-"""What is recorded of a sample besides its state."""
+"""Recorded outputs of a sample besides its state."""
 
 from __future__ import annotations
 

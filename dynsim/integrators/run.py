@@ -1,4 +1,4 @@
-"""The moving part of one simulation: what the integration reads, writes and counts."""
+"""Arrays of one integration: state, workspace, recorded rows and counters."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Error norm and step size."""
+"""Error norm and step-size control."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dynsim.dynamics.tree.joints import position_error
 from dynsim.integrators import run as ki
 from dynsim.integrators.events import next_tick
 from dynsim.integrators.run import Run
-from dynsim.jit.kernel import internal_kernel, kernel, merged_kernel
+from dynsim.jit.kernel import inline_kernel, internal_kernel, kernel
 
 
 @internal_kernel
@@ -44,7 +44,7 @@ def finite(values):
     return total == 0.0
 
 
-@merged_kernel
+@inline_kernel
 def finished(run: Run):
     """True when the run has ended, for whatever reason, or is asked to; sets STATUS at END."""
     end = run.clock[ki.END]

@@ -1,4 +1,4 @@
-"""What is watched at accepted steps: extremes of the contact forces, and whether these are unique."""
+"""Statistics of accepted steps: extremes of the contact forces, and their uniqueness."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""All that touches numba: compilation, its cache, struct types, SIMD."""
+"""Everything that uses numba: compilation, cache, struct types, SIMD."""

@@ -1,4 +1,4 @@
-"""How kernels are compiled: numba's compiler with some of its habits mended, so that code is compiled once.
+"""Compiler pipeline of the kernels: numba's, adapted so that each kernel is compiled only once.
 
 - It keeps every callee twice, as a library of its own and as a copy in its caller, see :class:`_OwnCallees`.
 - It compiles a function again for each set of options that it is called from, see :func:`register_part`.
@@ -243,7 +243,7 @@ class PartCompiler(_LeanCompiler):
         return result._replace(entry_point=entry)
 
 
-class ApartCompiler(PartCompiler):
+class NoInlineCompiler(PartCompiler):
     """numba's compiler, into :class:`_ToCall`."""
 
     library = _ToCall

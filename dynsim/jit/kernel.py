@@ -1,4 +1,4 @@
-"""The one place that compiles: ``@kernel`` on plain module-level functions.
+"""The decorator ``@kernel``: the only place where functions are compiled.
 
 How is in dynsim.jit.compiler. Here is the cache, because results must not depend on what a process has done before:
 numba's checks only the file that holds the function (an edit in a callee elsewhere silently runs old machine code) and
@@ -31,7 +31,7 @@ from numba.core import config, serialize
 from numba.core.caching import _Cache
 from numba.core.compiler import CompileResult
 
-from dynsim.jit.compiler import ApartCompiler, KernelCompiler, PartCompiler, as_part, packs_formulas, register_part
+from dynsim.jit.compiler import KernelCompiler, NoInlineCompiler, PartCompiler, as_part, packs_formulas, register_part
 
 _OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}, "_nrt": False}
 
@@ -239,7 +239,7 @@ def free_kernel(function: F) -> F:
     return _compile(function, nogil=True)
 
 
-def merged_kernel(function: F) -> F:
+def inline_kernel(function: F) -> F:
     """As :func:`kernel`, for callers of the right-hand side: merged into their caller before compilation.
 
     A compiled function carries the code of all it calls, so each extra level would compile the right-hand side again.
@@ -255,12 +255,12 @@ def internal_kernel(function: F) -> F:
     return register_part(function, PartCompiler, _OPTIONS)
 
 
-def apart_kernel(function: F) -> F:
+def noinline_kernel(function: F) -> F:
     """As :func:`internal_kernel`, for what is rarely called from the right-hand side: a call, never merged.
 
     Merged, it would take registers from what runs every time.
     """
-    return register_part(function, ApartCompiler, _OPTIONS)
+    return register_part(function, NoInlineCompiler, _OPTIONS)
 
 
 def exact_kernel(function: F) -> F:
@@ -271,7 +271,7 @@ def exact_kernel(function: F) -> F:
     return register_part(function, PartCompiler, {**_OPTIONS, "fastmath": False, "forceinline": True})
 
 
-class Direct:
+class FixedSignature:
     """A kernel that is called again and again with arguments of the same types, those of the first call.
 
     Numba looks at the types of all arguments in each call; in some hundred tables that takes as long as what many a

@@ -1,4 +1,4 @@
-"""What dynsim replaces of numba within its own compilations, and the numba that it was written for.
+"""Parts of numba that dynsim replaces in its own compilations, and the numba versions this was written for.
 
 Replaced blindly, the internals of another numba would give wrong code, not an error. So another minor version is
 refused when this module is imported, before its internals are; and another source of what is replaced, before a kernel

@@ -1,4 +1,4 @@
-"""A number type of N doubles for the compiler: kernels compile for it as they are, one source for scalar and vector.
+"""A compiler type of N doubles (SIMD): kernels compile for it unchanged, one source for scalar and vector.
 
 Arithmetic, roots and ``min``/``max`` go lane by lane in vector instructions. A comparison gives a :class:`Mask`, which
 has no truth: a branch on it does not compile, so no lane can be led where another one goes. What branches on data has
@@ -43,7 +43,7 @@ class Lanes(types.Type):
 
 
 class Mask(types.Type):
-    """N truths."""
+    """N booleans."""
 
     def __init__(self, count: int) -> None:
         self.lanes = count

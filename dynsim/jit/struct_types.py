@@ -1,4 +1,4 @@
-"""Named tuples of dynsim in compiled code: a block of memory, passed by its address.
+"""Struct types: named tuples in compiled code as memory blocks that are passed by address.
 
 numba flattens a tuple wherever a function is called: the tables of a model, a workspace and a run are some seven
 hundred numbers, so that more than half of what it wrote for a kernel took tuples apart and put them together again.

@@ -1,1 +1,1 @@
-"""What a scenario names by type: plants, motors, surfaces, controllers, paths."""
+"""Types that a scenario chooses by name: plants, motors, surfaces, controllers, paths."""

@@ -1,4 +1,4 @@
-"""Families of what a scenario chooses by ``type``: their members are modules, in the package or in plug-ins.
+"""Families of types that a scenario chooses by ``type``: modules of the package or of plug-ins.
 
 ``type: snake`` of a plant is the module ``dynsim.library.plants.snake``, else the entry point ``snake`` of the group
 ``dynsim.plants`` of whatever is installed. There is no other list. Entry points are looked for only when the package

@@ -1,1 +1,1 @@
-"""What a machine is made of, in SI units: bodies, joints, drives, surfaces, contacts; URDF in and out, MJCF out."""
+"""Descriptions of machines in SI units: bodies, joints, drives, surfaces, contacts; URDF in and out, MJCF out."""

@@ -1,4 +1,4 @@
-"""What drives a joint, as plain frozen data in SI units: DC motors, position servos, open torques."""
+"""Drives of joints as plain frozen data in SI units: DC motors, position servos, open torques."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""MJCF out: a robot as a file of MuJoCo, with the mass matrix and bias forces that dynsim has.
+"""MJCF export: a robot as a MuJoCo file with the same mass matrix and bias forces.
 
 What MuJoCo's format can state exactly is written: bodies, joints with limits, viscous losses, dry friction and rotor
 inertia, gears between joints, gravity, the initial posture. Motors become torques on their joints, within what their

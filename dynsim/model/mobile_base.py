@@ -1,4 +1,4 @@
-"""A base on two driven wheels and a caster."""
+"""Description of a base on two driven wheels and a caster."""
 
 from __future__ import annotations
 

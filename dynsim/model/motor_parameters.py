@@ -1,4 +1,4 @@
-"""What every motor of a scenario has, and the parameters of a brushed DC motor with a gear ([WM] eqs 16–25)."""
+"""Parameters common to all motors of a scenario, and those of a geared brushed DC motor ([WM] eqs 16–25)."""
 
 from __future__ import annotations
 

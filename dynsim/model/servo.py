@@ -1,4 +1,4 @@
-"""Position servos outside the compiled kernels: their parameters as a table, and their law for arrays of servos.
+"""Position servos outside the compiled kernels: parameter table, and the servo law for arrays of servos.
 
 It is the source that the kernels compile (``dynsim.dynamics.drive.servo``), called as plain Python: no numba here.
 """

@@ -1,4 +1,4 @@
-"""Parameters of a position servo as its data sheet has them, everything at the output shaft."""
+"""Data-sheet parameters of a position servo, all at the output shaft."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What points, spheres and capsules can touch: quadrics, rounded boxes and height fields, with their distances."""
+"""Contact surfaces: quadrics, rounded boxes and height fields, with their distance functions."""
 
 from __future__ import annotations
 

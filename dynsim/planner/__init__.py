@@ -1,1 +1,1 @@
-"""Where an arm braces itself, in what posture and with what forces: problem, local solver, search, and verification."""
+"""The brace planner: problem, local solver, search over brace sets, and verification."""

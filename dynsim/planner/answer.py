@@ -1,4 +1,4 @@
-"""Which points of an arm to brace: the answer for each number of braces, verified."""
+"""Result of the planner: the verified best set for each number of braces."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""References of a plan: postures at many instants, exactly on hand path and surfaces, and what they cost."""
+"""Dense references of a plan: postures at many instants, on hand path and surfaces, with their heat."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from dynsim.errors import ModelError
 from dynsim.jit.kernel import reals
 from dynsim.model.description import Array, Contact
 from dynsim.planner.compiled import ON
-from dynsim.planner.problem import CHARGED, Candidate, Clear, Task, key
+from dynsim.planner.problem import FINAL_SLIP_SCALE, Candidate, Clear, Task, key
 from dynsim.scenario import build
 
 # Instants of one pass along the path, at least, beside two for each knot; and the most time between two [s].
@@ -114,7 +114,7 @@ def statics(task: Task, braces: tuple[Candidate, ...], times: Array, q: Array, r
         name: (contact, None) for name, contact in contacts(task, braces).items()
     }
     try:
-        planner, tables = pressing(model, fine, whole, rates, placed, task.options.min_N, CHARGED)
+        planner, tables = pressing(model, fine, whole, rates, placed, task.options.min_N, FINAL_SLIP_SCALE)
     except ModelError as error:
         return f"between knots the postures jump: {error}"
     torques, forces, solved = planner.least_heat(whole, rates, accelerations, tables)

@@ -1,4 +1,4 @@
-"""Files of a plan: numbers, the scenario that runs, a table, figures, and a page of the best beside the unbraced."""
+"""Files of a plan: numbers, a runnable scenario, table, figures, and a viewer page."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The local solver: postures of one set of braces along the path, and their forces, of least heat.
+"""The local solver: for one set of braces, the postures along the path and brace forces of least heat.
 
     minimise   Σ_e share_e Σ_j w_ej τ_ej² + ε |S q|²   over postures q_k at knots and forces f_e ≥ min_N
     subject to hand(q_k) = p_k,  gap_c(q_k) = 0,  clearances, limits of joints

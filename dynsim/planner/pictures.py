@@ -1,4 +1,4 @@
-"""Figures of a plan, and the page of its best beside the unbraced arm."""
+"""Figures of a plan, and the page of the best plan beside the unbraced arm."""
 
 from __future__ import annotations
 

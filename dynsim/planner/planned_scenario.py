@@ -1,4 +1,4 @@
-"""A plan as a scenario that runs: posture at the start, references of all joints, braces that press, and gains."""
+"""A plan as a runnable scenario: initial posture, joint references, pressing braces, gains."""
 
 from __future__ import annotations
 

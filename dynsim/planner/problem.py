@@ -1,4 +1,4 @@
-"""What is planned: an arm, surfaces, the path of its hand, and the points that may be braced."""
+"""The planning problem: arm, surfaces, hand path, and points that may be braced."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ LINK_CLEARANCE = 2e-3
 # Slip [m/s] over which the friction that is charged grows to its value: a brace that creeps feels all of it, whatever
 # planned voltages, which must not ring, make of it. The search begins with smoother ones, for long steps and few local
 # optima.
-CHARGED, SHARPER, SMOOTHER = 1e-3, 3e-3, 1e-2
+FINAL_SLIP_SCALE, FINE_SLIP_SCALE, COARSE_SLIP_SCALE = 1e-3, 3e-3, 1e-2
 # Targets that differ by less are the same [m].
 SAME = 1e-6
 
@@ -256,10 +256,10 @@ class Task:
             chord=reals(chord),
             share=reals(np.full(len(knot), 1.0 / len(knot))),
             smooth=reals(SMOOTHNESS * bend.T @ bend),
-            slip_scale=reals([SMOOTHER]),
+            slip_scale=reals([COARSE_SLIP_SCALE]),
         )
 
-    def problem(self, braces: Sequence[Candidate], count: int, slip_scale: float = SMOOTHER) -> Problem:
+    def problem(self, braces: Sequence[Candidate], count: int, slip_scale: float = COARSE_SLIP_SCALE) -> Problem:
         """Of one set of braces at so many knots; its targets are its own, its room that of all with as many braces."""
         course = self._once(count, lambda: self.course(count))
         points = self._once(tuple(braces), lambda: self.points(braces))

@@ -1,4 +1,4 @@
-"""The search over sets of braces: they grow one by one from the best smaller ones.
+"""Search over sets of braces, grown one brace at a time from the best smaller sets.
 
 All sets of one brace are solved at one posture of the path without slip, the best of them again where they slip, and
 the best of those grow. What fails is "not found", never "impossible": postures are found from others by least change.
@@ -18,7 +18,7 @@ from dynsim.jit.kernel import reals
 from dynsim.model.description import Array
 from dynsim.planner.dense import Dense, references, touching_links
 from dynsim.planner.local import Local, solve
-from dynsim.planner.problem import CHARGED, SHARPER, SMOOTHER, Candidate, Task
+from dynsim.planner.problem import COARSE_SLIP_SCALE, FINAL_SLIP_SCALE, FINE_SLIP_SCALE, Candidate, Task
 
 # Sets of each size that go on from the cheap problem, and from the one with slip.
 BEAM = 3
@@ -101,7 +101,7 @@ class Search:
         self.path = CLOSED_KNOTS if task.kind == "closed" else PATH_KNOTS
 
     def solve(
-        self, braces: Set, start: Array, count: int, turns: int = 40, slip_scale: float = SMOOTHER
+        self, braces: Set, start: Array, count: int, turns: int = 40, slip_scale: float = COARSE_SLIP_SCALE
     ) -> Local | None:
         """Local optimum from postures at other knots, or from one posture."""
         self.tally.solves += 1
@@ -303,7 +303,7 @@ class Search:
         local = self.solve(braces, Q, half, 30) or self._walked(braces, Q, half)
         if local is None or local.cost > most:
             return None
-        return self.solve(braces, local.Q, self.path, 30, SHARPER) or local
+        return self.solve(braces, local.Q, self.path, 30, FINE_SLIP_SCALE) or local
 
     def _refined(self, paths: Mapping[Set, list[PosturePath]]) -> list[Planned]:
         """The best sets, their best paths at more knots, by the heat of their dense references."""
@@ -331,7 +331,7 @@ class Search:
 
     def _finer(self, braces: Set, coarse: Local, count: int) -> Planned | str:
         """A path at more knots with its dense references; in words why hand and surfaces are not kept between them."""
-        local = self.solve(braces, coarse.Q, count, 20, CHARGED) or coarse
+        local = self.solve(braces, coarse.Q, count, 20, FINAL_SLIP_SCALE) or coarse
         times = self.task.times(len(local.Q))
         dense = references(self.task, braces, times, local.Q)
         if isinstance(dense, str):

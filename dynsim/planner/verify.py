@@ -1,4 +1,4 @@
-"""Whether a plan survives: whole dynamics with friction and surfaces that are not as planned."""
+"""Verification of a plan: full dynamics with friction, and with surfaces displaced from their planned place."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a run leaves behind: the record, in memory and as a file. It knows nothing of the engine that made it."""
+"""Records: the signals of a run in memory and as a file, independent of the engine that made them."""
 
 from dynsim.record.content import FORMAT, TIME, Event, Signal
 from dynsim.record.record import Record

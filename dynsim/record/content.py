@@ -1,4 +1,4 @@
-"""What a record holds: signals on time axes, events, the scene; and what no record may hold."""
+"""Contents of a record: signals on time axes, events, scene; and the checks for invalid values."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Numbers that follow from the signals of a record alone: for summaries, for figures, for measured runs too."""
+"""Quantities computed from the signals of a record, for summaries and figures, of measured runs too."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What notebooks show of an object: a small table."""
+"""Notebook display of an object as a small table."""
 
 from __future__ import annotations
 

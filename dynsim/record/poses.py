@@ -1,4 +1,4 @@
-"""Where bodies and points were: from the scene of a record and the positions of its joints."""
+"""Poses of bodies and points over time, from the scene of a record and its joint positions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Records as HDF5 files, the reading half.
+"""Reading of records from HDF5 files.
 
 A file is HDF5 and, after its end, one line with the SHA-256 of all bytes before it. HDF5 ignores the line; with it,
 damage is found before the HDF5 library, which may crash or never return on a damaged file, has seen it. A file without

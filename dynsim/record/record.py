@@ -1,4 +1,4 @@
-"""Columnar signals over time, events, the scene, with units and provenance; HDF5 in and out.
+"""The record: signals over time, events, scene, units and provenance; saved as HDF5.
 
 A record knows nothing of the engine that made it: simulated and measured runs look the same.
 """

@@ -1,4 +1,4 @@
-"""What a record's robot looks like and where it stands: plain data, from which figures and viewers draw.
+"""The scene of a record: shapes and places of robot and surfaces, as plain data for figures and viewers.
 
 Placements are a position [m] and an orientation, a unit quaternion (w, x, y, z). A body's frame moves with its joint;
 at joint position zero it is the joint's frame, which is placed in the parent's frame.

@@ -1,4 +1,4 @@
-"""Numbers of many runs: their mean with its interval, their spread, and what each sampled parameter does to them."""
+"""Statistics of many runs: mean with interval, spread, and sensitivity to each sampled parameter."""
 
 from __future__ import annotations
 

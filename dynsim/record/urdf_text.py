@@ -1,4 +1,4 @@
-"""URDF of what a scene shows: links, joints and shapes; and the elements that other writers of URDF share."""
+"""URDF text of a scene (links, joints, shapes), and XML elements shared by all URDF writers."""
 
 from __future__ import annotations
 

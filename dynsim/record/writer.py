@@ -1,4 +1,4 @@
-"""Records as HDF5 files, the writing half: made in memory, with a digest of all bytes after the end."""
+"""Writing of records to HDF5 files, with a digest of all bytes at the end."""
 
 from __future__ import annotations
 

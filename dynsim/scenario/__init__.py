@@ -1,4 +1,4 @@
-"""Scenarios: YAML in (``reading``), a validated description of one simulation out (``schema``), built by ``build``."""
+"""Scenarios: read from YAML (``reading``), validated (``schema``), and built (``build``)."""
 
 from dynsim.scenario.build import build_model, require_scenario
 from dynsim.scenario.editors import json_schema

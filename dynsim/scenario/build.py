@@ -1,4 +1,4 @@
-"""What a scenario describes, built: its machine, controller, surfaces, contacts and loads."""
+"""Objects that a scenario describes: machine, controller, surfaces, contacts and loads."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What can touch a surface where a scenario does not name points: all joints, or the links as capsules."""
+"""Contact candidates where a scenario names no points: all joints as points, or links as capsules."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Keys of a scenario that have no effect in it: accepted, and a run warns of them."""
+"""Warnings for keys that are accepted but have no effect in a scenario."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What acts on a robot from outside: forces and torques on points of its bodies, and payloads fixed to them."""
+"""External loads of a scenario: forces and torques on bodies, and payloads fixed to them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a scenario may say: its keys with types, units, limits and defaults, and the scenario as frozen data."""
+"""Schema of a scenario: its keys with types, units, limits and defaults, as frozen data."""
 
 from __future__ import annotations
 

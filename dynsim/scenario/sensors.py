@@ -1,4 +1,4 @@
-"""The ``sensors:`` section of a scenario: what a sampled controller is told, how often, how late, how well."""
+"""The ``sensors:`` section of a scenario: rate, delay, resolution and noise of a sampled controller's inputs."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Compiled functions of the kinematic snake, which is no tree of bodies: chain, controller, support, plant, ticks."""
+"""Compiled functions of the kinematic snake: chain, controller, support, plant, ticks."""

@@ -1,4 +1,4 @@
-"""Wheel pairs that a record lifts, as angles of the pitch joints on the axles.
+"""Lifted wheel pairs of a record as angles of the pitch joints on their axles.
 
 The record says which pairs are on the ground, 0 or 1; the robot needs time for it. A pair's height follows
 

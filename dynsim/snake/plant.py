@@ -1,4 +1,4 @@
-"""Kinematic plant of the snake: its base moves as the grounded wheels allow, joints and wheels as they are told."""
+"""Kinematic plant of the snake: grounded wheels move the base; joints and wheels follow their commands."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from dynsim.jit.kernel import internal_kernel
 
 
 @internal_kernel
-def base_velocity(model, grounded, yaw, phi, u, rig):
-    """Velocity of the base part that the grounded wheels allow, into ``rig.base_rate``.
+def base_velocity(model, grounded, yaw, phi, u, ws):
+    """Velocity of the base part that the grounded wheels allow, into ``ws.base_rate``.
 
     Joint and wheel rates are given, so the rows (no side slip of every grounded pair, rolling of every grounded active
     wheel) are more than the three unknowns. Their least-squares solution is the motion of least dissipation when all
@@ -21,7 +21,7 @@ def base_velocity(model, grounded, yaw, phi, u, rig):
     slip : float
         Largest residual of a row [m/s].
     """
-    normal, out, joints = rig.normal, rig.base_rate, model.head_joints + model.base_joints
+    normal, out, joints = ws.normal, ws.base_rate, model.head_joints + model.base_joints
     slip = 0.0
     for sweep in range(2):  # 0: sum the normal equations, 1: residuals of the solution
         if sweep == 0:
@@ -33,7 +33,7 @@ def base_velocity(model, grounded, yaw, phi, u, rig):
             if pair > 0:
                 c, s = math.cos(heading), math.sin(heading)
                 x, y = x - model.link_length * c, y - model.link_length * s
-                rig.px[pair - 1], rig.py[pair - 1] = x, y
+                ws.px[pair - 1], ws.py[pair - 1] = x, y
                 heading += phi[model.head_joints + pair - 1]
                 spin += u[model.head_joints + pair - 1]
                 x -= model.link_length * math.cos(heading)
@@ -43,8 +43,8 @@ def base_velocity(model, grounded, yaw, phi, u, rig):
             vx, vy = 0.0, 0.0  # from the joint rates, pair 1 held
             for j in range(pair):
                 rate = u[model.head_joints + j]
-                vx -= rate * (y - rig.py[j])
-                vy += rate * (x - rig.px[j])
+                vx -= rate * (y - ws.py[j])
+                vy += rate * (x - ws.px[j])
             c, s = math.cos(heading), math.sin(heading)
             for kind in range(2):
                 if kind == 0:  # -s vx + c vy = 0
@@ -78,7 +78,7 @@ def base_velocity(model, grounded, yaw, phi, u, rig):
 
 
 @internal_kernel
-def advance_plant(model, grounded, period, substeps, state, u, rig):
+def advance_plant(model, grounded, period, substeps, state, u, ws):
     """Hold u for one control period: joints and wheels exactly, base pose by classical Runge-Kutta 4.
 
     Returns the largest slip met [m/s].
@@ -86,20 +86,20 @@ def advance_plant(model, grounded, period, substeps, state, u, rig):
     h, slip = period / substeps, 0.0
     for _ in range(substeps):
         for i in range(3):
-            rig.base_sum[i] = 0.0
+            ws.base_sum[i] = 0.0
         for stage in range(4):
             fraction = (0.0, 0.5, 0.5, 1.0)[stage]
             for j in range(state.phi.shape[0]):
-                rig.phi_stage[j] = state.phi[j] + fraction * h * u[j]
+                ws.phi_stage[j] = state.phi[j] + fraction * h * u[j]
             for i in range(3):
-                rig.base_stage[i] = state.base[i] + (fraction * h * rig.base_rate[i] if stage > 0 else 0.0)
-            now = base_velocity(model, grounded, rig.base_stage[2], rig.phi_stage, u, rig)
+                ws.base_stage[i] = state.base[i] + (fraction * h * ws.base_rate[i] if stage > 0 else 0.0)
+            now = base_velocity(model, grounded, ws.base_stage[2], ws.phi_stage, u, ws)
             slip = max(slip, now)
             weight = (1.0, 2.0, 2.0, 1.0)[stage]
             for i in range(3):
-                rig.base_sum[i] += weight * rig.base_rate[i]
+                ws.base_sum[i] += weight * ws.base_rate[i]
         for i in range(3):
-            state.base[i] += h / 6.0 * rig.base_sum[i]
+            state.base[i] += h / 6.0 * ws.base_sum[i]
         for j in range(state.phi.shape[0]):
             state.phi[j] += h * u[j]
         for j in range(state.rho.shape[0]):

@@ -1,4 +1,4 @@
-"""Measured values and statements of [T], to be set beside simulated ones.
+"""Measured values and statements of [T], for comparison with simulated ones.
 
 [T]: M. Tanaka et al., "Task-Space Control of Articulated Mobile Robots With a Soft Gripper for Operations", IEEE
 Transactions on Robotics 35(1), 2019.

@@ -1,4 +1,4 @@
-"""What the tick loop works on: schedule, state of plant and controller, workspace, recorded rows.
+"""Data of the tick loop: schedule, state of plant and controller, workspace, recorded rows.
 
 The state of the plant is the pose of the base part, the joint angles and the wheel angles. The pose of the controlled
 point follows from them and is never integrated: its error is the real one.
@@ -58,7 +58,7 @@ class SnakeState(NamedTuple):
     progress: np.ndarray  # (2,)
 
 
-class Rig(NamedTuple):
+class TickWorkspace(NamedTuple):
     """Workspace of the tick loop."""
 
     work: ControlWork
@@ -110,10 +110,10 @@ def new_state(model: SnakeModel) -> SnakeState:
     )
 
 
-def new_rig(model: SnakeModel) -> Rig:
+def new_tick_workspace(model: SnakeModel) -> TickWorkspace:
     """Empty workspace of :func:`run_ticks`."""
     joints = model.head_joints + model.base_joints
-    return Rig(
+    return TickWorkspace(
         work=new_work(model),
         base_rate=np.zeros(3),
         base_sum=np.zeros(3),

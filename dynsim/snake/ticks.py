@@ -1,11 +1,11 @@
-"""The compiled tick loop: what the controller believes and asks for, what the plant does, and their recording."""
+"""The compiled tick loop: estimate, control, plant and recording."""
 
 from __future__ import annotations
 
 import math
 
 from dynsim.jit.kernel import internal_kernel, kernel
-from dynsim.snake import controller as sc
+from dynsim.snake import controller
 from dynsim.snake import state as ss
 from dynsim.snake.controller import control_input, estimate_from_joints, sigma_min
 from dynsim.snake.kinematics import constraint_matrices, pose_of_point, walk_chain, wrap_angle
@@ -37,7 +37,7 @@ def copy(source, target):
 
 
 @internal_kernel
-def believe(model, schedule, state, rig):
+def believe(model, schedule, state, ws):
     """What the controller takes for w and phi ([T] IV.C.1 and IV.C.2), into ``state.w_hat`` and ``state.phi_hat``."""
     if schedule.state_source == ss.GIVEN:
         return
@@ -45,9 +45,9 @@ def believe(model, schedule, state, rig):
         for j in range(state.phi.shape[0]):
             state.phi_hat[j] = state.phi[j]
     if schedule.state_source == ss.MEASURED:
-        pose_of_point(model, state.base, state.phi, rig.work.frame, state.w_hat)
+        pose_of_point(model, state.base, state.phi, ws.work.frame, state.w_hat)
     else:
-        estimate_from_joints(model, state.phi_hat, rig.work.frame, rig.origin, state.w_hat, rig.pose)
+        estimate_from_joints(model, state.phi_hat, ws.work.frame, ws.origin, state.w_hat, ws.pose)
 
 
 @internal_kernel
@@ -124,8 +124,8 @@ def commanded_rate(velocity, row, done, speed, rate):
 
 
 @internal_kernel
-def command(model, law, schedule, state, velocity, moving, slows, rig):
-    """What the controller asks for in one control period: rates of joints and wheels, into ``rig.work.u``.
+def command(model, law, schedule, state, velocity, moving, slows, ws):
+    """What the controller asks for in one control period: rates of joints and wheels, into ``ws.work.u``.
 
     Rates of the beginning of the period, held, miss the constraints by O(period) at its end and leave a head error of
     that order. Those of its predicted middle (``schedule.midpoint``) make it O(period^2). The prediction is the closed
@@ -152,14 +152,14 @@ def command(model, law, schedule, state, velocity, moving, slows, rig):
     speed : float
         Rows of the commands that are carried out, 0 to 1.
     """
-    work, period, mode = rig.work, schedule.period, state.counts[ss.MODE]
+    work, period, mode = ws.work, schedule.period, state.counts[ss.MODE]
     phi, phi_hat, w_hat, w_target = state.phi, state.phi_hat, state.w_hat, state.w_target
-    pose, target, joints_ahead, u, error, rate = rig.pose, rig.target, rig.phi_stage, work.u, work.error, rig.rate
+    pose, target, joints_ahead, u, error, rate = ws.pose, ws.target, ws.phi_stage, work.u, work.error, ws.rate
     joints = phi.shape[0]
     full_gain = law.null_gain if state.counts[ss.TICKS] >= schedule.null_start_tick else 0.0
     null_gain = full_gain
-    allocate = law.limit_policy == sc.LIMITS_ALLOCATE
-    believe(model, schedule, state, rig)
+    allocate = law.limit_policy == controller.LIMITS_ALLOCATE
+    believe(model, schedule, state, ws)
     reason, waits, reductions, slowed = ss.NO_OBSTACLE, False, 0, False
     row, done, speed, tries = state.counts[ss.CARRIED_OUT], state.progress[ss.DONE], 1.0, 0
     commanded = False
@@ -215,7 +215,7 @@ def command(model, law, schedule, state, velocity, moving, slows, rig):
             break
     state.counts[ss.SLOWED] += int(slowed)
     state.counts[ss.NULL_REDUCED] += int(reductions > 0)
-    if law.limit_policy != sc.LIMITS_NONE:  # the mechanical stop, and what is left when no allocation helps
+    if law.limit_policy != controller.LIMITS_NONE:  # the mechanical stop, and what is left when no allocation helps
         for j in range(joints):
             up = max(model.upper[j] - phi[j], 0.0) / period
             down = min(model.lower[j] - phi[j], 0.0) / period
@@ -228,12 +228,12 @@ def command(model, law, schedule, state, velocity, moving, slows, rig):
 
 
 @internal_kernel
-def settle(schedule, state, moving, reason, commanded, speed, rig):
+def settle(schedule, state, moving, reason, commanded, speed, ws):
     """End a control period: beliefs, target, and the place in the commands, after :func:`command` and the plant.
 
     Returns True when the command was not carried out.
     """
-    period, u, rate, done = schedule.period, rig.work.u, rig.rate, state.progress[ss.DONE]
+    period, u, rate, done = schedule.period, ws.work.u, ws.rate, state.progress[ss.DONE]
     for j in range(state.phi.shape[0]):
         state.phi_hat[j] += period * u[j]  # feedforward; overwritten when the joints are read
     for i in range(6):
@@ -260,31 +260,31 @@ def settle(schedule, state, moving, reason, commanded, speed, rig):
 
 
 @internal_kernel
-def tick(model, law, schedule, state, velocity, moving, slows, rig):
+def tick(model, law, schedule, state, velocity, moving, slows, ws):
     """One control period of the kinematic robot: evaluate the controller, hold its rates, move the plant.
 
     Parameters as of :func:`command`. Returns the slip of the plant [m/s], and whether the command was not carried out.
     """
     mode = state.counts[ss.MODE]
-    reason, commanded, speed = command(model, law, schedule, state, velocity, moving, slows, rig)
-    slip = advance_plant(model, law.grounded[mode], schedule.period, schedule.substeps, state, rig.work.u, rig)
-    return slip, settle(schedule, state, moving, reason, commanded, speed, rig)
+    reason, commanded, speed = command(model, law, schedule, state, velocity, moving, slows, ws)
+    slip = advance_plant(model, law.grounded[mode], schedule.period, schedule.substeps, state, ws.work.u, ws)
+    return slip, settle(schedule, state, moving, reason, commanded, speed, ws)
 
 
 @internal_kernel
-def record_command(schedule, state, rig, r, trace):
+def record_command(schedule, state, ws, r, trace):
     """Write to row r of the trace what the controller has asked for in the period that has just ended."""
-    copy(rig.work.u, trace.u[r])
+    copy(ws.work.u, trace.u[r])
     copy(state.w_hat, trace.w_hat[r])
     for j in range(state.phi.shape[0]):
-        trace.at_limit[r, j] = rig.work.at_limit[j]
+        trace.at_limit[r, j] = ws.work.at_limit[j]
     # beliefs at the beginning of the period: take back the step that it has added
     for i in range(6):
-        trace.w_hat[r, i] -= schedule.period * rig.rate[i]
+        trace.w_hat[r, i] -= schedule.period * ws.rate[i]
 
 
 @kernel
-def command_tick(model, law, schedule, state, velocity, moving, slows, rig, r, trace):
+def command_tick(model, law, schedule, state, velocity, moving, slows, ws, r, trace):
     """One control period of a robot that something else moves: joints and wheels of ``state`` are what they are told.
 
     Parameters as of :func:`command`. What was told and believed at its beginning goes to row r of the trace, if it is
@@ -295,22 +295,22 @@ def command_tick(model, law, schedule, state, velocity, moving, slows, rig, r, t
         trace.mode[r] = state.counts[ss.MODE]
         copy(state.w_target, trace.w_target[r])
         copy(state.phi, trace.phi[r])
-    reason, commanded, speed = command(model, law, schedule, state, velocity, moving, slows, rig)
-    blocked = settle(schedule, state, moving, reason, commanded, speed, rig)
+    reason, commanded, speed = command(model, law, schedule, state, velocity, moving, slows, ws)
+    blocked = settle(schedule, state, moving, reason, commanded, speed, ws)
     if r >= 0:
-        record_command(schedule, state, rig, r, trace)
+        record_command(schedule, state, ws, r, trace)
     joints = state.phi.shape[0]
     for j in range(joints):
-        state.phi[j] += schedule.period * rig.work.u[j]
+        state.phi[j] += schedule.period * ws.work.u[j]
     for j in range(state.rho.shape[0]):
-        state.rho[j] += schedule.period * rig.work.u[joints + j]
+        state.rho[j] += schedule.period * ws.work.u[joints + j]
     return blocked
 
 
 @kernel
-def record_row(model, law, state, rig, r, trace):
+def record_row(model, law, state, ws, r, trace):
     """Write the state, and what follows from it, to row r of the trace."""
-    work, chain, support, pose, mode = rig.work, rig.work.chain, rig.work.support, rig.pose, state.counts[ss.MODE]
+    work, chain, support, pose, mode = ws.work, ws.work.chain, ws.work.support, ws.pose, state.counts[ss.MODE]
     phi, rho, grounded = state.phi, state.rho, law.grounded[mode]
     pose_of_point(model, state.base, phi, work.frame, pose)
     walk_chain(model, pose, phi, work.frame, chain)
@@ -330,7 +330,7 @@ def record_row(model, law, state, rig, r, trace):
 
 
 @kernel
-def run_ticks(model, law, schedule, state, velocity, count, moving, stop, stride, rig, trace):
+def run_ticks(model, law, schedule, state, velocity, count, moving, stop, stride, ws, trace):
     """Run control periods in the present mode.
 
     Parameters
@@ -356,11 +356,11 @@ def run_ticks(model, law, schedule, state, velocity, count, moving, stop, stride
         now = counts[ss.TICKS]
         r = now // stride if now % stride == 0 else -1
         if r >= 0:
-            record_row(model, law, state, rig, r, trace)
-        slip, blocked = tick(model, law, schedule, state, velocity, moving, slows, rig)
+            record_row(model, law, state, ws, r, trace)
+        slip, blocked = tick(model, law, schedule, state, velocity, moving, slows, ws)
         if r >= 0:
             trace.slip[r] = slip
-            record_command(schedule, state, rig, r, trace)
+            record_command(schedule, state, ws, r, trace)
         finite = 0.0
         for i in range(3):
             finite += base[i]

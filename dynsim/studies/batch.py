@@ -1,4 +1,4 @@
-"""Many runs: each ends as a summary, or as the reason why there is none."""
+"""Batch of runs: each ends with a summary, or with the reason for its failure."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Work on a Dask cluster: its scheduler keeps it, its workers do it, results stream back.
+"""Sweep on a Dask cluster: tasks go to its workers, results stream back.
 
 Whatever else a cluster does (start, retries after a worker's death, adaptive scaling) is left to Dask.
 """

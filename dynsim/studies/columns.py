@@ -1,4 +1,4 @@
-"""Summaries as columns of tables: one level of names, numbers only."""
+"""Summaries as flat columns of a table, numbers only."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""All variants of a scenario side by side."""
+"""Comparison of all variants of a scenario."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The journal of a sweep: a line for each run that is done, which outlives whatever ends the sweep."""
+"""The journal of a sweep: one line per finished run, kept when the sweep is interrupted."""
 
 from __future__ import annotations
 

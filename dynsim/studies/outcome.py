@@ -1,4 +1,4 @@
-"""How one run of many ended."""
+"""Outcome of one run of a batch: summary, or error."""
 
 from __future__ import annotations
 

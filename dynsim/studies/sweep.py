@@ -1,4 +1,4 @@
-"""A sweep: its runs, a journal that outlives whatever ends it, and a table of parameters and numbers."""
+"""A sweep: its runs, its journal, and a table of parameters and results."""
 
 from __future__ import annotations
 

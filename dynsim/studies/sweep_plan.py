@@ -1,4 +1,4 @@
-"""What a sweep runs: variants × grid × samples, each run known by its variant and values, never by its number."""
+"""Runs of a sweep: variants × grid × samples, each identified by its variant and values."""
 
 from __future__ import annotations
 

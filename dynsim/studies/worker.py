@@ -1,4 +1,4 @@
-"""A worker: a process of its own that does tasks for :mod:`dynsim.studies.processes`, until that has no more.
+"""Worker process for :mod:`dynsim.studies.processes`: does tasks until there are no more.
 
 Both talk in pickles, one after the other: tasks on the worker's standard input, answers on its standard output.
 Python's own multiprocessing would run the caller's script once more in every worker, and before it a ``signal.py`` of

@@ -1,1 +1,1 @@
-"""Files, YAML, signals, streams, terminal, memo."""
+"""Services of the operating system: files, YAML, signals, streams, terminal; and memoisation."""

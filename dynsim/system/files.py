@@ -1,4 +1,4 @@
-"""Files that are complete or not there at all, also several that belong together.
+"""Atomic writing of files: complete or not there at all, also for several that belong together.
 
 A file is written beside its target under a name that no other process has, and renamed when it is complete. So what is
 no file, a device, pipe or socket, is refused.

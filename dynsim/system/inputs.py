@@ -1,4 +1,4 @@
-"""Files that a user names: regular files of bounded size, as text or YAML. Reading them never blocks.
+"""Reading of files that users name: regular files of bounded size, as text or YAML, without blocking.
 
 YAML is built from the parser's events: so every error is one of ours with its line, aliases cannot grow without bound,
 and a file of some 100 000 numbers loads in a second (ruamel's compiled parser; its Python one takes ten times as long).

@@ -1,4 +1,4 @@
-"""Signals that ask a run to stop: heeded at once where that loses nothing, kept while a result is made or saved.
+"""Interrupt signals: handled at once, or postponed while a result is computed or saved.
 
 Python raises KeyboardInterrupt wherever it happens to be. Within a callback of the garbage collector it is lost, within
 one of the compiler it crashes the process, and between the last step and the saved record it would take the record with
@@ -33,7 +33,7 @@ def _compiler_waits(frame: FrameType | None) -> bool:
 
 
 @contextmanager
-def heeded() -> Iterator[list[int]]:
+def handled() -> Iterator[list[int]]:
     """Within: the ``STOP_SIGNALS`` raise KeyboardInterrupt, see above; gives the signals that came.
 
     One that is ignored (``nohup``) or that somebody else handles stays so.
@@ -72,7 +72,7 @@ def keep() -> None:
 
 
 def heed() -> None:
-    """Signals are heeded again; one that came in between is raised by the next :func:`check`."""
+    """Signals are handled again; one that came in between is raised by the next :func:`check`."""
     global _kept
     _kept = False
 
@@ -84,7 +84,7 @@ def check() -> None:
 
 
 def answered() -> None:
-    """The last signal has been heeded: :func:`check` need not raise for it any more."""
+    """The last signal has been handled: :func:`check` need not raise for it any more."""
     global _pending
     _pending = False
 

@@ -1,4 +1,4 @@
-"""What runs of a sweep have in common is computed once: results by the bits of what they were computed from."""
+"""Memoisation of results that runs of a sweep share, keyed by the bits of their inputs."""
 
 from __future__ import annotations
 

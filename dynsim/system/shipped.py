@@ -1,4 +1,4 @@
-"""Scenarios that come with dynsim: their files, found without loading anything."""
+"""Scenario files that come with dynsim, found without loading anything."""
 
 from __future__ import annotations
 

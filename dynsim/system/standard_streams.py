@@ -1,4 +1,4 @@
-"""Standard output and error that cannot break a run: closed pipes, full disks, terminals that are gone or ASCII only.
+"""Standard output and error that cannot break a run: closed pipes, full disks, ASCII terminals.
 
 What a command computes goes into files; that nobody reads what it prints is no reason to lose it.
 """

@@ -1,4 +1,4 @@
-"""What comes from files, made fit for a terminal.
+"""Text from files made safe to print on a terminal.
 
 A name in a scenario, a record or a servo map may hold anything: escape sequences that move the cursor, colour or
 rename the window, and the markup of rich. Both are shown as they are written, and do nothing.

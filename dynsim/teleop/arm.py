@@ -1,4 +1,4 @@
-"""A pilot commands the hand of an arm, and its mobile base: velocities that become references at every tick."""
+"""Teleoperation of an arm: a pilot's velocities of hand and base become references at every tick."""
 
 from __future__ import annotations
 

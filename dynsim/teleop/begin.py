@@ -1,4 +1,4 @@
-"""The session of a scenario: that of the arm or of the snake."""
+"""Choice of the teleoperation session for a scenario: arm or snake."""
 
 from __future__ import annotations
 

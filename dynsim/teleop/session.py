@@ -1,4 +1,4 @@
-"""A simulation in the hands of a pilot: tick by tick, with a script of all commands that gives the same run again.
+"""A teleoperated simulation, tick by tick, with a script of all commands that reproduces the run.
 
 A script is part of a scenario, so a session leaves a scenario: that of which it was made, with its commands and as long
 as it took. What a script looks like is the plant's: :mod:`dynsim.teleop.snake`, :mod:`dynsim.teleop.arm`.

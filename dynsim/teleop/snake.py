@@ -1,4 +1,4 @@
-"""A pilot commands a snake by its head or gripper: velocities of the target, modes and gripper ([T] IV.C)."""
+"""Teleoperation of a snake by head or gripper: target velocities, modes and gripper ([T] IV.C)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Signals, pipes and full disks as processes meet them: what was simulated is saved, nothing is left running."""
+"""Signals, closed pipes and full disks: simulated results are saved, and no process is left running."""
 
 import os
 import resource

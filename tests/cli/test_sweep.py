@@ -1,4 +1,4 @@
-"""``dynsim sweep`` as a user meets it: where its files go, what it says, how it ends."""
+"""``dynsim sweep`` on the command line: its files, messages and exit codes."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""Code that lies in the working directory is not run."""
+"""Python files in the working directory are not imported or run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every command in every page is one that dynsim has, with the options that it has, on scenarios that there are."""
+"""Commands in the pages exist, with their options, on scenarios that exist."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What README, tutorials and how-to pages show is run, page by page, in an empty folder.
+"""Code blocks of README, tutorials and how-to pages run, page by page, in an empty folder.
 
 A block of ``yaml`` with a title is a file; each line of ``bash`` is a command of dynsim, which must end well; lines
 of a ``text`` block after it must be in what it printed; blocks of ``python`` share their names. ``sh`` is not run;

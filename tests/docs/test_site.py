@@ -1,4 +1,4 @@
-"""The site builds without a warning, asks the network for nothing, and looks right to a browser on desk and phone."""
+"""The site builds without warnings, makes no network request, and fits screens of desk and phone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Films: as many frames as asked for, of their size and length, that show what the record has, and where."""
+"""Films: number of frames, size, length, and positions of what they show."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Broken inputs by the thousand: whatever comes in, dynsim ends well or with one clear error.
+"""Fuzzing of all inputs: every broken file ends well or with one clear error.
 
     inputs/      one module per kind of input; each draws a case from a seed and an index
     mutations    what breaks trees, texts and bytes

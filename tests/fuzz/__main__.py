@@ -1,4 +1,4 @@
-"""All cases of a seed, or one of them again. Failures are told as they come; Ctrl-C ends it with the table so far."""
+"""Command line of the fuzzer: all cases of a seed, or one of them again."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Deliberately broken loaders, one per kind of failure: the suite must find each of them.
+"""Deliberately broken loaders, one per kind of failure: the fuzzer must find each of them.
 
 Records are loaded as ever after what :data:`WAYS` has for the number of the case; every link weighs a hundredth more.
 """

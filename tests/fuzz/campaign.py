@@ -1,4 +1,4 @@
-"""Runs cases in worker processes; one that dies or hangs is a failure of the case it was at, and a new one goes on."""
+"""Fuzz campaign: cases run in worker processes; a dead or hung worker is a failure of its case."""
 
 from __future__ import annotations
 

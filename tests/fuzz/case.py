@@ -1,4 +1,4 @@
-"""One case: the files of an input, the commands that read them, and what must not be lost."""
+"""One fuzz case: input files, the commands that read them, and the files that must survive."""
 
 from __future__ import annotations
 

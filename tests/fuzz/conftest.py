@@ -1,4 +1,4 @@
-"""The sound records, made once."""
+"""Valid records for the fuzzer, made once."""
 
 from __future__ import annotations
 

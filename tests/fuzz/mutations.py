@@ -1,4 +1,4 @@
-"""What breaks an input: trees of keys and values, texts, bytes. All of it drawn from a ``random.Random``."""
+"""Random mutations of inputs: trees of keys and values, texts, bytes, drawn from a ``random.Random``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an input says, read without dynsim, held against what dynsim made of it.
+"""Inputs parsed without dynsim, compared with the objects that dynsim made of them.
 
 Every function answers with the losses as lines, none when all is there. Where the second reading cannot tell what an
 input says, it is not held against it.

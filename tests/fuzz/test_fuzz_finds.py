@@ -1,4 +1,4 @@
-"""The suite can fail: a loader broken on purpose is found, named rightly, and the cases after it are run."""
+"""The fuzzer can fail: deliberately broken loaders are found and named, and later cases still run."""
 
 from __future__ import annotations
 

@@ -290,7 +290,7 @@ def _into(target: int) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _alarm(limit: float, said: _Said) -> Iterator[None]:
-    """Ctrl-C after ``limit`` [s]; where not even that is heeded, the stack into the log and the end of the process."""
+    """Ctrl-C after ``limit`` [s]; where not even that is handled, the stack into the log and the end of the process."""
 
     def ring(number: int, frame: Any) -> None:
         said.rang_at = said.rang_at or traceback.extract_stack(frame)

@@ -1,4 +1,4 @@
-"""Every call by which dynsim lets something out of the process, found while it runs, and made to fail one at a time."""
+"""Output calls of dynsim (files, terminal, pipes), found while it runs, and made to fail one at a time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The offline check refuses whole motions, with joint, time and margin; and what passes never violates a limit."""
+"""The offline check: refusals name joint, time and margin; an accepted motion never violates a limit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Closing the loop: simulate, replay on virtual servos, compare; and the exports."""
+"""Simulation, replay on virtual servos and comparison in one chain; and the exports."""
 
 from __future__ import annotations
 

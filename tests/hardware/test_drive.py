@@ -1,4 +1,4 @@
-"""Servos that follow a pilot: whatever comes, or does not, they get no goal that a checked record could not ask for."""
+"""Servos that follow a pilot: every goal sent satisfies the limits of the offline check."""
 
 from __future__ import annotations
 

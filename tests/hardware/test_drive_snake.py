@@ -1,4 +1,4 @@
-"""A snake that a pilot drives on servos, over mode switches: its goals are those of the finished record's replay."""
+"""A driven snake on servos through mode switches: its goals are those of the record's replay."""
 
 from __future__ import annotations
 

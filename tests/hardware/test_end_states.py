@@ -1,4 +1,4 @@
-"""What servos are said to do in the end is what they do, whatever happens on the way there."""
+"""End states of a replay: the reported state of the servos is the actual one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fault scripts are held against the servos that are there."""
+"""Fault scripts are checked against the servos of the map."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The table of docs/hardware.md: its promises hold in every cell, and its ends are those of fresh runs."""
+"""The fault table of docs/hardware.md: each cell holds, and equals the end of a fresh run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every scripted fault ends as docs/hardware.md says, in time, and nothing but the policy's own goals follows it."""
+"""Scripted faults: the replay ends as docs/hardware.md says, in time, and sends only the policy's goals after it."""
 
 from __future__ import annotations
 

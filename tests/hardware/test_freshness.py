@@ -1,4 +1,4 @@
-"""Answers that belong to an earlier request never count, however late they are."""
+"""Answers to earlier requests are never taken for current ones, however late they arrive."""
 
 from __future__ import annotations
 

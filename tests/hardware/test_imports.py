@@ -1,4 +1,4 @@
-"""What importing the hardware layer must not pull in."""
+"""Imports of the hardware layer do not load servo or serial modules."""
 
 from __future__ import annotations
 

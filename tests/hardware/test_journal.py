@@ -1,4 +1,4 @@
-"""What a replay tells can fail in any way: the motion never hears of it, and it is reported."""
+"""Failing log and progress output of a replay: the motion is unaffected, and the failure is reported."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Servo maps name every model that there is a table of, and a replay on such servos is measured in their units."""
+"""Servo maps accept every model with a control table, and replays use the units of that model."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A nudge moves one joint a little and back, alone, and says which way."""
+"""A nudge moves one joint a little and back, alone, and reports its direction."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Other people's programs on `dynsim hw virtual`: the maker's two libraries and rustypot, unmodified, on a serial port.
+"""Unmodified clients (two libraries of the maker, rustypot) on `dynsim hw virtual`, through a serial port.
 
 Nothing asserts time: clients are given patience, because a busy machine may not run the servos for a while.
 """

@@ -1,4 +1,4 @@
-"""No output of a replay can touch its motion: each is made to fail, at every state, and the wire does not show it."""
+"""Failing outputs in every state of a replay: the bytes on the line stay the same."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The real serial path: virtual servos in one process, client and commands in others. Nothing asserts time."""
+"""Virtual servos behind a pseudo-terminal, client and commands in other processes. No times are asserted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Limits that the servos have stored, beside those of the map."""
+"""Limits stored in the servos, compared with those of the map."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The log of a replay must not keep the robot from being stopped."""
+"""A blocked log file must not keep the robot from being stopped."""
 
 import threading
 

@@ -1,4 +1,4 @@
-"""`dynsim hw stop`: what goes wrong once torque off was sent is told as not confirmed, and holds nothing up."""
+"""`dynsim hw stop`: failures after torque off are reported as not confirmed, and delay nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Terminals that are closed, held or gone, and signals, in the middle of a motion. Nothing asserts time."""
+"""Terminals that close, block or vanish, and signals, during a motion. No times are asserted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What keeps a robot from being armed."""
+"""Verification before torque on: each condition that must refuse it."""
 
 from __future__ import annotations
 

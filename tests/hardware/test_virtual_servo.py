@@ -1,4 +1,4 @@
-"""The virtual servos keep the rules of the real ones, as the manual states them."""
+"""Virtual servos follow the rules of the manual."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Drives in processes of their own."""
+"""Live drives in processes of their own."""
 
 from __future__ import annotations
 

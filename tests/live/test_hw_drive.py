@@ -1,4 +1,4 @@
-"""Servos that follow a pilot, in processes: a raw client drives, virtual servos move. Nothing asserts time."""
+"""Live drives in processes: a raw client drives, virtual servos follow. No times are asserted."""
 
 from __future__ import annotations
 

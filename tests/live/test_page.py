@@ -1,4 +1,4 @@
-"""A pilot in a real browser: keys, a faked gamepad, a finger on a stick, and focus that is lost."""
+"""The teleop page in a real browser: keys, a simulated gamepad, touch stick, and loss of focus."""
 
 from __future__ import annotations
 

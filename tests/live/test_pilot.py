@@ -1,4 +1,4 @@
-"""What a pilot may say, when velocities are zero, and that time is stretched, never caught up with."""
+"""Commands of a pilot: accepted values, zero velocities, and stretched time without catching up."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who gets in, who drives, what stops the robot, and what is left of a drive."""
+"""The teleop server: access, control by one pilot, stopping the robot, and files of a drive."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Exported robots and records, read back by programs that share nothing with dynsim: MuJoCo, Pinocchio, MCAP."""
+"""Exported robots and records, read back by independent programs: MuJoCo, Pinocchio, MCAP."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ import pinocchio as pin
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.random_robots import bench, random_contacts, random_positions, random_robot_of
+from support.random_robots import assemble, random_contacts, random_positions, random_robot_of
 
 from dynsim.compile.model import Model
 from dynsim.dynamics import tables as ka
@@ -235,7 +235,7 @@ def test_constrained_dynamics_without_friction(rolling, m_star, seed):
     rng, robot, oracle, q, v = case(seed, rolling)
     contacts = random_contacts(rng, robot, q, int(rng.integers(1, 4)))
     contacts = [type(c)(**{**vars(c), "friction": 0.0}) for c in contacts]
-    b = bench(robot, contacts, m_star=m_star)
+    b = assemble(robot, contacts, m_star=m_star)
     dy = b.derivative(b.state(q, v))
     J, target = np.zeros((len(contacts), oracle.model.nv)), np.zeros(len(contacts))
     for k, contact in enumerate(contacts):
@@ -258,7 +258,7 @@ def test_constrained_dynamics_without_friction(rolling, m_star, seed):
 def test_rates_of_the_coordinates(seed):
     """q̇ = N(q) v: the pose after a short time is that which Pinocchio's integration on the group gives."""
     _, robot, oracle, q, v = case(seed, False)
-    b = bench(robot)
+    b = assemble(robot)
     h = 1e-4
 
     def pose(rates: float) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Robots that others have made, of the package example-robot-data: against Pinocchio, and braced in a run.
+"""Robots of the package example-robot-data: against Pinocchio, and braced in a run.
 
 The package has no LBR iiwa; the xArm 7 is its arm of that build, seven joints about alternating axes.
 """

@@ -7,7 +7,7 @@ import pinocchio as pin
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from support.pinocchio_oracle import Oracle
-from support.random_robots import bench, random_contacts, random_robot
+from support.random_robots import assemble, random_contacts, random_robot
 
 from dynsim.compile.model import Model
 from dynsim.dynamics import tables as ka
@@ -97,7 +97,7 @@ def test_constrained_dynamics_without_friction(seed):
     contacts = random_contacts(rng, robot, q, int(rng.integers(1, 4)))
     contacts = [type(c)(**{**vars(c), "friction": 0.0}) for c in contacts]
     current = rng.normal(size=na)
-    b = bench(robot, contacts)
+    b = assemble(robot, contacts)
     dy = b.derivative(b.state(q, v, current))
 
     p = len(contacts)

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline, make_interp_spline
-from support.random_robots import Bench, bench, random_contacts
+from support.random_robots import CompiledSystem, assemble, random_contacts
 from support.real_wheels import MOTOR, WHEELS, RealWheels, random_base, random_serial, random_urdf
 
 from dynsim.compile.model import Model
@@ -68,7 +68,7 @@ def test_accelerations(arm, folder, seed):
     expected, condition = expected[oracle.index], np.linalg.cond(K)
     accelerations: list[np.ndarray] = []
     for m_star in (False, True):
-        b: Bench = bench(robot, m_star=m_star)
+        b: CompiledSystem = assemble(robot, m_star=m_star)
         accelerations.append(b.part(b.derivative(b.state(q, v, current)), "v"))
         np.testing.assert_allclose(accelerations[-1], expected, rtol=0, atol=1e-9 * (1.0 + np.abs(expected).max()))
         # As near as the dense system that the expected values come from can be solved.
@@ -101,7 +101,7 @@ def test_braced_on_surfaces(arm, m_star, folder, seed):
     if np.linalg.svd(J @ T)[1].min() < 1e-3:
         return
     expected, multipliers, K = oracle.accelerations(full, rates, torques(robot, oracle, current), J, target)
-    b = bench(robot, contacts, m_star=m_star)
+    b = assemble(robot, contacts, m_star=m_star)
     vdot = b.part(b.derivative(b.state(q, v, current)), "v")
     scale = 1e-14 * np.linalg.cond(K) * (1.0 + max(np.abs(expected).max(), np.abs(multipliers).max()))
     np.testing.assert_allclose(vdot, expected[oracle.index], rtol=0, atol=scale)
@@ -130,7 +130,7 @@ def test_mass_matrix_and_energy(arm, folder, seed):
     expected = T.T @ oracle.mass_matrix(full) @ T
     ours = model.mass_matrix(q) + np.diag(model.armature)
     np.testing.assert_allclose(ours, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
-    b = bench(robot)
+    b = assemble(robot)
     assert b.system.model.body[:2, ka.ARMATURE].min() > 0.0
     kinetic = model.kinetic_energy(q, v) + 0.5 * model.armature @ v**2
     rates = oracle.rates(q, v)
@@ -145,7 +145,7 @@ def test_points_and_their_rates(arm, folder, seed):
     model, full = Model(robot), oracle.configuration(q)
     point, h = np.random.default_rng(seed).normal(size=3), 1e-5
     T = np.column_stack([oracle.rates(q, unit) for unit in np.eye(model.n)])
-    b = bench(robot)
+    b = assemble(robot)
     qdot = b.part(b.derivative(b.state(q, v)), "q")
     joints = {"base": "heading"} | {link.name: link.joint for link in robot.links[2:]}
     for name, joint in joints.items():

@@ -6,7 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from support.pinocchio_oracle import Oracle
-from support.random_robots import bench, random_contacts, random_positions, random_robot
+from support.random_robots import assemble, random_contacts, random_positions, random_robot
 
 from dynsim.dynamics.state import OUT_FORCE, OUT_VECTOR
 from dynsim.integrators import run as ki
@@ -51,7 +51,7 @@ def test_accelerations_from_rest_agree_with_admm():
             )
             for c in random_contacts(rng, robot, q, int(rng.integers(1, 4)))
         ]
-        b = bench(robot, contacts, real=True)
+        b = assemble(robot, contacts, real=True)
         run = b.advance(b.new_run(b.state(q, np.zeros(n)), np.array([0.0, 1e-9])))
         if run.count[ki.STATUS] != ki.FINISHED:
             assert run.count[ki.STATUS] in (ki.FORCES_REVERSED, ki.NO_CONTACT_FORCES)
@@ -127,7 +127,7 @@ def ours_on_slope(alpha: float, mu: float, duration: float) -> tuple[float, np.n
     gravity = G * vector(np.sin(alpha), 0.0, -np.cos(alpha))
     floor = Quadric(np.zeros((3, 3)), vector(0, 0, 1), 0.0)
     contact = Contact("foot", "z", np.zeros(3), floor, friction=mu, pulling_friction="signed")
-    b = bench(Robot("block", links, (), ("z", np.zeros(3)), gravity), [contact], real=True)
+    b = assemble(Robot("block", links, (), ("z", np.zeros(3)), gravity), [contact], real=True)
     run = b.simulate(b.state(np.zeros(3), np.zeros(3)), np.array([0.0, duration]))
     touch = run.outputs("contact")[-1, 0]
     return float(run.states("q")[-1, 0]), touch[OUT_VECTOR : OUT_VECTOR + 3], float(touch[OUT_FORCE])

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from support.pinocchio_oracle import Oracle
-from support.random_robots import Bench, bench, random_contacts, random_robot, random_unit
+from support.random_robots import CompiledSystem, assemble, random_contacts, random_robot, random_unit
 
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact.rows import force_vectors, set_modes
@@ -23,13 +23,15 @@ from dynsim.model.urdf.build import read_urdf
 seeds = st.integers(0, 2**32 - 1)
 
 
-def stick(b: Bench, y: np.ndarray, *modes: int) -> None:
+def stick(b: CompiledSystem, y: np.ndarray, *modes: int) -> None:
     """Give the candidates these modes at the state y."""
     b.derivative(y)
     set_modes(b.system.contacts, b.system.couplings, b.system.unilateral, b.ws, integers(modes))
 
 
-def free_motion(b: Bench, oracle: Oracle, q: np.ndarray, v: np.ndarray, current: np.ndarray) -> tuple[np.ndarray, ...]:
+def free_motion(
+    b: CompiledSystem, oracle: Oracle, q: np.ndarray, v: np.ndarray, current: np.ndarray
+) -> tuple[np.ndarray, ...]:
     """M + J_m and what the joints are driven with, less the bias."""
     body, motor = b.system.model.body, b.system.drives.motor
     tau = -(body[:, ka.DAMPING] + body[:, ka.GEAR_DAMPING]) * v
@@ -57,7 +59,7 @@ def test_a_sticking_point_does_not_move(seed, m_star):
     """A point at rest on a plane, sphere or cylinder: Jp v̇ = −J̇p v in three dimensions, whatever the surface."""
     rng, robot, q, v, current = random_case(seed, least=4)
     contact = random_contacts(rng, robot, q, 1)[0]
-    oracle, b = Oracle(robot), bench(robot, [contact], m_star=m_star)
+    oracle, b = Oracle(robot), assemble(robot, [contact], m_star=m_star)
     body = int(contact.body.removeprefix("body_"))
     _, Jp, _, _ = oracle.point(body, contact.point, q, v)
     assume(np.linalg.svd(Jp)[1][-1] > 1e-2)
@@ -86,7 +88,7 @@ def test_rows_between_bodies_and_between_joints(seed, m_star):
     contacts = [replace(c, pulling_friction="signed") for c in random_contacts(rng, robot, q, 1)]
     q[joints[0]] = coupling.ratio * q[joints[1]] + coupling.offset
     robot = replace(robot, couplings=(coupling,), q0=q)
-    oracle, b = Oracle(robot), bench(robot, contacts, m_star=m_star)
+    oracle, b = Oracle(robot), assemble(robot, contacts, m_star=m_star)
     y = b.state(q, v, current)
     b.derivative(y)
     J, F, target = np.zeros((4, n)), np.zeros((4, n)), np.zeros(4)
@@ -131,7 +133,7 @@ def test_mimic_joints_move_as_those_of_the_reduced_system(file, couplings, m_sta
     """With v = G w, G from the followers' multipliers: Gᵀ M G ẇ = Gᵀ (tau − bias), M and bias those of Pinocchio."""
     robot = read_urdf(known(file))
     assert len(robot.couplings) == couplings
-    b = bench(robot, m_star=m_star)
+    b = assemble(robot, m_star=m_star)
     model = pin.buildModelFromUrdf(str(known(file)))
     data = model.createData()
     n = len(robot.links)
@@ -163,7 +165,7 @@ def test_an_open_contact_is_seen_and_carries_nothing():
     """OPEN: no row, no force, the free motion; the geometry is still there."""
     rng, robot, q, v, current = random_case(4)
     contacts: list[Contact] = random_contacts(rng, robot, q, 2)
-    b, free = bench(robot, contacts), bench(robot)
+    b, free = assemble(robot, contacts), assemble(robot)
     y = b.state(q, v, current)
     stick(b, y, ka.OPEN, ka.OPEN)
     b.ws.contacts[:] = 0.0

@@ -1,4 +1,4 @@
-"""Members of families from packages outside dynsim, which their entry points bring in; and what is wrong with some.
+"""Plug-ins: members of families from other packages, and errors of faulty ones.
 
 A folder NAME.dist-info on the path is what an installed distribution looks like to Python; nothing is installed.
 """

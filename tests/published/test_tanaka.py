@@ -1,4 +1,4 @@
-"""What Tanaka et al. (IEEE T-RO 35(1), 2019) state, with their sentence or table beside the assertion.
+"""Statements of Tanaka et al. (IEEE T-RO 35(1), 2019), with sentence or table beside each assertion.
 
 The robot here neither slips nor bends, so their measured deviations (Table III) must not appear: the control law alone
 brings every coordinate to its target.

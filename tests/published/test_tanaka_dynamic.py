@@ -1,4 +1,4 @@
-"""Table III and Figs 7 to 10 of [T] with servos that give way and wheels that can slip.
+"""Table III and Figs 7 to 10 of [T] with compliant servos and wheels that can slip.
 
 Nothing is tuned: the parameters are those of docs/snake.md, and what disagrees with the paper is told there.
 """

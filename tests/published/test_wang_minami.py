@@ -1,4 +1,4 @@
-"""What Wang and Minami state of their arm, with their sentence beside each assertion."""
+"""Statements of Wang and Minami about their arm, with sentence beside each assertion."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Two hundred of the drawn scenes of support/endings.py: each comes to its end, or says why it cannot."""
+"""Two hundred random ordinary scenes: each reaches its end, or names why it cannot."""
 
 from __future__ import annotations
 

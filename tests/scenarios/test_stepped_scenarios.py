@@ -1,4 +1,4 @@
-"""Time stepping in scenarios: it converges to the event-driven answer, and says what it does not do."""
+"""Time stepping in scenarios: convergence to the event-driven solution, and refused options."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Time stepping in scenarios: events at the times of steps, friction of wheels, what its summary says of the step."""
+"""Time stepping in scenarios: event times, wheel friction, and step statistics in the summary."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.stepping_benches import snake
+from support.stepping_systems import snake
 
 import dynsim
 from dynsim.engine.warnings import HALF_STEP_LIMIT, PENETRATION_LIMIT_M, SCHEME_LIMIT, coarse
@@ -111,8 +111,8 @@ def test_grips_that_cannot_be(change, says):
 
 def test_a_snake_on_wheels(tmp_path: Path):
     """A free root, twelve servos and fourteen wheels, all from a scenario: it sets out along its wheels."""
-    bench, _ = snake()
-    (tmp_path / "snake.urdf").write_text(write_urdf(bench.robot))
+    compiled, _ = snake()
+    (tmp_path / "snake.urdf").write_text(write_urdf(compiled.robot))
     wheels = "".join(
         f"    wheel_{k}: {{body: link_{min(k, 12)}, point_m: [{0.05 * (k > 12)}, {0.02 * (-1) ** k}, -0.03], "
         "grip: {axis: [1, 0, 0], ratio: 0.05}}\n"

@@ -1,1 +1,1 @@
-"""What tests and documented studies of faults share."""
+"""Helpers of tests and of documented studies."""

@@ -1,4 +1,4 @@
-"""How far the elbow comparison depends on what the paper does not say: one assumption changed at a time.
+"""Study: sensitivity of the elbow comparison to assumptions that the paper leaves open, one at a time.
 
 ``PYTHONPATH=tests python -m support.assumptions`` writes results/reference/assumptions.json, which docs/validation.md
 quotes.

@@ -1,4 +1,4 @@
-"""The published arm glued to its floor, on a real floor, and on one that all of its links can touch.
+"""Study: the published arm with its elbows glued to the floor, on a real floor, and with all links as candidates.
 
 ``PYTHONPATH=tests python -m support.contact`` writes results/contact/, which README.md and docs/validation.md quote, in
 about ten seconds once the kernels are compiled.

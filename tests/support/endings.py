@@ -1,4 +1,4 @@
-"""How ordinary braced arms end: thousands of drawn scenes, of which each must come to its end or to a named stop.
+"""Study: thousands of random braced arms; each run must reach its end or a named stop.
 
 Arms of 3 to 12 joints with DC motors lean on planes, pipes, spheres, boxes and terrain: points that are declared, all
 joints or all links may touch, with friction that holds more or as much at rest, payloads, pushes, soft and stiff gains,

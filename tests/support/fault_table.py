@@ -1,4 +1,4 @@
-"""What becomes of every fault under every policy in every state of a replay, by seeded runs on virtual servos.
+"""Study: the end of every fault under every policy in every state of a replay, on virtual servos.
 
     PYTHONPATH=tests python -m support.fault_table --runs 100 --out results/reference/bridge_faults.json
 

@@ -1,4 +1,4 @@
-"""Systems whose right-hand sides branch on their states in every way there is: the cases of tests about lanes."""
+"""Test cases for SIMD lanes: systems that reach every state-dependent branch of the right-hand side."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from dynsim.model.description import Contact, Coupling, Inertia, Link, Load, Qua
 from dynsim.model.drives import Motor, Servo, TorqueSource
 from support import lanes
 from support.random_robots import (
-    Bench,
-    bench,
+    CompiledSystem,
+    assemble,
     random_positions,
     random_robot,
     random_robot_of,
@@ -33,7 +33,7 @@ from support.random_robots import (
 class Case:
     """States of a system about one, at a time."""
 
-    bench: Bench
+    compiled: CompiledSystem
     y: np.ndarray
     spread: float  # of the lanes about y
     t: float = 0.0
@@ -46,14 +46,14 @@ def plane(rng: np.random.Generator, body: str, law: str = "signed", friction: fl
     return Contact(name, body, rng.normal(scale=0.3, size=3), surface, friction=friction, pulling_friction=law)
 
 
-def random_state(rng: np.random.Generator, b: Bench) -> np.ndarray:
+def random_state(rng: np.random.Generator, b: CompiledSystem) -> np.ndarray:
     y = b.state(random_positions(rng, b.robot), rng.normal(size=len(b.robot.links)))
     current = b.part(y, "current")
     current[:] = rng.normal(size=current.shape)
     return y
 
 
-def of(rng: np.random.Generator, b: Bench, spread: float, **keys: Any) -> Case:
+def of(rng: np.random.Generator, b: CompiledSystem, spread: float, **keys: Any) -> Case:
     return Case(b, random_state(rng, b), spread, **keys)
 
 
@@ -73,19 +73,19 @@ def on_planes(
     contacts = [plane(rng, f"body_{n - 1 - k % n}", law, friction) for k in range(count)]
     if twice:
         contacts[1] = replace(contacts[0], name="again")
-    return of(rng, bench(random_robot(rng, n), contacts, m_star=m_star), spread)
+    return of(rng, assemble(random_robot(rng, n), contacts, m_star=m_star), spread)
 
 
 def free(seed: int = 0) -> Case:
     rng = np.random.default_rng(seed)
-    return of(rng, bench(random_robot(rng, 8)), 1.0)
+    return of(rng, assemble(random_robot(rng, 8)), 1.0)
 
 
 def every_joint() -> Case:
     rng = np.random.default_rng(1)
     return of(
         rng,
-        bench(random_robot_of(rng, ["ball", "rolling", "planar", "floating", "wheeled", "prismatic", "revolute"])),
+        assemble(random_robot_of(rng, ["ball", "rolling", "planar", "floating", "wheeled", "prismatic", "revolute"])),
         1.0,
     )
 
@@ -99,7 +99,7 @@ def held(modes: list[int]) -> Case:
 
 def stick(case: Case, modes: list[int]) -> None:
     """Give the contacts modes; those that stick do so where they are."""
-    b = case.bench
+    b = case.compiled
     _, b.ws = run(case, [case.y], 0.0)
     lanes.plain(set_modes)(b.system.contacts, b.system.couplings, None, b.ws, integers(modes))
 
@@ -115,14 +115,14 @@ def curved() -> Case:
     contacts = [
         replace(plane(rng, f"body_{3 + k}"), surface=surface, name=str(k)) for k, surface in enumerate(surfaces)
     ]
-    return of(rng, bench(random_robot(rng, 6, branches=False), contacts), 1e-3)
+    return of(rng, assemble(random_robot(rng, 6, branches=False), contacts), 1e-3)
 
 
 def saddle() -> Case:
     """A surface that bends both ways, of which some lanes are too far for a distance along its normal."""
     rng = np.random.default_rng(9)
     contact = replace(plane(rng, "body_5"), surface=Quadric(np.diag([1.0, 0.5, -2.0]), np.zeros(3), -0.5))
-    return of(rng, bench(random_robot(rng, 6, branches=False), [contact]), 1.0)
+    return of(rng, assemble(random_robot(rng, 6, branches=False), [contact]), 1.0)
 
 
 def coupled(m_star: bool = False) -> Case:
@@ -130,7 +130,7 @@ def coupled(m_star: bool = False) -> Case:
     rng = np.random.default_rng(4)
     robot = random_robot(rng, 8)
     couplings = (Coupling("joint_6", "joint_2", 0.7, 0.1), Coupling("joint_1", "joint_7", -1.3))
-    b = bench(replace(robot, couplings=couplings), [plane(rng, "body_5")], m_star=m_star)
+    b = assemble(replace(robot, couplings=couplings), [plane(rng, "body_5")], m_star=m_star)
     case = of(rng, b, 1e-3)
     if not m_star:
         stick(case, [ka.STICKING])
@@ -151,7 +151,7 @@ def driven(t: float, t_step: float = 0.0) -> Case:
         Load("ends", "body_3", rng.normal(size=3), True, knots, coefficients, False),
         Load("held", "body_2", rng.normal(size=3), False, knots, coefficients, True),
     ]
-    b = bench(robot, loads=loads)
+    b = assemble(robot, loads=loads)
     reference = ka.ReferenceArrays(
         integers([0, ka.HELD_POSITION, 1, ka.REWRITTEN]),
         reals(rng.normal(size=4)),
@@ -170,7 +170,7 @@ def limited() -> Case:
     robot = random_robot(rng, 6)
     motors = [replace(motor, voltage_limit=15.0) for motor in robot.motors]
     motors[0] = replace(motors[0], current_limit=3.0)
-    return of(rng, bench(replace(robot, motors=tuple(motors))), 1.0)
+    return of(rng, assemble(replace(robot, motors=tuple(motors))), 1.0)
 
 
 def servos() -> Case:
@@ -186,7 +186,7 @@ def servos() -> Case:
         TorqueSource("joint_4", 0.3),
         Servo("joint_5", k_p=40.0, voltage_limit=0.5, **common),
     )
-    b = bench(replace(robot, motors=motors), held=rng.normal(size=6))
+    b = assemble(replace(robot, motors=motors), held=rng.normal(size=6))
     b.system.drives.table[2, ka.SERVO_MODE] = ka.OFF
     b.system.drives.table[5, ka.SAMPLED] = 1
     b.system.drives.input[5, ka.COMMAND] = 0.7
@@ -199,7 +199,7 @@ def rubbing() -> Case:
     robot = random_robot_of(rng, ["revolute"] * 4)
     links = tuple(replace(link, friction=0.1 * k) for k, link in enumerate(robot.links))
     motor = Motor("joint_2", 0.2, 1.3, 2e-3, 1e-4, 7.0, 1e-3, dry_friction=0.4)
-    b = bench(replace(robot, links=links, motors=(motor,)), real=True, dry=True)
+    b = assemble(replace(robot, links=links, motors=(motor,)), real=True, dry=True)
     unilateral = b.system.unilateral
     assert unilateral is not None
     unilateral.dry_table[:, ku.DRY_HOLDS] = 0
@@ -212,7 +212,7 @@ def unmoved() -> Case:
     """A point of a slide along x on a floor: a system of one row that is zero."""
     x, z = np.eye(3)[0], np.eye(3)[2]
     robot = Robot("slide", (Link("body", "joint", None, "prismatic", x, Inertia(1.0)),), (), ("body", np.zeros(3)))
-    b = bench(robot, [Contact("foot", "body", np.zeros(3), Quadric(np.zeros((3, 3)), z, 0.0))])
+    b = assemble(robot, [Contact("foot", "body", np.zeros(3), Quadric(np.zeros((3, 3)), z, 0.0))])
     return of(np.random.default_rng(8), b, 1.0)
 
 
@@ -250,7 +250,7 @@ TIMED = {
 
 def run(case: Case, states: list[np.ndarray], t: Any, **forms: Callable[..., Any]) -> tuple[np.ndarray, ka.Workspace]:
     """Derivative and workspace of states as lanes, or of one state as it is; kernels replaced by their ``forms``."""
-    b, count = case.bench, len(states)
+    b, count = case.compiled, len(states)
     parts, ws, dense = b.system, lanes.copies(b.ws), lanes.copies(b.system.dense)
     y, dy = states[0], np.zeros_like(states[0])
     if count > 1:

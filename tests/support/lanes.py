@@ -1,8 +1,8 @@
-"""The right-hand side on several states at once, in plain Python: which of its branches depend on the state?
+"""The right-hand side on several states at once, in plain Python: finds the branches that depend on the state.
 
-``Lanes`` are N doubles that are computed with as one. A comparison gives N truths; asked for one, as ``if`` does, they
-must agree, and the place in the kernels that asks is noted. So a run with lanes says what a compiler for vectors of
-doubles would stumble over. Constants of the model stay numbers, integers stay integers.
+``Lanes`` are N doubles on which arithmetic acts at once; N is 4 in the compiled kernels. A comparison gives N booleans.
+Where ``if`` needs a single one, they must agree, and the line of the kernel is noted: a compiler for vectors of doubles
+could not translate that branch. Constants of the model stay numbers, integers stay integers.
 """
 
 from __future__ import annotations

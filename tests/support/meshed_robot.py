@@ -1,4 +1,4 @@
-"""A robot from a URDF file with a mesh of each kind, and with one that is not there."""
+"""A URDF robot with a mesh of each file kind, and with one missing file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What share of small mistakes in kernels the tests notice: one line at a time is changed, and its tests are run.
+"""Mutation study: small mistakes put into kernel lines one at a time, and the share that tests notice.
 
 ``NUMBA_DISABLE_JIT=1 PYTHONPATH=tests python -m support.mutations OUT.json`` draws lines of the kernels at random,
 writes which tests reach each of them, then what became of each mistake. Kernels run as Python, so that a mistake is a

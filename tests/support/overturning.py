@@ -1,4 +1,4 @@
-"""Does bracing keep a mobile base from tipping over? The four elbow configurations, and what of the base decides.
+"""Study: does bracing keep a mobile base from tipping? Four elbow configurations, base parameters varied.
 
 ``PYTHONPATH=tests python -m support.overturning`` writes results/overturning/ (configurations.json, sweep.csv,
 sweep.png), which docs/validation.md quotes, in about two minutes.

@@ -1,4 +1,4 @@
-"""Child processes of tests: waited for by what they do, and ended whatever happens."""
+"""Child processes of tests: waits for their output, and ends them in any case."""
 
 from __future__ import annotations
 

@@ -191,7 +191,7 @@ def held_reference(angles: np.ndarray) -> ka.ReferenceArrays:
 
 
 @dataclass
-class Bench:
+class CompiledSystem:
     """A system with its workspace: what a test needs to evaluate one right-hand side."""
 
     robot: Robot
@@ -277,7 +277,7 @@ class Bench:
         advance(self.system, self.ws, run, limit)
         return run
 
-    def with_shapes(self) -> Bench:
+    def with_shapes(self) -> CompiledSystem:
         """As scenarios are that are stepped in time: all run one program."""
         return replace(self, system=with_shapes(self.system))
 
@@ -293,7 +293,7 @@ class Bench:
         return run
 
 
-def bench(
+def assemble(
     robot: Robot,
     contacts: list[Contact] | None = None,
     *,
@@ -305,7 +305,7 @@ def bench(
     real: bool = False,
     slow: float = 1e-5,
     dry: bool = False,
-) -> Bench:
+) -> CompiledSystem:
     """Compile a robot and its contacts, with a voltage PD that holds ``held`` (zero by default).
 
     ``real``: under the unilateral law, with the robot's joint stops; slip below ``slow`` [m/s] keeps its direction.
@@ -330,11 +330,11 @@ def bench(
         shapes=compile_shapes(robot, contacts or []),
         unilateral=compile_unilateral(robot, contacts or [], stops, slow, rubbing) if real else None,
     )
-    return Bench(robot, system, new_workspace(system), tuple(contacts or ()) if real else (), tuple(stops))
+    return CompiledSystem(robot, system, new_workspace(system), tuple(contacts or ()) if real else (), tuple(stops))
 
 
-def braced(rng: np.random.Generator) -> tuple[Bench, np.ndarray]:
+def braced(rng: np.random.Generator) -> tuple[CompiledSystem, np.ndarray]:
     """A tree with gentle motors and two points on their surfaces: what is fast and chatters amplifies rounding."""
     robot = random_robot(rng, 7)
     q = random_positions(rng, robot)
-    return bench(robot, random_contacts(rng, robot, q, 2), k_p=0.3, k_d=0.01), q
+    return assemble(robot, random_contacts(rng, robot, q, 2), k_p=0.3, k_d=0.01), q

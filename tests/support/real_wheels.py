@@ -1,4 +1,4 @@
-"""A mobile arm written apart from dynsim: planar base, two spinning wheels, rolling by three multipliers, in Pinocchio.
+"""Independent model of a mobile arm in Pinocchio: planar base, two spinning wheels, rolling by multipliers.
 
 The base slides along the world's x and y and turns about z; each wheel is a disc of its own that turns on its axle; the
 arm stands on the base. The axle does not slip sideways and no wheel slips along: rows A v = 0, whose forces are solved

@@ -1,4 +1,4 @@
-"""What the rotors' armature leaves out: the same run with every rotor as a spinning body of its own.
+"""Study: the effect of rotor armature as against rotors that are bodies of their own.
 
 dynsim gives a rotor the inertia J_m = I_m k² at its joint ([WM] eq 25), as if it turned about a resting axis. In
 truth it rides on the link before its joint and turns about the joint's axis a with that link's rate and k v on top, so

@@ -1,4 +1,4 @@
-"""What the shipped scenarios of the kinematic snake come to, and how far that depends on their settings.
+"""Study: results of the kinematic snake scenarios, and their sensitivity to settings.
 
 ``PYTHONPATH=tests python -m support.snake_kinematic`` writes results/snake/kinematic.json, which docs/snake.md quotes,
 in half a minute with compiled kernels.

@@ -1,4 +1,4 @@
-"""What the length of a step changes in Table III of the dynamic snake, and of which order time stepping is there.
+"""Study: effect of the step length on Table III of the dynamic snake, and the order of time stepping there.
 
 ``PYTHONPATH=tests python -m support.snake_steps`` writes results/snake/steps.json, which docs/snake.md quotes, in a
 minute or two.

@@ -1,4 +1,4 @@
-"""What the first run of all takes, which compiles the kernels, and a later one.
+"""Study: duration of the very first run, which compiles the kernels, and of a later one.
 
 ``PYTHONPATH=tests python -m support.start_up`` writes results/reference/start_up.json in two minutes: on a machine that
 does nothing else, the one of results/reference/bench.json.

@@ -1,4 +1,4 @@
-"""Cases with a known end for time stepping: a bead in bowls and over a hump, a knife edge, arms whose tip touches."""
+"""Time-stepping cases with known final states: a bead in bowls and over a hump, a knife edge, touching arms."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from dynsim.integrators.run import Run
 from dynsim.jit.kernel import integers, reals
 from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot
 from dynsim.model.drives import Servo
-from support.random_robots import Bench, bench
-from support.stepping_benches import plane, stepped
+from support.random_robots import CompiledSystem, assemble
+from support.stepping_systems import plane, stepped
 
 G = 9.81
 X, Y, Z = np.eye(3)
 
 
 class Case(NamedTuple):
-    """A bench, where it starts, how long it runs, and where it must end."""
+    """A system, where it starts, how long it runs, and where it must end."""
 
-    bench: Bench
+    compiled: CompiledSystem
     q: np.ndarray
     v: np.ndarray
     until: float
@@ -37,7 +37,7 @@ class Case(NamedTuple):
         """Its run with this step, sampled at every step."""
         until = self.until if until is None else until
         times = np.arange(round(until / step) + 1) * step
-        return stepped(self.bench, self.bench.state(self.q, self.v), times, step, theta, self.law)
+        return stepped(self.compiled, self.compiled.state(self.q, self.v), times, step, theta, self.law)
 
     def error(self, step: float, theta: float = 0.5) -> float:
         """Largest error at the end [m or rad]."""
@@ -49,14 +49,14 @@ def solved(law: Callable[..., object], until: float, start: np.ndarray, *more: o
     return solve_ivp(law, (0.0, until), start, "DOP853", rtol=1e-12, atol=1e-13, args=more)["y"][:, -1]
 
 
-def point(contact: Contact, mass: float, *, gravity: float = G) -> Bench:
+def point(contact: Contact, mass: float, *, gravity: float = G) -> CompiledSystem:
     """A body that does not turn, free along x, y and z, with one contact at its origin."""
     links = [
         Link(a, f"j{a}", "xy"[k - 1] if k else None, "prismatic", np.eye(3)[k], Inertia(mass if k == 2 else 0.0))
         for k, a in enumerate("xyz")
     ]
     robot = Robot("point", tuple(links), (), ("z", np.zeros(3)), gravity=np.array([0.0, 0.0, -gravity]))
-    return bench(robot, [contact], real=True)
+    return assemble(robot, [contact], real=True)
 
 
 def sphere(centre: np.ndarray, radius: float, side: float) -> Quadric:
@@ -65,7 +65,7 @@ def sphere(centre: np.ndarray, radius: float, side: float) -> Quadric:
     return Quadric(Q, -Q @ centre, 0.5 * side * (float(centre @ centre) / radius - radius))
 
 
-def bowl(friction: float, *, radius: float = 0.4, mass: float = 0.3, gravity: float = G) -> Bench:
+def bowl(friction: float, *, radius: float = 0.4, mass: float = 0.3, gravity: float = G) -> CompiledSystem:
     """A bead in a sphere whose lowest point is the origin."""
     surface = sphere(radius * Z, radius, -1.0)
     return point(Contact("bead", "z", np.zeros(3), surface, friction=friction), mass, gravity=gravity)
@@ -124,7 +124,7 @@ def knife_edge() -> Case:
         for k, (a, axis) in enumerate(zip("xyzt", (X, Y, Z, Z), strict=True))
     ]
     robot = Robot("sleigh", tuple(links), (), ("t", np.zeros(3)))
-    b = bench(robot, [Contact("blade", "t", np.zeros(3), plane(Z), friction=1e3)], real=True)
+    b = assemble(robot, [Contact("blade", "t", np.zeros(3), plane(Z), friction=1e3)], real=True)
 
     def law(_: float, y: np.ndarray) -> list[float]:
         along, rate, angle = y[:3]
@@ -207,7 +207,7 @@ def reach(last: float, x: float, z: float = FLOOR) -> np.ndarray:
     return np.array([first, first + bend, last])
 
 
-def arm(friction: float, reference: Callable | None = None, until: float = 0.0) -> Bench:
+def arm(friction: float, reference: Callable | None = None, until: float = 0.0) -> CompiledSystem:
     """The same arm in dynsim, its joints held to a reference of absolute angles by springs and dampers."""
     links = []
     for k in range(3):
@@ -218,7 +218,7 @@ def arm(friction: float, reference: Callable | None = None, until: float = 0.0) 
     servos = [Servo(f"j{k}", np.sqrt(DRAG), 1.0, STIFF / np.sqrt(DRAG)) for k in range(3 if reference else 0)]
     robot = Robot("arm", tuple(links), tuple(servos), ("rod_2", LENGTH[2] * X))
     surface = Quadric(np.zeros((3, 3)), Z, -FLOOR)
-    b = bench(robot, [Contact("tip", "rod_2", LENGTH[2] * X, surface, friction=friction)], real=True)
+    b = assemble(robot, [Contact("tip", "rod_2", LENGTH[2] * X, surface, friction=friction)], real=True)
     if reference is None:
         return b
     knots = np.linspace(0.0, until, 1001)

@@ -1,4 +1,4 @@
-"""Work that processes of tests are given: of a module, so that spawned ones can load it."""
+"""Tasks for worker processes of tests, in a module that spawned processes can import."""
 
 from __future__ import annotations
 

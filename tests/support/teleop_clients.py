@@ -1,4 +1,4 @@
-"""Drives in processes of their own, and raw clients of their servers."""
+"""Live drives in processes of their own, and raw clients of their servers."""
 
 from __future__ import annotations
 

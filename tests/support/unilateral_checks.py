@@ -1,4 +1,4 @@
-"""Random robots that touch surfaces, and what every sample of a run under the unilateral law must keep to."""
+"""Random robots that touch surfaces, and the checks of the unilateral law at every sample."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from dynsim.dynamics.state import (
     OUT_VECTOR,
 )
 from dynsim.integrators import run as ki
-from dynsim.integrators.contacts import events as ce
+from dynsim.integrators.contacts import events as ke
 from dynsim.model.description import Contact, Quadric
-from support.random_robots import Bench, bench, random_contacts, random_positions, random_robot
+from support.random_robots import CompiledSystem, assemble, random_contacts, random_positions, random_robot
 
 
 def raised(contact: Contact, height: float) -> Contact:
@@ -40,7 +40,7 @@ def raised(contact: Contact, height: float) -> Contact:
     return replace(contact, surface=replace(surface, c=0.5 * (float(centre @ surface.Q @ centre) - radius**2)))
 
 
-def random_touch(seed: int) -> tuple[Bench, np.ndarray]:
+def random_touch(seed: int) -> tuple[CompiledSystem, np.ndarray]:
     """A random robot with two to six contacts, on their surfaces or some centimetres off, and a state."""
     rng = np.random.default_rng(seed)
     n = int(rng.integers(3, 9))
@@ -60,7 +60,7 @@ def random_touch(seed: int) -> tuple[Bench, np.ndarray]:
         )
         contacts.append(raised(changed, rng.uniform(0.0, 0.1)) if rng.random() < 0.5 else changed)
     v = 0.3 * rng.normal(size=n) if rng.random() < 0.5 else np.zeros(n)
-    b = bench(robot, contacts, real=True, held=q[[robot.joint_names.index(m.joint) for m in robot.motors]])
+    b = assemble(robot, contacts, real=True, held=q[[robot.joint_names.index(m.joint) for m in robot.motors]])
     return b, b.state(q, v)
 
 
@@ -73,7 +73,7 @@ def ledger_residual(run: ki.Run) -> np.ndarray:
     return off / (1.0 + np.abs(stored).max() + spent.max() + np.abs(ledger[:, ELECTRICAL]).max())
 
 
-def violations(b: Bench, run: ki.Run) -> dict[str, float]:
+def violations(b: CompiledSystem, run: ki.Run) -> dict[str, float]:
     """The worst breach of each rule of the law over all samples: forces per the largest of a sample, plus 1 N [1, m].
 
     Rules: f_n ≥ 0; gap ≥ 0; f_n gap = 0; |f_t| ≤ μ f_n; sliding friction is μ f_n against slip.
@@ -115,7 +115,7 @@ def violations(b: Bench, run: ki.Run) -> dict[str, float]:
     return worst
 
 
-def _normal(b: Bench, contact: Contact, q: np.ndarray) -> np.ndarray:
+def _normal(b: CompiledSystem, contact: Contact, q: np.ndarray) -> np.ndarray:
     position = Model(b.robot).point_position(contact.body, contact.point, q)
     slope = contact.surface.Q @ position + contact.surface.b
     return slope / np.linalg.norm(slope)
@@ -125,6 +125,6 @@ def events(run: ki.Run) -> list[tuple[float, int, int]]:
     """Time, contact and kind of the logged events of contacts."""
     events_seen = []
     for t, code in zip(run.log_time, run.log_event[: run.count[ki.LOGGED]], strict=False):
-        k, kind = divmod(int(code) - ki.CONTACT_LOG, ce.LOG_KINDS)
+        k, kind = divmod(int(code) - ki.CONTACT_LOG, ke.LOG_KINDS)
         events_seen.append((float(t), k, kind))
     return events_seen

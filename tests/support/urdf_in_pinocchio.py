@@ -1,4 +1,4 @@
-"""A URDF file read by Pinocchio, beside what dynsim has read."""
+"""A URDF file read by Pinocchio, for comparison with dynsim's reading."""
 
 from __future__ import annotations
 

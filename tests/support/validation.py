@@ -1,4 +1,4 @@
-"""The numbers that README.md and docs/ quote, measured anew.
+"""Study: the numbers that README.md and docs/ quote, measured anew.
 
 ``PYTHONPATH=tests python -m support.validation`` writes results/reference/validation.json in about four minutes;
 ``python .ci/pages.py`` writes them into the pages.

@@ -1,4 +1,4 @@
-"""The arm of [WM] with its elbows on the floor: numbers and forces, and how far they depend on what is assumed.
+"""Study: results and forces of the arm of [WM] with elbows on the floor, and their sensitivity.
 
 [WM]: see docs/physics.md. What the paper states is asserted in tests/published/test_wang_minami.py.
 """

@@ -1,4 +1,4 @@
-"""Every member of a family in the package is what the protocol of its family says: for mypy, and when it is built."""
+"""Every family member in the package fulfils the protocol of its family, statically and at run time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Figures of a mobile base: from its record alone, and saying what the record says."""
+"""Figures of a mobile base, drawn from its record alone."""
 
 from __future__ import annotations
 

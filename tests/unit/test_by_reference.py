@@ -1,4 +1,4 @@
-"""Named tuples in compiled code are blocks in memory: what is put in comes out, however they are passed."""
+"""Named tuples passed by reference to compiled code keep their contents."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Names of the kernels' columns: one table knows nothing of another's, so a name must not be given twice."""
+"""Column names of kernel tables are unique across tables."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is said while kernels are compiled: in the log, on a terminal, and to a display, of other processes too."""
+"""Messages about kernel compilation: in the log, on a terminal, and from worker processes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""References that controllers give as positions: what the motors then follow, and what is refused."""
+"""Position references of controllers: the motor references made from them, and refusals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tables of hand paths: read as any other program reads them, or refused with file, line and reason."""
+"""CSV hand paths: read like by any other program, or refused with file, line and reason."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the pages on architecture, extending and development name exists: files, what is in them, and dotted names."""
+"""Names in the developer pages exist: files, their contents, and dotted names."""
 
 from __future__ import annotations
 

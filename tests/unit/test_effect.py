@@ -1,4 +1,4 @@
-"""Keys that a scenario may have and that change nothing: each is in the resolved scenario or in a warning."""
+"""Keys without effect: each is in the resolved scenario or in a warning."""
 
 from __future__ import annotations
 

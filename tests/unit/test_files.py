@@ -1,4 +1,4 @@
-"""Writing files: devices stay devices, links stay links, and what belongs together comes together or not at all."""
+"""Writing files: devices stay devices, links stay links, and groups of files are written all or none."""
 
 import os
 import signal

@@ -1,4 +1,4 @@
-"""Files that users name: only regular ones are read, and YAML gives plain values or one error with its line."""
+"""Reading files that users name: only regular ones, and YAML gives plain values or one error with its line."""
 
 import os
 import pwd

@@ -1,4 +1,4 @@
-"""Signals wait where raising for them would crash the process."""
+"""Signals are postponed where raising for them would crash the process."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def deeper() -> str:
 
 def test_a_signal_within_a_callback_of_the_compiler_waits():
     """Raised there, it is lost, and LLVM goes on without the code that it has asked for: a segmentation fault."""
-    with interruption.heeded() as received:
+    with interruption.handled() as received:
         assert _raw_object_cache_getbuffer() == "went on"
         assert received == [signal.SIGINT]
         with pytest.raises(KeyboardInterrupt):
@@ -38,7 +38,7 @@ def test_a_signal_within_a_callback_of_the_compiler_waits():
 
 
 def test_elsewhere_it_does_not():
-    with interruption.heeded(), pytest.raises(KeyboardInterrupt):
+    with interruption.handled(), pytest.raises(KeyboardInterrupt):
         deeper()
 
 

@@ -1,4 +1,4 @@
-"""What is logged, and that nobody who did not ask sees it."""
+"""Log messages: their content, and silence where logging was not requested."""
 
 from __future__ import annotations
 

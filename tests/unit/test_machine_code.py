@@ -1,4 +1,4 @@
-"""The same version gives the same numbers, whatever a process has compiled, loaded or found in its cache before."""
+"""Reproducibility: the same version gives the same numbers, whatever was compiled, loaded or cached before."""
 
 from __future__ import annotations
 
@@ -88,11 +88,11 @@ import numpy as np
 from contextlib import nullcontext
 from dynsim.jit import compiler, kernel as jit
 from dynsim.dynamics.tree.sweep import kinematics
-from support.random_robots import bench, random_robot
+from support.random_robots import assemble, random_robot
 
 if "numba's" in sys.argv:
     compiler._quick_look_ups = nullcontext
-b = bench(random_robot(np.random.default_rng(1), 3))
+b = assemble(random_robot(np.random.default_rng(1), 3))
 kinematics(b.system.model, b.ws)
 (file,) = jit.cache_folder().glob("*.kinematics-*")
 print(hashlib.sha256(pickle.loads(file.read_bytes()[32:])[0][2][0]).hexdigest())

@@ -1,4 +1,4 @@
-"""What runs of a sweep take over from each other: never anything else than what they would have computed."""
+"""Memoised results of sweeps equal freshly computed ones."""
 
 import itertools
 from collections.abc import Callable

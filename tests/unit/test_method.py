@@ -1,4 +1,4 @@
-"""``integrator.method: auto``: the fastest rate of a system at its start, and what is chosen by it."""
+"""``integrator.method: auto``: the fastest rate of a system at its start, and the chosen method."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Kinds of motors in scenarios: their keys, whose gains count, and errors that say what to do."""
+"""Kinds of motors in scenarios: their keys, the gains that apply, and errors that name the fix."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Names that say nothing: no variable, argument or function has one, in package, tests and scripts."""
+"""Banned names: no variable, argument or function has one, in package, tests and scripts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""numba stays what it is for everybody else in the process: dynsim changes it within its own compilations alone."""
+"""numba is unchanged for other code in the process: dynsim adapts it in its own compilations alone."""
 
 from __future__ import annotations
 

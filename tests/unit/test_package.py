@@ -1,4 +1,4 @@
-"""What a package must bring along: licence, types, how to cite it."""
+"""Package metadata: licence, types, citation."""
 
 from __future__ import annotations
 

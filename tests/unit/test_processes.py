@@ -1,4 +1,4 @@
-"""Workers: started from any script, gone at any time, and what is said of those that cannot work."""
+"""Worker processes: started from any script, killed at any time, and errors of those that cannot work."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""What takes long says how far it is; quiet mode says nothing."""
+"""Progress display of long work; quiet mode prints nothing."""
 
 import io
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""What a scenario says of a mobile arm: errors with key and line, resolved scenarios, arms from URDF files."""
+"""Scenarios of a mobile arm: errors with key and line, resolved scenarios, arms from URDF files."""
 
 from __future__ import annotations
 

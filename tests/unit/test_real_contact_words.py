@@ -1,4 +1,4 @@
-"""What runs of real contact say of themselves: stops, chatter, tiny falls, a base that could tip."""
+"""Messages of runs with real contact: stops, chatter, tiny falls, a base that could tip."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files of records from an enemy: every one is read as it was written, or refused in one line. None crashes the reader.
+"""Hostile record files: each is read as written or refused in one line; none crashes the reader.
 
 The HDF5 library itself crashes, or never returns, on one of sixty damaged files: so these tests read in children.
 """

@@ -1,4 +1,4 @@
-"""Scenario and Model in one line, for a console."""
+"""One-line ``repr`` of Scenario and Model."""
 
 from __future__ import annotations
 

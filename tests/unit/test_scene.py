@@ -1,4 +1,4 @@
-"""Scenes: what is written is what is read; surfaces know what they are."""
+"""Scenes: round trip through files; surfaces know their kind."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Surfaces that are elsewhere than the controller takes them, starts on references, and ends of waypoints."""
+"""Displaced surfaces, starts on references, and ends of waypoints."""
 
 from __future__ import annotations
 

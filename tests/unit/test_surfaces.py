@@ -1,4 +1,4 @@
-"""Boxes and height fields of scenarios, candidates that are joints and links, and what is wrong with them."""
+"""Boxes and height fields in scenarios, joints and links as candidates, and errors of all these."""
 
 from __future__ import annotations
 

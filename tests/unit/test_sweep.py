@@ -1,4 +1,4 @@
-"""Sweeps: what is run, that it is what single runs give, and that nothing which ends it takes other runs with it."""
+"""Sweeps: the set of runs, equality with single runs, and runs that survive an interruption."""
 
 import csv
 import json

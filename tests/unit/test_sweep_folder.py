@@ -1,4 +1,4 @@
-"""Folders of sweeps that something has happened to: one error that names the file and the fix, and nothing lost."""
+"""Damaged sweep folders: one error that names the file and the fix, and nothing lost."""
 
 import csv
 import json

@@ -1,4 +1,4 @@
-"""Tables of summaries: whole in files and pipes, and with joint stops; warnings of references beyond these."""
+"""Tables of summaries: complete in files and pipes, with joint stops, and warnings of references beyond these."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def test_joint_stops_have_rows(beyond: Record, tmp_path: Path) -> None:
 
 
 def test_tables_that_nobody_looks_at_are_whole(beyond: Record, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In a pipe all variants are in one table, no name is cut off and no warning broken; COLUMNS is heeded."""
+    """In a pipe all variants are in one table, no name is cut off and no warning broken; COLUMNS is handled."""
     monkeypatch.delenv("COLUMNS", raising=False)
     names = [f"a_variant_with_quite_a_long_name_{k}" for k in range(9)]
     text = shown(dict.fromkeys(names, beyond.summary))

@@ -1,4 +1,4 @@
-"""Names from files on a terminal: shown as they are written, whatever they would do."""
+"""Names from files on a terminal: control characters are printed, never executed."""
 
 import io
 

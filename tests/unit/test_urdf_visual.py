@@ -1,4 +1,4 @@
-"""What links of URDF files look like: read with good will, placed like their bodies, never a reason to refuse."""
+"""Visual shapes of URDF links: read leniently, placed like their bodies, never a reason to refuse."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Wrong keys of contacts, braces and surfaces: each is refused with file, line, key, value and what to do."""
+"""Wrong keys of contacts, braces and surfaces: each is refused with file, line, key, value and fix."""
 
 from __future__ import annotations
 

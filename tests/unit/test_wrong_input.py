@@ -1,4 +1,4 @@
-"""What a user of the Python interface gets wrong is one error of dynsim, in one line, that says what and what to do."""
+"""Wrong arguments to the Python interface: each raises one error of dynsim with the fix."""
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.random_robots import bench, random_inertia, random_robot, random_unit
+from support.random_robots import assemble, random_inertia, random_robot, random_unit
 
 from dynsim.compile.model import Model
 from dynsim.dynamics import tables as ka
@@ -150,7 +150,7 @@ def momentum(model: Model, q: np.ndarray, v: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("seed", range(3))
 def test_momentum_of_a_free_body_is_kept_whatever_its_own_motor_does(seed):
     rng = np.random.default_rng(seed)
-    b = bench(free_body(rng), held=np.array([1.0]))
+    b = assemble(free_body(rng), held=np.array([1.0]))
     model = Model(b.robot)
     q, v = rng.normal(scale=0.3, size=7), rng.normal(scale=0.5, size=7)
     run = b.simulate(b.state(q, v), np.linspace(0.0, 1.0, 11), rtol=1e-10)

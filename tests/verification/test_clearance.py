@@ -1,4 +1,4 @@
-"""Links that sink below surfaces, and references that tear a contact off."""
+"""Links that sink below surfaces, and references that pull a contact off."""
 
 import io
 import re

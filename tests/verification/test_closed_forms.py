@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.special import ellipk
-from support.random_robots import ADAPTIVE, Bench, bench
+from support.random_robots import ADAPTIVE, CompiledSystem, assemble
 
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.state import FRICTION, OUT_FORCE
@@ -23,14 +23,14 @@ def robot(*links: Link, motors: tuple[Motor, ...] = (), gravity: float = G) -> R
     return Robot("case", links, motors, (links[-1].name, np.zeros(3)), gravity=np.array([0.0, 0.0, -gravity]))
 
 
-def bead(mass: float, surface: Quadric, friction: float = 0.0, v_s: float = 1e-3, gravity: float = G) -> Bench:
+def bead(mass: float, surface: Quadric, friction: float = 0.0, v_s: float = 1e-3, gravity: float = G) -> CompiledSystem:
     """A point mass on three slides, held to a surface."""
     links = [
         Link(f"b{k}", f"j{k}", None if k == 0 else f"b{k - 1}", "prismatic", axis, Inertia(mass if k == 2 else 0.0))
         for k, axis in enumerate((X, Y, Z))
     ]
     contact = Contact("bead", "b2", np.zeros(3), surface, friction=friction, slip_smoothing=v_s)
-    return bench(robot(*links, gravity=gravity), [contact])
+    return assemble(robot(*links, gravity=gravity), [contact])
 
 
 @pytest.mark.parametrize("amplitude", [0.1, 1.5, 3.0])
@@ -40,7 +40,7 @@ def test_pendulum_period(amplitude, method):
     length = 0.7
     link = Link("bob", "hinge", None, "revolute", Y, Inertia(0.3, np.array([0.0, 0.0, -length])))
     period = 4.0 * np.sqrt(length / G) * ellipk(np.sin(0.5 * amplitude) ** 2)
-    b = bench(robot(link))
+    b = assemble(robot(link))
     run = b.simulate(b.state([amplitude], [0.0]), np.array([0.25, 0.5, 1.0]) * period, method, rtol=1e-11)
     # A thousand times the tolerance: near the top the swing magnifies errors.
     np.testing.assert_allclose(run.states("q")[:, 0], [0.0, -amplitude, amplitude], rtol=0, atol=1e-8)
@@ -51,7 +51,7 @@ def test_current_in_a_blocked_motor_rises_exponentially(method):
     """i = u/R (1 − exp(−R t/L))."""
     heavy = Link("wheel", "shaft", None, "revolute", Z, Inertia(1.0, np.zeros(3), 1e15 * np.eye(3)))
     motor = Motor("shaft", 0.2, resistance=1.1, inductance=1.7e-3, rotor_inertia=0.0, gear_ratio=3.0)
-    b = bench(robot(heavy, motors=(motor,)), held=np.array([0.4]), k_p=30.0, k_d=0.0)
+    b = assemble(robot(heavy, motors=(motor,)), held=np.array([0.4]), k_p=30.0, k_d=0.0)
     t = np.linspace(0.0, 8e-3, 9)
     run = b.simulate(b.state([0.0], [0.0]), t, method, rtol=1e-9)
     expected = 30.0 * 0.4 / 1.1 * (1.0 - np.exp(-1.1 / 1.7e-3 * t))
@@ -63,7 +63,7 @@ def test_current_in_a_blocked_motor_rises_exponentially(method):
 def test_current_with_a_voltage_limit_rises_as_if_the_limit_were_the_voltage(method):
     heavy = Link("wheel", "shaft", None, "revolute", Z, Inertia(1.0, np.zeros(3), 1e15 * np.eye(3)))
     motor = Motor("shaft", 0.2, 1.1, 1.7e-3, rotor_inertia=0.0, gear_ratio=3.0, voltage_limit=5.0)
-    b = bench(robot(heavy, motors=(motor,)), held=np.array([0.4]), k_p=30.0)
+    b = assemble(robot(heavy, motors=(motor,)), held=np.array([0.4]), k_p=30.0)
     t = np.array([1e-3, 5e-3])
     run = b.simulate(b.state([0.0], [0.0]), t, method, rtol=1e-9)
     expected = 5.0 / 1.1 * (1.0 - np.exp(-1.1 / 1.7e-3 * t))

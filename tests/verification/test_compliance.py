@@ -1,4 +1,4 @@
-"""What gives way in time stepping, contacts and ties between bodies: closed forms, bounds and the ledger."""
+"""Compliant contacts and ties in time stepping: closed forms, bounds and the ledger."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.random_robots import Bench, bench
-from support.stepping_benches import plane, stepped
+from support.random_robots import CompiledSystem, assemble
+from support.stepping_systems import plane, stepped
 
 from dynsim import load_scenario, simulate
 from dynsim.dynamics.contact import unilateral as ku
@@ -22,11 +22,11 @@ G, MASS, STIFFNESS, DAMPING = 9.81, 2.0, 2e4, 40.0
 Z = vector(0, 0, 1)
 
 
-def soft(stiffness: float = STIFFNESS, damping: float = DAMPING) -> Bench:
+def soft(stiffness: float = STIFFNESS, damping: float = DAMPING) -> CompiledSystem:
     """A mass on a vertical guide above a floor that gives way."""
     link = Link("mass", "up", None, "prismatic", Z, Inertia(MASS))
     contact = Contact("foot", "mass", np.zeros(3), plane(Z), stiffness=stiffness, damping=damping)
-    return bench(Robot("mass", (link,), (), ("mass", np.zeros(3))), [contact], real=True)
+    return assemble(Robot("mass", (link,), (), ("mass", np.zeros(3))), [contact], real=True)
 
 
 def balance(run) -> np.ndarray:
@@ -107,7 +107,7 @@ def test_four_feet_on_a_floor_that_gives_way_share_the_load():
         for k, foot in enumerate(feet)
     ]
     gravity = G * vector(0.2, 0.0, -1.0)
-    b = bench(Robot("box", tuple(floating(body)), (), ("box", np.zeros(3)), gravity=gravity), contacts, real=True)
+    b = assemble(Robot("box", tuple(floating(body)), (), ("box", np.zeros(3)), gravity=gravity), contacts, real=True)
     q = np.zeros(7)
     q[2], q[3] = 0.1, 1.0
     run = stepped(b, b.state(q, np.zeros(6)), np.array([0.0, 3.0]), 1e-3, 0.5)
@@ -120,7 +120,7 @@ def test_four_feet_on_a_floor_that_gives_way_share_the_load():
     assert run.stepping.statistics[WORST] < 1e-6
 
 
-def pair(ties: tuple[Tie, ...], *, mass: float = 1.0, loads: Sequence[Load] = ()) -> tuple[Bench, np.ndarray]:
+def pair(ties: tuple[Tie, ...], *, mass: float = 1.0, loads: Sequence[Load] = ()) -> tuple[CompiledSystem, np.ndarray]:
     """Two free bodies without weight, each a tree of its own, 0.3 m apart along x."""
     links = []
     for name, own in (("one", mass), ("two", 3.0)):
@@ -129,7 +129,7 @@ def pair(ties: tuple[Tie, ...], *, mass: float = 1.0, loads: Sequence[Load] = ()
     robot = Robot("pair", tuple(links), (), ("two", np.zeros(3)), gravity=np.zeros(3), ties=ties)
     q = np.zeros(14)
     q[3], q[10], q[7] = 1.0, 1.0, 0.3
-    return bench(robot, loads=list(loads), real=True), q
+    return assemble(robot, loads=list(loads), real=True), q
 
 
 def test_a_tie_between_two_trees_swings_with_their_reduced_mass():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from support.random_robots import bench, random_contacts, random_robot, surface_through
+from support.random_robots import assemble, random_contacts, random_robot, surface_through
 
 from dynsim.compile.model import Model
 from dynsim.dynamics import tables as ka
@@ -46,7 +46,7 @@ def test_articulated_and_m_star_agree(seed):
     robot, contacts, q, v, current = random_case(seed)
     J = rows(robot, contacts, q)
     assume(np.linalg.matrix_rank(J, tol=1e-2) == len(contacts))
-    fast, dense = bench(robot, contacts), bench(robot, contacts, m_star=True)
+    fast, dense = assemble(robot, contacts), assemble(robot, contacts, m_star=True)
     y = fast.state(q, v, current)
     a, b = fast.derivative(y), dense.derivative(y)
     assume(fast.ws.counts[ka.CONTRADICTORY] == 0)
@@ -63,7 +63,7 @@ def test_articulated_and_m_star_agree(seed):
 def test_both_solvers_agree_on_torques_that_have_no_circuit(seed):
     robot, contacts, q, v, _ = random_case(seed)
     robot = replace(robot, motors=tuple(TorqueSource(motor.joint) for motor in robot.motors))
-    fast, dense = bench(robot, contacts), bench(robot, contacts, m_star=True)
+    fast, dense = assemble(robot, contacts), assemble(robot, contacts, m_star=True)
     y = fast.state(q, v)
     a, b = fast.derivative(y), dense.derivative(y)
     assert np.abs(a - b).max() <= 1e-9 * (1.0 + np.abs(b).max())
@@ -75,7 +75,7 @@ def test_accelerations_keep_every_contact_on_its_surface(seed):
     robot, contacts, q, v, current = random_case(seed)
     J = rows(robot, contacts, q)
     assume(np.linalg.matrix_rank(J, tol=1e-2) == len(contacts))
-    b, model, eps = bench(robot, contacts), Model(robot), 1e-4
+    b, model, eps = assemble(robot, contacts), Model(robot), 1e-4
     vdot = b.part(b.derivative(b.state(q, v, current)), "v")
     assume(np.isfinite(vdot).all())
     for contact in contacts:
@@ -97,7 +97,10 @@ def test_a_contact_given_twice_shares_one_force(seed):
     assume(np.abs(J).max() > 1e-2)
     contact = replace(contacts[0], pulling_friction="signed")
     for m_star in (False, True):
-        single, two = bench(robot, [contact], m_star=m_star), bench(robot, [contact, contact], m_star=m_star)
+        single, two = (
+            assemble(robot, [contact], m_star=m_star),
+            assemble(robot, [contact, contact], m_star=m_star),
+        )
         rates = [x.derivative(x.state(q, v, current)) for x in (single, two)]
         a, b = (
             np.concatenate([x.part(dy, name) for name in ("q", "v", "current")])
@@ -119,7 +122,7 @@ def test_friction_takes_energy_where_the_surface_pushes_and_always_when_dissipat
         if np.abs(rows(robot, contacts, q)).max() < 1e-2:
             continue
         for law in ("signed", "dissipative"):
-            b = bench(robot, [replace(contacts[0], pulling_friction=law)])
+            b = assemble(robot, [replace(contacts[0], pulling_friction=law)])
             y = b.state(q, v, current)
             power = b.part(b.derivative(y), "ledger")[FRICTION]
             if b.ws.counts[ka.CONTRADICTORY]:
@@ -142,7 +145,7 @@ def test_no_consistent_friction_is_said_and_not_papered_over():
     refused = consistent = 0
     for seed in range(200):
         robot, contacts, q, v, current = random_case(seed, most=2)
-        b = bench(robot, [replace(c, friction=5.0, pulling_friction="dissipative") for c in contacts])
+        b = assemble(robot, [replace(c, friction=5.0, pulling_friction="dissipative") for c in contacts])
         y = b.state(q, v, current)
         dy = b.derivative(y)
         if b.ws.counts[ka.CONTRADICTORY] > 0:
@@ -187,7 +190,7 @@ def test_a_scaled_plane_is_the_same_contact(seed):
     scaled = Quadric(7.0 * plane.Q, 7.0 * plane.b, 7.0 * plane.c)
     results = []
     for surface in (plane, scaled):
-        b = bench(robot, [replace(contacts[0], surface=surface)])
+        b = assemble(robot, [replace(contacts[0], surface=surface)])
         results.append((b.derivative(b.state(q, v, current)).copy(), b.ws.contacts.copy(), b.ws.counts.copy()))
     for first, second in zip(*results, strict=True):
         # Where friction is contradictory both are NaN.

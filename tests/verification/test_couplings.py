@@ -1,4 +1,4 @@
-"""Joints that follow others: a gripper whose second finger mimics the first, and descriptions that cannot be."""
+"""Coupled joints: a gripper whose second finger mimics the first, and impossible couplings."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.random_robots import bench, random_robot
+from support.random_robots import assemble, random_robot
 
 from dynsim.compile.model import Model
 from dynsim.dynamics.state import CONSTRAINT
@@ -156,7 +156,7 @@ def test_a_chain_of_couplings_holds_in_a_run():
             random_robot(rng, 6, motors=False),
             couplings=(Coupling("joint_3", "joint_1", -0.7, 0.2), Coupling("joint_1", "joint_0", 1.3, -0.1)),
         )
-        b = bench(robot)
+        b = assemble(robot)
         run = b.simulate(b.state(robot.initial, np.zeros(6)), np.linspace(0.0, 0.5, 6), rtol=1e-8)
         q = run.states("q")
         assert np.ptp(q[:, 0]) > 1e-3

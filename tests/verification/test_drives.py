@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.optimize import brentq
-from support.random_robots import Bench, bench
+from support.random_robots import CompiledSystem, assemble
 
 from dynsim import load_scenario, simulate
 from dynsim.dynamics import tables as ka
@@ -36,7 +36,7 @@ def servo(**keys: float | bool) -> Servo:
     return Servo("shaft", **{"torque_constant": K_M, "resistance": R, "k_p": 40.0, "armature": 0.01, **keys})  # type: ignore[arg-type]
 
 
-def turned(b: Bench, times: np.ndarray, q: float = 0.0, v: float = 0.0, method: str = "dopri5"):
+def turned(b: CompiledSystem, times: np.ndarray, q: float = 0.0, v: float = 0.0, method: str = "dopri5"):
     """Angle and rate at times, (T,) each."""
     y = b.state(np.array([q]), np.array([v]))
     run = b.simulate(y, times, method, rtol=1e-11, atol=1e-12)
@@ -48,7 +48,7 @@ def turned(b: Bench, times: np.ndarray, q: float = 0.0, v: float = 0.0, method: 
 def test_servo_step_response(method, k_p, k_d):
     """I q̈ = K_m/R (k_p (r − q) − (k_d + K_m) q̇) − D_m q̇, under- and overdamped, from rest to r."""
     loss, r, times = 0.2, 0.8, np.linspace(0.0, 3.0, 31)
-    b = bench(wheel(servo(k_p=k_p, k_d=k_d, reflected_damping=loss)), held=np.array([r]))
+    b = assemble(wheel(servo(k_p=k_p, k_d=k_d, reflected_damping=loss)), held=np.array([r]))
     square = K_M / R * k_p / INERTIA
     half = 0.5 * (K_M / R * (k_d + K_M) + loss) / INERTIA
     root = np.sqrt(complex(half**2 - square))
@@ -61,7 +61,7 @@ def test_servo_step_response(method, k_p, k_d):
 
 def test_servo_in_velocity_mode_reaches_its_rate_exponentially():
     """I v̇ = K_m k_v/R (v_d − v): back-EMF is compensated. The reference is a line that somebody has rewritten."""
-    b = bench(wheel(servo(k_p=0.0, k_v=5.0, velocity_mode=True)))
+    b = assemble(wheel(servo(k_p=0.0, k_v=5.0, velocity_mode=True)))
     b.system.reference.spline[0] = ka.REWRITTEN
     b.system.drives.input[0, ka.LINE_RATE] = 1.7
     times = np.linspace(0.0, 1.0, 11)
@@ -71,7 +71,7 @@ def test_servo_in_velocity_mode_reaches_its_rate_exponentially():
 
 def test_a_rewritten_reference_is_a_line_in_time():
     """Followed with the lag K_m v_d / k_p, once transients are gone."""
-    b = bench(wheel(servo(k_p=40.0, k_d=3.0)))
+    b = assemble(wheel(servo(k_p=40.0, k_d=3.0)))
     b.system.reference.spline[0] = ka.REWRITTEN
     b.system.drives.input[0, [ka.LINE_START, ka.LINE_RATE, ka.LINE_SINCE]] = 0.4, 0.6, -1.0
     q, v = turned(b, np.array([0.0, 10.0]))
@@ -81,7 +81,7 @@ def test_a_rewritten_reference_is_a_line_in_time():
 
 def test_servo_at_its_voltage_limit():
     """v = U/K_m (1 − exp(−t K_m²/(R I))) while the target is far."""
-    b = bench(wheel(servo(voltage_limit=5.0)), held=np.array([1e3]))
+    b = assemble(wheel(servo(voltage_limit=5.0)), held=np.array([1e3]))
     times = np.linspace(0.0, 2.0, 11)
     _, v = turned(b, times)
     np.testing.assert_allclose(v, 5.0 / K_M * -np.expm1(-(K_M**2) / R / INERTIA * times), rtol=0, atol=1e-8)
@@ -90,7 +90,7 @@ def test_servo_at_its_voltage_limit():
 @pytest.mark.parametrize("limit", [{"current_limit": 0.7}, {"torque_limit": 0.7 * K_M}])
 def test_servo_at_its_current_limit(limit):
     """q = ½ K_m I/inertia t² while the target is far, with the terminal voltage that drives that current."""
-    b = bench(wheel(servo(**limit)), held=np.array([-1e3]))
+    b = assemble(wheel(servo(**limit)), held=np.array([-1e3]))
     times = np.linspace(0.0, 2.0, 5)
     q, _ = turned(b, times)
     np.testing.assert_allclose(q, -0.5 * K_M * 0.7 / INERTIA * times**2, rtol=0, atol=1e-8)
@@ -102,7 +102,7 @@ def test_servo_at_its_current_limit(limit):
 def test_coulomb_friction_stops_a_servo_that_is_off():
     """I v̇ = −τ_c v/√(v² + v_s²): F(v₀) − F(v) = τ_c t/I with F = √(v² + v_s²) − v_s asinh(v_s/v)."""
     friction, smoothing, v0 = 0.5, 0.05, 2.0
-    b = bench(wheel(servo(coulomb_friction=friction, coulomb_speed=smoothing)))
+    b = assemble(wheel(servo(coulomb_friction=friction, coulomb_speed=smoothing)))
     b.system.drives.table[0, ka.SERVO_MODE] = ka.OFF
 
     def left(v: float) -> float:
@@ -123,7 +123,7 @@ def test_coulomb_friction_stops_a_servo_that_is_off():
 @pytest.mark.parametrize(("torque", "limit", "acts"), [(0.4, np.inf, 0.4), (-3.0, 1.1, -1.1)])
 def test_open_torque(torque, limit, acts):
     """q = ½ τ/I t² with the torque that is asked for, within the limit."""
-    b = bench(wheel(TorqueSource("shaft", limit)), held=np.array([torque]))
+    b = assemble(wheel(TorqueSource("shaft", limit)), held=np.array([torque]))
     times = np.linspace(0.0, 2.0, 5)
     q, _ = turned(b, times)
     np.testing.assert_allclose(q, 0.5 * acts / INERTIA * times**2, rtol=0, atol=1e-8)
@@ -172,7 +172,7 @@ def law(motor: Drive, drives: ka.DriveArrays, q_ref: float, sampled: bool):
 @pytest.mark.parametrize("name", REGIMES)
 def test_linear_blocks_equal_complex_step_derivatives(name, sampled):
     motor, q, v = REGIMES[name]
-    b = bench(wheel(motor), held=np.array([1.0]))
+    b = assemble(wheel(motor), held=np.array([1.0]))
     drives = b.system.drives
     if name == "servo, off":
         drives.table[0, ka.SERVO_MODE] = ka.OFF
@@ -201,7 +201,7 @@ def test_linear_blocks_equal_complex_step_derivatives(name, sampled):
 def test_a_sampled_command_is_held_between_ticks(name):
     """Taken at one state, it acts at all others; away from it the continuous law differs."""
     motor, q, v = REGIMES[name]
-    b = bench(wheel(motor), held=np.array([1.0]))
+    b = assemble(wheel(motor), held=np.array([1.0]))
     at, away = b.state(np.array([q]), np.array([v])), b.state(np.array([q + 0.1]), np.array([v]))
     b.derivative(at)
     continuous = b.ws.motors[0, ka.VOLTAGE], b.ws.motors[0, ka.CURRENT]

@@ -1,4 +1,4 @@
-"""Friction that holds joints at rest, of gears and bearings: closed forms and the ledger, by steps and by events."""
+"""Dry friction of gears and bearings at rest and in motion: closed forms and the ledger, by steps and by events."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.random_robots import Bench, bench, random_robot
-from support.stepping_benches import plane, stepped
+from support.random_robots import CompiledSystem, assemble, random_robot
+from support.stepping_systems import plane, stepped
 
 from dynsim import load_scenario, simulate
 from dynsim.compile.model import Model
@@ -25,13 +25,13 @@ from dynsim.model.drives import Motor, Servo
 MASS, FRICTION = 2.0, 3.0
 
 
-def sliding(load: np.ndarray, friction: float = FRICTION) -> Bench:
+def sliding(load: np.ndarray, friction: float = FRICTION) -> CompiledSystem:
     """A mass on a horizontal guide that rubs, pushed by load[0] + load[1] t [N]."""
     link = Link("slide", "guide", None, "prismatic", vector(1, 0, 0), Inertia(MASS), friction=friction)
     coefficients = np.zeros((1, 6, 4))
     coefficients[0, 0, :2] = load
     push = Load("push", "slide", np.zeros(3), False, np.array([0.0, 100.0]), coefficients, True)
-    return bench(Robot("slide", (link,), (), ("slide", np.zeros(3))), loads=[push], real=True, dry=True)
+    return assemble(Robot("slide", (link,), (), ("slide", np.zeros(3))), loads=[push], real=True, dry=True)
 
 
 def test_a_bearing_holds_up_to_its_friction_and_no_further():
@@ -63,12 +63,12 @@ def test_a_growing_push_breaks_it_loose_when_it_reaches_the_friction(theta):
     assert errors[1] < (1e-5 if theta == 0.5 else 1e-2)
 
 
-def oscillator(start: float, friction: float = 0.4) -> tuple[Bench, np.ndarray, float, float]:
+def oscillator(start: float, friction: float = 0.4) -> tuple[CompiledSystem, np.ndarray, float, float]:
     """A wheel on a servo that is a spring of 20 N m/rad and a little damping; its state, stiffness and damping."""
     k_m, resistance, stiffness = 0.1, 2.0, 20.0
     servo = Servo("shaft", k_m, resistance, stiffness * resistance / k_m, coulomb_friction=friction)
     link = Link("wheel", "shaft", None, "revolute", vector(0, 0, 1), Inertia(1.0, tensor=np.diag([0.3, 0.3, 0.3])))
-    b = bench(Robot("wheel", (link,), (servo,), ("wheel", np.zeros(3))), real=True, dry=True)
+    b = assemble(Robot("wheel", (link,), (servo,), ("wheel", np.zeros(3))), real=True, dry=True)
     return b, b.state(np.array([start]), np.zeros(1)), stiffness, k_m**2 / resistance
 
 
@@ -109,7 +109,7 @@ def test_a_spring_with_dry_friction_comes_to_rest_in_closed_form():
     assert errors[1] < 0.5 * errors[0]
 
 
-def rolling(share: float) -> tuple[Bench, np.ndarray, float, float, float]:
+def rolling(share: float) -> tuple[CompiledSystem, np.ndarray, float, float, float]:
     """A wheel on a slope whose bearing takes a share of its pull; state, acceleration, drag and radius.
 
     (m + I/r²) a = m g sin α − τ/r, if that is positive.
@@ -124,7 +124,7 @@ def rolling(share: float) -> tuple[Bench, np.ndarray, float, float, float]:
     )
     gravity = 9.81 * vector(np.sin(slope), 0, -np.cos(slope))
     contact = Contact("tyre", "wheel", np.zeros(3), plane(vector(0, 0, 1)), friction=0.8, radius=radius)
-    b = bench(Robot("wheel", links, (), ("wheel", np.zeros(3)), gravity=gravity), [contact], real=True, dry=True)
+    b = assemble(Robot("wheel", links, (), ("wheel", np.zeros(3)), gravity=gravity), [contact], real=True, dry=True)
     acceleration = max(pull - drag / radius, 0.0) / (mass + inertia / radius**2)
     return b, b.state(np.array([0.0, radius, 0.0]), np.zeros(3)), acceleration, drag, radius
 
@@ -160,7 +160,7 @@ def test_a_held_arm_does_not_creep():
     """It sags, is held, and stays for 20 s; smoothed friction lets it creep by millimetres."""
     times, moved = np.array([0.0, 3.0, 23.0]), []
     for speed in (None, 1e-2):
-        b = bench(arm(0.8, coulomb_speed=speed), held=np.array([1.2, 0.3, 0.0]), real=True, dry=True)
+        b = assemble(arm(0.8, coulomb_speed=speed), held=np.array([1.2, 0.3, 0.0]), real=True, dry=True)
         run = stepped(b, b.state(np.array([1.2, 0.3, 0.0]), np.zeros(3)), times, 2.5e-3, 0.5)
         hand = run.outputs("hand")
         moved.append(np.abs(hand[2] - hand[1]).max())
@@ -171,7 +171,7 @@ def test_a_held_arm_does_not_creep():
 
 def test_joint_torques_have_the_friction_of_their_gear_in_them():
     """At rest the shaft carries the weight alone, whatever motor and gear share of it."""
-    b = bench(arm(0.8), held=np.array([1.2, 0.3, 0.0]), real=True, dry=True)
+    b = assemble(arm(0.8), held=np.array([1.2, 0.3, 0.0]), real=True, dry=True)
     run = stepped(b, b.state(np.array([1.2, 0.3, 0.0]), np.zeros(3)), np.array([0.0, 3.0]), 2.5e-3, 0.5)
     q, torque = run.states("q")[-1], run.outputs("torque")[-1]
     np.testing.assert_allclose(torque, Model(b.robot).bias_forces(q, np.zeros(3)), rtol=0, atol=1e-8)
@@ -196,7 +196,7 @@ def test_the_ledger_of_random_arms_that_rub(theta):
         motors=tuple(replace(motor, dry_friction=0.3) for motor in robot.motors),
     )
     assert any(isinstance(motor, Motor) for motor in robot.motors)
-    b = bench(robot, real=True, dry=True)
+    b = assemble(robot, real=True, dry=True)
     run = stepped(b, b.state(rng.normal(size=6), rng.normal(size=6)), np.linspace(0.0, 0.5, 6), 2e-3, theta)
     assert ledger_gap(run).max() < 1e-9
     ledger = run.states("ledger")
@@ -261,7 +261,7 @@ def test_events_roll_a_wheel_down_a_slope_against_its_bearing(method):
 def test_events_hold_an_arm_and_close_its_ledger(method):
     """It sags, joint after joint comes to rest, and nothing moves any more; the same place as by time stepping."""
     q0, places = np.array([1.2, 0.3, 0.0]), []
-    b = bench(arm(0.8), held=q0, real=True, dry=True)
+    b = assemble(arm(0.8), held=q0, real=True, dry=True)
     run = b.simulate(b.state(q0, np.zeros(3)), np.array([0.0, 1.0, 3.0, 23.0]), method, rtol=1e-8, atol=1e-10)
     hand = run.outputs("hand")
     assert np.abs(hand[3] - hand[2]).max() < 1e-10
@@ -272,7 +272,7 @@ def test_events_hold_an_arm_and_close_its_ledger(method):
     assert errors[1] < 0.5 * errors[0] < 1e-4
 
 
-def leaning(rate: float) -> tuple[Bench, np.ndarray]:
+def leaning(rate: float) -> tuple[CompiledSystem, np.ndarray]:
     """An arm whose joints hold its weight, its tip on a floor and pushed along it by rate t: more rows than motions."""
     robot, q0, tip = arm(8.0), np.array([1.2, 0.5, 0.4]), vector(0, 0, 0.3)
     height = float(Model(robot).point_position("link_2", tip, q0)[2])
@@ -280,7 +280,9 @@ def leaning(rate: float) -> tuple[Bench, np.ndarray]:
     coefficients = np.zeros((1, 6, 4))
     coefficients[0, 0, 1] = rate
     push = Load("push", "link_2", tip, False, np.array([0.0, 100.0]), coefficients, True)
-    b = bench(robot, [Contact("tip", "link_2", tip, floor, friction=0.5)], loads=[push], held=q0, real=True, dry=True)
+    b = assemble(
+        robot, [Contact("tip", "link_2", tip, floor, friction=0.5)], loads=[push], held=q0, real=True, dry=True
+    )
     return b, b.state(q0, np.zeros(3))
 
 
@@ -303,7 +305,7 @@ def test_joints_and_a_tip_that_hold_together_share_forces_that_are_open(method, 
 
 def test_each_joint_is_held_or_slides_by_its_own_force():
     """Of those that are held, which are the rows of the problem: the one at its bound that is accelerated slides."""
-    b = bench(arm(0.8), real=True, dry=True)
+    b = assemble(arm(0.8), real=True, dry=True)
     table, dry, vector = b.system.unilateral.dry_table, b.system.unilateral.dry, b.system.unilateral.vector
     for holds in ((1, 1, 1), (1, 0, 1), (0, 1, 1)):
         rows = [k for k in range(3) if holds[k] == 1]

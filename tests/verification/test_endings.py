@@ -1,4 +1,4 @@
-"""Every run ends: what bounds the loops of the integration where a trial does not repeat, and what stops a run."""
+"""Every run ends: bounds of the integration loops, and the reasons that stop a run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Three electrical energies, and a residual that means something when nothing happens."""
+"""The three electrical energies, and a ledger residual that is meaningful at rest."""
 
 import numpy as np
 import pytest

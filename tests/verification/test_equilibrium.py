@@ -1,4 +1,4 @@
-"""A start at rest: nothing jumps where weight, loads and braces are held by the currents of ``initial.equilibrium``.
+"""Equilibrium start: no jump where currents of ``initial.equilibrium`` carry weight, loads and braces.
 
 Verification: accelerations of the compiled right-hand side against zero, heat against numpy's least squares.
 """

@@ -1,4 +1,4 @@
-"""Inverse kinematics of a model: position, orientation, braces and limits, by going there and looking."""
+"""Inverse kinematics of a model: position, orientation, braces and limits, checked by forward kinematics."""
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.random_robots import ADAPTIVE, Bench, bench
+from support.random_robots import ADAPTIVE, CompiledSystem, assemble
 
 from dynsim.dynamics.state import CONSTRAINT, ELECTRICAL, FRICTION, GEAR, JOINT, JOULE, OUT_GAP
 from dynsim.integrators.radau5.step import (
@@ -39,7 +39,7 @@ from dynsim.model.drives import Motor
 Y, Z = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
 
 
-def arm(inductance: float = 1.7e-3, *, braced: bool = False, v_s: float = 0.05) -> tuple[Bench, np.ndarray]:
+def arm(inductance: float = 1.7e-3, *, braced: bool = False, v_s: float = 0.05) -> tuple[CompiledSystem, np.ndarray]:
     """A yawing four-link arm with motors; braced: its second elbow slides on the floor. Smooth: large v_s."""
     angles = np.array([0.3, 0.5 * np.pi - 0.4, 0.8, -1.1, 0.7])
     links, length = [], 0.3
@@ -66,7 +66,7 @@ def arm(inductance: float = 1.7e-3, *, braced: bool = False, v_s: float = 0.05) 
         # Signed friction is smooth; μ |f_n| has a kink where the floor begins to pull, and no order there.
         elbow = Contact("elbow", "b2", np.array([0.0, 0.0, length]), floor, friction=0.1, slip_smoothing=v_s)
         contacts = [replace(elbow, pulling_friction="signed")]
-    b = bench(robot, contacts, held=angles + np.array([0.3, 0.1, -0.2, 0.2, 0.3]), k_p=40.0, k_d=1.0)
+    b = assemble(robot, contacts, held=angles + np.array([0.3, 0.1, -0.2, 0.2, 0.3]), k_p=40.0, k_d=1.0)
     return b, b.state(angles, np.zeros(5))
 
 
@@ -75,7 +75,7 @@ def motion(run: Run) -> np.ndarray:
     return np.hstack([run.states("q"), run.states("v")])
 
 
-def errors(b: Bench, y: np.ndarray, method: str, steps: list[float], times: np.ndarray) -> np.ndarray:
+def errors(b: CompiledSystem, y: np.ndarray, method: str, steps: list[float], times: np.ndarray) -> np.ndarray:
     """Largest error of q, v at ``times`` for each step."""
     reference = motion(b.simulate(y, times, "dopri5", rtol=1e-12))
     return np.array([np.abs(motion(b.simulate(y, times, method, step=h, fixed=True)) - reference).max() for h in steps])
@@ -143,7 +143,7 @@ def test_adaptive_runs_meet_their_tolerance(method, rtol):
     assert np.abs(computed - expected).max() <= 20.0 * rtol * np.abs(expected).max()
 
 
-def double_pendulum() -> Bench:
+def double_pendulum() -> CompiledSystem:
     """Two point masses on rods of 1 m, without motors and losses: nothing damps an error."""
     links = [
         Link(
@@ -157,7 +157,7 @@ def double_pendulum() -> Bench:
         )
         for i in range(2)
     ]
-    return bench(Robot("double pendulum", tuple(links), (), ("b1", -Z)))
+    return assemble(Robot("double pendulum", tuple(links), (), ("b1", -Z)))
 
 
 @pytest.mark.parametrize("method", ADAPTIVE)
@@ -304,5 +304,5 @@ def test_slack_of_short_steps():
     assert [slack(driven.system, h, 1e-7) for h in steps] == pytest.approx([1.0, 1.0, 1.0, 10.0])
     assert [slack(driven.system, h, 1e-8) for h in steps] == [1.0] * 4
     assert slack(driven.system, 0.1 * SHORT, 1e-3) == pytest.approx(10.0)
-    free = bench(replace(driven.robot, motors=()))
+    free = assemble(replace(driven.robot, motors=()))
     assert slack(free.system, 0.1 * SHORT, 1e-6) == 1.0

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.special import ellipj
 from support.random_robots import (
-    bench,
+    assemble,
     random_contacts,
     random_positions,
     random_robot_of,
@@ -147,8 +147,8 @@ def test_a_free_gyroscope_is_the_closed_form_for_100_seconds(method, moments):
     drift, com = np.array([0.2, -0.1, 0.3]), robot.links[-1].inertia.com
     start = np.array([1.0, 2.0, 3.0])
     w_world = R[0] @ axes @ w
-    y = bench(robot).state(np.r_[start, quaternion(R[0])], np.r_[drift - np.cross(w_world, R[0] @ com), axes @ w])
-    run = bench(robot).simulate(y, times, method, rtol=1e-12, atol=1e-13)
+    y = assemble(robot).state(np.r_[start, quaternion(R[0])], np.r_[drift - np.cross(w_world, R[0] @ com), axes @ w])
+    run = assemble(robot).simulate(y, times, method, rtol=1e-12, atol=1e-13)
     q, v = run.states("q"), run.states("v")
     centre = start + R[0] @ com
     for k, t in enumerate(times):
@@ -159,7 +159,7 @@ def test_a_free_gyroscope_is_the_closed_form_for_100_seconds(method, moments):
     # A square root and four products, each rounded.
     assert np.abs(np.linalg.norm(q[:, 3:], axis=1) - 1.0).max() < 1e-15
     # Not only in the samples: an unscaled quaternion would be off by the sum of all errors, some 1e-12.
-    assert abs(np.linalg.norm(bench(robot).part(run.y, "q")[3:]) - 1.0) < 1e-15
+    assert abs(np.linalg.norm(assemble(robot).part(run.y, "q")[3:]) - 1.0) < 1e-15
 
 
 @pytest.mark.parametrize("method", ["dopri5", "radau5"])
@@ -170,7 +170,7 @@ def test_momentum_and_energy_of_a_free_robot(method):
     robot = replace(robot, gravity=np.zeros(3))
     model = Model(robot)
     q, v = random_positions(rng, robot), 0.5 * rng.normal(size=model.n)
-    b = bench(robot)
+    b = assemble(robot)
     times = np.linspace(0.0, 2.0, 21)
     run = b.simulate(b.state(q, v), times, method, rtol=1e-11)
     linear, angular = momenta(model, q, v)
@@ -230,7 +230,7 @@ def test_positions_along_rates_and_rates_across_them():
     for kinds in (("floating", "revolute", "ball"), ("rolling", "ball"), ("wheeled", "prismatic")):
         robot = random_robot_of(rng, kinds)
         q, u = random_positions(rng, robot), rng.normal(size=len(robot.links)) + 1j * rng.normal(size=len(robot.links))
-        b = bench(robot)
+        b = assemble(robot)
         model = b.system.model
         y, out, back = np.r_[0.0, q], np.zeros(1 + robot.nq, dtype=complex), np.zeros(len(u), dtype=complex)
         positions_along(model, y, 1, u, out)
@@ -252,7 +252,7 @@ def turned_starts(count: int) -> list[np.ndarray]:
 def test_steps_do_not_depend_on_the_attitude_of_the_start(make):
     """The same tumbling seen from turned frames: as many steps, the same errors, the same motion but for the turn."""
     robot = robot_of(make(body("body")))
-    model, b, times = Model(robot), bench(robot), np.linspace(0.0, 5.0, 11)
+    model, b, times = Model(robot), assemble(robot), np.linspace(0.0, 5.0, 11)
     w = np.array([0.8, 1.0, -0.4])
     counts, attitudes = [], []
     for R in turned_starts(6):
@@ -269,7 +269,7 @@ def test_steps_do_not_depend_on_the_attitude_of_the_start(make):
 def test_the_error_of_an_attitude_is_the_angle():
     """A quaternion off by a small rotation and by a factor: the norm is that of the angle's three components."""
     rng, robot = np.random.default_rng(3), robot_of(ball(body("body")))
-    b = bench(robot)
+    b = assemble(robot)
     rtol, atol = 1e-6, 1e-8
     for _ in range(20):
         q = quaternion(random_rotation(rng))
@@ -292,7 +292,7 @@ def displacement(q: np.ndarray, angle: np.ndarray) -> np.ndarray:
 
 def test_the_error_of_a_rolling_base_counts_both_distances():
     robot = robot_of(rolling(body("body")))
-    b = bench(robot)
+    b = assemble(robot)
     y, error = np.array([3.0, -0.5, 10.0]), np.array([1e-3, 2e-3, 5e-3])
     total, count = position_error(b.system.model, y, y, error, 0, 0.1, 1.0)
     assert count == 3
@@ -313,7 +313,7 @@ def test_a_rolling_base_on_a_slope_is_the_closed_form():
     """
     slope, w, times = 0.3, 0.7, np.linspace(0.0, 20.0, 41)
     robot = robot_of(tilted(rolling(body("body")), about(1, -slope)), DOWN)
-    b = bench(robot)
+    b = assemble(robot)
     run = b.simulate(b.state(np.zeros(3), np.array([0.0, w])), times, "dopri5", rtol=1e-11)
     g = 9.81 * np.sin(slope)
     speed = -g / w * np.sin(w * times)
@@ -327,7 +327,7 @@ def test_a_rolling_base_with_its_mass_ahead_swings_round():
     """The Chaplygin sleigh: with d the distance of the centre, V̇ = d ω², ω̇ = −m d V ω / (I + m d²)."""
     m, d, inertia = 2.0, 0.3, 0.05
     robot = robot_of(rolling(body("sleigh", inertia=Inertia(m, np.array([d, 0.0, 0.1]), inertia * np.eye(3)))))
-    b = bench(robot)
+    b = assemble(robot)
     for V, w in ((1.0, 0.5), (-0.4, 2.0)):
         rates = b.part(b.derivative(b.state(np.array([1.0, 2.0, 0.7]), np.array([V, w]))), "v")
         np.testing.assert_allclose(rates, [d * w**2, -m * d * V * w / (inertia + m * d**2)], rtol=1e-13)
@@ -349,7 +349,7 @@ def test_a_free_body_on_three_points_slides_on_a_plane(method):
     model = Model(robot)
     feet = [np.array([np.cos(a), np.sin(a), 0.0]) for a in (0.3, 2.4, 4.5)]
     contacts = [Contact(f"foot_{k}", "table", foot, PLANE, friction=0.2) for k, foot in enumerate(feet)]
-    b = bench(robot, contacts)
+    b = assemble(robot, contacts)
     times = np.linspace(0.0, 0.6, 61)
     start = b.state(np.r_[0.3, 0.1, 0.0, quaternion(about(2, 1.0))], np.array([1.5, 0.4, 0.0, 0.0, 0.0, 2.0]))
     run = b.simulate(start, times, method, rtol=1e-8)
@@ -381,7 +381,7 @@ def test_random_robots_stay_on_their_surfaces(method, seed):
     model = Model(robot)
     q, v = random_positions(rng, robot), np.zeros(model.n)
     contacts = [replace(c, friction=0.0) for c in random_contacts(rng, robot, q, 2)]
-    b = bench(robot, contacts)
+    b = assemble(robot, contacts)
     run = b.simulate(b.state(q, v), np.linspace(0.0, 0.5, 26), method, rtol=1e-7)
     assert run.extremes[:, DRIFT_MAX].max() < 1e-9
     assert np.abs(run.outputs("contact")).max() > 0.0
@@ -403,7 +403,7 @@ def test_a_start_off_the_surface_is_put_on_it(kinds):
     contact = replace(random_contacts(rng, robot, q, 1)[0], body=robot.links[-1].name, friction=0.0)
     position = model.point_position(contact.body, contact.point, q)
     surface = Quadric(np.zeros((3, 3)), np.array([0.0, 0.6, 0.8]), -float(position @ [0.0, 0.6, 0.8]) - 1e-3)
-    b = bench(robot, [replace(contact, surface=surface)])
+    b = assemble(robot, [replace(contact, surface=surface)])
     run = b.advance(b.new_run(b.state(q, v), np.array([0.0, 1e-3])), 0)
     settled = b.part(run.y, "q")
     assert run.count[PROJECTIONS] >= 1

@@ -11,19 +11,19 @@ from typing import Any
 import numpy as np
 import pytest
 from numba import config, types
-from support.random_robots import bench, random_contacts, random_robot
+from support.random_robots import assemble, random_contacts, random_robot
 
 from dynsim.compile.model import Model
 from dynsim.dynamics import derivative as system
 from dynsim.dynamics import ledger
 from dynsim.dynamics.tree import articulated, points, sweep
 from dynsim.integrators import driver, steps
-from dynsim.jit.kernel import Direct, reals
+from dynsim.jit.kernel import FixedSignature, reals
 
 PLAIN_PYTHON = """
 import sys
 import numpy as np
-from support.random_robots import bench, random_contacts, random_robot
+from support.random_robots import assemble, random_contacts, random_robot
 
 rng = np.random.default_rng(5)
 robot = random_robot(rng, 4)
@@ -31,9 +31,9 @@ q, v, i = rng.normal(size=4), rng.normal(size=4), rng.normal(size=len(robot.moto
 contacts = random_contacts(rng, robot, q, 1)
 rows = []
 for m_star in (False, True):
-    b = bench(robot, contacts, m_star=m_star)
+    b = assemble(robot, contacts, m_star=m_star)
     rows.append(b.derivative(b.state(q, v, i)))
-free = bench(robot)
+free = assemble(robot)
 rows += [free.simulate(free.state(q, v, i), np.array([4e-3]), m, step=1e-3).y for m in ("dopri5", "radau5")]
 np.savez(sys.argv[1], *rows)
 """
@@ -45,9 +45,9 @@ def run_everything() -> None:
     q = rng.normal(size=4)
     contacts = random_contacts(rng, robot, q, 1)
     for m_star in (False, True):
-        b = bench(robot, contacts, m_star=m_star)
+        b = assemble(robot, contacts, m_star=m_star)
         b.derivative(b.state(q, np.zeros(4)))
-    free = bench(robot)
+    free = assemble(robot)
     free.simulate(free.state(q, np.zeros(4)), np.array([1e-3]), "dopri5", step=1e-3)
     free.simulate(free.state(q, np.zeros(4)), np.array([1e-3]), "radau5")
     model = Model(robot)
@@ -98,7 +98,7 @@ def test_every_public_kernel_has_one_compiled_signature():
 
 def test_a_direct_kernel_is_the_kernel():
     """Also with other arrays than those of the first call."""
-    direct = Direct(steps.finite)
+    direct = FixedSignature(steps.finite)
     for values in ([1.0, 2.0], [1.0, np.nan, 3.0], []):
         assert direct(reals(values)) == steps.finite(reals(values)) == bool(np.isfinite(values).all())
 

@@ -1,4 +1,4 @@
-"""The right-hand side is fit for vectors of doubles: branches that look at the state are few, known, and listed here.
+"""State-dependent branches of the right-hand side: few, known, and listed here (vectorisation needs that).
 
 ``derivative`` runs as Python on numbers of four lanes (``tests/support/lanes.py``), each line. What a lane gets must be
 what a run of its own gets, to the bit, and every place that asks lanes for one truth must be in a list below.
@@ -110,7 +110,7 @@ FORMS = {
 
 def spread(case: Case, rng: np.random.Generator) -> list[np.ndarray]:
     """N states about that of the case."""
-    scale = np.where(np.arange(len(case.y)) < case.bench.system.layout.tracked, case.spread, 0.0)
+    scale = np.where(np.arange(len(case.y)) < case.compiled.system.layout.tracked, case.spread, 0.0)
     return [case.y + scale * rng.normal(size=len(case.y)) for _ in range(N)]
 
 
@@ -190,7 +190,7 @@ def test_integers_are_apart_from_reals(notes):
         case = make()
         _, ws = run(case, [case.y] * N, case.t)
         for name, table in ws._asdict().items():
-            expected = getattr(case.bench.ws, name).dtype
+            expected = getattr(case.compiled.ws, name).dtype
             assert {type(x) is int for x in table.flat} <= {expected == np.int64}, name
             kinds.add((name, expected == np.int64))
     assert {name for name, integer in kinds if integer} == {"active", "counts"}

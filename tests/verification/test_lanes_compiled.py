@@ -1,4 +1,4 @@
-"""Right-hand sides on lanes, compiled: a lane gets what a run of its own gets, to rounding, whatever the others do.
+"""Compiled right-hand sides on lanes: each lane equals a scalar evaluation to rounding.
 
 ``test_lanes`` runs the kernels' source on lanes as Python; here is the machine code, with the forms of
 ``dynsim.dynamics.simd.forms`` in it.
@@ -15,7 +15,14 @@ import numpy as np
 import pytest
 from support.lane_cases import CASES, TIMED, Case, of, plane
 from support.lanes import copies
-from support.random_robots import Bench, bench, braced, random_contacts, random_positions, random_robot
+from support.random_robots import (
+    CompiledSystem,
+    assemble,
+    braced,
+    random_contacts,
+    random_positions,
+    random_robot,
+)
 
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact.rows import set_modes
@@ -35,18 +42,20 @@ AMPLIFIED = {"every joint": 1e-11, "sliding, held, held": 1e-9}
 
 def spread(case: Case, count: int, rng: np.random.Generator) -> np.ndarray:
     """States about that of the case, (m, count)."""
-    scale = np.where(np.arange(len(case.y)) < case.bench.system.layout.tracked, 1.0, 0.0)
+    scale = np.where(np.arange(len(case.y)) < case.compiled.system.layout.tracked, 1.0, 0.0)
     return np.array([case.y + scale * rng.normal(size=len(case.y)) for _ in range(count)]).T.copy()
 
 
-def alone(b: Bench, system: System, t: float, y: np.ndarray, kept: ka.Workspace) -> tuple[np.ndarray, ka.Workspace]:
+def alone(
+    b: CompiledSystem, system: System, t: float, y: np.ndarray, kept: ka.Workspace
+) -> tuple[np.ndarray, ka.Workspace]:
     """The derivative by a workspace of its own."""
     ws, dy = copies(kept), np.zeros(len(y))
     derivative(system, t, reals(y), ws, dy)
     return dy, ws
 
 
-def rounded(b: Bench, y: np.ndarray, t: float) -> float:
+def rounded(b: CompiledSystem, y: np.ndarray, t: float) -> float:
     """What roundings of the state in its last bit change at most, of the largest rate: how ill-conditioned the tree is.
 
     Machine code of lanes contracts other products than that of one run where the processor has no 512-bit registers.
@@ -67,7 +76,7 @@ def evaluate(lanes: StageLanes, system: System) -> None:
     evaluate_four(lanes, system)
 
 
-def compare(b: Bench, y: np.ndarray, t: float | np.ndarray, tolerance: float) -> ka.Workspace:
+def compare(b: CompiledSystem, y: np.ndarray, t: float | np.ndarray, tolerance: float) -> ka.Workspace:
     """All lanes against runs of their own: NaN where they have it, else per largest entry."""
     kept, lanes = copies(b.ws), stage_lanes(b.ws, len(y), 0)
     lanes.t[:] = t
@@ -95,10 +104,10 @@ SLOW = {"no choice of signs"}
 def test_every_case_of_branches(name):
     """Lanes far apart, so that they take different branches wherever there are any."""
     case = (CASES | TIMED)[name]()
-    if not has_forms(case.bench.system):
+    if not has_forms(case.compiled.system):
         pytest.skip("goes without lanes")
     t = case.t + case.t_step * np.arange(WIDTH) if name in TIMED else case.t
-    compare(case.bench, spread(case, WIDTH, np.random.default_rng(99)), t, AMPLIFIED.get(name, ROUNDING))
+    compare(case.compiled, spread(case, WIDTH, np.random.default_rng(99)), t, AMPLIFIED.get(name, ROUNDING))
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -107,7 +116,7 @@ def test_random_trees(seed):
     rng = np.random.default_rng(seed)
     n, c = int(rng.integers(5, 12)), int(rng.integers(1, 4))
     robot = random_robot(rng, n)
-    b = bench(robot, random_contacts(rng, robot, random_positions(rng, robot), c))
+    b = assemble(robot, random_contacts(rng, robot, random_positions(rng, robot), c))
     b.system.drives.motor[:, ka.U_MAX] = 15.0
     y = np.zeros((b.system.layout.size, WIDTH))
     for k in range(WIDTH):
@@ -119,11 +128,11 @@ def test_random_trees(seed):
 def test_the_cases_have_lanes_that_differ():
     """Signs of friction and limits of voltage are not the same in all lanes above."""
     case = CASES["dissipative"]()
-    ws = compare(case.bench, spread(case, WIDTH, np.random.default_rng(99)), 0.0, ROUNDING)
+    ws = compare(case.compiled, spread(case, WIDTH, np.random.default_rng(99)), 0.0, ROUNDING)
     assert {*ws.rows[:3, ka.SIGN].flat} == {-1.0, 1.0}
     assert np.ptp(ws.rows[:3, ka.SIGN], axis=1).max() > 0.0
     case = CASES["voltage limits"]()
-    ws = compare(case.bench, spread(case, WIDTH, np.random.default_rng(99)), 0.0, ROUNDING)
+    ws = compare(case.compiled, spread(case, WIDTH, np.random.default_rng(99)), 0.0, ROUNDING)
     held = np.abs(ws.motors[:, ka.VOLTAGE]) == 15.0
     assert np.any(held)
     assert not np.all(held)
@@ -133,7 +142,7 @@ def test_the_cases_have_lanes_that_differ():
 def test_real_contact(frozen):
     """Points that slide either way, stick, and are off their planes; friction that depends on the speed."""
     rng = np.random.default_rng(12)
-    b = bench(random_robot(rng, 7), [plane(rng, f"body_{6 - k}") for k in range(4)], real=True)
+    b = assemble(random_robot(rng, 7), [plane(rng, f"body_{6 - k}") for k in range(4)], real=True)
     case = of(rng, b, 1.0)
     b.derivative(case.y, 0.0)
     modes = integers([ka.SLIDING, ka.STICKING, ka.OPEN, ka.SLIDING])
@@ -165,7 +174,7 @@ from support.lane_cases import CASES
 from test_lanes_compiled import compare, short_run, spread
 for name in ("curved", "dissipative", "voltage limits") if float(tolerance) else ():
     case = CASES[name]()
-    compare(case.bench, spread(case, 4, np.random.default_rng(99)), 0.0, float(tolerance))
+    compare(case.compiled, spread(case, 4, np.random.default_rng(99)), 0.0, float(tolerance))
 np.testing.assert_allclose(short_run(), np.load(samples), rtol=1e-9, atol=1e-9)
 """
 

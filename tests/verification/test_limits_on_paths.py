@@ -1,4 +1,4 @@
-"""Limits of joints hold in the references of hand paths, or the path is refused with joint, time and amount."""
+"""Joint limits in the references of hand paths: they hold, or the path is refused with joint and time."""
 
 from __future__ import annotations
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.random_robots import Bench, bench, random_contacts, random_robot, surface_through
+from support.random_robots import CompiledSystem, assemble, random_contacts, random_robot, surface_through
 
 from dynsim.compile.model import Model
 from dynsim.dynamics import tables as ka
@@ -16,7 +16,7 @@ from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot, vec
 G = 9.81
 
 
-def switch(b: Bench, y: np.ndarray, *modes: int) -> None:
+def switch(b: CompiledSystem, y: np.ndarray, *modes: int) -> None:
     b.derivative(y)
     set_modes(b.system.contacts, b.system.couplings, b.system.unilateral, b.ws, integers(modes))
 
@@ -37,7 +37,7 @@ def test_a_block_sticks_to_an_incline(method, alpha):
     mass, normal = 3.0, np.array([np.sin(alpha), 0.0, np.cos(alpha)])
     point = vector(0.1, -0.2, 0.0)
     floor = Quadric(np.zeros((3, 3)), normal, -float(normal @ point))
-    b = bench(block(mass), [Contact("foot", "z", point, floor, friction=0.1)])
+    b = assemble(block(mass), [Contact("foot", "z", point, floor, friction=0.1)])
     y = b.state(np.zeros(3), np.zeros(3))
     switch(b, y, ka.STICKING)
     run = b.simulate(y, np.linspace(0.0, 2.0, 5), method)
@@ -58,7 +58,7 @@ def residual_of_second_derivatives(kind: str, seed: int) -> float:
     q, v = rng.normal(size=(2, 6))
     contact = random_contacts(rng, robot, q, 1)[0]
     contact = Contact("c", "body_5", contact.point, surface_through(rng, kind, position(robot, contact.point, q)))
-    b, eps = bench(robot, [contact]), 1e-4
+    b, eps = assemble(robot, [contact]), 1e-4
     y = b.state(q, v, np.zeros(len(robot.motors)))
     switch(b, y, ka.STICKING)
     vdot = b.part(b.derivative(y), "v")
@@ -93,7 +93,7 @@ def test_modes_change_in_a_run(kind):
     q = rng.normal(size=6)
     point = rng.normal(scale=0.3, size=3)
     contact = Contact("c", "body_5", point, surface_through(rng, kind, position(robot, point, q)), friction=0.2)
-    b = bench(robot, [contact])
+    b = assemble(robot, [contact])
     y, times = b.state(q, np.zeros(6)), np.linspace(0.0, 0.1, 6)
 
     def go(*modes: int) -> np.ndarray:
@@ -126,7 +126,7 @@ def test_a_change_of_modes_leaves_nothing_of_the_rows_before():
     robot = random_robot(rng, 8)
     q, v = rng.normal(size=(2, 8))
     contacts = random_contacts(rng, robot, q, 3)
-    b, fresh = bench(robot, contacts), bench(robot, contacts)
+    b, fresh = assemble(robot, contacts), assemble(robot, contacts)
     y = b.state(q, v, np.zeros(len(robot.motors)))
     expected = fresh.derivative(y)
     for modes in ((ka.STICKING, ka.OPEN, ka.SLIDING), (ka.OPEN, ka.STICKING, ka.STICKING)):

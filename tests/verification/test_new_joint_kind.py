@@ -21,7 +21,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from support.random_robots import bench, random_inertia, random_robot_of, random_rotation, without_losses
+from support.random_robots import assemble, random_inertia, random_robot_of, random_rotation, without_losses
 
 import dynsim
 from dynsim.compile.clearance import poses
@@ -38,7 +38,7 @@ rate = -m * g * lead / (I + m * lead**2)
 model = Model(nut)
 for q, v in ((0.0, 0.0), (2.0, -3.0)):
     np.testing.assert_allclose(model.forward_dynamics([q], [v], [0.0]), rate, rtol=1e-14)
-b = bench(nut)
+b = assemble(nut)
 times = np.linspace(0.0, 0.1, 6)
 run = b.simulate(b.state([0.3], [2.0]), times, "dopri5", rtol=1e-8)
 q, v = run.states("q")[:, 0], run.states("v")[:, 0]

@@ -1,4 +1,4 @@
-"""Where contacts do not determine their forces or the motion: Painlevé's paradox, signs, dependent frictional rows."""
+"""Undetermined contact forces or motion: Painlevé's paradox, signs, dependent frictional rows."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.random_robots import Bench, bench, random_contacts, random_robot, random_unit
+from support.random_robots import CompiledSystem, assemble, random_contacts, random_robot, random_unit
 
 import dynsim
 from dynsim.dynamics import tables as ka
@@ -31,7 +31,7 @@ _TURN = np.hypot(3.0, 3.0 * MU)
 CRITICAL = 0.5 * (np.arctan2(3.0 * MU, -3.0) - np.arccos(-5.0 / _TURN) + 2.0 * np.pi) - np.pi
 
 
-def rod(friction_law: str, friction: float = MU) -> tuple[Bench, list[Contact]]:
+def rod(friction_law: str, friction: float = MU) -> tuple[CompiledSystem, list[Contact]]:
     """A free rod in the plane y = 0 of 1 kg, half length 0.5 m, whose lower end is held to the floor."""
     slim = np.diag([1.0, 1.0, 1.0]) * HALF**2 / 3.0
     links = (
@@ -40,16 +40,16 @@ def rod(friction_law: str, friction: float = MU) -> tuple[Bench, list[Contact]]:
         Link("rod", "lean", "lift", "revolute", Y, Inertia(1.0, np.zeros(3), slim)),
     )
     tip = Contact("tip", "rod", -HALF * Z, FLOOR, friction=friction, pulling_friction=friction_law)
-    return bench(Robot("rod", links, (), ("rod", np.zeros(3))), [tip]), [tip]
+    return assemble(Robot("rod", links, (), ("rod", np.zeros(3))), [tip]), [tip]
 
 
-def rod_state(b: Bench, lean: float, turn: float, slide: float = 3.0) -> np.ndarray:
+def rod_state(b: CompiledSystem, lean: float, turn: float, slide: float = 3.0) -> np.ndarray:
     """On the floor, with the centre's horizontal speed [m/s] and the rate of leaning [rad/s]."""
     rise = -HALF * np.sin(lean) * turn
     return b.state(np.array([0.0, HALF * np.cos(lean), lean]), np.array([slide, rise, turn]))
 
 
-def started(b: Bench, y: np.ndarray, method: str, *, end: float = 0.3, rtol: float = 1e-6) -> ki.Run:
+def started(b: CompiledSystem, y: np.ndarray, method: str, *, end: float = 0.3, rtol: float = 1e-6) -> ki.Run:
     """A run to its end or stop."""
     return b.advance(b.new_run(y, np.linspace(0.0, end, 4), method, rtol=rtol))
 
@@ -120,13 +120,13 @@ def test_signed_friction_goes_where_dissipative_friction_has_two_solutions():
     assert b.part(run.y, "q")[2] > -CRITICAL
 
 
-def random_case(seed: int, friction: float, most: int = 3) -> tuple[Bench, np.ndarray]:
+def random_case(seed: int, friction: float, most: int = 3) -> tuple[CompiledSystem, np.ndarray]:
     rng = np.random.default_rng(seed)
     n = int(rng.integers(3, 9))
     robot = random_robot(rng, n)
     q = rng.normal(size=n)
     contacts = random_contacts(rng, robot, q, int(rng.integers(1, most + 1)))
-    b = bench(robot, [replace(contact, friction=friction * rng.random()) for contact in contacts])
+    b = assemble(robot, [replace(contact, friction=friction * rng.random()) for contact in contacts])
     return b, b.state(q, rng.normal(size=n), rng.normal(size=len(robot.motors)))
 
 
@@ -207,7 +207,7 @@ def test_a_contact_without_load_has_no_sign():
             Contact(f"foot_{k}", "sledge", np.array([x, 0.0, 0.0]), FLOOR, friction=0.3, slip_smoothing=1e-12,
                     pulling_friction="dissipative") for k, x in enumerate((0.37, -0.4))
         ]  # fmt: skip
-        b = bench(robot, feet)
+        b = assemble(robot, feet)
         y = b.state(np.zeros(3), np.array([1.0, 0.0, 0.0]))
         results = []
         for sign in (1.0, -1.0):
@@ -219,7 +219,7 @@ def test_a_contact_without_load_has_no_sign():
     assert unloaded == 30
 
 
-def table(friction: float, law: str = "dissipative", feet: int = 4) -> Bench:
+def table(friction: float, law: str = "dissipative", feet: int = 4) -> CompiledSystem:
     """A free body on four legs, 0.8 m × 0.6 m, 0.5 m high, its centre of mass off the middle."""
     names = ("x", "y", "z", "yaw", "pitch", "roll")
     axes, kinds = (X, Y, Z, Z, Y, X), ("prismatic",) * 3 + ("revolute",) * 3
@@ -233,10 +233,10 @@ def table(friction: float, law: str = "dissipative", feet: int = 4) -> Bench:
         Contact(f"foot_{k}", "roll", np.array([x, y, 0.0]), FLOOR, friction=friction, pulling_friction=law)
         for k, (x, y) in enumerate(corners)
     ]
-    return bench(Robot("table", links, (), ("roll", np.zeros(3))), contacts)
+    return assemble(Robot("table", links, (), ("roll", np.zeros(3))), contacts)
 
 
-def sliding(b: Bench) -> np.ndarray:
+def sliding(b: CompiledSystem) -> np.ndarray:
     """Along x and turning."""
     return b.state(np.zeros(6), np.array([0.6, 0.1, 0.0, 2.0, 0.0, 0.0]))
 
@@ -268,7 +268,7 @@ def test_the_motion_of_a_table_on_four_legs_is_open(law):
     assert (spread.low, spread.high, spread.taken) == (low[3], high[3], taken[3])
 
 
-def _yaw_acceleration(b: Bench, y: np.ndarray, force: np.ndarray) -> float:
+def _yaw_acceleration(b: CompiledSystem, y: np.ndarray, force: np.ndarray) -> float:
     """Newton and Euler about the vertical through the centre of mass of a body that lies level."""
     b.derivative(y)
     state, rows, centre = b.ws.contacts, b.ws.rows[: len(force)], np.array([0.05, -0.04])
@@ -300,7 +300,7 @@ def test_a_point_that_no_joint_moves_along_its_normal_is_no_paradox():
         point = np.cross(axis, [0.3, 0.2, 0.1])
         foot = Contact("foot", "disc", point, Quadric(np.zeros((3, 3)), axis, 0.0), friction=0.9)
         for law in ("signed", "dissipative"):
-            b = bench(Robot("disc", (link,), (), ("disc", np.zeros(3))), [replace(foot, pulling_friction=law)])
+            b = assemble(Robot("disc", (link,), (), ("disc", np.zeros(3))), [replace(foot, pulling_friction=law)])
             b.derivative(b.state(np.zeros(1), np.ones(1)))
             since, room = np.full(1, np.inf), np.zeros((ROOM, 1, 1))
             assert force_verdict(b.ws, room, since, 0.0) == UNIQUE
@@ -309,7 +309,7 @@ def test_a_point_that_no_joint_moves_along_its_normal_is_no_paradox():
 
 def test_a_contact_given_twice_is_stopped_like_one():
     b, (tip,) = rod("signed")
-    twice = bench(b.robot, [tip, replace(tip, name="tip again")])
+    twice = assemble(b.robot, [tip, replace(tip, name="tip again")])
     for lean, status in ((0.3, ki.RUNNING), (-0.6, ki.FORCES_REVERSED)):
         run = twice.advance(twice.new_run(rod_state(twice, lean, 0.0), np.array([1.0]), "dopri5", step=1e-3), 0)
         assert run.count[ki.STATUS] == status

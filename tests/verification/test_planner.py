@@ -1,4 +1,4 @@
-"""The planner of braces: derivatives, closed forms, and what its plans cost when they are run."""
+"""The planner of braces: derivatives, closed forms, and predicted heat against simulated heat."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from dynsim.jit.kernel import integers, reals
 from dynsim.model.surfaces import Box, HeightField, Quadric, shape_arrays
 from dynsim.planner.compiled import Arm, Course, Points
 from dynsim.planner.local import Problem, workspace
-from dynsim.planner.problem import CHARGED, Options, task
+from dynsim.planner.problem import FINAL_SLIP_SCALE, Options, task
 from dynsim.planner.search import Search
 from dynsim.planner.verify import Tolerances, Verifier
 from dynsim.scenario.reading import scenario_from_resolved
@@ -200,7 +200,7 @@ def test_heat_is_that_of_brace_statics_along_the_references(searched) -> None:  
         slip = model.point_jacobian(brace.body, touching, position) @ rate
         slip[2] = 0.0
         speed = float(np.linalg.norm(slip))
-        friction = search.task.friction * speed / np.hypot(speed, CHARGED)
+        friction = search.task.friction * speed / np.hypot(speed, FINAL_SLIP_SCALE)
         lean = Brace(brace.body, touching, np.array([0.0, 0.0, 1.0]), friction, sliding=slip if speed > 1e-9 else None)
         heat.append(model.brace_statics(position, rate, acceleration, {"brace": lean}).heat)
     assert dense.heat == pytest.approx(float(np.trapezoid(heat, dense.fine) / dense.fine[-1]), rel=1e-3)

@@ -1,4 +1,4 @@
-"""Braced postures, hand paths with braces, planned voltages, and braces that press as they are told."""
+"""Braced postures, hand paths with braces, planned voltages, and prescribed brace forces."""
 
 from __future__ import annotations
 

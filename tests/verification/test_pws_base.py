@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.linalg import expm
-from support.random_robots import Bench, bench
+from support.random_robots import CompiledSystem, assemble
 from support.real_wheels import MOTOR
 
 import dynsim
@@ -58,7 +58,7 @@ def pose(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return START + q[:, 2:4] @ np.array([[c, s], [-s, c]]), HEADING + R / TRACK * (q[:, 1] - q[:, 0])
 
 
-def go(b: Bench, speed: float, turn: float, times: np.ndarray) -> tuple[np.ndarray, ...]:
+def go(b: CompiledSystem, speed: float, turn: float, times: np.ndarray) -> tuple[np.ndarray, ...]:
     """V, ω, places and headings of a base that starts so."""
     run = b.simulate(b.state(np.zeros(5), wheel_rates(speed, turn)), times, "dopri5", rtol=1e-12)
     return *speed_and_turn(run.states("v")), *pose(run.states("q"))
@@ -71,7 +71,7 @@ def go(b: Bench, speed: float, turn: float, times: np.ndarray) -> tuple[np.ndarr
 def test_a_base_coasts_on_an_arc(speed, turn):
     """Mass above the axle's middle, no losses: constant V and ω, a circle of radius V/ω."""
     times = np.linspace(0.0, 10.0, 41)
-    V, w, position, heading = go(bench(robot()), speed, turn, times)
+    V, w, position, heading = go(assemble(robot()), speed, turn, times)
     np.testing.assert_allclose(V, speed, rtol=1e-12)
     np.testing.assert_allclose(w, turn, rtol=1e-12)
     angle = HEADING + turn * times
@@ -83,7 +83,7 @@ def test_a_base_coasts_on_an_arc(speed, turn):
 def test_losses_of_the_wheels_slow_it_down_exponentially():
     """M V̇ = −2 D V/r², J ω̇ = −2 D (T/2r)² ω."""
     loss, times = 0.03, np.linspace(0.0, 2.0, 21)
-    V, w, _, heading = go(bench(robot(damping=loss)), 0.9, 1.3, times)
+    V, w, _, heading = go(assemble(robot(damping=loss)), 0.9, 1.3, times)
     straight, turning = 2.0 * loss / R**2 / ROLLING_MASS, 2.0 * loss * (0.5 * TRACK / R) ** 2 / TURNING
     np.testing.assert_allclose(V, 0.9 * np.exp(-straight * times), rtol=1e-9)
     np.testing.assert_allclose(w, 1.3 * np.exp(-turning * times), rtol=1e-9)
@@ -103,7 +103,7 @@ def test_mass_off_the_axle_turns_it_round(ahead):
         rate = MASS * ahead * top / J
         middle = -np.arctanh(backward / top) / rate
         times = np.linspace(0.0, 2.0 * middle, 31)
-        V, w, *_ = go(bench(robot(ahead)), backward, turn, times)
+        V, w, *_ = go(assemble(robot(ahead)), backward, turn, times)
         s = rate * (times - middle)
         np.testing.assert_allclose(V, top * np.tanh(s), rtol=0, atol=1e-9)
         np.testing.assert_allclose(w, np.sign(turn) * top * np.sqrt(ROLLING_MASS / J) / np.cosh(s), rtol=0, atol=1e-9)
@@ -116,7 +116,7 @@ def test_a_base_rolls_down_a_slope(off):
     """Heading at an angle to the steepest way down: V̇ = m g sin a cos(angle)/(m + 2 I/r²), and no drift across it."""
     slope, times = 0.2, np.linspace(0.0, 3.0, 13)
     down = 9.81 * np.sin(slope) * np.array([np.cos(HEADING + off), np.sin(HEADING + off)])
-    b = bench(robot(gravity=(*down, -9.81 * np.cos(slope))))
+    b = assemble(robot(gravity=(*down, -9.81 * np.cos(slope))))
     V, w, position, heading = go(b, 0.0, 0.0, times)
     rate = TOTAL * 9.81 * np.sin(slope) * np.cos(off) / ROLLING_MASS
     np.testing.assert_allclose(V, rate * times, rtol=0, atol=1e-11)
@@ -142,7 +142,7 @@ def per_wheel(sign: float, rotor: float) -> float:
 def test_torques_speed_up_the_wheels(sign):
     """φ̈ = τ/J − D φ̇/J: φ̇ = τ (1 − exp(−D t/J))/D."""
     loss, torque, times = 0.04, 0.3, np.linspace(0.0, 1.5, 16)
-    b = bench(robot(damping=loss, motor={"type": "torque"}), held=np.array([sign * torque, torque, 0.0]))
+    b = assemble(robot(damping=loss, motor={"type": "torque"}), held=np.array([sign * torque, torque, 0.0]))
     run = b.simulate(b.state(np.zeros(5), np.zeros(3)), times, "dopri5", rtol=1e-12)
     rate = torque / loss * (1.0 - np.exp(-loss * times / per_wheel(sign, 0.0)))
     np.testing.assert_allclose(run.states("v")[:, :2], np.stack([sign * rate, rate], axis=1), rtol=0, atol=1e-9)
@@ -152,7 +152,7 @@ def test_torques_speed_up_the_wheels(sign):
 def test_motors_turn_the_wheels_to_their_angles(sign):
     """Voltage PD, circuit, rotor and losses of both wheels: one linear system of angle, rate and current."""
     loss, goal, k_p, k_d, times = 0.04, 2.0, 30.0, 1.0, np.linspace(0.0, 1.5, 16)
-    b = bench(robot(damping=loss, motor=MOTOR), held=np.array([sign * goal, goal, 0.0]), k_p=k_p, k_d=k_d)
+    b = assemble(robot(damping=loss, motor=MOTOR), held=np.array([sign * goal, goal, 0.0]), k_p=k_p, k_d=k_d)
     run = b.simulate(b.state(np.zeros(5), np.zeros(3)), times, "dopri5", rtol=1e-12)
     K, k, L = 0.203 * 3.0, 3.0, 0.0017
     J, D = per_wheel(sign, 1.64e-4 * k**2), loss + 0.01 * k**2

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from support.lanes import copies
-from support.random_robots import Bench, bench, random_positions, random_robot, random_robot_of
+from support.random_robots import CompiledSystem, assemble, random_positions, random_robot, random_robot_of
 
 from dynsim.integrators.radau5.linear_systems import factor_both, solve_both
 from dynsim.integrators.radau5.tables import ALPHA_RADAU, BETA_RADAU, GAMMA_RADAU
@@ -19,13 +19,13 @@ def solve_compiled(system, ws, y, r, h):
     solve_both(system, ws, y, r, h)
 
 
-def driven() -> Bench:
-    return bench(random_robot(np.random.default_rng(0), 8))
+def driven() -> CompiledSystem:
+    return assemble(random_robot(np.random.default_rng(0), 8))
 
 
-def every_joint() -> Bench:
+def every_joint() -> CompiledSystem:
     kinds = ["ball", "rolling", "planar", "floating", "wheeled", "prismatic", "revolute"]
-    return bench(random_robot_of(np.random.default_rng(1), kinds))
+    return assemble(random_robot_of(np.random.default_rng(1), kinds))
 
 
 @pytest.mark.parametrize("make", [driven, every_joint])

@@ -1,4 +1,4 @@
-"""Rotors as armature against rotors as bodies, and motors that weigh something."""
+"""Rotor armature against rotors as bodies, and the mass of motors."""
 
 import numpy as np
 import pytest

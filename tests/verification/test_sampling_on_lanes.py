@@ -1,16 +1,16 @@
-"""Samples of RADAU5 that are computed together, and those that wait for others, are those that are computed alone."""
+"""Samples of RADAU5 computed on lanes or postponed equal those computed alone."""
 
 from __future__ import annotations
 
 import numpy as np
-from support.random_robots import Bench, braced
+from support.random_robots import CompiledSystem, braced
 
 from dynsim.integrators.run import EVALUATIONS, FINISHED, PROJECTIONS, SAMPLE, STATUS, TIME, Run
 
 STEP = 5e-3
 
 
-def unwaiting(b: Bench, y: np.ndarray, times: np.ndarray) -> Run:
+def unwaiting(b: CompiledSystem, y: np.ndarray, times: np.ndarray) -> Run:
     """A run whose samples do not wait, as something may happen between steps: after its end."""
     return b.advance(b.new_run(y, times, "radau5", step=STEP, fixed=True)._replace(breaks=np.array([1e3])))
 

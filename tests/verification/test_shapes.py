@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import make_interp_spline
 from scipy.optimize import minimize, minimize_scalar
-from support.random_robots import Bench, bench, random_robot, random_rotation, random_unit
+from support.random_robots import CompiledSystem, assemble, random_robot, random_rotation, random_unit
 
 from dynsim.compile.model import Model
 from dynsim.compile.shapes import compile_shapes, contact_gap, moves
@@ -101,7 +101,7 @@ def brute_gap(contact: Contact, start: np.ndarray, end: np.ndarray) -> float:
     return float(minimum.fun) - contact.radius
 
 
-def random_case(kind: str, shape: str, seed: int) -> tuple[Bench, Contact, np.ndarray, np.ndarray, np.ndarray]:
+def random_case(kind: str, shape: str, seed: int) -> tuple[CompiledSystem, Contact, np.ndarray, np.ndarray, np.ndarray]:
     """A point, a sphere or a capsule of a random robot beside a surface, with q, v and an acceleration."""
     rng = np.random.default_rng(seed)
     robot = random_robot(rng, 6, motors=False)
@@ -121,7 +121,7 @@ def random_case(kind: str, shape: str, seed: int) -> tuple[Bench, Contact, np.nd
         radius=0.0 if shape == "point" else 0.06,
         tip=end if shape == "capsule" else None,
     )
-    return bench(robot, [contact]), contact, q, v, a
+    return assemble(robot, [contact]), contact, q, v, a
 
 
 CASES = [(kind, shape) for kind in KINDS for shape in ("point", "sphere")] + [(kind, "capsule") for kind in BENT]
@@ -237,7 +237,7 @@ def test_a_capsule_that_meets_with_an_end_has_the_rows_of_a_sphere_there():
                 replace(capsule, surface=ball),
                 replace(capsule, surface=ball, point=end, tip=None),
             ):
-                with_capsule = bench(b.robot, [contact])
+                with_capsule = assemble(b.robot, [contact])
                 with_capsule.derivative(with_capsule.state(q, v))
                 rows.append(with_capsule.ws.rows.copy())
                 states.append(with_capsule.ws.contacts.copy())
@@ -265,7 +265,7 @@ def test_a_sphere_is_a_point_on_the_surface_that_lies_a_radius_further_out(kind,
         J = normal @ Model(robot).point_jacobian("body_5", point, q)
         v = v - J * (J @ v) / (J @ J)
         sphere, lone = (
-            bench(robot, [Contact("c", "body_5", point, surface, radius=rho)])
+            assemble(robot, [Contact("c", "body_5", point, surface, radius=rho)])
             for surface, rho in ((inner, radius), (outer, 0.0))
         )
         a, b = (x.part(x.derivative(x.state(q, v)), "v") for x in (sphere, lone))
@@ -303,7 +303,7 @@ def test_a_ball_and_a_cylinder_roll_down_a_slope(shape, share):
         contacts = [
             Contact(name, "body", vector(0, y, 0), floor, radius=r) for name, y in (("left", 0.3), ("right", -0.3))
         ]
-    b = bench(robot, contacts)
+    b = assemble(robot, contacts)
     y = b.state(pose(robot, r * NORMAL), np.zeros(6))
     b.derivative(y)
     set_modes(b.system.contacts, b.system.couplings, None, b.ws, integers([ka.STICKING] * len(contacts)))
@@ -320,7 +320,7 @@ def test_a_ball_rolls_over_a_sphere():
     """From near its top on a circle of R + r: its energy of motion is 7/10 m v² and comes from its height."""
     R, r, start = 0.5, 0.1, 0.2
     robot = free_body(Inertia.solid_sphere(1.0, r, np.zeros(3)))
-    b = bench(robot, [Contact("ball", "body", np.zeros(3), round_surface(np.zeros(3), R), radius=r)])
+    b = assemble(robot, [Contact("ball", "body", np.zeros(3), round_surface(np.zeros(3), R), radius=r)])
     y = b.state(pose(robot, (R + r) * np.array([np.sin(start), 0.0, np.cos(start)])), np.zeros(6))
     b.derivative(y)
     set_modes(b.system.contacts, b.system.couplings, None, b.ws, integers([ka.STICKING]))

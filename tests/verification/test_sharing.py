@@ -1,4 +1,4 @@
-"""Contacts that share forces: only several, and only where a force of one can take over from another's."""
+"""Shared contact forces: reported only for several contacts, and only where one can replace another."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What goes wrong with an operator: a source that fails, a path that is too fast, and one that is out of reach."""
+"""Failures of an operator's input: a failing source, a path too fast, a path out of reach."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Verification of the plant and the tick loop: rolling, order of the sampling error, what the controller may know."""
+"""The kinematic plant and the tick loop: rolling, order of the sampling error, the controller's knowledge."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Nobody but dynsim.dynamics.state knows where what lies in the state and in recorded outputs."""
+"""Only dynsim.dynamics.state knows the layout of the state vector and of recorded outputs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.random_robots import ADAPTIVE, Bench, bench, random_contacts, random_robot
+from support.random_robots import ADAPTIVE, CompiledSystem, assemble, random_contacts, random_robot
 
 import dynsim
 from dynsim.dynamics.derivative import new_workspace
@@ -67,7 +67,7 @@ COLUMNS = ("vdot", "current", "voltage", "torque", "hand", "energy", "contact", 
 class Pair:
     """A system with the standard layout, and the same one with another layout."""
 
-    def __init__(self, standard: Bench, gap: int) -> None:
+    def __init__(self, standard: CompiledSystem, gap: int) -> None:
         self.standard = standard
         self.layout = scattered_state(standard.system.layout, gap)
         system = standard.system._replace(layout=self.layout, unilateral=copy.deepcopy(standard.system.unilateral))
@@ -114,7 +114,7 @@ def random_pair(seed: int, *, gap: int = 2, m_star: bool = False, real: bool = F
     robot = random_robot(rng, 6)
     q = rng.normal(size=6)
     contacts = random_contacts(rng, robot, q, 2)
-    standard = bench(robot, contacts, m_star=m_star, held=q[: len(robot.motors)] + 0.3, real=real)
+    standard = assemble(robot, contacts, m_star=m_star, held=q[: len(robot.motors)] + 0.3, real=real)
     assert standard.sizes[1] >= 2
     standard = standard.with_shapes() if real else standard
     y = standard.state(q + rng.normal(scale=1e-4, size=6), rng.normal(size=6), rng.normal(size=len(robot.motors)))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.integrate import quad, solve_ivp
-from support.random_robots import Bench, bench, random_robot
-from support.stepping_benches import plane, snake, stepped
+from support.random_robots import CompiledSystem, assemble, random_robot
+from support.stepping_systems import plane, snake, stepped
 
 import dynsim
 from dynsim.dynamics import tables as ka
@@ -20,7 +20,7 @@ from dynsim.model.drives import Motor
 G = 9.81
 
 
-def block(friction: float, slope: float = 0.0, mass: float = 2.0, **law: float) -> Bench:
+def block(friction: float, slope: float = 0.0, mass: float = 2.0, **law: float) -> CompiledSystem:
     """A body that does not turn, with one point on a plane through the origin that falls towards +x.
 
     law: more of the contact.
@@ -31,7 +31,7 @@ def block(friction: float, slope: float = 0.0, mass: float = 2.0, **law: float) 
         for k, a in enumerate("xyz")
     ]
     normal = np.array([np.sin(slope), 0.0, np.cos(slope)])
-    return bench(
+    return assemble(
         Robot("block", tuple(links), (), ("z", np.zeros(3))),
         [Contact("foot", "z", np.zeros(3), plane(normal), friction=friction, **law)],
         real=True,
@@ -55,7 +55,7 @@ def test_a_block_sticks_on_a_slope_or_slides_down_it(slope, theta):
 def test_order_of_a_motion_with_motors(theta, order):
     """A random arm with motors against an adaptive method at a tolerance out of reach of the other."""
     robot = random_robot(np.random.default_rng(3), 4)
-    free, b, times = bench(robot), bench(robot, real=True), np.array([0.0, 0.2])
+    free, b, times = assemble(robot), assemble(robot, real=True), np.array([0.0, 0.2])
     start = np.full(4, 0.3), np.full(4, 0.5), np.zeros(b.system.layout.circuits)
     exact = free.simulate(free.state(*start), times, "dopri5", rtol=1e-11).states("q")[-1]
     errors = [
@@ -90,7 +90,7 @@ def test_a_rod_that_falls_on_its_stop_loses_there_what_it_has():
     mass, length, start = 0.8, 0.5, 1.2
     rod = Inertia(mass, 0.5 * length * np.eye(3)[2], mass * length**2 / 12.0 * np.diag([1.0, 1.0, 0.0]))
     link = Link("rod", "hinge", None, "revolute", np.eye(3)[1], rod, upper=0.5 * np.pi)
-    b = bench(Robot("rod", (link,), (), ("rod", length * np.eye(3)[2])), real=True)
+    b = assemble(Robot("rod", (link,), (), ("rod", length * np.eye(3)[2])), real=True)
     run = stepped(b, b.state([start], np.zeros(1)), np.array([0.0, 0.5]), 2e-3, 0.5)
     q, (stop,) = run.states("q")[-1, 0], b.system.unilateral.stop
     # It is at rest where it was found to be beyond: 5.5 rad/s for less than a step.
@@ -128,7 +128,7 @@ def test_friction_that_differs_along_and_across():
     np.testing.assert_allclose(force[0] / force[1], ratio**2, rtol=1e-3)
 
 
-def slide(b: Bench, speed: float, until: float, h: float) -> Run:
+def slide(b: CompiledSystem, speed: float, until: float, h: float) -> Run:
     """The block slides along x at first."""
     return b.simulate(b.state(np.zeros(3), [speed, 0.0, 0.0]), np.array([0.0, until]), "time_stepping", step=h)
 
@@ -196,7 +196,7 @@ def test_current_in_a_blocked_motor_is_that_of_the_trapezoidal_rule():
     heavy = Link("wheel", "shaft", None, "revolute", np.eye(3)[2], Inertia(1.0, np.zeros(3), 1e15 * np.eye(3)))
     motor = Motor("shaft", 0.2, resistance=1.1, inductance=1.7e-3, rotor_inertia=0.0, gear_ratio=3.0)
     robot = Robot("motor", (heavy,), (motor,), ("wheel", np.zeros(3)))
-    b = bench(robot, held=np.array([0.4]), k_p=30.0, k_d=0.0, real=True)
+    b = assemble(robot, held=np.array([0.4]), k_p=30.0, k_d=0.0, real=True)
     run = stepped(b, b.state([0.0], [0.0]), np.array([8e-3]), 1e-3, 0.5)
     x = 0.5e-3 * 1.1 / 1.7e-3
     np.testing.assert_allclose(

@@ -1,11 +1,18 @@
-"""The ledger of time stepping closes to rounding: the discrete balance, with what the steps themselves take of it."""
+"""The ledger of time stepping closes to rounding: the discrete energy balance."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.random_robots import Bench, bench, random_contacts, random_positions, random_robot, random_robot_of
-from support.stepping_benches import snake, stepped
+from support.random_robots import (
+    CompiledSystem,
+    assemble,
+    random_contacts,
+    random_positions,
+    random_robot,
+    random_robot_of,
+)
+from support.stepping_systems import snake, stepped
 
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.state import CONSTRAINT, ELECTRICAL, FRICTION, GEAR, JOINT, JOULE
@@ -37,7 +44,7 @@ def push(robot: Robot, rng: np.random.Generator) -> Load:
     return Load("push", robot.links[-1].name, rng.normal(size=3), True, np.array([0.0, 1.0]), coefficients, True)
 
 
-def moving(b: Bench, q: np.ndarray, seed: int) -> np.ndarray:
+def moving(b: CompiledSystem, q: np.ndarray, seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     return b.state(q, rng.normal(size=len(b.robot.links)), rng.normal(size=b.system.layout.circuits))
 
@@ -60,7 +67,7 @@ def test_arms_whose_inertia_changes(seed, theta):
     if robot.couplings:
         names = robot.joint_names
         q[names.index(free[0])] = 0.7 * q[names.index(free[1])]
-    b = bench(robot, random_contacts(rng, robot, q, 3), loads=[push(robot, rng)], real=True)
+    b = assemble(robot, random_contacts(rng, robot, q, 3), loads=[push(robot, rng)], real=True)
     run = stepped(b, moving(b, q, seed), TIMES, 3e-3, theta)
     assert run.stepping.statistics[CAPPED] == 0
     assert unexplained(run) < 1e-9
@@ -85,7 +92,7 @@ def test_servos_and_torque_sources(seed):
     ]
     assert len({type(motor) for motor in motors}) == 2
     robot = Robot(**{**vars(robot), "motors": tuple(motors)})
-    b = bench(robot, held=rng.normal(size=5), real=True)
+    b = assemble(robot, held=rng.normal(size=5), real=True)
     run = stepped(b, moving(b, rng.normal(size=5), seed), TIMES, 2e-3, 0.5)
     assert unexplained(run) < 1e-9
 
@@ -96,7 +103,7 @@ def test_bodies_that_are_free(kinds):
     rng = np.random.default_rng(len(kinds[0]))
     robot = random_robot_of(rng, kinds)
     q = random_positions(rng, robot)
-    b = bench(robot, random_contacts(rng, robot, q, 2), loads=[push(robot, rng)], real=True)
+    b = assemble(robot, random_contacts(rng, robot, q, 2), loads=[push(robot, rng)], real=True)
     run = stepped(b, moving(b, q, 1), TIMES, 3e-3, 0.5)
     assert unexplained(run) < 1e-9
 
@@ -118,7 +125,7 @@ def test_a_scene_of_the_snakes_size_keeps_its_cones_and_its_ledger():
 @pytest.mark.parametrize(("theta", "order"), [(0.5, 2), (1.0, 1)])
 def test_what_steps_take_is_of_their_order(theta, order):
     robot = random_robot(np.random.default_rng(3), 4)
-    b = bench(robot, real=True)
+    b = assemble(robot, real=True)
     y = b.state(np.full(4, 0.3), np.full(4, 0.5), np.zeros(b.system.layout.circuits))
     taken = [stepped(b, y, np.array([0.0, 0.2]), h, theta).states("scheme")[-1, 0] for h in (4e-4, 2e-4, 1e-4)]
     rates = np.log2(np.abs(np.divide(taken[:-1], taken[1:])))

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.random_robots import Bench, bench
-from support.stepping_benches import plane, stepped
+from support.random_robots import CompiledSystem, assemble
+from support.stepping_systems import plane, stepped
 
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.drive.servo import servo_block, servo_block_on, servo_circuit, servo_circuit_on, servo_segment
@@ -20,7 +20,7 @@ X, Y, Z = np.eye(3)
 RADIUS = 0.05
 
 
-def cart(gain: float) -> Bench:
+def cart(gain: float) -> CompiledSystem:
     """10 kg on one wheel, a velocity servo of 2.5 N m and 5.76 rad/s at 12 V that is told to roll at 0.1 m/s."""
     constant = 12.0 / 5.76
     servo = Servo("axle", constant, 12.0 * constant / 2.5, 0.0, k_v=gain, velocity_mode=True, voltage_limit=12.0,
@@ -31,7 +31,7 @@ def cart(gain: float) -> Bench:
         Link("wheel", "axle", "cart", "revolute", Y, Inertia(0.1, np.zeros(3), 2e-4 * np.eye(3))),
     )
     tyre = Contact("tyre", "wheel", np.zeros(3), plane(Z), friction=0.6, radius=RADIUS)
-    b = bench(Robot("cart", links, (servo,), ("cart", np.zeros(3))), [tyre], real=True)
+    b = assemble(Robot("cart", links, (servo,), ("cart", np.zeros(3))), [tyre], real=True)
     line = ka.ReferenceArrays(integers([ka.REWRITTEN]), reals([0.0]), reals([0.0, 1.0]), reals(np.zeros((1, 1, 6))))
     b.system = b.system._replace(reference=line)
     b.system.drives.input[0, ka.LINE_RATE] = 0.1 / RADIUS
@@ -52,7 +52,7 @@ def test_a_stiff_velocity_loop_rolls(gain, theta):
     assert run.stepping.statistics[UNSETTLED] == 0
 
 
-def stiff_arm(limit: float, current: float = np.inf) -> tuple[Bench, np.ndarray]:
+def stiff_arm(limit: float, current: float = np.inf) -> tuple[CompiledSystem, np.ndarray]:
     """Three joints with gains that ask for a thousand volts; at rest, and away from where they should be."""
     links = [
         Link(f"l{k}", f"j{k}", f"l{k - 1}" if k else None, "revolute", -Y, Inertia(1.0, 0.15 * X, 0.01 * np.eye(3)),
@@ -72,7 +72,7 @@ def stiff_arm(limit: float, current: float = np.inf) -> tuple[Bench, np.ndarray]
         )
         for k in range(3)
     ]
-    b = bench(
+    b = assemble(
         Robot("arm", tuple(links), tuple(motors), ("l2", 0.3 * X)),
         held=np.array([0.8, -0.6, 0.9]), k_p=2000.0, k_d=20.0, real=True,
     )  # fmt: skip
@@ -120,7 +120,7 @@ def test_servos_with_limits_of_current_and_open_torques_end_where_radau5_does():
         Servo("j1", 2.0, 1.0, 900.0, 10.0, armature=0.05, voltage_limit=8.0),
         TorqueSource("j2", torque_limit=0.4),
     )
-    b = bench(Robot("arm", links, drives, ("l2", 0.3 * X)), held=np.array([0.8, -0.6, 0.9]), real=True)
+    b = assemble(Robot("arm", links, drives, ("l2", 0.3 * X)), held=np.array([0.8, -0.6, 0.9]), real=True)
     y, times = b.state(np.zeros(3), np.zeros(3)), np.array([0.0, 0.3, 1.0])
     exact = b.simulate(y, times, "radau5", rtol=1e-9).states("q")
     errors = [np.abs(stepped(b, y, times, h, 0.5).states("q") - exact).max() for h in (2e-3, 1e-3, 5e-4)]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.stepping_benches import stepped
 from support.stepping_cases import G, X, Z, bead, bowl, hump, incline, knife_edge, plane, point, spherical_bowl, tip
+from support.stepping_systems import stepped
 
 from dynsim.dynamics.state import IMPACT_LOSS, OUT_FORCE, OUT_GAP
 from dynsim.integrators.run import LOGGED, TIME

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.random_robots import Bench, bench
-from support.stepping_benches import plane, stepped
+from support.random_robots import CompiledSystem, assemble
+from support.stepping_systems import plane, stepped
 
 from dynsim.dynamics.contact.cone.least_norm import select_least_norm
 from dynsim.dynamics.contact.cone.problem import CONE, CONE_ROOM, TANGENT
@@ -20,15 +20,15 @@ MASS, WIDTH, DEPTH, HEIGHT = 5.0, 0.4, 0.3, 0.7
 LEGS = [np.array([x * WIDTH, y * DEPTH, -HEIGHT]) for x in (1, -1) for y in (1, -1)]
 
 
-def body(points: list[np.ndarray], friction: float = 0.6) -> Bench:
+def body(points: list[np.ndarray], friction: float = 0.6) -> CompiledSystem:
     """A body that is free, with points on a floor."""
     inertia = Inertia(MASS, np.zeros(3), np.diag([0.3, 0.4, 0.6]))
     links = tuple(floating(Link("body", "root", None, "floating", np.eye(3)[0], inertia)))
     contacts = [Contact(f"foot_{k}", "body", p, plane(Z), friction=friction) for k, p in enumerate(points)]
-    return bench(Robot("body", links, (), ("body", np.zeros(3))), contacts, real=True).with_shapes()
+    return assemble(Robot("body", links, (), ("body", np.zeros(3))), contacts, real=True).with_shapes()
 
 
-def released(b: Bench, seconds: float, samples: int = 201, first: float = 0.0):
+def released(b: CompiledSystem, seconds: float, samples: int = 201, first: float = 0.0):
     """From rest at HEIGHT; ``first``: all weight on legs 1 and 3 as a start of the contact problem [N]."""
     y = b.state(np.r_[0.0, 0.0, HEIGHT, 1.0, 0.0, 0.0, 0.0], np.zeros(6))
     run = b.new_run(y, np.linspace(0.0, seconds, samples), "time_stepping", step=1e-3)

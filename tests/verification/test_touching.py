@@ -1,4 +1,4 @@
-"""Declared contact points: of a radius, and those that never touch."""
+"""Declared contact points: with a radius, and points that never touch."""
 
 from __future__ import annotations
 

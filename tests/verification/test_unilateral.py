@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.random_robots import Bench, bench
+from support.random_robots import CompiledSystem, assemble
 
 from dynsim import load_scenario, simulate
 from dynsim.compile.contact_law import SETTLE_SPEED
@@ -14,7 +14,7 @@ from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.state import FRICTION, OUT_FORCE, OUT_GAP, OUT_MODE
 from dynsim.integrators import run as ki
-from dynsim.integrators.contacts import events as ce
+from dynsim.integrators.contacts import events as ke
 from dynsim.integrators.contacts.events import consistent
 from dynsim.model.description import Contact, Inertia, Link, Load, Quadric, Robot, vector
 from dynsim.model.surfaces import Box
@@ -40,21 +40,21 @@ def happened(run: ki.Run) -> list[tuple[float, int, int]]:
     """Time, contact and kind of the logged events of contacts."""
     events = []
     for t, code in zip(run.log_time, run.log_event[: run.count[ki.LOGGED]], strict=False):
-        k, kind = divmod(int(code) - ki.CONTACT_LOG, ce.LOG_KINDS)
+        k, kind = divmod(int(code) - ki.CONTACT_LOG, ke.LOG_KINDS)
         events.append((float(t), k, kind))
     return events
 
 
-def residual(b: Bench, run: ki.Run) -> float:
+def residual(b: CompiledSystem, run: ki.Run) -> float:
     """What the ledger of a passive system without losses of joints does not explain [J]."""
     stored = run.outputs("energy").sum(axis=1)
     taken = run.states("ledger")[:, FRICTION] + run.states("loss").sum(axis=1)
     return float(np.abs(stored - stored[0] + taken).max())
 
 
-def sloped(alpha: float, mu: float, **law: float) -> Bench:
+def sloped(alpha: float, mu: float, **law: float) -> CompiledSystem:
     normal = np.array([np.sin(alpha), 0.0, np.cos(alpha)])
-    return bench(
+    return assemble(
         block(3.0),
         [
             Contact(
@@ -105,7 +105,7 @@ def test_a_block_without_friction_that_never_slips_stays(method, height):
 def test_a_bouncing_ball():
     """Impact times of a ball with restitution e, and the time at which its bounces have come to an end."""
     e, height = 0.6, 0.5
-    b = bench(
+    b = assemble(
         block(0.7),
         [Contact("foot", "z", np.zeros(3), plane(vector(0, 0, 1)), restitution=e, pulling_friction="signed")],
         real=True,
@@ -119,9 +119,9 @@ def test_a_bouncing_ball():
     np.testing.assert_allclose(times[:10], first + np.concatenate([[0.0], np.cumsum(flights)[:9]]), rtol=0, atol=1e-8)
     # Slower bounces are let settle.
     end = first * (1.0 + e) / (1.0 - e)
-    assert events[-1][2] == ce.LANDING
+    assert events[-1][2] == ke.LANDING
     assert times[-1] == pytest.approx(end, abs=2.0 * SETTLE_SPEED / G / (1.0 - e))
-    assert all(kind == ce.BOUNCE for _, _, kind in events[:-1])
+    assert all(kind == ke.BOUNCE for _, _, kind in events[:-1])
     assert np.abs(run.states("q")[-1]).max() <= 1e-9
     assert run.states("loss")[-1, 0] == pytest.approx(0.7 * G * height, rel=1e-9)
     assert residual(b, run) < 1e-8
@@ -134,15 +134,15 @@ def test_two_feet_that_bounce_at_one_instant(e):
     feet = [
         Contact(f"foot {x}", "z", vector(x, 0, 0), down, restitution=e, pulling_friction="signed") for x in (-0.2, 0.2)
     ]
-    b = bench(block(0.5), feet, real=True)
+    b = assemble(block(0.5), feet, real=True)
     run = b.simulate(b.state(vector(0, 0, height), np.zeros(3)), np.array([0.0, 2.0]), "dopri5")
     first = np.sqrt(2.0 * height / G)
-    times = np.array([t for t, _, kind in happened(run) if kind == ce.BOUNCE])
+    times = np.array([t for t, _, kind in happened(run) if kind == ke.BOUNCE])
     assert len(times) % 2 == 0
     flights = 2.0 * first * e ** np.arange(1, len(times) // 2)
     expected = first + np.concatenate([[0.0], np.cumsum(flights)])
     np.testing.assert_allclose(times, np.repeat(expected, 2), rtol=0, atol=1e-8)
-    assert [kind for _, _, kind in happened(run)][-2:] == [ce.LANDING] * 2
+    assert [kind for _, _, kind in happened(run)][-2:] == [ke.LANDING] * 2
     assert run.states("loss")[-1, 0] == pytest.approx(0.5 * G * height, rel=1e-9)
 
 
@@ -151,10 +151,10 @@ def test_two_feet_that_bounce_at_one_instant(e):
 def test_nothing_falls_through_a_body_within_one_step(method, thickness):
     """Falling freely steps are as long as the run; a plate's other side is as far from a point as its own."""
     plate = Box(vector(0, 0, -0.5 * thickness), np.eye(3), np.array([1.0, 1.0, thickness]), 1e-3)
-    b = bench(block(1.0), [Contact("foot", "z", np.zeros(3), plate, pulling_friction="signed")], real=True)
+    b = assemble(block(1.0), [Contact("foot", "z", np.zeros(3), plate, pulling_friction="signed")], real=True)
     run = b.simulate(b.state(vector(0.01, 0.0, 0.3), np.zeros(3)), np.array([0.0, 1.5]), method)
     ((time, _, kind), *_) = happened(run)
-    assert kind == ce.LANDING
+    assert kind == ke.LANDING
     assert time == pytest.approx(np.sqrt(0.6 / G), abs=1e-9)
     assert abs(run.states("q")[-1, 2]) <= 1e-9
 
@@ -188,7 +188,7 @@ def test_a_block_thrown_up_a_slope_stops_and_stays_or_comes_back():
         np.testing.assert_allclose(run.states("q"), along[:, None] * uphill, rtol=0, atol=1e-9)
         if mu > np.tan(alpha):
             ((when, _, kind),) = happened(run)
-            assert kind == ce.SLIP_STOP
+            assert kind == ke.SLIP_STOP
             assert when == pytest.approx(stop, abs=1e-10)
         assert residual(b, run) < 1e-9
 
@@ -221,12 +221,12 @@ def test_slip_starts_where_a_pull_reaches_static_friction():
         True,
     )
     contact = Contact("foot", "z", np.zeros(3), plane(normal), friction=mu, pulling_friction="signed")
-    b = bench(block(mass), [contact], loads=[pull], real=True)
+    b = assemble(block(mass), [contact], loads=[pull], real=True)
     run = b.simulate(b.state(np.zeros(3), np.zeros(3)), np.linspace(0.0, 5.0, 501), "dopri5")
     weight, friction_limit = mass * G * np.sin(alpha), mu * mass * G * np.cos(alpha)
     onset = np.sqrt(friction_limit**2 - weight**2) / rate
     (when, _, kind), *later = happened(run)
-    assert kind == ce.SLIP_START
+    assert kind == ke.SLIP_START
     assert not later
     assert when == pytest.approx(onset, abs=1e-10)
     downhill = np.array([np.cos(alpha), 0.0, -np.sin(alpha)])
@@ -238,7 +238,7 @@ def test_slip_starts_where_a_pull_reaches_static_friction():
     assert residual_with_load(b, run) < 1e-6
 
 
-def residual_with_load(b: Bench, run: ki.Run) -> float:
+def residual_with_load(b: CompiledSystem, run: ki.Run) -> float:
     stored = run.outputs("energy").sum(axis=1)
     taken = run.states("ledger")[:, FRICTION] + run.states("loss").sum(axis=1)
     return float(np.abs(stored - stored[0] + taken - run.states("load").sum(axis=1)).max())
@@ -248,11 +248,11 @@ def test_a_carriage_that_slides_askew_stops():
     """After v/(μ g), v²/(2 μ g) along its straight way."""
     mass, mu, speed = 2.0, 0.3, 1.0
     contact = Contact("foot", "z", np.zeros(3), plane(vector(0, 0, 1)), friction=mu, pulling_friction="signed")
-    b = bench(block(mass), [contact], real=True)
+    b = assemble(block(mass), [contact], real=True)
     v = speed * np.array([np.cos(0.3), np.sin(0.3), 0.0])
     run = b.simulate(b.state(np.zeros(3), v), np.linspace(0.0, 1.0, 11), "dopri5")
     ((when, _, kind),) = happened(run)
-    assert kind == ce.SLIP_STOP
+    assert kind == ke.SLIP_STOP
     assert when == pytest.approx(speed / (mu * G), abs=1e-10)
     np.testing.assert_allclose(run.states("q")[-1], v / speed * speed**2 / (2 * mu * G), rtol=0, atol=1e-9)
 
@@ -266,7 +266,7 @@ def pendulum(limit: float = np.inf, start: float = 1.0) -> Robot:
 
 def test_a_joint_stop_takes_the_momentum_of_a_falling_rod():
     """It falls onto its stop at 90°: the kinetic energy is lost, and the stop carries the moment of the weight."""
-    b = bench(pendulum(limit=0.5 * np.pi), [], real=True)
+    b = assemble(pendulum(limit=0.5 * np.pi), [], real=True)
     run = b.simulate(b.state(np.array([0.4]), np.zeros(1)), np.linspace(0.0, 2.0, 21), "dopri5", rtol=1e-10)
     fallen = 0.8 * G * 0.25 * np.cos(0.4)
     assert run.states("loss")[-1, 1] == pytest.approx(fallen, rel=1e-8)
@@ -274,14 +274,14 @@ def test_a_joint_stop_takes_the_momentum_of_a_falling_rod():
     np.testing.assert_allclose(run.states("q")[-1], 0.5 * np.pi, rtol=0, atol=1e-9)
     assert run.outputs("stop")[-1, 0] == pytest.approx(0.8 * G * 0.25, rel=1e-9)
     (code,) = run.log_event[: run.count[ki.LOGGED]]
-    assert code == ki.STOP_LOG + ce.STOP_HIT
+    assert code == ki.STOP_LOG + ke.STOP_HIT
     assert residual(b, run) < 1e-8
 
 
 def test_a_closed_stop_that_pulls_disagrees_with_its_mode():
     """Each of two stops alone, and none that is open."""
     link = replace(pendulum().links[0], lower=-1.0, upper=1.0)
-    b = bench(replace(pendulum(), links=(link,)), [], real=True)
+    b = assemble(replace(pendulum(), links=(link,)), [], real=True)
     table, stop = b.system.unilateral.stop_table, b.system.unilateral.stop
     assert len(table) == 2
     table[:, ku.STOP_CLOSED], stop[:, ku.STOP_FORCE] = 1, 2.0
@@ -294,7 +294,7 @@ def test_a_closed_stop_that_pulls_disagrees_with_its_mode():
         table[k, ku.STOP_CLOSED], stop[k, ku.STOP_FORCE] = 1, 2.0
 
 
-def rod(mu: float, phi: float, **law: float) -> tuple[Bench, float, float]:
+def rod(mu: float, phi: float, **law: float) -> tuple[CompiledSystem, float, float]:
     """A thin rod in the plane y = 0, on a point at its lower end; φ is the angle of the rod from the vertical."""
     mass, half = 1.0, 0.5
     links = (
@@ -313,7 +313,7 @@ def rod(mu: float, phi: float, **law: float) -> tuple[Bench, float, float]:
     contact = Contact(
         "foot", "rod", vector(0, 0, -half), plane(vector(0, 0, 1)), friction=mu, pulling_friction="signed", **law
     )
-    return bench(robot, [contact], real=True), mass, half
+    return assemble(robot, [contact], real=True), mass, half
 
 
 def test_a_leaning_rod_sticks_until_its_foot_slips():
@@ -336,7 +336,7 @@ def test_a_leaning_rod_sticks_until_its_foot_slips():
 
     onset = brentq(lambda phi: abs(forces(phi)[0]) - mu * forces(phi)[1], start, 1.2)
     (when, _, kind), *_ = happened(run)
-    assert kind == ce.SLIP_START
+    assert kind == ke.SLIP_START
     before = run.sample_time < when
     f_t, f_n = np.array([forces(phi) for phi in run.states("q")[before, 2]]).T
     touch = run.outputs("contact")[before, 0]

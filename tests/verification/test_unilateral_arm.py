@@ -1,17 +1,17 @@
-"""Real contact of an arm's elbow against equations made by hand, a rod that falls flat, rest, and paradoxes."""
+"""Real contact of an arm's elbow against hand-made equations, a rod that falls flat, rest, and paradoxes."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from support.random_robots import Bench, bench
+from support.random_robots import CompiledSystem, assemble
 from support.unilateral_checks import events, ledger_residual
 
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.state import OUT_FORCE, OUT_GAP, OUT_MODE, OUT_VECTOR
 from dynsim.integrators import run as ki
-from dynsim.integrators.contacts import events as ce
+from dynsim.integrators.contacts import events as ke
 from dynsim.integrators.project import GAP_TOLERANCE
 from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot, vector
 
@@ -35,7 +35,7 @@ MU, STATIC = 0.25, 0.3
 J1 = M1 * L**2 / 12.0
 
 
-def arm() -> Bench:
+def arm() -> CompiledSystem:
     links = (
         Link("cart", "rail", None, "prismatic", X, Inertia(M0)),
         Link("upper", "shoulder", "cart", "revolute", -Y, Inertia(M1, -0.5 * L * Z, np.diag([J1, J1, 0.0]))),
@@ -43,7 +43,7 @@ def arm() -> Bench:
     )
     links = (Link(**{**links[0].__dict__, "p_PJ": L * np.cos(A) * Z}), *links[1:])
     robot = Robot("arm", links, (), ("fore", -2.0 * C * Z))
-    return bench(robot, [touching("upper", -L * Z, friction=MU, static_friction=STATIC)], real=True)
+    return assemble(robot, [touching("upper", -L * Z, friction=MU, static_friction=STATIC)], real=True)
 
 
 def arm_equations(s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -114,14 +114,14 @@ def test_an_arm_with_one_elbow_on_the_floor_sticks_slips_and_lifts_off(swing):
         if piece.status == 0:
             break
         if piece.t_events[0].size:
-            expected.append((t, ce.LIFT_OFF))
+            expected.append((t, ke.LIFT_OFF))
             mode = "free"
         elif mode == "stick":
             direction = -np.sign(elbow(s, mode, direction)[2])
-            expected.append((t, ce.SLIP_START))
+            expected.append((t, ke.SLIP_START))
             mode = "slip"
         else:
-            expected.append((t, ce.SLIP_STOP))
+            expected.append((t, ke.SLIP_STOP))
             mode = "stick"
             _, f_n, f_t = elbow(s, mode, direction)
             if abs(f_t) > STATIC * f_n:
@@ -140,7 +140,7 @@ def test_an_arm_with_one_elbow_on_the_floor_sticks_slips_and_lifts_off(swing):
     assert np.abs(ledger_residual(run)).max() < 1e-9
 
 
-def rod(mu: float, phi: float, contacts: int = 1, **law: float) -> Bench:
+def rod(mu: float, phi: float, contacts: int = 1, **law: float) -> CompiledSystem:
     """A thin rod of 1 kg and 1 m in the plane y = 0, leaning by φ, its lower or both ends on the floor."""
     half = 0.5
     inertia = Inertia(1.0, np.zeros(3), np.diag([half**2 / 3, half**2 / 3, 0.0]))
@@ -151,7 +151,7 @@ def rod(mu: float, phi: float, contacts: int = 1, **law: float) -> Bench:
     )
     ends = [touching("rod", side * half * Z, friction=mu, **law) for side in (-1.0, 1.0)][:contacts]
     robot = Robot("rod", links, (), ("rod", -half * Z), q0=np.array([0.0, half * np.cos(phi), phi]))
-    return bench(robot, ends, real=True)
+    return assemble(robot, ends, real=True)
 
 
 @pytest.mark.parametrize("mu", [0.1, 0.3, 0.6])
@@ -161,8 +161,8 @@ def test_a_rod_falls_flat(mu):
     run = b.simulate(b.state(b.robot.initial, np.zeros(3)), np.linspace(0.0, 3.0, 301), "dopri5", rtol=1e-10)
     kinds = [kind for _, k, kind in events(run) if k == 0]
     # At the start it is held if μ is above what a rod at rest needs, 0.14.
-    assert (kinds[0] == ce.SLIP_START) == (mu > 0.2)
-    assert any(k == 1 and kind == ce.LANDING for _, k, kind in events(run))
+    assert (kinds[0] == ke.SLIP_START) == (mu > 0.2)
+    assert any(k == 1 and kind == ke.LANDING for _, k, kind in events(run))
     touch, q = run.outputs("contact"), run.states("q")
     assert touch[:, :, OUT_GAP].min() >= -1e-9
     assert touch[:, :, OUT_FORCE].min() >= -1e-9
@@ -205,7 +205,7 @@ def test_nothing_creeps_for_an_hour(scene):
             Link("fore", "elbow", "upper", "revolute", -Y, slim, p_PJ=-0.3 * Z),
         )
         q = np.array([2.2, 0.5 - 2.2])
-        b = bench(
+        b = assemble(
             Robot("arm", links, (), ("fore", -0.3 * Z), q0=q), [touching("fore", -0.3 * Z, friction=0.5)], real=True
         )
     else:
@@ -216,7 +216,7 @@ def test_nothing_creeps_for_an_hour(scene):
         )
         q, alpha = np.zeros(3), 0.46
         normal = vector(np.sin(alpha), 0.0, np.cos(alpha))
-        b = bench(
+        b = assemble(
             Robot("block", links, (), ("z", np.zeros(3))), [touching("z", np.zeros(3), normal, friction=0.5)], real=True
         )
     run = b.advance(b.new_run(b.state(q, 0.0 * q), np.linspace(0.0, 3600.0, 61), "dopri5"))

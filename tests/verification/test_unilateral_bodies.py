@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from support.random_robots import Bench, bench
+from support.random_robots import CompiledSystem, assemble
 from support.unilateral_checks import events, ledger_residual
 
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.state import OUT_MODE, OUT_VECTOR
-from dynsim.integrators.contacts import events as ce
+from dynsim.integrators.contacts import events as ke
 from dynsim.model.description import Contact, Inertia, Link, Load, Quadric, Robot, vector
 from dynsim.model.joints.ball import floating
 
@@ -24,12 +24,12 @@ def touching(body: str, point: np.ndarray, surface: Quadric = FLOOR, **law: floa
     return Contact(f"{body} {point}", body, point, surface, pulling_friction="signed", **law)
 
 
-def free_body(inertia: Inertia, contacts: list[Contact], loads: list[Load] | None = None) -> Bench:
+def free_body(inertia: Inertia, contacts: list[Contact], loads: list[Load] | None = None) -> CompiledSystem:
     links = floating(Link("body", "free", None, "floating", Z, inertia))
-    return bench(Robot("body", links, (), ("body", np.zeros(3))), contacts, loads=loads, real=True)
+    return assemble(Robot("body", links, (), ("body", np.zeros(3))), contacts, loads=loads, real=True)
 
 
-def placed(b: Bench, position: np.ndarray, velocity: np.ndarray, turning: np.ndarray) -> np.ndarray:
+def placed(b: CompiledSystem, position: np.ndarray, velocity: np.ndarray, turning: np.ndarray) -> np.ndarray:
     return b.state(np.concatenate([position, [1.0, 0.0, 0.0, 0.0]]), np.concatenate([velocity, turning]))
 
 
@@ -96,7 +96,7 @@ def test_a_disc_on_three_feet_slides_pivots_and_stops():
     np.testing.assert_allclose(q[early, :2], expected[:2].T, rtol=0, atol=1e-9)
     np.testing.assert_allclose(2.0 * np.arctan2(q[early, 6], q[early, 3]), expected[2], rtol=0, atol=1e-8)
     np.testing.assert_allclose(v[early][:, [0, 1, 5]], expected[3:].T, rtol=0, atol=1e-8)
-    times = [(t, k) for t, k, kind in events(run) if kind == ce.SLIP_STOP]
+    times = [(t, k) for t, k, kind in events(run) if kind == ke.SLIP_STOP]
     assert times[0][1] == 0
     # From 1e-5 m/s on, at some 0.5 m/s².
     assert times[0][0] == pytest.approx(last.t[-1], abs=1e-4)
@@ -118,7 +118,7 @@ def test_a_ball_slides_and_then_rolls(spin):
     slip = v0 + np.cross(spin, -radius * Z)
     stop = 2.0 * np.linalg.norm(slip) / (7.0 * mu * G)
     ((when, _, kind),) = events(run)
-    assert kind == ce.SLIP_STOP
+    assert kind == ke.SLIP_STOP
     assert when == pytest.approx(stop, abs=1e-10)
     t = np.minimum(run.sample_time, stop)[:, None]
     rolling_time = np.maximum(run.sample_time - stop, 0.0)[:, None]
@@ -161,7 +161,7 @@ def test_a_point_that_only_just_reaches_its_surface_is_seen():
     """Gravity upwards: the gap is a parabola with its least value in the middle of a long step."""
     robot = Robot("bead", (Link("z", "lift", None, "prismatic", Z, Inertia(1.0)),), (), ("z", np.zeros(3)), G * Z)
     for depth in (1e-7, -1e-7):
-        b = bench(robot, [touching("z", np.zeros(3))], real=True)
+        b = assemble(robot, [touching("z", np.zeros(3))], real=True)
         speed = np.sqrt(2.0 * G * (1.0 + depth))
         run = b.simulate(b.state(np.ones(1), np.array([-speed])), np.array([0.0, 2.0]), "dopri5", rtol=1e-10)
         happened = events(run)
@@ -201,7 +201,7 @@ def test_a_bead_in_a_bowl_reverses_or_sticks(law):
         Link("x", "jx", None, "prismatic", X, Inertia(0.0)),
         Link("z", "jz", "x", "prismatic", Z, Inertia(mass)),
     )
-    b = bench(
+    b = assemble(
         Robot("bead", links, (), ("z", np.zeros(3))), [touching("z", np.zeros(3), bowl(radius), **law)], real=True
     )
 
@@ -231,7 +231,7 @@ def test_a_bead_in_a_bowl_reverses_or_sticks(law):
     y = b.state(radius * vector(np.sin(start), 1.0 - np.cos(start), 0.0)[:2], np.zeros(2))
     run = b.simulate(y, np.linspace(0.0, t + 0.5, 201), "dopri5", **TIGHT)
     *_, (when, _, kind) = events(run)
-    assert kind == ce.SLIP_STOP
+    assert kind == ke.SLIP_STOP
     assert when == pytest.approx(t, abs=2e-9)
     angle = np.arctan2(run.states("q")[:, 0], radius - run.states("q")[:, 1])
     index = np.minimum(np.searchsorted(reversals, run.sample_time), len(path) - 1)
@@ -265,7 +265,7 @@ def test_four_feet_hold_as_long_as_any_split_of_their_forces_does(direction):
     happened = events(run)
     # Rounding may let one foot go, and be caught by the others, before all do at that instant.
     np.testing.assert_allclose([t for t, _, _ in happened], onset, rtol=0, atol=1e-10)
-    assert {k: kind for _, k, kind in happened} == dict.fromkeys(range(4), ce.SLIP_START)
+    assert {k: kind for _, k, kind in happened} == dict.fromkeys(range(4), ke.SLIP_START)
     touch = run.outputs("contact")
     before = run.sample_time < onset
     force = touch[before][:, :, OUT_VECTOR : OUT_VECTOR + 3]

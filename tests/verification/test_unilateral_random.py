@@ -1,4 +1,4 @@
-"""Random robots that land, slide, stick, rock and bounce on planes, spheres and cylinders keep to the law."""
+"""Random robots that land, slide, stick, rock and bounce fulfil the contact law."""
 
 from __future__ import annotations
 

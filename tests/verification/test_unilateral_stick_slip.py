@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.optimize import brentq
-from support.random_robots import Bench, bench
+from support.random_robots import CompiledSystem, assemble
 from support.unilateral_checks import events, random_touch, violations
 
 import dynsim
@@ -15,7 +15,7 @@ from dynsim.dynamics.state import OUT_VECTOR
 from dynsim.engine.force_indeterminacy import paradox
 from dynsim.errors import SimulationStopped
 from dynsim.integrators import run as ki
-from dynsim.integrators.contacts import events as ce
+from dynsim.integrators.contacts import events as ke
 from dynsim.model.description import Contact, Inertia, Link, Load, Quadric, Robot
 from dynsim.model.drives import Servo
 
@@ -35,7 +35,7 @@ def foot(body: str, point: np.ndarray) -> Contact:
     return Contact("foot", body, point, FLOOR, friction=KINETIC, static_friction=STATIC, pulling_friction="signed")
 
 
-def sledge(force: np.ndarray, rate: np.ndarray) -> Bench:
+def sledge(force: np.ndarray, rate: np.ndarray) -> CompiledSystem:
     """A block on the floor under a pull F + F' t; along x it takes a cart with it that runs on rails."""
     links = tuple(
         Link(name, f"joint_{name}", "wxyz"[k] if k else None, "prismatic", np.eye(3)[k], Inertia(mass))
@@ -43,10 +43,10 @@ def sledge(force: np.ndarray, rate: np.ndarray) -> Bench:
     )
     none = np.zeros(3)
     load = pull("z", np.append(force, none), np.append(rate, none))
-    return bench(Robot("sledge", links, (), ("z", none)), [foot("z", none)], loads=[load], real=True)
+    return assemble(Robot("sledge", links, (), ("z", none)), [foot("z", none)], loads=[load], real=True)
 
 
-def whisk(stiffness: float, speed: float) -> Bench:
+def whisk(stiffness: float, speed: float) -> CompiledSystem:
     """A block on the floor at the end of a bar of 1 m, turned about the vertical through a spring whose end moves."""
     end = np.array([1.0, 0.0, 0.0])
     links = (
@@ -56,7 +56,7 @@ def whisk(stiffness: float, speed: float) -> Bench:
     # A servo with next to no back-EMF is a spring to where it starts; the moment is what moving its end does.
     spring = Servo("hinge", torque_constant=1e-6, resistance=1.0, k_p=1e6 * stiffness)
     moment = pull("bar", np.zeros(6), np.append(np.zeros(5), stiffness * speed))
-    return bench(Robot("whisk", links, (spring,), ("bar", end)), [foot("bar", end)], loads=[moment], real=True)
+    return assemble(Robot("whisk", links, (spring,), ("bar", end)), [foot("bar", end)], loads=[moment], real=True)
 
 
 def test_a_block_dragged_through_a_spring_sticks_and_slips():
@@ -69,7 +69,7 @@ def test_a_block_dragged_through_a_spring_sticks_and_slips():
     first = STATIC * MASS * G / (stiffness * speed)
     run = b.simulate(b.state(np.zeros(2), np.zeros(2)), np.linspace(0.0, 3.6, 3601), rtol=1e-10)
     happened = events(run)
-    assert [kind for _, _, kind in happened] == [ce.SLIP_START, ce.SLIP_STOP] * (len(happened) // 2)
+    assert [kind for _, _, kind in happened] == [ke.SLIP_START, ke.SLIP_STOP] * (len(happened) // 2)
     assert len(happened) >= 8
     cycle = np.arange(len(happened) // 2)
     times = np.array([t for t, _, _ in happened]).reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""Wheels and what gives way, as scenarios say it: closed forms of rolling, bearings, soft ground and springs."""
+"""Wheels and compliant ground in scenarios: closed forms of rolling, bearings, soft ground and springs."""
 
 from __future__ import annotations
 

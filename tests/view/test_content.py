@@ -1,4 +1,4 @@
-"""What pages hold, without a browser: blocks of numbers, frames, meshes, the text of the page, the commands."""
+"""Data of viewer pages, without a browser: blocks of numbers, frames, meshes, HTML text, commands."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pages in a real browser: poses, forces, wheels and plots are the record's, and controls do what they say."""
+"""Viewer pages in a real browser: poses, forces, wheels and plots equal the record; controls work."""
 
 from __future__ import annotations
 

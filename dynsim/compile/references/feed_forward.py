@@ -1,4 +1,4 @@
-"""Planned voltages along joint references: gravity, the whole dynamics, and braces that press with given forces.
+"""Feed-forward voltages along joint references: gravity, full dynamics, and prescribed brace forces.
 
     K_m i = M v̇ + h + g + J_m v̇ + (D + D_m) v − J_cᵀ f_d,    u = R i + L di/dt + K_m v
 

@@ -12,7 +12,7 @@ from dynsim.compile.contact_law import format_quantity
 from dynsim.compile.hand_posture import hand_posture
 from dynsim.compile.model import Model
 from dynsim.compile.reaching import path_arrays
-from dynsim.dynamics import inverse_kinematics as ki
+from dynsim.dynamics import inverse_kinematics as kik
 from dynsim.dynamics.tables import workspace
 from dynsim.errors import UnreachableReference
 from dynsim.jit.kernel import reals
@@ -90,11 +90,11 @@ def follow(
                 progress(float(times[k]))
                 due = clock.perf_counter() + REPORT_S
             end = min(k + PIECE, len(times))
-            k, left = ki.follow_path(geometry, ws, path, wanted, carried, first, k, end, tolerance, there, result)
+            k, left = kik.follow_path(geometry, ws, path, wanted, carried, first, k, end, tolerance, there, result)
             if k < end:
                 free = path_arrays(model, joints, braces)
                 result[:] = 0.0
-                reached, _ = ki.follow_path(
+                reached, _ = kik.follow_path(
                     geometry, ws, free, wanted, carried, first, 0, len(times), tolerance, reals(q), result
                 )
                 if reached > k and (passed := _passed_limits(model, joints, times, result[:reached])):

@@ -1,4 +1,4 @@
-"""A smooth curve through points of the plane that a base with two driven wheels can follow, its heading the tangent."""
+"""A smooth plane curve through points, heading along its tangent, for a base with two driven wheels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""References that an operator rewrites at every tick: velocities of a hand and of a mobile base."""
+"""References rewritten at every tick from an operator's velocities of hand and mobile base."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Figures of a record, or of several side by side: files in a folder, drawn from the records and nothing else.
+"""Figures of one record or of several side by side, written to a folder.
 
 Matplotlib is loaded on the first drawing.
 """

@@ -1,4 +1,4 @@
-"""All figures of an arm: one run, or variants over each other."""
+"""The set of figures of an arm: one run, or variants over each other."""
 
 from __future__ import annotations
 

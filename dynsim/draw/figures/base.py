@@ -1,4 +1,4 @@
-"""A mobile base over time: loads of wheels and caster, tip margin, traction demand, reference against actual."""
+"""Figures of a mobile base over time: wheel and caster loads, tip margin, traction, reference and motion."""
 
 from __future__ import annotations
 

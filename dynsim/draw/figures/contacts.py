@@ -1,4 +1,4 @@
-"""Normal forces of the contacts, with the region in which the surface would have to pull, or with what they do.
+"""Figure of the normal forces of the contacts over time, with the region of pulling forces shaded.
 
 Under the bilateral law a force may have either sign, and what lies below zero is shaded. Under the unilateral one
 there is a mode at each instant instead: bands show when a contact is open, slides and sticks.

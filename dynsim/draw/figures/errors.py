@@ -1,4 +1,4 @@
-"""How far measured runs are from the simulated ones that they followed: the figure of `dynsim hw compare`."""
+"""Figure of the errors between measured and simulated runs, for `dynsim hw compare`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What happened at an instant, as marks over time axes: landings, lift-offs, begins and ends of slip, joint stops."""
+"""Marks of events over time axes: landings, lift-offs, begin and end of slip, joint stops."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Currents and voltages of the motors."""
+"""Figures of motor currents and voltages over time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The arm as a picture: 3D view and side view with elbows, surfaces, target and hand path."""
+"""Figure of the arm's posture: 3D view and side view with elbows, surfaces, target and hand path."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The arm as lines and points, from scene and body poses of its record: what a posture is drawn from, and how large."""
+"""Lines and points of an arm from the scene and body poses of its record, and their extent."""
 
 from __future__ import annotations
 

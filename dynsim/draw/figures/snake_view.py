@@ -1,4 +1,4 @@
-"""What all snake figures share: colours, one posture in top and side view, the chart of modes."""
+"""Shared parts of all snake figures: colours, top and side view of one posture, chart of modes."""
 
 from __future__ import annotations
 

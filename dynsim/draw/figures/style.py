@@ -1,4 +1,4 @@
-"""The look that all figures share: sizes, colours, time axes, saving."""
+"""Shared style of all figures: sizes, colours, time axes, saving."""
 
 from __future__ import annotations
 

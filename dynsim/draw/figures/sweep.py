@@ -1,4 +1,4 @@
-"""Many runs of one scenario: numbers over the grid, energy against error, distributions and sensitivities of samples.
+"""Figures of a sweep: values over the grid, energy against error, distributions and sensitivities.
 
 Drawn from the table alone.
 """

@@ -1,4 +1,4 @@
-"""Figures and tables laid out like those of [T], to be held beside the paper.
+"""Figures and tables in the layout of [T], for comparison with the paper.
 
 [T]: M. Tanaka et al., "Task-Space Control of Articulated Mobile Robots With a Soft Gripper for Operations", IEEE
 Transactions on Robotics 35(1), 2019. Its curves are not copied; numbers that its text states are drawn in.

@@ -1,4 +1,4 @@
-"""A mobile base from above: where it drove and stood, elbows and hand of its arm, where it presses on the ground."""
+"""Figure of a mobile base from above: path, elbows and hand of its arm, ground contacts."""
 
 from __future__ import annotations
 

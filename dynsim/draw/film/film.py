@@ -1,4 +1,4 @@
-"""A film: robots beside each other, the time, and a plot with a cursor."""
+"""A film of one or several robots side by side, with a clock and a plot with a cursor."""
 
 from __future__ import annotations
 

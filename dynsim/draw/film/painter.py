@@ -1,4 +1,4 @@
-"""Frames of one robot: what stands still is painted once, what moves from the farthest face to the nearest.
+"""Frames of one robot: static background drawn once, moving faces drawn from far to near.
 
 Painted with Pillow at ``FINER`` times the size and then reduced, which smooths all edges. Depth is that of a face's
 middle: bodies that are small beside their distances need no more, and no graphics card is asked for.

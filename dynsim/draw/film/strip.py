@@ -1,4 +1,4 @@
-"""The plot below the robots: drawn once, with a cursor that moves over it."""
+"""The plot below the robots: drawn once, with a moving cursor."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lines, arrows, rings and labels on a picture, in pixels."""
+"""Lines, arrows, rings and labels drawn on an image, in pixels."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Where robots and surfaces of a record are, and what they look like: for figures, films and pages alike."""
+"""Geometry of robots and surfaces of a record, for figures, films and pages."""

@@ -1,4 +1,4 @@
-"""From where a film looks: parallel projection, so that lengths are the same everywhere in the picture."""
+"""The camera of a film: a parallel projection, so that lengths are the same everywhere in the picture."""
 
 from __future__ import annotations
 

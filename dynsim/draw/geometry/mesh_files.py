@@ -1,4 +1,4 @@
-"""Triangles from mesh files: STL (both forms), OBJ and COLLADA, as far as robots of URDF files use them."""
+"""Triangles from mesh files: STL (text and binary), OBJ and COLLADA, the subset that URDF robots use."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Mesh(NamedTuple):
 def read_mesh(path: Path) -> Mesh:
     """The mesh of a file, in the frame and unit that a URDF file takes it in, a COLLADA file's with its colours.
 
-    The unit of a COLLADA file is heeded, its upward axis is not: so do the viewers that robots are made with.
+    The unit of a COLLADA file is handled, its upward axis is not: so do the viewers that robots are made with.
 
     Raises
     ------

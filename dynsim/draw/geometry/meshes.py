@@ -1,4 +1,4 @@
-"""Meshes of robots from URDF files: found, read once each, simplified together to what a page can carry."""
+"""Meshes of URDF robots: located, read once each, and simplified to a size that a page can carry."""
 
 from __future__ import annotations
 

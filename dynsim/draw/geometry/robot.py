@@ -1,4 +1,4 @@
-"""A record as something that moves in space: what pages and films of it share."""
+"""The moving robot of a record for pages and films: bodies, wheels, surfaces and their poses over time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What stands still or moves with a body, as the page draws it: shapes, rods where a body has none, surfaces."""
+"""Shapes of bodies and surfaces for pages and films; a rod stands for a body without a shape."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Points on the surfaces of a scene, next to what moves: what pictures and pages draw of them, and their normals."""
+"""Points and normals on the surfaces of a scene, for the part of a surface near the robot."""
 
 from __future__ import annotations
 

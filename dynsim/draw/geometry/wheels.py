@@ -1,4 +1,4 @@
-"""Wheels of a record, when each pair of them is on the ground, and what the robot stands on."""
+"""Wheels of a record, intervals in which each pair is on the ground, and support polygon."""
 
 from __future__ import annotations
 

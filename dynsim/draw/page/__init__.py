@@ -1,4 +1,4 @@
-"""Records to look at: one page of HTML that holds scene, data and program, for any browser, without a network.
+"""Viewer pages: one HTML file with scene, data and program, for any browser, without a network.
 
     Record(s) → head and blocks (:mod:`dynsim.draw.page.content`) → text (:mod:`dynsim.draw.page.html`)
 

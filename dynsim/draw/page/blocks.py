@@ -1,4 +1,4 @@
-"""Numbers over time as small blocks of bytes: quantised, differenced and split by bytes, so that they compress well.
+"""Compression of time series for pages: quantised, differenced, and split into byte planes.
 
 A column x becomes k = round((x − offset)/scale), 0 ≤ k < 2^b − 1 with b = 16 or 32; the last code stands for what is
 not finite. Differences of k modulo 2^b are stored, the lowest byte of all of them first. ``decode.js`` of the page has

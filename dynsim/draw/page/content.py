@@ -1,4 +1,4 @@
-"""What a page shows of records: bodies and where they were, paths, contacts, supports, motors, signals, events."""
+"""Data of a viewer page: body poses, paths, contacts, supports, motors, signals, events."""
 
 from __future__ import annotations
 

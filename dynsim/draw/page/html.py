@@ -1,4 +1,4 @@
-"""The page: its own files, three.js from its package, and the data, all in one text."""
+"""The HTML text of a page: its own scripts and styles, three.js from its package, and the data."""
 
 from __future__ import annotations
 

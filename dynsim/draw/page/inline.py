@@ -1,4 +1,4 @@
-"""A page inside a notebook."""
+"""A viewer page shown inside a notebook."""
 
 from __future__ import annotations
 

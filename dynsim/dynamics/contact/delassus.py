@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 
 from dynsim.dynamics import tables as ka
-from dynsim.jit.kernel import apart_kernel, internal_kernel
+from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
 # A pivot below this fraction of the largest entry counts as a dependent row: far above rounding (1e-16 times a few
 # dozen operations), far below what independent elbows give (> 1e-6).
@@ -44,7 +44,7 @@ def solve_small(small, state, active, p):
     return eliminate(small, state, active, p)
 
 
-@apart_kernel
+@noinline_kernel
 def eliminate(small, state, active, p):
     """:func:`solve_small` for any number of rows, without the closed forms."""
     largest = 0.0

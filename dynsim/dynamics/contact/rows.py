@@ -26,7 +26,7 @@ from dynsim.dynamics.tree.spatial import (
     vector,
     wrench_at,
 )
-from dynsim.jit.kernel import apart_kernel, internal_kernel
+from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
 
 @internal_kernel
@@ -175,7 +175,7 @@ def point_row(rows, r, at, d):
     put_six(rows, r, ka.ROW, wrench_at(at, d, ZERO_VECTOR))
 
 
-@apart_kernel
+@noinline_kernel
 def sticking_rows(model: ModelArrays, ws: Workspace, k, i):
     """Rows of candidate k, on link i, that sticks; the first one is there already.
 

@@ -1,4 +1,4 @@
-"""Candidates that are more than a point on a quadric: spheres and capsules, and surfaces with a distance of their own.
+"""Contact geometry of spheres and capsules, and of surfaces given by a signed distance.
 
 A candidate is a sphere of radius ρ about a point s of its body, or about the point of a straight axis s = a + u d,
 0 ≤ u ≤ 1, that is nearest to the surface. A surface is its signed distance φ with n = ∇φ, |n| = 1, and H = ∂²φ:

@@ -1,4 +1,4 @@
-"""Forces of points and joints that stick where their rows depend on each other: the split that real friction can carry.
+"""Split of forces among sticking points and joints with dependent rows, such that friction can carry it.
 
 Two braces that stick on a planar arm share their lateral row, points along one body their radial one: M v̇ knows the sum
 of their forces only. Such a set holds while any split lies in all cones |f_t| ≤ μ_s f_n. Where that of least norm does
@@ -14,7 +14,7 @@ from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.cone.socp import best_split, split_room_in
 from dynsim.dynamics.contact.unilateral import UnilateralArrays, dry_bound, note_dry_forces, note_stop_forces
 from dynsim.dynamics.tables import ContactArrays, Workspace
-from dynsim.jit.kernel import apart_kernel, internal_kernel
+from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
 # A pivot below this fraction of the largest is a row that depends on the others.
 NULL_TOLERANCE = 1e-10
@@ -47,7 +47,7 @@ def admissible_forces(contacts: ContactArrays, unilateral: UnilateralArrays | No
         look_at_forces(contacts, unilateral, ws)
 
 
-@apart_kernel
+@noinline_kernel
 def look_at_forces(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace):
     """:func:`admissible_forces` where there are dependent rows, stops or dry friction."""
     note_stop_forces(unilateral, ws)
@@ -69,7 +69,7 @@ def beyond_bounds(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Wor
     return False
 
 
-@apart_kernel
+@noinline_kernel
 def split_forces(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace):
     """The best split of the forces of all that sticks, into FORCE of its rows; its worst margin into BEST_MARGIN."""
     room, index, mu, rows = unilateral.room, unilateral.index, unilateral.vector[0], ws.rows

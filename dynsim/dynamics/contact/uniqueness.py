@@ -1,4 +1,4 @@
-"""Do the contacts determine their forces? Determinant and diagonal of J M⁻¹ F, watched at accepted steps.
+"""Test whether the contacts determine their forces: determinant and diagonal of J M⁻¹ F.
 
 With friction the matrix is A(σ) = A0 − B diag(σ): A0 = J M⁻¹ Jᵀ is what it is without friction, positive semidefinite,
 column m of B what the friction of contact m adds, σ_m = 1 for the signed law and the sign of f_m for the dissipative

@@ -1,4 +1,4 @@
-"""All drives of a system, told apart by kind: references, commands, torques, and the linear blocks of implicit methods.
+"""Drive laws of all motors by kind: references, commands, torques, and linear blocks of implicit methods.
 
 A drive kind is a constant in ``kernels.arrays``, a file of plain functions, a branch in each function below, and a
 line of ``model.arrays.compile_drives``.
@@ -22,7 +22,7 @@ from dynsim.dynamics.drive.servo import (
 from dynsim.dynamics.drive.torque import open_torque
 from dynsim.dynamics.state import StateLayout
 from dynsim.dynamics.tables import DriveArrays, ReferenceArrays, Workspace
-from dynsim.jit.kernel import apart_kernel, internal_kernel, kernel, merged_kernel
+from dynsim.jit.kernel import inline_kernel, internal_kernel, kernel, noinline_kernel
 
 for _law in (at_current_limit, clipped, dc_balance, dc_block, dc_command, dc_torque, open_torque):
     internal_kernel(_law)
@@ -31,7 +31,7 @@ for _law in (servo_segment, servo_circuit_on, servo_circuit, servo_block_on, ser
 for _law in (servo_command, servo_drag, servo_torque):
     internal_kernel(_law)
 # Few motors have it: merged, its product K_m v would be that of the balance too, whose last bits depend on that.
-apart_kernel(within_current)
+noinline_kernel(within_current)
 
 
 @internal_kernel
@@ -86,7 +86,7 @@ def fed_forward(voltage, grid, t, a, asked):
 
 
 # A call for each motor would take a fourteenth of an explicit step.
-@merged_kernel
+@inline_kernel
 def drive_dc(drives: DriveArrays, asked, i, ws: Workspace, a):
     """The DC motor a at a command [V] and a current [A]."""
     motors, motor, j = ws.motors, drives.motor, drives.table[a, ka.DRIVEN]

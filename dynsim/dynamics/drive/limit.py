@@ -1,4 +1,4 @@
-"""A bound on both sides, for every kind of drive."""
+"""Clamping of a value to ±limit, for every kind of drive."""
 
 from __future__ import annotations
 

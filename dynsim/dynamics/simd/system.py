@@ -10,7 +10,7 @@ from dynsim.dynamics.derivative import System, derivative
 from dynsim.dynamics.simd import forms  # noqa: F401
 from dynsim.dynamics.simd.tables import aligned, as_lanes, lane_workspace, tables_as_lanes
 from dynsim.dynamics.tables import Workspace
-from dynsim.jit.kernel import apart_kernel, internal_kernel
+from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
 # Parts of a system whose kernels have no forms for lanes.
 _WITHOUT_FORMS = ("dense", "shapes")
@@ -37,7 +37,7 @@ def stage_lanes(ws: Workspace, m: int, columns: int) -> StageLanes:
     return StageLanes(lane_workspace(ws), aligned(4), aligned(m, 4), aligned(m, 4), aligned(4), aligned(columns, 4))
 
 
-@apart_kernel
+@noinline_kernel
 def evaluate_four(lanes: StageLanes, system: System):
     """``derivative`` of all lanes, one program for all of its callers."""
     derivative(system, as_lanes(lanes.t)[()], as_lanes(lanes.y), tables_as_lanes(lanes.ws), as_lanes(lanes.f))

@@ -1,4 +1,4 @@
-"""Tables of lanes: float tables whose last axis is the lanes, seen by the compiler as tables of Lanes, and back."""
+"""Tables for SIMD: float tables whose last axis holds the lanes, converted to tables of Lanes and back."""
 
 from __future__ import annotations
 

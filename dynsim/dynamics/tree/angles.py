@@ -1,4 +1,4 @@
-"""Sines and cosines of joint angles."""
+"""Sines and cosines of joint angles, with the reduction of the angle."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ from dynsim.dynamics.tree.spatial import (
     times,
 )
 from dynsim.dynamics.tree.sweep import body_inertia, forward_sweep, inertial_wrench
-from dynsim.jit.kernel import apart_kernel, internal_kernel, kernel
+from dynsim.jit.kernel import internal_kernel, kernel, noinline_kernel
 
 
 @internal_kernel
@@ -127,7 +127,7 @@ def enter_column(ws: Workspace, i, k, r, w, own, total):
     return own + x * w, total - x * column[i, 0]
 
 
-@apart_kernel
+@noinline_kernel
 def sticking_columns(model: ModelArrays, ws: Workspace, k):
     """:func:`row_system` for the three rows of a point that sticks, k and the next two: their own directions.
 
@@ -177,7 +177,7 @@ def sticking_columns(model: ModelArrays, ws: Workspace, k):
     state[k, ka.RHS], state[b, ka.RHS], state[c, ka.RHS] = ta, tb, tc
 
 
-@apart_kernel
+@noinline_kernel
 def two_ended_row(model: ModelArrays, ws: Workspace, k):
     """Column, own entry and right-hand side of a row with two ends, as :func:`row_system` does them for one end.
 

@@ -1,4 +1,4 @@
-"""Joints beyond one angle or one sliding distance: what their coordinates mean, row by row.
+"""Joints with several rates (ball, rolling base, wheeled base): coordinates and transforms, row by row.
 
 Every joint is a sequence of one-velocity rows. A row is a link of the tree with a motion axis S and one velocity; all
 rows of a joint but the last are massless. The axes of a joint with several rows are fixed in the body that it carries,
@@ -48,7 +48,7 @@ from dynsim.dynamics.tree.spatial import (
     turn_z,
     vector,
 )
-from dynsim.jit.kernel import apart_kernel, internal_kernel, kernel
+from dynsim.jit.kernel import internal_kernel, kernel, noinline_kernel
 
 
 @internal_kernel
@@ -130,7 +130,7 @@ def row_rates(model: ModelArrays, ws: Workspace, i, v, vdot, gx, gy, gz):
         links[i, ka.A + s] = links[i, ka.S + s] * vdot + bias[s] * v + (links[j, ka.A + s] if j >= 0 else root[s])
 
 
-@apart_kernel
+@noinline_kernel
 def sweep_row(model: ModelArrays, ws: Workspace, i, v, vdot, gx, gy, gz):
     """R, p, S, V and A of row i into ``ws.links``: what ``forward_sweep`` does for a link (dynsim.dynamics.tree.sweep).
 
@@ -174,7 +174,7 @@ def quaternion_turn(w, x, y, z, dw, dx, dy, dz):
     return w * dx - x * dw - y * dz + z * dy, w * dy - y * dw - z * dx + x * dz, w * dz - z * dw - x * dy + y * dx
 
 
-@apart_kernel
+@noinline_kernel
 def position_rates(model: ModelArrays, ws: Workspace, dy, start):
     """q̇ = N(q) v into dy[start:]. Ball: ½ q ∘ (0, ω) with ω in the body; rolling: V (cos ψ, sin ψ), ω.
 

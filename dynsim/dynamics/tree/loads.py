@@ -9,7 +9,7 @@ import numpy as np
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.tables import ModelArrays, Workspace
 from dynsim.dynamics.tree.spatial import dot, rotate, rotation, six, transform, vector, wrench_at
-from dynsim.jit.kernel import apart_kernel, internal_kernel
+from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
 # LoadArrays.table, int
 LINK, IN_BODY, HOLDS, DATA, SEGMENTS = 0, 1, 2, 3, 4
@@ -91,7 +91,7 @@ def cubic(data, c, x):
     return data[c] + x * (data[c + 1] + x * (data[c + 2] + x * data[c + 3]))
 
 
-@apart_kernel
+@noinline_kernel
 def add_loads(model: ModelArrays, loads: LoadArrays, t, ws: Workspace, power, start):
     """Add S·W of every external wrench W to the applied forces of the joints that carry it, after ``forward_sweep``.
 

@@ -1,7 +1,7 @@
-"""What the ground carries of a mobile base: loads of wheels and caster, centre of pressure, how far it is from tipping.
+"""Ground reactions of a mobile base: wheel and caster loads, centre of pressure, distance from tipping.
 
-The base stands on the contact points of its left wheel L = (0, T/2), its right wheel R = (0, −T/2) and its caster
-C = (c_x, c_y), in the plane z = 0 of its frame, whose z is the normal of the ground. Three normal forces N balance the
+The base stands on the contact points of its left wheel l = (0, T/2), its right wheel r = (0, −T/2) and its caster
+c = (c_x, c_y), in the plane z = 0 of its frame, whose z is the normal of the ground. Three normal forces N balance the
 force along z and the moments about x and y, so they are determined; side slip and rolling take their forces along y and
 x there. The loads are those of a base that is held down: N < 0 pulls.
 """
@@ -30,14 +30,14 @@ from dynsim.dynamics.tree.spatial import (
     vector,
 )
 from dynsim.dynamics.tree.sweep import body_inertia, inertial_wrench
-from dynsim.jit.kernel import apart_kernel, integers, internal_kernel, reals
+from dynsim.jit.kernel import integers, internal_kernel, noinline_kernel, reals
 
 # SupportArrays.index, int: the body, and the rows of the wheels' rates
 BODY, LEFT, RIGHT = 0, 1, 2
 INDEX_SIZE = 3
 # SupportArrays.base
 TRACK, CASTER_X, CASTER_Y, SPIN_INERTIA, FRICTION = 0, 1, 2, 3, 4
-# Perimeter of the support triangle by the length of the side opposite to L, R and C: the largest margins there.
+# Perimeter of the support triangle by the length of the side opposite to l, r and c: the largest margins there.
 SHARE = 5
 BASE_SIZE = 8
 # SupportArrays.state: what is recorded of it
@@ -68,7 +68,7 @@ def no_support() -> SupportArrays:
     return SupportArrays(integers(np.zeros(0)), *(reals(np.zeros(0)) for _ in range(3)))
 
 
-@apart_kernel
+@noinline_kernel
 def ground_reaction(model: ModelArrays, loads: LoadArrays, t, ws: Workspace, support: SupportArrays):
     """Loads, centre of pressure, tip margin and traction demand at time t into ``support.state``.
 

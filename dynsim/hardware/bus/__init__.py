@@ -1,1 +1,1 @@
-"""The line to the servos: packets, control tables, what a bus can do, and the one behind a serial port."""
+"""The servo bus: packets, control tables, and the bus behind a serial port."""

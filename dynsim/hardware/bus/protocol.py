@@ -1,4 +1,4 @@
-"""What the replay needs of a bus, and what a servo answers."""
+"""Interface of a servo bus: the calls that the replay makes, and the answers of a servo."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""All servos on a port, whatever their bit rate: who answers, and torque off for everybody."""
+"""Scan of a port for servos at all bit rates, and torque off for all of them."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""A record becomes the motion of servos, and their measured motion a record: check, verify, replay, compare."""
+"""Replay of a record on servos: check, verification, motion, measured record, comparison."""

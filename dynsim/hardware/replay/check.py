@@ -1,4 +1,4 @@
-"""The offline check: would this record, at this speed and rate, ask anything of a servo that it must not do?
+"""The offline check of a motion before it is sent: limits of joints and servos at the given speed and rate.
 
 Every interval between samples is examined for the extremes of its interpolant. Nothing is ever clamped: a motion
 outside of the limits is refused as a whole, before a port is opened.

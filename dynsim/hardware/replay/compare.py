@@ -1,4 +1,4 @@
-"""How far a measured run is from the simulated one: delay, error with and without it, joint by joint."""
+"""Comparison of a measured run with the simulated one: delay, and error with and without it, per joint."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The progress bar of a replay, drawn by a thread of its own: a terminal that is held cannot touch the motion."""
+"""The progress bar of a replay, drawn in its own thread so that a blocked terminal cannot delay the motion."""
 
 from __future__ import annotations
 

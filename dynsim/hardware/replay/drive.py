@@ -1,4 +1,4 @@
-"""A pilot's drive on servos: postures of a simulation that go on coming while they are followed.
+"""Live drive of servos: postures of a running simulation are checked and followed as they arrive.
 
 The servos stay behind the simulation by at least half of ``safety.stop_time``: so much of the path ahead of the last
 goal is known and checked at every moment that a stop along it, in that time, ends before the path does. With b the path

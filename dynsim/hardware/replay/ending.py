@@ -1,4 +1,4 @@
-"""How a replay leaves the robot: at rest and holding, or without torque; after a fault nothing else is sent.
+"""End of a replay: the robot at rest with torque on, or torque off; after a fault nothing else is sent.
 
 Nothing here writes to a log, a terminal or a file; nothing that goes wrong on the way keeps the rest from being done,
 and what the servos do in the end is read from them.

@@ -1,4 +1,4 @@
-"""A path that comes knot by knot, each held against the limits of its joints before anything goes there.
+"""A path that grows knot by knot, each checked against joint limits before it is followed.
 
 The limits are those of the offline check, and so is the function,
 :meth:`~dynsim.hardware.replay.check.MotionLimits.margins`: of a whole record it looks at every interval, here at the

@@ -1,4 +1,4 @@
-"""Wheel pairs that are lifted while a pilot drives: postures are held back until it is known what lifting adds.
+"""Lifted wheel pairs in a live drive: postures wait until the extra joint angles of a lift are known.
 
 The height of a pair at a time t depends on when it is put down only where that is within ``lifts.blend_s``
 (:mod:`dynsim.snake.lifting`). So the posture of t is whole as soon as it is known which pairs are on the

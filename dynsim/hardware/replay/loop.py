@@ -1,4 +1,4 @@
-"""The cycle of a replay: at every deadline all goals are written and all states read, recorded and examined.
+"""The control loop of a replay: at each deadline it writes goals, reads states, records and checks them.
 
 Cycles start at absolute deadlines; one that is more than a period late is skipped, never made up for: the path waits.
 """

@@ -1,4 +1,4 @@
-"""The measured run: a record that describes itself, of the cycles of a replay, also of one that has died.
+"""The measured record of a replay, also of one that died before its end.
 
 Its scene, poses and events are those of the record that was followed, with joints where the servos were measured.
 """

@@ -1,4 +1,4 @@
-"""What a robot can be led along, a posture at every time, and how the loop goes along it, goal by goal."""
+"""Motions for servos: a posture for every time, and the progress of the loop along it."""
 
 from __future__ import annotations
 

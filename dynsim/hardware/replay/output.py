@@ -1,4 +1,4 @@
-"""What a replay lets out while it runs: a log to read along (``tail -f``), its cycles, progress.
+"""Outputs of a running replay: log file (``tail -f``), recorded cycles, progress.
 
 What is told is kept in memory by the loop, which waits for nobody; a thread takes it from there to a file or a display.
 A disk that is full or slow, a terminal that is held: neither touches the loop.

@@ -1,4 +1,4 @@
-"""The abort rules: from what one cycle brought in, whether the replay may go on.
+"""The abort rules: conditions on the answers of one cycle under which a replay stops.
 
 Every rule has a bound on its reaction, in cycles from the first cycle in which the trouble can be seen on the wire to
 the cycle in which the fault is declared: those of the map's ``safety``, one for an alert, and of what only health reads

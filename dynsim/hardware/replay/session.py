@@ -1,4 +1,4 @@
-"""A replay from opening its port to the files it leaves behind."""
+"""A replay session, from opening the port to the files it writes."""
 
 from __future__ import annotations
 

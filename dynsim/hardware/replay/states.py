@@ -1,4 +1,4 @@
-"""States of a replay, its progress as it is shown, the stop by the user, and its result."""
+"""Types of a replay: its states, progress, stop request, and result."""
 
 from __future__ import annotations
 

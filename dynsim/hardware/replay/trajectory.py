@@ -1,4 +1,4 @@
-"""A record as a path for the servos: continuous in time, with rest at both ends.
+"""Trajectory of servo goals from a record: continuous in time, at rest at both ends.
 
 Between the samples of a record joint angles are the cubic Hermite interpolant of (q, v), or straight where the record's
 rates are held from sample to sample (a sampled controller). Where the record begins or ends in motion, a stretch of

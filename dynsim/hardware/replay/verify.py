@@ -1,4 +1,4 @@
-"""Are the servos on the bus the ones of the map, set up as the replay needs them, fit to move, and near its start?
+"""Verification before torque on: servos match the map, are set up, healthy, and near the start posture.
 
 What limits a servo has stored itself is shown beside those of the map: they act where this program does not reach. The
 servo ignores goals beyond them without a word, and goes limp at its own thresholds. A difference that makes the map

@@ -1,1 +1,1 @@
-"""Servos in memory: their registers and motion, the line they hang on, scripted faults, and what they move."""
+"""Virtual servos: registers and motion, serial line, scripted faults, and the mechanics they move."""

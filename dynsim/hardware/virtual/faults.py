@@ -1,4 +1,4 @@
-"""Scripted faults of the virtual bus: what goes wrong, with whom, when, how often; reproducible by its seed."""
+"""Fault scripts of the virtual bus: which fault, at which servo, when, how often; reproducible by seed."""
 
 from __future__ import annotations
 

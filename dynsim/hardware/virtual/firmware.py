@@ -1,4 +1,4 @@
-"""What servos do with instructions of Protocol 2.0, and answer."""
+"""Firmware of a virtual servo: instructions of Protocol 2.0 and their answers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scripted faults strike: servos that fail at once, a port that dies, and status packets that come wrong or late."""
+"""Injection of scripted faults: failing servos, dying ports, corrupted or delayed status packets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Servos in memory on one half-duplex line: bytes in, bytes out with their arrival times.
+"""A virtual half-duplex line: bytes in, bytes out with their arrival times.
 
 :class:`dynsim.hardware.virtual.port.VirtualPort` puts a line under the client library on a virtual clock,
 :mod:`dynsim.hardware.virtual.pseudo_terminal` behind a serial device.

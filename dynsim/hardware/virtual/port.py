@@ -1,4 +1,4 @@
-"""Virtual servos under the client library, on a virtual clock."""
+"""A port of virtual servos for the client library, on a virtual clock."""
 
 from __future__ import annotations
 

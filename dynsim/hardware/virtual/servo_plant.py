@@ -1,4 +1,4 @@
-"""What the virtual servos move: a motor law shared by all, and the mechanics behind it.
+"""Mechanics moved by virtual servos: the motor law, and the interface of plants behind it.
 
 The position loop of an MX servo is (by default) proportional, and the motor brakes itself through its back-EMF:
 

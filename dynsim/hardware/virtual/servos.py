@@ -1,4 +1,4 @@
-"""The servos of a virtual line: what their registers do, their motion, heat, supply and watchdogs."""
+"""The servos of a virtual line: registers, motion, heat, supply and watchdogs."""
 
 from __future__ import annotations
 

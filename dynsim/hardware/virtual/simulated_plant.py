@@ -1,4 +1,4 @@
-"""A simulated robot behind the virtual servos: its bodies, gravity, joint stops, and what it is braced or stands on.
+"""A simulated robot behind virtual servos: bodies, gravity, joint stops, braces and ground.
 
 A :class:`dynsim.Simulation` moves it: the scenario's robot, with servos of the map's models for motors. Contacts are
 those of the engine under the unilateral law, whatever law the scenario has: a real floor does not pull. The integrator

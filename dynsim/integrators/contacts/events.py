@@ -1,4 +1,4 @@
-"""Events of the unilateral law: landing, lift-off, begin and end of slip, joint stops; what each of them changes.
+"""Events of the unilateral law (landing, lift-off, slip, joint stops) and the mode changes they cause.
 
 Each candidate has two guards, each stop and each joint with dry friction one. Off its surface the guard is the gap,
 closed it is the normal force; of a point that sticks the second guard is its margin μ_s f_n − |f_t|, of one that slides
@@ -23,7 +23,7 @@ from dynsim.integrators import run as ki
 from dynsim.integrators.contacts.impacts import evaluate, slip_speed
 from dynsim.integrators.contacts.modes import begin_slip, drops, resolve, slip_on
 from dynsim.integrators.run import Run
-from dynsim.jit.kernel import apart_kernel, internal_kernel
+from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
 # Kinds of guards, behind those of dynsim.integrators.events.
 NORMAL_GUARD, SLIP_GUARD, STOP_GUARD, DRY_GUARD = 10, 11, 12, 13
@@ -252,7 +252,7 @@ def consistent(system: System, ws: Workspace):
     return True
 
 
-@apart_kernel
+@noinline_kernel
 def solve_modes(system: System, ws: Workspace, run: Run, first):
     """Choose all modes anew, and log what that changes; ``first``: nothing of it is an event."""
     before = ws.counts[ka.DEPENDENT]
@@ -375,7 +375,7 @@ def break_loose(unilateral: UnilateralArrays, ws: Workspace, k):
     return True
 
 
-@apart_kernel
+@noinline_kernel
 def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Workspace, run: Run):
     """Do what the contact events at the end of the accepted step ask for; the next step starts anew."""
     if unilateral is None:

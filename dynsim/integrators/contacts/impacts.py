@@ -1,4 +1,4 @@
-"""What touches is brought onto its surface, and stopped by impulses where it approaches.
+"""Impacts: closing contacts are projected onto their surfaces, and impulses stop their approach.
 
 Moreau's law with Newton's restitution and Coulomb's cone on impulses, for everything that touches at once.
 """

@@ -1,4 +1,4 @@
-"""Which candidates are open, slide or stick: impacts, and the complementarity problem of the accelerations.
+"""Contact modes (open, sliding, sticking) from impacts and the complementarity problem of accelerations.
 
 At a start, a landing and the end of slip, forces may jump and all that touches is looked at anew. First what
 approaches is stopped by impulses (Moreau's law with Newton's restitution and Coulomb's cone on impulses); then

@@ -1,4 +1,4 @@
-"""The end of a step: its derivative, whether it is on the constraints and forces are unique there; samples on lanes.
+"""End of a RADAU5 step: derivative, constraint and uniqueness checks, and samples on lanes.
 
 RADAU5 evaluates it on lanes, together with samples of the steps before: four states take no longer than one alone.
 """

@@ -1,4 +1,4 @@
-"""The linear systems of RADAU5's Newton method, reduced to the rates: a real and a complex one, solved together.
+"""Linear systems of RADAU5's Newton method, reduced to the rates: one real and one complex, solved together.
 
 (g I − J) u = r with g = γ/h and with g = (α + iβ)/h, see dynsim.integrators.radau5.step. As Python they are two, by
 numpy. Compiled they are lanes of one: the real number, then real and imaginary part. To multiply by a complex number

@@ -46,7 +46,7 @@ from dynsim.integrators.radau5.tables import (
 from dynsim.integrators.run import Run
 from dynsim.integrators.steps import error_norm
 from dynsim.jit.compiler import form_of
-from dynsim.jit.kernel import apart_kernel, internal_kernel
+from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
 # Newton's method: most iterations, and the contraction below which the Jacobian stays.
 MOST_ITERATIONS, GOOD_CONTRACTION = 8, 0.05
@@ -57,7 +57,7 @@ SHORT, SLACK_RTOL = 0.005, 1e-6
 NO_STAGES = 10.5
 
 
-@apart_kernel
+@noinline_kernel
 def differentiate(system: System, ws: Workspace, run: Run):
     """Finite differences of v̇ along the rates' displacements, the rates and the currents, at (TIME, y).
 
@@ -194,7 +194,7 @@ def guess_stages(run: Run, h):
             )
 
 
-@apart_kernel
+@noinline_kernel
 def solve_stages(system: System, ws: Workspace, run: Run, h):
     """Newton's method for the stages of a step of length h; True when it has converged."""
     t, y, x, r = run.clock[ki.TIME], run.y, run.y_new, run.newton
@@ -292,7 +292,7 @@ def energy_error(system: System, run: Run, h):
     return largest
 
 
-@apart_kernel
+@noinline_kernel
 def step_radau5(system: System, ws: Workspace, run: Run):
     """One RADAU5 step; returns the error norm. stage[6] is the derivative at y_new."""
     t, h, y, y_new, r = run.clock[ki.TIME], run.clock[ki.STEP], run.y, run.y_new, run.newton

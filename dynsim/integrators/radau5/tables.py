@@ -1,4 +1,4 @@
-"""RADAU5: its coefficients, and what it keeps from step to step, Jacobian, factors, stages."""
+"""RADAU5 coefficients, and the data kept from step to step: Jacobian, factors, stages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rows that give way in time stepping: springs and dampers of contacts, and ties between bodies.
+"""Compliant rows in time stepping: springs and dampers of contacts, and ties between bodies.
 
 A spring k and a damper c on a row whose motion is x, and whose rates are u at the start and u' at the end of a step:
 

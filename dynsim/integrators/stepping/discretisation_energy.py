@@ -1,4 +1,4 @@
-"""What the discretisation of time stepping does to the energy: a term of its ledger, ``loss_scheme``.
+"""Energy error of time-stepping discretisation, a term of the ledger: ``loss_scheme``.
 
 A step solves, with the inertia M, the velocity products c and the weight g of its midpoint q_m, and Δ = v' − v,
 

@@ -15,7 +15,7 @@ from dynsim.dynamics.tree.articulated import accelerate, add_row_forces, factor,
 from dynsim.dynamics.tree.joints import normalise
 from dynsim.dynamics.tree.loads import add_loads
 from dynsim.integrators import run as ki
-from dynsim.integrators.contacts import events as kev
+from dynsim.integrators.contacts import events as ke
 from dynsim.integrators.events import take_ticks
 from dynsim.integrators.output import write_output
 from dynsim.integrators.run import Run
@@ -256,7 +256,7 @@ def count_step(unilateral: UnilateralArrays, law, s: SteppingArrays, ws: Workspa
 
 @internal_kernel
 def tell_changes(unilateral: UnilateralArrays, s: SteppingArrays, run: Run):
-    """Log and count what the accepted step has changed, at its end; True when the caller is to empty the kev.log.
+    """Log and count what the accepted step has changed, at its end; True when the caller is to empty the ke.log.
 
     What a contact begins with is no event.
     """
@@ -267,26 +267,26 @@ def tell_changes(unilateral: UnilateralArrays, s: SteppingArrays, run: Run):
         if before < 0 or before == now:
             continue
         if now == ka.OPEN:
-            kind = kev.LIFT_OFF
+            kind = ke.LIFT_OFF
             tally[k, ku.LIFT_OFFS] += 1.0
         elif before == ka.OPEN:
-            kind = kev.LANDING
+            kind = ke.LANDING
             tally[k, ku.LANDINGS] += 1.0
         elif now == ka.SLIDING:
-            kind = kev.SLIP_START
+            kind = ke.SLIP_START
             tally[k, ku.SLIP_STARTS] += 1.0
         else:
-            kind = kev.SLIP_STOP
-        kev.log(run, ki.CONTACT_LOG + kev.LOG_KINDS * k + kind)
+            kind = ke.SLIP_STOP
+        ke.log(run, ki.CONTACT_LOG + ke.LOG_KINDS * k + kind)
     for k in range(table.shape[0]):
         closed = table[k, ku.STOP_CLOSED] == 1
         if run.count[ki.STEPS] > 1 and table[k, ku.STOP_CLOSED] != table[k, ku.STOP_BEFORE]:
             stop[k, ku.HITS] += 1.0 if closed else 0.0
-            kev.log(run, ki.STOP_LOG + kev.LOG_KINDS * k + (kev.STOP_HIT if closed else kev.STOP_LEFT))
+            ke.log(run, ki.STOP_LOG + ke.LOG_KINDS * k + (ke.STOP_HIT if closed else ke.STOP_LEFT))
         table[k, ku.STOP_BEFORE] = table[k, ku.STOP_CLOSED]
     rubbing = unilateral.dry_table
     for k in range(rubbing.shape[0]):
-        kev.tell_joint(unilateral, run, k, 0 if abs(s.w[rubbing[k, ku.DRY_ROW]]) > kt.BAD else 1)
+        ke.tell_joint(unilateral, run, k, 0 if abs(s.w[rubbing[k, ku.DRY_ROW]]) > kt.BAD else 1)
     most = s.told.shape[0] + table.shape[0] + rubbing.shape[0]
     return run.count[ki.LOGGED] + most > run.log_time.shape[0]
 

@@ -1,4 +1,4 @@
-"""Time stepping: contacts that open, close, stick and slide within steps of one length, without locating anything.
+"""Time stepping: its equations, coefficients and workspace; contacts change within fixed steps.
 
 Moreau's and Jean's θ method for the whole coupled system. From (q, v, i) over a step h, with geometry at the midpoint
 q_m = q + h v / 2 and x_θ = x + θ (x' − x):

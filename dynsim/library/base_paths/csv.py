@@ -1,4 +1,4 @@
-"""A base motion from a CSV file: places t_s, x_m, y_m, or rates t_s, V_m_s, omega_rad_s."""
+"""A base motion from a CSV file with columns t_s, x_m, y_m, or rates t_s, V_m_s, omega_rad_s."""
 
 from __future__ import annotations
 

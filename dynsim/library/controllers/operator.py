@@ -1,4 +1,4 @@
-"""An operator's list of velocities for the hand of an arm and for its mobile base."""
+"""An operator's list of timed velocities for the hand of an arm and for its mobile base."""
 
 from __future__ import annotations
 

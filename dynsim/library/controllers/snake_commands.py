@@ -1,4 +1,4 @@
-"""Where the target comes from: the operator's velocity commands and generated target paths ([T] IV.C).
+"""Target motion of the snake: the operator's velocity commands and generated paths ([T] IV.C).
 
 A script is a :class:`dynsim.snake.description.CommandSource` that knows its future; a joystick is one that does not,
 and a script that a live operator has left is told as it was.

@@ -20,9 +20,9 @@ from dynsim.errors import ModelError
 from dynsim.jit.kernel import integers, reals
 from dynsim.library.controllers.snake_commands import STATES as MODE_STATES
 from dynsim.library.controllers.snake_commands import Script, ScriptedSource, TimedScript
-from dynsim.snake import controller as sc
+from dynsim.snake import controller
 from dynsim.snake import state as ss
-from dynsim.snake import support as ssup
+from dynsim.snake import support as stability
 from dynsim.snake.controller import ControlLaw, control_input, new_work
 from dynsim.snake.description import ModeTable, Policy, SnakeDescription, TaskSpaceController, conditioning
 from dynsim.snake.kinematics import SnakeModel, pose_of_point
@@ -31,10 +31,14 @@ from dynsim.snake.support import Cost
 
 ENGINE = "kinematic"
 
-COSTS = {"eq19": ssup.COST_ANGLES, "eq20": ssup.COST_SUPPORT_NORM, "eq20_min": ssup.COST_SUPPORT_MIN}
-LIMIT_POLICIES = {"none": sc.LIMITS_NONE, "saturate": sc.LIMITS_SATURATE, "allocate": sc.LIMITS_ALLOCATE}
+COSTS = {"eq19": stability.COST_ANGLES, "eq20": stability.COST_SUPPORT_NORM, "eq20_min": stability.COST_SUPPORT_MIN}
+LIMIT_POLICIES = {
+    "none": controller.LIMITS_NONE,
+    "saturate": controller.LIMITS_SATURATE,
+    "allocate": controller.LIMITS_ALLOCATE,
+}
 STATES = {"measured": ss.MEASURED, "estimated": ss.ESTIMATED, "feedforward": ss.FEEDFORWARD}
-FORMS = {"paper": sc.NULL_PAPER, "safe": sc.NULL_SAFE}
+FORMS = {"paper": controller.NULL_PAPER, "safe": controller.NULL_SAFE}
 
 
 # [T] Table II: mode number -> lifted wheel pairs of the base part (pair 1 at its head).

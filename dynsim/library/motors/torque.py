@@ -1,4 +1,4 @@
-"""A torque that the controller gives directly: no circuit, no gear; an ideal source whose power is τ v."""
+"""An ideal torque source commanded by the controller: no circuit, no gear; its power is τ v."""
 
 from __future__ import annotations
 

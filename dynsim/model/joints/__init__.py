@@ -1,4 +1,4 @@
-"""Kinds of joints, a module each: the rows that the kernels know them by, and their coordinates.
+"""Kinds of joints, one module each: coordinates and kernel rows.
 
 A module exposes ``ROWS``, its rows by name (:attr:`dynsim.model.description.Link.kind`), and for a joint with several
 of them a function that makes its links. Modules are found by being here. The motion itself is a branch of

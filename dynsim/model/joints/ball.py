@@ -1,4 +1,4 @@
-"""A ball joint, and a free body: position and attitude as a quaternion, rates of turning about the body's axes."""
+"""Ball joint and free body: attitude as a quaternion, angular rates about the body's axes."""
 
 from __future__ import annotations
 

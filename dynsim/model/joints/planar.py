@@ -1,4 +1,4 @@
-"""A body that slides in a plane and turns about its normal; or that rolls on it, without sliding sideways."""
+"""Planar joint: a body that slides in a plane and turns about its normal, or rolls without side slip."""
 
 from __future__ import annotations
 

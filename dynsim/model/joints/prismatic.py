@@ -1,4 +1,4 @@
-"""One distance along an axis."""
+"""Prismatic joint: one distance along an axis."""
 
 from __future__ import annotations
 

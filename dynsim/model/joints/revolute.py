@@ -1,4 +1,4 @@
-"""One angle about an axis; the axes x, y and z are rows of their own, for speed."""
+"""Revolute joint: one angle about an axis; x, y and z axes have faster rows of their own."""
 
 from __future__ import annotations
 

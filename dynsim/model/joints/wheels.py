@@ -1,4 +1,4 @@
-"""A base on two driven wheels of one axle, without side slip: its rates are those of the wheels ([WM] II.E)."""
+"""Base on two driven wheels of one axle, without side slip; its rates are those of the wheels ([WM] II.E)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""URDF in: the tree of bodies, their joints, limits and viscous losses.
+"""URDF import: bodies, joints, limits and viscous losses as a tree.
 
 Files are read strictly (:mod:`dynsim.model.urdf.reader`); everything behind fixed and locked joints is merged into the
 moving body that carries it. Motors, gears, contacts and gravity are not part of a URDF file: the scenario has them.

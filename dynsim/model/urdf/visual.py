@@ -1,4 +1,4 @@
-"""What the links of a URDF file look like: ``<visual>``, read with good will.
+"""Visual shapes of URDF links (``<visual>``), read leniently: an unreadable one is left out, never an error.
 
 Shapes have no part in the mechanics, and files in use hold many that are broken or of other programs: what cannot be
 drawn is passed over without a word. Meshes keep the name that the file gives them.

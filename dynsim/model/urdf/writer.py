@@ -1,4 +1,4 @@
-"""URDF out: bodies and joints of a robot as a file that reads back to the same dynamics."""
+"""URDF export: bodies and joints of a robot as a file that reads back to the same dynamics."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The XML of a URDF file: elements with their lines, and what their attributes say; nothing passed over in silence.
+"""XML of a URDF file: elements with line numbers, and attributes read as numbers; unknown ones are reported.
 
 Entities and DTDs are refused unread, and size, depth and number of elements are limited, so that reading always ends.
 """

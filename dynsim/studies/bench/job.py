@@ -1,4 +1,4 @@
-"""A whole run, 10 s of the published arm: its time in several programs, and how exact it is."""
+"""Benchmark of a whole run (10 s of the published arm): time and accuracy in several programs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The same robot in MuJoCo, for benchmarks and as an independent oracle: bodies, DC motors, voltage PD, contacts.
+"""The benchmark robot in MuJoCo, also an independent oracle: bodies, DC motors, voltage PD, contacts.
 
 Built from the compiled tables of a system, so that both programs get the same numbers. Needs MuJoCo ≥ 4.0, whose
 ``dcmotor`` actuator has an inductance and takes position and velocity set-points.

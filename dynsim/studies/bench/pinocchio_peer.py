@@ -1,4 +1,4 @@
-"""The same bodies in Pinocchio, for benchmarks and as an independent oracle; built from the compiled tables."""
+"""The benchmark robot in Pinocchio, also an independent oracle; built from the compiled tables."""
 
 from __future__ import annotations
 

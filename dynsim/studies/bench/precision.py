@@ -1,4 +1,4 @@
-"""Work and precision: what each adaptive method takes, and how exact it is, on every shipped scenario it integrates."""
+"""Work–precision benchmark: time and error of each adaptive method on the shipped scenarios."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Names of what is measured, and what all measurements share."""
+"""Names of the measured programs, and helpers shared by all benchmarks."""
 
 SCENARIO = "elbow_comparison"
 STEP = 1e-3  # MuJoCo's, in the whole job [s]

@@ -1,4 +1,4 @@
-"""One right-hand side of the published arm, with more and more links."""
+"""Benchmark of one right-hand side of the published arm, for growing numbers of links."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The benchmark: everything is measured, set side by side, and put into one result for JSON."""
+"""The whole benchmark: all measurements in one result, ready for JSON."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The dynamic snake beside the same robot in MuJoCo: time, and how near both come to Table III of the paper.
+"""Benchmark of the dynamic snake beside MuJoCo: time, and agreement with Table III of [T].
 
 MuJoCo gets the tree of bodies as it is exported, the voltage laws of the servos, and the lines that the controller of
 dynsim's run tells them: what it is asked to do is the same, forces, friction and contacts are its own.

@@ -1,4 +1,4 @@
-"""Sweeps of the published arm with two elbows: how their time grows with runs, and falls with cores."""
+"""Benchmark of sweeps of the published arm: time over runs and cores."""
 
 from __future__ import annotations
 

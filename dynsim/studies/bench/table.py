@@ -1,4 +1,4 @@
-"""The result as tables for a terminal."""
+"""Tables of the benchmark for a terminal."""
 
 from __future__ import annotations
 

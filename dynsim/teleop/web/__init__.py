@@ -1,4 +1,4 @@
-"""Scenarios driven in real time from a browser: a server for this machine alone, one pilot, others watch.
+"""Web teleoperation: a server on this machine, a pilot in a browser, and spectators.
 
 browser ─ PilotCommand at 50 Hz ─▶ Server ─▶ Deadman ─ a Command at each tick ─▶ Session ─ frames ─▶ Server ─▶ browsers
 """

@@ -1,4 +1,4 @@
-"""The dead-man's key, between the server, which hears the pilot, and the simulation, which asks at every tick."""
+"""The dead-man's key: set by the server's thread, read by the simulation at every tick."""
 
 from __future__ import annotations
 

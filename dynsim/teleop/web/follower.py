@@ -1,4 +1,4 @@
-"""A simulation in a process of its own, driven by a pilot and followed by servos: what that process does.
+"""Process of a simulation that is driven by a pilot and followed by servos.
 
     loop of the servos                                 this process
     ------------------                                 ------------

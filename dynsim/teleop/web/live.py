@@ -1,4 +1,4 @@
-"""A live drive: the simulation in the thread that asks for it, the server in another, frames in between."""
+"""A live drive: simulation in the calling thread, server in another, frames between them."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ class LiveDrive:
     def run(self, *, until_closed: bool = False) -> DriveReport:
         """Drive until the pilot ends it, Ctrl-C, the longest time, or with ``until_closed`` nobody is left.
 
-        Signals are heeded between ticks only, so that each one is driven and written down, or neither.
+        Signals are handled between ticks only, so that each one is driven and written down, or neither.
         """
         session, report = self.session, self.report
         try:

@@ -1,4 +1,4 @@
-"""Commands of a pilot's browser: small JSON texts of a few known keys, everything else refused by name."""
+"""Parsing of a pilot's commands: small JSON texts with known keys; others are refused by name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The server: the page by HTTP, commands and frames by a web socket, on this machine alone.
+"""The server of a drive: page by HTTP, commands and frames by web socket, on this machine only.
 
 Every user of a machine can reach its loopback, and every web page can ask a browser to: so there is a token in the
 path, ``Host`` must be this server (against names that are bound to it anew), and a socket's ``Origin`` its own page.

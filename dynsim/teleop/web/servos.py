@@ -1,4 +1,4 @@
-"""The servos' side of a drive: the process of the simulation from its start to its end, and what comes of it."""
+"""The servo side of a drive: starts and ends the simulation's process, and follows its postures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Records: sound ones broken in their HDF5 structure and in their bytes."""
+"""Records: valid ones with broken HDF5 structure or broken bytes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Servo maps: the shipped ones broken, held against a sound record."""
+"""Servo maps: the shipped ones, broken, checked against a valid record."""
 
 from __future__ import annotations
 

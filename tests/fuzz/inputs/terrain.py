@@ -1,4 +1,4 @@
-"""Maps of heights, broken by cells, rows, text and bytes, under an arm that may touch them."""
+"""Height-field files, broken by cells, rows, text and bytes, under an arm that may touch them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Forces that the motion does not determine: of all that are admissible, those of least norm, as far as cones allow.
+"""Indeterminate contact forces: the least-norm choice among all that satisfy the friction cones.
 
 The motion w = W f + b of a contact problem (dynsim.dynamics.contact.cone.problem) is determined, its forces f are not
 where rows depend on each other: four legs of a table, three elbows of a straight arm. On the faces of the cones where f

@@ -1,4 +1,4 @@
-"""Contact problems: unilateral forces, Coulomb cones and bilateral rows, all at once and without smoothing.
+"""The contact problem: unilateral forces, Coulomb cones and bilateral rows solved together, unsmoothed.
 
 Find f with u = W f + b (forces and accelerations, or impulses and velocities) such that every row or block of rows has
 

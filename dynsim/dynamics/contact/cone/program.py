@@ -1,4 +1,4 @@
-"""Small dense second-order-cone programs.
+"""Solver of small dense second-order-cone programs (interior point).
 
     minimise ½ xᵀ H x + gᵀ x   subject to   A x = b,   s = G x + h ∈ K
 

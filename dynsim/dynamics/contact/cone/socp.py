@@ -1,4 +1,4 @@
-"""How redundant contacts, and joints that rub, share their forces: furthest from slipping, and the least that holds."""
+"""Cone programs that share force among redundant contacts: largest margin to slip; least norm that holds."""
 
 from __future__ import annotations
 

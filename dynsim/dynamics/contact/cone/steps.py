@@ -1,4 +1,4 @@
-"""The steps of a contact problem's solution: its residual, Newton's step, and a sweep of block Gauss–Seidel.
+"""Steps of the contact-problem solver: residual, Newton step, and a block Gauss–Seidel sweep.
 
 The problem and its residual are those of dynsim.dynamics.contact.cone.problem; ``room`` is its scratch.
 """

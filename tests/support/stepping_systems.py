@@ -1,4 +1,4 @@
-"""Benches for time stepping: runs with a law of their own, and a scene of the snake's size."""
+"""Systems for tests of time stepping: runs with a contact law of their own, and a scene of the snake's size."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ from dynsim.integrators.run import Run
 from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot
 from dynsim.model.drives import Servo
 from dynsim.model.joints.ball import floating
-from support.random_robots import Bench, bench
+from support.random_robots import CompiledSystem, assemble
 
 
-def stepped(b: Bench, y: np.ndarray, times: np.ndarray, step: float, theta: float, law: dict | None = None) -> Run:
+def stepped(
+    b: CompiledSystem, y: np.ndarray, times: np.ndarray, step: float, theta: float, law: dict | None = None
+) -> Run:
     """A run by time stepping, tangents along x of the bodies; law: columns of the contacts' law."""
     b = b.with_shapes()
     run = b.new_run(y, times, "time_stepping", step=step, theta=theta)
@@ -26,7 +28,7 @@ def plane(normal: np.ndarray) -> Quadric:
     return Quadric(np.zeros((3, 3)), normal, 0.0)
 
 
-def snake(joints: int = 12, wheels: int = 14) -> tuple[Bench, np.ndarray]:
+def snake(joints: int = 12, wheels: int = 14) -> tuple[CompiledSystem, np.ndarray]:
     """A chain of yaw and pitch joints in turn that lies on a plane on wheels, two at each end and one at each joint."""
     length, inertia = 0.1, Inertia(0.3, np.zeros(3), np.diag([2e-4, 4e-4, 4e-4]))
     links = list(floating(Link("link_0", "root", None, "floating", np.eye(3)[0], inertia)))
@@ -51,7 +53,7 @@ def snake(joints: int = 12, wheels: int = 14) -> tuple[Bench, np.ndarray]:
     ]
     robot = Robot("snake", tuple(links), tuple(motors), (f"link_{joints}", np.zeros(3)))
     held = np.array([0.35 * np.sin(0.8 * k) if k % 2 == 0 else 0.0 for k in range(joints)])
-    b = bench(robot, contacts, held=held, real=True)
+    b = assemble(robot, contacts, held=held, real=True)
     q = np.zeros(robot.nq)
     q[2], q[3] = 0.03, 1.0
     return b, b.state(q, np.zeros(len(robot.links)))
