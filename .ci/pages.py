@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from dynsim.cli.tables import print_comparison
+from dynsim.snake.published import TABLE_III
 from dynsim.studies.bench.programs import (
     ABA,
     CONSTRAINT_DYNAMICS,
@@ -687,6 +688,57 @@ def steps() -> Any:
     return data("snake/steps.json")
 
 
+def observed(key: str) -> Any:
+    """A part of what the dynamic snake was observed to do."""
+    return data("snake/observations.json")[key]
+
+
+def converged(key: str) -> float:
+    """Largest error of the head with measured feedback, of both runs."""
+    return max(run[key] for run in observed("measured_feedback").values())
+
+
+def wheel_heights(which: int) -> list[float]:
+    """Heights of the lower (0) or the higher (1) wheel of all lifted pairs [mm]."""
+    return [pair[which] for pair in observed("lifted_wheels_mm").values()]
+
+
+def end_value_mm(moved: str, column: int) -> float:
+    """Where the head ends by the shortest step, of a manoeuvre of Table III."""
+    return 1e3 * steps()["end_values"][moved][0][column]
+
+
+@cache
+def bases() -> dict[tuple[float, float, float], dict[str, tuple[bool, float]]]:
+    """Of each base of the sweep (mass, track, caster), by variant: whether it stands, and its settled tip margin."""
+    swept: dict[tuple[float, float, float], dict[str, tuple[bool, float]]] = {}
+    with (ROOT / "results/overturning/sweep.csv").open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            base = float(row["mass_kg"]), float(row["track_m"]), float(row["caster_m"])
+            margin = float(row["tip_margin_min_settled"] or "nan")
+            swept.setdefault(base, {})[row["variant"]] = row["stands"] == "True", margin
+    return swept
+
+
+def standing(variant: str) -> int:
+    return sum(base[variant][0] for base in bases().values())
+
+
+def least_standing(variant: str, axis: int, **fixed_at: float) -> tuple[float, float]:
+    """Along one axis of the sweep: the largest value at which the base falls, and the next, at which it stands.
+
+    ``fixed_at`` : the other two, by name
+    """
+    names = ("mass", "track", "caster")
+    line = {
+        base[axis]: outcome[variant][0]
+        for base, outcome in bases().items()
+        if all(base[names.index(name)] == value for name, value in fixed_at.items())
+    }
+    falls = max(value for value, stands in line.items() if not stands)
+    return falls, min(value for value, stands in line.items() if value > falls)
+
+
 def kinematic() -> Any:
     return data("snake/kinematic.json")
 
@@ -1027,6 +1079,37 @@ NUMBERS |= {
     "snake_dz_mm": lambda: fixed(1e3 * sag_error("dz_m"), 1),
     "snake_steps_mm": lambda: fixed(steps()["spread_mm"], 2),
     "snake_steps_mrad": lambda: fixed(steps()["spread_mrad"], 2),
+    "snake_measured_mm": lambda: fixed(converged("position_mm"), 1),
+    "snake_measured_mrad": lambda: fixed(converged("attitude_mrad"), 1),
+    "snake_y_paper_y": lambda: fixed(1e3 * TABLE_III["y"].mean[1], 0),
+    "snake_y_paper_x": lambda: fixed(1e3 * TABLE_III["y"].mean[0], 0),
+    "snake_y_y": lambda: fixed(end_value_mm("y", 1), 0),
+    "snake_y_x": lambda: fixed(end_value_mm("y", 0), 0),
+    "snake_shaken_mm": lambda: fixed(observed("mode_switching")["moved_mm"], 0),
+    "snake_shaken_rad": lambda: fixed(observed("mode_switching")["turned_rad"], 2),
+    "snake_switched_mm": lambda: fixed(observed("mode_switching")["error_mm"], 0),
+    "snake_switched_rad": lambda: fixed(observed("mode_switching")["error_rad"], 2),
+    "snake_switched_first_mm": lambda: fixed(observed("mode_switching")["first_error_mm"], 0),
+    "snake_lower_least": lambda: fixed(min(wheel_heights(0)), 0),
+    "snake_lower_most": lambda: fixed(max(wheel_heights(0)), 0),
+    "snake_higher_least": lambda: fixed(min(wheel_heights(1)), 0),
+    "snake_higher_most": lambda: fixed(max(wheel_heights(1)), 0),
+    "bases": lambda: str(len(bases())),
+    "bases_stand_two": lambda: str(standing("two_elbows")),
+    "bases_stand_7": lambda: str(standing("elbow_7")),
+    "bases_least_two": lambda: fixed(min(base["two_elbows"][1] for base in bases().values()), 3),
+    "bases_least_7": lambda: fixed(min(base["elbow_7"][1] for base in bases().values()), 3),
+    "bases_fall": lambda: str(len(bases()) - standing("no_elbow")),
+    "bases_stand": lambda: str(standing("no_elbow")),
+    "bases_fall_kg": lambda: number(least_standing("no_elbow", 0, track=0.3, caster=0.15)[0], 1),
+    "bases_stand_kg": lambda: number(least_standing("no_elbow", 0, track=0.3, caster=0.15)[1], 2),
+    "bases_fall_caster": lambda: number(least_standing("no_elbow", 2, mass=4.0, track=0.3)[0], 1),
+    "bases_stand_caster": lambda: number(least_standing("no_elbow", 2, mass=4.0, track=0.3)[1], 2),
+    "bases_fulcrum_kg": lambda: number(max(base[0] for base, x in bases().items() if not x["elbow_4"][0]), 1),
+    "bases_only_4_falls": lambda: str(sum(x["no_elbow"][0] and not x["elbow_4"][0] for x in bases().values())),
+    "bases_fulcrum_N": lambda: fixed(
+        run("mobile_elbow_comparison elbow_4")["contacts"]["elbow_4"]["normal_force_mean_N"], 1
+    ),
     "snake_fall_half": lambda: fall_order("theta_0.5"),
     "snake_fall_one": lambda: fall_order("theta_1"),
     "snake_dbeta_rad": lambda: fixed(sag_error("dbeta_rad"), 3),

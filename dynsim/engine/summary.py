@@ -1,4 +1,8 @@
-"""Summary of a run: energies, tracking errors, contact forces, motor loads."""
+"""Summary (``summary.json``) of a dynamics run: energies, tracking errors, contact forces, motor loads, warnings.
+
+:func:`summarise` makes it from the record; the energy balance of the record is defined here too. The summary of the
+kinematic snake is in :mod:`dynsim.engine.kinematic_record`.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Files of a plan: numbers, a runnable scenario, table, figures, and a viewer page."""
+"""Writing the files of a brace plan: plan.json, plan.yaml, plan_table.csv and .json, figures, and view.html.
+
+plan.yaml is a scenario that runs. Figures and view.html are drawn by :mod:`dynsim.planner.pictures`.
+"""
 
 from __future__ import annotations
 
@@ -14,17 +17,24 @@ PLAN_FILES = ("plan.json", "plan.yaml", "plan_table.csv", "plan_table.json", "vi
 
 
 def check_plan_folder(folder: Path) -> None:
-    """Raise before the work what could not be written after it."""
+    """Raise, before planning starts, if the files of a plan cannot be written to the folder."""
     check_writable(folder, PLAN_FILES)
 
 
 def save_plan(plan: BracePlan, folder: Path, figures: bool = True, kind: str = "png") -> None:
-    """Write all files of a plan to a folder."""
+    """Write the files of a plan to a folder, in place of those of an earlier plan there.
+
+    A plan without an answer has plan.json and the tables only; without ``figures`` there is no view.html either. What
+    an earlier plan left of the others is removed, as it would not belong to the new numbers.
+    """
     folder.mkdir(parents=True, exist_ok=True)
+    drawn = [folder / "view.html", *(folder / "figures").glob("plan_*")]
     write_json(folder / "plan.json", plan.json)
     write_json(folder / "plan_table.json", plan.table)
     with replacing(folder / "plan_table.csv") as stream:
         stream.write(_csv(plan).encode())
+    for earlier in (folder / "plan.yaml", *drawn) if plan.best is None else drawn:
+        earlier.unlink(missing_ok=True)
     if plan.best is None:
         return
     with replacing(folder / "plan.yaml") as stream:

@@ -1,9 +1,9 @@
 """Reading of records from HDF5 files.
 
-A file is HDF5 and, after its end, one line with the SHA-256 of all bytes before it. HDF5 ignores the line; with it,
-damage is found before the HDF5 library, which may crash or never return on a damaged file, has seen it. A file without
-that line, or with another digest, is read only where the caller trusts it. Sizes are limited in both cases, before
-anything is unpacked.
+A file is HDF5 data followed by one line with the SHA-256 of all bytes before it, which HDF5 ignores. By it damage is
+detected before the HDF5 library is called, which may crash or hang on a damaged file. A file without that line, or with
+another digest, is read only with ``trust=True`` (``--trust``). Sizes are limited in both cases, before anything is
+decompressed. A file that may be of another run than those beside it is refused.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Lengths, limits and wheels of a snake, from the scene of its record: for figures and studies."""
+"""Joint axes and limits, number of head joints, wheel radius and track of a snake, from the scene of a record."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from dynsim.record.scene import Scene
 
 @dataclass(frozen=True)
 class SnakeGeometry:
-    """What figures and studies need of a snake besides its signals.
+    """Geometry of a snake.
 
     Attributes
     ----------
-    head_joints : joints of the head part, the first columns of ``phi``
-    pitch : (n_phi,) where a joint pitches; the others yaw
+    head_joints : number of joints in the head part; they are the first columns of ``phi``, the joint angles
+    pitch : (n_phi,) true where a joint turns about y (pitch), false about z (yaw)
     lower, upper : (n_phi,) limits of the joints [rad]
-    wheel_radius : [m]
-    half_track : (pairs,) axle middle to wheel [m]
+    wheel_radius : of the first pair [m]
+    half_track : (number of wheel pairs,) distance from the middle of an axle to its wheels [m]
     """
 
     head_joints: int

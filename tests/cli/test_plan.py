@@ -104,6 +104,11 @@ def test_a_scene_without_an_answer_ends_with_its_reason_and_code_2(
     change(data)
     path, out = tmp_path / "scene.yaml", tmp_path / "plan"
     path.write_text(to_yaml(data), encoding="utf-8")
+    (out / "figures").mkdir(parents=True)
+    earlier = [out / "plan.yaml", out / "view.html", out / "figures" / "plan_heat.png"]  # of a plan before
+    own = out / "figures" / "mine.png"
+    for file in (*earlier, own):
+        file.write_text("")
     result = CliRunner().invoke(app, ["plan", str(path), "--count", "0:1", "--starts", "1", "--out", str(out)])
     assert isinstance(result.exception, UnreachableReference)
     assert result.exception.exit_code == 2
@@ -111,7 +116,8 @@ def test_a_scene_without_an_answer_ends_with_its_reason_and_code_2(
     sizes = json.loads((out / "plan.json").read_text(encoding="utf-8"))["sizes"]
     assert [size["survives"] for size in sizes] == [None, None]
     assert all(reason in size["reason"] for size in sizes)
-    assert not (out / "plan.yaml").exists()
+    assert not any(file.exists() for file in earlier)
+    assert own.exists()
 
 
 def floor_below_reach(data: dict[str, Any]) -> None:

@@ -1,6 +1,6 @@
-"""Unmodified clients (two libraries of the maker, rustypot) on `dynsim hw virtual`, through a serial port.
+"""Dynamixel clients (dynamixel_sdk, dynamixel_easy_sdk, rustypot, our bus) on the serial port of `dynsim hw virtual`.
 
-Nothing asserts time: clients are given patience, because a busy machine may not run the servos for a while.
+No reply times are asserted: the clients get longer time-outs, as a busy machine may delay the virtual servos.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from dynsim.hardware.bus.control_table import BAUD_RATES, MODELS, MX_106, RAD_PE
 
 pytestmark = pytest.mark.long
 
-F = MX_106.fields
+FIELDS = MX_106.fields
 BAUD = 1_000_000
 FACTORY_BAUD = 57_600
-PATIENCE = 500  # ms that stand for the adapter's latency timer
+LATENCY_MS = 500  # in place of what the SDK allows for the adapter's latency timer
 MODEL_OF = {1: "MX-106", 2: "XM430-W350", 3: "XL430-W250", 4: "XH540-W270"}
 NUMBER_OF = {id_: MODELS[name].number for id_, name in MODEL_OF.items()}
 MAP = """\
@@ -65,7 +65,7 @@ def device(tmp_path: Path) -> Iterator[str]:
 @pytest.fixture
 def port(device: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[PortHandler]:
     """The library's own port, with patience."""
-    monkeypatch.setattr(sys.modules[PortHandler.__module__], "LATENCY_TIMER", PATIENCE)
+    monkeypatch.setattr(sys.modules[PortHandler.__module__], "LATENCY_TIMER", LATENCY_MS)
     handler = PortHandler(device)
     assert handler.setBaudRate(BAUD)
     yield handler
@@ -87,7 +87,7 @@ def test_every_instruction_of_the_makers_library(port: PortHandler) -> None:
     assert {id_: model for id_, (model, _) in library.broadcastPing(port)[0].items()} == NUMBER_OF
     # write and read of 1, 2 and 4 bytes, in one go and in two
     for size, name, value in ((1, "led", 1), (2, "position_p_gain", 700), (4, "profile_velocity", 123)):
-        address = F[name].address
+        address = FIELDS[name].address
         assert getattr(library, f"write{size}ByteTxRx")(port, 2, address, value) == (COMM_SUCCESS, 0)
         assert getattr(library, f"read{size}ByteTxRx")(port, 2, address) == (value, COMM_SUCCESS, 0)
         assert getattr(library, f"write{size}ByteTxOnly")(port, 3, address, value) == COMM_SUCCESS
@@ -95,56 +95,56 @@ def test_every_instruction_of_the_makers_library(port: PortHandler) -> None:
         assert getattr(library, f"read{size}ByteTx")(port, 3, address) == COMM_SUCCESS
         assert getattr(library, f"read{size}ByteRx")(port, 3) == (value, COMM_SUCCESS, 0)
     # registered writes
-    assert library.regWriteTxRx(port, 1, F["led"].address, 1, [1]) == (COMM_SUCCESS, 0)
-    assert library.regWriteTxOnly(port, 4, F["led"].address, 1, [1]) == COMM_SUCCESS
+    assert library.regWriteTxRx(port, 1, FIELDS["led"].address, 1, [1]) == (COMM_SUCCESS, 0)
+    assert library.regWriteTxOnly(port, 4, FIELDS["led"].address, 1, [1]) == COMM_SUCCESS
     time.sleep(0.1)
-    assert [library.read1ByteTxRx(port, id_, F["led"].address)[0] for id_ in (1, 4)] == [0, 0]
+    assert [library.read1ByteTxRx(port, id_, FIELDS["led"].address)[0] for id_ in (1, 4)] == [0, 0]
     assert library.action(port, sdk.BROADCAST_ID) == COMM_SUCCESS
-    assert [library.read1ByteTxRx(port, id_, F["led"].address)[0] for id_ in (1, 4)] == [1, 1]
+    assert [library.read1ByteTxRx(port, id_, FIELDS["led"].address)[0] for id_ in (1, 4)] == [1, 1]
     # groups
-    write = sdk.GroupSyncWrite(port, library, F["profile_acceleration"].address, 4)
+    write = sdk.GroupSyncWrite(port, library, FIELDS["profile_acceleration"].address, 4)
     for id_ in MODEL_OF:
         write.addParam(id_, [id_, 0, 0, 0])
     assert write.txPacket() == COMM_SUCCESS
     for exchange in ("txRxPacket", "fastSyncRead"):
-        sync_read = sdk.GroupSyncRead(port, library, F["profile_acceleration"].address, 4)
+        sync_read = sdk.GroupSyncRead(port, library, FIELDS["profile_acceleration"].address, 4)
         for id_ in MODEL_OF:
             sync_read.addParam(id_)
         assert getattr(sync_read, exchange)() == COMM_SUCCESS, exchange
-        accelerations = [sync_read.getData(id_, F["profile_acceleration"].address, 4) for id_ in MODEL_OF]
+        accelerations = [sync_read.getData(id_, FIELDS["profile_acceleration"].address, 4) for id_ in MODEL_OF]
         assert accelerations == list(MODEL_OF), exchange
     bulk_write = sdk.GroupBulkWrite(port, library)
-    bulk_write.addParam(1, F["led"].address, 1, [0])
-    bulk_write.addParam(2, F["profile_velocity"].address, 4, [99, 0, 0, 0])
+    bulk_write.addParam(1, FIELDS["led"].address, 1, [0])
+    bulk_write.addParam(2, FIELDS["profile_velocity"].address, 4, [99, 0, 0, 0])
     assert bulk_write.txPacket() == COMM_SUCCESS
     for exchange in ("txRxPacket", "fastBulkRead"):
         bulk_read = sdk.GroupBulkRead(port, library)
-        bulk_read.addParam(1, F["led"].address, 1)
-        bulk_read.addParam(2, F["profile_velocity"].address, 4)
+        bulk_read.addParam(1, FIELDS["led"].address, 1)
+        bulk_read.addParam(2, FIELDS["profile_velocity"].address, 4)
         assert getattr(bulk_read, exchange)() == COMM_SUCCESS, exchange
-        assert bulk_read.getData(1, F["led"].address, 1) == 0
-        assert bulk_read.getData(2, F["profile_velocity"].address, 4) == 99
+        assert bulk_read.getData(1, FIELDS["led"].address, 1) == 0
+        assert bulk_read.getData(2, FIELDS["profile_velocity"].address, 4) == 99
     assert library.clearMultiTurn(port, 1) == (COMM_SUCCESS, 0)
     # restart and factory reset
     assert library.reboot(port, 2) == (COMM_SUCCESS, 0)
     patiently(lambda: alive(2))
-    assert library.read4ByteTxRx(port, 2, F["profile_velocity"].address)[0] == 0
+    assert library.read4ByteTxRx(port, 2, FIELDS["profile_velocity"].address)[0] == 0
     assert library.factoryReset(port, 4, 0x01) == (COMM_SUCCESS, 0)
     port.setBaudRate(FACTORY_BAUD)
     patiently(lambda: alive(4))
-    assert library.read1ByteTxRx(port, 4, F["return_delay"].address)[0] == F["return_delay"].default
+    assert library.read1ByteTxRx(port, 4, FIELDS["return_delay"].address)[0] == FIELDS["return_delay"].default
     assert set(library.broadcastPing(port)[0]) == {4}
-    assert library.write1ByteTxRx(port, 4, F["baud"].address, BAUD_RATES.index(BAUD)) == (COMM_SUCCESS, 0)
+    assert library.write1ByteTxRx(port, 4, FIELDS["baud"].address, BAUD_RATES.index(BAUD)) == (COMM_SUCCESS, 0)
     port.setBaudRate(BAUD)
     # ID and protocol
-    assert library.write1ByteTxRx(port, 4, F["id"].address, 9) == (COMM_SUCCESS, 0)
-    assert library.write1ByteTxRx(port, 3, F["protocol"].address, 1) == (COMM_SUCCESS, 0)
+    assert library.write1ByteTxRx(port, 4, FIELDS["id"].address, 9) == (COMM_SUCCESS, 0)
+    assert library.write1ByteTxRx(port, 3, FIELDS["protocol"].address, 1) == (COMM_SUCCESS, 0)
     assert set(library.broadcastPing(port)[0]) == {1, 2, 9}
 
 
 def test_the_makers_easy_library(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     easy = pytest.importorskip("dynamixel_easy_sdk")
-    monkeypatch.setattr(sys.modules[PortHandler.__module__], "LATENCY_TIMER", PATIENCE)
+    monkeypatch.setattr(sys.modules[PortHandler.__module__], "LATENCY_TIMER", LATENCY_MS)
     connector = easy.Connector(device, BAUD)
     motors = {motor.id: motor for motor in connector.createAllMotors()}
     assert {id_: motor.model_number for id_, motor in motors.items()} == NUMBER_OF
@@ -212,7 +212,7 @@ def test_rustypot(device: str) -> None:
     for fast in (False, True):
         client.set_fast_sync_read(fast)
         assert client.sync_read_present_position(ids) == [2048] * 4
-        assert client.sync_read_raw_data(ids, F["present_position"].address, 4) == [b"\x00\x08\x00\x00"] * 4
+        assert client.sync_read_raw_data(ids, FIELDS["present_position"].address, 4) == [b"\x00\x08\x00\x00"] * 4
     client.set_fast_sync_read(False)
     client.sync_write_torque_enable(ids, [1, 1, 1, 1])
     client.sync_write_goal_position(ids, [2048 + 50 * id_ for id_ in ids])
@@ -260,8 +260,8 @@ def test_the_servos_see_a_client_that_is_stopped(device: str, port: PortHandler,
     library = Protocol2PacketHandler()
 
     def read(name: str) -> Any:
-        data, result, _ = library.readTxRx(port, 1, F[name].address, F[name].size)
-        return F[name].decode(bytes(data)) if result == COMM_SUCCESS else None
+        data, result, _ = library.readTxRx(port, 1, FIELDS[name].address, FIELDS[name].size)
+        return FIELDS[name].decode(bytes(data)) if result == COMM_SUCCESS else None
 
     with started([sys.executable, "-c", STEERING, device], tmp_path / "steering") as client:
         client.wait_for("told", count=30)

@@ -40,7 +40,7 @@ class Case:
     t_step: float = 0.0  # of time from lane to lane; 0: one time for all
 
 
-def plane(rng: np.random.Generator, body: str, law: str = "signed", friction: float = 0.2) -> Contact:
+def random_plane(rng: np.random.Generator, body: str, law: str = "signed", friction: float = 0.2) -> Contact:
     surface = Quadric(np.zeros((3, 3)), random_unit(rng), rng.normal())
     name = f"{body} {rng.integers(10**6)}"
     return Contact(name, body, rng.normal(scale=0.3, size=3), surface, friction=friction, pulling_friction=law)
@@ -53,7 +53,7 @@ def random_state(rng: np.random.Generator, b: CompiledSystem) -> np.ndarray:
     return y
 
 
-def of(rng: np.random.Generator, b: CompiledSystem, spread: float, **keys: Any) -> Case:
+def random_case(rng: np.random.Generator, b: CompiledSystem, spread: float, **keys: Any) -> Case:
     return Case(b, random_state(rng, b), spread, **keys)
 
 
@@ -70,20 +70,20 @@ def on_planes(
 ) -> Case:
     """A tree with points of its last bodies on planes, the first of them ``twice``."""
     rng = np.random.default_rng(seed)
-    contacts = [plane(rng, f"body_{n - 1 - k % n}", law, friction) for k in range(count)]
+    contacts = [random_plane(rng, f"body_{n - 1 - k % n}", law, friction) for k in range(count)]
     if twice:
         contacts[1] = replace(contacts[0], name="again")
-    return of(rng, assemble(random_robot(rng, n), contacts, m_star=m_star), spread)
+    return random_case(rng, assemble(random_robot(rng, n), contacts, m_star=m_star), spread)
 
 
 def free(seed: int = 0) -> Case:
     rng = np.random.default_rng(seed)
-    return of(rng, assemble(random_robot(rng, 8)), 1.0)
+    return random_case(rng, assemble(random_robot(rng, 8)), 1.0)
 
 
 def every_joint() -> Case:
     rng = np.random.default_rng(1)
-    return of(
+    return random_case(
         rng,
         assemble(random_robot_of(rng, ["ball", "rolling", "planar", "floating", "wheeled", "prismatic", "revolute"])),
         1.0,
@@ -113,16 +113,16 @@ def curved() -> Case:
     ]
     surfaces.append(Quadric(np.eye(3), np.zeros(3), 0.8))
     contacts = [
-        replace(plane(rng, f"body_{3 + k}"), surface=surface, name=str(k)) for k, surface in enumerate(surfaces)
+        replace(random_plane(rng, f"body_{3 + k}"), surface=surface, name=str(k)) for k, surface in enumerate(surfaces)
     ]
-    return of(rng, assemble(random_robot(rng, 6, branches=False), contacts), 1e-3)
+    return random_case(rng, assemble(random_robot(rng, 6, branches=False), contacts), 1e-3)
 
 
 def saddle() -> Case:
     """A surface that bends both ways, of which some lanes are too far for a distance along its normal."""
     rng = np.random.default_rng(9)
-    contact = replace(plane(rng, "body_5"), surface=Quadric(np.diag([1.0, 0.5, -2.0]), np.zeros(3), -0.5))
-    return of(rng, assemble(random_robot(rng, 6, branches=False), [contact]), 1.0)
+    contact = replace(random_plane(rng, "body_5"), surface=Quadric(np.diag([1.0, 0.5, -2.0]), np.zeros(3), -0.5))
+    return random_case(rng, assemble(random_robot(rng, 6, branches=False), [contact]), 1.0)
 
 
 def coupled(m_star: bool = False) -> Case:
@@ -130,8 +130,8 @@ def coupled(m_star: bool = False) -> Case:
     rng = np.random.default_rng(4)
     robot = random_robot(rng, 8)
     couplings = (Coupling("joint_6", "joint_2", 0.7, 0.1), Coupling("joint_1", "joint_7", -1.3))
-    b = assemble(replace(robot, couplings=couplings), [plane(rng, "body_5")], m_star=m_star)
-    case = of(rng, b, 1e-3)
+    b = assemble(replace(robot, couplings=couplings), [random_plane(rng, "body_5")], m_star=m_star)
+    case = random_case(rng, b, 1e-3)
     if not m_star:
         stick(case, [ka.STICKING])
     b.ws.active[2:, ka.BODY_B] = 3
@@ -161,7 +161,7 @@ def driven(t: float, t_step: float = 0.0) -> Case:
     )
     b.system = b.system._replace(reference=reference)
     b.system.drives.input[3, [ka.LINE_START, ka.LINE_RATE, ka.LINE_SINCE]] = rng.normal(size=3)
-    return of(rng, b, 1.0, t=t, t_step=t_step)
+    return random_case(rng, b, 1.0, t=t, t_step=t_step)
 
 
 def limited() -> Case:
@@ -170,7 +170,7 @@ def limited() -> Case:
     robot = random_robot(rng, 6)
     motors = [replace(motor, voltage_limit=15.0) for motor in robot.motors]
     motors[0] = replace(motors[0], current_limit=3.0)
-    return of(rng, assemble(replace(robot, motors=tuple(motors))), 1.0)
+    return random_case(rng, assemble(replace(robot, motors=tuple(motors))), 1.0)
 
 
 def servos() -> Case:
@@ -190,7 +190,7 @@ def servos() -> Case:
     b.system.drives.table[2, ka.SERVO_MODE] = ka.OFF
     b.system.drives.table[5, ka.SAMPLED] = 1
     b.system.drives.input[5, ka.COMMAND] = 0.7
-    return of(rng, b, 1.0)
+    return random_case(rng, b, 1.0)
 
 
 def rubbing() -> Case:
@@ -205,7 +205,7 @@ def rubbing() -> Case:
     unilateral.dry_table[:, ku.DRY_HOLDS] = 0
     unilateral.dry[:, ku.DRY_SIDE] = 1.0, -1.0, 1.0
     b.ws = new_workspace(b.system)
-    return of(rng, b, 1.0)
+    return random_case(rng, b, 1.0)
 
 
 def unmoved() -> Case:
@@ -213,7 +213,7 @@ def unmoved() -> Case:
     x, z = np.eye(3)[0], np.eye(3)[2]
     robot = Robot("slide", (Link("body", "joint", None, "prismatic", x, Inertia(1.0)),), (), ("body", np.zeros(3)))
     b = assemble(robot, [Contact("foot", "body", np.zeros(3), Quadric(np.zeros((3, 3)), z, 0.0))])
-    return of(np.random.default_rng(8), b, 1.0)
+    return random_case(np.random.default_rng(8), b, 1.0)
 
 
 # Name → states. Spread widely; by little where lanes must agree; not at all where rounding decides on pivots.

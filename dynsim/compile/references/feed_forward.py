@@ -1,8 +1,9 @@
-"""Feed-forward voltages along joint references: gravity, full dynamics, and prescribed brace forces.
+"""Feed-forward voltages along joint references, from statics or full dynamics and with brace forces.
 
-    K_m i = M v̇ + h + g + J_m v̇ + (D + D_m) v − J_cᵀ f_d,    u = R i + L di/dt + K_m v
+    K_m i = M v̇ + h + g + J_m v̇ + (D + D_m) v − Jᵀ f,    u = R i + L di/dt + K_m v
 
-f_d: normal forces as commanded, or those of least heat, and the friction of a point that slips along the references.
+f are the brace forces: normal forces, commanded or chosen for least motor heat, and friction where the references slip.
+Statics alone give u = R g / K_m. :func:`pressing` makes the tables of the braces, for the brace planner too.
 """
 
 from __future__ import annotations
@@ -22,11 +23,11 @@ from dynsim.model.drives import Motor
 
 Array = NDArray[np.float64]
 
-# Slip of the references [m/s] over which planned friction grows to its value: a jump would make the voltages ring.
+# Smoothing speed v_s of planned friction [m/s], μ s/√(s² + v_s²): a jump would make the voltages oscillate.
 SLIP_SCALE = 5e-3
-# Slower than this it has no direction [m/s].
+# Below this slip speed s no friction is planned [m/s].
 SLIP_MIN = 1e-9
-# Further off its surface than this, by the references, a brace carries nothing [m].
+# Largest distance of a brace from its surface, above or below, along the references [m]; beyond it ModelError.
 GAP_MAX = 2e-3
 
 

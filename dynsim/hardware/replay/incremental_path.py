@@ -1,8 +1,8 @@
-"""A path that grows knot by knot, each checked against joint limits before it is followed.
+"""A servo path that grows knot by knot; each knot must keep the motion limits before it is sent to servos.
 
-The limits are those of the offline check, and so is the function,
-:meth:`~dynsim.hardware.replay.check.MotionLimits.margins`: of a whole record it looks at every interval, here at the
-last one, and at the windows that end in it, and only where simple bounds do not say that all is well.
+The limits are those of the offline check of a record, by the same function (``MotionLimits.margins``).
+There every interval is checked; here only the newest one, and the time windows of jerk and shaking that end after the
+knot before it. The check is skipped where cheap bounds show that no limit is broken. Old knots are dropped.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from dynsim.hardware.servo_map import ServoMap
 
 
 class Sample(NamedTuple):
-    """One posture: time [s], joint angles [rad] and rates [rad/s], shape (N,), in the order of the map.
+    """One sample of the motion: time [s], joint angles [rad] and rates [rad/s], (N,), in the order of the servo map.
 
-    ``lift`` and ``lift_rate`` are what lifting wheel pairs adds to them, as in
+    ``lift`` and ``lift_rate`` are added to them where a snake lifts wheel pairs, as in
     :func:`~dynsim.hardware.replay.trajectory.path_of_record`.
     """
 

@@ -1,4 +1,7 @@
-"""An arm on a base with two driven wheels and a caster, which rolls without slip (Wang and Minami II.E, eqs 36–50)."""
+"""An arm on a wheeled base with power wheeled steering (PWS): two wheels, each may be driven, and a caster.
+
+The wheels roll without slip ([WM] II.E, eqs 36–50).
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from dynsim.compile.protocols import BuildContext
+from dynsim.compile.scene import BASE_WHEEL_WIDTH
 from dynsim.config.base import NonNegative, Positive, StrictConfig, Vector3, error_at
 from dynsim.errors import ModelError
 from dynsim.library import families
@@ -25,9 +29,6 @@ BASE = "base"
 
 MotorChoice: Any = families.union("motor")
 ArmChoice: Any = families.union("plant", only=("serial_arm", "urdf_arm"))
-
-# Of a wheel, in parts of its radius: for drawing.
-WHEEL_WIDTH = 0.5
 
 
 class WheelConfig(StrictConfig):
@@ -214,6 +215,6 @@ def _shapes(base: Base) -> tuple[Shape, ...]:
     r, x, y = base.wheel.radius_m, base.caster_m[0], base.caster_m[1]
     front, back = max(x, 0.0) + 0.5 * r, min(x, 0.0) - r
     low, high = 0.6 * r, max(base.mount.position_m[2], 1.6 * r)
-    size = (front - back, base.track_m - WHEEL_WIDTH * r, high - low)
+    size = (front - back, base.track_m - BASE_WHEEL_WIDTH * r, high - low)
     plate = Shape("box", size, (0.5 * (front + back), 0.0, 0.5 * (low + high)))
     return plate, Shape("sphere", (0.3 * r,), (x, y, 0.3 * r))

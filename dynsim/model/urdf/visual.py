@@ -1,7 +1,7 @@
-"""Visual shapes of URDF links (``<visual>``), read leniently: an unreadable one is left out, never an error.
+"""Visual shapes and named colours of URDF links (``<visual>``), read leniently.
 
-Shapes have no part in the mechanics, and files in use hold many that are broken or of other programs: what cannot be
-drawn is passed over without a word. Meshes keep the name that the file gives them.
+Shapes have no part in the mechanics, and URDF files often contain broken ones, or formats of other programs: a shape
+that cannot be parsed is left out without an error. A mesh keeps its file name; the file is not opened here.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from dynsim.record.quaternion import of_turn, product
 from dynsim.record.scene import Shape, ShapeKind
 
 Colour = tuple[float, float, float, float]
-# As in urdf_reader: larger numbers are no lengths.
+# As in dynsim.model.urdf.xml: no length, scale or angle is larger.
 _LARGEST = 1e15
 
 
@@ -27,19 +27,19 @@ def materials(robot: Element) -> dict[str, Colour]:
     return {name: colour for name, colour in colours.items() if colour is not None}
 
 
-def visual_shapes(link: Element, known: Mapping[str, Colour]) -> tuple[Shape, ...]:
-    """Shapes of a link in its frame; ``known`` are colours by name."""
-    shapes = [_shape(child, known) for child in link.children if child.tag == "visual"]
+def visual_shapes(link: Element, named_colours: Mapping[str, Colour]) -> tuple[Shape, ...]:
+    """Shapes of a link in its frame; ``named_colours`` are colours by name."""
+    shapes = [_shape(child, named_colours) for child in link.children if child.tag == "visual"]
     return tuple(shape for shape in shapes if shape is not None)
 
 
-def _shape(visual: Element, known: Mapping[str, Colour]) -> Shape | None:
+def _shape(visual: Element, named_colours: Mapping[str, Colour]) -> Shape | None:
     geometry = visual.child("geometry")
     if geometry is None or len(geometry.children) != 1:
         return None
     solid = geometry.children[0]
     material = visual.child("material")
-    colour = None if material is None else _colour(material, known)
+    colour = None if material is None else _colour(material, named_colours)
     origin = visual.child("origin")
     xyz = (0.0, 0.0, 0.0) if origin is None else _numbers(origin, "xyz", 3, "0 0 0")
     rpy = (0.0, 0.0, 0.0) if origin is None else _numbers(origin, "rpy", 3, "0 0 0")
@@ -66,11 +66,11 @@ def _shape(visual: Element, known: Mapping[str, Colour]) -> Shape | None:
     return Shape(kind, size, file=file, colour=colour).placed(np.array(xyz), turn)
 
 
-def _colour(material: Element, known: Mapping[str, Colour]) -> Colour | None:
+def _colour(material: Element, named_colours: Mapping[str, Colour]) -> Colour | None:
     stated = material.child("color")
     numbers = () if stated is None else _numbers(stated, "rgba", 4)
     if not numbers or not all(0.0 <= number <= 1.0 for number in numbers):
-        return known.get(material.attributes.get("name", ""))
+        return named_colours.get(material.attributes.get("name", ""))
     red, green, blue, opacity = numbers
     return red, green, blue, opacity
 

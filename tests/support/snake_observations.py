@@ -1,0 +1,89 @@
+"""Study: tracking with measured feedback, motion of the head during mode changes, and heights of lifted wheels.
+
+``PYTHONPATH=tests python -m support.snake_observations`` writes results/snake/observations.json, which docs/snake.md
+quotes, in a minute. All runs are those of the dynamic snake.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dynsim._version import __version__
+from dynsim.engine import simulate
+from dynsim.record import Record
+from dynsim.scenario import load_scenario
+from dynsim.system.files import write_json
+
+FILE = Path("results/snake/observations.json")
+MEASURED = ("beta", "y")
+# From the start of a mode until wheels are where they are lifted to [s].
+LIFTING_S = 0.6
+WHEELS, PAIRS = 14, 7
+
+
+def switching_run() -> Record:
+    """Modes 1 to 6 of the paper's Table II, one after the other ([T] V.B)."""
+    return simulate(load_scenario("snake_joint_limits", "cyclic", {"plant.level": "dynamic"}))
+
+
+def converged(variant: str) -> dict[str, float]:
+    """Largest error of the head in the last second, its state measured by motion capture with 10 ms delay."""
+    settings = {"controller.state": "measured", "sensors.motion_capture.delay_s": 0.01}
+    record = simulate(load_scenario("snake_positioning_dynamic", variant, settings))
+    off = np.abs(record["w"] - record["w_target"])[record.time >= record.time[-1] - 1.0]
+    return {"position_mm": 1e3 * float(off[:, :3].max()), "attitude_mrad": 1e3 * float(off[:, 3:].max())}
+
+
+def head_motion(record: Record) -> dict[str, float]:
+    """Largest distance and turn of the head from its pose at the first mode change, and its largest error."""
+    switching = record.time >= 2.0
+    w, target = record["w"][switching], record["w_target"][switching]
+    moved, off = w - w[0], w - target
+    return {
+        "moved_mm": 1e3 * float(np.linalg.norm(moved[:, :3], axis=1).max()),
+        "turned_rad": float(np.linalg.norm(moved[:, 3:], axis=1).max()),
+        "error_mm": 1e3 * float(np.linalg.norm(off[:, :3], axis=1).max()),
+        "error_rad": float(np.linalg.norm(off[:, 3:], axis=1).max()),
+        "first_error_mm": 1e3 * float(np.linalg.norm(off[0, :3])),
+        "first_error_rad": float(np.linalg.norm(off[0, 3:])),
+    }
+
+
+def lifted(record: Record) -> tuple[np.ndarray, np.ndarray]:
+    """Samples at which a pair has come to its lifted height, (T, 7), and the gaps of its wheels, (T, 7, 2) [m]."""
+    mode = record["mode"]
+    begun = np.maximum.accumulate(np.where(np.diff(mode, prepend=mode[0]) != 0.0, record.time, 0.0))
+    settled = record.time - begun > LIFTING_S
+    gaps = record["contact_gap"][:, :WHEELS].reshape(-1, PAIRS, 2)
+    return (record["grounded"] == 0.0) & settled[:, None], gaps
+
+
+def wheel_heights(record: Record) -> dict[str, list[float]]:
+    """By mode and lifted pair: mean heights of the lower and the higher wheel [mm]."""
+    up, gaps = lifted(record)
+    heights = {}
+    for mode in sorted(set(record["mode"])):
+        for pair in range(PAIRS):
+            chosen = gaps[up[:, pair] & (record["mode"] == mode), pair]
+            if len(chosen):
+                heights[f"mode {mode:.0f} pair {pair + 1}"] = [1e3 * x for x in np.sort(chosen, axis=1).mean(axis=0)]
+    return heights
+
+
+def study() -> dict[str, Any]:
+    """All of it."""
+    record = switching_run()
+    return {
+        "dynsim_version": __version__,
+        "measured_feedback": {variant: converged(variant) for variant in MEASURED},
+        "mode_switching": head_motion(record),
+        "lifted_wheels_mm": wheel_heights(record),
+    }
+
+
+if __name__ == "__main__":
+    FILE.parent.mkdir(parents=True, exist_ok=True)
+    write_json(FILE, study())
