@@ -56,16 +56,18 @@ STOP_SIZE = 6
 DRY_JOINT = 0  # link whose joint rubs
 DRY_ROW = 1
 DRY_DRIVE = 2  # whose gear does, -1 for none
-DRY_HOLDS = 3  # 1: it has a row, bounded in time stepping; 0: it slides, by the event-driven methods
+DRY_HOLDS = 3  # 1: it has a row, bounded in time stepping; 0: its force is constant, by the event-driven methods
 DRY_NEXT = 4  # scratch of the choice of modes
 DRY_TOLD = 5  # 1, 0: as the log was last told of it, held or sliding; -1: of nothing yet
 DRY_TABLE_SIZE = 6
 # UnilateralArrays.dry: the force of a joint at rest is any up to the sum of both, in motion that against it [N m or N]
 OF_GEAR, OF_JOINT = 0, 1
 DRY_FORCE = 2  # on the joint [N m or N]
-DRY_SIDE = 3  # sign of the rate at which it slides
+DRY_SIDE = 3  # sign of the rate at which it slides; between −1 and 1 at rest, where the force is that part of the bound
 DRY_AT = 4  # where it is held [rad or m]
-DRY_SIZE = 5
+DRY_SOLVED = 5  # its force in the choice of modes [N m or N]
+DRY_HEADWAY = 6  # what it began to slide with against its side, because the rows could not take it away
+DRY_SIZE = 7
 # UnilateralArrays.tie_table, int
 TIE_A, TIE_B = 0, 1  # links
 TIE_TURNS = 2  # 1: about its axis, 0: along it
@@ -179,8 +181,14 @@ def dry_rows_held(unilateral: UnilateralArrays):
 
 
 @internal_kernel
+def dry_rests(unilateral: UnilateralArrays, k):
+    """True for a joint that dry friction keeps at rest, by a row or, where contacts hold it, by a constant force."""
+    return unilateral.dry_table[k, DRY_HOLDS] == 1 or abs(unilateral.dry[k, DRY_SIDE]) < 1.0
+
+
+@internal_kernel
 def rub(unilateral: UnilateralArrays | None, ws: Workspace):
-    """Dry friction of the joints that slide, onto what is applied; its direction is constant within a step."""
+    """Dry friction of the joints without a row, onto what is applied; it is constant within a step."""
     if unilateral is None:  # known to the compiler
         return
     for k in range(unilateral.dry.shape[0]):

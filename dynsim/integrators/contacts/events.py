@@ -16,12 +16,12 @@ from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.rows import set_modes
 from dynsim.dynamics.contact.splits import dry_margin, margin
-from dynsim.dynamics.contact.unilateral import UnilateralArrays, stop_gap
+from dynsim.dynamics.contact.unilateral import UnilateralArrays, dry_rests, stop_gap
 from dynsim.dynamics.derivative import System
 from dynsim.dynamics.tables import ContactArrays, Workspace
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts.impacts import evaluate, slip_speed
-from dynsim.integrators.contacts.modes import begin_slip, drops, resolve, slip_on
+from dynsim.integrators.contacts.modes import begin_slip, drops, note_headway, resolve, slip_on
 from dynsim.integrators.run import Run
 from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
@@ -63,7 +63,9 @@ def contact_guard(contacts: ContactArrays, unilateral: UnilateralArrays | None, 
     if kind == DRY_GUARD:
         if unilateral.dry_table[k, ku.DRY_HOLDS] == 0:
             rate = ws.joints[unilateral.dry_table[k, ku.DRY_JOINT], ka.QD]
-            return unilateral.dry[k, ku.DRY_SIDE] * rate + BACKWARD
+            if dry_rests(unilateral, k):
+                return unilateral.number[ku.SLOW] - abs(rate)
+            return unilateral.dry[k, ku.DRY_SIDE] * rate + unilateral.dry[k, ku.DRY_HEADWAY] + BACKWARD
         if unilateral.number[ku.SPLIT] == 1.0 and best > 0.0:
             return best
         return dry_margin(unilateral, ws, k)
@@ -349,7 +351,7 @@ def log_changes(system: System, ws: Workspace, run: Run):
 def tell_joints(unilateral: UnilateralArrays, run: Run):
     """Log which joints dry friction has begun, or ceased, to hold since the log was last told of them."""
     for k in range(unilateral.dry_table.shape[0]):
-        tell_joint(unilateral, run, k, unilateral.dry_table[k, ku.DRY_HOLDS])
+        tell_joint(unilateral, run, k, 1 if dry_rests(unilateral, k) else 0)
 
 
 @internal_kernel
@@ -372,6 +374,7 @@ def break_loose(unilateral: UnilateralArrays, ws: Workspace, k):
         1.0 + abs(force)
     ):
         table[k, ku.DRY_HOLDS], unilateral.dry[k, ku.DRY_SIDE] = 0, -1.0 if force > 0.0 else 1.0
+        note_headway(unilateral, ws, k)
     return True
 
 

@@ -20,6 +20,7 @@ from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.cone import problem as kc
 from dynsim.dynamics.contact.rows import set_modes
+from dynsim.dynamics.contact.splits import NULL_TOLERANCE
 from dynsim.dynamics.contact.unilateral import UnilateralArrays, dry_bound, dry_rows_held, slide_direction
 from dynsim.dynamics.derivative import System
 from dynsim.dynamics.tables import Workspace
@@ -100,6 +101,7 @@ def choose(system: System, ws: Workspace, run: Run):
         evaluate(system, ws, run)
         return
     take_solution(system, ws, size, largest)
+    release_dependent_joints(system, ws)
     # What is left of rates after an impact that was let settle, and of points that were solved for as if at rest: those
     # that begin to slip would else go against the direction that they are given, and stop, and begin again.
     for k in range(mode.shape[0]):
@@ -119,6 +121,8 @@ def choose(system: System, ws: Workspace, run: Run):
     before = ws.counts[ka.DEPENDENT]
     evaluate(system, ws, run)
     unilateral.number[ku.REDUNDANT] = 1.0 if ws.counts[ka.DEPENDENT] > before else 0.0
+    for k in range(unilateral.dry_table.shape[0]):
+        note_headway(unilateral, ws, k)
     for k in range(mode.shape[0]):
         mode[k, ku.GIVES_WAY] = 0
         starts = mode[k, ku.WANTED] == ka.SLIDING and mode[k, ku.TOUCHING] == ka.STICKING
@@ -136,6 +140,13 @@ def hold_slow_joints(unilateral: UnilateralArrays, ws: Workspace):
 
 
 @internal_kernel
+def note_headway(unilateral: UnilateralArrays, ws: Workspace, k):
+    """What joint k, of those with dry friction, begins to slide with against its side."""
+    rate = ws.joints[unilateral.dry_table[k, ku.DRY_JOINT], ka.QD]
+    unilateral.dry[k, ku.DRY_HEADWAY] = max(0.0, -unilateral.dry[k, ku.DRY_SIDE] * rate)
+
+
+@internal_kernel
 def let_joints_slide(system: System, size, largest):
     """Which joints dry friction goes on to hold, into DRY_NEXT, and which ways the others slide."""
     unilateral, i = system.unilateral, system.couplings.joint.shape[0]
@@ -143,10 +154,72 @@ def let_joints_slide(system: System, size, largest):
     for k in range(table.shape[0]):
         table[k, ku.DRY_NEXT] = table[k, ku.DRY_HOLDS]
         if table[k, ku.DRY_HOLDS] == 1:
+            unilateral.dry[k, ku.DRY_SOLVED] = f[i]
             moves = abs(acceleration(unilateral, i, size)) > SLIP_TOLERANCE * largest
             if moves and abs(f[i]) >= dry_bound(unilateral, k) * (1.0 - ON_CONE):
                 table[k, ku.DRY_NEXT], unilateral.dry[k, ku.DRY_SIDE] = 0, -1.0 if f[i] > 0.0 else 1.0
             i += 1
+
+
+@internal_kernel
+def release_dependent_joints(system: System, ws: Workspace):
+    """Joints at rest that sliding contacts keep from moving have the constant force of the solution, not a row.
+
+    Such a row depends on the normal rows, and how they share a force changes the friction of what slides: no split of
+    the right-hand side is that of the solution. At rest Coulomb's law admits any force within the bound. Rows that
+    depend on those of sticking points and of other joints alone remain, see :mod:`dynsim.dynamics.contact.splits`.
+    """
+    unilateral, W = system.unilateral, ws.small[0]
+    table, dry, mode, bare, whole = unilateral.dry_table, unilateral.dry, unilateral.mode, 0, 0
+    bare_factor, whole_factor = unilateral.room[ku.SPLIT_MATRIX], unilateral.room[ku.NULL_SPACE]
+    bare_row, whole_row = unilateral.index[0], unilateral.index[1]
+    slides = False
+    for k in range(mode.shape[0]):
+        slides = slides or (mode[k, ku.WANTED] == ka.SLIDING and system.contacts.law[k, ka.MU] > 0.0)
+    if not slides or table.shape[0] == 0:
+        return
+    for r in range(system.couplings.joint.shape[0]):
+        bare = extended(bare_factor, W, bare_row, bare, r)
+    for k in range(unilateral.stop_table.shape[0]):
+        if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
+            bare = extended(bare_factor, W, bare_row, bare, unilateral.stop_table[k, ku.STOP_ROW])
+    for k in range(mode.shape[0]):
+        for s in range(3):
+            if mode[k, ku.WANTED] == ka.STICKING:
+                bare = extended(bare_factor, W, bare_row, bare, ws.active[k, ka.FIRST_ROW] + s)
+    for i in range(bare):
+        whole = extended(whole_factor, W, whole_row, whole, bare_row[i])
+    for k in range(mode.shape[0]):
+        if mode[k, ku.WANTED] == ka.SLIDING:
+            whole = extended(whole_factor, W, whole_row, whole, ws.active[k, ka.FIRST_ROW])
+    for k in range(table.shape[0]):
+        if table[k, ku.DRY_NEXT] == 0:
+            continue
+        r = table[k, ku.DRY_ROW]
+        with_bare = extended(bare_factor, W, bare_row, bare, r)
+        with_whole = extended(whole_factor, W, whole_row, whole, r)
+        if with_bare > bare and with_whole == whole:
+            bound = dry_bound(unilateral, k)
+            table[k, ku.DRY_NEXT] = 0
+            dry[k, ku.DRY_SIDE] = min(max(-dry[k, ku.DRY_SOLVED] / bound, -1.0), 1.0)
+        else:
+            bare, whole = with_bare, with_whole
+
+
+@internal_kernel
+def extended(factor, W, row, count, r):
+    """Extend a Cholesky factor of rows ``row[:count]`` of W by row r, unless it depends on them; how many there are."""
+    square = W[r, r]
+    for i in range(count):
+        total = W[r, row[i]]
+        for j in range(i):
+            total -= factor[count, j] * factor[i, j]
+        factor[count, i] = total / factor[i, i]
+        square -= factor[count, i] * factor[count, i]
+    if not square > NULL_TOLERANCE * W[r, r]:
+        return count
+    factor[count, count], row[count] = math.sqrt(square), r
+    return count + 1
 
 
 @internal_kernel
