@@ -329,8 +329,12 @@ def acceleration_range(system: System, t: float, y: Array) -> tuple[Array, Array
     return taken, np.minimum(ends[0], taken), np.maximum(ends[1], taken)
 
 
-def sharing(model: Model, contacts: Sequence[Contact], q: Array, modes: Array) -> list[str]:
-    """Names of the contacts whose rows depend on those of other contacts, in the first sample of each set of modes.
+def sharing(
+    model: Model, contacts: Sequence[Contact], q: Array, modes: Array, rests: NDArray[np.bool_] | None = None
+) -> list[str]:
+    """Names of contacts and joints whose rows depend on each other, in the first sample of each set of modes.
+
+    Contacts may share with each other, and with joints that dry friction keeps at rest; joints alone share nothing.
 
     Rows that are zero, such as that across a planar arm, and those that depend on each other within one contact, as
     where an arm has two joints before it, leave no choice between contacts: each contact counts with an orthonormal
@@ -340,23 +344,28 @@ def sharing(model: Model, contacts: Sequence[Contact], q: Array, modes: Array) -
     ----------
     q : samples, (T, nq) [rad or m]
     modes : of the contacts in them, (T, c), dynsim.dynamics.tables: OPEN, SLIDING, STICKING
+    rests : which joints dry friction keeps at rest in them, (T, n)
     """
     free = _free(model)
+    rests = np.zeros((len(modes), model.n), dtype=bool) if rests is None else rests
     shared: set[int] = set()
-    _, first = np.unique(modes, axis=0, return_index=True)
-    several = [
-        t for t in sorted(first) if np.count_nonzero(modes[t] != ka.OPEN) > 1 and (modes[t] == ka.STICKING).any()
-    ]
+    _, first = np.unique(np.column_stack([modes, rests]), axis=0, return_index=True)
+    closed, sticks = np.count_nonzero(modes != ka.OPEN, axis=1), (modes == ka.STICKING).any(axis=1)
+    several = [t for t in sorted(first) if (closed[t] > 1 and sticks[t]) or (closed[t] > 0 and rests[t].any())]
     for t in several[:MOST_SETS]:
         bases, owner = [], []
         for k in np.flatnonzero(modes[t] != ka.OPEN).tolist():
             basis = _basis(_rows(model, contacts[k], q[t], bool(modes[t, k] == ka.STICKING)) @ free)
             bases.append(basis)
             owner += [k] * len(basis)
+        for k in np.flatnonzero(rests[t]).tolist():
+            bases.append(_basis(np.eye(model.n)[k][None] @ free))
+            owner += [len(contacts) + k] * len(bases[-1])
         left, sizes, _ = np.linalg.svd(np.vstack(bases))
         rank = int(np.count_nonzero(sizes > DEPENDENT))
         shared.update(np.array(owner, dtype=int)[np.abs(left[:, rank:]).max(axis=1, initial=0.0) > DEPENDENT].tolist())
-    return [contacts[k].name for k in sorted(shared)]
+    names = [*(contact.name for contact in contacts), *model.joint_names]
+    return [names[k] for k in sorted(shared)]
 
 
 def _free(model: Model) -> Array:

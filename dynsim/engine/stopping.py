@@ -33,6 +33,7 @@ KINDS = {
     ki.OUT_OF_TIME: "out_of_time",
     ki.STUCK: "stuck",
 }
+STEP_OVER = "integrator.method: time_stepping, which goes on through it"
 _MODES = {ka.SLIDING: "slides", ka.STICKING: "sticks"}
 
 
@@ -78,6 +79,12 @@ def _doing(prepared: Prepared) -> str:
     return "; " + (", ".join(doing) if doing else "no contact is closed")
 
 
+def _can_step_over(prepared: Prepared) -> bool:
+    """Whether time stepping takes this system: real contacts, and no mobile base (see dynsim.engine.prepare)."""
+    events = prepared.system.unilateral is not None and prepared.run.stepping is None
+    return events and bool(prepared.contacts) and prepared.model.robot.base is None
+
+
 def _reason(scenario: Scenario, prepared: Prepared) -> str:
     run, status = prepared.run, int(prepared.run.count[ki.STATUS])
     t, method = float(run.clock[ki.TIME]), prepared.choice.method
@@ -92,6 +99,8 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
         )
     if status == ki.STEP_TOO_SMALL:
         stiff = "try a larger rtol" if method == "radau5" else "try integrator.method radau5, or a larger rtol"
+        if _can_step_over(prepared):
+            stiff = f"try {STEP_OVER}, or a larger rtol{_doing(prepared)}"
         if prepared.control.sample_time is not None:
             stiff += "; or a shorter controller.sample_time_s, or smaller gains: commands that are held for long sway"
         return f"{where}: the step size fell to {run.clock[ki.STEP]:.1e} s; {stiff}"
@@ -110,7 +119,8 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
         return (
             f"{where}: no progress, the last {ki.MOST_TRIALS} steps came no further than "
             f"{run.clock[ki.LEAST_PROGRESS]:.1e} s, the last of {run.clock[ki.STEP]:.1e} s{_doing(prepared)}; "
-            "take another integrator.method, a larger rtol, or longer steps where they are fixed"
+            f"take {STEP_OVER if _can_step_over(prepared) else 'another integrator.method'}, a larger rtol, or longer "
+            "steps where they are fixed"
         )
     if status == ki.OUT_OF_TIME:
         return (
@@ -129,11 +139,9 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
             law.mode[:, ku.BEFORE] != law.mode[:, ku.WANTED],
             np.abs(prepared.workspace.contacts[:, ka.GAP]) < START_TOLERANCE,
         )
-        # A mobile base cannot be stepped over: see prepare.
-        stepping = "integrator.method: time_stepping, which goes on through it, or "
         return (
             f"{where}: {'the' if at else 'a'} contact{at} opens and closes, or slips and sticks, without end; "
-            f"take {stepping if prepared.model.robot.base is None else ''}a larger integrator.atol"
+            f"take {f'{STEP_OVER}, or ' if _can_step_over(prepared) else ''}a larger integrator.atol"
         )
     ws = prepared.workspace
     gaps, rates = ws.rows[: ws.counts[ka.ROWS], [ka.ROW_GAP, ka.ROW_RATE]].T

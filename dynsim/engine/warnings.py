@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dynsim.compile.clearance import Sinking
 from dynsim.compile.contact_law import START_TOLERANCE, JointStop, format_quantity
@@ -25,6 +26,8 @@ from dynsim.scenario import Scenario
 from dynsim.scenario.effect import without_effect
 
 DRIFT_LIMIT_M = 1e-9
+# Slower than this a joint with dry friction is at rest [rad/s or m/s].
+AT_REST = 1e-9
 # Friction heat below zero by no more than this share of the turnover is rounding.
 FRICTION_ROUNDING = 1e-12
 # Limits in files are rounded: a joint that starts at 1.5707963 = 90° is not beyond it.
@@ -167,11 +170,19 @@ def _undetermined(record: Record, prepared: Prepared) -> list[str]:
     """Contact rows that depend on each other: forces, and with friction the motion too, that are one of many."""
     run, system, contacts = prepared.run, prepared.system, prepared.contacts
     evaluations = int(prepared.workspace.counts[ka.DEPENDENT])
-    if not evaluations:
+    rests = _joints_at_rest(record, prepared)
+    if not evaluations and not rests.any():
         return []
     # Under the unilateral law rows of what sticks depend on each other, which leaves no motion open.
     if system.unilateral is not None:
-        shared = sharing(prepared.model, contacts, record["q"], record["contact_mode"]) if len(record) else []
+        shared = sharing(prepared.model, contacts, record["q"], record["contact_mode"], rests) if len(record) else []
+        joints = [name for name in shared if name in prepared.model.joint_names]
+        if joints:
+            touching = [name for name in shared if name not in joints]
+            return [
+                f"{_few(touching)}: shared forces with the dry friction of {_few(joints)}, which keeps these joints at "
+                "rest; the motion does not determine them, and those of the record are one choice of many"
+            ]
         if not shared:
             return []
         return [
@@ -191,6 +202,20 @@ def _undetermined(record: Record, prepared: Prepared) -> list[str]:
             f"that keep their signs (this run: {spread.taken:.4g}); take away braces until the rest are independent"
         )
     return warnings
+
+
+def _few(names: Sequence[str], most: int = 4) -> str:
+    """Names in a sentence; of many the first, and how many more."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def _joints_at_rest(record: Record, prepared: Prepared) -> NDArray[np.bool_]:
+    """Joints that dry friction keeps at rest, by sample, (T, n)."""
+    rests = np.zeros((len(record), prepared.model.n), dtype=bool)
+    if "joint_friction" in record:
+        columns = [prepared.model.joint_names.index(joint) for joint in record.signals["joint_friction"].labels]
+        rests[:, columns] = np.abs(record["v"][:, columns]) < AT_REST
+    return rests
 
 
 def _sunk(record: Record, sunk: Sequence[Sinking]) -> list[str]:
