@@ -396,8 +396,9 @@ def plan_braces(
 def _bare(names: Sequence[str]) -> str:
     """Warning of candidates without a radius."""
     return (
-        f"plan: candidates {', '.join(names)} have radius 0 (links of a URDF have none, whatever <visual> shows): braces "
-        "would lay the axis itself onto the surface; give --radius, or name contacts.points with radius_m as --candidates"
+        f"plan: candidates {', '.join(names)} have radius 0 (links of a URDF have none, whatever <visual> shows): "
+        "braces would lay the axis itself onto the surface; give --radius, or name contacts.points with radius_m as "
+        "--candidates"
     )
 
 
