@@ -634,6 +634,11 @@ def planned_change(other: str) -> float:
     return max(100.0 * abs(size[other] / size["heat_W"] - 1.0) for size in sizes)
 
 
+def planned_nominal() -> list[float]:
+    """Heat of the runs as planned of the best answers over the planned heat."""
+    return [size["simulated_W"] / size["heat_W"] for size in planned_answers()]
+
+
 def planned_gains() -> str:
     """What plans cost on surfaces that are 5 mm off, by gain."""
     rows = []
@@ -657,12 +662,16 @@ def planned_scenes() -> str:
         best = next((size for size in scene["sizes"] if size["count"] == scene["best"]), None)
         head = (str(scene["seed"]), scene["kind"].replace("_", " "), str(scene["joints"]), f"{scene['friction']:g}")
         if best is None:
-            rows.append((*head, *(NONE,) * 6))
+            rows.append((*head, *(NONE,) * 7))
             continue
         gain, verdict = f"{best['k_p_V_per_rad']:g}", "yes" if best["survives"] else "no"
         near = fixed(best_beside_best_known(scene), 3)
-        rows.append((*head, number(free), str(best["count"]), number(best["heat_W"]), near, gain, verdict))
-    heads = ("scene", "with", "joints", "μ", "unbraced [W]", "braces", "heat [W]", "best known", "k_p", "survives")
+        heats = (number(best["heat_W"]), number(best["simulated_W"]))
+        rows.append((*head, number(free), str(best["count"]), *heats, near, gain, verdict))
+    heads = (
+        "scene", "with", "joints", "μ", "unbraced [W]", "braces", "heat [W]", "simulated [W]", "best known", "k_p",
+        "survives",
+    )  # fmt: skip
     return lines(heads, rows, left=2)
 
 
@@ -1158,7 +1167,8 @@ NUMBERS |= {
         max(scene["search_cpu_s"] for scene in data("planner/scenes.json") if scene["kind"] == "floor"), 1
     ),
     "planned_instants": lambda: fixed(planned_change("with_4_times_the_instants_W"), 1),
-    "planned_nominal": lambda: fixed(planned_change("simulated_W"), 1),
+    "planned_over": lambda: fixed(100.0 * (max(planned_nominal()) - 1.0), 1),
+    "planned_under": lambda: fixed(100.0 * (1.0 - min(planned_nominal())), 0),
     "friction_share_low": lambda: energy_share(0.0),
     "friction_share_high": lambda: energy_share(0.5),
     "friction_two_low": lambda: fixed(over_friction("two_elbows", "electrical_energy_J", min), 0),

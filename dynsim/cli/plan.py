@@ -32,8 +32,8 @@ def plan(
         str,
         typer.Option(
             metavar="LIST",
-            help="Points that may be braced: links (their joints), link_3:link_9, contact points, with commas; "
-            "default: all links but the first two, and all contact points.",
+            help="Points that may be braced: links (their joints), link_3:link_9, frames, contact points, with "
+            "commas; default: all links but the first two, and all contact points.",
         ),
     ] = "",
     along: Annotated[

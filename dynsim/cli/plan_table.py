@@ -56,16 +56,26 @@ def _cells(size: Size) -> tuple[str, ...]:
     )
 
 
+def _borne(shift_m: float | None, friction: float | None) -> list[str]:
+    """Errors that a refused plan bears, as far as they were tried."""
+    texts = []
+    if shift_m is not None:
+        texts.append(f"surfaces that are {1e3 * shift_m:.2g} mm off" if shift_m else "none of the surfaces tried")
+    if friction is not None:
+        texts.append(f"friction that is {100 * friction:.2g} % off" if friction else "none of friction tried")
+    return [f"of errors, each alone, up and down, bears {' and '.join(texts)}"] if texts else []
+
+
 def _notes(size: Size) -> list[str]:
     notes = [f"refused, {size.reason}"] if size.planned is not None and size.reason else []
     if size.planned is None:
         notes.append(size.reason)
+    if size.verdict is not None and not size.verdict.sound:
+        notes.append(f"refused as planned with k_p = {size.k_p:g} V/rad: no errors of the scene were tried")
     for brace, share in ({} if size.nominal is None else size.nominal.closed).items():
         if share < LIFTED:
             notes.append(f"{brace} lifts off, for {100.0 * (1.0 - share):.2g} % of the time of the run as planned")
     if size.tolerance is not None:
-        notes.append(
-            f"bears {1e3 * size.tolerance[0]:.2g} mm of surface, and {100 * size.tolerance[1]:.2g} % of friction"
-        )
+        notes += _borne(*size.tolerance)
     notes += [f"{label} would be cheaper, but: {why}" for label, why in size.cheaper]
     return notes

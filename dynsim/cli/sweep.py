@@ -112,6 +112,7 @@ def sweep(
             resume=resume,
             scheduler=scheduler,
             progress=report,
+            first=lambda row: _warn_of_unknown(row, plot or ()),
         )
     failed = [row for row in rows if row.status != OK]
     for row in failed[:_SHOWN]:
@@ -136,6 +137,19 @@ def _variants(known: Sequence[str], wanted: str | None) -> tuple[str | None, ...
     if wanted is None:
         return (known[0],)
     return tuple(known) if wanted == "all" else tuple(name.strip() for name in wanted.split(","))
+
+
+def _warn_of_unknown(row: SweepRow, plotted: Sequence[str]) -> None:
+    """Say of numbers to draw, before all is run, that the first run does not have them; another variant may."""
+    from dynsim.config.problems import suggest
+
+    for number in plotted:
+        if number not in row.numbers:
+            named = f" ({escaped(row.variant)})" if row.variant else ""
+            errors.print(
+                f"[yellow]warning:[/] --plot {escaped(number)}: run {row.run}{named} has no such number"
+                f"{suggest(number, row.numbers)}; Ctrl-C, then --resume with another --plot, loses no run"
+            )
 
 
 def _draw(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -41,7 +42,8 @@ class Size:
     planned : the set with its references; None: nothing was found, and ``reason`` says why
     verdict : of the corners; None where nothing was verified
     agreed, rounds : how many rounds of the search found this heat, of how many
-    tolerance : error of the surfaces [m] and share of friction that do hold; None unless asked for
+    tolerance : error of the surfaces [m] and share of friction that do hold, each alone; None unless asked for, and
+        where the run as planned is refused already
     cheaper : sets of less heat that were refused, and why
     """
 
@@ -51,7 +53,7 @@ class Size:
     agreed: int = 0
     rounds: int = 0
     reason: str = ""
-    tolerance: tuple[float, float] | None = None
+    tolerance: tuple[float | None, float | None] | None = None
     cheaper: tuple[tuple[str, str], ...] = ()
 
     @property
@@ -73,6 +75,12 @@ class Size:
     def nominal(self) -> Corner | None:
         """The run as planned; None where nothing was verified."""
         return None if self.verdict is None else self.verdict.nominal
+
+    @property
+    def expected(self) -> float:
+        """Heat by which numbers of braces rank [W]: of the run as planned, else the planned one."""
+        nominal = self.nominal
+        return self.heat if nominal is None or math.isnan(nominal.heat_W) else nominal.heat_W
 
     @property
     def survives(self) -> bool | None:
@@ -114,7 +122,7 @@ class BracePlan:
 
     def __repr__(self) -> str:
         best = self.best
-        text = "nothing found" if best is None else f"best: {best.label}, {best.heat:.4g} W"
+        text = "nothing found" if best is None else f"best: {best.label}, {best.expected:.4g} W"
         return f"<BracePlan {self.task.scenario.title}: {len(self.sizes)} sizes, {text}>"
 
     @property
@@ -124,8 +132,8 @@ class BracePlan:
 
     @property
     def best(self) -> Size | None:
-        """The least heat of those that survive, else of all; None where nothing was found."""
-        return min(self.answered, key=lambda size: (size.survives is False, size.heat), default=None)
+        """The least expected heat of those that survive, else of all; None where nothing was found."""
+        return min(self.answered, key=lambda size: (size.survives is False, size.expected), default=None)
 
     def size(self, count: int) -> Size:
         """The answer for a number of braces.
@@ -150,11 +158,11 @@ class BracePlan:
 
     @property
     def pareto(self) -> list[tuple[int, float]]:
-        """Numbers of braces, and heat [W], that no smaller number reaches."""
+        """Numbers of braces, and expected heat [W], that no smaller number reaches."""
         points: list[tuple[int, float]] = []
         for size in self.answered:
-            if not points or size.heat < points[-1][1]:
-                points.append((size.count, size.heat))
+            if not points or size.expected < points[-1][1]:
+                points.append((size.count, size.expected))
         return points
 
     def scenario(self, count: int) -> Scenario:
@@ -326,8 +334,8 @@ def plan_braces(
 
     Parameters
     ----------
-    candidates : links (their joints), ``first:last``, or contact points of the scenario; default: all links but the
-        first two, and all contact points
+    candidates : links (their joints), ``first:last``, frames, or contact points of the scenario; default: all links
+        but the first two, and all contact points
     along : shares of the way along links that are candidates too
     radius_m : of candidates; default: that of their links
     count : least and greatest number of braces
@@ -370,6 +378,8 @@ def plan_braces(
     tell = tell or (lambda text, share: None)
     with named(scenario):
         problem = task(scenario, options)
+        if problem.bare and most > 0:
+            warnings.warn(_bare(problem.bare), stacklevel=2)
         if not np.any(problem.arm.model.robot.gravity):
             raise ScenarioError("plant.gravity_m_s2 = [0, 0, 0]: without gravity an arm needs no braces")
         search = Search(problem, tell)
@@ -381,6 +391,15 @@ def plan_braces(
     singles = {brace.label: known[brace,] for brace in problem.candidates if (brace,) in known}
     heats = {size.count: _ranked(size, ranked[size.count]) for size in sizes}
     return BracePlan(problem, tuple(sizes), search.tally, singles, heats)
+
+
+def _bare(names: Sequence[str]) -> str:
+    """Warning of candidates without a radius."""
+    return (
+        f"plan: candidates {', '.join(names)} have radius 0 (links of a URDF have none, whatever <visual> shows): "
+        "braces would lay the axis itself onto the surface; give --radius, or name contacts.points with radius_m as "
+        "--candidates"
+    )
 
 
 def _ranked(size: Size, planned: Sequence[Planned]) -> list[tuple[str, float]]:
@@ -461,7 +480,7 @@ def _verified(
         planned, verdict = tried[chosen]
         cheaper = tuple((", ".join(b.label for b in p.braces), v.reason) for p, v in tried[:chosen])
         tolerance = None
-        if explain and not verdict.survives:
+        if explain and not verdict.survives and verdict.sound:
             tell("bisecting", 0.95)
             tolerance = verifier.tolerance(planned.braces, planned.dense, verdict.k_p)
         answered.append(

@@ -97,8 +97,8 @@ class Options:
 
     Attributes
     ----------
-    candidates : bodies or declared contact points, ``first:last`` for all from one to the other; empty: all links
-        beyond the second, and declared points
+    candidates : links, frames or declared contact points, ``first:last`` for all links from one to the other; empty:
+        all links beyond the second, and declared points
     along : shares of the way along links that are candidates too, beside their joints
     radius_m : of candidates; None: that of their links, and of declared points what they say
     count : least and greatest number of braces
@@ -133,6 +133,14 @@ class Task:
     kind: Kind
     candidates: tuple[Candidate, ...]
     friction: float
+
+    @property
+    def bare(self) -> list[str]:
+        """Names of candidates whose radius of zero nobody chose: it is that of their links."""
+        if self.options.radius_m is not None:
+            return []
+        declared = self.scenario.config.contacts.points
+        return list(dict.fromkeys(c.name for c in self.candidates if c.radius == 0.0 and c.name not in declared))
 
     @cached_property
     def _known(self) -> dict[Any, Any]:
@@ -313,6 +321,7 @@ def _candidates(scenario: Scenario, arm: MovingArm, options: Options, surfaces: 
     """Points that may be braced, each with each surface that it may lean on."""
     robot, declared = arm.model.robot, scenario.config.contacts.points
     links = [robot.links[i].name for i in arm.links]
+    frames = [frame.name for frame in robot.frames if frame.body in links]
     wanted: list[str] = []
     for text in options.candidates:
         first, _, last = text.partition(":")
@@ -346,9 +355,12 @@ def _candidates(scenario: Scenario, arm: MovingArm, options: Options, surfaces: 
             on = [point.surface] if point.surface in surfaces else list(surfaces)
             add(name, point.body, np.array(point.point_m), point.radius_m, on)
             continue
+        if name in frames:
+            add(name, name, np.zeros(3), robot.links[robot.attach(name, np.zeros(3))[0]].radius, surfaces)
+            continue
         if name not in links:
-            known_names = ", ".join([*declared, *links])
-            raise ModelError(f"plan: no candidate {name!r}; links and contact points: {known_names}")
+            known_names = ", ".join([*declared, *links, *frames])
+            raise ModelError(f"plan: no candidate {name!r}; contact points, links and frames: {known_names}")
         k = links.index(name)
         radius = robot.links[arm.links[k]].radius
         parent = int(arm.tables.parent[k])

@@ -85,7 +85,9 @@ def _loaded(scenario: Scenario) -> Robot:
     for name, config in scenario.config.loads.items():
         if isinstance(config, Payload):
             body, point, axes = _attached(bare, name, config)
-            inertias.setdefault(body, [bare.links[body].inertia]).append(_payload(name, config, point, axes))
+            # One of no mass leaves its link as it is, to the bit.
+            if config.mass_kg > 0.0:
+                inertias.setdefault(body, [bare.links[body].inertia]).append(_payload(name, config, point, axes))
     links = list(bare.links)
     for body, parts in inertias.items():
         links[body] = replace(links[body], inertia=Inertia.merged(parts))

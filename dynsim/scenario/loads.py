@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, model_validator
 
-from dynsim.config.base import BodyPoint, NonNegative, Positive, Vector3, error_at
+from dynsim.config.base import BodyPoint, NonNegative, Vector3, error_at
 from dynsim.record.csv_rows import read_rows
 
 FORCE_COLUMNS = ("t_s", "fx_N", "fy_N", "fz_N")
@@ -128,10 +128,10 @@ class Table(Sampled):
 
 
 class Payload(BodyPoint):
-    """A body that is fixed to one of the robot's; its centre of mass is at ``point_m``."""
+    """A body that is fixed to one of the robot's; its centre of mass is at ``point_m``; without mass it is none."""
 
     type: Literal["payload"]
-    mass_kg: Positive
+    mass_kg: NonNegative
     radius_m: NonNegative = Field(default=0.0, description="of a solid sphere; zero: a point mass")
     inertia_kg_m2: Annotated[list[NonNegative], Field(min_length=3, max_length=3)] | None = Field(
         default=None, description="xx yy zz about the centre of mass, in the axes of body; default: the sphere's"
@@ -141,6 +141,8 @@ class Payload(BodyPoint):
     def _check(self) -> Self:
         if self.inertia_kg_m2 is not None and self.radius_m > 0.0:
             raise error_at("inertia_kg_m2", "cannot be given together with radius_m; remove one of the two")
+        if self.inertia_kg_m2 is not None and self.mass_kg == 0.0:
+            raise error_at("inertia_kg_m2", "cannot be that of mass_kg = 0; remove it, or give radius_m instead")
         return self
 
 

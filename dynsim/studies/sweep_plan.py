@@ -23,6 +23,8 @@ ANY = "*"
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _RANGE = re.compile(rf"({_NUMBER}):({_NUMBER}):(\d+)")
+# A range without its count, or with one that is no whole number.
+_HALF_RANGE = re.compile(rf"({_NUMBER}):({_NUMBER})(:.*)?")
 _LAW = re.compile(rf"(\w+)\(\s*({_NUMBER})\s*,\s*({_NUMBER})\s*\)")
 # Laws of samples, and what their two numbers are.
 LAWS = {"normal": "mean, standard deviation", "uniform": "least, greatest"}
@@ -53,6 +55,9 @@ class Axis:
                 )
             # Twelve digits: 0.3 and not 0.30000000000000004.
             return cls(key, tuple(float(f"{x:.12g}") for x in np.linspace(start, stop, count)))
+        if match := _HALF_RANGE.fullmatch(value):
+            example = f"{key}={match[1]}:{match[2]}:5"
+            raise ScenarioError(f"--grid {text}: must be start:stop:count with a whole count, such as {example}")
         values = parse_yaml(f"[{value}]", ScenarioError, f"--grid {key}", line_numbers=False)
         if not values:
             raise ScenarioError(f"--grid {text}: has no values")

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -12,7 +13,10 @@ from support.planner_scenes import scene
 from typer.testing import CliRunner
 
 from dynsim.cli.app import app
+from dynsim.cli.plan_table import _notes
 from dynsim.errors import ModelError, ScenarioError, UnreachableReference
+from dynsim.planner.answer import Size
+from dynsim.planner.verify import Corner, Verdict
 from dynsim.scenario import load_scenario, to_yaml, variant_names
 
 import dynsim.cli.commands  # noqa: F401  # isort: skip
@@ -125,7 +129,7 @@ def floor_below_reach(data: dict[str, Any]) -> None:
 
 
 def floor_that_grips(data: dict[str, Any]) -> None:
-    data["contacts"]["friction"] = 3.0
+    data["contacts"]["friction"] = 6.0
 
 
 @pytest.mark.parametrize(
@@ -148,3 +152,29 @@ def test_where_no_brace_helps_the_answer_is_none(
     assert result.exit_code == 0, result.output
     assert reason in " ".join(result.output.split())
     assert json.loads((out / "plan.json").read_text(encoding="utf-8"))["best"] == 0
+
+
+def refused(corners: Sequence[Corner], tolerance: tuple[float | None, float | None] | None) -> Size:
+    """A size with a plan that some corner refuses."""
+    return Size(1, SimpleNamespace(heat=1.0), Verdict(50.0, tuple(corners)), tolerance=tolerance)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("size", "said"),
+    [
+        (
+            refused([Corner(1.0, 0.0, reason="too hot")], None),
+            "refused as planned with k_p = 50 V/rad: no errors of the scene were tried",
+        ),
+        (
+            refused([Corner(1.0, 0.0), Corner(0.8, 0.0, reason="too hot")], (0.005, 0.0)),
+            "of errors, each alone, up and down, bears surfaces that are 5 mm off and none of friction tried",
+        ),
+        (
+            refused([Corner(1.0, 0.0), Corner(0.8, 0.0, reason="too hot")], (None, 0.1)),
+            "of errors, each alone, up and down, bears friction that is 10 % off",
+        ),
+    ],
+)
+def test_only_errors_that_were_tried_are_spoken_of(size: Size, said: str) -> None:
+    assert _notes(size) == [said]

@@ -86,6 +86,9 @@ def test_a_number_that_no_run_has_is_refused_and_others_are_drawn_without_runs(t
     wrong = sweep("elbow_comparison", *varied, "--plot", "elbow_4.normal_force_max", folder=tmp_path)
     assert wrong.returncode == 2
     assert "did you mean 'elbow_4.normal_force_max_N'?" in wrong.stderr
+    # As soon as a run has ended, not only after all.
+    early = wrong.stderr.index("warning: --plot elbow_4.normal_force_max: run 0")
+    assert early < wrong.stderr.index("error: --plot elbow_4.normal_force_max: no run has that number")
     journal = (tmp_path / "out" / "runs.jsonl").read_bytes()
     asked = ["--resume", "--plot", "elbow_4.normal_force_max_N", "--plot", "joint_2.current_rms_A"]
     right = sweep("elbow_comparison", *varied, *asked, folder=tmp_path)

@@ -244,6 +244,25 @@ def test_hand_path_panels_have_one_scale_and_all_points(braced: Record) -> None:
             assert all(inside(*point) for point in braced[name][:, (i, j)])
 
 
+def test_labels_of_hand_path_ticks_stand_apart(braced: Record) -> None:
+    """Also about zero, where they are the widest: −0.050, −0.025."""
+    record = without(braced, "hand_position", "target_position")
+    turn = np.linspace(0.0, 2.0 * np.pi, len(braced))
+    circle = 0.051 * np.stack([np.cos(turn), np.sin(turn), 0.5 * np.sin(turn)], axis=1)
+    for name in ("hand_position", "target_position"):
+        record.add(name, circle, "m", labels=("x", "y", "z"))
+    with style.look():
+        figure = drawn(hand.path(record))
+        figure.draw_without_rendering()
+    for axes in figure.axes:
+        low, high = axes.get_xlim()
+        shown = [
+            label.get_window_extent() for label in axes.get_xticklabels() if low <= label.get_position()[0] <= high
+        ]
+        assert len(shown) >= 2
+        assert all(right.x0 - left.x1 > 3.0 for left, right in itertools.pairwise(shown))
+
+
 def test_target_that_is_held_is_a_mark(braced: Record) -> None:
     held = without(braced, "target_position")
     held.add("target_position", np.tile(braced["target_position"][0], (len(braced), 1)), "m", labels=("x", "y", "z"))
@@ -335,6 +354,19 @@ def test_side_view_shows_the_arm_and_which_contact_pulls(braced: Record) -> None
     # The arm stands in the plane x = y: seen from the side, all its 0.3 m links have their true length at the start.
     first = np.array(side.collections[0].get_segments())
     np.testing.assert_allclose(np.linalg.norm(first[1:, 1] - first[1:, 0], axis=1)[1:], 0.3, rtol=1e-6)
+
+
+def test_contacts_with_a_radius_are_marked_on_their_surface() -> None:
+    """Where the sphere touches, not at its centre above the floor."""
+    radii = {f"contacts.points.elbow_{k}.radius_m": 0.02 for k in (4, 7)}
+    overrides = {"duration_s": 0.05, "surfaces.floor.point_m": [0.0, 0.0, -0.02], **radii}
+    record = dynsim.simulate(load_scenario("pressing", "plain", overrides))
+    body, _ = skeleton.skeleton(record)
+    assert body is not None
+    touching = {point.name: (position, force) for point, _, position, force in body.contacts()}
+    position, force = touching["elbow_7"]
+    assert force > 0.0
+    assert position[2] == pytest.approx(-0.02, abs=1e-4)
 
 
 def test_labels_of_contacts_do_not_overprint_each_other(braced: Record) -> None:

@@ -139,6 +139,17 @@ def test_several_payloads_on_a_link_add_up(tmp_path: Path) -> None:
     assert np.allclose(inertia.com, [0.0, 0.0, 0.3 * 0.15 / 2.3], rtol=0.0, atol=1e-15)
 
 
+@pytest.mark.parametrize("shape", ["", ", radius_m: 0.1"])
+def test_a_payload_without_mass_adds_nothing(tmp_path: Path, shape: str) -> None:
+    """As a sweep over its mass begins: the link is that without a payload, to the bit."""
+    payload = f"  gripper: {{type: payload, body: link_2, mass_kg: 0, point_m: [0.1, 0, 0]{shape}}}\n"
+    loaded, bare = build.robot(read(tmp_path, payload)), build.robot(read(tmp_path, "  {}\n"))
+    for with_it, without in zip(loaded.links, bare.links, strict=True):
+        assert with_it.inertia.mass == without.inertia.mass
+        assert np.array_equal(with_it.inertia.com, without.inertia.com)
+        assert np.array_equal(with_it.inertia.tensor, without.inertia.tensor)
+
+
 @pytest.mark.parametrize(
     ("load", "expected"),
     [
@@ -159,7 +170,12 @@ def test_several_payloads_on_a_link_add_up(tmp_path: Path) -> None:
         ),
         ("{type: csv, body: link_1, file: steep.csv}", "steep.csv: numbers too large, or samples too close in time"),
         ("{type: payload, body: link_1}", "loads.push.mass_kg: is missing"),
-        ("{type: payload, body: link_1, mass_kg: 0}", "loads.push.mass_kg = 0: must be greater than 0"),
+        ("{type: payload, body: link_1, mass_kg: -1}", "loads.push.mass_kg = -1: must be "),
+        ("{type: payload, body: link_9, mass_kg: 0}", "case.yaml:6: loads.push.body: no body 'link_9'"),
+        (
+            "{type: payload, body: link_1, mass_kg: 0, inertia_kg_m2: [1, 1, 1]}",
+            "loads.push.inertia_kg_m2: cannot be that of mass_kg = 0",
+        ),
         (
             "{type: payload, body: link_1, mass_kg: 1, radius_m: 1, inertia_kg_m2: [1, 1, 1]}",
             "loads.push.inertia_kg_m2: cannot be given together with radius_m",

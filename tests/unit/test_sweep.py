@@ -72,6 +72,8 @@ def test_values_of_a_grid(text: str, values: tuple[Any, ...]):
         (lambda: Axis.parse("contacts.friction"), "must look like"),
         (lambda: Axis.parse("a=0:1:1"), "2 or more"),
         (lambda: Axis.parse("a=1,1"), "a value twice"),
+        (lambda: Axis.parse("a=0:0.5"), "must be start:stop:count with a whole count, such as a=0:0.5:5"),
+        (lambda: Axis.parse("a=0:0.5:0.1"), "must be start:stop:count with a whole count, such as a=0:0.5:5"),
         (lambda: Law.parse("a=cauchy(0,1)"), r"laws: normal\(mean, standard deviation\), uniform"),
         (lambda: Law.parse("a=normal(1,0)"), "spread that is positive"),
         (lambda: Law.parse("a=uniform(2,1)"), "spread that is positive"),
@@ -456,9 +458,9 @@ def test_figures_by_what_was_varied(tmp_path: Path, grid: list[str], sampled: li
 @pytest.mark.parametrize(
     ("key", "label"),
     [
-        ("base.tip_margin_min", "base.tip margin min"),
-        ("elbow_4.normal_force_max_N", "elbow 4.normal force max [N]"),
-        ("joint_1.torque_rms_N_m", "joint 1.torque rms [N m]"),
+        ("base.tip_margin_min", "base: tip margin min"),
+        ("elbow_4.normal_force_max_N", "elbow_4: normal force max [N]"),
+        ("joint_1.torque_rms_N_m", "joint_1: torque rms [N m]"),
         ("position_error_max_m", "position error max [m]"),
         ("slip_max_m_per_s", "slip max [m/s]"),
     ],
@@ -547,6 +549,27 @@ def test_runs_at_the_same_place_do_not_hide_each_other():
     # Those of the second lie on top.
     assert first > 2.0 * second
     assert axes.lines[0].get_zorder() > max(dots.get_zorder() for dots in axes.collections)
+
+
+def test_variants_differ_in_their_markers_and_the_best_runs_have_their_numbers():
+    rows = [row | {"run": k} for k, row in enumerate(ROWS)]
+    figure = pictures.pareto(pictures.Sweep("test", rows, ["a", "b"], ["mass"]))
+    assert figure is not None
+    axes = figure.axes[0]
+    first, second = (dots.get_paths()[0].vertices for dots in axes.collections)
+    assert first.shape != second.shape
+    # The lightest of the first place, of either variant, is the least in both.
+    assert [text.get_text() for text in axes.texts] == ["0"]
+
+
+@pytest.mark.parametrize("failed", [True, False])
+def test_cells_without_numbers_are_explained(failed: bool):
+    rows = [row if not failed or row["a"] or row["b"] == "x" else dict(list(row.items())[:4]) for row in ROWS]
+    figure = pictures.heat_map(pictures.Sweep("test", rows, ["a", "b"], ["mass"]))
+    assert figure is not None
+    assert [text.get_text() for legend in figure.legends for text in legend.get_texts()] == [
+        "no run ended well"
+    ] * failed
 
 
 def test_colour_bars_stand_below_their_column():

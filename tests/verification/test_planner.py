@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -14,11 +17,13 @@ from dynsim.compile.splines import clamped_cubic, quintic_rates
 from dynsim.errors import ModelError, ScenarioError
 from dynsim.jit.kernel import integers, reals
 from dynsim.model.surfaces import Box, HeightField, Quadric, shape_arrays
+from dynsim.planner.answer import BracePlan, Size
 from dynsim.planner.compiled import Arm, Course, Points
 from dynsim.planner.local import Problem, workspace
 from dynsim.planner.problem import FINAL_SLIP_SCALE, Options, task
-from dynsim.planner.search import Search
-from dynsim.planner.verify import Tolerances, Verifier
+from dynsim.planner.search import Search, Tally
+from dynsim.planner.verify import Corner, Tolerances, Verdict, Verifier
+from dynsim.scenario import to_yaml
 from dynsim.scenario.reading import scenario_from_resolved
 
 
@@ -309,3 +314,109 @@ def test_a_base_that_stands_is_planned_with_events_that_see_it_tip() -> None:
     plan = dynsim.plan_braces(scenario_from_resolved(data), candidates=["link_6", "link_8"], count=(1, 1), starts=1)
     assert plan.yaml["integrator"]["method"] == "auto"
     assert plan.size(1).verdict.nominal.heat_W == pytest.approx(plan.size(1).heat, rel=0.05)  # type: ignore[union-attr]
+
+
+URDF_ARM = """<robot name="arm"><link name="ground"/>
+  <link name="upper">{body}</link><joint name="a" type="revolute"><parent link="ground"/><child link="upper"/>
+    <origin xyz="0 0 0.3"/><axis xyz="0 1 0"/><limit lower="-3" upper="3" effort="9" velocity="9"/></joint>
+  <link name="mid">{body}</link><joint name="b" type="revolute"><parent link="upper"/><child link="mid"/>
+    <origin xyz="0.3 0 0"/><axis xyz="0 1 0"/><limit lower="-3" upper="3" effort="9" velocity="9"/></joint>
+  <link name="fore">{body}</link><joint name="c" type="revolute"><parent link="mid"/><child link="fore"/>
+    <origin xyz="0.3 0 0"/><axis xyz="0 1 0"/><limit lower="-3" upper="3" effort="9" velocity="9"/></joint>
+  <link name="pad"/><joint name="pad_fix" type="fixed"><parent link="fore"/><child link="pad"/>
+    <origin xyz="0.1 0 -0.02"/></joint>
+  <link name="tip"/><joint name="tip_fix" type="fixed"><parent link="fore"/><child link="tip"/>
+    <origin xyz="0.3 0 0"/></joint>
+</robot>"""
+BODY = (
+    '<inertial><origin xyz="0.15 0 0"/><mass value="0.3"/>'
+    '<inertia ixx="1e-4" ixy="0" ixz="0" iyy="2e-3" iyz="0" izz="2e-3"/></inertial>'
+)
+
+
+@pytest.fixture
+def urdf_arm(tmp_path: Path) -> dynsim.Scenario:
+    """Three joints of a URDF over a floor, with a pad as a frame."""
+    (tmp_path / "arm.urdf").write_text(URDF_ARM.format(body=BODY), encoding="utf-8")
+    hand = [0.7, 0.0, 0.2]
+    data = {
+        "duration_s": 2.0,
+        "plant": {"type": "urdf_arm", "file": "arm.urdf", "motor": MOTOR, "hand": {"body": "tip"}},
+        "controller": {
+            "type": "joint_pd",
+            "hand": {
+                "joints": ["a", "b", "c"],
+                "path": {"type": "waypoints", "times_s": [0.0, 1.0, 2.0], "points_m": [hand, hand, hand]},
+            },
+        },
+        "surfaces": {"floor": {"type": "plane"}},
+        "contacts": {"law": "unilateral", "points": {"heel": {"body": "mid", "radius_m": 0.03}}},
+    }
+    path = tmp_path / "arm.yaml"
+    path.write_text(to_yaml(data), encoding="utf-8")
+    return dynsim.load_scenario(path)
+
+
+def test_a_frame_is_a_candidate_at_its_point(urdf_arm: dynsim.Scenario) -> None:
+    (pad,) = task(urdf_arm, Options(candidates=("pad",))).candidates
+    assert (pad.name, pad.body, pad.point_m, pad.radius) == ("pad", "pad", (0.0, 0.0, 0.0), 0.0)
+    assert pad.on_joint == pytest.approx([0.1, 0.0, -0.02])
+    with pytest.raises(ModelError, match=r"no candidate 'foot'; contact points, links and frames: heel, .*pad"):
+        task(urdf_arm, Options(candidates=("foot",)))
+
+
+@pytest.mark.parametrize(
+    ("options", "bare"),
+    [
+        ({"candidates": ["heel", "fore", "pad"]}, "candidates fore, pad have radius 0"),
+        ({"candidates": ["heel", "fore"], "radius_m": 0.02}, ""),
+        ({"candidates": ["heel"]}, ""),
+    ],
+)
+def test_candidates_without_a_radius_are_warned_of(
+    urdf_arm: dynsim.Scenario, options: dict[str, Any], bare: str
+) -> None:
+    """Links of a URDF have none; a radius that was asked for, or that of a contact point, is meant."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        dynsim.plan_braces(urdf_arm, count=(0, 1), starts=1, verify=False, **options)
+    texts = [str(warning.message) for warning in caught if "radius 0" in str(warning.message)]
+    assert len(texts) == bool(bare)
+    assert all(bare in text and "--radius" in text for text in texts)
+
+
+def test_a_plan_that_costs_less_than_planned_holds() -> None:
+    """Braces that stick take less than the friction of creeping that is planned: no reason to refuse the plan.
+
+    What ranks then is the heat of the run as planned.
+    """
+    data = scene(11)
+    data["contacts"]["friction"] = 3.0
+    plan = dynsim.plan_braces(scenario_from_resolved(data), count=(1, 1), starts=1)
+    size = plan.size(1)
+    assert size.nominal is not None
+    assert size.nominal.heat_W < 0.5 * size.heat
+    assert size.survives, size.reason
+    assert plan.pareto == [(1, size.nominal.heat_W)]
+    # More by over 5 % is refused.
+    greedy = replace(size.dense, heat=size.nominal.heat_W / 1.06)
+    (verdict,) = Verifier(plan.task, Tolerances(gains=(size.k_p,))).verify([(size.braces, greedy)])
+    assert "over 5 % more than the planned" in verdict.reason
+    assert not verdict.sound
+
+
+def test_sizes_rank_by_the_heat_of_the_run_as_planned() -> None:
+    """Of two sizes the one whose run takes less is the best, though more was planned for it."""
+
+    class Stub(NamedTuple):
+        heat: float
+
+    def size(count: int, planned: float, simulated: float) -> Size:
+        corner = Corner(1.0, 0.0, heat_W=simulated)
+        return Size(count, Stub(planned), Verdict(100.0, (corner,)))  # type: ignore[arg-type]
+
+    sizes = (size(1, 0.6, 0.3), size(2, 0.5, 0.4), size(3, 0.45, float("nan")))
+    plan = BracePlan(None, sizes, Tally(), {}, {})  # type: ignore[arg-type]
+    assert plan.best is sizes[0]
+    assert [entry.expected for entry in sizes] == [0.3, 0.4, 0.45]
+    assert plan.pareto == [(1, 0.3)]

@@ -142,7 +142,9 @@ def _planes(figure: Figure, records: list[Record]) -> list[Axes]:
         axes.set_ylim(middle[j] - half, middle[j] + half)
         axes.set_xlabel(f"{'xyz'[i]} [m]")
         axes.set_ylabel(f"{'xyz'[j]} [m]")
-        axes.locator_params(nbins=5)
+        # Fewer beside each other, where "−0.050" is wide, than above each other.
+        axes.locator_params(axis="x", nbins=4)
+        axes.locator_params(axis="y", nbins=5)
     return panels
 
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 
 from dynsim.draw.figures.style import (
     BLUE,
@@ -17,6 +19,7 @@ from dynsim.draw.figures.style import (
     ORANGE,
     PULLING,
     Array,
+    legend_above,
     log_axis,
     new_figure,
     number,
@@ -27,6 +30,8 @@ from dynsim.draw.figures.style import (
 ARROW = 0.35
 # An arm that leaves its plane by less of its length is not drawn from above.
 FLAT = 0.02
+# Values whose ratio is larger are drawn on a logarithmic axis.
+WIDE = 20.0
 # Room to either side of an arm from above [m].
 MARGIN = 0.1
 
@@ -104,12 +109,12 @@ def posture(picture: PlanPicture) -> Figure | None:
     if not flat:
         views[1].set_ylim(aside.min() - MARGIN, aside.max() + MARGIN)
     views[-1].set_xlabel("along the heading [m]")
-    side.legend(loc="best")
+    legend_above(side, columns=2)
     return figure
 
 
 def _draw_poses(axes: Axes, picture: PlanPicture, seen: list[int], largest: float, length: float) -> None:
-    """Links, forces, and names of braces beside their places in the last pose."""
+    """Links, forces, and numbers of braces beside their points in the last pose: the legend has their names."""
     for k, pose in enumerate(picture.poses):
         shade = 0.25 + 0.75 * (k + 1) / len(picture.poses)
         for line in pose.lines:
@@ -122,44 +127,81 @@ def _draw_poses(axes: Axes, picture: PlanPicture, seen: list[int], largest: floa
                 axes.annotate("", xy=point, xytext=point - force, arrowprops=arrow)
             else:
                 axes.plot(*point, color=PULLING, alpha=shade, marker="o", markersize=4.0)
-    for name, point in zip(picture.braces, picture.poses[-1].points[:, seen], strict=True):
-        axes.annotate(name, point, xytext=(5.0, -9.0), textcoords="offset points", fontsize=7.0, color=PULLING)
+    for k, (name, point) in enumerate(zip(picture.braces, picture.poses[-1].points[:, seen], strict=True), start=1):
+        axes.annotate(
+            f"{k}",
+            point,
+            xytext=(6.0, -8.0),
+            textcoords="offset points",
+            ha="center",
+            va="center",
+            fontsize=7.5,
+            color=PULLING,
+            fontweight="bold",
+            path_effects=[withStroke(linewidth=2.0, foreground="white")],
+        )
+        axes.plot([], [], color=PULLING, marker=f"${k}$", linestyle="none", label=name)
 
 
 def heat_by_set(picture: PlanPicture) -> Figure | None:
-    """Heat of the best sets of each size; the answers filled, those that do not survive hatched."""
+    """Planned heat of the best sets of each size, and the simulated one of the answers, which are filled."""
     rows = [(count, label, heat, k) for count, sets in picture.sets.items() for k, (label, heat) in enumerate(sets)]
     if not rows:
         return None
-    figure = new_figure(1.2 + 0.26 * len(rows), f"{picture.title}: heat of the motors by set of braces")
-    axes = figure.subplots()
-    for y, (count, _, heat, k) in enumerate(rows):
+    texts, marks = [], []
+    for count, _, heat, k in rows:
+        corners = picture.corners.get(count, (heat, ()))[1]
         lost = k == 0 and picture.survives.get(count) is False
-        axes.barh(
-            y, heat, color=BLUE if k == 0 else "#B9D4E8", hatch="////" if lost else None, edgecolor="white", height=0.75
-        )
-        text = f" {number(heat, 3)} W" + (", does not survive" if lost else "")
-        axes.text(heat, y, text, va="center", fontsize=7.0)
-    axes.set_yticks(range(len(rows)), [f"{count}: {label}" for count, label, _, _ in rows], fontsize=7.0)
-    axes.invert_yaxis()
-    axes.set_xlabel("mean heat [W]")
-    if max(heat for *_, heat, _ in rows) > 20.0 * min(heat for *_, heat, _ in rows):
-        log_axis(axes, "x")
-    axes.margins(x=0.25)
-    return figure
+        run = f", simulated {number(corners[0][1], 3)} W" if k == 0 and corners and np.isfinite(corners[0][1]) else ""
+        texts.append(f"{number(heat, 3)} W{run}{', does not survive' if lost else ''}")
+        marks.append({"marker": "X" if lost else "o", "markerfacecolor": BLUE if k == 0 else "white"})
+    labels = [f"{count}: {label}" for count, label, _, _ in rows]
+    title = f"{picture.title}: heat of the motors by set of braces, the answers filled"
+    return _dots(title, labels, [heat for _, _, heat, _ in rows], texts, marks, "mean heat, planned [W]")
 
 
 def single_braces(picture: PlanPicture) -> Figure | None:
     """Least heat of an arm with one brace, by the point that is braced, in the middle of the path without slip."""
     if not picture.singles:
         return None
-    figure = new_figure(3.0, f"{picture.title}: one brace, by where it is")
+    heats = list(picture.singles.values())
+    best = min(heats)
+    texts = [f"{number(heat, 3)} W{', least' if heat == best else ''}" for heat in heats]
+    marks = [{"marker": "o", "markerfacecolor": BLUE if heat == best else "white"} for heat in heats]
+    title = f"{picture.title}: one brace, by where it is"
+    return _dots(title, list(picture.singles), heats, texts, marks, "least heat at one posture, no slip [W]")
+
+
+def _dots(
+    title: str,
+    labels: Sequence[str],
+    values: Sequence[float],
+    texts: Sequence[str],
+    marks: Sequence[Mapping[str, Any]],
+    axis: str,
+) -> Figure:
+    """A row with a dot and its text for each value: on a logarithmic axis, which values of many sizes need, bars would
+    begin anywhere."""
+    figure = new_figure(1.1 + 0.26 * len(values), title)
     axes = figure.subplots()
-    names = list(picture.singles)
-    axes.bar(range(len(names)), list(picture.singles.values()), color=ORANGE)
-    axes.set_xticks(range(len(names)), names, rotation=45.0, ha="right", fontsize=7.0)
-    axes.set_ylabel("heat, no slip [W]")
-    axes.set_yscale("log")
+    low, high = min(values), max(values)
+    wide = high > WIDE * low > 0.0
+    middle = np.sqrt(low * high) if wide else 0.5 * high
+    for y, (value, text, mark) in enumerate(zip(values, texts, marks, strict=True)):
+        axes.plot(value, y, color=BLUE, markersize=6.0, linestyle="none", clip_on=False, zorder=3, **mark)
+        # Towards the middle, where there is room.
+        offset, side = (7.0, "left") if value <= middle else (-7.0, "right")
+        axes.annotate(
+            text, (value, y), xytext=(offset, 0.0), textcoords="offset points", ha=side, va="center", fontsize=7.0
+        )
+    axes.set_yticks(range(len(labels)), labels, fontsize=7.0)
+    axes.set_ylim(len(labels) - 0.5, -0.5)
+    axes.set_xlabel(axis)
+    if wide:
+        axes.set_xlim(low / (high / low) ** 0.05, high * (high / low) ** 0.05)
+        log_axis(axes, "x")
+    else:
+        axes.set_xlim(0.0, 1.1 * high or 1.0)
     return figure
 
 
@@ -175,14 +217,18 @@ def robustness(picture: PlanPicture) -> Figure | None:
     for k, (count, (planned, corners)) in enumerate(shown.items()):
         at = np.arange(len(corners)) + (k - 0.5 * (len(shown) - 1)) * width
         colour = (BLUE, GREEN, ORANGE, GREY, PULLING)[k % 5]
-        upper.bar(at, [heat / planned for _, heat, _ in corners], width, color=colour, label=f"{count} braces")
+        upper.bar(at, [heat / planned for _, heat, _ in corners], width, color=colour, label=_number_of_braces(count))
         lower.bar(at, [error for _, _, error in corners], width, color=colour)
     upper.axhline(1.0, color="black", linewidth=0.6)
     upper.set_ylabel("heat over planned")
     lower.set_ylabel("hand's error, rms [mm]")
     lower.set_xticks(range(len(labels)), labels, rotation=25.0, ha="right", fontsize=6.5)
-    upper.legend(ncols=4)
+    legend_above(upper, columns=len(shown))
     return figure
+
+
+def _number_of_braces(count: int) -> str:
+    return f"{count} brace{'' if count == 1 else 's'}"
 
 
 FIGURES = {

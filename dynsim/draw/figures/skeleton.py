@@ -75,6 +75,8 @@ class Skeleton:
     def contacts(self) -> list[tuple[Point, SceneSurface, Array, float]]:
         """Contact, its surface, position and normal force at the end; NaN for a force that is not known.
 
+        A point with a radius is where its sphere touches, if a force says that it does.
+
         Of those that could touch, under the unilateral law, the ones that did in some sample.
         """
         record = self.record
@@ -89,11 +91,16 @@ class Skeleton:
             untouched = {
                 name for name, always in zip(record.labels["contact_mode"], open_always, strict=True) if always
             }
-        return [
-            (point, surface, point_positions(record, point, len(record) - 1), float(forces.get(point.name, np.nan)))
-            for point in self.scene.contacts
-            if (surface := self.scene.surface(point.surface)) is not None and point.name not in untouched
-        ]
+        contacts = []
+        for point in self.scene.contacts:
+            surface = self.scene.surface(point.surface)
+            if surface is None or point.name in untouched:
+                continue
+            position, force = point_positions(record, point, len(record) - 1), float(forces.get(point.name, np.nan))
+            if abs(force) > 0.0:
+                position = position - surface.gap(position) * surface.normal(position)
+            contacts.append((point, surface, position, force))
+        return contacts
 
 
 def _moves_beside(joint: Joint) -> bool:

@@ -15,6 +15,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 
 from dynsim.draw.figures import style
 from dynsim.draw.figures.style import Array
@@ -40,6 +41,8 @@ _COLOURS = 0.5
 _LABEL, _HEAD, _PART = 34, 58, 70
 # Rows of distributions.
 _ROWS = 6
+# Of variants among each other; and the most runs that have their number beside them.
+_MARKERS, _NUMBERED = "osD^vP*X", 12
 
 
 @dataclass(frozen=True)
@@ -96,14 +99,18 @@ class Sweep:
 
 
 def named(key: str) -> tuple[str, float]:
-    """Label of a number by its key, with the unit that is in it, and 1: ``base.tip_margin_min`` is drawn as it is."""
-    words = key.split("_")
+    """Label of a number by its key, with the unit that is in it, and 1: ``base.tip_margin_min`` is drawn as it is.
+
+    Names before the last point stay as they are: ``elbow_c: normal force max [N]``.
+    """
+    name, _, number = key.rpartition(".")
+    words = number.split("_")
     units: list[str] = []
     while len(words) > 1 and words[-1] in UNITS:
         units.insert(0, words.pop())
     per = units.index("per") if "per" in units else len(units)
     unit = " ".join(units[:per]) + ("/" + " ".join(units[per + 1 :]) if per < len(units) else "")
-    return f"{' '.join(words)}{f' [{unit}]' if unit else ''}", 1.0
+    return f"{name}{': ' if name else ''}{' '.join(words)}{f' [{unit}]' if unit else ''}", 1.0
 
 
 def draw(sweep: Sweep, folder: Path, kind: str = "png") -> list[Path]:
@@ -165,6 +172,7 @@ def heat_map(sweep: Sweep) -> Figure | None:
     figure = style.new_figure(_PANEL * len(variants) + _ROOM + _COLOURS, title)
     panels = figure.subplots(len(variants), len(metrics), squeeze=False, sharex=True, sharey=True)
     xs, ys = _levels(sweep.rows, x), _levels(sweep.rows, y)
+    empty = False
     for column, (metric, (label, scale)) in zip(panels.T, metrics.items(), strict=True):
         tables = [np.full((len(ys), len(xs)), np.nan) for _ in variants]
         for table, variant in zip(tables, variants, strict=True):
@@ -173,6 +181,7 @@ def heat_map(sweep: Sweep) -> Figure | None:
                     values = _values(_at(sweep.of(variant), {x: a, y: b}), metric) * scale
                     table[j, i] = values.mean() if len(values) else np.nan
         low, high = np.nanmin(tables), np.nanmax(tables)
+        empty = empty or bool(np.isnan(tables).any())
         norm = LogNorm(low, high) if _is_wide(low, high) else Normalize(low, high)
         for axes, table, variant in zip(column, tables, variants, strict=True):
             image = axes.imshow(table, origin="lower", aspect="auto", cmap="viridis", norm=norm)
@@ -185,6 +194,8 @@ def heat_map(sweep: Sweep) -> Figure | None:
         bar = figure.colorbar(image, ax=list(column), label=label, location="bottom", aspect=30, pad=0.02)
         if isinstance(norm, LogNorm):
             style.log_axis(bar.ax, "x")
+    if empty:
+        figure.legend(handles=[Patch(color=style.GREY, label="no run ended well")], loc="outside lower right")
     for axes in panels[:, 1:].flat:
         axes.set_ylabel("")
     for axes in panels[:-1].flat:
@@ -193,7 +204,7 @@ def heat_map(sweep: Sweep) -> Figure | None:
 
 
 def pareto(sweep: Sweep) -> Figure | None:
-    """Energy against error of all runs, and those that no other run beats in both; None without both."""
+    """Energy against error of all runs, and by number those that no other run beats in both; None without both."""
     if sweep.plotted or len(sweep.metrics) < 2:
         return None
     (energy, (energy_label, _)), (error, (error_label, scale)) = sweep.metrics.items()
@@ -207,12 +218,15 @@ def pareto(sweep: Sweep) -> Figure | None:
         xs, ys = np.array(points, dtype=float).reshape(-1, 2).T
         # Earlier ones are larger: equal runs of several variants are rings about each other.
         larger = 1.0 + 1.8 * (len(sweep.variants) - 1 - k) / last
-        size = (14 if len(sweep.rows) < 500 else 4) * larger**2
-        axes.scatter(
-            scale * xs, ys, s=size, color=styles[variant]["color"], label=variant or None, linewidths=0, zorder=3
-        )
+        size = (18 if len(sweep.rows) < 500 else 4) * larger**2
+        mark = {"color": styles[variant]["color"], "marker": _MARKERS[k % len(_MARKERS)]}
+        axes.scatter(scale * xs, ys, s=size, label=variant or None, linewidths=0, zorder=3, **mark)
     rows = [row for row in sweep.rows if None not in (row.get(error), row.get(energy))]
     front = best([(scale * row[error], row[energy]) for row in rows])
+    numbered = len(front) <= _NUMBERED and all("run" in row for row in rows)
+    for x, y in front if numbered else ():
+        run = next(row["run"] for row in rows if (scale * row[error], row[energy]) == (x, y))
+        axes.annotate(f"{run}", (x, y), xytext=(5.0, 4.0), textcoords="offset points", fontsize=7.0, zorder=5)
     axes.plot(
         *front.T,
         color=style.BLACK,
@@ -222,7 +236,7 @@ def pareto(sweep: Sweep) -> Figure | None:
         marker="o",
         markersize=5,
         markerfacecolor="none",
-        label="no run is better in both",
+        label=f"no run is better in both{', numbered as in the table' if numbered else ''}",
         zorder=4,
     )
     axes.margins(0.05)
