@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, model_validator
 
 from dynsim.config.base import Positive, StrictConfig, error_at
-from dynsim.config.problems import suggest
+from dynsim.config.problems import Origin, dotted, suggest
 from dynsim.errors import brief
 from dynsim.hardware.bus.control_table import (
     MAX_ID,
@@ -32,7 +32,7 @@ from dynsim.hardware.bus.control_table import (
 )
 from dynsim.hardware.errors import ServoMapError
 from dynsim.hardware.safety import BusSettings, Safety, objections_to_times
-from dynsim.hardware.strict_yaml import Objection, Within, read_yaml, rounded_up
+from dynsim.hardware.strict_yaml import Objection, Within, read_located, rounded_up
 from dynsim.snake.lifting import Lifts
 from dynsim.system.files import file_name
 from dynsim.system.inputs import is_file
@@ -312,10 +312,14 @@ class MappedServo:
     kind : Kind
     position_limits : tuple of float
         Lowest and highest joint angle [rad]; infinite for a wheel.
+    entry : str
+        File, line and key of the entry, or of its ``label``: for errors.
     """
 
-    def __init__(self, joint: str, entry: ServoEntry, kind: Kind) -> None:
+    def __init__(self, joint: str, entry: ServoEntry, kind: Kind, origin: Origin | None = None) -> None:
         self.joint = joint
+        keys = ("servos", joint, *(["label"] if entry.label else []))
+        self.entry = f"{origin.location(keys)}: {dotted(keys)}" if origin else dotted(keys)
         self.label = entry.label or joint
         self.id = entry.id
         self.sign = entry.sign
@@ -381,14 +385,14 @@ class ServoMap:
     servos : tuple of MappedServo
     """
 
-    def __init__(self, path: Path, content: _MapFile) -> None:
-        self.path = path
+    def __init__(self, content: _MapFile, origin: Origin) -> None:
+        self.path = Path(origin.file)
         self.robot = content.robot
         self.bus = content.bus
         self.safety = content.safety
         self.lifts = content.lifts
         self.servos = tuple(
-            MappedServo(joint, entry, content.kinds[entry.kind]) for joint, entry in content.servos.items()
+            MappedServo(joint, entry, content.kinds[entry.kind], origin) for joint, entry in content.servos.items()
         )
 
     @property
@@ -425,7 +429,7 @@ def load_servo_map(path: str | Path) -> ServoMap:
     named = path.parent in (Path(), Path("scenarios/hardware")) and shipped.is_file()
     if named and not is_file(path, ServoMapError):
         path = shipped
-    return ServoMap(path, read_yaml(path, _MapFile))
+    return ServoMap(*read_located(path, _MapFile))
 
 
 def json_schema() -> dict[str, Any]:
