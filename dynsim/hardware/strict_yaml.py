@@ -31,7 +31,8 @@ class Within:
         return core_schema.no_info_after_validator_function(self._checked, handler(source))
 
     def __get_pydantic_json_schema__(self, schema: core_schema.CoreSchema, handler: GetJsonSchemaHandler) -> Any:
-        return handler(schema) | {"minimum": self.low, "maximum": self.high}
+        json_schema = {key: value for key, value in handler(schema).items() if key != "exclusiveMinimum"}
+        return json_schema | {"minimum": self.low, "maximum": self.high}
 
     def _checked(self, value: float) -> float:
         if not self.low <= value <= self.high:
