@@ -37,6 +37,7 @@ _PICTURE = re.compile(r"\]\((?:\.\./)*(results/[\w/.-]+\.(?:png|gif))\)")
 def on_files(files: Files, config: Any) -> Files:
     """Add what is generated, and what pages show of the repository."""
     files.append(File.generated(config, "reference/scenario-keys.md", content=reference.scenario_page()))
+    files.append(File.generated(config, "reference/servo-map-keys.md", content=reference.servo_map_page()))
     files.append(File.generated(config, "reference/commands.md", content=reference.cli_page()))
     files.append(File.generated(config, WORKER, abs_src_path=str(SITE / WORKER)))
     files.append(File.generated(config, "gallery.md", content=gallery.page()))

@@ -1,4 +1,4 @@
-"""Pages of the reference that are generated: keys of scenarios from their schema, commands from the application."""
+"""Pages of the reference that are generated: keys of files from their schemas, commands from the application."""
 
 from __future__ import annotations
 
@@ -14,14 +14,32 @@ examples, is in [Scenarios](../scenarios.md). `dynsim schema` prints the schema 
 
 """
 
+SERVO_MAP_INTRODUCTION = """# Keys of servo maps
+
+Every key that a servo map may have, from the schema that it is checked with. What the keys mean together, with
+an example, is in [Replaying a record on Dynamixel servos](../hardware.md#the-servo-map). `dynsim hw schema` prints
+the schema for editors.
+
+"""
+
 
 def scenario_page() -> str:
     """The page on the keys of scenarios."""
     from dynsim.scenario import ScenarioConfig
 
-    schema = ScenarioConfig.model_json_schema()
+    return _page(SCENARIO_INTRODUCTION, ScenarioConfig.model_json_schema())
+
+
+def servo_map_page() -> str:
+    """The page on the keys of servo maps."""
+    from dynsim.hardware.servo_map import json_schema
+
+    return _page(SERVO_MAP_INTRODUCTION, json_schema())
+
+
+def _page(introduction: str, schema: Schema) -> str:
     named = {name: _title(name) for name in schema["$defs"]}
-    parts = [SCENARIO_INTRODUCTION, "## Top level\n\n", _keys(schema, named)]
+    parts = [introduction, "## Top level\n\n", _keys(schema, named)]
     for name, definition in sorted(schema["$defs"].items(), key=lambda item: named[item[0]].lower()):
         parts += [
             f"\n## {named[name]}\n\n",
@@ -58,6 +76,8 @@ def _default(value: Schema) -> str:
         return ""
     default = value["default"]
     words = {None: "none", True: "`true`", False: "`false`", "": "empty"}
+    if isinstance(default, dict) and "$ref" in value:
+        return "of its keys"
     if isinstance(default, (dict, list)):
         return f"`{default}`" if default else "none"
     return (

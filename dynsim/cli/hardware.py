@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from contextlib import nullcontext
 from enum import StrEnum
@@ -304,11 +305,12 @@ def compare(
     folder = out or measured.parent
     # First, because it refuses joints that are not there.
     figure = draw_comparison(comparison, folder / "comparison.png", joints or ())
-    table = Table("joint", "rms [rad]", "max [rad]", "at [s]", "rms, delay removed [rad]", "delay [ms]")
+    table = Table("joint", "rms [rad]", "max [rad]", "at [s]", "rms, common delay removed [rad]", "own delay [ms]")
+    common = not math.isnan(comparison.delay)
     for joint in comparison.joints:
-        delay = "-" if joint.delay != joint.delay else f"{joint.delay * 1e3:.1f}"
+        delay = "-" if math.isnan(joint.delay) else f"{joint.delay * 1e3:.1f}"
         errors = [f"{joint.rms:.5f}", f"{joint.max:.5f}", f"{joint.time_of_max:.3f}"]
-        table.add_row(joint.joint, *errors, f"{joint.rms_delay_removed:.5f}", delay)
+        table.add_row(joint.joint, *errors, f"{joint.rms_delay_removed:.5f}" if common else "-", delay)
     console.print(table)
     if comparison.wheels:
         wheels = Table(
@@ -319,7 +321,8 @@ def compare(
             angles = [f"{wheel.turned:.3f}", f"{wheel.angle_max:.4f}", f"{wheel.angle_end:+.4f}"]
             wheels.add_row(wheel.wheel, *rates, *angles)
         console.print(wheels)
-    console.print(f"delay {comparison.delay * 1e3:.1f} ms, worst joint {comparison.worst.joint}")
+    why = "" if common else " (none explains half of the mean square error of all joints)"
+    console.print(f"{comparison.delay_text}{why}, worst joint {comparison.worst.joint}")
     write_json(folder / "comparison.json", comparison.summary())
     console.print(f"figure: {figure}")
     if bounds:

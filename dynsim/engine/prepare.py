@@ -95,6 +95,7 @@ def prepare(
     times: np.ndarray | None = None,
     end: float | None = None,
     motors: Sequence[Drive] | None = None,
+    starts: bool = True,
 ) -> Prepared:
     """Compile a scenario; references that take long report to ``progress``.
 
@@ -106,6 +107,7 @@ def prepare(
     times : of samples [s]; default: those of the whole record
     end : of the run [s]; default: the scenario's duration
     motors : instead of those of the plant
+    starts : False for a run from a state, whose posture its caller checks instead of the scenario's
 
     Raises
     ------
@@ -128,7 +130,8 @@ def prepare(
     model = recall("model", lambda: Model(described), described)
     robot, places = model.robot, [contact.geometry for contact in contacts]
     law = scenario.config.contacts.law
-    recall("start", lambda: build.check_start(scenario, model, contacts), model, law, places)
+    if starts:
+        recall("start", lambda: build.check_start(scenario, model, contacts), model, law, places)
     loads = build.loads(scenario, robot)
     if pushable:
         loads = [*loads, *(_push(body) for body in robot.bodies)]

@@ -122,7 +122,14 @@ class Simulation:
         self._end = min(end, _FAR)
         # Tables that callers may change are nobody else's.
         with remembering(Memo()):
-            self._prepared = prepare(scenario, pushable=True, times=np.full(1, np.inf), end=self._end, motors=motors)
+            self._prepared = prepare(
+                scenario,
+                pushable=True,
+                times=np.full(1, np.inf),
+                end=self._end,
+                motors=motors,
+                starts=state is None,
+            )
         self._time, self._wall = start, 0.0
         # Of a ring, and of a run that goes on from another, the ledger counts from the first sample on.
         self._relative = trace is not None or state is not None

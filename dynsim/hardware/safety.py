@@ -29,26 +29,14 @@ _BAUD_CHOICES = [rate for rate in BAUD_RATES if rate <= 4_000_000]
 
 
 class BusSettings(StrictConfig):
-    """The serial line.
+    """The serial line."""
 
-    Attributes
-    ----------
-    baud : int
-        [bit/s].
-    rate : float
-        Goal and state cycles per second [Hz].
-    latency : float
-        What adapter and operating system may add to an answer [s].
-    return_delay : float
-        Longest return delay a servo may have stored [s].
-    """
-
-    baud: Annotated[int, Field(json_schema_extra={"enum": _BAUD_CHOICES})] = 3_000_000
-    rate: Positive = 200.0
+    baud: int = Field(3_000_000, json_schema_extra={"enum": [*_BAUD_CHOICES]}, description="bit rate [bit/s]")
+    rate: Positive = Field(200.0, description="goal and state cycles per second [Hz]")
     latency: Annotated[
         Positive, Within(1e-4, 2.54, "s", "no adapter answers at once, and no watchdog waits longer")
-    ] = 2e-3
-    return_delay: Annotated[float, Field(ge=0, le=508e-6)] = 0.0
+    ] = Field(2e-3, description="what adapter and operating system may add to an answer [s]")
+    return_delay: float = Field(0.0, ge=0, le=508e-6, description="longest return delay a servo may have stored [s]")
 
     @model_validator(mode="after")
     def _baud_is_one_of_the_servos(self) -> BusSettings:
@@ -58,53 +46,43 @@ class BusSettings(StrictConfig):
 
 
 class Supply(StrictConfig):
-    """Voltage range in which the robot may move [V]."""
+    """Voltage range in which the robot may move."""
 
-    lowest: Positive = 10.0
-    highest: Positive = 14.8
+    lowest: Positive = Field(10.0, description="[V]")
+    highest: Positive = Field(14.8, description="[V]")
 
 
 class Safety(StrictConfig):
-    """When to abort, and how to stop.
+    """When to abort, and how to stop."""
 
-    Attributes
-    ----------
-    policy : "hold", "decelerate" or "off"
-        What to do on a fault: freeze where the robot is; slow down along the path and hold; release torque.
-    stop_time : float
-        Time in which `decelerate` comes to rest [s].
-    run_up : float
-        Acceleration of the stretch added where a record begins or ends in motion [rad/s²].
-    approach_velocity : float
-        Top speed of the move to the start posture [rad/s].
-    start_distance : float
-        A joint further than this from the start posture is asked about once more [rad].
-    watchdog : float
-        Servos stop by themselves when the bus is silent for this long [s].
-    missed_cycles, late_cycles, following_cycles, torque_cycles : int
-        Consecutive cycles of one servo without a status, of late deadlines, of following error and of too much torque
-        that abort.
-    temperature_max : float
-        [°C].
-    at_end : "off" or "hold"
-        Torque after a run that went well. A robot that falls when limp holds.
-    """
-
-    policy: FaultPolicy = "decelerate"
-    stop_time: Annotated[float, Field(gt=0, le=3.0)] = 0.3
-    run_up: Annotated[Positive, Within(0.01, 1e5, "rad/s²", "takes minutes, or is a knock")] = 2.0
-    approach_velocity: Annotated[Positive, Within(1e-3, 1.0, "rad/s", "nobody has checked the way to the start")] = 0.3
+    policy: FaultPolicy = Field(
+        "decelerate",
+        description="on a fault: freeze where the robot is; slow down along the path and hold; release the torque",
+    )
+    stop_time: float = Field(0.3, gt=0, le=3.0, description="time in which `decelerate` comes to rest [s]")
+    run_up: Annotated[Positive, Within(0.01, 1e5, "rad/s²", "takes minutes, or is a knock")] = Field(
+        2.0, description="acceleration of the stretch added where a record begins or ends in motion [rad/s²]"
+    )
+    approach_velocity: Annotated[Positive, Within(1e-3, 1.0, "rad/s", "nobody has checked the way to the start")] = (
+        Field(0.3, description="top speed of the move to the start posture [rad/s]")
+    )
     start_distance: Annotated[
         Positive, Within(1e-3, 2 * math.pi, "rad", "no joint would ever, or always, be asked about")
-    ] = 0.5
-    watchdog: Annotated[float, Field(ge=0.02, le=2.54)] = 0.2
-    missed_cycles: Annotated[int, Field(ge=1, le=100)] = 3
-    late_cycles: Annotated[int, Field(ge=1, le=1000)] = 5
-    following_cycles: Annotated[int, Field(ge=1, le=100)] = 5
-    torque_cycles: Annotated[int, Field(ge=1, le=100)] = 10
-    temperature_max: Positive = 65.0
-    supply: Supply = Supply()
-    at_end: Literal["off", "hold"] = "off"
+    ] = Field(0.5, description="a joint further than this from the start posture is asked about once more [rad]")
+    watchdog: float = Field(
+        0.2, ge=0.02, le=2.54, description="servos stop by themselves when the bus is silent for this long [s]"
+    )
+    missed_cycles: int = Field(
+        3, ge=1, le=100, description="consecutive cycles of one servo without a status that abort"
+    )
+    late_cycles: int = Field(5, ge=1, le=1000, description="consecutive late cycles that abort")
+    following_cycles: int = Field(5, ge=1, le=100, description="consecutive cycles beyond following_error that abort")
+    torque_cycles: int = Field(10, ge=1, le=100, description="consecutive cycles beyond limits.torque that abort")
+    temperature_max: Positive = Field(65.0, description="of a servo, beyond which the replay aborts [°C]")
+    supply: Supply = Field(Supply(), description="beyond which the replay aborts, or does not start")
+    at_end: Literal["off", "hold"] = Field(
+        "off", description="torque after a run that went well; a robot that falls when limp holds"
+    )
 
 
 def objections_to_times(bus: BusSettings, safety: Safety) -> Iterable[Objection]:

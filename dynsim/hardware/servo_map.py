@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, model_validator
 
 from dynsim.config.base import Positive, StrictConfig, error_at
-from dynsim.config.problems import suggest
+from dynsim.config.problems import Origin, dotted, suggest
 from dynsim.errors import brief
 from dynsim.hardware.bus.control_table import (
     MAX_ID,
@@ -32,7 +32,7 @@ from dynsim.hardware.bus.control_table import (
 )
 from dynsim.hardware.errors import ServoMapError
 from dynsim.hardware.safety import BusSettings, Safety, objections_to_times
-from dynsim.hardware.strict_yaml import Objection, Within, read_yaml, rounded_up
+from dynsim.hardware.strict_yaml import Objection, Within, read_located, rounded_up
 from dynsim.snake.lifting import Lifts
 from dynsim.system.files import file_name
 from dynsim.system.inputs import is_file
@@ -54,52 +54,40 @@ _NO_LIMIT = "bounds nothing that a servo can do, or lets nothing pass"
 
 
 class Follows(StrictConfig):
-    """Signals of the record a servo follows.
+    """Signals of the record a servo follows."""
 
-    Attributes
-    ----------
-    position, velocity : str
-        Angle [rad] and its rate [rad/s].
-    torque : str or None
-        Joint torque [N m] to be held against ``limits.torque`` by the offline check.
-    rates : "continuous" or "held"
-        Whether the rate changes smoothly between samples, or is held until the next one (a sampled controller).
-    """
-
-    position: str
-    velocity: str
-    torque: str | None = None
-    rates: Literal["continuous", "held"] = "continuous"
+    position: str = Field(description="signal with the joint's angle [rad]")
+    velocity: str = Field(description="signal with its rate [rad/s]")
+    torque: str | None = Field(
+        None, description="signal with its torque [N m], which the offline check compares with limits.torque"
+    )
+    rates: Literal["continuous", "held"] = Field(
+        "continuous",
+        description="the rate changes smoothly between samples, or is held until the next one (a sampled controller)",
+    )
 
 
 class Limits(StrictConfig):
     """What a joint may do.
 
-    Attributes
-    ----------
-    position_deg : tuple of float or None
-        Lowest and highest joint angle [°]; None for a wheel.
-    velocity : float
-        Highest joint speed [rad/s].
-    torque : float
-        Joint torque at which the replay aborts [N·m].
-    acceleration : float
-        Highest acceleration of the path, between samples too [rad/s²]. The default lets the start of the published
-        arm's record pass, which jumps to 2.6 rad/s within 5 ms; a joint that turns a load wants less.
-    jerk : float
-        Highest change of acceleration, averaged in magnitude over 0.1 s [rad/s³]
-        (:meth:`dynsim.hardware.replay.trajectory.Path.jerk`). The default refuses a zigzag of 2 mrad every 5 ms.
-    shaking : float
-        Highest velocity that is gained and lost again within 0.3 s, or lost and gained [rad/s]
-        (:meth:`dynsim.hardware.replay.trajectory.Path.shaking`).
+    The default of the acceleration lets the start of the published arm's record pass, which jumps to 2.6 rad/s within
+    5 ms; a joint that turns a load wants less. That of the jerk refuses a zigzag of 2 mrad every 5 ms.
     """
 
-    position_deg: tuple[float, float] | None = None
-    velocity: Positive
-    torque: Positive
-    acceleration: Annotated[Positive, Within(0.01, 1e5, "rad/s²", _NO_LIMIT)] = 2000.0
-    jerk: Annotated[Positive, Within(0.01, 1e7, "rad/s³", _NO_LIMIT)] = 60_000.0
-    shaking: Annotated[Positive, Within(0.01, 100.0, "rad/s", _NO_LIMIT)] = 3.0
+    position_deg: tuple[float, float] | None = Field(
+        None, description="lowest and highest joint angle [°]; required in position mode, not for wheels"
+    )
+    velocity: Positive = Field(description="highest joint speed [rad/s]")
+    torque: Positive = Field(description="joint torque at which the replay aborts [N m]")
+    acceleration: Annotated[Positive, Within(0.01, 1e5, "rad/s²", _NO_LIMIT)] = Field(
+        2000.0, description="highest acceleration of the path, between samples too [rad/s²]"
+    )
+    jerk: Annotated[Positive, Within(0.01, 1e7, "rad/s³", _NO_LIMIT)] = Field(
+        60_000.0, description="highest change of acceleration, averaged in magnitude over 0.1 s [rad/s³]"
+    )
+    shaking: Annotated[Positive, Within(0.01, 100.0, "rad/s", _NO_LIMIT)] = Field(
+        3.0, description="highest velocity that is gained and lost again within 0.3 s, or lost and gained [rad/s]"
+    )
 
 
 # For editors; what loading says about it is in _position_limits_fit_the_mode.
@@ -112,30 +100,19 @@ _POSITION_NEEDS_LIMITS: dict[str, Any] = {
 
 
 class Kind(StrictConfig):
-    """Everything servos of one sort have in common.
+    """Everything servos of one sort have in common."""
 
-    Attributes
-    ----------
-    model : str
-        A name of :data:`dynsim.hardware.bus.control_table.MODELS`.
-    mode : "position" or "velocity"
-    firmware_min : int
-        Oldest firmware accepted.
-    follows : Follows
-    limits : Limits
-    following_error : float
-        Abort threshold between measured and commanded: [rad] in position mode, [rad/s] in velocity mode.
-    gear : float
-        Servo turns per joint turn.
-    """
-
-    model: Literal["MX-106", "MX-28", "XL430-W250", "XM430-W210", "XM430-W350", "XH540-W150", "XH540-W270"]
-    mode: Literal["position", "velocity"]
-    firmware_min: int = 41
-    follows: Follows
-    limits: Limits
-    following_error: Positive
-    gear: Positive = 1.0
+    model: Literal["MX-106", "MX-28", "XL430-W250", "XM430-W210", "XM430-W350", "XH540-W150", "XH540-W270"] = Field(
+        description="of the servo"
+    )
+    mode: Literal["position", "velocity"] = Field(description="of the servo: position for joints, velocity for wheels")
+    firmware_min: int = Field(41, description="oldest firmware accepted")
+    follows: Follows = Field(description="signals of the record")
+    limits: Limits = Field(description="what the joint may do")
+    following_error: Positive = Field(
+        description="largest difference of measured and commanded: [rad] in position mode, [rad/s] in velocity mode"
+    )
+    gear: Positive = Field(1.0, description="servo turns per joint turn")
 
     model_config = ConfigDict(json_schema_extra=_POSITION_NEEDS_LIMITS)
 
@@ -189,12 +166,18 @@ def _not_a_flag(value: Any) -> Any:
 class ServoEntry(StrictConfig):
     """One servo: its kind, bus ID, sense, zero, and (held joints) the angle it keeps instead of following a record."""
 
-    kind: str
-    id: Annotated[int, Field(ge=0, le=MAX_ID)]
-    sign: Annotated[Literal[1, -1], BeforeValidator(_not_a_flag)] = 1
-    zero_tick: Annotated[int, Field(ge=-(1 << 20), le=1 << 20)] = 2048
-    label: str | None = None
-    hold_at_deg: float | None = None
+    kind: str = Field(description="one of `kinds`")
+    id: int = Field(ge=0, le=MAX_ID, description="on the bus")
+    sign: Annotated[Literal[1, -1], BeforeValidator(_not_a_flag)] = Field(
+        1, description="sense of the servo against that of the joint"
+    )
+    zero_tick: int = Field(
+        2048, ge=-(1 << 20), le=1 << 20, description="servo position in the zero posture of the joint [ticks of 0.088°]"
+    )
+    label: str | None = Field(None, description="column of the record; default: the name of the joint")
+    hold_at_deg: float | None = Field(
+        None, description="angle that the joint keeps instead of following the record [°]"
+    )
 
 
 def _is_a_file_name(robot: str) -> str:
@@ -210,12 +193,16 @@ class _MapFile(StrictConfig):
 
     model_config = ConfigDict(title="ServoMap")
 
-    robot: Annotated[str, AfterValidator(_is_a_file_name)]
-    bus: BusSettings = BusSettings()
-    safety: Safety = Safety()
-    lifts: Lifts | None = None
-    kinds: dict[str, Kind]
-    servos: Annotated[dict[str, ServoEntry], Field(json_schema_extra={"minProperties": 1})]
+    robot: Annotated[str, AfterValidator(_is_a_file_name)] = Field(
+        description="name of the robot, also in that of its folder of results"
+    )
+    bus: BusSettings = Field(BusSettings(), description="the serial line")
+    safety: Safety = Field(Safety(), description="when to abort, and how to stop")
+    lifts: Lifts | None = Field(None, description="how a snake's wheel pairs are lifted")
+    kinds: dict[str, Kind] = Field(description="what several servos have in common")
+    servos: dict[str, ServoEntry] = Field(
+        json_schema_extra={"minProperties": 1}, description="the servo of each joint, by the joint's name"
+    )
 
     @model_validator(mode="after")
     def _entries_fit_each_other(self) -> _MapFile:
@@ -312,10 +299,14 @@ class MappedServo:
     kind : Kind
     position_limits : tuple of float
         Lowest and highest joint angle [rad]; infinite for a wheel.
+    entry : str
+        File, line and key of the entry, or of its ``label``: for errors.
     """
 
-    def __init__(self, joint: str, entry: ServoEntry, kind: Kind) -> None:
+    def __init__(self, joint: str, entry: ServoEntry, kind: Kind, origin: Origin | None = None) -> None:
         self.joint = joint
+        keys = ("servos", joint, *(["label"] if entry.label else []))
+        self.entry = f"{origin.location(keys)}: {dotted(keys)}" if origin else dotted(keys)
         self.label = entry.label or joint
         self.id = entry.id
         self.sign = entry.sign
@@ -381,14 +372,14 @@ class ServoMap:
     servos : tuple of MappedServo
     """
 
-    def __init__(self, path: Path, content: _MapFile) -> None:
-        self.path = path
+    def __init__(self, content: _MapFile, origin: Origin) -> None:
+        self.path = Path(origin.file)
         self.robot = content.robot
         self.bus = content.bus
         self.safety = content.safety
         self.lifts = content.lifts
         self.servos = tuple(
-            MappedServo(joint, entry, content.kinds[entry.kind]) for joint, entry in content.servos.items()
+            MappedServo(joint, entry, content.kinds[entry.kind], origin) for joint, entry in content.servos.items()
         )
 
     @property
@@ -425,7 +416,7 @@ def load_servo_map(path: str | Path) -> ServoMap:
     named = path.parent in (Path(), Path("scenarios/hardware")) and shipped.is_file()
     if named and not is_file(path, ServoMapError):
         path = shipped
-    return ServoMap(path, read_yaml(path, _MapFile))
+    return ServoMap(*read_located(path, _MapFile))
 
 
 def json_schema() -> dict[str, Any]:

@@ -31,7 +31,8 @@ class Within:
         return core_schema.no_info_after_validator_function(self._checked, handler(source))
 
     def __get_pydantic_json_schema__(self, schema: core_schema.CoreSchema, handler: GetJsonSchemaHandler) -> Any:
-        return handler(schema) | {"minimum": self.low, "maximum": self.high}
+        json_schema = {key: value for key, value in handler(schema).items() if key != "exclusiveMinimum"}
+        return json_schema | {"minimum": self.low, "maximum": self.high}
 
     def _checked(self, value: float) -> float:
         if not self.low <= value <= self.high:
@@ -49,7 +50,12 @@ def rounded_up(value: float) -> float:
 
 
 def read_yaml(path: Path, schema: type[_Schema], context: dict[str, Any] | None = None) -> _Schema:
-    """Read YAML into a pydantic model, whose validators are given ``context``.
+    """Read YAML into a pydantic model, whose validators are given ``context``; see :func:`read_located`."""
+    return read_located(path, schema, context)[0]
+
+
+def read_located(path: Path, schema: type[_Schema], context: dict[str, Any] | None = None) -> tuple[_Schema, Origin]:
+    """The same, with where its keys are in the file.
 
     Raises
     ------
@@ -59,8 +65,8 @@ def read_yaml(path: Path, schema: type[_Schema], context: dict[str, Any] | None 
     data = parse_yaml(read_text(path, ServoMapError), ServoMapError, str(path))
     if not isinstance(data, dict):
         raise ServoMapError(f"{path}: expected a mapping with the keys {', '.join(schema.model_fields)}")
+    origin = Origin(path, (data,))
     try:
-        return schema.model_validate(data, context=context)
+        return schema.model_validate(data, context=context), origin
     except ValidationError as error:
-        origin = Origin(path, (data,))
         raise ServoMapError(explain(error, data, origin, unknown_keys(error, data, origin, schema))) from None

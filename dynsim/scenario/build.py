@@ -431,6 +431,7 @@ def check_start(
     One error for all that do not: about the first, and with the names and gaps of the others.
     ``q`` : coordinates at the start, (nq,) [rad or m]; default: the robot's initial ones
     """
+    own = q is None
     q = model.robot.initial if q is None else q
     off: list[tuple[Contact, bool, tuple[str, str] | tuple[str, str, str], float]] = []
     for contact in touching:
@@ -447,13 +448,16 @@ def check_start(
     if off:
         contact, declared, keys, gap = off[0]
         position = model.point_position(contact.body, contact.point, q)
+        remedy = "take another posture to start from; or change the surface"
+        if own:
+            named = [contact for contact, by_name, *_ in off if by_name]
+            remedy = f"{_remedy(scenario, named)}change the initial configuration or the surface"
         others = ", ".join(f"{other.name} {its:+.4g} m from {other.surface_name!r}" for other, _, _, its in off[1:])
         raise ModelError(
             f"{dotted(keys)}: {'its point' if declared else contact.name} starts {gap:+.4g} m "
             f"from surface {contact.surface_name!r} "
             f"(limit {START_TOLERANCE:g} m), at {position.tolist()}{f' (also {others})' if others else ''}; "
-            f"{_remedy(scenario, [c for c, own, *_ in off if own])}change the initial configuration or the surface, "
-            "or disable the contact",
+            f"{remedy}, or disable the contact",
             keys=keys,
         )
 

@@ -11,8 +11,6 @@ in the air only while the record says so. Pitch angles follow from the heights a
 
 from __future__ import annotations
 
-from typing import Annotated
-
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
@@ -32,27 +30,19 @@ ROUNDING = 1e-9
 class Lifts(StrictConfig):
     """How wheel pairs that the record lifts are lifted.
 
-    Attributes
-    ----------
-    signal : str
-        Signal of the record with 1 where a wheel pair is on the ground, 0 where it is lifted.
-    joints : tuple of str
-        The pitch joints on the axles of the first, second, ... pair: every pair but the last has one. Lifting is added
-        to what they do otherwise; the first, on the axle that carries the head, follows the record and keeps the head
-        where it is.
-    clearance_mm : float
-        Height of the lower wheel of a lifted pair above the floor.
-    blend_s : float
-        Time to lift a pair, and to put it down [s of record time].
-    tilt_mm : float
-        A record is refused where one wheel of a grounded pair would be further above the floor: a bent base twists.
+    Every pair but the last has a pitch joint on its axle. Lifting is added to what these do otherwise; the first, on
+    the axle that carries the head, follows the record and keeps the head where it is.
     """
 
-    signal: str = "grounded"
-    joints: Annotated[tuple[str, ...], Field(min_length=1)]
-    clearance_mm: Positive = 5.0
-    blend_s: Positive = 0.3
-    tilt_mm: Positive = 2.5
+    signal: str = Field(
+        "grounded", description="of the record, with 1 where a wheel pair is on the ground, 0 where it is lifted"
+    )
+    joints: tuple[str, ...] = Field(min_length=1, description="pitch joints on the axles of the first, second, … pair")
+    clearance_mm: Positive = Field(5.0, description="height of the lower wheel of a lifted pair above the floor")
+    blend_s: Positive = Field(0.3, description="time to lift a pair, and to put it down, in record time")
+    tilt_mm: Positive = Field(
+        2.5, description="a record is refused where one wheel of a grounded pair would be higher: a bent base twists"
+    )
 
 
 def lifted(record: Record, lifts: Lifts) -> Fold:

@@ -14,6 +14,8 @@ from urllib.parse import unquote, urlsplit
 import pytest
 
 import dynsim
+from dynsim.hardware.safety import Safety
+from dynsim.hardware.servo_map import ServoEntry, _MapFile
 from dynsim.scenario import ScenarioConfig
 from dynsim.system.shipped import shipped_scenarios
 
@@ -24,7 +26,7 @@ pytest.importorskip("mkdocstrings")
 ROOT = Path(__file__).parents[2]
 OPENED = (
     "index", "gallery", "tutorials/first-arm", "quickstart", "how-to/export", "reference/scenario-keys",
-    "reference/python", "physics", "validation", "notebooks/sweep",
+    "reference/servo-map-keys", "reference/python", "physics", "validation", "notebooks/sweep",
 )  # fmt: skip
 
 pytestmark = pytest.mark.long
@@ -67,6 +69,9 @@ def test_the_reference_has_every_command_and_every_key(site: Path) -> None:
         assert f"<code>dynsim {name}</code>" in commands, name
     keys = (site / "reference" / "scenario-keys.html").read_text(encoding="utf-8")
     for name in ScenarioConfig.model_fields:
+        assert f"<code>{name}</code>" in keys, name
+    keys = (site / "reference" / "servo-map-keys.html").read_text(encoding="utf-8")
+    for name in (*_MapFile.model_fields, *Safety.model_fields, *ServoEntry.model_fields):
         assert f"<code>{name}</code>" in keys, name
     gallery = (site / "gallery.html").read_text(encoding="utf-8")
     for file in shipped_scenarios():
@@ -113,15 +118,34 @@ def test_search_finds_a_page_from_the_disk(browser: Any, site: Path) -> None:
     context.close()
 
 
-def test_titles_of_keys_are_those_of_families() -> None:
+def reference() -> Any:
+    """The module that generates pages."""
     spec = importlib.util.spec_from_file_location("reference", ROOT / "docs" / "site" / "reference.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    text = module.scenario_page()
+    return module
+
+
+def test_titles_of_keys_are_those_of_families() -> None:
+    text = reference().scenario_page()
     assert "## Plant serial_arm\n" in text
     assert "| `duration_s` | number > 0 | required |" in text
-    # Every link of the page has its heading.
+    assert links_without_heading(text) == set()
+
+
+def links_without_heading(text: str) -> set[str]:
+    """Links of a page within itself that lead nowhere."""
     headings = {line[3:].lower().replace(" ", "-") for line in text.splitlines() if line.startswith("## ")}
-    assert set(re.findall(r"\]\(#([^)]+)\)", text)) <= headings
+    return set(re.findall(r"\]\(#([^)]+)\)", text)) - headings
+
+
+def test_every_key_of_servo_maps_has_a_meaning_and_its_default() -> None:
+    text = reference().servo_map_page()
+    assert "| `watchdog` | number ≥ 0.02 ≤ 2.54 | `0.2` | servos stop by themselves when the bus is" in text
+    assert "| `velocity` | number > 0 | required | highest joint speed [rad/s] |" in text
+    rows = [line for line in text.splitlines() if line.startswith("| `")]
+    assert len(rows) > 40
+    assert [row for row in rows if row.endswith("|  |")] == []
+    assert links_without_heading(text) == set()

@@ -93,7 +93,10 @@ def test_a_record_in_motion_gets_a_run_up_and_a_run_out_at_rest(rig) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda record: record.signals.pop("v"), "shoulder follows the signal 'v'; the record has q, rho, rho_dot"),
+        (
+            lambda record: record.signals.pop("v"),
+            "servos.shoulder: follows the signal 'v'; the record has q, rho, rho_dot",
+        ),
         (lambda record: record["q"].__setitem__((3, 1), math.nan), "elbow: 'q' is nan at t = 0.015 s"),
         (lambda record: record.time.__setitem__(4, 0.0), "time does not increase at sample 4"),
         (lambda record: record.time.__setitem__(-1, math.inf), "time is inf at sample 239, of 240 samples"),
@@ -108,10 +111,35 @@ def test_unusable_records_are_refused(rig, change, message: str) -> None:
         check_motion(record, rig.map)
 
 
+def test_a_column_is_proposed_for_a_wrong_name(rig) -> None:
+    record = swing()
+    record.add("q", record["q"], "rad", labels=("shoulder", "elbow_pitch"))
+    with pytest.raises(CheckRefused, match=r"servos\.elbow: .* shoulder, elbow_pitch; did you mean 'elbow_pitch'\?$"):
+        check_motion(record, rig.map)
+
+
+def test_joints_without_a_servo_are_warned_of(rig) -> None:
+    """Not refused: wheels of a mobile base are rightly without."""
+    record = swing()
+    both, still = record["q"], np.zeros(len(record))
+    wrist = np.radians(12.3) * record.time / record.time[-1]
+    labels = ("shoulder", "elbow", "wrist", "tool")
+    record.add("q", np.column_stack([both, wrist, still, still]), "rad", labels=(*labels, "base.x"))
+    record.add("v", np.column_stack([record["v"], np.gradient(wrist, record.time), still]), "rad/s", labels=labels)
+    (warning,) = check_motion(record, rig.map).warnings
+    assert warning == (
+        "joints of the record without a servo, limp on the robot: wrist (moves by 12.3 deg); tool (does not move)"
+    )
+    assert not check_motion(swing(), rig.map).warnings
+
+
 def test_a_missing_column_and_a_wrong_unit_are_refused(rig) -> None:
     record = swing()
     record.add("q", record["q"], "rad", labels=("shoulder", "knee"))
-    with pytest.raises(CheckRefused, match="elbow follows column 'elbow' of 'q'; it has shoulder, knee"):
+    with pytest.raises(
+        CheckRefused,
+        match=r"rig\.yaml:\d+: servos\.elbow: follows column 'elbow' of 'q'; its columns are shoulder, knee",
+    ):
         check_motion(record, rig.map)
     record.add("q", record["q"], "deg", labels=("shoulder", "elbow"))
     with pytest.raises(CheckRefused, match="'q' is in 'deg'"):

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import csv
 import json
+import sys
 import time
 
 import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
+from dynsim import cli
 from dynsim.draw.figures import style
 from dynsim.errors import RecordError
 from dynsim.hardware.bus.control_table import MX_106
@@ -55,7 +57,28 @@ def test_joints_that_nearly_stand_tell_no_delay() -> None:
     measured.add("q", np.stack([late, shaken], axis=1), "rad", labels=("still", "moved"))
     comparison = compare_records(simulated, measured)
     assert all(np.isnan(joint.delay) for joint in comparison.joints)
-    assert comparison.delay == 0.0
+    assert np.isnan(comparison.delay)
+    assert [joint.rms_delay_removed for joint in comparison.joints] == [joint.rms for joint in comparison.joints]
+    assert comparison.summary()["delay_s"] is None
+    check_gate(comparison, Gate(delay_s=1e-6))
+
+
+def test_where_no_delay_is_common_nothing_says_zero(tmp_path, monkeypatch, capsys) -> None:
+    """A joint that lags by 50 ms, and another with a larger error of another kind."""
+    t = np.linspace(0, 4, 2001)
+    simulated, measured = Record(t), Record(t)
+    simulated.add("q", np.stack([np.sin(t), np.sin(t)], axis=1), "rad", labels=("late", "sagging"))
+    sagging = np.sin(t) + 0.2 * np.sin(7.0 * t)
+    measured.add("q", np.stack([np.sin(t - 0.05), sagging], axis=1), "rad", labels=("late", "sagging"))
+    ours, theirs = simulated.save(tmp_path / "record.h5"), measured.save(tmp_path / "measured.h5")
+    monkeypatch.setattr(sys, "argv", ["dynsim", "hw", "compare", str(ours), str(theirs)])
+    with pytest.raises(SystemExit) as leaving:
+        cli.main()
+    assert not leaving.value.code
+    *table, headline, _ = capsys.readouterr().out.splitlines()
+    assert headline.startswith("no common delay (none explains half of the mean square error of all joints), worst")
+    cells = [[cell.strip() for cell in line.split("│")[1:-1]] for line in table if "│" in line]
+    assert [(row[0], row[4], row[5]) for row in cells] == [("late", "-", "50.1"), ("sagging", "-", "-")]
 
 
 def test_a_known_delay_and_error_are_found() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +13,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import dynsim
+from dynsim import cli
 from dynsim.errors import ModelError
 from dynsim.hardware.bus.control_table import MX_28, MX_106, RAD_PER_TICK
 from dynsim.hardware.errors import ServoMapError
@@ -20,6 +23,7 @@ from dynsim.hardware.virtual.servo_plant import Drive, InertialLoad, MotorLaw
 from dynsim.hardware.virtual.servos import PHYSICS_STEP
 from dynsim.hardware.virtual.simulated_plant import START_CHANGE, SimulatedArm, _bare, simulated_arm
 from dynsim.model.drives import Servo
+from dynsim.record import Record
 
 pytestmark = pytest.mark.long
 
@@ -74,12 +78,61 @@ def test_braced_elbows_rest_on_the_floor_and_unload_the_servos() -> None:
     assert np.abs(braced.torque).max() < 0.6 * np.abs(free.torque).max()
 
 
-def test_the_plant_of_a_plan_starts_where_its_servos_are() -> None:
-    """References, which plans start on, are none of the plant's: ticks say where it stands."""
-    initial = {"initial": {"on_references": True}, "controller.hand": None}
-    waypoints = {"controller.joints": {"joint_2": {"times_s": [0.0, 1.0], "angles_deg": [60.0, 61.0]}}}
-    scenario = dynsim.load_scenario(ARM, variant="no_elbow", overrides=initial | waypoints)
-    assert _bare(scenario).config.initial is None
+PLANNED = """
+duration_s: 0.3
+plant:
+  type: serial_arm
+  link: {mass_kg: 0.2, length_m: 0.4, damping_N_m_s_per_rad: 0.3, motor: {type: wang_minami}}
+  chain:
+    - {axis: z, length_m: 0.0}
+    - {axis: y, initial_deg: 60}
+    - {axis: y, initial_deg: 60}
+    - {axis: y, initial_deg: -75}
+    - {axis: y, initial_deg: 60}
+controller:
+  type: joint_pd
+  joints:
+    joint_1: {times_s: [0.0, 0.2], angles_deg: [0.0, 0.5]}
+    joint_2: {times_s: [0.0, 0.2], angles_deg: [47.4168, 47.4168]}
+    joint_3: {times_s: [0.0, 0.2], angles_deg: [83.2501, 83.2501]}
+    joint_4: {times_s: [0.0, 0.2], angles_deg: [-40.6669, -40.6669]}
+    joint_5: {times_s: [0.0, 0.2], angles_deg: [-25.1507, -25.1507]}
+initial: {on_references: true, on_surface: [link_4, link_5]}
+surfaces: {floor: {type: plane}}
+contacts:
+  law: unilateral
+  friction: 0.2
+  points: {link_4: {body: link_4, radius_m: 0.01}, link_5: {body: link_5, radius_m: 0.01}}
+integrator: {method: time_stepping}
+"""
+"""As the planner writes the tutorial's arm: the posture of the plant, before ``initial``, is 10 mm below the floor."""
+
+
+def test_the_plant_of_a_plan_starts_where_its_servos_are(tmp_path, monkeypatch, capsys) -> None:
+    plan, servos = tmp_path / "plan.yaml", tmp_path / "map.yaml"
+    plan.write_text(PLANNED)
+    servos.write_text(re.sub(r"^  joint_([6-9]|10): .*\n", "", ARM_MAP.read_text(), flags=re.MULTILINE))
+    record = dynsim.simulate(dynsim.load_scenario(plan))
+    path, out = record.save(tmp_path / "record.h5"), tmp_path / "out"
+    options = ["--map", str(servos), "--port", "virtual", "--plant", str(plan), "--out", str(out), "--quiet"]
+    monkeypatch.setattr(sys, "argv", ["dynsim", "hw", "replay", str(path), *options])
+    with pytest.raises(SystemExit) as leaving:
+        cli.main()
+    assert not leaving.value.code, capsys.readouterr().err
+    measured = Record.load(out / "measured.h5")
+    assert measured.complete
+    np.testing.assert_allclose(measured["q"][0], record["q"][0], rtol=0, atol=0.05)
+    # As by `hw virtual`, which has no record: the scenario's own start.
+    plant = simulated_arm(str(plan), None, load_servo_map(servos), {})
+    np.testing.assert_allclose(plant.joint_positions, record["q"][0], rtol=0, atol=START_CHANGE)
+
+
+@pytest.mark.parametrize(("asked_for", "step"), [(None, 1e-3), (2e-4, 2e-4), (0.01, PHYSICS_STEP)])
+def test_time_stepping_of_the_scenario_is_that_of_the_plant(asked_for: float | None, step: float) -> None:
+    options = {"integrator": {"method": "time_stepping", "step_s": asked_for}, "contacts.law": "unilateral"}
+    integrator = _bare(dynsim.load_scenario("single_pendulum", overrides=options)).integrator
+    assert (integrator.method, integrator.step_s) == ("time_stepping", step)
+    assert _bare(dynsim.load_scenario(ARM, "no_elbow")).integrator.method == "dopri5"
 
 
 def test_a_limp_arm_falls_and_stays_above_the_floor_with_its_elbows() -> None:

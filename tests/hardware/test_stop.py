@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 import signal
+from typing import Any
 
 import numpy as np
 import pytest
 
+from dynsim.errors import SimulationStopped
 from dynsim.hardware.bus.packet import Instruction, Packet
 from dynsim.hardware.replay.rules import Cause
 from dynsim.hardware.replay.states import ReplayProgress, ReplayState, StopRequest, stop_on_signals
@@ -174,6 +176,24 @@ def test_an_exception_out_of_the_blue_still_stops_the_robot(rig, error) -> None:
     assert run.result.fault.cause == Cause.PROGRAM
     assert run.result.end_state == "off"
     assert not any(servo["torque_enable"] for servo in run.line.servos.registers.values())
+
+
+def test_a_simulated_robot_that_stops_is_a_fault_with_a_record(rig) -> None:
+    run = rig.prepare(policy="hold")
+    step, stops = run.line.servos.plant.step, []
+
+    def stopping(dt: float, drive: Any) -> None:
+        if run.replay.journal.state == ReplayState.REPLAY and run.clock.now() > 1.9 and not stops:
+            stops.append(SimulationStopped("stopped at t = 1.9 s: the contact at tip opens and closes"))
+            raise stops[0]
+        step(dt, drive)
+
+    run.line.servos.plant.step = stopping
+    result = run.replay.run()
+    assert result.fault.cause == Cause.SIMULATION
+    assert result.fault.text == f"the robot behind the virtual servos (--plant) {stops[0]}"
+    assert len(result.record)
+    assert result.end_state == "holding"
 
 
 def test_a_robot_found_holding_is_not_dropped_by_a_ctrl_c_while_arming(rig) -> None:

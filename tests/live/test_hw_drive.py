@@ -437,7 +437,7 @@ def test_a_map_that_does_not_say_how_wheels_are_lifted_is_refused(tmp_path: Path
         (
             ("--port", "virtual"),
             MAP.replace("tool_roll:", "tail:"),
-            "tail follows column 'tail' of 'q'",
+            "six.yaml:18: servos.tail: follows column 'tail' of 'q'",
         ),
         (("--port", "virtual", "--rate", "4000"), MAP, "Use --rate"),
         (

@@ -444,10 +444,18 @@ def test_states_of_other_robots_and_off_the_floor_are_refused():
     simulation = dynsim.Simulation(arm())
     state = simulation.state
     lifted = dynsim.State(0.0, state.q + 0.1, state.v, state.current)
-    with pytest.raises(ModelError, match="from surface 'floor'"):
+    with pytest.raises(ModelError, match=r"from surface 'floor'.*; take another posture to start from; or change the"):
         dynsim.Simulation(arm(), state=lifted)
     with pytest.raises(ModelError, match="kinematic"):
         dynsim.Simulation(dynsim.load_scenario("snake_circle"))
+
+
+def test_a_state_starts_a_scenario_whose_own_posture_is_below_the_floor():
+    sunk = arm(**{"controller": None, "plant.initial_deg": [0, 50, 90, -90, 45, 45, -90, 45, -45, 45]})
+    with pytest.raises(ModelError, match="from surface 'floor'"):
+        dynsim.Simulation(sunk)
+    state = dynsim.Simulation(arm()).state
+    np.testing.assert_array_equal(dynsim.Simulation(sunk, state=state).state.q, state.q)
 
 
 def real_arm(folder: Path, **overrides: object) -> dynsim.Scenario:

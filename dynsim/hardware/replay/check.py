@@ -58,6 +58,8 @@ SLOWEST, FASTEST = 0.01, 10.0
 """Path seconds per second that may be asked for."""
 LONGEST = 24 * 3600.0
 """Motion [s]; beyond that its time is a mistake."""
+STILL = 1e-6
+"""A joint of a record that turns less than this [rad] does not move."""
 ROUNDING = 1e-9
 """A joint of a record that rests at its very limit may be off by rounding of this size; a tick is 1.5e-3 rad."""
 
@@ -186,6 +188,8 @@ def check_motion(
                 lines.append(f"  --speed {math.floor(100 * slower) / 100:g} would pass")
         raise CheckRefused("\n".join(lines))
     warnings = [] if record.complete else ["the record is marked incomplete: it ends before its scenario does"]
+    if limp := without_servo(record, servo_map):
+        warnings.append(f"joints of the record without a servo, limp on the robot: {'; '.join(limp)}")
     if missing := long_steps(record, LONG, COMMON):
         warnings.append(
             f"{len(missing)} of {len(record) - 1} steps are long, samples of the record may be missing: {missing[0]}"
@@ -199,6 +203,26 @@ def check_motion(
         scene=record.scene,
         unmeasured=unmeasured(record, servo_map),
     )
+
+
+def without_servo(record: Record, servo_map: ServoMap) -> list[str]:
+    """Joints in the signals that the servos follow that are no servo's, each with how far it moves.
+
+    They have a column of positions and one of rates: the place of a mobile base in the plane is no joint.
+    """
+    follows = dict.fromkeys((servo.kind.follows.position, servo.kind.follows.velocity) for servo in servo_map.servos)
+    served = {(servo.kind.follows.position, servo.label) for servo in servo_map.servos}
+    texts = []
+    for position, velocity in follows:
+        rates = record.labels.get(velocity, ()) if velocity in record else ()
+        for column, label in enumerate(record.labels[position] if position in record else ()):
+            if (position, label) in served or label not in rates:
+                continue
+            turned = float(np.ptp(record[position][:, column]))
+            texts.append(
+                f"{label} ({f'moves by {math.degrees(turned):.1f} deg' if turned > STILL else 'does not move'})"
+            )
+    return texts
 
 
 def _check_duration(record: Record, speed: float) -> None:

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from dynsim.errors import SimulationStopped
 from dynsim.hardware.bus.clock import Clock
 from dynsim.hardware.bus.control_table import RAD_S2_PER_UNIT, RAD_S_PER_UNIT, WATCHDOG_SECONDS_PER_UNIT
 from dynsim.hardware.bus.protocol import Bus, NoAnswer, RequestRefused, too_busy
@@ -133,6 +134,8 @@ class Replay:
             cause = Cause.ARMING if self.journal.state == ReplayState.ARM else Cause.VERIFICATION
             busy = too_busy(self.bus) if isinstance(error, NoAnswer) else ""
             self._fault(Fault(cause, f"{error}{busy and '; '}{busy}", (error.id,)))
+        except SimulationStopped as error:
+            self._fault(Fault(Cause.SIMULATION, f"the robot behind the virtual servos (--plant) {error}"))
         except BaseException as error:
             # A robot with its torque on must not be left to itself, whatever went wrong.
             self._fault(Fault(Cause.PROGRAM, repr(error)))

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from dynsim.config.problems import suggest
 from dynsim.errors import CheckRefused
 from dynsim.hardware.replay.motion import Array
 from dynsim.hardware.servo_map import MappedServo, ServoMap
@@ -340,10 +341,15 @@ def column_of(record: Record, signal: str, servo: MappedServo, unit: str) -> Arr
         No such signal or column, another unit, or a value that is not finite.
     """
     if signal not in record:
-        raise CheckRefused(f"{servo.joint} follows the signal {signal!r}; the record has {', '.join(record)}")
+        raise CheckRefused(
+            f"{servo.entry}: follows the signal {signal!r}; the record has {', '.join(record)}{suggest(signal, record)}"
+        )
     labels = record.labels[signal]
     if servo.label not in labels:
-        raise CheckRefused(f"{servo.joint} follows column {servo.label!r} of {signal!r}; it has {', '.join(labels)}")
+        raise CheckRefused(
+            f"{servo.entry}: follows column {servo.label!r} of {signal!r}; "
+            f"its columns are {', '.join(labels)}{suggest(servo.label, labels)}"
+        )
     if record.units[signal] != unit:
         raise CheckRefused(f"signal {signal!r} is in {record.units[signal]!r}; {servo.joint} needs {unit!r}")
     if record[signal].ndim != 2:

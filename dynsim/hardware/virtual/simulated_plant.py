@@ -2,7 +2,7 @@
 
 A :class:`dynsim.Simulation` moves it: the scenario's robot, with servos of the map's models for motors. Contacts are
 those of the engine under the unilateral law, whatever law the scenario has: a real floor does not pull. The integrator
-is the default one, that of events; of a snake, which stands on its wheels, time stepping.
+is time stepping where the scenario has that, and for a snake, which stands on its wheels; else the one of events.
 
 What servos tell of a posture is rounded to ticks, so that a braced elbow may seem to be some tenths of a millimetre
 below its floor, or a joint beyond its stop. The arm then starts at the nearest posture that is possible.
@@ -36,8 +36,8 @@ log = logging.getLogger(__name__)
 START_CHANGE = 5.0 * RAD_PER_TICK
 """At the start joints are moved by this much at most to get off what they are in: ticks and backlash [rad]."""
 GAP = 1e-10  # [m]
-SNAKE_STEP = 2e-3
-"""Of time stepping, that of the servos' physics [s]."""
+SNAKE_STEP, ARM_STEP = 2e-3, 1e-3
+"""Of time stepping [s]: that of the servos' physics, which no arm exceeds, and of an arm whose scenario has none."""
 SLOW, STEADY = 1e-4, 1e-2
 """Slower [rad/s] and with less acceleration [rad/s²] a limp robot rests."""
 
@@ -216,11 +216,12 @@ def _bare(scenario: Scenario) -> Scenario:
         "sensors": None,
         "contacts": Contacts(**{**keys, "law": "unilateral"}),
         "loads": payloads,
+        "initial": None,  # the servos' ticks say where it stands
         "integrator": type(config.integrator)(method="dopri5"),  # set points change every 2 ms, which ends steps
     }
-    if config.initial is not None and config.initial.on_references:
-        # The servos' ticks say where it stands.
-        changes["initial"] = None
+    if config.integrator.method == "time_stepping":
+        step = min(config.integrator.step_s or ARM_STEP, SNAKE_STEP)
+        changes["integrator"] = config.integrator.model_copy(update={"step_s": step, "wall_limit_s": None})
     if hasattr(config.plant, "dynamics"):
         released = config.plant.dynamics.model_copy(update={"start": "released"})
         changes["plant"] = config.plant.model_copy(update={"dynamics": released})
