@@ -14,6 +14,7 @@ from dynsim import load_scenario, simulate
 from dynsim.compile.model import Model
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.state import ELECTRICAL, GEAR, JOINT, JOULE, OUT_MODE
+from dynsim.dynamics.tables import SLIDING
 from dynsim.errors import ModelError
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts.events import SLIP_START, SLIP_STOP
@@ -204,6 +205,7 @@ def test_the_ledger_of_random_arms_that_rub(theta):
 
 
 METHODS = ("dopri5", "radau5")
+STEPS = "time_stepping"
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -364,3 +366,62 @@ def test_slip_of_joints_is_among_the_events_of_a_run(tmp_path: Path):
         assert [event.kind for event in own] == ["slip_stop", "slip_start", "slip_stop"]
         times.append([event.time for event in own])
     np.testing.assert_allclose(times[0], times[1], rtol=0, atol=2e-3)  # steps of 1 ms
+
+
+TWO_ELBOWS = """
+name: two_elbows_drag
+duration_s: 1.6
+plant:
+  type: serial_arm
+  base: {position_m: [0, 0, 0.12]}
+  link: {mass_kg: 0.4, length_m: 0.3, friction_N_m: 0.05, motor: {type: dc, torque_constant_N_m_per_A: 0.0113,
+    resistance_ohm: 3.6, inductance_H: 0.0005, rotor_inertia_kg_m2: 1.0e-6, gear_ratio: 225,
+    gear_damping_N_m_s_per_rad: 1.0e-6}}
+  chain:
+    - {axis: z, length_m: 0.02}
+    - {axis: y, initial_deg: 110}
+    - {axis: y, initial_deg: -40}
+    - {axis: y, initial_deg: 50}
+    - {axis: y, length_m: 0.2, initial_deg: -60}
+controller:
+  type: joint_pd
+  k_p_V_per_rad: 200
+  k_d_V_s_per_rad: 5
+  joints:
+    joint_1: {times_s: [0.2, 1.2, 2.2, 3], angles_deg: [0, 3, -3, 0]}
+    joint_2: {times_s: [0, 3], angles_deg: [114.5, 114.5]}
+    joint_4: {times_s: [0.2, 1.2, 2.2, 3], angles_deg: [46.57, 44, 50, 46.57]}
+initial: {equilibrium: true, on_surface: [near, far]}
+surfaces: {floor: {type: plane}}
+contacts:
+  law: unilateral
+  friction: 0.3
+  points:
+    near: {body: link_2, point_m: [0, 0, 0.3]}
+    far: {body: link_4, point_m: [0, 0, 0.3]}
+"""
+
+
+def test_joints_rest_where_sliding_elbows_hold_them(tmp_path: Path):
+    """A yaw joint drags two elbows over a floor: their normal rows hold the pitch joints, which are at rest.
+
+    Contact forces and dry friction of these joints are not determined, and with another split of them the friction of
+    the elbows is another: both methods with events take the same, time stepping another one.
+    """
+    path = tmp_path / "drag.yaml"
+    path.write_text(TWO_ELBOWS, encoding="utf-8")
+    runs = {method: simulate(load_scenario(path, None, {"integrator.method": method})) for method in (*METHODS, STEPS)}
+    energy = {method: run.summary["electrical_energy_J"] for method, run in runs.items()}
+    assert energy["radau5"] == pytest.approx(energy["dopri5"], rel=1e-5)
+    assert energy[STEPS] == pytest.approx(energy["dopri5"], rel=0.02)
+    for run in runs.values():
+        assert run.time[-1] == pytest.approx(1.6)
+        assert abs(run.summary["energy_residual_relative"]) < 1e-6
+        resting = np.abs(run["v"]) < 1e-6
+        assert resting[:, 1].sum() > 30
+        assert (run["contact_mode"][resting[:, 1]] == SLIDING).any()
+        assert np.abs(run["joint_friction"]).max() <= 0.05 * (1.0 + 1e-6)
+        assert (run["contact_normal_force"] >= -1e-9).all()
+        names = next(text for text in run.summary["warnings"] if "shared forces with the dry friction of" in text)
+        assert "far: shared forces" in names
+        assert "joint_2" in names

@@ -26,15 +26,18 @@ contacts:
 YAW = "{axis: z, length_m: 0.05, mass_kg: 1}, "
 
 
-def shared(folder: Path, modes: list[int], *, yaw: bool = False, count: int = 6) -> list[str]:
-    """Names of those that share at a generic posture."""
+def shared(
+    folder: Path, modes: list[int], *, yaw: bool = False, count: int = 6, rests: list[int] | None = None
+) -> list[str]:
+    """Names of those that share at a generic posture; ``rests``: joints that dry friction keeps at rest."""
     last = count + yaw
     path, text = folder / "case.yaml", ARM.replace("YAW", YAW if yaw else "").replace("COUNT", str(count))
     path.write_text(text.replace("FIRST", str(last - 2)).replace("LAST", str(last)))
     scenario = dynsim.load_scenario(path)
     model = dynsim.build_model(scenario)
     q = np.random.default_rng(3).uniform(-0.5, 0.5, (1, model.n))
-    return sharing(model, build.contacts(scenario, model.robot), q, np.array([modes], dtype=float))
+    resting = np.isin(np.arange(model.n), rests or [])[None]
+    return sharing(model, build.contacts(scenario, model.robot), q, np.array([modes], dtype=float), resting)
 
 
 @pytest.mark.parametrize("modes", [[STICKING, OPEN, OPEN], [SLIDING, OPEN, OPEN], [OPEN, OPEN, OPEN]])
@@ -57,3 +60,11 @@ def test_with_one_yaw_joint_points_share_what_is_across_the_arm(tmp_path: Path) 
 def test_points_of_one_body_share_what_is_along_it_and_the_third_does_not(tmp_path: Path) -> None:
     assert shared(tmp_path, [OPEN, STICKING, STICKING]) == ["b", "tip"]
     assert shared(tmp_path, [STICKING, STICKING, STICKING], count=8) == ["b", "tip"]
+
+
+def test_a_sliding_point_shares_with_joints_at_rest_that_it_holds(tmp_path: Path) -> None:
+    """Its normal row is theirs where all joints before it rest; with one that moves nothing is shared."""
+    assert shared(tmp_path, [SLIDING, OPEN, OPEN], count=4, rests=[0, 1]) == ["a", "joint_1", "joint_2"]
+    assert shared(tmp_path, [SLIDING, OPEN, OPEN], count=4, rests=[0]) == []
+    assert shared(tmp_path, [SLIDING, OPEN, OPEN], count=4, rests=[2, 3]) == []
+    assert shared(tmp_path, [OPEN, OPEN, OPEN], count=4, rests=[0, 1, 2, 3]) == []
