@@ -63,8 +63,9 @@ def test_points_of_one_body_share_what_is_along_it_and_the_third_does_not(tmp_pa
 
 
 def test_a_sliding_point_shares_with_joints_at_rest_that_it_holds(tmp_path: Path) -> None:
-    """Its normal row is theirs where all joints before it rest; with one that moves nothing is shared."""
-    assert shared(tmp_path, [SLIDING, OPEN, OPEN], count=4, rests=[0, 1]) == ["a", "joint_1", "joint_2"]
-    assert shared(tmp_path, [SLIDING, OPEN, OPEN], count=4, rests=[0]) == []
-    assert shared(tmp_path, [SLIDING, OPEN, OPEN], count=4, rests=[2, 3]) == []
+    """The first body's end moves with the first joint alone, the next one's with both: both must rest to hold it."""
+    assert shared(tmp_path, [SLIDING, OPEN, OPEN], count=4, rests=[0]) == ["a", "joint_1"]
+    assert shared(tmp_path, [SLIDING, OPEN, OPEN], count=4, rests=[1, 2, 3]) == []
+    assert shared(tmp_path, [SLIDING, OPEN, OPEN], count=5, rests=[0, 1]) == ["a", "joint_1", "joint_2"]
+    assert shared(tmp_path, [SLIDING, OPEN, OPEN], count=5, rests=[0]) == []
     assert shared(tmp_path, [OPEN, OPEN, OPEN], count=4, rests=[0, 1, 2, 3]) == []
