@@ -8,7 +8,7 @@ import numpy as np
 
 from dynsim.compile.model import Model
 from dynsim.errors import ModelError
-from dynsim.model.description import Array, Contact
+from dynsim.model.description import Array, Contact, Robot
 
 HAND = "hand"
 
@@ -16,6 +16,8 @@ HAND = "hand"
 TOLERANCE = 1e-13
 REACHED = 1e-12
 ITERATIONS = 300
+# What a joint may be beyond its limit by rounding [rad or m].
+BEYOND = 1e-9
 STEP_MAX = 0.3  # [rad or m] per iteration, so that the branch of the start is kept
 
 
@@ -30,6 +32,8 @@ def gaps_and_rates(model: Model, contacts: Sequence[Contact], q: Array) -> tuple
 
 def on_surfaces(model: Model, contacts: Mapping[str, Contact], names: Sequence[str], keep: Sequence[str]) -> Array:
     """The posture nearest to the initial one, |q − q_0| least, with the named points on their surfaces, (nq,).
+
+    Joints that would go beyond their limits stay there, the one that goes furthest first, and the others go on.
 
     Gauss–Newton steps q ← q_0 + J⁺ (J (q − q_0) − e), then Newton's without the pull to q_0 for the last digits.
 
@@ -59,26 +63,52 @@ def on_surfaces(model: Model, contacts: Mapping[str, Contact], names: Sequence[s
     columns = [
         k for k, link in enumerate(robot.links) if len(link.row.neutral) == 1 and robot.joint_names[k] not in fixed
     ]
-    places = [robot.position_index[k] for k in columns]
-    points = [contacts[name] for name in names]
+    q, worst = _nearest(model, [contacts[name] for name in names], columns, {}, HAND in keep)
+    stopped: dict[int, float] = {}
+    while worst <= REACHED and (beyond := _furthest_beyond(robot, columns, q)) is not None:
+        stopped[beyond[0]] = beyond[1]
+        q, worst = _nearest(model, [contacts[name] for name in names], columns, stopped, HAND in keep)
+    if not worst <= REACHED:
+        within = f" with {', '.join(robot.joint_names[k] for k in stopped)} at the limit" if stopped else ""
+        raise ModelError(
+            f"initial: the joints that may move do not bring {', '.join(names)} onto the surfaces{within}; {worst:.3g} "
+            "m are left: keep fewer joints, or start closer"
+        )
+    return q
+
+
+def _nearest(
+    model: Model, points: Sequence[Contact], columns: Sequence[int], stopped: Mapping[int, float], keep_hand: bool
+) -> tuple[Array, float]:
+    """Posture with the points on their surfaces, joints ``stopped`` at these values; and the largest distance left."""
+    robot = model.robot
+    moving = [k for k in columns if k not in stopped]
+    places = [robot.position_index[k] for k in moving]
     start = robot.initial
     hand = model.point_position(*robot.hand, start)
     q = start.copy()
+    for k, value in stopped.items():
+        q[robot.position_index[k]] = value
     for turn in range(ITERATIONS):
         error, J = gaps_and_rates(model, points, q)
-        if HAND in keep:
+        if keep_hand:
             position, jacobian = model.point_position_and_jacobian(*robot.hand, q)
             error, J = np.concatenate([error, position - hand]), np.vstack([J, jacobian])
         pull = start[places] - q[places] if turn < ITERATIONS - 5 else 0.0 * q[places]
-        step = pull - np.linalg.lstsq(J[:, columns], error + J[:, columns] @ pull, rcond=1e-10)[0]
+        step = pull - np.linalg.lstsq(J[:, moving], error + J[:, moving] @ pull, rcond=1e-10)[0]
         longest = float(np.abs(step).max(initial=0.0))
         if np.abs(error).max(initial=0.0) <= TOLERANCE and longest < 1e-10:
             break
         q[places] += step * min(1.0, STEP_MAX / max(longest, 1e-300))
-    worst = float(np.abs(error).max(initial=0.0))
-    if not worst <= REACHED:
-        raise ModelError(
-            f"initial: the joints that may move do not bring {', '.join(names)} onto the surfaces; {worst:.3g} m are "
-            "left: keep fewer joints, or start closer"
-        )
-    return q
+    return q, float(np.abs(error).max(initial=0.0))
+
+
+def _furthest_beyond(robot: Robot, columns: Sequence[int], q: Array) -> tuple[int, float] | None:
+    """The joint furthest beyond its limit, and that limit; joints that start beyond are refused elsewhere."""
+    worst, furthest = BEYOND, None
+    for k in columns:
+        link, at, start = robot.links[k], q[robot.position_index[k]], robot.initial[robot.position_index[k]]
+        for side, limit in ((1.0, link.upper), (-1.0, link.lower)):
+            if side * (start - limit) <= 0.0 and side * (at - limit) > worst:
+                worst, furthest = side * (at - limit), (k, limit)
+    return furthest

@@ -7,13 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from dynsim.compile.clearance import sinking
 from dynsim.compile.equilibrium import holding_torques, load_forces, static_margin
 from dynsim.compile.model import Model
 from dynsim.compile.shapes import gap_at
 from dynsim.engine import Start
 from dynsim.engine.prepare import prepare
 from dynsim.errors import ModelError
-from dynsim.model.description import Contact
+from dynsim.model.description import Contact, Robot
 from dynsim.scenario import Scenario, build
 from dynsim.scenario.effect import without_effect
 from dynsim.system.memo import recall
@@ -59,8 +60,18 @@ def start_of(scenario: Scenario) -> Start:
                 solved[link.joint] = (to, was, "deg" if angle else "m")
     hand = model.point_position(*robot.hand, q)
     key = build.on_surface_key(scenario, aloft) if aloft else ""
-    idle = without_effect(scenario, bool(robot.motors))
-    return Start(hand, points, gaps, key, solved, *_margins(scenario, model, contacts), idle)
+    warnings = [*without_effect(scenario, bool(robot.motors)), *_below(scenario, robot)]
+    return Start(hand, points, gaps, key, solved, *_margins(scenario, model, contacts), warnings)
+
+
+def _below(scenario: Scenario, robot: Robot) -> list[str]:
+    """A sentence for each surface that bodies begin below."""
+    sunk = sinking(robot, build.surfaces(scenario), robot.initial[None])
+    return [
+        f"{', '.join(s.body for s in sunk if s.surface == surface)}: below {surface} at the start, by up to "
+        f"{1e3 * max(s.depth for s in sunk if s.surface == surface):.3g} mm; surfaces hold only the points of contacts"
+        for surface in dict.fromkeys(s.surface for s in sunk)
+    ]
 
 
 def _margins(scenario: Scenario, model: Model, contacts: Sequence[Contact]) -> tuple[float | None, float | None]:

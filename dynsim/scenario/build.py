@@ -156,6 +156,9 @@ def _posed(scenario: Scenario, built: Robot, touching: Sequence[Contact]) -> Rob
     if initial is None or not initial.on_surface:
         return built
     points = {contact.name: contact for contact in touching}
+    for name in initial.on_surface:
+        if name in points:
+            _check_body(scenario, built, points[name])
     try:
         return replace(built, q0=on_surfaces(Model(built), points, initial.on_surface, initial.keep))
     except ModelError as error:
@@ -433,14 +436,11 @@ def check_start(
     """
     own = q is None
     q = model.robot.initial if q is None else q
-    off: list[tuple[Contact, bool, tuple[str, str] | tuple[str, str, str], float]] = []
+    off: list[tuple[Contact, bool, tuple[str, ...], float]] = []
     for contact in touching:
-        declared = contact.name in scenario.config.contacts.points
-        keys = ("contacts", "points", contact.name) if declared else ("contacts", "candidates")
-        try:
-            gap = gap_at(model, contact, q)
-        except ModelError as error:
-            raise ModelError(f"{dotted((*keys, 'body'))}: {error}", keys=(*keys, "body")) from error
+        declared, keys = _keys_of(scenario, contact)
+        _check_body(scenario, model.robot, contact)
+        gap = gap_at(model, contact, q)
         if scenario.config.contacts.law == "unilateral" and gap > (-PRESSED if contact.stiffness > 0.0 else 0.0):
             continue
         if not abs(gap) <= START_TOLERANCE:
@@ -460,6 +460,21 @@ def check_start(
             f"{remedy}, or disable the contact",
             keys=keys,
         )
+
+
+def _keys_of(scenario: Scenario, contact: Contact) -> tuple[bool, tuple[str, ...]]:
+    """Whether the scenario declares a contact point by name, and the keys that it comes from."""
+    declared = contact.name in scenario.config.contacts.points
+    return declared, ("contacts", "points", contact.name) if declared else ("contacts", "candidates")
+
+
+def _check_body(scenario: Scenario, robot: Robot, contact: Contact) -> None:
+    """Refuse a contact on a body that the robot does not have, or that does not move."""
+    try:
+        robot.attach(contact.body, contact.point)
+    except ModelError as error:
+        keys = (*_keys_of(scenario, contact)[1], "body")
+        raise ModelError(f"{dotted(keys)}: {error}", keys=keys) from error
 
 
 def _remedy(scenario: Scenario, off: Sequence[Contact]) -> str:

@@ -175,7 +175,11 @@ class _Reader:
             # Any text may come: whatever the parser stumbles over, the text is at fault.
             mark = getattr(reason, "problem_mark", None) or getattr(reason, "context_mark", None)
             problem = getattr(reason, "problem", None) or getattr(reason, "context", None) or str(reason)
-            self._fail(mark.line + 1 if mark else None, f"not YAML: {' '.join(problem.split())}")
+            hint = " ".join(problem.split())
+            lines = text.split("\n")
+            if mark is not None and mark.line < len(lines) and lines[mark.line][mark.column :].startswith("\t"):
+                hint = "a tab; indent with spaces"
+            self._fail(mark.line + 1 if mark else None, f"not YAML: {hint}")
 
     def _fail(self, line: int | None, problem: str) -> NoReturn:
         location = f"{self._source}:{line}" if line and self._line_numbers else self._source

@@ -79,7 +79,8 @@ def test_yaml_becomes_plain_values(text: str, value: object):
         ("a: 1\n---\nb: 2", ":2: a second document begins"),
         ("a: [1", ": not YAML: "),
         ("%YAML 3.0\n---\na: 1", ":1: not YAML: "),
-        ("a: @x", ":1: not YAML: "),
+        ("a: @x", ":1: not YAML: found character"),
+        ("a:\n\tb: 1", ":2: not YAML: a tab; indent with spaces"),
     ],
 )
 def test_every_fault_of_yaml_is_one_line_with_its_place(text: str, message: str):

@@ -101,6 +101,10 @@ def test_points(tmp_path: Path, law: str, point: str, said: str) -> None:
         ("brace: {elbow: 1}", "brace: the references take elbow +0.8 m off surface 'floor' at t = 0.000 s"),
         ("brace: optimal, feed_forward: gravity", "feed_forward = 'gravity': brace plans the whole dynamics"),
         ("min_N: 2", "min_N = 2: min_N is for brace: optimal"),
+        (
+            "joints: {joint_7: {times_s: [0, 1], angles_deg: [0, 0]}}",
+            "joints: 'joint_7' is no joint with a motor; did you",
+        ),
     ],
 )
 def test_braces(tmp_path: Path, controller: str, said: str) -> None:
@@ -185,6 +189,20 @@ def test_surfaces(tmp_path: Path, thing: str, said: str) -> None:
 )
 def test_time_stepping(tmp_path: Path, law: str, integrator: str, said: str) -> None:
     assert refused(tmp_path, LAW=law, INTEGRATOR=integrator).startswith(f"case.yaml:10: integrator.{said}")
+
+
+def test_bodies_of_points_that_are_put_on_surfaces(tmp_path: Path) -> None:
+    text = refused(tmp_path, "initial: {on_surface: [two]}\n", POINT="}, two: {body: link_33")
+    assert text.startswith("case.yaml:8: contacts.points.two.body: no body 'link_33'; did you mean 'link_3'?")
+
+
+def test_bodies_below_a_surface_at_the_start_are_warned_of(tmp_path: Path) -> None:
+    """The floor is at the lower end of the arm, which stands upright; another plane has a link below it."""
+    path = written(tmp_path, POINT=", enabled: false")
+    assert check(dynsim.load_scenario(path)).warnings == []
+    path = written(tmp_path, THING="{type: plane, point_m: [0, 0, 0.55]}", POINT=", enabled: false")
+    (warning,) = check(dynsim.load_scenario(path)).warnings
+    assert warning.startswith("link_1: below thing at the start, by up to 250 mm; surfaces hold only")
 
 
 @pytest.mark.parametrize(

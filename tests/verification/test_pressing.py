@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -51,6 +53,34 @@ def test_posture_on_the_surfaces_with_least_change(keep):
         J = np.vstack([J, model.point_jacobian(*hand, q)])
     along = np.linalg.svd(J[:, free])[2][np.linalg.matrix_rank(J[:, free], tol=1e-9) :]
     assert np.abs(along @ (q - q_0)[free]).max() <= 1e-7
+
+
+def test_joints_stay_within_their_limits_on_the_way_to_the_surfaces(tmp_path: Path) -> None:
+    """A joint that would go beyond stays at its limit and the others reach the surface; or none do, which is said."""
+    path = tmp_path / "arm.yaml"
+    arm = """
+name: arm
+duration_s: 1
+plant: {type: serial_arm, base: {position_m: [0, 0, 0.2]}, chain: [
+  {axis: y, length_m: 0.4, mass_kg: 1, initial_deg: 60, limit_deg: [-90, 100]},
+  {axis: y, length_m: 0.4, mass_kg: 1, initial_deg: 20, limit_deg: [-UPPER, UPPER]}]}
+controller: {type: joint_pd}
+initial: {on_surface: [tip]}
+surfaces: {floor: {type: plane}}
+contacts: {law: unilateral, points: {tip: {body: link_2, point_m: [0, 0, 0.4]}}}
+"""
+    path.write_text(arm.replace("UPPER", "170"), encoding="utf-8")
+    free = dynsim.build_model(dynsim.load_scenario(path)).robot.initial
+    assert np.degrees(free[1]) > 25.0
+    path.write_text(arm.replace("UPPER", "25"), encoding="utf-8")
+    case = dynsim.load_scenario(path)
+    model = dynsim.build_model(case)
+    assert np.degrees(model.robot.initial[1]) == pytest.approx(25.0)
+    assert np.degrees(model.robot.initial[0]) <= 100.0
+    assert np.abs(gaps_and_rates(model, build.contacts(case), model.robot.initial)[0]).max() <= 1e-12
+    path.write_text(arm.replace("UPPER", "25").replace("[-90, 100]", "[-90, 62]"), encoding="utf-8")
+    with pytest.raises(DynsimError, match=r"onto the surfaces with joint_[12], joint_[12] at the limit; 0\.\d+ m"):
+        dynsim.build_model(dynsim.load_scenario(path))
 
 
 def test_candidates_are_put_on_their_surfaces_too():

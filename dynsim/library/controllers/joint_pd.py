@@ -20,6 +20,7 @@ from dynsim.compile.references.teleop import TeleopOptions
 from dynsim.compile.rolling import rolled, wheel_angles
 from dynsim.compile.splines import clamped_cubic, quintic_coefficients
 from dynsim.config.base import NonNegative, Positive, StrictConfig, Vector3, check_waypoints, error_at
+from dynsim.config.problems import suggest
 from dynsim.errors import ModelError
 from dynsim.library import families
 from dynsim.library.controllers.operator import OperatorConfig
@@ -266,9 +267,15 @@ def _check_names(config: Config, model: Model) -> None:
     robot = model.robot
     driven = [motor.joint for motor in robot.motors]
     in_hand = config.hand.joints if config.hand else config.operator.joints if config.operator else []
-    for name in [*config.joints, *config.torques, *in_hand]:
-        if name not in driven:
-            raise ModelError(f"controller: {name!r} is no joint with a motor; those are: {', '.join(driven) or 'none'}")
+    hand = ("hand" if config.hand else "operator", "joints")
+    for keys, names in ((("joints",), config.joints), (("torques",), config.torques), (hand, in_hand)):
+        for name in names:
+            if name not in driven:
+                raise ModelError(
+                    f"controller.{'.'.join(keys)}: {name!r} is no joint with a motor{suggest(name, driven)}; "
+                    f"those are: {', '.join(driven) or 'none'}",
+                    keys=("controller", *keys),
+                )
     sources = {motor.joint for motor in robot.motors if isinstance(motor, TorqueSource)}
     for name in [*config.joints, *in_hand]:
         if name in sources:
