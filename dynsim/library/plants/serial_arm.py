@@ -21,11 +21,14 @@ AXES = {"x": [1.0, 0.0, 0.0], "y": [0.0, 1.0, 0.0], "z": [0.0, 0.0, 1.0]}
 
 Limits = Annotated[list[float], Field(min_length=2, max_length=2)]
 
+# Links of a chain; each takes some kilobytes before anything is simulated.
+LINKS_MAX = 100_000
+
 
 class LinkKeys(StrictConfig):
     """Keys of one joint and the link it carries. The link lies along its own +z from the joint."""
 
-    count: int = Field(default=1, ge=1, le=100_000, description="so many equal links")
+    count: int = Field(default=1, ge=1, le=LINKS_MAX, description="so many equal links")
     kind: Literal["revolute", "prismatic"] = "revolute"
     axis: Literal["x", "y", "z"] | Vector3 = Field(default="y", description="joint axis in the link's frame")
     length_m: NonNegative = 0.3
@@ -169,6 +172,8 @@ class Config(StrictConfig):
     @model_validator(mode="after")
     def _check(self) -> Self:
         n = sum(link.count for link in self.chain)
+        if n > LINKS_MAX:
+            raise error_at("chain", f"{n} links; at most {LINKS_MAX}")
         if self.initial_deg is not None:
             if len(self.initial_deg) != n:
                 raise error_at("initial_deg", f"{len(self.initial_deg)} angles, the chain has {n} joints")
