@@ -197,7 +197,8 @@ class Asked(dict[str, Any]):
         return super().__contains__(name)
 
 
-@pytest.mark.parametrize("scenario", [pytest.param("elbow_comparison", marks=pytest.mark.long), "snake_joint_limits"])
+@pytest.mark.long  # draws dozens of figures
+@pytest.mark.parametrize("scenario", ["elbow_comparison", "snake_joint_limits"])
 def test_a_record_that_lacks_a_signal_is_drawn_without_or_refused(scenario: str, tmp_path: Path, monkeypatch) -> None:
     # What is drawn counts here, not the pictures; and a figure that does not ask for a signal is drawn without it.
     asks: dict[Any, set[str]] = {}
@@ -237,6 +238,7 @@ def test_a_record_that_lacks_a_signal_is_drawn_without_or_refused(scenario: str,
         assert figures.draw_comparison({"a": other}, tmp_path)
 
 
+@pytest.mark.long  # draws dozens of figures
 def test_odd_provenance_of_records_is_one_error(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(style, "save", lambda figure, path: path)
     record = dynsim.simulate(load_scenario("single_pendulum", overrides={"duration_s": 0.2, "metrics.settle_s": 0.0}))
