@@ -402,14 +402,15 @@ contacts:
 """
 
 
-def test_joints_rest_where_sliding_elbows_hold_them(tmp_path: Path):
+@pytest.mark.parametrize("friction", [0.3, 0.0])
+def test_joints_rest_where_sliding_elbows_hold_them(tmp_path: Path, friction: float):
     """A yaw joint drags two elbows over a floor: their normal rows hold the pitch joints, which are at rest.
 
     Contact forces and dry friction of these joints are not determined, and with another split of them the friction of
     the elbows is another: both methods with events take the same, time stepping another one.
     """
     path = tmp_path / "drag.yaml"
-    path.write_text(TWO_ELBOWS, encoding="utf-8")
+    path.write_text(TWO_ELBOWS.replace("  friction: 0.3", f"  friction: {friction}"), encoding="utf-8")
     runs = {method: simulate(load_scenario(path, None, {"integrator.method": method})) for method in (*METHODS, STEPS)}
     energy = {method: run.summary["electrical_energy_J"] for method, run in runs.items()}
     assert energy["radau5"] == pytest.approx(energy["dopri5"], rel=1e-5)

@@ -175,7 +175,7 @@ def release_dependent_joints(system: System, ws: Workspace):
     bare_row, whole_row = unilateral.index[0], unilateral.index[1]
     slides = False
     for k in range(mode.shape[0]):
-        slides = slides or (mode[k, ku.WANTED] == ka.SLIDING and system.contacts.law[k, ka.MU] > 0.0)
+        slides = slides or mode[k, ku.WANTED] == ka.SLIDING
     if not slides or table.shape[0] == 0:
         return
     for r in range(system.couplings.joint.shape[0]):
