@@ -1,4 +1,4 @@
-"""Build hook of hatchling: a package knows the commit that it was built from, which records name."""
+"""Build hook of hatchling that writes the commit of a build into the package; records name that commit."""
 
 from __future__ import annotations
 

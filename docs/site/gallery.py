@@ -1,4 +1,4 @@
-"""Films, tables and live pages of all shipped scenarios: ``python docs/site/gallery.py [--short] [SCENARIO…]``.
+"""Films, tables and viewer pages of shipped scenarios: ``python docs/site/gallery.py [--short] [SCENARIO…]``.
 
 Writes to build/gallery/NAME, from where the site takes them; what is there already is kept. ``--short``: a still
 instead of a film, of the first variant and its first second alone, for checks.

@@ -1,4 +1,4 @@
-"""Study: does bracing keep a mobile base from tipping? Four elbow configurations, base parameters varied.
+"""Study: tipping of a mobile base with four elbow configurations, and a sweep over parameters of the base.
 
 ``PYTHONPATH=tests python -m support.overturning`` writes results/overturning/ (configurations.json, sweep.csv,
 sweep.png), which docs/validation.md quotes, in about two minutes.

@@ -23,7 +23,7 @@ X, Y, Z = np.eye(3)
 
 
 class Case(NamedTuple):
-    """A system, where it starts, how long it runs, and where it must end."""
+    """A system with its start, duration and required end."""
 
     compiled: CompiledSystem
     q: np.ndarray

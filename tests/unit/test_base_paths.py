@@ -1,4 +1,4 @@
-"""Paths of a mobile base: closed forms, an integration of its own, and what no base on two wheels can follow."""
+"""Paths of a mobile base: closed forms, independent integration, and refusal of paths that no base can follow."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ Z = vector(0, 0, 1)
 
 
 def soft(stiffness: float = STIFFNESS, damping: float = DAMPING) -> CompiledSystem:
-    """A mass on a vertical guide above a floor that gives way."""
+    """A mass on a vertical guide above a compliant floor."""
     link = Link("mass", "up", None, "prismatic", Z, Inertia(MASS))
     contact = Contact("foot", "mass", np.zeros(3), plane(Z), stiffness=stiffness, damping=damping)
     return assemble(Robot("mass", (link,), (), ("mass", np.zeros(3))), [contact], real=True)

@@ -1,4 +1,4 @@
-"""Motors of a stepped simulation: modes of servos, one supply, brakes, and motors in place of the plant's."""
+"""Motors of stepped simulations: modes of servos, supply voltage, brakes, and motors that replace the plant's."""
 
 from __future__ import annotations
 

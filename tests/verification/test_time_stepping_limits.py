@@ -1,4 +1,4 @@
-"""Limits of drives in time stepping are those of the end of a step: stiff loops are not integrated explicitly there."""
+"""Limits of voltage, current and torque in time stepping, applied at the end of a step, where loops are stiff."""
 
 from __future__ import annotations
 
