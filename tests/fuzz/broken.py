@@ -1,7 +1,7 @@
 """Deliberately broken loaders, one per kind of failure: the fuzzer must find each of them.
 
-Before a record is loaded, the entry of :data:`WAYS` for the number of the case is called; every link of a serial arm has
-1 % more mass.
+Before a record is loaded, the entry of :data:`WAYS` for the number of the case is called. Every link of a serial arm
+has 1 % more mass.
 """
 
 from __future__ import annotations

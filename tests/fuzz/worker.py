@@ -1,13 +1,13 @@
 """A child process that runs fuzz cases and judges how each ends.
 
-A case is damaged inputs and the dynsim commands that read them. The parent (:mod:`fuzz.campaign`) notices when the child
-crashes. The child reads lines ``kind seed index`` and answers each with one line of JSON. Commands run in the child,
-through the entry point of the console script.
+A case is damaged inputs and the dynsim commands that read them. The parent (:mod:`fuzz.campaign`) notices when the
+child crashes. The child reads lines ``kind seed index`` and answers each with one line of JSON. Commands run in the
+child, through the entry point of the console script.
 
 A command must succeed, or refuse with one line that begins with ``error:`` (continued by indented ones), exit code 2 or
-3 and all files unchanged. Exceptions: ``hw replay`` may end with 1 to 4 and writes files however it ends; a run that
-stops on its way may write what was simulated, marked incomplete; a run that exceeds its time may end by Ctrl-C. ``check``
-and other ``hw`` commands change no file even where they succeed. No file named .tmp is left, and no signal is infinite.
+3 and all files unchanged. Exceptions: ``hw replay`` may end with 1 to 4 and may write files however it ends; a command
+may save a part that it marks incomplete; a run beyond its time limit must stop on Ctrl-C. ``check`` and other ``hw``
+commands must change no file where they succeed either. No temporary file is left; no signal of a run is infinite.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """Defects of dynamixel-sdk 4.1.0, each with a test that the bus of dynsim works despite it.
 
-If the first half of a test fails, the library is repaired: the workaround in dynsim/hardware/bus/dynamixel_bus.py can go.
+If the first half of a test fails, the library is repaired, and the workaround in dynsim/hardware/bus/dynamixel_bus.py
+can be removed.
 """
 
 from __future__ import annotations

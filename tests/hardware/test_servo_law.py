@@ -11,7 +11,7 @@ from dynsim.hardware.virtual.servo_plant import FREE_DAMPING, VELOCITY_TIME_CONS
 
 @pytest.mark.parametrize("voltage", [12.0, 9.5, 0.0, -1.0])
 def test_torque_is_stiffness_within_the_stall_torque_less_back_emf(voltage):
-    """Position mode: τ = clip(k e, ±τ_max) − d ω; velocity mode: τ = clip(J/T (ω_set − ω) + d ω, ±τ_max) − d ω; off: −0.1 d ω.
+    """Position τ = clip(k e, ±τ_max) − d ω; velocity τ = clip(J/T (ω_set − ω) + d ω, ±τ_max) − d ω; off τ = −0.1 d ω.
 
     τ torque [N m], e angle to the set position [rad], ω speed, ω_set its set value [rad/s]; k stiffness [N m/rad],
     d damping by back-EMF [N m s/rad], J inertia d²/(4k) [kg m²], T = VELOCITY_TIME_CONSTANT [s]; τ_max = τ_stall V/12

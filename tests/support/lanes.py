@@ -1,4 +1,4 @@
-"""Replacement of reals in kernels by vectors of N lanes, in plain Python, to find state-dependent branches (test_lanes).
+"""Replacement of the kernels' reals by N lanes, in plain Python, to find state-dependent branches (for test_lanes).
 
 ``Lanes`` are N doubles, one for each of N states; N is 4 in the compiled kernels. A comparison gives N booleans. An
 ``if`` on such a comparison is recorded with its line, since SIMD code has no such branch; lanes that disagree raise

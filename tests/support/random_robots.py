@@ -1,4 +1,4 @@
-"""Random robots of every joint kind, their states and contacts; ``CompiledSystem``, which evaluates and integrates them."""
+"""Random robots of every joint kind, with states and contacts; ``CompiledSystem``, to evaluate and integrate them."""
 
 from __future__ import annotations
 

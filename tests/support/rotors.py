@@ -1,10 +1,10 @@
 """Study: rotors as armature at their joints, against rotors that are bodies of their own.
 
-dynsim gives a rotor the inertia J_m = I_m k² at its joint ([WM] eq 25), as if its axis did not turn. In fact the
-link before the joint carries it: with ω the angular velocity of that link and a the joint's axis, the rotor has the
-speed k v + a·ω about its axis and the energy ½ I_m (k v + a·ω)². Here that is computed without dynsim's right-hand side:
-rotors are bodies of a larger tree, tied to their joints by θ = k q (θ: angle of the rotor on that link); the dense
-equations are integrated by the classical Runge–Kutta method.
+dynsim gives a rotor the inertia J_m = I_m k² at its joint ([WM] eq 25), as if its axis did not turn. In fact the link
+before the joint carries it: with ω the angular velocity of that link and a the axis of the joint, the rotor has the
+speed k v + a·ω about its axis and the energy ½ I_m (k v + a·ω)². Here that is computed without dynsim's right-hand
+side: rotors are bodies of a larger tree, tied to their joints by θ = k q (θ: angle of the rotor on that link), and the
+dense equations are integrated by the classical Runge–Kutta method.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from dynsim.record import FORMAT
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "dynsim"
 PAGES = ("architecture.md", "extending.md")
-# An extension of the site's generator, which has this name there and is no module of the package.
+# The error handler of codecs that dynsim.system.standard_streams registers under this name.
 NO_MODULES = {"dynsim.plain"}
 # Files that the reader of an example creates.
 MADE = {"dynsim/library/surfaces/ellipsoid.py", "dynsim/model/joints/screw.py"}

@@ -1,4 +1,4 @@
-"""Reproducible machine code: the same numbers whatever was compiled or loaded before; the folders that cache kernels."""
+"""Reproducible machine code: the same numbers whatever was compiled or loaded before; folders of the kernel cache."""
 
 from __future__ import annotations
 
