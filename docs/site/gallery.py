@@ -23,7 +23,7 @@ VIEW, FILM, STILL, TABLE = "view.html", "film.gif", "still.png", "table.txt"
 SIZE, FPS = (480, 300), 8
 SHORT_S = 1.0
 MOST = 6
-"""Robots in one film."""
+"""Largest number of robots in one film."""
 
 
 def build(name: str, short: bool) -> None:

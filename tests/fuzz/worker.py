@@ -7,7 +7,7 @@ child, through the entry point of the console script.
 A command must succeed, or refuse with one line that begins with ``error:`` (continued by indented ones), exit code 2 or
 3 and all files unchanged. Exceptions: ``hw replay`` may end with 1 to 4 and may write files however it ends; a command
 may save a part that it marks incomplete; a run beyond its time limit must stop on Ctrl-C. ``check`` and other ``hw``
-commands must change no file where they succeed either. No temporary file is left; no signal of a run is infinite.
+commands must change no file, even where they succeed. No temporary file is left; no signal of a run is infinite.
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ def once_deadly(task: tuple[int, str], look: Progress) -> int:
 
 
 def warned(number: int, look: Progress) -> bool:
-    """Logs a warning; whether it would have been made."""
+    """Log a warning; return whether its level is enabled."""
     log = logging.getLogger("dynsim.work")
     log.warning("number %d", number)
     return log.isEnabledFor(logging.WARNING)

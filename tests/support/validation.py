@@ -1,4 +1,4 @@
-"""Study: numbers of the shipped and of free scenarios that README.md and docs/ quote; other studies give the rest.
+"""Study: energies, errors, forces and residuals of scenarios that README.md and docs/ quote, simulated anew.
 
 ``PYTHONPATH=tests python -m support.validation`` writes results/reference/validation.json in about four minutes;
 ``python .ci/pages.py`` writes them into the pages.

@@ -19,7 +19,7 @@ from dynsim.dynamics.contact.braces import tables as kb
 from dynsim.errors import ModelError
 
 seeds = st.integers(0, 2**32 - 1)
-# Tolerance of components of virtual velocities and gradients, of size 1, that must be zero or not negative.
+# Tolerance of components of virtual velocities and gradients, of about 1, that must be zero or not negative.
 ROUNDING = 1e-9
 UP = np.array([0.0, 0.0, 1.0])
 

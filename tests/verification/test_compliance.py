@@ -30,7 +30,7 @@ def soft(stiffness: float = STIFFNESS, damping: float = DAMPING) -> CompiledSyst
 
 
 def balance(run) -> np.ndarray:
-    """Energy that is not there any more, nor in its ledger, at the samples [J]; no drives, no loads."""
+    """Energy that the ledger does not explain at the samples [J], of a system without drives and loads."""
     energy, ledger = run.outputs("energy").sum(axis=1), run.states("ledger")
     lost = run.states("elastic").sum(axis=1) + run.states("scheme")[:, 0] + run.states("loss").sum(axis=1)
     return energy - energy[0] + lost + ledger[:, FRICTION] - ledger[:, CONSTRAINT]

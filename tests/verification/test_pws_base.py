@@ -20,8 +20,8 @@ MASS, WHEEL_MASS = 3.5, 0.4
 # The body about its centre of mass, a wheel about its axle and across it.
 I_Z, I_AXLE, I_ACROSS = 0.07, 0.5 * WHEEL_MASS * R**2, 0.25 * WHEEL_MASS * R**2
 TOTAL = MASS + 2.0 * WHEEL_MASS
-# Effective mass for a force ahead at the middle of the axle; effective inertia for a moment about the vertical there.
-# Its wheels have no motors.
+# Effective mass for a force ahead at the middle of the axle; effective inertia for a moment about the vertical there;
+# both for wheels without motors.
 ROLLING_MASS = TOTAL + 2.0 * I_AXLE / R**2
 TURNING = I_Z + 2.0 * (I_ACROSS + WHEEL_MASS * (0.5 * TRACK) ** 2) + 2.0 * I_AXLE * (0.5 * TRACK / R) ** 2
 START, HEADING = np.array([0.7, -0.4]), 0.6

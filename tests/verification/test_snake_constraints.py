@@ -1,6 +1,6 @@
 """Snake constraints A(q) ẇ = B(q) u against finite differences of an independent chain of homogeneous transforms.
 
-Geometries, modes and states are random, the base tilted and off the ground, so that no term of A or B vanishes.
+Geometries, modes and states are random, the base tilted and off the ground, so that an error in any term shows.
 """
 
 import numpy as np

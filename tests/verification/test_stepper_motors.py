@@ -20,7 +20,7 @@ def servo(joint: str, **keys: float) -> Servo:
 
 
 def pendulum(**keys: float) -> dynsim.Simulation:
-    """The shipped rod, hanging 60° from straight down, on a servo instead of free."""
+    """The shipped pendulum at 60° from straight down, with a servo at its joint."""
     return dynsim.Simulation(dynsim.load_scenario("single_pendulum"), motors=[servo("joint_1", **keys)])
 
 

@@ -1,4 +1,4 @@
-"""Limits of voltage, current and torque in time stepping, applied at the end of a step, where loops are stiff."""
+"""Limits of voltage, current and torque in time stepping: they hold for the end of a step, also in stiff loops."""
 
 from __future__ import annotations
 
