@@ -1,8 +1,8 @@
 """Operator of a stepped simulation: commanded velocities of hand and base become references at every tick.
 
-The hand's target p_d moves with the commanded velocity v, in axes of the world; on a mobile base it moves with that, and
-v is in the base's axes. Each tick of length h takes the joint references at constant rates to q_d⁺, which puts the hand
-at p_d + h v (damped Gauss–Newton, :func:`dynsim.dynamics.inverse_kinematics.follow_path`):
+The hand's target p_d moves with the commanded velocity v, in axes of the world; on a mobile base it moves with that,
+and v is in the base's axes. Each tick of length h takes the joint references at constant rates to q_d⁺, which puts the
+hand at p_d + h v (damped Gauss–Newton, :func:`dynsim.dynamics.inverse_kinematics.follow_path`):
 
     q_d(t) = q_d + (q_d⁺ − q_d) (t − t_k)/h
 

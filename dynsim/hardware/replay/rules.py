@@ -1,7 +1,7 @@
 """The abort rules: conditions on the answers of one cycle under which a replay stops.
 
-Every rule has a bound on its reaction: the number of cycles from the first one whose answers show the trouble to the one
-in which the fault is declared. The bounds are those of the map's ``safety``; one cycle for an alert; for troubles
+Every rule has a bound on its reaction: the number of cycles from the first one whose answers show the trouble to the
+one in which the fault is declared. The bounds are those of the map's ``safety``; one cycle for an alert; for troubles
 that only health reads show, the cycles in which the health of all servos is read in turn.
 """
 
