@@ -19,8 +19,8 @@ def add_body_poses(record: Record) -> bool:
     """Add the poses of all bodies of the scene over time as signals; False where a joint was not recorded.
 
     ``body_position`` (T, bodies, 3) [m], ``body_orientation`` (T, bodies, 4): quaternions w, x, y, z whose signs do not
-    jump. In single precision, a tenth of a micrometre at a metre: they serve to draw; :func:`poses_at` computes poses
-    from the scene and joint positions in double precision.
+    jump. In single precision, a tenth of a micrometre at a metre: they serve to draw; the scene and the joint positions
+    give them in full precision.
     """
     scene = record.scene
     if scene is None or not scene.bodies or not all(_recorded(record, body.joint) for body in scene.bodies):

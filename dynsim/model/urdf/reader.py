@@ -1,8 +1,8 @@
 """Strict reading of URDF text to links and joints: all numbers are checked, errors name element and line.
 
-Elements that the URDF specification makes optional have the specification's default (a link without ``<inertial>`` has
-no mass, a joint without ``<axis>`` turns about x). Others that are missing, misspelt, repeated or not numbers are refused.
-Visuals are read leniently (:mod:`dynsim.model.urdf.visual`).
+Elements that the URDF specification makes optional have its defaults (a link without ``<inertial>`` has no mass, a
+joint without ``<axis>`` turns about x). Others that are missing, misspelt, repeated or not numbers are refused. Visuals
+are read leniently (:mod:`dynsim.model.urdf.visual`).
 """
 
 from __future__ import annotations
