@@ -1,4 +1,4 @@
-"""Build hook of hatchling: a package knows the commit that it was built from, which records name."""
+"""Build hook of hatchling that writes the commit of a build into the package; records name that commit."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class CommitHook(BuildHookInterface[Any]):
         """See hatchling; an editable install reads the checkout's own commit."""
         root = Path(self.root)
         if version == "editable" or (root / NAME).is_file():
-            return  # a source distribution that is built from has it
+            return  # the source distribution that is built from already contains it
         asked = subprocess.run(["git", "rev-parse", "HEAD"], cwd=root, capture_output=True, text=True, check=False)
         if asked.returncode == 0 and (root / ".git").exists():
             self._folder = tempfile.TemporaryDirectory()

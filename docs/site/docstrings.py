@@ -14,15 +14,15 @@ _ROLE = re.compile(r":\w+:`~?(?:[\w.]+\.)?([\w ]+)`")
 
 
 class Plain(griffe.Extension):
-    """Makes Markdown of what docstrings have of other markup."""
+    """Converts sections, sessions and roles in docstrings to Markdown."""
 
     def on_object(self, *, obj: griffe.Object, **kwargs: Any) -> None:
-        """What stands after the colon of a parameter is a sentence, no type; sessions are code; roles are names."""
+        """Treat the text after a parameter's colon as a sentence, not a type; sessions as code; roles as names."""
         if obj.docstring is None:
             return
         text = _ROLE.sub(r"`\1`", obj.docstring.value).replace("``", "`")
         parts = _SECTION.split(text)
-        # Texts and names of sections take turns.
+        # Names of sections alternate with their texts.
         sections = [f"{name}\n{'-' * len(name)}\n{_ENTRY.sub(_sentence, body)}" for name, body in _pairs(parts[1:])]
         head = _SESSION.sub(lambda match: f"```python\n{_code(match[0])}\n```\n", parts[0])
         obj.docstring.value = "".join([head, *sections])

@@ -1,4 +1,4 @@
-"""Films, tables and live pages of all shipped scenarios: ``python docs/site/gallery.py [--short] [SCENARIO…]``.
+"""Films, tables and viewer pages of shipped scenarios: ``python docs/site/gallery.py [--short] [SCENARIO…]``.
 
 Writes to build/gallery/NAME, from where the site takes them; what is there already is kept. ``--short``: a still
 instead of a film, of the first variant and its first second alone, for checks.
@@ -23,7 +23,7 @@ VIEW, FILM, STILL, TABLE = "view.html", "film.gif", "still.png", "table.txt"
 SIZE, FPS = (480, 300), 8
 SHORT_S = 1.0
 MOST = 6
-"""Robots in one film."""
+"""Largest number of robots in one film."""
 
 
 def build(name: str, short: bool) -> None:

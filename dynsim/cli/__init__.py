@@ -1,4 +1,4 @@
-"""The command line: ``dynsim run``, ``compare``, ``check``, ``list``, ``plot``, ``bench``, ``schema``, ``hw`` …"""
+"""The command line ``dynsim``: one module for each command or group of commands; here its entry point."""
 
 import atexit
 import gc
@@ -8,9 +8,9 @@ import sys
 
 def main() -> None:
     """Entry point of ``dynsim``."""
-    # Before numpy: dynsim's matrices are small, and threads that wait for work take a tenth of a run's processor time.
+    # Before numpy is imported: dynsim's matrices are small, and idle threads take a tenth of a run's processor time.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # Imports stay: to look for garbage in them as often as by default, and at the end, takes a third of `dynsim check`.
+    # Imported objects stay: garbage collection at its default rate, and at the end, takes a third of `dynsim check`.
     gc.set_threshold(200_000)
     atexit.register(gc.freeze)
     from dynsim.system import interruption

@@ -1,4 +1,4 @@
-"""Command ``dynsim animate``: writes films of records."""
+"""Command ``dynsim animate``: writes a film of one or several records."""
 
 from __future__ import annotations
 

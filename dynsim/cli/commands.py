@@ -1,4 +1,4 @@
-"""Commands run, compare, check, list, plot, bench and schema; heavy imports wait until a command is called."""
+"""Commands run, compare, check, list, plot, bench and schema; large imports are deferred until a command is called."""
 
 from __future__ import annotations
 

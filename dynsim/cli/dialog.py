@@ -1,4 +1,4 @@
-"""Questions and tables of the commands that move a robot: before a replay, and after a nudge of one servo."""
+"""Questions and tables of the commands that move a robot: before a replay, and about nudges of single servos."""
 
 from __future__ import annotations
 

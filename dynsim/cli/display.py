@@ -1,4 +1,4 @@
-"""Console, progress bars and the message that figures are being drawn."""
+"""Consoles, messages about written files, progress bars, and the display of drawing and compilation."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def say(text: str) -> None:
 
 
 def say_written(path: Path) -> None:
-    """Where the files of a command are."""
+    """Print where the files of a command are."""
     say(f"Written to {escaped(path)}")
 
 

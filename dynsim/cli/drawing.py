@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Figures:
-    """Figures of one record, or of several over each other, as files of a kind in a folder."""
+    """Figures of records, each alone or all in the same axes (``together``), as files of a kind in a folder."""
 
     records: dict[str, Record]
     folder: Path

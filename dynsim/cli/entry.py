@@ -22,7 +22,7 @@ from dynsim.system.terminal import escaped
 
 
 def main(received: Sequence[int]) -> None:
-    """Errors become one line and an exit code. Ctrl-C where nothing can be saved is typer's: 130.
+    """Errors become one line and an exit code. On Ctrl-C where nothing can be saved typer exits with 130.
 
     ``received`` : what :func:`dynsim.system.interruption.handled` gives, within which this runs
     """

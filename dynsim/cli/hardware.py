@@ -21,7 +21,7 @@ hw = typer.Typer(
     no_args_is_help=True,
     help="Replay a record on Dynamixel servos (or virtual ones). A software stop is no safety device: fit a power cut.",
 )
-# Paths must survive copy and paste: long lines are left to the terminal. Without markup: "[rad]" is a unit, no style.
+# Long lines are left to the terminal, so that paths can be copied. Without markup: "[rad]" is a unit, not a style.
 console = Terminal(soft_wrap=True, highlight=False, markup=False, emoji=False)
 
 

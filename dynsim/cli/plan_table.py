@@ -8,12 +8,12 @@ from dynsim.cli.display import console, say
 from dynsim.planner.answer import BracePlan, Size
 from dynsim.system.terminal import escaped
 
-# A brace that touches for less of the time has lifted off.
+# A brace that is in contact for less than this part of the time counts as lifted off.
 LIFTED = 0.999
 
 
 def print_plan(plan: BracePlan) -> None:
-    """A row for each number of braces, then what refused plans and what was not found."""
+    """Print a row for each number of braces, then reasons for refused plans, and plans that were not found."""
     table = Table(title=f"{escaped(plan.task.scenario.title)}: braces", title_justify="left")
     heads = (
         "braces", "on", "heat [W]", "simulated [W]", "all energy [J]", "k_p [V/rad]", "forces [N]", "rounds",

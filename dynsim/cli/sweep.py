@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from dynsim.studies.journal import SweepRow
     from dynsim.studies.sweep_plan import Plan
 
-# Reasons of failed runs that are printed.
+# Number of failed runs whose reasons are printed.
 _SHOWN = 5
 
 

@@ -1,4 +1,4 @@
-"""Tables of summaries and choices for the terminal."""
+"""Tables of summaries, comparisons, checked starts, and choices of scenario types for the terminal."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ Summary = Mapping[str, Any]
 _HEADING_WIDTH = 30
 
 
-# Energies of no more than this share of the turnover are rounding, and coordinates up to this [m].
+# Energies of no more than this share of the turnover, and coordinates up to this [m], are rounding.
 ROUNDING = 1e-12
 
 
 def _format(value: float, form: str) -> str:
-    """A number; 0 where it is zero, and no sign before zeros that it is rounded to."""
+    """Text of a number; "0" for zero, and no sign where it is rounded to zero."""
     text = format(value, form)
     if value == 0.0:
         return "0"

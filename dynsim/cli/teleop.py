@@ -30,7 +30,7 @@ UntilClosedOption = Annotated[
 ]
 OpenOption = Annotated[bool, typer.Option("--open/--no-open", help="Open the page in a browser.")]
 
-# Ticks later than this are told of at the end [s].
+# Ticks later than this are reported at the end [s].
 LATE = 0.05
 
 

@@ -1,4 +1,4 @@
-"""Base class of all parts of scenarios and servo maps: unknown keys refused, frozen after validation."""
+"""Base classes of the configurations in scenarios and servo maps, with number types, and checks of vectors and points."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NonNegative = Annotated[float, Field(ge=0)]
 def _forbid_conversion(schema: Any) -> None:
     """Make the numbers of a pydantic core schema take numbers only.
 
-    Otherwise ``true`` is 1 and the text "1_9.2" is 19.2: no file says so. Keys stay as they are, they are texts.
+    Otherwise ``true`` would be read as 1 and the text "1_9.2" as 19.2. Keys are texts and are not changed.
     """
     if isinstance(schema, dict):
         if schema.get("type") in ("float", "int"):

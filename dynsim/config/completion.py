@@ -1,4 +1,4 @@
-"""Shell completion of scenario and variant names; imports nothing heavy, as it runs at every Tab key."""
+"""Shell completion of scenario and variant names; imports no large packages, as it runs at every Tab key."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dynsim.system.shipped import shipped_scenario, shipped_scenarios
 
 
 def scenarios(incomplete: str) -> list[str]:
-    """Names of shipped scenarios, and YAML files of the folder that was begun."""
+    """Names of shipped scenarios and paths of YAML files that begin with the given text."""
     from glob import escape
 
     folder, separator, _ = incomplete.rpartition("/")

@@ -1,6 +1,6 @@
 """One-line error messages from pydantic's validation errors: file, line, key, value and fix.
 
-Scenarios and servo maps share it, so that errors of both read alike.
+Scenarios and servo maps share it, so that errors of both have the same form.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from pydantic import BaseModel, ValidationError
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
 
-# Most unknown keys and other problems in a message, and most characters of a value or key.
+# Most unknown keys, most other problems in a message, and most characters of a value or key.
 UNKNOWN_SHOWN = 20
 OTHERS_SHOWN = 4
 SHOWN_LIMIT = 80
-# Keys that say which of several configurations a mapping is.
+# Keys whose values select one of several configurations for a mapping.
 TAGS = ("type", "kind")
 # A list index in a dotted key.
 INDEX = re.compile("[0-9]{1,9}")
@@ -33,7 +33,7 @@ INDEX = re.compile("[0-9]{1,9}")
 
 @dataclass(frozen=True)
 class Origin:
-    """Where the values of a scenario come from, so that messages can name the line of a key.
+    """Origin of the values of a scenario, from which messages name the line of a key.
 
     Attributes
     ----------

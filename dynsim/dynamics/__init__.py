@@ -1,1 +1,1 @@
-"""Compiled mechanics: tables, trees of bodies, drives, contacts, and the derivative of the state."""
+"""Compiled equations of motion: tables, trees of bodies, drives, contacts, energy ledger, inverse kinematics."""

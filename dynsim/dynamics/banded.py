@@ -1,4 +1,4 @@
-"""Banded systems of linear equations."""
+"""Solver of banded systems of linear equations."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dynsim.jit.kernel import kernel
 
 @kernel
 def solve_banded(band, lower, upper, right):
-    """Solve A x = b by elimination with row exchanges, which fill up to ``lower`` further diagonals.
+    """Solve A x = b by elimination with row exchanges, which fill up to ``lower`` more diagonals above the band.
 
     Parameters
     ----------

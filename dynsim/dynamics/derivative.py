@@ -1,6 +1,6 @@
 """The coupled system of bodies, motors and contacts as one right-hand side dy/dt ([WM] eqs 28–35).
 
-Positions, rates, currents and integrals lie in the state as dynsim.dynamics.state says.
+The layout of y (positions, rates, currents, integrals) is in dynsim.dynamics.state.
 """
 
 from __future__ import annotations

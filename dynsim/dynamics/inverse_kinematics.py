@@ -1,4 +1,4 @@
-"""Positions of joints that take a point of a body along a path and keep others on their surfaces."""
+"""Inverse kinematics along a path: joint positions that reach its targets with brace points on their surfaces."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ STEP_MAX = 0.3  # [rad or m] per iteration, so that the branch of the start is k
 
 
 class PathArrays(NamedTuple):
-    """What follows a path, and room for one step. r = 3 + braces, c joints that move, n joints."""
+    """Point, joints and braces that follow a path, and scratch. r = 3 + braces, c moving joints, n joints."""
 
     link: int  # that carries the point
     point: np.ndarray  # (3,) in its frame [m]

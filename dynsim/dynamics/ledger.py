@@ -1,4 +1,4 @@
-"""Energies and the integrals of the ledger, which are states of the integrator."""
+"""Powers of the energy ledger, whose integrals are states; kinetic, potential and magnetic energy."""
 
 from __future__ import annotations
 

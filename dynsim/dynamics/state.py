@@ -8,12 +8,12 @@ State y, all in one vector, blocks in this order:
     ledger   (LEDGER_SIZE,) integrals of power [J], see dynsim.dynamics.ledger
     contact  (2 c,) impulse of the normal force [N s] and slip [m] of each contact point
     load     (l,)   work of each external wrench [J]
-    loss     (2,)   what impacts of contacts and of joint stops take [J]; only under the unilateral law
-    scheme   (1,)   what time steps take of the energy [J]; only of time stepping, see its discretisation_energy
+    loss     (2,)   energy lost in impacts of contacts and of joint stops [J]; only under the unilateral law
+    scheme   (1,)   energy lost by discretisation [J]; only in time stepping, see stepping.discretisation_energy
     elastic  (2,)   energy that contacts and ties have stored since the start, and what their dampers have taken [J];
                     only where some give way, see dynsim.integrators.stepping.compliance
 
-The first three are what error control looks at; the rest are integrals that nothing depends on.
+Error control covers the first three; the others are integrals on which the motion does not depend.
 """
 
 from __future__ import annotations

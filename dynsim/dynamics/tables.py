@@ -1,11 +1,11 @@
-"""Input and output tables of the kernels: a few flat arrays per concept, in SI units and the world frame W.
+"""Tables of the right-hand side: columns, constants and arrays of model, drives, contacts and workspace, in SI units.
 
-n links (one velocity each), na drives (motors), c contact points, p constraint rows. A link is one joint and the body
-it carries; links are ordered so that a parent comes before its children. Spatial vectors are (angular, linear) at the
-world origin, so inertias and forces of different bodies simply add.
+n links (one rate each), na drives (motors), c contact points, p constraint rows. A link is one row of a joint and the
+body that it carries; parents come before their children. Spatial vectors are (angular, linear) in W at the world
+origin, so inertias and wrenches of different bodies simply add.
 
-A table is one array whose columns are named by the constants below. Few arrays matter: every array of an argument
-costs copying in each compiled call, and what belongs to one link lies together.
+A table is one array whose columns are named by the constants below. Arrays are few because each costs time in every
+compiled call, and because the columns of one link are then next to each other in memory.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ REVOLUTE_X, REVOLUTE_Y, REVOLUTE_Z, REVOLUTE, PRISMATIC = 0, 1, 2, 3, 4
 BALL_X, BALL_Y, BALL_Z, ROLL, TURN, LEFT_WHEEL, RIGHT_WHEEL = 5, 6, 7, 8, 9, 10, 11
 # Friction of a contact under a negative (pulling) normal force, see dynsim.dynamics.contact.quadrics.
 FRICTION_SIGNED, FRICTION_DISSIPATIVE = 0, 1
-# What a candidate is at present: off its surface (no row), sliding (one row, friction in its direction), or held at its
-# anchor (three rows). Constant within a step.
+# Mode of a candidate: off its surface (no row), sliding (one row, friction in its direction), or held at its anchor
+# (three rows). Constant within a step.
 OPEN, SLIDING, STICKING = 0, 1, 2
 MOST_ROWS = 3  # of one candidate
 

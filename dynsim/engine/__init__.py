@@ -1,4 +1,4 @@
-"""Simulation of a scenario: the plant's engine turns it into a record."""
+"""Simulation and check of a scenario by the engine of its plant; types of progress and of a checked start."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from dynsim.scenario import Scenario, require_scenario
 from dynsim.system import interruption
 from dynsim.system.memo import remembering
 
-# A library says nothing unless it is asked to. Here, not in dynsim/__init__.py: everything that logs imports this.
+# No log output unless the caller configures it. Here, not in dynsim/__init__.py: every module that logs imports this.
 logging.getLogger("dynsim").addHandler(logging.NullHandler())
 log = logging.getLogger(__name__)
 

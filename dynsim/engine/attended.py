@@ -1,10 +1,10 @@
-"""Compiled code run in a thread, while the calling thread handles signals and the wall-time limit.
+"""Loading and running of compiled code in a thread; the calling thread handles signals and the wall-time limit.
 
 Compiled code neither receives signals nor reads a clock, and a single step may take a minute where a contact problem
-has no solution. So it runs without the interpreter's lock in another thread. The calling thread wakes up for a signal,
-and checks ten times a second for other reasons to end the run. Then compiled code is asked to return after its present
-step. If it does not return in time it is left running: the samples so far are in its arrays. The compiler runs in the
-same way.
+has no solution. So it runs in another thread, without the interpreter's lock. The calling thread wakes up for a signal,
+and checks ten times a second for other reasons to end the run. To end it, it asks compiled code to return after the
+present step. Code that does not return in time is left running; the samples so far are in its arrays. The compiler runs
+in the same way.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ log = logging.getLogger(__name__)
 
 # Interval of the checks, and how long to wait for compiled code that was asked to return [s].
 LOOK_S, PATIENCE_S = 0.1, 0.5
-# After so long in one and the same step it is stuck [s]: the longest that was ever seen, of 24 contacts whose forces no
-# method of the solver finds, took 80.
+# A run whose present step takes longer than this is stuck [s]. The longest step observed took 80 s: of 24 contacts
+# whose forces no method of the solver finds.
 STUCK_S = 600.0
-# A round of the solver of contact problems, times the cube of their rows [s].
+# Time of one iteration of the contact solver, divided by the cube of the number of rows [s].
 ROUND = 2e-9
 
 
 def attend(
     work: Callable[[], None], ask: Callable[[], None], look: Callable[[], None]
 ) -> tuple[bool, BaseException | None]:
-    """Do ``work`` in a thread of its own, and listen meanwhile.
+    """Do ``work`` in a thread of its own; meanwhile handle signals and call ``look``.
 
     Parameters
     ----------
     work : that releases the interpreter's lock
-    ask : asks it to end soon
+    ask : asks the work to end soon
     look : called every LOOK_S; what it raises, as what signals raise here, asks the work to end
 
     Returns

@@ -1,7 +1,7 @@
-"""Messages about the compilation of kernels: which, why again, and how long it takes.
+"""Messages about the compilation of kernels: which kernels, why they are compiled again, and for how long.
 
-One line in the log. On a terminal, where nobody else shows it, a line on stderr as it begins and as it ends. Commands
-show it in their bars: also what their worker processes compile, of which a file beside the kernels says so.
+Each compilation gives one line in the log. On a terminal without progress bars, lines on stderr mark its begin and its
+end. Commands show it in their progress bars, also that of worker processes, which mark it by a file beside the kernels.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from pathlib import Path
 
 from dynsim.jit.kernel import cache_folder, told_of_compilation
 
-# Beside the folders of kernels: how long the last compilation took, by what was compiled [s].
+# File beside the folders of kernels: duration of the last compilation of each kind [s].
 LAST = "compiled_in_s.json"
-# Of a file that says what a process compiles.
+# Suffix of the file that marks a compilation under way; its name is the process id.
 MARK = ".compiling"
-# Without a compilation to go by [s].
+# Expected duration, in words, where no earlier one is known.
 USUAL = "seconds to two minutes on two cores"
-# Between two looks of a display [s].
+# Interval at which a display reads those files [s].
 LOOK_S = 0.5
 
-# False where a command has bars of its own.
+# False where a command shows progress bars of its own.
 _on_terminal = True
 
 
 @dataclass(frozen=True)
 class Compilation:
-    """One that is under way.
+    """A compilation that is under way.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Engine of the multibody plants: integrate the coupled system and collect its record."""
+"""Engine of the multibody plants: integrates the coupled system and makes the record of the run."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 
 # More steps than any run takes.
 _ALL = 1 << 62
-# Ticks between two looks at Ctrl-C and the progress bar.
+# Ticks between two checks for Ctrl-C, at which the progress bar is updated.
 TICKS = 10
 
 

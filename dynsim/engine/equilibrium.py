@@ -1,12 +1,11 @@
-"""Equilibrium start (``initial.equilibrium``): currents that hold the posture, and commands that keep them.
+"""Equilibrium start (``initial.equilibrium``): motor currents that hold the posture, and references that keep them.
 
-At rest u = R i, so a controller that follows the posture without any error has to give R i. Where it plans voltages,
-they are that; else the references of all motors are moved by a constant for the whole run,
+At rest u = R i, so a controller whose references are the posture has to give R i. Planned voltages supply it, except
+for external loads. The part that is missing is given by a shift of all motors' references, constant over the run,
 
     DC motor, position servo: q_d + R i / k_p        torque source: τ_d + τ
 
-as if the sag under the weight at the start had been taken out of its set points. Errors, tracking and ledger are told
-against the references as they were.
+which cancels the sag under the weight at the start. Errors, tracking and ledger refer to the original references.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from dynsim.dynamics.tables import ReferenceArrays
 from dynsim.model.description import Array, Contact, Load
 from dynsim.model.drives import Motor, Servo, TorqueSource
 
-# What a reference begins with that counts as rest where the joint is [rad or m, rad/s or m/s].
+# A reference starts at rest at the joint's position if its offset and its rate are below this [rad or m, rad/s or m/s].
 AT_REST = 1e-4
 
 

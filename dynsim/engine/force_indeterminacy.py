@@ -1,7 +1,8 @@
-"""Warnings and stops where contact forces are not determined: Painlevé's paradox, dependent rows.
+"""Diagnosis of contact forces that are not unique: Painlevé's paradox, dependent rows; texts for warnings and stops.
 
-The watch itself is compiled (dynsim.dynamics.contact.uniqueness); here its finding is located and put into words,
-and the motion that dependent frictional rows leave open is measured. docs/physics.md derives the criteria.
+The check during a run is compiled (dynsim.dynamics.contact.uniqueness); here its finding is located in time and
+described, and the range of accelerations that dependent frictional rows allow is computed. docs/physics.md derives the
+criteria.
 """
 
 from __future__ import annotations
@@ -26,13 +27,13 @@ from dynsim.model.description import Contact
 
 Array = NDArray[np.float64]
 
-# A determinant below this fraction of the frictionless one, where the step size has collapsed, is what collapsed it.
+# Where the step size has collapsed, a determinant below this fraction of the frictionless one counts as the cause.
 NEAR_ZERO = 1e-3
-# At a crossing the friction that would just do is the present one.
+# A factor on the friction coefficients that avoids the paradox is reported if it is below this.
 WORTH_SAYING = 0.99
 # Halvings of the interval in which forces ceased to be unique.
 BISECTIONS = 50
-# Recorded samples at which the motion that dependent rows leave open is measured.
+# Recorded samples at which the range of accelerations of dependent rows is computed.
 SPREAD_SAMPLES = 5
 # Singular values of A below this fraction of the largest are null: well above rounding, well below those of braces.
 NULL_TOLERANCE = 1e-9

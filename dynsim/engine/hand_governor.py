@@ -1,18 +1,19 @@
 """Reference governor of the hand: limits its commanded velocity so that the joints can always stop in time.
 
-The state is the target p_d of the hand, its velocity v and the joints that have it there. v is admissible where the
-hand can come to rest from it: the points of a straight way, slowed by a h in each tick of length h,
+The state is the target p_d of the hand, its velocity v and the joint positions that reach p_d. v is admissible if the
+hand can come to rest along a straight line with the deceleration a. With ticks of length h, the points of that line
 
     p_d + h v,  p_d + h v + h (v − a h v/|v|),  …,  rest
 
-are all within reach, and the joints go there within their ranges, rates and accelerations. From an admissible velocity
-the first tick of that way is always open, and what is left of it is a way to rest again. So each tick takes
+must be within reach, and the joints must get there within their ranges, rates and accelerations. From an admissible
+velocity the first tick of this stopping path is always possible, and the rest of it is again a stopping path. So each
+tick takes
 
     v⁺ = v_rest + λ (v_wish − v_rest),   0 ≤ λ ≤ 1
 
-with v_rest the next velocity of the way to rest, v_wish that which was asked for, eased, and λ the largest found that
-is admissible: 1, or by bisection. Both ends differ from v by at most a h, hence v⁺ does. At the edge of reach, where
-joints would have to be infinitely fast, it is their acceleration that ends the way in time.
+with v_rest the next velocity of the stopping path, v_wish the commanded velocity with its change limited to a h, and λ
+the largest admissible value found: 1, or by bisection. Both differ from v by at most a h, hence v⁺ does. At the edge of
+reach, where joint rates would be unbounded, the limit on joint accelerations ends the path in time.
 
 Source: E. Gilbert, I. Kolmanovsky, "Nonlinear tracking control in the presence of state and control constraints: a
 generalized reference governor", Automatica 38 (2002); λ and the admissible way to rest are theirs.
@@ -37,15 +38,15 @@ from dynsim.jit.kernel import reals
 Array = NDArray[np.float64]
 
 HALVINGS = 6
-"""Of λ; each costs a way to rest."""
+"""Bisections of λ; each computes one stopping path."""
 ROUNDING = 1e-9
-"""Of joint rates and accelerations, in parts of their limits."""
+"""Tolerance of joint rates and accelerations, relative to their limits."""
 _STATE = ("target", "velocity", "joints", "rates", "hindrance", "_path")
 
 
 @dataclass(frozen=True)
 class StoppingPath:
-    """A way to rest: velocities, targets of the hand and joints of each tick, (T, 3), (T, 3) and (T, c)."""
+    """Hand velocities [m/s], hand targets [m] and joint positions of each tick, (T, 3), (T, 3) and (T, c)."""
 
     velocity: Array
     targets: Array

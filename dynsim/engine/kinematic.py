@@ -1,4 +1,4 @@
-"""Engine of the kinematic snake."""
+"""Engine of the kinematic snake: preparation, check and simulation of a scenario."""
 
 from __future__ import annotations
 

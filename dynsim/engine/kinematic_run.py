@@ -1,4 +1,4 @@
-"""One simulation of the kinematic snake: compiled ticks between mode switches in Python."""
+"""Run of the kinematic snake: control periods in compiled code, mode switches between them in Python."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dynsim.engine.snake_control import SnakeControl, copy_of
 from dynsim.snake.state import new_trace
 from dynsim.snake.ticks import record_row, run_ticks
 
-CHUNK = 500  # ticks between two looks at signals and the progress bar: about 25 ms, at worst ten times as long
+CHUNK = 500  # ticks between two checks for signals and updates of the bar: about 25 ms, at worst ten times as long
 
 
 class SnakeRun(SnakeControl):

@@ -4,7 +4,7 @@
 
 Bodies, motors with their controller, loads and active constraints are one right-hand side; contact modes stay those of
 the instant, so the equations hold until the next event. Constraints are part of A at the level of accelerations: each
-row that is held adds two eigenvalues at zero, along motions off the surface, which the simulation does not make.
+row that is held adds two eigenvalues at zero, for motions that violate it, which the simulation does not make.
 """
 
 from __future__ import annotations

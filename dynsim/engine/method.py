@@ -1,15 +1,15 @@
 """Choice of the integration method (``method: auto``) from the fastest rate of the system at its start.
 
-DOPRI5 is stable while h |λ| is below about 3.3, however smooth the motion; RADAU5 is held to its accuracy only. Of the
-spectrum of ∂(v, v̇, di/dt)/∂(q, v, i) at the start the part that can hold steps counts, that of drives and losses,
-linear and under the constraints that hold there:
+DOPRI5 is stable only while h |λ| is below about 3.3 (step h, eigenvalue λ), however smooth the motion; steps of RADAU5
+are limited by its accuracy alone. The rate is the spectral radius of that part of ∂(v, v̇, di/dt)/∂(q, v, i) which
+drives and losses give, linearised at the start, under the constraints that hold there:
 
     v̇ = W (∂τ/∂(q, v, i) − diag(D))       W = M⁻¹ − M⁻¹ Aᵀ (A M⁻¹ Aᵀ)⁺ A M⁻¹,  A: contacts and couplings
 
-Gravity and what grows with the speed are as slow as the motion itself. Where that part is zero, nothing damps what the
-steps are in error by, and the energy shows it: at rtol 1e-6 it is off by 1 to 17 rtol after ten seconds of DOPRI5, by
-0.3 to 0.9 of RADAU5, in twice the time. (From 1e-9 on the rest that its Newton method leaves is the larger part.)
-Nothing is timed: the choice is the same on every machine.
+Gravity and velocity forces are as slow as the motion itself. Where that part is zero, nothing damps the errors of the
+steps, and the energy drifts: at rtol 1e-6, in ten seconds, by 1 to 17 rtol with DOPRI5 and by 0.3 to 0.9 rtol with
+RADAU5, which takes twice the time. (From 1e-9 on the residual of its Newton iteration is the larger part.) Nothing is
+timed: the choice is the same on every machine.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from dynsim.scenario.schema import Integrator
 
 AUTO = "auto"
 PACE = 0.02
-"""Step that the accuracy of an arm's motion allows at least [s]."""
+"""Smallest step that the accuracy of an arm's motion is assumed to need [s]."""
 TOUCHING = 1e-6
-"""Contacts nearer than this hold at the start [m]."""
+"""A contact with a gap below this is closed at the start [m]."""
 SMALL = 36
 """Joints up to which Jacobians of RADAU5 cost less than half of its steps."""
 TIGHT = 1e-8

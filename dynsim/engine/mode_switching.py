@@ -10,7 +10,7 @@ from dynsim.snake.description import FIXING, SWITCHING, ModeTable, Policy
 
 
 class Refusal(NamedTuple):
-    """A mode that was asked for, or was a candidate, and would tip."""
+    """A mode that was requested, or was a candidate, and in which the robot would tip."""
 
     tick: int
     row: int
@@ -24,7 +24,7 @@ class ModeSwitcher:
 
     Every change of mode is tested by simulating the mode for one period with the present command. It tips when its
     support margin is anywhere not above ``least_margin``; such a mode is not taken and the present one stays. Only
-    when the present mode tips as well, the one that stands best is taken, the fixing mode among them.
+    if the present mode tips as well, the mode of largest support margin is taken; the fixing mode is a candidate too.
 
     Attributes
     ----------

@@ -1,14 +1,14 @@
 """Operator of a stepped simulation: commanded velocities of hand and base become references at every tick.
 
-The hand's target p_d moves with the velocity v that is asked for, in axes of the world; on a mobile base in those of
-the base, which carries it. Each tick of length h takes the joints to where the hand is at p_d + h v, at constant rates
-(damped Gauss–Newton, :func:`dynsim.dynamics.inverse_kinematics.follow_path`):
+The hand's target p_d moves with the commanded velocity v, in axes of the world; on a mobile base it moves with that,
+and v is in the base's axes. Each tick of length h takes the joint references at constant rates to q_d⁺, which puts the
+hand at p_d + h v (damped Gauss–Newton, :func:`dynsim.dynamics.inverse_kinematics.follow_path`):
 
     q_d(t) = q_d + (q_d⁺ − q_d) (t − t_k)/h
 
-v and the velocities of the base change from tick to tick by no more than their accelerations times h, also where the
-hand comes to the edge of what its joints can do (:mod:`dynsim.engine.hand_governor`). Wheels get the rates
-(V ∓ ω T/2)/r of what they roll without slip.
+v and the velocities of the base change from tick to tick by no more than their acceleration limits times h, also where
+joint limits restrict the hand (:mod:`dynsim.engine.hand_governor`). Wheels get the rates (V ∓ ω T/2)/r, at which they
+roll without slip.
 """
 
 from __future__ import annotations

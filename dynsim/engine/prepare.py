@@ -1,4 +1,4 @@
-"""Preparation of a run: the scenario compiled to kernel arrays, with every refusal before the first step."""
+"""Preparation of a dynamics run: the scenario compiled to kernel arrays, and the checks that refuse it beforehand."""
 
 from __future__ import annotations
 

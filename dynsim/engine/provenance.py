@@ -1,4 +1,4 @@
-"""Provenance of a record: scenario, version, commit, libraries."""
+"""Provenance of a record: scenario, engine, versions of dynsim, libraries and Python, commit, and date."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dynsim.library import families
 from dynsim.scenario import Scenario
 
 LIBRARIES = ("numpy", "scipy", "numba", "h5py")
-# In a built package: the commit that it was built from.
+# File of a built package that names the commit from which it was built.
 BUILT_FROM = "commit.txt"
 
 

@@ -1,4 +1,4 @@
-"""The record of a run from the columns that the kernels wrote."""
+"""The record of a dynamics run, made from the columns that the kernels wrote."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Writing the files of a run, all of them or none."""
+"""Names and writing of the files of a run: record, summary and scenario, replaced together."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dynsim.scenario import to_yaml
 from dynsim.system.files import discard, json_text, replace_together, write_text
 
 RUN_FILES = ("record.h5", "summary.json", "scenario.yaml")
-# What only describes records, and is drawn or written anew from them.
+# Files that are made from records, and can be made again.
 FIGURE_FORMATS = ("png", "pdf", "svg")
 VIEW = "view.html"
 FIGURES = (*(f"figures/*.{kind}" for kind in FIGURE_FORMATS), "figures/animation.gif", VIEW)

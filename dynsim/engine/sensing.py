@@ -13,12 +13,12 @@ from dynsim.model.description import Array, Robot
 from dynsim.record import Record
 from dynsim.scenario.sensors import Encoders
 
-# Arrivals this close to a tick belong to it [s].
+# A sample that arrives this little after a tick is available at that tick [s].
 ROUNDING = 1e-9
 
 
 class Stateful(Protocol):
-    """A simulation that tells its state."""
+    """A simulation whose state can be read."""
 
     @property
     def state(self) -> State:

@@ -1,8 +1,8 @@
 """Simulation under the caller's control: advance, read, rewrite references and wrenches, restore a snapshot.
 
 Steps are those of :func:`dynsim.simulate`, bit for bit, as long as nothing is rewritten: ``advance`` does not cut them.
-The step that would pass the time asked for is kept back, and the state there is taken from its dense output. Only when
-something is rewritten it is dropped, and a shorter one ends at that very time.
+The step that passes the requested time is kept, and the state at that time is taken from its dense output. Only when
+something is rewritten, that step is discarded, and a shorter one ends at the requested time.
 
 Long because: it is one class, the public stepper, and half of it is its documentation.
 """

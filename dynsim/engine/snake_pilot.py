@@ -1,8 +1,8 @@
 """The task-space control of the dynamic snake: at every tick, references for the servos of joints and wheels.
 
-At a tick: what sensors tell, the controller, modes and lifts, references. The servos of joints follow the integrated
-command, q_d(t) = φ + u (t − t_k), whatever the joints do ([T] IV.C); those of wheels the rates. Where the controller
-takes its state from:
+Order within a tick t_k: sensors, controller, modes and lifts, references. The servos of joints follow the integrated
+command, q_d(t) = φ + u (t − t_k), with commanded angles φ and rates u, whatever the joints do ([T] IV.C); those of
+wheels follow rates. The state that the controller uses:
 
     feedforward   its own command, integrated ([T] IV.C.2)
     estimated     encoders of the joints; x, y, γ of the head integrated ([T] IV.C.1)

@@ -14,7 +14,7 @@ from dynsim.snake.description import COORDINATES, conditioning
 from dynsim.snake.state import SnakeTrace
 
 OUT_OF_REACH = 1.0
-"""A target that waits for so long at the end of a run [s] is called out of reach."""
+"""A target whose motion has waited for this time at the end of a run [s] is reported out of reach."""
 
 
 def _wrapped(angle: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,8 +1,8 @@
 """Joint references of a dynamic snake, and its start: a preliminary run that raises the head to its posture.
 
-Gear friction keeps a head that was raised into its posture lower than one that came from above, by about 20 mm and
-0.09 rad. A real robot raises its head, so a preliminary run does, before t = 0: the head starts below its posture,
-settles, is raised, and settles again.
+Gear friction keeps a head that was raised into its posture lower than one that was lowered into it, by about 20 mm and
+0.09 rad. A real robot raises its head. So a preliminary run before t = 0 lets the head settle below its posture, raises
+it, and lets it settle again.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from dynsim.scenario.schema import Integrator
 from dynsim.snake.lifting import height_of
 from dynsim.system.memo import recall
 
-# How far below its posture the head begins, by its pitch joints from the base on [rad] (assumed).
+# Angles by which the head starts below its posture, for its pitch joints in order from the base [rad] (assumed).
 LOWERED = (0.10, 0.30, 0.15)
 # Times to settle, to raise the head, and to settle again [s] (assumed).
 SETTLE, RAISE, SETTLE_AGAIN = 0.5, 1.0, 1.0
-# Ticks between two looks at the geometry of lifted pairs while their heights do not change.
+# Ticks between two updates of the geometry of lifted pairs while their heights do not change.
 STEADY_TICKS = 4
 
 

@@ -1,4 +1,4 @@
-"""Start of a dynamic run: initial posture and state, and the checks before the first step."""
+"""Start of a dynamics run: initial posture, gaps and tip margin, and the checks before the first step."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from dynsim.scenario import Scenario, build
 from dynsim.scenario.effect import without_effect
 from dynsim.system.memo import recall
 
-# Joints that the solution of a posture has moved by less stay where they were [rad or m].
+# A joint that the solution of the posture moves by less than this counts as unmoved [rad or m].
 MOVED = 1e-12
 
 

@@ -1,4 +1,4 @@
-"""Data types of a stepped simulation: states, events, snapshots."""
+"""Data types of a stepped simulation: states, contact forces, snapshots; its guards, and events from the kernels."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from dynsim.record.measures import TIP_OVER
 
 Array = NDArray[np.float64]
 
-# Guards of events by name: number in the kernels, and what they are about.
+# Guards of events by name: their number in the kernels, and the kind of object that they observe.
 GUARDS = {
     "joint_position": (events.JOINT_POSITION, "joint"),
     "joint_rate": (events.JOINT_RATE, "joint"),

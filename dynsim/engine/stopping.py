@@ -1,4 +1,4 @@
-"""Messages for an integration that stopped before its end."""
+"""Messages and last state of an integration that stopped before its end."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from dynsim.integrators import project as kp
 from dynsim.integrators import run as ki
 from dynsim.scenario import Scenario
 
-# STATUS in a word.
+# Names of the values of STATUS.
 KINDS = {
     ki.NOT_FINITE: "not_finite",
     ki.STEP_TOO_SMALL: "step_too_small",

@@ -1,6 +1,6 @@
 """Summary (``summary.json``) of a dynamics run: energies, tracking errors, contact forces, motor loads, warnings.
 
-:func:`summarise` makes it from the record; the energy balance of the record is defined here too. The summary of the
+:func:`summarise` makes it from the record; the residual of the energy ledger is defined here too. The summary of the
 kinematic snake is in :mod:`dynsim.engine.kinematic_record`.
 """
 

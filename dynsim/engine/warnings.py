@@ -1,4 +1,4 @@
-"""Warnings of a run: sentences with the location, the number, and what to do about it."""
+"""Warnings of a dynamics run: sentences with the location, the number, and the remedy."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from dynsim.scenario.effect import without_effect
 DRIFT_LIMIT_M = 1e-9
 # Slower than this a joint with dry friction is at rest [rad/s or m/s].
 AT_REST = 1e-9
-# Friction heat below zero by no more than this share of the turnover is rounding.
+# Negative friction heat of no more than this share of the turnover is rounding.
 FRICTION_ROUNDING = 1e-12
 # Limits in files are rounded: a joint that starts at 1.5707963 = 90° is not beyond it.
 LIMIT_SLACK = 1e-6

@@ -1,4 +1,4 @@
-"""Replay of a record on Dynamixel servos: offline check, verification, timed replay, and virtual servos to prove it.
+"""Motion of Dynamixel servos: replay of a record, live drive, checks, calibration, comparison, and virtual servos.
 
-Nothing here knows how a record was made; nothing here imports the simulation kernels.
+Nothing here depends on how a record was made. Only ``virtual.simulated_plant`` uses the simulation.
 """

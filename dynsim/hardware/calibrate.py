@@ -1,4 +1,4 @@
-"""Calibration of zero ticks: the robot is put into its zero posture by hand, and its readings go to the map."""
+"""Calibration of a servo map: zero ticks read in a zero posture set by hand; zero ticks or signs written to the map."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from dynsim.system.files import write_text
 Key = Literal["zero_tick", "sign"]
 READS = 20
 STILL = 3
-"""Spread over the reads that still counts as standing still [ticks]."""
+"""Largest spread over the reads of a servo at rest [ticks]."""
 
 
 def read_zero_ticks(bus: Bus, servos: Iterable[MappedServo]) -> dict[str, int]:

@@ -1,4 +1,4 @@
-"""Exceptions of replays and hardware commands: one class per cause, each with its exit code."""
+"""Exceptions of replays and hardware commands, one class per cause, with exit codes."""
 
 from __future__ import annotations
 

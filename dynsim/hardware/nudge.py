@@ -1,7 +1,7 @@
-"""Check of the sense of rotation: turns each joint a little and back, and compares with the servo map.
+"""Check of the sense of rotation: turns each joint by a small angle and back, and compares with the servo map.
 
-A nudge is a replay of one servo, with all its checks, rules and its end: verified, armed where it stands, 3° and back
-at 0.1 rad/s at most, torque off. All other servos of the map stay limp.
+A nudge is a replay of one servo, with all checks and abort rules of a replay: the servo is verified, armed where it
+stands, moved by 3° and back at 0.1 rad/s at most, and its torque is switched off. All other servos have torque off.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ ANGLE = math.radians(3.0)
 SPEED = 0.1
 """Top speed of a nudge [rad/s]."""
 PAUSE = 0.5
-"""At the far end [s], for somebody to see it."""
+"""Pause at the far end [s], for a person to see the motion."""
 KNOTS = 31
 """Of each leg: the interpolant is within 1e-7 rad of the quintic."""
 YIELDS = 0.75

@@ -18,7 +18,7 @@ from dynsim.hardware.virtual.port import VirtualPort
 
 VIRTUAL = "virtual"
 PSEUDO_TERMINAL_LATENCY = 0.05
-"""Servos behind a pseudo-terminal are a program, which a busy computer may not run for a while [s]."""
+"""Latency allowed to virtual servos behind a pseudo-terminal, as a busy computer may suspend their process [s]."""
 
 
 @contextmanager

@@ -15,11 +15,11 @@ except ImportError:
     fcntl = termios = tty = None  # type: ignore[assignment]
 
 TerminalError: type[Exception] = OSError if termios is None else termios.error
-"""What a serial port raises beside OSError."""
+"""Exception that a serial port raises beside OSError."""
 
 
 def require_posix(user: str) -> None:
-    """Refuse who reads and writes as POSIX does it, by name.
+    """Refuse an operation that needs POSIX, named ``user`` in the message.
 
     Raises
     ------

@@ -16,15 +16,15 @@ from dynsim.hardware.bus.control_table import BAUD_RATES
 from dynsim.hardware.strict_yaml import Objection, Within, rounded_up
 
 LONGEST_REACTION = 0.5
-"""From the first cycle that shows a fault to the rule that declares it [s]."""
+"""Longest time from the first cycle that shows a fault to its declaration by a rule [s]."""
 STOP_CYCLES = 3
-"""A stop along the path takes as many cycles at least."""
+"""Least number of cycles of a stop along the path."""
 ROUNDED = 1e-9
-"""Part of a time by which a number of cycles may seem to exceed it."""
+"""Relative rounding error by which a number of cycles may exceed a time."""
 
 FaultPolicy = Literal["hold", "decelerate", "off"]
 
-# 4.5 Mbit/s is the servos' but not the client library's.
+# The servos know 4.5 Mbit/s, the client library does not.
 _BAUD_CHOICES = [rate for rate in BAUD_RATES if rate <= 4_000_000]
 
 

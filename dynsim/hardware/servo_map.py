@@ -1,6 +1,6 @@
-"""The servo map: which servo follows which column of a record, and the limits of that joint.
+"""The servo map: its schema, its checks and its files; servos, the columns of a record they follow, and limits.
 
-Joint angle and servo position are tied by
+Joint angle [rad] and servo position [ticks] are related by
 
     tick = zero_tick + sign · gear · angle / (2π/4096)
 

@@ -15,7 +15,7 @@ from dynsim.hardware.errors import ServoMapError
 from dynsim.system.inputs import parse_yaml, read_text
 
 Objection = tuple[str, str]
-"""Dotted key of a file, and what is wrong with it."""
+"""Dotted key of a file, and the reason why its value is refused."""
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from dynsim.jit.kernel import inline_kernel, internal_kernel, kernel
 
 @internal_kernel
 def collocated(newton: NewtonArrays | None, j, whole):
-    """The two bends of entry j, of the cubic through y, the stages and y_new = y + ``whole``."""
+    """Quadratic and cubic coefficient of entry j, of the cubic through y, the stages and y_new = y + ``whole``."""
     if newton is None:  # known to the compiler
         return 0.0, 0.0
     c0, c1 = NODE_RADAU[0], NODE_RADAU[1]

@@ -1,4 +1,4 @@
-"""DOPRI5, Dormand and Prince's explicit Runge–Kutta method of order 5: one step."""
+"""DOPRI5, the explicit Runge–Kutta method 5(4) of Dormand and Prince: coefficients and one step."""
 
 from __future__ import annotations
 

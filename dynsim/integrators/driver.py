@@ -1,16 +1,16 @@
-"""Time integration of the coupled system: one step per call of a method, error control, projection, sampling.
+"""Time integration of the coupled system: start, steps of the chosen method, acceptance, events, ticks, samples.
 
 Methods, all with dense output (so that records do not force steps):
 
 - ``DOPRI5``: Dormand–Prince 5(4), adaptive, six evaluations a step; dense output of order 4 (Hairer, Nørsett, Wanner:
-  Solving Ordinary Differential Equations I, II.5–II.6). For motion that nothing fast holds up;
-- ``RADAU5``: implicit, three stages of order 5 (order 3 in themselves), error estimate of order 3, adaptive: steps as
-  long as accuracy allows, however fast the motors are (−450 ± 1900i 1/s in the published arm), see ``radau5``; dense
-  output of order 3;
-- ``TIME_STEPPING``: contacts that open and close within fixed steps, see ``stepping``; linear between their ends.
+  Solving Ordinary Differential Equations I, II.5–II.6). For systems that are not stiff;
+- ``RADAU5``: implicit, order 5 with three stages (stage order 3), error estimate of order 3, adaptive; accuracy limits
+  its steps, not the fast eigenvalues of motors (−450 ± 1900i 1/s in the published arm), see ``radau5``; dense output of
+  order 3;
+- ``TIME_STEPPING``: contacts open and close within fixed steps, see ``stepping``; samples are linear within a step.
 
-After each accepted step q and v are projected onto the active rows when they have left them by more than
-``GAP_TOLERANCE`` or ``RATE_TOLERANCE``.
+After each accepted step of the adaptive methods q and v are projected onto the active rows if they are off them by more
+than ``GAP_TOLERANCE`` or ``RATE_TOLERANCE``, see ``project``.
 """
 
 from __future__ import annotations

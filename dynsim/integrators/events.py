@@ -1,10 +1,9 @@
 """Event location: a step ends where a guard function crosses zero; ticks end steps at given times.
 
-The event table has a guard for each event, its value at the last accepted step and the side of zero it was on. After a
-step that error control has accepted the guards are evaluated from what the right-hand side has left in the workspace;
-where one has passed zero the step is repeated, shorter, until it ends within ``event_tolerance`` beyond the root. The
-root is that of the method's own solution, of its full order; that of the dense output, of lower order, would have to be
-followed by such a step anyway.
+The event table has the guard of each event, its value at the last accepted step and on which side of zero that was.
+After a step that error control has accepted the guards are evaluated from the workspace of the right-hand side. If one
+has passed zero the step is repeated, shorter, until it ends within ``event_tolerance`` beyond the root. So the root is
+that of the method's own solution, not of the dense output, whose order is lower.
 """
 
 from __future__ import annotations
@@ -26,8 +25,8 @@ JOINT_POSITION, JOINT_RATE, MOTOR_CURRENT, MOTOR_VOLTAGE, CONTACT_FORCE, CONTACT
 HAND_X, HAND_Y, HAND_Z = 6, 7, 8
 TIP_MARGIN = 9
 
-# Steps that a root may take; regula falsi with halving (Illinois) needs about eight. Guards that jump, as forces do
-# where another split of them begins, are bisected in the end. Once there were too many the next one is the last.
+# Most trial steps for a root; regula falsi with halving (Illinois) needs about eight. After FALSI_LIMIT trials the
+# bracket is bisected, for guards that jump (forces do where their split changes); after SEARCH_LIMIT one more is taken.
 SEARCH_LIMIT, FALSI_LIMIT = 60, 16
 
 

@@ -1,4 +1,4 @@
-"""Recorded outputs of a sample besides its state."""
+"""Recorded outputs of a sample that are not states: accelerations, drives, hand, energies, contacts, support."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from dynsim.jit.kernel import internal_kernel
 
 @internal_kernel
 def write_output(system: System, ws: Workspace, run: Run, row):
-    """Everything worth recording that is not a state, after ``derivative``, into the columns of OutputLayout."""
+    """All recorded outputs that are not states, after ``derivative``, into the columns of OutputLayout."""
     fill_output(system, ws, run, run.output[row])
     write_support(system, ws, run, row)
 
 
 @internal_kernel
 def fill_output(system: System, ws: Workspace, run: Run, out):
-    """The same but for what the ground carries, into out (columns.size,); also of lanes."""
+    """The same without the ground reactions of a mobile base, into out (columns.size,); also for lanes."""
     joints, motors, motor, state, columns = ws.joints, ws.motors, system.drives.motor, ws.contacts, run.columns
     force_vectors(ws)
     for i in range(joints.shape[0]):

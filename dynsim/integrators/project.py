@@ -1,7 +1,7 @@
-"""Projection of positions and rates onto the constraints.
+"""Projection of positions and rates onto the active constraint rows.
 
-After each accepted step q and v are projected onto the active rows when they have left them by more than
-``GAP_TOLERANCE`` or ``RATE_TOLERANCE``.
+After each accepted step of the adaptive methods q and v are projected onto the active rows if they are off
+them by more than ``GAP_TOLERANCE`` or ``RATE_TOLERANCE``.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from dynsim.integrators import run as ki
 from dynsim.integrators.run import Run
 from dynsim.jit.kernel import internal_kernel
 
-# Projection: a tenth of the drift that is promised (1e-9 m), and a rate that adds less than that in a step.
+# A tenth of the specified drift (1e-9 m), and a rate that adds less than that in a step [m, m/s; rad, rad/s].
 GAP_TOLERANCE = 1e-10
 RATE_TOLERANCE = 1e-8
 PROJECTION_LIMIT = 6

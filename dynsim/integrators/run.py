@@ -1,4 +1,4 @@
-"""Arrays of one integration: state, workspace, recorded rows and counters."""
+"""Arrays of one integration: state, recorded rows, clock, counters, events, ticks; its methods and statuses."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ RUNNING, FINISHED, NOT_FINITE, STEP_TOO_SMALL, NOT_PROJECTED, NO_FORCES = 0, 1, 
 FORCES_REVERSED, SEVERAL_FORCES, STOPPED = 6, 7, 8
 # Under the unilateral law: no forces agree with Coulomb's law; modes change without end.
 NO_CONTACT_FORCES, CHATTER = 9, 10
-# MOST_TRIALS steps have come next to nowhere. By whoever listens: the wall limit is over; one step does not end.
+# MOST_TRIALS steps made hardly any progress. Set by the caller: the wall time limit is over; a step does not end.
 NO_PROGRESS, OUT_OF_TIME, STUCK = 11, 12, 13
 
 # Run.clock

@@ -1,4 +1,4 @@
-"""Error norm and step-size control."""
+"""Error norm, first step and step-size control; tests for the end of a run and for lack of progress."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Statistics of accepted steps: extremes of the contact forces, and their uniqueness."""
+"""Statistics of accepted steps: extremes of contact forces and gaps, time of pulling; uniqueness of the forces."""
 
 from __future__ import annotations
 

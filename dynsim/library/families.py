@@ -1,7 +1,7 @@
 """Families of types that a scenario chooses by ``type``: modules of the package or of plug-ins.
 
 ``type: snake`` of a plant is the module ``dynsim.library.plants.snake``, else the entry point ``snake`` of the group
-``dynsim.plants`` of whatever is installed. There is no other list. Entry points are looked for only when the package
+``dynsim.plants`` of an installed package. There is no other list. Entry points are looked for only when the package
 has no member of that name (looking takes milliseconds with few packages installed, more with many), and no plug-in is
 imported before a scenario names it; ``dynsim list``, ``dynsim schema`` and ``dynsim check`` look at all of them.
 """

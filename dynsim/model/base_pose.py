@@ -1,4 +1,4 @@
-"""Pose of a mobile base from the coordinates of its robot."""
+"""Pose of a mobile base in the world, from the coordinates q of its robot."""
 
 from __future__ import annotations
 

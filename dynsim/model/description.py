@@ -1,4 +1,4 @@
-"""Bodies, joints, contacts and loads as plain frozen data in SI units.
+"""Bodies, joints, frames, contacts, couplings, ties, loads and the robot as plain frozen data in SI units.
 
 Drives: :mod:`dynsim.model.drives`, surfaces: :mod:`dynsim.model.surfaces`.
 

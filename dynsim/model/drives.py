@@ -1,4 +1,4 @@
-"""Drives of joints as plain frozen data in SI units: DC motors, position servos, open torques."""
+"""Drives of joints as plain frozen data in SI units: DC motors, servos, ideal torque sources."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 SMOOTHING = 1e-2
-"""Speed below which gear friction fades where nothing is said of it [rad/s]."""
+"""Default of the speed below which smoothed gear friction decreases to zero [rad/s]."""
 
 
 @dataclass(frozen=True)
@@ -22,11 +22,11 @@ class Motor:
     torque_constant : K [N m/A = V s/rad]
     resistance : R [Ω]; inductance : L [H]; rotor_inertia : I_m [kg m²]
     gear_ratio : k; gear_damping : d_m on the motor side [N m s/rad]
-    dry_friction : of the gear, at the joint [N m or N]: it holds at rest; under the unilateral law
+    dry_friction : of the gear, at the joint [N m or N]: it holds the joint at rest; under the unilateral law
     voltage_limit : [V], inf for none
     current_limit : [A] that its driver keeps, inf for none
-    nominal_current : [A] that it stands for ever; nominal_torque : at the joint [N m or N]; inf where not known
-    mass : [kg] of a point on the link before the joint; on what stands fixed it moves nothing
+    nominal_current : [A], continuous rating; nominal_torque : at the joint [N m or N]; inf where not known
+    mass : [kg] of a point on the link before the joint; without effect where that is fixed to the world
     mass_point : (3,) or None
         Where, in that link's frame [m]; None: at the joint.
     """

@@ -1,9 +1,9 @@
 """MJCF export: a robot as a MuJoCo file with the same mass matrix and bias forces.
 
-What MuJoCo's format can state exactly is written: bodies, joints with limits, viscous losses, dry friction and rotor
-inertia, gears between joints, gravity, the initial posture. Motors become torques on their joints, within what their
-limit of current gives; circuits, smoothed gear friction and controllers stay with dynsim. Contact points become sites
-and surfaces become shapes that do not touch: MuJoCo's contacts are soft, dynsim's are not.
+Written are bodies, joints with limits, viscous losses, dry friction and rotor inertia, couplings, gravity and the
+initial posture, which MuJoCo's format states exactly. Motors become torques on their joints, bounded by their current
+limits; circuits, smoothed gear friction and controllers are left out. Contact points become sites and surfaces become
+shapes without contact, because MuJoCo's contacts are soft.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from dynsim.record.quaternion import of_matrix
 from dynsim.record.scene import HERE, SceneSurface, Shape
 from dynsim.record.urdf_text import Element, numbers, xml_text
 
-# MuJoCo refuses bodies without mass or inertia; this much of both [kg, kg m²] is no number of any robot.
+# MuJoCo refuses bodies without mass or inertia; this much is negligible in any robot [kg, kg m²].
 LEAST = 1e-12
-# Half the edge of a plane that is drawn [m].
+# Half the edge of the drawn part of a plane [m].
 _PLANE = 5.0
 _SIMPLE = {"revolute": "hinge", "prismatic": "slide"}
 _BALL = ["ball_x", "ball_y", "ball_z"]

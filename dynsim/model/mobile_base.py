@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# What the base stands on, in the order of the recorded loads.
+# Supports of the base, in the order of the recorded loads.
 SUPPORTS = ("left", "right", "caster")
 
 

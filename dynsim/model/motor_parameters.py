@@ -1,4 +1,4 @@
-"""Parameters common to all motors of a scenario, and those of a geared brushed DC motor ([WM] eqs 16–25)."""
+"""Keys common to all motors of a scenario, and those of a geared brushed DC motor ([WM] eqs 16–25)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dynsim.model.drives import Motor
 
 
 def limit(value: float | None) -> float:
-    """A limit as motors have it: infinite for none."""
+    """The value of an optional limit: infinite for none."""
     return np.inf if value is None else value
 
 

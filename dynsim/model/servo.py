@@ -1,6 +1,6 @@
-"""Position servos outside the compiled kernels: parameter table, and the servo law for arrays of servos.
+"""Servos outside the compiled kernels: the kernels' parameter row, and the servo law for arrays of servos.
 
-It is the source that the kernels compile (``dynsim.dynamics.drive.servo``), called as plain Python: no numba here.
+The law is the source that the kernels compile (``dynsim.dynamics.drive.servo``), called as plain Python without numba.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Data-sheet parameters of a position servo, all at the output shaft."""
+"""Data-sheet parameters of a servo in position or velocity mode, all at the output shaft."""
 
 from __future__ import annotations
 

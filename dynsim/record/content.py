@@ -13,9 +13,9 @@ from dynsim.errors import RecordError
 from dynsim.record.scene import Scene
 
 FORMAT = "dynsim-record-2"
-"""The one format that is written and read."""
+"""The only format of files that is written and read."""
 TIME = "time"
-"""Name of the axis that signals are on unless they name another."""
+"""Name of the time axis of signals that name no other."""
 
 
 @dataclass(frozen=True)

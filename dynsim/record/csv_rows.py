@@ -1,4 +1,4 @@
-"""Tables of numbers in CSV files: read as any other program reads them, or refused with file, line and reason."""
+"""Strict reading of tables and grids of numbers from CSV files; errors name file, line and reason."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from pathlib import Path
 from dynsim.errors import DynsimError
 from dynsim.system.inputs import read_text
 
-# Of a file [bytes]: some million rows.
+# Largest size of a file [bytes]: some million rows.
 SIZE_LIMIT = 100_000_000
-# float() takes more: "1_0", digits of other scripts. No other program would read the file so.
+# float() also accepts "1_0" and digits of other scripts, which other programs would not read as numbers.
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", re.ASCII | re.IGNORECASE)
 
 

@@ -1,4 +1,4 @@
-"""Records as tables of pandas and as data sets of xarray."""
+"""Conversion of records to pandas tables and xarray data sets."""
 
 from __future__ import annotations
 

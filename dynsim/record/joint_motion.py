@@ -1,4 +1,4 @@
-"""A record's joint motion for other programs."""
+"""Export of joint positions and rates of a record: CSV, ROS joint trajectory, or log for URDF joints."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A record as an MCAP file of ROS 2 messages, which rosbag2, Foxglove, PlotJuggler and RViz read; needs no ROS.
+"""Export of a record to an MCAP file of ROS 2 messages, for rosbag2, Foxglove, PlotJuggler and RViz; needs no ROS.
 
 Topics: ``/joint_states``, ``/tf`` and ``/tf_static`` (each body in the frame of the one that carries it, the root is
 ``world``), ``/robot_description`` (see :mod:`dynsim.record.urdf_text`), and ``/contacts/NAME`` for each contact point:
@@ -25,7 +25,7 @@ from dynsim.record.urdf_text import WORLD_LINK, scene_urdf
 from dynsim.system.files import replacing
 
 Array = NDArray[np.float64]
-# Who subscribes later gets the last message too, as ROS 2 has it for descriptions and static frames.
+# Later subscribers get the last message too, as is usual in ROS 2 for descriptions and static frames.
 _LATCHED = (
     "- history: 1\n  depth: 1\n  reliability: 1\n  durability: 1\n  deadline: {sec: 2147483647, nsec: 4294967295}\n"
     "  lifespan: {sec: 2147483647, nsec: 4294967295}\n  liveliness: 1\n"

@@ -1,4 +1,4 @@
-"""Quantities computed from the signals of a record, for summaries and figures, of measured runs too."""
+"""Quantities from the signals of a record, for summaries and figures: energy sinks, hand errors, base loads."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from dynsim.record import Record
 
 # Where the electrical energy goes, in the order in which it is drawn and printed.
 SINKS = ("heat_joule", "loss_gear", "loss_joint", "heat_friction")
-# Sinks that only some runs have: under the unilateral law, by time stepping. Elastic energy counts from the start.
+# Further sinks, under the unilateral law or by time stepping. Elastic energy is that gained since the start.
 MORE_SINKS = ("loss_impact", "loss_stop", "loss_damper", "energy_elastic", "loss_scheme")
 STORES = ("energy_kinetic", "energy_potential", "energy_magnetic")
 
 RESIDUAL_LIMIT = 1e-6
-# A smaller share of a run is rounding of sums of times.
+# A smaller share of the time of a run is rounding.
 ROUNDED = 1e-9
 
 # Kind of the event of a mobile base that tips; found between samples, where the margin is zero.

@@ -1,4 +1,4 @@
-"""Notebook display of an object as a small table."""
+"""HTML tables by which notebooks display objects."""
 
 from __future__ import annotations
 

@@ -19,8 +19,8 @@ def add_body_poses(record: Record) -> bool:
     """Add the poses of all bodies of the scene over time as signals; False where a joint was not recorded.
 
     ``body_position`` (T, bodies, 3) [m], ``body_orientation`` (T, bodies, 4): quaternions w, x, y, z whose signs do not
-    jump. In single precision, which is a tenth of a micrometre at a metre: they are to be drawn, and follow from the
-    scene and the joints' positions to the last digit.
+    jump. In single precision, a tenth of a micrometre at a metre: they serve to draw; the scene and the joint positions
+    give them in full precision.
     """
     scene = record.scene
     if scene is None or not scene.bodies or not all(_recorded(record, body.joint) for body in scene.bodies):
@@ -29,7 +29,7 @@ def add_body_poses(record: Record) -> bool:
     names = tuple(body.name for body in scene.bodies)
     position = np.empty((len(names), 3, len(record)), dtype=np.float32)
     orientation = np.empty((len(names), 4, len(record)), dtype=np.float32)
-    # Those of bodies that carry others yet to come.
+    # Poses of bodies that carry others which are still to be placed.
     known: dict[int, tuple[Array, Array]] = {}
     left = np.bincount([body.parent for body in scene.bodies if body.parent != WORLD], minlength=len(names))
     # The last samples of a run that diverged may be beyond all bounds.

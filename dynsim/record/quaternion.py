@@ -1,4 +1,4 @@
-"""Unit quaternions (w, x, y, z) as arrays of shape (4,) or, of many instants, (4, T)."""
+"""Operations on unit quaternions (w, x, y, z), arrays of shape (4,) or, for many instants, (4, T)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ Array = NDArray[np.float64]
 
 
 def of_turn(axis: ArrayLike, angle: ArrayLike) -> Array:
-    """Turn by an angle, () or (T,) [rad], about a unit axis, (3,): (cos q/2, a sin q/2)."""
+    """Turn by an angle q, () or (T,) [rad], about a unit axis a, (3,): (cos q/2, a sin q/2)."""
     half = 0.5 * np.asarray(angle, dtype=np.float64)
     s = np.sin(half)
     x, y, z = np.asarray(axis, dtype=np.float64)

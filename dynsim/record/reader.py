@@ -1,9 +1,9 @@
 """Reading of records from HDF5 files.
 
-A file is HDF5 data followed by one line with the SHA-256 of all bytes before it, which HDF5 ignores. By it damage is
-detected before the HDF5 library is called, which may crash or hang on a damaged file. A file without that line, or with
-another digest, is read only with ``trust=True`` (``--trust``). Sizes are limited in both cases, before anything is
-decompressed. A file that may be of another run than those beside it is refused.
+A file is HDF5 data followed by one line with the SHA-256 of all bytes before it, which HDF5 ignores. The digest reveals
+damage before the HDF5 library is called, which may crash or hang on a damaged file. A file without that line, or with
+another digest, is read only with ``trust=True`` (``--trust``). In both cases sizes are checked before data are
+decompressed. A file is refused if it may belong to another run than the files beside it.
 """
 
 from __future__ import annotations

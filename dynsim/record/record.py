@@ -1,6 +1,6 @@
-"""The record: signals over time, events, scene, units and provenance; saved as HDF5.
+"""The record: signals over time with units, events, scene, summary and provenance; loaded from and saved as HDF5.
 
-A record knows nothing of the engine that made it: simulated and measured runs look the same.
+A record does not depend on the engine that made it: simulated and measured runs have the same form.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ if TYPE_CHECKING:
     import pandas
     import xarray
 
-# Signals named in the repr.
+# Number of signals that the repr names.
 _SHOWN = 6
 
 
 class Entries(dict[str, Any]):
-    """A mapping that says in words which entry it does not have."""
+    """A mapping whose error for a missing entry names it and those that it has."""
 
     def __init__(self, kind: str, entries: Mapping[str, Any]) -> None:
         super().__init__(entries)

@@ -28,12 +28,12 @@ Matrix3 = tuple[Vector3, Vector3, Vector3]
 
 WORLD = -1
 """Index of the world among the bodies."""
-# What lies below a surface by less than this is on it [m]: contacts leave that, and so does single precision of poses.
+# A depth below a surface of less than this counts as zero [m]: contacts and single precision of poses leave so much.
 NOT_BELOW = 1e-4
 HERE: Quaternion = (1.0, 0.0, 0.0, 0.0)
-"""The orientation of what is not turned."""
+"""The orientation without rotation."""
 _FIELD = ("position", "spacing", "heights")
-"""What a height field has."""
+"""Attributes of a height field."""
 _CHECKS: Any = {"allow_inf_nan": False}
 """What pydantic is told of every class when it reads one."""
 

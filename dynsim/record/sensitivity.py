@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# Of all intervals.
+# Confidence level of the mean's interval, and probability of the samples' interval.
 LEVEL = 0.95
 
 
 @dataclass(frozen=True)
 class Spread:
-    """A number over samples.
+    """Statistics of a number over samples.
 
     Attributes
     ----------

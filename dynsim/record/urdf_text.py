@@ -16,9 +16,9 @@ from dynsim.record.scene import WORLD, Scene, Shape
 Array = NDArray[np.float64]
 Element = ElementTree.Element
 WORLD_LINK = "world"
-# URDF has no ball joint; programs that draw place such bodies by their frames.
+# URDF has no ball joint; viewers place such bodies by their frames.
 _KINDS = {"ball": "floating"}
-# Of a joint without a limit [rad or m, N m or N, rad/s or m/s]: URDF wants numbers.
+# Written for a joint without a limit, as URDF demands numbers [rad or m, N m or N, rad/s or m/s].
 _UNLIMITED = 1e9
 
 

@@ -16,7 +16,7 @@ from dynsim.record.content import FORMAT, TIME, Content, Event, Signal, check_na
 EVENT_COLUMNS = {"time": float, "kind": str, "name": str, "value": float, "description": str}
 """Attributes of events; each is a data set of the group ``events``."""
 _LABELS_IN_ATTRIBUTE = 1000
-"""More labels are a data set: HDF5 attributes end at 64 kB, which is 4090 labels."""
+"""More labels than this become a data set: HDF5 attributes have at most 64 kB, which is 4090 labels."""
 
 
 def encode(content: Content) -> memoryview:
@@ -25,7 +25,7 @@ def encode(content: Content) -> memoryview:
     Raises
     ------
     RecordError
-        The time axis, or a text that HDF5 cannot keep.
+        A time axis is invalid, or a text cannot be stored in HDF5.
     """
     import h5py
 

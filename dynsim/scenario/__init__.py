@@ -1,4 +1,4 @@
-"""Scenarios: read from YAML (``reading``), validated (``schema``), and built (``build``)."""
+"""Scenarios: reading from YAML (``reading``), validation (``schema``), and building of their objects (``build``)."""
 
 from dynsim.scenario.build import build_model, require_scenario
 from dynsim.scenario.editors import json_schema

@@ -1,4 +1,4 @@
-"""Objects that a scenario describes: machine, controller, surfaces, contacts and loads."""
+"""Construction of what a scenario describes: plant, initial posture, controller, surfaces, contacts and loads."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 # A contact point must start this close to its surface [m].
 START_TOLERANCE = 1e-6
-# What gives way may start pressed in by this much [m].
+# A compliant contact point may start at this depth below its surface [m].
 PRESSED = 5e-3
 
 

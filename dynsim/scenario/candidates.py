@@ -16,14 +16,14 @@ from dynsim.model.surfaces import Array, Surface
 
 log = logging.getLogger(__name__)
 
-# Configurations at which points are compared and rows looked at: what is so at all of them is so by structure.
+# Configurations at which points are compared and rows examined: a property that holds at all of them is structural.
 CONFIGURATIONS = 6
-# Points that are always as close as this are one [m]; rows smaller than this always are none.
+# Points closer than this at all configurations are one [m]; rows smaller than this at all configurations are zero.
 SAME = 1e-9
-# What is between the ends of a capsule is so much thinner [m]: where an end is nearest, or the axis lies along a face,
-# the ends touch alone, and the rows do not depend on each other.
+# The radius of a capsule between its ends is smaller by this [m]: where an end is nearest, or the axis lies along a
+# face, only the ends touch, and the rows are independent.
 THINNER = 1e-6
-# Of a capsule that moves along its axis, where its row is looked at.
+# Positions along the axis of a capsule at which its row is examined, in parts of its length.
 SHARES = (0.0, 0.3, 0.7, 1.0)
 
 

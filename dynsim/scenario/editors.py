@@ -1,4 +1,4 @@
-"""The JSON schema of scenario files."""
+"""The JSON schema of scenario files, for editors."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dynsim.scenario.schema import ScenarioConfig
 
 
 def json_schema() -> dict[str, Any]:
-    """JSON schema of scenario files, for editors; of ``variants`` it says only that they are mappings."""
+    """JSON schema of scenario files, for editors; it constrains ``variants`` only to be mappings."""
     schema = _by_type(ScenarioConfig.model_json_schema())
     schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
     schema["properties"]["variants"] = {
@@ -20,7 +20,7 @@ def json_schema() -> dict[str, Any]:
 
 
 def _by_type(schema: Any) -> Any:
-    """Choices as conditions, on ``type`` and on null: of ``oneOf`` and ``anyOf`` editors say only "no match"."""
+    """Choices as conditions on ``type`` and on null: for ``oneOf`` and ``anyOf`` editors report only "no match"."""
     if isinstance(schema, list):
         return [_by_type(item) for item in schema]
     if not isinstance(schema, dict):

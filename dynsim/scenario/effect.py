@@ -12,14 +12,14 @@ from dynsim.library.families import engine
 
 Keys = tuple[int | str, ...]
 
-# Sections that only plants with dynamics read.
+# Sections that only the dynamics engine reads.
 OF_DYNAMICS = ("contacts", "initial", "integrator", "metrics")
-# Sections of joint_pd that move a reference, or plan along one.
+# Sections of joint_pd that move a reference, or plan voltages along one.
 MOVING = ("hand", "base", "joints", "torques", "brace")
 
 
 def without_effect(scenario: Any, motors: bool = True) -> list[str]:
-    """A line for each key that the scenario sets and that changes nothing, with its place and why.
+    """A line for each key that the scenario sets and that changes nothing, with its place and the reason.
 
     ``scenario`` : a :class:`~dynsim.scenario.schema.Scenario`; ``motors`` : whether the plant has any
     """

@@ -1,4 +1,4 @@
-"""External loads of a scenario: forces and torques on bodies, and payloads fixed to them."""
+"""The ``loads:`` section of a scenario: forces and torques on bodies, and payloads fixed to them."""
 
 from __future__ import annotations
 

@@ -4,8 +4,8 @@
       box: {mass_kg: 0.3, size_m: [0.06, 0.06, 0.06], position_m: [0.4, 0.0, 0.03]}
       valve: {mass_kg: 1.0, shape: sphere, radius_m: 0.1, position_m: [0.5, 0, 0.4], hinge: {friction_N_m: 0.5}}
 
-A free one can touch all surfaces, with its corners or as a sphere, and roll on wheels; one on a hinge turns about its
-centre and touches nothing. Bodies do not touch each other.
+A free object can touch all surfaces, with its corners or as a sphere, and roll on wheels; one on a hinge turns about
+its centre and touches nothing. There is no contact between bodies.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Scenario files: merged with their variant and overrides, validated, with errors that name file, line, key and fix.
+"""Reading of scenario files: search, merging of variant and overrides, validation, and writing of resolved scenarios.
 
-A scenario file is one mapping; ``variants`` holds, by name, what differs (mappings merge, lists and values replace,
-null removes). Overrides come on top.
+Errors name file, line, key and fix. A scenario file is one mapping; ``variants`` holds the differences of each variant
+by its name (mappings merge, lists and values replace, null removes). Overrides are applied last.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from dynsim.system.shipped import shipped_scenario, shipped_scenarios
 
 # Keys of a file that are not part of one variant.
 TOP = ("variants",)
-# Numbers of a scenario, in whatever unit.
+# Largest magnitude of a number in a scenario, in any unit.
 SIZE_MAX = 1e30
 # Variants that are searched for further unknown keys once one was found.
 VARIANTS_SEARCHED = 100

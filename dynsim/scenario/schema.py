@@ -1,4 +1,4 @@
-"""Schema of a scenario: its keys with types, units, limits and defaults, as frozen data."""
+"""Schema of a scenario: its keys with types, units, limits and defaults, as frozen data; the validated scenario."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from dynsim.scenario.objects import SceneObject
 from dynsim.scenario.sensors import Sensors
 from dynsim.scenario.ties import TieChoice
 
-# Bytes of the name of a folder on common file systems.
+# Most bytes in the name of a folder on common file systems.
 NAME_LIMIT = 255
 
 

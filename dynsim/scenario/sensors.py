@@ -9,9 +9,9 @@ from pydantic import Field, StrictInt
 
 from dynsim.config.base import NonNegative, StrictConfig
 
-# Of a sensor: each sample is a call of Python [Hz].
+# Rate of a sensor [Hz]; limited because each sample is a call of Python.
 Rate = Annotated[float, Field(gt=0.0, le=1e5)]
-# Of the MX series: 4096 positions in a turn (data sheet).
+# Resolution of the MX series [deg]: 4096 positions in a turn (data sheet).
 MX_RESOLUTION = math.degrees(2.0 * math.pi / 4096)
 
 

@@ -1,4 +1,4 @@
-"""Batch of runs: each ends with a summary, or with the reason for its failure."""
+"""Batch of independent runs, in processes or on a cluster: each yields a summary, or the reason for its failure."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from dynsim.system.memo import Memo, remembering
 Keep = Literal["none", "failed", "all"]
 Task = TypeVar("Task")
 
-# Processes that a run may take with it before it is given up: the first may have been ended for another's memory.
+# Attempts of a run whose process is lost: the first may have been ended because another run used up the memory.
 ATTEMPTS = 2
 
 

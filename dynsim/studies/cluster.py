@@ -1,6 +1,6 @@
-"""Sweep on a Dask cluster: tasks go to its workers, results stream back.
+"""Batch of runs on a Dask cluster: tasks are sent to its workers, results are received as they come.
 
-Whatever else a cluster does (start, retries after a worker's death, adaptive scaling) is left to Dask.
+Start of the cluster, retries after the loss of a worker, and adaptive scaling are left to Dask.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from dynsim.system import interruption
 
 Task = TypeVar("Task")
 
-# Until the scheduler answers [s].
+# Longest wait for the scheduler's answer [s].
 _CONNECT_S = 10.0
-# Of one piece of work [s]: short for a cluster to be even, but so long that scheduler and client, which need some
-# milliseconds for each (docs/sweeps.md), are done with those of all threads meanwhile.
+# Duration of one piece of work [s]: short, to balance the load of the cluster, but so long that scheduler and client,
+# which need some milliseconds for each (docs/sweeps.md), handle those of all threads in that time.
 _PIECE_S, _PIECE_S_EACH = 1.0, 0.015
 _PIECE_MOST = 2048
-# Pieces that are out at a time: some for each thread of the cluster, and enough for it to grow by.
+# Pieces submitted at a time: some for each thread, and enough for adaptive scaling to add workers.
 _OUT_EACH, _OUT_LEAST = 3, 64
 
-# Runs of one process do not share its interpreter: threads of a worker would only wait for each other.
+# One run at a time in a process: threads of a worker would only wait for the interpreter's lock.
 _one_at_a_time = threading.Lock()
 
 

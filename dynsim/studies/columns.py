@@ -1,4 +1,4 @@
-"""Summaries as flat columns of a table, numbers only."""
+"""Columns of a table of runs: flat numbers of a summary, kinds of values, CSV text."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-# Names, which the table has elsewhere, and times of the machine, which no two runs share.
+# Excluded: names, which have columns of their own, and computing times, which are not reproducible.
 _NOT_OF_THE_RUN = ("scenario", "variant", "dynsim_version", "integration_wall_s", "real_time_factor")
 
 

@@ -1,4 +1,4 @@
-"""Comparison of all variants of a scenario."""
+"""Simulation of all variants of a scenario, and the files that compare their summaries."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The journal of a sweep: one line per finished run, kept when the sweep is interrupted."""
+"""The journal of a sweep: one line per finished run, from which an interrupted sweep is continued."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ OK, FAILED, LOST = "ok", "failed", "lost"
 
 @dataclass(frozen=True)
 class SweepRow:
-    """One run of the table: its numbers, or why there are none.
+    """One run of the table: its numbers, or the reason for its failure.
 
     Attributes
     ----------

@@ -10,15 +10,15 @@ from dynsim.record import Record
 
 @dataclass(frozen=True)
 class RunResult:
-    """How one run of many ended.
+    """Outcome of one run of a batch.
 
     Attributes
     ----------
     summary : numbers of the run; of one that stopped, what was simulated until then; empty when nothing was
     reason : why it failed, "" when it did not
-    lost : with its process, which was ended, so that another attempt may do better
-    record : where it was asked for
-    wall_s : time that it took, all in all [s]
+    lost : whether its process was lost, so that another attempt may succeed
+    record : if requested
+    wall_s : total computing time [s]
     """
 
     summary: dict[str, Any] = field(default_factory=dict)

@@ -1,5 +1,7 @@
-"""Work in processes: every result as it comes, Ctrl-C lets the workers hand back what they have, a killed one costs
-only the task that it had in hand, and so does one that gives no sign of life.
+"""Parallel work in worker processes: results in the order of completion, interruption, and loss of workers.
+
+Ctrl-C lets the workers return the results that they have. A worker that is killed, or gives no sign of life, costs only
+the task that it was doing.
 """
 
 from __future__ import annotations
@@ -32,17 +34,17 @@ if TYPE_CHECKING:
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
-# A worker that gives no sign of life for so long is given up; the other until its first one [s]. A thread of it gives
-# them, so that they say nothing of how long its work takes: they end where the process is stopped, or compiled code
-# holds the interpreter's lock for good.
+# Longest time between signs of life of a worker, and until its first one [s]. A thread of the worker sends them, so
+# they do not depend on the duration of its work; they end where the process is stopped, or compiled code never releases
+# the interpreter's lock.
 SILENT_S, START_S = 60.0, 600.0
-# So long a worker may take to hear of Ctrl-C; one that has heard may take any time to hand back what it has [s].
+# Longest time until a worker confirms Ctrl-C [s]; then it may take any time to return its results.
 _PATIENCE_S = 0.7
-# Between two looks for signals [s].
+# Interval of the checks for signals [s].
 _SIGNAL_S = 0.1
-# Of a task, to be sent before the worker has time for it: with longer ones another worker may have time sooner [s].
+# Longest task that is sent to a worker still busy [s]: for longer ones another worker may be free sooner.
 _QUICK_S = 0.5
-# Of its stderr, said when it cannot start.
+# Lines of a worker's stderr that are reported when it cannot start.
 _LAST_LINES = 12
 
 

@@ -1,4 +1,4 @@
-"""A sweep: its runs, its journal, and a table of parameters and results."""
+"""A sweep: carries out its runs, continues from its journal, writes the table of results and statistics."""
 
 from __future__ import annotations
 

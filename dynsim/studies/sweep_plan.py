@@ -17,7 +17,7 @@ from dynsim.errors import ScenarioError
 from dynsim.scenario import Scenario, ScenarioFile, SetOptions
 from dynsim.system.inputs import parse_yaml
 
-# More runs than this are a slip of the keyboard.
+# More runs than this are refused as a mistake.
 RUNS_MOST = 10_000_000
 ANY = "*"
 
@@ -26,7 +26,7 @@ _RANGE = re.compile(rf"({_NUMBER}):({_NUMBER}):(\d+)")
 # A range without its count, or with one that is no whole number.
 _HALF_RANGE = re.compile(rf"({_NUMBER}):({_NUMBER})(:.*)?")
 _LAW = re.compile(rf"(\w+)\(\s*({_NUMBER})\s*,\s*({_NUMBER})\s*\)")
-# Laws of samples, and what their two numbers are.
+# Distributions of samples, and the meanings of their two numbers.
 LAWS = {"normal": "mean, standard deviation", "uniform": "least, greatest"}
 
 

@@ -1,6 +1,6 @@
-"""Worker process for :mod:`dynsim.studies.processes`: does tasks until there are no more.
+"""Worker process for :mod:`dynsim.studies.processes`: carries out tasks until there are no more.
 
-Both talk in pickles, one after the other: tasks on the worker's standard input, answers on its standard output.
+Messages are pickles in sequence: tasks on the worker's standard input, answers on its standard output.
 Python's own multiprocessing would run the caller's script once more in every worker, and before it a ``signal.py`` of
 the working directory.
 """
@@ -27,8 +27,8 @@ from typing import Any, BinaryIO, NoReturn
 from dynsim.errors import DynsimError
 from dynsim.system import interruption
 
-# What a new process runs. The pipes are the worker's alone: what its work prints goes to stderr. A first message has
-# the folders where dynsim is looked for.
+# Program of a new process. Only the worker uses the pipes: output of its tasks goes to stderr. The first message has
+# the folders in which dynsim is searched for.
 START = """
 import os, pickle, sys
 tasks, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")

@@ -1,7 +1,7 @@
-"""Atomic writing of files: complete or not there at all, also for several that belong together.
+"""Atomic writing of files, marking of incomplete sets of files, and locks of folders.
 
-A file is written beside its target under a name that no other process has, and renamed when it is complete. So what is
-no file, a device, pipe or socket, is refused.
+A file is written beside its target under a name that no other process has, and renamed when it is complete. So devices,
+pipes and sockets are refused. While files that belong together are exchanged, a file ``INCOMPLETE`` marks their folder.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ _MARK = (
 )
 _TEMPORARY = re.compile(r"\.dynsim-[0-9a-f]{16}\.tmp")
 _LEFT_BEHIND = 60.0
-"""A temporary file that nobody holds is a dead run's when it is older than this [s]; a living one's may be unlocked for
-a moment after it is made."""
+"""An unlocked temporary file older than this [s] was left by a process that died; younger ones may not be locked
+yet."""
 _STREAM = re.compile(r"/dev/(stdin|stdout|stderr|fd/.*)|/proc/.*")
-"""Names of what a process has open, which may be a file, but not one to be replaced."""
+"""Names of open descriptors of a process: they may be files, but cannot be replaced."""
 _NAME_LENGTH = 120
 """Of a file name made from a text [characters]; file systems end at 255 bytes."""
 

@@ -1,8 +1,8 @@
 """Reading of files that users name: regular files of bounded size, as text or YAML, without blocking.
 
-YAML is built from the parser's events: so every error is one of ours with its line, aliases cannot grow without bound,
-and a file of some 100 000 numbers loads in a second (ruamel's compiled parser; its Python one takes ten times as long).
-Plain values are those of YAML 1.2's core schema: null, booleans, integers, floats and text; a date is text.
+YAML is built from the parser's events, so that every error is a dynsim error with its line, the expansion of aliases is
+bounded, and a file of some 100 000 numbers loads in a second (ruamel's compiled parser; its Python one takes ten times
+as long). Plain values are those of YAML 1.2's core schema: null, booleans, integers, floats and text; a date is text.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from dynsim.errors import DynsimError
 SIZE_LIMIT = 16_000_000
 NODE_LIMIT = 1_000_000
 DEPTH_LIMIT = 50
-# Digits of an integer: more than a float can hold are no quantity.
+# Most digits of an integer: about as many as a float can represent.
 DIGITS_LIMIT = 308
 
-# Makes the error to raise of its message: a class of errors, or one with something filled in.
+# Makes an error from its message: a class of errors, or a partial one.
 ErrorClass = Callable[[str], DynsimError]
 
 _NULLS = frozenset(("", "~", "null", "Null", "NULL"))
@@ -32,7 +32,7 @@ _INTEGER = re.compile(r"[-+]?(?:0b[01]+|0o[0-7]+|0x[0-9a-fA-F]+|[0-9]+)")
 _FLOAT = re.compile(
     r"[-+]?(?:(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?|\.inf|\.Inf|\.INF)|\.nan|\.NaN|\.NAN"
 )
-# What YAML does not allow in a text, escaped or not: control characters (but tab and line ends) and half characters.
+# Not allowed in a text of YAML, escaped or not: control characters except tab and line ends, and lone surrogates.
 _FORBIDDEN = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f\x80-\x84\x86-\x9f\ud800-\udfff\ufffe\uffff]")
 _CORE = "tag:yaml.org,2002:"
 _TEXT_TAGS = (None, "!", _CORE + "str")

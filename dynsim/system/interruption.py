@@ -1,9 +1,9 @@
 """Interrupt signals: handled at once, or postponed while a result is computed or saved.
 
-Python raises KeyboardInterrupt wherever it happens to be. Within a callback of the garbage collector it is lost, within
-one of the compiler it crashes the process, and between the last step and the saved record it would take the record with
-it. So a signal is also remembered, long work asks for it (:func:`check`), and within a callback of the compiler, and
-between :func:`keep` and :func:`heed`, it waits.
+Python raises KeyboardInterrupt at any point of a program. Within a callback of the garbage collector it is lost, within
+one of the compiler it crashes the process, and between the last step and the saved record the record would be lost. So
+a signal is also stored, long work checks for it (:func:`check`), and within a callback of the compiler, and between
+:func:`keep` and :func:`heed`, it is postponed.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from types import FrameType
 
 STOP_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
-# Functions of llvmlite that LLVM calls for compiled code from and to the cache: it goes on with what they return.
+# Callbacks of llvmlite by which LLVM reads and writes its cache of compiled code; an exception in them is not handled.
 _OF_THE_COMPILER = ("_raw_object_cache_notify", "_raw_object_cache_getbuffer")
 
 _pending = False

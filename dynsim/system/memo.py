@@ -14,12 +14,12 @@ from pydantic import BaseModel
 
 T = TypeVar("T")
 
-# Results of each kind that are kept: neighbours in a sweep differ in what comes last.
+# Number of results of each kind that are kept: few, as successive runs of a sweep share most inputs.
 KEPT = 4
 
 
 class Memo:
-    """Results of pure functions, each known by what it was computed from.
+    """Results of pure functions, each found by the inputs from which it was computed.
 
     Numbers, texts and arrays are the same where their bits are (−0.0 is not 0.0, 1 is not 1.0), and so are tuples,
     lists, dicts and configurations of such; anything else only where it is the same object, which must not be changed.

@@ -1,4 +1,4 @@
-"""Scenario files that come with dynsim, found without loading anything."""
+"""Folder and names of the scenario files that come with dynsim; imports nothing else of dynsim."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Standard output and error that cannot break a run: closed pipes, full disks, ASCII terminals.
+"""Standard output and error whose failures do not end a run: closed pipes, full disks, ASCII terminals.
 
-What a command computes goes into files; that nobody reads what it prints is no reason to lose it.
+Results of commands are in files, so a failure to print must not lose them.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any, TextIO, cast
 
-# Signs that dynsim prints → what stands for them where the encoding lacks them; of others "?".
+# Characters that dynsim prints → their replacements in encodings that lack them; others become "?".
 _PLAIN = {
     "−": "-", "–": "-", "—": "-", "…": "...", "→": "->", "·": " ", "×": "x", "°": " deg", "µ": "u", "μ": "mu",
     "Ω": "ohm", "²": "^2", "³": "^3", "⁻": "^-", "√": "sqrt", "∫": "int ", "Σ": "sum ", "τ": "tau", "≤": "<=",

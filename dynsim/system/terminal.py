@@ -1,7 +1,7 @@
-"""Text from files made safe to print on a terminal.
+"""A terminal of rich, and texts from files made safe to print on it.
 
-A name in a scenario, a record or a servo map may hold anything: escape sequences that move the cursor, colour or
-rename the window, and the markup of rich. Both are shown as they are written, and do nothing.
+A name in a scenario, a record or a servo map may contain escape sequences, which move the cursor, change colours or
+rename the window, and the markup of rich. Both are printed literally and have no effect.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from rich.console import Console, ConsoleDimensions
 from rich.markup import escape
 from rich.text import Text
 
-# Columns where nobody looks at a screen: a table in a file or a pipe is as wide as it needs to be.
+# Width of output to a file or pipe, in columns: tables are as wide as they need to be.
 UNBOUNDED = 10_000
 # Control characters, invisible and direction-changing ones, halves of surrogate pairs, line and paragraph separators.
 _UNFIT = {"Cc", "Cf", "Cs", "Zl", "Zp"}
@@ -41,9 +41,9 @@ def escaped_line(text: object) -> str:
 
 
 class Terminal(Console):
-    """A console on which no text, whoever printed it, can do more than be read.
+    """A console that removes control characters from all printed text, also from texts of other libraries.
 
-    Markup is read where the console is made to: :func:`escaped` is for what is put between.
+    Markup is interpreted if the console is set up to: texts that are inserted into markup need :func:`escaped`.
     """
 
     @property

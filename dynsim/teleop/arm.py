@@ -1,4 +1,4 @@
-"""Teleoperation of an arm: a pilot's velocities of hand and base become references at every tick."""
+"""Teleoperation of an arm: a pilot's velocities of hand and mobile base become references at every tick."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from dynsim.teleop.session import Array, Command, LiveFrame, PilotAxis, SpeedLim
 log = logging.getLogger(__name__)
 
 _NAMES = ("x", "y", "z", "ahead", "turn")
-# Velocity of the ticks by which kernels are loaded [m/s].
+# Velocity of the trial ticks that load the kernels [m/s].
 _SMALL = 1e-6
 
 

@@ -11,7 +11,7 @@ from dynsim.teleop.snake import DynamicSnakeSession, SnakeSession
 
 
 def begin(scenario: Scenario, *, limits: SpeedLimits | None = None, longest: float = 600.0) -> Session:
-    """A session of a scenario: plant, surfaces, contacts and loads are its own, what moved its references is left out.
+    """A session of a scenario, with its plant, surfaces, contacts and loads, without the motions of its references.
 
     Parameters
     ----------

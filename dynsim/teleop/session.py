@@ -1,7 +1,7 @@
-"""A teleoperated simulation, tick by tick, with a script of all commands that reproduces the run.
+"""Interface and data types of a teleoperated simulation, tick by tick, with a script of commands that reproduces it.
 
-A script is part of a scenario, so a session leaves a scenario: that of which it was made, with its commands and as long
-as it took. What a script looks like is the plant's: :mod:`dynsim.teleop.snake`, :mod:`dynsim.teleop.arm`.
+A session results in a scenario: the one that it was made of, with the pilot's commands as a script, and the duration of
+the session. The form of the script depends on the plant: :mod:`dynsim.teleop.snake`, :mod:`dynsim.teleop.arm`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ NO_REQUEST = 0
 
 @dataclass(frozen=True)
 class PilotAxis:
-    """One velocity that a pilot gives.
+    """One component of the velocities that a pilot commands.
 
     Attributes
     ----------

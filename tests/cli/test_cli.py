@@ -1,4 +1,4 @@
-"""The command line as a user meets it: files, exit codes, one-line errors, Ctrl-C."""
+"""The command line as a program: files, exit codes, one-line errors, completion, help, odd terminals and folders."""
 
 import csv
 import io

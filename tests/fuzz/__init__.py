@@ -1,4 +1,4 @@
-"""Fuzzing of all inputs: every broken file ends well or with one clear error.
+"""Fuzzing of all inputs: commands on damaged files must succeed or end with one clear error.
 
     inputs/      one module per kind of input; each draws a case from a seed and an index
     mutations    what breaks trees, texts and bytes

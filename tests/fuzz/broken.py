@@ -1,6 +1,7 @@
 """Deliberately broken loaders, one per kind of failure: the fuzzer must find each of them.
 
-Records are loaded as ever after what :data:`WAYS` has for the number of the case; every link weighs a hundredth more.
+Before a record is loaded, the entry of :data:`WAYS` for the number of the case is called. Every link of a serial arm
+has 1 % more mass.
 """
 
 from __future__ import annotations

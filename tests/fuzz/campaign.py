@@ -20,7 +20,8 @@ from fuzz.case import KINDS, draw
 from fuzz.worker import CRASH, FAILURES, HANG, INTERRUPTED, LOSS, OK, READY, REFUSED, Outcome
 
 SEED = 8
-# Of a command, a hang beyond [s]: well above what dynsim itself allows for reading a damaged record on a busy machine.
+# Time after which a command counts as hung [s]: well above the limit of dynsim for reading a damaged record, on a busy
+# machine too.
 LIMIT = 90.0
 ROOT = Path(__file__).resolve().parents[2]
 

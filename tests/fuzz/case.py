@@ -10,13 +10,13 @@ from pathlib import Path
 from random import Random
 
 KINDS = ("scenario", "override", "servo_map", "urdf", "csv_path", "record", "terrain", "sweep", "faults")
-# The file of each kind that is broken.
+# The file that is damaged, by kind.
 MAIN = {
     "scenario": "scenario.yaml", "override": "scenario.yaml", "servo_map": "map.yaml", "urdf": "robot.urdf",
     "csv_path": "path.csv", "record": "record.h5", "terrain": "heights.csv", "sweep": "out/runs.jsonl",
     "faults": "faults.yaml",
 }  # fmt: skip
-# What may stand in its place, and how often: no input may block or never end.
+# Substitutes for that file, and the share of cases with one: no input may block or never end.
 NO_FILES = ("pipe", "folder", "nothing", "link to /dev/zero", "link to /dev/null", "link to itself", "unreadable")
 NO_FILE_SHARE = 0.02
 SHIPPED = Path(__file__).resolve().parents[2] / "scenarios"

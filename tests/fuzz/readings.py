@@ -1,7 +1,7 @@
 """Inputs parsed without dynsim, compared with the objects that dynsim made of them.
 
-Every function answers with the losses as lines, none when all is there. Where the second reading cannot tell what an
-input says, it is not held against it.
+Every function returns the losses as lines of text, none where nothing is lost. An input that the second reader cannot
+read counts as no loss.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ import numpy as np
 
 # Digits 0 to 9 only, no underscores: what float() takes beyond that is not a number to other programs.
 DECIMAL = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
-# Keys whose values are made into something else on the way: paths absolute, names of folders from the file's name.
+# Keys whose values dynsim rewrites: paths absolute, names of folders from the file's name.
 _REWRITTEN = frozenset({"file", "name", "variant"})
-# What says yes and no without doubt where a flag is wanted.
+# Texts that are certainly true or false as a flag.
 _TRUE, _FALSE = ("true", "1", "1.0", "yes", "on", "y", "t"), ("false", "0", "0.0", "-0.0", "no", "off", "n", "f")
 ROUNDING = 1e-9
 

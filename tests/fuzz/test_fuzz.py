@@ -15,7 +15,7 @@ pytestmark = pytest.mark.long
 # Damaged records are slower to read than the rest.
 QUICK = {**dict.fromkeys(KINDS, 30), "record": 10}
 ALL = 6000
-# Cases that something was wrong with once: seed, kind, number.
+# Cases that have found a defect: seed, kind, number.
 ONCE = (
     (7_700_000, "record", 793),
     (7_700_000, "sweep", 1443),

@@ -1,4 +1,4 @@
-"""The fuzzer can fail: deliberately broken loaders are found and named, and later cases still run."""
+"""Deliberately broken loaders, which the fuzzer must find and name, and losses that its readings must find."""
 
 from __future__ import annotations
 
@@ -17,8 +17,7 @@ from fuzz.worker import CRASH, FILES, HANG, LOSS, MESSAGE, REFUSED, TRACEBACK
 
 pytestmark = pytest.mark.long
 
-# What becomes of each way in which the loader of records is broken, in the order of ``broken.WAYS``; the place is where
-# dynsim was at that moment.
+# Outcome, cause and place in dynsim of each failure of the loader of records, in the order of ``broken.WAYS``.
 LOADING = "cli/hardware.py:_checked"
 FOUND = {
     "raises": (TRACEBACK, "ValueError", LOADING),

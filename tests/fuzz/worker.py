@@ -1,8 +1,13 @@
-"""A child process that runs cases one by one and judges them; the parent (:mod:`fuzz.campaign`) sees it die.
+"""A child process that runs fuzz cases and judges how each ends.
 
-Reads lines ``kind seed index`` and answers each with one line of JSON. Commands run in process, through the entry point
-that the console script has. What a command may do: end well, or refuse with one line that begins with ``error:``
-(continued by indented ones) and exit code 2 or 3; and then every file is as it was.
+A case is damaged inputs and the dynsim commands that read them. The parent (:mod:`fuzz.campaign`) notices when the
+child crashes. The child reads lines ``kind seed index`` and answers each with one line of JSON. Commands run in the
+child, through the entry point of the console script.
+
+A command must succeed, or refuse with one line that begins with ``error:`` (continued by indented ones), exit code 2 or
+3 and all files unchanged. Exceptions: ``hw replay`` may end with 1 to 4 and may write files however it ends; a command
+may save a part that it marks incomplete; a run beyond its time limit must stop on Ctrl-C. ``check`` and other ``hw``
+commands must change no file, even where they succeed. No temporary file is left; no signal of a run is infinite.
 """
 
 from __future__ import annotations
@@ -42,7 +47,7 @@ TRACEBACK, HANG, CRASH, LOSS, MESSAGE, FILES, NUMBERS = (
 )
 FAILURES = (TRACEBACK, HANG, CRASH, LOSS, MESSAGE, FILES, NUMBERS)
 READY = "ready"
-# What a worker may use on top of what it has after loading everything [bytes].
+# Memory of a worker beyond that after all imports [bytes].
 MEMORY = 4 << 30
 # A simulation may take long because its input asks for it (stiff motors, say). It must then heed Ctrl-C [s].
 SIMULATION_LIMIT = 20.0

@@ -36,7 +36,7 @@ ERRORS: dict[str, Exception] = {
     "h5py.File": MemoryError(),
     "stream.close": OSError(5, "Input/output error"),
 }
-"""What other calls fail with than with a full disk."""
+"""Errors of calls that fail otherwise than by a full disk."""
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from .test_lifting import BLEND, CLEARANCE, JOINTS, Oracle, settled, snake_map, 
 
 RATE = 50.0
 REQUESTS = {150: 4, 300: SWITCHING, 700: FIXING, 860: 2}
-"""By ticks of 5 ms."""
+"""Requested modes by number of the tick of 5 ms."""
 
 
 def command(tick: int, requests: Mapping[int, int]) -> Command:
@@ -38,7 +38,7 @@ def command(tick: int, requests: Mapping[int, int]) -> Command:
 
 
 class SimulatedSnake:
-    """The simulation with all that its process does but the process, on the clock of the servos."""
+    """The simulation process of a drive, run in this process on the clock of the servos."""
 
     def __init__(
         self,

@@ -29,7 +29,7 @@ def doing(run: Run) -> dict[str, str]:
 
 
 def check_against_the_servos(run: Run) -> None:
-    """Torque, error and speed told are those of the servos; who is silent cannot be reached."""
+    """Torque, error and speed reported are those of the servos; a servo reported as silent cannot be reached."""
     servos = run.line.servos
     for end in run.result.servos:
         registers, index = servos.registers[end.id], servos.ids.index(end.id)

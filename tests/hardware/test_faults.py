@@ -21,9 +21,9 @@ from dynsim.hardware.virtual.servos import PHYSICS_STEP
 from .conftest import check_goals_within_limits
 
 SILENCING = ("lost_status", "late_status", "truncated_status", "bad_crc", "drop_off")
-"""Who suffers from these cannot say what it does."""
+"""Faults after which the struck servo cannot report its state."""
 DISABLING = ("reboot", "overload", "overheat", "temperature_ramp")
-"""These take the torque from their victim, at once or by and by."""
+"""Faults that switch off the torque of the struck servo, at once or after some time."""
 
 
 def reaction_bound(cause: Cause, servo_map: ServoMap, plan: CyclePlan) -> int:

@@ -1,4 +1,4 @@
-"""Answers to earlier requests are never taken for current ones, however late they arrive."""
+"""Late answers of servos: none is taken for the answer to a later request; length of requests after a missed answer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Imports of the hardware layer do not load servo or serial modules."""
+"""Modules that imports must not load: serial and servo modules by the commands, simulation by replay and ports."""
 
 from __future__ import annotations
 

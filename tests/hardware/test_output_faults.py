@@ -30,7 +30,7 @@ ENDINGS: dict[str, dict[str, Any]] = {
     "unplugged": {"faults": [{"kind": "unplug", "at": 1.9}]},
     "interrupted": {"stop_at": 2.8},
 }
-# In these the robot may be moving, or is being left: the loop must wait for nobody.
+# States in which the robot may be moving, or is being left: the loop must not wait for an output.
 ARMED = [
     state.name
     for state in (

@@ -1,4 +1,4 @@
-"""A blocked log file must not keep the robot from being stopped."""
+"""Log of a run written by a thread: control characters, a full disk, a blocked output, no thread to be had."""
 
 import threading
 

@@ -1,6 +1,7 @@
-"""Canaries: defects of dynamixel-sdk 4.1.0 the bus works around, each with the proof that the bus survives it.
+"""Defects of dynamixel-sdk 4.1.0, each with a test that the bus of dynsim works despite it.
 
-When the first half of a test fails, the library was mended: the detour in dynsim/hardware/bus/dynamixel_bus.py may go.
+If the first half of a test fails, the library is repaired, and the workaround in dynsim/hardware/bus/dynamixel_bus.py
+can be removed.
 """
 
 from __future__ import annotations

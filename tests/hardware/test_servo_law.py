@@ -1,4 +1,4 @@
-"""The virtual servos' torque is the position servo of the simulation with data-sheet parameters."""
+"""Torque of virtual servos (``MotorLaw``) against its formula in position mode, velocity mode and off."""
 
 from __future__ import annotations
 
@@ -11,7 +11,12 @@ from dynsim.hardware.virtual.servo_plant import FREE_DAMPING, VELOCITY_TIME_CONS
 
 @pytest.mark.parametrize("voltage", [12.0, 9.5, 0.0, -1.0])
 def test_torque_is_stiffness_within_the_stall_torque_less_back_emf(voltage):
-    """clip(k e, ±τ_stall V/12) − d ω; clip(J/T (ω_set − ω) + d ω, …) − d ω; off a tenth of d ω."""
+    """Position τ = clip(k e, ±τ_max) − d ω; velocity τ = clip(J/T (ω_set − ω) + d ω, ±τ_max) − d ω; off τ = −0.1 d ω.
+
+    τ torque [N m], e angle to the set position [rad], ω speed, ω_set its set value [rad/s]; k stiffness [N m/rad],
+    d damping by back-EMF [N m s/rad], J inertia d²/(4k) [kg m²], T = VELOCITY_TIME_CONSTANT [s]; τ_max = τ_stall V/12
+    with the stall torque τ_stall at 12 V [N m] and the supply V [V], zero where V < 0.
+    """
     rng = np.random.default_rng(7)
     law = MotorLaw([MX_106, MX_28, MX_106])
     available = law.stall_torque * max(voltage, 0.0) / 12.0

@@ -1,4 +1,4 @@
-"""The simulated arm behind virtual servos: gravity sags it, a real floor carries its elbows, and limp it falls."""
+"""The simulated arm on virtual servos: sag by gravity, elbows on a real floor, jams, falls without torque."""
 
 from __future__ import annotations
 

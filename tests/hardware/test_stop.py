@@ -1,4 +1,4 @@
-"""Ctrl-C at every state: once for a controlled stop, twice for torque off that really arrives."""
+"""Ctrl-C and other signals in every state of a replay: one for a controlled stop, a second one for torque off."""
 
 from __future__ import annotations
 

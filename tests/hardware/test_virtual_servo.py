@@ -1,4 +1,4 @@
-"""Virtual servos follow the rules of the manual."""
+"""Virtual servos against the manual: registers, limits, watchdog, modes, profile, supply, reboot, late answers."""
 
 from __future__ import annotations
 

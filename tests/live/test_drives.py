@@ -1,4 +1,4 @@
-"""A drive and its script are the same run, bit for bit; references do what velocities ask for."""
+"""Live drives: replay of a drive from its script bit for bit, references from velocities, limits of reach, refusals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Commands of a pilot: accepted values, zero velocities, and stretched time without catching up."""
+"""Commands of a pilot: accepted values, dead-man's key, silence; the clock, which stretches time without catching up."""
 
 from __future__ import annotations
 

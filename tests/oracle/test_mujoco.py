@@ -1,7 +1,8 @@
-"""MuJoCo as a second oracle: accelerations, the arm with its motors, and braces.
+"""MuJoCo as a second oracle: accelerations, the arm with its motors, held braces and soft contacts.
 
-MuJoCo's motor state and its semi-implicit Euler method are of first order in the step h, so trajectories agree to
-O(h): the error must halve with the step, and extrapolating it away must leave almost nothing.
+MuJoCo's motor state and its semi-implicit Euler method are of first order in the step h. Trajectories and held forces
+agree to O(h): halving the step halves the error; for the free arm, Richardson extrapolation leaves less than 5 % of it.
+The force of a soft contact differs by O(h²) without friction, by less than 0.2 % with friction at one step.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The dynamic snake in MuJoCo, as `dynsim bench` has it: the same bodies, and the same servos."""
+"""The dynamic snake in the MuJoCo model of `dynsim bench`: mass matrix, servo torques and one manoeuvre."""
 
 from __future__ import annotations
 

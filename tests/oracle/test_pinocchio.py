@@ -1,4 +1,4 @@
-"""Every intermediate against Pinocchio, an independent code, on random trees."""
+"""Poses, Jacobians, mass matrix, forces, energies and accelerations against Pinocchio, on random trees."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Real contact against Pinocchio's ADMM solver of the same problem, and against MuJoCo's softened one."""
+"""Real contact against Pinocchio's ADMM solver of the same problem, and against MuJoCo's soft contacts."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ G = 9.81
 
 
 def admm(W: np.ndarray, b: np.ndarray, mu: list[float]) -> tuple[np.ndarray, float]:
-    """Forces (tangents, normal for each contact) by Pinocchio's ADMM solver, and what it says is left [N, m/s²]."""
+    """Forces (tangents, normal for each contact) by Pinocchio's ADMM solver, and its residual [N, m/s²]."""
     model = pin.Model()
     model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "free")
     models, datas = pin.StdVec_ConstraintModel(), pin.StdVec_ConstraintData()

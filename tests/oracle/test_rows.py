@@ -1,4 +1,4 @@
-"""Rows of every kind against dense systems made of Pinocchio's M, bias and Jacobians."""
+"""Rows of contacts, of pairs of bodies and joints, and of couplings against dense systems of Pinocchio's quantities."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def stick(b: CompiledSystem, y: np.ndarray, *modes: int) -> None:
 def free_motion(
     b: CompiledSystem, oracle: Oracle, q: np.ndarray, v: np.ndarray, current: np.ndarray
 ) -> tuple[np.ndarray, ...]:
-    """M + J_m and what the joints are driven with, less the bias."""
+    """Mass matrix with armature, and joint forces of motors and losses minus the bias."""
     body, motor = b.system.model.body, b.system.drives.motor
     tau = -(body[:, ka.DAMPING] + body[:, ka.GEAR_DAMPING]) * v
     np.add.at(tau, b.system.drives.table[:, ka.DRIVEN], motor[:, ka.K_M] * current)

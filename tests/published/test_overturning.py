@@ -1,4 +1,4 @@
-"""[WM]: elbows on the floor "prevent from overturning"; the study of it, beside statics by hand."""
+"""[WM] on elbows that "prevent from overturning": the study of it, against statics by hand."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Two hundred random ordinary scenes: each reaches its end, or names why it cannot."""
+"""Two hundred random braced arms: each run ends, is refused, or stops for a reason of the physics; the journal."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from support.endings import FINISHED, METHODS, REFUSED, SURFACES, account, end, 
 
 from dynsim.engine.stopping import KINDS
 
-# Stops that say nothing of the physics: of 10 000 scenes one (9300, by its wall limit) ends so.
+# Stops without a reason in the physics: of 10 000 scenes one (9300, by its wall limit) ends so.
 UNEXPLAINED = {"step_too_small", "not_finite", "no_progress", "out_of_time", "stuck"}
 
 
@@ -22,7 +22,7 @@ def terrains(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
 
 
 def in_a_program_of_its_own(data: dict[str, Any]) -> bool:
-    """Explicit steps where more than points touch quadrics: no other default test compiles these."""
+    """Explicit steps with shapes other than points on quadrics: no other default test compiles these kernels."""
     (surface,) = data["surfaces"]
     touching = surface in ("box", "height_field") or data["contacts"]["candidates"] == "links"
     return touching and data["integrator"]["method"] == "dopri5"

@@ -39,7 +39,7 @@ Array = NDArray[np.float64]
 
 FILE = Path("results/endings/endings.json")
 SEED = 27
-# Wall time of a run after which it is told as one that was cut off [s]: a hundred times what the longest take.
+# Wall time after which a run counts as cut off [s]: a hundred times that of the longest.
 WALL_LIMIT_S = 60.0
 METHODS = ("radau5", "radau5", "dopri5", "time_stepping")
 SURFACES = ("plane", "cylinder", "sphere", "box", "height_field")

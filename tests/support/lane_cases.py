@@ -31,7 +31,7 @@ from support.random_robots import (
 
 @dataclass
 class Case:
-    """States of a system about one, at a time."""
+    """A system, a state y and a time t about which the states of the lanes are drawn."""
 
     compiled: CompiledSystem
     y: np.ndarray

@@ -1,8 +1,9 @@
-"""The right-hand side on several states at once, in plain Python: finds the branches that depend on the state.
+"""Replacement of the kernels' reals by N lanes, in plain Python, to find state-dependent branches (for test_lanes).
 
-``Lanes`` are N doubles on which arithmetic acts at once; N is 4 in the compiled kernels. A comparison gives N booleans.
-Where ``if`` needs a single one, they must agree, and the line of the kernel is noted: a compiler for vectors of doubles
-could not translate that branch. Constants of the model stay numbers, integers stay integers.
+``Lanes`` are N doubles, one for each of N states; N is 4 in the compiled kernels. A comparison gives N booleans. An
+``if`` on such a comparison is recorded with its line, since SIMD code has no such branch; lanes that disagree raise
+``Divergent``. Constants of the model become ``Constant``, which records where a real is taken for an integer; integers
+stay integers.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ KERNELS = str(Path(dynsim.dynamics.__file__).parent)
 
 
 class Place(NamedTuple):
-    """A line of the kernels."""
+    """A line of the kernels by its text."""
 
     file: str
     function: str
@@ -36,7 +37,7 @@ class Place(NamedTuple):
 
 
 class Line(NamedTuple):
-    """The same by its number."""
+    """A line of the kernels by its number."""
 
     path: str
     function: str

@@ -1,4 +1,4 @@
-"""Wheel pairs that a record lifts, on the whole robot in Pinocchio, and the kept study of how near wheels come to it.
+"""Wheel pairs of a snake on servos, posed in Pinocchio, and the study of their heights and directions.
 
 ``PYTHONPATH=tests python -m support.lifted_wheels`` writes results/snake/lifted_wheels.json, which docs/hardware.md
 quotes. The robot gets the pose of the head that the record holds and the angles that the servos are sent, and nothing

@@ -31,11 +31,11 @@ from _pytest.runner import runtestprotocol
 FACTOR = 1.0 + 1e-4
 # Processor time of a test with kernels as Python [s]; those that take longer only tell which lines they reach.
 TEST_S = 2.5
-# Of all tests of one mistake; and of one that does not end: so many times what it takes, and so much more.
+# Time for all tests of one mistake [s]. A test that does not end is stopped after SLOWER times its usual time + MORE_S.
 MISTAKE_S, SLOWER, MORE_S = 30.0, 8.0, 4.0
-# Of what no quick test has noticed so many late ones are tried, for so long [s].
+# Mistakes that no quick test notices: number of slower tests that are tried, and time for each [s].
 LATE, LATE_S = 4, 25.0
-# Of the examples of one test so many are tried.
+# Largest number of parametrised examples of a test that are tried.
 EXAMPLES = 3
 FLIPPED: dict[type, type] = {
     ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Lt: ast.Gt, ast.Gt: ast.Lt, ast.LtE: ast.GtE, ast.GtE: ast.LtE,

@@ -1,4 +1,4 @@
-"""Study: does bracing keep a mobile base from tipping? Four elbow configurations, base parameters varied.
+"""Study: tipping of a mobile base with four elbow configurations, and a sweep over parameters of the base.
 
 ``PYTHONPATH=tests python -m support.overturning`` writes results/overturning/ (configurations.json, sweep.csv,
 sweep.png), which docs/validation.md quotes, in about two minutes.
@@ -35,7 +35,7 @@ SCENARIO = "mobile_elbow_comparison"
 SCENARIOS = (SCENARIO, f"{SCENARIO}_driving")
 FOLDER = Path("results/overturning")
 
-# The hand starts beside its circle, so voltages jump; what the base feels of that is over within milliseconds.
+# The hand starts beside its circle, so voltages jump; the reaction of the base lasts milliseconds.
 START: dict[str, Any] = {"duration_s": 0.5, "record.rate_hz": 20_000}
 # Without a path the arm holds, and nothing jumps.
 HELD: dict[str, Any] = {"controller.hand": None}

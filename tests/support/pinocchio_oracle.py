@@ -1,4 +1,4 @@
-"""A robot in Pinocchio: an independent code for every intermediate."""
+"""A robot of revolute and prismatic joints in Pinocchio: mass matrix, and motion and Jacobian of points."""
 
 from __future__ import annotations
 

@@ -1,14 +1,14 @@
-"""Random scenes for the planner, and the kept study of them.
+"""Random scenes for the planner of braces, and studies of its plans and of the published arm's postures.
 
     PYTHONPATH=tests python -m support.planner_scenes --out results/planner
     PYTHONPATH=tests python -m support.planner_scenes --study reference --effort 100 --out results/planner
     PYTHONPATH=tests python -m support.planner_scenes --study gains --out results/planner
     PYTHONPATH=tests python -m support.planner_scenes --study posture --out results/planner
 
-The second one takes so many times as long for each search: how far the answers of the first are from the best known.
-It keeps what its file says of scenes that are not asked for.
-The third one runs the best plans, and those of the published arm, on surfaces 5 mm off with gains from stiff to soft.
-The fourth one is of the published posture, which no plan has chosen: the least heat that forces at its elbows leave.
+The first plans each scene. The second searches each scene with ``--effort`` times the usual rounds, for the best known
+answer; rows of other scenes in its file are kept. The third runs the best plans, and those of the published arm, on
+surfaces displaced by 5 mm, with stiff to soft gains. The fourth gives the least heat of the published arm at the
+postures of its scenario, which no plan has chosen, over all forces at its elbows of at least 0.5 N.
 
 Arms of 7 to 10 joints whose hand goes there and back along a short way, over a floor, a pipe, a box, or with a joint
 about a third axis. The seed of a scene is its number; the constants of the search were chosen on the first twenty.
@@ -38,9 +38,9 @@ from dynsim.scenario.reading import scenario_from_resolved
 from dynsim.studies.processes import cores
 from dynsim.system.files import write_json
 
-# Of the random postures of the reference.
+# Seed of the random postures of ``--study reference``.
 OTHER_SEED = 1000
-# Of the study of gains [V/rad].
+# Gains k_p of ``--study gains`` [V/rad].
 GAINS = (500.0, 200.0, 100.0, 50.0, 20.0)
 KINDS = ("floor", "pipe", "box", "third_axis")
 PERIOD_S = 10.0

@@ -1,4 +1,4 @@
-"""Random trees of bodies, states and contacts: every joint kind, branches, general axes and full inertia tensors."""
+"""Random robots of every joint kind, with states and contacts; ``CompiledSystem``, to evaluate and integrate them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Random snakes for property tests."""
+"""Random snake robots as a hypothesis strategy."""
 
 from hypothesis import strategies as st
 

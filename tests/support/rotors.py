@@ -1,9 +1,10 @@
-"""Study: the effect of rotor armature as against rotors that are bodies of their own.
+"""Study: rotors as armature at their joints, against rotors that are bodies of their own.
 
-dynsim gives a rotor the inertia J_m = I_m k² at its joint ([WM] eq 25), as if it turned about a resting axis. In
-truth it rides on the link before its joint and turns about the joint's axis a with that link's rate and k v on top, so
-that its energy is ½ I_m (k v + a·ω)². Here that is computed without dynsim's right-hand side: rotors are bodies of a
-larger tree, tied to their joints by θ = k q; the system is put together densely and integrated by the classical method.
+dynsim gives a rotor the inertia J_m = I_m k² at its joint ([WM] eq 25), as if its axis did not turn. In fact the link
+before the joint carries it: with ω the angular velocity of that link and a the axis of the joint, the rotor has the
+speed k v + a·ω about its axis and the energy ½ I_m (k v + a·ω)². Here that is computed without dynsim's right-hand
+side: rotors are bodies of a larger tree, tied to their joints by θ = k q (θ: angle of the rotor on that link), and the
+dense equations are integrated by the classical Runge–Kutta method.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from dynsim.model.description import Array, Contact, Inertia, Link, Quadric
 from dynsim.model.drives import Motor
 from dynsim.scenario import Scenario, build, build_model
 
-# Steps [s], and how long the first holds: while the motors take up the weight.
+# Step, and the shorter step of the first START_S, while the motors take up the weight [s].
 STEP, START_STEP, START_S = 5e-4, 1.25e-4, 0.5
 
 

@@ -19,7 +19,7 @@ from dynsim.system.files import write_json
 
 FILE = Path("results/snake/observations.json")
 MEASURED = ("beta", "y")
-# From the start of a mode until wheels are where they are lifted to [s].
+# Time from the start of a mode until wheels have reached their height [s].
 LIFTING_S = 0.6
 WHEELS, PAIRS = 14, 7
 

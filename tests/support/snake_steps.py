@@ -19,7 +19,7 @@ from dynsim.system.files import write_json
 
 SCENARIO, FILE = "snake_positioning_dynamic", Path("results/snake/steps.json")
 STEPS_MS = (1.0, 2.5, 5.0)
-# Of the head that is let go, where nothing comes to rest: the last is what the others are measured by.
+# Fall of the head after its release: steps, of which the last is the reference for the others, and duration.
 FALL_MS, FALL_S = (5.0, 2.5, 1.25, 0.3125), 0.15
 
 

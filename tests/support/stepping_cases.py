@@ -23,7 +23,7 @@ X, Y, Z = np.eye(3)
 
 
 class Case(NamedTuple):
-    """A system, where it starts, how long it runs, and where it must end."""
+    """A system with its start, duration and required end."""
 
     compiled: CompiledSystem
     q: np.ndarray
@@ -31,7 +31,7 @@ class Case(NamedTuple):
     until: float
     end: np.ndarray
     law: dict[int, float] = {}
-    read: Callable[[np.ndarray], np.ndarray] = np.asarray  # what ``end`` is of the positions
+    read: Callable[[np.ndarray], np.ndarray] = np.asarray  # from the positions to the form of ``end``
 
     def run(self, step: float, theta: float = 0.5, until: float | None = None) -> Run:
         """Its run with this step, sampled at every step."""

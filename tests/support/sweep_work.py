@@ -16,7 +16,7 @@ from dynsim.system import interruption
 
 
 def square(number: int, look: Progress) -> int:
-    """What most tasks do; some end their process, the first of its kind only or always."""
+    """The square of a number; ``DEADLY`` kills the process, ``REFUSED`` raises an error."""
     if number == DEADLY:
         os.kill(os.getpid(), signal.SIGKILL)
     if number == REFUSED:
@@ -25,7 +25,7 @@ def square(number: int, look: Progress) -> int:
 
 
 def once_deadly(task: tuple[int, str], look: Progress) -> int:
-    """The first process that meets ``DEADLY`` dies of it; a file tells the next one."""
+    """The square of a number; ``DEADLY`` kills the first process that gets it, which leaves a file for the next."""
     number, folder = task
     seen = Path(folder, "seen")
     if number == DEADLY and not seen.exists():
@@ -35,7 +35,7 @@ def once_deadly(task: tuple[int, str], look: Progress) -> int:
 
 
 def warned(number: int, look: Progress) -> bool:
-    """Logs a warning; whether it would have been made."""
+    """Log a warning; return whether its level is enabled."""
     log = logging.getLogger("dynsim.work")
     log.warning("number %d", number)
     return log.isEnabledFor(logging.WARNING)

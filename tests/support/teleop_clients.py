@@ -25,7 +25,7 @@ def prepare_child() -> None:
 
 
 class Teleop:
-    """A process of ``dynsim teleop``, or of another command with its page, and the address that it tells."""
+    """A process of ``dynsim teleop``, or of another command with its page, and the address that it prints."""
 
     def __init__(self, folder: Path, *arguments: str, command: Sequence[str] = ("teleop",)) -> None:
         self.folder = folder

@@ -1,4 +1,4 @@
-"""Study: the numbers that README.md and docs/ quote, measured anew.
+"""Study: energies, errors, forces and residuals of scenarios that README.md and docs/ quote, simulated anew.
 
 ``PYTHONPATH=tests python -m support.validation`` writes results/reference/validation.json in about four minutes;
 ``python .ci/pages.py`` writes them into the pages.
@@ -25,13 +25,13 @@ from support.rotors import rotor_energies
 from support.wang_minami import ELBOWS, elbow_forces, elbow_numbers
 
 FILE = Path("results/reference/validation.json")
-# Of a summary, what is not the same on every machine.
+# Keys of a summary that depend on the machine.
 OF_THE_MACHINE = ("integration_wall_s", "real_time_factor")
-# Fine enough for what happens in the first tenth of a second.
+# Fine enough for the first tenth of a second.
 RATE_HZ = 2000.0
 
 _FLOOR: dict[str, Any] = {"floor": {"type": "plane"}}
-# Motion that nothing damps, or only friction: no motor steers it back, so that the errors of the steps stay in it.
+# Scenarios without motors and with no loss but friction: errors of the steps accumulate, as no motor corrects them.
 FREE: dict[str, dict[str, Any]] = {
     "undamped fall of ten links, 5 s": {
         "duration_s": 5,

@@ -1,4 +1,4 @@
-"""Paths of a mobile base: closed forms, an integration of its own, and what no base on two wheels can follow."""
+"""Paths of a mobile base: closed forms, independent integration, and refusal of paths that no base can follow."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ TIMES = np.linspace(0.0, DURATION, 501)
 
 @pytest.fixture(scope="module")
 def model() -> Model:
-    """A base that starts off the origin, turned; so frames cannot be mixed up."""
+    """A base that starts off the origin and turned, so that an exchange of frames shows."""
     base = {"plant.base.position_m": PLACE.tolist(), "plant.base.heading_deg": 30}
     disabled = {f"contacts.points.elbow_{k}.enabled": False for k in (4, 7)}
     return build.build_model(load_scenario("mobile_elbow_comparison", overrides=base | disabled))

@@ -1,4 +1,4 @@
-"""The benchmark runs, compares like with like, and leaves dashes where a peer is missing. No times are asserted."""
+"""``dynsim bench`` in short: errors of all programs, dashes where a peer is missing. No times are asserted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Numbers in scenarios and servo maps must be numbers: strings and booleans are refused."""
+"""Numbers in scenarios and servo maps: strings and booleans are refused, numbers of numpy are accepted."""
 
 from __future__ import annotations
 

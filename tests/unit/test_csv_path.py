@@ -1,4 +1,4 @@
-"""CSV hand paths: read like by any other program, or refused with file, line and reason."""
+"""CSV hand paths: numbers read as other programs read them, or refused with file, line and reason."""
 
 from __future__ import annotations
 

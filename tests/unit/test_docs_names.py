@@ -1,4 +1,4 @@
-"""Names in the developer pages exist: files, their contents, and dotted names."""
+"""Names in developer pages and sources exist: files, their contents, dotted names, folders of the package."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from dynsim.record import FORMAT
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "dynsim"
 PAGES = ("architecture.md", "extending.md")
-# How texts are made plain, known to Python by that name.
+# The error handler of codecs that dynsim.system.standard_streams registers under this name.
 NO_MODULES = {"dynsim.plain"}
-# What the reader of an example makes.
+# Files that the reader of an example creates.
 MADE = {"dynsim/library/surfaces/ellipsoid.py", "dynsim/model/joints/screw.py"}
 
 

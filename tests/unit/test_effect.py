@@ -1,4 +1,4 @@
-"""Keys without effect: each is in the resolved scenario or in a warning."""
+"""Scenario keys without effect: each that a file sets is reported; such defaults are not in resolved scenarios."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Figures: every one is drawn from every kind of record, and says what the record says."""
+"""Figures of every kind of record, and their agreement with it: curves, labels, marks, scales and colours."""
 
 from __future__ import annotations
 

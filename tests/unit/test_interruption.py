@@ -1,4 +1,4 @@
-"""Signals are postponed where raising for them would crash the process."""
+"""Postponement of signals in callbacks of the compiler, where an exception would crash the process."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from dynsim.system import interruption
 
 @pytest.fixture(autouse=True)
 def interruptible():
-    """Background processes of a shell ignore the signal, and what is ignored stays so."""
+    """Python's handler of SIGINT, which background processes of a shell and their children ignore."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
 
 
 def _raw_object_cache_getbuffer() -> str:
-    """Named as llvmlite's: what LLVM calls when it wants compiled code from the cache."""
+    """Has the name of llvmlite's function that LLVM calls for compiled code from the cache."""
     return deeper()
 
 

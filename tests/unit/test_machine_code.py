@@ -1,4 +1,4 @@
-"""Reproducibility: the same version gives the same numbers, whatever was compiled, loaded or cached before."""
+"""Reproducible machine code: the same numbers whatever was compiled or loaded before; folders of the kernel cache."""
 
 from __future__ import annotations
 

@@ -13,9 +13,9 @@ import dynsim
 PACKAGE = Path(dynsim.__file__).parent
 REPOSITORY = Path(__file__).parents[2]
 BANNED = {"found", "given", "held", "hold", "one", "place", "rest", "told", "way", "what"}
-# A brake holds a joint and a reference a value: in a test of that, what is held has no better name.
+# In tests of brakes, which hold a joint, and of references, which hold a value.
 ALLOWED_IN_TESTS = {"held"}
-# Functions of the package are named by what they do or give.
+# Participles, which do not name an action or a result of a function.
 PARTICIPLES = {"folded", "shown", "sunk"}
 # Of the public interface: how long the last frame of a film stays.
 PUBLIC = {("cli/animate.py", "hold"), ("draw/film/film.py", "hold")}

@@ -1,4 +1,4 @@
-"""numba is unchanged for other code in the process: dynsim adapts it in its own compilations alone."""
+"""numba for other code in the process: unchanged by dynsim, which adapts it in its own compilations alone."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ def scene(objects, duration=0.5, **changes):
     return Scenario("scene", "", ScenarioConfig.model_validate(config | changes))
 
 
-# A point with a radius, far above the floor: beside bodies with corners it makes the scene one of the snake's program.
+# A point with a radius, far above the floor: with it, bodies with corners use the same compiled kernels as the snake.
 WITH_A_TIP = {"law": "unilateral", "friction": 0.3, "points": {"tip": {"body": "link_1", "radius_m": 0.01}}}
 BOX = {"mass_kg": 0.3, "size_m": [0.06, 0.08, 0.1], "position_m": [1.0, 0.0, -0.95]}
 

@@ -1,4 +1,4 @@
-"""Package metadata: licence, types, citation."""
+"""Package: licence, type marker, citation, public names, use without POSIX modules, caps on dependencies."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_the_citation_is_of_this_version_and_names_both_papers() -> None:
     assert (str(citation["version"]), citation["license"]) == (dynsim.__version__, PROJECT["license"])
     families = [[author["family-names"] for author in paper["authors"]] for paper in citation["references"]]
     assert families == [["Wang", "Minami"], ["Tanaka", "Tadakuma", "Nakajima", "Fujita"]]
-    # The titles of the documentation, which breaks its lines elsewhere.
+    # Titles as in the documentation, whose line breaks differ.
     for paper, page in zip(citation["references"], ("physics.md", "snake.md"), strict=True):
         assert paper["title"] in " ".join((ROOT / "docs" / page).read_text(encoding="utf-8").split())
 

@@ -1,4 +1,4 @@
-"""docs/physics.md names every equation of [WM], and functions that exist."""
+"""Table of equations in docs/physics.md: it names every equation of [WM], and functions that exist."""
 
 import importlib.util
 import re

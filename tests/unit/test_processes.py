@@ -1,4 +1,4 @@
-"""Worker processes: started from any script, killed at any time, and errors of those that cannot work."""
+"""Worker processes: started from any script, killed, or unable to start; errors and isolation of their tasks."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Messages of runs with real contact: stops, chatter, tiny falls, a base that could tip."""
+"""Messages of runs with real contact: joint stops, chatter, falls of nanometres, refusals for mobile bases."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Records: what is written is what is read; a failed write leaves what was there."""
+"""Records: round trip through files, signals and events, writes that fail, incomplete groups of files, data frames."""
 
 import sys
 from pathlib import Path

@@ -1,6 +1,7 @@
-"""Hostile record files: each is read as written or refused in one line; none crashes the reader.
+"""Damaged and malicious record files: each is read as written or refused in one line; none crashes dynsim.
 
-The HDF5 library itself crashes, or never returns, on one of sixty damaged files: so these tests read in children.
+The HDF5 library itself crashes, or never returns, on one of sixty damaged files, so these tests read files
+in child processes.
 """
 
 import itertools

@@ -1,4 +1,4 @@
-"""Scenes: round trip through files; surfaces know their kind."""
+"""Scenes: round trip through files, order of bodies, kinds, distances and drawn patches of surfaces."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Commands, paths and the mode switcher on their own."""
+"""Head paths, command scripts and the mode switcher of the snake, without a simulation."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Figures of a snake run: files are written and readable (what they look like is for eyes)."""
+"""Figures and tables of snake runs: files, axes and labels, charts of modes, values beside those of the paper."""
 
 import csv
 
@@ -25,7 +25,7 @@ def record():
 
 @pytest.fixture
 def unwritten(monkeypatch):
-    """Figures are drawn and named, not written: their numbers are what counts."""
+    """Draw figures without writing them; tests look at their contents."""
     monkeypatch.setattr(style, "save", lambda figure, path: path)
     monkeypatch.setattr(figures, "FRAMES", 2)
 

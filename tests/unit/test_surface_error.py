@@ -1,4 +1,4 @@
-"""Displaced surfaces, starts on references, and ends of waypoints."""
+"""Surfaces whose errors the controller does not know, starts on references, units of waypoints, ends of splines."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""URDF in and out: what is read is what Pinocchio reads, what is written reads back the same, bad files are named."""
+"""Reading and writing of URDF: agreement with Pinocchio, round trip, locked joints, errors that name bad files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An arm from a URDF file in a scenario: units of its two kinds of joints, and its limits."""
+"""An arm from a URDF file in a scenario: units of its joints, limits, locks, frames and free bodies."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""Theorems of rigid bodies, on random trees: energy, inverse and forward dynamics, momentum."""
+"""Dynamics of random trees: mass matrix, forces, Jacobians, energy and momentum; sines and cosines of the kernels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Poses of bodies from scene and joint positions against those of the model and of the snake's own chain."""
+"""Poses of bodies from scene and joint positions, against the model and the snake's kinematics; their record size."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from dynsim.record.scene import Body, Joint, Point, Scene, Shape
 from dynsim.scenario import load_scenario
 
 SINGLE = 3e-7
-"""Rounding to single precision, of numbers of about one."""
+"""Tolerance of poses kept in single precision: rounding of numbers of about 1 [m; rotation matrices 1]."""
 
 
 def posed(robot: Robot, q: np.ndarray) -> Record:

@@ -1,4 +1,4 @@
-"""Least-heat brace forces: each answer carries its own proof, checked with public methods of the model and numpy."""
+"""Least-heat brace forces: conditions of optimality, or a certificate that no forces exist; limits and refusals."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from dynsim.dynamics.contact.braces import tables as kb
 from dynsim.errors import ModelError
 
 seeds = st.integers(0, 2**32 - 1)
-# Of components of virtual velocities and gradients near 1 that would have to be zero or positive.
+# Tolerance of components of virtual velocities and gradients, of about 1, that must be zero or not negative.
 ROUNDING = 1e-9
 UP = np.array([0.0, 0.0, 1.0])
 

@@ -1,4 +1,4 @@
-"""Links that sink below surfaces, and references that pull a contact off."""
+"""Poses and gaps of many samples, depth of links below surfaces, and references that lift a contact off."""
 
 import io
 import re

@@ -1,4 +1,4 @@
-"""Motions and forces with a solution on paper."""
+"""Analytical solutions: pendulum, current of a blocked motor, block on an incline, bead on a sphere and a cylinder."""
 
 from __future__ import annotations
 

@@ -23,14 +23,14 @@ Z = vector(0, 0, 1)
 
 
 def soft(stiffness: float = STIFFNESS, damping: float = DAMPING) -> CompiledSystem:
-    """A mass on a vertical guide above a floor that gives way."""
+    """A mass on a vertical guide above a compliant floor."""
     link = Link("mass", "up", None, "prismatic", Z, Inertia(MASS))
     contact = Contact("foot", "mass", np.zeros(3), plane(Z), stiffness=stiffness, damping=damping)
     return assemble(Robot("mass", (link,), (), ("mass", np.zeros(3))), [contact], real=True)
 
 
 def balance(run) -> np.ndarray:
-    """Energy that is not there any more, nor in its ledger, at the samples [J]; no drives, no loads."""
+    """Energy that the ledger does not explain at the samples [J], of a system without drives and loads."""
     energy, ledger = run.outputs("energy").sum(axis=1), run.states("ledger")
     lost = run.states("elastic").sum(axis=1) + run.states("scheme")[:, 0] + run.states("loss").sum(axis=1)
     return energy - energy[0] + lost + ledger[:, FRICTION] - ledger[:, CONSTRAINT]

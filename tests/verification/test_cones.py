@@ -31,7 +31,7 @@ def solve(W, b, kind, mu=0.0, start=None, tolerance=1e-12):
 
 
 def test_no_rows_are_solved_by_no_forces():
-    """Also where nothing is compiled, which would not look at a room that is not there."""
+    """Compiled and as Python, which would raise an error if it read from an empty workspace."""
     no = np.zeros(0)
     for solve_them in (solve_cones, getattr(solve_cones, "py_func", solve_cones)):
         room = np.zeros((CONE_ROOM, 0, 0))
@@ -39,7 +39,7 @@ def test_no_rows_are_solved_by_no_forces():
 
 
 def violation(W, b, kind, mu, f):
-    """The worst violation of the conditions as they are written, in the units of u, without any natural map."""
+    """Largest violation of the conditions of the contact problem, in the units of u, without a natural map."""
     u, worst, k = W @ f + b, 0.0, 0
     while k < len(b):
         w = np.trace(W[k : k + 3, k : k + 3]) / 3 if kind[k] == CONE else W[k, k]

@@ -1,4 +1,4 @@
-"""Contacts: both solvers, the constraint itself, friction, and rows that depend on each other."""
+"""Bilateral contacts: agreement of both solvers, constraint, friction, dependent rows, gaps, number of contacts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Coupled joints: a gripper whose second finger mimics the first, and impossible couplings."""
+"""Coupled joints: a gripper whose second finger mimics the first, a chain of couplings, and impossible couplings."""
 
 from __future__ import annotations
 

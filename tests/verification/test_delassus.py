@@ -1,4 +1,4 @@
-"""The small systems of constraint forces: full rank and dependent rows against numpy's singular value decomposition."""
+"""Linear systems A f = b of constraint forces, of full rank or with dependent rows, against numpy's SVD."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ from dynsim.model.drives import Drive, Motor, Servo, TorqueSource
 
 INERTIA = 0.3  # of the wheel and of what turns with it [kg m²]
 K_M, R = 1.9, 2.3  # [V s/rad], [Ω]
-STEP = 1e-100  # of the complex step: no difference, so nothing cancels
+STEP = 1e-100  # of the complex step, which has no cancellation
 
 
 def wheel(motor: Drive) -> Robot:

@@ -1,4 +1,4 @@
-"""Dry friction of gears and bearings at rest and in motion: closed forms and the ledger, by steps and by events."""
+"""Dry friction of gears and bearings, by time stepping and with events: closed forms, the ledger, keys of scenarios."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ MASS, FRICTION = 2.0, 3.0
 
 
 def sliding(load: np.ndarray, friction: float = FRICTION) -> CompiledSystem:
-    """A mass on a horizontal guide that rubs, pushed by load[0] + load[1] t [N]."""
+    """A mass on a horizontal guide with dry friction [N], pushed by load[0] + load[1] t [N]."""
     link = Link("slide", "guide", None, "prismatic", vector(1, 0, 0), Inertia(MASS), friction=friction)
     coefficients = np.zeros((1, 6, 4))
     coefficients[0, 0, :2] = load

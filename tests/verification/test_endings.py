@@ -1,4 +1,4 @@
-"""Every run ends: bounds of the integration loops, and the reasons that stop a run."""
+"""End of every run: bounds of the integration loops, reasons that stop a run, wall limit, Ctrl-C, stuck steps."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ ENDLESS = Path(__file__).parents[1] / "data" / "endless" / "arm.yaml"
 
 @pytest.fixture(autouse=True)
 def nothing_is_left(monkeypatch: pytest.MonkeyPatch):
-    """What was left alone here has ended, or will."""
+    """Clear the flag of steps that were left running in a thread: those of these tests end on their own."""
     monkeypatch.setattr(interruption, "_left", False)
 
 

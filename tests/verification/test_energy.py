@@ -1,4 +1,4 @@
-"""The three electrical energies, and a ledger residual that is meaningful at rest."""
+"""Net, supply and drawn electrical energy, and the residual of the ledger at rest and in free motion."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ LOWERED = {"times_s": [0, 1], "angles_deg": [90, 170]}
 
 
 def arm(paths: list[dict]) -> dynsim.Record:
-    """One rod of 2 kg, or two in a row, lowered by motors that brake and so feed back."""
+    """One rod of 2 kg, or two in a row, lowered by motors that brake and return electrical energy."""
     chain = [{"axis": "y", "mass_kg": 2.0, "length_m": 1.0, "motor": MOTOR, "initial_deg": 90}]
     if len(paths) == 2:
         chain.append({**chain[0], "initial_deg": 0})

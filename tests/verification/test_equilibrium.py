@@ -1,6 +1,6 @@
-"""Equilibrium start: no jump where currents of ``initial.equilibrium`` carry weight, loads and braces.
+"""Equilibrium start (``initial.equilibrium``): rest under weight, loads and braces, least heat, tipping, refusals.
 
-Verification: accelerations of the compiled right-hand side against zero, heat against numpy's least squares.
+Accelerations of the compiled right-hand side are compared with zero, the heat with numpy's least squares.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from dynsim.engine.prepare import prepare
 from dynsim.errors import ModelError
 from dynsim.scenario import build
 
-# What is left of accelerations [rad/s²] and of currents that should be steady [A]: rounding of the statics, 1e-9 of
-# the forces at worst, over the lightest links.
+# Tolerances of accelerations [rad/s²] and of changes of currents [A]: rounding of the statics, at most 1e-9 of the
+# forces, divided by the inertia of the lightest links.
 STILL, STEADY = 1e-6, 1e-8
 HOLD = {"initial": {"equilibrium": True}, "duration_s": 0.2, "controller.hand": None}
 

@@ -1,4 +1,4 @@
-"""Inverse kinematics of a model: position, orientation, braces and limits, checked by forward kinematics."""
+"""Inverse kinematics: position, orientation, braces, limits and hand paths, checked by forward kinematics."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def arm() -> tuple[dynsim.Model, list]:  # type: ignore[type-arg]
 
 
 def test_hand_and_orientation_are_reached(arm) -> None:  # type: ignore[no-untyped-def]
-    """Poses of random postures, from starts near by."""
+    """Targets are the poses of random postures; the search starts near these."""
     model, _ = arm
     rng = np.random.default_rng(0)
     for _ in range(5):

@@ -1,4 +1,4 @@
-"""Integrators: order by halving the step, tolerance, dense output, drift, and the energy ledger."""
+"""Integrators: order, tolerance, dense output, drift, energy ledger, runs in pieces; error estimate of RADAU5."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""State-dependent branches of the right-hand side: few, known, and listed here (vectorisation needs that).
+"""List of the branches of the right-hand side that depend on state or time, with their treatment in SIMD code.
 
-``derivative`` runs as Python on numbers of four lanes (``tests/support/lanes.py``), each line. What a lane gets must be
-what a run of its own gets, to the bit, and every place that asks lanes for one truth must be in a list below.
+``derivative`` runs as Python on four states at once (``tests/support/lanes.py``), every line at least once. Each lane
+must equal, bit for bit, a run with its state alone. A line that needs one truth value for all lanes must be listed.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ PIVOT, DEPENDENT = "choice of a pivot", "dependent rows"
 CLOSED_FORM = "guard of a closed form; elimination else"
 SEGMENT = "segment of a reference or load"
 
-# Branches that are selects without another bit. FORMS below are the selects, and cases whose lanes disagree run them.
+# Branches that a select for each lane replaces, bit for bit. FORMS below are these selects; cases whose lanes differ
+# run them.
 SELECT = {
     Place("contact/m_star.py", "solve_m_star", "if factor != 0.0:"): "saves work alone: taking away zero is nothing",
     Place("contact/quadrics.py", "surface_distance", "if inner <= 0.0:"): "curved surface: no root along the normal",

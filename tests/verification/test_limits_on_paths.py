@@ -1,4 +1,4 @@
-"""Joint limits in the references of hand paths: they hold, or the path is refused with joint and time."""
+"""Joint limits in the references of hand paths: kept, or the path is refused with joint, time and amount."""
 
 from __future__ import annotations
 

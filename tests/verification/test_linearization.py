@@ -1,5 +1,8 @@
-"""Linear equations of a simulation: against Pinocchio and closed forms without contacts, against differences of
-equations that are put together here from M, h and point Jacobians in every contact mode."""
+"""Linear equations of a simulation, without contacts and in every contact mode, against independent equations.
+
+Without contacts these are Pinocchio's and closed forms; with contacts, differences of dense equations that are built
+here from M, h and point Jacobians.
+"""
 
 from __future__ import annotations
 

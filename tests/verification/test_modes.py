@@ -1,4 +1,8 @@
-"""Contacts between sticking, sliding and open: rows that hold a point at rest, and runs across changes of mode."""
+"""Contact rows in the modes open, sliding and sticking, where the test sets the mode by hand.
+
+Forces at rest, second derivatives of the gaps, runs before and after a change of mode, and no leftovers of the previous
+mode.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +26,7 @@ def switch(b: CompiledSystem, y: np.ndarray, *modes: int) -> None:
 
 
 def block(mass: float) -> Robot:
-    """A body that can go anywhere and does not turn."""
+    """A body that translates freely and does not rotate."""
     links = []
     for k, name in enumerate("xyz"):
         inertia = Inertia(mass if name == "z" else 0.0)

@@ -13,8 +13,8 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 
-# What runs in the copy. The nut of a vertical screw; and a screw anywhere in a tree beside the same tree with a sliding
-# and a turning joint in its place that a constraint couples, x = lead q, solved with its multiplier.
+# Program that runs in the copy: the nut of a vertical screw; and a screw in a tree, against the same tree with a
+# prismatic and a revolute joint in its place, coupled by the constraint x = lead q, solved with its multiplier.
 SCREW = """
 import sys
 from dataclasses import replace

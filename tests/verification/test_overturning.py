@@ -1,4 +1,4 @@
-"""Ground reactions of a mobile base, against Newton's law for bodies and explicit wheels.
+"""Ground reactions and tip margin of a mobile base, against Newton's law for all bodies and two separate wheels.
 
 The independent computation takes coordinates, rates and accelerations of a sample, follows the poses of all bodies
 (``clearance.poses``) and of two turning wheel discs along q + s q̇ + s² q̈/2, and differentiates them by central

@@ -26,7 +26,7 @@ FLOOR = Quadric(np.zeros((3, 3)), Z, 0.0)
 METHODS = ["dopri5", "radau5"]
 HALF, MU = 0.5, 2.0
 # A uniform rod of half length l that leans by θ, its tip sliding along +x: m A_11 = 1 + 3 s (s + μ c), with s = sin θ
-# and c = cos θ, is zero where 5 − 3 cos 2θ + 3 μ sin 2θ = 0. Under a pulling force, or sliding back, μ turns round.
+# and c = cos θ, is zero where 5 − 3 cos 2θ + 3 μ sin 2θ = 0. For a pulling force, or sliding along −x, μ changes sign.
 _TURN = np.hypot(3.0, 3.0 * MU)
 CRITICAL = 0.5 * (np.arctan2(3.0 * MU, -3.0) - np.arccos(-5.0 / _TURN) + 2.0 * np.pi) - np.pi
 

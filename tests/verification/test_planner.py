@@ -1,4 +1,4 @@
-"""The planner of braces: derivatives, closed forms, and predicted heat against simulated heat."""
+"""Planner of braces: derivatives, closed forms, planned against simulated heat, errors of the scene, refusals."""
 
 from __future__ import annotations
 

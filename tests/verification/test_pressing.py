@@ -22,7 +22,7 @@ def scenario(variant: str = "two_elbows", **overrides):
 
 
 def real_floor(tmp_path, **overrides):
-    """The published arm on a floor that only pushes."""
+    """The published arm on a floor with unilateral contact."""
     text = dynsim.load_scenario("elbow_comparison", variant="two_elbows").source.read_text()
     for line in ("  slip_smoothing_m_s: 0.001 ", "  pulling_friction: signed "):
         assert line in text

@@ -1,4 +1,4 @@
-"""The mobile base in motion: closed forms, wheels that do not slip, energy."""
+"""The mobile base in motion: closed forms, rolling without slip, energy, both solvers, stepped and continued runs."""
 
 from __future__ import annotations
 
@@ -20,14 +20,15 @@ MASS, WHEEL_MASS = 3.5, 0.4
 # The body about its centre of mass, a wheel about its axle and across it.
 I_Z, I_AXLE, I_ACROSS = 0.07, 0.5 * WHEEL_MASS * R**2, 0.25 * WHEEL_MASS * R**2
 TOTAL = MASS + 2.0 * WHEEL_MASS
-# What a force ahead at the axle's middle has to move, and a moment about the vertical there, on wheels without motors.
+# Effective mass for a force ahead at the middle of the axle; effective inertia for a moment about the vertical there;
+# both for wheels without motors.
 ROLLING_MASS = TOTAL + 2.0 * I_AXLE / R**2
 TURNING = I_Z + 2.0 * (I_ACROSS + WHEEL_MASS * (0.5 * TRACK) ** 2) + 2.0 * I_AXLE * (0.5 * TRACK / R) ** 2
 START, HEADING = np.array([0.7, -0.4]), 0.6
 
 
 def robot(ahead: float = 0.0, damping: float = 0.0, motor: Any = None, gravity: Any = (0.0, 0.0, -9.81)) -> Robot:
-    """A base with its centre of mass so far ahead of the axle [m]; its arm is a rotor without mass."""
+    """A base whose centre of mass is ``ahead`` of the axle [m]; its arm is a rotor without mass."""
     base = {
         "position_m": START.tolist(),
         "heading_deg": np.degrees(HEADING),

@@ -1,4 +1,4 @@
-"""Newton's linear systems of RADAU5: lanes of one, compiled, against the two that they are, and against the whole J."""
+"""Linear systems of RADAU5's Newton method: the compiled SIMD solve against plain Python and the full matrix."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dynsim.jit.kernel import kernel
 
 @kernel
 def solve_compiled(system, ws, y, r, h):
-    """Factors and solution as RADAU5 has them."""
+    """Factorise and solve the real and the complex system, as a step of RADAU5 does."""
     factor_both(system, r, h)
     solve_both(system, ws, y, r, h)
 

@@ -1,4 +1,4 @@
-"""Samples of RADAU5 computed on lanes or postponed equal those computed alone."""
+"""Samples of RADAU5 that lanes compute together, also when postponed until lanes are full, against single samples."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ STEP = 5e-3
 
 
 def unwaiting(b: CompiledSystem, y: np.ndarray, times: np.ndarray) -> Run:
-    """A run whose samples do not wait, as something may happen between steps: after its end."""
+    """A run whose samples are not postponed: it has a break of references, which lies after its end."""
     return b.advance(b.new_run(y, times, "radau5", step=STEP, fixed=True)._replace(breaks=np.array([1e3])))
 
 

@@ -1,4 +1,4 @@
-"""Shared contact forces: reported only for several contacts, and only where one can replace another."""
+"""Report of shared forces: of contacts, or of a contact and joints at rest, where one can replace another."""
 
 from __future__ import annotations
 

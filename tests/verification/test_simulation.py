@@ -1,4 +1,4 @@
-"""The stepper: the same numbers as a run in one go, rewritten references and wrenches, events, ticks, snapshots."""
+"""Stepped simulations: equality with a run in one go, rewritten references and wrenches, events, ticks, snapshots."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Verification: A(q) w' = B(q) u against finite differences of an independent chain of homogeneous transforms.
+"""Snake constraints A(q) ẇ = B(q) u against finite differences of an independent chain of homogeneous transforms.
 
-Random geometries, modes and states, the base tilted and off the ground (non-level): no term hides behind a zero.
+Geometries, modes and states are random, the base tilted and off the ground, so that an error in any term shows.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""Verification of the task-space controller: eqs 12-14 against dense linear algebra, and what follows from them."""
+"""Task-space controller of the snake: [T] eqs 12-14 against dense algebra, ranks, singularity, limits, refusals."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Verification of the dynamic snake: its tree against the kinematics, rolling, loads, lifts, sensors, sessions."""
+"""The dynamic snake: its tree against the kinematics, rolling, loads, lifts, sensors, sessions, step convergence."""
 
 import math
 

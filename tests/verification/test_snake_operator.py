@@ -27,7 +27,7 @@ def ramp(duration: float, **displacement: float) -> dict:
 
 
 class Live:
-    """One period at a time, ahead at 5 cm/s; from t = 1 s on it says, or does, something else."""
+    """Source of one command per period: ahead at 5 cm/s, and the result of ``then()`` from t = 1 s on."""
 
     def __init__(self, then):
         self.then = then

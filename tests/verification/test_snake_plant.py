@@ -1,4 +1,4 @@
-"""The kinematic plant and the tick loop: rolling, order of the sampling error, the controller's knowledge."""
+"""The kinematic snake and its tick loop: rolling, sampling error, feedback, limits, modes that tip, live sources."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Verification of support polygon, static margin and the gradients of the cost functions."""
+"""Support polygon, static margin and gradients of the cost functions of the snake."""
 
 import numpy as np
 import pytest

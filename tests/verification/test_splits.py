@@ -21,7 +21,7 @@ def margins(f: np.ndarray, first: np.ndarray, mu: np.ndarray) -> np.ndarray:
 
 
 def split(f0, N, first, mu) -> tuple[float, np.ndarray]:
-    """By the kernel, in a room that is too large and full of NaN."""
+    """Margin and forces by the kernel, whose workspace is larger than needed and filled with NaN."""
     r, c = N.shape[1], len(first)
     room = split_room(r + 1, c + 1)
     for table in room:

@@ -1,4 +1,4 @@
-"""Only dynsim.dynamics.state knows the layout of the state vector and of recorded outputs."""
+"""Layout of states and outputs: another layout gives the same runs, and only dynsim.dynamics.state has the indices."""
 
 from __future__ import annotations
 

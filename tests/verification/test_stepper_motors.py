@@ -1,4 +1,4 @@
-"""Motors of a stepped simulation: modes of servos, one supply, brakes, and motors in place of the plant's."""
+"""Motors of stepped simulations: modes of servos, supply voltage, brakes, and motors that replace the plant's."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def servo(joint: str, **keys: float) -> Servo:
 
 
 def pendulum(**keys: float) -> dynsim.Simulation:
-    """The shipped rod, hanging 60° from straight down, on a servo instead of free."""
+    """The shipped pendulum at 60° from straight down, with a servo at its joint."""
     return dynsim.Simulation(dynsim.load_scenario("single_pendulum"), motors=[servo("joint_1", **keys)])
 
 

@@ -1,4 +1,4 @@
-"""Time stepping: closed forms of sliding, sticking, landing and bouncing; order; what its ledger adds up to."""
+"""Time stepping: closed forms of sliding, sticking, landing, bouncing and friction laws; order; runs in pieces."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ G = 9.81
 def block(friction: float, slope: float = 0.0, mass: float = 2.0, **law: float) -> CompiledSystem:
     """A body that does not turn, with one point on a plane through the origin that falls towards +x.
 
-    law: more of the contact.
+    law: further arguments of the ``Contact``.
     """
     inertias = [Inertia(0.0), Inertia(0.0), Inertia(mass)]
     links = [

@@ -1,4 +1,4 @@
-"""The ledger of time stepping closes to rounding: the discrete energy balance."""
+"""Discrete energy balance of time stepping: the ledger closes to rounding; order of the loss of the steps."""
 
 from __future__ import annotations
 

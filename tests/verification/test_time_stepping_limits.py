@@ -1,4 +1,4 @@
-"""Limits of drives in time stepping are those of the end of a step: stiff loops are not integrated explicitly there."""
+"""Limits of voltage, current and torque in time stepping: they hold for the end of a step, also in stiff loops."""
 
 from __future__ import annotations
 

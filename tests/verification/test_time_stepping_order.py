@@ -11,7 +11,7 @@ from dynsim.dynamics.state import IMPACT_LOSS, OUT_FORCE, OUT_GAP
 from dynsim.integrators.run import LOGGED, TIME
 from dynsim.model.description import Contact
 
-# Errors at 1 ms of an independent prototype of the same law [m or rad]; here no more than twice of them.
+# Errors of an independent prototype of the same law with steps of 1 ms [m or rad]; the test allows twice as much.
 CASES = {
     "bead": (bead, 3.1e-5),
     "bead that slides": (lambda: bead(0.2), 1.2e-5),
@@ -23,7 +23,7 @@ CASES = {
     "block on an incline that stops": (lambda: incline(1.5), 7.4e-7),
     "tip that is free along the floor": (lambda: tip("free"), 5.9e-5),
     "tip that slides": (lambda: tip("slides"), 8.0e-8),
-    # The prototype began with a step that knew nothing of the one before: 6.3e-4, and an order below two.
+    # The prototype has 6.3e-4 and an order below two, as its first step has no previous one.
     "tip that sticks": (lambda: tip("sticks"), 9.4e-7),
 }
 

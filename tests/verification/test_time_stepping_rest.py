@@ -21,7 +21,7 @@ LEGS = [np.array([x * WIDTH, y * DEPTH, -HEIGHT]) for x in (1, -1) for y in (1, 
 
 
 def body(points: list[np.ndarray], friction: float = 0.6) -> CompiledSystem:
-    """A body that is free, with points on a floor."""
+    """A free body with points on a floor."""
     inertia = Inertia(MASS, np.zeros(3), np.diag([0.3, 0.4, 0.6]))
     links = tuple(floating(Link("body", "root", None, "floating", np.eye(3)[0], inertia)))
     contacts = [Contact(f"foot_{k}", "body", p, plane(Z), friction=friction) for k, p in enumerate(points)]

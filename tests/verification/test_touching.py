@@ -1,4 +1,4 @@
-"""Declared contact points: with a radius, and points that never touch."""
+"""Declared contact points: with a radius, points that never touch, and disabled points."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ def plane(normal: np.ndarray, point: np.ndarray = ORIGIN) -> Quadric:
 
 
 def block(mass: float) -> Robot:
-    """A body that can go anywhere and does not turn."""
+    """A body that translates freely and does not rotate."""
     links = []
     for k, name in enumerate("xyz"):
         inertia = Inertia(mass if name == "z" else 0.0)

@@ -1,4 +1,4 @@
-"""Real contact of an arm's elbow against hand-made equations, a rod that falls flat, rest, and paradoxes."""
+"""Real contact: an arm's elbow against equations derived by hand, a rod that falls flat, an hour of rest, a paradox."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ from support.unilateral_checks import random_touch, violations
 
 from dynsim.integrators import run as ki
 
-# No run ends without a name; those of random wedges and paradoxes are few.
+# Reasons that may stop a run before its end: few runs, with wedged points or a paradox.
 NAMED = (ki.FORCES_REVERSED, ki.SEVERAL_FORCES, ki.NO_CONTACT_FORCES, ki.CHATTER, ki.STEP_TOO_SMALL)
 LIMITS = {
     "pull": 1e-9,

@@ -27,7 +27,7 @@ def cart(height: float = RADIUS, **wheel: Any) -> dict[str, Any]:
 
 
 def run(slope: float = 0.0, duration: float = 1.0, **changes: Any) -> Record:
-    """Scenes on a plane; gravity leans by the slope [rad], towards x."""
+    """A run on a plane; gravity is inclined by the slope [rad] towards x."""
     config = {
         "name": "scene",
         "duration_s": duration,

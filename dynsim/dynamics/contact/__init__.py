@@ -1,1 +1,1 @@
-"""Contacts: geometry, rows, the Delassus system, laws."""
+"""Contacts: geometry, constraint rows, contact laws, and the solvers for contact and brace forces."""

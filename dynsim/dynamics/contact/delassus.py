@@ -1,8 +1,8 @@
-"""Small dense (Delassus) systems for the forces of constraint rows, also when rows are linearly dependent.
+"""Solver of small dense (Delassus) systems for the forces of constraint rows, which may be linearly dependent.
 
 One row format for every constraint: up to two links, ROW (the constrained motion is ROW · V), TARGET (what J vdot must
-be) and DIRECTION (the wrench of a unit force). Row and direction differ under sliding friction, so the p×p matrix is
-not symmetric.
+be) and DIRECTION (the wrench of a unit force). Under sliding friction row and direction differ, so the p×p matrix is
+not symmetric then.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ RANK_TOLERANCE = 1e-11
 def solve_small(small, state, active, p):
     """Solve the leading p×p of ``small[0]`` f = RHS for the constraint forces f, into the FORCE column of ``state``.
 
-    Gaussian elimination with partial pivoting; where a pivot vanishes :func:`least_norm` begins anew. Its solution is
-    the split of forces among dependent rows. Returns 1 in that case, else 0.
+    Gaussian elimination with partial pivoting. Where a pivot vanishes, :func:`least_norm` solves the system anew and
+    gives the split of least norm among dependent rows. Returns 1 in that case, else 0.
 
     Parameters
     ----------

@@ -16,7 +16,7 @@ from dynsim.jit.kernel import internal_kernel, kernel
 
 # ShapeArrays.kind, int
 SURFACE = 0  # one of the kinds below
-MOVES = 1  # 1: the point of the axis that is nearest to the surface touches, 0: its beginning
+MOVES = 1  # 1: the axis touches at its point nearest to the surface, 0: at its beginning
 FIELD = 2  # of a height field: where its coefficients begin in ShapeArrays.fields
 COUNT = 3  # 2: its numbers of grid lines along x and y
 SHAPE_KIND_SIZE = 5

@@ -23,7 +23,7 @@ from dynsim.dynamics.tree.spatial import (
 )
 from dynsim.jit.kernel import exact_kernel, internal_kernel
 
-# Tries, beyond two per contact, to find signs of dissipative contacts that agree with their forces.
+# Most solves, beyond two per contact, in search of signs of dissipative contacts that agree with their forces.
 SIGN_PASSES = 64
 # With more contacts than this not every choice of signs is tried.
 SIGNS_LIMIT = 8

@@ -1,8 +1,8 @@
-"""The table of active constraint rows: of closed candidates by their modes, and of coupled joints; their forces.
+"""Table of active constraint rows (couplings, dry friction, stops, contacts, ties), their forces and errors.
 
-A row is one scalar constraint J vdot = target with one force. It has a kind, an owner (a candidate or a coupling) and
-up to two bodies, and is rebuilt only when a mode changes: couplings first, then the candidates in their order; behind
-the active rows, one of no force for each candidate that is off its surface.
+A row is one scalar constraint J vdot = target with one force. It has a kind, an owner (the candidate, coupling, stop,
+joint or tie) and up to two bodies. The table is rebuilt only when a mode changes. Order: couplings, joints held by dry
+friction, closed joint stops, closed candidates, ties; behind these active rows, one without force per open candidate.
 """
 
 from __future__ import annotations

@@ -7,8 +7,8 @@ A candidate is a sphere of radius ρ about a point s of its body, or about the p
     rate      ġ = n · v                                     v: velocity of the body's point at s
     second    g̈ = n · a + v·H v − (v·H d + n·(ω × d))² / (d·H d)
 
-The last term is that of the nearest point as it moves along the axis, u̇ = −(v·H d + n·(ω × d)) / (d·H d): from
-min over u of φ, whose first derivative does not feel u̇. It is absent where u is held: of spheres, and at the ends.
+The last term is due to the motion of the nearest point along the axis, u̇ = −(v·H d + n·(ω × d)) / (d·H d). φ is
+stationary in u there, so u̇ is not in ġ. The term is absent where u is constant: for spheres, and at the ends.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ from dynsim.dynamics.tree.spatial import (
 )
 from dynsim.jit.kernel import internal_kernel
 
-# sin² of the angle between an axis and the direction along which the distance does not change, below which the nearest
-# point has no speed: the axis lies along a cylinder.
+# sin² of the angle between an axis and the direction of constant distance. Below it u̇ = 0: the axis is parallel to
+# that of a cylinder, say, and no point of it is nearest.
 ALONG = 1e-8
 
 

@@ -1,8 +1,9 @@
-"""Split of forces among sticking points and joints with dependent rows, such that friction can carry it.
+"""Split of forces among dependent rows of sticking points and held joints, within friction bounds if possible.
 
-Two braces that stick on a planar arm share their lateral row, points along one body their radial one: M v̇ knows the sum
-of their forces only. Such a set holds while any split lies in all cones |f_t| ≤ μ_s f_n. Where that of least norm does
-not, the forces become those of least norm among the splits that do; where none does, those with the best worst margin.
+Two sticking braces of a planar arm have dependent lateral rows, points along one body dependent radial rows: only the
+sum of their forces is in the equations of motion. Such a set sticks as long as some split lies in all cones
+|f_t| ≤ μ_s f_n. If the split of least norm does not, the one of least norm among those that do replaces it; if none
+does, the one with the largest worst margin.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from dynsim.dynamics.contact.unilateral import UnilateralArrays, dry_bound, note
 from dynsim.dynamics.tables import ContactArrays, Workspace
 from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
-# A pivot below this fraction of the largest is a row that depends on the others.
+# A row whose pivot is below this fraction of the largest depends on the others.
 NULL_TOLERANCE = 1e-10
 
 

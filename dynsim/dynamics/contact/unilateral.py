@@ -1,8 +1,8 @@
-"""The unilateral law of contacts, joint stops and dry friction of joints: its tables, slip direction, sliding friction.
+"""Tables of contacts, stops, dry friction and ties under the unilateral law; slip direction and friction forces.
 
-0 ≤ f_n ⟂ gap ≥ 0; a point that slides is driven by n − μ(s) t along t = v_t/|v_t|, one that is at rest is held while
-|f_t| ≤ μ_s f_n. Which candidates are open, slide or stick is constant within a step
-(:mod:`dynsim.integrators.contacts.modes` chooses); this module is what a right-hand side needs of the law.
+0 ≤ f_n ⟂ gap ≥ 0. The force on a sliding point is f_n (n − μ(s) t), t = v_t/|v_t|, s = |v_t|; a point at rest sticks
+while |f_t| ≤ μ_s f_n. Modes (open, sliding, sticking) are constant within a step of the event-driven integrators;
+:mod:`dynsim.integrators.contacts.modes` chooses them. Here are the parts of the law that the right-hand side needs.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ SPEED = 4  # v_t · REFERENCE [m/s]
 NEXT = 5  # 3: direction at the end of the step
 NEXT_SPEED = 8  # |v_t| there [m/s]
 LANDS_AT = 9  # depth below its surface at which a candidate that is off it has landed [m]
-HEADWAY = 10  # what it began to slip with against its direction, because the rows could not take it away [m/s]
+HEADWAY = 10  # speed against its direction with which it began to slip and that the rows could not remove [m/s]
 SLIDE_SIZE = 11
 # It lands at DEPTH until it has been higher than that, because projection leaves closed ones within half of it on
 # either side; then at the root itself.

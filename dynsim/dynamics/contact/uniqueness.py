@@ -1,7 +1,7 @@
 """Test whether the contacts determine their forces: determinant and diagonal of J M⁻¹ F.
 
-With friction the matrix is A(σ) = A0 − B diag(σ): A0 = J M⁻¹ Jᵀ is what it is without friction, positive semidefinite,
-column m of B what the friction of contact m adds, σ_m = 1 for the signed law and the sign of f_m for the dissipative
+With friction the matrix is A(σ) = A0 − B diag(σ). A0 = J M⁻¹ Jᵀ, positive semidefinite, is the matrix without friction;
+column m of B is the part of contact m's friction; σ_m is 1 for the signed law and the sign of f_m for the dissipative
 one. The forces are unique for every right-hand side exactly when the determinants of all A(σ) have one sign, which is
 that of A0; docs/physics.md derives it.
 """
@@ -21,7 +21,7 @@ UNIQUE, REVERSED, SEVERAL = 0, 1, 2
 # Blocks of the scratch ``room``, (ROOM, p, p); of SIGNS and FORCES only the first row is used.
 FRICTIONLESS, FRICTION, BASIS, MATRIX, PRODUCT, SIGNS, FORCES = 0, 1, 2, 3, 4, 5, 6
 ROOM = 7
-# A determinant above this fraction of what its terms would allow is positive without a closer look.
+# A determinant above this fraction of the bound by its terms is clearly positive.
 CLEAR = 1e-3
 # A normal mobility below this fraction of that along the force is the square of rounding.
 IMMOBILE = 1e-24

@@ -4,7 +4,7 @@ A driver that limits the current to ±I lets the voltage be no further from the 
 
     |u − K_m v| ≤ R I,  so that  L d|i|/dt ≤ R (I − |i|)
 
-The current comes near to I with the time constant L/R and never passes it.
+A current that starts within ±I thus approaches ±I no faster than with the time constant L/R and never exceeds it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ def dc_command(motor, a, q_ref, v_ref, q, v):
 
 
 def within_current(u, v, k_m, drop):
-    """The voltage u where it drives no more current than the limit [V], also beyond the limit of voltage.
+    """The voltage u, clipped so that it drives no more current than the limit [V]; may exceed the voltage limit.
 
     drop : R I of the limit [V]
     """

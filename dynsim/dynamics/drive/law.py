@@ -1,7 +1,7 @@
 """Drive laws of all motors by kind: references, commands, torques, and linear blocks of implicit methods.
 
-A drive kind is a constant in ``kernels.arrays``, a file of plain functions, a branch in each function below, and a
-line of ``model.arrays.compile_drives``.
+A drive kind is a constant in dynsim.dynamics.tables, a file of plain functions in this package, a branch in each
+function below that looks at the kind, and one in ``dynsim.compile.tables.compile_drives``.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 def clipped(x, limit):
-    """X within ±limit; NaN stays NaN."""
+    """Value x clamped to ±limit, by its real part; NaN stays NaN."""
     if x.real > limit:
         return limit
     if x.real < -limit:

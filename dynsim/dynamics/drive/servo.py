@@ -5,8 +5,8 @@
     i = (u − K_m v) / R                   u within ±U, then i within ±I
     τ = K_m i − τ_c v / √(v² + v_s²)
 
-all at the output shaft; J_m and D_m belong to the joint, as those of a DC motor. Where the current is at its limit the
-terminal voltage is what drives that current, R i + K_m v. Off, the circuit is open, and a drag of the gear is left.
+all at the output shaft; J_m and D_m are counted at the joint, as those of a DC motor. Where the current is at its limit
+the terminal voltage is R i + K_m v. A servo that is off has an open circuit, and only the drag of the gear is left.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""An open torque: the reference is the torque itself.
+"""An ideal torque source: the reference is the torque itself, within its limit.
 
-To the ledger it is an ideal source with K_m = 1 and R = 0: its current is τ, its voltage v, its power τ v.
+In the ledger it is a motor with K_m = 1 and R = 0: its current is τ, its voltage v, its power τ v.
 """
 
 from __future__ import annotations

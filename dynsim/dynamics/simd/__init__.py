@@ -1,1 +1,1 @@
-"""SIMD variants of the derivative: several states at once."""
+"""The right-hand side on SIMD lanes: variants of kernels, tables, and four states at once."""

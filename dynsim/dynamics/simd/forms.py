@@ -1,7 +1,7 @@
-"""Forms for lanes of the kernels that branch on data: selects, or the kernel itself lane by lane.
+"""Variants for SIMD lanes of kernels that branch on data: with selects, or the kernel itself lane by lane.
 
-They stand in for the kernels wherever those are compiled for lanes; numbers never see them. Everything else is the
-kernels' own source.
+The compiler takes them in place of the kernels for arguments with lanes only. All other kernels are compiled for lanes
+from their own source.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from dynsim.jit.simd import every, lanes_of, select
 
 
 def any_lanes(*kinds):
-    """Where any argument has lanes."""
+    """True where any argument has lanes."""
     return lanes_of(*kinds) > 0
 
 

@@ -1,4 +1,4 @@
-"""The right-hand side on lanes: four states and times at once, by the kernels of one."""
+"""The right-hand side on SIMD lanes: ``derivative`` of four states at four times, and its tables."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Trees of bodies: recursive sweeps, articulated inertias, joints, loads."""
+"""Trees of bodies: spatial algebra, joints, recursive sweeps, the articulated solve, loads, ground reactions."""

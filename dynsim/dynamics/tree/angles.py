@@ -1,4 +1,4 @@
-"""Sines and cosines of joint angles, with the reduction of the angle."""
+"""Sines and cosines of joint angles by range reduction and polynomials, without calls or branches."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""The O(n) solve: articulated-body elimination with several right-hand sides (M is never formed).
+"""The articulated solver: O(n) elimination for accelerations and the matrix of constraint rows; M is never formed.
 
-Eliminating the joints from the tips to the root factors M + J_m. For a right-hand side b let column(b) be what is left
-at each joint after the elimination; then a·(M + J_m)⁻¹ b = Σ_i column(a)_i column(b)_i / D_i. So the p×p matrix of the
+Eliminating the joints from the tips to the root factors M + J_m; D_i is the pivot of joint i. For a right-hand side b
+let column(b) be the eliminated b; then a·(M + J_m)⁻¹ b = Σ_i column(a)_i column(b)_i / D_i. So the p×p matrix of the
 constraints needs only dot products of columns, and one forward sweep gives vdot.
 """
 

@@ -1,4 +1,4 @@
-"""Joints with several rates (ball, rolling base, wheeled base): coordinates and transforms, row by row.
+"""Rows of joints with several rates (ball, rolling base, wheeled base): axes, poses, coordinates, and q̇ = N(q) v.
 
 Every joint is a sequence of one-velocity rows. A row is a link of the tree with a motion axis S and one velocity; all
 rows of a joint but the last are massless. The axes of a joint with several rows are fixed in the body that it carries,

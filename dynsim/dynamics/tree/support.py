@@ -1,9 +1,9 @@
-"""Ground reactions of a mobile base: wheel and caster loads, centre of pressure, distance from tipping.
+"""Ground reactions of a mobile base: wheel and caster loads, centre of pressure, tip margin, traction.
 
 The base stands on the contact points of its left wheel l = (0, T/2), its right wheel r = (0, −T/2) and its caster
 c = (c_x, c_y), in the plane z = 0 of its frame, whose z is the normal of the ground. Three normal forces N balance the
-force along z and the moments about x and y, so they are determined; side slip and rolling take their forces along y and
-x there. The loads are those of a base that is held down: N < 0 pulls.
+force along z and the moments about x and y, so they are determined; the constraints against side slip and of rolling
+give the forces along y and x. The base is assumed to stay on the ground: N < 0 is a pull.
 """
 
 from __future__ import annotations

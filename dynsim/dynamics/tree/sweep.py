@@ -1,4 +1,4 @@
-"""Recursive Newton–Euler: kinematics, inverse dynamics, bias forces, and the mass matrix by unit accelerations."""
+"""Recursive Newton–Euler sweeps: kinematics, inverse dynamics, bias forces, and the mass matrix."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The two clocks of a replay: wall time for real ports, virtual time for servos in memory."""
+"""Clocks of a replay: their interface, wall time for serial ports, virtual time for servos in memory."""
 
 from __future__ import annotations
 

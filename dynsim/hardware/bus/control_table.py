@@ -1,8 +1,8 @@
-"""Control tables of MX(2.0), XL430, XM430 and XH540 servos, Protocol 2.0, as data.
+"""Control tables and specifications of MX(2.0), XL430, XM430 and XH540 servos, Protocol 2.0, as data.
 
 Source: ROBOTIS e-Manual, the page of each model, chapters Specifications and Control Table. Limits stored in a servo
-changed between firmware versions: the replay reads them from the servo and never assumes the defaults given here,
-which only fill the virtual servos.
+changed between firmware versions: the replay reads them from the servo; the defaults given here only fill the virtual
+servos.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ RETURN_DELAY_SECONDS_PER_UNIT = 2e-6
 BROADCAST_ID = 254
 MAX_ID = 252
 EEPROM_END = 64
-"""What stands at lower addresses is kept without power."""
+"""Registers at lower addresses keep their values without power."""
 
 BAUD_RATES = (9_600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)
 """Bits per second by the code stored at address 8. The Python client library refuses 4.5 Mbit/s."""

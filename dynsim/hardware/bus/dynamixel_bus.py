@@ -1,19 +1,19 @@
 """Dynamixel servos through the unmodified client library (dynamixel-sdk 4.1.0), on real and virtual ports alike.
 
-What the library does not survive, and what is done about it here (tests/hardware/test_sdk_defects.py holds a canary for
-each: when one fails, the library was mended and the detour can go):
+Defects of the library, and their workarounds here (tests/hardware/test_sdk_defects.py has a test for each defect: when
+one fails, the library was repaired and the workaround can be removed):
 
-- A read that is interrupted leaves ``port.is_using`` set, and every later write is dropped: it is cleared before each
-  transaction, and signals only set a flag.
-- One lost status costs a time-out and hides all servos behind it: the sync read takes the bytes itself, decodes all
-  that come, and keys them by ID. The library's receive loop would also swallow the status after a cut one.
+- An interrupted read leaves ``port.is_using`` set, and every later write is dropped: the flag is cleared before each
+  transaction, and signal handlers only set a flag of their own.
+- One lost status packet costs a time-out and the answers of all later servos: the sync read here takes the bytes
+  itself, decodes all packets, and assigns them by ID. The library also drops the packet after a truncated one.
 - Group reads drop the error byte: the decoder keeps it.
 - Byte stuffing of requests is lost, some stuffed answers are mangled: a request whose body holds FF FF FD is rejected
   here, answers of a wrong length count as garbled, and Fast Sync Read is never used.
-- Its single read takes any status of the servo for the answer, whatever its length: it is received here too.
-- ``getData`` knows no negative numbers: fields decode themselves.
+- Its single read accepts any status of the servo as the answer, whatever its length: it is received here too.
+- ``getData`` returns no negative numbers: fields are decoded here.
 - A dead port raises termios.error or OSError beside SerialException; a stalled one blocks: all become PortError, and
-  writes wait here. pyserial's write with a time-out counts the time in which this very process was stopped.
+  writes wait here. pyserial's write time-out also counts time in which this process was suspended.
 """
 
 from __future__ import annotations

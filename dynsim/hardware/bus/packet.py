@@ -1,4 +1,4 @@
-"""Dynamixel Protocol 2.0 packets: checksum, byte stuffing, and a decoder that finds its way back after garbage.
+"""Dynamixel Protocol 2.0 packets: checksum, byte stuffing, encoder, and a decoder that resynchronises after noise.
 
 FF FF FD 00 | ID | length (2) | instruction | parameters | CRC-16 (2), the length counting instruction, parameters and
 checksum. Wherever FF FF FD turns up between the length and the checksum the sender inserts another FD.
@@ -19,7 +19,7 @@ from dynsim.hardware.bus.control_table import BROADCAST_ID
 HEADER = b"\xff\xff\xfd"
 STATUS = 0x55
 MAX_LENGTH = 1024
-"""Longest length field taken for real; a longer one is noise."""
+"""Largest length field that is accepted; a larger one is noise."""
 
 
 class Instruction(IntEnum):

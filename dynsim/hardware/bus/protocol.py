@@ -25,7 +25,7 @@ class ServoReply(NamedTuple):
 
 @dataclass(frozen=True)
 class BlockRead:
-    """What one sync read brought in.
+    """Result of one sync read.
 
     Attributes
     ----------

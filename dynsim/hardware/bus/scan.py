@@ -13,7 +13,7 @@ from dynsim.hardware.posix import TerminalError
 
 SCAN_BAUD_RATES = (57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000)
 STOP_BAUD_RATES = (3_000_000, 1_000_000, 57_600, 115_200, 2_000_000, 4_000_000)
-"""Those in use come first."""
+"""The most common rates come first."""
 
 
 SHOWN = (

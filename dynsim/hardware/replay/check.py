@@ -1,7 +1,7 @@
 """The offline check of a motion before it is sent: limits of joints and servos at the given speed and rate.
 
-Every interval between samples is examined for the extremes of its interpolant. Nothing is ever clamped: a motion
-outside of the limits is refused as a whole, before a port is opened.
+Every interval between samples is examined for the extremes of its interpolant. Nothing is clamped: a motion beyond a
+limit is refused as a whole, before a port is opened. Also here: the plan of a cycle of the bus.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ TURNAROUND = 50e-6
 USB_TRANSACTION = 1e-3
 """Planned cost of waiting for an answer through a USB adapter with its latency timer at 1 ms [s]."""
 WATCHDOG_CYCLES = 3
-"""The servos' watchdogs must outlast so many cycles."""
+"""Least time of the servos' watchdogs, in cycles."""
 BUS_SHARE = 0.97
-"""Largest part of the period the bus may be busy."""
+"""Largest part of the period in which the bus may be busy."""
 
 Quantity = Literal["position", "velocity", "acceleration", "jerk", "shaking", "torque"]
 UNITS: dict[Quantity, str] = {

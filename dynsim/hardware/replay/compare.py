@@ -1,4 +1,4 @@
-"""Comparison of a measured run with the simulated one: delay, and error with and without it, per joint."""
+"""Comparison of a measured run with the simulated one, per joint: delay, errors with and without it, gate, figure."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from dynsim.snake.lifting import Lifts, lifted
 
 Array = NDArray[np.float64]
 MAX_DELAY = 0.5
-"""Longest delay looked for [s]."""
+"""Largest delay that is considered [s]."""
 MOVING = 3 * RAD_PER_TICK
-"""A joint that moves less than this [rad], three steps of a servo's encoder, says nothing about delay."""
+"""The delay is not determined from a joint that moves less than this [rad], three steps of a servo's encoder."""
 WHEEL_ANGLE, WHEEL_RATE = "rho", "rho_dot"
-"""Signals of what turns on and on: where it stands says nothing, how far it has turned and how fast it turns does."""
+"""Signals of wheels, which turn without end: compared are angles turned since the start and rates, not positions."""
 
 
 class Gate(StrictConfig):
-    """What a comparison must not exceed.
+    """Largest errors that a comparison may have.
 
     Attributes
     ----------

@@ -15,7 +15,7 @@ from dynsim.hardware.replay.states import ReplayProgress
 DRAWING_INTERVAL = 0.1
 """Between two drawings [s]."""
 PATIENCE = 1.0
-"""Longest wait for a terminal that is held, after the run [s]."""
+"""Longest wait for a terminal that accepts no output, after the run [s]."""
 
 
 class Display:

@@ -1,13 +1,13 @@
 """Live drive of servos: postures of a running simulation are checked and followed as they arrive.
 
-The servos stay behind the simulation by at least half of ``safety.stop_time``: so much of the path ahead of the last
-goal is known and checked at every moment that a stop along it, in that time, ends before the path does. With b the path
-that is known ahead [s], T the stop time and h the period, a cycle goes on by s h, where s is the largest speed with
+The servos stay behind the simulation by at least half of ``safety.stop_time``. So enough of the path ahead of the last
+goal is known and checked that the servos can stop along it within that time. With b the length of known path ahead [s],
+T the stop time and h the period, a cycle advances by s h along the path, where s is the largest speed with
 
     s² T/2 ≤ b − s h,     s ≤ 1,     s ≤ s_before + h/T
 
-A simulation that is late so slows the robot down along its path, to rest where the path ends, and it speeds up again as
-slowly. Nothing is ever made up for: the simulation waits for the servos (:meth:`Feed.tell`), not they for it.
+So a simulation that is late slows the robot down along its path, to rest where the path ends; the robot speeds up again
+at the same rate. Lost time is not made up for: the simulation waits for the servos (:meth:`Feed.tell`).
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from dynsim.hardware.servo_map import ServoMap
 from dynsim.record.scene import Scene
 
 SLACK = 0.1
-"""By so much more than the way to a stop the simulation may be ahead of the servos [s]."""
+"""Largest lead of the simulation over the servos, beyond the path that a stop takes [s]."""
 SILENCE = 5.0
-"""After so long without a posture the drive is over [s]; the robot has been at rest for most of it."""
+"""Time without a posture after which the drive ends [s]; the robot is at rest for most of it."""
 MOST_BROKEN = 4
 """Violations that a fault names."""
 REST = 1e-9
-"""Closer to its end [s] a path is over."""
+"""A path whose end is closer than this [s] is finished."""
 
 
 class Feed(Protocol):

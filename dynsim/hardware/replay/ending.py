@@ -1,7 +1,7 @@
-"""End of a replay: the robot at rest with torque on, or torque off; after a fault nothing else is sent.
+"""End of a replay: stops the robot and leaves torque on, or switches torque off, then reads the state of the servos.
 
-Nothing here writes to a log, a terminal or a file; nothing that goes wrong on the way keeps the rest from being done,
-and what the servos do in the end is read from them.
+After a fault nothing is sent beyond what the fault policy needs. Nothing here writes to a log, a terminal or a file. A
+step that fails does not prevent the next ones.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ REST_TIME = 1.0
 """Longest wait for the servos to stand still, and for silent ones to come back (a restart takes 0.3 s) [s]."""
 REST_CYCLES = 10
 AT_REST = 0.1
-"""Slower joints and wheels stand still [rad/s]; a few units of the velocity register."""
+"""Joints and wheels slower than this are at rest [rad/s]; a few units of the velocity register."""
 READS = 3
-"""Times a servo is asked before it counts as silent."""
+"""Reads after which a servo that has not answered counts as silent."""
 
 
 class Ending:

@@ -1,8 +1,8 @@
 """A servo path that grows knot by knot; each knot must keep the motion limits before it is sent to servos.
 
-The limits are those of the offline check of a record, by the same function (``MotionLimits.margins``).
-There every interval is checked; here only the newest one, and the time windows of jerk and shaking that end after the
-knot before it. The check is skipped where cheap bounds show that no limit is broken. Old knots are dropped.
+Limits and their function (``MotionLimits.margins``) are those of the offline check of a record. There every interval is
+checked; here only the newest one, and the time windows of jerk and shaking that end after the knot before it. The check
+is skipped where simple bounds show that no limit is exceeded. Old knots are dropped.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Lifted wheel pairs in a live drive: postures wait until the extra joint angles of a lift are known.
 
 The height of a pair at a time t depends on when it is put down only where that is within ``lifts.blend_s``
-(:mod:`dynsim.snake.lifting`). So the posture of t is whole as soon as it is known which pairs are on the
-ground until t + blend_s. The rate of what is added is a central difference, for which the posture after it is folded
-first. What leaves here is what the replay of the finished record makes of it, by the same functions.
+(:mod:`dynsim.snake.lifting`). So the posture of t is complete once it is known which pairs are on the ground until
+t + blend_s. The rates of the added angles are central differences, so they need the angles of the next posture too. The
+results equal those of a replay of the finished record, which uses the same functions.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The control loop of a replay: at each deadline it writes goals, reads states, records and checks them.
 
-Cycles start at absolute deadlines; one that is more than a period late is skipped, never made up for: the path waits.
+Cycles start at absolute deadlines. A cycle that is more than a period late is skipped; the path waits meanwhile.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from dynsim.hardware.servo_map import MappedServo, ServoMap
 Array = NDArray[np.float64]
 
 FIELDS = MX_106.fields
-"""Items the two models share have the same address in both."""
+"""Registers that all models share have the same address in all of them."""
 STATE = struct.Struct("<hii")
 """Effort, velocity and position in a block of :data:`~dynsim.hardware.bus.control_table.STATE_BLOCK`."""
 

@@ -1,8 +1,8 @@
-"""The replay: a checked motion on a bus of servos.
+"""State machine of a replay: a checked motion carried out by the servos of a bus.
 
-CONNECT → VERIFY → ARM → MOVE_TO_START → SETTLE → REPLAY → SETTLE → DISARM, and from everywhere → FAULT. The offline
-check (:mod:`dynsim.hardware.replay.check`) has been passed before. After a fault nothing is sent but what the fault
-policy says.
+CONNECT → VERIFY → ARM → MOVE_TO_START → SETTLE → REPLAY → SETTLE → DISARM, and from each state → FAULT. A motion must
+have passed the offline check (:mod:`dynsim.hardware.replay.check`). After a fault only the commands of the fault policy
+are sent.
 """
 
 from __future__ import annotations

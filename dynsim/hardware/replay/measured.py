@@ -1,6 +1,6 @@
-"""The measured record of a replay, also of one that died before its end.
+"""The measured record of a replay, also of one whose process died before its end.
 
-Its scene, poses and events are those of the record that was followed, with joints where the servos were measured.
+Scene and events are those of the record that was followed; body poses follow from the measured joint angles.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ END_STATE = "not known: the program died"
 
 
 def timing_of(rows: Rows, layout: Layout) -> TimingStatistics | None:
-    """None before the second cycle."""
+    """Timing statistics of the recorded cycles; None before the second cycle."""
     if len(rows) < 2:
         return None
     path_time = rows["path_time"]

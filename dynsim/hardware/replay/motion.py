@@ -1,4 +1,4 @@
-"""Motions for servos: a posture for every time, and the progress of the loop along it."""
+"""Motions for servos: postures as functions of time, advance of the loop along them, and demands on the servos."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 QUINTIC_PEAK = 1.875
-"""Top speed of :func:`quintic`, times its duration."""
+"""Largest rate of :func:`quintic`, times its duration."""
 
 
 class Motion(Protocol):
-    """Something to follow, over its own time."""
+    """A posture as a function of the motion's own time."""
 
     def at(self, time: float) -> tuple[Array, Array]:
         """Joint angles [rad] and their derivatives with respect to ``time``, shape (N,)."""
@@ -28,7 +28,7 @@ class Motion(Protocol):
 
 
 class GoalCourse(Motion, Protocol):
-    """How the loop goes along a motion: a period further from goal to goal, whatever the clock says.
+    """Advance of the loop along a motion: one period from goal to goal, whatever the clock reads.
 
     Attributes
     ----------

@@ -1,7 +1,7 @@
 """Outputs of a running replay: log file (``tail -f``), recorded cycles, progress.
 
-What is told is kept in memory by the loop, which waits for nobody; a thread takes it from there to a file or a display.
-A disk that is full or slow, a terminal that is held: neither touches the loop.
+The loop keeps its outputs in memory and never waits; a thread writes them to files or a display. So a disk that is full
+or slow, or a terminal that accepts no output, does not delay the loop.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from dynsim.system.files import INCOMPLETE, lock
 from dynsim.system.terminal import plain
 
 INTERVAL = 0.5
-"""Between two writes of what has come since [s]: a process that is killed loses no more than this."""
+"""Between two writes [s]: a process that is killed loses the outputs of about this time."""
 PATIENCE = 5.0
 """Longest wait for a file or display that does not come back, after the run [s]."""
 LOG_INTERVAL = 1.0

@@ -1,8 +1,8 @@
 """The abort rules: conditions on the answers of one cycle under which a replay stops.
 
-Every rule has a bound on its reaction, in cycles from the first cycle in which the trouble can be seen on the wire to
-the cycle in which the fault is declared: those of the map's ``safety``, one for an alert, and of what only health reads
-show as many as it takes to read the health of all servos in turn.
+Every rule has a bound on its reaction: the number of cycles from the first one whose answers show the trouble to the
+one in which the fault is declared. The bounds are those of the map's ``safety``; one cycle for an alert; for troubles
+that only health reads show, the cycles in which the health of all servos is read in turn.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A replay session, from opening the port to the files it writes."""
+"""A replay session: opens the port, runs the replay, writes its files, and raises its failures as exceptions."""
 
 from __future__ import annotations
 

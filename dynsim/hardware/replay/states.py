@@ -1,4 +1,4 @@
-"""Types of a replay: its states, progress, stop request, and result."""
+"""Types of a replay: states, stop request and its signal handlers, progress, timing statistics, result."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Trajectory of servo goals from a record: continuous in time, at rest at both ends.
 
-Between the samples of a record joint angles are the cubic Hermite interpolant of (q, v), or straight where the record's
-rates are held from sample to sample (a sampled controller). Where the record begins or ends in motion, a stretch of
+Between the samples of a record joint angles are the cubic Hermite interpolant of (q, v), or linear where the record's
+rates are held from sample to sample (a sampled controller). Where the record begins or ends in motion, an interval of
 constant acceleration is added (a parabola, which the same interpolant represents exactly), so that the robot starts and
 ends at rest without a jump in velocity.
 """
@@ -25,14 +25,14 @@ from dynsim.snake.lifting import grounded_pairs, lifted
 REST = 1e-6
 """Joint speed [rad/s] below which a record counts as at rest."""
 HOLE, LONG = 2.5, 1.5
-"""Steps of so many times the median step: a motion that is not known in between. Of so many times the step that a tenth
-of all steps does not exceed: samples missing. The median itself is a long one where every third sample is missing."""
+"""A step of more than HOLE times the median step is a gap in which the motion is not known. A step of more than LONG
+times the 10 % quantile of all steps lacks samples; the median may itself be such a step."""
 COMMON = 0.1
 JERK_WINDOW = 0.1
-"""Over which the change of acceleration is averaged [s]: twice the lag of these servos (43.5 ms). A single jump in the
-velocity of a record is a knock, and bounded by the acceleration; jumps one after the other wear the gears."""
+"""Time over which the change of acceleration is averaged [s]: twice the lag of these servos (43.5 ms). A single jump in
+the velocity of a record is bounded by the limit on acceleration; repeated jumps wear the gears."""
 GROUNDED = "grounded"
-"""Where dynsim's own records say which wheel pairs are on the ground; looked at when the map has no ``lifts``."""
+"""Signal of dynsim's records with the wheel pairs on the ground; read where the map has no ``lifts``."""
 SHAKING_WINDOW = 0.3
 """In which velocity that is gained and lost again counts as shaking [s]."""
 

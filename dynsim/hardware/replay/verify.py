@@ -1,8 +1,7 @@
-"""Verification before torque on: servos match the map, are set up, healthy, and near the start posture.
+"""Verification before torque on: servos match the map, are configured, healthy, and near the start posture.
 
-What limits a servo has stored itself is shown beside those of the map: they act where this program does not reach. The
-servo ignores goals beyond them without a word, and goes limp at its own thresholds. A difference that makes the map
-untrue keeps the robot from being armed.
+Limits stored in a servo are shown beside those of the map: the servo ignores goals beyond them without an answer, and
+switches torque off at its own thresholds. A difference that contradicts the map prevents arming.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ from dynsim.hardware.servo_map import MappedServo, ServoMap
 EEPROM_BLOCK = (0, 64)
 TRIAL_READS = 10
 TRIAL_MISSES = 2
-"""Of ten trial reads a servo may miss so many."""
+"""Largest number of TRIAL_READS that a servo may miss."""
 NEEDED_SHUTDOWN = 0b0010_0100  # overheating, overload
 STATUS_TO_ALL = 2
 ACKNOWLEDGE = (

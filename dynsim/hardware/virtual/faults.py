@@ -1,4 +1,4 @@
-"""Fault scripts of the virtual bus: which fault, at which servo, when, how often; reproducible by seed."""
+"""Fault scripts of virtual servos: kind, servo, time and probability of each fault; reproducible by seed."""
 
 from __future__ import annotations
 

@@ -12,19 +12,19 @@ from dynsim.hardware.virtual.servos import Hearing, VirtualServos
 CLEAR_TURNS = b"\x01\x44\x58\x4c\x22"
 RESET_ALL = 0xFF
 KEPT_BY_RESET: dict[int, tuple[str, ...]] = {RESET_ALL: (), 0x01: ("id",), 0x02: ("id", "baud")}
-"""Registers that a factory reset leaves alone, by its parameter."""
+"""Registers that a factory reset does not change, by its parameter."""
 
 SHADOWED = (Instruction.WRITE, Instruction.REG_WRITE)
-"""What a servo does without an answer when it is sent to its secondary ID, in RAM."""
+"""Instructions that a servo carries out without an answer when they are sent to its secondary ID, in RAM."""
 
 
 class Answer(NamedTuple):
-    """What is put on the line at one time.
+    """A frame that one or several servos send at one time.
 
     Attributes
     ----------
     servos : tuple of int
-        Who speaks, by the IDs they had at first; more than one when they share an ID.
+        The servos that send, by the IDs they had at first; more than one when they share an ID.
     frame : bytes
     chained : bool
         It follows on the answer before without a pause.

@@ -11,7 +11,7 @@ from dynsim.hardware.virtual.servos import OVERHEATING, OVERLOAD, VirtualServos
 
 
 class Injection:
-    """Carries out what a fault script says beyond what the servos' own physics knows of it.
+    """Applies the faults of a script that the model of the servos does not include.
 
     Attributes
     ----------

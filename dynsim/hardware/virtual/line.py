@@ -1,4 +1,4 @@
-"""A virtual half-duplex line: bytes in, bytes out with their arrival times.
+"""A virtual half-duplex line with servos: takes the bytes of requests, returns those of answers with arrival times.
 
 :class:`dynsim.hardware.virtual.port.VirtualPort` puts a line under the client library on a virtual clock,
 :mod:`dynsim.hardware.virtual.pseudo_terminal` behind a serial device.

@@ -15,7 +15,7 @@ from dynsim.hardware.virtual.line import VirtualLine
 class VirtualPort(PortHandler):
     """The client library's port on a :class:`VirtualLine` and a clock that begins at 0.
 
-    On a virtual clock nothing here waits: reading with nothing to read lets time pass until the next byte or the
+    On a virtual clock nothing here waits: a read without waiting bytes advances the clock to the next byte or the
     time-out.
     """
 

@@ -1,4 +1,4 @@
-"""Virtual servos behind a pseudo-terminal: a serial device any Dynamixel tool can open."""
+"""Virtual servos behind a pseudo-terminal, which programs open as a serial device."""
 
 from __future__ import annotations
 
@@ -19,14 +19,15 @@ _BAUD_BY_CODE = {
     getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()
 }
 _TCGETS2 = 0x802C542A
-"""Asks Linux for the settings of a terminal with its bit rate as a number: clients set rates that have no code."""
+"""Linux request for the settings of a terminal with the bit rate as a number: clients set rates that have no code."""
 _OUTPUT_SPEED = slice(40, 44)
 IDLE = 1e-3
-"""Longest wait for bytes before the servos move on [s]; short, for a request to find little motion to catch up with."""
+"""Longest wait for bytes before the motion of the servos is computed further [s]; short, so that a request needs little
+of it."""
 
 
 STALL = 10e-3
-"""Of a longer pause of this process the servos notice so much [s]."""
+"""Longest pause of this process that the servos take into account; of longer ones this part [s]."""
 
 
 class PseudoTerminal:

@@ -33,7 +33,7 @@ class ServoRegisters:
         self.model = model
         self._table = bytearray(TABLE_SIZE)
         self._field_at = {field.address: name for name, field in model.fields.items()}
-        # Each read of a state asks for a dozen registers: their places are looked up once.
+        # Each read of a state needs a dozen registers: their addresses are looked up once.
         self._places = {
             name: (slice(field.address, field.address + field.size), field.size, field.signed)
             for name, field in model.fields.items()

@@ -1,4 +1,4 @@
-"""Mechanics moved by virtual servos: the motor law, and the interface of plants behind it.
+"""Mechanics of virtual servos: motor law, interface of the plants that servos move, and a plant of inertias.
 
 The position loop of an MX servo is (by default) proportional, and the motor brakes itself through its back-EMF:
 
@@ -33,7 +33,7 @@ FREE_DAMPING = 0.1
 
 @dataclass
 class Drive:
-    """What the servos' controllers ask of their motors; all arrays of shape (N,), in servo angles.
+    """Set points of the servos' controllers for their motors; all arrays of shape (N,), in servo angles.
 
     Attributes
     ----------

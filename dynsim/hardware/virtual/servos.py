@@ -25,14 +25,14 @@ from dynsim.hardware.virtual.registers import ServoRegisters
 from dynsim.hardware.virtual.servo_plant import Drive, InertialLoad, ServoPlant
 
 PROTOCOL = 2
-"""That of the line. A servo in which another one is set is silent for good, as nobody speaks it."""
+"""Protocol of the line. A servo set to another one never answers."""
 PHYSICS_STEP = 2e-3
 COMMUNICATION_END = 14
-"""IDs, bit rate and protocol stand at lower addresses."""
+"""Settings of communication (IDs, bit rate, protocol) have lower addresses than this."""
 GOALS = range(100, 120)
 """Addresses of goals and profile: a write to nothing else changes neither torque nor mode."""
 TRAJECTORY = 136, 144
-"""Where the profile's own speed and position stand; kept up to date only for those who read them."""
+"""Addresses of the profile's speed and position, which are updated only when they are read."""
 STATE = range(124, 136)
 """Addresses of load, speed and position, which are read in each cycle, without voltage, temperature and clock."""
 BOOT_TIME = 0.3

@@ -4,8 +4,8 @@ A :class:`dynsim.Simulation` moves it: the scenario's robot, with servos of the 
 those of the engine under the unilateral law, whatever law the scenario has: a real floor does not pull. The integrator
 is time stepping where the scenario has that, and for a snake, which stands on its wheels; else the one of events.
 
-What servos tell of a posture is rounded to ticks, so that a braced elbow may seem to be some tenths of a millimetre
-below its floor, or a joint beyond its stop. The arm then starts at the nearest posture that is possible.
+The angles that servos report are rounded to ticks, so a braced elbow may appear some tenths of a millimetre below its
+floor, or a joint beyond its stop. The arm then starts at the nearest admissible posture.
 """
 
 from __future__ import annotations

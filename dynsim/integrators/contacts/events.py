@@ -1,11 +1,11 @@
-"""Events of the unilateral law (landing, lift-off, slip, joint stops) and the mode changes they cause.
+"""Events of the unilateral law (contacts, joint stops, dry friction): guards, mode changes and log.
 
-Each candidate has two guards, each stop and each joint with dry friction one. Off its surface the guard is the gap,
-closed it is the normal force; of a point that sticks the second guard is its margin μ_s f_n − |f_t|, of one that slides
-its speed along the direction that it began the step with; of joints that rub likewise. All of them fall through zero.
+Each candidate has two guards; each stop and each joint with dry friction has one. The first guard of a candidate is its
+gap if open, its normal force if closed. The second is the margin μ_s f_n − |f_t| if it sticks; if it slides, its speed
+along the slip direction at the start of the step. Guards of joints are alike. An event is a fall through zero.
 
-Lift-off and the begin of slip leave forces as they are, so that the one candidate is switched by hand: its
-complementarity problem is degenerate there. Everything else, and whatever this leaves inconsistent, is solved anew.
+Forces are continuous at lift-off and at the start of slip, where the complementarity problem is degenerate: the mode of
+that one candidate is set directly. After all other events, and where that is inconsistent, all modes are solved for.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ NORMAL_GUARD, SLIP_GUARD, STOP_GUARD, DRY_GUARD = 10, 11, 12, 13
 LANDING, LIFT_OFF, SLIP_START, SLIP_STOP, BOUNCE, CHATTERS, STOP_HIT, STOP_LEFT = 0, 1, 2, 3, 4, 5, 6, 7
 LOG_KINDS = 8
 
-# Run.gaps: what a candidate was like at the start of the step.
+# Run.gaps: gap, its rate, normal and position of a candidate at the start of the step.
 GAP_THEN, RATE_THEN, NORMAL_THEN, POSITION_THEN = 0, 1, 2, 5
 
 # A candidate that starts, or comes to rest, this close to its surface touches it [m].

@@ -1,6 +1,6 @@
-"""Impacts: closing contacts are projected onto their surfaces, and impulses stop their approach.
+"""Impacts: touching contacts are projected onto their surfaces, and impulses stop or reverse their approach.
 
-Moreau's law with Newton's restitution and Coulomb's cone on impulses, for everything that touches at once.
+Moreau's law with Newton's restitution and Coulomb's cone on impulses, for all contacts and stops that touch, at once.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from dynsim.integrators.project import project_level
 from dynsim.integrators.run import Run
 from dynsim.jit.kernel import internal_kernel
 
-# A point that approaches faster than this many tolerances of projected rates strikes.
+# An approach faster than this many times the projection tolerance of rates is an impact.
 STRIKE = 3.0
-# Impacts at one instant, of which each is the cause of the next, before restitution is none.
+# Successive impacts at one instant after which restitution is zero.
 MOST_BOUNCES = 30.0
 # Starts of an impact problem with restitution, which has no solution where that contradicts friction.
 BOUNCE_STARTS = 40

@@ -1,14 +1,14 @@
 """Contact modes (open, sliding, sticking) from impacts and the complementarity problem of accelerations.
 
-At a start, a landing and the end of slip, forces may jump and all that touches is looked at anew. First what
-approaches is stopped by impulses (Moreau's law with Newton's restitution and Coulomb's cone on impulses); then
+Forces may jump at a start, a landing and the end of slip, so the modes of all that touches are chosen anew. First
+impulses stop what approaches (:mod:`dynsim.integrators.contacts.impacts`); then
 
     0 ≤ f_n ⟂ n·r̈ ≥ 0,   |f_t| ≤ μ_s f_n, and f_t = −μ_s f_n a_t/|a_t| where a_t ≠ 0
 
-is solved for what is at rest along its surface, with one unknown, f_n (n − μ t), for each point that slides already.
-The solution says which points leave, which stick, and where slip begins, in which direction.
+is solved for the points at rest along their surfaces; points that slide already have the force f_n (n − μ t) with the
+one unknown f_n. The solution tells which points lift off, which stick, and which begin to slip in which direction.
 
-Long because: impacts and the choice of modes share the rows, the system and the scratch of one gathered problem.
+Long because: the steps of the choice share the rows, the system and the scratch of one gathered problem.
 """
 
 from __future__ import annotations

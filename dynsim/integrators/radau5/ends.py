@@ -1,6 +1,6 @@
 """End of a RADAU5 step: derivative, constraint and uniqueness checks, and samples on lanes.
 
-RADAU5 evaluates it on lanes, together with samples of the steps before: four states take no longer than one alone.
+The end is evaluated on SIMD lanes with waiting samples of earlier steps: four states cost about as much as one.
 """
 
 from __future__ import annotations

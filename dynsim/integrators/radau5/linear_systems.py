@@ -1,8 +1,9 @@
 """Linear systems of RADAU5's Newton method, reduced to the rates: one real and one complex, solved together.
 
-(g I − J) u = r with g = γ/h and with g = (α + iβ)/h, see dynsim.integrators.radau5.step. As Python they are two, by
-numpy. Compiled they are lanes of one: the real number, then real and imaginary part. To multiply by a complex number
-is then x ∘ (p, m) = p x + m x', x' with those two parts exchanged; the inverse matrices are such pairs.
+(g I − J) u = r with g = γ/h and with g = (α + iβ)/h, see dynsim.integrators.radau5.step. In Python numpy solves the two
+one after the other. Compiled code solves them at once on SIMD lanes: lane 0 is the real system, lanes 1 and 2 are real
+and imaginary part of the complex one. A factor is then a pair (p, m): x ∘ (p, m) = p x + m x', where x' is x with lanes
+1 and 2 exchanged; the inverse matrices consist of such pairs.
 """
 
 from __future__ import annotations

@@ -1,17 +1,17 @@
 """RADAU5, Radau IIA of order 5 with three stages: one step by simplified Newton, circuits and positions eliminated.
 
 Stages Z_i = h Σ a_ij f(t + c_j h, y + Z_j), and y_new = y + Z_3 (Hairer, Wanner: Solving Ordinary Differential
-Equations II, IV.8). With W = T⁻¹ Z the linear systems of Newton's method fall apart into a real one and a complex one
-of the size of the state, g I − J with g = γ/h or (α + iβ)/h, and these into ones of the size of the rates. Of
+Equations II, IV.8). With W = T⁻¹ Z the linear systems of Newton's method decouple into a real and a complex one of the
+size of the state, g I − J with g = γ/h or (α + iβ)/h, and each of these reduces to one of the size of the rates. Of
 
     q̇ = N v,    v̇ = f(q, v, i),    di/dt = a q + b v + c i + …
 
-the first and the last rows are solved by hand, u_q = (r_q + N u_v)/g and u_i = (r_i + a u_q + b u_v)/(g − c), so
+the first and the last rows are eliminated, u_q = (r_q + N u_v)/g and u_i = (r_i + a u_q + b u_v)/(g − c), so
 
     (g − ∂f/∂v − ∂f/∂θ/g − ∂f/∂i (a/g + b)/(g − c)) u_v = r_v + ∂f/∂θ N⁺ r_q/g + ∂f/∂i (r_i + a r_q/g)/(g − c),
 
-θ being displacements along the rates. The change of N along q is left out of the Jacobian, which costs Newton's method
-some contraction where a body tumbles, not accuracy. Jacobian and factors are kept for as long as it contracts.
+θ being displacements along the rates. The Jacobian neglects the change of N with q: where bodies rotate in space
+Newton's method converges more slowly, to the same solution. Jacobian and factors are kept as long as it converges.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""RADAU5 coefficients, and the data kept from step to step: Jacobian, factors, stages."""
+"""Coefficients of RADAU5, and the data that it keeps from step to step: Jacobian, factors, stages, counters."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Time stepping: contacts and limits of drives within fixed steps."""
+"""Time stepping with fixed steps: contacts, compliant rows, drives, ledger and discretisation energy."""

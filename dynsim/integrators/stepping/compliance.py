@@ -8,12 +8,13 @@ With K = φ h k + c its impulse p = h f makes a row of the contact problem with 
 
     u' + a + ε p = 0,    ε = 1/(h φ K),    a = (k x + (1 − φ) K u)/(φ K)
 
-φ is θ of the step as long as that resolves the spring, z = h² k w ≤ 1 with the row's mobility w. With φ = ½ what is
-stiffer would swing with the factor −1, and throw off what lands: 1 − φ falls with 1/z, and to K comes a damping that
-grows to 2 h k, whose work is the scheme's. Its limit is a rigid row that is brought back by half of its depth a step.
+φ is the θ of the step if the step resolves the spring, z = h² k w ≤ 1 with the mobility w of the row. For a stiffer
+spring φ = ½ would give an oscillation with the factor −1 per step and throw landing bodies off. There 1 − φ falls with
+1/z, and K gets an additional damping that grows to 2 h k; its work counts as discretisation energy. In the limit the
+row is rigid, and half of its depth is removed in each step.
 
-What a spring has stored is integrated with the state, and so is what dampers take. Beyond its bound a tie gives: its
-rest moves, so that its spring stays at the bound.
+The energy stored in springs and the loss in dampers are integrated with the state. A tie yields at its bound: its rest
+position moves, so that the spring force stays at the bound.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ from dynsim.jit.kernel import internal_kernel
 
 # A force is at its bound when less than this share of it is missing.
 AT_BOUND = 1e-12
-# Time in which what steps do not resolve comes back, in steps.
+# Time in which unresolved springs return to their rest, in steps.
 RETURN_STEPS = 2.0
 # ε of the tangents of a contact that gives way, in mobilities of theirs: a spring 1/(h² ε) that no step resolves, some
 # 1e9 N/m where it holds a kilogram.

@@ -1,17 +1,17 @@
-"""The contact law of time stepping: Coulomb's cone on the rates of a step's end, turned to the geometry there.
+"""The contact law of time stepping: Coulomb's cone on the rates at the end of a step, with the rows of that end.
 
-The rows J of a step are those of its midpoint. Along geometry that turns, J(q_m) v' = 0 would take ½ m (h κ v²)² in
-each step from a body that only follows its surface. The rows of the end are known without another sweep: on the same
-rates v the rows of this step give r = J_k v, those of the last one gave s = J_{k−1} v, so that to O(h²)
-J(q') v' = J_k v' + c h/(h + h_last) with c = r − s. The law is on
+The rows J of a step are those of its midpoint. On a surface of curvature κ, J(q_m) v' = 0 would take the energy
+½ m (h κ v²)² in each step from a body that only follows the surface. The rows at the end are extrapolated without
+another sweep: with the same rates v the rows of this step give r = J_k v, those of the last step s = J_{k−1} v, so that
+J(q') v' = J_k v' + c h/(h + h_last) up to O(h²), with c = r − s. The law is on
 
     w = J_k v' + a,    a = c h/(h + h_last),    0 ≤ p_n ⟂ w_n ≥ 0,  |p_t| ≤ μ p_n,  w_t = −λ p_t
 
-W = J M⁻¹ Jᵀ stays symmetric and there is one problem a step. A contact that has slid, and cannot stop in this step,
-takes the direction of its mean slip: w_t = u_t + u_t'. One that strikes has no past: a = 0, or Newton's e u_n. What its
-landing has left of depth is taken back slowly, no more of it than the energy of the landing allows.
+W = J M⁻¹ Jᵀ stays symmetric, and each step solves one contact problem. For a contact that slides and cannot stop within
+the step friction is along the mean slip: w_t = u_t + u_t'. A contact that lands has no earlier rows: a = 0, or e u_n by
+Newton's restitution. Its penetration is removed slowly, and only as far as the energy lost in the landing allows.
 
-The mean law on all rows, J (v + v') = 0, would be simpler: its factor of disturbances is −1, rates alternate for ever.
+The law on mean rates, J (v + v') = 0, would be simpler but multiplies disturbances by −1: rates alternate undamped.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from dynsim.integrators.stepping.compliance import (
 from dynsim.integrators.stepping.tables import SteppingArrays, geometry, place_joints
 from dynsim.jit.kernel import internal_kernel
 
-# cos of the angle by which a row may turn in a step and still be the same row: more is a kink, an edge, another place.
+# cos of the largest angle by which a row turns in a step; beyond it the contact is at a kink, an edge, another place.
 SAME_ROW = 0.95
 # A place of contact that has moved by more than this times the way of the body there is another one; by less than the
 # second, which the body may have gone as it turned back, it is the same [m].

@@ -5,16 +5,16 @@ A step solves, with the inertia M, the velocity products c and the weight g of i
     M(q_m) Δ = h (τ̂ + Q − c(q_m, v_b) − g(q_m)) + Jᵀ p,        L (i' − i) = h û
 
 where τ̂ and û are torques and circuit voltages as its linear blocks have them at x_θ. Dotted with the means v̄ and ī of
-both ends, this is a balance of powers. That of the laws at x_θ, which the ledger has, differs from it, and so does the
-change of the energy that bodies and coils really have, E(q', v') − E(q, v). What these differences add up to is the
-energy that the steps make of nothing:
+both ends, this is a balance of powers. The powers of the ledger, of the laws at x_θ, differ from these, and so does the
+change of the energy of bodies and coils, E(q', v') − E(q, v). The sum of the differences is the energy that the
+discretisation adds:
 
-    E' − E − v̄·M Δ − h v̄·(c + g)          the inertia is that of one posture within a step, velocities are those of one
-    + h (v̄·τ̂ − v_θ·τ(x_θ))                drives are linear within a step, and their power is that of x_θ
+    E' − E − v̄·M Δ − h v̄·(c + g)          inertia and velocity products are those of one posture within a step
+    + h (v̄·τ̂ − v_θ·τ(x_θ))                drives are linear within a step, and their power is that at x_θ
     + h L (ī·û − i_θ·û(x_θ))               likewise
 
-Each term is computed from what went into the step, none from the ledger: an error of the solution, or a power that is
-booked wrongly, stays in the residual. The sum is of first order in h where velocities jump, else of the method's.
+Each term is computed from the inputs of the step, none from the ledger: an error of the solution, or a wrong power in
+the ledger, stays in the residual. The sum is of first order in h where velocities jump, else of the method's order.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""The drives within a step of time stepping: implicit by their linear blocks, limits decided where the step ends.
+"""The drives within a step of time stepping: implicit by linear blocks, with limits decided at x_θ.
 
-A law with limits is linear on each of its segments: its command, ±U or ±I. A loop that was judged at the start of the
-step, and cut there, would be integrated explicitly: a stiff one swings for ever. So each drive begins with the segment
-that held it last, and the step is taken again where the state x_θ that it leads to lies on another one.
+A law with limits is linear on each of its segments: unlimited, ±U or ±I. Choosing the segment from the state at the
+start of the step would be explicit, and a stiff loop would oscillate between its limits. So each drive starts from its
+last segment, and the step is repeated if the resulting state x_θ is on another one.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from dynsim.integrators.stepping import tables as kt
 from dynsim.integrators.stepping.tables import place_joints
 from dynsim.jit.kernel import internal_kernel
 
-# How often a step is taken for the segments of its drives; from the second number on one drive changes at a time, as
-# several that change at once may take each other back.
+# Most repetitions of a step for the segments of its drives; after ALL_AT_ONCE of them one drive changes at a time, as
+# changes of several at once may undo each other.
 MOST_TRIES, ALL_AT_ONCE = 16, 4
 
 

@@ -1,4 +1,4 @@
-"""One step of time stepping, its ledger, samples and driver; equations: :mod:`dynsim.integrators.stepping.tables`."""
+"""One step of time stepping, its ledger, samples and driver; equations in dynsim.integrators.stepping.tables."""
 
 from __future__ import annotations
 

@@ -1,19 +1,18 @@
-"""Time stepping: its equations, coefficients and workspace; contacts change within fixed steps.
+"""Time stepping: its equations, tables and workspace, and the geometry of a step.
 
 Moreau's and Jean's θ method for the whole coupled system. From (q, v, i) over a step h, with geometry at the midpoint
 q_m = q + h v / 2 and x_θ = x + θ (x' − x):
 
     M (v' − v) = h (τ_θ + Q − bias) + Jᵀ p,    L (i' − i) = h (u_θ − R i_θ − K_m v_θ),    q' = q + h v_θ
 
-Drives are implicit, by their linear blocks: i' is eliminated, and what is left of voltage loops, back-EMF and damping
-comes to the diagonal of M (``step_drives``). The impulses p solve one contact problem over all candidates that touch at
-q_m; its law is on the rates at the end, turned to the geometry of the end (``step_contacts``).
+Drives are implicit by their linear blocks: i' is eliminated, which adds the effect of voltage loops, back-EMF and
+damping to the diagonal of M (``stepping.drives``). The impulses p solve one contact problem over all candidates that
+touch at q_m; its law is on the rates at the end, with the rows of the end (``stepping.contacts``).
 
 θ = 1 damps and is of first order; θ = 1/2 is of second order between events, and keeps the energy of linear systems,
 contacts aside, to rounding. A landing leaves a penetration of up to h times its speed, which is taken back.
 
-The ledger holds what the scheme does: power at x_θ, friction −p_t·(u + u')/2, and of rows that hold p_n (u_n + u_n')/2.
-This module has the tables, and the geometry of a step.
+The ledger has the discrete works: power at x_θ, friction −p_t·(u + u')/2, and p_n (u_n + u_n')/2 of rows that hold.
 """
 
 from __future__ import annotations

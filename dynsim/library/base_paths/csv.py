@@ -20,9 +20,9 @@ from dynsim.record.csv_rows import read_table
 
 PLACES = ("t_s", "x_m", "y_m")
 RATES = ("t_s", "V_m_s", "omega_rad_s")
-# Rows nearer than this to the last one of the curve say how fast it is gone along, not where it leads [m].
+# Rows nearer than this to the last point of the curve determine the speed along it, not its shape [m].
 SPACING = 1e-3
-# A corner between two rows that far apart; rows of a smooth path turn less [rad].
+# Turns between such rows that exceed this are corners; rows of a smooth path turn less [rad].
 TURN_LIMIT = np.deg2rad(15.0)
 
 

@@ -1,4 +1,4 @@
-"""An operator's list of timed velocities for the hand of an arm and for its mobile base."""
+"""Configuration of an operator: timed velocities of the hand and of the mobile base, ticks, rate limits, braces."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Target motion of the snake: the operator's velocity commands and generated paths ([T] IV.C).
 
-A script is a :class:`dynsim.snake.description.CommandSource` that knows its future; a joystick is one that does not,
-and a script that a live operator has left is told as it was.
+A script is a :class:`dynsim.snake.description.CommandSource` whose later commands are known, unlike those of a
+joystick. The script of a live operator is replayed tick by tick as it was recorded.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ STATES = {"switching": SWITCHING, "fixing": FIXING}
 
 
 class SnakeCommand(StrictConfig):
-    """One entry of the operator's list; what it does not name stays as it was."""
+    """One entry of the operator's list; values that it does not name stay as they were."""
 
     at_s: NonNegative
     velocity: Coordinates | None = Field(

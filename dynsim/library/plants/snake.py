@@ -23,7 +23,7 @@ from dynsim.snake.lifting import Lifts
 
 ENGINE = "kinematic"
 
-# Tyres that give way (assumed): with rigid ones nothing says how left and right share the load of a pair.
+# Compliant tyres (assumed): with rigid ones the loads of the left and right wheel of a pair are not determined.
 TYRES = {"stiffness_N_per_m": 1e5, "damping_N_s_per_m": 200.0}
 MotorChoice: Any = families.union("motor")
 DrivenSide = Literal["left", "right", "none"]

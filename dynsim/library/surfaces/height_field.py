@@ -16,9 +16,9 @@ from dynsim.model.surfaces import HeightField
 from dynsim.record.csv_rows import SIZE_LIMIT, read_grid
 from dynsim.system.inputs import read_bytes
 
-# Cubics need as many heights each way.
+# Least number of heights along x and along y, for cubics.
 LEAST = 4
-# Of a height [m].
+# Largest magnitude of a height [m].
 LIMIT = 1e6
 
 

@@ -1,7 +1,7 @@
-"""Kinds of joints, one module each: coordinates and kernel rows.
+"""Kinds of joints, one module each: rows, coordinates, units, and the motion of the body in the joint's frame.
 
 A module exposes ``ROWS``, its rows by name (:attr:`dynsim.model.description.Link.kind`), and for a joint with several
-of them a function that makes its links. Modules are found by being here. The motion itself is a branch of
+of them a function that makes its links. All modules of this package are used. The kernels' motion is a branch of
 :func:`dynsim.dynamics.tree.sweep.forward_sweep` (one angle, one distance) or of
 :func:`dynsim.dynamics.tree.joints.row_motion` (everything else).
 """
@@ -27,7 +27,7 @@ DISTANCE = ("m", "m/s", "m/s²", "N")
 
 @dataclass(frozen=True)
 class Row:
-    """One velocity of a joint.
+    """One row of a joint: one rate.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Ball joint and free body: attitude as a quaternion, angular rates about the body's axes."""
+"""Ball joint and free body: attitude as a quaternion (w, x, y, z), angular velocity in the body's axes."""
 
 from __future__ import annotations
 

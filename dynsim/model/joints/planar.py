@@ -1,4 +1,4 @@
-"""Planar joint: a body that slides in a plane and turns about its normal, or rolls without side slip."""
+"""Planar joints: a body that slides in a plane and turns about its normal, or rolls in it without side slip."""
 
 from __future__ import annotations
 

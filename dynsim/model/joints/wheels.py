@@ -1,4 +1,4 @@
-"""Base on two driven wheels of one axle, without side slip; its rates are those of the wheels ([WM] II.E)."""
+"""Mobile base on two wheels of one axle that roll without slip; its rates are those of the wheels ([WM] II.E)."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""URDF import: bodies, joints, limits and viscous losses as a tree.
+"""URDF import: bodies, joints, limits, viscous losses, couplings, frames and shapes of a robot.
 
 Files are read strictly (:mod:`dynsim.model.urdf.reader`); everything behind fixed and locked joints is merged into the
-moving body that carries it. Motors, gears, contacts and gravity are not part of a URDF file: the scenario has them.
+moving body that carries it. Motors, contacts and gravity are not taken from a URDF file but from the scenario.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from dynsim.model.urdf.reader import MOVING, SEVERAL, UrdfJoint, UrdfTree, read_
 from dynsim.record.scene import Shape, quaternion
 
 HAND = "hand"
-# Makers of the rows of joints that have several.
+# Functions that make the rows of joints with several of them.
 ROWS = {"floating": floating, "planar": planar}
 
 

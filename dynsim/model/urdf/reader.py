@@ -1,7 +1,8 @@
-"""Strict reading of URDF text: every element with its line, every number checked, nothing guessed or dropped.
+"""Strict reading of URDF text to links and joints: all numbers are checked, errors name element and line.
 
-What the URDF specification lets a file leave out has the specification's value (a link without ``<inertial>`` has no
-mass, a joint without ``<axis>`` turns about x); what else is missing, misspelt, there twice or no number is refused.
+Elements that the URDF specification makes optional have its defaults (a link without ``<inertial>`` has no mass, a
+joint without ``<axis>`` turns about x). Others that are missing, misspelt, repeated or not numbers are refused. Visuals
+are read leniently (:mod:`dynsim.model.urdf.visual`).
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ LINKS_MAX = 2000
 MOVING = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 # Joints with several rates.
 SEVERAL = ("floating", "planar")
-# Numbers whose magnitude stands for "no limit" [rad, m, N m …]: URDF demands some number for most limits.
+# A limit of at least this magnitude means "no limit" [rad, m, N m …]: URDF demands some number for most limits.
 UNLIMITED = 1e9
 
 

@@ -18,8 +18,8 @@ from dynsim.record.urdf_text import add_shapes, connect, numbers, xml_text
 def write_urdf(robot: Robot) -> str:
     """Write the bodies, joints and shapes of a robot as URDF text.
 
-    Frames, and the hand as one of them, are links without mass. Losses of joints are those of their bearings: what a
-    motor takes is its own.
+    Frames, and the hand as one of them, are links without mass. Losses of joints are those of their bearings, without
+    those of motors.
 
     Numbers are written in full, so that reading the text back gives the same dynamics to rounding.
 

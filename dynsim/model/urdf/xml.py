@@ -23,10 +23,10 @@ from dynsim.system.inputs import read_bytes
 # The largest robots in use have some 100 links and 1 MB of text.
 BYTES_MAX, ELEMENTS_MAX, DEPTH_MAX = 16_000_000, 100_000, 100
 ATTRIBUTES_MAX, NAME_LENGTH_MAX, _NUMBER_LENGTH_MAX = 100, 200, 400
-# No robot has such numbers, and with larger ones products overflow.
+# Largest magnitude of a number: no robot needs larger ones, and their products could overflow.
 _MAGNITUDE_MAX = 1e15
 
-# Elements of physics, whose values are attributes.
+# Elements of physics; their values are attributes, so text in them is an error.
 _WITHOUT_TEXT = {"mass", "inertia", "origin", "axis", "limit", "dynamics", "mimic"}
 
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")

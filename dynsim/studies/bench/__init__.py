@@ -1,5 +1,6 @@
 """Benchmarks: time and accuracy of right-hand side and whole runs, beside Pinocchio and MuJoCo.
 
-All contenders get the same robot, from the same tables, and run in one thread. They take turns and medians of CPU time
-are reported, so that what else the machine does hits all alike; ratios carry over to other machines, times do not.
+All programs get the same robot, from the same tables, and run in one thread. They run in turns, and medians of CPU time
+are reported, so that other load on the machine affects all alike. Ratios of times depend less on the machine than
+times. Further benchmarks: sweeps (wall time, several processes), and work against precision of dynsim alone.
 """

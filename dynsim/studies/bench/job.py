@@ -27,7 +27,7 @@ SPHERE_RADIUS = 100.0  # of the surfaces that stand for the floor where MuJoCo h
 
 @dataclass(frozen=True)
 class Case:
-    """One whole run that several programs do.
+    """One whole run that several programs simulate.
 
     Attributes
     ----------

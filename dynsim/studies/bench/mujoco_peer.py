@@ -1,4 +1,4 @@
-"""The benchmark robot in MuJoCo, also an independent oracle: bodies, DC motors, voltage PD, contacts.
+"""The benchmark robot in MuJoCo, also a reference for tests: bodies, DC motors, voltage PD, contacts, time loops.
 
 Built from the compiled tables of a system, so that both programs get the same numbers. Needs MuJoCo ≥ 4.0, whose
 ``dcmotor`` actuator has an inductance and takes position and velocity set-points.
@@ -17,7 +17,7 @@ from dynsim.dynamics.derivative import System
 
 Array = NDArray[np.float64]
 
-# A sphere of this radius, centred in the contact point, rests on a plane that lies this much lower [m].
+# Radius of a sphere about the contact point, which rests on a plane that is lower by this [m].
 FOOT_RADIUS = 0.01
 # Constraint impedance close to one: the least softness that MuJoCo's solver accepts.
 STIFFEST = [0.9999, 0.9999, 0.001, 0.5, 2.0]

@@ -1,4 +1,4 @@
-"""The benchmark robot in Pinocchio, also an independent oracle; built from the compiled tables."""
+"""The benchmark robot in Pinocchio, built from the compiled tables, and its forward dynamics; also used by tests."""
 
 from __future__ import annotations
 

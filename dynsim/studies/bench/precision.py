@@ -20,7 +20,7 @@ RTOLS = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9)
 REFERENCE = "dopri5", 1e-12
 ATOL_PER_RTOL = 1e-2
 ANGLE_MIN = 1e-3
-"""Largest angle of a joint that its error is at least put in relation to [rad, m]."""
+"""Errors of a joint are relative to its largest position, or to this if that is less [rad, m]."""
 
 
 class _Run(NamedTuple):

@@ -13,10 +13,10 @@ SAME_TASK = {
     MUJOCO_FREE: DYNSIM_FREE,
     MUJOCO_CONTACTS: DYNSIM_CONTACTS,
 }
-"""Of the right-hand side: peers, and what of dynsim does the same."""
+"""Right-hand side: programs, and the measurement of dynsim for the same task."""
 RIGHT_HAND_SIDES = (DYNSIM_FREE, DYNSIM_CONTACTS, *SAME_TASK)
 
 DYNSIM_RADAU5 = "dynsim radau5 rtol 1e-6"
 MUJOCO_EULER, MUJOCO_IMPLICIT = "MuJoCo Euler 1 ms", "MuJoCo implicitfast 1 ms"
 JOBS = (DYNSIM_RADAU5, MUJOCO_EULER, MUJOCO_IMPLICIT)
-"""Of the whole job."""
+"""Programs that simulate the whole run."""

@@ -32,9 +32,9 @@ from dynsim.studies.bench.programs import (
 
 Array = NDArray[np.float64]
 Contender = tuple[Callable[[], Any], int]
-"""A call, and how often it does the work."""
+"""A call, and the number of evaluations in it."""
 
-# Pinocchio's Data grows with the square of the links: 0.85 GB at 300.
+# Memory of Pinocchio's Data grows with the square of the number of links: 0.85 GB at 300.
 PINOCCHIO_LINKS_MAX = 300
 _PYTHON_ABA = "Pinocchio ABA, one Python call each"
 

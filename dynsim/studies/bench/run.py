@@ -25,7 +25,7 @@ def run_bench(quick: bool = False, tell: Callable[[str], object] = lambda text: 
     Parameters
     ----------
     quick : up to 100 links, fewer rounds, smaller sweeps, work and precision of one scenario
-    tell : called with what comes next
+    tell : called with the name of the next measurement
 
     Returns
     -------

@@ -1,7 +1,7 @@
 """Benchmark of the dynamic snake beside MuJoCo: time, and agreement with Table III of [T].
 
-MuJoCo gets the tree of bodies as it is exported, the voltage laws of the servos, and the lines that the controller of
-dynsim's run tells them: what it is asked to do is the same, forces, friction and contacts are its own.
+MuJoCo gets the exported tree of bodies, the voltage laws of the servos, and the piecewise linear references that the
+controller gave in dynsim's run. So the commands are the same; forces, friction and contacts are MuJoCo's.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 
 SCENARIO = "snake_positioning_dynamic"
 DYNSIM = "dynsim 2.5 ms, with its controller"
-# Step [s], and whether dry friction is as stiff as MuJoCo accepts; at 2.5 ms that does not stay calm.
+# Step [s], and whether dry friction has the greatest stiffness that MuJoCo accepts; at 2.5 ms that is not stable.
 MUJOCO = {
     "MuJoCo 2.5 ms": (2.5e-3, False),
     "MuJoCo 2 ms, stiff friction": (2e-3, True),

@@ -1,4 +1,4 @@
-"""Benchmark of sweeps of the published arm: time over runs and cores."""
+"""Benchmark of sweeps of the published arm: wall time by numbers of runs and processes."""
 
 from __future__ import annotations
 

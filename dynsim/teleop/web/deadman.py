@@ -9,7 +9,7 @@ from dynsim.teleop.session import NO_REQUEST, Command, PilotAxis
 from dynsim.teleop.web.pilot import PilotCommand
 
 SILENCE = 0.25
-"""After so long without a word from the pilot velocities are zero [s]."""
+"""Time without a message from the pilot after which velocities are zero [s]."""
 
 NOBODY, RELEASED, DRIVING, SILENT = "nobody drives", "key released", "driving", "silent"
 
@@ -17,8 +17,8 @@ NOBODY, RELEASED, DRIVING, SILENT = "nobody drives", "key released", "driving", 
 class Deadman:
     """The newest command of the pilot; safe to use from two threads.
 
-    Velocities are zero unless the dead-man's key is held and the last word is not older than ``SILENCE``. After
-    silence, and for a new pilot, the key counts only once it was heard released: nothing goes on by itself.
+    Velocities are zero unless the dead-man's key is held and the last message is not older than ``SILENCE``. After
+    silence, and for a new pilot, the key has an effect only after a message that it is released.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ class Deadman:
         self._silent = False
 
     def hear(self, command: PilotCommand) -> None:
-        """A word of the pilot; one that was overtaken by a later one is dropped."""
+        """Take a message of the pilot; it is dropped if a later one was received before."""
         with self._lock:
             now = self._clock()
             if self._newest is not None and command.count <= self._newest.count:

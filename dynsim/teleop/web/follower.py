@@ -2,10 +2,10 @@
 
     loop of the servos                                 this process
     ------------------                                 ------------
-    tells its time in shared memory        ──▶         Follower.ready: the next tick may be simulated
-    reads a pipe without ever waiting      ◀──         Follower.hear: a posture for every tick
+    writes its time to shared memory       ──▶         Follower.ready: the next tick may be simulated
+    reads a pipe without waiting           ◀──         Follower.hear: a posture for every tick
 
-Nothing that happens here, a compiler, a browser, a disk, can delay the servos: they have an interpreter of their own.
+The loop of the servos has an interpreter of its own, so compilation, browsers or disks in this process do not block it.
 """
 
 from __future__ import annotations
@@ -38,15 +38,15 @@ from dynsim.teleop.session import Array, Session, SpeedLimits
 from dynsim.teleop.web.live import DriveReport, LiveDrive
 
 NOT_YET = -math.inf
-"""Time that the servos tell before they are where the simulation begins."""
+"""Time that the servos report before they have reached the initial posture."""
 NICENESS = 5
 REGULAR, BROKEN, NOT_LIFTED = 0.0, 1.0, 2.0
-"""What is said behind a time that is no number: that the drive has ended, and how."""
+"""Codes of the end of a drive, sent after a time that is not a number."""
 
 
 @dataclass(frozen=True)
 class DriveRequest:
-    """A drive that is to be."""
+    """Inputs of a drive."""
 
     scenario: Scenario
     servo_map: ServoMap

@@ -1,4 +1,4 @@
-"""A live drive: simulation in the calling thread, server in another, frames between them."""
+"""A live drive: simulation in real time in the calling thread, server in another thread, and the report of the drive."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from dynsim.teleop.web.deadman import DRIVING, Deadman
 from dynsim.teleop.web.server import FRAMES, Server
 
 WAIT = 1e-3
-"""Between two looks whether a follower is ready [s]."""
+"""Interval of the checks whether a follower is ready [s]."""
 NOT_READY = "the robot is not ready yet"
 
 
 class RealTimeClock:
-    """Says when the next tick is due.
+    """Computes when the next tick is due.
 
-    A tick that begins late makes the later ones late: at most one of them follows without a pause, whatever is lost
-    beyond that is lost, and the clock of the simulation falls behind that of the wall. So no motion is ever faster than
-    it was asked for, and no pilot sees his commands in a burst.
+    After a late tick at most one tick follows without a pause; a larger delay is not made up for, and simulated time
+    falls behind wall time. So motions are not faster than commanded over more than a tick, and commands do not act in
+    bursts.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Parsing of a pilot's commands: small JSON texts with known keys; others are refused by name."""
+"""Parsing of a pilot's messages: small JSON texts with known keys; others are refused with a reason."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from typing import Any, NoReturn
 from dynsim.snake.description import FIXING, NO_REQUEST, SWITCHING
 
 MOST_BYTES = 4096
-"""Of a message; a longer one closes the connection."""
+"""Largest size of a message [bytes]; a longer one closes the connection."""
 MOST_COUNT = 2**53
-"""What a browser can count to."""
+"""Largest integer that a browser represents exactly."""
 STEPS = 100
-"""In which full speed is divided: a stick that trembles does not fill the script."""
+"""Steps of the speeds up to full speed, so that noise of a joystick does not add entries to the script."""
 REQUESTS = {"switching": SWITCHING, "fixing": FIXING}
 ACTIONS = ("take", "leave", "end")
 
 
 class Refused(ValueError):
-    """A message that is none; its text says why."""
+    """A message that is not valid; the text gives the reason."""
 
 
 @dataclass(frozen=True)
 class PilotCommand:
-    """What the pilot asks for now.
+    """The present command of the pilot.
 
     Attributes
     ----------

@@ -1,7 +1,7 @@
 """The server of a drive: page by HTTP, commands and frames by web socket, on this machine only.
 
-Every user of a machine can reach its loopback, and every web page can ask a browser to: so there is a token in the
-path, ``Host`` must be this server (against names that are bound to it anew), and a socket's ``Origin`` its own page.
+Every user of the machine, and every web page in a browser on it, can reach the loopback address. So the path contains a
+token, ``Host`` must be this server (against DNS rebinding), and the ``Origin`` of a web socket must be its own page.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from dynsim.teleop.web.pilot import MOST_BYTES, PilotCommand, Refused, parse
 
 HERE = "127.0.0.1"
 FRAMES = 60.0
-"""Pictures that a client gets at most [1/s]."""
+"""Most frames that a client gets [1/s]."""
 MOST_CLIENTS = 16
 MOST_WORDS = 400
-"""Messages of a client in a second, which a browser at 50 Hz does not come near."""
+"""Most messages of a client in a second; a browser sends 50."""
 MOST_REFUSED = 20
 """Messages of a client that are none, after which it is closed."""
 GOODBYE = 1.0

@@ -37,9 +37,9 @@ FAULTS = {
     NOT_LIFTED: "wheel pairs cannot be lifted as the pilot's robot has them",
 }
 LOOK = 0.2
-"""Between two looks for a Ctrl-C while the simulation is waited for [s]."""
+"""Interval of the checks for Ctrl-C while waiting for the simulation [s]."""
 PATIENCE = 5.0
-"""For a process that has nothing left to do [s]."""
+"""Longest wait for the end of a process that has finished its work [s]."""
 
 
 class PipeFeed:

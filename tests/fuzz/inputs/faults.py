@@ -25,7 +25,7 @@ faults:
 
 
 def make_motion(folder: Path) -> None:
-    """A short record of the small robot of the bridge's tests, and its map."""
+    """A short record of the small robot of ``support.fault_table``, and its map."""
     from support.fault_table import MAP, swing
 
     swing(0.1).save(folder / "rig.h5")

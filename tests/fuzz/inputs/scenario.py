@@ -10,7 +10,7 @@ from fuzz.case import SHIPPED, Draft
 from fuzz.mutations import mutate_text, mutate_tree, yaml_text
 from fuzz.readings import merged, scenario_losses, yaml_tree
 
-# Weights: the dynamic ones read most, the snake's fewer.
+# Scenarios and their weights in the draw.
 NAMES = (
     "elbow_comparison",
     "single_pendulum",

@@ -1,4 +1,4 @@
-"""Folders of sweeps, broken, of which ``--resume`` is asked."""
+"""Damaged folders of sweeps, which ``dynsim sweep --resume`` continues."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ COMMAND = [
     "--grid", "plant.chain.0.mass_kg=1,2,3,4", "--jobs", "1", "--no-figures", "--quiet", "--out", "out",
 ]  # fmt: skip
 PLAN, JOURNAL = "sweep.json", "runs.jsonl"
-# Columns of the table that may hold digits and are no numbers.
+# Columns of the table with text, which may consist of digits.
 TEXTS = ("variant", "status", "reason", "warnings")
 
 
 def make_sweep(folder: Path) -> None:
-    """A small, sound sweep of four runs in ``folder``, of no commit: those of a tree that is edited would not go on."""
+    """A valid sweep of four runs in ``folder``, without a commit: an edited tree would refuse to resume one with it."""
     from dynsim.scenario import read_scenario
     from dynsim.studies.sweep import run_sweep
     from dynsim.studies.sweep_plan import Axis, Plan
@@ -34,7 +34,7 @@ def make_sweep(folder: Path) -> None:
 
 
 def forget_commit() -> None:
-    """Let sweeps of this process be of no commit."""
+    """Make sweeps of this process store no commit."""
     from dynsim.studies import sweep
 
     sweep.commit = lambda: ""

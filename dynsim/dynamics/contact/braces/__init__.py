@@ -1,1 +1,1 @@
-"""Statics of braces: forces that hold a posture at least cost."""
+"""Brace forces of least motor heat for a given motion, and their tables."""

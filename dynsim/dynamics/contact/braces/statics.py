@@ -1,12 +1,11 @@
-"""Forces of braces that realise a motion with the least heat in the motors: a cone program in the forces.
+"""Brace forces of least motor heat for a given motion, their ranges, and certificates where there are none.
 
     tau = M vdot + h + g + J_m vdot + (D + D_m) v − Bᵀ f,    minimise Σ w_j tau_j²,  w = R / K_m²
 
-with f = (f_n, f_1, f_2) of each brace and the rows of B the velocities of its point along n and two tangents;
-subject to lower ≤ tau ≤ upper (zero where there is no motor), |f_t| ≤ μ f_n and f_n ≥ min_N. A brace that slides has
-f_t = −μ f_n d instead, one whose normal force is commanded has f_n = that. The unknowns are what is left then: three
-forces of a brace that is held, f_n alone of one that slides or has no friction, and no normal force where that is
-commanded.
+subject to lower ≤ tau ≤ upper (both zero for a joint without a motor), |f_t| ≤ μ f_n and f_n ≥ min_N: a second-order
+cone program. Each brace has f = (f_n, f_1, f_2) along its normal n and two tangents; the rows of B map rates to the
+velocities of its point along them. A sliding brace has f_t = −μ f_n d, d the direction of slip; a commanded f_n is
+given. So the unknowns of a brace are f if it is held, f_n if it slides or has no friction, without f_n if commanded.
 """
 
 from __future__ import annotations
@@ -23,10 +22,10 @@ from dynsim.dynamics.tree.points import point_jacobian, point_position
 from dynsim.dynamics.tree.sweep import kinematics, newton_euler
 from dynsim.jit.kernel import internal_kernel, kernel
 
-# How far forces violate the constraints, and how far apart the ends of an interval may be [1]: beyond it there is no
-# solution, and below it nothing but one.
+# Tolerance of the largest margin to the constraints, in units of the force scale [1]: below −SLACK there is no
+# solution, within ±SLACK the solution has no interior.
 SLACK = 1e-9
-# Torques that are this part of the force scale within their limits need no program that looks for more room.
+# Where all torques are this share of the force scale within their limits, no program maximises the margin.
 AMPLE = 1e-6
 # Intervals are open where forces this many times their scale are still possible.
 FAR = 1e4

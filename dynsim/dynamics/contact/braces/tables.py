@@ -20,7 +20,7 @@ COMMANDED = 16  # [N], NaN for none
 BRACE_SIZE = 17
 # BraceArrays.motors: a torque source has K_m = 1 and no resistance, a joint without a motor K_m = 1 and no current
 HEAT = 0  # w = R / K_m² [W/(N m)²]
-LOWER = 1  # torque limits at the rate of the moment [N m], infinite for none; both zero without a motor
+LOWER = 1  # torque limits at the present joint rate [N m], infinite for none; both zero without a motor
 UPPER = 2
 CONSTANT, RESISTANCE, VOLTAGE_LIMIT, CURRENT_LIMIT = 3, 4, 5, 6  # K_m [N m/A], R [Ω], U [V], I [A]
 MOTOR_SIZE = 7

@@ -1,1 +1,1 @@
-"""Contact problems: forces within friction cones, and cone programs."""
+"""Solvers of contact problems with friction cones, and of second-order cone programs."""

@@ -1,13 +1,13 @@
-"""Indeterminate contact forces: the least-norm choice among all that satisfy the friction cones.
+"""Selection of indeterminate contact forces: towards least norm, as far as the friction cones allow.
 
-The motion w = W f + b of a contact problem (dynsim.dynamics.contact.cone.problem) is determined, its forces f are not
-where rows depend on each other: four legs of a table, three elbows of a straight arm. On the faces of the cones where f
-is, f = S x with a column of S for each direction in which a force may change, of length one:
+The motion w = W f + b of a contact problem (dynsim.dynamics.contact.cone.problem) is unique, but its forces f are not
+where rows depend on each other: four legs of a table, three elbows of a straight arm. On the faces of the cones that
+contain f, f = S x; S has a column of length one for each direction in which a force may change:
 
     n, t1, t2 of a point that sticks (n alone without friction),   n − μ w_t/|w_t| of one that slides,   a one-way row
 
-G = Sᵀ W S is singular there, and x + (its null space) makes the same motion. The member of least norm is the projection
-of x on the range of G; where it leaves a cone, the way towards it ends at that cone.
+There G = Sᵀ W S is singular, and x plus any vector of its null space gives the same motion. The solution of least norm
+is the projection of x on the range of G. Where that is outside a cone, f stops on the way to it at the first cone.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from dynsim.dynamics.contact.cone import problem as kc
 from dynsim.dynamics.contact.cone.steps import block_size
 from dynsim.jit.kernel import internal_kernel
 
-# Rooms: G, its factor, the columns S (their coefficients along the rows of their block), vectors in first rows.
+# Blocks of the scratch ``room``: G, its factor, columns S (coefficients on the rows of their block), then vectors.
 MATRIX, FACTOR, COLUMNS, NOW, GOAL, RIGHT, PIVOT, ROW, SIZE = 0, 1, 2, 3, 4, 5, 6, 7, 8
-# A row that leaves faster than this has no force, and slower slip has no direction [m/s].
+# A row that separates faster than this has no force; slip slower than this has no direction [m/s].
 STILL = 1e-9
-# A pivot below this times the mean of the diagonal: G is singular. The projection shifts by this times that mean, and
-# each of its refinements multiplies the error by as much.
+# G is singular if a pivot is below SINGULAR times the mean of its diagonal. The projection adds SHIFT times that mean
+# to the diagonal; each refinement multiplies the error by about SHIFT.
 SINGULAR, SHIFT, REFINEMENTS = 1e-10, 1e-6, 4
-# Halvings of the way to a cone; what of the largest force may lie beyond it.
+# Bisections of the way to a cone; share of the largest force that may lie outside it.
 HALVINGS, ROUNDING = 50, 1e-12
 
 

@@ -1,4 +1,4 @@
-"""The contact problem: unilateral forces, Coulomb cones and bilateral rows solved together, unsmoothed.
+"""Solver of the contact problem: bilateral and unilateral rows, Coulomb cones and dry joint friction, unsmoothed.
 
 Find f with u = W f + b (forces and accelerations, or impulses and velocities) such that every row or block of rows has
 
@@ -7,15 +7,15 @@ Find f with u = W f + b (forces and accelerations, or impulses and velocities) s
     CONE         0 ≤ f_n ⟂ u_n ≥ 0,  |f_t| ≤ μ f_n,  u_t = −λ f_t with λ ≥ 0, and λ = 0 inside the cone
     BOX          |f| ≤ μ,  u = −λ f with λ ≥ 0, and λ = 0 within the bounds: dry friction of a joint
 
-A CONE row is followed by its two TANGENT rows. Friction is not associated: u_n does not depend on μ |u_t|. A row that
-gives way, u = W f + b + ε f, is one with ε more on the diagonal of W; bounds that are not ±μ are those of f less their
-mean f_m, with W f_m more in b.
+A CONE row is followed by its two TANGENT rows. Friction is not associated: u_n has no term μ |u_t|. A compliant row,
+u = W f + b + ε f, has ε added to its diagonal entry of W. Bounds other than ±μ are shifted by their mean f_m: the
+unknown is f − f_m, and W f_m is added to b.
 
 The method is a semismooth Newton method on the natural map of Alart and Curnier (Computer Methods in Applied Mechanics
-and Engineering 92, 1991), from the caller's last forces: a few steps where little has changed. Where it does not
-converge, sweeps of block Gauss–Seidel with the exact solution of each block, and scattered starts, take turns with it;
-then paths of problems whose blocks are less and less on their own. A proximal term keeps Newton's matrix regular when
-rows depend on each other; it has no part in the solution.
+and Engineering 92, 1991), started from the caller's last forces. Where it does not converge, it alternates with sweeps
+of block Gauss–Seidel (each block solved exactly) and with scattered starts. The last resort is a homotopy from nearly
+decoupled blocks to the problem. A proximal term keeps Newton's matrix regular when rows depend on each other; it does
+not change the solution.
 """
 
 from __future__ import annotations

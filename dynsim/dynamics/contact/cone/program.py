@@ -4,8 +4,8 @@
 
 K is a product of cones {(s_0, s_1): |s_1| ≤ s_0} of any sizes; a cone of size 1 is s_0 ≥ 0. A primal–dual
 interior-point method with Nesterov–Todd scaling and Mehrotra's corrector (as in coneqp of CVXOPT), for a dozen
-unknowns. H must be positive semidefinite; A may have dependent rows. Optimal is what fulfils, with multipliers y and
-z ∈ K,
+unknowns. H must be positive semidefinite; A may have dependent rows. x is optimal if there are multipliers y and
+z ∈ K with
 
     H x + g + Aᵀ y − Gᵀ z = 0,   A x = b,   G x + h = s,   s · z = 0
 """
@@ -20,13 +20,13 @@ import numpy as np
 from dynsim.jit.kernel import integers, internal_kernel, kernel, reals
 
 ITERATIONS = 60
-# Of what must vanish, in units of a program whose numbers are near 1: the rounding of some dozen operations.
+# Tolerance of the optimality conditions, for a program scaled to numbers near 1: the rounding of some dozen operations.
 TOLERANCE = 1e-13
-# Products s · z of a cone that nothing is left of in double precision.
+# Least product s · z of a cone: smaller ones are lost in double precision.
 GAP_MIN = 1e-16
-# Below CLOSE so many steps that do not halve what is left end the iteration.
+# Below CLOSE, the iteration ends after PATIENCE steps that do not halve the residual.
 CLOSE, PATIENCE = 1e-9, 2
-# Keeps the Newton system regular along directions that nothing determines; the optimum is the same.
+# Regularises the Newton system along undetermined directions; the optimum is the same.
 REGULAR = 1e-13
 # Of unknowns whose pivots have lost all digits: this part of what they are the difference of.
 PIVOT_MIN = 1e-14

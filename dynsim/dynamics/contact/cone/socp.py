@@ -1,4 +1,4 @@
-"""Cone programs that share force among redundant contacts: largest margin to slip; least norm that holds."""
+"""Split of forces among redundant sticking contacts by cone programs: least norm in the cones, or largest margin."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact.cone.program import ConeProgram, cone_program, laid_out, program_size, solve_cone_program
 from dynsim.jit.kernel import internal_kernel, kernel
 
-# Weight of |z|² beside the margin: makes the best split unique where forces do not matter to any contact.
+# Weight of |z|² beside the margin: makes the best split unique where the margin alone does not.
 LEAST_WEIGHT = 1e-13
-# Margins are looked for up to this many times the largest given force: two walls can be pressed apart without limit.
+# Bound on the margin, in units of the largest given force: pressing two walls apart has no largest margin.
 MARGIN_MAX = 10.0
-# What a force may be off, of the largest: tangential ones without friction, and cones that touch at one point.
+# Tolerance in units of the largest force: for tangential forces without friction, and for cones that meet in a point.
 FORCE_TOLERANCE = 1e-9
 
 

@@ -1,6 +1,6 @@
-"""Steps of the contact-problem solver: residual, Newton step, and a block Gauss–Seidel sweep.
+"""Steps of the contact-problem solver: residual, Newton step, block Gauss–Seidel sweep; layout of its scratch.
 
-The problem and its residual are those of dynsim.dynamics.contact.cone.problem; ``room`` is its scratch.
+The problem and its residual are those of dynsim.dynamics.contact.cone.problem; ``room`` is its scratch array.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ SHIFTED_RIGHT, KEPT, LAST, ANCHOR, PROOF, NO_FRICTION, KNOWN = 13, 14, 15, 16, 1
 CONE_ROOM = 20
 # STATUS of a block at its first row: no force, u = 0, slides, at the bound FIRST.
 OFF, HOLDS, SLIDES, CLAMPED = 0.0, 1.0, 2.0, 3.0
-# The proximal term is this times the relative residual, but no less than what keeps elimination far from rounding.
+# The proximal term is PROXIMAL_FACTOR times the relative residual, at least LEAST_PROXIMAL, which is above rounding.
 PROXIMAL_FACTOR, LEAST_PROXIMAL = 1e3, 1e-11
 ROOT_STEPS = 60
 
