@@ -1,4 +1,4 @@
-"""The command line as a program: files, exit codes, one-line errors, completion, help, odd terminals and folders."""
+"""The command line: files, exit codes, one-line errors, completion, help, ASCII terminals, a folder that is gone."""
 
 import csv
 import io

@@ -1,4 +1,4 @@
-"""Commands of a pilot: accepted values, dead-man's key, silence; the clock, which stretches time without catching up."""
+"""Commands of a pilot: accepted values, dead-man's key, silence; a clock that stretches time and does not catch up."""
 
 from __future__ import annotations
 

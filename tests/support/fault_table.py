@@ -3,9 +3,9 @@
     PYTHONPATH=tests python -m support.fault_table --runs 100 --out results/reference/bridge_faults.json
 
 prints the table of docs/hardware.md. A cell is a fault, the state of the replay in which it strikes, and a policy; its
-runs differ in their seed: servo, instant, and what the fault does at random. Each run is
-checked against the bytes on the line and the registers: after the fault only the policy sends goals, no torque is
-switched on, and the servos are in the state that is reported.
+runs differ in their seed: servo, instant, and what the fault does at random. Each run is checked against the bytes on
+the line and the registers: after the fault only the policy sends goals, no torque is switched on, and the servos are in
+the state that is reported.
 """
 
 from __future__ import annotations
