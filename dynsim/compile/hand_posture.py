@@ -12,7 +12,7 @@ from dynsim.errors import ModelError, UnreachableReference
 from dynsim.model.description import Array, Contact, Robot
 
 ITERATIONS = 200
-# Longest step of a coordinate in one turn [rad or m], so that the branch of the start is kept.
+# Longest step of a coordinate in one iteration [rad or m], against jumps to another branch of solutions.
 STEP_MAX = 0.3
 # Greatest damping, far from the target; near it the steps are Newton's.
 DAMPING = 1e-2

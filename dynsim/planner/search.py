@@ -1,7 +1,7 @@
 """Search over sets of braces, grown one brace at a time from the best smaller sets.
 
-All sets of one brace are solved at one posture of the path without slip, the best of them again where they slip, and
-the best of those grow. What fails is "not found", never "impossible": postures are found from others by least change.
+All sets of one brace are solved without slip, the best of them with slip along the path, and the best of these get one
+more brace. A set that fails is "not found", not "impossible": postures come from others by least change.
 """
 
 from __future__ import annotations

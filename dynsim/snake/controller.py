@@ -2,7 +2,7 @@
 
 With M = B~ W^(-1/2) and its factorisation M = L Q^T (Householder reflections of the rows, one row at a time), the
 weighted pseudo inverse is B~^(W+) v = W^(-1/2) Q L^-1 v, and I - Q Q^T projects on the null space. Rows can be added
-one by one, which is how a joint is taken out of the allocation while it sits at its limit.
+one by one, which is how a joint is taken out of the allocation while it is at its limit.
 """
 
 from __future__ import annotations
