@@ -14,7 +14,7 @@ from dynsim.model.surfaces import Surface
 
 # Depth beyond its radius at which a body does not yet count as sinking [m]: the tolerance of contacts at the start.
 SLACK = 1e-6
-# Parts into which an axis is cut to find its depth in a box or a height field.
+# Parts into which an axis is divided to find its depth in a box or a height field.
 POINTS = 16
 
 

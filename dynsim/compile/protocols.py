@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class BuildContext:
-    """What there is when a member is built.
+    """Data of the scenario for the ``build`` of a member.
 
     Attributes
     ----------

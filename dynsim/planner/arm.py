@@ -1,4 +1,4 @@
-"""A robot as the tables of the compiled statics: the joints that move, and the surfaces around it."""
+"""Tables of an arm for the compiled statics: the joints that move, surfaces, and points of link axes."""
 
 from __future__ import annotations
 

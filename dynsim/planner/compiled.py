@@ -39,13 +39,13 @@ from dynsim.dynamics.tree.spatial import (
 )
 from dynsim.jit.kernel import internal_kernel, kernel
 
-# What is lost of a row of constraints that others imply.
+# A constraint row of which less than this share is independent of the others is dependent.
 DEPENDENT = 1e-9
 # Distance from hand path and surfaces that counts as none [m].
 ON = 1e-9
 # First damping of the steps beside the curvature of the heat, and its bounds, over the largest of that curvature.
 DAMPING, DAMPING_MIN, DAMPING_MAX = 1e-3, 1e-7, 1e6
-# Longest step of a coordinate in one turn [rad or m].
+# Longest step of a coordinate in one iteration [rad or m].
 REACH = 0.6
 # Points that are so much further from a surface than they must be are left out of a step [m].
 NEARBY = 0.5

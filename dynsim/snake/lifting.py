@@ -5,8 +5,8 @@ The record has each pair on the ground or off it, 1 or 0; a lift takes time. The
     eta(t) = clearance s((t - t_up)/blend) s((t_down - t)/blend),   s(u) = 10 u^3 - 15 u^4 + 6 u^5
 
 from the first sample t_up at which it is lifted; it is zero again at t_down, the first at which it is grounded. So a
-pair is in the air only while the record has it off the ground. Pitch angles follow from the heights and the yaw angles of every sample
-(:mod:`dynsim.snake.base_part`), before anything moves.
+pair is in the air only while the record has it off the ground. Pitch angles are computed from the heights and the yaw
+angles of every sample (:mod:`dynsim.snake.base_part`), before anything moves.
 """
 
 from __future__ import annotations
