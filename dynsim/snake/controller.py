@@ -1,8 +1,9 @@
 """The snake's task-space control law, compiled: weighted redundancy resolution ([T] eqs 9-17).
 
 The commanded motion fixes B~ u, u the joint and wheel rates; W weights u. With M = B~ W^(-1/2) and its factorisation
-M = L Q^T (Householder reflections of the rows, one row at a time), the weighted pseudo-inverse is B~^(W+) v = W^(-1/2) Q L^-1 v, and I - Q Q^T projects on the null space. Rows can be added
-one by one, which is how a joint is taken out of the allocation while it is at its limit.
+M = L Q^T (Householder reflections of the rows, one row at a time), the weighted pseudo-inverse is
+B~^(W+) v = W^(-1/2) Q L^-1 v, and I - Q Q^T projects on the null space. Rows can be added one by one, which is how a
+joint is taken out of the allocation while it is at its limit.
 """
 
 from __future__ import annotations
