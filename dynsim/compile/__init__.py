@@ -1,1 +1,1 @@
-"""Compilation of a description to tables of numbers: model, contacts, references, surfaces."""
+"""Translation of descriptions to tables and references: model, contacts, loads, postures, equilibrium, scene."""

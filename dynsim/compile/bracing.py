@@ -1,4 +1,4 @@
-"""Statics and dynamics of a braced arm: brace forces that realise a motion with the least motor heat."""
+"""Braces of an arm, and their forces of least motor heat for given motions."""
 
 from __future__ import annotations
 

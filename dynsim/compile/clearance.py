@@ -1,4 +1,4 @@
-"""Distances of points and link axes from surfaces, at samples of the joint positions."""
+"""Body poses, distances of points and link axes from surfaces, and sinking, at samples of joint positions."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import numpy as np
 from dynsim.model.description import Array, Link, Quadric, Robot
 from dynsim.model.surfaces import Surface
 
-# By how much a body may lie deeper than its radius without a warning [m]: the tolerance of contacts at the start.
+# Depth beyond its radius at which a body does not yet count as sinking [m]: the tolerance of contacts at the start.
 SLACK = 1e-6
-# Parts into which an axis is cut to find its depth in a box or a height field.
+# Parts into which an axis is divided to find its depth in a box or a height field.
 POINTS = 16
 
 

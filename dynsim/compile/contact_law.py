@@ -23,9 +23,9 @@ from dynsim.model.drives import TorqueSource
 
 # A joint may start this far beyond its stop [rad or m].
 START_TOLERANCE = 1e-6
-# After an impact a point that leaves more slowly than this stays: bounces that accumulate come to an end [m/s]. More
-# than points reach that fall through the depth at which they count as landed (6e-5 under gravity): two points that rock
-# would give each other that speed for ever.
+# After an impact a point that separates more slowly than this stays closed, which ends accumulating bounces [m/s]. It
+# exceeds the speed of a fall through the depth at which points count as landed (6e-5 under gravity), which two points
+# of a rocking body would otherwise exchange without end.
 SETTLE_SPEED = 1e-4
 
 

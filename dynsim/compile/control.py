@@ -1,4 +1,4 @@
-"""Data that a joint controller hands to the simulation: references, feed-forward voltages, gains."""
+"""Joint control as data for the simulation: references, feed-forward voltages, gains, hand and base paths."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from dynsim.system.memo import recall
 if TYPE_CHECKING:
     from dynsim.snake.description import TaskSpaceController
 
-# Samples in a segment of the reference splines, and segments that are looked at together.
+# Samples in a segment of the reference splines, and segments that are sampled together.
 _PER_SEGMENT = 4
 _PIECE = 4096
 # Knots that the longest steps of an implicit method straddle (of 20 ms; 55 ms in the published arm).

@@ -2,7 +2,8 @@
 
 Six-vectors at the world origin: motions (ω, v), forces (n, f). × is the cross product of motions, ×* that of a motion
 and a force, and (F ×̄*) V = V ×* F. S is the axis of a joint, V and A (less gravity) velocity and acceleration of its
-body, V_p and A_p those of the body that it is mounted on; I_c, f_c and B_c are sums of I, f and B over a subtree:
+body, V_p and A_p those of the body that it is mounted on; I and f are spatial inertia and wrench of a body; I_c, f_c
+and B_c are sums of I, f and B over a subtree:
 
     S' = V_p × S,   S'' = A_p × S + V_p × S',   Ṡ = V × S
     2 B = (V ×*) I − I (V ×) + (I V) ×̄*

@@ -1,10 +1,10 @@
 """Motor torques that hold a posture at rest against weight, loads and braces, with the least heat.
 
-    τ = h + g − J_wᵀ W − J_cᵀ f,    minimise Σ R i²,  K_m i = τ
+    τ = g − J_wᵀ W − J_cᵀ f,    minimise Σ R i²,  K_m i = τ
 
-with the forces f of the contacts that touch. The bilateral law has no friction at rest, and normal forces of either
-sign. Under the unilateral law f_n ≥ 0 and |f_t| ≤ μ_s f_n. There frictionless forces are tried first, which leave all
-friction as a reserve against slip; friction is used only where the posture cannot rest without it.
+with the external wrenches W and the forces f of the contacts that touch. The bilateral law has no friction at rest, and
+normal forces of either sign. Under the unilateral law f_n ≥ 0 and |f_t| ≤ μ_s f_n: forces without friction are tried
+first, which leave all friction as a reserve against slip; those with friction only where there is no other equilibrium.
 """
 
 from __future__ import annotations

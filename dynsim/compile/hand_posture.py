@@ -12,14 +12,14 @@ from dynsim.errors import ModelError, UnreachableReference
 from dynsim.model.description import Array, Contact, Robot
 
 ITERATIONS = 200
-# Longest step of a coordinate in one turn [rad or m], so that the branch of the start is kept.
+# Longest step of a coordinate in one iteration [rad or m], against jumps to another branch of solutions.
 STEP_MAX = 0.3
-# Greatest damping, far from the target; near it the steps are Newton's.
+# Largest damping, far from the target; near it damping vanishes.
 DAMPING = 1e-2
 
 
 class Kinematics(Protocol):
-    """Of :class:`dynsim.Model`, as far as postures need it."""
+    """The part of :class:`dynsim.Model` that postures need."""
 
     robot: Robot
     n: int

@@ -1,4 +1,4 @@
-"""Postures that put points of an arm on their surfaces (closure of the contact constraints)."""
+"""Postures with points of an arm on their surfaces (closure of the contact constraints), nearest to the initial one."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ HAND = "hand"
 TOLERANCE = 1e-13
 REACHED = 1e-12
 ITERATIONS = 300
-# What a joint may be beyond its limit by rounding [rad or m].
+# Rounding by which a joint may be beyond its limit [rad or m].
 BEYOND = 1e-9
-STEP_MAX = 0.3  # [rad or m] per iteration, so that the branch of the start is kept
+STEP_MAX = 0.3  # [rad or m] per iteration, against jumps to another branch of solutions
 
 
 def gaps_and_rates(model: Model, contacts: Sequence[Contact], q: Array) -> tuple[Array, Array]:

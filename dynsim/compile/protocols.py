@@ -1,7 +1,7 @@
 """Interfaces of the families: a member is a module with ``Config`` and ``build(config, context)``.
 
-A scenario names a member by ``type``. Its section is validated by the member's ``Config``; ``build`` makes of it what
-the engines work with.
+A scenario names a member by ``type``. The member's ``Config`` validates the section; ``build`` turns it into the
+object that the engines use.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class BuildContext:
-    """What there is when a member is built.
+    """Data of the scenario for the ``build`` of a member.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Arrays of the inverse kinematics of a hand: targets, limits, weights and results."""
+"""Tables of the inverse kinematics of a hand: its point, moving joints with limits, braces, and scratch."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from dynsim.model.description import Contact
 def path_arrays(
     model: Model, joints: Sequence[str], braces: Sequence[Contact] = (), limited: bool = False
 ) -> PathArrays:
-    """Joints that take the hand of a robot along a path and keep points on their surfaces meanwhile.
+    """Tables for joints that move the hand of a robot along a path while braces stay on their surfaces.
 
-    ``limited`` : the limits of the joints hold on the way
+    ``limited`` : the limits of the joints hold along the path
     """
     columns = [model.joint_names.index(name) for name in joints]
     link, point = model.robot.attach(*model.robot.hand)

@@ -1,4 +1,4 @@
-"""The scene of a robot for its record: bodies, joints, surfaces and points, from which pictures are drawn."""
+"""The scene of an arm or a snake for its record, for pictures: bodies, joints, shapes, surfaces and points."""
 
 from __future__ import annotations
 

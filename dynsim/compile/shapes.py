@@ -1,4 +1,4 @@
-"""Kernel tables of contact candidates with a shape (spheres, capsules), and their distances."""
+"""Kernel tables of contact candidates with a shape (spheres, capsules), and distances from surfaces."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ joint of the head branch, which turns its head side, has the axis −e_z or −e
 (:mod:`dynsim.snake.base_part`).
 
 All wheels are bodies, spheres where they touch: a driven one has a servo in velocity mode, the others turn freely.
-Their masses are part of the links', which are those of the kinematic level; what is their own is the spin inertia.
+Their masses are in those of the links, which are the ones of the kinematic level; they add only their spin inertia.
 """
 
 from __future__ import annotations

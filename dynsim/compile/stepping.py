@@ -1,4 +1,4 @@
-"""Tables of the system for time stepping; shape tables are always present, so one program fits all scenes."""
+"""Shape tables for time stepping where a system has none, so that one compiled program fits all scenes."""
 
 from __future__ import annotations
 

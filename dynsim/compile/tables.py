@@ -1,4 +1,4 @@
-"""Kernel tables of robot, drives, contacts and loads; impossible descriptions are refused here."""
+"""Kernel tables of bodies, drives, contacts, loads, couplings and mobile base; checks of descriptions."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from dynsim.model.drives import Drive, Motor, Servo, TorqueSource
 from dynsim.model.servo import servo_row
 
 # Largest initial angle [rad]: beyond it the reduction to a quarter turn leaves too few digits
-# (dynsim.dynamics.tree.sweep.sine_cosine).
+# (dynsim.dynamics.tree.angles.sine_cosine).
 ANGLE_LIMIT = 1e6
-# By how much the initial position of a coupled joint may differ from what its leader wants: rounding [rad or m].
+# Rounding by which the initial position of a follower may differ from that by its leader [rad or m].
 COUPLING_TOLERANCE = 1e-6
 
 _FRICTION = {"signed": ka.FRICTION_SIGNED, "dissipative": ka.FRICTION_DISSIPATIVE}

@@ -18,7 +18,7 @@ from dynsim.dynamics.tree.sweep import kinematics
 from dynsim.jit.kernel import internal_kernel, kernel
 
 ITERATIONS = 200
-STEP_MAX = 0.3  # [rad or m] per iteration, so that the branch of the start is kept
+STEP_MAX = 0.3  # [rad or m] per iteration, against jumps to another branch of solutions
 
 
 class PathArrays(NamedTuple):

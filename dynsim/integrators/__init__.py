@@ -1,1 +1,1 @@
-"""Compiled integrators: radau5, dopri5 and time stepping, with events, dense output and projection."""
+"""Compiled integrators: RADAU5, DOPRI5 and time stepping, with events, impacts, dense output and projection."""

@@ -1,1 +1,1 @@
-"""Everything that uses numba: compilation, cache, struct types, SIMD."""
+"""Compilation with numba: kernel decorators, cache, compiler pipeline, struct types, SIMD."""

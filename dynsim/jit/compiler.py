@@ -1,11 +1,13 @@
-"""Compiler pipeline of the kernels: numba's, adapted so that each kernel is compiled only once.
+"""Compiler pipeline of the kernels, numba's with changes that save compilation time; variants for SIMD lanes.
+
+The changes avoid these costs of numba's pipeline:
 
 - It keeps every callee twice, as a library of its own and as a copy in its caller, see :class:`_OwnCallees`.
-- It compiles a function again for each set of options that it is called from, see :func:`register_part`.
-- It takes named tuples apart wherever a function is called, see dynsim.jit.struct_types.
-- It looks the same things up again and again, see :func:`_quick_look_ups`.
+- It compiles a function again for each set of options of its callers, see :func:`register_part`.
+- It takes named tuples apart at every call, see dynsim.jit.struct_types.
+- It repeats the same look-ups, see :func:`_quick_look_ups`.
 
-All of it acts in dynsim's own compilations alone; what it replaces is in dynsim.jit.numba_version.
+The changes act in dynsim's own compilations only; the parts of numba that they replace are in dynsim.jit.numba_version.
 """
 
 from __future__ import annotations

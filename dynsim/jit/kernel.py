@@ -1,8 +1,8 @@
-"""The decorator ``@kernel``: the only place where functions are compiled.
+"""Decorators of compiled functions (``@kernel`` and its kinds), and the cache of their machine code on disk.
 
-How is in dynsim.jit.compiler. Here is the cache, because results must not depend on what a process has done before:
-numba's checks only the file that holds the function (an edit in a callee elsewhere silently runs old machine code) and
-believes whatever bytes it finds, see :class:`_KernelCache`.
+The compiler pipeline is in dynsim.jit.compiler. The cache replaces numba's, which checks only the file of the function
+itself, so that after an edit of a callee in another file old machine code is run, and which does not detect damaged
+files, see :class:`_KernelCache`.
 """
 
 from __future__ import annotations

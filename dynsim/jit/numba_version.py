@@ -1,8 +1,8 @@
 """Parts of numba that dynsim replaces in its own compilations, and the numba versions this was written for.
 
-Replaced blindly, the internals of another numba would give wrong code, not an error. So another minor version is
-refused when this module is imported, before its internals are; and another source of what is replaced, before a kernel
-is compiled. After a look at what changed, ``python -m dynsim.jit.numba_version`` prints the table anew.
+Replacing internals of another numba could give wrong machine code without an error. So another minor version is refused
+when this module is imported, before numba's internals are. Changed source of a replaced part is refused before a kernel
+is compiled. After a review of such changes ``python -m dynsim.jit.numba_version`` prints the new table.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""A compiler type of N doubles (SIMD): kernels compile for it unchanged, one source for scalar and vector.
+"""A compiler type of N doubles (SIMD) with its operations: one source of a kernel serves numbers and vectors.
 
 Arithmetic, roots and ``min``/``max`` go lane by lane in vector instructions. A comparison gives a :class:`Mask`, which
-has no truth: a branch on it does not compile, so no lane can be led where another one goes. What branches on data has
-a form for lanes, see dynsim.dynamics.simd.forms; :func:`select` and :func:`every` are for those.
+has no truth value: a branch on it does not compile, as lanes could not take different branches. Kernels that branch on
+data have variants for lanes, made with :func:`select` and :func:`every`, see dynsim.dynamics.simd.forms.
 
-Lanes are what LLVM makes of ``<N x double>`` on the processor at hand: one register of AVX-512 for eight, two of AVX2,
+LLVM maps ``<N x double>`` to the registers of the processor: eight lanes are one register of AVX-512, two of AVX2 or
 four of SSE2.
 """
 

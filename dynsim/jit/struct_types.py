@@ -1,13 +1,12 @@
 """Struct types: named tuples in compiled code as memory blocks that are passed by address.
 
-numba flattens a tuple wherever a function is called: the tables of a model, a workspace and a run are some seven
-hundred numbers, so that more than half of what it wrote for a kernel took tuples apart and put them together again.
-Here a tuple lies in memory, the tuples in it within it, and what passes is one address; a field is one load.
+numba flattens tuples at every call: the tables of a model, a workspace and a run are some seven hundred numbers, and
+more than half of the code of a kernel took tuples apart and put them together. Here a tuple is one block of memory,
+with its inner tuples inside; a call passes its address, and reading a field by its name is one load.
 
-A tuple is never changed, so the address is declared to be the only way to what it holds (``noalias``), and loads are
-moved out of loops. A tuple that compiled code makes lives in the frame of the function that makes it, one for each
-place in the source; returned tuples, and those in variables that are assigned in several places, are copied, so that
-what is kept from one turn of a loop to the next stays what it was. Fields are reached by their names.
+Tuples are immutable, so their addresses are declared ``noalias``, and LLVM moves loads out of loops. A tuple made by
+compiled code lives in the stack frame of the function that makes it, one per place in the source. Returned tuples, and
+those in variables that are assigned in several places, are copied, so that a later iteration cannot overwrite them.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""The brace planner: problem, local solver, search over brace sets, and verification."""
+"""The brace planner: problem, local solver, search over brace sets, verification, result and its files."""

@@ -1,4 +1,4 @@
-"""Result of the planner: the verified best set for each number of braces."""
+"""Entry to the planner, and its result: the best sets for each number of braces with their verification."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from dynsim.planner.verify import Corner, Tolerances, Verdict, Verifier
 from dynsim.record import Record
 from dynsim.scenario import Scenario, require_scenario
 
-# Share of the heat within which two rounds have found the same.
+# Two rounds agree if their heats differ by less than this share.
 AGREE = 0.01
 # Gains of plans that are not verified, and of those without braces.
 K_P = 500.0

@@ -1,4 +1,4 @@
-"""A robot as the tables of the compiled statics: the joints that move, and the surfaces around it."""
+"""Tables of an arm for the compiled statics: the joints that move, surfaces, and points of link axes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from dynsim.model.drives import Motor
 from dynsim.model.surfaces import Surface, shape_arrays
 from dynsim.planner.compiled import Arm
 
-# How far plans stay from joint limits [rad or m], at most so much of the range: what soft gains give way by.
+# Distance that plans keep from joint limits [rad or m], at most this share of the range: for errors under soft gains.
 FROM_STOP, FROM_STOP_SHARE = 0.05, 0.05
 
 

@@ -1,14 +1,14 @@
 """Statics of a braced arm at many instants with exact derivatives, and the steps of the local solver, compiled.
 
-Of an arm whose joints each have one coordinate, on a base that stands, with braces c whose forces are
+For an arm whose joints each have one coordinate, on a fixed base, with braces c whose forces are
 
     F_c = f_c (n − μ v_t / √(|v_t|² + v_s²)),    τ = g(q) + (D + D_m) v − Σ_c J_cᵀ F_c
 
-n: normal of the surface at the brace, v_t: velocity of the touching point along it. Postures q_k belong to knots;
-instants e lie between knots, at q_e = Σ_k blend_ek q_k with velocities v_e = Σ_k chord_ek q_k, so that back and forth
-along one path are two instants of one posture.
+n: normal of the surface at the brace, v_t: velocity of the touching point along the surface. Postures q_k belong to
+knots; instants e lie between knots, at q_e = Σ_k blend_ek q_k with velocities v_e = Σ_k chord_ek q_k. So one posture
+has two instants on a path that goes back and forth.
 
-Everything is in one file: the cache of compiled code asks whether the file of a function has changed.
+All is in one file, because for this package the cache of compiled code checks the function's own file only.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ from dynsim.dynamics.tree.spatial import (
 )
 from dynsim.jit.kernel import internal_kernel, kernel
 
-# What is lost of a row of constraints that others imply.
+# A constraint row of which less than this share is independent of the others is dependent.
 DEPENDENT = 1e-9
 # Distance from hand path and surfaces that counts as none [m].
 ON = 1e-9
 # First damping of the steps beside the curvature of the heat, and its bounds, over the largest of that curvature.
 DAMPING, DAMPING_MIN, DAMPING_MAX = 1e-3, 1e-7, 1e6
-# Longest step of a coordinate in one turn [rad or m].
+# Longest step of a coordinate in one iteration [rad or m].
 REACH = 0.6
 # Points that are so much further from a surface than they must be are left out of a step [m].
 NEARBY = 0.5

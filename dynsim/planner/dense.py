@@ -21,9 +21,9 @@ from dynsim.scenario import build
 
 # Instants of one pass along the path, at least, beside two for each knot; and the most time between two [s].
 INSTANTS, SPACING = 50, 0.1
-# Slower than this the hand rests [m/s].
+# A hand slower than this is at rest [m/s].
 RESTS = 1e-2
-# Instants at which links are compared with each other.
+# Instants at which links are checked for contact with each other.
 LOOKS = 11
 
 

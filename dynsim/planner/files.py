@@ -1,4 +1,4 @@
-"""Writing the files of a brace plan: plan.json, plan.yaml, plan_table.csv and .json, figures, and view.html.
+"""Files of a brace plan and their writing: plan.json, plan.yaml, plan_table.csv and .json, figures, view.html.
 
 plan.yaml is a scenario that runs. Figures and view.html are drawn by :mod:`dynsim.planner.pictures`.
 """

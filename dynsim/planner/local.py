@@ -3,9 +3,9 @@
     minimise   Σ_e share_e Σ_j w_ej τ_ej² + ε |S q|²   over postures q_k at knots and forces f_e ≥ min_N
     subject to hand(q_k) = p_k,  gap_c(q_k) = 0,  clearances, limits of joints
 
-Gauss and Newton's method on the manifold of the equations: a step in what they leave free (a basis of it at each
-knot), kept within the inequalities by dual active sets; then back onto the manifold by least change, and the forces of
-least heat of each instant anew. So every iterate is feasible, and the heat alone tells whether a step is good.
+Gauss–Newton method on the manifold of the equations: a step in its tangent space (with a basis at each knot), kept
+within the inequalities by a dual active-set method; then the least change back onto the manifold, and the forces of
+least heat for each instant. So every iterate is feasible, and a step is accepted by its cost alone.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from dynsim.model.description import Array
 from dynsim.planner import compiled
 from dynsim.planner.compiled import Arm, Course, Points, Work
 
-# Most constraints of one step that take part.
+# Most constraints that take part in one step.
 WORKING_SETS = 160
 
 

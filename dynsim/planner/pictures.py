@@ -17,7 +17,7 @@ from dynsim.scenario import build
 
 # Instants of the first pass that the arm is drawn at.
 POSES = 4
-# Points of the grid that surfaces are drawn from, each way, and how far it goes beyond the arm [m].
+# Grid points along each axis from which surfaces are drawn, and the margin of the grid around the arm [m].
 GRID, BEYOND = 160, 0.15
 
 

@@ -15,9 +15,9 @@ from dynsim.scenario.reading import scenario_from_resolved
 
 # Digits that waypoints are written with: a nanometre at the end of any arm.
 DIGITS = 10
-# Gain of joints that press no brace [V/rad], and below which part of the greatest lever a joint is one.
+# Gain of joints that press no brace [V/rad]: those whose lever is below this share of the greatest.
 STIFF, FREE = 500.0, 0.05
-# Instants at which that is looked at.
+# Instants at which levers are compared.
 LOOKS = 12
 # Keys of the controller that a plan replaces.
 REPLACED = (

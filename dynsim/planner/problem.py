@@ -1,4 +1,4 @@
-"""The planning problem: arm, surfaces, hand path, and points that may be braced."""
+"""The planning problem: options, arm, surfaces, clearances, hand path, and points that may be braced."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 """Search over sets of braces, grown one brace at a time from the best smaller sets.
 
-All sets of one brace are solved at one posture of the path without slip, the best of them again where they slip, and
-the best of those grow. What fails is "not found", never "impossible": postures are found from others by least change.
+For each number of braces, sets are solved at one posture of the path without slip, the best of them at a few knots with
+slip; the best of these get one more brace. A set without a solution is "not found", not "impossible": the solver starts
+from postures of other sets.
 """
 
 from __future__ import annotations

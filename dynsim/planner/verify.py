@@ -1,4 +1,4 @@
-"""Verification of a plan: full dynamics with friction, and with surfaces displaced from their planned place."""
+"""Verification of a plan by simulation: with planned and changed friction, and with displaced surfaces."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from dynsim.record.measures import hand_target
 from dynsim.scenario import Scenario
 from dynsim.studies.batch import simulate_batch
 
-# Part of a driver's limit of current that counts as reached.
+# Share of a driver's current limit that counts as reached.
 AT_LIMIT = 0.999
-# Below its limits a joint touches its stop [rad or m].
+# A joint this close to its limit touches its stop [rad or m].
 AT_STOP = 1e-6
-# Deeper than that what is not declared would touch [m]: samples, and the tolerance of references.
+# Depth beyond which a body that is no brace touches [m]; allows for sampling and the tolerance of references.
 SUNK = 1e-4
-# Gains that are tried of each plan.
+# Most gains that are tried for each plan.
 TRIES = 3
 # Bisections of an error that a plan bears.
 STEPS = 5

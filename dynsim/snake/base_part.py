@@ -1,4 +1,4 @@
-"""The base part of a snake, from its axles on the ground: a strip of plates hinged at the axles.
+"""Kinematics of a snake's base part with lifted wheel pairs: pitch angles of plates that are hinged at the axles.
 
 Between two axles there are two links and a yaw joint, whose axis is normal to both: a segment is a flat plate, whatever
 its yaw angle. A pitch joint turns about the axle it sits on, so the base part is a strip of plates hinged at its axles.

@@ -1,8 +1,9 @@
 """The snake's task-space control law, compiled: weighted redundancy resolution ([T] eqs 9-17).
 
-With M = B~ W^(-1/2) and its factorisation M = L Q^T (Householder reflections of the rows, one row at a time), the
-weighted pseudo inverse is B~^(W+) v = W^(-1/2) Q L^-1 v, and I - Q Q^T projects on the null space. Rows can be added
-one by one, which is how a joint is taken out of the allocation while it sits at its limit.
+The commanded motion fixes B~ u, u the joint and wheel rates; W weights u. With M = B~ W^(-1/2) and its factorisation
+M = L Q^T (Householder reflections of the rows, one row at a time), the weighted pseudo-inverse is
+B~^(W+) v = W^(-1/2) Q L^-1 v, and I - Q Q^T projects on the null space. Rows can be added one by one, which is how a
+joint is taken out of the allocation while it is at its limit.
 """
 
 from __future__ import annotations
@@ -25,7 +26,9 @@ from dynsim.snake.kinematics import (
 )
 from dynsim.snake.support import Cost, Support, cost_gradient, new_support
 
+# Joint limits: ignored, clamped in the tick loop, or also kept by taking joints at a limit out of the allocation.
 LIMITS_NONE, LIMITS_SATURATE, LIMITS_ALLOCATE = 0, 1, 2
+# Null-space term: as printed in [T] eq 14, or in the form that never raises the cost, see control_input.
 NULL_PAPER, NULL_SAFE = 0, 1
 
 

@@ -1,4 +1,4 @@
-"""Description of an articulated mobile robot and of its task-space controller, between families and engine."""
+"""Description of an articulated mobile robot, its modes, commands and task-space controller, and its conditioning."""
 
 from __future__ import annotations
 

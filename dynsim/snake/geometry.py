@@ -1,4 +1,4 @@
-"""Joint axes and limits, number of head joints, wheel radius and track of a snake, from the scene of a record."""
+"""Geometry of a snake (joint axes and limits, head joints, wheels) from the scene of its record."""
 
 from __future__ import annotations
 

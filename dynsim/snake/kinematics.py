@@ -5,8 +5,9 @@ Soft Gripper for Operations", IEEE Transactions on Robotics 35(1), 2019.
 
 The chain is walked from the controlled point E tailward: E, head point, theta_1, psi_1, ..., theta_(n_h/2),
 psi_(n_h/2) (wheel pair 1), then theta, wheel pair 2, theta, wheel pair 3, ... to the tail axle. Neighbours are one
-link length apart. A body tailward of a joint is turned by Rz(theta) or Ry(psi) against the body headward of it, so
-psi > 0 raises the head. Pitch joints of the base part only lift wheels ([T] II.A) and stay at zero here.
+link length apart, E and the head point ``point_offset``. A body tailward of a joint is turned by Rz(theta) or Ry(psi)
+against the body headward of it, so psi > 0 raises the head. Pitch joints of the base part only lift wheels ([T] II.A)
+and stay at zero here.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from dynsim.jit.kernel import internal_kernel, kernel
 
 
 class SnakeModel(NamedTuple):
-    """What the kernels know of a robot; lengths [m], angles [rad], masses [kg].
+    """Parameters of a robot for the kernels; lengths [m], angles [rad], masses [kg].
 
     n_phi = head_joints + base_joints joints, base_joints + 1 wheel pairs, head_joints + 2 base_joints links.
     """

@@ -1,12 +1,12 @@
 """Lifted wheel pairs of a record as angles of the pitch joints on their axles.
 
-The record says which pairs are on the ground, 0 or 1; the robot needs time for it. A pair's height follows
+The record has each pair on the ground or off it, 1 or 0; a lift takes time. The height of a pair follows
 
     eta(t) = clearance s((t - t_up)/blend) s((t_down - t)/blend),   s(u) = 10 u^3 - 15 u^4 + 6 u^5
 
-from the sample t_up on in which it is first lifted, and is zero again at t_down, when it is first grounded: a pair is
-in the air only while the record says so. Pitch angles follow from the heights and the yaw angles of every sample
-(:mod:`dynsim.snake.base_part`), before anything moves.
+from the first sample t_up at which it is lifted; it is zero again at t_down, the first at which it is grounded. So a
+pair is in the air only while the record has it off the ground. Pitch angles are computed from the heights and the yaw
+angles of every sample (:mod:`dynsim.snake.base_part`), before anything moves.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Measured values and statements of [T], for comparison with simulated ones.
+"""Measured values and statements of [T], and tables that compare them with records of simulations.
 
 [T]: M. Tanaka et al., "Task-Space Control of Articulated Mobile Robots With a Soft Gripper for Operations", IEEE
 Transactions on Robotics 35(1), 2019.
@@ -15,7 +15,7 @@ from dynsim.record import Record
 from dynsim.snake.description import COORDINATES
 from dynsim.snake.geometry import snake_geometry
 
-Table = list[list[str]]  # head line first
+Table = list[list[str]]  # headings first
 
 
 class Displacement(NamedTuple):

@@ -1,7 +1,7 @@
 """Data of the tick loop: schedule, state of plant and controller, workspace, recorded rows.
 
 The state of the plant is the pose of the base part, the joint angles and the wheel angles. The pose of the controlled
-point follows from them and is never integrated: its error is the real one.
+point follows from them and is not integrated, so that its error contains no drift.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from dynsim.snake.controller import ControlWork, new_work
 from dynsim.snake.kinematics import SnakeModel
 
-# Where beliefs come from; GIVEN: who moves the robot writes them.
+# Source of the state that the controller believes; GIVEN: the caller that moves the robot writes it.
 MEASURED, ESTIMATED, FEEDFORWARD, GIVEN = 0, 1, 2, 3
 # Why a command cannot be carried out.
 NO_OBSTACLE, JOINT_LIMIT, RATE_LIMIT, SINGULAR, ATTITUDE = 0, 1, 2, 3, 4

@@ -1,7 +1,7 @@
 """Support polygon, static stability and the cost functions of the redundancy ([T] eqs 19 and 20).
 
-Everything here is a function of the joint angles alone: distances between points of the robot do not change when the
-whole robot moves on the plane.
+These are functions of the joint angles and of which wheel pairs are grounded: distances between points of the robot do
+not change when the whole robot moves on the plane.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The compiled tick loop: estimate, control, plant and recording."""
+"""The compiled tick loop: state estimate, limits on the target's speed, control, plant and recording."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from dynsim.snake.kinematics import constraint_matrices, pose_of_point, walk_cha
 from dynsim.snake.plant import advance_plant
 from dynsim.snake.support import cost_value, polygon_area, support_polygon
 
-# With gain K, damping that withholds this much of a command leaves a head error of WITHHELD / K [m/s, rad/s].
+# Part of a command that damping may withhold [m/s, rad/s]; with gain K the head error is WITHHELD / K.
 WITHHELD = 1e-5
 # A target is not turned further than this towards beta = +-90 deg [rad].
 BETA_LIMIT = 0.5 * math.pi - 0.02
 # Steps in which a null-space motion that is too fast is reduced, the last of them to nothing.
 NULL_REDUCTIONS = 4
-# Tries to find a speed of the target that keeps the limits: each takes ROOM of what the last one leaves, but not less
-# than LEAST_PART of its speed, because the predicted middle of a period that is much too fast says little.
+# Most trials for a target speed that keeps the limits. Each takes the share ROOM of the speed that the last one allows,
+# but at least LEAST_PART of the last speed, as the prediction at a speed far too high is inaccurate.
 SLOW_DOWNS = 8
 ROOM = 0.98
 LEAST_PART = 0.25
-# A target that would have to be slower than this part of its commanded speed waits.
+# The target waits if it would have to be slower than this share of its commanded speed.
 LEAST_SPEED = 0.01
-# A joint that is nearer to its limit than this [rad] is at it; one further off that is in the way was too fast.
+# A joint nearer to its limit than this [rad] is at it; a joint further off that blocks a command was too fast.
 AT_LIMIT = 0.05
 
 

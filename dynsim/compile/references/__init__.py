@@ -1,1 +1,1 @@
-"""Reference motions: inverse kinematics along paths, splines, feed-forward."""
+"""Reference motions: inverse kinematics along paths, plane curves, teleoperation, feed-forward voltages."""

@@ -1,9 +1,9 @@
-"""Feed-forward voltages along joint references, from statics or full dynamics and with brace forces.
+"""Feed-forward voltages along joint references: from full dynamics with brace forces, or from gravity alone.
 
     K_m i = M v̇ + h + g + J_m v̇ + (D + D_m) v − Jᵀ f,    u = R i + L di/dt + K_m v
 
 f are the brace forces: normal forces, commanded or chosen for least motor heat, and friction where the references slip.
-Statics alone give u = R g / K_m. :func:`pressing` makes the tables of the braces, for the brace planner too.
+Gravity alone gives u = R g / K_m. :func:`pressing` makes the tables of the braces, for the brace planner too.
 """
 
 from __future__ import annotations

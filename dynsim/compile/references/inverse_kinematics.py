@@ -1,4 +1,4 @@
-"""Joint references for a hand path, on the joints that the scenario names."""
+"""Joint references by inverse kinematics of a hand path, on the joints that the scenario names."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ Array = NDArray[np.float64]
 
 # Limits in files are rounded: 1.5707963 = 90° is not beyond 90° [rad or m].
 LIMIT_SLACK = 1e-6
-# Targets between two looks at the clock and at Ctrl-C: some milliseconds.
+# Targets between two checks of the clock and for Ctrl-C: some milliseconds.
 PIECE = 256
-# Wall time before the first report of progress, and between two [s]: most paths are done before anyone asks.
+# Wall time before the first report of progress, and between two [s]; most paths take less than the first.
 QUIET_S, REPORT_S = 1.0, 0.1
 
 

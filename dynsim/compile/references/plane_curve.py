@@ -14,7 +14,7 @@ from dynsim.model.description import Robot
 
 Array = NDArray[np.float64]
 
-# The turn between two samples of the tangent that no base follows [rad].
+# A turn of the tangent between two samples that counts as a corner, which no base follows [rad].
 JUMP = 0.2
 # A first point this far off the base's start is refused [m].
 START_TOLERANCE = 1e-6

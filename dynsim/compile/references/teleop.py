@@ -1,4 +1,4 @@
-"""References rewritten at every tick from an operator's velocities of hand and mobile base."""
+"""Velocities of hand and mobile base from an operator: their source, a script of them, options of the references."""
 
 from __future__ import annotations
 

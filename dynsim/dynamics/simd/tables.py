@@ -1,4 +1,4 @@
-"""Tables for SIMD: float tables whose last axis holds the lanes, converted to tables of Lanes and back."""
+"""Tables for SIMD: float tables whose last axis is the lanes, as tables of Lanes, and single lanes of them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dynsim.dynamics.tables import Workspace
 from dynsim.jit.simd import INT32, Lanes, lanes_of
 from dynsim.jit.struct_types import Tables, made, parts_of
 
-# How many lanes there are: two registers of AVX2, one of AVX-512.
+# Number of lanes: four doubles are one register of AVX2.
 WIDTH = 4
 # Tables of a workspace that have lanes, as one more axis, the last; rows and modes are the same for all.
 WITH_LANES = ("links", "joints", "trig", "motors", "contacts", "rows", "column", "small")

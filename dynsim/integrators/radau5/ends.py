@@ -1,6 +1,6 @@
 """End of a RADAU5 step: derivative, constraint and uniqueness checks, and samples on lanes.
 
-The end is evaluated on SIMD lanes with waiting samples of earlier steps: four states cost about as much as one.
+On SIMD lanes the end is evaluated with waiting samples of earlier steps: four states cost about as much as one.
 """
 
 from __future__ import annotations

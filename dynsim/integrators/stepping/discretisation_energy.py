@@ -7,7 +7,7 @@ A step solves, with the inertia M, the velocity products c and the weight g of i
 where τ̂ and û are torques and circuit voltages as its linear blocks have them at x_θ. Dotted with the means v̄ and ī of
 both ends, this is a balance of powers. The powers of the ledger, of the laws at x_θ, differ from these, and so does the
 change of the energy of bodies and coils, E(q', v') − E(q, v). The sum of the differences is the energy that the
-discretisation adds:
+discretisation adds; it enters ``loss_scheme`` with a minus sign:
 
     E' − E − v̄·M Δ − h v̄·(c + g)          inertia and velocity products are those of one posture within a step
     + h (v̄·τ̂ − v_θ·τ(x_θ))                drives are linear within a step, and their power is that at x_θ

@@ -22,7 +22,7 @@ from dynsim.jit.kernel import integers, internal_kernel, kernel, reals
 ITERATIONS = 60
 # Tolerance of the optimality conditions, for a program scaled to numbers near 1: the rounding of some dozen operations.
 TOLERANCE = 1e-13
-# Least product s · z of a cone: smaller ones are lost in double precision.
+# Complementarity gap at which the iteration ends: smaller ones are lost in double precision.
 GAP_MIN = 1e-16
 # Below CLOSE, the iteration ends after PATIENCE steps that do not halve the residual.
 CLOSE, PATIENCE = 1e-9, 2
