@@ -36,7 +36,7 @@ from dynsim.record.measures import hand_target
 from dynsim.record.poses import point_positions
 from dynsim.record.scene import Point, SceneSurface
 
-# An axis of the 3D view shorter than this share of the longest has two ticks.
+# An axis of the 3D view shorter than this share of the longest gets two ticks.
 SHORT_AXIS = 0.45
 # Most joints that are drawn as dots.
 DOTS = 40

@@ -42,14 +42,14 @@ TRIANGLES = 20_000
 PAPER, GROUND, LINES, FAINT, SURFACE = "#FFFFFF", "#F1F3F5", "#D3D8DE", "#ECEEF1", "#C9D3DE"
 BODY, HUB, WHEEL, SUPPORT = "#AEB7C4", "#4A5260", "#3A4048", "#D5EAF8"
 FRICTION = "#7A3E9D"
-# Friction of less than this share of the largest normal force has no arrow.
+# Friction forces of less than this share of the largest normal force get no arrow.
 FRICTION_SHOWN = 1e-3
 MODES = {0: GREY, 1: ORANGE, 2: GREEN}
 # Towards the light, seen by the viewer: right, up, near.
 LIGHT = np.array([-0.35, 0.75, 0.56]) / np.linalg.norm([-0.35, 0.75, 0.56])
-# A lower picture [pixel] has smaller texts.
+# Height of a picture [pixel] below which texts are smaller.
 LOW = 200
-# Points of a path at most.
+# Most points of a path.
 WAY = 600
 
 
