@@ -31,7 +31,7 @@ from dynsim.integrators import run as ki
 from dynsim.integrators.output import fill_output
 
 Array = NDArray[np.float64]
-# Steps of the differences [rad, m, rad/s, A, …]: from where rounding is least to below what friction is smoothed over.
+# Steps of the differences [rad, m, rad/s, A, …]: from least rounding error to below the speeds that smooth friction.
 STEPS = tuple(1e-2 / 3.0**k for k in range(9))
 # Rows whose largest entry is below this count as zero [SI units].
 NOTHING = 1e-6

@@ -44,7 +44,7 @@ SHIPPED = _CHECKOUT if _CHECKOUT.is_dir() else _PACKAGE / "shipped_scenarios" / 
 
 
 HIGHEST_SUPPLY, RATED_SUPPLY = 14.8, 12.0
-"""Upper end of the recommended supply of the MX series, and that of its data sheet [V]; speed and torque grow with it."""
+"""Highest recommended supply of the MX series, and supply of its data sheet [V]; speed and torque grow with it."""
 FURTHEST_OFF = 1.0
 """Largest limit on the following error of a position servo; a larger one would have no effect [rad]."""
 ROOM = 20.0

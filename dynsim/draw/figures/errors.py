@@ -25,7 +25,7 @@ class Followed:
 
     Attributes
     ----------
-    kind : what they are, such as "joints"
+    kind : plural noun, such as "joints"
     quantity, error : labels of the axes, with units
     scale : of the error's unit to that of the values
     names : of the joints

@@ -34,7 +34,7 @@ UNITS = {"m", "s", "rad", "N", "A", "V", "W", "J", "kg", "per"}
 _BARS, _BINS = 12, 40
 # Values whose ratio is larger are drawn on a logarithmic axis or colour scale.
 _WIDE = 8.0
-# Height and width of a panel, height of a bar of a tornado, of what is about them, and of a bar of colours [inch].
+# Height and width of a panel, height of a bar of a tornado, of their surroundings, and of a colour bar [inch].
 _PANEL, _ACROSS, _BAR, _ROOM = 2.1, 3.5, 0.22, 0.9
 _COLOURS = 0.5
 # A label of an axis, the title of a panel and a part of the figure's are not longer [characters].

@@ -37,7 +37,7 @@ class Meshes:
         self._missing: dict[str, None] = {}
 
     def of_robot(self, record: Record) -> None:
-        """Look for what follows where the robot of this record came from."""
+        """Search for the next meshes in the folders of this record's robot."""
         scenario = record.provenance.get("scenario", {})
         files = named(scenario.get("plant", {}) if isinstance(scenario, Mapping) else {}, "file")
         self._folders = tuple(Path(file).parent for file in files if isinstance(file, str))
