@@ -1,4 +1,4 @@
-"""Preparation of a dynamics run: the scenario compiled to kernel arrays, and the checks that refuse it beforehand."""
+"""Preparation of a dynamics run: the scenario compiled to kernel arrays, and the checks before the first step."""
 
 from __future__ import annotations
 
