@@ -34,7 +34,7 @@ def main(received: Sequence[int]) -> None:
                 code = _explain_lost_output(output.failure)
     code = interruption.exit_code(received) if code == SimulationInterrupted.exit_code else code
     if interruption.is_left():
-        # The interpreter would take down what a thread in compiled code still works on.
+        # At its end the interpreter would free data that a thread in compiled code still uses.
         with suppress(OSError, ValueError):
             sys.stderr.flush()
         os._exit(code)

@@ -1,4 +1,4 @@
-"""Command ``dynsim plan``: finds which points of an arm to brace, where, in what posture and with what force."""
+"""Command ``dynsim plan``: finds the points of an arm to brace, their places, the postures and the brace forces."""
 
 from __future__ import annotations
 

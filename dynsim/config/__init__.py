@@ -1,1 +1,1 @@
-"""Base class of configurations, and the wording of validation errors."""
+"""Base classes of configurations, messages of validation errors, and shell completion."""

@@ -1,4 +1,4 @@
-"""Base classes of the configurations in scenarios and servo maps, with number types, and checks of vectors and points."""
+"""Base classes of configurations in scenarios and servo maps; types and checks of numbers, vectors and waypoints."""
 
 from __future__ import annotations
 

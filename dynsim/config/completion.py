@@ -25,7 +25,7 @@ def variants(ctx: typer.Context, incomplete: str) -> list[str]:
     # Imported here: the command line loads this module.
     from dynsim.system.inputs import YamlMapping, is_file, parse_yaml, read_text
 
-    # While the option lacks its value, what stands before it is not parsed yet.
+    # While the option has no value yet, the arguments before it are not parsed.
     path = Path(ctx.params.get("scenario") or next(iter(ctx.args), ""))
     try:
         path = path if is_file(path, ScenarioError) else shipped_scenario(path) or path

@@ -1,1 +1,1 @@
-"""Pictures of records: figures, films and pages."""
+"""Figures, films and viewer pages of records."""

@@ -38,7 +38,7 @@ class Compilation:
 
     Attributes
     ----------
-    text : what, why and how long
+    text : kernels, reason and expected duration
     since : time of the clock at its beginning [s]
     expected : how long the last one of this kind took [s]; None: there was none
     """

@@ -37,7 +37,7 @@ class Balance:
     shift : (na,) of their references [rad or m; N m of a torque source]
     heat : Σ R i² [W]
     normal_forces : by contact that touches [N]; empty where the controller plans them
-    warnings : what jumps all the same
+    warnings : jumps that remain at the start
     """
 
     current: Array

@@ -39,15 +39,15 @@ SPREAD_SAMPLES = 5
 NULL_TOLERANCE = 1e-9
 # A spread below this fraction of the accelerations is rounding of the null space.
 SPREAD_TOLERANCE = 1e-7
-# Sets of modes that are looked at: each is a singular value decomposition of the rows of all that is closed.
+# Most sets of modes that are examined, each by a singular value decomposition of the rows of all closed contacts.
 MOST_SETS = 50
-# Singular values of unit rows below this are none: their square is what the elimination of A takes for dependent.
+# Singular values of unit rows below this count as zero: their square is the tolerance of the elimination of A.
 DEPENDENT = 1e-6
 
 
 @dataclass(frozen=True)
 class MotionSpread:
-    """What dependent frictional rows leave open: the range of one joint's acceleration over all admissible splits.
+    """Range of one joint's acceleration over all admissible distributions of dependent frictional forces.
 
     Attributes
     ----------

@@ -31,9 +31,9 @@ from dynsim.integrators import run as ki
 from dynsim.integrators.output import fill_output
 
 Array = NDArray[np.float64]
-# Steps of the differences [rad, m, rad/s, A, …]: from where rounding is least to below what friction is smoothed over.
+# Steps of the differences [rad, m, rad/s, A, …]: from least rounding error to below the speeds that smooth friction.
 STEPS = tuple(1e-2 / 3.0**k for k in range(9))
-# Rows whose largest entry is below this are zero but for rounding [SI units].
+# Rows whose largest entry is below this count as zero [SI units].
 NOTHING = 1e-6
 MODES = {ka.OPEN: "open", ka.SLIDING: "sliding", ka.STICKING: "sticking"}
 INPUTS = ("command", "reference", "reference_rate", "force", "torque")
@@ -53,8 +53,8 @@ class Linearization:
     A, B, C, D : (x, x), (x, u), (y, x), (y, u)
     states, inputs, outputs : names of rows and columns
     time : [s]
-    x, xdot : (x,) the state, that of a step which ends there, and its rate, which is zero at rest alone
-    modes : of each contact point: open, sliding or sticking; of the bilateral law all slide
+    x, xdot : (x,) the state, at the end of a step, and its rate, which is zero only in an equilibrium
+    modes : of each contact point: open, sliding or sticking; under the bilateral law all slide
     error : largest difference between two estimates of an entry, in parts of the largest entry of its row
     """
 

@@ -1,4 +1,4 @@
-"""Preparation of a dynamics run: the scenario compiled to kernel arrays, and the checks that refuse it beforehand."""
+"""Preparation of a dynamics run: the scenario compiled to kernel arrays, and the checks before the first step."""
 
 from __future__ import annotations
 
@@ -48,10 +48,10 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-# How much longer than the wall limit a run has to be estimated at to be refused: of small systems estimates are up to
-# so many times too long.
+# A run is refused if its estimated time exceeds the wall limit by this factor: estimates of small systems are too long
+# by up to that factor.
 CLEARLY = 10.0
-# Steps that an explicit method may be held to by the electrical poles alone: a quarter of an hour for ten joints.
+# Most steps of an explicit method that the electrical poles may require: a quarter of an hour for ten joints.
 STEPS_LIMIT = 2e8
 # More steps than any run takes.
 _EVERY_STEP = 1 << 62

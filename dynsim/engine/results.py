@@ -38,7 +38,7 @@ def save_run(record: Record, folder: Path) -> None:
 
 
 def save_drive(record: Record, folder: Path) -> None:
-    """:func:`save_run` of what nobody can do again: where the record has no room, the script that repeats it is kept.
+    """:func:`save_run` of a live drive; if the record cannot be written, the script that reproduces it is kept.
 
     Raises
     ------

@@ -54,19 +54,19 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-# Steps in one compiled piece: it ends sooner where somebody wants it to, see dynsim.engine.attended.
+# Most steps in one call of compiled code, which ends sooner on request, see dynsim.engine.attended.
 _PIECE = 1 << 62
-# Of the ticks of callers: kinds are bits of a number, and shorter periods would take for ever.
+# Limits on ticks of callers: their number (kinds are bits of an integer), and their period [s].
 MOST_TICKS, SHORTEST_PERIOD = 60, 1e-9
-# Ticks this close to the time asked for belong to it, per second of it.
+# Ticks within this of the requested time are included, relative to that time.
 TICK_SLACK = 1e-12
-# End of a run without end [s]: far beyond any, and still a number to reckon with.
+# End of a run without a given end [s]: finite, and later than any time in use.
 _FAR = 1e300
 SERVO_MODES = {"position": ka.POSITION_MODE, "velocity": ka.VELOCITY_MODE, "off": ka.OFF}
-# What kernels sample into: of another size after each refill.
+# Buffers into which kernels sample; their sizes change.
 _BUFFERS = {f"run.{field}": field for field in ("sample_time", "sample", "output")}
-# Inertia of a joint whose brake is closed [kg m² or kg]: what no load moves, not even by a rounding of its angle, so
-# that a contact point behind closed brakes alone stays where it is.
+# Inertia of a joint whose brake is closed [kg m² or kg]: so large that loads do not change its position even by
+# rounding, and a contact point carried by braked joints alone stays where it is.
 BRAKED = 1e30
 
 

@@ -40,7 +40,7 @@ from dynsim.snake.ticks import command_tick, record_row
 _ROOT_COORDINATES = 7
 # How often somebody looks whether the head lies on the ground, and how long it does until the run ends [s].
 OVERLOAD_LOOK, LIES_FOR = 0.1, 0.5
-# What a snapshot keeps of the switcher and of the pilot itself: values that are replaced, and never written to.
+# Attributes of the switcher and of the pilot that a snapshot keeps: their values are replaced, never modified in place.
 _SWITCHER = ("row", "switching", "next_switch", "switches", "_place")
 _OWN = (
     "block",

@@ -41,7 +41,7 @@ def attitude_distance(w: NDArray[np.float64], w_target: NDArray[np.float64]) -> 
 
 
 def hold_last(trace: SnakeTrace) -> None:
-    """Complete the last row, at whose time no control period begins: what was held goes on."""
+    """Complete the last row, at whose time no control period begins, with the values held until then."""
     if len(trace.u) > 1:
         for array in (trace.u, trace.slip, trace.at_limit):
             array[-1] = array[-2]

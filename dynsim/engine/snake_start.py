@@ -33,7 +33,7 @@ STEADY_TICKS = 4
 
 
 class WheelLifter:
-    """Heights of the wheel pairs over time, and what that asks of the pitch joints on their axles.
+    """Heights of the wheel pairs over time, and the resulting angles of the pitch joints on their axles.
 
     What is to be put down goes down before the next is lifted.
     """

@@ -31,7 +31,7 @@ GUARDS = {
 }
 
 
-# What contacts, joint stops and joints with dry friction do, by its number in the kernels.
+# Events of contacts, joint stops and joints with dry friction, by their numbers in the kernels.
 CONTACT_EVENTS = {
     contact_events.LANDING: "landing",
     contact_events.LIFT_OFF: "lift_off",

@@ -38,7 +38,7 @@ _MODES = {ka.SLIDING: "slides", ka.STICKING: "sticks"}
 
 
 def stopped(scenario: Scenario, prepared: Prepared) -> SimulationStopped:
-    """The stop of a run whose STATUS says that it has not come to its end."""
+    """The exception for a run whose STATUS shows that it stopped before its end."""
     run = prepared.run
     kind = KINDS[int(run.count[ki.STATUS])]
     if finding := paradox(prepared.system, prepared.workspace, run, prepared.contacts):

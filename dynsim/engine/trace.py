@@ -1,4 +1,4 @@
-"""Sampling of a stepped simulation: blocks of sample times for the kernels, and the rows that are kept."""
+"""Sampling of a stepped simulation: blocks of sample times for the kernels, and the sampled rows that are kept."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dynsim.integrators import run as ki
 Array = NDArray[np.float64]
 Rows = tuple[Array, Array, Array]
 
-# Rows of the buffer that kernels sample into before it is emptied.
+# Number of rows of the buffer into which kernels sample before it is emptied.
 BLOCK = 256
 
 

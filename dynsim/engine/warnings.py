@@ -35,8 +35,8 @@ LIMIT_SLACK = 1e-6
 # Part of a limit of current that counts as reached.
 NEAR_LIMIT = 1e-3
 NOT_ENFORCED = "no law enforces this limit"
-# Time stepping, without a warning: what its steps may take or make of the turnover, by how much of it the energy may
-# depend on when within a step something happens, and how deep points may sink.
+# Time stepping, limits of warnings: energy taken or added by the steps, and change of the energy if all came half a
+# step later, both as shares of the turnover; depth of points below surfaces [m].
 SCHEME_LIMIT = 1e-2
 HALF_STEP_LIMIT = 2e-2
 PENETRATION_LIMIT_M = 1e-3

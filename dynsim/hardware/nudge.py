@@ -34,11 +34,11 @@ SPEED = 0.1
 PAUSE = 0.5
 """Pause at the far end [s], for a person to see the motion."""
 KNOTS = 31
-"""Of each leg: the interpolant is within 1e-7 rad of the quintic."""
+"""Knots of each leg: the interpolant is within 1e-7 rad of the quintic."""
 YIELDS = 0.75
-"""Following error that ends a nudge, in parts of its angle: a joint that is held fast is not pushed harder."""
+"""Following error that ends a nudge, in parts of its angle, so that a blocked joint is not loaded further."""
 MOVED = 0.5
-"""Less than this part of the angle is no motion to tell a sense from."""
+"""Least motion from which the sense of rotation is determined, in parts of the angle."""
 
 
 @dataclass(frozen=True)

@@ -44,11 +44,11 @@ SHIPPED = _CHECKOUT if _CHECKOUT.is_dir() else _PACKAGE / "shipped_scenarios" / 
 
 
 HIGHEST_SUPPLY, RATED_SUPPLY = 14.8, 12.0
-"""Of the recommended range of the MX series, and of its data sheet [V]; speed and torque grow with the supply."""
+"""Highest recommended supply of the MX series, and supply of its data sheet [V]; speed and torque grow with it."""
 FURTHEST_OFF = 1.0
-"""Following error of a position servo beyond which the rule would watch nothing [rad]."""
+"""Largest limit on the following error of a position servo; a larger one would have no effect [rad]."""
 ROOM = 20.0
-"""Temperature of a room, and so of a servo that has not moved yet [°C]."""
+"""Room temperature, which a servo that has not moved yet has [°C]."""
 
 _NO_LIMIT = "bounds nothing that a servo can do, or lets nothing pass"
 

@@ -20,7 +20,7 @@ Objection = tuple[str, str]
 
 @dataclass(frozen=True)
 class Within:
-    """Annotation of a number from ``low`` to ``high``; the error says why, and what to write instead."""
+    """Annotation of a number from ``low`` to ``high``; its error gives the reason and a valid value."""
 
     low: float
     high: float

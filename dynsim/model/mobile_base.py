@@ -25,7 +25,7 @@ class MobileBase:
     caster : (3,) where the caster touches the ground, in the base's frame [m]
     spin_inertia : of one wheel about its axle [kg m²]
     wheel_friction : μ between wheels and ground, for the traction demand
-    stop_on_overturn : whether a run ends when it tips; else it goes on as if held down
+    stop_on_overturn : whether a run ends when the base tips; else it continues with a base that cannot tip
     """
 
     body: str

@@ -17,7 +17,7 @@ _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", re.ASCII | re.IGNORE
 
 
 def read_rows(file: str, *headers: Sequence[str], kind: str) -> list[list[float]]:
-    """The rows that :func:`read_table` reads, where their number of columns tells which header it was."""
+    """The rows of :func:`read_table`, for headers of different numbers of columns."""
     return read_table(file, *headers, kind=kind)[1]
 
 
@@ -26,7 +26,7 @@ def read_table(file: str, *headers: Sequence[str], kind: str) -> tuple[tuple[str
 
     Parameters
     ----------
-    kind : what needs the rows, for the message
+    kind : name of the object that the rows describe, for the message
 
     Raises
     ------

@@ -35,7 +35,7 @@ HERE: Quaternion = (1.0, 0.0, 0.0, 0.0)
 _FIELD = ("position", "spacing", "heights")
 """Attributes of a height field."""
 _CHECKS: Any = {"allow_inf_nan": False}
-"""What pydantic is told of every class when it reads one."""
+"""Configuration of pydantic for reading each class."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Construction of what a scenario describes: plant, initial posture, controller, surfaces, contacts and loads."""
+"""Construction of a scenario's objects: plant in its initial posture, controller, surfaces, contacts and loads."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ PRESSED = 5e-3
 
 
 def machine(scenario: Scenario) -> Robot | SnakeDescription:
-    """What the plant of the scenario is, a tree of bodies or a snake."""
+    """The plant of the scenario: a tree of bodies, or the description of a snake."""
     if scenario.engine == "kinematic":
         # Imported here and below: an arm needs nothing of a snake.
         from dynsim.snake.description import SnakeDescription

@@ -1,1 +1,1 @@
-"""Studies over several runs."""
+"""Studies of several runs: variants, batches and sweeps, in processes or on a cluster; benchmarks."""

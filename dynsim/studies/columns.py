@@ -27,7 +27,7 @@ def flat(summary: dict[str, Any]) -> dict[str, Any]:
 
 
 def is_text(value: Any) -> bool:
-    """True for what no column of numbers takes."""
+    """True for a text, which has no place in a column of numbers."""
     return isinstance(value, str)
 
 
@@ -37,7 +37,7 @@ def is_scalar(value: Any) -> bool:
 
 
 def is_finite(value: Any) -> bool:
-    """True for a number that a double holds; not for infinity, nor for what is no number."""
+    """True for a finite number of double precision."""
     return isinstance(value, (int, float)) and abs(value) <= sys.float_info.max
 
 

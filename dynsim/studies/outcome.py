@@ -14,7 +14,7 @@ class RunResult:
 
     Attributes
     ----------
-    summary : numbers of the run; of one that stopped, what was simulated until then; empty when nothing was
+    summary : numbers of the run, of a stopped one those until its stop; empty when nothing was simulated
     reason : why it failed, "" when it did not
     lost : whether its process was lost, so that another attempt may succeed
     record : if requested

@@ -40,7 +40,7 @@ def run_sweep(
     progress: Callable[[int, int], None] | None = None,
     first: Callable[[SweepRow], None] | None = None,
 ) -> list[SweepRow]:
-    """Run what a plan asks for and write plan, journal, records, tables and statistics of samples to a folder.
+    """Carry out the runs of a plan; write plan, journal, records, tables and statistics of samples to a folder.
 
     Parameters
     ----------

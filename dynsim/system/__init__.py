@@ -1,1 +1,1 @@
-"""Services of the operating system: files, YAML, signals, streams, terminal; and memoisation."""
+"""Files, YAML input, signals, standard streams, terminal, shipped scenarios; and memoisation."""

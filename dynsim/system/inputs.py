@@ -36,7 +36,7 @@ _FLOAT = re.compile(
 _FORBIDDEN = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f\x80-\x84\x86-\x9f\ud800-\udfff\ufffe\uffff]")
 _CORE = "tag:yaml.org,2002:"
 _TEXT_TAGS = (None, "!", _CORE + "str")
-# Events that begin a value, and the method that reads it; what those are that cannot begin a key.
+# Events that begin a value, and the method that reads it; names of those that cannot begin a key.
 _VALUES = {"ScalarEvent": "_scalar", "MappingStartEvent": "_mapping", "SequenceStartEvent": "_list", "AliasEvent": ""}
 _NO_KEYS = {"MappingStartEvent": "a mapping", "SequenceStartEvent": "a list", "AliasEvent": "an alias"}
 # Stands for the value of an anchor whose end has not come yet.

@@ -30,7 +30,7 @@ codecs.register_error("dynsim.plain", _plain)
 
 
 class LenientStream:
-    """A text stream that swallows what cannot be written after its first failure, which ``failure`` keeps."""
+    """A text stream that discards its output from its first failure on, which ``failure`` keeps."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream

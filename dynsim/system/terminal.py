@@ -41,7 +41,7 @@ def escaped_line(text: object) -> str:
 
 
 class Terminal(Console):
-    """A console that removes control characters from all printed text, also from texts of other libraries.
+    """A console that prints control characters in escaped form, also in texts of other libraries.
 
     Markup is interpreted if the console is set up to: texts that are inserted into markup need :func:`escaped`.
     """

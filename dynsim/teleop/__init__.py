@@ -1,1 +1,1 @@
-"""Teleoperation: sessions of the arm and the snake, and the web page that commands them."""
+"""Teleoperation: sessions of arm and snake, and the web server by which a pilot commands them."""

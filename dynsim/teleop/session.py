@@ -39,7 +39,7 @@ class PilotAxis:
 
 @dataclass(frozen=True)
 class Command:
-    """What the simulation is to do in one tick.
+    """Command of a pilot for one tick of the simulation.
 
     Attributes
     ----------

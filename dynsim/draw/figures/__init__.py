@@ -1,4 +1,4 @@
-"""Figures of one record or of several side by side, written to a folder.
+"""Figures of one record, or comparisons of several, written to a folder; single figures by name.
 
 Matplotlib is loaded on the first drawing.
 """
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 MEASURED, SIMULATED = "dynsim.draw.figures.measured", "dynsim.draw.figures.arm"
 # Module with ``draw`` and ``draw_comparison``, and with ``figures`` and ``comparisons``, the makers by name → sets of
-# signals, any of which tells its records; the first module that finds one draws.
+# signals. A module draws the records that have one of its sets; the first module that matches is used.
 MODULES: dict[str, tuple[set[str], ...]] = {
     "dynsim.draw.figures.snake": ({"posture"}, {"base_pose", "mode"}, {"w", "w_target"}),
     MEASURED: ({"q_goal"}, {"record_time"}, {"torque_estimate"}),

@@ -1,4 +1,4 @@
-"""The set of figures of an arm: one run, or variants over each other."""
+"""The set of figures of an arm, fixed or on a mobile base: of one run, or of variants over each other."""
 
 from __future__ import annotations
 

@@ -16,11 +16,11 @@ from dynsim.record import Record
 from dynsim.record.measures import TIP_OVER, overturns_settled, percent
 
 LOADS, MARGIN, TRACTION = "wheel_load", "tip_margin", "traction_demand"
-# Without load the demand has no bound, and the margin none where the ground carries almost nothing: axes end here.
+# Ends of the axes: the traction demand is unbounded without load, the tip margin where the ground carries almost none.
 TRACTION_TOP, MARGIN_LOW = 2.5, -2.0
-# Of left wheel, right wheel and caster; the left is wider, to be seen below the right where they carry the same.
+# Colours and widths of left wheel, right wheel and caster; the left is wider, so that it is visible at equal loads.
 LOOKS = ((style.BLUE, 2.0), (style.GREEN, 1.0), (style.ORANGE, 1.2))
-# Tracking: axes of positions and headings show at least this [m, °], so that rest is not drawn as motion.
+# Tracking: least range of the axes of positions and headings [m, °], so that rounding at rest is not enlarged.
 LEAST_POSITION, LEAST_HEADING = 1e-3, 0.1
 MILLI = 1e3
 

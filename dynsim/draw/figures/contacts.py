@@ -1,7 +1,7 @@
-"""Figure of the normal forces of the contacts over time, with the region of pulling forces shaded.
+"""Figure of the normal contact forces over time, with pulling forces or contact modes marked.
 
-Under the bilateral law a force may have either sign, and what lies below zero is shaded. Under the unilateral one
-there is a mode at each instant instead: bands show when a contact is open, slides and sticks.
+Under the bilateral law a force may have either sign; the region below zero is shaded. Under the unilateral law bands
+show the mode of each contact: open, sliding or sticking.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from dynsim.draw.figures.style import Array
 from dynsim.record import Record
 from dynsim.record.measures import percent
 
-# More rows than this do not fit a page; height of one [inch].
+# Most rows on a page; height of a row [inch].
 ROWS, ROW = 8, 1.75
-# More samples than this are not drawn as dots.
+# Most samples that are drawn as dots.
 DOTS = 150
-# Modes by their number: what a contact does, the colour of its bands, and what of the summary says for how long.
+# Modes by their number: name, colour of the bands, and key of the summary with the share of time.
 MODE = "contact_mode"
 MODES = (
     ("open", "#EFEFEF", "closed_fraction"),

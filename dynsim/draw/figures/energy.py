@@ -1,4 +1,4 @@
-"""Electrical energy and work over time ([WM] Figs 7, 8), and the ledger of where the energy went."""
+"""Figures of electrical energy and work over time ([WM] Figs 7, 8), and of the energy ledger."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ TERMS = {
     "energy_potential": ("Δ potential energy", "#CC79A7"),
     "energy_magnetic": ("Δ magnetic energy", "#7F7F7F"),
 }
-# Finals further apart than this need a logarithmic axis.
+# Largest ratio of final values that is drawn on a linear axis.
 LOG_RATIO = 8.0
-# A term with more than this share of the turnover hides the others: they get a panel of their own.
+# Share of the turnover above which one term hides the others, which then get a panel of their own.
 DOMINANT = 0.8
 # Less than this share of the largest term is rounding.
 NOTHING = 1e-9

@@ -12,20 +12,20 @@ from matplotlib.axes import Axes
 from dynsim.draw.figures import style
 from dynsim.draw.figures.style import Array
 
-# Drawn in colour where none are named: those with the largest rms.
+# Number of joints drawn in colour where none are named: those with the largest rms errors.
 STRONG = 4
 FAINT: dict[str, Any] = {"color": "#CFCFCF", "linewidth": 0.7}
-# On top and dashed: where both agree, both are seen.
+# On top and dashed, so that both are visible where they agree.
 SIMULATED: dict[str, Any] = {"color": style.BLACK, "linewidth": 0.9, "linestyle": (0, (4, 3))}
 
 
 @dataclass(frozen=True)
 class Followed:
-    """A quantity that several joints have.
+    """One quantity of several joints, simulated and measured, and its errors.
 
     Attributes
     ----------
-    kind : what they are, such as "joints"
+    kind : plural noun, such as "joints"
     quantity, error : labels of the axes, with units
     scale : of the error's unit to that of the values
     names : of the joints

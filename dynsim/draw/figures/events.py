@@ -24,11 +24,11 @@ MARKS: dict[str, tuple[str, str, str]] = {
     "chatter": ("*", "★", "chatter"),
 }
 COLOUR = "#555555"
-# Lines of more events than this would hide the curves; their marks stay.
+# Most events that get vertical lines; more would hide the curves, and get marks only.
 LINES = 40
-# Marks lie so far below the upper edge, and rows of them so far from each other [point].
+# Distance of the marks from the upper edge, and between their rows [point].
 BELOW, ROW = 4.0, 6.0
-# Characters of a line that explains marks: it fits under the narrowest panel over time.
+# Most characters in a line of the legend of marks, which fits under the narrowest panel.
 WIDEST = 50
 
 

@@ -1,4 +1,4 @@
-"""The hand against its target: paths in three planes and the tracking error ([WM] Figs 4–6)."""
+"""Figures of the hand and its target: paths in three planes, and tracking error over time ([WM] Figs 4–6)."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from dynsim.record.measures import hand_error, hand_target
 
 PLANES = ((0, 1), (0, 2), (1, 2))
 MILLI = 1e3
-# A target that stays within this is held, not followed [m].
+# A target whose motion stays within this is fixed [m].
 HELD = 1e-6
-# Legends: where the path has the hand, and where the goals of the joints have it.
+# Legends: position of the hand by its path, and by the goals of the joints.
 TARGET, GOALS = "target", "goals"
-# Where a hand starts: the same mark for all variants, so that the legend shows what is drawn.
+# Mark of the start of a hand, the same for all variants.
 START: dict[str, Any] = {
     "linestyle": "none",
     "marker": "o",

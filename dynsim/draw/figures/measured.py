@@ -13,7 +13,7 @@ from dynsim.draw.figures import hand, posture, style
 from dynsim.draw.figures.style import Array
 from dynsim.record import TIME, Record
 
-# Most joints on a page; of more, those with the largest error are drawn.
+# Most joints on a page; of more joints, those with the largest errors are drawn.
 JOINTS = 24
 # Most lines in one panel.
 LINES = 12

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from dynsim.draw.figures import events, style
 from dynsim.record import Record
 
-# Up to so many motors a line each; beyond that as many with the largest currents, and the envelope of all.
+# Most motors with lines of their own: those with the largest currents; of more motors the envelope is drawn too.
 LARGEST = 6
 
 

@@ -26,13 +26,13 @@ from dynsim.draw.figures.style import (
     save_all,
 )
 
-# Length of an arrow of the greatest force, over the height of what is seen, at most.
+# Largest length of the arrow of the greatest force, in parts of the height of the view.
 ARROW = 0.35
-# An arm that leaves its plane by less of its length is not drawn from above.
+# An arm that leaves its plane by less than this part of its length is not drawn from above.
 FLAT = 0.02
 # Values whose ratio is larger are drawn on a logarithmic axis.
 WIDE = 20.0
-# Room to either side of an arm from above [m].
+# Margin to either side of an arm in the view from above [m].
 MARGIN = 0.1
 
 

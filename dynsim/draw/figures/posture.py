@@ -1,4 +1,4 @@
-"""Figure of the arm's posture: 3D view and side view with elbows, surfaces, target and hand path."""
+"""Figures of an arm's posture: 3D view and side view with elbows, surfaces, target and hand path; comparison."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ from dynsim.record.measures import hand_target
 from dynsim.record.poses import point_positions
 from dynsim.record.scene import Point, SceneSurface
 
-# An axis of the 3D view shorter than this share of the longest has two ticks.
+# An axis of the 3D view shorter than this share of the longest gets two ticks.
 SHORT_AXIS = 0.45
-# Joints are dots up to this many.
+# Most joints that are drawn as dots.
 DOTS = 40
 ARM_COLOUR = "#444444"
 BASE_COLOUR = "#D5D5D5"

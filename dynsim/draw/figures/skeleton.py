@@ -17,19 +17,19 @@ from dynsim.record.measures import hand_target
 from dynsim.record.poses import POSITION, point_positions
 from dynsim.record.scene import WORLD, Joint, Point, Scene, SceneSurface
 
-# Postures drawn faintly, evenly over the run, besides the last one.
+# Number of postures drawn faintly, at even intervals of the run, besides the last one.
 FAINT = 6
-# Text at the contacts: size and height of its two lines [point].
+# Text at the contacts: font size, and height of its two lines [point].
 LABEL_SIZE, LABEL_HEIGHT = 7.0, 19.0
 # From the middle of a contact's mark to its text [point].
 NEAR_CONTACT = 7.0
-# Body poses are in single precision: what spreads no further than this does not spread [m].
+# Extents up to this count as zero, as body poses are in single precision [m].
 NOTHING = 1e-6
 
 
 @dataclass(frozen=True)
 class Skeleton:
-    """A robot whose bodies were placed over time."""
+    """A robot with the poses of its bodies over time."""
 
     record: Record
     scene: Scene

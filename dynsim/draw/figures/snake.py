@@ -1,4 +1,4 @@
-"""Figures and animation of a snake run, from its record alone.
+"""Figures and animation of a snake run, and comparisons of runs, from their records alone.
 
 Postures in top and side view with grounded and lifted wheels and the support polygon; controlled variable against its
 target; joint angles with their limits; cost, smallest singular value, support margin, modes.
@@ -43,9 +43,9 @@ from dynsim.record import Record
 from dynsim.snake.geometry import snake_geometry
 from dynsim.snake.published import used_limit
 
-# Postures of an animation, in a row, and over each other in one picture.
+# Numbers of postures: of an animation, in a row, and over each other in one picture.
 FRAMES, IN_A_ROW, IN_A_PICTURE = 50, 6, 7
-# Postures over time in grey: the lines beside them have the colours.
+# Greys of postures over time, as the lines beside them have colours.
 SHADES = LinearSegmentedColormap.from_list("shades", ["#CFCFCF", "#000000"])
 
 

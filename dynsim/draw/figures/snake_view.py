@@ -24,15 +24,15 @@ from dynsim.snake.geometry import snake_geometry
 
 BODY, HEAD, GROUND, LIFT, TARGET, SUPPORT = "#444444", style.PULLING, style.BLUE, "#FFFFFF", style.GREEN, style.SKY
 SYMBOLS = {"alpha": "α", "beta": "β", "gamma": "γ"}
-# Beyond this many modes their numbers do not fit above the bars of a chart.
+# Most modes whose numbers fit above the bars of a chart.
 NUMBERED = 30
-# Parts of a run, of which shares and ranges are drawn where lines and bars would fill the panel: more modes than that.
+# Intervals of a run. Where it has more modes than this, shares and ranges in the intervals are drawn, not each mode.
 TURNS = 160
-# From never to always.
+# Colours of shares of time from 0 to 1.
 SHARES = LinearSegmentedColormap.from_list("shares", [LIFT, GROUND])
-# A top view is at least this high, in parts of its width: a straight robot is a thin line.
+# Least height of a top view, in parts of its width, as a straight robot is a thin line.
 LEAST_HEIGHT = 0.3
-# Numbers at the vertical axes of postures [point].
+# Font size of the numbers at the vertical axes of postures [point].
 SMALL = 6.5
 
 

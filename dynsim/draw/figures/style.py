@@ -1,4 +1,4 @@
-"""Shared style of all figures: sizes, colours, time axes, saving."""
+"""Shared style of all figures: sizes, colours, titles, legends, axes over time, texts of numbers, saving."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ BLUE, ORANGE, GREEN, PURPLE, SKY, BLACK = "#0072B2", "#E69F00", "#009E73", "#CC7
 # Kept for pulling contacts in every figure, so no variant may have it.
 PULLING = "#D55E00"
 GREY = "#7F7F7F"
-# What lies below a surface that only contact points are held by.
+# Parts of links below a surface, where no contact point holds them.
 DEEP = "#882255"
 VARIANT_COLOURS = (BLUE, GREEN, ORANGE, PURPLE, SKY, BLACK, "#8C6D31")
 AXIS_COLOURS = {"x": BLUE, "y": GREEN, "z": ORANGE}

@@ -1,6 +1,6 @@
 """Figures of a sweep: values over the grid, energy against error, distributions and sensitivities.
 
-Drawn from the table alone.
+Only the table of the sweep is needed.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from dynsim.draw.figures.style import Array
 from dynsim.record.sensitivity import LEVEL, sensitivities, spread
 
 ENERGY = "electrical_energy_J"
-# Label, and what the number is multiplied by for it. The first error that the table has is drawn.
+# Label, and factor to its unit. The first error that the table has is drawn.
 ENERGIES = {ENERGY: ("electrical energy [J]", 1.0)}
 ERRORS = {
     "hand_error_rms_m": ("hand error, rms [mm]", 1e3),
     "final_position_error_m": ("final position error [mm]", 1e3),
 }
-# What keys of a summary end with.
+# Unit parts at the ends of summary keys.
 UNITS = {"m", "s", "rad", "N", "A", "V", "W", "J", "kg", "per"}
-# Parameters of a tornado, and bars of a histogram.
+# Most parameters of a tornado diagram, and number of bars of a histogram.
 _BARS, _BINS = 12, 40
-# Values whose ratio is larger are of very different size.
+# Values whose ratio is larger are drawn on a logarithmic axis or colour scale.
 _WIDE = 8.0
-# Height and width of a panel, height of a bar of a tornado, of what is about them, and of a bar of colours [inch].
+# Height and width of a panel, height of a bar of a tornado, of their surroundings, and of a colour bar [inch].
 _PANEL, _ACROSS, _BAR, _ROOM = 2.1, 3.5, 0.22, 0.9
 _COLOURS = 0.5
 # A label of an axis, the title of a panel and a part of the figure's are not longer [characters].

@@ -1,7 +1,7 @@
 """Figures and tables in the layout of [T], for comparison with the paper.
 
 [T]: M. Tanaka et al., "Task-Space Control of Articulated Mobile Robots With a Soft Gripper for Operations", IEEE
-Transactions on Robotics 35(1), 2019. Its curves are not copied; numbers that its text states are drawn in.
+Transactions on Robotics 35(1), 2019. Its curves are not reproduced; numbers that its text states are shown.
 """
 
 from __future__ import annotations

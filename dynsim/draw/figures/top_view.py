@@ -1,4 +1,4 @@
-"""Figure of a mobile base from above: path, elbows and hand of its arm, ground contacts."""
+"""Figure of a mobile base from above: path, arm, elbows and hand, supports, and centre of pressure in its frame."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from dynsim.record.scene import Point
 
 Rows = NDArray[np.intp]
 
-# Height of the row with the base in its own frame, where it stands below the world [inch].
+# Height of the panel in the base's frame where it is placed below that in the world [inch].
 BELOW = 2.9
 
-# So many support triangles at most, evenly over the way, at least this share of their size apart.
+# Most support triangles, at even distances along the path, and their least distance in parts of their size.
 TRIANGLES, APART = 6, 0.25
 ELBOW_COLOURS = (style.ORANGE, style.GREEN, "#8C6D31")
 ARM_ABOVE = "#A8A8A8"

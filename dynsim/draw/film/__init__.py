@@ -1,4 +1,4 @@
-"""Films of records: without display, graphics card or browser.
+"""Films of records, painted without display, graphics card or browser.
 
 Record(s) → robots of :mod:`dynsim.draw.geometry.robot` → painted frames (:mod:`dynsim.draw.film.painter`) over a plot
 (:mod:`dynsim.draw.film.strip`) → file (:mod:`dynsim.draw.film.encode`)

@@ -1,4 +1,4 @@
-"""Frames to a file: GIF by Pillow, MP4 by PyAV."""
+"""Writing of frames to a film file: GIF by Pillow, MP4 by PyAV; limits on its length."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from PIL import Image, ImageColor
 from dynsim.draw.figures.style import GREY, PULLING, VARIANT_COLOURS
 from dynsim.errors import RecordError
 
-# Of a GIF: instants are multiples of a hundredth of a second, and players slow down what is shorter than two.
+# Largest frame rate of a GIF [1/s]: times are multiples of 0.01 s, and players slow down frames of less than 0.02 s.
 GIF_FPS_MAX = 50
-# Pixels of all its frames, a byte each in memory.
+# Most pixels of all frames of a GIF, a byte each in memory.
 GIF_PIXELS_MAX = 1_000_000_000
-# More frames than this are no film any more, but hours of painting.
+# Most frames of a film: more would take hours to paint.
 FRAMES_MAX = 100_000
-# Frames from which the colours of a GIF are taken.
+# Number of frames from which the palette of a GIF is made.
 SAMPLED = 6
-# Colours of a palette that differ by no more of 255 are one.
+# Colours of a palette that differ by no more than this (of 255) are merged.
 NEARLY = 9
-# Quality of H.264: less is better and larger; 18 is hardly told from the original.
+# Quality parameter of H.264: smaller is better and gives larger files; 18 is almost the original.
 QUALITY = 20
 
 

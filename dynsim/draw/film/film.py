@@ -27,9 +27,9 @@ from dynsim.system.terminal import plain
 HEAD, PLOT = 26, 0.24
 # Least height of the plot, and least size of a film that has one [pixel].
 PLOT_MIN, WITH_PLOT = 84, (240, 220)
-# Around a robot at most [pixel], and as a part of a small picture.
+# Margin around a robot: at most [pixel], and as a part of a small picture.
 ROOM, ROOM_SHARE = 14, 0.05
-# Least width and height of what shows one robot [pixel].
+# Least width and height of the picture of one robot [pixel].
 CELL_MIN = 60
 SIZE_MIN, SIZE_MAX = 160, 4096
 FPS_MAX, SPEED_MAX = 120, 1000.0

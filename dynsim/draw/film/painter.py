@@ -1,7 +1,7 @@
 """Frames of one robot: static background drawn once, moving faces drawn from far to near.
 
-Painted with Pillow at ``FINER`` times the size and then reduced, which smooths all edges. Depth is that of a face's
-middle: bodies that are small beside their distances need no more, and no graphics card is asked for.
+Painted with Pillow at ``FINER`` times the size and then reduced, which smooths all edges. Faces are sorted by the depth
+of their centres, which suffices for faces that are small compared with their distances.
 """
 
 from __future__ import annotations
@@ -37,19 +37,19 @@ from dynsim.record.scene import HERE, WORLD, SceneSurface
 
 Array = NDArray[np.float64]
 FINER = 2
-# Triangles of all meshes at most: a film of a robot is some 500 pixels wide.
+# Most triangles of all meshes: a film of a robot is some 500 pixels wide.
 TRIANGLES = 20_000
 PAPER, GROUND, LINES, FAINT, SURFACE = "#FFFFFF", "#F1F3F5", "#D3D8DE", "#ECEEF1", "#C9D3DE"
 BODY, HUB, WHEEL, SUPPORT = "#AEB7C4", "#4A5260", "#3A4048", "#D5EAF8"
 FRICTION = "#7A3E9D"
-# Friction of less than this share of the largest normal force has no arrow.
+# Friction forces of less than this share of the largest normal force get no arrow.
 FRICTION_SHOWN = 1e-3
 MODES = {0: GREY, 1: ORANGE, 2: GREEN}
 # Towards the light, seen by the viewer: right, up, near.
 LIGHT = np.array([-0.35, 0.75, 0.56]) / np.linalg.norm([-0.35, 0.75, 0.56])
-# A lower picture [pixel] has smaller texts.
+# Height of a picture [pixel] below which texts are smaller.
 LOW = 200
-# Points of a path at most.
+# Most points of a path.
 WAY = 600
 
 

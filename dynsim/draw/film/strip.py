@@ -1,4 +1,4 @@
-"""The plot below the robots: drawn once, with a moving cursor."""
+"""The plot below the robots of a film: one signal over time, drawn once, with a moving cursor."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from dynsim.errors import RecordError
 from dynsim.record import TIME, Record
 from dynsim.system.terminal import plain
 
-# What a strip shows unless told: the first that the record, or one of several, has.
+# Signals shown by default: the first of them that the record, or one of several records, has.
 ONE = ("contact_normal_force", "wheel_load", "hand_error", "support_margin", "position_error", "power", "q", "phi")
 SEVERAL = ("energy_electrical", "hand_error", "position_error", "tip_margin", "support_margin", "q", "phi")
 DPI = 100
 CURSOR = "#202428"
-# Columns of a signal that have lines of their own: the largest ones. All others are in the range of all.
+# Number of columns of a signal with lines of their own: the largest ones. A band shows the range of all columns.
 NAMED = 4
-# A narrower plot has no room for a legend beside it [pixel], and a name no more letters.
+# Least width of a plot with a legend beside it [pixel], and most letters of a name in it.
 LEGEND_MIN, LETTERS = 400, 16
-# Height of one name in it [pixel]; those that do not fit have none.
+# Height of one name in the legend [pixel]; names that do not fit are left out.
 LEGEND_ROW = 14
 
 

@@ -1,4 +1,4 @@
-"""Lines, arrows, rings and labels drawn on an image, in pixels."""
+"""Lines, dashes, arrows, rings and labels drawn on an image, in pixels; the font of films."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The camera of a film: a parallel projection, so that lengths are the same everywhere in the picture."""
+"""The camera of a film: a parallel projection, so that the scale does not depend on the distance; named views."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 View = Literal["side", "top", "iso"]
-# From the robot to the camera, the robot's longest way being x.
+# Directions from the robot to the camera, in axes whose x is the robot's longest horizontal extent.
 FROM: dict[str, tuple[float, float, float]] = {
     "side": (0.0, -1.0, 0.0),
     "top": (0.0, 0.0, 1.0),
@@ -25,7 +25,7 @@ class Camera:
     Attributes
     ----------
     axes : (3, 3) unit vectors in the world: right, up and towards the viewer
-    centre : (3,) what is seen in the middle [m]
+    centre : (3,) the point r that is shown in the middle [m]
     scale : [pixel/m]
     middle : (2,) of the picture [pixel]; y is down
     """

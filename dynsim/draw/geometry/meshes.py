@@ -1,4 +1,4 @@
-"""Meshes of URDF robots: located, read once each, and simplified to a size that a page can carry."""
+"""Meshes of URDF robots: located, read once each, and simplified to a number of triangles for a page or film."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from dynsim.draw.geometry.mesh_files import Mesh, read_mesh
 from dynsim.errors import RecordError
 from dynsim.record import Record
 
-# Triangles of all meshes of a page at most: some 1 MB of it.
+# Most triangles of all meshes of a page: some 1 MB.
 TRIANGLES = 100_000
-# Corners nearer to each other than this share of a mesh's size are one: STL repeats them for every triangle.
+# Corners closer than this share of a mesh's size are merged: STL repeats them for every triangle.
 _WELD = 2.0**-20
-# The same before a mesh is simplified: slivers, of which meshes from CAD are full, would hold that up. The next one is
-# tried where this many times too many triangles are left.
+# Such shares used before a mesh is simplified, as thin triangles, frequent in meshes from CAD, hinder that. The next
+# share is tried if more than this many times the allowed triangles are left.
 _COARSE, _TOO_MANY = (1 / 500, 1 / 250, 1 / 120, 1 / 60, 1 / 30), 1.5
-# Where the collapses of fast_simplification end: at an error of a hundredth of the size.
+# Parameter of fast_simplification: edges are collapsed up to an error of a hundredth of the size.
 _AGGRESSIVENESS = 2.5
-# Fewer triangles than a tetrahedron has are no solid.
+# Least number of triangles of a solid, those of a tetrahedron.
 _LEAST = 4
 
 
 class Meshes:
-    """Meshes, each once; those of a record are looked for where its robot's file is."""
+    """Meshes, each once; files of a record's meshes are searched for in the folder of its robot's file."""
 
     def __init__(self) -> None:
         self.unique: list[Mesh] = []
@@ -37,7 +37,7 @@ class Meshes:
         self._missing: dict[str, None] = {}
 
     def of_robot(self, record: Record) -> None:
-        """Look for what follows where the robot of this record came from."""
+        """Search for the next meshes in the folders of this record's robot."""
         scenario = record.provenance.get("scenario", {})
         files = named(scenario.get("plant", {}) if isinstance(scenario, Mapping) else {}, "file")
         self._folders = tuple(Path(file).parent for file in files if isinstance(file, str))

@@ -1,4 +1,4 @@
-"""The moving robot of a record for pages and films: bodies, wheels, surfaces and their poses over time."""
+"""The moving robot of a record for pages and films: bodies, wheels, surfaces, poses, paths, contacts, penetrations."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from dynsim.record.poses import ORIENTATION, POSITION, point_positions
 from dynsim.record.scene import NOT_BELOW, WORLD, Point, Scene, Vector3
 
 Array = NDArray[np.float64]
-# Poses between the frames of a page are interpolated: to this [m].
+# Largest error of poses that are interpolated between the frames of a page [m].
 POSE_ERROR = 4e-5
-# Frames of a longer run are thinned though poses between them be off by more.
+# Most frames; longer runs have fewer frames than POSE_ERROR needs.
 FRAMES = 20_000
 WORLD_AXES = np.eye(3)
 HERE_POINT: Vector3 = (0.0, 0.0, 0.0)

@@ -1,4 +1,4 @@
-"""Shapes of bodies and surfaces for pages and films; a rod stands for a body without a shape."""
+"""Shapes of bodies and surfaces for pages and films, and their faces; rods for bodies without shapes."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from dynsim.record.scene import HERE, WORLD, Body, Scene, SceneSurface, Shape
 
 Array = NDArray[np.float64]
 Faces = NDArray[np.int64]
-# Faces around what is round, and between the equator and a pole.
+# Numbers of faces around a round solid, and between its equator and a pole.
 AROUND, RINGS = 28, 4
-# Pieces that are as long as thick, at either end of a long rod.
+# Number of pieces as long as thick at either end of a long rod.
 ENDS = 3
 # Radius of a rod drawn for a body without shapes, in parts of the robot's reach.
 ROD = 0.008
-# A sphere or cylinder of more than this many times what is shown is drawn only next to the robot.
+# A spherical or cylindrical surface larger than this many times the view is drawn only near the robot.
 LARGE = 4.0
 
 

@@ -1,4 +1,4 @@
-"""Points and normals on the surfaces of a scene, for the part of a surface near the robot."""
+"""Grids of points on the surfaces of a scene, for quadrics on the part near the robot; corners of boxes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dynsim.record.quaternion import rotated
 from dynsim.record.scene import SceneSurface
 
 Array = NDArray[np.float64]
-# Points along each side of the part of a curved surface that is drawn, and of a face of a box.
+# Numbers of points along each side of the drawn part of a curved surface, and of a face of a box.
 PATCH, FACE = 41, 13
 
 

@@ -1,4 +1,4 @@
-"""Wheels of a record, intervals in which each pair is on the ground, and support polygon."""
+"""Wheels of a record in groups, times on the ground, support polygon, and centre of pressure or mass."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
     Record(s) → head and blocks (:mod:`dynsim.draw.page.content`) → text (:mod:`dynsim.draw.page.html`)
 
-It knows records and nothing of who made them: simulated and measured ones look the same.
+It depends on records alone: simulated and measured ones are shown in the same way.
 """
 
 from dynsim.draw.page.content import viewable

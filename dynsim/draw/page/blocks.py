@@ -1,8 +1,8 @@
 """Compression of time series for pages: quantised, differenced, and split into byte planes.
 
-A column x becomes k = round((x − offset)/scale), 0 ≤ k < 2^b − 1 with b = 16 or 32; the last code stands for what is
-not finite. Differences of k modulo 2^b are stored, the lowest byte of all of them first. ``decode.js`` of the page has
-the way back.
+A column x becomes k = round((x − offset)/scale), 0 ≤ k < 2^b − 1 with b = 16 or 32; the last code stands for values
+that are not finite. Differences of k modulo 2^b are stored, the lowest byte of all of them first. ``decode.js`` of the
+page decodes them. Also here: meshes as blocks.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from dynsim.draw.geometry.mesh_files import Mesh
 
-# Half a step of a code is at most this, where a largest error is asked for: else 32 bits are taken.
+# Largest code of a finite value by number of bits; 32 bits are used where half a step of 16 exceeds the allowed error.
 _CODES = {16: 2**16 - 2, 32: 2**32 - 2}
 _TYPES: dict[int, np.dtype[Any]] = {16: np.dtype("<u2"), 32: np.dtype("<u4")}
 
 
 class Blocks:
-    """Collects blocks; what describes one goes into the head of the page."""
+    """Collects blocks; the description of a block goes into the head of the page."""
 
     def __init__(self) -> None:
         self._parts: list[bytes] = []

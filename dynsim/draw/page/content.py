@@ -32,11 +32,12 @@ from dynsim.record.poses import ORIENTATION, POSITION
 from dynsim.record.scene import Scene
 
 Array = NDArray[np.float64]
-# Samples of a signal that plots get; longer ones keep the least and the largest of each bin.
+# Most samples of a signal in plots; of longer signals the least and the largest value of each bin are kept.
 PLOTTED = 8000
-# Between samples currents may jump: the heat by trapezoids is that of the record to this share.
+# Largest relative error of the heat by the trapezoidal rule against that of the record: currents may jump between
+# samples.
 HEAT_ERROR = 0.05
-# Signals that the scene itself shows.
+# Signals that the 3D view shows, and plots do not.
 _SHOWN = {POSITION, ORIENTATION, "posture"}
 
 

@@ -1,4 +1,4 @@
-"""The HTML text of a page: its own scripts and styles, three.js from its package, and the data."""
+"""The HTML text of a viewer page: its scripts and styles, three.js from its package, and the data; writing of pages."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""The servo bus: packets, control tables, and the bus behind a serial port."""
+"""The servo bus: interface, packets, control tables, clocks, scan, and the bus behind a serial port."""

@@ -39,11 +39,11 @@ from dynsim.hardware.posix import TerminalError, require_posix
 WRITE_TIMEOUT = 0.25
 """Longest wait for a port that takes no byte [s]."""
 READ_WAIT = 5e-4
-"""Longest wait for a byte before time-outs are looked at [s]."""
+"""Longest wait for a byte before time-outs are checked [s]."""
 NOTHING_TO_READ = "returned no data"
-"""What pyserial says of a read that was announced and brought nothing."""
+"""Part of pyserial's message for a read without data from a port that was ready."""
 MARKS = 16
-"""Reads after which an answer that was missed is not expected any more."""
+"""Number of reads after which a missed answer is no longer expected."""
 RETRIES = 2
 """Further attempts of a single read or write; the timed loop makes none."""
 TORQUE_ENABLE = 64
@@ -55,7 +55,7 @@ class SerialPort(PortHandler):
     Attributes
     ----------
     longest_pause : float
-        By which the system has run this process too late while it waited for a byte [s].
+        Longest delay by the operating system in a wait for a byte [s].
     """
 
     def __init__(self, name: str, *, exclusive: bool = True) -> None:

@@ -51,15 +51,15 @@ UNITS: dict[Quantity, str] = {
     "torque": "N m",
 }
 SLOWED: dict[Quantity, int] = {"velocity": 1, "acceleration": 2, "jerk": 2, "shaking": 1}
-"""Power of the speed with which a quantity falls, or falls at least: the window of jerk and shaking holds less of a
-path that is run through more slowly."""
+"""Exponent n: at the speed s of the path the quantity is proportional to s^n, or decreases faster (jerk and shaking,
+whose time window covers less of a slower path)."""
 
 SLOWEST, FASTEST = 0.01, 10.0
-"""Path seconds per second that may be asked for."""
+"""Range of speeds of the path, in path seconds per second."""
 LONGEST = 24 * 3600.0
-"""Motion [s]; beyond that its time is a mistake."""
+"""Longest motion [s]; longer times are refused as a mistake."""
 STILL = 1e-6
-"""A joint of a record that turns less than this [rad] does not move."""
+"""A joint of a record that turns less than this [rad] counts as unmoved."""
 ROUNDING = 1e-9
 """A joint of a record that rests at its very limit may be off by rounding of this size; a tick is 1.5e-3 rad."""
 

@@ -35,20 +35,20 @@ SLACK = 0.1
 SILENCE = 5.0
 """Time without a posture after which the drive ends [s]; the robot is at rest for most of it."""
 MOST_BROKEN = 4
-"""Violations that a fault names."""
+"""Largest number of violations that a fault names."""
 REST = 1e-9
 """A path whose end is closer than this [s] is finished."""
 
 
 class Feed(Protocol):
-    """Where the postures come from. Nothing here waits, writes, or raises.
+    """Source of the postures. Its methods do not wait, write files, or raise.
 
     Attributes
     ----------
     over : bool
         The drive has ended as it should, and all its samples have been taken.
     fault : str
-        Why no more will come, though it has not; empty where all is well.
+        Why no more postures will come although the drive has not ended; empty without a fault.
     """
 
     @property

@@ -30,7 +30,7 @@ from dynsim.snake.lifting import (
 
 @dataclass
 class _Held:
-    """A posture without what lifting adds, until that is known.
+    """A posture without the angles that lifting adds, kept until these are known.
 
     Attributes
     ----------

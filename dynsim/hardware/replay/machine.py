@@ -34,14 +34,14 @@ from dynsim.hardware.servo_map import MappedServo, ServoMap
 from dynsim.system.files import write_json
 
 APPROACH_ACCELERATION = 10.0
-"""Profile acceleration the firmware is given for the move to the start [rad/s²]."""
+"""Profile acceleration written to the servos for the move to the start [rad/s²]."""
 SETTLE_CYCLES = 10
 SETTLE_TIME = 3.0
 """Longest wait for the servos to come to rest [s]."""
 RECORD = "measured record"
-"""Name of that output among those that failed."""
+"""Name of the measured record in the list of outputs that failed."""
 DRY_RUN_TIME = 1.0
-"""Reading without moving, to time the bus [s]."""
+"""Duration of a dry run, which reads without moving, to measure the timing of the bus [s]."""
 
 
 class Replay:

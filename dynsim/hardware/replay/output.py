@@ -34,7 +34,7 @@ from dynsim.system.terminal import plain
 INTERVAL = 0.5
 """Between two writes [s]: a process that is killed loses the outputs of about this time."""
 PATIENCE = 5.0
-"""Longest wait for a file or display that does not come back, after the run [s]."""
+"""Longest wait for a blocked file or display after the run [s]."""
 LOG_INTERVAL = 1.0
 """Between two lines about the following error [s]."""
 PART = "measured.part"
@@ -44,14 +44,14 @@ MEASURED, SUMMARY, LOG = "measured.h5", "summary.json", "replay.log"
 REGISTERS, REGISTERS_AFTER_FAULT = "registers.json", "registers_after_fault.json"
 FILES = (PART, MEASURED, SUMMARY, LOG, REGISTERS, REGISTERS_AFTER_FAULT, INCOMPLETE)
 MADE_OF_THEM = ("comparison.*", "figures")
-"""What other commands put beside a measured record."""
+"""Files that other commands write beside a measured record."""
 
 P = ParamSpec("P")
 T = TypeVar("T")
 
 
 class Journal:
-    """Keeps the state of a replay, and tells of it. Nothing here raises.
+    """Keeps the state of a replay, and passes it to log and observer. Nothing here raises.
 
     Attributes
     ----------

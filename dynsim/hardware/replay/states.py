@@ -37,7 +37,7 @@ NOT_ARMED = "not armed"
 HOLDING, LIMP, MOVING = "holding", "limp: off", "moving"
 SILENT, TRIPPED = "does not answer", "watchdog tripped"
 WHOLE = {HOLDING: "holding", LIMP: "off", SILENT: "unreachable"}
-"""What the robot does where all its servos do the same; other things are called as they are."""
+"""End state of the robot where all its servos have the same one; other states keep their names."""
 
 
 class StopRequest:

@@ -44,7 +44,7 @@ OVERLOAD_FRACTION = 0.9  # of stall torque (unverified)
 OVERLOAD_TIME = 1.0  # s (unverified)
 SUPPLY, SUPPLY_RESISTANCE = 12.0, 0.05  # V, Ω
 BROWN_OUT = 6.0
-"""Below this supply the servos' electronics stop, and start anew when it is back [V] (unverified)."""
+"""Supply below which the servos' electronics stop; they restart above it [V] (unverified)."""
 OVERHEATING, OVERLOAD, INPUT_VOLTAGE = 1 << 2, 1 << 5, 1 << 0
 
 
@@ -57,7 +57,7 @@ class Hearing:
     by_id : dict of int to list of int
         By the ID they have now; more than one where they share it.
     by_shadow : dict of int to list of int
-        By their secondary ID: they obey what is written to it, and do not answer.
+        By their secondary ID: they carry out writes to it, and do not answer.
     members : int array
         Their places in the order of the line.
     """

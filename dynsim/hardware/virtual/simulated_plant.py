@@ -34,12 +34,12 @@ Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
 START_CHANGE = 5.0 * RAD_PER_TICK
-"""At the start joints are moved by this much at most to get off what they are in: ticks and backlash [rad]."""
+"""Largest change of a joint at the start that removes penetrations, which ticks and backlash cause [rad]."""
 GAP = 1e-10  # [m]
 SNAKE_STEP, ARM_STEP = 2e-3, 1e-3
-"""Of time stepping [s]: that of the servos' physics, which no arm exceeds, and of an arm whose scenario has none."""
+"""Time steps [s]: that of the servos' physics, which is the largest, and of an arm whose scenario has none."""
 SLOW, STEADY = 1e-4, 1e-2
-"""Slower [rad/s] and with less acceleration [rad/s²] a limp robot rests."""
+"""A robot with torque off is at rest below this rate [rad/s] and this acceleration [rad/s²]."""
 
 
 class SimulatedArm:

@@ -1,4 +1,4 @@
-"""Continuous voltage PD on joint references (Wang and Minami, eq 56): u = k_p (q_d − q) + k_d (v_d − v)."""
+"""Voltage PD on joint references, continuous or sampled (Wang and Minami, eq 56): u = k_p (q_d − q) + k_d (v_d − v)."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ ENGINE = "dynamics"
 PathChoice: Any = families.union("path")
 BasePathChoice: Any = families.union("base_path")
 
-# Of the reference splines: half a gigabyte for each joint.
+# Most segments of the reference splines: half a gigabyte for each joint.
 SEGMENTS_MAX = 10_000_000
-# Of a base between two knots [rad]: more is no longer the motion that the path describes.
+# Largest turn of a base between two knots [rad]; with more the spline would deviate from the path.
 TURN_MAX = 0.2
 
 

@@ -1,1 +1,1 @@
-"""Plants, one file each: ``Config``, ``build(config, context)``, and ``ENGINE``, which says what simulates it."""
+"""Plants, one file each: ``Config``, ``build(config, context)``, and ``ENGINE``, the engine that simulates it."""

@@ -1,4 +1,4 @@
-"""Revolute joint: one angle about an axis; x, y and z axes have faster rows of their own."""
+"""Revolute joint: one angle about an axis. For axes x, y and z of the joint's frame kernels have faster codes."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Robots from URDF files: reading, building, writing."""
+"""URDF files: strict reading, import of robots, visual shapes, export."""

@@ -22,7 +22,7 @@ from dynsim.studies.bench.programs import DYNSIM_RADAU5, MUJOCO_EULER, MUJOCO_IM
 
 Array = NDArray[np.float64]
 
-SPHERE_RADIUS = 100.0  # of the surfaces that stand for the floor where MuJoCo holds points by tendons [m]
+SPHERE_RADIUS = 100.0  # of spherical surfaces in place of the floor where MuJoCo holds points by tendons [m]
 
 
 @dataclass(frozen=True)

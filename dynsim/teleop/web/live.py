@@ -1,4 +1,4 @@
-"""A live drive: simulation in real time in the calling thread, server in another thread, and the report of the drive."""
+"""A live drive: simulation in real time in the calling thread, server in another, and the report of the drive."""
 
 from __future__ import annotations
 
