@@ -1,4 +1,4 @@
-"""MkDocs hooks: generated reference, files from outside of docs/, and links to them."""
+"""MkDocs hooks: generated pages, files from outside of docs/ and links to them, equations as MathML, indices."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ OUTSIDE = {
 }
 WORKER = "iframe-worker.js"
 _EQUATION = re.compile(r"^```math\n(.*?)^```$", flags=re.MULTILINE | re.DOTALL)
-# A symbol of one letter with an index; before it what is left as it is: code, headings, targets of links, marks.
+# A symbol of one letter with an index. The first alternatives match what must not change: code, headings, link targets,
+# HTML tags.
 _INDEX = re.compile(
     r"(?P<kept>^```.*?^```$|^ {4}.*?$|^#.*?$|`[^`]*`|\]\([^)]*\)|<[a-z!/][^>]*>)"
     r"|(?<![\w-])(?P<letter>[^\W\d_][\u0300-\u036f]*)_(?P<index>[^\W_]{1,8})(?![\w*_])",

@@ -1,6 +1,6 @@
-"""B-spline interpolation of samples, and the minimum-jerk motion from rest to rest.
+"""Spline interpolation of samples (quintic, cubic), and the minimum-jerk motion from rest to rest.
 
-scipy is not used because its import takes 0.3 s.
+scipy is not used here because its import takes 0.3 s.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 # Quintic B-splines at their knots, and their sixth difference.
 _VALUE = np.array([1.0, 26.0, 66.0, 26.0, 1.0]) / 120.0
 _DIFFERENCE = np.array([1.0, -6.0, 15.0, -20.0, 15.0, -6.0, 1.0])
-# Diagonals beside the main one that those take: a sixth difference at the second sample begins with the first unknown.
+# Half bandwidth of the equations: a row of sixth differences has up to six unknowns on one side of the diagonal.
 _BESIDE = 6
 
 

@@ -12,8 +12,8 @@ tick takes
     v⁺ = v_rest + λ (v_wish − v_rest),   0 ≤ λ ≤ 1
 
 with v_rest the next velocity of the stopping path, v_wish the commanded velocity with its change limited to a h, and λ
-the largest admissible value found: 1, or by bisection. Both differ from v by at most a h, hence v⁺ does. At the edge of
-reach, where joint rates would be unbounded, the limit on joint accelerations ends the path in time.
+the largest admissible value found: 1, or by bisection. v_rest and v_wish differ from v by at most a h, hence v⁺ does.
+At the edge of reach, where joint rates would be unbounded, the limit on joint accelerations ends the path in time.
 
 Source: E. Gilbert, I. Kolmanovsky, "Nonlinear tracking control in the presence of state and control constraints: a
 generalized reference governor", Automatica 38 (2002); λ and the admissible way to rest are theirs.

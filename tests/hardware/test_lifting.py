@@ -1,7 +1,9 @@
-"""Wheel pairs that a record lifts, against the whole robot in Pinocchio, from the recorded head to the tail.
+"""Lifting of wheel pairs when a record of the snake is replayed on servos: poses in Pinocchio, settings, refusals.
 
-The oracle gets the pose of the head that the record holds and the angles that the servos are sent, and nothing of the
-base part: that pair 1 comes to lie on the floor at the recorded place shows that the head is where the record has it.
+The kinematic model is flat, so the check of a replay adds pitch angles that lift the pairs which the record has off the
+ground. The oracle is a Pinocchio model of all 18 joints. It gets the recorded pose of the head and the angles that the
+servos are sent, but no positions of the wheeled part: if pair 1, the first behind the head, lies on the floor at its
+recorded place, the head is where the record has it.
 """
 
 from __future__ import annotations

@@ -13,8 +13,8 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 
-# Program that runs in the copy: the nut of a vertical screw; and a screw in a tree, against the same tree with a
-# prismatic and a revolute joint in its place, coupled by the constraint x = lead q, solved with its multiplier.
+# Two tests that run in the copy: the nut of a vertical screw; and a tree with a screw joint against the same tree with
+# a prismatic and a revolute joint instead, coupled by x = lead · q with a Lagrange multiplier.
 SCREW = """
 import sys
 from dataclasses import replace

@@ -1,8 +1,11 @@
-"""Tables of contacts, stops, dry friction and ties under the unilateral law; slip direction and friction forces.
+"""Tables of contacts under the unilateral law, of joint stops, dry friction and ties; slip and friction coefficient.
 
 0 ≤ f_n ⟂ gap ≥ 0. The force on a sliding point is f_n (n − μ(s) t), t = v_t/|v_t|, s = |v_t|; a point at rest sticks
 while |f_t| ≤ μ_s f_n. Modes (open, sliding, sticking) are constant within a step of the event-driven integrators;
 :mod:`dynsim.integrators.contacts.modes` chooses them. Here are the parts of the law that the right-hand side needs.
+
+A tie is a spring and damper between two bodies along or about an axis, with a bound of its force.
+``NAME = 0  # 3: …`` means three columns from column 0.
 """
 
 from __future__ import annotations
@@ -18,16 +21,16 @@ from dynsim.dynamics.tables import ContactArrays, Workspace
 from dynsim.jit.kernel import internal_kernel
 
 # UnilateralArrays.slide
-REFERENCE = 0  # 3: direction of slip at the start of the step, or since it began while FROZEN; 0 before any
+REFERENCE = 0  # 3: direction of slip at the start of the step; while FROZEN that with which it began; 0 before any
 FROZEN = 3  # 1: slip is too slow to have a direction of its own, that of REFERENCE stands
 SPEED = 4  # v_t · REFERENCE [m/s]
 NEXT = 5  # 3: direction at the end of the step
 NEXT_SPEED = 8  # |v_t| there [m/s]
 LANDS_AT = 9  # depth below its surface at which a candidate that is off it has landed [m]
-HEADWAY = 10  # speed against its direction with which it began to slip and that the rows could not remove [m/s]
+HEADWAY = 10  # speed against REFERENCE that was left when slip began; its reversal is counted from there [m/s]
 SLIDE_SIZE = 11
-# It lands at DEPTH until it has been higher than that, because projection leaves closed ones within half of it on
-# either side; then at the root itself.
+# LANDS_AT is DEPTH until the candidate has been higher than −DEPTH, because projection leaves closed contacts within
+# ± DEPTH/2; after that it is AT_ROOT, practically at gap = 0.
 DEPTH, AT_ROOT = 2e-10, 1e-13
 # UnilateralArrays.tally, of a candidate
 TIME_OPEN, TIME_SLIDING, TIME_STICKING = 0, 1, 2  # in the order of the modes [s]

@@ -1,7 +1,7 @@
 """Dynamixel servos through the unmodified client library (dynamixel-sdk 4.1.0), on real and virtual ports alike.
 
-Defects of the library, and their workarounds here (tests/hardware/test_sdk_defects.py has a test for each defect: when
-one fails, the library was repaired and the workaround can be removed):
+Defects of the library, and their workarounds here (tests/hardware/test_sdk_defects.py tests those that can be shown:
+when one of its tests fails, the library was repaired and the workaround can be removed):
 
 - An interrupted read leaves ``port.is_using`` set, and every later write is dropped: the flag is cleared before each
   transaction, and signal handlers only set a flag of their own.
@@ -10,7 +10,8 @@ one fails, the library was repaired and the workaround can be removed):
 - Group reads drop the error byte: the decoder keeps it.
 - Byte stuffing of requests is lost, some stuffed answers are mangled: a request whose body holds FF FF FD is rejected
   here, answers of a wrong length count as garbled, and Fast Sync Read is never used.
-- Its single read accepts any status of the servo as the answer, whatever its length: it is received here too.
+- Its read of one servo accepts any status of that servo as the answer, whatever its length: answers to single reads,
+  too, are received and checked here.
 - ``getData`` returns no negative numbers: fields are decoded here.
 - A dead port raises termios.error or OSError beside SerialException; a stalled one blocks: all become PortError, and
   writes wait here. pyserial's write time-out also counts time in which this process was suspended.

@@ -11,7 +11,7 @@ from dynsim.hardware.virtual.servos import OVERHEATING, OVERLOAD, VirtualServos
 
 
 class Injection:
-    """Applies the faults of a script that the model of the servos does not include.
+    """Applies those faults of a script that are not part of the servo model.
 
     Attributes
     ----------

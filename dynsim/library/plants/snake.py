@@ -2,6 +2,7 @@
 
 [T]: M. Tanaka et al., "Task-Space Control of Articulated Mobile Robots With a Soft Gripper for Operations", IEEE
 Transactions on Robotics 35(1), 2019. Values that [T] does not give are marked "assumed".
+Kinematic by default; ``level: dynamic`` gives a tree of bodies with masses, servos and tyres.
 """
 
 from __future__ import annotations
