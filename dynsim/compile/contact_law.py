@@ -1,4 +1,4 @@
-"""Tables of the unilateral law for the kernels: contact friction, joint stops, dry friction, ties.
+"""Tables of the unilateral law for the kernels: law of each contact, joint stops, dry friction, ties.
 
 The law itself is in :mod:`dynsim.dynamics.contact.unilateral` and :mod:`dynsim.integrators.contacts`.
 """
@@ -23,9 +23,9 @@ from dynsim.model.drives import TorqueSource
 
 # A joint may start this far beyond its stop [rad or m].
 START_TOLERANCE = 1e-6
-# After an impact a point that separates more slowly than this stays closed, which ends accumulating bounces [m/s]. It
-# exceeds the speed of a fall through the depth at which points count as landed (6e-5 under gravity), which two points
-# of a rocking body would otherwise exchange without end.
+# After an impact a point that separates more slowly than this stays closed, which ends a series of ever smaller
+# bounces [m/s]. It exceeds 6e-5 m/s, the speed gained by falling through the depth at which a point counts as landed:
+# with a lower bound two points of a rocking body would land in turn without end.
 SETTLE_SPEED = 1e-4
 
 

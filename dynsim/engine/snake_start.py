@@ -1,8 +1,8 @@
-"""Joint references of a dynamic snake, and its start: a preliminary run that raises the head to its posture.
+"""Lifting of a dynamic snake's wheel pairs, as joint angles, and its start: a preliminary run that raises the head.
 
-Gear friction keeps a head that was raised into its posture lower than one that was lowered into it, by about 20 mm and
-0.09 rad. A real robot raises its head. So a preliminary run before t = 0 lets the head settle below its posture, raises
-it, and lets it settle again.
+The references at each tick are in :mod:`dynsim.engine.snake_pilot`. Because of gear friction a head that was raised
+into its posture rests about 20 mm and 0.09 rad lower than one that was lowered into it. A real robot raises its head. So
+a preliminary run before t = 0 lets the head settle below its posture, raises it, and lets it settle again.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Tables of an arm for the compiled statics: the joints that move, surfaces, and points of link axes."""
+"""Tables of an arm for the planner's compiled statics: the joints that move, surfaces, points along link axes."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from dynsim.record.csv_rows import read_rows
 FORCE_COLUMNS = ("t_s", "fx_N", "fy_N", "fz_N")
 TORQUE_COLUMNS = ("mx_N_m", "my_N_m", "mz_N_m")
 
-# Times, (K + 1,) [s], and polynomials between them, (K, 6, 4).
+# Times, (K + 1,) [s], and coefficients of cubic polynomials of the six components between them, (K, 6, 4).
 Pieces = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
@@ -25,7 +25,7 @@ class WrenchConfig(BodyPoint):
 
 
 class Constant(WrenchConfig):
-    """A force and a torque that stay as they are."""
+    """A constant force and torque."""
 
     type: Literal["constant"]
     force_N: Vector3 = [0.0, 0.0, 0.0]

@@ -54,7 +54,8 @@ class Terminal:
             preexec_fn=enter,
         )
         os.close(slave)
-        wait_for(lambda: "REPLAY         enter" in servos.log)
+        wait_for(lambda: "REPLAY         enter" in servos.log or self.process.poll() is not None)
+        assert self.process.poll() is None, os.read(self.master, 65536).decode(errors="replace")
 
     def close(self) -> None:
         os.close(self.master)

@@ -1,4 +1,4 @@
-"""Names from files on a terminal: control characters are printed, never executed."""
+"""Names from files on a terminal: control characters are shown as escapes, never sent."""
 
 import io
 

@@ -1,7 +1,8 @@
 """SIMD right-hand sides in machine code: rates of four states at once equal those of each state alone, to rounding.
 
 ``test_lanes`` evaluates the Python source of the kernels on four states at once; this file tests the compiled code,
-with the branch-free replacements of ``dynsim.dynamics.simd.forms``. A short run agrees between Python, SSE2 and AVX2.
+with the replacements of ``dynsim.dynamics.simd.forms`` for kernels that branch. A short run agrees between Python, SSE2
+and AVX2.
 """
 
 from __future__ import annotations

@@ -1,4 +1,8 @@
-"""Splits of redundant contact forces and second-order-cone programs: conditions of optimality, and other methods."""
+"""Sharing of redundant contact forces (splits), and second-order-cone programs: tests of optimality.
+
+A split has the least norm among those in all friction cones; if there is none, it has the largest worst margin
+μ f_n − |f_t|. Results are checked by conditions of optimality and against other solvers.
+"""
 
 from __future__ import annotations
 
