@@ -1,8 +1,8 @@
 """Lifting of a dynamic snake's wheel pairs, as joint angles, and its start: a preliminary run that raises the head.
 
 The references at each tick are in :mod:`dynsim.engine.snake_pilot`. Because of gear friction a head that was raised
-into its posture rests about 20 mm and 0.09 rad lower than one that was lowered into it. A real robot raises its head. So
-a preliminary run before t = 0 lets the head settle below its posture, raises it, and lets it settle again.
+into its posture rests about 20 mm and 0.09 rad lower than one that was lowered into it. A real robot raises its head.
+So a preliminary run before t = 0 lets the head settle below its posture, raises it, and lets it settle again.
 """
 
 from __future__ import annotations
