@@ -16,8 +16,9 @@ SINKS = ("heat_joule", "loss_gear", "loss_joint", "heat_friction")
 MORE_SINKS = ("loss_impact", "loss_stop", "loss_damper", "energy_elastic", "loss_scheme")
 STORES = ("energy_kinetic", "energy_potential", "energy_magnetic")
 
+# Largest residual of the energy ledger without a warning, as a share of the turnover.
 RESIDUAL_LIMIT = 1e-6
-# A smaller share of the time of a run is rounding.
+# A share of a run's time below this is rounding error.
 ROUNDED = 1e-9
 
 # Kind of the event of a mobile base that tips; found between samples, where the margin is zero.

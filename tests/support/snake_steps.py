@@ -1,4 +1,4 @@
-"""Study: effect of the step length on Table III of the dynamic snake, and the order of time stepping there.
+"""Study of the dynamic snake: step length and Table III of [T]; order of time stepping while a released head falls.
 
 ``PYTHONPATH=tests python -m support.snake_steps`` writes results/snake/steps.json, which docs/snake.md quotes, in a
 minute or two.

@@ -1,9 +1,9 @@
-"""Lifted wheel pairs in a live drive: postures wait until the extra joint angles of a lift are known.
+"""Lifted wheel pairs in a live drive: postures are held back until the joint angles that lifting adds are known.
 
-The height of a pair at a time t depends on when it is put down only where that is within ``lifts.blend_s``
-(:mod:`dynsim.snake.lifting`). So the posture of t is complete once it is known which pairs are on the ground until
-t + blend_s. The rates of the added angles are central differences, so they need the angles of the next posture too. The
-results equal those of a replay of the finished record, which uses the same functions.
+A lifted pair comes down over the time ``lifts.blend_s`` (:mod:`dynsim.snake.lifting`), so its height at t depends on
+when it is put down only if that is before t + blend_s. The posture of t is complete once it is known which pairs are on
+the ground until then. The rates of these angles are central differences, so they need the angles of the next posture
+too. The results equal those of a replay of the finished record, which uses the same functions.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
-"""Mechanics of virtual servos: motor law, interface of the plants that servos move, and a plant of inertias.
+"""Mechanics of virtual servos: motor law, interface of plants behind servos, and inertias as the simplest plant.
 
-The position loop of an MX servo is (by default) proportional, and the motor brakes itself through its back-EMF:
+The position loop of a Dynamixel MX servo is (by default) proportional, and the motor brakes itself by its back-EMF:
 
     τ = clip(k (θ_set − θ), ±τ_stall V/12) − d ω        d = τ_stall / ω_no_load
 
-so that a constant speed ω is followed with the lag d/k, in time as well as in angle per speed, and ω_no_load is never
-exceeded. k is the MX-106's stiffness at its default gain, 41 N·m/rad, scaled with stall torque for other models. Gear
-friction is left out.
+with the supply V; τ_stall and ω_no_load are those at 12 V. A constant speed ω is followed with a lag of d/k in time, of
+ω d/k in angle, and the motor by itself never exceeds ω_no_load V/12. k is the MX-106's stiffness at its default gain,
+41 N·m/rad, scaled with stall torque for other models. Gear friction is left out.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 
 STIFFNESS_PER_STALL_TORQUE = 41.0 / MX_106.stall_torque  # 1/rad
 VELOCITY_TIME_CONSTANT = 0.02
-"""Closed loop of the velocity mode on the servo's own inertia [s] (unverified)."""
+"""Time constant of the closed velocity loop, with the servo's own inertia only [s] (unverified)."""
 FREE_DAMPING = 0.1
 """Damping of an unpowered gear train as a fraction of the back-EMF damping (unverified)."""
 

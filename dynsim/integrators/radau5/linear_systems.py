@@ -1,9 +1,10 @@
 """Linear systems of RADAU5's Newton method, reduced to the rates: one real and one complex, solved together.
 
-(g I − J) u = r with g = γ/h and with g = (α + iβ)/h, see dynsim.integrators.radau5.step. In Python numpy solves the two
-one after the other. Compiled code solves them at once on SIMD lanes: lane 0 is the real system, lanes 1 and 2 are real
-and imaginary part of the complex one. A factor is then a pair (p, m): x ∘ (p, m) = p x + m x', where x' is x with lanes
-1 and 2 exchanged; the inverse matrices consist of such pairs.
+The systems are (g I − J) u = r, J the Jacobian of ẏ, with g = γ/h and with g = (α + iβ)/h, see
+dynsim.integrators.radau5.step. In Python numpy solves the two one after the other. Compiled code solves them at once on
+SIMD lanes: lane 0 is the real system, lanes 1 and 2 are real and imaginary part of the complex one. A number to
+multiply by is then a pair (p, m): x ∘ (p, m) = p x + m x', where x' is x with lanes 1 and 2 exchanged; the inverse
+matrices consist of such pairs.
 """
 
 from __future__ import annotations

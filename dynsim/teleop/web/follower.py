@@ -2,8 +2,8 @@
 
     loop of the servos                                 this process
     ------------------                                 ------------
-    writes its time to shared memory       ──▶         Follower.ready: the next tick may be simulated
-    reads a pipe without waiting           ◀──         Follower.hear: a posture for every tick
+    writes how far its time is, shared     ──▶         ServoFollower.ready: the next tick may be simulated
+    reads a pipe without waiting           ◀──         ServoFollower.hear: writes a posture for every tick
 
 The loop of the servos has an interpreter of its own, so compilation, browsers or disks in this process do not block it.
 """
