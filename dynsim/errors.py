@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 
@@ -15,6 +16,11 @@ def brief(value: object) -> str:
     """Any value in an error message: in one line, and not long."""
     text = " ".join(repr(value).split())
     return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def first_few(names: Sequence[str], most: int = 4) -> str:
+    """Names for a sentence: the first, and how many more there are."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 class ScenarioError(DynsimError):

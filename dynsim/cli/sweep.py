@@ -103,6 +103,13 @@ def sweep(
     others = scheduler is not None or min(jobs or cores(), plan.runs) > 1
     if not others:
         keep_memory()
+    unchecked = list(plot or ())
+
+    def warn_once(row: SweepRow) -> None:
+        if row.status == OK:
+            _warn_of_unknown(row, unchecked)
+            unchecked.clear()
+
     with sweep_progress(plan.runs, quiet) as report:
         rows = run_sweep(
             plan,
@@ -112,7 +119,7 @@ def sweep(
             resume=resume,
             scheduler=scheduler,
             progress=report,
-            first=lambda row: _warn_of_unknown(row, plot or ()),
+            ended=warn_once,
         )
     failed = [row for row in rows if row.status != OK]
     for row in failed[:_SHOWN]:

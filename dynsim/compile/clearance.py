@@ -156,6 +156,11 @@ def sinking(robot: Robot, surfaces: Mapping[str, Surface], q: Array) -> list[Sin
     return sunk
 
 
+def by_surface(sunk: Sequence[Sinking]) -> dict[str, list[Sinking]]:
+    """Bodies below each surface that has any below it, by its name."""
+    return {surface: [s for s in sunk if s.surface == surface] for surface in dict.fromkeys(s.surface for s in sunk)}
+
+
 def _axis_gaps(robot: Robot, surfaces: Mapping[str, Surface], q: Array) -> Iterator[tuple[Link, str, Array]]:
     """Least distance of each body's axes from each surface, (T,) [m]; at their ends where all surfaces are planes."""
     tips, carriers = axis_ends(robot), robot.carriers

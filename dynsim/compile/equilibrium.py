@@ -18,7 +18,7 @@ from dynsim.compile.bracing import MIN_N, BracePlanner, brace_rows
 from dynsim.compile.model import Model
 from dynsim.compile.shapes import share_of_axis
 from dynsim.dynamics.contact.braces import tables as kb
-from dynsim.errors import ModelError
+from dynsim.errors import ModelError, first_few
 from dynsim.model.description import Array, Contact, Load
 from dynsim.model.drives import Servo
 
@@ -165,9 +165,8 @@ def _why(model: Model, limits: Array, needed: Array, braces: Sequence[str]) -> s
         weak.append((abs(torque), f"{link.joint} {torque:.4g} {unit} ({reason})"))
     text = "initial.equilibrium: nothing holds this posture at rest"
     if weak:
-        shown = [entry for _, entry in sorted(weak, key=lambda entry: -entry[0])[:4]]
-        more = f" and {len(weak) - len(shown)} more" if len(weak) > len(shown) else ""
-        text += f": weight and loads ask for {', '.join(shown)}{more}"
+        largest = [entry for _, entry in sorted(weak, key=lambda entry: -entry[0])]
+        text += f": weight and loads ask for {first_few(largest)}"
     carries = f"; {', '.join(braces)} cannot carry it" if braces else "; no contact touches"
     return f"{text}{carries}. Change the posture, let a brace carry it, or take initial.equilibrium away"
 

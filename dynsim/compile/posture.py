@@ -63,18 +63,19 @@ def on_surfaces(model: Model, contacts: Mapping[str, Contact], names: Sequence[s
     columns = [
         k for k, link in enumerate(robot.links) if len(link.row.neutral) == 1 and robot.joint_names[k] not in fixed
     ]
-    q, worst = _nearest(model, [contacts[name] for name in names], columns, {}, HAND in keep)
-    stopped: dict[int, float] = {}
-    while worst <= REACHED and (beyond := _furthest_beyond(robot, columns, q)) is not None:
+    points, stopped = [contacts[name] for name in names], dict[int, float]()
+    while True:
+        q, worst = _nearest(model, points, columns, stopped, HAND in keep)
+        if not worst <= REACHED:
+            within = f" with {', '.join(robot.joint_names[k] for k in stopped)} at the limit" if stopped else ""
+            raise ModelError(
+                f"initial: the joints that may move do not bring {', '.join(names)} onto the surfaces{within}; "
+                f"{worst:.3g} m are left: keep fewer joints, or start closer"
+            )
+        beyond = _furthest_beyond(robot, columns, q)
+        if beyond is None:
+            return q
         stopped[beyond[0]] = beyond[1]
-        q, worst = _nearest(model, [contacts[name] for name in names], columns, stopped, HAND in keep)
-    if not worst <= REACHED:
-        within = f" with {', '.join(robot.joint_names[k] for k in stopped)} at the limit" if stopped else ""
-        raise ModelError(
-            f"initial: the joints that may move do not bring {', '.join(names)} onto the surfaces{within}; {worst:.3g} "
-            "m are left: keep fewer joints, or start closer"
-        )
-    return q
 
 
 def _nearest(

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from dynsim.compile.clearance import sinking
+from dynsim.compile.clearance import by_surface, sinking
 from dynsim.compile.equilibrium import holding_torques, load_forces, static_margin
 from dynsim.compile.model import Model
 from dynsim.compile.shapes import gap_at
@@ -66,11 +66,11 @@ def start_of(scenario: Scenario) -> Start:
 
 def _below(scenario: Scenario, robot: Robot) -> list[str]:
     """A sentence for each surface that bodies begin below."""
-    sunk = sinking(robot, build.surfaces(scenario), robot.initial[None])
+    sunk = by_surface(sinking(robot, build.surfaces(scenario), robot.initial[None]))
     return [
-        f"{', '.join(s.body for s in sunk if s.surface == surface)}: below {surface} at the start, by up to "
-        f"{1e3 * max(s.depth for s in sunk if s.surface == surface):.3g} mm; surfaces hold only the points of contacts"
-        for surface in dict.fromkeys(s.surface for s in sunk)
+        f"{', '.join(s.body for s in below)}: below {surface} at the start, by up to "
+        f"{1e3 * max(s.depth for s in below):.3g} mm; surfaces hold only the points of contacts"
+        for surface, below in sunk.items()
     ]
 
 

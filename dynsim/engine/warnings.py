@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.compile.clearance import Sinking
+from dynsim.compile.clearance import Sinking, by_surface
 from dynsim.compile.contact_law import START_TOLERANCE, JointStop, format_quantity
 from dynsim.compile.control import JointControl
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.engine.force_indeterminacy import motion_spread, sharing
 from dynsim.engine.prepare import Prepared
+from dynsim.errors import first_few
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts import events as ke
 from dynsim.integrators.stepping import tables as kt
@@ -180,8 +181,8 @@ def _undetermined(record: Record, prepared: Prepared) -> list[str]:
         if joints:
             touching = [name for name in shared if name not in joints]
             return [
-                f"{_few(touching)}: shared forces with the dry friction of {_few(joints)}, which keeps these joints at "
-                "rest; the motion does not determine them, and those of the record are one choice of many"
+                f"{first_few(touching)}: shared forces with the dry friction of {first_few(joints)}, which keeps these "
+                "joints at rest; the motion does not determine them, and those of the record are one choice of many"
             ]
         if not shared:
             return []
@@ -204,11 +205,6 @@ def _undetermined(record: Record, prepared: Prepared) -> list[str]:
     return warnings
 
 
-def _few(names: Sequence[str], most: int = 4) -> str:
-    """Names in a sentence; of many the first, and how many more."""
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
-
-
 def _joints_at_rest(record: Record, prepared: Prepared) -> NDArray[np.bool_]:
     """Joints that dry friction keeps at rest, by sample, (T, n)."""
     rests = np.zeros((len(record), prepared.model.n), dtype=bool)
@@ -221,8 +217,7 @@ def _joints_at_rest(record: Record, prepared: Prepared) -> NDArray[np.bool_]:
 def _sunk(record: Record, sunk: Sequence[Sinking]) -> list[str]:
     """One warning per surface: the bodies that samples of the record show below it, and the one that is deepest."""
     warnings = []
-    for surface in dict.fromkeys(s.surface for s in sunk):
-        below = [s for s in sunk if s.surface == surface]
+    for surface, below in by_surface(sunk).items():
         deepest = max(below, key=lambda s: s.depth)
         names = ", ".join(s.body for s in below)
         verb = "passes" if len(below) == 1 else "pass"

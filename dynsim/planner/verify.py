@@ -290,9 +290,7 @@ class Verifier:
                 return f"the base tips at t = {time[int(margin.argmin())]:.3g} s"
         return ""
 
-    def tolerance(
-        self, braces: tuple[Candidate, ...], dense: Dense, k_p: float, steps: int = STEPS
-    ) -> tuple[float | None, float | None]:
+    def tolerance(self, braces: tuple[Candidate, ...], dense: Dense, k_p: float) -> tuple[float | None, float | None]:
         """Greatest error of the surfaces [m] and of friction (as a share) that do hold, each by bisection alone.
 
         None: plans were not asked to bear such errors.
@@ -308,11 +306,11 @@ class Verifier:
                 return None
             if bears(corner(high)):
                 return high
-            for _ in range(steps):
+            for _ in range(STEPS):
                 middle = 0.5 * (low + high)
                 low, high = (middle, high) if bears(corner(middle)) else (low, middle)
             return low
 
-        return largest(self.tolerances.most_shift, lambda x: (1.0, x)), largest(
-            self.tolerances.most_friction, lambda x: (1.0 + x, 0.0)
-        )
+        shift = largest(self.tolerances.most_shift, lambda x: (1.0, x))
+        friction = largest(self.tolerances.most_friction, lambda x: (1.0 + x, 0.0))
+        return shift, friction

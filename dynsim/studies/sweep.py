@@ -38,7 +38,7 @@ def run_sweep(
     resume: bool = False,
     scheduler: str | None = None,
     progress: Callable[[int, int], None] | None = None,
-    first: Callable[[SweepRow], None] | None = None,
+    ended: Callable[[SweepRow], None] | None = None,
 ) -> list[SweepRow]:
     """Carry out the runs of a plan; write plan, journal, records, tables and statistics of samples to a folder.
 
@@ -48,7 +48,7 @@ def run_sweep(
     jobs, keep_records, scheduler : see :func:`dynsim.studies.batch.simulate_batch`
     resume : take over what the folder's journal has of the same scenario; only lost runs and those not there are run
     progress : called with how many runs are done and how many of them have failed
-    first : called with the first run that has ended well, as soon as there is one
+    ended : called with every run that is done, also with those taken over
 
     Returns
     -------
@@ -79,17 +79,10 @@ def run_sweep(
         earlier = earlier_rows(folder, header, resume, TABLES)
         rows = {point.run: earlier[point.identity].placed(point) for point in points if point.identity in earlier}
         left = [point for point in points if point.run not in rows]
-        failed, seen = sum(row.status != OK for row in rows.values()), False
+        failed = sum(row.status != OK for row in rows.values())
         with _goes_on(folder):
             write_text(folder / PLAN, json_text(header))
             with SweepJournal(folder, rows.values()) as journal:
-
-                def see(row: SweepRow) -> None:
-                    nonlocal seen
-                    if not seen and row.status == OK:
-                        seen = True
-                        if first is not None:
-                            first(row)
 
                 def take(point: SweepPoint, result: RunResult) -> None:
                     nonlocal failed
@@ -99,14 +92,16 @@ def run_sweep(
                     row = rows[point.run] = SweepRow.of(point, result)
                     journal.add(row)
                     failed += row.status != OK
-                    see(row)
+                    if ended is not None:
+                        ended(row)
                     if progress is not None:
                         progress(len(rows), failed)
 
                 if progress is not None:
                     progress(len(rows), failed)
-                for row in rows.values():
-                    see(row)
+                if ended is not None:
+                    for row in rows.values():
+                        ended(row)
                 work = BatchWork(plan.scenario, keep_records)
                 interrupted = run_all(work, left, take, jobs=jobs, scheduler=scheduler)
             done = [rows[run] for run in sorted(rows)]

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from support.documented_arm import plant
 
 import dynsim
 from dynsim import cli
@@ -78,32 +79,22 @@ def test_braced_elbows_rest_on_the_floor_and_unload_the_servos() -> None:
     assert np.abs(braced.torque).max() < 0.6 * np.abs(free.torque).max()
 
 
-PLANNED = """
-duration_s: 0.3
-plant:
-  type: serial_arm
-  link: {mass_kg: 0.2, length_m: 0.4, damping_N_m_s_per_rad: 0.3, motor: {type: wang_minami}}
-  chain:
-    - {axis: z, length_m: 0.0}
-    - {axis: y, initial_deg: 60}
-    - {axis: y, initial_deg: 60}
-    - {axis: y, initial_deg: -75}
-    - {axis: y, initial_deg: 60}
-controller:
+PLANNED = f"""duration_s: 0.3
+{plant("wang_minami")}controller:
   type: joint_pd
   joints:
-    joint_1: {times_s: [0.0, 0.2], angles_deg: [0.0, 0.5]}
-    joint_2: {times_s: [0.0, 0.2], angles_deg: [47.4168, 47.4168]}
-    joint_3: {times_s: [0.0, 0.2], angles_deg: [83.2501, 83.2501]}
-    joint_4: {times_s: [0.0, 0.2], angles_deg: [-40.6669, -40.6669]}
-    joint_5: {times_s: [0.0, 0.2], angles_deg: [-25.1507, -25.1507]}
-initial: {on_references: true, on_surface: [link_4, link_5]}
-surfaces: {floor: {type: plane}}
+    joint_1: {{times_s: [0.0, 0.2], angles_deg: [0.0, 0.5]}}
+    joint_2: {{times_s: [0.0, 0.2], angles_deg: [47.4168, 47.4168]}}
+    joint_3: {{times_s: [0.0, 0.2], angles_deg: [83.2501, 83.2501]}}
+    joint_4: {{times_s: [0.0, 0.2], angles_deg: [-40.6669, -40.6669]}}
+    joint_5: {{times_s: [0.0, 0.2], angles_deg: [-25.1507, -25.1507]}}
+initial: {{on_references: true, on_surface: [link_4, link_5]}}
+surfaces: {{floor: {{type: plane}}}}
 contacts:
   law: unilateral
   friction: 0.2
-  points: {link_4: {body: link_4, radius_m: 0.01}, link_5: {body: link_5, radius_m: 0.01}}
-integrator: {method: time_stepping}
+  points: {{link_4: {{body: link_4, radius_m: 0.01}}, link_5: {{body: link_5, radius_m: 0.01}}}}
+integrator: {{method: time_stepping}}
 """
 """As the planner writes the tutorial's arm: the posture of the plant, before ``initial``, is 10 mm below the floor."""
 

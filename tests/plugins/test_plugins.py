@@ -18,6 +18,7 @@ import jsonschema
 import numpy as np
 import pytest
 from ruamel.yaml import YAML
+from support.documented_arm import plant
 
 from dynsim.record import Record
 
@@ -30,25 +31,16 @@ plant: {type: cart_pole, motor: {type: small_servo}}
 controller: {type: sway, amplitudes: {slide: 0.1}, period_s: 1}
 """
 # The braced arm of the documentation, its hand on a helix that is nearly a line.
-MOUND = """duration_s: 0.2
-plant:
-  type: serial_arm
-  link: {mass_kg: 0.2, length_m: 0.4, damping_N_m_s_per_rad: 0.3, motor: {type: small_servo}}
-  chain:
-    - {axis: z, length_m: 0.0}
-    - {axis: y, initial_deg: 60}
-    - {axis: y, initial_deg: 60}
-    - {axis: y, initial_deg: -75}
-    - {axis: y, initial_deg: 60}
-controller:
+MOUND = f"""duration_s: 0.2
+{plant("small_servo")}controller:
   type: joint_pd
   hand:
     joints: [joint_1, joint_4, joint_5]
-    path: {type: helix, center_m: [1.31, 0, 0.18249], radius_m: 0.05, pitch_m: 0.01}
+    path: {{type: helix, center_m: [1.31, 0, 0.18249], radius_m: 0.05, pitch_m: 0.01}}
 surfaces:
-  mound: {type: ellipsoid, center_m: [0.69282032303, 0, -0.2], half_axes_m: [0.8, 0.5, 0.2], yaw_deg: 20}
+  mound: {{type: ellipsoid, center_m: [0.69282032303, 0, -0.2], half_axes_m: [0.8, 0.5, 0.2], yaw_deg: 20}}
 contacts:
-  points: {elbow: {body: link_4, surface: mound}}
+  points: {{elbow: {{body: link_4, surface: mound}}}}
   reference_tolerance_m: 0.02
 """
 

@@ -7,11 +7,10 @@ import csv
 
 import numpy as np
 import pytest
+from support.snake_observations import by_wheel, head_motion, lifted, settled, switching_run
 from support.snake_steps import end_values, fall_errors
 
 from dynsim.draw.figures.snake import draw_comparison
-from dynsim.engine import simulate
-from dynsim.scenario import load_scenario
 from dynsim.snake.published import TABLE_III, displacement, table_iii_dynamic
 
 SCENARIO = "snake_positioning_dynamic"
@@ -89,29 +88,22 @@ def test_the_table_has_paper_and_all_three_ways(simulated, tmp_path):
 
 @pytest.fixture(scope="module")
 def switched():
-    return simulate(load_scenario("snake_joint_limits", "cyclic", {"plant.level": "dynamic", "duration_s": 12.0}))
+    return switching_run(12.0)
 
 
 def test_mode_switching_shakes_the_head(switched):
     """[T] V.B, Figs 9, 10: "position error and attitude error were about 30 mm and 0.1 rad"."""
-    record = switched
-    switching = record.time >= 2.0
-    off = record["w"][switching] - record["w"][switching][0]
-    position, attitude = np.linalg.norm(off[:, :3], axis=1).max(), np.linalg.norm(off[:, 3:], axis=1).max()
-    assert 0.010 <= position <= 0.045
-    assert 0.04 <= attitude <= 0.13
-    assert record.summary["mode_switches"] == 10
-    commanded = record["phi_command"][:, 6:]
+    moved = head_motion(switched)
+    assert 10.0 <= moved["moved_mm"] <= 45.0
+    assert 0.04 <= moved["turned_rad"] <= 0.13
+    assert switched.summary["mode_switches"] == 10
+    commanded = switched["phi_command"][:, 6:]
     assert np.abs(commanded[-1]).max() < 0.7 * np.abs(commanded[0]).max()  # the base straightens, as in Fig 10
 
 
 def test_lifted_wheels_carry_nothing_once_they_are_lifted(switched):
     """In all modes of Table II; what goes down takes 0.25 s, what rises after it as long."""
-    mode, time = switched["mode"], switched.time
-    begun = np.maximum.accumulate(np.where(np.diff(mode, prepend=mode[0]) != 0.0, time, 0.0))
-    settled = time - begun > 0.6
-    assert set(mode[settled]) == {1, 2, 3, 4, 5, 6}
-    lifted = (switched["grounded"] == 0.0) & settled[:, None]
-    load, gap = (switched[name][:, :14].reshape(-1, 7, 2) for name in ("contact_normal_force", "contact_gap"))
-    assert load[lifted].max() == 0.0
-    assert gap[lifted].min() > 2e-3
+    assert set(switched["mode"][settled(switched)]) == {1, 2, 3, 4, 5, 6}
+    up = lifted(switched)
+    assert by_wheel(switched, "contact_normal_force")[up].max() == 0.0
+    assert by_wheel(switched, "contact_gap")[up].min() > 2e-3

@@ -24,9 +24,10 @@ LIFTING_S = 0.6
 WHEELS, PAIRS = 14, 7
 
 
-def switching_run() -> Record:
+def switching_run(duration_s: float = 22.0) -> Record:
     """Modes 1 to 6 of the paper's Table II, one after the other ([T] V.B)."""
-    return simulate(load_scenario("snake_joint_limits", "cyclic", {"plant.level": "dynamic"}))
+    settings = {"plant.level": "dynamic", "duration_s": duration_s}
+    return simulate(load_scenario("snake_joint_limits", "cyclic", settings))
 
 
 def converged(variant: str) -> dict[str, float]:
@@ -52,18 +53,26 @@ def head_motion(record: Record) -> dict[str, float]:
     }
 
 
-def lifted(record: Record) -> tuple[np.ndarray, np.ndarray]:
-    """Samples at which a pair has come to its lifted height, (T, 7), and the gaps of its wheels, (T, 7, 2) [m]."""
+def settled(record: Record) -> np.ndarray:
+    """Samples at which the wheels have come to the heights of their mode, (T,)."""
     mode = record["mode"]
     begun = np.maximum.accumulate(np.where(np.diff(mode, prepend=mode[0]) != 0.0, record.time, 0.0))
-    settled = record.time - begun > LIFTING_S
-    gaps = record["contact_gap"][:, :WHEELS].reshape(-1, PAIRS, 2)
-    return (record["grounded"] == 0.0) & settled[:, None], gaps
+    return record.time - begun > LIFTING_S
+
+
+def lifted(record: Record) -> np.ndarray:
+    """Samples at which a pair has come to its lifted height, (T, 7)."""
+    return (record["grounded"] == 0.0) & settled(record)[:, None]
+
+
+def by_wheel(record: Record, signal: str) -> np.ndarray:
+    """A signal of contacts, of the wheels of each pair, (T, 7, 2)."""
+    return record[signal][:, :WHEELS].reshape(-1, PAIRS, 2)
 
 
 def wheel_heights(record: Record) -> dict[str, list[float]]:
     """By mode and lifted pair: mean heights of the lower and the higher wheel [mm]."""
-    up, gaps = lifted(record)
+    up, gaps = lifted(record), by_wheel(record, "contact_gap")
     heights = {}
     for mode in sorted(set(record["mode"])):
         for pair in range(PAIRS):

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.draw.geometry.mesh_files import Mesh, read_mesh
-from dynsim.errors import RecordError
+from dynsim.errors import RecordError, first_few
 from dynsim.record import Record
 
 # Most triangles of all meshes of a page: some 1 MB.
@@ -55,8 +55,7 @@ class Meshes:
     def notes(self) -> list[str]:
         """What could not be drawn."""
         names = list(self._missing)
-        more = f" and {len(names) - 4} more" if len(names) > 4 else ""
-        return [f"meshes not found, rods instead: {', '.join(names[:4])}{more}"] if names else []
+        return [f"meshes not found, rods instead: {first_few(names)}"] if names else []
 
     def _places(self, file: str) -> Iterator[Path]:
         """Where a mesh may lie: beside the robot's file, or in its package, found like ROS does or above that file."""

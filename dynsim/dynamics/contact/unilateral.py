@@ -68,9 +68,8 @@ OF_GEAR, OF_JOINT = 0, 1
 DRY_FORCE = 2  # on the joint [N m or N]
 DRY_SIDE = 3  # sign of the rate at which it slides; between −1 and 1 at rest, where the force is that part of the bound
 DRY_AT = 4  # where it is held [rad or m]
-DRY_SOLVED = 5  # its force in the choice of modes [N m or N]
-DRY_HEADWAY = 6  # what it began to slide with against its side, because the rows could not take it away
-DRY_SIZE = 7
+DRY_HEADWAY = 5  # what it began to slide with against its side, because the rows could not take it away
+DRY_SIZE = 6
 # UnilateralArrays.tie_table, int
 TIE_A, TIE_B = 0, 1  # links
 TIE_TURNS = 2  # 1: about its axis, 0: along it

@@ -154,7 +154,6 @@ def let_joints_slide(system: System, size, largest):
     for k in range(table.shape[0]):
         table[k, ku.DRY_NEXT] = table[k, ku.DRY_HOLDS]
         if table[k, ku.DRY_HOLDS] == 1:
-            unilateral.dry[k, ku.DRY_SOLVED] = f[i]
             moves = abs(acceleration(unilateral, i, size)) > SLIP_TOLERANCE * largest
             if moves and abs(f[i]) >= dry_bound(unilateral, k) * (1.0 - ON_CONE):
                 table[k, ku.DRY_NEXT], unilateral.dry[k, ku.DRY_SIDE] = 0, -1.0 if f[i] > 0.0 else 1.0
@@ -184,9 +183,8 @@ def release_dependent_joints(system: System, ws: Workspace):
         if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
             bare = extended(bare_factor, W, bare_row, bare, unilateral.stop_table[k, ku.STOP_ROW])
     for k in range(mode.shape[0]):
-        for s in range(3):
-            if mode[k, ku.WANTED] == ka.STICKING:
-                bare = extended(bare_factor, W, bare_row, bare, ws.active[k, ka.FIRST_ROW] + s)
+        for s in range(3 if mode[k, ku.WANTED] == ka.STICKING else 0):
+            bare = extended(bare_factor, W, bare_row, bare, ws.active[k, ka.FIRST_ROW] + s)
     for i in range(bare):
         whole = extended(whole_factor, W, whole_row, whole, bare_row[i])
     for k in range(mode.shape[0]):
@@ -199,9 +197,9 @@ def release_dependent_joints(system: System, ws: Workspace):
         with_bare = extended(bare_factor, W, bare_row, bare, r)
         with_whole = extended(whole_factor, W, whole_row, whole, r)
         if with_bare > bare and with_whole == whole:
-            bound = dry_bound(unilateral, k)
-            table[k, ku.DRY_NEXT] = 0
-            dry[k, ku.DRY_SIDE] = min(max(-dry[k, ku.DRY_SOLVED] / bound, -1.0), 1.0)
+            # Rows of joints come first, so that they are the same in the reduced problem.
+            share = -unilateral.vector[ku.SOLUTION, r] / dry_bound(unilateral, k)
+            table[k, ku.DRY_NEXT], dry[k, ku.DRY_SIDE] = 0, min(max(share, -1.0), 1.0)
         else:
             bare, whole = with_bare, with_whole
 
