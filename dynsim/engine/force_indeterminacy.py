@@ -333,7 +333,9 @@ def acceleration_range(system: System, t: float, y: Array) -> tuple[Array, Array
 def sharing(
     model: Model, contacts: Sequence[Contact], q: Array, modes: Array, rests: NDArray[np.bool_] | None = None
 ) -> list[str]:
-    """Names of contacts and joints whose rows depend on each other, in the first sample of each set of modes.
+    """Names of contacts and joints whose rows depend on each other, in one sample of each set of modes.
+
+    The sample is the first with the most joints at rest: rows that depend on each other do so among more rows too.
 
     Contacts may share with each other, and with joints that dry friction keeps at rest; joints alone share nothing.
 
@@ -350,7 +352,8 @@ def sharing(
     free = _free(model)
     rests = np.zeros((len(modes), model.n), dtype=bool) if rests is None else rests
     shared: set[int] = set()
-    _, first = np.unique(np.column_stack([modes, rests]), axis=0, return_index=True)
+    order = np.argsort(-rests.sum(axis=1), kind="stable")
+    first = order[np.unique(modes[order], axis=0, return_index=True)[1]]
     closed, sticks = np.count_nonzero(modes != ka.OPEN, axis=1), (modes == ka.STICKING).any(axis=1)
     several = [t for t in sorted(first) if (closed[t] > 1 and sticks[t]) or (closed[t] > 0 and rests[t].any())]
     for t in several[:MOST_SETS]:
