@@ -61,6 +61,12 @@ def data(file: str) -> Any:
     return json.loads((ROOT / "results" / file).read_text(encoding="utf-8"))
 
 
+@cache
+def table_of(file: str) -> list[dict[str, str]]:
+    with (ROOT / "results" / file).open(encoding="utf-8", newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
 def validation() -> Any:
     return data("reference/validation.json")
 
@@ -468,8 +474,7 @@ def sweeps() -> str:
 @cache
 def swept(name: str) -> dict[tuple[str, float], dict[str, str]]:
     """Rows of a sweep over one key, by variant and value."""
-    with (ROOT / "results" / "sweeps" / name / "sweep.csv").open(encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    rows = table_of(f"sweeps/{name}/sweep.csv")
     key = list(rows[0])[2]
     return {(row["variant"], float(row[key])): row for row in rows}
 
@@ -675,12 +680,6 @@ def planned_scenes() -> str:
     return lines(heads, rows, left=2)
 
 
-@cache
-def table_iii() -> list[dict[str, str]]:
-    with (ROOT / "results" / "snake" / "table_iii.csv").open(encoding="utf-8") as file:
-        return list(csv.DictReader(file))
-
-
 def snake_table_iii() -> str:
     """Table III of the paper on the snake, and the same simulated."""
     shown = ("paper_mean", "paper_sd", "kinematic", "dynamic", "measured")
@@ -688,7 +687,7 @@ def snake_table_iii() -> str:
     rows = [
         [row["variant"], f"`{row['quantity']}`", *(f"{float(row[name]) + 0.0:.4g}" for name in shown[:2])]
         + [f"{round(float(row[name]), 4) + 0.0:.4f}" for name in shown[2:]]
-        for row in table_iii()
+        for row in table_of("snake/table_iii.csv")
     ]
     return lines(heads, rows, left=2)
 
@@ -720,13 +719,12 @@ def end_value_mm(moved: str, column: int) -> float:
 @cache
 def bases() -> dict[tuple[float, float, float], dict[str, tuple[bool, float]]]:
     """Of each base of the sweep (mass, track, caster), by variant: whether it stands, and its settled tip margin."""
-    swept: dict[tuple[float, float, float], dict[str, tuple[bool, float]]] = {}
-    with (ROOT / "results/overturning/sweep.csv").open(encoding="utf-8", newline="") as file:
-        for row in csv.DictReader(file):
-            base = float(row["mass_kg"]), float(row["track_m"]), float(row["caster_m"])
-            margin = float(row["tip_margin_min_settled"] or "nan")
-            swept.setdefault(base, {})[row["variant"]] = row["stands"] == "True", margin
-    return swept
+    outcomes: dict[tuple[float, float, float], dict[str, tuple[bool, float]]] = {}
+    for row in table_of("overturning/sweep.csv"):
+        base = float(row["mass_kg"]), float(row["track_m"]), float(row["caster_m"])
+        margin = float(row["tip_margin_min_settled"] or "nan")
+        outcomes.setdefault(base, {})[row["variant"]] = row["stands"] == "True", margin
+    return outcomes
 
 
 def standing(variant: str) -> int:
@@ -881,7 +879,11 @@ def fall_order(theta: str) -> str:
 
 def sag_error(quantity: str) -> float:
     """Root mean square of what the dynamic snake is off the paper in a quantity, over the six manoeuvres."""
-    off = [float(row["dynamic"]) - float(row["paper_mean"]) for row in table_iii() if row["quantity"] == quantity]
+    off = [
+        float(row["dynamic"]) - float(row["paper_mean"])
+        for row in table_of("snake/table_iii.csv")
+        if row["quantity"] == quantity
+    ]
     return math.sqrt(sum(x * x for x in off) / len(off))
 
 
@@ -1005,8 +1007,7 @@ def explicit_over_implicit() -> list[float]:
 
 def battery(column: str) -> list[float]:
     """What the dynamic snake draws, by manoeuvre."""
-    with (ROOT / "results" / "snake" / "energy.csv").open(encoding="utf-8") as file:
-        return [float(row[column]) for row in csv.DictReader(file)]
+    return [float(row[column]) for row in table_of("snake/energy.csv")]
 
 
 HELD_CASE = "two elbows held, no friction"
