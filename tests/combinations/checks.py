@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from combinations.agreement import disagreements
 from combinations.bodies import position_rates
+from combinations.energy import residual_floor, turnover_and_residual
 from combinations.observed import OPEN, SLIDING, STICKING, Observed, Touch, balance, whole_steps
 from combinations.running import Run
 from combinations.verdicts import untrue
@@ -290,7 +291,10 @@ def motion(seen: Observed) -> Finding:
 
 def _stepped_motion(seen: Observed) -> Finding:
     """Between samples that lie a step apart rates change by that of one step or of two, whose accelerations are known."""
-    h = seen.step
+    h, period = seen.step, seen.sample_time
+    # Steps end at ticks.
+    if period is not None and abs(period / h - round(period / h)) > 1e-6:
+        return
     beside = np.flatnonzero(np.abs(np.diff(seen.time) - h) < 1e-6 * h) + 1
     beside = beside[beside > 1]
     if not len(beside):
@@ -605,42 +609,6 @@ def ledger(seen: Observed) -> Finding:
         yield f"the residual is {relative:.3e} of the turnover by the signals, {told:.3e} in the summary"
     if relative > RESIDUAL and not _warned(seen, "the energy ledger does not close"):
         yield f"the ledger does not close: {relative:.3e} of the turnover, and no warning says so"
-
-
-def residual_floor(seen: Observed) -> float:
-    """Least energy to which a residual is compared, as docs/physics.md has it [J]."""
-    reach, lever, mass = {}, 0.0, 0.0
-    for link in seen.bodies.robot.links:
-        reach[link.name] = 0.0 if link.parent is None else reach[link.parent] + float(np.linalg.norm(link.p_PJ))
-        lever += link.inertia.mass * (reach[link.name] + float(np.linalg.norm(link.inertia.com)))
-        mass += link.inertia.mass
-    g, record = float(np.linalg.norm(seen.bodies.gravity)), seen.record
-    stores = (
-        np.abs(record["energy_kinetic"]),
-        np.abs(record["energy_potential"] - record["energy_potential"][0]),
-        np.abs(record["energy_magnetic"]),
-    )
-    floor = seen.scenario.integrator.rtol * max(lever * g, *(float(store.max(initial=0.0)) for store in stores))
-    # Landings are located to some 1e-10 m (docs/physics.md); ten of them.
-    return max(floor, mass * g * 1e-3 * RESIDUAL) if seen.real and floor == 0.0 else floor
-
-
-def turnover_and_residual(seen: Observed) -> tuple[float, float]:
-    """Energy that changed hands, and the largest imbalance of the signals [J]."""
-    record = seen.record
-    sources = record["energy_electrical"] + record["work_constraint"]
-    size = np.abs(record["energy_electrical"]) + np.abs(record["work_constraint"])
-    if "work_loads" in record:
-        sources = sources + record["work_loads"].sum(axis=1)
-        size = size + np.abs(record["work_loads"]).sum(axis=1)
-    sinks = ("heat_joule", "loss_gear", "loss_joint", "heat_friction", "loss_impact", "loss_stop", "loss_damper")
-    for name in (*sinks, "energy_elastic", "loss_scheme"):
-        if name in record:
-            sources, size = sources - record[name], size + np.abs(record[name])
-    for name in ("energy_kinetic", "energy_potential", "energy_magnetic"):
-        change = record[name] - record[name][0]
-        sources, size = sources - change, size + np.abs(change)
-    return float(0.5 * size.max(initial=0.0)), float(np.abs(sources).max(initial=0.0))
 
 
 def losses(seen: Observed) -> Finding:
