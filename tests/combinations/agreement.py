@@ -89,12 +89,23 @@ def _solvers(runs: Mapping[str, Run]) -> Iterator[tuple[str, str]]:
         if way != "m_star" or method not in runs:
             continue
         a, b = _measures(runs[method].record), _measures(run.record)
-        worst, text = _widest(runs[method].record, a, run.record, b, lambda measure, _: SOLVERS * (1.0 + measure.size))
+        worst, text = _widest(runs[method].record, a, run.record, b, _of_solvers(run))
         if worst > 1.0:
             # Where motion multiplies errors, rounding grows with those of steps.
             error = _own_error(run, 0.5)
             if 1e-3 * max((float(own.max(initial=0.0)) for _, own in error.values()), default=0.0) < worst * SOLVERS:
                 yield "solvers", f"{name} and {method}: {text}"
+
+
+def _of_solvers(run: Run) -> Any:
+    """What the solvers may differ by: rounding, and what their rounding makes of the steps that tolerances choose."""
+    assert run.resolved is not None
+    share = SOLVERS + 0.03 * run.resolved.integrator.rtol
+
+    def allowed(measure: Measure, time: Array) -> Array:
+        return np.asarray(SOLVERS + share * measure.size)[None]
+
+    return allowed
 
 
 def _pair(first: str, run: Run, other: str, second: Run) -> Iterator[tuple[str, str]]:
