@@ -40,7 +40,7 @@ STOP_SLACK = 1e-6
 CONE = 1e-5
 # Contact problems of steps are solved to 1e-8 m/s, which leaves forces off by more where rows are nearly dependent, as
 # those of the corners of a box.
-STEPPED_CONE = 1e-3
+STEPPED_CONE = 1e-5
 # What sticks moves no faster: limit of the projection of velocities [m/s]; steps solve contact problems to 1e-8.
 CREEP = 1e-6
 # Slip below this has no direction of its own: 1000 atol of the default [m/s].
@@ -276,7 +276,7 @@ def _integral_error(seen: Observed, value: Array, rate: Array) -> tuple[Array, A
     # What rings or is cut by a limit between samples shows in how much rates bend around them.
     bend = np.zeros_like(rate)
     bend[1:-1] = np.abs(rate[2:] - 2.0 * rate[1:-1] + rate[:-2])
-    reach = 2.0 * h * np.max([bend[np.clip(rows + k, 0, len(rate) - 1)] for k in range(-2, 5)], axis=0)
+    reach = (5.0 if seen.settling > 0.0 else 2.0) * h * np.max([bend[np.clip(rows + k, 0, len(rate) - 1)] for k in range(-2, 5)], axis=0)
     return off, 2.0 * np.abs(simpson - trapezoid) + reach + rounding + drift, rows
 
 
@@ -381,10 +381,13 @@ def touching(seen: Observed) -> Finding:
 
 
 def _reach(seen: Observed, touch: Touch) -> Array:
-    """How far from its surface what touches may be, (T,) [m]: of steps what they go along the normal, and sag."""
+    """How far from its surface what touches may be, (T,) [m]: of steps what they go along the normal.
+
+    What starts within a micrometre is on its surface.
+    """
     if not seen.stepped:
         return np.full(len(seen), 10.0 * DRIFT)
-    return 1e-7 + seen.step * (_fastest_approach(touch) + np.linalg.norm(touch.slip, axis=1))
+    return 1e-6 + seen.step * (_fastest_approach(touch) + np.linalg.norm(touch.slip, axis=1))
 
 
 def _fastest_approach(touch: Touch) -> Array:

@@ -295,6 +295,9 @@ def _stepped_balance(seen: Observed) -> Balance:
         turned = _turned(touch.force[rows], later.normal, touch.normal)
         for force in (touch.force[rows], turned):
             slack = slack + np.abs(_contact_term(seen, middle, touch, force) - _contact_term(seen, end, later, later.force[rows]))
+        # Tangents may turn about the normal as much as that turns.
+        angle = np.linalg.norm(later.normal - touch.normal, axis=1, keepdims=True)
+        slack = slack + np.abs(_contact_term(seen, middle, touch, angle * np.cross(touch.normal, turned)))
     return _balanced(seen, rows, terms, slack)
 
 
