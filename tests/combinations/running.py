@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 import warnings
 from collections.abc import Mapping
@@ -87,23 +88,31 @@ def run(scene: Scene, method: str, way: str = "simulate") -> Run:
     return Run(settings, scenario, method, way, record, failure, said, checked)
 
 
+def _simulation(scenario: Scenario) -> Simulation:
+    """As ``simulate`` makes it: one with ticks of Python has no end, where a step would end in another way."""
+    sensors, controller = scenario.config.sensors, scenario.controller
+    attended = sensors is not None or getattr(controller, "operator", None) is not None
+    attended = attended or getattr(controller, "type", "") == "task_space"
+    return Simulation(scenario, duration=math.inf if attended else None)
+
+
 def _in_pieces(scenario: Scenario) -> Record:
-    simulation = Simulation(scenario)
+    simulation = _simulation(scenario)
     for share in PIECES:
         simulation.advance(share * scenario.duration_s)
     simulation.advance(scenario.duration_s)
-    return simulation.record()
+    return simulation.record(scenario)
 
 
 def _with_snapshot(scenario: Scenario) -> Record:
     """Go on from a snapshot, and again from there."""
-    simulation = Simulation(scenario)
+    simulation = _simulation(scenario)
     simulation.advance(0.3 * scenario.duration_s)
     snapshot = simulation.snapshot()
     simulation.advance(0.8 * scenario.duration_s)
     simulation.restore(snapshot)
     simulation.advance(scenario.duration_s)
-    return simulation.record()
+    return simulation.record(scenario)
 
 
 def _in_a_batch(scenario: Scenario) -> Record:
