@@ -1,0 +1,2 @@
+def untrue(scenario, run, seen):
+    return []
