@@ -54,11 +54,13 @@ def _law(method: str) -> _Law:
     return _Law(method)
 
 
+@cache
 def pairs(seed: int) -> list[dict[str, str]]:
     """Assignments that hold every pair of levels of different factors that is not refused."""
     return _covering(seed, 2)
 
 
+@cache
 def triples(seed: int) -> list[dict[str, str]]:
     """The same for every triple."""
     return _covering(seed, 3)
@@ -75,6 +77,7 @@ def draw(seed: int, number: int) -> dict[str, str]:
     raise AssertionError("nearly all assignments are refused")
 
 
+@cache
 def allowed(size: int, method: str) -> NDArray[np.bool_]:
     """Which combinations of so many levels, by their numbers in ascending order, a method takes."""
     law = _law(method)
@@ -100,7 +103,7 @@ def _combinations(size: int) -> list[tuple[int, ...]]:
 def _covering(seed: int, size: int) -> list[dict[str, str]]:
     """Greedy: of some random assignments that hold a combination still missing, the one that holds most of them."""
     random = np.random.default_rng([seed, size])
-    missing = {kind: allowed(size, kind) for kind in KINDS}
+    missing = {kind: allowed(size, kind).copy() for kind in KINDS}
     taken: list[dict[str, str]] = []
     for kind in KINDS:
         law, lacks = _law(kind), missing[kind]

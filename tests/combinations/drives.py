@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.random import Generator
 
-from combinations.factors import DC, PLANNED, SAMPLED, Levels
+from combinations.factors import PLANNED, SAMPLED, Levels
 from combinations.plants import Joint, Plant
 from dynsim import Model
 
@@ -82,11 +82,16 @@ def controller(
     elif level == "pressing":
         # Of the declared points all press, or the elbow alone.
         alone = levels["start"] in ("on_surface", "on_references") and levels["points"] != "elbow"
-        section["brace"] = "optimal" if random.random() < 0.5 and not alone else {"elbow": float(random.uniform(1.0, 8.0))}
+        section["brace"] = (
+            "optimal" if random.random() < 0.5 and not alone else {"elbow": float(random.uniform(1.0, 8.0))}
+        )
     followed: list[Joint] = []
     if level == "hand_path":
         followed = _followers(random, levels, robot, moved)
-        section["hand"] = {"joints": [joint.name for joint in followed], **_path(random, robot, followed, model, duration)}
+        section["hand"] = {
+            "joints": [joint.name for joint in followed],
+            **_path(random, robot, followed, model, duration),
+        }
         if levels["contact"] == "glued" and any(joint.before for joint in followed):
             section["hand"]["braces"] = ["elbow"]
     elif level == "operator":
@@ -104,9 +109,7 @@ def controller(
     return section
 
 
-def _gains(
-    random: Generator, levels: Levels, robot: Plant, driven: dict[str, dict[str, Any]]
-) -> dict[str, Any]:
+def _gains(random: Generator, levels: Levels, robot: Plant, driven: dict[str, dict[str, Any]]) -> dict[str, Any]:
     """A gain for each DC motor: soft to stiff, softer where commands are held between samples."""
     sampled = levels["controller"] in SAMPLED
     stiff = float(10.0 ** random.uniform(-0.5, 0.3)) * (0.3 if sampled else 1.0)
@@ -135,9 +138,7 @@ def _followers(random: Generator, levels: Levels, robot: Plant, moved: Sequence[
     return behind if behind and random.random() < 0.5 else [joint for joint in moved if joint.name != "grip"]
 
 
-def _path(
-    random: Generator, robot: Plant, followed: Sequence[Joint], model: Model, duration: float
-) -> dict[str, Any]:
+def _path(random: Generator, robot: Plant, followed: Sequence[Joint], model: Model, duration: float) -> dict[str, Any]:
     """A line that the joints can follow: to where small turns of theirs take the hand."""
     q = np.array(model.robot.initial)
     start = model.point_position(*robot.hand, q)
@@ -159,6 +160,9 @@ def _waypoints(random: Generator, levels: Levels, free: Sequence[Joint], duratio
     able = [joint for joint in free if not (held and joint.before)]
     if not able and levels["start"] == "on_references":
         able = list(free)
+    if levels["controller"] == "pressing" and levels["points"] in ("two", "same_link"):
+        # They would take a point that presses off its surface.
+        able = []
     joints: dict[str, Any] = {}
     for k in random.permutation(len(able)).tolist()[: 1 + int(random.integers(2))]:
         joint = able[k]
@@ -170,9 +174,7 @@ def _waypoints(random: Generator, levels: Levels, free: Sequence[Joint], duratio
     return {"joints": joints} if joints else {}
 
 
-def _torques(
-    random: Generator, driven: dict[str, dict[str, Any]], model: Model, duration: float
-) -> dict[str, Any]:
+def _torques(random: Generator, driven: dict[str, dict[str, Any]], model: Model, duration: float) -> dict[str, Any]:
     """What holds the weight, and a wave about it that presses and lifts."""
     weight = model.bias_forces(np.array(model.robot.initial), np.zeros(model.n))
     rates = {link.joint: i for i, link in enumerate(model.robot.links)}
@@ -185,8 +187,3 @@ def _torques(
         values = [hold + wave, hold, hold - wave]
         torques[name] = {"times_s": [0.0, 0.5 * duration, duration], "torques_N_m": values}
     return torques
-
-
-def is_dc(levels: Levels) -> bool:
-    """Whether all motors are DC motors."""
-    return levels["motor"] in DC

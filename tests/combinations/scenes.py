@@ -174,7 +174,9 @@ class _Touching:
         if contact == "links":
             # Thicker than the link, which would take its place.
             radius = robot.radius + THICKER
-        gap = {"above": float(random.uniform(1e-3, 6e-3)), "on_surface": float(random.uniform(-2e-3, 2e-3))}.get(start, 0.0)
+        gap = {"above": float(random.uniform(1e-3, 6e-3)), "on_surface": float(random.uniform(-2e-3, 2e-3))}.get(
+            start, 0.0
+        )
         # Not all of several points can be moved at once.
         self.gap = 0.0 if contact == "glued" or start not in ("on_surface", "on_references") else 3e-3
         if contact == "glued" and levels["points"] != "elbow":
@@ -395,7 +397,7 @@ class _Touching:
             height = 0.07
             if self._levels["rubbing"] in ("bearing", "both"):
                 thing["wheels"]["rear"]["friction_N_m"] = 0.002
-        thing["position_m"] = (there + [0.0, 0.0, height + drop]).tolist()
+        thing["position_m"] = (there + np.array([0.0, 0.0, height + drop])).tolist()
         return {"thing": thing}
 
     def _away(self) -> Array:
@@ -430,7 +432,9 @@ def _loads(random: Generator, levels: Levels, robot: plants.Plant, duration: flo
     force = random.uniform(-3.0, 3.0, size=3).tolist()
     if level == "constant":
         torque = random.uniform(-0.1, 0.1, size=3).tolist()
-        return {"wind": {"type": "constant", "body": body, "point_m": list(tip), "force_N": force, "torque_N_m": torque}}
+        return {
+            "wind": {"type": "constant", "body": body, "point_m": list(tip), "force_N": force, "torque_N_m": torque}
+        }
     if level in ("push", "body_push"):
         times = (np.array([0.2, 0.4, 0.7]) * duration).tolist()
         push: dict[str, Any] = {"type": "samples", "body": body, "times_s": times}

@@ -17,12 +17,13 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from combinations.covering import draw, pairs, refused_share, triples
 from combinations.factors import FACTORS
-from combinations.running import Run, expected, faults, runs
+from combinations.running import Run, faults, runs
 from combinations.scenes import Scene, scene
 from dynsim.engine import Progress
 from dynsim.errors import SimulationInterrupted
@@ -67,8 +68,16 @@ def assignment(cover: str, seed: int, number: int) -> dict[str, str]:
     return {"pairs": pairs, "triples": triples}[cover](seed)[number]
 
 
-def look_at(levels: Mapping[str, str], seed: int, number: int, folder: Path, *, thorough: bool | None = None) -> Outcome:
-    """Run a scene by all its methods and look at everything.
+def look_at(
+    levels: Mapping[str, str],
+    seed: int,
+    number: int,
+    folder: Path,
+    *,
+    thorough: bool | None = None,
+    takes: Callable[[Scene, str, str], bool] = lambda drawn, method, way: True,
+) -> Outcome:
+    """Run a scene by all its methods, or by those that ``takes`` lets through, and look at everything.
 
     Raises
     ------
@@ -76,7 +85,7 @@ def look_at(levels: Mapping[str, str], seed: int, number: int, folder: Path, *, 
     """
     began = time.monotonic()
     drawn = scene(levels, seed + number, folder)
-    done = runs(drawn)
+    done = runs(drawn, partial(takes, drawn))
     problems = faults(drawn, done, thorough=number % THOROUGH == 0 if thorough is None else thorough)
     problems += _checked(drawn, done)
     return Outcome(
@@ -97,6 +106,8 @@ def _checked(drawn: Scene, done: Mapping[str, Run]) -> list[tuple[str, str]]:
     said: list[tuple[str, str]] = []
     for name, own in done.items():
         said += [(problem.kind, f"{name}: {problem.detail}") for problem in checks.problems(own.scenario, own)]
+    if not done:
+        return said
     first = next(iter(done.values()))
     return said + [(problem.kind, problem.detail) for problem in checks.compare(first.scenario, done)]
 
@@ -132,7 +143,9 @@ def keep(outcome: Outcome, folder: Path, target: Path) -> None:
 
 def table(outcomes: Sequence[Outcome]) -> str:
     """Levels with their scenes, how their runs ended, and how many scenes have problems."""
-    lines = [f"{'factor':<12}{'level':<15}{'scenes':>7}{'runs':>6}{'finished':>10}{'stopped':>9}{'refused':>9}{'failing':>9}"]
+    lines = [
+        f"{'factor':<12}{'level':<15}{'scenes':>7}{'runs':>6}{'finished':>10}{'stopped':>9}{'refused':>9}{'failing':>9}"
+    ]
     for factor, levels in FACTORS.items():
         for level in levels:
             own = [outcome for outcome in outcomes if outcome.levels[factor] == level]
