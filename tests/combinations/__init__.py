@@ -3,6 +3,8 @@
     factors      the factors and their levels, and which levels refuse each other
     covering     few assignments of levels that hold each pair, or each triple
     scenes       the scenario of an assignment
+    plants       their robots
+    drives       their motors and controllers
     running      a scene run with a method, in one of several ways
     checks       what must hold of every record, and between the records of a scene
     verdicts     whether warnings and stops are true

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -87,23 +88,31 @@ def run(scene: Scene, method: str, way: str = "simulate") -> Run:
     return Run(settings, scenario, method, way, record, failure, said, checked)
 
 
+def _simulation(scenario: Scenario) -> Simulation:
+    """As ``simulate`` makes it: one with ticks of Python has no end, where a step would end in another way."""
+    sensors, controller = scenario.config.sensors, scenario.controller
+    attended = sensors is not None or getattr(controller, "operator", None) is not None
+    attended = attended or getattr(controller, "type", "") == "task_space"
+    return Simulation(scenario, duration=math.inf if attended else None)
+
+
 def _in_pieces(scenario: Scenario) -> Record:
-    simulation = Simulation(scenario)
+    simulation = _simulation(scenario)
     for share in PIECES:
         simulation.advance(share * scenario.duration_s)
     simulation.advance(scenario.duration_s)
-    return simulation.record()
+    return simulation.record(scenario)
 
 
 def _with_snapshot(scenario: Scenario) -> Record:
     """Go on from a snapshot, and again from there."""
-    simulation = Simulation(scenario)
+    simulation = _simulation(scenario)
     simulation.advance(0.3 * scenario.duration_s)
     snapshot = simulation.snapshot()
     simulation.advance(0.8 * scenario.duration_s)
     simulation.restore(snapshot)
     simulation.advance(scenario.duration_s)
-    return simulation.record()
+    return simulation.record(scenario)
 
 
 def _in_a_batch(scenario: Scenario) -> Record:
@@ -131,21 +140,25 @@ WAYS = {
 }
 
 
-def runs(scene: Scene) -> dict[str, Run]:
+def runs(scene: Scene, takes: Callable[[str, str], bool] = lambda method, way: True) -> dict[str, Run]:
     """A scene by all its methods, by ``METHOD``, and in further ways by ``METHOD/WAY``.
 
-    ``auto`` takes one of the others, and is run where the scene is to be run in another way than ``simulate``.
+    ``auto`` takes one of the others, and is run where the scene is to be run in no further way. ``takes`` may leave
+    out methods and ways.
     """
-    done = {method: run(scene, method) for method in scene.methods if method != "auto"}
+    done = {method: run(scene, method) for method in scene.methods if method != "auto" and takes(method, "simulate")}
+    if not done:
+        return {}
     # Which method runs in another way, changes from scene to scene.
     method = sorted(done)[scene.seed % len(done)]
     way = scene.levels["way"]
     if way != "simulate":
         done[f"{method}/{way}"] = run(scene, method, way)
-    elif "auto" in scene.methods:
+    elif "auto" in scene.methods and takes("auto", way):
         done["auto"] = run(scene, "auto")
-    if scene.levels["solver"] == M_STAR:
-        method = sorted(set(done) & {"dopri5", "radau5"})[scene.seed % 2]
+    able = sorted(set(done) & {"dopri5", "radau5"})
+    if scene.levels["solver"] == M_STAR and able and takes(able[scene.seed % len(able)], M_STAR):
+        method = able[scene.seed % len(able)]
         done[f"{method}/{M_STAR}"] = run(scene, method, M_STAR)
     return done
 
@@ -212,7 +225,9 @@ def different(a: Record, b: Record) -> list[str]:
     return [
         name
         for name in names
-        if name not in a or name not in b or not np.array_equal(np.asarray(a[name]), np.asarray(b[name]), equal_nan=True)
+        if name not in a
+        or name not in b
+        or not np.array_equal(np.asarray(a[name]), np.asarray(b[name]), equal_nan=True)
     ]
 
 
@@ -267,7 +282,7 @@ def _page(own: Run, folder: Path) -> str:
     from dynsim.draw import page
 
     assert own.record is not None
-    page.write(folder / "view.html", {"run": own.record})
+    page.write({"run": own.record}, folder / "view.html")
     return ""
 
 
