@@ -116,15 +116,7 @@ def prepare(
     ScenarioError
         The record would be larger than ``record.size_limit_GB``, or the explicit method would need too many steps.
     """
-    described, contacts = build.robot_and_contacts(scenario)
-    piloted: JointControl | None = None
-    if type(described) is not Robot:
-        # The snake's modules wait until there is a snake.
-        from dynsim.compile.snake_tree import SnakeTree
-        from dynsim.engine.snake_start import begun
-
-        if isinstance(described, SnakeTree):
-            described, piloted = begun(scenario, described, follow_lines)
+    described, contacts, piloted = at_start(scenario)
     if motors is not None:
         described = replace(described, motors=tuple(motors))
     model = recall("model", lambda: Model(described), described)
@@ -221,6 +213,20 @@ def prepare(
         lanes=has_forms(system),
     )
     return Prepared(model, contacts, control, system, run, new_workspace(system), loads, stops, choice, balance, dry)
+
+
+def at_start(scenario: Scenario) -> tuple[Robot, list[Contact], JointControl | None]:
+    """The robot in the posture in which its run begins, its contacts, and a snake's control (None: another robot)."""
+    described, contacts = build.robot_and_contacts(scenario)
+    if type(described) is not Robot:
+        # The snake's modules wait until there is a snake.
+        from dynsim.compile.snake_tree import SnakeTree
+        from dynsim.engine.snake_start import begun
+
+        if isinstance(described, SnakeTree):
+            robot, control = begun(scenario, described, follow_lines)
+            return robot, contacts, control
+    return described, contacts, None
 
 
 def _check_friction(robot: Robot, real: bool, stepped: bool) -> None:
