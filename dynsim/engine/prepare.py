@@ -30,6 +30,7 @@ from dynsim.engine.compilation import kernels_logged
 from dynsim.engine.equilibrium import Balance, balanced, shifted
 from dynsim.engine.method import AUTO, Choice, choose
 from dynsim.engine.outcome import check_size
+from dynsim.engine.soundness import check_inertia
 from dynsim.errors import ModelError, ScenarioError, SimulationStopped
 from dynsim.integrators import driver
 from dynsim.integrators import run as ki
@@ -124,6 +125,7 @@ def prepare(
     law = scenario.config.contacts.law
     if starts:
         recall("start", lambda: build.check_start(scenario, model, contacts), model, law, places)
+        recall("inertia", lambda: check_inertia(model), model)
     loads = build.loads(scenario, robot)
     if pushable:
         loads = [*loads, *(_push(body) for body in robot.bodies)]

@@ -13,6 +13,7 @@ from dynsim.compile.model import Model
 from dynsim.compile.shapes import gap_at
 from dynsim.engine import Start
 from dynsim.engine.prepare import at_start, prepare
+from dynsim.engine.soundness import unstable_loop
 from dynsim.errors import ModelError
 from dynsim.model.description import Contact, Robot
 from dynsim.scenario import Scenario, build
@@ -27,7 +28,10 @@ def check(scenario: Scenario, started: Callable[[Start], None]) -> Start:
     """See :func:`dynsim.engine.check`."""
     start = start_of(scenario)
     started(start)
-    control = prepare(scenario).control
+    prepared = prepare(scenario)
+    control = prepared.control
+    if (unstable := unstable_loop(scenario, prepared)) is not None:
+        start = replace(start, warnings=[*start.warnings, unstable[0]])
     if control.path is not None and control.teleop is None:
         begin = control.path.position(np.zeros(1))[0]
         start = replace(start, off_path=float(np.linalg.norm(begin - start.hand)))

@@ -52,8 +52,8 @@ def ids(changes) -> str:
 
 
 @pytest.mark.parametrize("method", METHODS, ids=ids)
-def test_a_sample_at_a_tick_has_the_voltage_of_its_own_state(arm, method):
-    """From the first to the last; within a period the voltage is that of the tick, to the bit."""
+def test_the_voltage_at_a_tick_follows_from_the_same_sample(arm, method):
+    """From the first to the last; within a period the voltage of the tick holds, to the bit."""
     record = simulate(arm(**method))
     assert len(record) == 101  # the last one is at a tick, as the first is
     at_ticks = record["voltage"][::2]
@@ -67,7 +67,7 @@ def test_a_sample_at_a_tick_has_the_voltage_of_its_own_state(arm, method):
 @pytest.mark.parametrize("method", [METHODS[0], METHODS[5]], ids=ids)
 def test_a_servo_has_current_and_torque_of_the_command_at_its_tick(tmp_path, method):
     """Without a circuit they jump with the voltage: i = (u − K_m v)/R."""
-    # Its gain is its own.
+    # The gain is part of the motor.
     text = ARM.replace(f"k_p_V_per_rad: {K_P}, k_d_V_s_per_rad: {K_D}, ", "")
     (tmp_path / "arm.yaml").write_text(text)
     motor = {**SERVO, "k_p_V_per_rad": K_P}
@@ -83,7 +83,7 @@ def test_a_servo_has_current_and_torque_of_the_command_at_its_tick(tmp_path, met
 
 @pytest.mark.parametrize("method", METHODS, ids=ids)
 @pytest.mark.parametrize("delay", [0.0, PERIOD, 2.5 * PERIOD])
-def test_the_voltage_is_that_of_the_measurement_in_force(arm, method, delay):
+def test_the_voltage_follows_from_the_measurement_in_force(arm, method, delay):
     """``q_measured`` at a tick is what the controller has at that tick, with the delay of its encoders."""
     record = simulate(arm(**method, sensors__encoders={"delay_s": delay}))
     measured = record["q_measured"][::2]
@@ -106,7 +106,7 @@ def test_pieces_and_batches_have_the_same_samples(arm, method, encoders):
     for end in (0.5 * PERIOD, 3 * PERIOD, 3.3 * PERIOD, 10 * PERIOD, 0.2):
         simulation.advance(end)
         part = simulation.record()
-        # A record within a period ends a step of its own there.
+        # A record within a period ends an additional step there.
         for name in ("q", "v", "voltage", "current", "torque"):
             np.testing.assert_allclose(
                 part[name], whole[name][: len(part)], rtol=0.0, atol=1e-6, err_msg=f"{name} {end}"
@@ -121,14 +121,14 @@ def test_pieces_and_batches_have_the_same_samples(arm, method, encoders):
 
 @pytest.mark.parametrize("method", [METHODS[0], METHODS[3], METHODS[5]], ids=ids)
 def test_a_caller_between_two_pieces_is_a_sampled_controller_too(arm, method):
-    """What is set at the time of a sample is in that sample."""
+    """A command that is set at the time of a sample is in that sample."""
     simulation = Simulation(arm(controller=None, **method))
-    given = [1.0, -2.0, 0.5]
-    for k, voltage in enumerate(given):
+    commands = [1.0, -2.0, 0.5]
+    for k, voltage in enumerate(commands):
         simulation.set_command("joint_1", voltage)
         simulation.advance((k + 1) * PERIOD)
     record = simulation.record()
-    np.testing.assert_array_equal(record["voltage"][:, 0], [*np.repeat(given, 2), given[-1]])
+    np.testing.assert_array_equal(record["voltage"][:, 0], [*np.repeat(commands, 2), commands[-1]])
 
 
 @pytest.mark.parametrize("method", [METHODS[0], METHODS[3]], ids=ids)

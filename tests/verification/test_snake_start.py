@@ -62,14 +62,14 @@ def test_a_plate_ahead_of_the_head_leaves_the_start_alone(alone):
 
 def test_a_tied_object_starts_where_it_is_placed(alone):
     """Its ties begin at t = 0, at rest as the head is then; before that they would drag it along."""
-    place = [0.3, 0.0, 0.03]
-    box = {"mass_kg": 0.2, "size_m": [0.06, 0.06, 0.06], "position_m": place}
+    position = [0.3, 0.0, 0.03]
+    box = {"mass_kg": 0.2, "size_m": [0.06, 0.06, 0.06], "position_m": position}
     record = simulate(dynamic(objects={"load": box}, ties=ties()))
     own = alone["q"].shape[1]
     np.testing.assert_array_equal(record["q"][0, :own], alone["q"][0])
     columns = [record.labels["q"].index(f"load.{axis}") for axis in "xyz"]
-    np.testing.assert_array_equal(record["q"][0, columns], place)
-    # The forces of the first step: at rest at t = 0, they grow with the falling load and the swaying head.
+    np.testing.assert_array_equal(record["q"][0, columns], position)
+    # These are the forces of the first step. The ties are at rest at t = 0, and the load begins to fall.
     assert np.abs(record["tie_force"][0]).max() < 0.5
 
 
