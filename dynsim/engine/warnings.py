@@ -188,9 +188,17 @@ def _undetermined(record: Record, prepared: Prepared) -> list[str]:
         joints = [name for name in shared if name in prepared.model.joint_names]
         if joints:
             touching = [name for name in shared if name not in joints]
+            slides = (record["contact_mode"] == ka.SLIDING) & rests.any(axis=1)[:, None]
+            sliding = [
+                contact.name
+                for contact, some in zip(contacts, slides.any(axis=0), strict=True)
+                if some and contact.friction > 0.0 and contact.name in touching
+            ]
+            motion = f"; while {first_few(sliding)} slides, other choices may move otherwise" if sliding else ""
             return [
                 f"{first_few(touching)}: shared forces with the dry friction of {first_few(joints)}, which keeps these "
                 "joints at rest; the motion does not determine them, and those of the record are one choice of many"
+                f"{motion}"
             ]
         if not shared:
             return []

@@ -185,7 +185,7 @@ def dry_bound(unilateral: UnilateralArrays, k):
 
 @internal_kernel
 def holding_bound(unilateral: UnilateralArrays, k):
-    """Largest dry friction that holds joint k of those that have it, while modes are chosen a little less [N m or N]."""
+    """Dry friction that may hold joint k of those that have it; while modes are chosen a little less [N m or N]."""
     return unilateral.number[HOLDING] * dry_bound(unilateral, k)
 
 

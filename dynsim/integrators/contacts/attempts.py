@@ -49,7 +49,7 @@ def take_back(system: System, ws: Workspace, run: Run):
         unilateral.number[i] = kept[at + i]
     for i in range(run.y.shape[0]):
         run.y[i] = run.y_new[i]
-    # With the rows that are there, for the places of points; then with those that were.
+    # First with the present rows, for the positions of points, which the earlier rows start from.
     evaluate(system, ws, run)
     set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
     evaluate(system, ws, run)

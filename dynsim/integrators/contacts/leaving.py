@@ -27,8 +27,8 @@ NO_ACCELERATION = 1e-8
 def approach_without_force(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace, k):
     """Acceleration of sticking candidate k towards its surface without its own force, right after ``derivative``.
 
-    Forces of all others are those of the contact problem in which sticking points may slip, held joints may move and
-    stops may open; sliding points keep their direction. Positive, by NO_ACCELERATION, if nothing moves the point; the
+    The contact problem has all other forces: sticking points may slip in it, held joints move and stops open; sliding
+    points keep their direction. Positive, by NO_ACCELERATION, if nothing moves the point; the
     guard of a point that leaves falls through zero [m/s²].
     """
     index, vector, active, W = unilateral.index, unilateral.vector, ws.active, ws.small[0]
@@ -36,10 +36,10 @@ def approach_without_force(contacts: ContactArrays, unilateral: UnilateralArrays
     joints, closed = ws.counts[ka.COUPLED], 0
     for j in range(unilateral.stop_table.shape[0]):
         closed += unilateral.stop_table[j, ku.STOP_CLOSED]
-    held = dry_rows_held(unilateral)
-    couplings = joints - closed - held
+    resting = dry_rows_held(unilateral)
+    couplings = joints - closed - resting
     for r in range(joints):
-        kind = kc.BOTH_WAYS if r < couplings else kc.BOX if r < couplings + held else kc.ONE_WAY
+        kind = kc.BOTH_WAYS if r < couplings else kc.BOX if r < couplings + resting else kc.ONE_WAY
         index[ku.KINDS, r], index[ku.TABLE_ROW, r], vector[ku.CONE_FRICTION, r] = kind, r, 0.0
     for j in range(unilateral.dry_table.shape[0]):
         if unilateral.dry_table[j, ku.DRY_HOLDS] == 1:
@@ -75,7 +75,7 @@ def approach_without_force(contacts: ContactArrays, unilateral: UnilateralArrays
 def watch_unpressed(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace, h):
     """Add an accepted step to the time of each point that sticks although nothing presses it.
 
-    Only if the split of least norm lies in all cones: supports that deform alike have this split, and hold the point.
+    Only if the split of least norm lies in all cones: equally stiff supports have this split, and hold the point.
     Otherwise the guard of the normal force lets the point leave.
     """
     if unilateral.number[ku.REDUNDANT] == 1.0 and unilateral.number[ku.SPLIT] == 0.0 and ws.counts[ka.STUCK] > 0:
@@ -87,6 +87,6 @@ def add_unpressed(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Wor
     """:func:`watch_unpressed` where rows depend on each other."""
     find_splits(unilateral, ws)
     for k in range(ws.contacts.shape[0]):
-        if ws.active[k, ka.MODE] == ka.STICKING and normal_is_open(unilateral, ws, k):
-            if approach_without_force(contacts, unilateral, ws, k) < 0.0:
-                unilateral.tally[k, ku.UNPRESSED] += h
+        is_open = ws.active[k, ka.MODE] == ka.STICKING and normal_is_open(unilateral, ws, k)
+        if is_open and approach_without_force(contacts, unilateral, ws, k) < 0.0:
+            unilateral.tally[k, ku.UNPRESSED] += h
