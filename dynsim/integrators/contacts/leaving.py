@@ -28,8 +28,8 @@ def approach_without_force(contacts: ContactArrays, unilateral: UnilateralArrays
     """Acceleration of sticking candidate k towards its surface without its own force, right after ``derivative``.
 
     The contact problem has all other forces: sticking points may slip in it, held joints move and stops open; sliding
-    points keep their direction. Positive, by NO_ACCELERATION, if nothing moves the point; the
-    guard of a point that leaves falls through zero [m/s²].
+    points keep their direction. Positive, by NO_ACCELERATION, if nothing moves the point, so that the guard of a point
+    that leaves falls through zero [m/s²].
     """
     index, vector, active, W = unilateral.index, unilateral.vector, ws.active, ws.small[0]
     # Rows of joints come first: couplings, dry friction, stops.
