@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 from combinations.bodies import position_rates, times
 from combinations.observed import Observed
 from combinations.surfaces import nearest
+from dynsim.model.drives import Motor
 
 Array = NDArray[np.float64]
 
@@ -58,8 +58,8 @@ class State:
     rubbing: Array
 
 
-def state_of(seen: Observed, values: Mapping[str, Sequence[float]]) -> State:
-    """What the bodies are at the state of a stop, or the last sample."""
+def state_of(seen: Observed, values: Mapping[str, Sequence[float]], currents: Array | None = None) -> State:
+    """What the bodies are at the state of a stop, or the last sample; ``currents`` : of all drives, if known."""
     q = np.array(values["q"]) if "q" in values else seen.q[-1]
     v = np.array(values["v"]) if "v" in values else seen.v[-1]
     motion = seen.bodies.motion(q[None], v[None], np.zeros((1, len(v))))
@@ -91,7 +91,11 @@ def state_of(seen: Observed, values: Mapping[str, Sequence[float]]) -> State:
     bound = np.array([link.friction + gears.get(link.joint, 0.0) for link in seen.robot.links]) * seen.real
     resting = [int(j) for j in np.flatnonzero((bound > 0.0) & (np.abs(v) < RESTS))]
     rubbing = np.where((bound > 0.0) & (np.abs(v) >= RESTS), -bound * np.sign(v), 0.0)
-    current = np.array(values["current"]) if len(values.get("current", ())) else np.zeros(0)
+    current = seen.record["current"][-1].copy() if currents is None else currents
+    circuits = [a for a, motor in enumerate(seen.robot.motors) if isinstance(motor, Motor)]
+    if currents is None and len(values.get("current", ())) == len(circuits):
+        # Those of circuits are of the state, the others' those of the last sample.
+        current[circuits] = values["current"]
     mass = seen.bodies.mass_matrix(q)
     return State(
         q, v, current, mass, names, rows, slip, friction, static, resting, [float(bound[j]) for j in resting], rubbing
@@ -154,9 +158,30 @@ def _paradox(state: State, sliding: Sequence[int], inverse: Array) -> bool:
 
 def exists(seen: Observed, values: Mapping[str, Sequence[float]], time: float) -> bool:
     """Whether there are contact forces that agree with Coulomb's law at a state, by a damped projected iteration."""
-    state = state_of(seen, values)
-    if not state.names and not state.resting:
+    return _solved(seen, state_of(seen, values), time)[0]
+
+
+def leaves(seen: Observed, name: str, i: int) -> bool:
+    """Whether a contact would leave its surface at a sample if it had no force, all others having theirs."""
+    state = state_of(seen, {"q": seen.q[i].tolist(), "v": seen.v[i].tolist()}, seen.record["current"][i])
+    if name not in state.names:
         return True
+    k = state.names.index(name)
+    without = replace(
+        state,
+        **{key: [entry for m, entry in enumerate(getattr(state, key)) if m != k] for key in
+           ("names", "rows", "slip", "friction", "static")},
+    )  # fmt: skip
+    solved, acceleration = _solved(seen, without, float(seen.time[i]))
+    drift = _drifts(seen, state)[k][0]
+    gain = float(state.rows[k][0] @ acceleration + drift)
+    return solved and gain > -1e-6 * (np.abs(acceleration).max(initial=0.0) + 1.0)
+
+
+def _solved(seen: Observed, state: State, time: float) -> tuple[bool, Array]:
+    """Whether there are forces by Coulomb's law at a state, and the accelerations with them, (n,)."""
+    if not state.names and not state.resting:
+        return True, np.linalg.solve(state.mass, _applied(seen, state, time))
     push = _applied(seen, state, time)
     inverse = np.linalg.inv(state.mass)
     rows = np.vstack([*state.rows, *(np.eye(len(state.v))[j][None] for j in state.resting)])
@@ -176,7 +201,7 @@ def exists(seen: Observed, values: Mapping[str, Sequence[float]], time: float) -
             f[r] += DAMPING * (np.clip(wanted, -bound, bound) - f[r])
         if np.abs(W @ (f - before)).max() < 1e-13 * scale:
             break
-    return _violation(state, W, free, f) < SOLVED * scale
+    return _violation(state, W, free, f) < SOLVED * scale, inverse @ (push + rows.T @ f)
 
 
 def _contact(state: State, k: int, W: Array, free: Array, f: Array) -> None:
@@ -186,12 +211,12 @@ def _contact(state: State, k: int, W: Array, free: Array, f: Array) -> None:
     block = W[r, r]
     speed = float(np.linalg.norm(state.slip[k]))
     if speed > RESTS:
-        way = np.concatenate([[1.0], -state.friction[k] * state.slip[k] / speed])
-        own = float(block[0] @ way)
+        direction = np.concatenate([[1.0], -state.friction[k] * state.slip[k] / speed])
+        own = float(block[0] @ direction)
         if own <= 0.0:
             return
         f_n = max(0.0, float(f[3 * k] - a[0] / own))
-        f[r] += DAMPING * (f_n * way - f[r])
+        f[r] += DAMPING * (f_n * direction - f[r])
         return
     size = float(np.trace(block)) or 1.0
     wanted = f[r] - a / size
@@ -227,8 +252,7 @@ def _applied(seen: Observed, state: State, time: float) -> Array:
     """Generalised forces beside contacts and what rests, weight and velocity products among them, (n,)."""
     motion = seen.bodies.motion(state.q[None], state.v[None], np.zeros((1, len(state.v))))
     push = -seen.bodies.along_rows(motion, seen.bodies.wrenches(motion))[0] - seen.bodies.damping * state.v
-    current = _currents(seen, state)
-    push = push + seen.driven_torques(current[None], state.v[None])[0] + state.rubbing
+    push = push + seen.driven_torques(state.current[None], state.v[None])[0] + state.rubbing
     for load in seen.loads:
         body, point = seen.robot.attach(load.body, load.point)
         wrench = load.components(np.array([time]))
@@ -237,15 +261,6 @@ def _applied(seen: Observed, state: State, time: float) -> Array:
             parts = [times(motion.rotation[body], part) for part in parts]
         push = push + seen.bodies.force_along_rows(motion, body, motion.point(body, point), *parts)[0]
     return np.asarray(push)
-
-
-def _currents(seen: Observed, state: State) -> Array:
-    """Currents of all drives: those of circuits are of the state, the others those of the last sample."""
-    last = seen.record["current"][-1].copy()
-    circuits = [a for a, motor in enumerate(seen.robot.motors) if type(motor).__name__ == "Motor"]
-    if len(state.current) == len(circuits):
-        last[circuits] = state.current
-    return last
 
 
 def _drifts(seen: Observed, state: State) -> Array:
@@ -258,7 +273,7 @@ def _drifts(seen: Observed, state: State) -> Array:
     motion = seen.bodies.motion(q, np.repeat(state.v[None], 3, axis=0), np.zeros((3, len(state.v))))
     drifts = []
     by_name = {contact.name: contact for contact in seen.described_contacts}
-    for name, rows in zip(state.names, state.rows, strict=True):
+    for name in state.names:
         contact = by_name[name]
         body, point = seen.robot.attach(contact.body, contact.point)
         tip = None if contact.tip is None else motion.point(body, seen.robot.attach(contact.body, contact.tip)[1])

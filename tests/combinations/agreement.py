@@ -34,7 +34,13 @@ ENERGIES = ("energy_electrical", "heat_joule", "heat_friction", "energy_kinetic"
 # Methods split what an impact takes between its normal and its friction in their own ways.
 TAKEN = ("heat_friction", "loss_impact")
 # What a warning says that leaves the motion open.
-NOT_UNIQUE = ("leave the motion open", "chatter", "turns its own force against it")
+NOT_UNIQUE = (
+    "leave the motion open",
+    "the motion is not unique",
+    "other choices may move otherwise",
+    "chatter",
+    "turns its own force against it",
+)
 # Of forces alone, which other methods split in another way; where elbows slide the motion follows, a little.
 NOT_UNIQUE_FORCES, SPLIT_SHARE = "one choice of many", 0.03
 
@@ -85,8 +91,8 @@ def _ends(runs: Mapping[str, Run]) -> Iterator[tuple[str, str]]:
 
 def _solvers(runs: Mapping[str, Run]) -> Iterator[tuple[str, str]]:
     for name, run in runs.items():
-        method, _, way = name.partition("/")
-        if way != "m_star" or method not in runs:
+        method, _, solver = name.partition("/")
+        if solver != "m_star" or method not in runs:
             continue
         a, b = _measures(runs[method].record), _measures(run.record)
         worst, text = _widest(runs[method].record, a, run.record, b, _of_solvers(run))

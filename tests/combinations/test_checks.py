@@ -1,25 +1,18 @@
-"""Each check finds what it is there for: a good record passes, and each way of spoiling it is a finding of that check."""
+"""Each check finds what it is there for: a good record passes, and each way of spoiling it is found by that check."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import replace
 from functools import cache
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 import pytest
-from combinations.bodies import Bodies, position_rates
-from combinations.checks import CHECKS, compare, problems
-from combinations.observed import Observed
-from combinations.running import Run
-from combinations.surfaces import nearest, shape
-from combinations.verdicts import UNVERIFIED, VERIFIERS
-from support.pinocchio_oracle import Oracle
-from support.random_robots import random_robot
 
+from combinations.checks import problems
+from combinations.running import Run
 from dynsim import check, simulate
 from dynsim.errors import DynsimError, SimulationStopped
 from dynsim.record import Record
@@ -49,7 +42,9 @@ ARM = {
         "push": {"type": "constant", "body": "link_3", "force_N": [1.5, 0.5, -2.0]},
         "lean": {"type": "constant", "body": "box", "force_N": [0.8, 0.0, 0.0]},
     },
-    "objects": {"box": {"mass_kg": 0.5, "size_m": [0.1, 0.1, 0.1], "position_m": [1.0, 1.0, -0.03], "rpy_deg": [5, 0, 0]}},
+    "objects": {
+        "box": {"mass_kg": 0.5, "size_m": [0.1, 0.1, 0.1], "position_m": [1.0, 1.0, -0.03], "rpy_deg": [5, 0, 0]}
+    },
     "record": {"rate_hz": 1000.0},
     "metrics": {"settle_s": 0.0},
 }
