@@ -142,8 +142,8 @@ def _measures(record: Record | None) -> list[Measure]:
     assert record is not None
     q = record["q"]
     moved = np.abs(q - q[:1]).max(axis=0, initial=0.0)
-    # Joints of one kind move together: what stands still is off by what its neighbours are.
-    measures = [Measure("q", q, np.full(q.shape[1], max(float(moved.max(initial=0.0)), 1e-4)))]
+    # What stands still is off by a part of what its neighbours are.
+    measures = [Measure("q", q, np.maximum(moved, max(0.1 * float(moved.max(initial=0.0)), 1e-4)))]
     parts = [record[name] - (record[name][0] if name == "energy_potential" else 0.0) for name in ENERGIES]
     parts[2] = sum((record[name] for name in TAKEN if name in record), start=np.zeros(len(record)))
     energies = np.stack(parts, axis=1)
