@@ -91,6 +91,7 @@ class SteppingArrays(NamedTuple):
     before: np.ndarray  # (BEFORE_SIZE, n) see V_START and what follows it
     energy: np.ndarray  # (2, 2) at START and STOP of the step: MECHANICAL and MAGNETIC [J]
     rate: np.ndarray  # (2, p) row rates at the start and the end
+    direction: np.ndarray  # (p, 6) wrenches of unit forces of the rows, kept while a sample is swept
     impulse: np.ndarray  # (p,) of the rows of candidate k at 3 k, then couplings: the next start
     f: np.ndarray  # (p,)
     b: np.ndarray  # (p,) row rates at the end without impulses
@@ -127,6 +128,7 @@ def stepping_arrays(
         before=np.zeros((BEFORE_SIZE, n)),
         energy=np.full((2, 2), np.nan),
         rate=np.zeros((2, p)),
+        direction=np.zeros((p, 6)),
         impulse=np.zeros(p),
         f=np.zeros(p),
         b=np.zeros(p),
