@@ -9,7 +9,8 @@ J(q') v' = J_k v' + c h/(h + h_last) up to O(h²), with c = r − s. The law is 
 
 W = J M⁻¹ Jᵀ stays symmetric, and each step solves one contact problem. For a contact that slides and cannot stop within
 the step friction is along the mean slip: w_t = u_t + u_t'. A contact that lands has no earlier rows: a = 0, or e u_n by
-Newton's restitution. Its penetration is removed slowly, and only as far as the energy lost in the landing allows.
+Newton's restitution. Its penetration is removed slowly, and only as far as the energy lost in the landing allows. A joint
+that has passed its stop at a hit is moved back in the same way.
 
 The law on mean rates, J (v + v') = 0, would be simpler but multiplies disturbances by −1: rates alternate undamped.
 """
@@ -279,6 +280,21 @@ def return_rate(gap, turned, budget, h):
 
 
 @internal_kernel
+def stop_return(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, k, h):
+    """Rate at which closed joint stop k moves its joint back, as far as its hits have taken energy [rad/s or m/s].
+
+    The impulse of the last step, ``s.f`` of its row, says how much energy this rate needs.
+    """
+    loss, rate = unilateral.stop[k, ku.STOP_LOSS], 0.0
+    if loss > 0.0:
+        rate = return_rate(min(stop_gap(unilateral, ws, k), 0.0), 0.0, loss, h)
+        impulse = s.f[unilateral.stop_table[k, ku.STOP_ROW]]
+        if rate * impulse > loss:
+            rate = loss / impulse
+    return rate
+
+
+@internal_kernel
 def largest_mobility(W, r):
     """Larger eigenvalue of the block of W of the two tangents behind row r."""
     a, b, c = W[r + 1, r + 1], W[r + 1, r + 2], W[r + 2, r + 2]
@@ -301,6 +317,9 @@ def solve_contacts(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Wor
         s.f[r] = s.impulse[start + r] if r < coupled else 0.0
     for k in range(unilateral.dry.shape[0]):
         s.mu[unilateral.dry_table[k, ku.DRY_ROW]] = h * (unilateral.dry[k, ku.OF_GEAR] + unilateral.dry[k, ku.OF_JOINT])
+    for k in range(unilateral.stop_table.shape[0]):
+        if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
+            s.right[unilateral.stop_table[k, ku.STOP_ROW]] -= stop_return(unilateral, s, ws, k, h)
     soften_ties(unilateral, s, ws, h)
     rigid = False
     for k in range(ws.contacts.shape[0]):
