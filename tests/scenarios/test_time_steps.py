@@ -103,6 +103,43 @@ def test_a_state_beyond_a_stop_is_refused_by_every_method(method, tmp_path: Path
             dynsim.Simulation(scenario, state=state)
 
 
+JAM = """
+duration_s: 1
+plant:
+  type: serial_arm
+  gravity_m_s2: [0, 0, 0]
+  chain:
+    - {axis: y, length_m: 0.3, mass_kg: 0.5, initial_deg: 90, damping_N_m_s_per_rad: 0.2,
+       motor: {type: torque, limit_N_m: 50}}
+controller: {type: joint_pd, torques: {joint_1: {times_s: [0, 0.5, 1], torques_N_m: [1, 0, -1]}}}
+surfaces: {s: {type: plane, point_m: [0.3, 0, 0], normal: [0.9659258, 0, 0.2588190]}}
+contacts:
+  law: unilateral
+  friction: 0.6
+  points: {tip: {body: link_1, point_m: [0, 0, 0.3], surface: s}}
+record: {rate_hz: 1000}
+"""
+
+
+def test_a_jam_takes_the_same_energy_whatever_the_step(tmp_path: Path):
+    """μ tan 75° = 2.2: a tip that is wedged cannot be pushed out of its plane; 5.5e7 J of friction heat once."""
+    path = tmp_path / "jam.yaml"
+    path.write_text(JAM)
+    heat = []
+    for step in (1e-3, 5e-4, 1e-4):
+        steps = {"integrator.method": "time_stepping", "integrator.step_s": step}
+        summary = dynsim.simulate(dynsim.load_scenario(path, overrides=steps)).summary
+        solved = summary["time_stepping"]
+        assert solved["capped_solves"] == 0
+        assert 0 < solved["dropped_solves"] < 0.25 * solved["contact_solves"]
+        assert solved["residual_max_m_s"] <= 1e-10
+        assert abs(summary["scheme_loss_J"]) < 1e-11
+        assert summary["energy_residual_relative"] < 1e-12
+        heat.append(summary["friction_heat_J"])
+    np.testing.assert_allclose(heat, heat[-1], rtol=1e-2)
+    assert heat[-1] > 0.06
+
+
 def test_a_stop_is_hit_and_left(tmp_path: Path):
     """A pendulum swings against its stop after a quarter of its period, loses its speed, and is pulled away."""
     path = tmp_path / "stop.yaml"
