@@ -219,6 +219,9 @@ def gaps(seen: Observed) -> Finding:
                     f"glued to"
                 )
             continue
+        # What no joint moves along the normal lies where it lies, and a warning says so.
+        if f"{name}: no joint moves this point along the normal" in " ".join(seen.run.warnings):
+            continue
         deepest = int(touch.gap.argmin())
         sag = 2.0 * np.abs(touch.normal_force).max() / contact.stiffness if contact.stiffness > 0.0 else 0.0
         begun = max(-float(touch.gap[0]), 0.0)

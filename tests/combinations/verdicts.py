@@ -202,6 +202,9 @@ def _passes_limit(match: Match, seen: Observed) -> str:
     over = np.flatnonzero(beyond > 1e-6)
     if not over.size:
         return "no sample is beyond it"
+    still = float(beyond[-1]) > 1e-6
+    if still and "has moved it back" in match.string or not still and "it is still" in match.string:
+        return f"it is {beyond[-1]:.3g} beyond it at the end"
     first = float(seen.time[over[0]])
     return "" if _near(first, match[3]) or abs(first - float(match[3])) < 1e-3 else f"first at t = {first:.4g} s"
 
@@ -349,6 +352,17 @@ def _would_slip(match: Match, seen: Observed) -> str:
     return "" if _near(most, match[2]) else f"it needs {most:.4g} times in the samples"
 
 
+def _left_out(match: Match, seen: Observed) -> str:
+    """The joints give the point no velocity along the normal, in any sample."""
+    touch = _touch(seen, match[1])
+    if touch is None:
+        return "no such contact"
+    J = seen.bodies.jacobian(seen.motion, touch.body, touch.position)
+    along = np.abs(np.einsum("tk,tkn->tn", touch.normal, J)).max(initial=0.0)
+    # Lever arms of metres, rounded.
+    return "" if along <= 1e-9 * (1.0 + np.abs(J).max(initial=0.0)) else f"joints move it by {along:.3g} m/rad"
+
+
 def _jumps(match: Match, seen: Observed) -> str:
     return "" if (seen.config.get("initial") or {}).get("equilibrium") else "no equilibrium was asked for"
 
@@ -400,6 +414,7 @@ VERIFIERS: dict[str, Callable[[Match, Observed], str]] = {
     rf"^the base tips over at t = .*below zero in {NUMBER}(?: % of the samples)?[,;]": _tips,
     rf"^the base is lifted: no load on its wheels and caster in {NUMBER} % of the samples": _lifted,
     rf"^the (\S+) wheel would slip: it needs up to {NUMBER} times the traction": _would_slip,
+    r"^(?:contacts\.points\.)?(.+): no joint moves this point along the normal of": _left_out,
     r"^initial.equilibrium: .*that jumps at the start": _jumps,
     rf"^controller.sample_time_s = {NUMBER} s: the sampled loop is unstable": _unstable,
     r"^the motion is not unique: nothing presses (.+), held by": _unpressed,
