@@ -87,10 +87,16 @@ def finite(run: Run) -> Finding:
             yield f"{name} is not finite, first in sample {rows[0, 0]}"
 
 
+def _starts_softly(seen: Observed) -> bool:
+    """Whether the plant is a dynamic snake that has settled before the run."""
+    plant = seen.config["plant"]
+    return "dynamics" in plant and plant["dynamics"].get("start", "soft") == "soft"
+
+
 def start(seen: Observed) -> Finding:
     """The first sample is the posture that the scenario asks for, at rest."""
     # A soft start settles into another posture.
-    if seen.time[0] != 0.0 or seen.config["plant"].get("start") == "soft":
+    if seen.time[0] != 0.0 or _starts_softly(seen):
         return
     asked = build.unposed(seen.scenario).initial
     initial = seen.config.get("initial") or {}

@@ -223,7 +223,11 @@ def gaps(seen: Observed) -> Finding:
         deepest = int(touch.gap.argmin())
         sag = 2.0 * np.abs(touch.normal_force).max() / contact.stiffness if contact.stiffness > 0.0 else 0.0
         begun = max(-float(touch.gap[0]), 0.0)
-        allowed = DRIFT if not seen.stepped else 1e-7 + sag + 1.5 * seen.step * float(_fastest_approach(touch)[deepest])
+        allowed = DRIFT
+        if seen.stepped:
+            # The gap of the middle of a step decides: until its end a point moves and falls freely.
+            fall = 0.5 * seen.step**2 * float(np.linalg.norm(seen.bodies.gravity))
+            allowed = 1e-7 + sag + 1.5 * seen.step * float(_fastest_approach(touch)[deepest]) + fall
         if -touch.gap[deepest] > allowed + begun:
             yield (
                 f"{name} at t = {seen.time[deepest]:.6g} s is {-touch.gap[deepest]:.3g} m below its surface "

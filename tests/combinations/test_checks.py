@@ -190,6 +190,59 @@ def test_corrupted_signals_are_found(method: str, fault: str) -> None:
     assert expected <= _kinds(spoilt)
 
 
+def _below(data: np.ndarray) -> np.ndarray:
+    """Positions with the elbow bent a little further in one sample."""
+    data[60, 1] += 0.01
+    return data
+
+
+def _beyond_its_stop(data: np.ndarray) -> np.ndarray:
+    data[-300:, 2] = np.radians(100.5)
+    return data
+
+
+@pytest.mark.parametrize("method", ["radau5", "time_stepping"])
+def test_points_below_surfaces_and_joints_beyond_stops_are_found(method: str) -> None:
+    run = _run(method)
+    assert run.record is not None
+    tip = run.record["contact_mode"][60, run.record.labels["contact_mode"].index("tip")]
+    assert tip > 0
+    assert "gaps" in _kinds(_spoilt(run, q=_below))
+    assert "stops" in _kinds(_spoilt(run, q=_beyond_its_stop))
+
+
+def test_wrong_currents_of_circuits_are_found() -> None:
+    """Samples four times as dense resolve L/R = 1.5 ms."""
+    settings = {**deepcopy(ARM), "duration_s": 0.1, "record": {"rate_hz": 4000.0}, "integrator": {"method": "radau5"}}
+    run = _simulated(settings)
+    assert problems(settings, run) == []
+    assert "circuit" in _kinds(_spoilt(run, voltage=_times(1.1)))
+
+
+def test_a_start_that_is_not_in_equilibrium_is_found() -> None:
+    settings = {**deepcopy(ARM), "initial": {"equilibrium": True}, "integrator": {"method": "radau5"}}
+    del settings["objects"], settings["loads"]["lean"]
+    run = _simulated(settings)
+    assert problems(settings, run) == []
+    assert "equilibrium" in _kinds(_spoilt(run, vdot=_shifted(1.0, 0, 1)))
+
+
+def test_wrong_wheel_loads_are_found() -> None:
+    arm = {"type": "serial_arm", "chain": [{"axis": "y", "length_m": 0.3, "mass_kg": 0.5, "initial_deg": 30.0}]}
+    settings = {
+        "name": "mobile",
+        "duration_s": 0.1,
+        "plant": {"type": "pws_arm", "base": {}, "arm": arm},
+        "contacts": {"law": "unilateral"},
+        "integrator": {"method": "radau5"},
+        "record": {"rate_hz": 1000.0},
+        "metrics": {"settle_s": 0.0},
+    }
+    run = _simulated(settings)
+    assert problems(settings, run) == []
+    assert "support" in _kinds(_spoilt(run, wheel_load=_times(1.05)))
+
+
 def test_a_check_that_disagrees_with_the_run_is_found() -> None:
     assert "check" in _kinds(replace(_run("radau5"), checked="refused"))
 
