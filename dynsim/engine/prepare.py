@@ -18,7 +18,6 @@ from dynsim.compile.model import Model
 from dynsim.compile.shapes import compile_shapes
 from dynsim.compile.stepping import with_shapes
 from dynsim.compile.tables import compile_contacts, compile_couplings, compile_drives, compile_loads, compile_support
-from dynsim.config.problems import listed
 from dynsim.dynamics import state as kst
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.derivative import System, new_workspace
@@ -40,6 +39,7 @@ from dynsim.model.description import Array, Contact, Load, Robot
 from dynsim.model.drives import Drive, Motor
 from dynsim.record.poses import pose_columns
 from dynsim.scenario import Scenario, build
+from dynsim.scenario.combinations import check_robot
 from dynsim.scenario.schema import Integrator
 from dynsim.system.memo import Memo, recall, remembering
 
@@ -140,19 +140,13 @@ def prepare(
     stops = joint_stops(robot) if real else []
     stepped = scenario.integrator.method == "time_stepping"
     dry = dry_frictions(robot) if real else []
-    _check_friction(robot, real, stepped)
+    check_robot(scenario.config, robot)
     gives = bool(robot.ties) or any(contact.stiffness > 0.0 for contact in contacts)
     sizes = kst.LOSSES if real else 0, 1 if stepped else 0, kst.ELASTIC_SIZE if gives else 0
     layout = state_layout(model.nq, n, robot.circuits, c, len(loads), *sizes)
     columns = output_layout(n, na, c, ks.OUTPUTS if robot.base else 0, len(stops), len(dry), len(robot.ties))
     if times is None:
         times = sample_times(scenario, layout, columns, n)
-    if stepped and robot.base is not None:
-        raise ModelError(
-            "integrator.method = 'time_stepping': it locates no events, so a mobile base would tip unseen; "
-            "take auto, or a plant without mobile base",
-            keys=("integrator", "method"),
-        )
     joint_rows = len(robot.couplings) + len(stops) + len(dry) + len(robot.ties)
     _check_work(scenario, n, c + joint_rows, scenario.integrator.method)
     control = piloted or _control(scenario, model, contacts, progress)
@@ -221,20 +215,6 @@ def prepare(
         lanes=has_forms(system),
     )
     return Prepared(model, contacts, control, system, run, new_workspace(system), loads, stops, choice, balance, dry)
-
-
-def _check_friction(robot: Robot, real: bool, stepped: bool) -> None:
-    """Refuse friction that holds joints at rest, and ties, where law and method have none."""
-    if robot.ties and not stepped:
-        raise ModelError(f"tie {robot.ties[0].name}: only integrator.method: time_stepping has ties", keys=("plant",))
-    rubbing = [link.joint for link in robot.links if link.friction > 0.0]
-    rubbing += [motor.joint for motor in robot.motors if isinstance(motor, Motor) and motor.dry_friction > 0.0]
-    if rubbing and not real:
-        raise ModelError(
-            f"dry friction of {listed(rubbing)}: it needs contacts.law: unilateral, also where nothing touches; "
-            "or set it to 0 and take a damping instead",
-            keys=("plant",),
-        )
 
 
 def _check_sensors(scenario: Scenario, control: JointControl) -> None:

@@ -45,6 +45,7 @@ from dynsim.record import Event, Record
 from dynsim.record.measures import TIP_OVER
 from dynsim.scenario import Scenario, require_scenario
 from dynsim.scenario.build import check_start
+from dynsim.scenario.combinations import LINEARIZATION, WATCHED_EVENTS
 from dynsim.system import interruption
 from dynsim.system.memo import Memo, remembering
 
@@ -351,11 +352,8 @@ class Simulation:
         ScenarioError
             Under ``integrator.method: time_stepping``, which locates nothing within its steps.
         """
-        if self._prepared.run.method == ki.TIME_STEPPING:
-            raise ScenarioError(
-                "integrator.method: time_stepping locates no events: look with every(), at the step's times, or take "
-                "another method"
-            )
+        if conflict := WATCHED_EVENTS.conflict(self.scenario.config):
+            raise ScenarioError(f"Simulation.watch {WATCHED_EVENTS.message(conflict)}")
         if kind not in GUARDS:
             raise ModelError(f"no event {brief(kind)}; events: {', '.join(GUARDS)}")
         number, family = GUARDS[kind]
@@ -538,8 +536,8 @@ class Simulation:
         ScenarioError
             No such input or output, or ``integrator.method: time_stepping``, which knows no modes between its steps.
         """
-        if self._prepared.run.method == ki.TIME_STEPPING:
-            raise ScenarioError("integrator.method: time_stepping has no modes to linearize with; take another method")
+        if conflict := LINEARIZATION.conflict(self.scenario.config):
+            raise ScenarioError(f"Simulation.linearize {LINEARIZATION.message(conflict)}")
         before = self.snapshot()
         try:
             self._settle_now()
