@@ -137,14 +137,26 @@ def _nameable(scenario: Scenario, built: Robot) -> list[Contact]:
     initial = scenario.config.initial
     if initial is None or not initial.on_surface:
         return []
+    return [*contacts(scenario, built), *disabled_points(scenario, built)]
+
+
+def disabled_points(scenario: Scenario, described: Robot) -> list[Contact]:
+    """Disabled contact points. They touch nothing, but a start or a path may keep them on their surfaces.
+
+    So the same motion can be simulated with and without a brace.
+    """
     options = scenario.config.contacts
-    disabled = [name for name, point in options.points.items() if not point.enabled and name in initial.on_surface]
-    if not disabled:
-        return contacts(scenario, built)
-    chosen = {name: options.points[name].model_copy(update={"enabled": True}) for name in disabled}
-    only = options.model_copy(update={"points": chosen, "candidates": "points"})
+    known = surfaces(scenario)
+    points = {
+        name: point.model_copy(update={"enabled": True})
+        for name, point in options.points.items()
+        if not point.enabled and point.surface in known
+    }
+    if not points:
+        return []
+    only = options.model_copy(update={"points": points, "candidates": "points"})
     alone = replace(scenario, config=scenario.config.model_copy(update={"contacts": only}))
-    return [*contacts(scenario, built), *contacts(alone, built)]
+    return contacts(alone, replace(described, feet=()))
 
 
 def _posed(scenario: Scenario, built: Robot, touching: Sequence[Contact]) -> Robot:
@@ -231,16 +243,21 @@ def controller(
     # Of a snake at whatever level.
     if families.member("plant", scenario.plant.type).ENGINE != families.member("controller", config.type).ENGINE:
         raise ModelError(f"controller {config.type!r} cannot drive a {scenario.plant.type!r}")
+    believed = scenario
     if isinstance(machine, Model) and scenario.config.surface_error is not None:
         # What it plans with is not what is there.
-        believed = scenario.config.model_copy(update={"surface_error": None})
-        touching = contacts(replace(scenario, config=believed), machine.robot)
+        believed = replace(scenario, config=scenario.config.model_copy(update={"surface_error": None}))
+        touching = contacts(believed, machine.robot)
     elif touching is None:
         touching = contacts(scenario, machine.robot) if isinstance(machine, Model) else ()
     points = {contact.name: contact for contact in touching}
     declared = [name for name in points if name in scenario.config.contacts.points]
-    looked = _Looked(points)
-    context = BuildContext(scenario.duration_s, machine, progress=progress, contacts=looked, declared=declared)
+    unused = disabled_points(believed, machine.robot) if isinstance(machine, Model) else []
+    disabled = [contact.name for contact in unused]
+    looked = _Looked({**points, **{contact.name: contact for contact in unused}})
+    context = BuildContext(
+        scenario.duration_s, machine, progress=progress, contacts=looked, declared=declared, disabled=disabled
+    )
     if isinstance(machine, Model):
 
         def built() -> JointControl:
@@ -252,7 +269,7 @@ def controller(
             return None if looked.at else made[0]
 
         made: list[JointControl] = []
-        known = recall("controller", blind, config, scenario.duration_s, machine, [*points], declared)
+        known = recall("controller", blind, config, scenario.duration_s, machine, [*points], declared, disabled)
         control = known or (made[0] if made else built())
         # The kernels would follow the last polynomial on.
         if control.end < scenario.duration_s * (1.0 - 1e-6):

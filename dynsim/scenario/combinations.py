@@ -92,6 +92,16 @@ def _contact_keys(*names: str) -> Callable[[Any], Iterator[str]]:
     return used
 
 
+def _compliance(config: Any) -> Iterator[str]:
+    # Resolved scenarios write out the default damping of 0.
+    yield from _contact_keys("stiffness_N_per_m")(config)
+    if config.contacts.damping_N_s_per_m:
+        yield "contacts.damping_N_s_per_m"
+    yield from (
+        f"contacts.points.{name}.damping_N_s_per_m" for name, p in config.contacts.points.items() if p.damping_N_s_per_m
+    )
+
+
 def _candidates(config: Any) -> Iterator[str]:
     if config.contacts.candidates != "points":
         yield "contacts.candidates"
@@ -173,7 +183,7 @@ RESTRICTIONS = (
         "contacts of the event-driven methods are rigid",
         laws=LAWS[1:],
         methods=TIME_STEPPING,
-        keys=_contact_keys("stiffness_N_per_m", "damping_N_s_per_m"),
+        keys=_compliance,
     ),
     Restriction(
         "ties",
