@@ -15,6 +15,7 @@ from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.engine.force_indeterminacy import motion_spread, sharing
 from dynsim.engine.prepare import Prepared
+from dynsim.engine.soundness import unstable_loop
 from dynsim.errors import first_few
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts import events as ke
@@ -61,7 +62,9 @@ def warnings_of(
     sunk : bodies below surfaces; motors : their loads
     """
     robot = prepared.model.robot
+    unstable = unstable_loop(scenario, prepared)
     warnings = [
+        *([] if unstable is None else [unstable[0]]),
         *_contact_warnings(record, scenario, prepared, summary),
         *_saturated(record, robot),
         *_passed_limits(record, robot, prepared.system.unilateral is not None),

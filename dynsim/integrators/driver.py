@@ -11,6 +11,9 @@ Methods, all with dense output (so that records do not force steps):
 
 After each accepted step of the adaptive methods q and v are projected onto the active rows if they are off them by more
 than ``GAP_TOLERANCE`` or ``RATE_TOLERANCE``, see ``project``.
+
+A sample at a tick has the values that are in force from the tick on: it is recorded at the end of the step before, and
+again once the commands have been taken.
 """
 
 from __future__ import annotations
@@ -26,7 +29,7 @@ from dynsim.dynamics.tree.joints import normalise
 from dynsim.dynamics.tree.support import watch_support
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts.events import consistent, solve_modes, switch_contacts, take_directions, watch_modes
-from dynsim.integrators.dense import sample_step, write_waiting
+from dynsim.integrators.dense import rewrite_sample, sample_step, write_waiting
 from dynsim.integrators.dopri5 import step_dopri5
 from dynsim.integrators.events import arm_events, cut_step, fire_events, take_ticks
 from dynsim.integrators.project import settle
@@ -139,6 +142,8 @@ def ready(system: System, ws: Workspace, run: Run):
     if count[ki.STARTED] == 0:
         start(system, ws, run)
         arm_events(system, ws, run)
+        if count[ki.STATUS] == ki.RUNNING:
+            rewrite_sample(system, ws, run)
     count[ki.TICKED] = due & ~ki.TAKE_COMMANDS
     return count[ki.TICKED] == 0
 
