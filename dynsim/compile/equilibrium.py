@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dynsim.compile.bracing import MIN_N, BracePlanner, brace_rows
+from dynsim.compile.mobility import immobile_at
 from dynsim.compile.model import Model
 from dynsim.compile.shapes import share_of_axis
 from dynsim.dynamics.contact.braces import tables as kb
@@ -66,6 +67,10 @@ def holding_torques(
         raise ModelError("initial.equilibrium: not for robots with coupled joints, which share a motor", keys=KEYS)
     touching = [(contact, *_touching_point(model, contact, q)) for contact in contacts]
     touching = [contact for contact in touching if abs(contact[-1]) <= TOUCHING or (real and contact[-1] < 0.0)]
+    # A point that no joint moves along its normal carries nothing, see dynsim.integrators.contacts.impacts.
+    touching = [
+        entry for entry in touching if not (entry[0].left_out or immobile_at(model, entry[1], entry[2], entry[3], q))
+    ]
     # Frictionless first, then all that Coulomb allows; with a least force first, so that what presses goes on to press.
     attempts = [(0.0, MIN_N), (0.0, 0.0), (1.0, MIN_N), (1.0, 0.0)] if real and touching else [(0.0, 0.0)]
     pushes = [

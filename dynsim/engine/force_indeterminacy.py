@@ -162,7 +162,8 @@ def contact_matrices(system: System, ws: ka.Workspace, t: float, y: Array) -> Co
     rows, directions = ws.column[:, 1 : 1 + 2 * p : 2], ws.column[:, 2 : 2 + 2 * p : 2]
     inverse = ws.links[:, ka.INVERSE_D, None]
     frictionless = rows.T @ (inverse * rows)
-    moving = np.diag(frictionless) > kq.IMMOBILE * (inverse * directions**2).sum(axis=0)
+    least = np.maximum(kq.IMMOBILE * (inverse * directions**2).sum(axis=0), state[:, ka.ROW_FLOOR])
+    moving = np.diag(frictionless) > least
     frictionless = frictionless * np.outer(moving, moving)
     dissipative = active[:, ka.LAW] == ka.FRICTION_DISSIPATIVE
     signs = np.where(dissipative, state[:, ka.SIGN], 1.0)

@@ -14,6 +14,7 @@ import numpy as np
 from dynsim.compile.clearance import gaps
 from dynsim.compile.contact_law import DryFriction, JointStop, compile_unilateral, dry_frictions, joint_stops
 from dynsim.compile.control import JointControl
+from dynsim.compile.mobility import mobility_floors
 from dynsim.compile.model import Model
 from dynsim.compile.shapes import compile_shapes
 from dynsim.compile.stepping import with_shapes
@@ -162,12 +163,13 @@ def prepare(
     if initial is not None and initial.equilibrium:
         with kernels_logged(log, "the start at rest", loads=False):
             balance = balanced(model, contacts, build.loads(scenario, robot), control, real)
+    floors = None if real else recall("floors", lambda: mobility_floors(model, contacts), model, places)
     system = System(
         layout=layout,
         model=model.arrays,
         drives=drives,
         reference=control.reference if balance is None else shifted(control.reference, balance.shift),
-        contacts=compile_contacts(robot, contacts),
+        contacts=compile_contacts(robot, contacts, floors),
         loads=compile_loads(robot, loads),
         dense=np.zeros((size, size + 1)) if options.solver == "m_star" else None,
         couplings=compile_couplings(robot),
@@ -297,8 +299,9 @@ def guards(
     rows = []
     if robot.base is not None:
         rows.append((TIP_MARGIN, 0, -1, ki.STOP if robot.base.stop_on_overturn else ki.LOG))
-    for k in range(len(contacts)):
-        rows += [(ke.NORMAL_GUARD, k, -1, ki.LOG), (ke.SLIP_GUARD, k, -1, ki.LOG)]
+    for k, contact in enumerate(contacts):
+        if not contact.left_out:
+            rows += [(ke.NORMAL_GUARD, k, -1, ki.LOG), (ke.SLIP_GUARD, k, -1, ki.LOG)]
     rows += [(ke.STOP_GUARD, k, -1, ki.LOG) for k in range(len(stops))]
     rows += [(ke.DRY_GUARD, k, -1, ki.LOG) for k in range(len(dry))]
     if not rows:

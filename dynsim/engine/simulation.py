@@ -470,9 +470,17 @@ class Simulation:
             v -= response * (v[j] / response[j])
             v[j] = 0.0
         armature[j] = BRAKED if closed else self._armature[j]
+        self._set_floors()
         if run.count[ki.MODES_DUE] == 0:
             run.count[ki.MODES_DUE] = ki.AFTER_JUMP
         self._restart()
+
+    def _set_floors(self) -> None:
+        """Let glued contacts have forces at any mobility while a brake is closed: behind brakes all are minute."""
+        workspace, law = self._prepared.workspace, self._prepared.system.contacts.law
+        braked = (self.model.arrays.body[:, ka.ARMATURE] == BRAKED).any()
+        first = workspace.active[: len(law), ka.FIRST_ROW]
+        workspace.rows[first, ka.ROW_FLOOR] = 0.0 if braked else law[:, ka.FLOOR]
 
     def release(self, joint: str) -> None:
         """Give a motor back to the controller and references of the scenario."""

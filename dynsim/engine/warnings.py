@@ -24,7 +24,7 @@ from dynsim.model.description import Robot
 from dynsim.model.drives import Drive, Motor, Servo, TorqueSource
 from dynsim.record import Record
 from dynsim.record.measures import RESIDUAL_LIMIT, TIP_OVER, least_loads, overturns_settled, percent
-from dynsim.scenario import Scenario
+from dynsim.scenario import Scenario, build
 from dynsim.scenario.effect import without_effect
 
 DRIFT_LIMIT_M = 1e-9
@@ -104,11 +104,13 @@ def _contact_warnings(record: Record, scenario: Scenario, prepared: Prepared, su
                 f"{percent(contact['pulling_fraction'])} of the run, with up to "
                 f"{-contact['normal_force_min_N']:.3g} N; a real arm would lift off"
             )
+    left_out = {contact.name for contact in contacts if contact.left_out}
+    warnings += build.left_out_warnings(scenario, contacts)
     initial, columns = scenario.config.initial, record.labels["contact_gap"]
     placed = () if initial is None else initial.on_surface
     for contact in summary["contacts"]:
         name = contact["name"]
-        if "gap_min_m" in contact and contact["closed_fraction"] == 0.0:
+        if "gap_min_m" in contact and contact["closed_fraction"] == 0.0 and name not in left_out:
             nearest = int(record["contact_gap"][:, columns.index(name)].argmin())
             warnings.append(
                 f"{name}: this brace never touches the {contact['surface']}: it carries nothing; nearest "

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.compile.control import JointControl
+from dynsim.compile.mobility import with_immobile_marked
 from dynsim.compile.model import Model
 from dynsim.compile.posture import on_surfaces
 from dynsim.compile.protocols import BuildContext
@@ -251,7 +252,9 @@ def controller(
     elif touching is None:
         touching = contacts(scenario, machine.robot) if isinstance(machine, Model) else ()
     points = {contact.name: contact for contact in touching}
-    declared = [name for name in points if name in scenario.config.contacts.points]
+    declared = [
+        name for name, contact in points.items() if name in scenario.config.contacts.points and not contact.left_out
+    ]
     unused = disabled_points(believed, machine.robot) if isinstance(machine, Model) else []
     disabled = [contact.name for contact in unused]
     looked = _Looked({**points, **{contact.name: contact for contact in unused}})
@@ -353,6 +356,10 @@ def contacts(scenario: Scenario, described: Robot | None = None) -> list[Contact
                 **_law(options, point),
             )
         )
+    if result:
+        places = [contact.geometry for contact in result]
+        marks = recall("left out", lambda: with_immobile_marked(described, result), described, places)
+        result = [replace(contact, left_out=mark.left_out) for contact, mark in zip(result, marks, strict=True)]
     if options.candidates != "points":
         law = _law(options, ContactPoint(body=""))
         result += [replace(contact, **law) for contact in candidates(options.candidates, described, known, result)]
@@ -469,8 +476,10 @@ def check_start(
         if own and scenario.plant.type == "snake":  # `initial` does not place its joints
             remedy = "move the surface or change plant.initial_joints_rad"
         elif own:
-            named = [contact for contact, by_name, *_ in off if by_name]
+            named = [other for other, by_name, *_ in off if by_name and not other.left_out]
             remedy = f"{_remedy(scenario, named)}change the initial configuration or the surface"
+        if contact.left_out:
+            remedy = "no joint moves it along the normal: move the surface"
         others = ", ".join(f"{other.name} {its:+.4g} m from {other.surface_name!r}" for other, _, _, its in off[1:])
         raise ModelError(
             f"{dotted(keys)}: {'its point' if declared else contact.name} starts {gap:+.4g} m "
@@ -494,6 +503,17 @@ def _check_body(scenario: Scenario, robot: Robot, contact: Contact) -> None:
     except ModelError as error:
         keys = (*_keys_of(scenario, contact)[1], "body")
         raise ModelError(f"{dotted(keys)}: {error}", keys=keys) from error
+
+
+def left_out_warnings(scenario: Scenario, contacts: Sequence[Contact]) -> list[str]:
+    """Return a sentence for each contact that no joint moves along the normal of its surface."""
+    return [
+        f"{dotted(_keys_of(scenario, contact)[1]) if _keys_of(scenario, contact)[0] else contact.name}: no joint moves "
+        f"this point along the normal of {contact.surface_name}, so its force changes no motion; it is left out of the "
+        "contacts, with a force of zero"
+        for contact in contacts
+        if contact.left_out
+    ]
 
 
 def _remedy(scenario: Scenario, off: Sequence[Contact]) -> str:

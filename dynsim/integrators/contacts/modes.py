@@ -59,7 +59,7 @@ def resolve(system: System, ws: Workspace, run: Run, touch):
         mode[k, ku.BEFORE], mode[k, ku.STRUCK] = ws.active[k, ka.MODE], 0
     for k in range(table.shape[0]):
         table[k, ku.STOP_BEFORE] = table[k, ku.STOP_CLOSED]
-    if find_touching(unilateral, ws, touch):
+    if find_touching(system, ws, touch):
         impact(system, ws, run)
         if run.count[ki.STATUS] == ki.NO_CONTACT_FORCES:
             return
