@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dynsim.compile.contact_law import joint_stops
 from dynsim.compile.model import Model
 from dynsim.compile.references.teleop import VelocitySource
 from dynsim.compile.tables import check_couplings
@@ -654,6 +655,8 @@ class Simulation:
             run.y[part] = values
         q = run.y[block(run.layout, "q")]
         check_couplings(model.robot, q)
+        if self._prepared.system.unilateral is not None:
+            joint_stops(model.robot, q)
         check_start(self._scenario, model, self._prepared.contacts, q)
 
     def _reach(self, until: float) -> None:
