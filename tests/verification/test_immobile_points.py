@@ -173,6 +173,15 @@ def test_a_point_immobile_at_the_start_does_not_move_the_arm(tmp_path: Path, met
     assert touching.summary["energy_residual_relative"] < LEDGER
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_a_nearly_immobile_point_below_its_surface_does_not_move_the_arm(tmp_path: Path, method: str) -> None:
+    """At a depth of 1e-7 m and a lever of 1.6e-7 m a projection would turn the link by 0.6 rad."""
+    wall = {"point_m": [0.3 - 1e-7, 0.0, 0.0], "normal": [-1.0, 0.0, 0.0]}
+    touching, free = both(tmp_path, swing(90.00003), wall, to=130.0, method=method)
+    assert np.degrees(touching["q"][0, 0]) == pytest.approx(90.00003, abs=1e-9)
+    np.testing.assert_allclose(touching["q"][-1], free["q"][-1], rtol=0.0, atol=1e-5)
+
+
 # A second link, folded back onto the first. From there its end comes below the floor if the first joint turns alone,
 # and above it if the second one does: the gap has a saddle, at zero.
 FOLDED = [

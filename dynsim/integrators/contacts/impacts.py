@@ -61,8 +61,9 @@ def evaluate(system: System, ws: Workspace, run: Run):
 def find_touching(system: System, ws: Workspace, touch):
     """Note what touches and does not leave; True when some of it approaches.
 
-    A point that no joint moves along its normal in this posture does not touch: its force would be anything. Should the
-    posture change it lands as soon as it is deeper than it is now.
+    A point that no joint moves along its normal in this posture does not touch: its force would be anything. Neither
+    does a point that a projection could bring onto its surface only by another posture. Should the posture change it
+    lands as soon as it is deeper than it is now.
     """
     unilateral = system.unilateral
     state, mode, table, stop = ws.contacts, unilateral.mode, unilateral.stop_table, unilateral.stop
@@ -71,7 +72,7 @@ def find_touching(system: System, ws: Workspace, touch):
         limit = STRIKE * kp.RATE_TOLERANCE * (1.0 + slip_speed(ws, k))
         closed = ws.active[k, ka.MODE] != ka.OPEN
         near = closed or (state[k, ka.GAP] <= touch and state[k, ka.GAP_RATE] <= limit)
-        if near and not moves_along_normal(system.model, system.contacts, ws, k):
+        if near and not moves_along_normal(system.model, system.contacts, ws, k, state[k, ka.GAP]):
             near = closed = False
             unilateral.slide[k, ku.LANDS_AT] = ku.DEPTH + max(0.0, -state[k, ka.GAP])
         mode[k, ku.TOUCHING] = 1 if near else 0

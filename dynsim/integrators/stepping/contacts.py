@@ -129,7 +129,9 @@ def list_contacts(system, s: SteppingArrays, ws: Workspace, h):
         known = last[kt.LISTED] == 1.0 and goes_on(system, last, ws, k, h)
         s.turn[k, kt.KNOWN] = 1.0 if known else 0.0
         listed = ws.contacts[k, ka.GAP] <= kt.MARGIN or (known and last[kt.CLOSED] == 1.0)
-        mode = ka.STICKING if listed and moves_along_normal(system.model, system.contacts, ws, k) else ka.OPEN
+        # Its depth is no reason: it is taken back slowly.
+        listed = listed and moves_along_normal(system.model, system.contacts, ws, k, 0.0)
+        mode = ka.STICKING if listed else ka.OPEN
         changed = changed or mode != s.modes[k]
         s.modes[k] = mode
     if changed:
