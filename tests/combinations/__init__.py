@@ -1,0 +1,14 @@
+"""Every feature together with every other: seeded scenes that cover each pair of factor levels, run by every method.
+
+    factors      the factors and their levels, and which levels refuse each other
+    covering     few assignments of levels that hold each pair, or each triple
+    scenes       the scenario of an assignment
+    plants       their robots
+    drives       their motors and controllers
+    running      a scene run with a method, in one of several ways
+    checks       what must hold of every record, and between the records of a scene
+    verdicts     whether warnings and stops are true
+    study        many scenes, counted by factor
+
+``PYTHONPATH=.:tests python -m combinations --seed 1 --count 100`` runs scenes that no test runs.
+"""

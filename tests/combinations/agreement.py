@@ -1,0 +1,246 @@
+"""How far the runs of one scene may differ: as far as the methods' own errors, seen by running them more finely.
+
+Most runs agree at once, within what their tolerances or steps promise for motion that forgets its errors. Those that do
+not are run again with a tenth of the tolerance, or half the step: what that changes is the method's error, also where
+motion multiplies it. Where both are sure of their results and these differ, the motion is not unique, and a warning
+must say so; or one of them is wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from combinations.running import Run
+from dynsim import simulate
+from dynsim.errors import DynsimError, SimulationStopped
+from dynsim.record import Record
+
+Array = NDArray[np.float64]
+
+# Errors of well-behaved motion, in units of rtol, and of steps as a share of what is moved in one of them.
+ADAPTIVE_SHARE, STEPPED_SHARE, STEPS = 300.0, 0.01, 2.0
+# Of the two solvers, which solve the same equations.
+SOLVERS = 1e-8
+# Errors seen by a finer run count so many times: refinement tells their size, not their bound.
+SURE = 10.0
+# Samples by which an impact may be early or late.
+JUMPS = 3
+ENERGIES = ("energy_electrical", "heat_joule", "heat_friction", "energy_kinetic", "energy_potential")
+# Methods split what an impact takes between its normal and its friction in their own ways.
+TAKEN = ("heat_friction", "loss_impact")
+# What a warning says that leaves the motion open.
+NOT_UNIQUE = (
+    "leave the motion open",
+    "the motion is not unique",
+    "other choices may move otherwise",
+    "chatter",
+    "turns its own force against it",
+)
+# Of forces alone, which other methods split in another way; where elbows slide, or bodies
+# land on several points, the motion follows, a little.
+NOT_UNIQUE_FORCES, SPLIT_SHARE = "shared forces", 0.03
+
+
+@dataclass(frozen=True)
+class Measure:
+    """Something that runs are compared by, over the samples that both have.
+
+    ``values`` : (T, k); ``size`` : (k,) what changes of it count against
+    """
+
+    name: str
+    values: Array
+    size: Array
+
+
+def disagreements(scenario: Mapping[str, Any], runs: Mapping[str, Run]) -> Iterator[tuple[str, str]]:
+    """Kind and sentence of each pair of runs that differ more than they may."""
+    usable = {name: run for name, run in runs.items() if _is_usable(run)}
+    yield from _ends(runs)
+    yield from _solvers(usable)
+    plain = {name: run for name, run in usable.items() if "/" not in name and name != "auto"}
+    if len(plain) < 2:
+        return
+    first = next((name for name in ("radau5", "dopri5") if name in plain), next(iter(plain)))
+    for name, run in plain.items():
+        if name != first:
+            yield from _pair(first, plain[first], name, run)
+
+
+def _is_usable(run: Run) -> bool:
+    record = run.record
+    return record is not None and run.resolved is not None and "vdot" in record and len(record) > 1
+
+
+def _ends(runs: Mapping[str, Run]) -> Iterator[tuple[str, str]]:
+    """What one method refuses by a rule of the scene and not of the method, all refuse."""
+    plain = {name: run for name, run in runs.items() if "/" not in name}
+    stopped = {name: run for name, run in plain.items() if isinstance(run.error, SimulationStopped)}
+    finished = [name for name, run in plain.items() if run.error is None]
+    for name, run in stopped.items():
+        if finished and not isinstance(run.error, type(None)):
+            error = run.error
+            assert isinstance(error, SimulationStopped)
+            if error.kind in ("not_finite", "not_projected"):
+                yield "ends", f"{name} stops ({error.kind}) where {', '.join(finished)} go on: {str(error)[:200]}"
+
+
+def _solvers(runs: Mapping[str, Run]) -> Iterator[tuple[str, str]]:
+    for name, run in runs.items():
+        method, _, solver = name.partition("/")
+        if solver != "m_star" or method not in runs:
+            continue
+        a, b = _measures(runs[method].record), _measures(run.record)
+        worst, text = _widest(runs[method].record, a, run.record, b, _of_solvers(run))
+        if worst > 1.0:
+            # Where motion multiplies errors, rounding grows with those of steps.
+            error = _own_error(run, 0.5)
+            if 1e-3 * max((float(own.max(initial=0.0)) for _, own in error.values()), default=0.0) < worst * SOLVERS:
+                yield "solvers", f"{name} and {method}: {text}"
+
+
+def _of_solvers(run: Run) -> Any:
+    """What the solvers may differ by: rounding, and what their rounding makes of the steps that tolerances choose."""
+    assert run.resolved is not None
+    share = SOLVERS + 0.03 * run.resolved.integrator.rtol
+
+    def allowed(measure: Measure, time: Array) -> Array:
+        return np.asarray(SOLVERS + share * measure.size)[None]
+
+    return allowed
+
+
+def _pair(first: str, run: Run, other: str, second: Run) -> Iterator[tuple[str, str]]:
+    a, b = _measures(run.record), _measures(second.record)
+    allowed = _promised(run, second)
+    worst, text = _widest(run.record, a, second.record, b, allowed)
+    if worst <= 1.0:
+        return
+    if any(part in warning for warning in (*run.warnings, *second.warnings) for part in NOT_UNIQUE):
+        return
+    errors = [_own_error(run, 0.1), _own_error(second, 0.5 if "time_stepping" in other else 0.1)]
+
+    def finer(measure: Measure, time: Array) -> Array:
+        own = np.zeros(len(time))
+        for error in errors:
+            # A run that cannot be made more finely tells nothing of its error.
+            own = own + (np.interp(time, *error[measure.name]) if measure.name in error else np.inf)
+        return np.asarray(allowed(measure, time) + SURE * own[:, None] * measure.size)
+
+    worst, text = _widest(run.record, a, second.record, b, finer)
+    if worst > 1.0:
+        yield "methods", f"{first} and {other}: {text}, though finer steps change either by less"
+
+
+def _measures(record: Record | None) -> list[Measure]:
+    """Positions, each against what it moves, and energies against what changes hands."""
+    assert record is not None
+    q = record["q"]
+    moved = np.abs(q - q[:1]).max(axis=0, initial=0.0)
+    # What stands still is off by a part of what its neighbours are.
+    measures = [Measure("q", q, np.maximum(moved, max(0.1 * float(moved.max(initial=0.0)), 1e-4)))]
+    parts = [record[name] - (record[name][0] if name == "energy_potential" else 0.0) for name in ENERGIES]
+    parts[2] = sum((record[name] for name in TAKEN if name in record), start=np.zeros(len(record)))
+    energies = np.stack(parts, axis=1)
+    size = float(np.abs(energies).max(initial=0.0))
+    measures.append(Measure("energy", energies, np.full(len(ENERGIES), max(size, 1e-9))))
+    return measures
+
+
+def _promised(run: Run, other: Run) -> Any:
+    """What may differ at once, by measure."""
+    share, step = 0.0, 0.0
+    speed = 0.0
+    for own in (run, other):
+        assert own.resolved is not None
+        assert own.record is not None
+        options = own.resolved.integrator
+        if options.method == "time_stepping":
+            step = float(own.record.summary["time_stepping"]["step_s"])
+            share += STEPPED_SHARE
+            speed = float(np.abs(own.record["v"]).max(initial=0.0))
+        else:
+            share += ADAPTIVE_SHARE * options.rtol
+
+    if any(NOT_UNIQUE_FORCES in warning for own in (run, other) for warning in own.warnings):
+        share += SPLIT_SHARE
+
+    def allowed(measure: Measure, time: Array) -> Array:
+        # Landings are early or late by a step.
+        late = STEPS * step * speed if measure.name == "q" else 2.0 * STEPPED_SHARE * measure.size * (step > 0.0)
+        return np.asarray(share * measure.size + late + 1e-8)[None]
+
+    return allowed
+
+
+def _widest(
+    first: Record | None, a: list[Measure], second: Record | None, b: list[Measure], allowed: Any
+) -> tuple[float, str]:
+    """Largest difference against what is allowed, over the samples that both have, and its sentence."""
+    assert first is not None
+    assert second is not None
+    worst, text = 0.0, ""
+    _, i, j = np.intersect1d(first.time.round(9), second.time.round(9), return_indices=True)
+    # Where one has stopped, what it did last is not compared.
+    keep = first.time[i] <= min(first.time[-1], second.time[-1]) * (1.0 if first.complete and second.complete else 0.95)
+    i, j = i[keep], j[keep]
+    if not len(i):
+        return worst, text
+    for own, other in zip(a, b, strict=True):
+        off = _apart(own.values[i], other.values[j], own.name == "energy")
+        # A run that goes astray must not set the scale.
+        size = np.minimum(own.size, other.size)
+        limit = np.broadcast_to(allowed(Measure(own.name, own.values, size), first.time[i]), off.shape)
+        share = off / limit
+        if share.max() > worst:
+            worst = float(share.max())
+            # Where it begins says more than where it is largest.
+            t = int((share.max(axis=1) > min(1.0, 0.999 * worst)).argmax())
+            k = int(share[t].argmax())
+            name = first.labels["q"][k] if own.name == "q" else ENERGIES[k]
+            text = (
+                f"{own.name} {name} at t = {first.time[i[t]]:.6g} s is {own.values[i[t], k]:.8g} and "
+                f"{other.values[j[t], k]:.8g}, {off[t, k]:.3g} apart (allowed {limit[t, k]:.3g})"
+            )
+    return worst, text
+
+
+def _apart(a: Array, b: Array, jumps: bool) -> Array:
+    """Distances of values at samples; of what jumps, from all that the other has about that time."""
+    if not jumps:
+        return np.asarray(np.abs(a - b))
+    around = [b[np.clip(np.arange(len(b)) + shift, 0, len(b) - 1)] for shift in range(-JUMPS, JUMPS + 1)]
+    return np.asarray(np.maximum(np.maximum(a - np.max(around, axis=0), np.min(around, axis=0) - a), 0.0))
+
+
+def _own_error(run: Run, part: float) -> dict[str, tuple[Array, Array]]:
+    """By what part of its size each measure has changed until some times when a run is made more finely."""
+    assert run.resolved is not None
+    options: dict[str, float] = {}
+    if run.resolved.integrator.method == "time_stepping":
+        assert run.record is not None
+        options["step_s"] = part * float(run.record.summary["time_stepping"]["step_s"])
+    else:
+        options["rtol"] = max(part * run.resolved.integrator.rtol, 1e-13)
+        options["atol"] = max(part * run.resolved.integrator.atol, 1e-16)
+    integrator = run.resolved.integrator.model_copy(update=options)
+    config = run.resolved.config.model_copy(update={"integrator": integrator})
+    try:
+        finer: Record | None = simulate(replace(run.resolved, config=config))
+    except SimulationStopped as stop:
+        finer = stop.record
+    except DynsimError:
+        finer = None
+    if finer is None or len(finer) < 2 or run.record is None:
+        return {}
+    errors = {}
+    _, i, j = np.intersect1d(run.record.time.round(9), finer.time.round(9), return_indices=True)
+    for own, other in zip(_measures(run.record), _measures(finer), strict=True):
+        off = (np.abs(own.values[i] - other.values[j]) / np.minimum(own.size, other.size)).max(axis=1)
+        errors[own.name] = run.record.time[i], np.maximum.accumulate(off)
+    return errors

@@ -1,0 +1,185 @@
+"""Checks of a scene's runs that share no code with the kernels: what must hold of every record, and between methods.
+
+Each check is a function of what a record shows (:class:`combinations.observed.Observed`) and yields a sentence with
+the worst sample. Tolerances say where they come from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from combinations.agreement import disagreements
+from combinations.commands import commands
+from combinations.contact_law import CREEP, dry, friction, gaps, stops, touching
+from combinations.energy import ledger, losses, powers
+from combinations.newton import circuit, equation, momentum, motion, support
+from combinations.observed import Observed, warned
+from combinations.running import Run
+from combinations.verdicts import untrue
+from dynsim.errors import SimulationStopped
+from dynsim.model.drives import Motor
+from dynsim.scenario import build
+
+# The first sample of what starts on a surface is projected onto it, from up to a micrometre.
+START = 1e-5
+# A force beyond this many times what weight, loads and motors can do at a lever of 5 cm is none of this world.
+ABSURD, LEVER_M = 1e6, 0.05
+# Signals that may be NaN, where there is no load to divide by.
+MAY_BE_NAN = ("center_of_pressure", "traction_demand")
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is wrong with a run.
+
+    ``kind`` : the check, in a word; ``detail`` : a sentence with name, time and numbers
+    """
+
+    kind: str
+    detail: str
+
+
+Finding = Iterator[str]
+
+
+def problems(scenario: Mapping[str, Any], run: Run) -> list[Problem]:
+    """Everything that is wrong with a run, each check once with its worst sample."""
+    listed = [Problem("check", text) for text in started_as_checked(run)]
+    if run.record is None or run.resolved is None:
+        return listed
+    listed += [Problem("finite", text) for text in finite(run)]
+    if isinstance(run.error, SimulationStopped) and not len(run.record):
+        listed.append(Problem("verdict", f"stops ({run.error.kind}) before anything moves: {str(run.error)[:200]}"))
+    if listed or not len(run.record) or "vdot" not in run.record:
+        return listed
+    seen = Observed(run)
+    for name, check in CHECKS.items():
+        listed += [Problem(name, text) for text in check(seen)]
+    listed += [Problem("verdict", text) for text in untrue(scenario, run, seen)]
+    return listed
+
+
+def compare(scenario: Mapping[str, Any], runs: Mapping[str, Run]) -> list[Problem]:
+    """Where the runs of one scene by several methods, solvers and ways differ more than they may."""
+    return [Problem(kind, text) for kind, text in disagreements(scenario, runs)]
+
+
+def started_as_checked(run: Run) -> Finding:
+    """``check`` refuses a scene if and only if it does not start."""
+    started = run.record is not None or isinstance(run.error, SimulationStopped)
+    if started and run.checked is not None:
+        yield f"check refuses what runs: {run.checked[:200]}"
+    if not started and run.checked is None:
+        yield f"check passes what does not start: {str(run.error)[:200]}"
+
+
+def finite(run: Run) -> Finding:
+    """All signals are numbers, and the run covers its time unless it stopped."""
+    assert run.record is not None
+    for name in run.record:
+        data = np.asarray(run.record[name], dtype=np.float64)
+        if name not in MAY_BE_NAN and not np.isfinite(data).all():
+            rows = np.argwhere(~np.isfinite(data.reshape(len(data), -1)))
+            yield f"{name} is not finite, first in sample {rows[0, 0]}"
+
+
+def start(seen: Observed) -> Finding:
+    """The first sample is the posture that the scenario asks for, at rest."""
+    # A soft start settles into a posture of its own.
+    if seen.time[0] != 0.0 or seen.config["plant"].get("start") == "soft":
+        return
+    asked = build.unposed(seen.scenario).initial
+    initial = seen.config.get("initial") or {}
+    free = np.zeros(len(asked), dtype=bool)
+    places = dict(zip(seen.joints, seen.bodies.places, strict=True))
+    if initial.get("on_references"):
+        for joint, path in ((seen.config.get("controller") or {}).get("joints") or {}).items():
+            key = next((key for key in path if key.startswith(("angles_", "positions_"))), None)
+            if key is not None and joint in places:
+                first = float(path[key][0])
+                asked[places[joint]] = np.radians(first) if key.endswith("deg") else first
+            elif joint in places:
+                free[places[joint]] = True
+    if initial.get("on_surface"):
+        kept = [places[joint] for joint in initial.get("keep", []) if joint in places]
+        free[:] = True
+        free[kept] = False
+        for touch in seen.touches():
+            if touch.contact.name in initial["on_surface"] and abs(touch.gap[0]) > START:
+                yield f"{touch.contact.name} starts {touch.gap[0]:+.3g} m from its surface, not on it"
+    off = np.where(free, 0.0, np.abs(seen.q[0] - asked))
+    if off.max(initial=0.0) > START:
+        k = int(off.argmax())
+        name = seen.record.labels["q"][k]
+        yield f"{name} starts at {seen.q[0, k]:.6g}, asked for {asked[k]:.6g}"
+    # Against the posture that the resolved scenario has, where points were to be put on surfaces.
+    off = np.abs(seen.q[0] - seen.robot.initial)
+    if off.max(initial=0.0) > START:
+        k = int(off.argmax())
+        yield f"{seen.record.labels['q'][k]} starts at {seen.q[0, k]:.6g}, the scenario has {seen.robot.initial[k]:.6g}"
+    fastest = float(np.abs(seen.v[0]).max(initial=0.0))
+    # What starts on its surfaces is at rest; an impact at the start could only take velocities away.
+    if fastest > CREEP:
+        yield f"{seen.joints[int(np.abs(seen.v[0]).argmax())]} starts with a rate of {fastest:.3g}, not at rest"
+
+
+def equilibrium(seen: Observed) -> Finding:
+    """What starts in equilibrium does not accelerate."""
+    initial, controller = seen.config.get("initial") or {}, seen.config.get("controller") or {}
+    if not initial.get("equilibrium") or seen.time[0] != 0.0:
+        return
+    if any(not isinstance(motor, Motor) for motor in seen.robot.motors) and (
+        controller.get("joints") or controller.get("hand")
+    ):
+        return
+    # A reference that begins elsewhere or moving, and a torque that does, jump at the start, and a warning says so.
+    if warned(seen, "that jumps at the start all the same") or warned(seen, "the start slips at"):
+        return
+    size = np.abs(seen.vdot[0])
+    # A millionth of what the weight does to a joint that is let go.
+    if size.max(initial=0.0) > 1e-4 * (1.0 + np.linalg.norm(seen.bodies.gravity)):
+        yield f"{seen.joints[int(size.argmax())]} starts with an acceleration of {size.max():.3g}, from equilibrium"
+
+
+def absurd(seen: Observed) -> Finding:
+    """No force is beyond what weight, loads, motors and the motion could do."""
+    weight = sum(link.inertia.mass for link in seen.bodies.robot.links)
+    size = weight * (np.linalg.norm(seen.bodies.gravity) + 1.0)
+    size += sum(
+        float(np.linalg.norm(load.components(seen.time)[:, :3], axis=1).max(initial=0.0)) for load in seen.loads
+    )
+    size += float(np.abs(seen.driven_torques(seen.record["current"], seen.v)).sum(axis=1).max(initial=0.0)) / LEVER_M
+    for name in ("contact_normal_force", "stop_force", "joint_friction", "tie_force"):
+        if name not in seen.record or not seen.record[name].size:
+            continue
+        most = float(np.abs(seen.record[name]).max())
+        if most > ABSURD * size:
+            yield f"{name} comes to {most:.3g}, where weight, loads and motors make {size:.3g}"
+    # An impact of what moves takes at most all its energy; a scene of some kilograms knows no speeds like these.
+    if np.abs(seen.v).max(initial=0.0) > 1e5 or np.abs(seen.q).max(initial=0.0) > 1e6:
+        yield f"rates come to {np.abs(seen.v).max():.3g}, positions to {np.abs(seen.q).max():.3g}"
+
+
+CHECKS: dict[str, Callable[[Observed], Finding]] = {
+    "start": start,
+    "equilibrium": equilibrium,
+    "equation": equation,
+    "momentum": momentum,
+    "motion": motion,
+    "circuit": circuit,
+    "support": support,
+    "touching": touching,
+    "friction": friction,
+    "gaps": gaps,
+    "stops": stops,
+    "dry": dry,
+    "ledger": ledger,
+    "losses": losses,
+    "powers": powers,
+    "commands": commands,
+    "absurd": absurd,
+}

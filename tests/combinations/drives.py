@@ -1,0 +1,189 @@
+"""Motors and controllers of scenes: gains that hold the arm, references that move it a little."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.random import Generator
+
+from combinations.factors import PLANNED, SAMPLED, Levels
+from combinations.plants import Joint, Plant
+from dynsim import Model
+
+# Controllers whose references are waypoints where a start asks for some.
+FOLLOWERS = ("hold", "waypoints", "hand_path", *SAMPLED, *PLANNED)
+
+
+def motors(random: Generator, levels: Levels, robot: Plant) -> dict[str, dict[str, Any]]:
+    """A motor for each joint that has one, by its name."""
+    level = levels["motor"]
+    if level == "none":
+        return {}
+    chosen = {joint.name: _motor(random, level, joint) for joint in robot.joints if joint.name != "base.right"}
+    if level == "partly":
+        own = [joint.name for joint in robot.joints if joint.before and joint.name in chosen]
+        chosen.pop(own[int(random.integers(len(own)))], None)
+    gear = float(random.uniform(0.05, 0.3)) if levels["rubbing"] in ("gear", "both") else 0.0
+    for motor in chosen.values():
+        if gear and motor["type"] != "torque":
+            motor["coulomb_friction_N_m"] = gear
+        elif motor["type"] in ("servo", "mx_28", "mx_106"):
+            motor["coulomb_friction_N_m"] = 0.0
+    return chosen
+
+
+def _motor(random: Generator, level: str, joint: Joint) -> dict[str, Any]:
+    if level == "torque":
+        return {"type": "torque", "limit_N_m": 80.0}
+    if level in ("servo", "velocity") and joint.turns:
+        if level == "velocity":
+            return {"type": "mx_28"}
+        return {
+            "type": "servo",
+            "voltage_V": 12.0,
+            "stall_torque_N_m": float(random.uniform(30.0, 60.0)),
+            "no_load_speed_rad_per_s": 5.0,
+            "k_p_V_per_rad": float(random.uniform(40.0, 120.0)),
+            "rotor_inertia_kg_m2": 0.02,
+            **({"current_limit_A": 12.0} if random.random() < 0.5 else {}),
+        }
+    if level in ("published", "partly") and joint.turns:
+        return {"type": "wang_minami"}
+    # Of the size of Maxon's RE 40 with a gear of 113:1, at a slide on a spindle.
+    return {
+        "type": "dc",
+        "torque_constant_N_m_per_A": 0.0302,
+        "resistance_ohm": 0.299,
+        "inductance_H": 8.23e-5,
+        "rotor_inertia_kg_m2": 1.42e-5,
+        "gear_ratio": 113.0 if joint.turns else 300.0,
+        "gear_damping_N_m_s_per_rad": 3e-6,
+        **({"voltage_limit_V": 24.0, "peak_current_A": 12.0} if level == "dc" else {}),
+    }
+
+
+def controller(
+    random: Generator, levels: Levels, robot: Plant, driven: dict[str, dict[str, Any]], model: Model, duration: float
+) -> dict[str, Any] | None:
+    """The ``controller:`` section; None: there is none."""
+    level = levels["controller"]
+    if level == "none":
+        return None
+    section: dict[str, Any] = {"type": "joint_pd", **_gains(random, levels, robot, driven)}
+    moved = [joint for joint in robot.joints if joint.name in driven and not joint.name.startswith("base.")]
+    if level in SAMPLED:
+        section["sample_time_s"] = float(random.choice((0.0005, 0.001)))
+    if level == "torques":
+        section["torques"] = _torques(random, driven, model, duration)
+    elif level == "gravity":
+        section["feed_forward"] = str(random.choice(("gravity", "dynamics")))
+    elif level == "pressing":
+        # Of the declared points all press, or the elbow alone.
+        alone = levels["start"] in ("on_surface", "on_references") and levels["points"] != "elbow"
+        section["brace"] = (
+            "optimal" if random.random() < 0.5 and not alone else {"elbow": float(random.uniform(1.0, 8.0))}
+        )
+    followed: list[Joint] = []
+    if level == "hand_path":
+        followed = _followers(random, levels, robot, moved)
+        section["hand"] = {
+            "joints": [joint.name for joint in followed],
+            **_path(random, robot, followed, model, duration),
+        }
+        if levels["contact"] == "glued" and any(joint.before for joint in followed):
+            section["hand"]["braces"] = ["elbow"]
+    elif level == "operator":
+        speed = random.uniform(-0.1, 0.1, size=3).tolist()
+        section["operator"] = {
+            "joints": [joint.name for joint in _followers(random, levels, robot, moved)],
+            "commands": [{"at_s": 0.0, "hand": speed}, {"at_s": 0.5 * duration, "hand": [0.0, 0.0, 0.0]}],
+        }
+        if levels["plant"] == "mobile" and "base.left" in driven:
+            section["operator"]["commands"][0]["base"] = [0.05, 0.1]
+    moves = level in ("waypoints", *PLANNED) or (level in SAMPLED and random.random() < 0.7)
+    if moves or (levels["start"] == "on_references" and level in FOLLOWERS):
+        free = [joint for joint in moved if joint not in followed and driven[joint.name]["type"] != "torque"]
+        section |= _waypoints(random, levels, free, duration)
+    return section
+
+
+def _gains(random: Generator, levels: Levels, robot: Plant, driven: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """A gain for each DC motor: soft to stiff, softer where commands are held between samples."""
+    sampled = levels["controller"] in SAMPLED
+    stiff = float(10.0 ** random.uniform(-0.5, 0.3)) * (0.3 if sampled else 1.0)
+    k_p: list[float] = []
+    k_d: list[float] = []
+    for joint in robot.joints:
+        # Both wheels have the motor of the left one.
+        motor = driven.get("base.left" if joint.name == "base.right" else joint.name)
+        if motor is None or motor["type"] not in ("wang_minami", "dc"):
+            continue
+        p, d = (400.0, 12.0) if motor["type"] == "wang_minami" else (40.0, 1.5) if joint.turns else (1000.0, 20.0)
+        k_p.append(stiff * p)
+        k_d.append(stiff * d)
+    return {"k_p_V_per_rad": k_p, "k_d_V_s_per_rad": k_d} if k_p else {}
+
+
+def _followers(random: Generator, levels: Levels, robot: Plant, moved: Sequence[Joint]) -> list[Joint]:
+    """The joints that follow the hand: those behind the elbow, or all; a joint near its stop stays out."""
+    moved = [joint for joint in moved if joint.name not in robot.limited] or moved
+    if levels["plant"] == "mimic":
+        moved = [joint for joint in moved if joint.turns]
+    behind = [joint for joint in moved if not joint.before and joint.name != "grip"]
+    if levels["start"] == "on_references":
+        # One has waypoints.
+        return moved[:-1] or moved
+    return behind if behind and random.random() < 0.5 else [joint for joint in moved if joint.name != "grip"]
+
+
+def _path(random: Generator, robot: Plant, followed: Sequence[Joint], model: Model, duration: float) -> dict[str, Any]:
+    """A line that the joints can follow: to where small turns of theirs take the hand."""
+    q = np.array(model.robot.initial)
+    start = model.point_position(*robot.hand, q)
+    index = {link.joint: int(k) for link, k in zip(model.robot.links, model.robot.position_index, strict=True)}
+    # Where all turn alike, a planar arm stays bent.
+    for k, joint in enumerate(followed):
+        q[index[joint.name]] += (0.02 if not joint.turns else 0.08) * (-1.0) ** k * float(random.uniform(0.5, 1.0))
+    end = model.point_position(*robot.hand, q)
+    path = {"type": "line", "from_m": start.tolist(), "to_m": end.tolist(), "duration_s": duration}
+    return {"path": path, "tolerance_m": 0.05 if len(followed) < 3 else 1e-6}
+
+
+def _waypoints(random: Generator, levels: Levels, free: Sequence[Joint], duration: float) -> dict[str, Any]:
+    """Waypoints of one joint or two; behind the elbow where that is glued or put on its surface."""
+    held = levels["contact"] == "glued" or levels["start"] == "on_references" or levels["controller"] in PLANNED
+    if levels["plant"] == "mimic" and levels["start"] == "on_references":
+        # It leads another, which starts where the file says.
+        free = [joint for joint in free if joint.name != "grip"]
+    able = [joint for joint in free if not (held and joint.before)]
+    if not able and levels["start"] == "on_references":
+        able = list(free)
+    if levels["controller"] == "pressing" and levels["points"] in ("two", "same_link"):
+        # They would take a point that presses off its surface.
+        able = []
+    joints: dict[str, Any] = {}
+    for k in random.permutation(len(able)).tolist()[: 1 + int(random.integers(2))]:
+        joint = able[k]
+        scale = 1.0 if joint.turns else 0.002
+        start = joint.start + (scale * float(random.uniform(1.0, 4.0)) if levels["start"] == "on_references" else 0.0)
+        ways = [start, *(start + scale * random.uniform(-15.0, 15.0, size=2)).tolist()]
+        key = "angles_deg" if joint.turns else "positions_m"
+        joints[joint.name] = {"times_s": [0.0, 0.5 * duration, duration], key: ways}
+    return {"joints": joints} if joints else {}
+
+
+def _torques(random: Generator, driven: dict[str, dict[str, Any]], model: Model, duration: float) -> dict[str, Any]:
+    """What holds the weight, and a wave about it that presses and lifts."""
+    weight = model.bias_forces(np.array(model.robot.initial), np.zeros(model.n))
+    rates = {link.joint: i for i, link in enumerate(model.robot.links)}
+    torques: dict[str, Any] = {}
+    for name, motor in driven.items():
+        if motor["type"] != "torque" or name.startswith("base."):
+            continue
+        hold = float(weight[rates[name]])
+        wave = float(random.uniform(-1.0, 1.0)) * (0.3 + 0.5 * abs(hold))
+        values = [hold + wave, hold, hold - wave]
+        torques[name] = {"times_s": [0.0, 0.5 * duration, duration], "torques_N_m": values}
+    return torques

@@ -1,0 +1,172 @@
+"""The factors of a scene and their levels, and which levels refuse each other."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+Levels = Mapping[str, str]
+
+# The method is no factor: each scene is run by all that know what is in it, see :func:`methods`.
+FACTORS: dict[str, tuple[str, ...]] = {
+    # With its kinds of joints: revolute; also prismatic; of a file, with a branch; coupled; with a free or a planar root.
+    "plant": ("revolute", "prismatic", "urdf", "mimic", "floating", "planar", "mobile", "snake"),
+    # partly: a joint before the elbow has none; dc: with limits of voltage and current; velocity: a servo in that mode.
+    "motor": ("none", "partly", "published", "dc", "servo", "velocity", "torque"),
+    "rubbing": ("nothing", "viscous", "bearing", "gear", "both"),
+    "stops": ("none", "far", "reached"),
+    # nothing: glued law, no point; free: unilateral law, no point; then what can touch under the unilateral law.
+    "contact": ("nothing", "free", "glued", "points", "joints", "links"),
+    # Of declared points: the elbow alone; and the hand; and a second of the same link; and a point on the first axis.
+    "points": ("elbow", "two", "same_link", "unmoved"),
+    "shape": ("point", "sphere"),
+    # steep: a plane that the elbow leaves at a flat angle.
+    "surface": ("plane", "inclined", "steep", "sphere", "cylinder", "bowl", "pipe", "box", "height_field"),
+    "friction": ("none", "coulomb", "static", "stribeck", "viscous", "high", "grip"),
+    "give": ("rigid", "restitution", "compliant"),
+    "controller": (
+        "none", "hold", "waypoints", "hand_path", "operator", "sampled", "encoders", "delayed", "torques", "gravity",
+        "pressing",
+    ),
+    "start": ("given", "above", "on_surface", "on_references", "equilibrium"),
+    "loads": ("none", "payload", "constant", "push", "body_push"),
+    "objects": ("none", "box", "sphere", "hinge", "cart"),
+    "ties": ("none", "linear", "torsion", "bounded"),
+    "precision": ("default", "tight", "coarse"),
+    "solver": ("articulated", "m_star"),
+    "way": ("simulate", "pieces", "snapshot", "batch"),
+}  # fmt: skip
+METHODS = ("auto", "dopri5", "radau5", "time_stepping")
+METHOD = "method"
+"""A factor of refusals beside those of :data:`FACTORS`."""
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """Levels that cannot be combined.
+
+    Attributes
+    ----------
+    levels : of two or more factors, each a level or several; ``method`` may be among them
+    reason : why not
+    error : pattern of what dynsim says to a scene that has them; empty: no scene could say it, the levels exclude
+        each other by what they mean
+    """
+
+    levels: tuple[tuple[str, tuple[str, ...]], ...]
+    reason: str
+    error: str = ""
+
+    def holds(self, levels: Levels) -> bool:
+        """Whether an assignment, which may be partial, has them all."""
+        return all(levels.get(factor) in refused for factor, refused in self.levels)
+
+    def holds_for(self, method: str) -> bool:
+        """Whether it is about a method, or about all."""
+        return method in dict(self.levels).get(METHOD, (method,))
+
+
+def _refuse(reason: str, error: str = "", **levels: str | tuple[str, ...]) -> Refusal:
+    chosen = tuple((key, (value,) if isinstance(value, str) else value) for key, value in levels.items())
+    return Refusal(chosen, reason, error)
+
+
+UNILATERAL = ("free", "points", "joints", "links")
+GLUED = ("nothing", "glued")
+SAMPLED = ("sampled", "encoders", "delayed")
+# What follows references that a whole run has, and what plans voltages along them.
+PLANNED = ("gravity", "pressing")
+DC = ("published", "dc")
+STEPPED = "only time stepping has it"
+
+REFUSALS: tuple[Refusal, ...] = (
+    # Feature × law.
+    _refuse("under the glued law joints do not rest", r"dry friction of .* needs contacts.law: unilateral",
+            contact=GLUED, rubbing=("bearing", "gear", "both")),
+    _refuse("a glued point has one coefficient", r"is read under law: unilateral only",
+            contact=GLUED, friction=("static", "stribeck", "viscous")),
+    _refuse("what is glued does not bounce or give way", r"is read under law: unilateral only",
+            contact=GLUED, give=("restitution", "compliant")),
+    # Feature × method.
+    _refuse(STEPPED, r"grip: needs integrator.method: time_stepping",
+            friction="grip", method=("auto", "dopri5", "radau5")),
+    _refuse(STEPPED, r"stiffness_N_per_m: needs integrator.method: time_stepping",
+            give="compliant", method=("auto", "dopri5", "radau5")),
+    _refuse(STEPPED, r"has no ties",
+            ties=("linear", "torsion", "bounded"), method=("auto", "dopri5", "radau5")),
+    _refuse("time stepping solves with articulated sweeps", r"is not of integrator.method: time_stepping",
+            solver="m_star", method="time_stepping"),
+    # Law or plant × method.
+    _refuse("time stepping has the unilateral law alone", r"needs `contacts: \{law: unilateral\}`",
+            contact=GLUED, method="time_stepping"),
+    _refuse("time stepping locates no overturning", r"mobile base",
+            plant="mobile", method="time_stepping"),
+    _refuse("a snake's wheels stand on tyres, which only time stepping has", r"needs integrator.method: time_stepping",
+            plant="snake", method=("auto", "dopri5", "radau5")),
+    # Plant × feature.
+    _refuse("a snake stands on its wheels", r"is read under law: unilateral only|needs `contacts", plant="snake",
+            contact=GLUED),
+    _refuse("a snake has a controller of its own", r"cannot drive a 'snake'", plant="snake",
+            controller=("hold", "waypoints", "hand_path", "torques", "gravity", "pressing")),
+    _refuse("a snake starts raised from below", r"", plant="snake",
+            start=("on_surface", "on_references", "equilibrium")),
+    _refuse("the joints of a snake are servos on position", r"", plant="snake",
+            motor=("none", "partly", "published", "dc", "velocity", "torque")),
+    _refuse("the postures of coupled joints are those of their file", r"not for robots with coupled joints",
+            plant="mimic", start=("on_surface", "equilibrium")),
+    _refuse("nothing holds what floats", r"nothing holds this posture",
+            plant="floating", start="equilibrium", contact=("nothing", "free", "glued")),
+    _refuse("nothing holds a free body", r"nothing holds this posture",
+            objects=("box", "sphere", "cart"), start="equilibrium", contact=GLUED),
+    _refuse("such motors hold no posture", r"nothing holds this posture",
+            motor=("none", "velocity"), start="equilibrium"),
+    _refuse("such motors hold no posture", r"nothing holds this posture", controller="none", start="equilibrium"),
+    # Motor × controller.
+    _refuse("a plan of voltages needs a DC motor at each joint", r"DC motor", motor=(
+        "none", "partly", "servo", "velocity", "torque"), controller=PLANNED),
+    _refuse("a plan of voltages needs a DC motor at each joint", r"DC motor",
+            plant=("floating", "planar", "mimic"), controller=PLANNED),
+    _refuse("a plan of voltages needs a DC motor at each joint, those of objects too", r"DC motor",
+            objects=("box", "sphere", "hinge", "cart"), controller=PLANNED),
+    _refuse("torques are of motors of that type", r"torque", motor=(
+        "none", "partly", "published", "dc", "servo", "velocity"), controller="torques"),
+    _refuse("nobody follows a path", r"motor", motor="none",
+            controller=("waypoints", "hand_path", "operator", "sampled", "encoders", "delayed")),
+    _refuse("a torque follows no path", r"motor|torque", motor="torque",
+            controller=("waypoints", "hand_path", "operator")),
+    # Motor × friction of the gear.
+    _refuse("there is no gear", "", motor=("none", "torque"), rubbing=("gear", "both")),
+    _refuse("what presses starts on its surface", r"the references take .* off surface",
+            controller="pressing", start="above"),
+    # Start × others.
+    _refuse("no joint has waypoints", r"no joint has waypoints|cannot drive", start="on_references",
+            controller=("none", "operator", "torques")),
+    _refuse("no joint follows waypoints", r"no joint has waypoints|motor", start="on_references",
+            motor=("none", "torque")),
+    _refuse("a glued point starts on its surface", r"from surface", start="above", contact="glued"),
+    _refuse("no declared point", r"brace|contact", controller="pressing", contact=("nothing", "free")),
+)  # fmt: skip
+
+
+# What dynsim may say of a start, by its numbers: whether a scene has one it finds out.
+STARTS = {
+    "equilibrium": r"initial\.equilibrium: nothing holds this posture",
+    "on_surface": r"the joints that may move do not bring",
+    "on_references": r"the joints that may move do not bring",
+}
+
+
+def methods(levels: Levels) -> tuple[str, ...]:
+    """The methods that know all that an assignment has; ``auto`` among them."""
+    return tuple(method for method in METHODS if refused(levels, method) is None)
+
+
+def refused(levels: Levels, method: str) -> Refusal | None:
+    """The first refusal that an assignment, which may be partial, meets with a method; None: it is taken."""
+    return next((refusal for refusal in REFUSALS if refusal.holds({**levels, METHOD: method})), None)
+
+
+def matches(refusal: Refusal, text: str) -> bool:
+    """Whether an error is the one that a refusal announces."""
+    return bool(refusal.error) and re.search(refusal.error, " ".join(text.split())) is not None

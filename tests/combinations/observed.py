@@ -1,0 +1,384 @@
+"""A record beside what its scenario says: bodies, contacts, drives, loads at the samples, by the checks' own means."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from combinations.bodies import Bodies, Motion, position_rates, times
+from combinations.running import Run
+from combinations.surfaces import Shape, nearest, shape
+from dynsim.model.description import Contact, Load, Robot
+from dynsim.model.drives import Motor, Servo, TorqueSource
+from dynsim.model.surfaces import HeightField
+from dynsim.record import Record
+from dynsim.scenario import build
+
+Array = NDArray[np.float64]
+
+OPEN, SLIDING, STICKING = 0, 1, 2
+# Samples count as the ends of steps of time stepping that are no further from them, in steps.
+AT_STEP = 1e-6
+# Samples resolve a circuit that are no further apart than this part of L/R; else what an event makes swing is left out
+# for so long, which is three of the longest periods of published motors in stiff loops [s].
+RESOLVED, SETTLING = 0.3, 0.03
+
+
+@dataclass(frozen=True)
+class Touch:
+    """One contact at all samples.
+
+    Attributes
+    ----------
+    contact : its description; body : index of its body
+    position : where it touches, (T, 3) [m]; normal : (T, 3); gap : (T,) [m]
+    slip, slip_before : (T, 3) tangential velocity [m/s]; the second at the start of the step, by events the same
+    approach : velocity along the normal, (T,) [m/s]
+    force : (T, 3) [N]; normal_force : (T,) as recorded [N]; mode : (T,)
+    """
+
+    contact: Contact
+    body: int
+    position: Array
+    normal: Array
+    gap: Array
+    slip: Array
+    slip_before: Array
+    approach: Array
+    force: Array
+    normal_force: Array
+    mode: Array
+
+    @property
+    def turned(self) -> Array:
+        """By how much the normal has turned since the sample before, (T,) [rad]."""
+        return np.asarray(np.linalg.norm(np.diff(self.normal, axis=0, prepend=self.normal[:1]), axis=1))
+
+    @property
+    def tangential(self) -> Array:
+        """The part of the force in the surface, (T, 3) [N]."""
+        return self.force - (self.force * self.normal).sum(axis=1, keepdims=True) * self.normal
+
+
+class Observed:
+    """What the checks look at, of a run with a record of the dynamics."""
+
+    def __init__(self, run: Run) -> None:
+        assert run.record is not None
+        assert run.resolved is not None
+        self.run = run
+        self.record: Record = run.record
+        self.scenario = run.resolved
+        self.config: dict[str, Any] = run.resolved.resolved
+        self.robot: Robot = build.robot(run.resolved)
+        self.bodies = Bodies(self.robot)
+        self.time = self.record.time
+        self.q, self.v, self.vdot = (self.record[name] for name in ("q", "v", "vdot"))
+        self.real = self.config["contacts"]["law"] == "unilateral"
+        self.stepped = run.resolved.integrator.method == "time_stepping"
+        self.step = float(self.record.summary["time_stepping"]["step_s"]) if self.stepped else 0.0
+        self.joints = list(self.robot.joint_names)
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @cached_property
+    def motion(self) -> Motion:
+        """Of all bodies at the samples."""
+        return self.bodies.motion(self.q, self.v, self.vdot)
+
+    @cached_property
+    def shapes(self) -> dict[str, Shape]:
+        """Surfaces by name."""
+        error = self.config.get("surface_error") or {}
+        shift, fields = np.array(error.get("shift_m", [0.0, 0.0, 0.0])), build.surfaces(self.scenario)
+        made = {}
+        for name, config in self.config["surfaces"].items():
+            described, grid = fields[name], None
+            if isinstance(described, HeightField):
+                grid = described.origin - shift[:2], described.spacing, described.heights - shift[2]
+            made[name] = shape(config, shift, grid)
+        return made
+
+    @cached_property
+    def described_contacts(self) -> list[Contact]:
+        """Contacts of the scenario that the record has, in the record's order."""
+        by_name = {contact.name: contact for contact in build.contacts(self.scenario, self.robot)}
+        return [by_name[name] for name in self.record.labels["contact_gap"]]
+
+    def touches(self, motion: Motion | None = None) -> list[Touch]:
+        """The contacts, at the samples or where another motion has them."""
+        return (
+            self._touches_of_samples
+            if motion is None
+            else [self._touch(k, contact, motion) for k, contact in enumerate(self.described_contacts)]
+        )
+
+    @cached_property
+    def _touches_of_samples(self) -> list[Touch]:
+        return [self._touch(k, contact, self.motion) for k, contact in enumerate(self.described_contacts)]
+
+    def _touch(self, k: int, contact: Contact, motion: Motion) -> Touch:
+        body, point = self.robot.attach(contact.body, contact.point)
+        start = motion.point(body, point)
+        tip = None if contact.tip is None else motion.point(body, self.robot.attach(contact.body, contact.tip)[1])
+        surface = self.shapes[contact.surface_name]
+        centre = nearest(surface, start, tip)
+        far, normal = surface.look(centre)
+        position = centre - contact.radius * normal
+        velocity = motion.velocity(body, position)
+        approach = (velocity * normal).sum(axis=1)
+        before = velocity
+        if self.stepped and motion is self.motion:
+            before = np.einsum(
+                "tkn,tn->tk", self.bodies.jacobian(motion, body, position), self.v - self.step * self.vdot
+            )
+        record = self.record
+        force = record["contact_normal_force"][:, k]
+        mode = record["contact_mode"][:, k] if "contact_mode" in record else np.full(len(force), SLIDING)
+        return Touch(
+            contact,
+            body,
+            position,
+            np.asarray(normal, dtype=np.float64),
+            far - contact.radius,
+            velocity - approach[:, None] * normal,
+            before - (before * normal).sum(axis=1, keepdims=True) * normal,
+            approach,
+            record["contact_force"][:, k],
+            force,
+            mode,
+        )
+
+    @cached_property
+    def loads(self) -> list[Load]:
+        """Forces and torques from outside."""
+        return build.loads(self.scenario, self.robot)
+
+    @cached_property
+    def event_times(self) -> Array:
+        """When something happened that may make velocities or accelerations jump [s]."""
+        instants = [self.time[0] - 1e-12, *(event.time for event in self.record.events)]
+        for load in self.loads:
+            instants += list(load.knots)
+        return np.array(sorted(instants))
+
+    @cached_property
+    def settling(self) -> float:
+        """How long after an event circuits may swing that samples do not resolve [s]."""
+        spacing = float(np.diff(self.time).max(initial=0.0))
+        lags = [motor.inductance / motor.resistance for motor in self.robot.motors if isinstance(motor, Motor)]
+        return SETTLING if lags and spacing > RESOLVED * min(lags) else 0.0
+
+    def quiet(self, count: int = 1) -> NDArray[np.bool_]:
+        """Whether nothing happens from each sample to the count-th after it, or swings on from before, (T − count,)."""
+        before = np.searchsorted(self.event_times, self.time[:-count] - self.settling, side="left")
+        after = np.searchsorted(self.event_times, self.time[count:], side="right")
+        return np.asarray(before == after)
+
+    # Sampled loops hold their commands from one tick to the next.
+    @property
+    def sample_time(self) -> float | None:
+        """Period of the controller [s], None of a continuous one."""
+        return (self.config.get("controller") or {}).get("sample_time_s")
+
+    @cached_property
+    def constants(self) -> Array:
+        """Torque per ampere of each drive; of a torque source one, whose current is its torque."""
+        return np.array(
+            [1.0 if isinstance(motor, TorqueSource) else motor.joint_constant for motor in self.robot.motors]
+        )
+
+    def driven_torques(self, current: Array, v: Array) -> Array:
+        """What drives exert on joints at currents (T, na) and rates (T, n), without dry friction that holds, (T, n)."""
+        torque = np.zeros_like(v)
+        for a, motor in enumerate(self.robot.motors):
+            j = self.joints.index(motor.joint)
+            torque[:, j] += self.constants[a] * current[:, a]
+            if isinstance(motor, Servo) and motor.coulomb_friction > 0.0 and self._smoothed(motor):
+                speed = 1e-2 if motor.coulomb_speed is None else motor.coulomb_speed
+                torque[:, j] -= motor.coulomb_friction * v[:, j] / np.hypot(v[:, j], speed)
+        return torque
+
+    def _smoothed(self, motor: Servo) -> bool:
+        return motor.coulomb_speed is not None or not self.real
+
+    def has_circuits(self) -> bool:
+        """Whether currents are states."""
+        return any(isinstance(motor, Motor) for motor in self.robot.motors)
+
+    def joint_signal(self, name: str) -> Array:
+        """A signal of some joints spread over all of them, (T, n)."""
+        spread = np.zeros_like(self.v)
+        if name in self.record:
+            for k, joint in enumerate(self.record.labels[name]):
+                spread[:, self.joints.index(joint)] += self.record[name][:, k]
+        return spread
+
+    def tie_wrenches(self, motion: Motion) -> list[tuple[int, int, Array, Array, Array]]:
+        """First body, second body, place, force and moment of each tie on the first body."""
+        acting = []
+        for k, tie in enumerate(self.robot.ties if "tie_force" in self.record else ()):
+            (a, _), (b, other) = self.robot.attach(tie.body, tie.point), self.robot.attach(tie.other, tie.other_point)
+            axis = self.robot.attached_axes(tie.body) @ np.asarray(tie.axis) / np.linalg.norm(tie.axis)
+            along = times(motion.rotation[a], np.broadcast_to(axis, (len(motion.rotation[a]), 3)))
+            push = along * self.record["tie_force"][:, k : k + 1]
+            still = np.zeros_like(push)
+            force, moment = (still, push) if tie.turns else (push, still)
+            acting.append((a, b, motion.point(b, other), force, moment))
+        return acting
+
+
+@dataclass(frozen=True)
+class Balance:
+    """Generalised forces at samples: what is left of the equation of motion, and how large its terms are.
+
+    Attributes
+    ----------
+    rows : indices of the samples; rest : (len(rows), n) [N m or N]; scale : (len(rows), n), the sum of the sizes
+    slack : (len(rows), n), by how much terms may be off that the record does not show exactly
+    """
+
+    rows: NDArray[np.int64]
+    left: Array
+    scale: Array
+    slack: Array
+
+
+def balance(seen: Observed) -> Balance:
+    """M v̇ + h + D v − τ − Jᵀ f − loads of all samples at which the record shows every term.
+
+    By events the terms belong to the sample's state. Time stepping has the means of its last step, at the midpoint:
+    the state at the step's start follows from the accelerations, which are means too; contacts act where the step
+    ends.
+    """
+    if seen.stepped:
+        return _stepped_balance(seen)
+    rows = np.arange(len(seen))
+    motion = seen.motion
+    terms = [seen.bodies.along_rows(motion, seen.bodies.wrenches(motion)), seen.bodies.armature * seen.vdot]
+    terms += [seen.bodies.damping * seen.v, -seen.driven_torques(seen.record["current"], seen.v)]
+    terms += [-seen.joint_signal("joint_friction"), -seen.joint_signal("stop_force")]
+    terms += [*_contact_terms(seen, motion, rows), *_load_terms(seen, motion, seen.time), *_tie_terms(seen, motion)]
+    return _balanced(seen, rows, terms, np.zeros_like(seen.v))
+
+
+def _stepped_balance(seen: Observed) -> Balance:
+    h, theta = seen.step, seen.scenario.integrator.theta
+    rows = whole_steps(seen)
+    if not len(rows):
+        return Balance(rows, np.zeros((0, seen.bodies.n)), np.zeros((0, seen.bodies.n)), np.zeros((0, seen.bodies.n)))
+    a, v_end, q_end = seen.vdot[rows], seen.v[rows], seen.q[rows]
+    v_start = v_end - h * a
+    v_theta = v_start + theta * h * a
+    q_middle = q_end + position_rates(seen.bodies, q_end, 0.5 * h * v_start - h * v_theta)
+    middle = seen.bodies.motion(q_middle, v_theta, a)
+    end = seen.bodies.motion(q_end, v_end, a)
+    current, slack = _theta_currents(seen, rows, v_theta, theta)
+    terms = [seen.bodies.along_rows(middle, seen.bodies.wrenches(middle)), seen.bodies.armature * a]
+    terms += [seen.bodies.damping * v_theta, -seen.driven_torques(current, v_theta)]
+    terms += [-seen.joint_signal(name)[rows] for name in ("joint_friction", "stop_force")]
+    terms += _contact_terms(seen, end, rows)
+    terms += _load_terms(seen, middle, seen.time[rows] - h + theta * h)
+    terms += [term[rows] for term in _tie_terms(seen, seen.motion)]
+    # Velocity products are those of rates that the last acceleration leads to, which after an impact is far off, or
+    # of the start where contacts have changed.
+    inertial = terms[0]
+    last = np.where((rows > 1)[:, None], seen.vdot[np.maximum(rows - 1, 0)], 0.0)
+    led = seen.bodies.motion(q_middle, v_start + theta * h * last, a)
+    begun = seen.bodies.motion(q_middle, v_start, a)
+    terms[0], other = (seen.bodies.along_rows(moving, seen.bodies.wrenches(moving)) for moving in (led, begun))
+    slack = slack + np.abs(other - terms[0]) + np.abs(inertial - terms[0])
+    # Contacts act at the middle of the step, and the record has them at its end: that turns them with the normal.
+    there, here = seen.touches(middle), seen.touches(end)
+    for touch, later in zip(there, here, strict=True):
+        turned = _turned(touch.force[rows], later.normal, touch.normal)
+        for force in (touch.force[rows], turned):
+            slack = slack + np.abs(
+                _contact_term(seen, middle, touch, force) - _contact_term(seen, end, later, later.force[rows])
+            )
+        # Tangents may turn about the normal as much as that turns.
+        angle = np.linalg.norm(later.normal - touch.normal, axis=1, keepdims=True)
+        slack = slack + np.abs(_contact_term(seen, middle, touch, angle * np.cross(touch.normal, turned)))
+    return _balanced(seen, rows, terms, slack)
+
+
+def whole_steps(seen: Observed) -> NDArray[np.int64]:
+    """Samples at the end of a step of time stepping at whose start there is one too."""
+    h, a = seen.step, seen.vdot[1:]
+    change = np.diff(seen.v, axis=0)
+    # Where a load begins or ends, steps do too; from there on samples may lie between their ends.
+    beside = np.abs(np.diff(seen.time) - h) < AT_STEP * h
+    moved = np.abs(change - h * a).max(axis=1) <= AT_STEP * (np.abs(change) + h * np.abs(a)).max(axis=1) + 1e-13
+    return np.flatnonzero(beside & moved) + 1
+
+
+def _theta_currents(seen: Observed, rows: NDArray[np.int64], v_theta: Array, theta: float) -> tuple[Array, Array]:
+    """Currents that went into the steps that end at samples, and by how much torques may be off for them, (·, n)."""
+    current = seen.record["current"]
+    now, before = current[rows], current[rows - 1]
+    used = now - (1.0 - theta) * (now - before)
+    slack = np.zeros_like(v_theta)
+    for a, motor in enumerate(seen.robot.motors):
+        j = seen.joints.index(motor.joint)
+        size = seen.constants[a] * np.abs(now[:, a] - before[:, a])
+        if not isinstance(motor, Motor):
+            # Where a limit comes or goes within a step, the law is not linear in it; held commands jump at ticks.
+            slack[:, j] += size
+    return used, slack
+
+
+def _contact_terms(seen: Observed, motion: Motion, rows: NDArray[np.int64]) -> list[Array]:
+    touches = seen.touches(None if motion is seen.motion else motion)
+    return [_contact_term(seen, motion, touch, touch.force[rows]) for touch in touches]
+
+
+def _contact_term(seen: Observed, motion: Motion, touch: Touch, force: Array) -> Array:
+    return -seen.bodies.force_along_rows(motion, touch.body, touch.position, force, np.zeros_like(force))
+
+
+def _turned(force: Array, normal: Array, other: Array) -> Array:
+    """Forces turned as a normal turns into another one, the shortest way, (T, 3)."""
+    axis = np.cross(normal, other)
+    cosine = (normal * other).sum(axis=1, keepdims=True)
+    along = (axis * force).sum(axis=1, keepdims=True)
+    return np.asarray(cosine * force + np.cross(axis, force) + axis * along / np.maximum(1.0 + cosine, 1e-6))
+
+
+def _load_terms(seen: Observed, motion: Motion, time: Array) -> list[Array]:
+    terms = []
+    for load in seen.loads:
+        body, point = seen.robot.attach(load.body, load.point)
+        wrench = load.components(time)
+        parts = [wrench[:, :3], wrench[:, 3:]]
+        if load.in_body:
+            parts = [times(motion.rotation[body], part) for part in parts]
+        terms.append(-seen.bodies.force_along_rows(motion, body, motion.point(body, point), parts[0], parts[1]))
+    return terms
+
+
+def _tie_terms(seen: Observed, motion: Motion) -> list[Array]:
+    terms = []
+    for a, b, position, force, moment in seen.tie_wrenches(motion):
+        on_first = seen.bodies.force_along_rows(motion, a, position, force, moment)
+        on_second = seen.bodies.force_along_rows(motion, b, position, -force, -moment)
+        terms.append(-(on_first + on_second))
+    return terms
+
+
+def _balanced(seen: Observed, rows: NDArray[np.int64], terms: list[Array], slack: Array) -> Balance:
+    basis = seen.bodies.free_directions()
+    left = sum(terms[1:], start=terms[0].copy())
+    scale = np.sum([np.abs(term) for term in terms], axis=0)
+    if seen.robot.couplings:
+        left, scale, slack = left @ basis, scale @ np.abs(basis), slack @ np.abs(basis)
+    return Balance(rows, left, scale, slack)
+
+
+def warned(seen: Observed, text: str) -> bool:
+    """Whether a warning of the run has this text in it."""
+    return any(text in warning for warning in seen.run.warnings)

@@ -1,0 +1,309 @@
+"""Runs of a scene: by each method that knows all it has, and in one of several ways."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+import warnings
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from combinations.factors import STARTS
+from combinations.scenes import Scene
+from dynsim import Simulation, check, simulate, simulate_batch
+from dynsim.errors import DynsimError, SimulationInterrupted, SimulationStopped
+from dynsim.record import Record
+from dynsim.scenario import Scenario, build, build_model
+from dynsim.scenario.reading import scenario_from_resolved
+
+M_STAR = "m_star"
+# Shares of the duration that a run in pieces stops at: one within the first step, two close together.
+PIECES = (1e-6, 0.1234, 0.4, 0.400001, 0.77)
+
+
+@dataclass(frozen=True)
+class Run:
+    """A scene run with a method, in one of several ways.
+
+    Attributes
+    ----------
+    scenario : as a scenario file would have it, with the method
+    resolved : the scenario as dynsim read it; None: it was refused while reading
+    method : ``auto``, ``dopri5``, ``radau5`` or ``time_stepping``
+    way : ``simulate``, ``pieces``, ``snapshot``, ``batch``, or ``m_star``, which is simulated with that solver
+    record : None where there is none: it was refused, or stopped before the first sample
+    error : with which it was refused or stopped
+    warnings : of the record's summary
+    checked : the text with which ``check`` refused it; None: it did not
+    """
+
+    scenario: Mapping[str, Any]
+    resolved: Scenario | None
+    method: str
+    way: str
+    record: Record | None
+    error: Exception | None
+    warnings: list[str] = field(default_factory=list)
+    checked: str | None = None
+
+    @property
+    def status(self) -> str:
+        """``finished``, ``refused``, the kind of a stop, or the class of an error that is no message."""
+        if self.error is None:
+            return "finished"
+        if isinstance(self.error, SimulationStopped):
+            return self.error.kind or "stopped"
+        return "refused" if isinstance(self.error, DynsimError) else type(self.error).__name__
+
+
+def run(scene: Scene, method: str, way: str = "simulate") -> Run:
+    """Check a scene and run it, whatever becomes of it."""
+    solver = M_STAR if way == M_STAR else "articulated"
+    settings = scene.with_method(method, solver)
+    try:
+        scenario = scene.load(method, solver)
+    except DynsimError as error:
+        return Run(settings, None, method, way, None, error, [], str(error))
+    checked, record, failure = None, None, None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            check(scenario)
+        except DynsimError as error:
+            checked = str(error)
+        try:
+            record = WAYS[way](scenario)
+        except SimulationInterrupted:
+            raise
+        except SimulationStopped as stop:
+            record, failure = stop.record, stop
+        except Exception as error:  # a fault of dynsim in one scene must not keep the others from running
+            failure = error
+    said = list(record.summary["warnings"]) if record is not None else []
+    return Run(settings, scenario, method, way, record, failure, said, checked)
+
+
+def _simulation(scenario: Scenario) -> Simulation:
+    """As ``simulate`` makes it: one with ticks of Python has no end, where a step would end in another way."""
+    sensors, controller = scenario.config.sensors, scenario.controller
+    attended = sensors is not None or getattr(controller, "operator", None) is not None
+    attended = attended or getattr(controller, "type", "") == "task_space"
+    return Simulation(scenario, duration=math.inf if attended else None)
+
+
+def _in_pieces(scenario: Scenario) -> Record:
+    simulation = _simulation(scenario)
+    for share in PIECES:
+        simulation.advance(share * scenario.duration_s)
+    simulation.advance(scenario.duration_s)
+    return simulation.record(scenario)
+
+
+def _with_snapshot(scenario: Scenario) -> Record:
+    """Go on from a snapshot, and again from there."""
+    simulation = _simulation(scenario)
+    simulation.advance(0.3 * scenario.duration_s)
+    snapshot = simulation.snapshot()
+    simulation.advance(0.8 * scenario.duration_s)
+    simulation.restore(snapshot)
+    simulation.advance(scenario.duration_s)
+    return simulation.record(scenario)
+
+
+def _in_a_batch(scenario: Scenario) -> Record:
+    """Beside a run of the same robot, with which it shares what they have in common."""
+    first, second = simulate_batch([scenario, scenario], keep_records="all")
+    for result in (first, second):
+        if result.record is None:
+            # The error itself, which a batch tells in words alone.
+            return simulate(scenario)
+    assert first.record is not None
+    assert second.record is not None
+    differ = different(first.record, second.record)
+    assert not differ, f"two runs of a batch differ in {differ}"
+    if not first.ok:
+        return simulate(scenario)
+    return second.record
+
+
+WAYS = {
+    "simulate": simulate,
+    "pieces": _in_pieces,
+    "snapshot": _with_snapshot,
+    "batch": _in_a_batch,
+    M_STAR: simulate,
+}
+
+
+def runs(scene: Scene, takes: Callable[[str, str], bool] = lambda method, way: True) -> dict[str, Run]:
+    """A scene by all its methods, by ``METHOD``, and in further ways by ``METHOD/WAY``.
+
+    ``auto`` takes one of the others, and is run where the scene is to be run in no further way. ``takes`` may leave
+    out methods and ways.
+    """
+    done = {method: run(scene, method) for method in scene.methods if method != "auto" and takes(method, "simulate")}
+    if not done:
+        return {}
+    # Which method runs in another way, changes from scene to scene.
+    method = sorted(done)[scene.seed % len(done)]
+    way = scene.levels["way"]
+    if way != "simulate":
+        done[f"{method}/{way}"] = run(scene, method, way)
+    elif "auto" in scene.methods and takes("auto", way):
+        done["auto"] = run(scene, "auto")
+    able = sorted(set(done) & {"dopri5", "radau5"})
+    if scene.levels["solver"] == M_STAR and able and takes(able[scene.seed % len(able)], M_STAR):
+        method = able[scene.seed % len(able)]
+        done[f"{method}/{M_STAR}"] = run(scene, method, M_STAR)
+    return done
+
+
+def faults(scene: Scene, done: Mapping[str, Run], *, thorough: bool = False) -> list[tuple[str, str]]:
+    """What is wrong with the way in which runs began, ended and were kept: (kind, what) of each.
+
+    Parameters
+    ----------
+    thorough : repeat the resolved scenario; save and load the record; draw figures and page; export
+    """
+    wrong: list[tuple[str, str]] = []
+    for name, own in done.items():
+        wrong += [(kind, f"{name}: {text}") for kind, text in _began(scene, own)]
+        same, _, way = name.partition("/")
+        if way and way != M_STAR and (differ := _differs(done[same], own)):
+            wrong.append(("way", f"{name} is not {same}: {differ}"))
+    if (auto := done.get("auto")) is not None and auto.record is not None:
+        same = str(auto.record.summary["method"])
+        if same in done and (differ := _differs(done[same], auto)):
+            wrong.append(("way", f"auto is not {same}: {differ}"))
+    if thorough:
+        for name, own in done.items():
+            if "/" not in name and own.record is not None:
+                wrong += [(kind, f"{name}: {text}") for kind, text in _kept(own)]
+    return wrong
+
+
+def _began(scene: Scene, own: Run) -> list[tuple[str, str]]:
+    """``check`` succeeds if and only if the run begins; only what may be refused is; other errors are none."""
+    refused = isinstance(own.error, DynsimError) and not isinstance(own.error, SimulationStopped)
+    if own.error is not None and not isinstance(own.error, DynsimError):
+        return [("crash", f"{type(own.error).__name__}: {own.error}")]
+    if own.checked is None and refused:
+        return [("check", f"passes, but the run says: {own.error}")]
+    if own.checked is not None and not refused:
+        return [("check", f"the run begins, but check says: {own.checked}")]
+    if refused and not expected(scene, str(own.error)):
+        return [("refused", str(own.error))]
+    return []
+
+
+def expected(scene: Scene, text: str) -> bool:
+    """Whether an error is that of a start which a scene may have, by its numbers."""
+    import re
+
+    pattern = STARTS.get(scene.levels["start"])
+    return pattern is not None and re.search(pattern, " ".join(text.split())) is not None
+
+
+def _differs(a: Run, b: Run) -> str:
+    """What differs between runs that are to be the same to the bit; empty: nothing."""
+    if a.status != b.status:
+        return f"{a.status}, {b.status}: {b.error or a.error}"
+    if a.record is None or b.record is None:
+        return ""
+    names = different(a.record, b.record)
+    return f"different {', '.join(names)}" if names else ""
+
+
+def different(a: Record, b: Record) -> list[str]:
+    """Names of the signals that are not the same to the bit."""
+    names = sorted({*a, *b})
+    return [
+        name
+        for name in names
+        if name not in a
+        or name not in b
+        or not np.array_equal(np.asarray(a[name]), np.asarray(b[name]), equal_nan=True)
+    ]
+
+
+def _kept(own: Run) -> list[tuple[str, str]]:
+    """The resolved scenario repeats the run; what is saved is what was there; figures, page and exports succeed."""
+    assert own.resolved is not None
+    assert own.record is not None
+    wrong: list[tuple[str, str]] = []
+    again = _again(own)
+    if differ := _differs(own, again):
+        wrong.append(("repeat", f"its resolved scenario: {differ}"))
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for name, keep in KEPT.items():
+            try:
+                said = keep(own, Path(folder))
+            except Exception as error:
+                said = f"{type(error).__name__}: {error}"
+            if said:
+                wrong.append((name, said))
+    return wrong
+
+
+def _again(own: Run) -> Run:
+    assert own.resolved is not None
+    assert own.record is not None
+    failure, record = None, None
+    try:
+        record = simulate(scenario_from_resolved(own.record.provenance["scenario"]))
+    except SimulationStopped as stop:
+        record, failure = stop.record, stop
+    except DynsimError as error:
+        failure = error
+    return Run(own.scenario, own.resolved, own.method, own.way, record, failure)
+
+
+def _save(own: Run, folder: Path) -> str:
+    assert own.record is not None
+    own.record.save(folder / "record.h5")
+    differ = different(own.record, Record.load(folder / "record.h5"))
+    return f"loaded with other {', '.join(differ)}" if differ else ""
+
+
+def _draw(own: Run, folder: Path) -> str:
+    from dynsim.draw.figures import draw
+
+    assert own.record is not None
+    return "" if draw(own.record, folder / "figures") else "no figure"
+
+
+def _page(own: Run, folder: Path) -> str:
+    from dynsim.draw import page
+
+    assert own.record is not None
+    page.write({"run": own.record}, folder / "view.html")
+    return ""
+
+
+def _export(own: Run, folder: Path) -> str:
+    from dynsim.record.joint_motion import export_record
+    from dynsim.record.mcap_file import write_mcap
+
+    assert own.record is not None
+    export_record(own.record, folder / "run.csv", "csv")
+    write_mcap(own.record, folder / "run.mcap")
+    return ""
+
+
+def _describe(own: Run, folder: Path) -> str:
+    """As URDF, which has no wheels that roll without slip, and as MJCF."""
+    assert own.resolved is not None
+    model = build_model(own.resolved)
+    for text in (model.to_urdf, lambda: model.to_mjcf(build.contacts(own.resolved), build.surfaces(own.resolved))):
+        with suppress(DynsimError):
+            text()
+    return ""
+
+
+KEPT = {"save": _save, "figures": _draw, "page": _page, "export": _export, "describe": _describe}

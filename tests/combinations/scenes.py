@@ -1,0 +1,522 @@
+"""The scenario of an assignment of levels: short, of a robot that people could build, varied by a seed."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from combinations import drives, plants
+from combinations.factors import FACTORS, SAMPLED, Levels, methods
+from dynsim import Model, check
+from dynsim.errors import DynsimError
+from dynsim.scenario import Scenario, build_model, load_scenario
+from dynsim.scenario.reading import scenario_from_resolved, to_yaml
+
+Array = NDArray[np.float64]
+
+# Wall time after which a run counts as endless [s].
+WALL_LIMIT_S = 60.0
+# Radius of spheres about points [m], and what a declared point of a link with a radius is thicker by.
+SPHERE, THICKER = 0.02, 0.002
+# Scenes that are drawn until nothing starts in a surface.
+ATTEMPTS = 4
+# Heights of a grid along each side, and their distance [m].
+GRID, SPACING = 24, 0.1
+# What differs between methods, by the level of precision.
+ADAPTIVE = {"default": {}, "tight": {"rtol": 1e-9, "atol": 1e-11}, "coarse": {"rtol": 1e-5, "atol": 1e-7}}
+STEPPED = {"default": {}, "tight": {"step_s": 2.5e-4}, "coarse": {"step_s": 2e-3, "theta": 1.0}}
+# Of a snake, whose control period they divide.
+SNAKE_STEPPED = {"default": {}, "tight": {"step_s": 1.25e-3}, "coarse": {"step_s": 5e-3, "theta": 1.0}}
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A scene and the folder with its files.
+
+    Attributes
+    ----------
+    levels : of all factors
+    seed : that it was drawn with
+    settings : as a scenario file would have it, without ``integrator``
+    folder : of ``scenario.yaml`` and the files that it names
+    """
+
+    levels: Levels
+    seed: int
+    settings: Mapping[str, Any]
+    folder: Path
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """By which it can run; ``auto`` is one of the others."""
+        return methods(self.levels)
+
+    def with_method(self, method: str, solver: str = "articulated") -> dict[str, Any]:
+        """Its settings with a method: the whole scenario."""
+        stepped = method == "time_stepping"
+        fixed = SNAKE_STEPPED if self.levels["plant"] == "snake" else STEPPED
+        options = dict((fixed if stepped else ADAPTIVE)[self.levels["precision"]])
+        if solver != "articulated":
+            options["solver"] = solver
+        return {**self.settings, "integrator": {"method": method, **options, "wall_limit_s": WALL_LIMIT_S}}
+
+    def load(self, method: str, solver: str = "articulated") -> Scenario:
+        """Its scenario, read from its file; raises what reading raises."""
+        file = self.folder / f"{method}_{solver}.yaml"
+        file.write_text(to_yaml(self.with_method(method, solver)), "utf-8")
+        return load_scenario(file)
+
+    def text(self, method: str = "auto") -> str:
+        """Its scenario file, with the levels above."""
+        levels = ", ".join(f"{factor} {self.levels[factor]}" for factor in FACTORS)
+        return f"# seed {self.seed}: {levels}\n{to_yaml(self.with_method(method))}"
+
+
+def scene(levels: Levels, seed: int, folder: Path) -> Scene:
+    """The scene of an assignment; files go to the folder, which must be there."""
+    # The same in every process: Python's own hashes of texts are not.
+    number = zlib.crc32("/".join(levels[factor] for factor in FACTORS).encode())
+    for attempt in range(ATTEMPTS):
+        random = np.random.default_rng([seed, number, attempt])
+        draft = _snake(random, levels) if levels["plant"] == "snake" else _arm(random, levels, folder)
+        draft["name"] = "combined"
+        for section in [key for key, value in draft.items() if value is None or value == {}]:
+            del draft[section]
+        drawn = Scene(levels, seed, draft, folder)
+        if not _in_a_surface(drawn):
+            break
+    return drawn
+
+
+def _in_a_surface(drawn: Scene) -> bool:
+    """Whether something beside the declared points starts below a surface: the scene asks for what it need not."""
+    try:
+        check(drawn.load(drawn.methods[-1]))
+    except DynsimError as error:
+        return "from surface" in str(error)
+    return False
+
+
+def _arm(random: Generator, levels: Levels, folder: Path) -> dict[str, Any]:
+    duration = float(random.uniform(0.2, 0.4))
+    robot = plants.plant(random, levels)
+    driven = drives.motors(random, levels, robot)
+    plants.set_motors(robot, driven)
+    plants.set_losses(robot, random, levels["rubbing"])
+    _set_stops(random, levels, robot)
+    for name, text in robot.files.items():
+        (folder / name).write_text(text, "utf-8")
+    model = _model(robot, folder)
+    touching = _Touching(random, levels, robot, model, folder)
+    settings: dict[str, Any] = {
+        "duration_s": duration,
+        "plant": robot.section,
+        "controller": drives.controller(random, levels, robot, driven, model, duration),
+        "surfaces": touching.surfaces,
+        "contacts": touching.contacts,
+        "initial": _initial(levels, touching, robot),
+        "loads": _loads(random, levels, robot, duration),
+        "objects": touching.objects(),
+        "ties": _ties(random, levels, robot),
+        "sensors": _sensors(random, levels),
+        "record": {"rate_hz": 500.0},
+        "metrics": {"settle_s": 0.0},
+    }
+    return settings
+
+
+def _model(robot: plants.Plant, folder: Path) -> Model:
+    """The robot alone, to see where its points are."""
+    plant = dict(robot.section)
+    if "file" in plant:
+        plant["file"] = str(folder / plant["file"])
+    alone = {"duration_s": 1.0, "plant": plant, "contacts": {"law": "unilateral"}}
+    return build_model(scenario_from_resolved(alone))
+
+
+def _set_stops(random: Generator, levels: Levels, robot: plants.Plant) -> None:
+    if levels["stops"] == "none":
+        return
+    able = [joint for joint in robot.joints if not joint.name.startswith("base.")]
+    if levels["stops"] == "far":
+        for joint in able:
+            reach = 170.0 if joint.turns else 0.5
+            plants.set_limits(robot, joint, joint.start - reach, joint.start + reach)
+        return
+    if levels["start"] == "on_references":
+        # The others may start elsewhere.
+        able = [joint for joint in able if joint.before]
+    for k in random.permutation(len(able)).tolist()[: 1 + int(random.integers(2))]:
+        joint = able[k]
+        robot.limited.add(joint.name)
+        reach = float(random.uniform(0.2, 2.0)) * (1.0 if joint.turns else 0.002)
+        plants.set_limits(robot, joint, joint.start - reach, joint.start + 1.5 * reach)
+
+
+class _Touching:
+    """What touches what: surfaces under the points of the robot, and objects on a shelf of their own."""
+
+    def __init__(self, random: Generator, levels: Levels, robot: plants.Plant, model: Model, folder: Path) -> None:
+        self._random, self._levels, self._robot, self._model, self._folder = random, levels, robot, model, folder
+        self._q = np.array(model.robot.initial)
+        self.surfaces: dict[str, Any] = {}
+        self.points: dict[str, Any] = {}
+        self.elbow = model.point_position(*robot.elbow, self._q)
+        contact, start = levels["contact"], levels["start"]
+        radius = SPHERE if levels["shape"] == "sphere" else 0.0
+        if contact == "links":
+            # Thicker than the link, which would take its place.
+            radius = robot.radius + THICKER
+        gap = {"above": float(random.uniform(1e-3, 6e-3)), "on_surface": float(random.uniform(-2e-3, 2e-3))}.get(
+            start, 0.0
+        )
+        # Not all of several points can be moved at once.
+        self.gap = 0.0 if contact == "glued" or start not in ("on_surface", "on_references") else 3e-3
+        if contact == "glued" and levels["points"] != "elbow":
+            gap = 0.0
+        self._floor(radius, gap)
+        self.points["elbow"] = self._point(robot.elbow, "floor", radius)
+        self._more(radius)
+        if levels["plant"] == "floating" and contact in ("points", "joints", "links"):
+            self._feet()
+        if contact in ("nothing", "free"):
+            for point in self.points.values():
+                point["enabled"] = False
+        self._friction()
+
+    @property
+    def on_surface(self) -> list[str]:
+        """The points that start on their surfaces, those that may start above them left out."""
+        if self._levels["contact"] == "glued":
+            return list(self.points)
+        return ["elbow", *(name for name in self.points if name.startswith("foot"))]
+
+    def _point(self, place: tuple[str, list[float]], surface: str, radius: float) -> dict[str, Any]:
+        body, point = place
+        settings: dict[str, Any] = {"body": body, "point_m": list(point), "surface": surface}
+        if radius:
+            settings["radius_m"] = radius
+        return settings
+
+    def _floor(self, radius: float, gap: float) -> None:
+        """The surface below the elbow."""
+        random, kind = self._random, self._levels["surface"]
+        wide = self._levels["contact"] in ("joints", "links") or self._levels["objects"] not in ("none", "hinge")
+        # Across the plane of the arm, where the other joints stay as far above it.
+        heading = self._across()
+        normal = _unit(np.array([0.0, 0.0, 1.0]) + float(random.uniform(-0.05, 0.05)) * heading)
+        if kind in ("sphere", "cylinder") and not wide and random.random() < 0.8:
+            normal = _unit(np.array([0.0, 0.0, 1.0]) + float(random.uniform(0.2, 0.8)) * heading)
+        if kind == "steep" and self._levels["contact"] == "links":
+            # A link that passes by would be in it.
+            kind = "inclined"
+        if kind == "steep":
+            normal = self._steep(heading)
+        if kind == "inclined":
+            normal = _unit(np.array([0.0, 0.0, 1.0]) + float(random.uniform(0.2, 0.8)) * heading)
+        if kind in ("box", "height_field"):
+            normal = np.array([0.0, 0.0, 1.0])
+        place = self.elbow - (radius + gap) * normal
+        size = float(random.uniform(0.1, 0.3))
+        if kind in ("bowl", "pipe"):
+            size = 4.0 if wide else float(random.uniform(0.3, 0.6))
+        self.normal = normal
+        if kind == "steep" and wide:
+            kind, size = "sphere", 0.05
+        if kind in ("plane", "inclined", "steep"):
+            surface: dict[str, Any] = {"type": "plane", "point_m": place.tolist(), "normal": normal.tolist()}
+        elif kind in ("sphere", "bowl"):
+            sign = 1.0 if kind == "bowl" else -1.0
+            surface = {"type": "sphere", "center_m": (place + sign * size * normal).tolist(), "radius_m": size}
+        elif kind in ("cylinder", "pipe"):
+            sign = 1.0 if kind == "pipe" else -1.0
+            axis = _unit(np.cross(normal, _unit(random.normal(size=3))))
+            centre = (place + sign * size * normal).tolist()
+            surface = {"type": "cylinder", "point_m": centre, "axis": axis.tolist(), "radius_m": size}
+        elif kind == "box":
+            edges = random.uniform(0.15, 0.5, size=3).tolist()
+            turn = [0.0, 0.0, float(random.uniform(-90, 90))]
+            centre = (place - [0.0, 0.0, 0.5 * edges[2]]).tolist()
+            surface = {"type": "box", "center_m": centre, "edges_m": edges, "rpy_deg": turn}
+        else:
+            surface = self._terrain(place)
+        if kind in ("bowl", "pipe"):
+            surface["inside"] = True
+        self.surfaces["floor"] = surface
+
+    def _across(self) -> Array:
+        """Horizontal direction across the arm's plane."""
+        hand = self._model.point_position(*self._robot.hand, self._q) - self.elbow
+        along = np.array([hand[0], hand[1], 0.0])
+        if np.linalg.norm(along) < 1e-3:
+            along = np.array([1.0, 0.0, 0.0])
+        return _unit(np.cross(along, [0.0, 0.0, 1.0])) * float(self._random.choice((-1.0, 1.0)))
+
+    def _steep(self, heading: Array) -> Array:
+        """A normal that the elbow's motion about one joint leaves at a flat angle, and that looks up."""
+        body, point = self._robot.elbow
+        jacobian = self._model.point_jacobian(body, np.array(point), self._q)
+        moving = [column for column in jacobian.T if np.linalg.norm(column) > 0.05]
+        way = _unit(moving[-1]) if moving else np.array([0.0, 0.0, 1.0])
+        side = _unit(np.cross(way, heading) if abs(way @ heading) < 0.9 else np.cross(way, [0.0, 0.0, 1.0]))
+        angle = np.radians(float(self._random.uniform(60.0, 80.0)))
+        normal = np.cos(angle) * way + np.sin(angle) * side
+        return normal if normal[2] > 0.0 else -normal
+
+    def _terrain(self, place: Array) -> dict[str, Any]:
+        """A hill, which its spline meets but for rounding; its top is below the elbow."""
+        x = SPACING * (np.arange(GRID) - 0.5 * (GRID - 1))
+        bends = self._random.uniform(0.05, 0.3, size=2)
+        np.save(self._folder / "terrain.npy", -np.add.outer(bends[0] * x**2, bends[1] * x**2))
+        corner = -0.5 * SPACING * (GRID - 1)
+        origin = (place + [corner, corner, 0.0]).tolist()
+        return {"type": "height_field", "file": "terrain.npy", "spacing_m": [SPACING] * 2, "origin_m": origin}
+
+    def _more(self, radius: float) -> None:
+        """Further points, each on a small ball of its own where other links do not come."""
+        level, robot = self._levels["points"], self._robot
+        body, point = robot.elbow
+        if level == "two":
+            end = self._model.point_position(*robot.hand, self._q)
+            way = _unit(end - self._model.point_position(robot.hand[0], self._behind(robot.hand), self._q))
+            self._ball("hand", robot.hand, radius, end, -way)
+        elif level == "same_link":
+            place = (body, [0.0, 0.0, point[2] + 0.05])
+            there = self._model.point_position(*place, self._q)
+            along = _unit(there - self.elbow)
+            normal = _unit(self.normal - (self.normal @ along) * along)
+            self._ball("shin", place, radius, there, normal)
+        elif level == "unmoved":
+            first = next(joint for joint in robot.joints if not joint.name.startswith("base."))
+            place = (first.body, [0.0, 0.0, 0.0])
+            there = self._model.point_position(*place, self._q)
+            way = self._model.point_position(*robot.hand, self._q) - there
+            way[2] = 0.0
+            # Behind the arm.
+            way = _unit(way) if np.linalg.norm(way) > 1e-3 else np.array([1.0, 0.0, 0.0])
+            self._ball("root", place, radius, there, _unit(way + self._random.uniform(-0.3, 0.3, size=3)))
+
+    def _behind(self, place: tuple[str, list[float]]) -> list[float]:
+        return [place[1][0], place[1][1], place[1][2] - 0.05]
+
+    def _ball(self, name: str, place: tuple[str, list[float]], radius: float, there: Array, normal: Array) -> None:
+        size = 0.03
+        centre = (there - (radius + size + self.gap) * normal).tolist()
+        self.surfaces[f"{name}_ball"] = {"type": "sphere", "center_m": centre, "radius_m": size}
+        self.points[name] = self._point(place, f"{name}_ball", radius)
+
+    def _feet(self) -> None:
+        """The trunk of a floating robot stands on four feet."""
+        base = self._model.point_position("trunk", np.zeros(3), self._q)
+        slab = [*(base[:2]), base[2] - 0.1 - SPHERE]
+        self.surfaces["slab"] = {
+            "type": "box",
+            "center_m": [float(slab[0]), float(slab[1]), float(slab[2] - 0.025)],
+            "edges_m": [0.5, 0.5, 0.05],
+        }
+        for k, (x, y) in enumerate([(0.1, 0.1), (0.1, -0.1), (-0.1, 0.1), (-0.1, -0.1)]):
+            self.points[f"foot_{k + 1}"] = self._point(("trunk", [x, y, -0.1]), "slab", SPHERE)
+
+    def _friction(self) -> None:
+        """The ``contacts:`` section."""
+        random, levels = self._random, self._levels
+        law = "bilateral" if levels["contact"] in ("nothing", "glued") else "unilateral"
+        level, own = levels["friction"], dict[str, Any]()
+        own["friction"] = float({"none": 0.0, "high": random.uniform(1.2, 3.0)}.get(level, random.uniform(0.1, 0.5)))
+        if level in ("static", "stribeck"):
+            own["static_friction"] = own["friction"] * float(random.uniform(1.2, 2.0))
+        if levels["give"] == "restitution":
+            own["restitution"] = float(random.uniform(0.2, 0.8))
+        elif levels["give"] == "compliant":
+            own["stiffness_N_per_m"] = float(10.0 ** random.uniform(3.5, 5.0))
+            own["damping_N_s_per_m"] = float(random.uniform(10.0, 200.0))
+        self.contacts: dict[str, Any] = {"law": law}
+        # Said of the point here and there, instead of all.
+        (self.points["elbow"] if random.random() < 0.3 and level != "stribeck" else self.contacts).update(own)
+        if level == "stribeck":
+            self.contacts["stribeck_m_s"] = float(random.choice((0.01, 0.1)))
+        if level == "viscous":
+            self.contacts["viscous_friction_s_per_m"] = float(random.uniform(0.1, 1.0))
+        if level == "grip":
+            self.points["elbow"]["grip"] = {
+                "axis": random.normal(size=3).tolist(),
+                "ratio": float(random.uniform(0.0, 0.8)),
+            }
+        if levels["contact"] in ("joints", "links"):
+            self.contacts["candidates"] = levels["contact"]
+        if law == "bilateral" and levels["contact"] == "glued":
+            self.contacts["reference_tolerance_m"] = 1.0
+            if random.random() < 0.3:
+                self.contacts["pulling_friction"] = "signed"
+        self.contacts["points"] = self.points
+
+    def objects(self) -> dict[str, Any]:
+        """A body beside the robot, at rest on a shelf or a little above it."""
+        random, level = self._random, self._levels["objects"]
+        if level == "none":
+            return {}
+        # Far from the arm, on the free side of its floor.
+        there = self.elbow + 2.0 * self.normal + self._away()
+        if level == "hinge":
+            hinge: dict[str, Any] = {"axis": random.normal(size=3).tolist(), "damping_N_m_s_per_rad": 0.01}
+            if "dopri5" not in methods(self._levels):
+                hinge["friction_N_m"] = 0.02
+            return {"thing": {"mass_kg": 0.5, "size_m": [0.1, 0.2, 0.1], "position_m": there.tolist(), "hinge": hinge}}
+        edges = [1.0, 1.0, 0.1]
+        centre = (there - [0.0, 0.0, 0.05]).tolist()
+        self.surfaces["shelf"] = {"type": "box", "center_m": centre, "edges_m": edges}
+        drop = float(random.choice((0.0, random.uniform(1e-3, 0.02))))
+        if self._levels["start"] == "equilibrium":
+            drop = 0.0
+        thing: dict[str, Any] = {"mass_kg": float(random.uniform(0.2, 1.0))}
+        if level == "box":
+            size = random.uniform(0.04, 0.1, size=3).tolist()
+            thing |= {"size_m": size, "rpy_deg": [0.0, 0.0, float(random.uniform(-90, 90))]}
+            height = 0.5 * size[2]
+        elif level == "sphere":
+            thing |= {"shape": "sphere", "radius_m": 0.05}
+            height = 0.05
+        else:
+            wheel = {"radius_m": 0.05, "mass_kg": 0.2}
+            thing |= {
+                "size_m": [0.3, 0.15, 0.04],
+                "wheels": {
+                    name: {**wheel, "position_m": place}
+                    for name, place in {
+                        "left": [0.05, 0.1, -0.02], "right": [0.05, -0.1, -0.02], "rear": [-0.12, 0.0, -0.02],
+                    }.items()
+                },
+            }  # fmt: skip
+            height = 0.07
+            if self._levels["rubbing"] in ("bearing", "both"):
+                thing["wheels"]["rear"]["friction_N_m"] = 0.002
+        thing["position_m"] = (there + np.array([0.0, 0.0, height + drop])).tolist()
+        return {"thing": thing}
+
+    def _away(self) -> Array:
+        side = np.cross(self.normal, [0.0, 0.0, 1.0])
+        return _unit(side) if np.linalg.norm(side) > 0.1 else np.array([1.0, 0.0, 0.0])
+
+
+def _unit(vector: Array) -> Array:
+    scaled: Array = vector / np.linalg.norm(vector)
+    return scaled
+
+
+def _initial(levels: Levels, touching: _Touching, robot: plants.Plant) -> dict[str, Any] | None:
+    start = levels["start"]
+    if start in ("given", "above"):
+        return None
+    initial: dict[str, Any] = {}
+    if start in ("on_surface", "on_references") and levels["plant"] != "mimic":
+        initial["on_surface"] = touching.on_surface
+    if start == "on_references":
+        initial["on_references"] = True
+    if start == "equilibrium":
+        initial["equilibrium"] = True
+    return initial
+
+
+def _loads(random: Generator, levels: Levels, robot: plants.Plant, duration: float) -> dict[str, Any]:
+    level, (body, tip) = levels["loads"], robot.hand
+    if level == "payload":
+        mass, size = float(random.uniform(0.05, 0.3)), 0.03
+        return {"tool": {"type": "payload", "body": body, "point_m": list(tip), "mass_kg": mass, "radius_m": size}}
+    force = random.uniform(-3.0, 3.0, size=3).tolist()
+    if level == "constant":
+        torque = random.uniform(-0.1, 0.1, size=3).tolist()
+        return {
+            "wind": {"type": "constant", "body": body, "point_m": list(tip), "force_N": force, "torque_N_m": torque}
+        }
+    if level in ("push", "body_push"):
+        times = (np.array([0.2, 0.4, 0.7]) * duration).tolist()
+        push: dict[str, Any] = {"type": "samples", "body": body, "times_s": times}
+        push["force_N"] = [[0.0] * 3, (3.0 * np.array(force)).tolist(), [0.0] * 3]
+        if level == "body_push":
+            push |= {"frame": "body", "interpolation": "linear", "point_m": [0.01, 0.0, 0.05]}
+            push["torque_N_m"] = [[0.0] * 3, random.uniform(-0.3, 0.3, size=3).tolist(), [0.05, 0.0, 0.0]]
+        return {"push": push}
+    return {}
+
+
+def _ties(random: Generator, levels: Levels, robot: plants.Plant) -> dict[str, Any]:
+    level = levels["ties"]
+    if level == "none":
+        return {}
+    own = [joint.body for joint in robot.joints if not joint.name.startswith("base.")]
+    other = "thing" if levels["objects"] != "none" else own[0]
+    tie: dict[str, Any] = {"body": own[-1], "other": other, "axis": random.normal(size=3).tolist()}
+    if level == "torsion":
+        tie |= {"type": "torsion", "stiffness_N_m_per_rad": 2.0, "damping_N_m_s_per_rad": 0.02}
+    else:
+        tie |= {"type": "linear", "stiffness_N_per_m": 200.0, "damping_N_s_per_m": 2.0, "point_m": [0.0, 0.0, 0.02]}
+    if level == "bounded":
+        tie["bound_N"] = float(random.uniform(0.2, 2.0))
+    return {"spring": tie}
+
+
+def _sensors(random: Generator, levels: Levels) -> dict[str, Any]:
+    level = levels["controller"]
+    if level not in SAMPLED[1:]:
+        return {}
+    encoders: dict[str, Any] = {"resolution_deg": 0.01}
+    if level == "delayed":
+        encoders |= {"delay_s": 0.001, "noise_deg": 0.002}
+    return {"seed": int(random.integers(1000)), "encoders": encoders}
+
+
+def _snake(random: Generator, levels: Levels) -> dict[str, Any]:
+    """A snake on the ground that moves its head; beside it what the other factors say."""
+    duration = float(random.uniform(0.3, 0.6))
+    settings: dict[str, Any] = {
+        "duration_s": duration,
+        "plant": {"type": "snake", "level": "dynamic", "mass_kg": float(random.uniform(8.0, 12.0))},
+        "record": {"rate_hz": 200.0},
+        "metrics": {"settle_s": 0.0},
+    }
+    controller: dict[str, Any] = {"type": "task_space"}
+    level = levels["controller"]
+    if level == "none":
+        return settings
+    if level == "operator":
+        speed = [*random.uniform(-0.1, 0.1, size=3).tolist(), 0.0, 0.0, float(random.uniform(-0.2, 0.2))]
+        controller["commands"] = [{"at_s": 0.05, "velocity": speed}]
+    else:
+        controller["state"] = {"sampled": "feedforward", "encoders": "estimated", "delayed": "measured"}[level]
+        step = [*random.uniform(-0.03, 0.03, size=3).tolist(), 0.0, 0.0, 0.0]
+        controller["paths"] = [{"type": "ramp", "start_s": 0.0, "duration_s": duration, "displacement": step}]
+    if random.random() < 0.5:
+        # Lifted pairs, the first among them here and there.
+        controller |= {"modes": {1: [1, 4] if random.random() < 0.5 else [3, 6]}, "switching": {"order": [1]}}
+    settings["controller"] = controller
+    own = {"none": 0.0, "high": 1.5}.get(levels["friction"], 0.6)
+    settings["contacts"] = {"friction": own}
+    if levels["give"] == "rigid":
+        settings["contacts"] |= {"stiffness_N_per_m": None}
+    if levels["friction"] in ("static", "stribeck"):
+        settings["contacts"]["static_friction"] = 1.3 * own
+    if levels["objects"] in ("box", "sphere", "cart", "hinge"):
+        shape = {"shape": "sphere", "radius_m": 0.05} if levels["objects"] == "sphere" else {"size_m": [0.1, 0.1, 0.1]}
+        height = 0.05 if levels["objects"] != "hinge" else 0.4
+        thing = {"mass_kg": 0.5, **shape, "position_m": [2.0, 0.5, height]}
+        if levels["objects"] == "hinge":
+            thing["hinge"] = {"axis": [0.0, 0.0, 1.0]}
+        settings["objects"] = {"thing": thing}
+        if levels["ties"] != "none":
+            settings["ties"] = {
+                "spring": {
+                    "type": "linear", "body": "thing", "other": "head", "axis": [1.0, 0.0, 0.0],
+                    "stiffness_N_per_m": 50.0, "damping_N_s_per_m": 1.0,
+                }
+            }  # fmt: skip
+    if levels["surface"] == "box":
+        edges = [0.5, 2.0, 0.02]
+        settings["surfaces"] = {"plate": {"type": "box", "center_m": [1.2, 0.0, 0.01], "edges_m": edges}}
+    return settings

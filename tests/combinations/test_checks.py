@@ -1,0 +1,334 @@
+"""Each check finds what it is there for: a good record passes, and each way of spoiling it is found by that check."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import deepcopy
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from support.pinocchio_oracle import Oracle
+from support.random_robots import random_positions, random_robot, random_robot_of
+
+from combinations.accelerations import critical
+from combinations.bodies import Bodies, position_rates
+from combinations.checks import compare, problems
+from combinations.observed import Observed
+from combinations.running import Run
+from combinations.surfaces import nearest, shape
+from dynsim import check, simulate
+from dynsim.errors import DynsimError, SimulationStopped
+from dynsim.record import Record
+from dynsim.scenario.reading import scenario_from_resolved
+
+# Two pitch joints whose tip slides over a floor, sticks and lifts off; a box that slides down beside them.
+ARM = {
+    "name": "checked",
+    "duration_s": 0.4,
+    "plant": {
+        "type": "serial_arm",
+        "link": {"radius_m": 0.01, "damping_N_m_s_per_rad": 0.05, "motor": {"type": "wang_minami"}},
+        "chain": [
+            {"axis": "z", "length_m": 0.0, "mass_kg": 0.2},
+            {"axis": "y", "length_m": 0.3, "mass_kg": 0.4, "initial_deg": 60.0, "friction_N_m": 0.02},
+            {"axis": "y", "length_m": 0.3, "mass_kg": 0.4, "initial_deg": 80.0, "limit_deg": [-170.0, 100.0]},
+        ],
+    },
+    "controller": {"type": "joint_pd", "k_p_V_per_rad": 60.0, "k_d_V_s_per_rad": 2.0},
+    "surfaces": {"floor": {"type": "plane", "point_m": [0.0, 0.0, -0.09]}},
+    "contacts": {
+        "law": "unilateral",
+        "friction": 0.3,
+        "points": {"tip": {"body": "link_3", "point_m": [0.0, 0.0, 0.3], "surface": "floor"}},
+    },
+    "loads": {
+        "push": {"type": "constant", "body": "link_3", "force_N": [1.5, 0.5, -2.0]},
+        "lean": {"type": "constant", "body": "box", "force_N": [0.8, 0.0, 0.0]},
+    },
+    "objects": {
+        "box": {"mass_kg": 0.5, "size_m": [0.1, 0.1, 0.1], "position_m": [1.0, 1.0, -0.03], "rpy_deg": [5, 0, 0]}
+    },
+    "record": {"rate_hz": 1000.0},
+    "metrics": {"settle_s": 0.0},
+}
+
+
+@cache
+def _run(method: str, kind: str = "") -> Run:
+    settings = deepcopy(ARM)
+    settings["integrator"] = {"method": method}
+    if kind == "sampled":
+        settings["controller"]["sample_time_s"] = 0.002
+        del settings["plant"]["chain"][1]["friction_N_m"]
+    return _simulated(settings)
+
+
+def _simulated(settings: dict[str, Any]) -> Run:
+    scenario, checked = scenario_from_resolved(settings), None
+    record, failure = None, None
+    try:
+        check(scenario)
+    except DynsimError as error:
+        checked = str(error)
+    try:
+        record = simulate(scenario)
+    except SimulationStopped as stop:
+        record, failure = stop.record, stop
+    except DynsimError as error:
+        failure = error
+    said = list(record.summary["warnings"]) if record is not None else []
+    return Run(settings, scenario, scenario.integrator.method, "simulate", record, failure, said, checked)
+
+
+def _spoilt(run: Run, **signals: Callable[[np.ndarray], np.ndarray]) -> Run:
+    """The run with some signals of its record changed."""
+    assert run.record is not None
+    record = Record(run.record.time, provenance=run.record.provenance)
+    record.signals.update(run.record.signals)
+    record.summary.update(run.record.summary)
+    record.events.extend(run.record.events)
+    for name, change in signals.items():
+        signal = record.signals[name]
+        record.signals[name] = replace(signal, data=change(np.array(signal.data)))
+    return replace(run, record=record)
+
+
+def _kinds(run: Run) -> set[str]:
+    return {problem.kind for problem in problems(run.scenario, run)}
+
+
+@pytest.mark.parametrize("kind", ["", "sampled"])
+@pytest.mark.parametrize("method", ["dopri5", "radau5", "time_stepping"])
+def test_good_records_pass(method: str, kind: str) -> None:
+    run = _run(method, kind)
+    assert problems(run.scenario, run) == []
+    # There is something to check: contacts that slide and stick, a stop, dry friction.
+    assert run.record is not None
+    modes = run.record["contact_mode"]
+    assert {0, 1} <= set(np.unique(modes))
+
+
+def _shifted(by: float, first: int = 0, count: int | None = None) -> Callable[[np.ndarray], np.ndarray]:
+    def change(data: np.ndarray) -> np.ndarray:
+        data[first : None if count is None else first + count] += by
+        return data
+
+    return change
+
+
+def _times(factor: float) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda data: factor * data
+
+
+def _turned_tangent(data: np.ndarray) -> np.ndarray:
+    """Friction on the floor turned by 40°, normal forces kept."""
+    turn = np.radians(40.0)
+    x, y = data[..., 0].copy(), data[..., 1].copy()
+    data[..., 0], data[..., 1] = np.cos(turn) * x - np.sin(turn) * y, np.sin(turn) * x + np.cos(turn) * y
+    return data
+
+
+def _stronger_friction(data: np.ndarray) -> np.ndarray:
+    data[..., :2] *= 1.2
+    return data
+
+
+def _with_nan(data: np.ndarray) -> np.ndarray:
+    data[len(data) // 2] = np.nan
+    return data
+
+
+def _one_absurd(data: np.ndarray) -> np.ndarray:
+    data[len(data) // 2] = 1e16
+    return data
+
+
+def _falling(data: np.ndarray) -> np.ndarray:
+    data[len(data) // 2 :] -= 0.05 * data.max()
+    return data
+
+
+def _lagging(data: np.ndarray) -> np.ndarray:
+    """Held a tick longer than it was."""
+    return np.concatenate([data[:2], data[:-2]])
+
+
+SPOILT: dict[str, tuple[dict[str, Callable[[np.ndarray], np.ndarray]], set[str]]] = {
+    "first sample elsewhere": ({"q": _shifted(0.01, 0, 1)}, {"start"}),
+    "starts moving": ({"v": _shifted(0.01, 0, 1)}, {"start"}),
+    "accelerations of other forces": ({"vdot": _times(1.05)}, {"motion"}),
+    "current that gives another torque": ({"current": _times(1.05)}, {"equation"}),
+    "turned tangent": ({"contact_force": _turned_tangent}, {"equation", "friction", "momentum"}),
+    "outside the cone": ({"contact_force": _stronger_friction}, {"friction"}),
+    "other normal force": ({"contact_normal_force": _times(1.01)}, {"touching"}),
+    "pulling": ({"contact_normal_force": _times(-1.0), "contact_force": _times(-1.0)}, {"touching", "equation"}),
+    "force of an open contact": ({"contact_mode": _times(0.0)}, {"touching"}),
+    "other gap": ({"contact_gap": _shifted(1e-4)}, {"touching"}),
+    "slip of the other way": ({"contact_slip_velocity": _times(-1.0)}, {"touching"}),
+    "dry friction beyond its bound": ({"joint_friction": _times(1.5)}, {"dry", "equation"}),
+    "dry friction that drives": ({"joint_friction": _times(-1.0)}, {"dry", "equation"}),
+    "kinetic energy": ({"energy_kinetic": _times(1.001)}, {"ledger"}),
+    "electrical energy": ({"energy_electrical": _times(1.01)}, {"ledger"}),
+    "Joule heat": ({"heat_joule": _times(1.5)}, {"powers"}),
+    "losses": ({"loss_joint": _times(1.5)}, {"powers"}),
+    "losses that fall": ({"loss_joint": _falling}, {"losses"}),
+    "voltage of another gain": ({"voltage": _times(1.1)}, {"commands"}),
+    "not finite": ({"contact_force": _with_nan}, {"finite"}),
+    "absurd force": ({"contact_normal_force": _one_absurd}, {"absurd"}),
+}
+
+
+@pytest.mark.parametrize("fault", SPOILT)
+@pytest.mark.parametrize("method", ["radau5", "time_stepping"])
+def test_what_is_spoilt_is_found(method: str, fault: str) -> None:
+    changes, expected = SPOILT[fault]
+    spoilt = _spoilt(_run(method), **changes)
+    assert expected <= _kinds(spoilt)
+
+
+def test_a_check_that_disagrees_with_the_run_is_found() -> None:
+    assert "check" in _kinds(replace(_run("radau5"), checked="refused"))
+
+
+@cache
+def _unique(method: str, friction: float) -> Run:
+    """The arm alone, without what leaves forces open."""
+    settings = deepcopy(ARM)
+    del settings["objects"], settings["loads"]["lean"], settings["plant"]["chain"][1]["friction_N_m"]
+    settings["contacts"]["friction"] = friction
+    settings["integrator"] = {"method": method}
+    return _simulated(settings)
+
+
+@pytest.mark.parametrize("stranger", ["", "dopri5", "radau5", "time_stepping"])
+def test_runs_of_a_scene_agree_and_strangers_do_not(stranger: str) -> None:
+    runs = {name: _unique(name, 0.1 if name == stranger else 0.3) for name in ("dopri5", "radau5", "time_stepping")}
+    assert {problem.kind for problem in compare(ARM, runs)} == ({"methods"} if stranger else set())
+
+
+# Kinds of stops that a benign scene has no reason for.
+@pytest.mark.parametrize("kind", ["chatter", "no_progress", "not_projected", "forces_reversed", "no_contact_forces"])
+def test_a_stop_without_reason_is_found(kind: str) -> None:
+    run = _run("radau5")
+    assert run.record is not None
+    state = {name: run.record[name][-1].tolist() for name in ("q", "v", "current")}
+    stop = SimulationStopped("stopped", time=float(run.record.time[-1]), state=state, kind=kind)
+    assert "verdict" in _kinds(replace(run, error=stop))
+
+
+def test_a_true_paradox_is_none() -> None:
+    """Painlevé's rod: slender, sliding on its tip at 60°, μ above the critical 4/3 of I = m l²/12."""
+    rod = {
+        "name": "rod",
+        "duration_s": 0.3,
+        "plant": {
+            "type": "serial_arm",
+            "chain": [
+                {"kind": "prismatic", "axis": "x", "length_m": 0.0, "mass_kg": 0.0},
+                {"kind": "prismatic", "axis": "z", "length_m": 0.0, "mass_kg": 0.0},
+                {"axis": "y", "length_m": 1.0, "mass_kg": 1.0, "initial_deg": 30.0},
+            ],
+        },
+        "surfaces": {"floor": {"type": "plane"}},
+        "contacts": {"law": "unilateral", "friction": 3.0, "points": {"tip": {"body": "link_3", "surface": "floor"}}},
+        "record": {"rate_hz": 200.0},
+        "metrics": {"settle_s": 0.0},
+    }
+    run = _simulated(rod)
+    assert run.record is not None
+    seen = Observed(run)
+    v = np.zeros(3)
+    paradox = {}
+    for speed in (1.0, -1.0):
+        v[0] = speed
+        paradox[speed] = critical(seen, {"q": seen.robot.initial.tolist(), "v": v.tolist()})
+    # In one direction of the slip alone.
+    assert sorted(paradox.values()) == [False, True]
+
+
+FALSE_WARNINGS = (
+    "tip: this brace never touches the floor: it carries nothing; nearest 3 mm at t = 0 s",
+    "joint_1: voltage at its limit of 24 V for 50.0 % of the run",
+    "joint_3: passes its lower position limit of 0° (0 rad) by up to 1° (0.02 rad), first at t = 0.1 s; no law",
+    "the energy ledger does not close: residual 1.0e-03 of the turnover; tighten integrator.rtol or the step",
+    "friction has put 0.3 J into the arm: an error of the integration; shorten integrator.step_s",
+    "tip: chatter, more than 200 contact events within 1 s; what left more slowly was kept on the surface",
+    "joint_1 9 of 2 A: the current, rms over the run, is more than nominal, which a motor does not stand for long",
+    "link_2 passes below floor by more than the link's radius: link_2, of 10 mm, by up to 90 mm in the samples, first",
+    "a warning that nobody has heard of",
+)
+
+
+@pytest.mark.parametrize("warning", FALSE_WARNINGS)
+def test_a_false_warning_is_found(warning: str) -> None:
+    run = _run("radau5")
+    assert "verdict" in _kinds(replace(run, warnings=[*run.warnings, warning]))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_own_bodies_are_those_of_pinocchio(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    robot = random_robot(random, 7)
+    q, v, vdot = (random.normal(size=(1, 7)) for _ in range(3))
+    bodies, oracle = Bodies(robot), Oracle(robot)
+    motion = bodies.motion(q, v, vdot)
+    forces = oracle.back(pin.rnea(oracle.model, oracle.data, *(oracle.to(x[0]) for x in (q, v, vdot))))
+    # Rounding of two codes.
+    np.testing.assert_allclose(
+        bodies.along_rows(motion, bodies.wrenches(motion))[0], forces, rtol=0, atol=1e-11 * (1.0 + np.abs(forces).max())
+    )
+    np.testing.assert_allclose(
+        bodies.mass_matrix(q[0]) - np.diag(bodies.armature), oracle.mass_matrix(q[0]), rtol=0, atol=1e-11
+    )
+    point = random.normal(size=3)
+    position, J, velocity, _ = oracle.point(6, point, q[0], v[0])
+    np.testing.assert_allclose(motion.point(6, point)[0], position, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(bodies.jacobian(motion, 6, position[None])[0], J, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(motion.velocity(6, position[None])[0], velocity, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("kind", ["ball", "floating", "planar", "rolling"])
+def test_joints_with_several_rows_move_as_their_rates_say(kind: str) -> None:
+    """Velocities and accelerations against differences of positions and velocities."""
+    random = np.random.default_rng(3)
+    robot = random_robot_of(random, [kind, "revolute"])
+    bodies = Bodies(robot)
+    q = random_positions(random, robot)
+    v, vdot = random.normal(size=(2, bodies.n))
+    h = 1e-4
+    # Two steps of constant acceleration either way, positions by the midpoint rule.
+    states = [(q, v)]
+    for sign in (-1.0, 1.0):
+        middle = q + 0.5 * sign * h * position_rates(bodies, q[None], v[None])[0]
+        states.append(
+            (
+                q + sign * h * position_rates(bodies, middle[None], v[None] + 0.5 * sign * h * vdot)[0],
+                v + sign * h * vdot,
+            )
+        )
+    now, before, after = (bodies.motion(a[None], b[None], vdot[None]) for a, b in states)
+    body, point = bodies.n - 1, random.normal(size=3)
+    places = [motion.point(body, point) for motion in (before, now, after)]
+    velocities = [motion.velocity(body, motion.point(body, point)) for motion in (before, now, after)]
+    # The error of a central difference.
+    np.testing.assert_allclose((places[2] - places[0]) / (2 * h), velocities[1], rtol=0, atol=1e-5)
+    gain = now.rushing[body] + np.cross(now.turning[body], places[1]) + np.cross(now.spin[body], velocities[1])
+    np.testing.assert_allclose((velocities[2] - velocities[0]) / (2 * h), gain, rtol=0, atol=1e-5)
+
+
+def test_own_nearest_points_are_nearest() -> None:
+    """Of axes to a box and a sphere, against a fine search; distances from a box against those of its faces."""
+    random = np.random.default_rng(0)
+    box = shape({"type": "box", "center_m": [0, 0, 0], "edges_m": [1, 2, 3], "edge_radius_m": 0.1}, np.zeros(3))
+    assert box.distance(np.array([[0.7, 0.0, 0.0], [0.0, -1.5, 0.0]])) == pytest.approx([0.2, 0.5])
+    sphere = shape({"type": "sphere", "center_m": [0, 0, 0], "radius_m": 1.0}, np.zeros(3))
+    for surface in (box, sphere):
+        start, end = random.normal(scale=3.0, size=(2, 50, 3))
+        far = surface.distance(nearest(surface, start, end))
+        many = [surface.distance(start + u * (end - start)) for u in np.linspace(0.0, 1.0, 2001)]
+        outside = np.min(many, axis=0) > 0.0
+        assert (far[outside] <= np.min(many, axis=0)[outside] + 1e-9).all()

@@ -1,0 +1,131 @@
+"""Every feature with every other: scenes that hold each pair of levels run, and everything holds of their records."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from combinations import covering, study
+from combinations.covering import LEVELS, NUMBER, allowed, draw, pairs, refused_share
+from combinations.factors import FACTORS, METHOD, REFUSALS, Refusal, matches, methods
+from combinations.running import M_STAR
+from combinations.scenes import Scene, scene
+from dynsim.engine.prepare import prepare
+from dynsim.errors import DynsimError
+
+SEED = 1
+# Scenes of the default tests: the first of the cover that share the programs which other tests have too.
+FEW = 30
+# Scenes of the slow study.
+TRIPLES = 1000
+# What a few refused levels are completed to a whole scene from.
+TRIES = 2000
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_every_pair_that_is_not_refused_is_held_by_a_scene_of_each_kind_of_method(seed: int) -> None:
+    cover = pairs(seed)
+    for method in ("dopri5", "time_stepping"):
+        held = np.zeros((len(LEVELS),) * 2, dtype=bool)
+        for levels in cover:
+            if method in methods(levels):
+                numbers = sorted(NUMBER[factor, levels[factor]] for factor in FACTORS)
+                held[np.ix_(numbers, numbers)] = True
+        lacking = [
+            (LEVELS[a], LEVELS[b])
+            for a, b in np.argwhere(allowed(2, method) & ~held).tolist()
+            if _possible(dict([LEVELS[a], LEVELS[b]]), method)
+        ]
+        assert not lacking
+
+
+def test_at_most_15_percent_of_the_pairs_are_refused() -> None:
+    assert refused_share() <= 0.15
+    assert all(refusal.reason for refusal in REFUSALS)
+
+
+def test_scenes_are_the_same_for_ever(tmp_path: Path) -> None:
+    levels = draw(7, 5)
+    assert levels == draw(7, 5)
+    texts = []
+    for name in ("a", "b"):
+        folder = tmp_path / name
+        folder.mkdir()
+        texts.append(scene(levels, 5, folder).text())
+    assert texts[0] == texts[1]
+
+
+@pytest.mark.parametrize("refusal", [r for r in REFUSALS if r.error], ids=str)
+def test_what_is_refused_is_said(refusal: Refusal, tmp_path: Path) -> None:
+    """The scene of an assignment that meets this refusal alone; dynsim says what the table says."""
+    for k in range(TRIES):
+        levels = draw(SEED, k)
+        levels.update({factor: refused[k % len(refused)] for factor, refused in refusal.levels if factor != METHOD})
+        method = dict(refusal.levels).get(METHOD, ("dopri5",))[0]
+        for tried in (method, "time_stepping"):
+            others = [r for r in REFUSALS if r.holds({**levels, METHOD: tried})]
+            if others == [refusal]:
+                with pytest.raises(DynsimError) as raised:
+                    _begin(levels, tried, tmp_path)
+                assert matches(refusal, str(raised.value)), raised.value
+                return
+    pytest.fail("no assignment meets this refusal alone")
+
+
+def _begin(levels: dict[str, str], method: str, folder: Path) -> None:
+    prepare(scene(levels, SEED, folder).load(method, levels["solver"]))
+
+
+def _possible(wanted: dict[str, str], method: str) -> bool:
+    """Whether any whole assignment has these levels: they may refuse each other by way of a third factor."""
+    random = np.random.default_rng(SEED)
+    law = covering._law(method)
+    return any(
+        covering._filled(random, law, [NUMBER[item] for item in wanted.items()]) is not None for _ in range(TRIES)
+    )
+
+
+@pytest.mark.parametrize("number", range(FEW))
+def test_few_scenes(number: int, tmp_path: Path) -> None:
+    _holds(number, tmp_path, takes=_shares_a_program)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("number", range(len(pairs(SEED))))
+def test_every_pair(number: int, tmp_path: Path) -> None:
+    _holds(number, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", range(TRIPLES))
+def test_triples(number: int, tmp_path: Path) -> None:
+    _holds(number, tmp_path, cover="triples")
+
+
+def _holds(number: int, folder: Path, cover: str = "pairs", **options: Any) -> None:
+    levels = study.assignment(cover, SEED, number)
+    outcome = study.look_at(levels, SEED, number, folder, **options)
+    assert not outcome.problems, "\n".join(
+        [
+            *(f"{kind}: {text}" for kind, text in outcome.problems),
+            f"again: PYTHONPATH=.:tests python -m combinations --cover {cover} --seed {SEED} --repeat {number}",
+            scene(levels, SEED + number, folder).text(),
+        ]
+    )
+
+
+def _shares_a_program(drawn: Scene, method: str, way: str) -> bool:
+    """Whether the default tests have its program: those of docs/dev/tests.md."""
+    if method == "time_stepping":
+        return True
+    if method == "auto" or way == M_STAR:
+        return False
+    try:
+        shapes = prepare(drawn.load(method)).system.shapes is not None
+    except DynsimError:
+        return True
+    glued = drawn.levels["contact"] in ("nothing", "glued")
+    return not shapes or (method == "radau5" and not glued)
