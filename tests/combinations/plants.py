@@ -148,7 +148,8 @@ def _urdf(random: Generator, name: str, levels: Levels, light: float) -> Plant:
         across, along = mass * (length**2 + 3e-3) / 12.0, mass * 3e-4
         return (
             f'  <link name="{body}"><inertial><origin xyz="0.01 0 {length / 2:.6g}"/><mass value="{mass:.6g}"/>'
-            f'<inertia ixx="{across:.6g}" ixy="0" ixz="0" iyy="{across:.6g}" iyz="0" izz="{along:.6g}"/></inertial></link>'
+            f'<inertia ixx="{across:.6g}" ixy="0" ixz="0" iyy="{across:.6g}" iyz="0" izz="{along:.6g}"/></inertial>'
+            "</link>"
         )
 
     def joint(own: str, kind: str, parent: str, child: str, xyz: str, axis: str = "", inner: str = "") -> str:

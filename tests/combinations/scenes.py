@@ -13,7 +13,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from combinations import drives, plants
-from combinations.factors import FACTORS, SAMPLED, Levels, methods
+from combinations.factors import FACTORS, GLUED, SAMPLED, Levels, methods
 from dynsim import Model, check
 from dynsim.errors import DynsimError
 from dynsim.scenario import Scenario, build_model, load_scenario
@@ -90,7 +90,7 @@ def scene(levels: Levels, seed: int, folder: Path) -> Scene:
         for section in [key for key, value in draft.items() if value is None or value == {}]:
             del draft[section]
         drawn = Scene(levels, seed, draft, folder)
-        if not _in_a_surface(drawn):
+        if not drawn.methods or not _in_a_surface(drawn):
             break
     return drawn
 
@@ -276,7 +276,7 @@ class _Touching:
         bends = self._random.uniform(0.05, 0.3, size=2)
         np.save(self._folder / "terrain.npy", -np.add.outer(bends[0] * x**2, bends[1] * x**2))
         corner = -0.5 * SPACING * (GRID - 1)
-        origin = (place + [corner, corner, 0.0]).tolist()
+        origin = (place + np.array([corner, corner, 0.0])).tolist()
         return {"type": "height_field", "file": "terrain.npy", "spacing_m": [SPACING] * 2, "origin_m": origin}
 
     def _more(self, radius: float) -> None:
@@ -415,7 +415,7 @@ def _initial(levels: Levels, touching: _Touching, robot: plants.Plant) -> dict[s
     if start in ("given", "above"):
         return None
     initial: dict[str, Any] = {}
-    if start in ("on_surface", "on_references") and levels["plant"] != "mimic":
+    if start == "on_surface" or (start == "on_references" and levels["plant"] != "mimic"):
         initial["on_surface"] = touching.on_surface
     if start == "on_references":
         initial["on_references"] = True
@@ -489,22 +489,29 @@ def _snake(random: Generator, levels: Levels) -> dict[str, Any]:
         speed = [*random.uniform(-0.1, 0.1, size=3).tolist(), 0.0, 0.0, float(random.uniform(-0.2, 0.2))]
         controller["commands"] = [{"at_s": 0.05, "velocity": speed}]
     else:
-        controller["state"] = {"sampled": "feedforward", "encoders": "estimated", "delayed": "measured"}[level]
+        # The others, which a snake's controller is not, are refused.
+        states = {"sampled": "feedforward", "encoders": "estimated", "delayed": "measured"}
+        controller["state"] = states.get(level, "measured")
         step = [*random.uniform(-0.03, 0.03, size=3).tolist(), 0.0, 0.0, 0.0]
         controller["paths"] = [{"type": "ramp", "start_s": 0.0, "duration_s": duration, "displacement": step}]
     if random.random() < 0.5:
         # Lifted pairs, the first among them here and there.
         controller |= {"modes": {1: [1, 4] if random.random() < 0.5 else [3, 6]}, "switching": {"order": [1]}}
-    settings["controller"] = controller
+    settings["controller"] = controller if level in ("operator", *SAMPLED) else {"type": "joint_pd"}
     own = {"none": 0.0, "high": 1.5}.get(levels["friction"], 0.6)
     settings["contacts"] = {"friction": own}
-    if levels["give"] == "rigid":
-        settings["contacts"] |= {"stiffness_N_per_m": None}
+    if levels["give"] != "compliant":
+        settings["contacts"]["stiffness_N_per_m"] = None
+    if levels["give"] == "restitution":
+        settings["contacts"]["restitution"] = 0.3
+    if levels["contact"] in GLUED:
+        settings["contacts"]["law"] = "bilateral"
     if levels["friction"] in ("static", "stribeck"):
         settings["contacts"]["static_friction"] = 1.3 * own
     if levels["objects"] in ("box", "sphere", "cart", "hinge"):
         shape = {"shape": "sphere", "radius_m": 0.05} if levels["objects"] == "sphere" else {"size_m": [0.1, 0.1, 0.1]}
-        height = 0.05 if levels["objects"] != "hinge" else 0.4
+        # At rest on the ground, or above it.
+        height = float(random.choice((0.05, 0.25))) if levels["objects"] != "hinge" else 0.4
         thing = {"mass_kg": 0.5, **shape, "position_m": [2.0, 0.5, height]}
         if levels["objects"] == "hinge":
             thing["hinge"] = {"axis": [0.0, 0.0, 1.0]}

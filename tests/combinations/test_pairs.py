@@ -58,7 +58,7 @@ def test_scenes_are_the_same_for_ever(tmp_path: Path) -> None:
     assert texts[0] == texts[1]
 
 
-@pytest.mark.parametrize("refusal", [r for r in REFUSALS if r.error], ids=str)
+@pytest.mark.parametrize("refusal", [r for r in REFUSALS if r.error], ids=lambda r: r.name)
 def test_what_is_refused_is_said(refusal: Refusal, tmp_path: Path) -> None:
     """The scene of an assignment that meets this refusal alone; dynsim says what the table says."""
     for k in range(TRIES):
