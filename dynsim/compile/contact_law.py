@@ -15,7 +15,7 @@ from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.cone import problem as kc
 from dynsim.dynamics.contact.cone.socp import split_size
-from dynsim.dynamics.contact.unilateral import UnilateralArrays
+from dynsim.dynamics.contact.unilateral import UnilateralArrays, kept_size
 from dynsim.errors import ModelError
 from dynsim.jit.kernel import integers, reals
 from dynsim.model.description import Contact, Robot, Tie
@@ -92,7 +92,7 @@ def compile_unilateral(
     slide[:, ku.LANDS_AT] = ku.DEPTH
     tally, number = np.zeros((c, ku.TALLY_SIZE)), np.zeros(ku.NUMBERS)
     tally[:, ku.SETTLE], tally[:, ku.WINDOW_START], number[ku.LAST_CHANGE] = SETTLE_SPEED, -np.inf, -np.inf
-    number[ku.SLOW] = slow
+    number[ku.SLOW], number[ku.HOLDING] = slow, 1.0
     return UnilateralArrays(
         slide=reals(slide),
         mode=integers(np.zeros((c, ku.MODE_SIZE))),
@@ -108,6 +108,7 @@ def compile_unilateral(
         room=reals(np.zeros((ku.ROOM, p, p))),
         split_room=reals(np.zeros(split_size(3 * c + len(dry), c + len(dry)))),
         number=reals(number),
+        kept=reals(np.zeros(kept_size(c, s, len(dry)))),
     )
 
 

@@ -4,7 +4,8 @@
 
 with the external wrenches W and the forces f of the contacts that touch. The bilateral law has no friction at rest, and
 normal forces of either sign. Under the unilateral law f_n ≥ 0 and |f_t| ≤ μ_s f_n: forces without friction are tried
-first, which leave all friction as a reserve against slip; those with friction only where there is no other equilibrium.
+first, which leave all friction as a reserve against slip; those with friction only where there is no other equilibrium,
+with RESERVED of μ_s if that is enough: on the edge of a cone rounding decides whether a point sticks.
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ from dynsim.model.drives import Servo
 # Contacts nearer than this are closed at the start [m].
 TOUCHING = 1e-6
 KEYS = ("initial", "equilibrium")
+# Fraction of the static friction that an equilibrium uses if it can.
+RESERVED = 0.9
 
 
 @dataclass(frozen=True)
@@ -36,11 +39,13 @@ class Rest:
     torques : (n,) of the motors [N m or N], zero of joints without one that can
     normal_forces : of the contacts that touch, by name [N]; negative: the surface pulls
     forces : of the same on the arm: index of the link, point in its frame [m], force in the world [N]
+    on_edge : True if only all of the static friction holds it
     """
 
     torques: Array
     normal_forces: dict[str, float]
     forces: list[tuple[int, Array, Array]]
+    on_edge: bool = False
 
 
 def holding_torques(
@@ -66,8 +71,11 @@ def holding_torques(
         raise ModelError("initial.equilibrium: not for robots with coupled joints, which share a motor", keys=KEYS)
     touching = [(contact, *_touching_point(model, contact, q)) for contact in contacts]
     touching = [contact for contact in touching if abs(contact[-1]) <= TOUCHING or (real and contact[-1] < 0.0)]
-    # Frictionless first, then all that Coulomb allows; with a least force first, so that what presses goes on to press.
-    attempts = [(0.0, MIN_N), (0.0, 0.0), (1.0, MIN_N), (1.0, 0.0)] if real and touching else [(0.0, 0.0)]
+    # Frictionless first, then with a reserve, then all that Coulomb allows; each with a least force first, so that what
+    # presses goes on to press.
+    attempts = [(0.0, 0.0)]
+    if real and touching:
+        attempts = [(share, least) for share in (0.0, RESERVED, 1.0) for least in (MIN_N, 0.0)]
     pushes = [
         _row(link, point, push, 0.0, 0.0, float(np.linalg.norm(push)))
         for link, point, push in load_forces(model, q, loads)
@@ -89,7 +97,7 @@ def holding_torques(
             names = [contact.name for contact, *_ in touching]
             forces = arrays.forces[: len(rows)] if real else arrays.forces[: len(rows)].reshape(-1, 2, 3).sum(axis=1)
             places = [(link, point, force) for (_, link, point, *_), force in zip(touching, forces, strict=True)]
-            return Rest(torques[0], dict(zip(names, normal.tolist(), strict=True)), places)
+            return Rest(torques[0], dict(zip(names, normal.tolist(), strict=True)), places, share == 1.0)
     raise ModelError(_why(model, arrays.motors, arrays.free, [contact[0].name for contact in touching]), keys=KEYS)
 
 

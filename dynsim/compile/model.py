@@ -187,6 +187,18 @@ class Model:
         articulated.forward_dynamics(self._bodies, self._workspace)
         return self._workspace.joints[:, ka.QDD].copy()
 
+    def articulated_inertia(self, q: ArrayLike) -> Array:
+        """Inertia that each joint moves while all joints behind it are free, rotors included, (n,) [kg m²; kg].
+
+        Pivots of the mass matrix, by the articulated sweep. For a joint that moves no inertia the pivot is zero to
+        rounding, and undefined for the joints before it.
+        """
+        self._set(q)
+        self._workspace.joints[:, ka.APPLIED] = 0.0
+        articulated.forward_dynamics(self.arrays, self._workspace)
+        with np.errstate(divide="ignore"):
+            return 1.0 / self._workspace.links[:, ka.INVERSE_D]
+
     def derivatives(self, q: ArrayLike, v: ArrayLike, vdot: ArrayLike) -> InverseDynamicsDerivatives:
         """Derivatives of inverse dynamics, ∂tau/∂q, ∂tau/∂v and ∂tau/∂v̇ = M, in closed form, (n, n) each.
 

@@ -38,6 +38,7 @@ class Balance:
     heat : Σ R i² [W]
     normal_forces : by contact that touches [N]; empty where the controller plans them
     warnings : jumps that remain at the start
+    on_edge : True if only all of the static friction holds the posture
     """
 
     current: Array
@@ -45,6 +46,7 @@ class Balance:
     heat: float
     normal_forces: dict[str, float] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+    on_edge: bool = False
 
 
 def balanced(
@@ -65,7 +67,7 @@ def balanced(
     robot, motors = model.robot, model.robot.motors
     index = [model.joint_names.index(motor.joint) for motor in motors]
     begin, rate = _begin(control.reference, len(motors))
-    current, shift = np.zeros(len(motors)), np.zeros(len(motors))
+    current, shift, on_edge = np.zeros(len(motors)), np.zeros(len(motors)), False
     jumps: list[str] = []
     planned = control.reference.voltage
     if not len(planned):
@@ -76,7 +78,7 @@ def balanced(
             or (isinstance(motor, Motor) and k_p > 0.0)
         ]  # fmt: skip
         balance = holding_torques(model, robot.initial, contacts, loads, able, real)
-        torques, forces = balance.torques, balance.normal_forces
+        torques, forces, on_edge = balance.torques, balance.normal_forces, balance.on_edge
     else:
         # The plan says what presses; loads it does not know, and the motors carry them.
         torques, forces = load_torques(model, robot.initial, loads), {}
@@ -113,7 +115,7 @@ def balanced(
         if jumps
         else ()
     )  # fmt: skip
-    return Balance(current, shift, float(resistance @ current**2), forces, said)
+    return Balance(current, shift, float(resistance @ current**2), forces, said, on_edge)
 
 
 def shifted(reference: ReferenceArrays, shift: Array) -> ReferenceArrays:

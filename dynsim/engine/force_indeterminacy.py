@@ -359,7 +359,7 @@ def sharing(
     for t in several[:MOST_SETS]:
         bases, owner = [], []
         for k in np.flatnonzero(modes[t] != ka.OPEN).tolist():
-            basis = _basis(_rows(model, contacts[k], q[t], bool(modes[t, k] == ka.STICKING)) @ free)
+            basis = _basis(touching_rows(model, contacts[k], q[t], bool(modes[t, k] == ka.STICKING)) @ free)
             bases.append(basis)
             owner += [k] * len(basis)
         for k in np.flatnonzero(rests[t]).tolist():
@@ -382,7 +382,7 @@ def _free(model: Model) -> Array:
     return np.linalg.svd(rows)[2][len(rows) :].T
 
 
-def _rows(model: Model, contact: Contact, q: Array, sticks: bool) -> Array:
+def touching_rows(model: Model, contact: Contact, q: Array, sticks: bool) -> Array:
     """Jacobian of the place that touches, (3, n), or of its distance, (1, n), where it slides."""
     body, point = model.robot.attach(contact.body, contact.point)
     if contact.tip is not None:

@@ -30,6 +30,7 @@ from dynsim.engine.compilation import kernels_logged
 from dynsim.engine.equilibrium import Balance, balanced, shifted
 from dynsim.engine.method import AUTO, Choice, choose
 from dynsim.engine.outcome import check_size
+from dynsim.engine.soundness import check_inertia
 from dynsim.errors import ModelError, ScenarioError, SimulationStopped
 from dynsim.integrators import driver
 from dynsim.integrators import run as ki
@@ -116,15 +117,7 @@ def prepare(
     ScenarioError
         The record would be larger than ``record.size_limit_GB``, or the explicit method would need too many steps.
     """
-    described, contacts = build.robot_and_contacts(scenario)
-    piloted: JointControl | None = None
-    if type(described) is not Robot:
-        # The snake's modules wait until there is a snake.
-        from dynsim.compile.snake_tree import SnakeTree
-        from dynsim.engine.snake_start import begun
-
-        if isinstance(described, SnakeTree):
-            described, piloted = begun(scenario, described, follow_lines)
+    described, contacts, piloted = at_start(scenario)
     if motors is not None:
         described = replace(described, motors=tuple(motors))
     model = recall("model", lambda: Model(described), described)
@@ -132,6 +125,7 @@ def prepare(
     law = scenario.config.contacts.law
     if starts:
         recall("start", lambda: build.check_start(scenario, model, contacts), model, law, places)
+        recall("inertia", lambda: check_inertia(model), model)
     loads = build.loads(scenario, robot)
     if pushable:
         loads = [*loads, *(_push(body) for body in robot.bodies)]
@@ -221,6 +215,20 @@ def prepare(
         lanes=has_forms(system),
     )
     return Prepared(model, contacts, control, system, run, new_workspace(system), loads, stops, choice, balance, dry)
+
+
+def at_start(scenario: Scenario) -> tuple[Robot, list[Contact], JointControl | None]:
+    """The robot in the posture in which its run begins, its contacts, and a snake's control (None: another robot)."""
+    described, contacts = build.robot_and_contacts(scenario)
+    if type(described) is not Robot:
+        # The snake's modules wait until there is a snake.
+        from dynsim.compile.snake_tree import SnakeTree
+        from dynsim.engine.snake_start import begun
+
+        if isinstance(described, SnakeTree):
+            robot, control = begun(scenario, described, follow_lines)
+            return robot, contacts, control
+    return described, contacts, None
 
 
 def _check_friction(robot: Robot, real: bool, stepped: bool) -> None:

@@ -589,10 +589,14 @@ class Simulation:
         scenario : that the record is said to be of, where it was found on the way; default: what is simulated
         pictured : with scene and poses of bodies
         """
-        if self._prepared.run.count[ki.PENDING] == 1 and not self.finished:
-            # Samples up to the present time lie in the step that is kept back: end it here, and take that back.
+        count = self._prepared.run.count
+        if (count[ki.PENDING] == 1 or count[ki.STARTED] == 0) and not self.finished:
+            # Samples up to the present time lie in the step that is kept back, or the last one wants what has been set
+            # at its time: end the step here, begin the next one, and take that back.
             before = self.snapshot()
             self._settle_now()
+            if self._loaded:
+                self._kernel(self._prepared.system, self._prepared.workspace, self._prepared.run, 0)
             times, states, outputs = self._trace.rows(self._prepared.run)
             self.restore(before)
         else:

@@ -3,6 +3,7 @@
 The references at each tick are in :mod:`dynsim.engine.snake_pilot`. Because of gear friction a head that was raised
 into its posture rests about 20 mm and 0.09 rad lower than one that was lowered into it. A real robot raises its head.
 So a preliminary run before t = 0 lets the head settle below its posture, raises it, and lets it settle again.
+Only the ground and payloads are part of it: objects, ties and other surfaces exist from t = 0 on.
 """
 
 from __future__ import annotations
@@ -14,13 +15,14 @@ from dataclasses import replace
 import numpy as np
 
 from dynsim.compile.control import JointControl
-from dynsim.compile.snake_tree import SnakeTree, configuration, lifted_moments
+from dynsim.compile.snake_tree import GROUND, SnakeTree, configuration, lifted_moments
 from dynsim.errors import ModelError
 from dynsim.model.description import Array
 from dynsim.model.drives import Servo
 from dynsim.scenario import Scenario, build
 from dynsim.scenario.loads import Payload
 from dynsim.scenario.schema import Integrator
+from dynsim.snake.description import ModeTable
 from dynsim.snake.lifting import height_of
 from dynsim.system.memo import recall
 
@@ -122,7 +124,8 @@ def begun(scenario: Scenario, robot: SnakeTree, follow: Follow) -> tuple[SnakeTr
     Raises
     ------
     ModelError
-        See :func:`dynsim.scenario.build.controller`; or the control period is no multiple of the step.
+        See :func:`dynsim.scenario.build.controller`; the control period is not a multiple of the step; or a mode lifts
+        wheel pair 1.
     """
     d, config = robot.description, scenario.config
     controller = None if scenario.controller is None else build.controller(scenario, d)
@@ -130,12 +133,17 @@ def begun(scenario: Scenario, robot: SnakeTree, follow: Follow) -> tuple[SnakeTr
     if controller is not None:
         grounded = controller.law.grounded[controller.fixing_row].astype(np.float64)
         _check_step(config.integrator, controller.schedule.period)
+        _check_modes(controller.modes)
     lifter = WheelLifter(robot, grounded)
     height, phi = lifter.heights(0.0), np.asarray(d.initial_joints)
     added = lifter.angles(0.0, phi[d.head_joints :])
     if robot.raised:
-        known = config.plant, config.contacts, config.integrator, config.surfaces, config.loads, grounded
-        q = recall("raised", lambda: _raised(scenario, robot, height, added, follow), *known)
+        alone = _alone(scenario)
+        parts = alone.config
+        known = parts.plant, parts.contacts, parts.integrator, parts.surfaces, parts.surface_error, parts.loads
+        own = recall("raised", lambda: _raised(alone, height, added, follow), *known, grounded)
+        # Objects start where the scenario places them.
+        q = np.concatenate([own, robot.initial[len(own) :]])
     else:
         q = configuration(robot, phi, height)
     robot = replace(robot, q0=q)
@@ -154,25 +162,58 @@ def _check_step(integrator: Integrator, period: float) -> None:
         )
 
 
-def _raised(scenario: Scenario, robot: SnakeTree, height: Array, added: Array, follow: Follow) -> Array:
-    """Coordinates (nq,) after the head was raised into the initial posture."""
+def _check_modes(modes: ModeTable) -> None:
+    """ModelError where a mode lifts wheel pair 1: the head is on its body, and no joint raises it."""
+    lifting = [str(number) for number, row in zip(modes.numbers, modes.grounded, strict=True) if row[0] == 0]
+    if lifting:
+        raise ModelError(
+            f"controller.modes: {'mode' if len(lifting) == 1 else 'modes'} {', '.join(lifting)} cannot lift wheel "
+            "pair 1 under plant.level: dynamic: it carries the head, and no joint raises it; remove pair 1, or use "
+            "plant.level: kinematic",
+            keys=("controller", "modes"),
+        )
+
+
+def _alone(scenario: Scenario) -> Scenario:
+    """The scenario of the preliminary run: the robot and its payloads on the ground.
+
+    Objects, ties and other surfaces are placed for the raised head. A plate just ahead of it would push against the
+    lowered head and throw the robot back; a tied object would be dragged along.
+    """
+    config = scenario.config
+    dynamics = scenario.plant.dynamics.model_copy(update={"start": "released"})
+    points = {
+        name: point
+        for name, point in config.contacts.points.items()
+        # Wheels of an object are named object.wheel.
+        if point.surface == GROUND and point.body.partition(".")[0] not in config.objects
+    }
+    changes = {
+        "plant": scenario.plant.model_copy(update={"dynamics": dynamics}),
+        "controller": None,
+        "initial": None,
+        "loads": {name: load for name, load in config.loads.items() if isinstance(load, Payload)},
+        "objects": {},
+        "ties": {},
+        "surfaces": {name: surface for name, surface in config.surfaces.items() if name == GROUND},
+        "contacts": config.contacts.model_copy(update={"points": points}),
+    }
+    return replace(scenario, config=config.model_copy(update=changes))
+
+
+def _raised(alone: Scenario, height: Array, added: Array, follow: Follow) -> Array:
+    """Coordinates (nq,) of the robot alone after its head was raised into the initial posture."""
+    robot = build.robot(alone)
+    assert isinstance(robot, SnakeTree)
     d = robot.description
     lowered = np.zeros(len(d.joint_names))
     pitches = np.flatnonzero(d.pitch)[::-1][: len(LOWERED)]
     lowered[pitches] = LOWERED[: len(pitches)]
     below = np.clip(d.initial_joints - lowered, d.lower, d.upper)
-    dynamics = scenario.plant.dynamics.model_copy(update={"start": "released"})
-    payloads = {name: load for name, load in scenario.config.loads.items() if isinstance(load, Payload)}
-    changes = {
-        "plant": scenario.plant.model_copy(update={"dynamics": dynamics}),
-        "controller": None,
-        "loads": payloads,
-    }
-    bare = replace(scenario, config=scenario.config.model_copy(update=changes))
     first, last = command_angles(robot, below, added), command_angles(robot, d.initial_joints, added)
     phases: list[Phase] = [
         (SETTLE, {joint: (angle, 0.0) for joint, angle in first.items()}),
         (SETTLE + RAISE, {joint: (angle, (last[joint] - angle) / RAISE) for joint, angle in first.items()}),
         (SETTLE + RAISE + SETTLE_AGAIN, {joint: (angle, 0.0) for joint, angle in last.items()}),
     ]
-    return follow(bare, configuration(robot, below, height), phases)
+    return follow(alone, configuration(robot, below, height), phases)

@@ -12,7 +12,8 @@ from dynsim.compile.equilibrium import holding_torques, load_forces, static_marg
 from dynsim.compile.model import Model
 from dynsim.compile.shapes import gap_at
 from dynsim.engine import Start
-from dynsim.engine.prepare import prepare
+from dynsim.engine.prepare import at_start, prepare
+from dynsim.engine.soundness import unstable_loop
 from dynsim.errors import ModelError
 from dynsim.model.description import Contact, Robot
 from dynsim.scenario import Scenario, build
@@ -27,7 +28,10 @@ def check(scenario: Scenario, started: Callable[[Start], None]) -> Start:
     """See :func:`dynsim.engine.check`."""
     start = start_of(scenario)
     started(start)
-    control = prepare(scenario).control
+    prepared = prepare(scenario)
+    control = prepared.control
+    if (unstable := unstable_loop(scenario, prepared)) is not None:
+        start = replace(start, warnings=[*start.warnings, unstable[0]])
     if control.path is not None and control.teleop is None:
         begin = control.path.position(np.zeros(1))[0]
         start = replace(start, off_path=float(np.linalg.norm(begin - start.hand)))
@@ -36,7 +40,7 @@ def check(scenario: Scenario, started: Callable[[Start], None]) -> Start:
 
 def start_of(scenario: Scenario) -> Start:
     """Posture, gaps and margin at t = 0, whether they are allowed or not."""
-    described, contacts = build.robot_and_contacts(scenario)
+    described, contacts, piloted = at_start(scenario)
     model = recall("model", lambda: Model(described), described)
     robot = model.robot
     q, points = robot.initial, {}
@@ -49,6 +53,8 @@ def start_of(scenario: Scenario) -> Start:
         points[contact.name] = model.point_position(contact.body, contact.point, q)
     declared = scenario.config.contacts.points
     aloft = [name for name, gap in gaps.items() if name in declared and abs(gap) > build.START_TOLERANCE]
+    if piloted is not None:  # a snake, whose joints `initial` does not place
+        aloft = []
     solved = {}
     if scenario.config.initial is not None and scenario.config.initial.on_surface:
         before = build.unposed(scenario).initial

@@ -13,6 +13,7 @@ from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.state import block
 from dynsim.engine.force_indeterminacy import paradox
 from dynsim.engine.prepare import Prepared
+from dynsim.engine.soundness import moving_nothing, unstable_stop
 from dynsim.errors import SimulationStopped
 from dynsim.integrators import project as kp
 from dynsim.integrators import run as ki
@@ -40,7 +41,16 @@ _MODES = {ka.SLIDING: "slides", ka.STICKING: "sticks"}
 def stopped(scenario: Scenario, prepared: Prepared) -> SimulationStopped:
     """The exception for a run whose STATUS shows that it stopped before its end."""
     run = prepared.run
-    kind = KINDS[int(run.count[ki.STATUS])]
+    status, time = int(run.count[ki.STATUS]), float(run.clock[ki.TIME])
+    kind = KINDS[status]
+    if status != ki.STOPPED:  # a base that tips over does so whatever the reason
+        q, v = (run.y[block(run.layout, name)] for name in ("q", "v"))
+        elapsed = float((run.tick_table[:, ki.TICK_COUNT] * run.tick[:, ki.TICK_PERIOD]).max(initial=0.0))
+        if unstable := unstable_stop(scenario, prepared, q, v, elapsed):
+            words = f"stopped at t = {time:.6g} s"
+            if status == ki.OUT_OF_TIME:
+                words = _reason(scenario, prepared)
+            return SimulationStopped(f"{words}: {unstable}", time=time, state=last_state(prepared, run.y), kind=kind)
     if finding := paradox(prepared.system, prepared.workspace, run, prepared.contacts):
         reached, y, words = finding
         return SimulationStopped(
@@ -89,6 +99,9 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
     run, status = prepared.run, int(prepared.run.count[ki.STATUS])
     t, method = float(run.clock[ki.TIME]), prepared.choice.method
     where = f"stopped at t = {t:.6g} s"
+    diverged = status in (ki.NOT_FINITE, ki.STEP_TOO_SMALL, ki.NO_PROGRESS)
+    if diverged and (nothing := moving_nothing(prepared.model, run.y[block(run.layout, "q")])):
+        return f"{where}: {nothing}"
     if status == ki.NOT_FINITE:
         return f"{where}: the state is no longer finite (divergence); look at the last state for a joint that runs away"
     if status == ki.NO_FORCES:
@@ -98,11 +111,11 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
             "lower contacts.friction, or take contacts.pulling_friction: signed"
         )
     if status == ki.STEP_TOO_SMALL:
-        stiff = "try a larger rtol" if method == "radau5" else "try integrator.method radau5, or a larger rtol"
+        stiff = "look at the last state for a joint that runs away"
+        if method != "radau5":
+            stiff = f"try integrator.method radau5, or {stiff}"
         if _can_step_over(prepared):
-            stiff = f"try {STEP_OVER}, or a larger rtol{_doing(prepared)}"
-        if prepared.control.sample_time is not None:
-            stiff += "; or a shorter controller.sample_time_s, or smaller gains: commands that are held for long sway"
+            stiff = f"try {STEP_OVER}{_doing(prepared)}"
         return f"{where}: the step size fell to {run.clock[ki.STEP]:.1e} s; {stiff}"
     if status == ki.STOPPED:
         return (
@@ -119,8 +132,8 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
         return (
             f"{where}: no progress, the last {ki.MOST_TRIALS} steps came no further than "
             f"{run.clock[ki.LEAST_PROGRESS]:.1e} s, the last of {run.clock[ki.STEP]:.1e} s{_doing(prepared)}; "
-            f"take {STEP_OVER if _can_step_over(prepared) else 'another integrator.method'}, a larger rtol, or longer "
-            "steps where they are fixed"
+            f"take {STEP_OVER if _can_step_over(prepared) else 'another integrator.method'}, or longer steps if they are "
+            "fixed"
         )
     if status == ki.OUT_OF_TIME:
         return (

@@ -15,6 +15,7 @@ from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.engine.force_indeterminacy import motion_spread, sharing
 from dynsim.engine.prepare import Prepared
+from dynsim.engine.soundness import unstable_loop
 from dynsim.errors import first_few
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts import events as ke
@@ -27,6 +28,12 @@ from dynsim.scenario import Scenario
 from dynsim.scenario.effect import without_effect
 
 DRIFT_LIMIT_M = 1e-9
+# A larger acceleration of a joint at an equilibrium start is a motion, not rounding [rad/s² or m/s²].
+STARTS_MOVING = 1e-6
+# Slip that begins earlier is of the start [s].
+AT_ONCE = 1e-3
+# An unpressed point that sticks for a smaller fraction of the run would read 0.0 %.
+SHORT = 5e-4
 # Slower than this a joint with dry friction is at rest [rad/s or m/s].
 AT_REST = 1e-9
 # Negative friction heat of no more than this share of the turnover is rounding.
@@ -61,7 +68,9 @@ def warnings_of(
     sunk : bodies below surfaces; motors : their loads
     """
     robot = prepared.model.robot
+    unstable = unstable_loop(scenario, prepared)
     warnings = [
+        *([] if unstable is None else [unstable[0]]),
         *_contact_warnings(record, scenario, prepared, summary),
         *_saturated(record, robot),
         *_passed_limits(record, robot, prepared.system.unilateral is not None),
@@ -77,6 +86,8 @@ def warnings_of(
     elif summary["constraint_drift_max_m"] > DRIFT_LIMIT_M:
         warnings.append(f"contacts drifted by {summary['constraint_drift_max_m']:.1e} m")
     warnings += _undetermined(record, prepared)
+    warnings += _unpressed(record, prepared)
+    warnings += _slipping_start(record, prepared)
     warnings += _sunk(record, sunk)
     warnings += _beyond_stops(robot, prepared.stops, prepared.control)
     warnings += without_effect(scenario, bool(robot.motors))
@@ -180,9 +191,17 @@ def _undetermined(record: Record, prepared: Prepared) -> list[str]:
         joints = [name for name in shared if name in prepared.model.joint_names]
         if joints:
             touching = [name for name in shared if name not in joints]
+            slides = (record["contact_mode"] == ka.SLIDING) & rests.any(axis=1)[:, None]
+            sliding = [
+                contact.name
+                for contact, some in zip(contacts, slides.any(axis=0), strict=True)
+                if some and contact.friction > 0.0 and contact.name in touching
+            ]
+            motion = f"; while {first_few(sliding)} slides, other choices may move otherwise" if sliding else ""
             return [
                 f"{first_few(touching)}: shared forces with the dry friction of {first_few(joints)}, which keeps these "
                 "joints at rest; the motion does not determine them, and those of the record are one choice of many"
+                f"{motion}"
             ]
         if not shared:
             return []
@@ -203,6 +222,43 @@ def _undetermined(record: Record, prepared: Prepared) -> list[str]:
             f"that keep their signs (this run: {spread.taken:.4g}); take away braces until the rest are independent"
         )
     return warnings
+
+
+def _unpressed(record: Record, prepared: Prepared) -> list[str]:
+    """Contacts that stick although nothing presses them, which leaves the motion open."""
+    unilateral, time = prepared.system.unilateral, record.time[-1] if len(record) else 0.0
+    if unilateral is None or not time > 0.0:
+        return []
+    shares = unilateral.tally[:, ku.UNPRESSED] / time
+    stuck = [
+        f"{contact.name} ({percent(min(share, 1.0))} of the run)"
+        for contact, share in zip(prepared.contacts, shares, strict=True)
+        if share >= SHORT
+    ]
+    if not stuck:
+        return []
+    return [
+        f"the motion is not unique: nothing presses {first_few(stuck)}, held by forces within the friction cones; "
+        "without these forces it would leave its surface, which agrees with the contact law too. This run keeps it, as "
+        "equally stiff supports would; lower contacts.friction, or model the supports (contacts.stiffness_N_per_m with "
+        "integrator.method: time_stepping)"
+    ]
+
+
+def _slipping_start(record: Record, prepared: Prepared) -> list[str]:
+    """An equilibrium on the edge of friction cones that slips at the start."""
+    if prepared.balance is None or not prepared.balance.on_edge or not len(record):
+        return []
+    if np.abs(record["vdot"][0]).max(initial=0.0) > STARTS_MOVING:
+        slips = 0.0
+    else:
+        slips = min((event.time for event in record.events if event.kind == "slip_start"), default=np.inf)
+    if slips > AT_ONCE:
+        return []
+    return [
+        f"initial.equilibrium: the start slips at t = {slips:.3g} s, because this posture needs all of the static "
+        "friction; raise contacts.friction, or change the posture"
+    ]
 
 
 def _joints_at_rest(record: Record, prepared: Prepared) -> NDArray[np.bool_]:

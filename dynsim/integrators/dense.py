@@ -97,6 +97,28 @@ def write_sample(system: System, ws: Workspace, run: Run):
 
 
 @internal_kernel
+def sampled_now(run: Run):
+    """True where the last sample that was recorded is at TIME, apart from rounding."""
+    s, t = run.count[ki.SAMPLE] - 1, run.clock[ki.TIME]
+    return s >= 0 and abs(run.sample_time[s] - t) <= 1e-12 * max(1.0, abs(t))
+
+
+@internal_kernel
+def rewrite_sample(system: System, ws: Workspace, run: Run):
+    """Record a sample at TIME again, after commands, loads or modes have jumped: it has their values from now on.
+
+    Right after a start: ``ws`` is of the present state, and remains so.
+    """
+    if not sampled_now(run):
+        return
+    run.count[ki.SAMPLE] -= 1
+    row = run.sample[run.count[ki.SAMPLE]]
+    for j in range(row.shape[0]):
+        row[j] = run.y[j]
+    write_sample(system, ws, run)
+
+
+@internal_kernel
 def write_samples(newton: NewtonArrays | None, system: System, ws: Workspace, run: Run, more):
     """Record so many ``more`` samples, whose states are there; on lanes up to three of them wait for the next ones."""
     for _ in range(more):

@@ -11,6 +11,9 @@ Methods, all with dense output (so that records do not force steps):
 
 After each accepted step of the adaptive methods q and v are projected onto the active rows if they are off them by more
 than ``GAP_TOLERANCE`` or ``RATE_TOLERANCE``, see ``project``.
+
+A sample at a tick has the values that are in force from the tick on: it is recorded at the end of the step before, and
+again once the commands have been taken.
 """
 
 from __future__ import annotations
@@ -19,14 +22,14 @@ from collections.abc import Callable
 
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact.unilateral import UnilateralArrays
-from dynsim.dynamics.derivative import System
+from dynsim.dynamics.derivative import System, derivative
 from dynsim.dynamics.drive.law import take_commands
 from dynsim.dynamics.tables import Workspace
 from dynsim.dynamics.tree.joints import normalise
 from dynsim.dynamics.tree.support import watch_support
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts.events import consistent, solve_modes, switch_contacts, take_directions, watch_modes
-from dynsim.integrators.dense import sample_step, write_waiting
+from dynsim.integrators.dense import rewrite_sample, sample_step, write_waiting
 from dynsim.integrators.dopri5 import step_dopri5
 from dynsim.integrators.events import arm_events, cut_step, fire_events, take_ticks
 from dynsim.integrators.project import settle
@@ -78,7 +81,7 @@ def accept(system: System, ws: Workspace, run: Run):
     t, h = run.clock[ki.TIME], run.clock[ki.STEP]
     if not end_accepted(run.newton, system, ws, run):
         return
-    watch_modes(system.unilateral, ws, h, run.gaps)
+    watch_modes(system.contacts, system.unilateral, ws, h, run.gaps)
     # The event of tipping has asked for the ground's reaction at the end of this step.
     if run.event.shape[0] > 0:
         watch_support(run.support)
@@ -128,17 +131,33 @@ def go_on(run: Run, order, beta):
 
 
 @internal_kernel
+def evaluate_for_commands(unilateral: UnilateralArrays | None, system: System, ws: Workspace, run: Run):
+    """The state that commands are computed from, into ``ws``; on the rows, if contact modes are those of this state.
+
+    At the start, and after a jump of rates, rows are still those of before: held joints may have no place yet, and
+    projection onto them would move the robot.
+    """
+    if unilateral is not None and run.count[ki.MODES_DUE] > 0:
+        derivative(system, run.clock[ki.TIME], run.y, ws, run.stage[0])
+        run.count[ki.EVALUATIONS] += 1
+        return
+    settle(system, run.clock[ki.TIME], run.y, ws, run.stage[0], run)
+
+
+@internal_kernel
 def ready(system: System, ws: Workspace, run: Run):
     """Start or restart where that is due, and do what is due at this time; False when the caller is to look."""
     count = run.count
     due = take_ticks(run)
     if due & ki.TAKE_COMMANDS:
-        settle(system, run.clock[ki.TIME], run.y, ws, run.stage[0], run)
+        evaluate_for_commands(system.unilateral, system, ws, run)
         take_commands(system.drives, system.reference, run.clock[ki.TIME], ws)
         count[ki.STARTED] = 0
     if count[ki.STARTED] == 0:
         start(system, ws, run)
         arm_events(system, ws, run)
+        if count[ki.STATUS] == ki.RUNNING:
+            rewrite_sample(system, ws, run)
     count[ki.TICKED] = due & ~ki.TAKE_COMMANDS
     return count[ki.TICKED] == 0
 

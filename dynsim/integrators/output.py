@@ -27,21 +27,11 @@ def write_output(system: System, ws: Workspace, run: Run, row):
 @internal_kernel
 def fill_output(system: System, ws: Workspace, run: Run, out):
     """The same without the ground reactions of a mobile base, into out (columns.size,); also for lanes."""
-    joints, motors, motor, state, columns = ws.joints, ws.motors, system.drives.motor, ws.contacts, run.columns
+    joints, state, columns = ws.joints, ws.contacts, run.columns
     force_vectors(ws)
     for i in range(joints.shape[0]):
         out[columns.vdot + i] = joints[i, ka.QDD]
-    for a in range(motors.shape[0]):
-        i = system.drives.table[a, ka.DRIVEN]
-        out[columns.current + a] = motors[a, ka.CURRENT]
-        out[columns.voltage + a] = motors[a, ka.VOLTAGE]
-        out[columns.torque + a] = (
-            motor[a, ka.K_M] * motors[a, ka.CURRENT]
-            - motor[a, ka.J_M] * joints[i, ka.QDD]
-            - motor[a, ka.D_M] * joints[i, ka.QD]
-            - motors[a, ka.DRAG]
-            - motors[a, ka.DRY_DRAG]
-        )
+    fill_drives(system, ws, run, out)
     point_position(ws, run.hand_link, run.hand_point, out[columns.hand : columns.hand + 3])
     out[columns.energy] = kinetic_energy(system.model, ws)
     out[columns.energy + 1] = potential_energy(system.model, ws)
@@ -56,6 +46,23 @@ def fill_output(system: System, ws: Workspace, run: Run, out):
             out[k + kst.OUT_SLIP + s] = state[c, ka.SLIP_VELOCITY + s]
         k += kst.OUTPUTS_PER_CONTACT
     row_forces(system.unilateral, out[columns.stop :], out[columns.dry :], out[columns.tie :])
+
+
+@internal_kernel
+def fill_drives(system: System, ws: Workspace, run: Run, out):
+    """Currents, voltages and shaft torques of the motors, at the accelerations that are in ``out``."""
+    joints, motors, motor, columns = ws.joints, ws.motors, system.drives.motor, run.columns
+    for a in range(motors.shape[0]):
+        i = system.drives.table[a, ka.DRIVEN]
+        out[columns.current + a] = motors[a, ka.CURRENT]
+        out[columns.voltage + a] = motors[a, ka.VOLTAGE]
+        out[columns.torque + a] = (
+            motor[a, ka.K_M] * motors[a, ka.CURRENT]
+            - motor[a, ka.J_M] * out[columns.vdot + i]
+            - motor[a, ka.D_M] * joints[i, ka.QD]
+            - motors[a, ka.DRAG]
+            - motors[a, ka.DRY_DRAG]
+        )
 
 
 @internal_kernel

@@ -449,7 +449,9 @@ def check_start(
         contact, declared, keys, gap = off[0]
         position = model.point_position(contact.body, contact.point, q)
         remedy = "take another posture to start from; or change the surface"
-        if own:
+        if own and scenario.plant.type == "snake":  # `initial` does not place its joints
+            remedy = "move the surface or change plant.initial_joints_rad"
+        elif own:
             named = [contact for contact, by_name, *_ in off if by_name]
             remedy = f"{_remedy(scenario, named)}change the initial configuration or the surface"
         others = ", ".join(f"{other.name} {its:+.4g} m from {other.surface_name!r}" for other, _, _, its in off[1:])

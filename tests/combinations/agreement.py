@@ -9,7 +9,7 @@ must say so; or one of them is wrong.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,6 @@ from combinations.running import Run
 from dynsim import simulate
 from dynsim.errors import DynsimError, SimulationStopped
 from dynsim.record import Record
-from dynsim.scenario.reading import scenario_from_resolved
 
 Array = NDArray[np.float64]
 
@@ -29,8 +28,19 @@ ADAPTIVE_SHARE, STEPPED_SHARE, STEPS = 300.0, 0.01, 2.0
 SOLVERS = 1e-8
 # Errors seen by a finer run count so many times: refinement tells their size, not their bound.
 SURE = 10.0
+# Samples by which an impact may be early or late.
+JUMPS = 3
+ENERGIES = ("energy_electrical", "heat_joule", "heat_friction", "energy_kinetic", "energy_potential")
+# Methods split what an impact takes between its normal and its friction in their own ways.
+TAKEN = ("heat_friction", "loss_impact")
 # What a warning says that leaves the motion open.
-NOT_UNIQUE = ("leave the motion open", "chatter", "turns its own force against it")
+NOT_UNIQUE = (
+    "leave the motion open",
+    "the motion is not unique",
+    "other choices may move otherwise",
+    "chatter",
+    "turns its own force against it",
+)
 # Of forces alone, which other methods split in another way; where elbows slide the motion follows, a little.
 NOT_UNIQUE_FORCES, SPLIT_SHARE = "one choice of many", 0.03
 
@@ -81,16 +91,27 @@ def _ends(runs: Mapping[str, Run]) -> Iterator[tuple[str, str]]:
 
 def _solvers(runs: Mapping[str, Run]) -> Iterator[tuple[str, str]]:
     for name, run in runs.items():
-        method, _, way = name.partition("/")
-        if way != "m_star" or method not in runs:
+        method, _, solver = name.partition("/")
+        if solver != "m_star" or method not in runs:
             continue
         a, b = _measures(runs[method].record), _measures(run.record)
-        worst, text = _widest(runs[method].record, a, run.record, b, lambda measure, _: SOLVERS * (1.0 + measure.size))
+        worst, text = _widest(runs[method].record, a, run.record, b, _of_solvers(run))
         if worst > 1.0:
             # Where motion multiplies errors, rounding grows with those of steps.
             error = _own_error(run, 0.5)
             if 1e-3 * max((float(own.max(initial=0.0)) for _, own in error.values()), default=0.0) < worst * SOLVERS:
                 yield "solvers", f"{name} and {method}: {text}"
+
+
+def _of_solvers(run: Run) -> Any:
+    """What the solvers may differ by: rounding, and what their rounding makes of the steps that tolerances choose."""
+    assert run.resolved is not None
+    share = SOLVERS + 0.03 * run.resolved.integrator.rtol
+
+    def allowed(measure: Measure, time: Array) -> Array:
+        return np.asarray(SOLVERS + share * measure.size)[None]
+
+    return allowed
 
 
 def _pair(first: str, run: Run, other: str, second: Run) -> Iterator[tuple[str, str]]:
@@ -122,10 +143,11 @@ def _measures(record: Record | None) -> list[Measure]:
     moved = np.abs(q - q[:1]).max(axis=0, initial=0.0)
     # Joints of one kind move together: what stands still is off by what its neighbours are.
     measures = [Measure("q", q, np.full(q.shape[1], max(float(moved.max(initial=0.0)), 1e-4)))]
-    names = ("energy_electrical", "heat_joule", "heat_friction", "energy_kinetic", "energy_potential")
-    energies = np.stack([record[name] - (record[name][0] if name == "energy_potential" else 0.0) for name in names], axis=1)
+    parts = [record[name] - (record[name][0] if name == "energy_potential" else 0.0) for name in ENERGIES]
+    parts[2] = sum((record[name] for name in TAKEN if name in record), start=np.zeros(len(record)))
+    energies = np.stack(parts, axis=1)
     size = float(np.abs(energies).max(initial=0.0))
-    measures.append(Measure("energy", energies, np.full(len(names), max(size, 1e-9))))
+    measures.append(Measure("energy", energies, np.full(len(ENERGIES), max(size, 1e-9))))
     return measures
 
 
@@ -166,38 +188,49 @@ def _widest(
     # Where one has stopped, what it did last is not compared.
     keep = first.time[i] <= min(first.time[-1], second.time[-1]) * (1.0 if first.complete and second.complete else 0.95)
     i, j = i[keep], j[keep]
+    if not len(i):
+        return worst, text
     for own, other in zip(a, b, strict=True):
-        if not len(i):
-            continue
-        off = np.abs(own.values[i] - other.values[j])
-        size = np.maximum(own.size, other.size)
+        off = _apart(own.values[i], other.values[j], own.name == "energy")
+        # A run that goes astray must not set the scale.
+        size = np.minimum(own.size, other.size)
         limit = np.broadcast_to(allowed(Measure(own.name, own.values, size), first.time[i]), off.shape)
         share = off / limit
         if share.max() > worst:
-            t, k = np.unravel_index(share.argmax(), share.shape)
             worst = float(share.max())
-            name = first.labels["q"][k] if own.name == "q" else ("electrical", "Joule", "friction", "kinetic", "potential")[k]
+            # Where it begins says more than where it is largest.
+            t = int((share.max(axis=1) > min(1.0, 0.999 * worst)).argmax())
+            k = int(share[t].argmax())
+            name = first.labels["q"][k] if own.name == "q" else ENERGIES[k]
             text = (
-                f"{own.name} of {name} at t = {first.time[i[t]]:.6g} s is {own.values[i[t], k]:.8g} and "
+                f"{own.name} {name} at t = {first.time[i[t]]:.6g} s is {own.values[i[t], k]:.8g} and "
                 f"{other.values[j[t], k]:.8g}, {off[t, k]:.3g} apart (allowed {limit[t, k]:.3g})"
             )
     return worst, text
 
 
+def _apart(a: Array, b: Array, jumps: bool) -> Array:
+    """Distances of values at samples; of what jumps, from all that the other has about that time."""
+    if not jumps:
+        return np.asarray(np.abs(a - b))
+    around = [b[np.clip(np.arange(len(b)) + shift, 0, len(b) - 1)] for shift in range(-JUMPS, JUMPS + 1)]
+    return np.asarray(np.maximum(np.maximum(a - np.max(around, axis=0), np.min(around, axis=0) - a), 0.0))
+
+
 def _own_error(run: Run, part: float) -> dict[str, tuple[Array, Array]]:
     """By what part of its size each measure has changed until some times when a run is made more finely."""
     assert run.resolved is not None
-    config = dict(run.resolved.resolved)
-    options = dict(config["integrator"])
+    options: dict[str, float] = {}
     if run.resolved.integrator.method == "time_stepping":
         assert run.record is not None
         options["step_s"] = part * float(run.record.summary["time_stepping"]["step_s"])
     else:
         options["rtol"] = max(part * run.resolved.integrator.rtol, 1e-13)
         options["atol"] = max(part * run.resolved.integrator.atol, 1e-16)
-    config["integrator"] = options
+    integrator = run.resolved.integrator.model_copy(update=options)
+    config = run.resolved.config.model_copy(update={"integrator": integrator})
     try:
-        finer: Record | None = simulate(scenario_from_resolved(config))
+        finer: Record | None = simulate(replace(run.resolved, config=config))
     except SimulationStopped as stop:
         finer = stop.record
     except DynsimError:
@@ -207,6 +240,6 @@ def _own_error(run: Run, part: float) -> dict[str, tuple[Array, Array]]:
     errors = {}
     _, i, j = np.intersect1d(run.record.time.round(9), finer.time.round(9), return_indices=True)
     for own, other in zip(_measures(run.record), _measures(finer), strict=True):
-        off = (np.abs(own.values[i] - other.values[j]) / np.maximum(own.size, other.size)).max(axis=1)
+        off = (np.abs(own.values[i] - other.values[j]) / np.minimum(own.size, other.size)).max(axis=1)
         errors[own.name] = run.record.time[i], np.maximum.accumulate(off)
     return errors

@@ -17,7 +17,7 @@ from dynsim.model.description import Robot
 
 Array = NDArray[np.float64]
 
-# Rows whose axes are fixed in the body that the whole joint carries; they share the velocity of what that is mounted on.
+# Rows whose axes are fixed in the body that the whole joint carries; they share the velocity of their mount.
 _SEVERAL = ("ball_x", "ball_y", "ball_z", "roll", "turn", "left_wheel", "right_wheel")
 _FIRST = ("ball_x", "roll", "left_wheel")
 

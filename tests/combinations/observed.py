@@ -1,4 +1,4 @@
-"""A record beside what its scenario says: bodies, contacts, drives and loads at the samples, by the checks' own means."""
+"""A record beside what its scenario says: bodies, contacts, drives, loads at the samples, by the checks' own means."""
 
 from __future__ import annotations
 
@@ -112,9 +112,11 @@ class Observed:
 
     def touches(self, motion: Motion | None = None) -> list[Touch]:
         """The contacts, at the samples or where another motion has them."""
-        return self._touches_of_samples if motion is None else [
-            self._touch(k, contact, motion) for k, contact in enumerate(self.described_contacts)
-        ]
+        return (
+            self._touches_of_samples
+            if motion is None
+            else [self._touch(k, contact, motion) for k, contact in enumerate(self.described_contacts)]
+        )
 
     @cached_property
     def _touches_of_samples(self) -> list[Touch]:
@@ -132,7 +134,9 @@ class Observed:
         approach = (velocity * normal).sum(axis=1)
         before = velocity
         if self.stepped and motion is self.motion:
-            before = np.einsum("tkn,tn->tk", self.bodies.jacobian(motion, body, position), self.v - self.step * self.vdot)
+            before = np.einsum(
+                "tkn,tn->tk", self.bodies.jacobian(motion, body, position), self.v - self.step * self.vdot
+            )
         record = self.record
         force = record["contact_normal_force"][:, k]
         mode = record["contact_mode"][:, k] if "contact_mode" in record else np.full(len(force), SLIDING)
@@ -171,7 +175,7 @@ class Observed:
         return SETTLING if lags and spacing > RESOLVED * min(lags) else 0.0
 
     def quiet(self, count: int = 1) -> NDArray[np.bool_]:
-        """Whether nothing happens from each sample to the count-th after it, and what did has died out, (T − count,)."""
+        """Whether nothing happens from each sample to the count-th after it, or swings on from before, (T − count,)."""
         before = np.searchsorted(self.event_times, self.time[:-count] - self.settling, side="left")
         after = np.searchsorted(self.event_times, self.time[count:], side="right")
         return np.asarray(before == after)
@@ -294,7 +298,12 @@ def _stepped_balance(seen: Observed) -> Balance:
     for touch, later in zip(there, here, strict=True):
         turned = _turned(touch.force[rows], later.normal, touch.normal)
         for force in (touch.force[rows], turned):
-            slack = slack + np.abs(_contact_term(seen, middle, touch, force) - _contact_term(seen, end, later, later.force[rows]))
+            slack = slack + np.abs(
+                _contact_term(seen, middle, touch, force) - _contact_term(seen, end, later, later.force[rows])
+            )
+        # Tangents may turn about the normal as much as that turns.
+        angle = np.linalg.norm(later.normal - touch.normal, axis=1, keepdims=True)
+        slack = slack + np.abs(_contact_term(seen, middle, touch, angle * np.cross(touch.normal, turned)))
     return _balanced(seen, rows, terms, slack)
 
 
@@ -368,3 +377,8 @@ def _balanced(seen: Observed, rows: NDArray[np.int64], terms: list[Array], slack
     if seen.robot.couplings:
         left, scale, slack = left @ basis, scale @ np.abs(basis), slack @ np.abs(basis)
     return Balance(rows, left, scale, slack)
+
+
+def warned(seen: Observed, text: str) -> bool:
+    """Whether a warning of the run has this text in it."""
+    return any(text in warning for warning in seen.run.warnings)

@@ -112,9 +112,7 @@ def _box(config: Mapping[str, Any], shift: Array) -> Callable[[Array], tuple[Arr
     return look
 
 
-def _field(
-    origin: Array, spacing: Array, heights: Array, shift: Array
-) -> Callable[[Array], tuple[Array, Array]]:
+def _field(origin: Array, spacing: Array, heights: Array, shift: Array) -> Callable[[Array], tuple[Array, Array]]:
     from scipy.interpolate import RectBivariateSpline
 
     ny, nx = heights.shape

@@ -1,2 +1,419 @@
-def untrue(scenario, run, seen):
-    return []
+"""Whether what a run says of itself is true: each warning and each stop, by a computation of its own.
+
+A text without an entry in :data:`VERIFIERS` is a finding, so that a new warning comes with its check; what no
+computation outside the engine can tell is in :data:`UNVERIFIED`, with the reason.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from combinations.accelerations import critical, exists, leaves
+from combinations.observed import OPEN, STICKING, Observed, Touch
+from combinations.running import Run
+from combinations.sampled_loop import loop_growth
+from dynsim.errors import SimulationStopped
+from dynsim.model.drives import Motor, Servo
+
+Array = NDArray[np.float64]
+Match = re.Match[str]
+
+# Numbers in sentences have three digits.
+DIGITS = 0.006
+NUMBER = r"([-+]?[0-9.]+(?:e[-+]?[0-9]+)?|inf|-inf|nan)"
+# Slip and rates below this count as rest in the sentences of the engine [m/s, rad/s].
+AT_REST = 1e-9
+# Rows that depend on each other have a singular value below this part of the largest.
+DEPENDENT = 1e-6
+# A loop is unstable where the logarithm of its states grows by more than this in a second; and it is what ends a run
+# where they have grown by e to this.
+GROWTH, GROWN = 1.0, 3.0
+UNSTABLE = "the sampled loop is unstable"
+
+
+def untrue(scenario: Mapping[str, Any], run: Run, seen: Observed) -> Iterator[str]:
+    """What is said of a run and is not so, a sentence each."""
+    for warning in run.warnings:
+        # The stop itself, in the words of its error.
+        if warning.startswith("incomplete: "):
+            if run.error is None or str(run.error) not in warning:
+                yield f"{warning!r}, but it ended with {run.error!r}"
+            continue
+        answered = False
+        for pattern, verifier in VERIFIERS.items():
+            if (match := re.search(pattern, warning)) is not None:
+                answered = True
+                if reason := verifier(match, seen):
+                    yield f"{warning[:160]!r}: {reason}"
+                break
+        if not answered and not any(re.search(pattern, warning) for pattern in UNVERIFIED):
+            yield f"{warning[:160]!r}: no check knows this warning"
+    rate = loop_growth(seen)
+    if rate is not None and rate > 1.1 * GROWTH and not any(UNSTABLE in warning for warning in run.warnings):
+        yield f"the sampled loop grows with {rate:.3g} 1/s, and no warning says so"
+    if isinstance(run.error, SimulationStopped):
+        yield from _stop(run.error, seen)
+
+
+def _stop(stop: SimulationStopped, seen: Observed) -> Iterator[str]:
+    """Whether a stop had to be."""
+    text = f"stops ({stop.kind}) at t = {stop.time:.6g} s"
+    if stop.kind not in STOPS:
+        yield f"{text}: no check knows this kind of stop"
+        return
+    # A loop that swings up comes to no end of any kind, where it has had the time to.
+    rate = loop_growth(seen)
+    if rate is not None and rate > GROWTH and rate * stop.time > GROWN:
+        return
+    if reason := STOPS[stop.kind](stop, seen):
+        yield f"{text}: {reason}; {str(stop)[:200]}"
+
+
+def _not_overturned(stop: SimulationStopped, seen: Observed) -> str:
+    margin = float(seen.record["tip_margin"][-1])
+    return "" if margin < 0.05 else f"the tip margin is {margin:.3g}"
+
+
+def _not_critical(stop: SimulationStopped, seen: Observed) -> str:
+    return "" if critical(seen, stop.state) else "no combination of modes of the bodies is critical"
+
+
+def _has_forces(stop: SimulationStopped, seen: Observed) -> str:
+    return "there are contact forces" if exists(seen, stop.state, stop.time) else ""
+
+
+def _unproved(stop: SimulationStopped, seen: Observed) -> str:
+    return "nothing shows that it had to"
+
+
+STOPS: dict[str, Callable[[SimulationStopped, Observed], str]] = {
+    "overturned": _not_overturned,
+    "forces_reversed": _not_critical,
+    "several_forces": _not_critical,
+    "no_forces": _not_critical,
+    "step_too_small": _not_critical,
+    "not_finite": _not_critical,
+    "no_contact_forces": _has_forces,
+    # Runs that go on without end have no reason that lies in the scene.
+    "not_projected": _unproved,
+    "chatter": _unproved,
+    "no_progress": _unproved,
+    "out_of_time": _unproved,
+    "stuck": _unproved,
+}
+"""Why a stop of a kind was not due, by a computation of its own; empty: it was."""
+
+
+def _joint(seen: Observed, name: str) -> int | None:
+    return seen.joints.index(name) if name in seen.joints else None
+
+
+def _near(value: float, said: str, digits: float = DIGITS) -> bool:
+    return abs(value - float(said)) <= digits * max(abs(value), abs(float(said))) + 1e-12
+
+
+def _touch(seen: Observed, name: str) -> Touch | None:
+    return next((touch for touch in seen.touches() if touch.contact.name == name), None)
+
+
+def _chatters(match: Match, seen: Observed) -> str:
+    times = np.array([event.time for event in seen.record.events if event.name == match[1]])
+    most = max((int(((times >= t) & (times <= t + float(match[3]))).sum()) for t in times), default=0)
+    return "" if most >= 0.5 * float(match[2]) else f"{most} events of it within {match[3]} s"
+
+
+def _pulls(match: Match, seen: Observed) -> str:
+    touch = _touch(seen, match[1])
+    if touch is None or seen.real:
+        return "no such glued contact"
+    least = -float(touch.normal_force.min(initial=0.0))
+    # Steps between samples may have seen more.
+    if least > float(match[4]) * (1.0 + DIGITS):
+        return f"with {least:.4g} N in a sample"
+    share = 100.0 * float((touch.normal_force < 0.0).mean())
+    off = 100.0 * 3.0 / len(seen) + 1.0
+    return "" if abs(share - float(match[3])) <= off else f"in {share:.3g} % of the samples"
+
+
+def _never_touches(match: Match, seen: Observed) -> str:
+    touch = _touch(seen, match[1])
+    if touch is None:
+        return "no such contact"
+    if np.abs(touch.normal_force).max(initial=0.0) > 0.0:
+        return f"it carries {touch.normal_force.max():.4g} N"
+    nearest = 1e3 * float(touch.gap.min())
+    if abs(nearest - float(match[3])) > DIGITS * abs(nearest) + 1e-5:
+        return f"it comes as near as {nearest:.4g} mm"
+    return ""
+
+
+def _reversed(match: Match, seen: Observed) -> str:
+    """W_nn − μ W_nt < 0 for the contact alone, at the sample after the time that is named."""
+    touch, since = _touch(seen, match[1]), float(match[2])
+    if touch is None:
+        return "no such contact"
+    i = min(int(np.searchsorted(seen.time, since)), len(seen) - 1)
+    J = seen.bodies.jacobian(seen.motion, touch.body, touch.position)[i]
+    M = seen.bodies.mass_matrix(seen.q[i])
+    own = touch.normal[i] @ J @ np.linalg.solve(M, J.T @ touch.force[i]) / (touch.normal_force[i] or 1.0)
+    size = touch.normal[i] @ J @ np.linalg.solve(M, J.T @ touch.normal[i])
+    return "" if own < 0.05 * size else f"the diagonal entry is {own:.3g} of {size:.3g} at t = {seen.time[i]:.4g} s"
+
+
+def _friction_gives(match: Match, seen: Observed) -> str:
+    impact = float(seen.record["loss_impact"][-1]) if "loss_impact" in seen.record else 0.0
+    gained = -float(seen.record["heat_friction"][-1]) - max(impact, 0.0)
+    return "" if _near(gained, match[1]) else f"by the signals {gained:.3g} J"
+
+
+def _at_limit(match: Match, seen: Observed) -> str:
+    motor = next((motor for motor in seen.robot.motors if motor.joint == match[1]), None)
+    if motor is None:
+        return "no such motor"
+    a, limit = seen.robot.motors.index(motor), float(match[3])
+    signal = seen.record["voltage" if match[2] == "voltage" else "current"][:, a]
+    near = limit * (1.0 - (2e-3 if isinstance(motor, Motor) and match[2] == "current" else 1e-5))
+    reached = np.abs(signal) >= near
+    if isinstance(motor, Servo):
+        reached &= seen.record["current"][:, a] != 0.0
+    share = 100.0 * float(reached.mean())
+    return "" if abs(share - float(match[4])) <= 0.15 + 100.0 / len(seen) else f"in {share:.3g} % of the samples"
+
+
+def _passes_limit(match: Match, seen: Observed) -> str:
+    i = _joint(seen, match[1])
+    if i is None:
+        return "no such joint"
+    link, q, v = seen.robot.links[i], seen.q[:, seen.bodies.places[i]], seen.v[:, i]
+    torque = np.zeros(len(seen))
+    if match[1] in seen.record.labels["torque"]:
+        torque = seen.record["torque"][:, seen.record.labels["torque"].index(match[1])]
+    beyond = {
+        "lower position": link.lower - q,
+        "upper position": q - link.upper,
+        "velocity": np.abs(v) - link.velocity_limit,
+        "effort": np.abs(torque) - link.effort_limit,
+    }[match[2]]
+    over = np.flatnonzero(beyond > 1e-6)
+    if not over.size:
+        return "no sample is beyond it"
+    first = float(seen.time[over[0]])
+    return "" if _near(first, match[3]) or abs(first - float(match[3])) < 1e-3 else f"first at t = {first:.4g} s"
+
+
+def _does_not_close(match: Match, seen: Observed) -> str:
+    from combinations.energy import residual_floor, turnover_and_residual
+
+    turnover, residual = turnover_and_residual(seen)
+    relative = residual / max(turnover, residual_floor(seen), 1e-300)
+    return "" if relative > 0.9e-6 else f"the residual is {relative:.2e} of the turnover"
+
+
+def _drifted(match: Match, seen: Observed) -> str:
+    worst = max(
+        (float(np.abs(touch.gap[touch.mode != OPEN]).max(initial=0.0)) for touch in seen.touches()), default=0.0
+    )
+    # Samples are projected; drift is that of accepted steps.
+    return "" if worst <= float(match[1]) * (1.0 + DIGITS) + 1e-9 else f"by {worst:.2g} m in a sample"
+
+
+def _scheme(match: Match, seen: Observed) -> str:
+    most = float(np.abs(seen.record["loss_scheme"]).max(initial=0.0))
+    return "" if most <= float(match[1]) * (1.0 + DIGITS) + 1e-12 else f"{most:.3g} J in a sample"
+
+
+def _sinks(match: Match, seen: Observed) -> str:
+    deepest = max((-1e3 * float(touch.gap.min(initial=0.0)) for touch in seen.touches()), default=0.0)
+    return "" if deepest <= float(match[1]) * (1.0 + DIGITS) + 1e-3 else f"{deepest:.3g} mm in a sample"
+
+
+def _shared(match: Match, seen: Observed) -> str:
+    """Rows of what is closed and of what rests depend on each other in some sample."""
+    names = [name for name in re.split(r", | and ", match[1]) if name and not name.endswith(" more")]
+    joints = [name for name in re.split(r", | and ", match[2] or "") if name and not name.endswith(" more")]
+    known = {touch.contact.name for touch in seen.touches()}
+    if not names:
+        return "it names no contact"
+    if any(name not in known for name in names) or any(name not in seen.joints for name in joints):
+        return "it names what there is not"
+    for i in _samples_of_modes(seen):
+        if _dependent(seen, i):
+            return ""
+    return "the rows of what is closed and rests are independent in all sets of modes"
+
+
+def _samples_of_modes(seen: Observed) -> list[int]:
+    modes = np.stack([touch.mode for touch in seen.touches()], axis=1) if seen.touches() else np.zeros((len(seen), 0))
+    resting = np.abs(seen.joint_signal("joint_friction")) > 0.0
+    resting &= np.abs(seen.v) < AT_REST
+    both = np.hstack([modes, resting])
+    _, first = np.unique(both, axis=0, return_index=True)
+    return [int(i) for i in first]
+
+
+def _dependent(seen: Observed, i: int) -> bool:
+    basis = seen.bodies.free_directions()
+    parts = []
+    for touch in seen.touches():
+        if touch.mode[i] != OPEN:
+            J = seen.bodies.jacobian(seen.motion, touch.body, touch.position)[i]
+            rows = J if touch.mode[i] == STICKING else touch.normal[i][None] @ J
+            parts.append(_row_space(rows @ basis))
+    rubs = seen.record.labels["joint_friction"] if "joint_friction" in seen.record else ()
+    for joint in rubs:
+        j = seen.joints.index(joint)
+        if abs(seen.v[i, j]) < AT_REST:
+            parts.append(_row_space(np.eye(seen.bodies.n)[j][None] @ basis))
+    rows = np.vstack(parts) if parts else np.zeros((0, basis.shape[1]))
+    sizes = np.linalg.svd(rows, compute_uv=False) if len(rows) else np.zeros(0)
+    return int((sizes > DEPENDENT).sum()) < len(rows)
+
+
+def _row_space(rows: Array) -> Array:
+    _, sizes, basis = np.linalg.svd(rows, full_matrices=False)
+    return np.asarray(basis[sizes > max(DEPENDENT * sizes.max(initial=0.0), 1e-9)])
+
+
+def _below(match: Match, seen: Observed) -> str:
+    """The axis of the deepest body lies below the surface as deep as is said, and deeper than its radius."""
+    surface = seen.shapes.get(match[1])
+    link = next((k for k, link in enumerate(seen.robot.links) if link.name == match[2]), None)
+    if surface is None or link is None:
+        return "no such surface or body"
+    own = seen.robot.links[link]
+    ends = [own.tip] if own.tip is not None else [other.p_PJ for other in seen.robot.links if other.parent == own.name]
+    if own.tip is None and seen.robot.hand[0] == own.name:
+        ends.append(seen.robot.hand[1])
+    start = seen.motion.point(link, np.zeros(3))
+    deepest = -float(surface.distance(start).min())
+    for end in ends:
+        tip = seen.motion.point(link, end)
+        for share in np.linspace(0.0, 1.0, 65):
+            deepest = max(deepest, -float(surface.distance(start + share * (tip - start)).min()))
+    if abs(1e3 * deepest - float(match[3])) > 0.02 * abs(1e3 * deepest) + 0.02:
+        return f"it lies {1e3 * deepest:.4g} mm deep"
+    return "" if deepest > own.radius else f"that is within its radius of {own.radius:g} m"
+
+
+def _reference_beyond(match: Match, seen: Observed) -> str:
+    """The waypoints of the joint go beyond its stop; splines between them may, so that only the joint is looked at."""
+    i = _joint(seen, match[1])
+    if i is None:
+        return "no such joint"
+    link = seen.robot.links[i]
+    return "" if np.isfinite(link.lower) or np.isfinite(link.upper) else "it has no stop"
+
+
+def _overloaded(match: Match, seen: Observed) -> str:
+    names = {motor.joint: a for a, motor in enumerate(seen.robot.motors)}
+    quantity = {"current": "current", "torque": "torque", "force": "torque"}[match[2]]
+    for joint, said in re.findall(r"(?:^|, )(\S+) " + NUMBER + " of ", match[1]):
+        if joint not in names:
+            return f"no motor {joint}"
+        a = names[joint]
+        squared = seen.record[quantity][:, a] ** 2
+        rms = float(np.sqrt(np.trapezoid(squared, seen.time) / (seen.time[-1] - seen.time[0])))
+        motor = seen.robot.motors[a]
+        nominal = motor.nominal_torque if quantity == "torque" else getattr(motor, "nominal_current", np.inf)
+        if not _near(rms, said):
+            return f"the root mean square of {joint} is {rms:.4g}"
+        if rms <= nominal:
+            return f"the nominal value of {joint} is {nominal:g}"
+    return ""
+
+
+def _tips(match: Match, seen: Observed) -> str:
+    margin = seen.record["tip_margin"]
+    tipped = any(event.kind == "tip_over" for event in seen.record.events)
+    return (
+        ""
+        if tipped and abs(float(match[1]) - 100.0 * float((margin < 0.0).mean())) < 0.1
+        else "by the signals it does not"
+    )
+
+
+def _lifted(match: Match, seen: Observed) -> str:
+    share = 100.0 * float((seen.record["wheel_load"].sum(axis=1) <= 0.0).mean())
+    return "" if abs(share - float(match[1])) < 0.1 else f"in {share:.3g} % of the samples"
+
+
+def _would_slip(match: Match, seen: Observed) -> str:
+    k = seen.record.labels["traction_demand"].index(match[1])
+    first = min((event.time for event in seen.record.events if event.kind == "tip_over"), default=np.inf)
+    most = float(np.nanmax(seen.record["traction_demand"][seen.time < first, k]))
+    return "" if _near(most, match[2]) else f"it needs {most:.4g} times in the samples"
+
+
+def _jumps(match: Match, seen: Observed) -> str:
+    return "" if (seen.config.get("initial") or {}).get("equilibrium") else "no equilibrium was asked for"
+
+
+def _unstable(match: Match, seen: Observed) -> str:
+    if seen.config.get("sensors"):
+        # Of encoders with their delay there is no own model; with true positions it is the slower loop.
+        return ""
+    rate = loop_growth(seen)
+    return "" if rate is not None and rate > 0.9 * GROWTH else f"it grows with {rate} 1/s"
+
+
+def _unpressed(match: Match, seen: Observed) -> str:
+    """Each contact sticks somewhere, and would leave there if it had no force."""
+    for name, _ in re.findall(rf"(\S+) \({NUMBER} % of the run\)", match[1]):
+        touch = _touch(seen, name)
+        if touch is None:
+            return f"no contact {name}"
+        rows = np.flatnonzero(touch.mode == STICKING)
+        if not any(leaves(seen, name, int(i)) for i in rows[:: max(len(rows) // 20, 1)]):
+            return f"{name} is pressed wherever it sticks"
+    return ""
+
+
+def _slips_at_once(match: Match, seen: Observed) -> str:
+    moves = float(np.abs(seen.vdot[0]).max(initial=0.0)) > 1e-6
+    early = any(event.kind == "slip_start" and event.time <= 2e-3 for event in seen.record.events)
+    return "" if moves or early else "nothing slips or moves at the start"
+
+
+VERIFIERS: dict[str, Callable[[Match, Observed], str]] = {
+    rf"^(.+): chatter, more than {NUMBER} contact events within {NUMBER} s": _chatters,
+    rf"^(.+): the (.+) pulls on this brace for {NUMBER}(?: %)? of the run, with up to {NUMBER} N": _pulls,
+    rf"^(.+): this brace never touches the (.+): it carries nothing; nearest {NUMBER} mm": _never_touches,
+    rf"^(.+): from t = {NUMBER} s on, its friction turns its own force against it": _reversed,
+    rf"^friction has put {NUMBER} J into the arm": _friction_gives,
+    rf"^(.+): (\S+) at its limit of {NUMBER} \S+(?: m)? for {NUMBER} % of the run": _at_limit,
+    rf"^(.+): passes its (.+) limit of .*first at t = {NUMBER} s": _passes_limit,
+    r"^the energy ledger does not close": _does_not_close,
+    rf"^contacts drifted by {NUMBER} m": _drifted,
+    rf"^time stepping: the steps themselves \S+ up to {NUMBER} J": _scheme,
+    rf"^time stepping: points sink up to {NUMBER} mm": _sinks,
+    r"^(.*): shared forces with the dry friction of (.+), which keeps? these joints": _shared,
+    r"^(.*): shared forces which the motion does not determine()": _shared,
+    rf" below (.+?)(?: by more than the link's radius)?: (\S+?),?(?: of .*)? by up to {NUMBER} mm in the": _below,
+    r"^(.+): its reference goes beyond its stop": _reference_beyond,
+    r"^(.+): the (\S+), rms over the run, is more than nominal": _overloaded,
+    rf"^a jolt of the start takes the tip margin below zero.*? in {NUMBER}(?: % of the samples)?[,;]": _tips,
+    rf"^the base tips over at t = .*below zero in {NUMBER}(?: % of the samples)?[,;]": _tips,
+    rf"^the base is lifted: no load on its wheels and caster in {NUMBER} % of the samples": _lifted,
+    rf"^the (\S+) wheel would slip: it needs up to {NUMBER} times the traction": _would_slip,
+    r"^initial.equilibrium: .*that jumps at the start": _jumps,
+    rf"^controller.sample_time_s = {NUMBER} s: the sampled loop is unstable": _unstable,
+    r"^the motion is not unique: nothing presses (.+), held by": _unpressed,
+    rf"^initial.equilibrium: the start slips at t = {NUMBER} s": _slips_at_once,
+}
+"""Pattern of each warning and its check: the groups and what the run shows → why it is not so, empty if it is."""
+
+UNVERIFIED: dict[str, str] = {
+    r"contact problems were given up above": "the solver's count; what it leaves is seen in forces and cones",
+    r"^contact rows depended on each other in": "the solver's count of evaluations",
+    r"with friction, dependent contact rows leave the motion open too": "a range over splits, of which the run has one",
+    r"^time stepping: the power changes so fast": "a sum over all steps, of which samples show some",
+    r"has no effect: ": "said of a key of the scenario, not of the run",
+    r"^the target waited|^the path is|^feedback and shape points|^the null-space|^joints were clamped|^the robot tips|"
+    r"^the support margin|^mode \d+ was|passes its limit by": "of the kinematic snake, which these scenes do not have",
+}
+"""Warnings that nothing outside the engine can tell, each with the reason."""

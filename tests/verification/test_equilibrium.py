@@ -10,6 +10,7 @@ import pytest
 
 import dynsim
 from dynsim import load_scenario, simulate
+from dynsim.dynamics.tables import SLIDING, STICKING
 from dynsim.engine.prepare import prepare
 from dynsim.errors import ModelError
 from dynsim.scenario import build
@@ -213,3 +214,46 @@ def test_what_has_no_motors_rests_on_friction_or_is_refused():
     assert record["contact_mode"][0, 0] == 2
     with pytest.raises(ModelError, match=r"nothing holds this posture.*foot cannot carry it"):
         simulate(load_scenario("block_on_slope", "slides", held))
+
+
+# The tip is straight below a joint without a motor, so that only friction balances the weight about it. The least heat
+# presses the tip no more than that friction needs.
+ON_FRICTION = """
+name: on_friction
+duration_s: 0.1
+plant:
+  type: serial_arm
+  base: {position_m: [0, 0, 0.32139380484326966]}
+  link: {radius_m: 0.02, mass_kg: 0.4, length_m: 0.25, damping_N_m_s_per_rad: 0.01}
+  chain:
+    - {axis: y, initial_deg: 130}
+    - {axis: y, initial_deg: 100, motor: {type: wang_minami}}
+controller: {type: joint_pd}
+initial: {equilibrium: true}
+surfaces: {floor: {type: plane}}
+contacts: {law: unilateral, friction: 0.2, points: {tip: {body: link_2, point_m: [0, 0, 0.25], surface: floor}}}
+record: {rate_hz: 1000}
+"""
+
+
+def test_start_that_needs_friction_keeps_a_tenth_in_reserve(tmp_path):
+    path = tmp_path / "on_friction.yaml"
+    path.write_text(ON_FRICTION, encoding="utf-8")
+    record = simulate(load_scenario(path, overrides={"integrator.method": "dopri5"}))
+    assert (record["contact_mode"] == STICKING).all()
+    assert np.abs(record["v"]).max() < 1e-9
+    force, normal = record["contact_force"][0, 0], record["contact_normal_force"][0, 0]
+    # Tolerance of the program of the statics.
+    assert np.hypot(force[0], force[1]) == pytest.approx(0.9 * 0.2 * normal, rel=1e-6)
+    assert not [warning for warning in record.summary["warnings"] if "initial.equilibrium" in warning]
+
+
+def test_start_that_slips_on_the_edge_of_its_cone_is_reported():
+    """Static friction of a slope's angle, to the tolerance of the statics; kinetic friction does not hold the block."""
+    start = {"initial": {"equilibrium": True}, "duration_s": 0.01}
+    record = simulate(load_scenario("block_on_slope", "slides", {**start, "contacts.static_friction": 0.4 - 4e-10}))
+    assert record["contact_mode"][-1, 0] == SLIDING
+    assert [w for w in record.summary["warnings"] if w.startswith("initial.equilibrium: the start slips at t = ")]
+    # All of the friction is needed here too, but rounding does not decide.
+    holds = still(load_scenario("block_on_slope", "slides", {**start, "contacts.static_friction": 0.42}))
+    assert not [warning for warning in holds.summary["warnings"] if "initial.equilibrium" in warning]

@@ -13,26 +13,28 @@ import math
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.cone.socp import best_split, split_room_in
-from dynsim.dynamics.contact.unilateral import UnilateralArrays, dry_bound, note_dry_forces, note_stop_forces
+from dynsim.dynamics.contact.unilateral import UnilateralArrays, holding_bound, note_dry_forces, note_stop_forces
 from dynsim.dynamics.tables import ContactArrays, Workspace
 from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
 # A row whose pivot is below this fraction of the largest depends on the others.
 NULL_TOLERANCE = 1e-10
+# A unit direction of splits whose part along a normal row is smaller leaves that normal force as it is.
+NORMAL_PART = 1e-6
 
 
 @internal_kernel
-def margin(contacts: ContactArrays, ws: Workspace, k):
+def margin(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace, k):
     """μ_s f_n − |f_t| of candidate k, which sticks [N]."""
     r, rows = ws.active[k, ka.FIRST_ROW], ws.rows
     a, b = rows[r + 1, ka.FORCE], rows[r + 2, ka.FORCE]
-    return contacts.law[k, ka.STATIC] * rows[r, ka.FORCE] - math.sqrt(a * a + b * b)
+    return unilateral.number[ku.HOLDING] * contacts.law[k, ka.STATIC] * rows[r, ka.FORCE] - math.sqrt(a * a + b * b)
 
 
 @internal_kernel
 def dry_margin(unilateral: UnilateralArrays, ws: Workspace, k):
     """What is left of the dry friction of a joint that it holds [N m or N]."""
-    return dry_bound(unilateral, k) - abs(ws.rows[unilateral.dry_table[k, ku.DRY_ROW], ka.FORCE])
+    return holding_bound(unilateral, k) - abs(ws.rows[unilateral.dry_table[k, ku.DRY_ROW], ka.FORCE])
 
 
 @internal_kernel
@@ -62,7 +64,7 @@ def look_at_forces(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Wo
 def beyond_bounds(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace):
     """True where a point or a joint that sticks has more force than its friction can have."""
     for k in range(ws.contacts.shape[0]):
-        if ws.active[k, ka.MODE] == ka.STICKING and margin(contacts, ws, k) < 0.0:
+        if ws.active[k, ka.MODE] == ka.STICKING and margin(contacts, unilateral, ws, k) < 0.0:
             return True
     for k in range(unilateral.dry_table.shape[0]):
         if unilateral.dry_table[k, ku.DRY_HOLDS] == 1 and dry_margin(unilateral, ws, k) < 0.0:
@@ -75,10 +77,41 @@ def split_forces(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Work
     """The best split of the forces of all that sticks, into FORCE of its rows; its worst margin into BEST_MARGIN."""
     room, index, mu, rows = unilateral.room, unilateral.index, unilateral.vector[0], ws.rows
     first, row = index[0], index[1]
+    points, count, p = find_splits(unilateral, ws)
+    for j in range(points):
+        mu[j] = unilateral.number[ku.HOLDING] * contacts.law[ws.active[row[first[j]], ka.OWNER], ka.STATIC]
+    j = points
+    for k in range(unilateral.dry_table.shape[0]):
+        if unilateral.dry_table[k, ku.DRY_HOLDS] == 1:
+            mu[j] = holding_bound(unilateral, k)
+            j += 1
+    force, out = unilateral.vector[1], unilateral.vector[2]
+    for i in range(p):
+        force[i] = rows[row[i], ka.FORCE]
+    width = int(unilateral.number[ku.WIDTH])
+    unilateral.number[ku.SPLIT] = 1.0
+    programs = split_room_in(unilateral.split_room, index[3], width, count)
+    worst = best_split(force[:p], room[ku.NULL_SPACE], width, first, mu, points, count - points, out[:p], programs)
+    unilateral.number[ku.BEST_MARGIN] = worst
+    for i in range(p):
+        rows[row[i], ka.FORCE] = out[i]
+
+
+@internal_kernel
+def find_splits(unilateral: UnilateralArrays, ws: Workspace):
+    """Directions in which the forces of all that sticks may change, into NULL_SPACE, right after ``derivative``.
+
+    index[0] is the first row of each sticking point, then of each held joint, and index[1] the rows in the table.
+
+    Returns
+    -------
+    points, count, p : sticking points, those and held joints, and their rows
+    """
+    room, first, row = unilateral.room, unilateral.index[0], unilateral.index[1]
     count, p = 0, 0
     for k in range(ws.contacts.shape[0]):
         if ws.active[k, ka.MODE] == ka.STICKING:
-            first[count], mu[count] = p, contacts.law[k, ka.STATIC]
+            first[count] = p
             for s in range(3):
                 row[p] = ws.active[k, ka.FIRST_ROW] + s
                 p += 1
@@ -86,21 +119,26 @@ def split_forces(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Work
     points = count
     for k in range(unilateral.dry_table.shape[0]):
         if unilateral.dry_table[k, ku.DRY_HOLDS] == 1:
-            first[count], mu[count], row[p] = p, dry_bound(unilateral, k), unilateral.dry_table[k, ku.DRY_ROW]
+            first[count], row[p] = p, unilateral.dry_table[k, ku.DRY_ROW]
             p += 1
             count += 1
-    force, out = unilateral.vector[1], unilateral.vector[2]
     for i in range(p):
-        force[i] = rows[row[i], ka.FORCE]
         for j in range(p):
             room[ku.SPLIT_MATRIX, i, j] = ws.small[0, row[i], row[j]]
-    width = null_space(room[ku.SPLIT_MATRIX], p, room[ku.NULL_SPACE], index[2])
-    unilateral.number[ku.SPLIT] = 1.0
-    programs = split_room_in(unilateral.split_room, index[3], width, count)
-    worst = best_split(force[:p], room[ku.NULL_SPACE], width, first, mu, points, count - points, out[:p], programs)
-    unilateral.number[ku.BEST_MARGIN] = worst
-    for i in range(p):
-        rows[row[i], ka.FORCE] = out[i]
+    unilateral.number[ku.WIDTH] = null_space(room[ku.SPLIT_MATRIX], p, room[ku.NULL_SPACE], unilateral.index[2])
+    return points, count, p
+
+
+@internal_kernel
+def normal_is_open(unilateral: UnilateralArrays, ws: Workspace, k):
+    """True if the splits found last leave the normal force of candidate k, which sticks, undetermined."""
+    row = 0
+    for j in range(k):
+        row += 3 if ws.active[j, ka.MODE] == ka.STICKING else 0
+    for c in range(int(unilateral.number[ku.WIDTH])):
+        if abs(unilateral.room[ku.NULL_SPACE, row, c]) > NORMAL_PART:
+            return True
+    return False
 
 
 @internal_kernel

@@ -40,7 +40,8 @@ SETTLE = 8  # slower than that a touching point counts as at rest along the norm
 WINDOW_START, WINDOW_COUNT = 9, 10  # of the count of events that tells chatter
 CHATTERED = 11  # how often SETTLE was raised because of it
 DEEPEST = 12  # largest depth below the surface [m]
-TALLY_SIZE = 13
+UNPRESSED = 13  # time for which it stuck although nothing pressed it [s]
+TALLY_SIZE = 14
 # UnilateralArrays.stop_table, int
 STOP_JOINT = 0  # link whose joint it stops
 STOP_CLOSED = 1
@@ -108,7 +109,9 @@ BEST_MARGIN = 1  # the worst margin of the best split of their forces [N], where
 SPLIT = 2  # 1: BEST_MARGIN counts at this evaluation
 SLOW = 3  # below this speed the direction of slip is frozen [m/s]
 LAST_CHANGE, CHANGES = 4, 5  # time of the last change of modes, and how many there were at that time
-NUMBERS = 6
+HOLDING = 6  # share of the friction at rest that counts where modes are chosen; 1 outside of such a choice
+WIDTH = 7  # number of independent splits of the last evaluation with dependent rows, columns of room[NULL_SPACE]
+NUMBERS = 8
 
 
 class UnilateralArrays(NamedTuple):
@@ -128,6 +131,13 @@ class UnilateralArrays(NamedTuple):
     room: np.ndarray  # (ROOM, p, p) two matrices of the splits, one of the problem that chooses modes, its scratch
     split_room: np.ndarray  # scratch of the splits
     number: np.ndarray  # (NUMBERS,)
+    kept: np.ndarray  # the tables above that a choice of modes writes, as they were before it
+
+
+def kept_size(contacts: int, stops: int, joints: int) -> int:
+    """Length of ``kept``, see :mod:`dynsim.integrators.contacts.attempts`."""
+    candidate, stop, joint = SLIDE_SIZE + MODE_SIZE + TALLY_SIZE, STOP_TABLE_SIZE + STOP_SIZE, DRY_TABLE_SIZE + DRY_SIZE
+    return contacts * candidate + stops * stop + joints * joint + NUMBERS
 
 
 @internal_kernel
@@ -171,6 +181,12 @@ def note_stop_forces(unilateral: UnilateralArrays, ws: Workspace):
 def dry_bound(unilateral: UnilateralArrays, k):
     """Dry friction of joint k of those that have it, of gear and bearing together [N m or N]."""
     return unilateral.dry[k, OF_GEAR] + unilateral.dry[k, OF_JOINT]
+
+
+@internal_kernel
+def holding_bound(unilateral: UnilateralArrays, k):
+    """Dry friction that may hold joint k of those that have it; while modes are chosen a little less [N m or N]."""
+    return unilateral.number[HOLDING] * dry_bound(unilateral, k)
 
 
 @internal_kernel

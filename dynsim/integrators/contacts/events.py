@@ -6,6 +6,8 @@ along the slip direction at the start of the step. Guards of joints are alike. A
 
 Forces are continuous at lift-off and at the start of slip, where the complementarity problem is degenerate: the mode of
 that one candidate is set directly. After all other events, and where that is inconsistent, all modes are solved for.
+So they are at the end of the best split of dependent rows, where several points and joints start to slip at once and
+forces jump.
 """
 
 from __future__ import annotations
@@ -15,12 +17,14 @@ import math
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.rows import set_modes
-from dynsim.dynamics.contact.splits import dry_margin, margin
-from dynsim.dynamics.contact.unilateral import UnilateralArrays, dry_rests, stop_gap
+from dynsim.dynamics.contact.splits import dry_margin, margin, normal_is_open
+from dynsim.dynamics.contact.unilateral import UnilateralArrays, dry_rests, dry_rows_held, stop_gap
 from dynsim.dynamics.derivative import System
 from dynsim.dynamics.tables import ContactArrays, Workspace
 from dynsim.integrators import run as ki
+from dynsim.integrators.contacts.attempts import keep, take_back
 from dynsim.integrators.contacts.impacts import evaluate, slip_speed
+from dynsim.integrators.contacts.leaving import approach_without_force, watch_unpressed
 from dynsim.integrators.contacts.modes import begin_slip, drops, note_headway, resolve, slip_on
 from dynsim.integrators.run import Run
 from dynsim.jit.kernel import internal_kernel, noinline_kernel
@@ -46,6 +50,13 @@ INSTANT = 1e-11
 BACKWARD = 2e-11
 # Forces that contradict their modes by less than this, absolute [N] and of the largest, are rounding.
 FORCE_SLACK = 1e-9
+# Margins of a split that differ by less, as a fraction of its largest force, are the same: the accuracy of the program
+# that finds the best split.
+SPLIT_SLACK = 1e-7
+# At the end of the best split sticking is still a solution. So friction at rest is reduced for the choice of modes, by
+# FIRST_REDUCTION and ten times more up to MOST_REDUCTION, until the chosen modes agree with their forces: far above
+# rounding and the tolerances of the choice, far below what friction coefficients are known to.
+FIRST_REDUCTION, MOST_REDUCTION = 1e-5, 2e-3
 # Of the largest force: what counts as none where a point that sticks gives way.
 NO_FORCE = 1e-8
 
@@ -71,6 +82,9 @@ def contact_guard(contacts: ContactArrays, unilateral: UnilateralArrays | None, 
         return dry_margin(unilateral, ws, k)
     mode = ws.active[k, ka.MODE]
     if kind == NORMAL_GUARD:
+        if mode == ka.STICKING and unilateral.number[ku.SPLIT] == 1.0 and normal_is_open(unilateral, ws, k):
+            # The least of all normal forces that are possible only touches zero.
+            return approach_without_force(contacts, unilateral, ws, k)
         return (
             ws.contacts[k, ka.GAP] + unilateral.slide[k, ku.LANDS_AT]
             if mode == ka.OPEN
@@ -83,7 +97,7 @@ def contact_guard(contacts: ContactArrays, unilateral: UnilateralArrays | None, 
         # nothing of what is left. Once none fit, those of the best margin show which contacts give way.
         if unilateral.number[ku.SPLIT] == 1.0 and best > 0.0:
             return best
-        return margin(contacts, ws, k)
+        return margin(contacts, unilateral, ws, k)
     return 1.0
 
 
@@ -157,10 +171,11 @@ def note_gaps(ws: Workspace, gaps):
 
 
 @internal_kernel
-def watch_modes(unilateral: UnilateralArrays | None, ws: Workspace, h, gaps):
+def watch_modes(contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: Workspace, h, gaps):
     """At an accepted step, before its samples: times in each mode, depths, gaps and directions of slip at its end."""
     if unilateral is None:
         return
+    watch_unpressed(contacts, unilateral, ws, h)
     note_gaps(ws, gaps)
     state, tally, slide = ws.contacts, unilateral.tally, unilateral.slide
     for k in range(state.shape[0]):
@@ -226,8 +241,18 @@ def at_limit(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspac
 
     The guards of dependent rows fall together, with the best worst margin. Those with a better one hold.
     """
-    slack = FORCE_SLACK * (1.0 + abs(ws.contacts[k, ka.NORMAL_FORCE]))
-    return unilateral.number[ku.SPLIT] == 0.0 or margin(contacts, ws, k) <= unilateral.number[ku.BEST_MARGIN] + slack
+    if unilateral.number[ku.SPLIT] == 0.0:
+        return True
+    return margin(contacts, unilateral, ws, k) <= unilateral.number[ku.BEST_MARGIN] + split_slack(ws)
+
+
+@internal_kernel
+def split_slack(ws: Workspace):
+    """Difference below which margins of a split are the same [N or N m]."""
+    largest = 0.0
+    for r in range(ws.counts[ka.ROWS]):
+        largest = max(largest, abs(ws.rows[r, ka.FORCE]))
+    return SPLIT_SLACK * (1.0 + largest)
 
 
 @internal_kernel
@@ -266,6 +291,61 @@ def solve_modes(system: System, ws: Workspace, run: Run, first):
     tell_joints(system.unilateral, run)
     rearm(run)
     count_changes(system, run)
+
+
+@internal_kernel
+def split_ends(system: System, ws: Workspace, run: Run):
+    """True if the best split of several points and joints that stick together has reached its end.
+
+    What then starts to slip, and with which forces, is not continuous: a point or joint by itself would only be one of
+    those that start. A single sticking point without held joints starts by itself, in the direction of its friction.
+    """
+    unilateral, strongest = system.unilateral, 0.0
+    if unilateral.number[ku.SPLIT] == 0.0 or ws.counts[ka.STUCK] + dry_rows_held(unilateral) < 2:
+        return False
+    for k in range(ws.contacts.shape[0]):
+        strongest = max(strongest, ws.contacts[k, ka.NORMAL_FORCE])
+    for e in range(run.event.shape[0]):
+        kind, k = run.event_table[e, ki.EVENT_KIND], run.event_table[e, ki.EVENT_INDEX]
+        if kind < NORMAL_GUARD or run.event[e, ki.VALUE] > 0.0:
+            continue
+        if kind == DRY_GUARD and unilateral.dry_table[k, ku.DRY_HOLDS] == 1:
+            return True
+        # One at the apex of its cone leaves, and one whose friction drops is chosen for at full friction.
+        if kind == SLIP_GUARD and ws.active[k, ka.MODE] == ka.STICKING and not drops(system, k):
+            pressed = ws.rows[ws.active[k, ka.FIRST_ROW], ka.FORCE] > NO_FORCE * strongest
+            if pressed and at_limit(system.contacts, unilateral, ws, k):
+                return True
+    return False
+
+
+@noinline_kernel
+def solve_reduced(system: System, ws: Workspace, run: Run):
+    """Choose all modes with a little less friction at rest, and log what that changes; False if no choice agrees.
+
+    Then everything is as it was before.
+    """
+    number, clock = system.unilateral.number, run.clock
+    before, not_unique, reduction = ws.counts[ka.DEPENDENT], clock[ki.NOT_UNIQUE], FIRST_REDUCTION
+    keep(system.unilateral, ws, run)
+    agrees = False
+    while not agrees and reduction <= MOST_REDUCTION:
+        number[ku.HOLDING] = 1.0 - reduction
+        resolve(system, ws, run, TOUCH)
+        # At full friction modes would agree in which too much sticks.
+        agrees = run.count[ki.STATUS] == ki.RUNNING and consistent(system, ws)
+        if not agrees:
+            take_back(system, ws, run)
+        reduction *= 10.0
+    number[ku.HOLDING], ws.counts[ka.DEPENDENT] = 1.0, before
+    if agrees:
+        log_changes(system, ws, run)
+        tell_joints(system.unilateral, run)
+        rearm(run)
+        count_changes(system, run)
+    else:
+        clock[ki.NOT_UNIQUE] = not_unique
+    return agrees
 
 
 @internal_kernel
@@ -370,9 +450,7 @@ def break_loose(unilateral: UnilateralArrays, ws: Workspace, k):
     if table[k, ku.DRY_HOLDS] == 0:
         return False
     force = ws.rows[table[k, ku.DRY_ROW], ka.FORCE]
-    if not split or dry_margin(unilateral, ws, k) <= unilateral.number[ku.BEST_MARGIN] + FORCE_SLACK * (
-        1.0 + abs(force)
-    ):
+    if not split or dry_margin(unilateral, ws, k) <= unilateral.number[ku.BEST_MARGIN] + split_slack(ws):
         table[k, ku.DRY_HOLDS], unilateral.dry[k, ku.DRY_SIDE] = 0, -1.0 if force > 0.0 else 1.0
         note_headway(unilateral, ws, k)
     return True
@@ -392,6 +470,9 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
         return
     # Samples may have left another state in the workspace.
     evaluate(system, ws, run)
+    if split_ends(system, ws, run) and solve_reduced(system, ws, run):
+        run.count[ki.STARTED] = 0
+        return
     strongest = 0.0
     for k in range(mode.shape[0]):
         mode[k, ku.WANTED] = ws.active[k, ka.MODE]

@@ -21,7 +21,13 @@ from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.cone import problem as kc
 from dynsim.dynamics.contact.rows import set_modes
 from dynsim.dynamics.contact.splits import NULL_TOLERANCE
-from dynsim.dynamics.contact.unilateral import UnilateralArrays, dry_bound, dry_rows_held, slide_direction
+from dynsim.dynamics.contact.unilateral import (
+    UnilateralArrays,
+    dry_bound,
+    dry_rows_held,
+    holding_bound,
+    slide_direction,
+)
 from dynsim.dynamics.derivative import System
 from dynsim.dynamics.tables import Workspace
 from dynsim.integrators import run as ki
@@ -155,7 +161,7 @@ def let_joints_slide(system: System, size, largest):
         table[k, ku.DRY_NEXT] = table[k, ku.DRY_HOLDS]
         if table[k, ku.DRY_HOLDS] == 1:
             moves = abs(acceleration(unilateral, i, size)) > SLIP_TOLERANCE * largest
-            if moves and abs(f[i]) >= dry_bound(unilateral, k) * (1.0 - ON_CONE):
+            if moves and abs(f[i]) >= holding_bound(unilateral, k) * (1.0 - ON_CONE):
                 table[k, ku.DRY_NEXT], unilateral.dry[k, ku.DRY_SIDE] = 0, -1.0 if f[i] > 0.0 else 1.0
             i += 1
 
@@ -261,7 +267,7 @@ def reduce_rows(system: System, ws: Workspace, run: Run, p):
         index[ku.TABLE_ROW, r], vector[ku.FIRST_PART, r], vector[ku.SECOND_PART, r] = r, 0.0, 0.0
     for k in range(unilateral.dry_table.shape[0]):
         if unilateral.dry_table[k, ku.DRY_HOLDS] == 1:
-            vector[ku.CONE_FRICTION, unilateral.dry_table[k, ku.DRY_ROW]] = dry_bound(unilateral, k)
+            vector[ku.CONE_FRICTION, unilateral.dry_table[k, ku.DRY_ROW]] = holding_bound(unilateral, k)
     size = first
     for k in range(mode.shape[0]):
         if mode[k, ku.TOUCHING] == 0:
@@ -341,7 +347,9 @@ def drops(system: System, k):
 @internal_kernel
 def friction_at_rest(system: System, k):
     """Coefficient of the cone of candidate k, which is at rest along its surface."""
-    return system.contacts.law[k, ka.MU if system.unilateral.mode[k, ku.GIVES_WAY] == 1 else ka.STATIC]
+    if system.unilateral.mode[k, ku.GIVES_WAY] == 1:
+        return system.contacts.law[k, ka.MU]
+    return system.unilateral.number[ku.HOLDING] * system.contacts.law[k, ka.STATIC]
 
 
 @internal_kernel
@@ -360,7 +368,7 @@ def give_way(system: System, ws: Workspace, size, largest):
         while index[ku.TABLE_ROW, i] != ws.active[k, ka.FIRST_ROW]:
             i += 1
         holds = mode[k, ku.WANTED] == ka.STICKING and mode[k, ku.GIVES_WAY] == 0 and f[i] > 0.0
-        if holds and drops(system, k) and slips(system, i, size, largest, system.contacts.law[k, ka.STATIC]):
+        if holds and drops(system, k) and slips(system, i, size, largest, friction_at_rest(system, k)):
             mode[k, ku.GIVES_WAY] = 1
             changed = True
     return changed

@@ -16,8 +16,9 @@ from dynsim.dynamics.tree.joints import normalise
 from dynsim.dynamics.tree.loads import add_loads
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts import events as ke
+from dynsim.integrators.dense import sampled_now
 from dynsim.integrators.events import take_ticks
-from dynsim.integrators.output import write_output
+from dynsim.integrators.output import fill_drives, write_output
 from dynsim.integrators.run import Run
 from dynsim.integrators.stepping import tables as kt
 from dynsim.integrators.stepping.compliance import book_soft_contact, book_ties
@@ -333,11 +334,26 @@ def commands_due(system: System, ws: Workspace, run: Run):
             ws.joints[i, ka.QD] = run.y[system.layout.v + i]
         take_commands(system.drives, system.reference, run.clock[ki.TIME], ws)
     run.count[ki.TICKED] = due & ~ki.TAKE_COMMANDS
+    if due & ki.TAKE_COMMANDS or run.count[ki.STARTED] == 0:
+        rewrite_drives(system, ws, run)
     if run.count[ki.STARTED] == 0:
         run.count[ki.STARTED] = 1
         for i in range(ws.joints.shape[0]):
             run.stepping.before[kt.ACCELERATION, i] = 0.0
     return run.count[ki.TICKED] != 0
+
+
+@internal_kernel
+def rewrite_drives(system: System, ws: Workspace, run: Run):
+    """Currents, voltages and torques of a sample at TIME, recorded at the end of the last step, by the commands from
+    now on. Its accelerations and forces are still the means of that step."""
+    if not sampled_now(run):
+        return
+    place_joints(system, ws, run.y)
+    for i in range(ws.joints.shape[0]):
+        ws.joints[i, ka.QD], ws.joints[i, ka.APPLIED] = run.y[system.layout.v + i], 0.0
+    drive(system.drives, system.reference, run.clock[ki.TIME], run.y, system.layout, ws)
+    fill_drives(system, ws, run, run.output[run.count[ki.SAMPLE] - 1])
 
 
 @internal_kernel

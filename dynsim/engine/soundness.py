@@ -1,0 +1,312 @@
+"""Whether a system can be integrated: joints that move no inertia, and stability of sampled control loops.
+
+A loop is stable at a posture if its spectral radius over a period is at most 1. The open loop is linear in small
+deviations δq, v and currents i, with the commands u held:
+
+    M v̇ = K_m i − D v,    L di/dt = u − R i − K_m v,    u = −k_p δq̂ − k_d v̂ at each tick
+
+in the motions that couplings and the contacts that hold allow. Over a period it is integrated exactly. Positions q̂ and
+rates v̂ are the true ones at the tick, or measurements of encoders with their delay. Gravity and velocity products are
+left out: a posture that falls slowly is not an unstable loop.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.linalg import expm, null_space
+
+from dynsim.compile.model import Model
+from dynsim.compile.shapes import gap_at
+from dynsim.config.problems import listed
+from dynsim.dynamics import tables as ka
+from dynsim.engine.force_indeterminacy import touching_rows
+from dynsim.errors import ModelError
+from dynsim.model.description import Array, Contact
+from dynsim.scenario import Scenario, build
+from dynsim.scenario.sensors import Encoders
+
+if TYPE_CHECKING:
+    from dynsim.engine.prepare import Prepared
+
+# The inertia of a joint counts as zero below this part of Σ m l² + tr I of the bodies that it moves, and below this
+# part of their Σ m r² about the world's origin, which is rounding of the sweep.
+NOTHING, CANCELLED = 1e-12, 1e-14
+# Joints up to which the loop is examined: its matrices have three rows each.
+LARGE = 100
+# Growth of deviations that counts [1/s], and per period: free motions have a double eigenvalue 1 with rounding 1e-8.
+GROWTH, ROUNDING = 1.0, 1e-6
+# Periods of encoders and of the controller must be multiples of each other to this relative accuracy.
+WHOLE = 1e-9
+# Shorter periods that are tried for a message, each half the one before.
+HALVINGS = 8
+# Logarithm of the growth of deviations up to a stop, from which on it is the reason of the stop: a factor of 20.
+GROWN = 3.0
+
+
+@dataclass(frozen=True)
+class Growth:
+    """Growth of deviations of a sampled loop.
+
+    Attributes
+    ----------
+    radius : spectral radius, per ``period`` [s]
+    motor : number of the motor whose command has the largest part in it
+    """
+
+    radius: float
+    period: float
+    motor: int
+
+    @property
+    def rate(self) -> float:
+        """[1/s], negative where they decay."""
+        return math.log(max(self.radius, 1e-300)) / self.period
+
+    @property
+    def unstable(self) -> bool:
+        """Whether deviations grow, beyond rounding."""
+        return self.radius > 1.0 + ROUNDING and self.rate > GROWTH
+
+
+@dataclass(frozen=True)
+class HeldLoop:
+    """The linear open loop dx/dt = A x + B u of states x = (δq, v, i), with commands u; δq and v in free motions.
+
+    Attributes
+    ----------
+    A, B : (s, s), (s, na)
+    position, rate : positions and rates of the motors' joints, (na, s)
+    gain : k_p and k_d of the held commands, (na, 2); 0 for commands that do not follow the state
+    """
+
+    A: Array
+    B: Array
+    position: Array
+    rate: Array
+    gain: Array
+
+    def growth(self, period: float) -> Growth:
+        """With positions and rates of the ticks."""
+        law = -self.gain[:, :1] * self.position - self.gain[:, 1:] * self.rate
+        advance, input_ = self._over(period)
+        return _growth(advance + input_ @ law, law, period)
+
+    def growth_by_encoders(self, period: float, encoders: Encoders) -> Growth | None:
+        """With positions of encoders and their differences; None where the two periods do not fit each other."""
+        between = period if encoders.rate_hz is None else 1.0 / encoders.rate_hz
+        ratio = max(period, between) / min(period, between)
+        if abs(ratio - round(ratio)) > WHOLE * ratio:
+            return None
+        step, steps = min(period, between), round(ratio)
+        size, na = self.B.shape
+        kept = math.ceil(encoders.delay_s / between + 1.0 - WHOLE) + 2
+        # The vector has the states, the commands, and so many samples, beginning with the last one.
+        whole = size + na + kept * na
+        samples = size + na
+        advance, input_ = self._over(step)
+        product = np.eye(whole)
+        for k in range(steps):
+            if between <= period or k == 0:
+                taken = np.eye(whole)
+                taken[samples + na :, samples:] = np.eye((kept - 1) * na, kept * na)
+                taken[samples : samples + na] = 0.0
+                taken[samples : samples + na, :size] = self.position
+                product = taken @ product
+            if period <= between or k == 0:
+                since = k * step if between > period else 0.0  # the last sample was taken so long ago
+                late = max(0, math.ceil((encoders.delay_s - since) / between - WHOLE))
+                commanded = np.eye(whole)
+                commanded[size : size + na] = 0.0
+                last, before = (samples + (late + j) * na for j in range(2))
+                commanded[size : size + na, last : last + na] -= np.diag(self.gain[:, 0] + self.gain[:, 1] / between)
+                commanded[size : size + na, before : before + na] += np.diag(self.gain[:, 1] / between)
+                product = commanded @ product
+            moved = np.eye(whole)
+            moved[:size, :size], moved[:size, size : size + na] = advance, input_
+            product = moved @ product
+        commands = np.zeros((na, whole))
+        commands[:, size : size + na] = np.eye(na)
+        return _growth(product, commands, steps * step)
+
+    def _over(self, period: float) -> tuple[Array, Array]:
+        """x(t + period) = advance x + input u."""
+        size, na = self.B.shape
+        both = expm(np.block([[self.A, self.B], [np.zeros((na, size + na))]]) * period)
+        return both[:size, :size], both[:size, size:]
+
+
+def _growth(step: Array, commands: Array, period: float) -> Growth:
+    values, vectors = np.linalg.eig(step)
+    worst = int(np.abs(values).argmax())
+    return Growth(float(np.abs(values[worst])), period, int(np.abs(commands @ vectors[:, worst]).argmax()))
+
+
+def held_loop(model: Model, drives: ka.DriveArrays, q: Array, rows: Array) -> HeldLoop:
+    """The loop at coordinates q (nq,), whose rates v meet ``rows`` v = 0, (r, n).
+
+    Gear friction that is smoothed has its slope at rest.
+    """
+    free = null_space(rows) if len(rows) else np.eye(model.n)
+    f, na = free.shape[1], len(drives.table)
+    circuits = np.flatnonzero(drives.table[:, ka.DRIVE_KIND] == ka.DC_MOTOR)
+    size = 2 * f + len(circuits)
+    inertia = free.T @ (model.mass_matrix(q) + np.diag(model.armature)) @ free
+    A, B = np.zeros((size, size)), np.zeros((size, na))
+    position, rate = np.zeros((na, size)), np.zeros((na, size))
+    A[:f, f : 2 * f] = np.eye(f)
+    force, pushed = -free.T @ np.diag(model.damping) @ free, np.zeros((f, na))
+    pulled = np.zeros((f, len(circuits)))
+    gain = np.zeros((na, 2))
+    for a, (table, motor) in enumerate(zip(drives.table, drives.motor, strict=True)):
+        joint = free[table[ka.DRIVEN]]
+        position[a, :f], rate[a, f : 2 * f] = joint, joint
+        k_m, resistance = motor[ka.K_M], motor[ka.RESISTANCE]
+        if table[ka.DRIVE_KIND] == ka.DC_MOTOR:
+            e = int(np.searchsorted(circuits, a))
+            pulled[:, e] = k_m * joint
+            A[2 * f + e, f : 2 * f] = -k_m / motor[ka.INDUCTANCE] * joint
+            A[2 * f + e, 2 * f + e] = -resistance / motor[ka.INDUCTANCE]
+            B[2 * f + e, a] = 1.0 / motor[ka.INDUCTANCE]
+            gain[a] = motor[ka.K_P], motor[ka.K_D]
+        elif table[ka.DRIVE_KIND] == ka.POSITION_SERVO:
+            drag = motor[ka.COULOMB] / motor[ka.COULOMB_SPEED] if motor[ka.COULOMB] > 0.0 else 0.0
+            force -= drag * np.outer(joint, joint)
+            if table[ka.SERVO_MODE] == ka.OFF:
+                continue
+            force -= k_m * k_m / resistance * np.outer(joint, joint)
+            pushed[:, a] = k_m / resistance * joint
+            velocity = table[ka.SERVO_MODE] == ka.VELOCITY_MODE
+            gain[a] = (0.0, motor[ka.K_V] - k_m) if velocity else (motor[ka.K_P], motor[ka.K_D])
+    A[f : 2 * f, f:] = np.linalg.solve(inertia, np.hstack([force, pulled]))
+    B[f : 2 * f] = np.linalg.solve(inertia, pushed)
+    # Continuous commands are part of A. Commands that callers hold do not follow the state.
+    follows = drives.table[:, ka.SAMPLED] == ka.CONTINUOUS
+    at_once = np.where(follows[:, None], gain, 0.0)
+    A -= B @ (at_once[:, :1] * position + at_once[:, 1:] * rate)
+    return HeldLoop(A, B, position, rate, np.where((drives.table[:, ka.SAMPLED] == ka.AT_TICKS)[:, None], gain, 0.0))
+
+
+def held_rows(model: Model, contacts: Sequence[Contact], real: bool, q: Array) -> Array:
+    """Rows of couplings and of the contacts that hold at q: all by the bilateral law, else closed ones, at rest."""
+    robot = model.robot
+    joints = {joint: k for k, joint in enumerate(robot.joint_names)}
+    rows = [np.zeros((0, model.n))]
+    for coupling in robot.couplings:
+        row = np.zeros((1, model.n))
+        row[0, joints[coupling.joint]], row[0, joints[coupling.leader]] = 1.0, -coupling.ratio
+        rows.append(row)
+    for contact in contacts:
+        if contact.stiffness > 0.0 or (real and abs(gap_at(model, contact, q)) > build.START_TOLERANCE):
+            continue
+        rows.append(touching_rows(model, contact, q, real and contact.friction > 0.0))
+    return np.vstack(rows)
+
+
+def loop_growth(scenario: Scenario, prepared: Prepared, q: Array, period: float) -> Growth | None:
+    """Growth of the sampled loop at coordinates q (nq,); None where it is not examined."""
+    model, drives = prepared.model, prepared.system.drives
+    if model.n > LARGE or not len(drives.table) or not np.isfinite(q).all():
+        return None
+    rows = held_rows(model, prepared.contacts, prepared.system.unilateral is not None, q)
+    try:
+        loop = held_loop(model, drives, q, rows)
+    except np.linalg.LinAlgError:  # a joint that moves no inertia has its own message
+        return None
+    if not loop.A.shape[0] or not (np.isfinite(loop.A).all() and loop.gain.any()):
+        return None
+    encoders = None if scenario.config.sensors is None else scenario.config.sensors.encoders
+    return loop.growth(period) if encoders is None else loop.growth_by_encoders(period, encoders)
+
+
+def unstable_loop(scenario: Scenario, prepared: Prepared, q: Array | None = None) -> tuple[str, Growth] | None:
+    """A sentence about a sampled loop that is unstable at coordinates q (default: the start), and its growth.
+
+    None for a stable loop, without a sampled controller, and for more than :data:`LARGE` joints.
+    """
+    period = prepared.control.sample_time
+    if period is None:
+        return None
+    at = prepared.model.robot.initial if q is None else q
+    growth = loop_growth(scenario, prepared, at, period)
+    if growth is None or not growth.unstable:
+        return None
+    remedy = "use smaller gains"
+    for halved in range(1, HALVINGS + 1):
+        shorter = loop_growth(scenario, prepared, at, period / 2**halved)
+        if shorter is not None and not shorter.unstable:
+            remedy = f"use {period / 2**halved:.3g}, which is stable, or smaller gains"
+            break
+    table, motor = prepared.system.drives.table[growth.motor], prepared.system.drives.motor[growth.motor]
+    gains = f"k_p = {motor[ka.K_P]:.4g} V/rad, k_d = {motor[ka.K_D]:.4g} V s/rad"
+    if table[ka.DRIVE_KIND] == ka.POSITION_SERVO and table[ka.SERVO_MODE] == ka.VELOCITY_MODE:
+        gains = f"k_v = {motor[ka.K_V]:.4g} V s/rad"
+    return (
+        f"controller.sample_time_s = {period:g} s: the sampled loop is unstable in the posture "
+        f"{'of the start' if q is None else 'reached'}, deviations grow {math.exp(growth.rate * period):.4g} times per "
+        f"period (most at {prepared.model.robot.motors[growth.motor].joint}, {gains}); {remedy}"
+    ), growth
+
+
+def unstable_stop(scenario: Scenario, prepared: Prepared, q: Array, v: Array, elapsed: float) -> str:
+    """The sentence of a loop whose growth is the reason of a stop after ``elapsed`` [s]; empty where it is not.
+
+    Deviations have had the time to grow by e³, and the kinetic energy is greater than at the start, or is not finite.
+    """
+    for at in (None, q):
+        verdict = unstable_loop(scenario, prepared, at)
+        if verdict is None or verdict[1].rate * elapsed < GROWN:
+            continue
+        if not (np.isfinite(q).all() and np.isfinite(v).all()):
+            return verdict[0]
+        energy = prepared.model.kinetic_energy(q, v)
+        if energy > 0.0:
+            return f"{verdict[0]}; the kinetic energy has grown to {energy:.3g} J"
+    return ""
+
+
+def without_inertia(model: Model, q: Array) -> list[int]:
+    """Numbers of the joints that move no inertia at coordinates q (nq,); for several in a row only the last one."""
+    links = model.robot.links
+    felt = model.articulated_inertia(q)
+    mass = np.array([link.inertia.mass for link in links])
+    own = np.array([np.trace(link.inertia.tensor) for link in links])
+    positions = model.joint_positions(q, *((k, link.inertia.com) for k, link in enumerate(links)))
+    origins, centres = positions[: model.n], positions[model.n + 1 :]
+    numbers = {link.name: k for k, link in enumerate(links)}
+    parents = [-1 if link.parent is None else numbers[link.parent] for link in links]
+    behind = np.eye(model.n, dtype=bool)
+    for k in range(model.n - 1, -1, -1):
+        if parents[k] >= 0:
+            behind[parents[k]] |= behind[k]
+    slides = np.array([link.kind == "prismatic" for link in links])
+    lever = ((centres[None] - origins[:, None]) ** 2).sum(axis=2)
+    about_joint = np.where(slides, behind @ mass, (behind * (mass * lever + own)).sum(axis=1)) + model.armature
+    about_origin = behind @ (mass * (centres**2).sum(axis=1))
+    none = felt <= np.maximum(NOTHING * about_joint, np.where(slides, 0.0, CANCELLED * about_origin))
+    return [k for k in np.flatnonzero(none).tolist() if np.count_nonzero(none & behind[k]) == 1]
+
+
+def moving_nothing(model: Model, q: Array) -> str:
+    """A sentence about joints that move no inertia at coordinates q (nq,), or an empty string."""
+    if not np.isfinite(q).all():
+        return ""
+    none = without_inertia(model, q)
+    if not none:
+        return ""
+    joints = listed([model.robot.links[k].joint for k in none])
+    bodies = listed([model.robot.links[k].name for k in none])
+    return (
+        f"joint {joints} moves no inertia in this posture: the mass behind it ({bodies}) is zero or lies on its axis "
+        "without moments; give moments of inertia or a rotor inertia, change the posture, or lock the joint"
+    )
+
+
+def check_inertia(model: Model) -> None:
+    """Refuse a start in which a joint has nothing to accelerate: ModelError."""
+    if sentence := moving_nothing(model, model.robot.initial):
+        raise ModelError(f"plant: {sentence}", keys=("plant",))

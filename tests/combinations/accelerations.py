@@ -1,0 +1,311 @@
+"""The problem of accelerations and contact forces at one state, from the bodies alone.
+
+Modes that are not decided are those of points and joints at rest. Matrices come from the checks' own mass matrix and
+Jacobians; what accelerates points without forces comes from differences of their own motion.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from combinations.bodies import position_rates, times
+from combinations.observed import Observed
+from combinations.surfaces import nearest
+from dynsim.model.drives import Motor
+
+Array = NDArray[np.float64]
+
+# What is nearer to its surface is closed [m]; what moves more slowly rests [m/s, rad/s].
+CLOSED, RESTS = 1e-5, 1e-5
+# Determinants and diagonals below this part of the frictionless ones are as good as zero: a step ends just before.
+CRITICAL = 0.02
+# Most joints and contacts whose combinations are looked at one by one.
+FEW = 8
+# Steps of the differences that give a point's drift [s].
+DRIFT_STEP = 1e-4
+# Sweeps of the projected iteration, its damping, and what is left of accelerations that counts as none.
+SWEEPS, DAMPING, SOLVED = 20000, 0.7, 1e-7
+
+
+@dataclass(frozen=True)
+class State:
+    """The bodies at one instant.
+
+    Attributes
+    ----------
+    q, v, current : of the state
+    mass : M + J_m, (n, n)
+    names : closed contacts; rows : of each, normal and two tangents, (3, n); slip : (2,) along the tangents [m/s]
+    friction : coefficient of each; resting : joints at rest that rub, with their bounds
+    """
+
+    q: Array
+    v: Array
+    current: Array
+    mass: Array
+    names: list[str]
+    rows: list[Array]
+    slip: list[Array]
+    friction: list[float]
+    static: list[float]
+    resting: list[int]
+    bounds: list[float]
+    rubbing: Array
+
+
+def state_of(seen: Observed, values: Mapping[str, Sequence[float]], currents: Array | None = None) -> State:
+    """What the bodies are at the state of a stop, or the last sample; ``currents`` : of all drives, if known."""
+    q = np.array(values["q"]) if "q" in values else seen.q[-1]
+    v = np.array(values["v"]) if "v" in values else seen.v[-1]
+    motion = seen.bodies.motion(q[None], v[None], np.zeros((1, len(v))))
+    names, rows, slip, friction, static = [], [], [], [], []
+    for contact in seen.described_contacts:
+        body, point = seen.robot.attach(contact.body, contact.point)
+        start = motion.point(body, point)
+        tip = None if contact.tip is None else motion.point(body, seen.robot.attach(contact.body, contact.tip)[1])
+        surface = seen.shapes[contact.surface_name]
+        centre = nearest(surface, start, tip)
+        far, normal = surface.look(centre)
+        if far[0] - contact.radius > CLOSED:
+            continue
+        n = np.asarray(normal[0], dtype=np.float64)
+        along = np.cross(n, np.eye(3)[np.abs(n).argmin()])
+        along /= np.linalg.norm(along)
+        frame = np.stack([n, along, np.cross(n, along)])
+        J = frame @ seen.bodies.jacobian(motion, body, centre - contact.radius * normal)[0]
+        names.append(contact.name)
+        rows.append(J)
+        slip.append((J @ v)[1:])
+        speed = float(np.linalg.norm(slip[-1]))
+        mu = contact.friction + contact.viscous_friction * speed
+        if contact.stribeck > 0.0:
+            mu += (contact.friction_at_rest - contact.friction) * float(np.exp(-((speed / contact.stribeck) ** 2)))
+        friction.append(mu)
+        static.append(contact.friction_at_rest)
+    gears = {motor.joint: getattr(motor, "dry_friction", 0.0) for motor in seen.robot.motors}
+    bound = np.array([link.friction + gears.get(link.joint, 0.0) for link in seen.robot.links]) * seen.real
+    resting = [int(j) for j in np.flatnonzero((bound > 0.0) & (np.abs(v) < RESTS))]
+    rubbing = np.where((bound > 0.0) & (np.abs(v) >= RESTS), -bound * np.sign(v), 0.0)
+    current = seen.record["current"][-1].copy() if currents is None else currents
+    circuits = [a for a, motor in enumerate(seen.robot.motors) if isinstance(motor, Motor)]
+    if currents is None and len(values.get("current", ())) == len(circuits):
+        # Those of circuits are of the state, the others' those of the last sample.
+        current[circuits] = values["current"]
+    mass = seen.bodies.mass_matrix(q)
+    return State(
+        q, v, current, mass, names, rows, slip, friction, static, resting, [float(bound[j]) for j in resting], rubbing
+    )
+
+
+def critical(seen: Observed, values: Mapping[str, Sequence[float]]) -> bool:
+    """Whether some combination of modes has a paradox: contacts slide, and others stick, joints rest or are let go.
+
+    A contact that slides has its slip's direction, or, from rest, any.
+    """
+    state = state_of(seen, values)
+    basis = seen.bodies.free_directions()
+    for held_joints in _subsets(state.resting):
+        for mode in _modes(len(state.names)):
+            sliding = [k for k, m in enumerate(mode) if m == 1]
+            if not sliding:
+                continue
+            fixed = [np.eye(len(state.v))[j][None] for j in held_joints]
+            fixed += [state.rows[k] for k, m in enumerate(mode) if m == 2]
+            free = _null_space(np.vstack(fixed) @ basis, basis) if fixed else basis
+            if free.shape[1] == 0:
+                continue
+            inverse = free @ np.linalg.solve(free.T @ state.mass @ free, free.T)
+            if _paradox(state, sliding, inverse):
+                return True
+    return False
+
+
+def _paradox(state: State, sliding: Sequence[int], inverse: Array) -> bool:
+    """Whether det or a diagonal entry of N W (N − μ T)ᵀ falls to zero, for the directions that slip can have."""
+    choices = []
+    for k in sliding:
+        speed = float(np.linalg.norm(state.slip[k]))
+        if speed > RESTS:
+            choices.append([state.slip[k] / speed])
+        else:
+            # The worst direction is that of the largest coupling, either way.
+            normal, tangents = state.rows[k][0], state.rows[k][1:]
+            coupling = tangents @ inverse @ normal
+            size = float(np.linalg.norm(coupling))
+            worst = coupling / size if size > 0.0 else np.array([1.0, 0.0])
+            choices.append([worst, -worst])
+    N = np.stack([state.rows[k][0] for k in sliding])
+    bare = N @ inverse @ N.T
+    values = np.linalg.eigvalsh(bare)
+    if values[0] <= 1e-11 * values[-1]:
+        return False
+    for directions in itertools.islice(itertools.product(*choices), 64):
+        # From rest the static coefficient may hold.
+        mu = [max(state.friction[k], state.static[k]) for k in sliding]
+        T = np.stack([direction @ state.rows[k][1:] for k, direction in zip(sliding, directions, strict=True)])
+        for sign in (1.0, -1.0):
+            # Glued contacts pull too, which turns friction round.
+            A = bare - sign * N @ inverse @ (np.array(mu)[:, None] * T).T
+            if np.linalg.det(A) < CRITICAL * np.linalg.det(bare) or (np.diag(A) < CRITICAL * np.diag(bare)).any():
+                return True
+    return False
+
+
+def exists(seen: Observed, values: Mapping[str, Sequence[float]], time: float) -> bool:
+    """Whether there are contact forces that agree with Coulomb's law at a state, by a damped projected iteration."""
+    return _solved(seen, state_of(seen, values), time)[0]
+
+
+def leaves(seen: Observed, name: str, i: int) -> bool:
+    """Whether a contact would leave its surface at a sample if it had no force, all others having theirs."""
+    state = state_of(seen, {"q": seen.q[i].tolist(), "v": seen.v[i].tolist()}, seen.record["current"][i])
+    if name not in state.names:
+        return True
+    k = state.names.index(name)
+    without = replace(
+        state,
+        **{key: [entry for m, entry in enumerate(getattr(state, key)) if m != k] for key in
+           ("names", "rows", "slip", "friction", "static")},
+    )  # fmt: skip
+    solved, acceleration = _solved(seen, without, float(seen.time[i]))
+    drift = _drifts(seen, state)[k][0]
+    gain = float(state.rows[k][0] @ acceleration + drift)
+    return solved and gain > -1e-6 * (np.abs(acceleration).max(initial=0.0) + 1.0)
+
+
+def _solved(seen: Observed, state: State, time: float) -> tuple[bool, Array]:
+    """Whether there are forces by Coulomb's law at a state, and the accelerations with them, (n,)."""
+    if not state.names and not state.resting:
+        return True, np.linalg.solve(state.mass, _applied(seen, state, time))
+    push = _applied(seen, state, time)
+    inverse = np.linalg.inv(state.mass)
+    rows = np.vstack([*state.rows, *(np.eye(len(state.v))[j][None] for j in state.resting)])
+    drift = _drifts(seen, state)
+    free = rows @ inverse @ push + np.concatenate([drift.ravel(), np.zeros(len(state.resting))])
+    W = rows @ inverse @ rows.T
+    c = len(state.names)
+    f = np.zeros(len(rows))
+    scale = np.abs(free).max(initial=0.0) + 1e-9
+    for _ in range(SWEEPS):
+        before = f.copy()
+        for k in range(c):
+            _contact(state, k, W, free, f)
+        for m, bound in enumerate(state.bounds):
+            r = 3 * c + m
+            wanted = f[r] - (W[r] @ f + free[r]) / W[r, r]
+            f[r] += DAMPING * (np.clip(wanted, -bound, bound) - f[r])
+        if np.abs(W @ (f - before)).max() < 1e-13 * scale:
+            break
+    return _violation(state, W, free, f) < SOLVED * scale, inverse @ (push + rows.T @ f)
+
+
+def _contact(state: State, k: int, W: Array, free: Array, f: Array) -> None:
+    """One contact's force, the others' kept."""
+    r = slice(3 * k, 3 * k + 3)
+    a = W[3 * k : 3 * k + 3] @ f + free[r]
+    block = W[r, r]
+    speed = float(np.linalg.norm(state.slip[k]))
+    if speed > RESTS:
+        direction = np.concatenate([[1.0], -state.friction[k] * state.slip[k] / speed])
+        own = float(block[0] @ direction)
+        if own <= 0.0:
+            return
+        f_n = max(0.0, float(f[3 * k] - a[0] / own))
+        f[r] += DAMPING * (f_n * direction - f[r])
+        return
+    size = float(np.trace(block)) or 1.0
+    wanted = f[r] - a / size
+    wanted[0] = max(wanted[0], 0.0)
+    tangential, most = float(np.linalg.norm(wanted[1:])), state.static[k] * wanted[0]
+    if tangential > most:
+        wanted[1:] *= most / max(tangential, 1e-300)
+    f[r] += DAMPING * (wanted - f[r])
+
+
+def _violation(state: State, W: Array, free: Array, f: Array) -> float:
+    """Largest acceleration that the law does not allow, of what touches and what rests."""
+    a, worst = W @ f + free, 0.0
+    for k in range(len(state.names)):
+        own, force = a[3 * k : 3 * k + 3], f[3 * k : 3 * k + 3]
+        size = float(np.trace(W[3 * k : 3 * k + 3, 3 * k : 3 * k + 3])) or 1.0
+        worst = max(worst, -own[0], min(own[0], size * force[0]))
+        if float(np.linalg.norm(state.slip[k])) <= RESTS:
+            moved = force - own / size
+            most = state.static[k] * max(moved[0], 0.0)
+            tangential = float(np.linalg.norm(moved[1:]))
+            kept = moved[1:] * min(1.0, most / max(tangential, 1e-300))
+            worst = max(worst, size * float(np.linalg.norm(kept - force[1:])))
+    c = 3 * len(state.names)
+    for m, bound in enumerate(state.bounds):
+        r = c + m
+        kept = np.clip(f[r] - a[r] / W[r, r], -bound, bound)
+        worst = max(worst, float(W[r, r] * abs(kept - f[r])))
+    return worst
+
+
+def _applied(seen: Observed, state: State, time: float) -> Array:
+    """Generalised forces beside contacts and what rests, weight and velocity products among them, (n,)."""
+    motion = seen.bodies.motion(state.q[None], state.v[None], np.zeros((1, len(state.v))))
+    push = -seen.bodies.along_rows(motion, seen.bodies.wrenches(motion))[0] - seen.bodies.damping * state.v
+    push = push + seen.driven_torques(state.current[None], state.v[None])[0] + state.rubbing
+    for load in seen.loads:
+        body, point = seen.robot.attach(load.body, load.point)
+        wrench = load.components(np.array([time]))
+        parts = [wrench[:, :3], wrench[:, 3:]]
+        if load.in_body:
+            parts = [times(motion.rotation[body], part) for part in parts]
+        push = push + seen.bodies.force_along_rows(motion, body, motion.point(body, point), *parts)[0]
+    return np.asarray(push)
+
+
+def _drifts(seen: Observed, state: State) -> Array:
+    """Accelerations of what touches along normal and tangents without any of the joints, (c, 3) [m/s²].
+
+    From the places of gaps and the velocities of touching points, before and after at constant rates.
+    """
+    steps = np.array([-DRIFT_STEP, 0.0, DRIFT_STEP])
+    q = np.stack([state.q + h * position_rates(seen.bodies, state.q[None], state.v[None])[0] for h in steps])
+    motion = seen.bodies.motion(q, np.repeat(state.v[None], 3, axis=0), np.zeros((3, len(state.v))))
+    drifts = []
+    by_name = {contact.name: contact for contact in seen.described_contacts}
+    for name in state.names:
+        contact = by_name[name]
+        body, point = seen.robot.attach(contact.body, contact.point)
+        tip = None if contact.tip is None else motion.point(body, seen.robot.attach(contact.body, contact.tip)[1])
+        surface = seen.shapes[contact.surface_name]
+        centre = nearest(surface, motion.point(body, point), tip)
+        far, normal = surface.look(centre)
+        velocity = motion.velocity(body, centre - contact.radius * normal)
+        rate = (velocity[2] - velocity[0]) / (2.0 * DRIFT_STEP)
+        n = np.asarray(normal[1])
+        along = np.cross(n, np.eye(3)[np.abs(n).argmin()])
+        along /= np.linalg.norm(along)
+        bend = (far[2] - 2.0 * far[1] + far[0]) / DRIFT_STEP**2
+        drifts.append([bend, along @ rate, np.cross(n, along) @ rate])
+    return np.array(drifts).reshape(-1, 3)
+
+
+def _subsets(items: Sequence[int]) -> list[tuple[int, ...]]:
+    """All subsets of a few, of many all, none, and all but one."""
+    if len(items) <= FEW:
+        return [subset for size in range(len(items) + 1) for subset in itertools.combinations(items, size)]
+    return [tuple(items), (), *(tuple(item for item in items if item != left) for left in items)]
+
+
+def _modes(count: int) -> list[tuple[int, ...]]:
+    """Open, sliding, sticking of each contact; of many all alike, or one alone."""
+    if count <= 4:
+        return list(itertools.product((0, 1, 2), repeat=count))
+    alone = [tuple(1 if k == m else other for k in range(count)) for m in range(count) for other in (0, 2)]
+    return [(1,) * count, *alone]
+
+
+def _null_space(rows: Array, basis: Array) -> Array:
+    _, sizes, vectors = np.linalg.svd(rows)
+    rank = int((sizes > 1e-9 * max(sizes.max(initial=0.0), 1e-300)).sum())
+    return np.asarray(basis @ vectors[rank:].T)

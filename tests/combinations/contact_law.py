@@ -1,0 +1,298 @@
+"""The laws of contacts, joint stops and dry friction on records."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from combinations.observed import OPEN, SLIDING, STICKING, Observed, Touch, warned
+
+Array = NDArray[np.float64]
+Finding = Iterator[str]
+
+# Promise of docs/physics.md: gaps after a step's projection [m]; and where a point counts as landed.
+DRIFT = 1e-9
+# Of joint stops: limits in files are rounded [rad or m].
+STOP_SLACK = 1e-6
+# Share of the force that a frozen direction of slip and the tolerance of an event leave.
+CONE = 1e-5
+# What sticks moves no faster: limit of the projection of velocities [m/s]; steps solve contact problems to 1e-8.
+CREEP = 1e-6
+# Slip below this has no direction of its own: 1000 atol of the default [m/s].
+SLOW = 1e-4
+
+
+def touching(seen: Observed) -> Finding:
+    """Gaps, slip and normals of the record are those of the posture; what is open has no force, none pulls."""
+    for k, touch in enumerate(seen.touches()):
+        name = touch.contact.name
+        off = np.abs(touch.gap - seen.record["contact_gap"][:, k])
+        # Two searches for a nearest point.
+        if off.max() > 1e-8 + 1e-6 * np.abs(touch.gap[off.argmax()]):
+            i = int(off.argmax())
+            yield (
+                f"{name} at t = {seen.time[i]:.6g} s: gap {seen.record['contact_gap'][i, k]:.6g}, own "
+                f"{touch.gap[i]:.6g} m"
+            )
+        slip = seen.record["contact_slip_velocity"][:, k]
+        off = np.where(touch.mode != OPEN, np.abs(slip - touch.slip).max(axis=1), 0.0)
+        if off.max() > 1e-7 + 1e-6 * np.abs(slip).max():
+            i = int(off.argmax())
+            yield f"{name} at t = {seen.time[i]:.6g} s: slip {slip[i]} m/s, own {touch.slip[i]}"
+        along = (touch.force * touch.normal).sum(axis=1)
+        size = np.linalg.norm(touch.force, axis=1)
+        off = np.abs(along - touch.normal_force) - _share(seen, touch) * size
+        if (off > 1e-9).any():
+            i = int(off.argmax())
+            yield (
+                f"{name} at t = {seen.time[i]:.6g} s: its force has {along[i]:.6g} N along the normal, "
+                f"f_n is {touch.normal_force[i]:.6g} N"
+            )
+        if not seen.real:
+            continue
+        if (touch.normal_force < -1e-9 - CONE * size.max()).any():
+            i = int(touch.normal_force.argmin())
+            yield f"{name} at t = {seen.time[i]:.6g} s pulls with {-touch.normal_force[i]:.4g} N"
+        unheld = (touch.mode == OPEN) & (size > 1e-9)
+        if unheld.any():
+            yield (
+                f"{name} at t = {seen.time[unheld.argmax()]:.6g} s is open and has a force of "
+                f"{size[unheld].max():.4g} N"
+            )
+        if touch.contact.stiffness == 0.0:
+            far = (touch.normal_force > 1e-9) & (touch.gap > _reach(seen, touch))
+            if far.any():
+                i = int(np.where(far, touch.gap, 0.0).argmax())
+                yield (
+                    f"{name} at t = {seen.time[i]:.6g} s: {touch.normal_force[i]:.4g} N at a gap of {touch.gap[i]:.3g} "
+                    f"m"
+                )
+
+
+def _reach(seen: Observed, touch: Touch) -> Array:
+    """How far from its surface what touches may be, (T,) [m]: of steps what they go along the normal.
+
+    What starts within a micrometre is on its surface.
+    """
+    if not seen.stepped:
+        return np.full(len(seen), 10.0 * DRIFT)
+    return 1e-6 + seen.step * (_fastest_approach(touch) + np.linalg.norm(touch.slip, axis=1))
+
+
+def _fastest_approach(touch: Touch) -> Array:
+    """Largest speed along the normal until each sample, (T,) [m/s]."""
+    return np.asarray(np.maximum.accumulate(np.abs(touch.approach)))
+
+
+def coefficient(touch: Touch, speed: Array) -> Array:
+    """μ at speeds of slip, (T,)."""
+    contact = touch.contact
+    at_rest = contact.friction_at_rest
+    mu = contact.friction + contact.viscous_friction * speed
+    if contact.stribeck > 0.0:
+        mu = mu + (at_rest - contact.friction) * np.exp(-((speed / contact.stribeck) ** 2))
+    return np.asarray(mu)
+
+
+def friction(seen: Observed) -> Finding:
+    """Friction stays in its cone, is on its edge against the slip where there is some, and slips nowhere else."""
+    for touch in seen.touches():
+        yield from _glued_friction(seen, touch) if not seen.real else _real_friction(seen, touch)
+
+
+def _glued_friction(seen: Observed, touch: Touch) -> Finding:
+    contact = touch.contact
+    speed = np.linalg.norm(touch.slip, axis=1)
+    smooth = np.hypot(speed, contact.slip_smoothing)
+    size = touch.normal_force if contact.pulling_friction == "signed" else np.abs(touch.normal_force)
+    expected = -contact.friction * (size / smooth)[:, None] * touch.slip
+    off = np.abs(touch.tangential - expected).max(axis=1)
+    allowed = 1e-6 * np.abs(touch.normal_force) + 1e-9
+    if (off > allowed).any():
+        i = int((off / allowed).argmax())
+        yield (
+            f"{contact.name} at t = {seen.time[i]:.6g} s: friction {touch.tangential[i]} N, "
+            f"{expected[i]} by the slip {touch.slip[i]} m/s"
+        )
+
+
+def _real_friction(seen: Observed, touch: Touch) -> Finding:
+    contact, f_n = touch.contact, touch.normal_force
+    tangential = touch.tangential
+    speed, size = np.linalg.norm(touch.slip, axis=1), np.linalg.norm(tangential, axis=1)
+    closed = touch.mode != OPEN
+    slips = closed & (touch.mode == SLIDING) & (f_n > 0.0)
+    # Steps take μ of their start, the direction of their mean, and rates of before an impact.
+    before = touch.slip_before
+    speed = np.maximum(speed, np.linalg.norm(before, axis=1))
+    most = np.maximum(contact.friction_at_rest, coefficient(touch, speed))
+    if contact.grip_axis is None:
+        over = size - most * f_n
+        allowed = _share(seen, touch) * np.linalg.norm(touch.force, axis=1) + 1e-9 * (1.0 + np.abs(f_n).max())
+        if (closed & (over > allowed)).any():
+            i = int(np.where(closed, over - allowed, -np.inf).argmax())
+            yield (
+                f"{contact.name} at t = {seen.time[i]:.6g} s: friction of {size[i]:.6g} N is outside the cone of "
+                f"{most[i]:.4g} × {f_n[i]:.6g} N"
+            )
+    power = (tangential * touch.slip).sum(axis=1)
+    # A step in which slip ends may end with some of it turned round.
+    gained = slips & (power > size * (_share(seen, touch) * speed + (SLOW if seen.stepped else 1e-7)) + 1e-12)
+    if seen.stepped:
+        gained &= (tangential * before).sum(axis=1) > 0.0
+    if gained.any():
+        i = int(np.where(gained, power, 0.0).argmax())
+        yield f"{contact.name} at t = {seen.time[i]:.6g} s: friction drives the slip with {power[i]:.4g} W"
+    if contact.grip_axis is None:
+        yield from _against_slip(seen, touch, slips, before)
+    # What sticks does not move. Steps end with what they have solved the problem to.
+    # A sphere that rolls has velocities of its own at other places: only the place that touches counts.
+    sticks = closed & (touch.mode == STICKING)
+    if seen.stepped:
+        # A step at whose end slip is over had some of it.
+        sticks &= np.concatenate([[False], sticks[:-1]])
+    moving = sticks & (np.linalg.norm(touch.slip, axis=1) > _creep(seen, touch))
+    if moving.any():
+        own = np.linalg.norm(touch.slip, axis=1)
+        i = int(np.where(moving, own, 0.0).argmax())
+        yield f"{contact.name} at t = {seen.time[i]:.6g} s sticks and slips with {own[i]:.3g} m/s"
+
+
+def _share(seen: Observed, touch: Touch) -> Array:
+    """Part of a force by which its parts may be off, (T,): by steps it belongs to the normal of half a step before."""
+    return CONE + touch.turned if seen.stepped else np.full(len(seen), CONE)
+
+
+def _creep(seen: Observed, touch: Touch) -> Array:
+    """Slip of what sticks, (T,) [m/s]: nothing; of steps what turns of the surface add, and of soft contacts sag."""
+    if not seen.stepped:
+        return np.full(len(seen), CREEP)
+    moved = np.linalg.norm(np.diff(touch.position, axis=0, prepend=touch.position[:1]), axis=1)
+    speed = np.abs(touch.approach) + np.linalg.norm(touch.slip, axis=1)
+    soft = 1e-3 if touch.contact.stiffness > 0.0 else 0.0
+    spin = np.linalg.norm(seen.motion.spin[touch.body], axis=1)
+    return np.asarray(SLOW + soft + 2.0 * (spin * moved + touch.turned * speed))
+
+
+def _against_slip(seen: Observed, touch: Touch, slips: NDArray[np.bool_], before: Array) -> Finding:
+    """Sliding friction is μ f_n against the slip."""
+    speed, f_n = np.linalg.norm(touch.slip, axis=1), touch.normal_force
+    if seen.stepped:
+        # A step in which slip begins, ends or turns has friction of its own mean: only steady ones tell.
+        earlier = np.linalg.norm(before, axis=1)
+        both = np.maximum(speed, earlier)
+        turned = np.linalg.norm(touch.slip - before, axis=1)
+        steady = slips & (np.minimum(speed, earlier) > SLOW) & (turned < 0.2 * both)
+        middle = 0.5 * (touch.slip + before)
+        low, high = coefficient(touch, np.minimum(speed, earlier)), coefficient(touch, both)
+        # The contact's place moves on the body within a step, and the tangent plane turns.
+        share = turned / np.maximum(both, 1e-300) + np.abs(high - low) / np.maximum(high, 1e-300) + 1e-3
+    else:
+        steady, middle = slips & (speed > SLOW), touch.slip
+        share = np.full(len(seen), 1e-3)
+    pace = np.maximum(np.linalg.norm(middle, axis=1), 1e-300)
+    mu = coefficient(touch, np.linalg.norm(before, axis=1) if seen.stepped else speed)
+    expected = -(mu * f_n / pace)[:, None] * middle
+    off = np.linalg.norm(touch.tangential - expected, axis=1)
+    allowed = share * np.linalg.norm(touch.force, axis=1) + 1e-9
+    wrong = steady & (off > allowed)
+    # From rest the static coefficient holds until the first step of slip is over.
+    if wrong.any():
+        i = int(np.where(wrong, off / allowed, 0.0).argmax())
+        yield (
+            f"{touch.contact.name} at t = {seen.time[i]:.6g} s: friction {touch.tangential[i].round(5)} N, "
+            f"{expected[i].round(5)} N against the slip {middle[i].round(6)} m/s, in {wrong.sum()} samples"
+        )
+
+
+def gaps(seen: Observed) -> Finding:
+    """Nothing lies below its surface: by events within what projection leaves, by steps within their way."""
+    for touch in seen.touches():
+        name, contact = touch.contact.name, touch.contact
+        if not seen.real:
+            worst = int(np.abs(touch.gap).argmax())
+            if abs(touch.gap[worst]) > DRIFT and not warned(seen, "contacts drifted"):
+                yield (
+                    f"{name} at t = {seen.time[worst]:.6g} s is {touch.gap[worst]:+.3g} m off the surface that it is "
+                    f"glued to"
+                )
+            continue
+        deepest = int(touch.gap.argmin())
+        sag = 2.0 * np.abs(touch.normal_force).max() / contact.stiffness if contact.stiffness > 0.0 else 0.0
+        begun = max(-float(touch.gap[0]), 0.0)
+        allowed = DRIFT if not seen.stepped else 1e-7 + sag + 1.5 * seen.step * float(_fastest_approach(touch)[deepest])
+        if -touch.gap[deepest] > allowed + begun:
+            yield (
+                f"{name} at t = {seen.time[deepest]:.6g} s is {-touch.gap[deepest]:.3g} m below its surface "
+                f"(allowed {allowed:.3g})"
+            )
+
+
+def stops(seen: Observed) -> Finding:
+    """Joints stay within their stops, and steps take back what one let pass; a stop pushes only at its end."""
+    if not seen.real:
+        return
+    for i, (link, k) in enumerate(zip(seen.robot.links, seen.bodies.places, strict=True)):
+        for side, limit in ((1.0, link.lower), (-1.0, link.upper)):
+            if not np.isfinite(limit):
+                continue
+            beyond, rate = side * (limit - seen.q[:, k]), np.abs(seen.v[:, i])
+            deepest = int(beyond.argmax())
+            fastest = float(rate[: deepest + 1].max(initial=0.0))
+            allowed = STOP_SLACK + (1.5 * seen.step * fastest if seen.stepped else 0.0)
+            if beyond[deepest] > allowed:
+                yield (
+                    f"{link.joint} at t = {seen.time[deepest]:.6g} s is {beyond[deepest]:.3g} beyond its stop (allowed "
+                    f"{allowed:.3g})"
+                )
+            # 20 ms to come back, at 0.02 a second at the most, and as long again for what energy is left to do it.
+            late = seen.time >= seen.time[deepest] + 0.2 + 2.0 * max(float(beyond[deepest]), 0.0) / 0.02
+            if beyond[deepest] > 10.0 * STOP_SLACK and late.any():
+                still = float(beyond[late].min())
+                if still > 0.5 * beyond[deepest]:
+                    since = seen.time[-1] - seen.time[deepest]
+                    yield f"{link.joint} is {still:.3g} beyond its stop for {since:.3g} s and does not come back"
+    if "stop_force" in seen.record:
+        yield from _stop_forces(seen)
+
+
+def _stop_forces(seen: Observed) -> Finding:
+    for k, joint in enumerate(seen.record.labels["stop_force"]):
+        i = seen.joints.index(joint)
+        link, q = seen.robot.links[i], seen.q[:, seen.bodies.places[i]]
+        force = seen.record["stop_force"][:, k]
+        near = STOP_SLACK + (2.0 * seen.step * np.abs(seen.v[:, i]).max() if seen.stepped else 0.0)
+        pushes = ((force > 1e-9) & (q - link.lower > near)) | ((force < -1e-9) & (link.upper - q > near))
+        if pushes.any():
+            i = int(np.where(pushes, np.abs(force), 0.0).argmax())
+            yield f"{joint} at t = {seen.time[i]:.6g} s: its stop pushes with {force[i]:.4g} and is not reached"
+
+
+def dry(seen: Observed) -> Finding:
+    """Dry friction of joints stays within its bound, and is on it, against the motion, where there is some."""
+    if "joint_friction" not in seen.record:
+        return
+    gears = {motor.joint: getattr(motor, "dry_friction", 0.0) for motor in seen.robot.motors}
+    for k, joint in enumerate(seen.record.labels["joint_friction"]):
+        i = seen.joints.index(joint)
+        bound = seen.robot.links[i].friction + gears.get(joint, 0.0)
+        torque, rate = seen.record["joint_friction"][:, k], seen.v[:, i]
+        if (np.abs(torque) > bound * (1.0 + 1e-6) + 1e-12).any():
+            t = int(np.abs(torque).argmax())
+            yield (
+                f"{joint} at t = {seen.time[t]:.6g} s: dry friction of {torque[t]:.6g} is beyond its bound {bound:.6g}"
+            )
+        moves = np.abs(rate) > 10.0 * CREEP
+        if seen.stepped:
+            # Steady motion only: a step in which it stops or begins has any force within the bound.
+            gain = seen.step * seen.vdot[:, i]
+            moves &= np.minimum((rate - gain) * rate, (rate + gain) * rate) > 0.01 * rate**2
+        off = np.where(moves, np.abs(torque + bound * np.sign(rate)), 0.0)
+        if (off > 1e-6 * bound + 1e-9).any():
+            t = int(off.argmax())
+            yield (
+                f"{joint} at t = {seen.time[t]:.6g} s moves with {rate[t]:.3g} and its dry friction is "
+                f"{torque[t]:.6g} of {bound:.6g}"
+            )

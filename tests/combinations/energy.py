@@ -1,0 +1,156 @@
+"""Energies on records: those of the bodies, the ledger as docs/physics.md defines it, losses and heat."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from combinations.newton import integral_error, jumps_at_ticks
+from combinations.observed import STICKING, Observed, warned, whole_steps
+from dynsim.model.drives import Motor, Servo, TorqueSource
+
+Array = NDArray[np.float64]
+Finding = Iterator[str]
+
+# Share of the turnover above which a ledger must warn.
+RESIDUAL = 1e-6
+
+
+def ledger(seen: Observed) -> Finding:
+    """Energies are those of the bodies, the ledger closes or a warning says so, and losses only grow."""
+    record = seen.record
+    kinetic, potential = seen.bodies.energies(seen.motion, seen.v)
+    own = {"energy_kinetic": kinetic, "energy_potential": potential - potential[0] + record["energy_potential"][0]}
+    current = record["current"]
+    magnetic = np.zeros(len(seen))
+    for a, motor in enumerate(seen.robot.motors):
+        if isinstance(motor, Motor):
+            magnetic = magnetic + 0.5 * motor.inductance * current[:, a] ** 2
+    own["energy_magnetic"] = magnetic
+    for name, values in own.items():
+        off = np.abs(record[name] - values)
+        scale = np.abs(values).max(initial=0.0) + np.abs(kinetic).max(initial=0.0)
+        # Samples of steps lie on their ends only where these are whole ones.
+        if off.max() > 1e-8 * scale + 1e-12:
+            i = int(off.argmax())
+            yield f"{name} at t = {seen.time[i]:.6g} s is {record[name][i]:.9g} J, of the bodies {values[i]:.9g} J"
+    turnover, residual = turnover_and_residual(seen)
+    floor = residual_floor(seen)
+    relative = residual / max(turnover, floor) if max(turnover, floor) > 0.0 else 0.0
+    reported = float(record.summary["energy_residual_relative"])
+    if abs(relative - reported) > 0.01 * max(relative, reported) + 1e-12:
+        yield f"the residual is {relative:.3e} of the turnover by the signals, {reported:.3e} in the summary"
+    if relative > RESIDUAL and not warned(seen, "the energy ledger does not close"):
+        yield f"the ledger does not close: {relative:.3e} of the turnover, and no warning says so"
+
+
+def losses(seen: Observed) -> Finding:
+    """Losses never fall."""
+    turnover, _ = turnover_and_residual(seen)
+    names = ["heat_joule", "loss_joint", "loss_gear"]
+    restitution = any(touch.contact.restitution > 0.0 for touch in seen.touches())
+    signed = any(touch.contact.pulling_friction == "signed" for touch in seen.touches()) and not seen.real
+    if not restitution and not signed:
+        names += ["heat_friction"]
+        # What takes a point out of the surface again comes from what steps have taken there.
+        names += [name for name in ("loss_impact", "loss_stop") if name in seen.record and not seen.stepped]
+    for name in names:
+        fall = -np.diff(seen.record[name])
+        # Steps take friction of what sticks for none; what is left of rates is solved to 1e-8 m/s.
+        allowed = (1e-7 if seen.stepped else 1e-9) * turnover + 1e-12
+        if seen.stepped and name == "heat_friction" and fall.size:
+            # Within an impact friction may give what its normal impulse takes: only their sum is a loss.
+            fall = fall - np.maximum(np.diff(seen.record["loss_impact"]), 0.0)
+        if fall.size and fall.max() > allowed and not warned(seen, "friction has put"):
+            yield f"{name} falls by {fall.max():.3g} J at t = {seen.time[int(fall.argmax()) + 1]:.6g} s"
+
+
+def powers(seen: Observed) -> Finding:
+    """Heat and losses are the integrals of what the samples show of them."""
+    record, current = seen.record, seen.record["current"]
+    heat = np.zeros(len(seen))
+    for a, motor in enumerate(seen.robot.motors):
+        if not isinstance(motor, TorqueSource):
+            heat = heat + motor.resistance * current[:, a] ** 2
+    rubbed = np.zeros(len(seen))
+    for touch in seen.touches():
+        rubbed = rubbed - np.where(touch.mode == STICKING, 0.0, (touch.tangential * touch.slip).sum(axis=1))
+    lost = (seen.bodies.damping * seen.v**2).sum(axis=1) - (seen.joint_signal("joint_friction") * seen.v).sum(axis=1)
+    for motor in seen.robot.motors:
+        if isinstance(motor, Servo) and motor.coulomb_friction > 0.0 and not seen.real:
+            rate = seen.v[:, seen.joints.index(motor.joint)]
+            lost = lost + motor.coulomb_friction * rate**2 / np.hypot(rate, motor.coulomb_speed or 1e-2)
+    drawn = (current * record["voltage"]).sum(axis=1)
+    work = {
+        "heat_joule": (record["heat_joule"], heat),
+        "losses of gears and joints": (record["loss_gear"] + record["loss_joint"], lost),
+        "heat_friction": (record["heat_friction"], rubbed),
+        "energy_electrical": (record["energy_electrical"], drawn),
+    }
+    if jumps_at_ticks(seen) or seen.sample_time is not None:
+        del work["energy_electrical"]
+        if jumps_at_ticks(seen):
+            del work["heat_joule"], work["losses of gears and joints"]
+    turnover, _ = turnover_and_residual(seen)
+    for name, (total, power) in work.items():
+        yield from _integrated(seen, name, total, power, turnover)
+
+
+def _integrated(seen: Observed, name: str, total: Array, power: Array, turnover: float) -> Finding:
+    if not seen.stepped:
+        off, allowed, rows = integral_error(seen, total[:, None], power[:, None])
+        allowed = allowed + 1e-5 * turnover
+        rows = rows + 2
+    else:
+        rows = whole_steps(seen)
+        h, now, before = seen.step, power[rows], power[rows - 1]
+        # Power at the mean state of a step: between those of its ends, and as much off as these differ.
+        off = np.abs(total[rows] - total[rows - 1] - 0.5 * h * (now + before))[:, None]
+        allowed = (h * np.abs(now - before) + 0.02 * h * (np.abs(now) + np.abs(before)) + 1e-6 * turnover)[:, None]
+        quiet = np.array([(np.abs(seen.event_times - t) > 2.0 * h).all() for t in seen.time[rows]], dtype=bool)
+        off = np.where(quiet[:, None], off, 0.0) if len(rows) else off
+    if off.size and (off / allowed).max() > 1.0:
+        k = int((off / allowed).argmax())
+        yield (
+            f"{name} until t = {seen.time[rows[k]]:.6g} s is {off[k, 0]:.3g} J off the integral of what the "
+            f"samples show "
+            f"(allowed {allowed[k, 0]:.3g} J)"
+        )
+
+
+def residual_floor(seen: Observed) -> float:
+    """Least energy to which a residual is compared, as docs/physics.md has it [J]."""
+    reach, lever, mass = {}, 0.0, 0.0
+    for link in seen.bodies.robot.links:
+        reach[link.name] = 0.0 if link.parent is None else reach[link.parent] + float(np.linalg.norm(link.p_PJ))
+        lever += link.inertia.mass * (reach[link.name] + float(np.linalg.norm(link.inertia.com)))
+        mass += link.inertia.mass
+    g, record = float(np.linalg.norm(seen.bodies.gravity)), seen.record
+    stores = (
+        np.abs(record["energy_kinetic"]),
+        np.abs(record["energy_potential"] - record["energy_potential"][0]),
+        np.abs(record["energy_magnetic"]),
+    )
+    floor = seen.scenario.integrator.rtol * max(lever * g, *(float(store.max(initial=0.0)) for store in stores))
+    # Landings are located to some 1e-10 m (docs/physics.md); ten of them.
+    return max(floor, mass * g * 1e-3 * RESIDUAL) if seen.real and floor == 0.0 else floor
+
+
+def turnover_and_residual(seen: Observed) -> tuple[float, float]:
+    """Energy that changed hands, and the largest imbalance of the signals [J]."""
+    record = seen.record
+    sources = record["energy_electrical"] + record["work_constraint"]
+    size = np.abs(record["energy_electrical"]) + np.abs(record["work_constraint"])
+    if "work_loads" in record:
+        sources = sources + record["work_loads"].sum(axis=1)
+        size = size + np.abs(record["work_loads"]).sum(axis=1)
+    sinks = ("heat_joule", "loss_gear", "loss_joint", "heat_friction", "loss_impact", "loss_stop", "loss_damper")
+    for name in (*sinks, "energy_elastic", "loss_scheme"):
+        if name in record:
+            sources, size = sources - record[name], size + np.abs(record[name])
+    for name in ("energy_kinetic", "energy_potential", "energy_magnetic"):
+        change = record[name] - record[name][0]
+        sources, size = sources - change, size + np.abs(change)
+    return float(0.5 * size.max(initial=0.0)), float(np.abs(sources).max(initial=0.0))

@@ -1,0 +1,205 @@
+"""Newton's and Euler's laws on records: forces and accelerations, momentum, rates, circuits.
+
+An integral over samples is taken by Simpson's rule, and may be off by as much as it and the trapezoidal rule differ,
+and as rates bend around: far more than its error is where motion is smooth, and enough where it is not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from combinations.bodies import position_rates
+from combinations.observed import Observed, balance, whole_steps
+from dynsim.model.drives import Motor
+
+Array = NDArray[np.float64]
+Finding = Iterator[str]
+
+# Terms of the equation of motion cancel to this part of their size: by events the record's accelerations and forces
+# solve one linear system, whose condition costs up to six of sixteen digits.
+BALANCE = 1e-8
+# Forces of a step, and where it puts contacts, from differences of samples: h Δv̇ of rounded rates.
+STEPPED_BALANCE = 1e-7
+
+
+def equation(seen: Observed) -> Finding:
+    """Forces of the record move the bodies as the record says: weight, contacts, loads, drives, friction, stops."""
+    state = balance(seen)
+    if not len(state.rows):
+        return
+    share = STEPPED_BALANCE if seen.stepped else BALANCE
+    allowed = share * state.scale.max(axis=1, keepdims=True) + 2.0 * state.slack + 1e-10
+    excess = np.abs(state.left) / allowed
+    if excess.max() > 1.0:
+        row, j = np.unravel_index(excess.argmax(), excess.shape)
+        names = seen.joints if not seen.robot.couplings else [f"direction {k}" for k in range(state.left.shape[1])]
+        yield (
+            f"{names[j]} at t = {seen.time[state.rows[row]]:.6g} s: {state.left[row, j]:.4g} of terms of "
+            f"{state.scale[row].max():.4g} are left, in {(excess.max(axis=1) > 1.0).sum()} of {len(state.rows)} samples"
+        )
+
+
+def free_sets(seen: Observed) -> list[list[int]]:
+    """Bodies of each tree that floats; trees tied to each other move as one."""
+    bodies, n = seen.bodies, seen.bodies.n
+    root = [bodies.ancestors(i)[-1] for i in range(n)]
+    floats = {
+        r
+        for r in set(root)
+        if [link.kind for link in seen.robot.links[r : r + 6]] == ["prismatic"] * 3 + ["ball_x", "ball_y", "ball_z"]
+    }
+    sets = {r: [i for i in range(n) if root[i] == r] for r in floats}
+    return [sets[r] for r in sorted(sets)]
+
+
+def momentum(seen: Observed) -> Finding:
+    """Momentum and angular momentum of every set of free bodies change by the impulses of what acts on it."""
+    for chosen in free_sets(seen):
+        angular, linear = seen.bodies.momentum(seen.motion, chosen)
+        moment, force, size = _acting_on(seen, set(chosen))
+        both, rate = np.hstack([angular, linear]), np.hstack([moment, force])
+        name = seen.robot.links[chosen[-1]].name
+        if seen.stepped:
+            rows = whole_steps(seen)
+            # Means over the step, taken where it ends: as much off as the step is long beside the motion.
+            off = np.abs(both[rows] - both[rows - 1] - seen.step * rate[rows])
+            reach = 1.0 + np.linalg.norm(seen.motion.origin[chosen[-1]][rows], axis=1)
+            allowed = (seen.step * 0.02 * size[rows] * reach + 1e-12)[:, None]
+        else:
+            off, allowed, rows = integral_error(seen, both, rate)
+        if off.size and (off / allowed).max() > 1.0:
+            k, c = np.unravel_index((off / allowed).argmax(), off.shape)
+            kind = ("angular momentum", "momentum")[c // 3]
+            yield (
+                f"{name}: {kind} along {'xyz'[c % 3]} at t = {seen.time[rows[k]]:.6g} s is off the impulses by "
+                f"{off[k, c]:.3g} (allowed {np.broadcast_to(allowed, off.shape)[k, c]:.3g})"
+            )
+
+
+def _acting_on(seen: Observed, chosen: set[int]) -> tuple[Array, Array, Array]:
+    """Moment about the world's origin and force from outside on a set of bodies, and the sum of their sizes."""
+    moment, force, size = np.zeros((len(seen), 3)), np.zeros((len(seen), 3)), np.zeros(len(seen))
+
+    def add(at: Array, push: Array, twist: Array | float = 0.0) -> None:
+        nonlocal moment, force, size
+        moment = moment + np.cross(at, push) + twist
+        force = force + push
+        size = size + np.linalg.norm(push, axis=1) + np.linalg.norm(np.broadcast_to(twist, push.shape), axis=1)
+
+    for i in chosen:
+        body = seen.robot.links[i].inertia
+        add(seen.motion.point(i, body.com), np.broadcast_to(body.mass * seen.bodies.gravity, (len(seen), 3)))
+    for touch in seen.touches():
+        if touch.body in chosen:
+            add(touch.position, touch.force)
+    for load in seen.loads:
+        body, point = seen.robot.attach(load.body, load.point)
+        if body in chosen:
+            wrench = load.components(seen.time)
+            parts = [wrench[:, :3], wrench[:, 3:]]
+            if load.in_body:
+                parts = [np.einsum("tij,tj->ti", seen.motion.rotation[body], part) for part in parts]
+            add(seen.motion.point(body, point), *parts)
+    for a, b, at, push, twist in seen.tie_wrenches(seen.motion):
+        for body, sign in ((a, 1.0), (b, -1.0)):
+            if body in chosen:
+                add(at, sign * push, sign * twist)
+    return moment, force, size
+
+
+def integral_error(seen: Observed, value: Array, rate: Array) -> tuple[Array, Array, NDArray[np.int64]]:
+    """By how much values (T, k) change otherwise than the integral of their rates, over pairs of equal intervals in
+    which nothing happens; what is allowed; and the first sample of each pair."""
+    if len(seen) < 3:
+        return np.zeros((0, value.shape[1])), np.ones((0, value.shape[1])), np.zeros(0, dtype=np.int64)
+    interval = np.diff(seen.time)
+    even = np.abs(interval[1:] - interval[:-1]) <= 1e-9 * interval[1:]
+    rows = np.flatnonzero(even & seen.quiet(2))
+    h = interval[rows][:, None]
+    f0, f1, f2 = rate[rows], rate[rows + 1], rate[rows + 2]
+    simpson, trapezoid = h / 3.0 * (f0 + 4.0 * f1 + f2), h / 2.0 * (f0 + 2.0 * f1 + f2)
+    off = np.abs(value[rows + 2] - value[rows] - simpson)
+    rounding = 1e-12 * np.abs(value).max(axis=0, initial=0.0) + 1e-13
+    # Projection of samples and steps' errors move states within tolerances of the integrator.
+    config = seen.scenario.integrator
+    drift = 100.0 * (config.atol + config.rtol * np.abs(value[rows]).max(initial=0.0))
+    # What rings or is cut by a limit between samples shows in how much rates bend around them.
+    bend = np.zeros_like(rate)
+    bend[1:-1] = np.abs(rate[2:] - 2.0 * rate[1:-1] + rate[:-2])
+    reach = (
+        (5.0 if seen.settling > 0.0 else 2.0)
+        * h
+        * np.max([bend[np.clip(rows + k, 0, len(rate) - 1)] for k in range(-2, 5)], axis=0)
+    )
+    return off, 2.0 * np.abs(simpson - trapezoid) + reach + rounding + drift, rows
+
+
+def motion(seen: Observed) -> Finding:
+    """Accelerations add up to rates, and rates to positions."""
+    if seen.stepped:
+        yield from _stepped_motion(seen)
+        return
+    if jumps_at_ticks(seen):
+        return
+    speeds = position_rates(seen.bodies, seen.q, seen.v)
+    for label, value, rate in (("v", seen.v, seen.vdot), ("q", seen.q, speeds)):
+        off, allowed, rows = integral_error(seen, value, rate)
+        if off.size and (off / allowed).max() > 1.0:
+            k, j = np.unravel_index((off / allowed).argmax(), off.shape)
+            yield (
+                f"{label} of {seen.record.labels[label][j]} at t = {seen.time[rows[k]]:.6g} s is {off[k, j]:.3g} "
+                f"off the "
+                f"integral of its rate (allowed {allowed[k, j]:.3g})"
+            )
+
+
+def _stepped_motion(seen: Observed) -> Finding:
+    """Between samples a step apart rates change by that of one step or of two, whose accelerations are known."""
+    h = seen.step
+    # Steps end at ticks and where commands come in late: three may lie between samples.
+    if seen.sample_time is not None:
+        return
+    beside = np.flatnonzero(np.abs(np.diff(seen.time) - h) < 1e-6 * h) + 1
+    beside = beside[beside > 1]
+    if not len(beside):
+        return
+    change, now, before = seen.v[beside] - seen.v[beside - 1], h * seen.vdot[beside], h * seen.vdot[beside - 1]
+    bend = now - before
+    share = ((change - before) * bend).sum(axis=1) / np.maximum((bend * bend).sum(axis=1), 1e-300)
+    off = np.abs(change - before - np.clip(share, 0.0, 1.0)[:, None] * bend).max(axis=1)
+    allowed = 1e-6 * (np.abs(now) + np.abs(before)).max(axis=1) + 1e-12
+    # Where a step was cut at the end of a load, three steps may lie between samples.
+    wrong = (off > allowed) & np.array([(np.abs(seen.event_times - t) > 2.0 * h).all() for t in seen.time[beside]])
+    if wrong.any():
+        k = int(np.where(wrong, off, 0.0).argmax())
+        yield (
+            f"rates at t = {seen.time[beside[k]]:.6g} s are {off[k]:.3g} off what the accelerations make of the "
+            f"last ones"
+        )
+
+
+def jumps_at_ticks(seen: Observed) -> bool:
+    """Whether accelerations jump where commands are taken: those of drives without a circuit, or with a fast one."""
+    direct = any(not isinstance(motor, Motor) for motor in seen.robot.motors)
+    return seen.sample_time is not None and (direct or seen.settling > 0.0)
+
+
+def circuit(seen: Observed) -> Finding:
+    """L di/dt = u − R i − K v of DC motors."""
+    if seen.stepped or seen.sample_time is not None:
+        return
+    current, voltage = seen.record["current"], seen.record["voltage"]
+    for a, motor in enumerate(seen.robot.motors):
+        if not isinstance(motor, Motor) or seen.settling > 0.0:
+            continue
+        j = seen.joints.index(motor.joint)
+        rate = (
+            voltage[:, a] - motor.resistance * current[:, a] - motor.joint_constant * seen.v[:, j]
+        ) / motor.inductance
+        off, allowed, rows = integral_error(seen, current[:, a : a + 1], rate[:, None])
+        if off.size and (off / allowed).max() > 1.0:
+            k = int((off / allowed).argmax())
+            yield f"current of {motor.joint} at t = {seen.time[rows[k]]:.6g} s is {off[k, 0]:.3g} A off its circuit"

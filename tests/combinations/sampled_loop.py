@@ -1,0 +1,82 @@
+"""How fast a sampled loop grows, by a discretisation of the checks' own: the matrix exponential over one period."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from combinations.observed import Observed
+from dynsim.model.drives import Motor, Servo, TorqueSource
+
+Array = NDArray[np.float64]
+
+
+def loop_growth(seen: Observed) -> float | None:
+    """Logarithm per second of the growth of the slower of two loops; None where no command is sampled.
+
+    One with all contacts let go, one with those held that touch at the start: between them lies what contacts do.
+    No weight and no velocity products: what grows without them is the loop.
+    """
+    period = seen.sample_time
+    if period is None or not seen.robot.motors or seen.config.get("sensors"):
+        return None
+    basis = seen.bodies.free_directions()
+    first = seen.bodies.motion(seen.robot.initial[None], np.zeros((1, seen.bodies.n)), np.zeros((1, seen.bodies.n)))
+    rows = [np.zeros((0, seen.bodies.n))]
+    for touch in seen.touches(first):
+        if abs(touch.gap[0]) < 1e-6 and touch.contact.stiffness == 0.0:
+            J = seen.bodies.jacobian(first, touch.body, touch.position)[0]
+            rows.append(J if seen.real and touch.contact.friction > 0.0 else touch.normal[0][None] @ J)
+    _, sizes, vectors = np.linalg.svd(np.vstack(rows) @ basis)
+    rank = int((sizes > 1e-9).sum())
+    radii = [_spectral_radius(seen, free) for free in (basis, basis @ vectors[rank:].T) if free.shape[1]]
+    return float(np.log(max(min(radii), 1e-300))) / period if radii else None
+
+
+def _spectral_radius(seen: Observed, basis: Array) -> float:
+    """Largest eigenvalue over one period of the motions in a basis, (n, k)."""
+    from scipy.linalg import expm
+
+    period, controller = seen.sample_time, seen.config.get("controller") or {}
+    n, motors = seen.bodies.n, seen.robot.motors
+    M = basis.T @ seen.bodies.mass_matrix(seen.robot.initial) @ basis
+    k = basis.shape[1]
+    circuits = [motor for motor in motors if isinstance(motor, Motor)]
+    size = 2 * k + len(circuits)
+    A, B, K = np.zeros((size, size)), np.zeros((size, len(motors))), np.zeros((len(motors), size))
+    A[:k, k : 2 * k] = np.eye(k)
+    inverse = np.linalg.inv(M)
+    A[k : 2 * k, k : 2 * k] = -inverse @ basis.T @ np.diag(seen.bodies.damping) @ basis
+    c = 2 * k
+    for a, motor in enumerate(motors):
+        row = np.eye(n)[seen.joints.index(motor.joint)] @ basis
+        if isinstance(motor, TorqueSource):
+            continue
+        k_m, resistance = motor.joint_constant, motor.resistance
+        k_p, k_d = _gains(controller, motor)
+        K[a, :k], K[a, k : 2 * k] = -k_p * row, -k_d * row
+        if isinstance(motor, Motor):
+            A[k : 2 * k, c] = inverse @ row * k_m
+            A[c, c], A[c, k : 2 * k] = -resistance / motor.inductance, -k_m * row / motor.inductance
+            B[c, a] = 1.0 / motor.inductance
+            c += 1
+        else:
+            A[k : 2 * k, k : 2 * k] -= np.outer(inverse @ row, row) * k_m**2 / resistance
+            B[k : 2 * k, a] = inverse @ row * k_m / resistance
+    joined = np.zeros((size + len(motors),) * 2)
+    joined[:size, :size], joined[:size, size:] = A, B
+    E = expm(joined * period)
+    return float(np.abs(np.linalg.eigvals(E[:size, :size] + E[:size, size:] @ K)).max())
+
+
+def _gains(controller: Mapping[str, Any], motor: Motor | Servo) -> tuple[float, float]:
+    if isinstance(motor, Servo):
+        return (0.0, motor.k_v) if motor.velocity_mode else (motor.k_p, motor.k_d)
+    gains = []
+    for key, default in (("k_p_V_per_rad", 500.0), ("k_d_V_s_per_rad", 20.0)):
+        value = controller.get(key, default)
+        gains.append(float(value.get(motor.joint, default) if isinstance(value, Mapping) else value))
+    return gains[0], gains[1]

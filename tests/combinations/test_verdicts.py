@@ -1,0 +1,66 @@
+"""Every warning and every kind of stop that the engine has comes with a check, or with the reason why it has none."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import dynsim
+from combinations.verdicts import STOPS, UNVERIFIED, VERIFIERS
+from dynsim.engine.stopping import KINDS
+
+PACKAGE = Path(dynsim.__file__).parent
+# Where sentences for the list of warnings of a run of the dynamics are made.
+SOURCES = ("engine/warnings.py", "engine/soundness.py", "engine/equilibrium.py")
+# Sentences there that end as part of an error, of a stop, or of another sentence.
+PARTS = (
+    r"^joint .* moves no inertia in this posture",
+    r"^plant: ",
+    r"; the kinetic energy has grown to",
+    r"^use .*, which is stable, or smaller gains",
+    r"^the torque of .* begins with|^the reference of .* begins",
+    r"^the motion does not determine|^in the samples",
+    r"^; while .* slides, other choices may move otherwise",
+    r"^f_t = |^friction has put ",
+    r"^of the start|^stops are enforced|^the stop holds only",
+    r"^k_[pv] = ",
+)
+LEAST_WORDS = 5
+
+
+def sentences(source: str) -> Iterator[str]:
+    """Texts with placeholders of a module, a number for each."""
+    tree = ast.parse(source)
+    within = {id(inner) for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for inner in ast.walk(node)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.JoinedStr) and sum(id(node) == inner for inner in within) <= 1:
+            yield "".join(
+                part.value if isinstance(part, ast.Constant) and isinstance(part.value, str) else "1"
+                for part in node.values
+            )
+
+
+@pytest.mark.parametrize("module", SOURCES)
+def test_every_warning_has_a_check_or_a_reason(module: str) -> None:
+    known = [*VERIFIERS, *UNVERIFIED, *PARTS]
+    source = (PACKAGE / module).read_text("utf-8")
+    lacking = [
+        text
+        for text in sentences(source)
+        if len(re.findall(r"[a-z]{2,}", text)) >= LEAST_WORDS and not any(re.search(pattern, text) for pattern in known)
+    ]
+    assert lacking == []
+
+
+def test_every_stop_has_a_check() -> None:
+    assert set(KINDS.values()) == set(STOPS)
+
+
+def test_a_warning_without_a_check_is_seen() -> None:
+    source = 'f"{contact}: this is a new warning, with a number of {number} m"'
+    (text,) = sentences(source)
+    assert not any(re.search(pattern, text) for pattern in (*VERIFIERS, *UNVERIFIED, *PARTS))

@@ -1,0 +1,212 @@
+"""Dry joint friction with sampled commands and with contacts, and points that nothing presses.
+
+Each test is a scene whose answer is known: in closed form, by symmetry, or by time stepping, which solves one contact
+problem a step and knows no modes.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+from dynsim import Simulation, load_scenario, simulate
+from dynsim.dynamics.tables import SLIDING, STICKING
+from dynsim.record import Record
+
+STEPS = "time_stepping"
+EVENTS = [pytest.param("dopri5", id="dopri5"), pytest.param("radau5", id="radau5")]
+
+SAMPLED = """
+name: sampled
+duration_s: 0.05
+plant:
+  type: serial_arm
+  link: {friction_N_m: 0.1, motor: {type: wang_minami}}
+  chain: [{initial_deg: 100}, {initial_deg: 30}]
+controller: {type: joint_pd, sample_time_s: 0.001, k_p_V_per_rad: 20, k_d_V_s_per_rad: 0.5}
+contacts: {law: unilateral}
+record: {rate_hz: 1000}
+"""
+
+
+def run(folder: Path, text: str, **overrides: object) -> Record:
+    """Record of a scenario; keys of ``overrides`` with ``__`` for dots."""
+    path = folder / "scene.yaml"
+    path.write_text(text, encoding="utf-8")
+    return simulate(load_scenario(path, None, {key.replace("__", "."): value for key, value in overrides.items()}))
+
+
+@pytest.mark.parametrize("sensors", [None, {"encoders": {}}], ids=["ideal", "encoders"])
+@pytest.mark.parametrize("method", ["dopri5", "radau5", "auto", STEPS])
+def test_sampled_arm_with_dry_friction_starts_in_its_posture(tmp_path: Path, method: str, sensors: object):
+    record = run(tmp_path, SAMPLED, integrator__method=method, sensors=sensors)
+    np.testing.assert_allclose(np.degrees(record["q"][0]), [100.0, 30.0], rtol=0, atol=1e-12)
+    assert np.abs(np.diff(record["q"], axis=0)).max() < 0.01
+    if sensors is None:
+        # By dopri5 at rtol 1e-9: 0.00590287 J. Time stepping is of first order, 0.3 % here.
+        assert record.summary["electrical_energy_J"] == pytest.approx(0.0059029, rel=0.01 if method == STEPS else 1e-5)
+
+
+def test_brake_closed_at_the_first_tick_keeps_the_posture(tmp_path: Path):
+    path = tmp_path / "scene.yaml"
+    path.write_text(SAMPLED, encoding="utf-8")
+    simulation = Simulation(load_scenario(path, None, {"integrator.method": "dopri5"}))
+    simulation.set_brake("joint_2", closed=True)
+    simulation.advance(0.01)
+    q = np.degrees(simulation.record()["q"])
+    np.testing.assert_allclose(q[0], [100.0, 30.0], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(q[:, 1], 30.0, rtol=0, atol=1e-9)
+
+
+# One joint moves the tip at 75° to the normal of a plane that it touches. At μ tan 75° > 1 friction could hold it there
+# whatever the torque; nothing presses it any more when the torque has changed its sign.
+FLAT = """
+name: flat
+duration_s: {duration}
+plant:
+  type: serial_arm
+  gravity_m_s2: [0, 0, 0]
+  chain:
+    - {{axis: y, length_m: 0.3, mass_kg: 0.5, initial_deg: 90, friction_N_m: {dry}, damping_N_m_s_per_rad: 0.2,
+       motor: {{type: torque, limit_N_m: 50}}}}
+controller:
+  type: joint_pd
+  torques: {{joint_1: {{times_s: [0, 0.5, 1], torques_N_m: [1, 0, -1]}}}}
+surfaces: {{s: {{type: plane, point_m: [0.3, 0, 0], normal: [0.9659258262890683, 0, 0.25881904510252074]}}}}
+contacts: {{law: unilateral, friction: 0.6, points: {{tip: {{body: link_1, point_m: [0, 0, 0.3], surface: s}}}}}}
+record: {{rate_hz: 1000}}
+"""
+
+
+@pytest.mark.parametrize("dry", [0.0, 0.05])
+@pytest.mark.parametrize("method", EVENTS)
+def test_stuck_point_leaves_when_nothing_presses_it(tmp_path: Path, method: str, dry: float):
+    """The torque is the spline −3 s + 4 s³ at s = t − 0.5, and the joint breaks loose where that is −dry."""
+    leaves = 0.5 + (brentq(lambda s: 4.0 * s**3 - 3.0 * s + dry, 0.0, 0.1) if dry else 0.0)
+    record = run(tmp_path, FLAT.format(duration=0.6, dry=dry), integrator__method=method)
+    events = {event.kind: event.time for event in record.events if event.name == "tip"}
+    # The guard is an acceleration, zero to 1e-8 of the largest one.
+    assert events == {"lift_off": pytest.approx(leaves, abs=1e-7)}
+    assert record["contact_normal_force"][record.time > 0.52].max() == 0.0
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("dry", [0.0, 0.05])
+def test_point_that_leaves_at_a_flat_angle_moves_as_by_time_stepping(tmp_path: Path, dry: float):
+    text = FLAT.format(duration=0.8, dry=dry)
+    events, steps = (run(tmp_path, text, integrator__method=method) for method in ("dopri5", STEPS))
+    # Steps of 1 ms, of first order at the lift-off.
+    assert steps["q"][-1, 0] == pytest.approx(events["q"][-1, 0], rel=5e-3)
+    assert steps["v"][-1, 0] == pytest.approx(events["v"][-1, 0], rel=5e-3)
+
+
+# Two points on surfaces at 45°, 5 cm and 15 cm beyond the centre of mass of a free body. The load along the body is
+# shared in halves, 4 N each, and its moment pulls the far point with 0.8 N off its surface.
+WEDGE = """
+name: wedge
+duration_s: 0.05
+plant:
+  type: serial_arm
+  gravity_m_s2: [-8, 0, -1.6]
+  chain:
+    - {kind: prismatic, axis: x, length_m: 0, mass_kg: 0}
+    - {kind: prismatic, axis: z, length_m: 0, mass_kg: 0}
+    - {axis: y, length_m: 0.3, mass_kg: 1, initial_deg: 90}
+surfaces:
+  a: {type: plane, point_m: [0.2, 0, 0], normal: [1, 0, 1]}
+  b: {type: plane, point_m: [0.3, 0, 0], normal: [1, 0, 1]}
+contacts:
+  law: unilateral
+  friction: 2
+  points:
+    near: {body: link_3, point_m: [0, 0, 0.2], surface: a}
+    far: {body: link_3, point_m: [0, 0, 0.3], surface: b}
+"""
+
+
+def test_warning_names_a_point_that_sticks_although_nothing_presses_it(tmp_path: Path):
+    record = run(tmp_path, WEDGE, integrator__method="dopri5")
+    np.testing.assert_allclose(record["contact_normal_force"][-1], np.sqrt(0.5) * np.array([5.2 + 1.2, 3.2]), rtol=1e-9)
+    text = "the motion is not unique: nothing presses far (100.0 % of the run), held by forces within the friction"
+    assert [warning for warning in record.summary["warnings"] if warning.startswith(text)]
+    # A load that presses both points leaves forces open, not the motion.
+    pressed = run(tmp_path, WEDGE.replace("-8, 0, -1.6", "-8, 0, 0"), integrator__method="dopri5")
+    assert (pressed["contact_mode"] == STICKING).all()
+    assert not [warning for warning in pressed.summary["warnings"] if "not unique" in warning]
+
+
+def elbow_on(surface: str, friction: float, dry: float) -> str:
+    """A six-joint arm with dry friction whose elbow rests on a surface, while two joints follow references."""
+    pitch, length = [115, 125, 60, 40, 70], 0.25
+    relative = np.diff([0, *pitch])
+    elbow = np.zeros(3)
+    for angle in np.radians(np.cumsum(relative[:2])):
+        across = np.sin(angle) * np.array([np.cos(np.radians(10)), np.sin(np.radians(10))])
+        elbow += length * np.array([*across, np.cos(angle)])
+    radius = 0.3
+    below, above = ([*elbow[:2].tolist(), float(elbow[2] + z)] for z in (-radius, radius))
+    shape = {
+        "plane": f"{{type: plane, point_m: {elbow.tolist()}, normal: [0.1, 0.05, 1]}}",
+        "sphere": f"{{type: sphere, center_m: {below}, radius_m: {radius}}}",
+        "cylinder": f"{{type: cylinder, point_m: {below}, axis: [0.3, 1, 0], radius_m: {radius}}}",
+        "bowl": f"{{type: sphere, center_m: {above}, radius_m: {radius}, inside: true}}",
+    }[surface]
+    chain = "".join(f"    - {{axis: y, initial_deg: {angle}}}\n" for angle in relative)
+    return f"""
+name: elbow_on_{surface}
+duration_s: 0.4
+plant:
+  type: serial_arm
+  link: {{length_m: {length}, mass_kg: 0.4, radius_m: 0.02, damping_N_m_s_per_rad: 0.05, friction_N_m: {dry},
+    motor: {{type: wang_minami}}}}
+  chain:
+    - {{axis: z, length_m: 0, mass_kg: 0.2, initial_deg: 10}}
+{chain}controller:
+  type: joint_pd
+  k_p_V_per_rad: 300
+  k_d_V_s_per_rad: 12
+  joints:
+    joint_1: {{times_s: [0, 0.4], angles_deg: [10, 25]}}
+    joint_2: {{times_s: [0, 0.4], angles_deg: [115, 120]}}
+initial: {{on_surface: [elbow], equilibrium: true}}
+surfaces: {{s: {shape}}}
+contacts: {{law: unilateral, friction: {friction}, points: {{elbow: {{body: link_4, surface: s}}}}}}
+record: {{rate_hz: 1000}}
+"""
+
+
+def test_elbow_and_two_joints_start_to_move_at_once(tmp_path: Path):
+    """At 10.25 ms the best split of the friction ends. The elbow and joints 1 and 2 move, the others stay at rest.
+
+    Released one after the other they end in det J M⁻¹F < 0, which stopped runs as Painlevé's paradox.
+    """
+    text = elbow_on("plane", 0.05, 0.1)
+    events, steps = (
+        run(tmp_path, text, duration_s=0.014, integrator__method=method, integrator__step_s=step)
+        for method, step in (("dopri5", None), (STEPS, 1e-5))
+    )
+    starts = [event for event in events.events if event.kind == "slip_start" and event.time < 0.0104]
+    assert {event.name for event in starts} == {"elbow", "joint_1", "joint_2"}
+    np.testing.assert_allclose([event.time for event in starts], 0.01025, rtol=0, atol=5e-6)
+    for record in (events, steps):
+        moving = np.abs(record["v"][12]) > 1e-9
+        assert moving.tolist() == [True, True, False, False, False, False]
+        assert record["contact_mode"][12, 0] == SLIDING
+    # First order of steps of 10 µs.
+    np.testing.assert_allclose(events["contact_normal_force"][12], steps["contact_normal_force"][12], rtol=1e-3)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("surface", ["plane", "sphere", "cylinder", "bowl"])
+@pytest.mark.parametrize("friction", [0.05, 0.1, 0.2, 0.3, 0.5])
+def test_elbow_and_resting_joints_move_as_by_time_stepping(tmp_path: Path, surface: str, friction: float):
+    """Runs of such scenes stopped as Painlevé's paradox, or as chatter."""
+    for dry in (0.02, 0.1, 0.3):
+        text = elbow_on(surface, friction, dry)
+        runs = [run(tmp_path, text, integrator__method=method) for method in ("dopri5", STEPS)]
+        events, steps = (record.summary["electrical_energy_J"] for record in runs)
+        # Time stepping is of first order while joints rub; its steps are 1 ms.
+        assert steps == pytest.approx(events, rel=1e-4)
