@@ -93,7 +93,7 @@ def state_of(seen: Observed, values: Mapping[str, Sequence[float]], currents: Ar
     rubbing = np.where((bound > 0.0) & (np.abs(v) >= RESTS), -bound * np.sign(v), 0.0)
     current = seen.record["current"][-1].copy() if currents is None else currents
     circuits = [a for a, motor in enumerate(seen.robot.motors) if isinstance(motor, Motor)]
-    if currents is None and len(values.get("current", ())) == len(circuits):
+    if circuits and currents is None and len(values.get("current", ())) == len(circuits):
         # Those of circuits are of the state, the others' those of the last sample.
         current[circuits] = values["current"]
     mass = seen.bodies.mass_matrix(q)
@@ -120,12 +120,12 @@ def critical(seen: Observed, values: Mapping[str, Sequence[float]]) -> bool:
             if free.shape[1] == 0:
                 continue
             inverse = free @ np.linalg.solve(free.T @ state.mass @ free, free.T)
-            if _paradox(state, sliding, inverse):
+            if _paradox(state, sliding, inverse, (1.0,) if seen.real else (1.0, -1.0)):
                 return True
     return False
 
 
-def _paradox(state: State, sliding: Sequence[int], inverse: Array) -> bool:
+def _paradox(state: State, sliding: Sequence[int], inverse: Array, signs: Sequence[float]) -> bool:
     """Whether det or a diagonal entry of N W (N − μ T)ᵀ falls to zero, for the directions that slip can have."""
     choices = []
     for k in sliding:
@@ -148,8 +148,8 @@ def _paradox(state: State, sliding: Sequence[int], inverse: Array) -> bool:
         # From rest the static coefficient may hold.
         mu = [max(state.friction[k], state.static[k]) for k in sliding]
         T = np.stack([direction @ state.rows[k][1:] for k, direction in zip(sliding, directions, strict=True)])
-        for sign in (1.0, -1.0):
-            # Glued contacts pull too, which turns friction round.
+        for sign in signs:
+            # Glued contacts may pull, which turns friction round.
             A = bare - sign * N @ inverse @ (np.array(mu)[:, None] * T).T
             if np.linalg.det(A) < CRITICAL * np.linalg.det(bare) or (np.diag(A) < CRITICAL * np.diag(bare)).any():
                 return True

@@ -41,8 +41,9 @@ NOT_UNIQUE = (
     "chatter",
     "turns its own force against it",
 )
-# Of forces alone, which other methods split in another way; where elbows slide the motion follows, a little.
-NOT_UNIQUE_FORCES, SPLIT_SHARE = "one choice of many", 0.03
+# Of forces alone, which other methods split in another way; where elbows slide, or bodies
+# land on several points, the motion follows, a little.
+NOT_UNIQUE_FORCES, SPLIT_SHARE = "shared forces", 0.03
 
 
 @dataclass(frozen=True)

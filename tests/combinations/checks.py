@@ -16,7 +16,7 @@ from combinations.agreement import disagreements
 from combinations.commands import commands
 from combinations.contact_law import CREEP, dry, friction, gaps, stops, touching
 from combinations.energy import ledger, losses, powers
-from combinations.newton import circuit, equation, momentum, motion
+from combinations.newton import circuit, equation, momentum, motion, support
 from combinations.observed import Observed, warned
 from combinations.running import Run
 from combinations.verdicts import untrue
@@ -171,6 +171,7 @@ CHECKS: dict[str, Callable[[Observed], Finding]] = {
     "momentum": momentum,
     "motion": motion,
     "circuit": circuit,
+    "support": support,
     "touching": touching,
     "friction": friction,
     "gaps": gaps,

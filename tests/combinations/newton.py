@@ -79,7 +79,7 @@ def momentum(seen: Observed) -> Finding:
             )
 
 
-def _acting_on(seen: Observed, chosen: set[int]) -> tuple[Array, Array, Array]:
+def _acting_on(seen: Observed, chosen: set[int], weight: bool = True) -> tuple[Array, Array, Array]:
     """Moment about the world's origin and force from outside on a set of bodies, and the sum of their sizes."""
     moment, force, size = np.zeros((len(seen), 3)), np.zeros((len(seen), 3)), np.zeros(len(seen))
 
@@ -89,8 +89,8 @@ def _acting_on(seen: Observed, chosen: set[int]) -> tuple[Array, Array, Array]:
         force = force + push
         size = size + np.linalg.norm(push, axis=1) + np.linalg.norm(np.broadcast_to(twist, push.shape), axis=1)
 
-    for i in chosen:
-        body = seen.robot.links[i].inertia
+    for i in chosen if weight else ():
+        body = seen.bodies.robot.links[i].inertia
         add(seen.motion.point(i, body.com), np.broadcast_to(body.mass * seen.bodies.gravity, (len(seen), 3)))
     for touch in seen.touches():
         if touch.body in chosen:
@@ -203,3 +203,41 @@ def circuit(seen: Observed) -> Finding:
         if off.size and (off / allowed).max() > 1.0:
             k = int((off / allowed).argmax())
             yield f"current of {motor.joint} at t = {seen.time[rows[k]]:.6g} s is {off[k, 0]:.3g} A off its circuit"
+
+
+def support(seen: Observed) -> Finding:
+    """Wheels and caster of a mobile base carry what its own tree of bodies asks of the ground."""
+    base = seen.robot.base
+    if base is None:
+        return
+    bodies, motion = seen.bodies, seen.motion
+    body = [link.name for link in seen.robot.links].index(base.body)
+    root = bodies.ancestors(body)[-1]
+    tree = {i for i in range(bodies.n) if bodies.ancestors(i)[-1] == root}
+    needed = bodies.wrenches(motion)
+    moment, force = (sum((needed[i][part] for i in tree), start=np.zeros((len(seen), 3))) for part in (0, 1))
+    # Weight is in what bodies need already.
+    acting_moment, acting_force, _ = _acting_on(seen, tree, weight=False)
+    moment, force = moment - acting_moment, force - acting_force
+    # Wheels spin about an axle that turns with the base.
+    left, right = (seen.joints.index(joint) for joint in base.wheels)
+    axle = motion.rotation[body][:, :, 1]
+    spin = base.spin_inertia * (seen.v[:, left] + seen.v[:, right])[:, None]
+    rate = base.spin_inertia * (seen.vdot[:, left] + seen.vdot[:, right])[:, None]
+    moment = moment + rate * axle + spin * np.cross(motion.spin[body], axle)
+    at = motion.origin[body]
+    own_moment = np.einsum("tji,tj->ti", motion.rotation[body], moment - np.cross(at, force))
+    own_force = np.einsum("tji,tj->ti", motion.rotation[body], force)
+    feet = np.array([[0.0, 0.5 * base.track], [0.0, -0.5 * base.track], base.caster[:2]])
+    levers = np.stack([np.ones(3), feet[:, 1], -feet[:, 0]])
+    loads = np.linalg.solve(levers, np.stack([own_force[:, 2], own_moment[:, 0], own_moment[:, 1]])).T
+    off = np.abs(loads - seen.record["wheel_load"]).max(axis=1)
+    # Steps have forces of their own middle, and the samples' accelerations are means.
+    size = np.abs(loads).max(axis=1) + np.linalg.norm(force, axis=1)
+    allowed = (1e-2 if seen.stepped else 1e-6) * size + 1e-9
+    if (off > allowed).any():
+        i = int((off / allowed).argmax())
+        yield (
+            f"wheels and caster at t = {seen.time[i]:.6g} s carry {seen.record['wheel_load'][i].round(4)} N, "
+            f"by the bodies {loads[i].round(4)} N"
+        )

@@ -9,10 +9,17 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
+from support.pinocchio_oracle import Oracle
+from support.random_robots import random_positions, random_robot, random_robot_of
 
-from combinations.checks import problems
+from combinations.accelerations import critical
+from combinations.bodies import Bodies, position_rates
+from combinations.checks import compare, problems
+from combinations.observed import Observed
 from combinations.running import Run
+from combinations.surfaces import nearest, shape
 from dynsim import check, simulate
 from dynsim.errors import DynsimError, SimulationStopped
 from dynsim.record import Record
@@ -181,3 +188,140 @@ def test_what_is_spoilt_is_found(method: str, fault: str) -> None:
     changes, expected = SPOILT[fault]
     spoilt = _spoilt(_run(method), **changes)
     assert expected <= _kinds(spoilt)
+
+
+def test_a_check_that_disagrees_with_the_run_is_found() -> None:
+    assert "check" in _kinds(replace(_run("radau5"), checked="refused"))
+
+
+def test_runs_of_a_scene_agree_and_strangers_do_not() -> None:
+    runs = {method: _run(method) for method in ("dopri5", "radau5", "time_stepping")}
+    assert compare(ARM, runs) == []
+    for name, change in (("q", _shifted(0.05, 200)), ("heat_joule", _times(1.3))):
+        for method in runs:
+            others = {**runs, method: _spoilt(runs[method], **{name: change})}
+            assert "methods" in {problem.kind for problem in compare(ARM, others)}, (name, method)
+
+
+# Kinds of stops that a benign scene has no reason for.
+@pytest.mark.parametrize("kind", ["chatter", "no_progress", "not_projected", "forces_reversed", "no_contact_forces"])
+def test_a_stop_without_reason_is_found(kind: str) -> None:
+    run = _run("radau5")
+    assert run.record is not None
+    state = {name: run.record[name][-1].tolist() for name in ("q", "v", "current")}
+    stop = SimulationStopped("stopped", time=float(run.record.time[-1]), state=state, kind=kind)
+    assert "verdict" in _kinds(replace(run, error=stop))
+
+
+def test_a_true_paradox_is_none() -> None:
+    """Painlevé's rod: slender, sliding on its tip at 60°, μ above the critical 4/3 of I = m l²/12."""
+    rod = {
+        "name": "rod",
+        "duration_s": 0.3,
+        "plant": {
+            "type": "serial_arm",
+            "chain": [
+                {"kind": "prismatic", "axis": "x", "length_m": 0.0, "mass_kg": 0.0},
+                {"kind": "prismatic", "axis": "z", "length_m": 0.0, "mass_kg": 0.0},
+                {"axis": "y", "length_m": 1.0, "mass_kg": 1.0, "initial_deg": 30.0},
+            ],
+        },
+        "surfaces": {"floor": {"type": "plane"}},
+        "contacts": {"law": "unilateral", "friction": 3.0, "points": {"tip": {"body": "link_3", "surface": "floor"}}},
+        "record": {"rate_hz": 200.0},
+        "metrics": {"settle_s": 0.0},
+    }
+    run = _simulated(rod)
+    assert run.record is not None
+    seen = Observed(run)
+    v = np.zeros(3)
+    paradox = {}
+    for speed in (1.0, -1.0):
+        v[0] = speed
+        paradox[speed] = critical(seen, {"q": seen.robot.initial.tolist(), "v": v.tolist()})
+    # In one direction of the slip alone.
+    assert sorted(paradox.values()) == [False, True]
+
+
+FALSE_WARNINGS = (
+    "tip: this brace never touches the floor: it carries nothing; nearest 3 mm at t = 0 s",
+    "joint_1: voltage at its limit of 24 V for 50.0 % of the run",
+    "joint_3: passes its lower position limit of 0° (0 rad) by up to 1° (0.02 rad), first at t = 0.1 s; no law",
+    "the energy ledger does not close: residual 1.0e-03 of the turnover; tighten integrator.rtol or the step",
+    "friction has put 0.3 J into the arm: an error of the integration; shorten integrator.step_s",
+    "tip: chatter, more than 200 contact events within 1 s; what left more slowly was kept on the surface",
+    "joint_1 9 of 2 A: the current, rms over the run, is more than nominal, which a motor does not stand for long",
+    "link_2 passes below floor by more than the link's radius: link_2, of 10 mm, by up to 90 mm in the samples, first",
+    "a warning that nobody has heard of",
+)
+
+
+@pytest.mark.parametrize("warning", FALSE_WARNINGS)
+def test_a_false_warning_is_found(warning: str) -> None:
+    run = _run("radau5")
+    assert "verdict" in _kinds(replace(run, warnings=[*run.warnings, warning]))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_own_bodies_are_those_of_pinocchio(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    robot = random_robot(random, 7)
+    q, v, vdot = (random.normal(size=(1, 7)) for _ in range(3))
+    bodies, oracle = Bodies(robot), Oracle(robot)
+    motion = bodies.motion(q, v, vdot)
+    forces = oracle.back(pin.rnea(oracle.model, oracle.data, *(oracle.to(x[0]) for x in (q, v, vdot))))
+    # Rounding of two codes.
+    np.testing.assert_allclose(
+        bodies.along_rows(motion, bodies.wrenches(motion))[0], forces, rtol=0, atol=1e-11 * (1.0 + np.abs(forces).max())
+    )
+    np.testing.assert_allclose(
+        bodies.mass_matrix(q[0]) - np.diag(bodies.armature), oracle.mass_matrix(q[0]), rtol=0, atol=1e-11
+    )
+    point = random.normal(size=3)
+    position, J, velocity, _ = oracle.point(6, point, q[0], v[0])
+    np.testing.assert_allclose(motion.point(6, point)[0], position, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(bodies.jacobian(motion, 6, position[None])[0], J, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(motion.velocity(6, position[None])[0], velocity, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("kind", ["ball", "floating", "planar", "rolling"])
+def test_joints_with_several_rows_move_as_their_rates_say(kind: str) -> None:
+    """Velocities and accelerations against differences of positions and velocities."""
+    random = np.random.default_rng(3)
+    robot = random_robot_of(random, [kind, "revolute"])
+    bodies = Bodies(robot)
+    q = random_positions(random, robot)
+    v, vdot = random.normal(size=(2, bodies.n))
+    h = 1e-4
+    # Two steps of constant acceleration either way, positions by the midpoint rule.
+    states = [(q, v)]
+    for sign in (-1.0, 1.0):
+        middle = q + 0.5 * sign * h * position_rates(bodies, q[None], v[None])[0]
+        states.append(
+            (
+                q + sign * h * position_rates(bodies, middle[None], v[None] + 0.5 * sign * h * vdot)[0],
+                v + sign * h * vdot,
+            )
+        )
+    now, before, after = (bodies.motion(a[None], b[None], vdot[None]) for a, b in states)
+    body, point = bodies.n - 1, random.normal(size=3)
+    places = [motion.point(body, point) for motion in (before, now, after)]
+    velocities = [motion.velocity(body, motion.point(body, point)) for motion in (before, now, after)]
+    # The error of a central difference.
+    np.testing.assert_allclose((places[2] - places[0]) / (2 * h), velocities[1], rtol=0, atol=1e-5)
+    gain = now.rushing[body] + np.cross(now.turning[body], places[1]) + np.cross(now.spin[body], velocities[1])
+    np.testing.assert_allclose((velocities[2] - velocities[0]) / (2 * h), gain, rtol=0, atol=1e-5)
+
+
+def test_own_nearest_points_are_nearest() -> None:
+    """Of axes to a box and a sphere, against a fine search; distances from a box against those of its faces."""
+    random = np.random.default_rng(0)
+    box = shape({"type": "box", "center_m": [0, 0, 0], "edges_m": [1, 2, 3], "edge_radius_m": 0.1}, np.zeros(3))
+    assert box.distance(np.array([[0.7, 0.0, 0.0], [0.0, -1.5, 0.0]])) == pytest.approx([0.2, 0.5])
+    sphere = shape({"type": "sphere", "center_m": [0, 0, 0], "radius_m": 1.0}, np.zeros(3))
+    for surface in (box, sphere):
+        start, end = random.normal(scale=3.0, size=(2, 50, 3))
+        far = surface.distance(nearest(surface, start, end))
+        many = [surface.distance(start + u * (end - start)) for u in np.linspace(0.0, 1.0, 2001)]
+        outside = np.min(many, axis=0) > 0.0
+        assert (far[outside] <= np.min(many, axis=0)[outside] + 1e-9).all()
