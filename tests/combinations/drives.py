@@ -129,7 +129,11 @@ def _gains(random: Generator, levels: Levels, robot: Plant, driven: dict[str, di
         p, d = (400.0, 12.0) if motor["type"] == "wang_minami" else (40.0, 1.5) if joint.turns else (1000.0, 20.0)
         k_p.append(stiff * p)
         k_d.append(stiff * d)
-    return {"k_p_V_per_rad": k_p, "k_d_V_s_per_rad": k_d} if k_p else {}
+    if not k_p:
+        return {}
+    if len(set(k_p)) == 1:
+        return {"k_p_V_per_rad": k_p[0], "k_d_V_s_per_rad": k_d[0]}
+    return {"k_p_V_per_rad": k_p, "k_d_V_s_per_rad": k_d}
 
 
 def _followers(random: Generator, levels: Levels, robot: Plant, moved: Sequence[Joint]) -> list[Joint]:
