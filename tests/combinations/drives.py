@@ -171,13 +171,13 @@ def _waypoints(random: Generator, levels: Levels, free: Sequence[Joint], duratio
     if not able and levels["start"] == "on_references":
         able = list(free)
     # Where they would take a point that presses off its surface, they rest.
-    rest = levels["controller"] == "pressing" and levels["points"] in ("two", "same_link")
+    idle = levels["controller"] == "pressing" and levels["points"] in ("two", "same_link")
     joints: dict[str, Any] = {}
     for k in random.permutation(len(able)).tolist()[: 1 + int(random.integers(2))]:
         joint = able[k]
         scale = 1.0 if joint.turns else 0.002
         start = joint.start + (scale * float(random.uniform(1.0, 4.0)) if levels["start"] == "on_references" else 0.0)
-        ways = [start, *(start + (0.0 if rest else scale) * random.uniform(-15.0, 15.0, size=2)).tolist()]
+        ways = [start, *(start + (0.0 if idle else scale) * random.uniform(-15.0, 15.0, size=2)).tolist()]
         key = "angles_deg" if joint.turns else "positions_m"
         joints[joint.name] = {"times_s": [0.0, 0.5 * duration, duration], key: ways}
     return {"joints": joints} if joints else {}
@@ -189,8 +189,8 @@ def _torques(random: Generator, joints: Sequence[str], model: Model, duration: f
     rates = {link.joint: i for i, link in enumerate(model.robot.links)}
     torques: dict[str, Any] = {}
     for name in joints:
-        hold = float(weight[rates[name]])
-        wave = float(random.uniform(-1.0, 1.0)) * (0.3 + 0.5 * abs(hold))
-        values = [hold + wave, hold, hold - wave]
+        carried = float(weight[rates[name]])
+        wave = float(random.uniform(-1.0, 1.0)) * (0.3 + 0.5 * abs(carried))
+        values = [carried + wave, carried, carried - wave]
         torques[name] = {"times_s": [0.0, 0.5 * duration, duration], "torques_N_m": values}
     return torques

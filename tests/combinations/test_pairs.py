@@ -117,11 +117,11 @@ def _holds(number: int, folder: Path, cover: str = "pairs", **options: Any) -> N
     )
 
 
-def _shares_a_program(drawn: Scene, method: str, way: str) -> bool:
+def _shares_a_program(drawn: Scene, method: str, manner: str) -> bool:
     """Whether the default tests have its program: those of docs/dev/tests.md."""
     if method == "time_stepping":
         return True
-    if method == "auto" or way == M_STAR:
+    if method == "auto" or manner == M_STAR:
         return False
     try:
         shapes = prepare(drawn.load(method)).system.shapes is not None
