@@ -75,7 +75,7 @@ def look_at(
     folder: Path,
     *,
     thorough: bool | None = None,
-    takes: Callable[[Scene, str, str], bool] = lambda drawn, method, way: True,
+    takes: Callable[[Scene, str, str], bool] = lambda drawn, method, manner: True,
 ) -> Outcome:
     """Run a scene by all its methods, or by those that ``takes`` lets through, and look at everything.
 

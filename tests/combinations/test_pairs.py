@@ -58,7 +58,7 @@ def test_scenes_are_the_same_for_ever(tmp_path: Path) -> None:
     assert texts[0] == texts[1]
 
 
-@pytest.mark.parametrize("refusal", [r for r in REFUSALS if r.error], ids=str)
+@pytest.mark.parametrize("refusal", [r for r in REFUSALS if r.error], ids=lambda r: r.name)
 def test_what_is_refused_is_said(refusal: Refusal, tmp_path: Path) -> None:
     """The scene of an assignment that meets this refusal alone; dynsim says what the table says."""
     for k in range(TRIES):
@@ -117,11 +117,11 @@ def _holds(number: int, folder: Path, cover: str = "pairs", **options: Any) -> N
     )
 
 
-def _shares_a_program(drawn: Scene, method: str, way: str) -> bool:
+def _shares_a_program(drawn: Scene, method: str, manner: str) -> bool:
     """Whether the default tests have its program: those of docs/dev/tests.md."""
     if method == "time_stepping":
         return True
-    if method == "auto" or way == M_STAR:
+    if method == "auto" or manner == M_STAR:
         return False
     try:
         shapes = prepare(drawn.load(method)).system.shapes is not None
