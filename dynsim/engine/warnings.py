@@ -193,7 +193,7 @@ def _undetermined(record: Record, prepared: Prepared) -> list[str]:
         joints = [name for name in shared if name in prepared.model.joint_names]
         if joints:
             touching = [name for name in shared if name not in joints]
-            slides = (record["contact_mode"] == ka.SLIDING) & rests.any(axis=1)[:, None]
+            slides = (record["contact_mode"] == ka.SLIDING) & rests.any(axis=1, keepdims=True)
             sliding = [
                 contact.name
                 for contact, some in zip(contacts, slides.any(axis=0), strict=True)
