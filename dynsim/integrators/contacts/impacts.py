@@ -63,6 +63,7 @@ def find_touching(unilateral: UnilateralArrays, ws: Workspace, touch):
         limit = STRIKE * kp.RATE_TOLERANCE * (1.0 + slip_speed(ws, k))
         closed = ws.active[k, ka.MODE] != ka.OPEN
         near = closed or (state[k, ka.GAP] <= touch and state[k, ka.GAP_RATE] <= limit)
+        near = near and mode[k, ku.LEAVES] == 0
         mode[k, ku.TOUCHING] = 1 if near else 0
         if near and state[k, ka.GAP_RATE] < -limit:
             mode[k, ku.STRUCK] = 1
