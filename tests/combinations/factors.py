@@ -87,7 +87,7 @@ STEPPED = "only time stepping has it"
 
 REFUSALS: tuple[Refusal, ...] = (
     # Feature × law.
-    _refuse("under the glued law joints do not rest", r"dry friction of joints \(.*\) requires contacts.law: unilateral",
+    _refuse("under the glued law joints do not rest", r"dry friction of joints \(.*\) requires contacts.law",
             contact=GLUED, rubbing=("bearing", "gear", "both")),
     _refuse("a glued point has one coefficient", r"requires contacts.law: unilateral",
             contact=GLUED, friction=("static", "stribeck", "viscous", "grip")),

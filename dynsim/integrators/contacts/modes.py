@@ -130,7 +130,7 @@ def choose(system: System, ws: Workspace, run: Run):
     for k in range(unilateral.dry_table.shape[0]):
         note_headway(unilateral, ws, k)
     for k in range(mode.shape[0]):
-        mode[k, ku.GIVES_WAY] = 0
+        mode[k, ku.GIVES_WAY], mode[k, ku.LEAVES] = 0, 0
         starts = mode[k, ku.WANTED] == ka.SLIDING and mode[k, ku.TOUCHING] == ka.STICKING
         unilateral.slide[k, ku.HEADWAY] = max(0.0, -unilateral.slide[k, ku.SPEED]) if starts else 0.0
 
