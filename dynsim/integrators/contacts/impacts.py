@@ -72,13 +72,10 @@ def find_touching(system: System, ws: Workspace, touch):
         limit = STRIKE * kp.RATE_TOLERANCE * (1.0 + slip_speed(ws, k))
         closed = ws.active[k, ka.MODE] != ka.OPEN
         near = closed or (state[k, ka.GAP] <= touch and state[k, ka.GAP_RATE] <= limit)
-<<<<<<< HEAD
+        near = near and mode[k, ku.LEAVES] == 0
         if near and not moves_along_normal(system.model, system.contacts, ws, k, state[k, ka.GAP]):
             near = closed = False
             unilateral.slide[k, ku.LANDS_AT] = ku.DEPTH + max(0.0, -state[k, ka.GAP])
-=======
-        near = near and mode[k, ku.LEAVES] == 0
->>>>>>> eba8f21eb1351f7407ae79a64cea3bab5609ba7d
         mode[k, ku.TOUCHING] = 1 if near else 0
         if near and state[k, ka.GAP_RATE] < -limit:
             mode[k, ku.STRUCK] = 1
