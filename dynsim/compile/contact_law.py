@@ -168,24 +168,33 @@ def contact_laws(robot: Robot, contacts: Sequence[Contact]) -> NDArray[np.float6
     return law
 
 
-def joint_stops(robot: Robot) -> list[JointStop]:
-    """The stops of a robot's joints: their finite limits, the lower one first.
+def joint_stops(robot: Robot, q: NDArray[np.float64] | None = None) -> list[JointStop]:
+    """Return the stops of a robot's joints: their finite limits, the lower one first.
+
+    Parameters
+    ----------
+    q : (nq,) ndarray
+        Start [rad or m]; default: the robot's initial positions.
 
     Raises
     ------
     ModelError
-        A joint starts beyond its stop.
+        If a joint starts beyond its stop.
     """
-    stops = []
+    stops, remedy = [], "change its initial position or its limit"
+    if q is None:
+        q = robot.initial
+    else:
+        remedy = "start from a state within its stops"
     for link, k in zip(robot.links, robot.position_index, strict=True):
         for side, limit in ((1.0, link.lower), (-1.0, link.upper)):
             if np.isfinite(limit):
-                beyond = side * (limit - robot.initial[k])
+                beyond = side * (limit - q[k])
                 if beyond > START_TOLERANCE:
                     raise ModelError(
-                        f"{link.joint}: starts at {format_quantity(robot.initial[k], link.units[0])}, beyond its "
+                        f"{link.joint}: starts at {format_quantity(q[k], link.units[0])}, beyond its "
                         f"stop at {format_quantity(limit, link.units[0])}; "
-                        "contacts.law: unilateral enforces it: change its initial position or its limit",
+                        f"contacts.law: unilateral enforces it: {remedy}",
                         keys=("plant",),
                     )
                 stops.append(JointStop(link.joint, side, float(limit)))

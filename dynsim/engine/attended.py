@@ -160,7 +160,7 @@ def _short_steps(prepared: Prepared) -> int:
     """
     if prepared.system.unilateral is not None:
         rows = max(prepared.workspace.small.shape[1], 1)
-        return int(LOOK_S / (kt.LAST_ROUNDS * ROUND * rows**3)) if prepared.run.stepping is not None else 0
+        return int(LOOK_S / (kt.MOST_ROUNDS * ROUND * rows**3)) if prepared.run.stepping is not None else 0
     n, p = len(prepared.workspace.joints), prepared.workspace.small.shape[1]
     seconds = right_hand_side(n, p, dense=prepared.system.dense is not None)
     # Of RADAU5 with a Jacobian and its factors.

@@ -11,6 +11,7 @@ from dynsim.engine import SIMULATION, Progress, attended
 from dynsim.engine.outcome import interrupted, raise_stopped
 from dynsim.engine.prepare import Prepared, prepare, sample_times
 from dynsim.engine.recording import make_record
+from dynsim.engine.soundness import unstable_loop
 from dynsim.engine.start import check
 from dynsim.engine.stepped import event_name, own_guards, take_log
 from dynsim.engine.stopping import last_state, stopped
@@ -43,6 +44,8 @@ def simulate(scenario: Scenario, progress: Progress | None = None, *, pictured: 
     size = prepared.model.n, len(prepared.contacts), len(prepared.stops)
     # Loading or compiling the kernels is no integration time.
     recall("kernels", partial(attended.load, prepared), prepared.choice.method, *size)
+    if (unstable := unstable_loop(scenario, prepared)) is not None:
+        log.warning("%s: %s", scenario.title, unstable[0])
     watch, run = attended.WallWatch(scenario.integrator.wall_limit_s), prepared.run
 
     def look() -> None:

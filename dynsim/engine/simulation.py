@@ -9,6 +9,7 @@ Long because: it is one class, the public stepper, and half of it is its documen
 
 from __future__ import annotations
 
+import logging
 import math
 import time as clock
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -18,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dynsim.compile.contact_law import joint_stops
 from dynsim.compile.model import Model
 from dynsim.compile.references.teleop import VelocitySource
 from dynsim.compile.tables import check_couplings
@@ -33,6 +35,7 @@ from dynsim.engine.outcome import mark_stopped, raise_stopped
 from dynsim.engine.prepare import prepare, sample_times
 from dynsim.engine.recording import make_record
 from dynsim.engine.sensing import EncodedCommands
+from dynsim.engine.soundness import unstable_loop
 from dynsim.engine.stepped import GUARDS, Snapshot, State, Touch, event_name, own_guards, take_log
 from dynsim.engine.stopping import stopped
 from dynsim.engine.trace import Trace
@@ -51,6 +54,8 @@ from dynsim.system.memo import Memo, remembering
 if TYPE_CHECKING:
     from dynsim.engine.snake_pilot import SnakePilot
     from dynsim.snake.description import CommandSource
+
+log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
@@ -130,6 +135,9 @@ class Simulation:
                 motors=motors,
                 starts=state is None,
             )
+        if (unstable := unstable_loop(scenario, self._prepared)) is not None:
+            # Live sessions may never make a record, whose summary has this warning.
+            log.warning("%s: %s", scenario.title, unstable[0])
         self._time, self._wall = start, 0.0
         # Of a ring, and of a run that goes on from another, the ledger counts from the first sample on.
         self._relative = trace is not None or state is not None
@@ -648,6 +656,8 @@ class Simulation:
             run.y[part] = values
         q = run.y[block(run.layout, "q")]
         check_couplings(model.robot, q)
+        if self._prepared.system.unilateral is not None:
+            joint_stops(model.robot, q)
         check_start(self._scenario, model, self._prepared.contacts, q)
 
     def _reach(self, until: float) -> None:

@@ -132,8 +132,8 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
         return (
             f"{where}: no progress, the last {ki.MOST_TRIALS} steps came no further than "
             f"{run.clock[ki.LEAST_PROGRESS]:.1e} s, the last of {run.clock[ki.STEP]:.1e} s{_doing(prepared)}; "
-            f"take {STEP_OVER if _can_step_over(prepared) else 'another integrator.method'}, or longer steps if they are "
-            "fixed"
+            f"take {STEP_OVER if _can_step_over(prepared) else 'another integrator.method'}, or longer steps where "
+            "they are fixed"
         )
     if status == ki.OUT_OF_TIME:
         return (

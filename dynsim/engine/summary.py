@@ -268,6 +268,7 @@ def _time_stepping(run: ki.Run) -> dict[str, Any]:
         "step_s": float(run.clock[ki.STEP]),
         "contact_solves": int(results[kt.SOLVES]),
         "long_solves": int(results[kt.LONG_SOLVES]),
+        "dropped_solves": int(results[kt.DROPPED]),
         "capped_solves": int(results[kt.CAPPED]),
         "residual_max_m_s": float(results[kt.WORST]),
         "limits_unsettled": int(results[kt.UNSETTLED]),

@@ -292,8 +292,8 @@ def _sunk(record: Record, sunk: Sequence[Sinking]) -> list[str]:
 def _passed_limits(record: Record, robot: Robot, real: bool) -> list[str]:
     """Limits of joints that samples of the record lie beyond.
 
-    Stops are the only ones that are enforced, and only under the unilateral law (``real``); beyond them lies then what
-    the steps of time stepping let joints go too far.
+    Only stops are enforced, and only under the unilateral law (``real``). Under it time stepping alone lets joints pass
+    their stops: by up to a step at a hit, after which they are moved back.
     """
     torque = dict(zip(record.labels["torque"], record["torque"].T, strict=True))
     warnings = []
@@ -302,14 +302,10 @@ def _passed_limits(record: Record, robot: Robot, real: bool) -> list[str]:
             continue
         q = record["q"][:, k]
         position, velocity, _, force = link.units
-        passed = (
-            "the stop holds only at the ends of steps: a shorter integrator.step_s lets it pass less"
-            if real
-            else "stops are enforced under contacts.law: unilateral"
-        )
+        below, above = link.lower - q, q - link.upper
         for quantity, limit, unit, beyond, note in (
-            ("lower position", link.lower, position, link.lower - q, passed),
-            ("upper position", link.upper, position, q - link.upper, passed),
+            ("lower position", link.lower, position, below, _after_passing(below[-1], position, real)),
+            ("upper position", link.upper, position, above, _after_passing(above[-1], position, real)),
             ("velocity", link.velocity_limit, velocity, np.abs(v) - link.velocity_limit, NOT_ENFORCED),
             (
                 "effort",
@@ -327,6 +323,17 @@ def _passed_limits(record: Record, robot: Robot, real: bool) -> list[str]:
                     f"{format_quantity(amount, unit, 3)}, first at t = {first:.4g} s; {note}"
                 )
     return warnings
+
+
+def _after_passing(left: float, unit: str, real: bool) -> str:
+    """Consequence and fix for a joint that has passed its stop and is ``left`` beyond it at the end [rad or m]."""
+    if not real:
+        return "stops are enforced under contacts.law: unilateral"
+    if left > LIMIT_SLACK:
+        end = f"it is still {format_quantity(left, unit, 3)} beyond its stop at the end"
+    else:
+        end = "time stepping has moved it back to its stop"
+    return f"{end}; a shorter integrator.step_s lets it pass less"
 
 
 def _beyond_stops(robot: Robot, stops: Sequence[JointStop], control: JointControl) -> list[str]:

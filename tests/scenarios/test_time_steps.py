@@ -10,7 +10,7 @@ from support.stepping_systems import snake
 
 import dynsim
 from dynsim.engine.warnings import HALF_STEP_LIMIT, PENETRATION_LIMIT_M, SCHEME_LIMIT, coarse
-from dynsim.errors import ScenarioError
+from dynsim.errors import ModelError, ScenarioError
 from dynsim.model.urdf.writer import write_urdf
 
 G, H = 9.81, 1e-3
@@ -49,6 +49,95 @@ def test_bounces_are_landings_and_lift_offs_when_events_have_them():
     assert len(times(record, "lift_off")) == contact["lift_offs"]
     kinds = [event.kind for event in record.events if "slip" not in event.kind]
     assert kinds == ["landing", "lift_off"] * (len(kinds) // 2) + ["landing"] * (len(kinds) % 2)
+
+
+@pytest.mark.parametrize("step", [1e-3, 2.5e-4])
+@pytest.mark.parametrize("friction", [0.0, 0.01, 0.3])
+def test_a_joint_is_moved_back_to_the_stop_that_it_has_passed(friction, step, tmp_path: Path):
+    """A link falls from 60° on its stop at 120°, m g l/2 (cos 60° − cos 120°) = 1.962 J, less the friction of 60°."""
+    path = tmp_path / "stop.yaml"
+    path.write_text(
+        "duration_s: 3\n"
+        "plant: {type: serial_arm, chain: [{axis: y, length_m: 0.5, mass_kg: 0.8, initial_deg: 60,\n"
+        f"  friction_N_m: {friction}, limit_deg: [-170, 120]}}]}}\n"
+        f"contacts: {{law: unilateral}}\nrecord: {{rate_hz: {1.0 / step}}}\n"
+    )
+    steps = {"integrator.method": "time_stepping", "integrator.step_s": step}
+    record = dynsim.simulate(dynsim.load_scenario(path, overrides=steps))
+    passed = record["q"][:, 0] - np.radians(120.0)
+    deepest = int(passed.argmax())
+    # A step whose midpoint is before the stop passes it. From then on the joint moves back, at up to 0.02 rad/s.
+    assert 0.0 < passed[deepest] <= 1.5 * record["v"][:, 0].max() * step
+    assert np.diff(passed[deepest:]).max() < 1e-12
+    assert np.abs(record["v"][deepest + 1 :]).max() < 0.0201
+    assert abs(passed[-1]) < 1e-9
+    assert [event.kind for event in record.events if "stop_" in event.kind] == ["stop_hit"]
+    # The energy of the hit, less the work of the way back.
+    taken = 0.8 * G * 0.25 - friction * np.radians(60.0)
+    assert record.summary["stop_loss_J"] == pytest.approx(taken, abs=(2.0 + friction) * passed[deepest])
+    assert record.summary["energy_residual_relative"] < 1e-13
+    (warning,) = record.summary["warnings"]
+    assert "time stepping has moved it back to its stop" in warning
+    weight = 0.8 * G * 0.25 * np.sin(np.radians(120.0))
+    assert np.abs(record["stop_force"][-1]).max() == pytest.approx(weight, abs=friction + 1e-6)
+
+
+@pytest.mark.parametrize("method", ["time_stepping", "dopri5"])
+def test_a_state_beyond_a_stop_is_refused_by_every_method(method, tmp_path: Path):
+    """Event-driven methods would move the joint to its stop at once, time stepping would leave it where it is."""
+    path = tmp_path / "stop.yaml"
+    path.write_text(
+        "duration_s: 1\n"
+        "plant: {type: serial_arm, chain: [{axis: y, length_m: 0.5, mass_kg: 1, limit_deg: [-170, 120]}]}\n"
+        "contacts: {law: unilateral}\n"
+    )
+    scenario = dynsim.load_scenario(path, overrides={"integrator.method": method})
+    for degrees in (120.0, 120.5):
+        state = dynsim.State(0.0, np.radians([degrees]), np.zeros(1), np.zeros(0))
+        if degrees == 120.0:
+            dynsim.Simulation(scenario, state=state)
+            continue
+        with pytest.raises(
+            ModelError, match=r"joint_1: starts at 120\.5° .*, beyond its stop at 120° .* within its stops"
+        ):
+            dynsim.Simulation(scenario, state=state)
+
+
+JAM = """
+duration_s: 1
+plant:
+  type: serial_arm
+  gravity_m_s2: [0, 0, 0]
+  chain:
+    - {axis: y, length_m: 0.3, mass_kg: 0.5, initial_deg: 90, damping_N_m_s_per_rad: 0.2,
+       motor: {type: torque, limit_N_m: 50}}
+controller: {type: joint_pd, torques: {joint_1: {times_s: [0, 0.5, 1], torques_N_m: [1, 0, -1]}}}
+surfaces: {s: {type: plane, point_m: [0.3, 0, 0], normal: [0.9659258, 0, 0.2588190]}}
+contacts:
+  law: unilateral
+  friction: 0.6
+  points: {tip: {body: link_1, point_m: [0, 0, 0.3], surface: s}}
+record: {rate_hz: 1000}
+"""
+
+
+def test_a_jam_takes_the_same_energy_whatever_the_step(tmp_path: Path):
+    """μ tan 75° = 2.2: a tip that is wedged cannot be pushed out of its plane; 5.5e7 J of friction heat once."""
+    path = tmp_path / "jam.yaml"
+    path.write_text(JAM)
+    heat = []
+    for step in (1e-3, 5e-4, 1e-4):
+        steps = {"integrator.method": "time_stepping", "integrator.step_s": step}
+        summary = dynsim.simulate(dynsim.load_scenario(path, overrides=steps)).summary
+        solved = summary["time_stepping"]
+        assert solved["capped_solves"] == 0
+        assert 0 < solved["dropped_solves"] < 0.25 * solved["contact_solves"]
+        assert solved["residual_max_m_s"] <= 1e-10
+        assert abs(summary["scheme_loss_J"]) < 1e-11
+        assert summary["energy_residual_relative"] < 1e-12
+        heat.append(summary["friction_heat_J"])
+    np.testing.assert_allclose(heat, heat[-1], rtol=1e-2)
+    assert heat[-1] > 0.06
 
 
 def test_a_stop_is_hit_and_left(tmp_path: Path):

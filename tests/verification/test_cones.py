@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
+from support.cone_checks import violation
 
 from dynsim.dynamics.contact.cone.problem import (
     BOTH_WAYS,
@@ -36,35 +37,6 @@ def test_no_rows_are_solved_by_no_forces():
     for solve_them in (solve_cones, getattr(solve_cones, "py_func", solve_cones)):
         room = np.zeros((CONE_ROOM, 0, 0))
         assert solve_them(np.zeros((0, 0)), no, np.zeros(0, dtype=np.int64), no, 0, no, room, 1e-12) == 0.0
-
-
-def violation(W, b, kind, mu, f):
-    """Largest violation of the conditions of the contact problem, in the units of u, without a natural map."""
-    u, worst, k = W @ f + b, 0.0, 0
-    while k < len(b):
-        w = np.trace(W[k : k + 3, k : k + 3]) / 3 if kind[k] == CONE else W[k, k]
-        if kind[k] == BOTH_WAYS:
-            worst = max(worst, abs(u[k]))
-            k += 1
-            continue
-        if kind[k] == BOX:
-            # Within the bounds it does not move; at one of them it moves against the force.
-            worst = max(worst, w * (abs(f[k]) - mu[k]), min(abs(u[k]), abs(w * (f[k] + np.sign(u[k]) * mu[k]))))
-            k += 1
-            continue
-        # One of the two vanishes, and neither is negative.
-        worst = max(worst, min(abs(u[k]), abs(w * f[k])), -u[k], -w * f[k])
-        if kind[k] == CONE:
-            f_t, u_t = f[k + 1 : k + 3], u[k + 1 : k + 3]
-            size, margin = np.linalg.norm(u_t), mu[k] * f[k] - np.linalg.norm(f_t)
-            worst = max(worst, -w * margin)
-            # It sticks; or it is on the cone, and the force opposes the slip.
-            opposed = np.linalg.norm(f_t * size + u_t * np.linalg.norm(f_t)) / max(size, np.linalg.norm(f_t), 1e-300)
-            if mu[k] * f[k] > 0:
-                worst = max(worst, min(size, max(abs(w * margin), min(opposed * w, opposed))))
-            k += 2
-        k += 1
-    return worst
 
 
 def test_a_block_on_a_slope_sticks_below_its_friction_angle_and_slides_beyond():

@@ -131,6 +131,12 @@ def test_a_run_and_a_stop_name_the_unstable_loop():
     assert any("sampled loop is unstable" in text for text in raised.value.record.summary["warnings"])
 
 
+def test_a_session_logs_the_unstable_loop_when_it_starts(caplog):
+    scenario = load_scenario("elbow_comparison", "two_elbows", {"controller.sample_time_s": 0.001})
+    Simulation(scenario)
+    assert any("sampled loop is unstable" in message for message in caplog.messages)
+
+
 def wrist(**changes) -> Robot:
     """A link and a wrist about its own axis y, whose mass lies on that axis."""
     mass = Inertia(0.08, np.zeros(3), np.zeros((3, 3)))

@@ -11,7 +11,7 @@ from dynsim.dynamics import state as kst
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.cone import problem as kc
-from dynsim.dynamics.contact.cone.problem import approach, solve_cones
+from dynsim.dynamics.contact.cone.problem import approach_or_draw_near, solve_cones
 from dynsim.dynamics.contact.rows import row_errors, set_modes
 from dynsim.dynamics.contact.unilateral import UnilateralArrays, dry_rows_held, stop_gap
 from dynsim.dynamics.derivative import System, derivative
@@ -162,7 +162,7 @@ def solve_problem(unilateral: UnilateralArrays, W, size, largest, starts):
     b, mu, f, good = vector[ku.OFFSET], vector[ku.CONE_FRICTION], vector[ku.SOLUTION], 1e-2 * CONE_TOLERANCE
     good *= max(largest, IMMOBILE)
     if starts > 0:
-        residual = approach(W, b, kind, mu, size, f, room, good, starts)
+        residual = approach_or_draw_near(W, b, kind, mu, size, f, room, good, starts)
     else:
         residual = solve_cones(W, b, kind, mu, size, f, room, good)
     return 0.0 <= residual <= CONE_TOLERANCE * (1.0 + largest)

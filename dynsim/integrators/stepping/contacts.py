@@ -9,7 +9,8 @@ J(q') v' = J_k v' + c h/(h + h_last) up to O(h²), with c = r − s. The law is 
 
 W = J M⁻¹ Jᵀ stays symmetric, and each step solves one contact problem. For a contact that slides and cannot stop within
 the step friction is along the mean slip: w_t = u_t + u_t'. A contact that lands has no earlier rows: a = 0, or e u_n by
-Newton's restitution. Its penetration is removed slowly, and only as far as the energy lost in the landing allows.
+Newton's restitution. Its penetration is removed slowly, and only as far as the energy lost in the landing allows; a
+joint that has passed its stop at a hit is moved back likewise.
 
 The law on mean rates, J (v + v') = 0, would be simpler but multiplies disturbances by −1: rates alternate undamped.
 """
@@ -23,7 +24,7 @@ from dynsim.dynamics.contact import distance as kd
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.cone import problem as kc
 from dynsim.dynamics.contact.cone.least_norm import select_least_norm
-from dynsim.dynamics.contact.cone.problem import approach
+from dynsim.dynamics.contact.cone.problem import approach, draw_near
 from dynsim.dynamics.contact.cone.steps import motion
 from dynsim.dynamics.contact.rows import point_row, set_modes
 from dynsim.dynamics.contact.unilateral import UnilateralArrays, sliding_friction, stop_gap
@@ -51,6 +52,8 @@ TOUCHES = 1e-9
 # A gap is closed, and depth taken back, within this time, and no shorter one than so many steps [s]; not faster than
 # this [m/s]. Shorter times bounce.
 RETURN_TIME, RETURN_STEPS, RETURN_SPEED = 0.02, 10.0, 0.02
+# Impulses that do not solve their problem are no larger than this times the largest rate, each over its mobility.
+MOST_UNSOLVED = 1e3
 # Gaps by which the scheme itself sways, in units of h |a_n|, are none: feedback on them would feed energy.
 SWAY = 2.0
 
@@ -279,6 +282,21 @@ def return_rate(gap, turned, budget, h):
 
 
 @internal_kernel
+def stop_return(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, k, h):
+    """Rate at which closed joint stop k moves its joint back, as far as its hits have taken energy [rad/s or m/s].
+
+    The impulse of the last step, ``s.f`` of its row, says how much energy this rate needs.
+    """
+    loss, rate = unilateral.stop[k, ku.STOP_LOSS], 0.0
+    if loss > 0.0:
+        rate = return_rate(min(stop_gap(unilateral, ws, k), 0.0), 0.0, loss, h)
+        impulse = s.f[unilateral.stop_table[k, ku.STOP_ROW]]
+        if rate * impulse > loss:
+            rate = loss / impulse
+    return rate
+
+
+@internal_kernel
 def largest_mobility(W, r):
     """Larger eigenvalue of the block of W of the two tangents behind row r."""
     a, b, c = W[r + 1, r + 1], W[r + 1, r + 2], W[r + 2, r + 2]
@@ -290,7 +308,7 @@ def solve_contacts(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Wor
     """Impulses of all rows, by the last ones as a start, and their mean forces into ``ws.rows``; then ``s.memory``.
 
     Where the slip of a contact that was to slide on ends, or turns back, the law is that of the end after all: at most
-    once for each contact.
+    once for each contact. A problem without solution is solved without what the law adds to the rates: at most once.
     """
     p, coupled, rows = ws.counts[ka.ROWS], ws.counts[ka.COUPLED], ws.rows
     start = 3 * ws.contacts.shape[0]
@@ -301,6 +319,9 @@ def solve_contacts(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Wor
         s.f[r] = s.impulse[start + r] if r < coupled else 0.0
     for k in range(unilateral.dry.shape[0]):
         s.mu[unilateral.dry_table[k, ku.DRY_ROW]] = h * (unilateral.dry[k, ku.OF_GEAR] + unilateral.dry[k, ku.OF_JOINT])
+    for k in range(unilateral.stop_table.shape[0]):
+        if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
+            s.right[unilateral.stop_table[k, ku.STOP_ROW]] -= stop_return(unilateral, s, ws, k, h)
     soften_ties(unilateral, s, ws, h)
     rigid = False
     for k in range(ws.contacts.shape[0]):
@@ -311,13 +332,19 @@ def solve_contacts(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Wor
             for m in range(ka.MOST_ROWS):
                 s.f[r + m] = s.impulse[3 * k + m]
             turn_rows(law, s, ws, k, h)
-    for _ in range(1 + ws.contacts.shape[0]):
+    for _ in range(2 + ws.contacts.shape[0]):
         for k in range(ws.contacts.shape[0]):
             if ws.active[k, ka.MODE] == ka.STICKING:
                 for m in range(ka.MOST_ROWS):
                     r = ws.active[k, ka.FIRST_ROW] + m
                     s.right[r] = s.b[r] + s.turn[k, kt.ADDED + m]
-        solve_problem(s, ws.small[0], p, rigid)
+        residual = solve_problem(s, ws.small[0], p, rigid)
+        if not residual <= kt.BAD and drop_turns(law, unilateral, s, ws, p):
+            continue
+        s.statistics[kt.WORST] = max(s.statistics[kt.WORST], residual)
+        if not residual <= kt.BAD:
+            s.statistics[kt.CAPPED] += 1.0
+            hold_energy(s, ws.small[0], p)
         if not slip_ends(s, ws):
             break
     for r in range(p):
@@ -334,19 +361,66 @@ def solve_contacts(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Wor
 def solve_problem(s: SteppingArrays, W, p, rigid):
     """Impulses f and law rates w of the problem W f + ``s.right``; where f is not unique, that of least norm.
 
-    rigid : False where all contacts give way, which makes W regular, and f unique
+    rigid : False where all contacts give way, which makes W regular, and f unique. Returns the residual.
     """
-    residual = approach(W, s.right, s.kind, s.mu, p, s.f, s.room, kt.GOOD, kt.QUICK_ROUNDS)
+    residual = approach(W, s.right, s.kind, s.mu, p, s.f, s.room, kt.GOOD, 1)
     s.statistics[kt.SOLVES] += 1.0
-    if not residual <= kt.BAD:
+    if not residual <= kt.FAIR:
         s.statistics[kt.LONG_SOLVES] += 1.0
+        residual = draw_near(W, s.right, s.kind, s.mu, p, s.f, s.room, kt.GOOD)
+    if not residual <= kt.FAIR:
         residual = approach(W, s.right, s.kind, s.mu, p, s.f, s.room, kt.GOOD, kt.LAST_ROUNDS)
-    if not residual <= kt.BAD:
-        s.statistics[kt.CAPPED] += 1.0
-    s.statistics[kt.WORST] = max(s.statistics[kt.WORST], residual)
     motion(W, s.right, p, s.f, s.w)
     if rigid and residual <= kt.BAD:
         select_least_norm(W, s.w, s.kind, s.mu, p, s.f, s.room)
+    return residual
+
+
+@internal_kernel
+def drop_turns(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, p):
+    """Set what the law adds to the rates of rigid contacts and stops to zero, and all impulses; False if it was zero.
+
+    Where W is of deficient rank the additions need not be a motion of the system, and then there may be no solution.
+    The rates without impulses are a motion, and with them alone there is one. Compliant contacts keep their springs.
+    """
+    dropped = False
+    for k in range(unilateral.stop_table.shape[0]):
+        if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
+            r = unilateral.stop_table[k, ku.STOP_ROW]
+            dropped = dropped or s.right[r] != s.b[r]
+            s.right[r] = s.b[r]
+    for k in range(ws.contacts.shape[0]):
+        turn = s.turn[k]
+        if ws.active[k, ka.MODE] == ka.STICKING and law[k, ka.CONTACT_STIFFNESS] == 0.0:
+            for m in range(ka.MOST_ROWS):
+                dropped = dropped or turn[kt.ADDED + m] != 0.0
+                turn[kt.ADDED + m], turn[kt.TURNED + m] = 0.0, 0.0
+            turn[kt.PUSH], turn[kt.MEAN] = 0.0, 0.0
+    if dropped:
+        s.statistics[kt.DROPPED] += 1.0
+        # The last ones may be huge.
+        for r in range(p):
+            s.f[r] = 0.0
+    return dropped
+
+
+@internal_kernel
+def hold_energy(s: SteppingArrays, W, p):
+    """Scale impulses that solve nothing by the factor from 0 to 1 for which ½ fᵀ W f + f·b, what they add, is least.
+
+    A scaled f stays in its cones and takes energy, whatever f is.
+    """
+    linear, square, strongest, fastest = 0.0, 0.0, 0.0, 0.0
+    for k in range(p):
+        linear += s.f[k] * s.right[k]
+        square += s.f[k] * (s.w[k] - s.right[k])
+        strongest, fastest = max(strongest, abs(W[k, k] * s.f[k])), max(fastest, abs(s.right[k]))
+    part = min(max(-linear / square, 0.0), 1.0) if square > 0.0 else 0.0
+    if part * strongest > MOST_UNSOLVED * fastest:
+        part = MOST_UNSOLVED * fastest / strongest
+    for k in range(p):
+        s.f[k] *= part
+    motion(W, s.right, p, s.f, s.w)
 
 
 @internal_kernel

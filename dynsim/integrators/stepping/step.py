@@ -293,8 +293,31 @@ def tell_changes(unilateral: UnilateralArrays, s: SteppingArrays, run: Run):
 
 
 @internal_kernel
+def keep_directions(s: SteppingArrays, ws: Workspace):
+    """Copy the wrenches of unit forces of all active rows: those with which the step was solved."""
+    for r in range(ws.counts[ka.ROWS]):
+        for j in range(6):
+            s.direction[r, j] = ws.rows[r, ka.DIRECTION + j]
+
+
+@internal_kernel
+def put_directions_back(s: SteppingArrays, ws: Workspace):
+    """Undo what ``geometry`` has made of the directions: the forces of the step belong to its rows alone.
+
+    ``geometry`` leaves the rows of sticking contacts with tangents of its own, without the factor of the grip.
+    """
+    for r in range(ws.counts[ka.ROWS]):
+        for j in range(6):
+            ws.rows[r, ka.DIRECTION + j] = s.direction[r, j]
+
+
+@internal_kernel
 def sample_moreau(system: System, ws: Workspace, run: Run):
-    """Record every sample time within the step, the state linear in between; forces are the means of the step."""
+    """Record every sample time within the step, the state linear in between.
+
+    Forces are the means of the step, as vectors too: along the normal and the tangents at its midpoint, by which the
+    sum of all forces is the change of momentum.
+    """
     t, h, last = run.clock[ki.TIME], run.clock[ki.STEP], run.count[ki.SAMPLE]
     s = run.stepping
     until = t + h + 1e-12 * max(1.0, t + h)
@@ -309,7 +332,9 @@ def sample_moreau(system: System, ws: Workspace, run: Run):
         for i in range(ws.joints.shape[0]):
             ws.joints[i, ka.QD], ws.joints[i, ka.APPLIED] = row[system.layout.v + i], 0.0
         drive(system.drives, system.reference, run.sample_time[last], row, system.layout, ws)
+        keep_directions(s, ws)
         geometry(system, system.model, ws)
+        put_directions_back(s, ws)
         write_output(system, ws, run, last)
         # What lies between the ends of a step is linear, energy is not.
         between = -(1.0 - x) * (s.energy[kt.START, kt.MECHANICAL] + s.energy[kt.START, kt.MAGNETIC])

@@ -32,10 +32,12 @@ from dynsim.dynamics.tree.spatial import cross, dot, dot_vector, put_vector, rot
 from dynsim.dynamics.tree.sweep import forward_sweep
 from dynsim.jit.kernel import integers, internal_kernel, reals
 
-# A residual that is good enough, and one above which a solve counts as capped [m/s]; starts before it is. Below the
-# second what touches does not leave, and what sticks does not slip.
-GOOD, BAD = 1e-11, 1e-8
-QUICK_ROUNDS, LAST_ROUNDS = 2, 12
+# Residuals of contact problems [m/s]: the aim of a search, one that ends it, and one above which a solve counts as
+# capped. Below the last a point that touches does not leave, and a point that sticks does not slip.
+GOOD, FAIR, BAD = 1e-11, 1e-10, 1e-8
+# Starts of the last search, and in all searches together.
+LAST_ROUNDS = 12
+MOST_ROUNDS = 1 + kc.NEAR_STEPS + LAST_ROUNDS
 # A gap that counts as closed: far above rounding [m].
 MARGIN = 1e-10
 # SteppingArrays.memory: of the last accepted step, and of the one that is tried; its columns, of a candidate
@@ -59,12 +61,12 @@ KNOWN = 8  # 1: its rows are those of the last step, turned
 STRUCK = 9  # what the step books as its impact loss [J]
 PRESSED_IN, IMPLICIT = 10, 11  # of what gives way: gap at the start [m], and φ of its law
 TURN_SIZE = 12
-# SteppingArrays.statistics: largest residual [m/s], solves above BAD, largest penetration [m]; solves, and those that
-# took more than the quick rounds; most of what steps have taken of the energy, or made (negative), at any time [J];
+# SteppingArrays.statistics: largest residual [m/s], solves above BAD, largest penetration [m]; solves, and solves with
+# more than one start; most of what steps have taken of the energy, or made (negative), at any time [J];
 # steps whose limits of drives contradict each other; energy that would be another one if all came half a step later
-# [J].
-WORST, CAPPED, PENETRATION, SOLVES, LONG_SOLVES, TAKEN, UNSETTLED, HALF_STEP = 0, 1, 2, 3, 4, 5, 6, 7
-STATISTICS_SIZE = 8
+# [J]; solves without what the law adds to the rates, because with it there was no solution.
+WORST, CAPPED, PENETRATION, SOLVES, LONG_SOLVES, TAKEN, UNSETTLED, HALF_STEP, DROPPED = 0, 1, 2, 3, 4, 5, 6, 7, 8
+STATISTICS_SIZE = 9
 # SteppingArrays.before: rates at the start; rates of the velocity products; acceleration of the last step, and then of
 # this one; what is applied at the start, without loads; rates at the end of the last accepted step.
 V_START, V_BIAS, ACCELERATION, APPLIED_THEN, V_LAST = 0, 1, 2, 3, 4
@@ -91,6 +93,7 @@ class SteppingArrays(NamedTuple):
     before: np.ndarray  # (BEFORE_SIZE, n) see V_START and what follows it
     energy: np.ndarray  # (2, 2) at START and STOP of the step: MECHANICAL and MAGNETIC [J]
     rate: np.ndarray  # (2, p) row rates at the start and the end
+    direction: np.ndarray  # (p, 6) wrenches of unit forces of the rows, kept while a sample is swept
     impulse: np.ndarray  # (p,) of the rows of candidate k at 3 k, then couplings: the next start
     f: np.ndarray  # (p,)
     b: np.ndarray  # (p,) row rates at the end without impulses
@@ -127,6 +130,7 @@ def stepping_arrays(
         before=np.zeros((BEFORE_SIZE, n)),
         energy=np.full((2, 2), np.nan),
         rate=np.zeros((2, p)),
+        direction=np.zeros((p, 6)),
         impulse=np.zeros(p),
         f=np.zeros(p),
         b=np.zeros(p),

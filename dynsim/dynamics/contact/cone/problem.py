@@ -12,10 +12,11 @@ u = W f + b + ε f, has ε added to its diagonal entry of W. Bounds other than �
 unknown is f − f_m, and W f_m is added to b.
 
 The method is a semismooth Newton method on the natural map of Alart and Curnier (Computer Methods in Applied Mechanics
-and Engineering 92, 1991), started from the caller's last forces. Where it does not converge, it alternates with sweeps
-of block Gauss–Seidel (each block solved exactly) and with scattered starts. The last resort is a homotopy from nearly
-decoupled blocks to the problem. A proximal term keeps Newton's matrix regular when rows depend on each other; it does
-not change the solution.
+and Engineering 92, 1991), started from the caller's last forces. A proximal term keeps Newton's matrix regular when
+rows depend on each other; it does not change the solution. With W of deficient rank Newton's method may cycle among
+active sets. Then the proximal-point method (Rockafellar, SIAM Journal on Control and Optimization 14, 1976) solves a
+sequence of regular problems instead. The last resort is sweeps of block Gauss–Seidel (each block solved exactly) and
+scattered starts: with strong friction the map is not monotone, and the sequence may end elsewhere.
 """
 
 from __future__ import annotations
@@ -49,7 +50,19 @@ from dynsim.dynamics.contact.cone.steps import (
 )
 from dynsim.jit.kernel import internal_kernel, kernel
 
-__all__ = ["BOTH_WAYS", "BOX", "CONE", "CONE_ROOM", "NO_SOLUTION", "ONE_WAY", "TANGENT", "approach", "solve_cones"]
+__all__ = [
+    "BOTH_WAYS",
+    "BOX",
+    "CONE",
+    "CONE_ROOM",
+    "NO_SOLUTION",
+    "ONE_WAY",
+    "TANGENT",
+    "approach",
+    "approach_or_draw_near",
+    "draw_near",
+    "solve_cones",
+]
 
 # What ``solve_cones`` returns instead of a residual when it has proved that there is no solution.
 NO_SOLUTION = -1.0
@@ -58,8 +71,10 @@ NO_SOLUTION = -1.0
 NEWTON_STEPS, FULL_STEPS, HALVINGS = 20, 6, 8
 # Starts in all, sweeps that come before a start times its number, and where that number starts anew.
 ROUNDS, SWEEPS, SWEPT_ROUNDS = 200, 10, 40
-# Of paths: how many, steps of one, starts at each.
-PATHS, PATH_STEPS, PATH_ROUNDS = 40, 150, 8
+# Starts before a proof is tried, and of each problem of the proof.
+FEW_ROUNDS = 8
+# Proximal-point method: number of steps, first and least ε.
+NEAR_STEPS, FIRST_EPSILON, LEAST_EPSILON = 60, 1e-3, 1e-9
 # A proof holds for all forces up to this times |b| / mobility; its problem is regularised by the second number.
 PROVED_FORCE, PROOF_SHIFT, PROOF_STEPS = 1e6, 1e-6, 4
 
@@ -85,18 +100,22 @@ def solve_cones(W, b, kind, mu, p, f, room, tolerance):
     """
     if p == 0:  # of a system that nothing can touch, there is no room either
         return 0.0
-    residual = approach(W, b, kind, mu, p, f, room, tolerance, PATH_ROUNDS)
+    residual = approach_or_draw_near(W, b, kind, mu, p, f, room, tolerance, FEW_ROUNDS)
     if residual <= tolerance:
         return residual
     if impossible(W, b, kind, mu, p, room):
         return NO_SOLUTION
-    residual = approach(W, b, kind, mu, p, f, room, tolerance, ROUNDS)
-    if residual <= tolerance:
-        return residual
-    for attempt in range(PATHS):
-        residual = follow_path(W, b, kind, mu, p, f, room, tolerance, attempt)
-        if residual <= tolerance:
-            break
+    return approach(W, b, kind, mu, p, f, room, tolerance, ROUNDS)
+
+
+@internal_kernel
+def approach_or_draw_near(W, b, kind, mu, p, f, room, tolerance, rounds):
+    """:func:`solve_cones` without a proof: one start, then :func:`draw_near`, then up to ``rounds`` starts."""
+    residual = approach(W, b, kind, mu, p, f, room, tolerance, 1)
+    if not residual <= tolerance:
+        residual = draw_near(W, b, kind, mu, p, f, room, tolerance)
+    if not residual <= tolerance:
+        residual = approach(W, b, kind, mu, p, f, room, tolerance, rounds)
     return residual
 
 
@@ -194,50 +213,44 @@ def shift(W, b, p, room, epsilon):
 
 
 @internal_kernel
-def follow_path(W, b, kind, mu, p, f, room, tolerance, attempt):
-    """Follow the solution of (W + ε w) f + b − ε w a = 0, cones as before, from ε = 1 to none.
+def draw_near(W, b, kind, mu, p, f, room, tolerance):
+    """Solve (W + ε w) f' + b − ε w f = 0, cones as before, again and again (proximal point); returns the residual.
 
-    At first blocks hardly feel each other. Each ``attempt`` has its own anchor a, and so another path; steps of ε grow
-    while the solution can be followed and shrink where it cannot. Leaves f as it was when the end is no nearer.
+    A fixed point solves the problem itself, whatever ε is; if forces are not unique, they stay near the start f. As
+    W + ε w is regular, each of these problems takes few Newton steps. ε falls after a solved
+    problem and grows after an unsolved one. Leaves the best f.
     """
-    shifted, right, mobility = room[SHIFTED], room[SHIFTED_RIGHT, 0], room[MOBILITY, 0]
-    kept, last, anchor = room[KEPT, 0], room[LAST, 0], room[ANCHOR, 0]
+    shifted, right = room[SHIFTED], room[SHIFTED_RIGHT, 0]
+    kept, anchor = room[KEPT, 0], room[ANCHOR, 0]
     mobilities(W, kind, p, room)
     least, _ = measure(W, b, kind, mu, p, f, room)
     scale = 0.0
     for k in range(p):
-        kept[k] = f[k]
+        kept[k], anchor[k] = f[k], f[k]
         scale = max(scale, abs(b[k]))
-    scatter(mobility, p, anchor, attempt * scale, attempt)
-    for k in range(p):
-        if kind[k] == CONE or kind[k] == ONE_WAY:
-            anchor[k] = abs(anchor[k])
-        f[k], last[k] = anchor[k], anchor[k]
-    epsilon, factor = 1.0, 0.3
-    for _ in range(PATH_STEPS):
-        mobilities(W, kind, p, room)
+    epsilon, inner = FIRST_EPSILON, max(0.1 * tolerance, 1e-14 * scale)
+    for _ in range(NEAR_STEPS):
         shift(W, b, p, room, epsilon)
-        shifted_residual = approach(shifted, right, kind, mu, p, f, room, max(tolerance, 1e-9 * scale), PATH_ROUNDS)
-        if shifted_residual <= 1e-6 * scale:
+        left = approach(shifted, right, kind, mu, p, f, room, inner, 1)
+        # ``approach`` has left those of the shifted problem.
+        mobilities(W, kind, p, room)
+        residual, _ = measure(W, b, kind, mu, p, f, room)
+        if residual < least:
+            least = residual
             for k in range(p):
-                last[k] = f[k]
-            if epsilon <= 1e-11:
-                break
-            factor = max(0.5 * factor, 0.01)
-        else:
-            for k in range(p):
-                f[k] = last[k]
-            epsilon /= factor
-            factor = math.sqrt(factor)
-            if factor > 0.98:
-                break
-        epsilon *= factor
-    residual = approach(W, b, kind, mu, p, f, room, tolerance, ROUNDS)
-    if not residual < least:
-        residual = least
+                kept[k] = f[k]
+        if least <= tolerance:
+            break
+        solved = left <= 0.1 * residual + inner
         for k in range(p):
-            f[k] = kept[k]
-    return residual
+            if solved:
+                anchor[k] = f[k]
+            else:
+                f[k] = anchor[k]
+        epsilon = max(0.3 * epsilon, LEAST_EPSILON) if solved else min(10.0 * epsilon, 1.0)
+    for k in range(p):
+        f[k] = kept[k]
+    return least
 
 
 @internal_kernel
@@ -257,7 +270,7 @@ def impossible(W, b, kind, mu, p, room):
     shift(W, b, p, room, PROOF_SHIFT)
     # What is left of what is left: each time a millionth of what forces can move.
     for _ in range(PROOF_STEPS):
-        approach(room[SHIFTED], right, kind, none, p, proof, room, 1e-9 * scale, PATH_ROUNDS)
+        approach(room[SHIFTED], right, kind, none, p, proof, room, 1e-9 * scale, FEW_ROUNDS)
         mobilities(W, kind, p, room)
         for k in range(p):
             free = kind[k] == TANGENT or kind[k] == BOX

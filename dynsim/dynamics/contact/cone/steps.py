@@ -113,10 +113,13 @@ def newton_step(W, b, kind, mu, p, f, room, relative, most):
     known = room[KNOWN, 0]
     for k in range(p):
         known[k] = b[k]
-    for m in range(p):
+    m = 0
+    while m < p:
+        # STATUS is written at the first row of a block only: at tangents there is what another problem left.
         if status[m] == CLAMPED:
             for k in range(p):
                 known[k] += W[k, m] * first[m]
+        m += block_size(kind, m)
     r, k = 0, 0
     while k < p:
         more = near * mobility[k]
