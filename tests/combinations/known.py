@@ -1,4 +1,4 @@
-"""Combinations in which dynsim was once wrong: levels that differ from a plain scene, and numbers of scenes that showed it."""
+"""Combinations that were wrong once: levels that differ from a plain scene, and numbers of scenes that showed it."""
 
 from __future__ import annotations
 
