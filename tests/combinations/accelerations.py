@@ -1,7 +1,7 @@
 """The problem of accelerations and contact forces at one state, from the bodies alone.
 
-Modes that are not decided are those of points and joints at rest. Matrices come from the checks' own mass matrix and
-Jacobians; what accelerates points without forces comes from differences of their own motion.
+Only points and joints at rest have undecided modes. Mass matrix and Jacobians are computed without the kernels; drift
+accelerations of points are differences of their velocities.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from dynsim.model.drives import Motor
 
 Array = NDArray[np.float64]
 
-# What is nearer to its surface is closed [m]; what moves more slowly rests [m/s, rad/s].
+# Largest gap of a closed contact [m]; largest rate at rest [m/s, rad/s].
 CLOSED, RESTS = 1e-5, 1e-5
 # Determinants and diagonals below this part of the frictionless ones are as good as zero: a step ends just before.
 CRITICAL = 0.02
@@ -28,7 +28,7 @@ CRITICAL = 0.02
 FEW = 8
 # Steps of the differences that give a point's drift [s].
 DRIFT_STEP = 1e-4
-# Sweeps of the projected iteration, its damping, and what is left of accelerations that counts as none.
+# Sweeps and damping of the projected iteration, and the relative violation that counts as zero.
 SWEEPS, DAMPING, SOLVED = 20000, 0.7, 1e-7
 
 
@@ -38,9 +38,9 @@ class State:
 
     Attributes
     ----------
-    q, v, current : of the state
+    q, v, current : positions, rates and currents
     mass : M + J_m, (n, n)
-    names : closed contacts; rows : of each, normal and two tangents, (3, n); slip : (2,) along the tangents [m/s]
+    names : closed contacts; rows : normal and two tangents of each, (3, n); slip : (2,) along the tangents [m/s]
     friction : coefficient of each; resting : joints at rest that rub, with their bounds
     """
 
@@ -59,7 +59,7 @@ class State:
 
 
 def state_of(seen: Observed, values: Mapping[str, Sequence[float]], currents: Array | None = None) -> State:
-    """What the bodies are at the state of a stop, or the last sample; ``currents`` : of all drives, if known."""
+    """Return the state of a stop, or of the last sample; ``currents`` : currents of all drives, if known."""
     q = np.array(values["q"]) if "q" in values else seen.q[-1]
     v = np.array(values["v"]) if "v" in values else seen.v[-1]
     motion = seen.bodies.motion(q[None], v[None], np.zeros((1, len(v))))
@@ -133,7 +133,7 @@ def _paradox(state: State, sliding: Sequence[int], inverse: Array, signs: Sequen
         if speed > RESTS:
             choices.append([state.slip[k] / speed])
         else:
-            # The worst direction is that of the largest coupling, either way.
+            # The direction with the largest coupling is the worst, with either sign.
             normal, tangents = state.rows[k][0], state.rows[k][1:]
             coupling = tangents @ inverse @ normal
             size = float(np.linalg.norm(coupling))
@@ -228,7 +228,7 @@ def _contact(state: State, k: int, W: Array, free: Array, f: Array) -> None:
 
 
 def _violation(state: State, W: Array, free: Array, f: Array) -> float:
-    """Largest acceleration that the law does not allow, of what touches and what rests."""
+    """Largest violation of the law by the acceleration of a contact or resting joint."""
     a, worst = W @ f + free, 0.0
     for k in range(len(state.names)):
         own, force = a[3 * k : 3 * k + 3], f[3 * k : 3 * k + 3]
@@ -249,7 +249,7 @@ def _violation(state: State, W: Array, free: Array, f: Array) -> float:
 
 
 def _applied(seen: Observed, state: State, time: float) -> Array:
-    """Generalised forces beside contacts and what rests, weight and velocity products among them, (n,)."""
+    """Generalised forces without contacts and resting joints, with weight and velocity products, (n,)."""
     motion = seen.bodies.motion(state.q[None], state.v[None], np.zeros((1, len(state.v))))
     push = -seen.bodies.along_rows(motion, seen.bodies.wrenches(motion))[0] - seen.bodies.damping * state.v
     push = push + seen.driven_torques(state.current[None], state.v[None])[0] + state.rubbing
@@ -264,7 +264,7 @@ def _applied(seen: Observed, state: State, time: float) -> Array:
 
 
 def _drifts(seen: Observed, state: State) -> Array:
-    """Accelerations of what touches along normal and tangents without any of the joints, (c, 3) [m/s²].
+    """Accelerations of contacts along normal and tangents at zero joint accelerations, (c, 3) [m/s²].
 
     From the places of gaps and the velocities of touching points, before and after at constant rates.
     """
@@ -298,7 +298,7 @@ def _subsets(items: Sequence[int]) -> list[tuple[int, ...]]:
 
 
 def _modes(count: int) -> list[tuple[int, ...]]:
-    """Open, sliding, sticking of each contact; of many all alike, or one alone."""
+    """Open, sliding, sticking for each contact; for many contacts equal modes, or one different."""
     if count <= 4:
         return list(itertools.product((0, 1, 2), repeat=count))
     alone = [tuple(1 if k == m else other for k in range(count)) for m in range(count) for other in (0, 2)]

@@ -1,9 +1,8 @@
-"""How far the runs of one scene may differ: as far as the methods' own errors, seen by running them more finely.
+"""Agreement of the runs of one scene, within the errors of the methods.
 
-Most runs agree at once, within what their tolerances or steps promise for motion that forgets its errors. Those that do
-not are run again with a tenth of the tolerance, or half the step: what that changes is the method's error, also where
-motion multiplies it. Where both are sure of their results and these differ, the motion is not unique, and a warning
-must say so; or one of them is wrong.
+Most runs agree within the errors that their tolerances or steps imply for stable motion. If not, both are repeated with
+a tenth of the tolerance or half the step: the change is the method's error, even if the motion multiplies errors. If
+both errors are small and the results differ, the motion is not unique, which a warning must report, or one is wrong.
 """
 
 from __future__ import annotations
@@ -22,11 +21,11 @@ from dynsim.record import Record
 
 Array = NDArray[np.float64]
 
-# Errors of well-behaved motion, in units of rtol, and of steps as a share of what is moved in one of them.
+# Errors of stable motion: in units of rtol, as a share for time stepping, and in steps.
 ADAPTIVE_SHARE, STEPPED_SHARE, STEPS = 300.0, 0.01, 2.0
-# Of the two solvers, which solve the same equations.
+# Difference of the two solvers, which solve the same equations.
 SOLVERS = 1e-8
-# Errors seen by a finer run count so many times: refinement tells their size, not their bound.
+# Factor on errors estimated by a finer run: an estimate is not a bound.
 SURE = 10.0
 # Samples by which an impact may be early or late.
 JUMPS = 3
@@ -138,11 +137,11 @@ def _pair(first: str, run: Run, other: str, second: Run) -> Iterator[tuple[str, 
 
 
 def _measures(record: Record | None) -> list[Measure]:
-    """Positions, each against what it moves, and energies against what changes hands."""
+    """Positions relative to their motion, and energies relative to the largest one."""
     assert record is not None
     q = record["q"]
     moved = np.abs(q - q[:1]).max(axis=0, initial=0.0)
-    # What stands still is off by a part of what its neighbours are.
+    # Errors of joints that barely move are a part of their neighbours' errors.
     measures = [Measure("q", q, np.maximum(moved, max(0.1 * float(moved.max(initial=0.0)), 1e-4)))]
     parts = [record[name] - (record[name][0] if name == "energy_potential" else 0.0) for name in ENERGIES]
     parts[2] = sum((record[name] for name in TAKEN if name in record), start=np.zeros(len(record)))
@@ -153,7 +152,7 @@ def _measures(record: Record | None) -> list[Measure]:
 
 
 def _promised(run: Run, other: Run) -> Any:
-    """What may differ at once, by measure."""
+    """Return the limit of each measure without repeated runs."""
     share, step = 0.0, 0.0
     speed = 0.0
     for own in (run, other):
@@ -181,12 +180,12 @@ def _promised(run: Run, other: Run) -> Any:
 def _widest(
     first: Record | None, a: list[Measure], second: Record | None, b: list[Measure], allowed: Any
 ) -> tuple[float, str]:
-    """Largest difference against what is allowed, over the samples that both have, and its sentence."""
+    """Return the largest difference relative to its limit, over the common samples, and a sentence about it."""
     assert first is not None
     assert second is not None
     worst, text = 0.0, ""
     _, i, j = np.intersect1d(first.time.round(9), second.time.round(9), return_indices=True)
-    # Where one has stopped, what it did last is not compared.
+    # The last part of a stopped run is not compared.
     keep = first.time[i] <= min(first.time[-1], second.time[-1]) * (1.0 if first.complete and second.complete else 0.95)
     i, j = i[keep], j[keep]
     if not len(i):
@@ -199,7 +198,7 @@ def _widest(
         share = off / limit
         if share.max() > worst:
             worst = float(share.max())
-            # Where it begins says more than where it is largest.
+            # Its beginning is more useful than its maximum.
             t = int((share.max(axis=1) > min(1.0, 0.999 * worst)).argmax())
             k = int(share[t].argmax())
             name = first.labels["q"][k] if own.name == "q" else ENERGIES[k]
@@ -211,7 +210,7 @@ def _widest(
 
 
 def _apart(a: Array, b: Array, jumps: bool) -> Array:
-    """Distances of values at samples; of what jumps, from all that the other has about that time."""
+    """Distances of values at samples; for values that jump, from the range of the other near that time."""
     if not jumps:
         return np.asarray(np.abs(a - b))
     around = [b[np.clip(np.arange(len(b)) + shift, 0, len(b) - 1)] for shift in range(-JUMPS, JUMPS + 1)]

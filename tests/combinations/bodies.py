@@ -40,7 +40,7 @@ class Motion:
 
     Attributes
     ----------
-    rotation, origin : of each body's frame in the world, n times (T, 3, 3) and (T, 3) [m]
+    rotation, origin : frame of each body in the world, n times (T, 3, 3) and (T, 3) [m]
     spin, flow : angular velocity of each body, and velocity of its point at the world's origin, n times (T, 3)
     turning, rushing : angular acceleration and rate of ``flow``, n times (T, 3)
     axis, drift : each row's motion per unit rate, angular and linear at the world's origin, n times (T, 3)
@@ -56,7 +56,7 @@ class Motion:
     drift: list[Array] = field(default_factory=list)
 
     def point(self, body: int, at: Array) -> Array:
-        """Where a point of a body's frame is, (T, 3) [m]; ``at`` : (3,) or (T, 3)."""
+        """Return the place of a point of a body's frame, (T, 3) [m]; ``at`` : (3,) or (T, 3)."""
         return self.origin[body] + times(self.rotation[body], np.broadcast_to(at, self.origin[body].shape))
 
     def velocity(self, body: int, position: Array) -> Array:

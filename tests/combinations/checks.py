@@ -1,7 +1,7 @@
-"""Checks of a scene's runs that share no code with the kernels: what must hold of every record, and between methods.
+"""Checks of a scene's runs that share no code with the kernels: properties of every record, and agreement of methods.
 
-Each check is a function of what a record shows (:class:`combinations.observed.Observed`) and yields a sentence with
-the worst sample. Tolerances say where they come from.
+Each check is a function of a record (:class:`combinations.observed.Observed`) and yields a sentence about the worst
+sample. A comment next to each tolerance explains its value.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from dynsim.errors import SimulationStopped
 from dynsim.model.drives import Motor
 from dynsim.scenario import build
 
-# The first sample of what starts on a surface is projected onto it, from up to a micrometre.
+# A start within a micrometre of a surface is projected onto it; this moves the first sample.
 START = 1e-5
-# A force beyond this many times what weight, loads and motors can do at a lever of 5 cm is none of this world.
+# A force above this multiple of weight, loads and motor torques at a lever of 5 cm is absurd.
 ABSURD, LEVER_M = 1e6, 0.05
-# Signals that may be NaN, where there is no load to divide by.
+# Signals that may be NaN because they divide by a load that may be zero.
 MAY_BE_NAN = ("center_of_pressure", "traction_demand")
 
 
 @dataclass(frozen=True)
 class Problem:
-    """What is wrong with a run.
+    """A fault of a run.
 
     ``kind`` : the check, in a word; ``detail`` : a sentence with name, time and numbers
     """
@@ -89,7 +89,7 @@ def finite(run: Run) -> Finding:
 
 def start(seen: Observed) -> Finding:
     """The first sample is the posture that the scenario asks for, at rest."""
-    # A soft start settles into a posture of its own.
+    # A soft start settles into another posture.
     if seen.time[0] != 0.0 or seen.config["plant"].get("start") == "soft":
         return
     asked = build.unposed(seen.scenario).initial
@@ -136,11 +136,11 @@ def equilibrium(seen: Observed) -> Finding:
         controller.get("joints") or controller.get("hand")
     ):
         return
-    # A reference that begins elsewhere or moving, and a torque that does, jump at the start, and a warning says so.
+    # References and torques that jump at the start are reported by a warning.
     if warned(seen, "that jumps at the start all the same") or warned(seen, "the start slips at"):
         return
     size = np.abs(seen.vdot[0])
-    # A millionth of what the weight does to a joint that is let go.
+    # Far below the acceleration of a joint that falls.
     if size.max(initial=0.0) > 1e-4 * (1.0 + np.linalg.norm(seen.bodies.gravity)):
         yield f"{seen.joints[int(size.argmax())]} starts with an acceleration of {size.max():.3g}, from equilibrium"
 
@@ -158,10 +158,10 @@ def absurd(seen: Observed) -> Finding:
             continue
         most = float(np.abs(seen.record[name]).max())
         if most > ABSURD * size:
-            yield f"{name} comes to {most:.3g}, where weight, loads and motors make {size:.3g}"
-    # An impact of what moves takes at most all its energy; a scene of some kilograms knows no speeds like these.
+            yield f"{name} reaches {most:.3g}, but weight, loads and motors only {size:.3g}"
+    # Scenes of a few kilograms do not reach such speeds.
     if np.abs(seen.v).max(initial=0.0) > 1e5 or np.abs(seen.q).max(initial=0.0) > 1e6:
-        yield f"rates come to {np.abs(seen.v).max():.3g}, positions to {np.abs(seen.q).max():.3g}"
+        yield f"rates reach {np.abs(seen.v).max():.3g}, positions reach {np.abs(seen.q).max():.3g}"
 
 
 CHECKS: dict[str, Callable[[Observed], Finding]] = {

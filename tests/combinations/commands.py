@@ -1,4 +1,4 @@
-"""What a controller asks for on records: continuous commands, and those that are held from tick to tick."""
+"""Commands of controllers on records: continuous commands, and commands held from tick to tick."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ SHOWS_HELD_UNTIL_TICK = False
 
 
 def commands(seen: Observed) -> Finding:
-    """Voltages are what the controller asks for: now, or at the last tick, for joints whose reference stands still."""
+    """Voltages are the controller's commands now, or at the last tick, for joints with a constant reference."""
     controller = seen.config.get("controller") or {}
     if controller.get("type") != "joint_pd" or any(
         controller.get(key) for key in ("hand", "operator", "brace", "torques")
     ):
         return
-    # Encoders tell of other states; references of what starts in equilibrium are shifted to hold it.
+    # Encoders measure other states; an equilibrium start shifts the references.
     if seen.config.get("sensors") or (seen.config.get("initial") or {}).get("equilibrium"):
         return
     if controller.get("feed_forward", "none") != "none":

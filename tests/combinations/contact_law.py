@@ -20,12 +20,12 @@ STOP_SLACK = 1e-6
 CONE = 1e-5
 # What sticks moves no faster: limit of the projection of velocities [m/s]; steps solve contact problems to 1e-8.
 CREEP = 1e-6
-# Slip below this has no direction of its own: 1000 atol of the default [m/s].
+# The direction of slower slip is noise: 1000 times the default atol [m/s].
 SLOW = 1e-4
 
 
 def touching(seen: Observed) -> Finding:
-    """Gaps, slip and normals of the record are those of the posture; what is open has no force, none pulls."""
+    """Gaps, slip and normals of the record agree with the posture; open contacts have no force, and none pulls."""
     for k, touch in enumerate(seen.touches()):
         name = touch.contact.name
         off = np.abs(touch.gap - seen.record["contact_gap"][:, k])
@@ -72,9 +72,9 @@ def touching(seen: Observed) -> Finding:
 
 
 def _reach(seen: Observed, touch: Touch) -> Array:
-    """How far from its surface what touches may be, (T,) [m]: of steps what they go along the normal.
+    """Largest gap of a contact with a force, (T,) [m]; time stepping adds the motion of a step along the normal.
 
-    What starts within a micrometre is on its surface.
+    A point that starts within a micrometre of its surface counts as closed.
     """
     if not seen.stepped:
         return np.full(len(seen), 10.0 * DRIFT)
@@ -147,8 +147,7 @@ def _real_friction(seen: Observed, touch: Touch) -> Finding:
         yield f"{contact.name} at t = {seen.time[i]:.6g} s: friction drives the slip with {power[i]:.4g} W"
     if contact.grip_axis is None:
         yield from _against_slip(seen, touch, slips, before)
-    # What sticks does not move. Steps end with what they have solved the problem to.
-    # A sphere that rolls has velocities of its own at other places: only the place that touches counts.
+    # Only the velocity of the touching place counts: other points of a rolling sphere move.
     sticks = closed & (touch.mode == STICKING)
     if seen.stepped:
         # A step at whose end slip is over had some of it.
@@ -166,7 +165,7 @@ def _share(seen: Observed, touch: Touch) -> Array:
 
 
 def _creep(seen: Observed, touch: Touch) -> Array:
-    """Slip of what sticks, (T,) [m/s]: nothing; of steps what turns of the surface add, and of soft contacts sag."""
+    """Largest slip of a sticking contact, (T,) [m/s]: time stepping adds the turn of the surface in a step."""
     if not seen.stepped:
         return np.full(len(seen), CREEP)
     moved = np.linalg.norm(np.diff(touch.position, axis=0, prepend=touch.position[:1]), axis=1)
@@ -180,7 +179,7 @@ def _against_slip(seen: Observed, touch: Touch, slips: NDArray[np.bool_], before
     """Sliding friction is μ f_n against the slip."""
     speed, f_n = np.linalg.norm(touch.slip, axis=1), touch.normal_force
     if seen.stepped:
-        # A step in which slip begins, ends or turns has friction of its own mean: only steady ones tell.
+        # If slip begins, ends or turns within a step, its friction is a mean: only steady slip is compared.
         earlier = np.linalg.norm(before, axis=1)
         both = np.maximum(speed, earlier)
         turned = np.linalg.norm(touch.slip - before, axis=1)
@@ -198,7 +197,6 @@ def _against_slip(seen: Observed, touch: Touch, slips: NDArray[np.bool_], before
     off = np.linalg.norm(touch.tangential - expected, axis=1)
     allowed = share * np.linalg.norm(touch.force, axis=1) + 1e-9
     wrong = steady & (off > allowed)
-    # From rest the static coefficient holds until the first step of slip is over.
     if wrong.any():
         i = int(np.where(wrong, off / allowed, 0.0).argmax())
         yield (
@@ -219,7 +217,7 @@ def gaps(seen: Observed) -> Finding:
                     f"glued to"
                 )
             continue
-        # What no joint moves along the normal lies where it lies, and a warning says so.
+        # A point that no joint moves along the normal is left out of the contacts, with a warning.
         if f"{name}: no joint moves this point along the normal" in " ".join(seen.run.warnings):
             continue
         deepest = int(touch.gap.argmin())

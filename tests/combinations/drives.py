@@ -23,8 +23,10 @@ def motors(random: Generator, levels: Levels, robot: Plant) -> dict[str, dict[st
         return {}
     chosen = {joint.name: _motor(random, level, joint) for joint in robot.joints if joint.name != "base.right"}
     if level == "partly":
+        # Braces carry two of them with friction alone.
         own = [joint.name for joint in robot.joints if joint.before and joint.name in chosen]
-        chosen.pop(own[int(random.integers(len(own)))], None)
+        for k in random.permutation(len(own)).tolist()[: 1 + int(random.integers(2))]:
+            del chosen[own[k]]
     gear = float(random.uniform(0.05, 0.3)) if levels["rubbing"] in ("gear", "both") else 0.0
     for motor in chosen.values():
         if gear and motor["type"] != "torque":

@@ -1,4 +1,4 @@
-"""Energies on records: those of the bodies, the ledger as docs/physics.md defines it, losses and heat."""
+"""Energies on records: stored energies, the ledger as docs/physics.md defines it, losses and heat."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ RESIDUAL = 1e-6
 
 
 def ledger(seen: Observed) -> Finding:
-    """Energies are those of the bodies, the ledger closes or a warning says so, and losses only grow."""
+    """Stored energies agree with the bodies, and the ledger closes unless a warning reports its residual."""
     record = seen.record
     kinetic, potential = seen.bodies.energies(seen.motion, seen.v)
     own = {"energy_kinetic": kinetic, "energy_potential": potential - potential[0] + record["energy_potential"][0]}
@@ -43,7 +43,7 @@ def ledger(seen: Observed) -> Finding:
     if abs(relative - reported) > 0.01 * max(relative, reported) + 1e-12:
         yield f"the residual is {relative:.3e} of the turnover by the signals, {reported:.3e} in the summary"
     if relative > RESIDUAL and not warned(seen, "the energy ledger does not close"):
-        yield f"the ledger does not close: {relative:.3e} of the turnover, and no warning says so"
+        yield f"the ledger does not close: {relative:.3e} of the turnover, without a warning"
 
 
 def losses(seen: Observed) -> Finding:
@@ -54,11 +54,11 @@ def losses(seen: Observed) -> Finding:
     signed = any(touch.contact.pulling_friction == "signed" for touch in seen.touches()) and not seen.real
     if not restitution and not signed:
         names += ["heat_friction"]
-        # What takes a point out of the surface again comes from what steps have taken there.
+        # Energy that moves a point back out of its surface is taken from the impact losses.
         names += [name for name in ("loss_impact", "loss_stop") if name in seen.record and not seen.stepped]
     for name in names:
         fall = -np.diff(seen.record[name])
-        # Steps take friction of what sticks for none; what is left of rates is solved to 1e-8 m/s.
+        # Rates of sticking points are solved to 1e-8 m/s only.
         allowed = (1e-7 if seen.stepped else 1e-9) * turnover + 1e-12
         if seen.stepped and name == "heat_friction" and fall.size:
             # Within an impact friction may give what its normal impulse takes: only their sum is a loss.
@@ -68,7 +68,7 @@ def losses(seen: Observed) -> Finding:
 
 
 def powers(seen: Observed) -> Finding:
-    """Heat and losses are the integrals of what the samples show of them."""
+    """Heat and losses are the integrals of the powers at the samples."""
     record, current = seen.record, seen.record["current"]
     heat = np.zeros(len(seen))
     for a, motor in enumerate(seen.robot.motors):
@@ -114,14 +114,13 @@ def _integrated(seen: Observed, name: str, total: Array, power: Array, turnover:
     if off.size and (off / allowed).max() > 1.0:
         k = int((off / allowed).argmax())
         yield (
-            f"{name} until t = {seen.time[rows[k]]:.6g} s is {off[k, 0]:.3g} J off the integral of what the "
-            f"samples show "
+            f"{name} until t = {seen.time[rows[k]]:.6g} s is {off[k, 0]:.3g} J off the integral over the samples "
             f"(allowed {allowed[k, 0]:.3g} J)"
         )
 
 
 def residual_floor(seen: Observed) -> float:
-    """Least energy to which a residual is compared, as docs/physics.md has it [J]."""
+    """Return the floor of the denominator of the relative residual, as in docs/physics.md [J]."""
     reach, lever, mass = {}, 0.0, 0.0
     for link in seen.bodies.robot.links:
         reach[link.name] = 0.0 if link.parent is None else reach[link.parent] + float(np.linalg.norm(link.p_PJ))

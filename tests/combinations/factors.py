@@ -12,7 +12,8 @@ Levels = Mapping[str, str]
 FACTORS: dict[str, tuple[str, ...]] = {
     # With its kinds of joints: revolute; also prismatic; of a file, with a branch; coupled; a free or a planar root.
     "plant": ("revolute", "prismatic", "urdf", "mimic", "floating", "planar", "mobile", "snake"),
-    # partly: a joint before the elbow has none; dc: with limits of voltage and current; velocity: a servo in that mode.
+    # partly: one joint before the elbow has none, or two; dc: with limits of voltage and current; velocity: a servo in
+    # that mode.
     "motor": ("none", "partly", "published", "dc", "servo", "velocity", "torque"),
     "rubbing": ("nothing", "viscous", "bearing", "gear", "both"),
     "stops": ("none", "far", "reached"),

@@ -1,7 +1,7 @@
 """Newton's and Euler's laws on records: forces and accelerations, momentum, rates, circuits.
 
-An integral over samples is taken by Simpson's rule, and may be off by as much as it and the trapezoidal rule differ,
-and as rates bend around: far more than its error is where motion is smooth, and enough where it is not.
+Integrals over samples use Simpson's rule. Their error is bounded by the difference from the trapezoidal rule and by
+second differences of the rates nearby; for smooth motion this bound is far above the error.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def free_sets(seen: Observed) -> list[list[int]]:
 
 
 def momentum(seen: Observed) -> Finding:
-    """Momentum and angular momentum of every set of free bodies change by the impulses of what acts on it."""
+    """Momentum and angular momentum of every set of free bodies change by the impulses that act on it."""
     for chosen in free_sets(seen):
         angular, linear = seen.bodies.momentum(seen.motion, chosen)
         moment, force, size = _acting_on(seen, set(chosen))
@@ -64,7 +64,7 @@ def momentum(seen: Observed) -> Finding:
         name = seen.robot.links[chosen[-1]].name
         if seen.stepped:
             rows = whole_steps(seen)
-            # Means over the step, taken where it ends: as much off as the step is long beside the motion.
+            # Means over the step, evaluated at its end: the error is of the order of the step.
             off = np.abs(both[rows] - both[rows - 1] - seen.step * rate[rows])
             reach = 1.0 + np.linalg.norm(seen.motion.origin[chosen[-1]][rows], axis=1)
             allowed = (seen.step * 0.02 * size[rows] * reach + 1e-12)[:, None]
@@ -111,8 +111,10 @@ def _acting_on(seen: Observed, chosen: set[int], weight: bool = True) -> tuple[A
 
 
 def integral_error(seen: Observed, value: Array, rate: Array) -> tuple[Array, Array, NDArray[np.int64]]:
-    """By how much values (T, k) change otherwise than the integral of their rates, over pairs of equal intervals in
-    which nothing happens; what is allowed; and the first sample of each pair."""
+    """Return errors of the changes of values (T, k) against integrals of their rates, limits, and first samples.
+
+    Each row belongs to a pair of equal intervals without events.
+    """
     if len(seen) < 3:
         return np.zeros((0, value.shape[1])), np.ones((0, value.shape[1])), np.zeros(0, dtype=np.int64)
     interval = np.diff(seen.time)
@@ -171,7 +173,7 @@ def _stepped_motion(seen: Observed) -> Finding:
     share = ((change - before) * bend).sum(axis=1) / np.maximum((bend * bend).sum(axis=1), 1e-300)
     off = np.abs(change - before - np.clip(share, 0.0, 1.0)[:, None] * bend).max(axis=1)
     allowed = 1e-6 * (np.abs(now) + np.abs(before)).max(axis=1) + 1e-12
-    # Where a step was cut at the end of a load, three steps may lie between samples.
+    # If a step was cut at the end of a load, three steps may lie between samples.
     wrong = (off > allowed) & np.array([(np.abs(seen.event_times - t) > 2.0 * h).all() for t in seen.time[beside]])
     if wrong.any():
         k = int(np.where(wrong, off, 0.0).argmax())
@@ -232,7 +234,7 @@ def support(seen: Observed) -> Finding:
     levers = np.stack([np.ones(3), feet[:, 1], -feet[:, 0]])
     loads = np.linalg.solve(levers, np.stack([own_force[:, 2], own_moment[:, 0], own_moment[:, 1]])).T
     off = np.abs(loads - seen.record["wheel_load"]).max(axis=1)
-    # Steps have forces of their own middle, and the samples' accelerations are means.
+    # Forces of a step belong to its middle, and the samples' accelerations are means.
     size = np.abs(loads).max(axis=1) + np.linalg.norm(force, axis=1)
     allowed = (1e-2 if seen.stepped else 1e-6) * size + 1e-9
     if (off > allowed).any():

@@ -1,4 +1,4 @@
-"""A record beside what its scenario says: bodies, contacts, drives, loads at the samples, by the checks' own means."""
+"""A record and its scenario: bodies, contacts, drives and loads at the samples, computed without the kernels."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from dynsim.scenario import build
 Array = NDArray[np.float64]
 
 OPEN, SLIDING, STICKING = 0, 1, 2
-# Samples count as the ends of steps of time stepping that are no further from them, in steps.
+# Largest distance of a sample from the end of a step to count as that end, in steps.
 AT_STEP = 1e-6
-# Samples resolve a circuit that are no further apart than this part of L/R; else what an event makes swing is left out
-# for so long, which is three of the longest periods of published motors in stiff loops [s].
+# Samples resolve a circuit if their spacing is below this part of L/R. If not, this time after an event is left out,
+# three of the longest periods of published motors in stiff loops [s].
 RESOLVED, SETTLING = 0.3, 0.03
 
 
@@ -88,12 +88,12 @@ class Observed:
 
     @cached_property
     def motion(self) -> Motion:
-        """Of all bodies at the samples."""
+        """Motion of all bodies at the samples."""
         return self.bodies.motion(self.q, self.v, self.vdot)
 
     @cached_property
     def shapes(self) -> dict[str, Shape]:
-        """Surfaces by name."""
+        """Surfaces of the scenario, with their names as keys."""
         error = self.config.get("surface_error") or {}
         shift, fields = np.array(error.get("shift_m", [0.0, 0.0, 0.0])), build.surfaces(self.scenario)
         made = {}
@@ -188,7 +188,7 @@ class Observed:
 
     @cached_property
     def constants(self) -> Array:
-        """Torque per ampere of each drive; of a torque source one, whose current is its torque."""
+        """Torque per ampere of each drive; 1 for torque sources, whose current is their torque."""
         return np.array(
             [1.0 if isinstance(motor, TorqueSource) else motor.joint_constant for motor in self.robot.motors]
         )
@@ -235,7 +235,7 @@ class Observed:
 
 @dataclass(frozen=True)
 class Balance:
-    """Generalised forces at samples: what is left of the equation of motion, and how large its terms are.
+    """Generalised forces at samples: residual and size of the equation of motion.
 
     Attributes
     ----------
@@ -285,8 +285,8 @@ def _stepped_balance(seen: Observed) -> Balance:
     terms += _contact_terms(seen, end, rows)
     terms += _load_terms(seen, middle, seen.time[rows] - h + theta * h)
     terms += [term[rows] for term in _tie_terms(seen, seen.motion)]
-    # Velocity products are those of rates that the last acceleration leads to, which after an impact is far off, or
-    # of the start where contacts have changed.
+    # Velocity products use rates extrapolated with the last acceleration, which is far off after an impact, or the
+    # rates of the start if contacts have changed.
     inertial = terms[0]
     last = np.where((rows > 1)[:, None], seen.vdot[np.maximum(rows - 1, 0)], 0.0)
     led = seen.bodies.motion(q_middle, v_start + theta * h * last, a)
@@ -311,7 +311,7 @@ def whole_steps(seen: Observed) -> NDArray[np.int64]:
     """Samples at the end of a step of time stepping at whose start there is one too."""
     h, a = seen.step, seen.vdot[1:]
     change = np.diff(seen.v, axis=0)
-    # Where a load begins or ends, steps do too; from there on samples may lie between their ends.
+    # Steps end at the beginning and end of a load; later samples may lie between the ends of steps.
     beside = np.abs(np.diff(seen.time) - h) < AT_STEP * h
     moved = np.abs(change - h * a).max(axis=1) <= AT_STEP * (np.abs(change) + h * np.abs(a)).max(axis=1) + 1e-13
     return np.flatnonzero(beside & moved) + 1
@@ -327,7 +327,7 @@ def _theta_currents(seen: Observed, rows: NDArray[np.int64], v_theta: Array, the
         j = seen.joints.index(motor.joint)
         size = seen.constants[a] * np.abs(now[:, a] - before[:, a])
         if not isinstance(motor, Motor):
-            # Where a limit comes or goes within a step, the law is not linear in it; held commands jump at ticks.
+            # If a limit begins or ends within a step, the law is not linear; held commands jump at ticks.
             slack[:, j] += size
     return used, slack
 

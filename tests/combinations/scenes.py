@@ -294,8 +294,11 @@ class _Touching:
             normal = _unit(self.normal - (self.normal @ along) * along)
             self._ball("shin", spot, radius, there, normal)
         elif level == "unmoved":
-            first = next(joint for joint in robot.joints if not joint.name.startswith("base."))
-            spot = (first.body, [0.0, 0.0, 0.0])
+            # The last joint that has its centre on the axis of the first: that moves it by rounding.
+            bodies = [joint.body for joint in robot.joints if not joint.name.startswith("base.")]
+            centres = [self._model.point_position(body, np.zeros(3), self._q) for body in bodies]
+            last = max(k for k, centre in enumerate(centres) if np.linalg.norm(centre - centres[0]) < 1e-9)
+            spot = (bodies[last], [0.0, 0.0, 0.0])
             there = self._model.point_position(*spot, self._q)
             toward = self._model.point_position(*robot.hand, self._q) - there
             toward[2] = 0.0

@@ -122,7 +122,7 @@ def _field(origin: Array, spacing: Array, heights: Array, shift: Array) -> Calla
     def height(px: Array, py: Array) -> tuple[Array, Array, Array]:
         cx, cy = np.clip(px, x[0], x[-1]), np.clip(py, y[0], y[-1])
         slope_x, slope_y = spline.ev(cx, cy, dx=1), spline.ev(cx, cy, dy=1)
-        # Beyond the grid it goes on straight.
+        # The surface is extended linearly beyond the grid.
         return spline.ev(cx, cy) + slope_x * (px - cx) + slope_y * (py - cy), slope_x, slope_y
 
     def look(r: Array) -> tuple[Array, Array]:
@@ -131,7 +131,7 @@ def _field(origin: Array, spacing: Array, heights: Array, shift: Array) -> Calla
         for _ in range(200):
             z, slope_x, slope_y = height(at[:, 0], at[:, 1])
             rise = r[:, 2] - z
-            # Least squares of the distance, by Gauss and Newton, which near the surface converges at once.
+            # Gauss–Newton iteration for the least distance; it converges quickly near the surface.
             dx, dy = r[:, 0] - at[:, 0], r[:, 1] - at[:, 1]
             gx, gy = dx + slope_x * rise, dy + slope_y * rise
             det = (1 + slope_x**2) * (1 + slope_y**2) - (slope_x * slope_y) ** 2

@@ -1,4 +1,4 @@
-"""Each check finds what it is there for: a good record passes, and each way of spoiling it is found by that check."""
+"""A good record passes all checks, and each kind of corruption is found by the check for it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from dynsim.errors import DynsimError, SimulationStopped
 from dynsim.record import Record
 from dynsim.scenario.reading import scenario_from_resolved
 
-# Two pitch joints whose tip slides over a floor, sticks and lifts off; a box that slides down beside them.
+# Two pitch joints whose tip slides over a floor, sticks and lifts off; a box on the floor next to them.
 ARM = {
     "name": "checked",
     "duration_s": 0.4,
@@ -184,7 +184,7 @@ SPOILT: dict[str, tuple[dict[str, Callable[[np.ndarray], np.ndarray]], set[str]]
 
 @pytest.mark.parametrize("fault", SPOILT)
 @pytest.mark.parametrize("method", ["radau5", "time_stepping"])
-def test_what_is_spoilt_is_found(method: str, fault: str) -> None:
+def test_corrupted_signals_are_found(method: str, fault: str) -> None:
     changes, expected = SPOILT[fault]
     spoilt = _spoilt(_run(method), **changes)
     assert expected <= _kinds(spoilt)
@@ -196,7 +196,7 @@ def test_a_check_that_disagrees_with_the_run_is_found() -> None:
 
 @cache
 def _unique(method: str, friction: float) -> Run:
-    """The arm alone, without what leaves forces open."""
+    """The arm without objects and dry friction, so that forces are unique."""
     settings = deepcopy(ARM)
     del settings["objects"], settings["loads"]["lean"], settings["plant"]["chain"][1]["friction_N_m"]
     settings["contacts"]["friction"] = friction
@@ -220,7 +220,7 @@ def test_a_stop_without_reason_is_found(kind: str) -> None:
     assert "verdict" in _kinds(replace(run, error=stop))
 
 
-def test_a_true_paradox_is_none() -> None:
+def test_critical_friction_finds_a_true_paradox() -> None:
     """Painlevé's rod: slender, sliding on its tip at 60°, μ above the critical 4/3 of I = m l²/12."""
     rod = {
         "name": "rod",
@@ -259,7 +259,7 @@ FALSE_WARNINGS = (
     "tip: chatter, more than 200 contact events within 1 s; what left more slowly was kept on the surface",
     "joint_1 9 of 2 A: the current, rms over the run, is more than nominal, which a motor does not stand for long",
     "link_2 passes below floor by more than the link's radius: link_2, of 10 mm, by up to 90 mm in the samples, first",
-    "a warning that nobody has heard of",
+    "an unknown warning",
 )
 
 
@@ -270,7 +270,7 @@ def test_a_false_warning_is_found(warning: str) -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_own_bodies_are_those_of_pinocchio(seed: int) -> None:
+def test_bodies_agree_with_pinocchio(seed: int) -> None:
     random = np.random.default_rng(seed)
     robot = random_robot(random, 7)
     q, v, vdot = (random.normal(size=(1, 7)) for _ in range(3))

@@ -1,4 +1,4 @@
-"""Every warning and every kind of stop that the engine has comes with a check, or with the reason why it has none."""
+"""Every warning and every kind of stop of the engine has a check, or a reason why it cannot be checked."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Whether what a run says of itself is true: each warning and each stop, by a computation of its own.
+"""Truth of the warnings and stops of a run, each verified by a separate computation.
 
-A text without an entry in :data:`VERIFIERS` is a finding, so that a new warning comes with its check; what no
-computation outside the engine can tell is in :data:`UNVERIFIED`, with the reason.
+A warning without an entry in :data:`VERIFIERS` is a finding, so that each new warning needs a check. Warnings that
+only the engine can verify are in :data:`UNVERIFIED`, with the reason.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ UNSTABLE = "the sampled loop is unstable"
 
 
 def untrue(scenario: Mapping[str, Any], run: Run, seen: Observed) -> Iterator[str]:
-    """What is said of a run and is not so, a sentence each."""
+    """Yield a sentence for each wrong warning or stop, and for a warning that is missing."""
     for warning in run.warnings:
         # The stop itself, in the words of its error.
         if warning.startswith("incomplete: "):
@@ -55,7 +55,7 @@ def untrue(scenario: Mapping[str, Any], run: Run, seen: Observed) -> Iterator[st
             yield f"{warning[:160]!r}: no check knows this warning"
     rate = loop_growth(seen)
     if rate is not None and rate > 1.1 * GROWTH and not any(UNSTABLE in warning for warning in run.warnings):
-        yield f"the sampled loop grows with {rate:.3g} 1/s, and no warning says so"
+        yield f"the sampled loop grows with {rate:.3g} 1/s, without a warning"
     if isinstance(run.error, SimulationStopped):
         yield from _stop(run.error, seen)
 
@@ -66,7 +66,7 @@ def _stop(stop: SimulationStopped, seen: Observed) -> Iterator[str]:
     if stop.kind not in STOPS:
         yield f"{text}: no check knows this kind of stop"
         return
-    # A loop that swings up comes to no end of any kind, where it has had the time to.
+    # An unstable loop with time to grow explains a stop of any kind.
     rate = loop_growth(seen)
     if rate is not None and rate > GROWTH and rate * stop.time > GROWN:
         return
@@ -99,14 +99,14 @@ STOPS: dict[str, Callable[[SimulationStopped, Observed], str]] = {
     "step_too_small": _not_critical,
     "not_finite": _not_critical,
     "no_contact_forces": _has_forces,
-    # Runs that go on without end have no reason that lies in the scene.
+    # The scene gives no reason for runs that do not end.
     "not_projected": _unproved,
     "chatter": _unproved,
     "no_progress": _unproved,
     "out_of_time": _unproved,
     "stuck": _unproved,
 }
-"""Why a stop of a kind was not due, by a computation of its own; empty: it was."""
+"""Check of each kind of stop; returns the reason why the stop is wrong, or an empty string."""
 
 
 def _joint(seen: Observed, name: str) -> int | None:
@@ -221,7 +221,7 @@ def _drifted(match: Match, seen: Observed) -> str:
     worst = max(
         (float(np.abs(touch.gap[touch.mode != OPEN]).max(initial=0.0)) for touch in seen.touches()), default=0.0
     )
-    # Samples are projected; drift is that of accepted steps.
+    # Samples are projected; the drift is measured at accepted steps.
     return "" if worst <= float(match[1]) * (1.0 + DIGITS) + 1e-9 else f"by {worst:.2g} m in a sample"
 
 
@@ -236,18 +236,18 @@ def _sinks(match: Match, seen: Observed) -> str:
 
 
 def _shared(match: Match, seen: Observed) -> str:
-    """Rows of what is closed and of what rests depend on each other in some sample."""
+    """Rows of closed contacts and resting joints depend on each other in some sample."""
     names = [name for name in re.split(r", | and ", match[1]) if name and not name.endswith(" more")]
     joints = [name for name in re.split(r", | and ", match[2] or "") if name and not name.endswith(" more")]
     known = {touch.contact.name for touch in seen.touches()}
     if not names:
         return "it names no contact"
     if any(name not in known for name in names) or any(name not in seen.joints for name in joints):
-        return "it names what there is not"
+        return "it names unknown contacts or joints"
     for i in _samples_of_modes(seen):
         if _dependent(seen, i):
             return ""
-    return "the rows of what is closed and rests are independent in all sets of modes"
+    return "rows of closed contacts and resting joints are independent in all sets of modes"
 
 
 def _samples_of_modes(seen: Observed) -> list[int]:
@@ -423,12 +423,12 @@ VERIFIERS: dict[str, Callable[[Match, Observed], str]] = {
 """Pattern of each warning and its check: the groups and what the run shows → why it is not so, empty if it is."""
 
 UNVERIFIED: dict[str, str] = {
-    r"contact problems were given up above": "the solver's count; what it leaves is seen in forces and cones",
+    r"contact problems were given up above": "the solver's count; forces and cones are checked",
     r"^contact rows depended on each other in": "the solver's count of evaluations",
     r"with friction, dependent contact rows leave the motion open too": "a range over splits, of which the run has one",
     r"^time stepping: the power changes so fast": "a sum over all steps, of which samples show some",
     r"has no effect: ": "said of a key of the scenario, not of the run",
     r"^the target waited|^the path is|^feedback and shape points|^the null-space|^joints were clamped|^the robot tips|"
-    r"^the support margin|^mode \d+ was|passes its limit by": "of the kinematic snake, which these scenes do not have",
+    r"^the support margin|^mode \d+ was|passes its limit by": "for the kinematic snake, which these scenes do not have",
 }
 """Warnings that nothing outside the engine can tell, each with the reason."""
