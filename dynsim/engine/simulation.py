@@ -64,7 +64,7 @@ Array = NDArray[np.float64]
 _PIECE = 1 << 62
 # Limits on ticks of callers: their number (kinds are bits of an integer), and their period [s].
 MOST_TICKS, SHORTEST_PERIOD = 60, 1e-9
-# Ticks within this of the requested time are included, relative to that time.
+# Ticks, and ends of references, within this of the requested time count as at it, relative to that time.
 TICK_SLACK = 1e-12
 # End of a run without a given end [s]: finite, and later than any time in use.
 _FAR = 1e300
@@ -304,8 +304,9 @@ class Simulation:
             raise ScenarioError(f"cannot advance to t = {brief(until)} s: the simulation is at {self._time:g} s")
         until = min(float(until), self._end)
         last = self._prepared.control.end
-        if not self._frozen and until > last:
-            self._reach(last)
+        # References of the whole run may end a rounding before it, where nothing is to be rewritten.
+        if not self._frozen and until > last + TICK_SLACK * max(1.0, abs(last)):
+            self._reach(max(last, self._time))
             if not self.finished:
                 self._freeze()
         self._reach(until)

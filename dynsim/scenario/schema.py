@@ -16,6 +16,7 @@ from dynsim.record import notebook
 from dynsim.scenario.combinations import BILATERAL_KEYS, THETA, UNILATERAL_KEYS, check_keys
 from dynsim.scenario.effect import idle_keys, is_set
 from dynsim.scenario.loads import LoadConfig
+from dynsim.scenario.nulls import write_nulls
 from dynsim.scenario.objects import SceneObject
 from dynsim.scenario.sensors import Sensors
 from dynsim.scenario.ties import TieChoice
@@ -367,6 +368,7 @@ class Scenario:
         Defaults that change nothing are left out.
         """
         resolved = self.config.model_dump(mode="json", exclude_none=True)
+        write_nulls(self.config, resolved, section_defaults(resolved["plant"], resolved))
         for section in ("loads", "objects", "ties"):
             if not getattr(self.config, section):
                 del resolved[section]

@@ -93,7 +93,10 @@ def _simulation(scenario: Scenario) -> Simulation:
     sensors, controller = scenario.config.sensors, scenario.controller
     attended = sensors is not None or getattr(controller, "operator", None) is not None
     attended = attended or getattr(controller, "type", "") == "task_space"
-    return Simulation(scenario, duration=math.inf if attended else None)
+    simulation = Simulation(scenario, duration=math.inf if attended else None)
+    if attended:
+        simulation.end_samples(scenario.duration_s)
+    return simulation
 
 
 def _in_pieces(scenario: Scenario) -> Record:
