@@ -27,7 +27,7 @@ from dynsim.dynamics.state import OutputLayout, StateLayout, block, output_layou
 from dynsim.dynamics.tree import support as ks
 from dynsim.engine import REFERENCES, Progress
 from dynsim.engine.compilation import kernels_logged
-from dynsim.engine.equilibrium import Balance, balanced, shifted
+from dynsim.engine.equilibrium import Balance, balanced, pressed, shifted
 from dynsim.engine.method import AUTO, Choice, choose
 from dynsim.engine.outcome import check_size
 from dynsim.engine.soundness import check_inertia
@@ -162,7 +162,10 @@ def prepare(
     balance, initial = None, scenario.config.initial
     if initial is not None and initial.equilibrium:
         with kernels_logged(log, "the start at rest", loads=False):
-            balance = balanced(model, contacts, build.loads(scenario, robot), control, real)
+            still, requested = build.loads(scenario, robot), robot.initial
+            model = pressed(model, contacts, still, control, real)
+            balance = balanced(model, contacts, still, control, real, requested)
+            robot = model.robot
     floors = None if real else recall("floors", lambda: mobility_floors(model, contacts), model, places)
     system = System(
         layout=layout,

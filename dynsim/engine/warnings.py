@@ -189,11 +189,12 @@ def _undetermined(record: Record, prepared: Prepared) -> list[str]:
         return []
     # Under the unilateral law rows of what sticks depend on each other, which leaves no motion open.
     if system.unilateral is not None:
-        shared = sharing(prepared.model, contacts, record["q"], record["contact_mode"], rests) if len(record) else []
-        joints = [name for name in shared if name in prepared.model.joint_names]
+        if not len(record):
+            return []
+        shared = sharing(prepared.model, contacts, record["q"], record["contact_mode"], rests)
+        touching, joints = shared.contacts, shared.joints
         if joints:
-            touching = [name for name in shared if name not in joints]
-            slides = (record["contact_mode"] == ka.SLIDING) & rests.any(axis=1, keepdims=True)
+            slides = (record["contact_mode"] == ka.SLIDING) & rests.any(axis=1)[:, None]
             sliding = [
                 contact.name
                 for contact, some in zip(contacts, slides.any(axis=0), strict=True)
@@ -205,10 +206,10 @@ def _undetermined(record: Record, prepared: Prepared) -> list[str]:
                 "joints at rest; the motion does not determine them, and those of the record are one choice of many"
                 f"{motion}"
             ]
-        if not shared:
+        if not touching:
             return []
         return [
-            f"{', '.join(shared)}: shared forces which the motion does not determine, as points that stick do: "
+            f"{', '.join(touching)}: shared forces which the motion does not determine, as points that stick do: "
             "they are the split of least norm among those that lie in all friction cones"
         ]
     warnings = [f"contact rows depended on each other in {evaluations} evaluations: forces are the split of least norm"]

@@ -179,7 +179,10 @@ def _posed(scenario: Scenario, built: Robot, touching: Sequence[Contact]) -> Rob
 
 
 def _first_references(scenario: Scenario, built: Robot) -> Array | None:
-    """Coordinates where waypoints of joints begin, (nq,), the others as they are; None where that is not asked for."""
+    """Coordinates where waypoints of joints begin, (nq,); None if that is not requested.
+
+    Followers of these joints are where their leaders have them, the other joints where the plant has them.
+    """
     initial = scenario.config.initial
     if initial is None or not initial.on_references:
         return None
@@ -190,6 +193,13 @@ def _first_references(scenario: Scenario, built: Robot) -> Array | None:
     for name, path in waypoints.items():
         if name in built.joint_names:
             q[built.position_index[built.joint_names.index(name)]] = path.values[0]
+    places, placed = dict(zip(built.joint_names, built.position_index, strict=True)), {*waypoints}
+    # A follower may lead another joint, and couplings have no order.
+    for _ in built.couplings:
+        for coupling in built.couplings:
+            if coupling.leader in placed and coupling.joint not in waypoints:
+                q[places[coupling.joint]] = coupling.ratio * q[places[coupling.leader]] + coupling.offset
+                placed.add(coupling.joint)
     return q
 
 

@@ -166,9 +166,6 @@ def _path(random: Generator, robot: Plant, followed: Sequence[Joint], model: Mod
 def _waypoints(random: Generator, levels: Levels, free: Sequence[Joint], duration: float) -> dict[str, Any]:
     """Waypoints of one joint or two; behind the elbow where that is glued or put on its surface."""
     held = levels["contact"] == "glued" or levels["start"] == "on_references" or levels["controller"] in PLANNED
-    if levels["plant"] == "mimic" and levels["start"] == "on_references":
-        # It leads another, which starts where the file says.
-        free = [joint for joint in free if joint.name != "grip"]
     able = [joint for joint in free if not (held and joint.before)]
     if not able and levels["start"] == "on_references":
         able = list(free)
