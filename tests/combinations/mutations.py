@@ -1,8 +1,8 @@
 """Mutation check of the harness: faults that dynsim once had are put back one by one, and the scenes must find each.
 
-    PYTHONPATH=.:tests python -m combinations.mutations --count 12 --only jam
+    PYTHONPATH=.:tests python -m combinations.mutations --only jam
 
-copies the package, restores the fault, compiles it, and runs scenes of the pair cover that have the levels concerned.
+copies the package, restores the fault, compiles it, and runs the scenes of :mod:`combinations.known` that once had it.
 """
 
 from __future__ import annotations
@@ -19,13 +19,11 @@ from pathlib import Path
 from typing import Any
 
 import dynsim
-from combinations.covering import pairs
-from combinations.factors import SAMPLED, UNILATERAL
+from combinations import study
+from combinations.known import KNOWN, KNOWN_SEED
 
-SEED = 1
 PACKAGE = Path(dynsim.__file__).parent
 TESTS = Path(__file__).parents[1]
-RUBBING = ("bearing", "gear", "both")
 
 
 @dataclass(frozen=True)
@@ -34,22 +32,17 @@ class Fault:
 
     Attributes
     ----------
-    name : in a word or two
-    effect : of the fault, on runs
+    name : key of the scenes in :data:`combinations.known.KNOWN`
     texts : file below the package, present text, text with the fault
-    levels : of the scenes that can have it, by factor
     """
 
     name: str
-    effect: str
     texts: tuple[tuple[str, str, str], ...]
-    levels: dict[str, tuple[str, ...]]
 
 
 FAULTS = (
     Fault(
-        "start",
-        "sampled commands with dry joint friction start the arm at q = 0",
+        "sampled_start",
         (
             (
                 "integrators/driver.py",
@@ -57,17 +50,13 @@ FAULTS = (
                 "    if unilateral is not None and run.count[ki.MODES_DUE] < 0:\n        derivative(",
             ),
         ),
-        {"controller": SAMPLED, "rubbing": RUBBING, "contact": UNILATERAL},
     ),
     Fault(
-        "directions",
-        "time stepping records contact forces along other tangents than those of the step",
+        "force_of_spheres",
         (("integrators/stepping/step.py", "        put_directions_back(s, ws)\n", ""),),
-        {"contact": UNILATERAL[1:], "friction": ("coulomb", "static", "viscous", "stribeck", "high")},
     ),
     Fault(
         "jam",
-        "friction holds a point that nothing presses",
         (
             (
                 "integrators/contacts/events.py",
@@ -75,11 +64,9 @@ FAULTS = (
                 "if mode == ka.STICKING and unilateral.number[ku.SPLIT] == 2.0 and normal_is_open",
             ),
         ),
-        {"surface": ("steep",), "friction": ("high", "static", "stribeck"), "contact": ("points",)},
     ),
     Fault(
-        "immobile",
-        "a contact point that no joint moves gets a constraint row",
+        "unmoved",
         (
             ("scenario/build.py", "left_out=mark.left_out)", "left_out=False)"),
             (
@@ -88,17 +75,13 @@ FAULTS = (
                 "if False and not moves_along_normal(",
             ),
         ),
-        {"points": ("unmoved",), "contact": ("points", "joints", "links", "glued")},
     ),
     Fault(
-        "cone",
-        "an equilibrium that needs friction starts on the edge of the friction cone",
+        "equilibrium",
         (("compile/equilibrium.py", "RESERVED = 0.9", "RESERVED = 1.0"),),
-        {"start": ("equilibrium",), "contact": UNILATERAL[1:]},
     ),
     Fault(
-        "stops",
-        "time stepping leaves a joint beyond a stop that it has passed",
+        "passed_stop",
         (
             (
                 "integrators/stepping/contacts.py",
@@ -106,17 +89,13 @@ FAULTS = (
                 "    if loss < 0.0:\n        rate = return_rate(min(stop_gap",
             ),
         ),
-        {"stops": ("reached",), "contact": UNILATERAL},
     ),
     Fault(
-        "soft start",
-        "the preliminary run of the snake sees objects and ties",
+        "snake_start",
         (("engine/snake_start.py", "        alone = _alone(scenario)\n", "        alone = scenario\n"),),
-        {"plant": ("snake",)},
     ),
     Fault(
-        "signals",
-        "the recorded voltage of a sampled loop is that held until the tick",
+        "voltage",
         (
             (
                 "integrators/dense.py",
@@ -124,7 +103,6 @@ FAULTS = (
                 "    if run.count[ki.SAMPLE] >= 0:\n        return\n",
             ),
         ),
-        {"controller": SAMPLED},
     ),
 )
 
@@ -139,8 +117,7 @@ def restore(fault: Fault, folder: Path) -> None:
     """
     target = folder / PACKAGE.name
     shutil.copytree(PACKAGE, target, ignore=shutil.ignore_patterns("__pycache__"))
-    scenarios = PACKAGE.parent / "scenarios"
-    if scenarios.exists():
+    if (scenarios := PACKAGE.parent / "scenarios").exists():
         (folder / "scenarios").symlink_to(scenarios)
     for name, present, faulty in fault.texts:
         path = target / name
@@ -150,49 +127,48 @@ def restore(fault: Fault, folder: Path) -> None:
         path.write_text(text.replace(present, faulty), "utf-8")
 
 
-def concerned(fault: Fault, count: int) -> list[int]:
-    """Numbers of the first scenes of the pair cover that have the fault's levels."""
-    cover = pairs(SEED)
-    fitting = [k for k, levels in enumerate(cover) if all(levels[f] in own for f, own in fault.levels.items())]
-    return fitting[:count]
+def problems(name: str) -> list[str]:
+    """Problems of the scenes of a known fault, with the package that this process has."""
+    listed = []
+    for number in KNOWN[name].numbers:
+        with tempfile.TemporaryDirectory() as temporary:
+            outcome = study.look_at(KNOWN[name].assignment, KNOWN_SEED, number, Path(temporary), thorough=False)
+        listed += [f"scene {number}: {kind}: {text}" for kind, text in outcome.problems]
+    return listed
 
 
-def look(folder: Path, numbers: list[int]) -> dict[int, list[tuple[str, str]]]:
-    """Problems of scenes by number, found with the package in ``folder``, in a process of its own."""
-    journal = folder / "journal.jsonl"
-    # A seed keeps the order of sets, and with it that of what is drawn, the same in both runs.
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), str(TESTS)])}
-    command = [sys.executable, "-m", "combinations", "--cover", "pairs", "--seed", str(SEED), "--journal", str(journal)]
-    command += ["--jobs", "1", "--numbers", *map(str, numbers)]
-    subprocess.run(command, env=environment, cwd=folder, capture_output=True, check=False, timeout=3600)
-    rows: list[dict[str, Any]] = [json.loads(line) for line in journal.read_text("utf-8").splitlines()]
-    return {row["number"]: [(kind, text) for kind, text in row["problems"]] for row in rows}
-
-
-def found(fault: Fault, count: int) -> dict[int, list[tuple[str, str]]]:
-    """Problems of the scenes that a fault concerns, once it is back."""
+def problems_with(fault: Fault) -> list[str]:
+    """:func:`problems` in a process of its own, whose package has the fault."""
     with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary)
-        restore(fault, folder)
-        return look(folder, concerned(fault, count))
+        restore(fault, Path(temporary))
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join([temporary, str(TESTS)])}
+        command = [sys.executable, "-m", "combinations.mutations", "--inspect", fault.name]
+        done = subprocess.run(command, env=environment, cwd=temporary, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise RuntimeError(f"{fault.name}: {done.stderr[-2000:]}")
+        report: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+        if Path(report["package"]).parent != Path(temporary).resolve():
+            raise RuntimeError(f"{fault.name}: the process used {report['package']}, not the package with the fault")
+        return list(report["problems"])
 
 
 def main() -> int:
-    """Print which scenes find each fault; 1 if one is not found."""
+    """Print what the scenes say of each fault; 1 if one is not found."""
     parser = argparse.ArgumentParser(prog="python -m combinations.mutations", description=__doc__)
-    parser.add_argument("--count", type=int, default=12, help="most scenes for each fault")
-    parser.add_argument("--only", choices=[fault.name for fault in FAULTS], help="this fault alone")
+    names = [fault.name for fault in FAULTS]
+    parser.add_argument("--only", choices=names, help="this fault alone")
+    parser.add_argument("--inspect", choices=names, help="print the problems of its scenes, with the present package")
     options = parser.parse_args()
+    if options.inspect is not None:
+        print(json.dumps({"package": str(PACKAGE.resolve()), "problems": problems(options.inspect)}))
+        return 0
     missed = 0
     for fault in FAULTS:
-        if options.only not in (None, fault.name):
-            continue
-        seen = {number: texts for number, texts in found(fault, options.count).items() if texts}
-        missed += not seen
-        print(f"{fault.name} ({fault.effect}): {'found' if seen else 'NOT FOUND'} by scenes {sorted(seen)}", flush=True)
-        for number, texts in seen.items():
-            kind, text = texts[0]
-            print(f"    {number}: {kind}: {text[:200]}", flush=True)
+        if options.only in (None, fault.name):
+            told = problems_with(fault)
+            missed += not told
+            print(f"{fault.name} ({KNOWN[fault.name].fault}): {'found' if told else 'NOT FOUND'}", flush=True)
+            print("".join(f"    {text[:200]}\n" for text in told[:4]), end="", flush=True)
     return 1 if missed else 0
 
 
