@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from dynsim.cli.tables import print_comparison
+from dynsim.scenario.combinations import LAWS, METHODS, RESTRICTIONS
 from dynsim.snake.published import TABLE_III
 from dynsim.studies.bench.programs import (
     ABA,
@@ -557,6 +558,19 @@ def comparison() -> str:
     return "```\n" + "\n".join([*shown, "", *notes]) + "\n```\n"
 
 
+def combinations() -> str:
+    """Which contact laws and methods support a feature that not all of them support, and why."""
+
+    def supported(names: tuple[str, ...], all_of_them: tuple[str, ...]) -> str:
+        return "all" if names == all_of_them else ", ".join(f"`{name}`" for name in names)
+
+    rows = [
+        [r.feature, supported(r.laws, LAWS), supported(r.methods, METHODS), f"{r.reason}; {r.fix}"]
+        for r in RESTRICTIONS
+    ]
+    return "\n" + lines(["feature", "contact law", "method", "why, and what to do instead"], rows, left=4) + "\n"
+
+
 def faults() -> str:
     return "\n" + markdown(data("reference/bridge_faults.json")["cells"]).strip("\n") + "\n\n"
 
@@ -892,8 +906,8 @@ TABLES: dict[str, Callable[[], str]] = {
     for table in (
         elbows_in_short, elbows, glued_and_real, overturning_holds, overturning_drives, assumptions, ledger,
         snake_table_iii, time_stepping, endings, right_hand_side, ratios, job, precision, sweeps, snake_bench,
-        comparison, faults, planned_arm, planned_gains, planned_scenes, snake_positioning, snake_limits, snake_ways,
-        snake_circles, snake_order, snake_areas, snake_on_servos,
+        combinations, comparison, faults, planned_arm, planned_gains, planned_scenes, snake_positioning, snake_limits,
+        snake_ways, snake_circles, snake_order, snake_areas, snake_on_servos,
     )
 }  # fmt: skip
 

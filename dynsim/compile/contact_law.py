@@ -141,6 +141,7 @@ def contact_laws(robot: Robot, contacts: Sequence[Contact]) -> NDArray[np.float6
     """
     # Without an axis friction is isotropic; tangents follow one that is seldom along a normal.
     law = np.ones((len(contacts), ka.CONTACT_LAW_SIZE))
+    law[:, ka.FLOOR] = 0.0
     for row, contact in zip(law, contacts, strict=True):
         where = f"contact {contact.name}"
         if not contact.friction >= 0.0:

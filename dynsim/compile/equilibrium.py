@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dynsim.compile.bracing import MIN_N, BracePlanner, brace_rows
+from dynsim.compile.mobility import immobile_at
 from dynsim.compile.model import Model
 from dynsim.compile.shapes import share_of_axis
 from dynsim.dynamics.contact.braces import tables as kb
@@ -69,8 +70,7 @@ def holding_torques(
     robot = model.robot
     if robot.couplings:
         raise ModelError("initial.equilibrium: not for robots with coupled joints, which share a motor", keys=KEYS)
-    touching = [(contact, *_touching_point(model, contact, q)) for contact in contacts]
-    touching = [contact for contact in touching if abs(contact[-1]) <= TOUCHING or (real and contact[-1] < 0.0)]
+    touching = touching_contacts(model, contacts, q, real)
     # Frictionless first, then with a reserve, then all that Coulomb allows; each with a least force first, so that what
     # presses goes on to press.
     attempts = [(0.0, 0.0)]
@@ -99,6 +99,18 @@ def holding_torques(
             places = [(link, point, force) for (_, link, point, *_), force in zip(touching, forces, strict=True)]
             return Rest(torques[0], dict(zip(names, normal.tolist(), strict=True)), places, share == 1.0)
     raise ModelError(_why(model, arrays.motors, arrays.free, [contact[0].name for contact in touching]), keys=KEYS)
+
+
+def touching_contacts(
+    model: Model, contacts: Sequence[Contact], q: Array, real: bool
+) -> list[tuple[Contact, int, Array, Array, float]]:
+    """Contacts that touch and can carry, each with its link, point on it [m], normal in the world, and gap [m]."""
+    touching = [(contact, *_touching_point(model, contact, q)) for contact in contacts]
+    touching = [contact for contact in touching if abs(contact[-1]) <= TOUCHING or (real and contact[-1] < 0.0)]
+    # A point that no joint moves along its normal carries nothing, see dynsim.integrators.contacts.impacts.
+    return [
+        entry for entry in touching if not (entry[0].left_out or immobile_at(model, entry[1], entry[2], entry[3], q))
+    ]
 
 
 def _touching_point(model: Model, contact: Contact, q: Array) -> tuple[int, Array, Array, float]:

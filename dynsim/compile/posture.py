@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from dynsim.compile.model import Model
+from dynsim.compile.shapes import gap_at
 from dynsim.errors import ModelError
 from dynsim.model.description import Array, Contact, Robot
 
@@ -16,6 +17,8 @@ HAND = "hand"
 TOLERANCE = 1e-13
 REACHED = 1e-12
 ITERATIONS = 300
+# A point that no joint moves along its normal must start this close to its surface [m].
+START_TOLERANCE = 1e-6
 # Rounding by which a joint may be beyond its limit [rad or m].
 BEYOND = 1e-9
 STEP_MAX = 0.3  # [rad or m] per iteration, against jumps to another branch of solutions
@@ -54,6 +57,11 @@ def on_surfaces(model: Model, contacts: Mapping[str, Contact], names: Sequence[s
             raise ModelError(f"initial.on_surface: no contact {name!r}; those are: {', '.join(contacts) or 'none'}")
         if contacts[name].tip is not None:
             raise ModelError(f"initial.on_surface: {name!r} is the axis of a link; name the points at its ends")
+        if contacts[name].left_out and abs(gap := gap_at(model, contacts[name], robot.initial)) > START_TOLERANCE:
+            raise ModelError(
+                f"initial.on_surface: no joint moves {name!r} along the normal of "
+                f"{contacts[name].surface_name!r}, which it is {gap:+.4g} m from; take it off the list"
+            )
     fixed = [name for name in keep if name != HAND]
     for name in fixed:
         if name not in robot.joint_names:
@@ -63,7 +71,8 @@ def on_surfaces(model: Model, contacts: Mapping[str, Contact], names: Sequence[s
     columns = [
         k for k, link in enumerate(robot.links) if len(link.row.neutral) == 1 and robot.joint_names[k] not in fixed
     ]
-    points, stopped = [contacts[name] for name in names], dict[int, float]()
+    points = [contacts[name] for name in names if not contacts[name].left_out]
+    stopped = dict[int, float]()
     while True:
         q, worst = _nearest(model, points, columns, stopped, HAND in keep)
         if not worst <= REACHED:

@@ -31,7 +31,8 @@ class BuildContext:
     duration : simulated time [s]
     machine : what a controller, or the path of a base, is built for; None for the other families
     joint : the joint of a motor, "" for the other families
-    contacts : contacts of the scenario by name; declared : those that are points of it, not other candidates
+    contacts : contacts of the scenario by name, also disabled points
+    declared : names of the enabled points; disabled : of the others, which a path may still follow along a surface
     progress : to be called with the time [s] that references have come to, when they take long; None: nobody listens
     """
 
@@ -41,6 +42,7 @@ class BuildContext:
     progress: Callable[[float], None] | None = None
     contacts: Mapping[str, Contact] = field(default_factory=dict)
     declared: Sequence[str] = ()
+    disabled: Sequence[str] = ()
 
     def at_joint(self, joint: str) -> BuildContext:
         """The context of a motor on that joint."""

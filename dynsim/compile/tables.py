@@ -165,8 +165,10 @@ def _dc_motor(m: Motor, k_p: float, k_d: float) -> np.ndarray:
     return row
 
 
-def compile_contacts(robot: Robot, contacts: Sequence[Contact]) -> ka.ContactArrays:
+def compile_contacts(robot: Robot, contacts: Sequence[Contact], floors: np.ndarray | None = None) -> ka.ContactArrays:
     """Tables of the contact points.
+
+    floors : (c,) mobilities along the normals up to which contacts have no force [1/kg], for the bilateral law
 
     Raises
     ------
@@ -182,6 +184,7 @@ def compile_contacts(robot: Robot, contacts: Sequence[Contact]) -> ka.ContactArr
             raise ModelError(f"contact {contact.name}: {error}") from None
         surface = contact.surface
         link[k, ka.LINK], link[k, ka.FRICTION_LAW] = body, _FRICTION[contact.pulling_friction]
+        link[k, ka.LEFT_OUT] = contact.left_out
         point[k, ka.POINT : ka.POINT + 3] = on_body
         if not isinstance(surface, Quadric):  # any plane will do: its rows are overwritten
             point[k, ka.QUADRIC + 8] = 1.0
@@ -192,7 +195,10 @@ def compile_contacts(robot: Robot, contacts: Sequence[Contact]) -> ka.ContactArr
         point[k, ka.QUADRIC : ka.QUADRIC + 6] = surface.Q[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
         point[k, ka.QUADRIC + 6 : ka.QUADRIC + 9] = scale * surface.b
         point[k, ka.QUADRIC + 9] = scale * surface.c
-    return ka.ContactArrays(integers(link), reals(point), reals(contact_laws(robot, contacts)))
+    law = contact_laws(robot, contacts)
+    if floors is not None:
+        law[:, ka.FLOOR] = floors
+    return ka.ContactArrays(integers(link), reals(point), reals(law))
 
 
 def compile_loads(robot: Robot, loads: Sequence[Load]) -> LoadArrays:

@@ -55,13 +55,18 @@ class System(NamedTuple):
 
 
 def new_workspace(system: System) -> Workspace:
-    """The workspace of a system: couplings hold, candidates slide, under the unilateral law they are open."""
+    """The workspace of a system: couplings hold, candidates slide, under the unilateral law they are open.
+
+    Candidates that are left out are open under both laws.
+    """
     contacts, couplings, unilateral = system.contacts, system.couplings, system.unilateral
     c, joint_rows = contacts.link.shape[0], couplings.joint.shape[0]
     if unilateral is not None:
         joint_rows += unilateral.stop.shape[0] + unilateral.dry.shape[0] + unilateral.tie.shape[0]
     ws = workspace(system.model.tree.shape[0], system.drives.table.shape[0], c, joint_rows)
-    set_modes(contacts, couplings, unilateral, ws, integers(np.full(c, ka.SLIDING if unilateral is None else ka.OPEN)))
+    modes = np.full(c, ka.SLIDING if unilateral is None else ka.OPEN)
+    modes[contacts.link[:, ka.LEFT_OUT] == 1] = ka.OPEN
+    set_modes(contacts, couplings, unilateral, ws, integers(modes))
     return ws
 
 

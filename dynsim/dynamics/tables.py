@@ -88,7 +88,8 @@ BLOCK_SIZE = 6
 LINK = 0
 FRICTION_LAW = 1
 CURVED = 2  # 0 for a plane: Q = 0, and then b is its unit normal
-CONTACT_LINK_SIZE = 3
+LEFT_OUT = 3  # 1: no joint moves it along the normal in any posture; it has no active row, ever
+CONTACT_LINK_SIZE = 4
 # ContactArrays.point
 POINT = 0  # 3: in the body's frame [m]
 QUADRIC = 3  # 10: C(r) = r.Q r/2 + b.r + c: Q xx xy xz yy yz zz, b, c
@@ -104,7 +105,8 @@ GRIP = 6  # of time stepping: friction along GRIP_AXIS per that across; 1: isotr
 GRIP_AXIS = 7  # 3: in the body's frame
 CONTACT_STIFFNESS = 10  # of time stepping: of surface and body along the normal [N/m]; 0: rigid
 CONTACT_DAMPING = 11  # [N s/m]
-CONTACT_LAW_SIZE = 12
+FLOOR = 12  # of the bilateral law: with a mobility along the normal up to this it has no force [1/kg]
+CONTACT_LAW_SIZE = 13
 # CouplingArrays.joint, int
 FOLLOWER = 0  # link whose joint follows
 LEADER = 1
@@ -166,7 +168,8 @@ ROW_MU = 16  # friction that DIRECTION carries
 ROW_GAP = 17  # what projection takes away from the positions [m or rad], see dynsim.dynamics.contact.rows
 ROW_RATE = 18  # and from the rates [m/s or rad/s]
 ROW_OFFSET = 19  # of a joint row: what its two joints, times its coefficients, must add up to [rad or m]
-ROW_STATE_SIZE = 20
+ROW_FLOOR = 20  # with a mobility up to this the row has no force
+ROW_STATE_SIZE = 21
 # Workspace.active, int: of each row
 ROW_KIND = 0
 OWNER = 1  # candidate, tie, coupling or, counted on behind the couplings, joint stop, then dry friction of a joint

@@ -5,21 +5,25 @@ for external loads. The part that is missing is given by a shift of all motors' 
 
     DC motor, position servo: q_d + R i / k_p        torque source: τ_d + τ
 
-which cancels the sag under the weight at the start. Errors, tracking and ledger refer to the original references.
+which cancels the sag under the weight at the start. Compliant contacts that carry are pressed in: references move with
+the joints that do this. Errors, tracking and ledger refer to the original references.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from dynsim.compile.contact_law import format_quantity
 from dynsim.compile.control import JointControl
-from dynsim.compile.equilibrium import holding_torques, load_torques
+from dynsim.compile.equilibrium import holding_torques, load_torques, touching_contacts
 from dynsim.compile.model import Model
+from dynsim.compile.pressing import pressed_in
+from dynsim.compile.shapes import gap_at
 from dynsim.dynamics.tables import ReferenceArrays
+from dynsim.errors import first_few
 from dynsim.model.description import Array, Contact, Load
 from dynsim.model.drives import Motor, Servo, TorqueSource
 
@@ -49,8 +53,25 @@ class Balance:
     on_edge: bool = False
 
 
-def balanced(
+def pressed(
     model: Model, contacts: Sequence[Contact], loads: Sequence[Load], control: JointControl, real: bool
+) -> Model:
+    """The model in the posture that its start at rest has; parameters and errors are those of :func:`balanced`.
+
+    Only compliant contacts change it, which carry nothing unless they are pressed in.
+    """
+    if len(control.reference.voltage):
+        return model
+    return pressed_in(model, contacts, loads, _able(model, control), real)
+
+
+def balanced(
+    model: Model,
+    contacts: Sequence[Contact],
+    loads: Sequence[Load],
+    control: JointControl,
+    real: bool,
+    requested: Array | None = None,
 ) -> Balance:
     """The start at rest of a robot under its controller.
 
@@ -58,6 +79,7 @@ def balanced(
     ----------
     loads : those of the scenario, as they are at t = 0
     real : the unilateral law
+    requested : (nq,) posture before :func:`pressed`, in which references begin; default: the initial one
 
     Raises
     ------
@@ -65,23 +87,22 @@ def balanced(
         Nothing holds the posture.
     """
     robot, motors = model.robot, model.robot.motors
+    requested = robot.initial if requested is None else requested
     index = [model.joint_names.index(motor.joint) for motor in motors]
     begin, rate = _begin(control.reference, len(motors))
     current, shift, on_edge = np.zeros(len(motors)), np.zeros(len(motors)), False
     jumps: list[str] = []
     planned = control.reference.voltage
     if not len(planned):
-        able = [
-            motor.joint
-            for motor, k_p in zip(motors, control.k_p, strict=True)
-            if isinstance(motor, TorqueSource) or (isinstance(motor, Servo) and not motor.velocity_mode)
-            or (isinstance(motor, Motor) and k_p > 0.0)
-        ]  # fmt: skip
-        balance = holding_torques(model, robot.initial, contacts, loads, able, real)
-        torques, forces, on_edge = balance.torques, balance.normal_forces, balance.on_edge
+        balance = holding_torques(model, robot.initial, contacts, loads, _able(model, control), real)
+        torques, on_edge = balance.torques, balance.on_edge
+        forces = {**balance.normal_forces, **_of_springs(model, contacts, balance.normal_forces)}
     else:
         # The plan says what presses; loads it does not know, and the motors carry them.
         torques, forces = load_torques(model, robot.initial, loads), {}
+        touching = touching_contacts(model, contacts, robot.initial, real)
+        if compliant := [contact.name for contact, *_ in touching if contact.stiffness > 0.0]:
+            jumps.append(f"the planned voltages count on {first_few(compliant)}, which deform before they carry")
     for a, (motor, i) in enumerate(zip(motors, index, strict=True)):
         if isinstance(motor, TorqueSource):
             current[a] = torques[i]
@@ -100,7 +121,9 @@ def balanced(
         if drop != 0.0 and k_p > 0.0:
             shift[a] = drop / k_p
         unit = robot.links[i].units
-        at = robot.initial[robot.position_index[i]]
+        at = requested[robot.position_index[i]]
+        if k_p > 0.0:
+            shift[a] += robot.initial[robot.position_index[i]] - at
         if k_p > 0.0 and abs(begin[a] - at) > AT_REST:
             jumps.append(
                 f"the reference of {motor.joint} begins {format_quantity(begin[a] - at, unit[0], 3)} from "
@@ -116,6 +139,25 @@ def balanced(
         else ()
     )  # fmt: skip
     return Balance(current, shift, float(resistance @ current**2), forces, said, on_edge)
+
+
+def _able(model: Model, control: JointControl) -> list[str]:
+    """Joints whose motors can give a torque at rest."""
+    return [
+        motor.joint
+        for motor, k_p in zip(model.robot.motors, control.k_p, strict=True)
+        if isinstance(motor, TorqueSource) or (isinstance(motor, Servo) and not motor.velocity_mode)
+        or (isinstance(motor, Motor) and k_p > 0.0)
+    ]  # fmt: skip
+
+
+def _of_springs(model: Model, contacts: Sequence[Contact], names: Container[str]) -> dict[str, float]:
+    """Normal forces of compliant contacts by their depth [N]: rigid bodies may not determine how they share a load."""
+    return {
+        contact.name: contact.stiffness * max(-gap_at(model, contact, model.robot.initial), 0.0)
+        for contact in contacts
+        if contact.stiffness > 0.0 and contact.name in names
+    }
 
 
 def shifted(reference: ReferenceArrays, shift: Array) -> ReferenceArrays:

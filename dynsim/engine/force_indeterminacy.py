@@ -65,6 +65,17 @@ class MotionSpread:
 
 
 @dataclass(frozen=True)
+class Sharing:
+    """Names of contacts, and of joints that dry friction keeps at rest, whose forces the motion does not determine.
+
+    Contacts of a snake have the names of its wheels, and so have the wheels' joints.
+    """
+
+    contacts: list[str]
+    joints: list[str]
+
+
+@dataclass(frozen=True)
 class ContactMatrices:
     """A(σ) = A0 − B diag(σ) of one state, A(σ) f = rhs, of the p active rows.
 
@@ -162,7 +173,8 @@ def contact_matrices(system: System, ws: ka.Workspace, t: float, y: Array) -> Co
     rows, directions = ws.column[:, 1 : 1 + 2 * p : 2], ws.column[:, 2 : 2 + 2 * p : 2]
     inverse = ws.links[:, ka.INVERSE_D, None]
     frictionless = rows.T @ (inverse * rows)
-    moving = np.diag(frictionless) > kq.IMMOBILE * (inverse * directions**2).sum(axis=0)
+    least = np.maximum(kq.IMMOBILE * (inverse * directions**2).sum(axis=0), state[:, ka.ROW_FLOOR])
+    moving = np.diag(frictionless) > least
     frictionless = frictionless * np.outer(moving, moving)
     dissipative = active[:, ka.LAW] == ka.FRICTION_DISSIPATIVE
     signs = np.where(dissipative, state[:, ka.SIGN], 1.0)
@@ -332,8 +344,8 @@ def acceleration_range(system: System, t: float, y: Array) -> tuple[Array, Array
 
 def sharing(
     model: Model, contacts: Sequence[Contact], q: Array, modes: Array, rests: NDArray[np.bool_] | None = None
-) -> list[str]:
-    """Names of contacts and joints whose rows depend on each other, in one sample of each set of modes.
+) -> Sharing:
+    """Contacts and joints whose rows depend on each other, in one sample of each set of modes.
 
     The sample is the first with the most joints at rest: rows that depend on each other do so among more rows too.
 
@@ -368,8 +380,11 @@ def sharing(
         left, sizes, _ = np.linalg.svd(np.vstack(bases))
         rank = int(np.count_nonzero(sizes > DEPENDENT))
         shared.update(np.array(owner, dtype=int)[np.abs(left[:, rank:]).max(axis=1, initial=0.0) > DEPENDENT].tolist())
-    names = [*(contact.name for contact in contacts), *model.joint_names]
-    return [names[k] for k in sorted(shared)]
+    c = len(contacts)
+    return Sharing(
+        [contacts[k].name for k in sorted(shared) if k < c],
+        [model.joint_names[k - c] for k in sorted(shared) if k >= c],
+    )
 
 
 def _free(model: Model) -> Array:
@@ -383,7 +398,11 @@ def _free(model: Model) -> Array:
 
 
 def touching_rows(model: Model, contact: Contact, q: Array, sticks: bool) -> Array:
-    """Jacobian of the place that touches, (3, n), or of its distance, (1, n), where it slides."""
+    """Jacobian of the forces of a contact that rigid bodies would have to determine, (r, n).
+
+    A point that sticks has three, one that slides the normal force. The depth of a compliant contact determines its
+    normal force: it has those across the normal, or none.
+    """
     body, point = model.robot.attach(contact.body, contact.point)
     if contact.tip is not None:
         end = model.robot.attach(contact.body, contact.tip)[1]
@@ -392,6 +411,8 @@ def touching_rows(model: Model, contact: Contact, q: Array, sticks: bool) -> Arr
     normal = contact.surface.normal(model.point_position(body, point, q))
     rotation, _ = model.body_pose(body, q)
     jacobian = model.point_jacobian(body, point - contact.radius * (rotation.T @ normal), q)
+    if contact.stiffness > 0.0:
+        return (np.eye(3) - np.outer(normal, normal)) @ jacobian if sticks else np.zeros((0, jacobian.shape[1]))
     return jacobian if sticks else (normal @ jacobian)[None]
 
 

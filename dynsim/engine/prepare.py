@@ -14,11 +14,11 @@ import numpy as np
 from dynsim.compile.clearance import gaps
 from dynsim.compile.contact_law import DryFriction, JointStop, compile_unilateral, dry_frictions, joint_stops
 from dynsim.compile.control import JointControl
+from dynsim.compile.mobility import mobility_floors
 from dynsim.compile.model import Model
 from dynsim.compile.shapes import compile_shapes
 from dynsim.compile.stepping import with_shapes
 from dynsim.compile.tables import compile_contacts, compile_couplings, compile_drives, compile_loads, compile_support
-from dynsim.config.problems import listed
 from dynsim.dynamics import state as kst
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.derivative import System, new_workspace
@@ -27,7 +27,7 @@ from dynsim.dynamics.state import OutputLayout, StateLayout, block, output_layou
 from dynsim.dynamics.tree import support as ks
 from dynsim.engine import REFERENCES, Progress
 from dynsim.engine.compilation import kernels_logged
-from dynsim.engine.equilibrium import Balance, balanced, shifted
+from dynsim.engine.equilibrium import Balance, balanced, pressed, shifted
 from dynsim.engine.method import AUTO, Choice, choose
 from dynsim.engine.outcome import check_size
 from dynsim.engine.soundness import check_inertia
@@ -41,6 +41,7 @@ from dynsim.model.description import Array, Contact, Load, Robot
 from dynsim.model.drives import Drive, Motor
 from dynsim.record.poses import pose_columns
 from dynsim.scenario import Scenario, build
+from dynsim.scenario.combinations import check_robot
 from dynsim.scenario.schema import Integrator
 from dynsim.system.memo import Memo, recall, remembering
 
@@ -134,19 +135,13 @@ def prepare(
     stops = joint_stops(robot) if real else []
     stepped = scenario.integrator.method == "time_stepping"
     dry = dry_frictions(robot) if real else []
-    _check_friction(robot, real, stepped)
+    check_robot(scenario.config, robot)
     gives = bool(robot.ties) or any(contact.stiffness > 0.0 for contact in contacts)
     sizes = kst.LOSSES if real else 0, 1 if stepped else 0, kst.ELASTIC_SIZE if gives else 0
     layout = state_layout(model.nq, n, robot.circuits, c, len(loads), *sizes)
     columns = output_layout(n, na, c, ks.OUTPUTS if robot.base else 0, len(stops), len(dry), len(robot.ties))
     if times is None:
         times = sample_times(scenario, layout, columns, n)
-    if stepped and robot.base is not None:
-        raise ModelError(
-            "integrator.method = 'time_stepping': it locates no events, so a mobile base would tip unseen; "
-            "take auto, or a plant without mobile base",
-            keys=("integrator", "method"),
-        )
     joint_rows = len(robot.couplings) + len(stops) + len(dry) + len(robot.ties)
     _check_work(scenario, n, c + joint_rows, scenario.integrator.method)
     control = piloted or _control(scenario, model, contacts, progress)
@@ -167,13 +162,17 @@ def prepare(
     balance, initial = None, scenario.config.initial
     if initial is not None and initial.equilibrium:
         with kernels_logged(log, "the start at rest", loads=False):
-            balance = balanced(model, contacts, build.loads(scenario, robot), control, real)
+            still, requested = build.loads(scenario, robot), robot.initial
+            model = pressed(model, contacts, still, control, real)
+            balance = balanced(model, contacts, still, control, real, requested)
+            robot = model.robot
+    floors = None if real else recall("floors", lambda: mobility_floors(model, contacts), model, places)
     system = System(
         layout=layout,
         model=model.arrays,
         drives=drives,
         reference=control.reference if balance is None else shifted(control.reference, balance.shift),
-        contacts=compile_contacts(robot, contacts),
+        contacts=compile_contacts(robot, contacts, floors),
         loads=compile_loads(robot, loads),
         dense=np.zeros((size, size + 1)) if options.solver == "m_star" else None,
         couplings=compile_couplings(robot),
@@ -229,20 +228,6 @@ def at_start(scenario: Scenario) -> tuple[Robot, list[Contact], JointControl | N
             robot, control = begun(scenario, described, follow_lines)
             return robot, contacts, control
     return described, contacts, None
-
-
-def _check_friction(robot: Robot, real: bool, stepped: bool) -> None:
-    """Refuse friction that holds joints at rest, and ties, where law and method have none."""
-    if robot.ties and not stepped:
-        raise ModelError(f"tie {robot.ties[0].name}: only integrator.method: time_stepping has ties", keys=("plant",))
-    rubbing = [link.joint for link in robot.links if link.friction > 0.0]
-    rubbing += [motor.joint for motor in robot.motors if isinstance(motor, Motor) and motor.dry_friction > 0.0]
-    if rubbing and not real:
-        raise ModelError(
-            f"dry friction of {listed(rubbing)}: it needs contacts.law: unilateral, also where nothing touches; "
-            "or set it to 0 and take a damping instead",
-            keys=("plant",),
-        )
 
 
 def _check_sensors(scenario: Scenario, control: JointControl) -> None:
@@ -317,8 +302,9 @@ def guards(
     rows = []
     if robot.base is not None:
         rows.append((TIP_MARGIN, 0, -1, ki.STOP if robot.base.stop_on_overturn else ki.LOG))
-    for k in range(len(contacts)):
-        rows += [(ke.NORMAL_GUARD, k, -1, ki.LOG), (ke.SLIP_GUARD, k, -1, ki.LOG)]
+    for k, contact in enumerate(contacts):
+        if not contact.left_out:
+            rows += [(ke.NORMAL_GUARD, k, -1, ki.LOG), (ke.SLIP_GUARD, k, -1, ki.LOG)]
     rows += [(ke.STOP_GUARD, k, -1, ki.LOG) for k in range(len(stops))]
     rows += [(ke.DRY_GUARD, k, -1, ki.LOG) for k in range(len(dry))]
     if not rows:

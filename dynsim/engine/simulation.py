@@ -48,6 +48,7 @@ from dynsim.record import Event, Record
 from dynsim.record.measures import TIP_OVER
 from dynsim.scenario import Scenario, require_scenario
 from dynsim.scenario.build import check_start
+from dynsim.scenario.combinations import LINEARIZATION, WATCHED_EVENTS
 from dynsim.system import interruption
 from dynsim.system.memo import Memo, remembering
 
@@ -63,7 +64,7 @@ Array = NDArray[np.float64]
 _PIECE = 1 << 62
 # Limits on ticks of callers: their number (kinds are bits of an integer), and their period [s].
 MOST_TICKS, SHORTEST_PERIOD = 60, 1e-9
-# Ticks within this of the requested time are included, relative to that time.
+# Ticks, and ends of references, within this of the requested time count as at it, relative to that time.
 TICK_SLACK = 1e-12
 # End of a run without a given end [s]: finite, and later than any time in use.
 _FAR = 1e300
@@ -303,8 +304,9 @@ class Simulation:
             raise ScenarioError(f"cannot advance to t = {brief(until)} s: the simulation is at {self._time:g} s")
         until = min(float(until), self._end)
         last = self._prepared.control.end
-        if not self._frozen and until > last:
-            self._reach(last)
+        # References of the whole run may end a rounding before it, where nothing is to be rewritten.
+        if not self._frozen and until > last + TICK_SLACK * max(1.0, abs(last)):
+            self._reach(max(last, self._time))
             if not self.finished:
                 self._freeze()
         self._reach(until)
@@ -359,11 +361,8 @@ class Simulation:
         ScenarioError
             Under ``integrator.method: time_stepping``, which locates nothing within its steps.
         """
-        if self._prepared.run.method == ki.TIME_STEPPING:
-            raise ScenarioError(
-                "integrator.method: time_stepping locates no events: look with every(), at the step's times, or take "
-                "another method"
-            )
+        if conflict := WATCHED_EVENTS.conflict(self.scenario.config):
+            raise ScenarioError(f"Simulation.watch {WATCHED_EVENTS.message(conflict)}")
         if kind not in GUARDS:
             raise ModelError(f"no event {brief(kind)}; events: {', '.join(GUARDS)}")
         number, family = GUARDS[kind]
@@ -480,9 +479,17 @@ class Simulation:
             v -= response * (v[j] / response[j])
             v[j] = 0.0
         armature[j] = BRAKED if closed else self._armature[j]
+        self._set_floors()
         if run.count[ki.MODES_DUE] == 0:
             run.count[ki.MODES_DUE] = ki.AFTER_JUMP
         self._restart()
+
+    def _set_floors(self) -> None:
+        """Let glued contacts have forces at any mobility while a brake is closed: behind brakes all are minute."""
+        workspace, law = self._prepared.workspace, self._prepared.system.contacts.law
+        braked = (self.model.arrays.body[:, ka.ARMATURE] == BRAKED).any()
+        first = workspace.active[: len(law), ka.FIRST_ROW]
+        workspace.rows[first, ka.ROW_FLOOR] = 0.0 if braked else law[:, ka.FLOOR]
 
     def release(self, joint: str) -> None:
         """Give a motor back to the controller and references of the scenario."""
@@ -546,8 +553,8 @@ class Simulation:
         ScenarioError
             No such input or output, or ``integrator.method: time_stepping``, which knows no modes between its steps.
         """
-        if self._prepared.run.method == ki.TIME_STEPPING:
-            raise ScenarioError("integrator.method: time_stepping has no modes to linearize with; take another method")
+        if conflict := LINEARIZATION.conflict(self.scenario.config):
+            raise ScenarioError(f"Simulation.linearize {LINEARIZATION.message(conflict)}")
         before = self.snapshot()
         try:
             self._settle_now()

@@ -52,7 +52,8 @@ def start_of(scenario: Scenario) -> Start:
             continue
         points[contact.name] = model.point_position(contact.body, contact.point, q)
     declared = scenario.config.contacts.points
-    aloft = [name for name, gap in gaps.items() if name in declared and abs(gap) > build.START_TOLERANCE]
+    movable = declared.keys() - {contact.name for contact in contacts if contact.left_out}
+    aloft = [name for name, gap in gaps.items() if name in movable and abs(gap) > build.START_TOLERANCE]
     if piloted is not None:  # a snake, whose joints `initial` does not place
         aloft = []
     solved = {}
@@ -66,7 +67,11 @@ def start_of(scenario: Scenario) -> Start:
                 solved[link.joint] = (to, was, "deg" if angle else "m")
     hand = model.point_position(*robot.hand, q)
     key = build.on_surface_key(scenario, aloft) if aloft else ""
-    warnings = [*without_effect(scenario, bool(robot.motors)), *_below(scenario, robot)]
+    warnings = [
+        *without_effect(scenario, bool(robot.motors)),
+        *_below(scenario, robot),
+        *build.left_out_warnings(scenario, contacts),
+    ]
     return Start(hand, points, gaps, key, solved, *_margins(scenario, model, contacts), warnings)
 
 

@@ -24,7 +24,7 @@ from dynsim.model.description import Robot
 from dynsim.model.drives import Drive, Motor, Servo, TorqueSource
 from dynsim.record import Record
 from dynsim.record.measures import RESIDUAL_LIMIT, TIP_OVER, least_loads, overturns_settled, percent
-from dynsim.scenario import Scenario
+from dynsim.scenario import Scenario, build
 from dynsim.scenario.effect import without_effect
 
 DRIFT_LIMIT_M = 1e-9
@@ -112,11 +112,13 @@ def _contact_warnings(record: Record, scenario: Scenario, prepared: Prepared, su
                 f"{percent(contact['pulling_fraction'])} of the run, with up to "
                 f"{-contact['normal_force_min_N']:.3g} N; a real arm would lift off"
             )
+    left_out = {contact.name for contact in contacts if contact.left_out}
+    warnings += build.left_out_warnings(scenario, contacts)
     initial, columns = scenario.config.initial, record.labels["contact_gap"]
     placed = () if initial is None else initial.on_surface
     for contact in summary["contacts"]:
         name = contact["name"]
-        if "gap_min_m" in contact and contact["closed_fraction"] == 0.0:
+        if "gap_min_m" in contact and contact["closed_fraction"] == 0.0 and name not in left_out:
             nearest = int(record["contact_gap"][:, columns.index(name)].argmin())
             warnings.append(
                 f"{name}: this brace never touches the {contact['surface']}: it carries nothing; nearest "
@@ -187,10 +189,11 @@ def _undetermined(record: Record, prepared: Prepared) -> list[str]:
         return []
     # Under the unilateral law rows of what sticks depend on each other, which leaves no motion open.
     if system.unilateral is not None:
-        shared = sharing(prepared.model, contacts, record["q"], record["contact_mode"], rests) if len(record) else []
-        joints = [name for name in shared if name in prepared.model.joint_names]
+        if not len(record):
+            return []
+        shared = sharing(prepared.model, contacts, record["q"], record["contact_mode"], rests)
+        touching, joints = shared.contacts, shared.joints
         if joints:
-            touching = [name for name in shared if name not in joints]
             slides = (record["contact_mode"] == ka.SLIDING) & rests.any(axis=1)[:, None]
             sliding = [
                 contact.name
@@ -203,10 +206,10 @@ def _undetermined(record: Record, prepared: Prepared) -> list[str]:
                 "joints at rest; the motion does not determine them, and those of the record are one choice of many"
                 f"{motion}"
             ]
-        if not shared:
+        if not touching:
             return []
         return [
-            f"{', '.join(shared)}: shared forces which the motion does not determine, as points that stick do: "
+            f"{', '.join(touching)}: shared forces which the motion does not determine, as points that stick do: "
             "they are the split of least norm among those that lie in all friction cones"
         ]
     warnings = [f"contact rows depended on each other in {evaluations} evaluations: forces are the split of least norm"]

@@ -234,6 +234,7 @@ class Contact:
     tip : (3,) or None
         The other end of a capsule's axis, in the same frame [m]. Where the surface bends away from the free side the
         nearest point of the axis touches, elsewhere ``point``.
+    left_out : no joint moves it along the normal in any posture, so that it never touches
     """
 
     name: str
@@ -254,6 +255,7 @@ class Contact:
     damping: float = 0.0
     radius: float = 0.0
     tip: Array | None = None
+    left_out: bool = False
 
     @property
     def friction_at_rest(self) -> float:

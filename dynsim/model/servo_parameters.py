@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from collections.abc import Mapping
+from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
 
 from dynsim.config.base import NonNegative, Positive, error_at
 from dynsim.model.drives import Servo
 from dynsim.model.motor_parameters import DriveParameters, limit
+
+# Gains that each mode uses; the first must be positive.
+GAINS = {"position": ("k_p_V_per_rad", "k_d_V_s_per_rad"), "velocity": ("k_v_V_s_per_rad",)}
 
 
 class ServoParameters(DriveParameters):
@@ -45,15 +49,25 @@ class ServoParameters(DriveParameters):
             raise error_at("nominal_current_A", f"is more than current_limit_A = {self.current_limit_A:g}")
         return self
 
+    @model_validator(mode="before")
+    @classmethod
+    def _gains_of_the_mode(cls, data: Any) -> Any:
+        """Set the default gains of the other mode to 0: the user did not write them, and they have no effect."""
+        if not isinstance(data, Mapping):
+            return data
+        mode = data.get("mode", cls.model_fields["mode"].default)
+        others = [key for name, keys in GAINS.items() if name != mode for key in keys]
+        return {**{key: 0.0 for key in others if cls.model_fields[key].default}, **data} if mode in GAINS else data
+
     @model_validator(mode="after")
     def _check_gains(self) -> Self:
-        gains = {"position": ("k_p_V_per_rad", "k_d_V_s_per_rad"), "velocity": ("k_v_V_s_per_rad",)}
-        own = gains.pop(self.mode)
-        if getattr(self, own[0]) == 0.0:
-            raise error_at(own[0], f"must be positive in mode {self.mode}")
-        for foreign in sum(gains.values(), ()):
-            if getattr(self, foreign) != 0.0:
-                raise error_at(foreign, f"has no effect in mode {self.mode}")
+        own = GAINS[self.mode][0]
+        if getattr(self, own) == 0.0:
+            raise error_at(own, f"must be positive in mode {self.mode}")
+        for name, keys in GAINS.items():
+            for key in keys:
+                if name != self.mode and getattr(self, key) != 0.0:
+                    raise error_at(key, f"has no effect in mode {self.mode}")
         return self
 
     def servo(self, joint: str) -> Servo:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.compile.control import JointControl
+from dynsim.compile.mobility import with_immobile_marked
 from dynsim.compile.model import Model
 from dynsim.compile.posture import on_surfaces
 from dynsim.compile.protocols import BuildContext
@@ -137,14 +138,26 @@ def _nameable(scenario: Scenario, built: Robot) -> list[Contact]:
     initial = scenario.config.initial
     if initial is None or not initial.on_surface:
         return []
+    return [*contacts(scenario, built), *disabled_points(scenario, built)]
+
+
+def disabled_points(scenario: Scenario, described: Robot) -> list[Contact]:
+    """Disabled contact points. They touch nothing, but a start or a path may keep them on their surfaces.
+
+    So the same motion can be simulated with and without a brace.
+    """
     options = scenario.config.contacts
-    disabled = [name for name, point in options.points.items() if not point.enabled and name in initial.on_surface]
-    if not disabled:
-        return contacts(scenario, built)
-    chosen = {name: options.points[name].model_copy(update={"enabled": True}) for name in disabled}
-    only = options.model_copy(update={"points": chosen, "candidates": "points"})
+    known = surfaces(scenario)
+    points = {
+        name: point.model_copy(update={"enabled": True})
+        for name, point in options.points.items()
+        if not point.enabled and point.surface in known
+    }
+    if not points:
+        return []
+    only = options.model_copy(update={"points": points, "candidates": "points"})
     alone = replace(scenario, config=scenario.config.model_copy(update={"contacts": only}))
-    return [*contacts(scenario, built), *contacts(alone, built)]
+    return contacts(alone, replace(described, feet=()))
 
 
 def _posed(scenario: Scenario, built: Robot, touching: Sequence[Contact]) -> Robot:
@@ -166,7 +179,10 @@ def _posed(scenario: Scenario, built: Robot, touching: Sequence[Contact]) -> Rob
 
 
 def _first_references(scenario: Scenario, built: Robot) -> Array | None:
-    """Coordinates where waypoints of joints begin, (nq,), the others as they are; None where that is not asked for."""
+    """Coordinates where waypoints of joints begin, (nq,); None if that is not requested.
+
+    Followers of these joints are where their leaders have them, the other joints where the plant has them.
+    """
     initial = scenario.config.initial
     if initial is None or not initial.on_references:
         return None
@@ -177,6 +193,13 @@ def _first_references(scenario: Scenario, built: Robot) -> Array | None:
     for name, path in waypoints.items():
         if name in built.joint_names:
             q[built.position_index[built.joint_names.index(name)]] = path.values[0]
+    places, placed = dict(zip(built.joint_names, built.position_index, strict=True)), {*waypoints}
+    # A follower may lead another joint, and couplings have no order.
+    for _ in built.couplings:
+        for coupling in built.couplings:
+            if coupling.leader in placed and coupling.joint not in waypoints:
+                q[places[coupling.joint]] = coupling.ratio * q[places[coupling.leader]] + coupling.offset
+                placed.add(coupling.joint)
     return q
 
 
@@ -231,16 +254,23 @@ def controller(
     # Of a snake at whatever level.
     if families.member("plant", scenario.plant.type).ENGINE != families.member("controller", config.type).ENGINE:
         raise ModelError(f"controller {config.type!r} cannot drive a {scenario.plant.type!r}")
+    believed = scenario
     if isinstance(machine, Model) and scenario.config.surface_error is not None:
         # What it plans with is not what is there.
-        believed = scenario.config.model_copy(update={"surface_error": None})
-        touching = contacts(replace(scenario, config=believed), machine.robot)
+        believed = replace(scenario, config=scenario.config.model_copy(update={"surface_error": None}))
+        touching = contacts(believed, machine.robot)
     elif touching is None:
         touching = contacts(scenario, machine.robot) if isinstance(machine, Model) else ()
     points = {contact.name: contact for contact in touching}
-    declared = [name for name in points if name in scenario.config.contacts.points]
-    looked = _Looked(points)
-    context = BuildContext(scenario.duration_s, machine, progress=progress, contacts=looked, declared=declared)
+    declared = [
+        name for name, contact in points.items() if name in scenario.config.contacts.points and not contact.left_out
+    ]
+    unused = disabled_points(believed, machine.robot) if isinstance(machine, Model) else []
+    disabled = [contact.name for contact in unused]
+    looked = _Looked({**points, **{contact.name: contact for contact in unused}})
+    context = BuildContext(
+        scenario.duration_s, machine, progress=progress, contacts=looked, declared=declared, disabled=disabled
+    )
     if isinstance(machine, Model):
 
         def built() -> JointControl:
@@ -252,7 +282,7 @@ def controller(
             return None if looked.at else made[0]
 
         made: list[JointControl] = []
-        known = recall("controller", blind, config, scenario.duration_s, machine, [*points], declared)
+        known = recall("controller", blind, config, scenario.duration_s, machine, [*points], declared, disabled)
         control = known or (made[0] if made else built())
         # The kernels would follow the last polynomial on.
         if control.end < scenario.duration_s * (1.0 - 1e-6):
@@ -336,6 +366,10 @@ def contacts(scenario: Scenario, described: Robot | None = None) -> list[Contact
                 **_law(options, point),
             )
         )
+    if result:
+        places = [contact.geometry for contact in result]
+        marks = recall("left out", lambda: with_immobile_marked(described, result), described, places)
+        result = [replace(contact, left_out=mark.left_out) for contact, mark in zip(result, marks, strict=True)]
     if options.candidates != "points":
         law = _law(options, ContactPoint(body=""))
         result += [replace(contact, **law) for contact in candidates(options.candidates, described, known, result)]
@@ -452,8 +486,10 @@ def check_start(
         if own and scenario.plant.type == "snake":  # `initial` does not place its joints
             remedy = "move the surface or change plant.initial_joints_rad"
         elif own:
-            named = [contact for contact, by_name, *_ in off if by_name]
+            named = [other for other, by_name, *_ in off if by_name and not other.left_out]
             remedy = f"{_remedy(scenario, named)}change the initial configuration or the surface"
+        if contact.left_out:
+            remedy = "no joint moves it along the normal: move the surface"
         others = ", ".join(f"{other.name} {its:+.4g} m from {other.surface_name!r}" for other, _, _, its in off[1:])
         raise ModelError(
             f"{dotted(keys)}: {'its point' if declared else contact.name} starts {gap:+.4g} m "
@@ -477,6 +513,17 @@ def _check_body(scenario: Scenario, robot: Robot, contact: Contact) -> None:
     except ModelError as error:
         keys = (*_keys_of(scenario, contact)[1], "body")
         raise ModelError(f"{dotted(keys)}: {error}", keys=keys) from error
+
+
+def left_out_warnings(scenario: Scenario, contacts: Sequence[Contact]) -> list[str]:
+    """Return a sentence for each contact that no joint moves along the normal of its surface."""
+    return [
+        f"{dotted(_keys_of(scenario, contact)[1]) if _keys_of(scenario, contact)[0] else contact.name}: no joint moves "
+        f"this point along the normal of {contact.surface_name}, so its force changes no motion; it is left out of the "
+        "contacts, with a force of zero"
+        for contact in contacts
+        if contact.left_out
+    ]
 
 
 def _remedy(scenario: Scenario, off: Sequence[Contact]) -> str:

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from dynsim.compile.clearance import axis_ends
+from dynsim.compile.mobility import SAME, moves, random_configurations
 from dynsim.compile.model import Model
 from dynsim.compile.shapes import bends_outward
 from dynsim.model.description import Contact, Robot
@@ -16,15 +17,9 @@ from dynsim.model.surfaces import Array, Surface
 
 log = logging.getLogger(__name__)
 
-# Configurations at which points are compared and rows examined: a property that holds at all of them is structural.
-CONFIGURATIONS = 6
-# Points closer than this at all configurations are one [m]; rows smaller than this at all configurations are zero.
-SAME = 1e-9
 # The radius of a capsule between its ends is smaller by this [m]: where an end is nearest, or the axis lies along a
 # face, only the ends touch, and the rows are independent.
 THINNER = 1e-6
-# Positions along the axis of a capsule at which its row is examined, in parts of its length.
-SHARES = (0.0, 0.3, 0.7, 1.0)
 
 
 def candidates(kind: str, robot: Robot, surfaces: Mapping[str, Surface], declared: Iterable[Contact]) -> list[Contact]:
@@ -40,7 +35,7 @@ def candidates(kind: str, robot: Robot, surfaces: Mapping[str, Surface], declare
     without mass and extent, such as a carriage, has no sphere.
     """
     model = Model(robot)
-    configurations = _configurations(robot)
+    configurations = random_configurations(robot)
     taken = [contact for contact in declared if contact.tip is None]
     names = {contact.name for contact in declared}
     contacts: list[Contact] = []
@@ -68,7 +63,7 @@ def candidates(kind: str, robot: Robot, surfaces: Mapping[str, Surface], declare
             kept.append((contact, places))
         for contact, _ in kept:
             name = contact.name if len(surfaces) == 1 else f"{contact.name}_{surface_name}"
-            if _moves(model, contact, configurations):
+            if moves(model, contact, configurations):
                 contacts.append(replace(contact, name=_unused(name, names)))
             else:
                 still.append(name)
@@ -112,21 +107,6 @@ def _links(robot: Robot, surface: Surface, on: str) -> list[Contact]:
     return [*starts, *ends, *capsules] if bends_outward(surface) else starts + ends
 
 
-def _configurations(robot: Robot) -> list[Array]:
-    """Random coordinates; quaternions are unit."""
-    rng = np.random.default_rng(0)
-    configurations = []
-    for _ in range(CONFIGURATIONS):
-        q = np.zeros(robot.nq)
-        for link, k in zip(robot.links, robot.position_index, strict=True):
-            size = len(link.row.neutral)
-            q[k : k + size] = rng.normal(size=size)
-            if size == 4:
-                q[k : k + 4] /= np.linalg.norm(q[k : k + 4])
-        configurations.append(q)
-    return configurations
-
-
 def _places(model: Model, contact: Contact, configurations: Iterable[Array]) -> Array:
     """Positions of the point of a contact [m]."""
     return np.array([model.point_position(contact.body, contact.point, q) for q in configurations])
@@ -134,19 +114,6 @@ def _places(model: Model, contact: Contact, configurations: Iterable[Array]) -> 
 
 def _same(a: Array, b: Array) -> bool:
     return bool(np.abs(a - b).max() <= SAME)
-
-
-def _moves(model: Model, contact: Contact, configurations: Iterable[Array]) -> bool:
-    """Whether any joint moves any part of a candidate along the normal."""
-    points = [contact.point]
-    if contact.tip is not None:
-        points = [contact.point + share * (contact.tip - contact.point) for share in SHARES]
-    for q in configurations:
-        for point in points:
-            position, jacobian = model.point_position_and_jacobian(contact.body, point, q)
-            if np.abs(contact.surface.normal(position) @ jacobian).max() > SAME:
-                return True
-    return False
 
 
 def _unused(name: str, names: set[str]) -> str:

@@ -13,8 +13,10 @@ from dynsim.config.base import BodyPoint, NonNegative, Positive, StrictConfig, V
 from dynsim.config.problems import Origin, listed
 from dynsim.library.families import engine, section_defaults, union
 from dynsim.record import notebook
+from dynsim.scenario.combinations import BILATERAL_KEYS, THETA, UNILATERAL_KEYS, check_keys
 from dynsim.scenario.effect import idle_keys, is_set
 from dynsim.scenario.loads import LoadConfig
+from dynsim.scenario.nulls import write_nulls
 from dynsim.scenario.objects import SceneObject
 from dynsim.scenario.sensors import Sensors
 from dynsim.scenario.ties import TieChoice
@@ -22,20 +24,6 @@ from dynsim.scenario.ties import TieChoice
 # Most bytes in the name of a folder on common file systems.
 NAME_LIMIT = 255
 
-
-# Keys that only one law reads.
-BILATERAL_KEYS = ("slip_smoothing_m_s", "pulling_friction")
-UNILATERAL_KEYS = (
-    "static_friction",
-    "stribeck_m_s",
-    "viscous_friction_s_per_m",
-    "restitution",
-    "grip",
-    "stiffness_N_per_m",
-    "damping_N_s_per_m",
-)
-# The trapezoidal rule of time stepping.
-THETA = 0.5
 Share = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
 
 
@@ -129,25 +117,12 @@ class Contacts(StrictConfig):
         return BILATERAL_KEYS if self.law == "unilateral" else UNILATERAL_KEYS
 
     @model_validator(mode="after")
-    def _check_law(self) -> Self:
-        """Keys of the other law would be read by nobody."""
-        other = "unilateral" if self.law == "bilateral" else "bilateral"
-        fix = f"is read under law: {other} only, this is law: {self.law}; remove it, or change the law"
-        for key in self.other_keys:
-            if key in self.model_fields_set:
-                raise error_at(key, fix)
-        if self.law == "bilateral" and self.candidates != "points":
-            raise error_at(
-                "candidates", f"{self.candidates!r} would glue all of them to their surfaces; it needs law: unilateral"
-            )
+    def _check_coefficients(self) -> Self:
         self._check_compliance()
         kinetic, static = self.coefficients()
         if static < kinetic:
             raise error_at("static_friction", f"is less than friction {self.friction:g}; it must hold as much or more")
         for name, point in self.points.items():
-            keys = sorted(point.model_fields_set & set(UNILATERAL_KEYS))
-            if self.law == "bilateral" and keys:
-                raise error_at(f"points.{name}.{keys[0]}", fix)
             kinetic, static = self.coefficients(point)
             if static < kinetic:
                 key = "friction" if point.static_friction is None else "static_friction"
@@ -231,17 +206,6 @@ class Integrator(StrictConfig):
             raise ValueError("is no longer there; take dopri5, or time_stepping where steps are to be fixed")
         return value
 
-    @model_validator(mode="after")
-    def _check_method(self) -> Self:
-        stepping = self.method == "time_stepping"
-        if stepping and self.solver != "articulated":
-            raise error_at(
-                "solver", "is not of integrator.method: time_stepping, which solves with articulated sweeps; remove it"
-            )
-        if self.theta != THETA and not stepping:
-            raise error_at("theta", f"is of method: time_stepping only, this is method: {self.method}; remove it")
-        return self
-
 
 class RecordOptions(StrictConfig):
     """What is recorded."""
@@ -295,39 +259,8 @@ class ScenarioConfig(StrictConfig):
         return laid_under(section_defaults(data.get("plant"), data), data)
 
     @model_validator(mode="after")
-    def _check_stepped_contacts(self) -> Self:
-        if self.contacts.law == "bilateral" and self.integrator.method == "time_stepping":
-            raise error_at("integrator.method", "needs `contacts: {law: unilateral}`, also where nothing touches")
-        return self
-
-    @model_validator(mode="after")
-    def _check_grips(self) -> Self:
-        """The event-driven methods know round cones only."""
-        for name, point in self.contacts.points.items():
-            if point.grip is not None and self.integrator.method != "time_stepping":
-                raise error_at(
-                    f"contacts.points.{name}.grip",
-                    f"needs integrator.method: time_stepping; {self.integrator.method} finds begin and end of slip by "
-                    "one coefficient for all directions",
-                )
-        return self
-
-    @model_validator(mode="after")
-    def _check_stiffness(self) -> Self:
-        """The event-driven methods know rigid contacts only, and no ties."""
-        for name in self.ties:
-            if self.integrator.method != "time_stepping":
-                raise error_at(
-                    f"ties.{name}", f"needs integrator.method: time_stepping; {self.integrator.method} has no ties"
-                )
-        configs: dict[str, Contacts | ContactPoint] = {"contacts": self.contacts}
-        configs |= {f"contacts.points.{name}": point for name, point in self.contacts.points.items()}
-        for where, config in configs.items():
-            if config.stiffness_N_per_m is not None and self.integrator.method != "time_stepping":
-                raise error_at(
-                    f"{where}.stiffness_N_per_m",
-                    f"needs integrator.method: time_stepping; contacts of {self.integrator.method} are rigid",
-                )
+    def _check_combinations(self) -> Self:
+        check_keys(self)
         return self
 
     @field_validator("name", "variant")
@@ -435,6 +368,7 @@ class Scenario:
         Defaults that change nothing are left out.
         """
         resolved = self.config.model_dump(mode="json", exclude_none=True)
+        write_nulls(self.config, resolved, section_defaults(resolved["plant"], resolved))
         for section in ("loads", "objects", "ties"):
             if not getattr(self.config, section):
                 del resolved[section]

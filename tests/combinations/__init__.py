@@ -2,6 +2,7 @@
 
     factors      the factors and their levels, and which levels refuse each other
     covering     few assignments of levels that hold each pair, or each triple
+    known        combinations that were wrong once
     scenes       the scenario of an assignment
     plants       their robots
     drives       their motors and controllers

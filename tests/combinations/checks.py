@@ -26,6 +26,8 @@ from dynsim.scenario import build
 
 # A start within a micrometre of a surface is projected onto it; this moves the first sample.
 START = 1e-5
+# Shortest lever arm by which a joint presses a compliant contact in [m].
+PRESSED_LEVER_M = 0.05
 # A force above this multiple of weight, loads and motor torques at a lever of 5 cm is absurd.
 ABSURD, LEVER_M = 1e6, 0.05
 # Signals that may be NaN because they divide by a load that may be zero.
@@ -110,21 +112,29 @@ def start(seen: Observed) -> Finding:
                 asked[places[joint]] = np.radians(first) if key.endswith("deg") else first
             elif joint in places:
                 free[places[joint]] = True
+        for coupling in seen.robot.couplings:
+            asked[places[coupling.joint]] = coupling.ratio * asked[places[coupling.leader]] + coupling.offset
+    # An equilibrium presses compliant contacts in: bodies move about as far, and joints by that over a lever arm.
+    deepest = 0.0
+    if initial.get("equilibrium"):
+        deepest = max((-float(t.gap[0]) for t in seen.touches() if t.contact.stiffness > 0.0), default=0.0)
+    allowed = START + max(deepest, 0.0) / PRESSED_LEVER_M
     if initial.get("on_surface"):
         kept = [places[joint] for joint in initial.get("keep", []) if joint in places]
         free[:] = True
         free[kept] = False
         for touch in seen.touches():
-            if touch.contact.name in initial["on_surface"] and abs(touch.gap[0]) > START:
+            presses = allowed if touch.contact.stiffness > 0.0 else START
+            if touch.contact.name in initial["on_surface"] and abs(touch.gap[0]) > presses:
                 yield f"{touch.contact.name} starts {touch.gap[0]:+.3g} m from its surface, not on it"
     off = np.where(free, 0.0, np.abs(seen.q[0] - asked))
-    if off.max(initial=0.0) > START:
+    if off.max(initial=0.0) > allowed:
         k = int(off.argmax())
         name = seen.record.labels["q"][k]
         yield f"{name} starts at {seen.q[0, k]:.6g}, asked for {asked[k]:.6g}"
     # Against the posture that the resolved scenario has, where points were to be put on surfaces.
     off = np.abs(seen.q[0] - seen.robot.initial)
-    if off.max(initial=0.0) > START:
+    if off.max(initial=0.0) > allowed:
         k = int(off.argmax())
         yield f"{seen.record.labels['q'][k]} starts at {seen.q[0, k]:.6g}, the scenario has {seen.robot.initial[k]:.6g}"
     fastest = float(np.abs(seen.v[0]).max(initial=0.0))

@@ -137,7 +137,7 @@ def _named(chosen: Sequence[int]) -> dict[str, str]:
 def _filled(
     random: Generator, law: _Law, wanted: Sequence[int], lacks: NDArray[np.bool_] | None = None
 ) -> list[int] | None:
-    """A whole assignment around some levels, preferring those of which most is missing; None where it comes to nothing."""
+    """A whole assignment around some levels, preferring those of which most is missing; None: it comes to nothing."""
     chosen = list(wanted)
     there = {LEVELS[k][0] for k in chosen}
     left = [choices for factor, choices in zip(FACTORS, CHOICES, strict=True) if factor not in there]

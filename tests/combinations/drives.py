@@ -23,8 +23,10 @@ def motors(random: Generator, levels: Levels, robot: Plant) -> dict[str, dict[st
         return {}
     chosen = {joint.name: _motor(random, level, joint) for joint in robot.joints if joint.name != "base.right"}
     if level == "partly":
+        # Braces carry two of them with friction alone.
         own = [joint.name for joint in robot.joints if joint.before and joint.name in chosen]
-        chosen.pop(own[int(random.integers(len(own)))], None)
+        for k in random.permutation(len(own)).tolist()[: 1 + int(random.integers(2))]:
+            del chosen[own[k]]
     gear = float(random.uniform(0.05, 0.3)) if levels["rubbing"] in ("gear", "both") else 0.0
     for motor in chosen.values():
         if gear and motor["type"] != "torque":
@@ -73,10 +75,14 @@ def controller(
         return None
     section: dict[str, Any] = {"type": "joint_pd", **_gains(random, levels, robot, driven)}
     moved = [joint for joint in robot.joints if joint.name in driven and not joint.name.startswith("base.")]
+    if level in ("waypoints", "hand_path", "operator", "torques"):
+        # Those that have no motor are refused.
+        moved = moved or [joint for joint in robot.joints if not joint.name.startswith("base.")]
     if level in SAMPLED:
         section["sample_time_s"] = float(random.choice((0.0005, 0.001)))
     if level == "torques":
-        section["torques"] = _torques(random, driven, model, duration)
+        able = [joint.name for joint in moved if driven.get(joint.name, {}).get("type") == "torque"]
+        section["torques"] = _torques(random, able or [moved[-1].name], model, duration)
     elif level == "gravity":
         section["feed_forward"] = str(random.choice(("gravity", "dynamics")))
     elif level == "pressing":
@@ -104,7 +110,9 @@ def controller(
             section["operator"]["commands"][0]["base"] = [0.05, 0.1]
     moves = level in ("waypoints", *PLANNED) or (level in SAMPLED and random.random() < 0.7)
     if moves or (levels["start"] == "on_references" and level in FOLLOWERS):
-        free = [joint for joint in moved if joint not in followed and driven[joint.name]["type"] != "torque"]
+        free = [joint for joint in moved if joint not in followed]
+        if level != "waypoints":
+            free = [joint for joint in free if driven[joint.name]["type"] != "torque"]
         section |= _waypoints(random, levels, free, duration)
     return section
 
@@ -123,7 +131,11 @@ def _gains(random: Generator, levels: Levels, robot: Plant, driven: dict[str, di
         p, d = (400.0, 12.0) if motor["type"] == "wang_minami" else (40.0, 1.5) if joint.turns else (1000.0, 20.0)
         k_p.append(stiff * p)
         k_d.append(stiff * d)
-    return {"k_p_V_per_rad": k_p, "k_d_V_s_per_rad": k_d} if k_p else {}
+    if not k_p:
+        return {}
+    if len(set(k_p)) == 1:
+        return {"k_p_V_per_rad": k_p[0], "k_d_V_s_per_rad": k_d[0]}
+    return {"k_p_V_per_rad": k_p, "k_d_V_s_per_rad": k_d}
 
 
 def _followers(random: Generator, levels: Levels, robot: Plant, moved: Sequence[Joint]) -> list[Joint]:
@@ -154,36 +166,30 @@ def _path(random: Generator, robot: Plant, followed: Sequence[Joint], model: Mod
 def _waypoints(random: Generator, levels: Levels, free: Sequence[Joint], duration: float) -> dict[str, Any]:
     """Waypoints of one joint or two; behind the elbow where that is glued or put on its surface."""
     held = levels["contact"] == "glued" or levels["start"] == "on_references" or levels["controller"] in PLANNED
-    if levels["plant"] == "mimic" and levels["start"] == "on_references":
-        # It leads another, which starts where the file says.
-        free = [joint for joint in free if joint.name != "grip"]
     able = [joint for joint in free if not (held and joint.before)]
     if not able and levels["start"] == "on_references":
         able = list(free)
-    if levels["controller"] == "pressing" and levels["points"] in ("two", "same_link"):
-        # They would take a point that presses off its surface.
-        able = []
+    # Where they would take a point that presses off its surface, they rest.
+    idle = levels["controller"] == "pressing" and levels["points"] in ("two", "same_link")
     joints: dict[str, Any] = {}
     for k in random.permutation(len(able)).tolist()[: 1 + int(random.integers(2))]:
         joint = able[k]
         scale = 1.0 if joint.turns else 0.002
         start = joint.start + (scale * float(random.uniform(1.0, 4.0)) if levels["start"] == "on_references" else 0.0)
-        ways = [start, *(start + scale * random.uniform(-15.0, 15.0, size=2)).tolist()]
+        ways = [start, *(start + (0.0 if idle else scale) * random.uniform(-15.0, 15.0, size=2)).tolist()]
         key = "angles_deg" if joint.turns else "positions_m"
         joints[joint.name] = {"times_s": [0.0, 0.5 * duration, duration], key: ways}
     return {"joints": joints} if joints else {}
 
 
-def _torques(random: Generator, driven: dict[str, dict[str, Any]], model: Model, duration: float) -> dict[str, Any]:
+def _torques(random: Generator, joints: Sequence[str], model: Model, duration: float) -> dict[str, Any]:
     """What holds the weight, and a wave about it that presses and lifts."""
     weight = model.bias_forces(np.array(model.robot.initial), np.zeros(model.n))
     rates = {link.joint: i for i, link in enumerate(model.robot.links)}
     torques: dict[str, Any] = {}
-    for name, motor in driven.items():
-        if motor["type"] != "torque" or name.startswith("base."):
-            continue
-        hold = float(weight[rates[name]])
-        wave = float(random.uniform(-1.0, 1.0)) * (0.3 + 0.5 * abs(hold))
-        values = [hold + wave, hold, hold - wave]
+    for name in joints:
+        carried = float(weight[rates[name]])
+        wave = float(random.uniform(-1.0, 1.0)) * (0.3 + 0.5 * abs(carried))
+        values = [carried + wave, carried, carried - wave]
         torques[name] = {"times_s": [0.0, 0.5 * duration, duration], "torques_N_m": values}
     return torques

@@ -10,9 +10,10 @@ Levels = Mapping[str, str]
 
 # The method is no factor: each scene is run by all that know what is in it, see :func:`methods`.
 FACTORS: dict[str, tuple[str, ...]] = {
-    # With its kinds of joints: revolute; also prismatic; of a file, with a branch; coupled; with a free or a planar root.
+    # With its kinds of joints: revolute; also prismatic; of a file, with a branch; coupled; a free or a planar root.
     "plant": ("revolute", "prismatic", "urdf", "mimic", "floating", "planar", "mobile", "snake"),
-    # partly: a joint before the elbow has none; dc: with limits of voltage and current; velocity: a servo in that mode.
+    # partly: one joint before the elbow has none, or two; dc: with limits of voltage and current; velocity: a servo in
+    # that mode.
     "motor": ("none", "partly", "published", "dc", "servo", "velocity", "torque"),
     "rubbing": ("nothing", "viscous", "bearing", "gear", "both"),
     "stops": ("none", "far", "reached"),
@@ -62,6 +63,11 @@ class Refusal:
         """Whether an assignment, which may be partial, has them all."""
         return all(levels.get(factor) in refused for factor, refused in self.levels)
 
+    @property
+    def name(self) -> str:
+        """Its levels, in a word."""
+        return "-".join("|".join(levels) for _, levels in self.levels)
+
     def holds_for(self, method: str) -> bool:
         """Whether it is about a method, or about all."""
         return method in dict(self.levels).get(METHOD, (method,))
@@ -82,33 +88,33 @@ STEPPED = "only time stepping has it"
 
 REFUSALS: tuple[Refusal, ...] = (
     # Feature × law.
-    _refuse("under the glued law joints do not rest", r"dry friction of .* needs contacts.law: unilateral",
+    _refuse("under the glued law joints do not rest", r"dry friction of joints \(.*\) requires contacts.law",
             contact=GLUED, rubbing=("bearing", "gear", "both")),
-    _refuse("a glued point has one coefficient", r"is read under law: unilateral only",
-            contact=GLUED, friction=("static", "stribeck", "viscous")),
-    _refuse("what is glued does not bounce or give way", r"is read under law: unilateral only",
+    _refuse("a glued point has one coefficient", r"requires contacts.law: unilateral",
+            contact=GLUED, friction=("static", "stribeck", "viscous", "grip")),
+    _refuse("what is glued does not bounce or give way", r"requires contacts.law: unilateral",
             contact=GLUED, give=("restitution", "compliant")),
     # Feature × method.
-    _refuse(STEPPED, r"grip: needs integrator.method: time_stepping",
+    _refuse(STEPPED, r"grip: requires integrator.method: time_stepping",
             friction="grip", method=("auto", "dopri5", "radau5")),
-    _refuse(STEPPED, r"stiffness_N_per_m: needs integrator.method: time_stepping",
+    _refuse(STEPPED, r"stiffness_N_per_m.*: requires integrator.method: time_stepping",
             give="compliant", method=("auto", "dopri5", "radau5")),
-    _refuse(STEPPED, r"has no ties",
+    _refuse(STEPPED, r"ties.*requires integrator.method: time_stepping",
             ties=("linear", "torsion", "bounded"), method=("auto", "dopri5", "radau5")),
-    _refuse("time stepping solves with articulated sweeps", r"is not of integrator.method: time_stepping",
+    _refuse("time stepping solves with articulated sweeps", r"integrator.solver.*requires integrator.method: auto",
             solver="m_star", method="time_stepping"),
     # Law or plant × method.
-    _refuse("time stepping has the unilateral law alone", r"needs `contacts: \{law: unilateral\}`",
+    _refuse("time stepping has the unilateral law alone", r"requires contacts.law: unilateral",
             contact=GLUED, method="time_stepping"),
     _refuse("time stepping locates no overturning", r"mobile base",
             plant="mobile", method="time_stepping"),
-    _refuse("a snake's wheels stand on tyres, which only time stepping has", r"needs integrator.method: time_stepping",
+    # They would run without tyres, slowly, until contacts contradict each other.
+    _refuse("how the rigid wheels of a snake share its weight is not determined", "",
             plant="snake", method=("auto", "dopri5", "radau5")),
     # Plant × feature.
-    _refuse("a snake stands on its wheels", r"is read under law: unilateral only|needs `contacts", plant="snake",
-            contact=GLUED),
-    _refuse("a snake has a controller of its own", r"cannot drive a 'snake'", plant="snake",
-            controller=("hold", "waypoints", "hand_path", "torques", "gravity", "pressing")),
+    _refuse("a snake stands on its wheels", "", plant="snake", contact=GLUED),
+    _refuse("a snake has a controller of its own", r"cannot drive a 'snake'",
+            plant="snake", controller=("hold", "waypoints", "hand_path", "torques", "gravity", "pressing")),
     _refuse("a snake starts raised from below", r"", plant="snake",
             start=("on_surface", "on_references", "equilibrium")),
     _refuse("the joints of a snake are servos on position", r"", plant="snake",
@@ -119,9 +125,9 @@ REFUSALS: tuple[Refusal, ...] = (
             plant="floating", start="equilibrium", contact=("nothing", "free", "glued")),
     _refuse("nothing holds a free body", r"nothing holds this posture",
             objects=("box", "sphere", "cart"), start="equilibrium", contact=GLUED),
-    _refuse("such motors hold no posture", r"nothing holds this posture",
-            motor=("none", "velocity"), start="equilibrium"),
-    _refuse("such motors hold no posture", r"nothing holds this posture", controller="none", start="equilibrium"),
+    # But where friction or braces hold all.
+    _refuse("such motors hold no posture", "", motor=("none", "velocity"), start="equilibrium"),
+    _refuse("such motors hold no posture", "", controller="none", start="equilibrium"),
     # Motor × controller.
     _refuse("a plan of voltages needs a DC motor at each joint", r"DC motor", motor=(
         "none", "partly", "servo", "velocity", "torque"), controller=PLANNED),
@@ -132,7 +138,7 @@ REFUSALS: tuple[Refusal, ...] = (
     _refuse("torques are of motors of that type", r"torque", motor=(
         "none", "partly", "published", "dc", "servo", "velocity"), controller="torques"),
     _refuse("nobody follows a path", r"motor", motor="none",
-            controller=("waypoints", "hand_path", "operator", "sampled", "encoders", "delayed")),
+            controller=("waypoints", "hand_path", "operator")),
     _refuse("a torque follows no path", r"motor|torque", motor="torque",
             controller=("waypoints", "hand_path", "operator")),
     # Motor × friction of the gear.

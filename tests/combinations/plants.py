@@ -148,7 +148,8 @@ def _urdf(random: Generator, name: str, levels: Levels, light: float) -> Plant:
         across, along = mass * (length**2 + 3e-3) / 12.0, mass * 3e-4
         return (
             f'  <link name="{body}"><inertial><origin xyz="0.01 0 {length / 2:.6g}"/><mass value="{mass:.6g}"/>'
-            f'<inertia ixx="{across:.6g}" ixy="0" ixz="0" iyy="{across:.6g}" iyz="0" izz="{along:.6g}"/></inertial></link>'
+            f'<inertia ixx="{across:.6g}" ixy="0" ixz="0" iyy="{across:.6g}" iyz="0" izz="{along:.6g}"/></inertial>'
+            "</link>"
         )
 
     def joint(own: str, kind: str, parent: str, child: str, xyz: str, axis: str = "", inner: str = "") -> str:
@@ -196,13 +197,13 @@ def _urdf(random: Generator, name: str, levels: Levels, light: float) -> Plant:
         "hand": {"body": "tool0"},
     }
     if root is not None:
-        place = random.uniform(-0.2, 0.2, size=3).tolist()
+        spot = random.uniform(-0.2, 0.2, size=3).tolist()
         turn = [0.0, 0.0, float(random.uniform(-180, 180))]
         if root == "planar":
-            place[2] = 0.0
+            spot[2] = 0.0
         elif levels["contact"] in ("nothing", "free", "glued"):
             turn = random.uniform(-40, 40, size=3).tolist()
-        section["initial_pose"] = {"root": {"position_m": place, "rpy_deg": turn}}
+        section["initial_pose"] = {"root": {"position_m": spot, "rpy_deg": turn}}
     files = {"robot.urdf": "\n".join(text) + "\n"}
     return Plant(section, joints, ("fore", [0.0, 0.0, 0.0]), ("tool0", [0.0, 0.0, 0.0]), 0.0, files)
 
@@ -219,8 +220,8 @@ def set_limits(robot: Plant, joint: Joint, lower: float, upper: float) -> None:
     own = f'<limit lower="{scale * lower:.9g}" upper="{scale * upper:.9g}" effort="0" velocity="0"/>'
     inner = text[start:end]
     if "<limit" in inner:
-        head, _, rest = inner.partition("<limit")
-        inner = head + own + rest.partition("/>")[2]
+        head, _, tail = inner.partition("<limit")
+        inner = head + own + tail.partition("/>")[2]
     else:
         inner += own
     robot.files["robot.urdf"] = text[:start] + inner.replace("continuous", "revolute") + text[end:]

@@ -61,14 +61,14 @@ class Run:
         return "refused" if isinstance(self.error, DynsimError) else type(self.error).__name__
 
 
-def run(scene: Scene, method: str, way: str = "simulate") -> Run:
+def run(scene: Scene, method: str, manner: str = "simulate") -> Run:
     """Check a scene and run it, whatever becomes of it."""
-    solver = M_STAR if way == M_STAR else "articulated"
+    solver = M_STAR if manner == M_STAR else "articulated"
     settings = scene.with_method(method, solver)
     try:
         scenario = scene.load(method, solver)
     except DynsimError as error:
-        return Run(settings, None, method, way, None, error, [], str(error))
+        return Run(settings, None, method, manner, None, error, [], str(error))
     checked, record, failure = None, None, None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -77,7 +77,7 @@ def run(scene: Scene, method: str, way: str = "simulate") -> Run:
         except DynsimError as error:
             checked = str(error)
         try:
-            record = WAYS[way](scenario)
+            record = WAYS[manner](scenario)
         except SimulationInterrupted:
             raise
         except SimulationStopped as stop:
@@ -85,7 +85,7 @@ def run(scene: Scene, method: str, way: str = "simulate") -> Run:
         except Exception as error:  # a fault of dynsim in one scene must not keep the others from running
             failure = error
     said = list(record.summary["warnings"]) if record is not None else []
-    return Run(settings, scenario, method, way, record, failure, said, checked)
+    return Run(settings, scenario, method, manner, record, failure, said, checked)
 
 
 def _simulation(scenario: Scenario) -> Simulation:
@@ -93,7 +93,10 @@ def _simulation(scenario: Scenario) -> Simulation:
     sensors, controller = scenario.config.sensors, scenario.controller
     attended = sensors is not None or getattr(controller, "operator", None) is not None
     attended = attended or getattr(controller, "type", "") == "task_space"
-    return Simulation(scenario, duration=math.inf if attended else None)
+    simulation = Simulation(scenario, duration=math.inf if attended else None)
+    if attended:
+        simulation.end_samples(scenario.duration_s)
+    return simulation
 
 
 def _in_pieces(scenario: Scenario) -> Record:
@@ -140,7 +143,7 @@ WAYS = {
 }
 
 
-def runs(scene: Scene, takes: Callable[[str, str], bool] = lambda method, way: True) -> dict[str, Run]:
+def runs(scene: Scene, takes: Callable[[str, str], bool] = lambda method, manner: True) -> dict[str, Run]:
     """A scene by all its methods, by ``METHOD``, and in further ways by ``METHOD/WAY``.
 
     ``auto`` takes one of the others, and is run where the scene is to be run in no further way. ``takes`` may leave
@@ -151,10 +154,10 @@ def runs(scene: Scene, takes: Callable[[str, str], bool] = lambda method, way: T
         return {}
     # Which method runs in another way, changes from scene to scene.
     method = sorted(done)[scene.seed % len(done)]
-    way = scene.levels["way"]
-    if way != "simulate":
-        done[f"{method}/{way}"] = run(scene, method, way)
-    elif "auto" in scene.methods and takes("auto", way):
+    manner = scene.levels["way"]
+    if manner != "simulate":
+        done[f"{method}/{manner}"] = run(scene, method, manner)
+    elif "auto" in scene.methods and takes("auto", manner):
         done["auto"] = run(scene, "auto")
     able = sorted(set(done) & {"dopri5", "radau5"})
     if scene.levels["solver"] == M_STAR and able and takes(able[scene.seed % len(able)], M_STAR):
@@ -173,8 +176,8 @@ def faults(scene: Scene, done: Mapping[str, Run], *, thorough: bool = False) -> 
     wrong: list[tuple[str, str]] = []
     for name, own in done.items():
         wrong += [(kind, f"{name}: {text}") for kind, text in _began(scene, own)]
-        same, _, way = name.partition("/")
-        if way and way != M_STAR and (differ := _differs(done[same], own)):
+        same, _, manner = name.partition("/")
+        if manner and manner != M_STAR and (differ := _differs(done[same], own)):
             wrong.append(("way", f"{name} is not {same}: {differ}"))
     if (auto := done.get("auto")) is not None and auto.record is not None:
         same = str(auto.record.summary["method"])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -56,7 +56,7 @@ def _spectral_radius(seen: Observed, basis: Array) -> float:
         if isinstance(motor, TorqueSource):
             continue
         k_m, resistance = motor.joint_constant, motor.resistance
-        k_p, k_d = _gains(controller, motor)
+        k_p, k_d = _gains(controller, motor, sum(isinstance(other, Motor) for other in motors[:a]))
         K[a, :k], K[a, k : 2 * k] = -k_p * row, -k_d * row
         if isinstance(motor, Motor):
             A[k : 2 * k, c] = inverse @ row * k_m
@@ -72,11 +72,12 @@ def _spectral_radius(seen: Observed, basis: Array) -> float:
     return float(np.abs(np.linalg.eigvals(E[:size, :size] + E[:size, size:] @ K)).max())
 
 
-def _gains(controller: Mapping[str, Any], motor: Motor | Servo) -> tuple[float, float]:
+def _gains(controller: Mapping[str, Any], motor: Motor | Servo, number: int) -> tuple[float, float]:
+    """Of a motor; ``number``: that it has among the DC motors, where each has a gain of its own."""
     if isinstance(motor, Servo):
         return (0.0, motor.k_v) if motor.velocity_mode else (motor.k_p, motor.k_d)
     gains = []
     for key, default in (("k_p_V_per_rad", 500.0), ("k_d_V_s_per_rad", 20.0)):
         value = controller.get(key, default)
-        gains.append(float(value.get(motor.joint, default) if isinstance(value, Mapping) else value))
+        gains.append(float(value[number] if isinstance(value, Sequence) else value))
     return gains[0], gains[1]

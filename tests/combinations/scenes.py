@@ -13,7 +13,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from combinations import drives, plants
-from combinations.factors import FACTORS, SAMPLED, Levels, methods
+from combinations.factors import FACTORS, GLUED, SAMPLED, Levels, methods
 from dynsim import Model, check
 from dynsim.errors import DynsimError
 from dynsim.scenario import Scenario, build_model, load_scenario
@@ -90,7 +90,7 @@ def scene(levels: Levels, seed: int, folder: Path) -> Scene:
         for section in [key for key, value in draft.items() if value is None or value == {}]:
             del draft[section]
         drawn = Scene(levels, seed, draft, folder)
-        if not _in_a_surface(drawn):
+        if not drawn.methods or not _in_a_surface(drawn):
             break
     return drawn
 
@@ -198,8 +198,8 @@ class _Touching:
             return list(self.points)
         return ["elbow", *(name for name in self.points if name.startswith("foot"))]
 
-    def _point(self, place: tuple[str, list[float]], surface: str, radius: float) -> dict[str, Any]:
-        body, point = place
+    def _point(self, spot: tuple[str, list[float]], surface: str, radius: float) -> dict[str, Any]:
+        body, point = spot
         settings: dict[str, Any] = {"body": body, "point_m": list(point), "surface": surface}
         if radius:
             settings["radius_m"] = radius
@@ -223,7 +223,7 @@ class _Touching:
             normal = _unit(np.array([0.0, 0.0, 1.0]) + float(random.uniform(0.2, 0.8)) * heading)
         if kind in ("box", "height_field"):
             normal = np.array([0.0, 0.0, 1.0])
-        place = self.elbow - (radius + gap) * normal
+        spot = self.elbow - (radius + gap) * normal
         size = float(random.uniform(0.1, 0.3))
         if kind in ("bowl", "pipe"):
             size = 4.0 if wide else float(random.uniform(0.3, 0.6))
@@ -231,22 +231,22 @@ class _Touching:
         if kind == "steep" and wide:
             kind, size = "sphere", 0.05
         if kind in ("plane", "inclined", "steep"):
-            surface: dict[str, Any] = {"type": "plane", "point_m": place.tolist(), "normal": normal.tolist()}
+            surface: dict[str, Any] = {"type": "plane", "point_m": spot.tolist(), "normal": normal.tolist()}
         elif kind in ("sphere", "bowl"):
             sign = 1.0 if kind == "bowl" else -1.0
-            surface = {"type": "sphere", "center_m": (place + sign * size * normal).tolist(), "radius_m": size}
+            surface = {"type": "sphere", "center_m": (spot + sign * size * normal).tolist(), "radius_m": size}
         elif kind in ("cylinder", "pipe"):
             sign = 1.0 if kind == "pipe" else -1.0
             axis = _unit(np.cross(normal, _unit(random.normal(size=3))))
-            centre = (place + sign * size * normal).tolist()
+            centre = (spot + sign * size * normal).tolist()
             surface = {"type": "cylinder", "point_m": centre, "axis": axis.tolist(), "radius_m": size}
         elif kind == "box":
             edges = random.uniform(0.15, 0.5, size=3).tolist()
             turn = [0.0, 0.0, float(random.uniform(-90, 90))]
-            centre = (place - [0.0, 0.0, 0.5 * edges[2]]).tolist()
+            centre = (spot - [0.0, 0.0, 0.5 * edges[2]]).tolist()
             surface = {"type": "box", "center_m": centre, "edges_m": edges, "rpy_deg": turn}
         else:
-            surface = self._terrain(place)
+            surface = self._terrain(spot)
         if kind in ("bowl", "pipe"):
             surface["inside"] = True
         self.surfaces["floor"] = surface
@@ -264,19 +264,19 @@ class _Touching:
         body, point = self._robot.elbow
         jacobian = self._model.point_jacobian(body, np.array(point), self._q)
         moving = [column for column in jacobian.T if np.linalg.norm(column) > 0.05]
-        way = _unit(moving[-1]) if moving else np.array([0.0, 0.0, 1.0])
-        side = _unit(np.cross(way, heading) if abs(way @ heading) < 0.9 else np.cross(way, [0.0, 0.0, 1.0]))
+        toward = _unit(moving[-1]) if moving else np.array([0.0, 0.0, 1.0])
+        side = _unit(np.cross(toward, heading) if abs(toward @ heading) < 0.9 else np.cross(toward, [0.0, 0.0, 1.0]))
         angle = np.radians(float(self._random.uniform(60.0, 80.0)))
-        normal = np.cos(angle) * way + np.sin(angle) * side
+        normal = np.cos(angle) * toward + np.sin(angle) * side
         return normal if normal[2] > 0.0 else -normal
 
-    def _terrain(self, place: Array) -> dict[str, Any]:
+    def _terrain(self, spot: Array) -> dict[str, Any]:
         """A hill, which its spline meets but for rounding; its top is below the elbow."""
         x = SPACING * (np.arange(GRID) - 0.5 * (GRID - 1))
         bends = self._random.uniform(0.05, 0.3, size=2)
         np.save(self._folder / "terrain.npy", -np.add.outer(bends[0] * x**2, bends[1] * x**2))
         corner = -0.5 * SPACING * (GRID - 1)
-        origin = (place + [corner, corner, 0.0]).tolist()
+        origin = (spot + np.array([corner, corner, 0.0])).tolist()
         return {"type": "height_field", "file": "terrain.npy", "spacing_m": [SPACING] * 2, "origin_m": origin}
 
     def _more(self, radius: float) -> None:
@@ -285,32 +285,35 @@ class _Touching:
         body, point = robot.elbow
         if level == "two":
             end = self._model.point_position(*robot.hand, self._q)
-            way = _unit(end - self._model.point_position(robot.hand[0], self._behind(robot.hand), self._q))
-            self._ball("hand", robot.hand, radius, end, -way)
+            toward = _unit(end - self._model.point_position(robot.hand[0], self._behind(robot.hand), self._q))
+            self._ball("hand", robot.hand, radius, end, -toward)
         elif level == "same_link":
-            place = (body, [0.0, 0.0, point[2] + 0.05])
-            there = self._model.point_position(*place, self._q)
+            spot = (body, [0.0, 0.0, point[2] + 0.05])
+            there = self._model.point_position(*spot, self._q)
             along = _unit(there - self.elbow)
             normal = _unit(self.normal - (self.normal @ along) * along)
-            self._ball("shin", place, radius, there, normal)
+            self._ball("shin", spot, radius, there, normal)
         elif level == "unmoved":
-            first = next(joint for joint in robot.joints if not joint.name.startswith("base."))
-            place = (first.body, [0.0, 0.0, 0.0])
-            there = self._model.point_position(*place, self._q)
-            way = self._model.point_position(*robot.hand, self._q) - there
-            way[2] = 0.0
+            # The last joint that has its centre on the axis of the first: that moves it by rounding.
+            bodies = [joint.body for joint in robot.joints if not joint.name.startswith("base.")]
+            centres = [self._model.point_position(body, np.zeros(3), self._q) for body in bodies]
+            last = max(k for k, centre in enumerate(centres) if np.linalg.norm(centre - centres[0]) < 1e-9)
+            spot = (bodies[last], [0.0, 0.0, 0.0])
+            there = self._model.point_position(*spot, self._q)
+            toward = self._model.point_position(*robot.hand, self._q) - there
+            toward[2] = 0.0
             # Behind the arm.
-            way = _unit(way) if np.linalg.norm(way) > 1e-3 else np.array([1.0, 0.0, 0.0])
-            self._ball("root", place, radius, there, _unit(way + self._random.uniform(-0.3, 0.3, size=3)))
+            toward = _unit(toward) if np.linalg.norm(toward) > 1e-3 else np.array([1.0, 0.0, 0.0])
+            self._ball("root", spot, radius, there, _unit(toward + self._random.uniform(-0.3, 0.3, size=3)))
 
-    def _behind(self, place: tuple[str, list[float]]) -> list[float]:
-        return [place[1][0], place[1][1], place[1][2] - 0.05]
+    def _behind(self, spot: tuple[str, list[float]]) -> list[float]:
+        return [spot[1][0], spot[1][1], spot[1][2] - 0.05]
 
-    def _ball(self, name: str, place: tuple[str, list[float]], radius: float, there: Array, normal: Array) -> None:
+    def _ball(self, name: str, spot: tuple[str, list[float]], radius: float, there: Array, normal: Array) -> None:
         size = 0.03
         centre = (there - (radius + size + self.gap) * normal).tolist()
         self.surfaces[f"{name}_ball"] = {"type": "sphere", "center_m": centre, "radius_m": size}
-        self.points[name] = self._point(place, f"{name}_ball", radius)
+        self.points[name] = self._point(spot, f"{name}_ball", radius)
 
     def _feet(self) -> None:
         """The trunk of a floating robot stands on four feet."""
@@ -388,8 +391,8 @@ class _Touching:
             thing |= {
                 "size_m": [0.3, 0.15, 0.04],
                 "wheels": {
-                    name: {**wheel, "position_m": place}
-                    for name, place in {
+                    name: {**wheel, "position_m": spot}
+                    for name, spot in {
                         "left": [0.05, 0.1, -0.02], "right": [0.05, -0.1, -0.02], "rear": [-0.12, 0.0, -0.02],
                     }.items()
                 },
@@ -415,7 +418,7 @@ def _initial(levels: Levels, touching: _Touching, robot: plants.Plant) -> dict[s
     if start in ("given", "above"):
         return None
     initial: dict[str, Any] = {}
-    if start in ("on_surface", "on_references") and levels["plant"] != "mimic":
+    if start == "on_surface" or (start == "on_references" and levels["plant"] != "mimic"):
         initial["on_surface"] = touching.on_surface
     if start == "on_references":
         initial["on_references"] = True
@@ -489,22 +492,29 @@ def _snake(random: Generator, levels: Levels) -> dict[str, Any]:
         speed = [*random.uniform(-0.1, 0.1, size=3).tolist(), 0.0, 0.0, float(random.uniform(-0.2, 0.2))]
         controller["commands"] = [{"at_s": 0.05, "velocity": speed}]
     else:
-        controller["state"] = {"sampled": "feedforward", "encoders": "estimated", "delayed": "measured"}[level]
+        # The others, which a snake's controller is not, are refused.
+        states = {"sampled": "feedforward", "encoders": "estimated", "delayed": "measured"}
+        controller["state"] = states.get(level, "measured")
         step = [*random.uniform(-0.03, 0.03, size=3).tolist(), 0.0, 0.0, 0.0]
         controller["paths"] = [{"type": "ramp", "start_s": 0.0, "duration_s": duration, "displacement": step}]
     if random.random() < 0.5:
         # Lifted pairs, the first among them here and there.
         controller |= {"modes": {1: [1, 4] if random.random() < 0.5 else [3, 6]}, "switching": {"order": [1]}}
-    settings["controller"] = controller
+    settings["controller"] = controller if level in ("operator", *SAMPLED) else {"type": "joint_pd"}
     own = {"none": 0.0, "high": 1.5}.get(levels["friction"], 0.6)
     settings["contacts"] = {"friction": own}
-    if levels["give"] == "rigid":
-        settings["contacts"] |= {"stiffness_N_per_m": None}
+    if levels["give"] != "compliant":
+        settings["contacts"]["stiffness_N_per_m"] = None
+    if levels["give"] == "restitution":
+        settings["contacts"]["restitution"] = 0.3
+    if levels["contact"] in GLUED:
+        settings["contacts"]["law"] = "bilateral"
     if levels["friction"] in ("static", "stribeck"):
         settings["contacts"]["static_friction"] = 1.3 * own
     if levels["objects"] in ("box", "sphere", "cart", "hinge"):
         shape = {"shape": "sphere", "radius_m": 0.05} if levels["objects"] == "sphere" else {"size_m": [0.1, 0.1, 0.1]}
-        height = 0.05 if levels["objects"] != "hinge" else 0.4
+        # At rest on the ground, or above it.
+        height = float(random.choice((0.05, 0.25))) if levels["objects"] != "hinge" else 0.4
         thing = {"mass_kg": 0.5, **shape, "position_m": [2.0, 0.5, height]}
         if levels["objects"] == "hinge":
             thing["hinge"] = {"axis": [0.0, 0.0, 1.0]}

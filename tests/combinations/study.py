@@ -75,7 +75,7 @@ def look_at(
     folder: Path,
     *,
     thorough: bool | None = None,
-    takes: Callable[[Scene, str, str], bool] = lambda drawn, method, way: True,
+    takes: Callable[[Scene, str, str], bool] = lambda drawn, method, manner: True,
 ) -> Outcome:
     """Run a scene by all its methods, or by those that ``takes`` lets through, and look at everything.
 
@@ -231,6 +231,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--count", type=int, default=100, help="scenes")
     parser.add_argument("--first", type=int, default=0, help="number of the first")
+    parser.add_argument("--numbers", type=int, nargs="*", help="these scenes instead")
     parser.add_argument("--cover", choices=("none", "pairs", "triples"), default="none", help="instead of fresh scenes")
     parser.add_argument("--jobs", type=int, default=2, help="processes")
     parser.add_argument("--journal", type=Path, help="file with a line for each scene; those that have one are not run")
@@ -245,10 +246,12 @@ def main() -> int:
     options = _options()
     if options.repeat is not None:
         return _repeat(options)
-    wanted = range(options.first, options.first + options.count)
+    wanted: Sequence[int] = range(options.first, options.first + options.count)
     if options.cover != "none":
         whole = len({"pairs": pairs, "triples": triples}[options.cover](options.seed))
         wanted = range(options.first, min(options.first + options.count, whole))
+    if options.numbers is not None:
+        wanted = options.numbers
     earlier = [outcome for outcome in _noted(options.journal, options.seed) if outcome.number in wanted]
     left = sorted(set(wanted) - {outcome.number for outcome in earlier})
 

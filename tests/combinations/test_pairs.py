@@ -11,6 +11,7 @@ import pytest
 from combinations import covering, study
 from combinations.covering import LEVELS, NUMBER, allowed, draw, pairs, refused_share
 from combinations.factors import FACTORS, METHOD, REFUSALS, Refusal, matches, methods
+from combinations.known import KNOWN, KNOWN_SEED
 from combinations.running import M_STAR
 from combinations.scenes import Scene, scene
 from dynsim.engine.prepare import prepare
@@ -58,7 +59,7 @@ def test_scenes_are_the_same_for_ever(tmp_path: Path) -> None:
     assert texts[0] == texts[1]
 
 
-@pytest.mark.parametrize("refusal", [r for r in REFUSALS if r.error], ids=str)
+@pytest.mark.parametrize("refusal", [r for r in REFUSALS if r.error], ids=lambda r: r.name)
 def test_what_is_refused_is_said(refusal: Refusal, tmp_path: Path) -> None:
     """The scene of an assignment that meets this refusal alone; dynsim says what the table says."""
     for k in range(TRIES):
@@ -93,6 +94,11 @@ def test_few_scenes(number: int, tmp_path: Path) -> None:
     _holds(number, tmp_path, takes=_shares_a_program)
 
 
+@pytest.mark.parametrize(("name", "number"), [(name, number) for name in KNOWN for number in KNOWN[name].numbers])
+def test_scenes_that_were_wrong_once(name: str, number: int, tmp_path: Path) -> None:
+    _all_holds(KNOWN[name].assignment, KNOWN_SEED, number, tmp_path, thorough=False, takes=_shares_a_program)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("number", range(len(pairs(SEED))))
 def test_every_pair(number: int, tmp_path: Path) -> None:
@@ -106,22 +112,24 @@ def test_triples(number: int, tmp_path: Path) -> None:
 
 
 def _holds(number: int, folder: Path, cover: str = "pairs", **options: Any) -> None:
-    levels = study.assignment(cover, SEED, number)
-    outcome = study.look_at(levels, SEED, number, folder, **options)
+    _all_holds(study.assignment(cover, SEED, number), SEED, number, folder, **options)
+
+
+def _all_holds(levels: dict[str, str], seed: int, number: int, folder: Path, **options: Any) -> None:
+    outcome = study.look_at(levels, seed, number, folder, **options)
     assert not outcome.problems, "\n".join(
         [
             *(f"{kind}: {text}" for kind, text in outcome.problems),
-            f"again: PYTHONPATH=.:tests python -m combinations --cover {cover} --seed {SEED} --repeat {number}",
-            scene(levels, SEED + number, folder).text(),
+            scene(levels, seed + number, folder).text(),
         ]
     )
 
 
-def _shares_a_program(drawn: Scene, method: str, way: str) -> bool:
+def _shares_a_program(drawn: Scene, method: str, manner: str) -> bool:
     """Whether the default tests have its program: those of docs/dev/tests.md."""
     if method == "time_stepping":
         return True
-    if method == "auto" or way == M_STAR:
+    if method == "auto" or manner == M_STAR:
         return False
     try:
         shapes = prepare(drawn.load(method)).system.shapes is not None

@@ -62,6 +62,31 @@ def test_resolved_scenario_reads_back_as_itself(tmp_path: Path):
     assert scenario_from_resolved(scenario.resolved).resolved == scenario.resolved
 
 
+DYNAMIC_SNAKE = """
+duration_s: 0.05
+plant: {type: snake, level: dynamic}
+controller: {type: task_space, state: measured}
+contacts: {stiffness_N_per_m: null, restitution: 0.3}
+sensors: {motion_capture: {rate_hz: null}}
+integrator: {step_s: null}
+"""
+
+
+def test_nulls_in_whose_place_defaults_would_come_are_resolved(tmp_path: Path):
+    """Of a plant (tyres, the length of steps) and of a key (the rate of a sensor)."""
+    scenario = load_scenario(write(tmp_path, DYNAMIC_SNAKE))
+    resolved = scenario.resolved
+    for again in (scenario_from_resolved(resolved), load_scenario(write(tmp_path, to_yaml(resolved)))):
+        assert again.resolved == resolved
+        assert again.config.contacts == scenario.config.contacts
+        assert again.config.contacts.stiffness_N_per_m is again.integrator.step_s is None
+        assert again.config.sensors.motion_capture.rate_hz is None
+    # No others.
+    text = to_yaml(resolved)
+    assert text.count(": null") == 3
+    assert ": null" not in to_yaml(load_scenario("elbow_comparison").resolved)
+
+
 def test_a_scenario_of_another_version_is_refused_in_one_line():
     resolved = load_scenario("elbow_comparison").resolved
     resolved["integrator"]["newer"] = 1

@@ -65,7 +65,7 @@ def test_dry_friction_of_the_file_holds_at_rest(scenario: Path):
     """Gravity pulls the car of 1 kg and the arm along the rail with 19.62 N."""
     text = SLIDE.replace("<limit lower", '<dynamics friction="30"/><limit lower')
     (scenario.parent / "slide.urdf").write_text(text)
-    with pytest.raises(ModelError, match=r"dry friction of slide: it needs contacts.law: unilateral"):
+    with pytest.raises(ModelError, match=r"dry friction of joints \(slide\) requires contacts.law: unilateral"):
         run(scenario, {})
     real = {"contacts.law": "unilateral", "duration_s": 0.4}  # its stop is at 1 m
     assert np.abs(run(scenario, real)["q"][:, 0]).max() < 1e-12

@@ -258,7 +258,7 @@ def test_scenarios_say_what_gives_way(tmp_path: Path):
     assert record.summary["damper_loss_J"] == pytest.approx(record["loss_damper"][-1])
     assert record.summary["energy_residual_relative"] < 1e-9
     for key, value, words in (
-        ("integrator.method", "radau5", "contacts of radau5 are rigid"),
+        ("integrator.method", "radau5", "contacts of the event-driven methods are rigid"),
         ("contacts.points.foot.restitution", 0.5, "what gives way has no restitution"),
         ("contacts.points.foot.stiffness_N_per_m", None, "is that of what gives way"),
     ):

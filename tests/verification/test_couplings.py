@@ -163,3 +163,10 @@ def test_a_chain_of_couplings_holds_in_a_run():
         assert np.abs(q[:, 1] - 1.3 * q[:, 0] + 0.1).max() <= 1e-9
         assert np.abs(q[:, 3] + 0.7 * q[:, 1] - 0.2).max() <= 1e-9
         assert np.abs(run.states("ledger")[:, CONSTRAINT]).max() < 1e-8
+
+
+def test_a_follower_starts_where_the_first_reference_of_its_leader_has_it(gripper: Path):
+    path = {"times_s": [0, 1], "positions_m": [0.02, 0.04]}
+    changes = {"initial": {"on_references": True}, "controller.joints": {"left_finger": path}}
+    robot = build_model(load_scenario(gripper, overrides=changes)).robot
+    np.testing.assert_allclose(robot.initial, [np.radians(70), 0.02, 1.5 * 0.02 + 0.01], rtol=0, atol=1e-15)

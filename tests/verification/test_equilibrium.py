@@ -257,3 +257,45 @@ def test_start_that_slips_on_the_edge_of_its_cone_is_reported():
     # All of the friction is needed here too, but rounding does not decide.
     holds = still(load_scenario("block_on_slope", "slides", {**start, "contacts.static_friction": 0.42}))
     assert not [warning for warning in holds.summary["warnings"] if "initial.equilibrium" in warning]
+
+
+COMPLIANT = """
+duration_s: 0.1
+plant:
+  type: serial_arm
+  link: {mass_kg: 0.4, length_m: 0.3}
+  base: {position_m: [0, 0, 0.15]}
+  chain:
+    - {axis: y, initial_deg: 120, motor: {type: wang_minami}}
+    - {axis: y, initial_deg: -30, motor: {type: wang_minami}}
+controller: {type: joint_pd, k_p_V_per_rad: 300, k_d_V_s_per_rad: 10}
+surfaces: {floor: {type: plane}}
+contacts:
+  law: unilateral
+  stiffness_N_per_m: 2.0e+4
+  friction: 0.4
+  points: {elbow: {body: link_2, surface: floor}}
+objects:
+  thing: {mass_kg: 0.5, size_m: [0.2, 0.1, 0.1], position_m: [2, 0, 0.05]}
+initial: {equilibrium: true}
+integrator: {method: time_stepping}
+"""
+
+
+def test_compliant_contacts_start_pressed_in(tmp_path):
+    """An arm on a compliant brace, and a box that four springs carry, of which rigid bodies do not determine the share.
+
+    The force of each is its stiffness times its depth, the weight of the box that of all four, and nothing accelerates.
+    """
+    path = tmp_path / "compliant.yaml"
+    path.write_text(COMPLIANT)
+    record = simulate(load_scenario(path))
+    assert np.abs(record["vdot"]).max() < STILL
+    gap, force = record["contact_gap"][0], record["contact_normal_force"][0]
+    np.testing.assert_allclose(force, 2e4 * np.maximum(-gap, 0.0), rtol=0, atol=1e-6)
+    names = record.labels["contact_gap"]
+    corners = [k for k, name in enumerate(names) if name.startswith("thing") and force[k] > 0.0]
+    assert len(corners) == 4
+    np.testing.assert_allclose(force[corners], 0.5 * 9.81 / 4.0, rtol=1e-6)
+    assert force[names.index("elbow")] > 0.1
+    np.testing.assert_allclose(record["q"][-1], record["q"][0], rtol=0, atol=1e-9)

@@ -208,5 +208,48 @@ def test_elbow_and_resting_joints_move_as_by_time_stepping(tmp_path: Path, surfa
         text = elbow_on(surface, friction, dry)
         runs = [run(tmp_path, text, integrator__method=method) for method in ("dopri5", STEPS)]
         events, steps = (record.summary["electrical_energy_J"] for record in runs)
-        # Time stepping is of first order while joints rub; its steps are 1 ms.
-        assert steps == pytest.approx(events, rel=1e-4)
+        # Time stepping is of first order while joints rub; with steps of 1 ms at most 1.4e-4 here. In one scene the
+        # sliding elbow shares its force with joints at rest, so that its friction is a choice, and so is the motion:
+        # by time stepping 0.3 % less, for steps of 0.1 ms too, and the warning says so.
+        shares = (surface, friction, dry) == ("bowl", 0.05, 0.3)
+        assert steps == pytest.approx(events, rel=4e-3 if shares else 2e-4)
+        assert not shares or "while elbow slides, other choices may move otherwise" in runs[0].summary["warnings"][0]
+
+
+# A push grows slowly at an elbow that creeps over a box, while joints rest, slip and rest again.
+CREEP = """
+name: creeping_elbow
+duration_s: 0.95
+plant:
+  type: serial_arm
+  link:
+    radius_m: 0.0285
+    friction_N_m: 0.2034
+    motor: {type: dc, torque_constant_N_m_per_A: 0.04687, resistance_ohm: 1.474, inductance_H: 8.446e-05,
+      rotor_inertia_kg_m2: 4.41e-05, gear_ratio: 100, gear_damping_N_m_s_per_rad: 8.747e-06, voltage_limit_V: 24,
+      peak_current_A: 7.15, coulomb_friction_N_m: 0.06832}
+  chain:
+    - {axis: z, length_m: 0, mass_kg: 0.5815, initial_deg: -1.679}
+    - {axis: y, length_m: 0.3113, mass_kg: 0.1484, initial_deg: 105.76}
+    - {axis: z, length_m: 0.2207, mass_kg: 0.2854, initial_deg: 3.642}
+    - {axis: y, length_m: 0.2798, mass_kg: 0.4424, initial_deg: 8.855}
+    - {axis: y, length_m: 0.1711, mass_kg: 0.58, initial_deg: -68.58}
+controller: {type: joint_pd, k_p_V_per_rad: 748.5, k_d_V_s_per_rad: 38.77}
+surfaces:
+  s: {type: box, center_m: [0.7662, -0.01972, -0.3934], edges_m: [0.389, 0.4654, 0.2649], rpy_deg: [0, 0, -39.31]}
+contacts: {law: unilateral, friction: 0.1848, points: {elbow: {body: link_5, surface: s}}}
+initial: {on_surface: [elbow]}
+loads:
+  tool: {type: payload, body: link_5, point_m: [0, 0, 0.1711], mass_kg: 0.3637, radius_m: 0.03}
+  push: {type: samples, body: link_5, times_s: [0.5748, 1.1495, 1.7243],
+    force_N: [[0, 0, 0], [6.634, -1.45, 0.763], [0, 0, 0]]}
+record: {rate_hz: 100}
+"""
+
+
+@pytest.mark.long
+def test_elbow_that_creeps_beside_resting_joints_keeps_its_forces(tmp_path: Path):
+    """Such a run stopped at 0.9003 s, where no forces seemed to agree with Coulomb's law."""
+    events, steps = (run(tmp_path, CREEP, integrator__method=method) for method in ("dopri5", STEPS))
+    assert events.time[-1] == pytest.approx(0.95)
+    assert steps.summary["electrical_energy_J"] == pytest.approx(events.summary["electrical_energy_J"], rel=1e-2)

@@ -27,17 +27,25 @@ YAW = "{axis: z, length_m: 0.05, mass_kg: 1}, "
 
 
 def shared(
-    folder: Path, modes: list[int], *, yaw: bool = False, count: int = 6, rests: list[int] | None = None
+    folder: Path,
+    modes: list[int],
+    *,
+    yaw: bool = False,
+    count: int = 6,
+    rests: list[int] | None = None,
+    stiffness: float = 0.0,
 ) -> list[str]:
     """Names of those that share at a generic posture; ``rests``: joints that dry friction keeps at rest."""
     last = count + yaw
     path, text = folder / "case.yaml", ARM.replace("YAW", YAW if yaw else "").replace("COUNT", str(count))
     path.write_text(text.replace("FIRST", str(last - 2)).replace("LAST", str(last)))
-    scenario = dynsim.load_scenario(path)
+    changes = {"integrator.method": "time_stepping", "contacts.stiffness_N_per_m": stiffness} if stiffness else {}
+    scenario = dynsim.load_scenario(path, overrides=changes)
     model = dynsim.build_model(scenario)
     q = np.random.default_rng(3).uniform(-0.5, 0.5, (1, model.n))
     resting = np.isin(np.arange(model.n), rests or [])[None]
-    return sharing(model, build.contacts(scenario, model.robot), q, np.array([modes], dtype=float), resting)
+    names = sharing(model, build.contacts(scenario, model.robot), q, np.array([modes], dtype=float), resting)
+    return [*names.contacts, *names.joints]
 
 
 @pytest.mark.parametrize("modes", [[STICKING, OPEN, OPEN], [SLIDING, OPEN, OPEN], [OPEN, OPEN, OPEN]])
@@ -69,3 +77,21 @@ def test_a_sliding_point_shares_with_joints_at_rest_that_it_holds(tmp_path: Path
     assert shared(tmp_path, [SLIDING, OPEN, OPEN], count=5, rests=[0, 1]) == ["a", "joint_1", "joint_2"]
     assert shared(tmp_path, [SLIDING, OPEN, OPEN], count=5, rests=[0]) == []
     assert shared(tmp_path, [OPEN, OPEN, OPEN], count=4, rests=[0, 1, 2, 3]) == []
+
+
+def test_joints_that_have_the_names_of_contacts_are_no_contacts(tmp_path: Path) -> None:
+    """A snake's wheels: the joint of each has the name of its contact."""
+    path, text = tmp_path / "case.yaml", ARM.replace("YAW", "").replace("COUNT", "4")
+    path.write_text(text.replace("FIRST", "2").replace("LAST", "4").replace("{a: ", "{joint_2: "))
+    scenario = dynsim.load_scenario(path)
+    model = dynsim.build_model(scenario)
+    q, rests = np.full((1, model.n), 0.3), np.array([[True, False, False, False]])
+    names = sharing(model, build.contacts(scenario, model.robot), q, np.array([[SLIDING, OPEN, OPEN]]), rests)
+    assert (names.contacts, names.joints) == (["joint_2"], ["joint_1"])
+
+
+def test_a_compliant_contact_shares_only_friction(tmp_path: Path) -> None:
+    """Its depth determines its normal force, so that no joint at rest can take that over."""
+    assert shared(tmp_path, [SLIDING, OPEN, OPEN], count=4, rests=[0], stiffness=1e4) == []
+    assert shared(tmp_path, [OPEN, STICKING, STICKING], stiffness=1e4) == []
+    assert shared(tmp_path, [STICKING, STICKING, OPEN], yaw=True, stiffness=1e4) == ["a", "b"]

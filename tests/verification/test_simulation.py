@@ -583,3 +583,36 @@ def test_a_brake_that_closes_throws_a_point_off_the_floor_and_not_into_it(tmp_pa
             break
     assert abs(before.v[4]) > 1e-3
     np.testing.assert_allclose(after.v, velocity, rtol=0, atol=1e-5)
+
+
+# By 13 knot distances the references of a run of this duration end a rounding before it.
+ROUNDED = """
+duration_s: 0.23151866400857443
+plant:
+  type: serial_arm
+  link: {length_m: 0.3, mass_kg: 0.5, motor: {type: wang_minami}}
+  chain: [{count: 2}]
+controller: {type: joint_pd, joints: {joint_1: {times_s: [0, 0.05], angles_deg: [0, 4]}}}
+record: {rate_hz: 500}
+integrator: {method: dopri5}
+metrics: {settle_s: 0}
+"""
+
+
+@pytest.mark.parametrize("method", ["dopri5", "radau5"])
+def test_references_that_end_a_rounding_before_the_run_do_not_cut_its_last_step(tmp_path, method):
+    path = tmp_path / "rounded.yaml"
+    path.write_text(ROUNDED)
+    scenario = dynsim.load_scenario(path, overrides={"integrator.method": method})
+    simulation = dynsim.Simulation(scenario)
+    assert simulation._prepared.control.end < scenario.duration_s
+    simulation.advance(0.1)
+    before = simulation.snapshot()
+    simulation.advance(0.2)
+    simulation.restore(before)
+    simulation.advance(scenario.duration_s)
+    whole, pieces = dynsim.simulate(scenario), simulation.record()
+    assert whole.time[-1] == scenario.duration_s
+    for name in whole:
+        assert whole[name].tobytes() == pieces[name].tobytes(), name
+    assert whole.summary["steps"] == pieces.summary["steps"]

@@ -1,5 +1,6 @@
 """The dynamic snake: its tree against the kinematics, rolling, loads, lifts, sensors, sessions, step convergence."""
 
+import json
 import math
 
 import numpy as np
@@ -12,7 +13,7 @@ from dynsim.engine import simulate
 from dynsim.engine.simulation import Simulation
 from dynsim.engine.snake_pilot import base_pose, roll_pitch_yaw
 from dynsim.engine.snake_start import WheelLifter
-from dynsim.errors import ModelError, SimulationStopped
+from dynsim.errors import DynsimError, ModelError, SimulationStopped
 from dynsim.scenario import build, load_scenario, scenario_from_resolved
 from dynsim.snake.kinematics import pose_of_point
 from dynsim.teleop.begin import begin
@@ -331,3 +332,11 @@ def test_with_friction_the_split_of_rigid_wheels_is_what_steps_and_events_differ
     # 0.55 N on one processor, less than 0.5 on another: the head goes with the split.
     assert np.abs(loads[0].sum(axis=2) - loads[1].sum(axis=2)).max() < 1.0
     assert np.abs(loads[0] - loads[1]).max() > 2.0
+
+
+def test_a_controller_of_arms_cannot_drive_it(tmp_path):
+    """The error is about the controller, not about a key that the plant's defaults would give it."""
+    plant, path = {"type": "snake", "level": "dynamic"}, tmp_path / "snake.yaml"
+    path.write_text(json.dumps({"duration_s": 1, "plant": plant, "controller": {"type": "joint_pd"}}))
+    with pytest.raises(DynsimError, match="controller 'joint_pd' cannot drive a 'snake'"):
+        simulate(load_scenario(path))

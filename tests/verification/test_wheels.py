@@ -175,7 +175,7 @@ ties:
 @pytest.mark.parametrize(
     ("changes", "line", "says"),
     [
-        ({"METHOD": "radau5"}, 11, r"ties.spring.*needs integrator.method: time_stepping; radau5 has no ties"),
+        ({"METHOD": "radau5"}, 11, r"ties.spring.*requires integrator.method: time_stepping \(here: radau5\)"),
         ({"WHEELS": "wheels: {a: {position_m: [0, 0, 0], radius_m: 1, mass_kg: 1}}"}, 9, "wheels.*are of free objects"),
         ({"STIFF": "bound_N: 3"}, 11, "stiffness_N_per_m: is needed, or damping_N_s_per_m"),
         ({"OTHER": "link_1"}, 12, "other.*a tie has two ends"),

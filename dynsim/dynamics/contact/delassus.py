@@ -30,14 +30,18 @@ def solve_small(small, state, active, p):
         Matrix, not symmetric under friction, and scratch.
     state, active : (p or more, ROW_STATE_SIZE), (p or more, ACTIVE_SIZE) int
     """
-    if p == 1 and small[0, 0, 0] != 0.0:
+    if p == 1 and abs(small[0, 0, 0]) > state[0, ka.ROW_FLOOR]:
         state[0, ka.FORCE] = state[0, ka.RHS] / small[0, 0, 0]
+        return 0
+    if p == 1 and abs(small[0, 0, 0]) <= state[0, ka.ROW_FLOOR]:
+        state[0, ka.FORCE] = 0.0
         return 0
     if p == 2:
         a, b, c, d = small[0, 0, 0], small[0, 0, 1], small[0, 1, 0], small[0, 1, 1]
         determinant = a * d - b * c
         # Well conditioned: Cramer's rule loses no more than the elimination.
-        if abs(determinant) > 1e-3 * (abs(a * d) + abs(b * c)):
+        floors = state[0, ka.ROW_FLOOR] * state[1, ka.ROW_FLOOR]
+        if abs(determinant) > 1e-3 * (abs(a * d) + abs(b * c)) + floors:
             x, y = state[0, ka.RHS] / determinant, state[1, ka.RHS] / determinant
             state[0, ka.FORCE], state[1, ka.FORCE] = d * x - b * y, a * y - c * x
             return 0
@@ -50,6 +54,8 @@ def eliminate(small, state, active, p):
     largest = 0.0
     for i in range(p):
         state[i, ka.FORCE] = state[i, ka.RHS]
+        # A row without mobility is dependent even if no other row has more.
+        largest = max(largest, state[i, ka.ROW_FLOOR] / RANK_TOLERANCE)
         for j in range(p):
             small[1, i, j] = small[0, i, j]
             largest = max(largest, abs(small[0, i, j]))

@@ -62,7 +62,7 @@ def set_modes(
         if modes[k] == ka.SLIDING:
             new_row(ws, p, ka.SLIDING_ROW, k, i)
             active[p, ka.LAW] = contacts.link[k, ka.FRICTION_LAW]
-            rows[p, ka.ROW_MU] = contacts.law[k, ka.MU]
+            rows[p, ka.ROW_MU], rows[p, ka.ROW_FLOOR] = contacts.law[k, ka.MU], contacts.law[k, ka.FLOOR]
             p += 1
         elif modes[k] == ka.STICKING:
             sticking += 1

@@ -93,7 +93,8 @@ TIE_SIZE = 29
 # UnilateralArrays.mode, int: columns
 WANTED, BEFORE, TOUCHING, STRUCK = 0, 1, 2, 3
 GIVES_WAY = 4  # 1: it has come to its static cone, and the kinetic coefficient holds from now on
-MODE_SIZE = 5
+LEAVES = 5  # 1: nothing presses it, and the next choice of modes is without it
+MODE_SIZE = 6
 # UnilateralArrays.vector: three of the splits of forces, then those of the problem that chooses modes
 OFFSET, SOLUTION, CONE_FRICTION, FIRST_PART, SECOND_PART = 3, 4, 5, 6, 7
 VECTORS = 8

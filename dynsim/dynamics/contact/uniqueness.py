@@ -158,7 +158,7 @@ def drop_immobile(ws: Workspace, room):
         along = 0.0
         for i in range(last_link(ws, k) + 1):
             along += ws.column[i, 2 + 2 * k] * ws.column[i, 2 + 2 * k] * ws.links[i, ka.INVERSE_D]
-        if room[FRICTIONLESS, k, k] <= IMMOBILE * along:
+        if room[FRICTIONLESS, k, k] <= max(IMMOBILE * along, ws.rows[k, ka.ROW_FLOOR]):
             for m in range(p):
                 room[FRICTIONLESS, k, m], room[FRICTIONLESS, m, k], room[FRICTION, k, m] = 0.0, 0.0, 0.0
 

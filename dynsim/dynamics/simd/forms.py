@@ -62,13 +62,14 @@ def surface_distance_lanes(value, slope, curvature):
 @form_of(solve_small, any_lanes)
 def solve_small_lanes(small, state, active, p):
     """The closed forms where they hold for all lanes; else the kernel's choice for each of them, added up."""
-    if p == 1 and every(small[0, 0, 0] != 0.0):
+    if p == 1 and every(abs(small[0, 0, 0]) > state[0, ka.ROW_FLOOR]):
         state[0, ka.FORCE] = state[0, ka.RHS] / small[0, 0, 0]
         return 0
     if p == 2:
         a, b, c, d = small[0, 0, 0], small[0, 0, 1], small[0, 1, 0], small[0, 1, 1]
         determinant = a * d - b * c
-        if every(abs(determinant) > 1e-3 * (abs(a * d) + abs(b * c))):
+        floors = state[0, ka.ROW_FLOOR] * state[1, ka.ROW_FLOOR]
+        if every(abs(determinant) > 1e-3 * (abs(a * d) + abs(b * c)) + floors):
             x, y = state[0, ka.RHS] / determinant, state[1, ka.RHS] / determinant
             state[0, ka.FORCE], state[1, ka.FORCE] = d * x - b * y, a * y - c * x
             return 0

@@ -205,8 +205,9 @@ def _slopes(function: Callable[[Array], Array], q: Array, step: float = 1e-6) ->
 
 def _bare(scenario: Scenario) -> Scenario:
     """The plant of a scenario, its payloads and what it can touch: no controller, no forces over time, no glue."""
+    from dynsim.scenario.combinations import BILATERAL_KEYS
     from dynsim.scenario.loads import Payload
-    from dynsim.scenario.schema import BILATERAL_KEYS, Contacts
+    from dynsim.scenario.schema import Contacts
 
     config = scenario.config
     payloads = {name: load for name, load in config.loads.items() if isinstance(load, Payload)}

@@ -491,11 +491,14 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
             by_hand = break_loose(unilateral, ws, k) and by_hand
         elif ws.active[k, ka.MODE] == ka.OPEN:
             by_hand = False
+        elif kind == NORMAL_GUARD and mode[k, ku.WANTED] == ka.STICKING and unilateral.number[ku.SPLIT] == 1.0:
+            # The others may start to slip as it leaves.
+            mode[k, ku.LEAVES], by_hand = 1, False
         elif kind == NORMAL_GUARD:
             mode[k, ku.WANTED] = ka.OPEN
             tell(system, run, k, LIFT_OFF)
         elif mode[k, ku.WANTED] == ka.STICKING:
-            if not at_limit(system.contacts, unilateral, ws, k):
+            if mode[k, ku.LEAVES] == 1 or not at_limit(system.contacts, unilateral, ws, k):
                 continue
             r = ws.active[k, ka.FIRST_ROW]
             if ws.rows[r, ka.FORCE] <= NO_FORCE * strongest:

@@ -12,6 +12,7 @@ from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.cone import problem as kc
 from dynsim.dynamics.contact.cone.problem import approach_or_draw_near, solve_cones
+from dynsim.dynamics.contact.mobility import moves_along_normal
 from dynsim.dynamics.contact.rows import row_errors, set_modes
 from dynsim.dynamics.contact.unilateral import UnilateralArrays, dry_rows_held, stop_gap
 from dynsim.dynamics.derivative import System, derivative
@@ -31,6 +32,8 @@ MOST_BOUNCES = 30.0
 BOUNCE_STARTS = 40
 # What begins to touch is brought this close to its surface [m].
 FOOT_TOLERANCE = 1e-13
+# Projections that leave more than this part of a gap converge linearly: the point leads to a singular posture.
+SLOWLY = 0.1
 # Of a solution of the cones: residual by the largest entry, and what of the largest force is none.
 CONE_TOLERANCE, FORCE_TOLERANCE = 1e-9, 1e-9
 # Where nothing is faster, or accelerated by more, residuals are not compared with it: behind closed brakes a point has
@@ -55,14 +58,24 @@ def evaluate(system: System, ws: Workspace, run: Run):
 
 
 @internal_kernel
-def find_touching(unilateral: UnilateralArrays, ws: Workspace, touch):
-    """Note what touches and does not leave; True when some of it approaches."""
+def find_touching(system: System, ws: Workspace, touch):
+    """Note what touches and does not leave; True when some of it approaches.
+
+    A point that no joint moves along its normal in this posture does not touch: its force would be anything. Neither
+    does a point that a projection could bring onto its surface only by another posture. Should the posture change it
+    lands as soon as it is deeper than it is now.
+    """
+    unilateral = system.unilateral
     state, mode, table, stop = ws.contacts, unilateral.mode, unilateral.stop_table, unilateral.stop
     strikes = False
     for k in range(mode.shape[0]):
         limit = STRIKE * kp.RATE_TOLERANCE * (1.0 + slip_speed(ws, k))
         closed = ws.active[k, ka.MODE] != ka.OPEN
         near = closed or (state[k, ka.GAP] <= touch and state[k, ka.GAP_RATE] <= limit)
+        near = near and mode[k, ku.LEAVES] == 0
+        if near and not moves_along_normal(system.model, system.contacts, ws, k, state[k, ka.GAP]):
+            near = closed = False
+            unilateral.slide[k, ku.LANDS_AT] = ku.DEPTH + max(0.0, -state[k, ka.GAP])
         mode[k, ku.TOUCHING] = 1 if near else 0
         if near and state[k, ka.GAP_RATE] < -limit:
             mode[k, ku.STRUCK] = 1
@@ -107,13 +120,16 @@ def come_down(system: System, ws: Workspace, run: Run):
             ka.OPEN if not stays else ka.STICKING if ws.active[k, ka.MODE] == ka.STICKING else ka.SLIDING
         )
     set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
+    before = math.inf
     for _ in range(kp.PROJECTION_LIMIT):
         evaluate(system, ws, run)
         worst = 0.0
         for r in range(ws.counts[ka.ROWS]):
             worst = max(worst, abs(ws.rows[r, ka.ROW_GAP]))
-        if worst <= FOOT_TOLERANCE:
+        # Where a point is nearly immobile along its normal, steps only halve the way to where it is quite immobile.
+        if worst <= FOOT_TOLERANCE or SLOWLY * before < worst <= kp.GAP_TOLERANCE:
             return
+        before = worst
         project_level(system, ws, run.y, 0)
 
 

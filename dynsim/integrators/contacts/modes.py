@@ -65,7 +65,7 @@ def resolve(system: System, ws: Workspace, run: Run, touch):
         mode[k, ku.BEFORE], mode[k, ku.STRUCK] = ws.active[k, ka.MODE], 0
     for k in range(table.shape[0]):
         table[k, ku.STOP_BEFORE] = table[k, ku.STOP_CLOSED]
-    if find_touching(unilateral, ws, touch):
+    if find_touching(system, ws, touch):
         impact(system, ws, run)
         if run.count[ki.STATUS] == ki.NO_CONTACT_FORCES:
             return
@@ -130,7 +130,7 @@ def choose(system: System, ws: Workspace, run: Run):
     for k in range(unilateral.dry_table.shape[0]):
         note_headway(unilateral, ws, k)
     for k in range(mode.shape[0]):
-        mode[k, ku.GIVES_WAY] = 0
+        mode[k, ku.GIVES_WAY], mode[k, ku.LEAVES] = 0, 0
         starts = mode[k, ku.WANTED] == ka.SLIDING and mode[k, ku.TOUCHING] == ka.STICKING
         unilateral.slide[k, ku.HEADWAY] = max(0.0, -unilateral.slide[k, ku.SPEED]) if starts else 0.0
 

@@ -26,6 +26,7 @@ from dynsim.dynamics.contact.cone import problem as kc
 from dynsim.dynamics.contact.cone.least_norm import select_least_norm
 from dynsim.dynamics.contact.cone.problem import approach, draw_near
 from dynsim.dynamics.contact.cone.steps import motion
+from dynsim.dynamics.contact.mobility import moves_along_normal
 from dynsim.dynamics.contact.rows import point_row, set_modes
 from dynsim.dynamics.contact.unilateral import UnilateralArrays, sliding_friction, stop_gap
 from dynsim.dynamics.tables import Workspace
@@ -128,6 +129,8 @@ def list_contacts(system, s: SteppingArrays, ws: Workspace, h):
         known = last[kt.LISTED] == 1.0 and goes_on(system, last, ws, k, h)
         s.turn[k, kt.KNOWN] = 1.0 if known else 0.0
         listed = ws.contacts[k, ka.GAP] <= kt.MARGIN or (known and last[kt.CLOSED] == 1.0)
+        # Its depth is no reason: it is taken back slowly.
+        listed = listed and moves_along_normal(system.model, system.contacts, ws, k, 0.0)
         mode = ka.STICKING if listed else ka.OPEN
         changed = changed or mode != s.modes[k]
         s.modes[k] = mode

@@ -117,8 +117,12 @@ class Config(StrictConfig):
     """
 
     type: Literal["joint_pd"]
-    k_p_V_per_rad: NonNegative | list[NonNegative] = Field(default=500.0, description="V/m at a prismatic joint")
-    k_d_V_s_per_rad: NonNegative | list[NonNegative] = Field(default=20.0, description="V s/m at a prismatic joint")
+    k_p_V_per_rad: NonNegative | list[NonNegative] | None = Field(
+        default=None, description="default: 500; V/m at a prismatic joint"
+    )
+    k_d_V_s_per_rad: NonNegative | list[NonNegative] | None = Field(
+        default=None, description="default: 20; V s/m at a prismatic joint"
+    )
     hand: HandReference | None = Field(default=None, description="a path for the hand")
     base: BaseReference | None = Field(default=None, description="a path for the mobile base; none: it holds")
     operator: OperatorConfig | None = Field(
@@ -251,6 +255,10 @@ def _planned(
     if config.brace is None:
         return planned_voltages(context.model, times, positions, {}, whole=config.feed_forward == "dynamics")
     forces = dict.fromkeys(context.declared) if config.brace == "optimal" else dict(config.brace)
+    for name in context.disabled:
+        if name in forces:
+            text = f"controller.brace: contact {name!r} is disabled and cannot press; enable it, or remove it here"
+            raise ModelError(text, keys=("controller",))
     braces = {name: (_contact(context, name, "brace"), force) for name, force in forces.items()}
     return planned_voltages(context.model, times, positions, braces, config.min_N)
 
@@ -369,14 +377,17 @@ def _base_coordinates(
     return np.hstack([angles, np.vstack([start[2:], ways[:, -1]])])
 
 
-_KEYS = {"k_p": "k_p_V_per_rad", "k_d": "k_d_V_s_per_rad"}
+# Keys of the gains, and their defaults. A default is not in the scenario: for servos the key would be an error.
+_GAINS = {"k_p": ("k_p_V_per_rad", 500.0), "k_d": ("k_d_V_s_per_rad", 20.0)}
 
 
 def _gains(config: Config, robot: Robot, name: str) -> NDArray[np.float64]:
-    """One gain of every motor: the controller's for DC motors, a servo's own, none of a torque source."""
-    key, motors = _KEYS[name], robot.motors
+    """One gain of every motor, (na,): the controller's for DC motors, a servo's own, 0 for a torque source."""
+    (key, default), motors = _GAINS[name], robot.motors
     gain, circuits = getattr(config, key), [isinstance(motor, Motor) for motor in motors]
-    if key in config.model_fields_set and motors and not any(circuits):
+    if gain is None:
+        gain = default
+    elif motors and not any(circuits):
         raise ModelError(f"controller: {key} has no effect: it is for DC motors, servos have gains of their own")
     if isinstance(gain, list) and len(gain) != sum(circuits):
         kind = "motors" if all(circuits) else "DC motors"

@@ -23,6 +23,8 @@ from dynsim.snake.description import SnakeDescription
 from dynsim.snake.lifting import Lifts
 
 ENGINE = "kinematic"
+# The controller whose keys `section_defaults` knows.
+TASK_SPACE = "task_space"
 
 # Compliant tyres (assumed): with rigid ones the loads of the left and right wheel of a pair are not determined.
 TYRES = {"stiffness_N_per_m": 1e5, "damping_N_s_per_m": 200.0}
@@ -116,7 +118,8 @@ def section_defaults(plant: Mapping[str, Any], sections: Mapping[str, Any]) -> d
         if not isinstance(contacts, Mapping) or contacts.get("stiffness_N_per_m", TYRES) is not None:
             defaults["contacts"] |= TYRES
     controller = sections.get("controller")
-    if isinstance(controller, Mapping):
+    # Another controller is refused as such, not for a key that the user did not write.
+    if isinstance(controller, Mapping) and controller.get("type") == TASK_SPACE:
         defaults["controller"] = {"state": "feedforward"}  # [T] IV.C.2
         sensor = {"measured": "motion_capture", "estimated": "encoders"}.get(str(controller.get("state")))
         if sensor is not None:

@@ -1,0 +1,107 @@
+"""Contact points that no joint moves along the normal of their surface: in any posture, or in one of them.
+
+The force on such a point changes no motion, so no equation determines it. A point that is immobile in every posture is
+left out of the contact problem; in a single posture it carries nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from dynsim.compile.model import Model
+from dynsim.dynamics.contact.delassus import RANK_TOLERANCE
+from dynsim.dynamics.contact.mobility import IMMOBILE
+from dynsim.errors import ModelError
+from dynsim.model.description import Array, Contact, Robot
+from dynsim.model.surfaces import Quadric
+
+# Configurations at which points are compared and rows examined: a property that holds at all of them is structural.
+CONFIGURATIONS = 6
+# Points closer than this at all configurations are the same [m]; rows smaller than this at all of them are zero.
+SAME = 1e-9
+# Positions along the axis of a capsule at which its row is examined, in parts of its length.
+SHARES = (0.0, 0.3, 0.7, 1.0)
+
+
+def random_configurations(robot: Robot) -> list[Array]:
+    """Return random coordinates, always the same; quaternions are unit."""
+    rng = np.random.default_rng(0)
+    configurations = []
+    for _ in range(CONFIGURATIONS):
+        q = np.zeros(robot.nq)
+        for link, k in zip(robot.links, robot.position_index, strict=True):
+            size = len(link.row.neutral)
+            q[k : k + size] = rng.normal(size=size)
+            if size == 4:
+                q[k : k + 4] /= np.linalg.norm(q[k : k + 4])
+        configurations.append(q)
+    return configurations
+
+
+def moves(model: Model, contact: Contact, configurations: Iterable[Array], *, anywhere: bool = False) -> bool:
+    """Return whether any joint moves any part of a candidate along the normal.
+
+    anywhere : a motion along the surface counts too
+    """
+    points = [contact.point]
+    if contact.tip is not None:
+        points = [contact.point + share * (contact.tip - contact.point) for share in SHARES]
+    for q in configurations:
+        for point in points:
+            position, jacobian = model.point_position_and_jacobian(contact.body, point, q)
+            rates = jacobian if anywhere else contact.surface.normal(position) @ jacobian
+            if np.abs(rates).max(initial=0.0) > SAME:
+                return True
+    return False
+
+
+def with_immobile_marked(robot: Robot, contacts: Sequence[Contact]) -> list[Contact]:
+    """Return the contacts, with ``left_out`` set for each that no joint moves along the normal in any posture.
+
+    The faces of a box and the slopes of a height field cannot be judged by a few random postures. A point on such a
+    surface is left out only if no joint moves it in any direction.
+    """
+    model, configurations = Model(robot), random_configurations(robot)
+    marked = []
+    for contact in contacts:
+        try:
+            robot.attach(contact.body, contact.point)
+        except ModelError:  # an unknown or a fixed body: the check of the start names it
+            marked.append(contact)
+            continue
+        anywhere = not isinstance(contact.surface, Quadric)
+        marked.append(replace(contact, left_out=not moves(model, contact, configurations, anywhere=anywhere)))
+    return marked
+
+
+def immobile_at(model: Model, link: int, point: Array, normal: Array, q: Array) -> bool:
+    """Return whether rounding alone is left of the motion of a link's point along a normal, in a posture.
+
+    The same limit as :func:`dynsim.dynamics.contact.mobility.moves_along_normal`.
+    """
+    position, jacobian = model.point_position_and_jacobian(link, point, q)
+    places = np.vstack([model.joint_positions(q), position])
+    scale = np.linalg.norm(places, axis=1).max() + np.linalg.norm(jacobian, axis=0)
+    return bool((np.abs(normal @ jacobian) <= IMMOBILE * scale).all())
+
+
+def mobility_floors(model: Model, contacts: Sequence[Contact]) -> Array:
+    """Return for each contact the mobility along its normal below which a glued one has no force, (c,) [1/kg].
+
+    That is the fraction of a typical mobility below which a row counts as dependent. The typical one is the
+    largest of random postures, with the diagonal of the mass matrix in place of the matrix, which makes it up to n
+    times too large.
+    """
+    floors = np.zeros(len(contacts))
+    if not contacts:
+        return floors
+    for q in random_configurations(model.robot)[:2]:
+        inertia = np.diag(model.mass_matrix(q)) + model.armature
+        for k, contact in enumerate(contacts):
+            position, jacobian = model.point_position_and_jacobian(contact.body, contact.point, q)
+            typical = float(((contact.surface.normal(position) @ jacobian) ** 2 / inertia).sum())
+            floors[k] = max(floors[k], RANK_TOLERANCE * typical)
+    return floors

@@ -1,0 +1,47 @@
+"""Mobility of candidates along their normals in the present posture."""
+
+from __future__ import annotations
+
+import math
+
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.tables import ContactArrays, ModelArrays, Workspace
+from dynsim.dynamics.tree.spatial import ZERO_VECTOR, dot, dot_vector, six, vector, wrench_at
+from dynsim.jit.kernel import noinline_kernel
+
+# Rate of a point along its normal by the rate of a joint, as a fraction of the terms that cancel in it, below which it
+# is rounding. Rounding is 1e-16 times some dozen operations; at the limit the forces have three digits left.
+IMMOBILE = 1e-12
+# A rate of more than this is not rounding for any robot [m/rad or m/m].
+CLEARLY = 1e-9
+# A point is not brought onto its surface by a joint that would have to move further than this [rad or m].
+WAY = 0.1
+
+
+@noinline_kernel
+def moves_along_normal(model: ModelArrays, contacts: ContactArrays, ws: Workspace, k, gap):
+    """True if some joint moves candidate k along its normal, and far enough to close ``gap`` [m], after a sweep.
+
+    The rate by joint i is S_i · (p × n, n). Its terms are products of the distances of joint and point from the origin:
+    the largest of these, times the angular part of S, and its linear part are the scale of rounding.
+    """
+    if contacts.link[k, ka.LEFT_OUT] == 1:
+        return False
+    links, state = ws.links, ws.contacts
+    at, last = vector(state, k, ka.POSITION), contacts.link[k, ka.LINK]
+    row = wrench_at(at, vector(state, k, ka.NORMAL), ZERO_VECTOR)
+    square, i, least = dot_vector(at, at), last, abs(gap) / WAY
+    while i >= 0:
+        if abs(dot(six(links, i, ka.S), row)) > max(CLEARLY, least):
+            return True
+        p = vector(links, i, ka.P)
+        square = max(square, dot_vector(p, p))
+        i = model.tree[i, ka.PARENT]
+    i = last
+    while i >= 0:
+        S = six(links, i, ka.S)
+        turn, shift = S[0] * S[0] + S[1] * S[1] + S[2] * S[2], S[3] * S[3] + S[4] * S[4] + S[5] * S[5]
+        if abs(dot(S, row)) > max(IMMOBILE * (math.sqrt(turn * square) + math.sqrt(shift)), least):
+            return True
+        i = model.tree[i, ka.PARENT]
+    return False

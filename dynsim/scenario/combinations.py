@@ -1,0 +1,245 @@
+"""Features that a contact law or an integration method does not support: one table.
+
+Validation of a scenario refuses the combinations that its keys show, preparation of a run those that its robot shows (a
+URDF file, say, that has dry friction), and docs/limits.md prints the table.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from dynsim.config.base import error_at
+from dynsim.config.problems import dotted, listed
+from dynsim.errors import ModelError
+from dynsim.model.description import Robot
+from dynsim.model.drives import Motor
+
+LAWS = ("bilateral", "unilateral")
+METHODS = ("auto", "dopri5", "radau5", "time_stepping")
+EVENT_DRIVEN, TIME_STEPPING = METHODS[:3], METHODS[3:]
+
+# Keys of contacts and of their points that only one law reads.
+BILATERAL_KEYS = ("slip_smoothing_m_s", "pulling_friction")
+UNILATERAL_KEYS = (
+    "static_friction",
+    "stribeck_m_s",
+    "viscous_friction_s_per_m",
+    "restitution",
+    "grip",
+    "stiffness_N_per_m",
+    "damping_N_s_per_m",
+)
+# The trapezoidal rule of time stepping.
+THETA = 0.5
+
+
+@dataclass(frozen=True)
+class Restriction:
+    """A feature that not every contact law and integration method supports.
+
+    Attributes
+    ----------
+    feature : in words, for the table
+    reason : why the others do not support it
+    laws, methods : that support it
+    fix : what to do instead of changing law or method
+    keys : the scenario's keys that use it, dotted, read from its ScenarioConfig
+    parts : names of the robot's joints, ties or bases that use it
+    at : the key that an error about the robot names
+    """
+
+    feature: str
+    reason: str
+    laws: tuple[str, ...] = LAWS
+    methods: tuple[str, ...] = METHODS
+    fix: str = "remove this key"
+    keys: Callable[[Any], Iterator[str]] | None = None
+    parts: Callable[[Robot], list[str]] | None = None
+    at: tuple[str, ...] = ("plant",)
+
+    def conflict(self, config: Any) -> str:
+        """The law or method that the feature requires and the scenario does not have; "" if it has them."""
+        law, method = config.contacts.law, config.integrator.method
+        if law not in self.laws:
+            return f"requires contacts.law: {_either(self.laws)} (here: {law})"
+        if method not in self.methods:
+            return f"requires integrator.method: {_either(self.methods)} (here: {method})"
+        return ""
+
+    def message(self, conflict: str) -> str:
+        """The sentence of an error."""
+        change = "the law" if "contacts.law" in conflict else "the method"
+        return f"{conflict}, because {self.reason}; {self.fix}, or change {change}"
+
+
+def _either(names: tuple[str, ...]) -> str:
+    return " or ".join(part for part in (", ".join(names[:-1]), names[-1]) if part)
+
+
+def _contact_keys(*names: str) -> Callable[[Any], Iterator[str]]:
+    """Keys of that name, of contacts and of their points, that the scenario sets."""
+
+    def used(config: Any) -> Iterator[str]:
+        sections = {"contacts": config.contacts}
+        sections |= {f"contacts.points.{name}": point for name, point in config.contacts.points.items()}
+        for where, section in sections.items():
+            for name in names:
+                if name in section.model_fields_set and getattr(section, name, None) is not None:
+                    yield f"{where}.{name}"
+
+    return used
+
+
+def _compliance(config: Any) -> Iterator[str]:
+    # Resolved scenarios write out the default damping of 0.
+    yield from _contact_keys("stiffness_N_per_m")(config)
+    if config.contacts.damping_N_s_per_m:
+        yield "contacts.damping_N_s_per_m"
+    yield from (
+        f"contacts.points.{name}.damping_N_s_per_m" for name, p in config.contacts.points.items() if p.damping_N_s_per_m
+    )
+
+
+def _candidates(config: Any) -> Iterator[str]:
+    if config.contacts.candidates != "points":
+        yield "contacts.candidates"
+
+
+def _stepping(config: Any) -> Iterator[str]:
+    if config.integrator.method == "time_stepping":
+        yield "integrator.method"
+
+
+def _ties(config: Any) -> Iterator[str]:
+    yield from (f"ties.{name}" for name in config.ties)
+
+
+def _dense(config: Any) -> Iterator[str]:
+    if config.integrator.solver == "m_star":
+        yield "integrator.solver"
+
+
+def _theta(config: Any) -> Iterator[str]:
+    if config.integrator.theta != THETA:
+        yield "integrator.theta"
+
+
+def _rubbing(robot: Robot) -> list[str]:
+    joints = [link.joint for link in robot.links if link.friction > 0.0]
+    return joints + [m.joint for m in robot.motors if isinstance(m, Motor) and m.dry_friction > 0.0]
+
+
+WATCHED_EVENTS = Restriction(
+    "`Simulation.watch`",
+    "time stepping does not locate events within its steps",
+    methods=EVENT_DRIVEN,
+    fix="test the condition in Simulation.every()",
+)
+LINEARIZATION = Restriction(
+    "`Simulation.linearize`",
+    "time stepping chooses contact modes only for whole steps",
+    methods=EVENT_DRIVEN,
+    fix="start a Simulation with another method from this state",
+)
+
+RESTRICTIONS = (
+    Restriction(
+        "`integrator.method: time_stepping`",
+        "time stepping has only contacts that push",
+        laws=LAWS[1:],
+        methods=TIME_STEPPING,
+        fix="set `contacts: {law: unilateral}`, even if nothing touches",
+        keys=_stepping,
+    ),
+    Restriction(
+        "smoothed slip direction, pulling friction (`contacts.slip_smoothing_m_s`, `contacts.pulling_friction`)",
+        "real contacts stick, and cannot pull",
+        laws=LAWS[:1],
+        keys=_contact_keys(*BILATERAL_KEYS),
+    ),
+    Restriction(
+        "static, Stribeck and viscous friction, restitution",
+        "contacts that are held to their surfaces neither stick nor bounce",
+        laws=LAWS[1:],
+        keys=_contact_keys("static_friction", "stribeck_m_s", "viscous_friction_s_per_m", "restitution"),
+    ),
+    Restriction(
+        "contact candidates `joints` and `links`",
+        "the bilateral law would hold all of them to their surfaces",
+        laws=LAWS[1:],
+        keys=_candidates,
+    ),
+    Restriction(
+        "friction that depends on direction (`grip`)",
+        "the event-driven methods detect slip with one coefficient for all directions",
+        laws=LAWS[1:],
+        methods=TIME_STEPPING,
+        keys=_contact_keys("grip"),
+    ),
+    Restriction(
+        "compliant contacts (`stiffness_N_per_m`, `damping_N_s_per_m`)",
+        "contacts of the event-driven methods are rigid",
+        laws=LAWS[1:],
+        methods=TIME_STEPPING,
+        keys=_compliance,
+    ),
+    Restriction(
+        "ties",
+        "the event-driven methods have no bounded springs",
+        laws=LAWS[1:],
+        methods=TIME_STEPPING,
+        keys=_ties,
+        parts=lambda robot: [tie.name for tie in robot.ties],
+        fix="remove the tie",
+    ),
+    Restriction(
+        "dry friction of joints",
+        "friction that holds a joint at rest is a unilateral law",
+        laws=LAWS[1:],
+        parts=_rubbing,
+        fix="set the friction to 0 and use damping",
+    ),
+    Restriction(
+        "a mobile base",
+        "time stepping does not locate events, so that it would miss the instant of overturning",
+        methods=EVENT_DRIVEN,
+        parts=lambda robot: [] if robot.base is None else [robot.base.body],
+        fix="use a plant without a mobile base",
+        at=("integrator", "method"),
+    ),
+    Restriction(
+        "`integrator.solver: m_star`",
+        "time stepping solves with articulated sweeps",
+        methods=EVENT_DRIVEN,
+        keys=_dense,
+    ),
+    Restriction(
+        "`integrator.theta`",
+        "it is a parameter of that method",
+        methods=TIME_STEPPING,
+        keys=_theta,
+    ),
+    WATCHED_EVENTS,
+    LINEARIZATION,
+)
+
+
+def check_keys(config: Any) -> None:
+    """Raise the error of the first restriction that the keys of a ScenarioConfig break, for a validator."""
+    for restriction in RESTRICTIONS:
+        if restriction.keys is None or not (conflict := restriction.conflict(config)):
+            continue
+        for key in restriction.keys(config):
+            raise error_at(key, restriction.message(conflict))
+
+
+def check_robot(config: Any, robot: Robot) -> None:
+    """Raise ModelError for the first restriction that the parts of a robot break."""
+    for restriction in RESTRICTIONS:
+        if restriction.parts is None or not (conflict := restriction.conflict(config)):
+            continue
+        if names := restriction.parts(robot):
+            text = f"{dotted(restriction.at)}: {restriction.feature} ({listed(names)}) {restriction.message(conflict)}"
+            raise ModelError(text, keys=restriction.at)
