@@ -27,7 +27,7 @@ PARTS = (
     r"^plant: ",
     r"; the kinetic energy has grown to",
     r"^use .*, which is stable, or smaller gains",
-    r"^the torque of .* begins with|^the reference of .* begins",
+    r"^the torque of .* begins with|^the reference of .* begins|^the planned voltages count on",
     r"^the motion does not determine|^in the samples",
     r"^; while .* slides, other choices may move otherwise",
     r"^f_t = |^friction has put ",
