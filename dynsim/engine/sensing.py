@@ -142,6 +142,8 @@ class EncodedCommands:
         """What the controller was told, held from tick to tick."""
         times = np.array([time for time, _ in self._measured]) - ROUNDING
         rows = np.searchsorted(times, record.time, side="right") - 1
-        measured = np.array([positions for _, positions in self._measured])[rows]
+        # A run may have stopped before its first tick.
+        told = np.reshape([positions for _, positions in self._measured], (len(times), len(self._joints)))
+        measured = told[rows]
         text = "joints as the controller's encoders tell them"
         record.add("q_measured", measured, self._unit, labels=self._joints, description=text)

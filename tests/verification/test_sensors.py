@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dynsim import Simulation, load_scenario, simulate
-from dynsim.errors import ModelError
+from dynsim.errors import ModelError, SimulationStopped
 from dynsim.record import Record
 
 PERIOD = 2e-3
@@ -137,3 +137,12 @@ def test_sensors_that_nobody_reads_are_refused_where_they_stand(tmp_path, change
     at = f"arm.yaml:{line}" if line else "overrides"
     with pytest.raises(ModelError, match=rf"{at}.*sensors\.(encoders|motion_capture).*{words}"):
         simulate(load_scenario(path, None, changes))
+
+
+def test_a_run_that_stops_before_its_first_sample_says_why(run):
+    """A force that no step is short enough for."""
+    push = {"type": "constant", "body": "link_3", "force_N": [1e30, 0.0, 0.0]}
+    with pytest.raises(SimulationStopped) as stop:
+        run({}, loads__push=push)
+    assert len(stop.value.record) == 0
+    assert stop.value.record["q_measured"].shape == (0, 3)
