@@ -105,9 +105,9 @@ class EncodedCommands:
     ) -> None:
         self.period, self._take = period, take
         places = dict(zip(robot.joint_names, robot.position_index, strict=True))
-        at = np.array([places[motor.joint] for motor in robot.motors])
+        at = np.array([places[motor.joint] for motor in robot.motors], dtype=np.int64)
         turns = {link.joint: link.units[0] == "rad" for link in robot.links}
-        revolute = np.array([turns[motor.joint] for motor in robot.motors])
+        revolute = np.array([turns[motor.joint] for motor in robot.motors], dtype=np.bool_)
         self._joints, self._unit = (
             tuple(motor.joint for motor in robot.motors),
             " or ".join(unit for unit, there in (("rad", revolute.any()), ("m", not revolute.all())) if there),

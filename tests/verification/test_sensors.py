@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dynsim import Simulation, load_scenario, simulate
+from dynsim import Simulation, check, load_scenario, simulate
 from dynsim.errors import ModelError, SimulationStopped
 from dynsim.record import Record
 
@@ -137,6 +137,22 @@ def test_sensors_that_nobody_reads_are_refused_where_they_stand(tmp_path, change
     at = f"arm.yaml:{line}" if line else "overrides"
     with pytest.raises(ModelError, match=rf"{at}.*sensors\.(encoders|motion_capture).*{words}"):
         simulate(load_scenario(path, None, changes))
+
+
+def test_encoders_of_a_plant_without_motors_tell_nothing(tmp_path):
+    path = tmp_path / "pendulum.yaml"
+    path.write_text(PENDULUM)
+    scenario = load_scenario(path)
+    assert any("sensors.encoders has no effect: the plant has no motors" in text for text in check(scenario).warnings)
+    assert simulate(scenario)["q_measured"].shape == (11, 0)
+
+
+PENDULUM = """
+duration_s: 0.05
+plant: {type: serial_arm, chain: [{length_m: 0.3, mass_kg: 0.5}]}
+controller: {type: joint_pd, sample_time_s: 0.002}
+sensors: {encoders: {}}
+"""
 
 
 def test_a_run_that_stops_before_its_first_sample_says_why(run):
