@@ -143,7 +143,6 @@ class EncodedCommands:
         times = np.array([time for time, _ in self._measured]) - ROUNDING
         rows = np.searchsorted(times, record.time, side="right") - 1
         # A run may have stopped before its first tick.
-        told = np.reshape([positions for _, positions in self._measured], (len(times), len(self._joints)))
-        measured = told[rows]
+        readings = np.reshape([positions for _, positions in self._measured], (len(times), len(self._joints)))
         text = "joints as the controller's encoders tell them"
-        record.add("q_measured", measured, self._unit, labels=self._joints, description=text)
+        record.add("q_measured", readings[rows], self._unit, labels=self._joints, description=text)
