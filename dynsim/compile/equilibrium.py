@@ -197,24 +197,27 @@ def static_margin(model: Model, q: Array, forces: Sequence[tuple[int, Array, Arr
     Parameters
     ----------
     q : (nq,) coordinates
-    forces : from outside beside the weight: index of the link, point in its frame [m], force in the world [N]
+    forces : from outside beside the weight: index of the link, point in its frame [m], force in the world [N]; those on
+        objects beside the base do not count, as their weights do not
     """
     robot, base = model.robot, model.robot.base
     assert base is not None
     axes, origin = model.body_pose(base.body, q)
-    force, moment = np.zeros(3), np.zeros(3)
+    force, moment, carried = np.zeros(3), np.zeros(3), robot.tree_of(base.body)
     weights = [(i, link.inertia.com, link.inertia.mass * robot.gravity) for i, link in enumerate(robot.links)]
     for link, point, push in (*weights, *forces):
+        if not carried[link]:
+            continue
         force += push
         moment += np.cross(model.point_position(link, point, q) - origin, push)
     # What the ground gives back, in the axes of the base.
-    carried, (turn_x, turn_y) = -float(axes[:, 2] @ force), (-axes.T @ moment)[:2]
-    if carried <= 0.0:
+    pressed, (turn_x, turn_y) = -float(axes[:, 2] @ force), (-axes.T @ moment)[:2]
+    if pressed <= 0.0:
         return -1.0
     x, y = base.caster[:2]
     caster = -turn_y / x
     difference = 2.0 * (turn_x - caster * y) / base.track
-    loads = np.array([carried - caster + difference, carried - caster - difference, 2.0 * caster]) / 2.0
+    loads = np.array([pressed - caster + difference, pressed - caster - difference, 2.0 * caster]) / 2.0
     half = 0.5 * base.track
     sides = np.array([np.hypot(x, y + half), np.hypot(x, y - half), base.track])
-    return float((loads / carried * sides.sum() / sides).min())
+    return float((loads / pressed * sides.sum() / sides).min())

@@ -247,7 +247,6 @@ def compile_support(robot: Robot) -> ks.SupportArrays:
     if base is None:
         return ks.no_support()
     sizes = ks.BASE_SIZE, ks.STATE_SIZE, ks.LEAST_SIZE
-    arrays = ks.SupportArrays(integers(np.zeros(ks.INDEX_SIZE)), *(reals(np.full(size, np.inf)) for size in sizes))
     bodies, joints = [link.name for link in robot.links], robot.joint_names
     if base.body not in bodies or not set(base.wheels) <= set(joints):
         raise ModelError(
@@ -258,6 +257,9 @@ def compile_support(robot: Robot) -> ks.SupportArrays:
     x, y = (float(part) for part in base.caster[:2])
     if x == 0.0:
         raise ModelError(f"{robot.name}: the caster is below the axle, so that the base has no triangle to stand on")
+    own = integers(robot.tree_of(base.body))
+    numbers = (reals(np.full(size, np.inf)) for size in sizes)
+    arrays = ks.SupportArrays(integers(np.zeros(ks.INDEX_SIZE)), own, *numbers)
     arrays.index[[ks.BODY, ks.LEFT, ks.RIGHT]] = bodies.index(base.body), *map(joints.index, base.wheels)
     arrays.base[[ks.TRACK, ks.CASTER_X, ks.CASTER_Y]] = base.track, x, y
     arrays.base[[ks.SPIN_INERTIA, ks.FRICTION]] = base.spin_inertia, base.wheel_friction

@@ -88,6 +88,7 @@ def _stepped(scenario: Scenario, progress: Progress | None, pictured: bool) -> R
 
     # Without an end, as a session: a step that ends at a tick and one at the end of a run need not be the same.
     simulation = Simulation(scenario, duration=math.inf)
+    simulation.end_samples(scenario.duration_s)
     prepared, operator, k = simulation._prepared, simulation.operator, 0
     # It has times of its own; a record that is too large is refused before it begins.
     sample_times(scenario, prepared.run.layout, prepared.run.columns, len(prepared.model.robot.links))

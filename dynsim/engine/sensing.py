@@ -105,9 +105,9 @@ class EncodedCommands:
     ) -> None:
         self.period, self._take = period, take
         places = dict(zip(robot.joint_names, robot.position_index, strict=True))
-        at = np.array([places[motor.joint] for motor in robot.motors])
+        at = np.array([places[motor.joint] for motor in robot.motors], dtype=np.int64)
         turns = {link.joint: link.units[0] == "rad" for link in robot.links}
-        revolute = np.array([turns[motor.joint] for motor in robot.motors])
+        revolute = np.array([turns[motor.joint] for motor in robot.motors], dtype=np.bool_)
         self._joints, self._unit = (
             tuple(motor.joint for motor in robot.motors),
             " or ".join(unit for unit, there in (("rad", revolute.any()), ("m", not revolute.all())) if there),
@@ -142,6 +142,7 @@ class EncodedCommands:
         """What the controller was told, held from tick to tick."""
         times = np.array([time for time, _ in self._measured]) - ROUNDING
         rows = np.searchsorted(times, record.time, side="right") - 1
-        measured = np.array([positions for _, positions in self._measured])[rows]
+        # A run may have stopped before its first tick.
+        readings = np.reshape([positions for _, positions in self._measured], (len(times), len(self._joints)))
         text = "joints as the controller's encoders tell them"
-        record.add("q_measured", measured, self._unit, labels=self._joints, description=text)
+        record.add("q_measured", readings[rows], self._unit, labels=self._joints, description=text)

@@ -312,6 +312,18 @@ class Simulation:
         self._reach(until)
         return self.state
 
+    def end_samples(self, time: float) -> None:
+        """Let the samples end with one at a time [s], as those of a run that ends there do; the simulation goes on.
+
+        Raises
+        ------
+        ScenarioError
+            A time that is past.
+        """
+        if not time >= self._time:
+            raise ScenarioError(f"samples cannot end at t = {brief(time)} s: the simulation is at {self._time:g} s")
+        self._trace.end_at(float(time), self._prepared.run)
+
     def every(self, period: float, call: Callable[[Simulation], None], *, first: float | None = None) -> None:
         """Call back every ``period`` [s] from ``first`` on (default: now): a sampled controller.
 

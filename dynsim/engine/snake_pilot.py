@@ -286,15 +286,24 @@ class SnakePilot(SnakeControl):
         rows, q, v = len(record), record["q"], record["v"]
         if rows == 0:
             return
-        ticks = np.rint(record.time / self.period).astype(int) // self.stride
+        # The last sample may be one between the ticks, at the end of the run.
+        ticks = np.floor(record.time / self.period + 1e-6).astype(int) // self.stride
         d, law, model = self.description, self.controller.law, self.model
         trace = SnakeTrace(*(array[ticks] for array in self.trace))
         commanded = trace.phi.copy()
         trace.base[:], trace.phi[:] = base_pose(q), q[:, self._joints]
         trace.rho[:] = q[:, _places(self.robot, self.robot.wheel_joints)]
-        if ticks[-1] >= self._commanded:
+        end, begun = float(record.time[-1]), float(ticks[-1] * self.stride * self.period)
+        between, before = end > begun + 1e-6 * self.period, trace.w_target[-1].copy()
+        if between or ticks[-1] >= self._commanded:
             trace.mode[-1], trace.w_target[-1] = self.state.counts[ss.MODE], self.state.w_target
             commanded[-1], trace.w_hat[-1] = self.state.phi, self.state.w_hat
+        if between:
+            # Joints follow lines since the last tick, and the target has been moved up to the next one.
+            now = self.tick * self.period
+            commanded[-1] += (end - now) * self.ws.work.u[: commanded.shape[1]]
+            if end < now:
+                trace.w_target[-1] = before + (end - begun) / (now - begun) * (self.state.w_target - before)
         hold_last(trace)
         w, points, shown, write_row = np.zeros((rows, 6)), [], copy_of(self.state), FixedSignature(record_row)
         for r in range(rows):

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.engine.prepare import Prepared
-from dynsim.engine.trace import Rows
+from dynsim.engine.trace import TraceState
 from dynsim.integrators import events
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts import events as contact_events
@@ -122,7 +122,7 @@ class Snapshot:
     owner: object
     arrays: dict[str, NDArray[Any]]
     time: float
-    trace: tuple[tuple[Rows, ...], int]
+    trace: TraceState
     happened: tuple[Event, ...]
     frozen: bool
     attendants: list[dict[str, Any]]

@@ -12,6 +12,7 @@ from dynsim.integrators import run as ki
 
 Array = NDArray[np.float64]
 Rows = tuple[Array, Array, Array]
+TraceState = tuple[tuple[Rows, ...], int, float, Array | None]
 
 # Number of rows of the buffer into which kernels sample before it is emptied.
 BLOCK = 256
@@ -22,7 +23,7 @@ class Trace:
 
     Parameters
     ----------
-    start, end, rate : first time, end [s] and rate [1/s] of the samples
+    start, end, rate : first time, end [s] and rate [1/s] of the samples; at the end there is one, whatever the rate
     keep : samples that are kept: all (None), the last so many, or none (0)
     times : of all samples, where they are known beforehand
     """
@@ -31,6 +32,15 @@ class Trace:
         self._start, self._end, self._rate, self._keep, self._times = start, end, rate, keep, times
         self._rows: deque[Rows] = deque()
         self._next = 0
+
+    def end_at(self, end: float, run: ki.Run) -> None:
+        """Let the samples, also those that the run has yet to take into its buffer, end with one at a time [s]."""
+        self._end, self._times = end, None
+        if self._keep != 0:
+            taken = int(run.count[ki.SAMPLE])
+            times = self._even_times(self._next + taken, len(run.sample_time) - taken)
+            run.sample_time[taken:] = np.inf
+            run.sample_time[taken : taken + len(times)] = times
 
     def taken(self, run: ki.Run) -> Rows:
         """What the buffer of the run holds."""
@@ -59,13 +69,13 @@ class Trace:
         """Outputs of the last sample that is kept."""
         return self._rows[-1][2][-1] if self._rows else None
 
-    def snapshot(self) -> tuple[tuple[Rows, ...], int]:
+    def snapshot(self) -> TraceState:
         """What :meth:`restore` goes back to; rows are never written again, so they are shared."""
-        return tuple(self._rows), self._next
+        return tuple(self._rows), self._next, self._end, self._times
 
-    def restore(self, snapshot: tuple[tuple[Rows, ...], int]) -> None:
+    def restore(self, snapshot: TraceState) -> None:
         """Go back to a snapshot."""
-        rows, self._next = snapshot
+        rows, self._next, self._end, self._times = snapshot
         self._rows = deque(rows)
 
     def _block(self, until: float) -> Array:
@@ -79,7 +89,17 @@ class Trace:
         else:
             if math.isfinite(until):
                 count = max(count, int((until - self._start) * self._rate) + 2 - first)
-            times = self._start + np.arange(first, first + count) / self._rate
-            times = times[times <= self._end * (1.0 + 1e-12)]
+            times = self._even_times(first, count)
         # After the last sample the buffer must not hold steps back.
         return np.append(times, np.inf) if len(times) < count else times
+
+    def _even_times(self, first: int, count: int) -> Array:
+        """So many times from a number on, or those up to the end, which is the last."""
+        start, end, rate = self._start, self._end, self._rate
+        if not math.isfinite(end):
+            return start + np.arange(first, first + count) / rate
+        # As dynsim.engine.prepare.sample_times has it.
+        last = math.floor((end - start) * rate * (1.0 + 1e-12))
+        times = start + np.arange(first, min(first + count, last + 1)) / rate
+        apart = end - (start + last / rate) > 1e-9 * (end - start)
+        return np.append(times, end) if apart and first <= last + 1 < first + count else times

@@ -423,6 +423,13 @@ class Robot:
         _, frame = self._find(name)
         return np.eye(3) if frame is None else frame.R
 
+    def tree_of(self, body: str) -> NDArray[np.bool_]:
+        """Which links belong to the tree of a link, (n,): those with the same ancestor that the world carries."""
+        roots: dict[str, str] = {}
+        for link in self.links:
+            roots[link.name] = link.name if link.parent is None else roots[link.parent]
+        return np.array([root == roots[body] for root in roots.values()])
+
     def _find(self, name: str) -> tuple[int, Frame | None]:
         names, carriers = [link.name for link in self.links], self.carriers
         bodies = [name for name in names if name not in carriers]

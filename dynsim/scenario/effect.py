@@ -26,7 +26,7 @@ def without_effect(scenario: Any, motors: bool = True) -> list[str]:
     config = scenario.config
     texts: dict[Keys, str] = {}
     if config.controller is not None and not motors:
-        texts[("controller",)] = "the plant has no motors"
+        texts[("controller",)] = texts[("sensors", "encoders")] = "the plant has no motors"
     for keys, why in idle_keys(config).items():
         if keys[:1] not in texts:
             texts[keys] = why

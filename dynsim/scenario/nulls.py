@@ -30,8 +30,8 @@ def _write_within(value: Any, written: Any, defaults: Any) -> None:
         for name, part in value.items():
             _write_within(part, _entry(written, name), _entry(defaults, name))
     elif isinstance(value, (list, tuple)) and isinstance(written, list):
-        for part, place in zip(value, written, strict=True):
-            _write_within(part, place, None)
+        for part, dumped in zip(value, written, strict=True):
+            _write_within(part, dumped, None)
 
 
 def _entry(mapping: Any, key: Any) -> Any:

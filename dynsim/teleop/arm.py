@@ -134,6 +134,7 @@ class ArmSession:
         """The record of all ticks so far; its scenario is the script."""
         before = self.simulation.snapshot()
         if not self.simulation.finished:
+            self.simulation.end_samples(self.ticks * self.period)
             self.simulation.advance(self.ticks * self.period)
         # As ticks are counted: a step that ends a rounding before one would not be that of a run which ends there.
         duration = max(self.ticks, 1) * self.period

@@ -195,6 +195,7 @@ class DynamicSnakeSession(SnakeSession):
         before, longest = simulation.snapshot(), self._run.ticks
         # As a run that ends here: the command at this tick is yet to come.
         self._run.ticks = self.ticks
+        simulation.end_samples(self.ticks * self.period)
         simulation.advance(self.ticks * self.period)
         record = simulation.record(script)
         self._run.ticks = longest

@@ -67,6 +67,20 @@ def test_a_drive_may_end_at_any_tick(ticks: int) -> None:
     assert_same(record, replayed(record))
 
 
+def test_a_drive_that_ends_between_samples_has_one_at_its_end() -> None:
+    """At 30 Hz, after 37 ticks of 10 ms; what comes after a look at the record has none there."""
+    session = begin(load_scenario("six_axis_arm", overrides={"record.rate_hz": 30}))
+    records = []
+    for ticks in (37, 8):
+        for _ in range(ticks):
+            session.tick(Command((0.05, -0.03, 0.02)))
+        records.append(session.record())
+    for record, end in zip(records, (0.37, 0.45), strict=True):
+        assert record.time[-1] == record.summary["duration_s"] == pytest.approx(end, rel=1e-12)
+        assert len(record) == math.floor(30.0 * end) + 2
+        assert_same(record, replayed(record))
+
+
 @pytest.mark.parametrize(
     ("name", "variant", "size"), [("snake_operator", None, 0.6), ("snake_circle", "backward_switching", 0.6)]
 )

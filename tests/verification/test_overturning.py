@@ -432,3 +432,21 @@ def test_path_length_of_wheels_that_turn_is_that_of_their_angles(tmp_path):
     length = record.summary["base"]["path_length_m"]
     assert length > 1e-4
     assert length == pytest.approx(np.trapezoid(rate, record.time), rel=1e-3)
+
+
+# ---- objects beside the base, which it does not carry
+
+VALVE = {"mass_kg": 2.0, "size_m": [0.1, 0.1, 0.1], "position_m": [1.3, -0.2, 0.5], "hinge": {"axis": [0, 0, 1]}}
+DROP = {"type": "constant", "body": "valve", "force_N": [0.0, 0.0, -40.0]}
+
+
+def test_what_hangs_on_a_hinge_beside_the_base_does_not_load_it(tmp_path):
+    """Nor does a load on it; the same for the margin at rest that check tells, and for stopping where it tips."""
+    real = {"contacts": {"law": "unilateral"}, "duration_s": 0.02}
+    beside = read(tmp_path, SWINGING, overturn="stop", objects={"valve": VALVE}, loads={"drop": DROP}, **real)
+    alone = read(tmp_path, SWINGING, **real)
+    record, expected = dynsim.simulate(beside), dynsim.simulate(alone)
+    for name in ("wheel_load", "center_of_pressure", "tip_margin", "traction_demand"):
+        # Both runs are right to about 1e-9, by steps of their own.
+        np.testing.assert_allclose(record[name], expected[name], rtol=1e-6, atol=1e-6, err_msg=name)
+    assert dynsim.check(beside).tip_margin == pytest.approx(dynsim.check(alone).tip_margin, rel=1e-12)

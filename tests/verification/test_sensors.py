@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
-from dynsim import Simulation, load_scenario, simulate
-from dynsim.errors import ModelError
+from dynsim import Simulation, check, load_scenario, simulate
+from dynsim.engine import attended
+from dynsim.errors import ModelError, ScenarioError, SimulationStopped
+from dynsim.integrators import run as ki
 from dynsim.record import Record
 
 PERIOD = 2e-3
@@ -137,3 +141,61 @@ def test_sensors_that_nobody_reads_are_refused_where_they_stand(tmp_path, change
     at = f"arm.yaml:{line}" if line else "overrides"
     with pytest.raises(ModelError, match=rf"{at}.*sensors\.(encoders|motion_capture).*{words}"):
         simulate(load_scenario(path, None, changes))
+
+
+def test_encoders_of_a_plant_without_motors_tell_nothing(tmp_path):
+    path = tmp_path / "pendulum.yaml"
+    path.write_text(PENDULUM)
+    scenario = load_scenario(path)
+    assert any("sensors.encoders has no effect: the plant has no motors" in text for text in check(scenario).warnings)
+    assert simulate(scenario)["q_measured"].shape == (11, 0)
+
+
+PENDULUM = """
+duration_s: 0.05
+plant: {type: serial_arm, chain: [{length_m: 0.3, mass_kg: 0.5}]}
+controller: {type: joint_pd, sample_time_s: 0.002}
+sensors: {encoders: {}}
+"""
+
+
+def test_a_run_that_ends_between_samples_has_one_at_its_end(run):
+    """As every run; the time is no tick, no sample of the rate, and not where a step would have ended."""
+    record = run({"resolution_deg": 0}, duration_s=0.0237, controller__joints={})
+    assert record.time[-1] == record.summary["duration_s"] == 0.0237
+    np.testing.assert_array_equal(record.time[:-1], np.arange(12) / 500.0)
+    np.testing.assert_array_equal(record["q_measured"][-1], record["q_measured"][-2])
+
+
+def test_pieces_of_a_run_that_ends_between_samples_are_the_run(run, tmp_path):
+    encoders = {"resolution_deg": 0}
+    record = run(encoders, duration_s=0.0237)
+    scenario = load_scenario(tmp_path / "arm.yaml", None, {"sensors.encoders": encoders, "duration_s": 0.0237})
+    simulation = Simulation(scenario, duration=math.inf)
+    simulation.advance(0.0031)
+    kept = simulation.snapshot()
+    simulation.end_samples(0.0101)
+    simulation.advance(0.0101)
+    assert simulation.record().time[-1] == 0.0101
+    simulation.restore(kept)
+    simulation.end_samples(scenario.duration_s)
+    simulation.advance(scenario.duration_s)
+    pieces = simulation.record(scenario)
+    for name in record:
+        assert record[name].tobytes() == pieces[name].tobytes(), name
+    with pytest.raises(ScenarioError, match="samples cannot end"):
+        simulation.end_samples(0.01)
+
+
+def test_a_run_that_stops_before_its_first_tick_says_why(run, monkeypatch):
+    """Where there are no forces at the start, encoders have told nothing yet."""
+
+    def stop_at_once(prepared, *_):
+        prepared.run.count[ki.STATUS] = ki.NOT_FINITE
+        return prepared, None
+
+    monkeypatch.setattr(attended, "advance", stop_at_once)
+    with pytest.raises(SimulationStopped) as stop:
+        run({})
+    assert len(stop.value.record) == 0
+    assert stop.value.record["q_measured"].shape == (0, 3)

@@ -212,6 +212,28 @@ def test_a_session_is_a_run_of_its_script_bit_for_bit():
         np.testing.assert_array_equal(record[name], again[name], err_msg=name)
 
 
+@pytest.mark.parametrize("rate", [200, 100])
+@pytest.mark.parametrize("duration", [0.0821, 0.0838, 0.085])
+def test_a_run_that_ends_between_samples_has_one_at_its_end(duration, rate):
+    """What it was told there lies on the lines between the ticks of a longer run."""
+    commands = [{"at_s": 0.02, "velocity": [0.05, 0, 0.02, 0, 0, 0]}]
+
+    def of(end, rate_hz):
+        settings = {"duration_s": end, "record.rate_hz": rate_hz, "controller.commands": commands}
+        return simulate(load_scenario("snake_operator", None, {"plant.level": "dynamic", **settings}))
+
+    record, longer = of(duration, rate), of(0.1, 200)
+    assert record.time[-1] == record.summary["duration_s"] == duration
+    # A run has as many ticks as periods fit best: after 0.0821 s it has 16, and the target stands from 0.080 s on.
+    commanded_until = min(duration, 0.005 * round(duration / 0.005))
+    for name, at in (("w_target", commanded_until), ("phi_command", duration)):
+        expected = [np.interp(at, longer.time, column) for column in longer[name].T]
+        if name == "phi_command" and commanded_until < duration:
+            expected = longer[name][16] + (duration - 0.08) * longer["phi_dot_command"][15]
+        np.testing.assert_allclose(record[name][-1], expected, rtol=0.0, atol=1e-12, err_msg=name)
+    assert np.abs(record["w_target"][-1] - record["w_target"][0]).max() > 2e-3
+
+
 def test_a_snapshot_has_the_same_future():
     simulation = Simulation(dynamic(controller__state="measured", duration_s=2.0))
     simulation.advance(1.1)

@@ -4,6 +4,9 @@ The base stands on the contact points of its left wheel l = (0, T/2), its right 
 c = (c_x, c_y), in the plane z = 0 of its frame, whose z is the normal of the ground. Three normal forces N balance the
 force along z and the moments about x and y, so they are determined; the constraints against side slip and of rolling
 give the forces along y and x. The base is assumed to stay on the ground: N < 0 is a pull.
+
+It carries its own tree of bodies. What objects beside it need comes from their hinges and contacts; what joins them to
+the tree acts on the base from outside, as contacts do.
 """
 
 from __future__ import annotations
@@ -16,6 +19,7 @@ import numpy as np
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.tables import ModelArrays, Workspace
 from dynsim.dynamics.tree.joints import row_rates
+from dynsim.dynamics.tree.loads import LINK as LOAD_LINK
 from dynsim.dynamics.tree.loads import LoadArrays, load_wrench
 from dynsim.dynamics.tree.spatial import (
     ZERO_SIX,
@@ -58,6 +62,7 @@ class SupportArrays(NamedTuple):
     """The mobile base of a robot; tables of size zero: it has none."""
 
     index: np.ndarray  # (INDEX_SIZE,) int
+    carried: np.ndarray  # (n,) int: 1 for the rows of its own tree, 0 for those of objects beside it
     base: np.ndarray  # (BASE_SIZE,)
     state: np.ndarray  # (STATE_SIZE,) written by ground_reaction
     least: np.ndarray  # (LEAST_SIZE,) of the loads and of the margin at accepted steps, see watch_support
@@ -65,7 +70,7 @@ class SupportArrays(NamedTuple):
 
 def no_support() -> SupportArrays:
     """That of a robot without a mobile base."""
-    return SupportArrays(integers(np.zeros(0)), *(reals(np.zeros(0)) for _ in range(3)))
+    return SupportArrays(*(integers(np.zeros(0)) for _ in range(2)), *(reals(np.zeros(0)) for _ in range(3)))
 
 
 @noinline_kernel
@@ -74,29 +79,35 @@ def ground_reaction(model: ModelArrays, loads: LoadArrays, t, ws: Workspace, sup
 
     To be called right after ``derivative``; overwrites V with what it is and A with the accelerations minus gravity.
 
-    Balance of momentum of all bodies about the world origin: W = Σ (İV − weight) + İ_a − Σ W_contact − Σ W_load. The
-    inertia I_a of the wheels about their axle y is not in the tensors of the bodies but on the rows of the wheels; its
-    momentum I_a (φ̇_L + φ̇_R) y changes by I_a ((φ̈_L + φ̈_R) y + (φ̇_L + φ̇_R) ω × y). Momentum of rotors and gears is left
-    out, as it is of all joints. Moved to the base's frame, M_x = (N_L − N_R) T/2 + N_C c_y, M_y = −N_C c_x,
-    F_z = ΣN; M_z = (F_R − F_L) T/2 and F_x = F_L + F_R give the forces along x that roll the wheels.
+    Balance of momentum of all bodies of its tree about the world origin: W = Σ (İV − weight) + İ_a − Σ W_contact −
+    Σ W_load. The inertia I_a of the wheels about their axle y is not in the tensors of the bodies but on the rows of
+    the wheels; its momentum I_a (φ̇_L + φ̇_R) y changes by I_a ((φ̈_L + φ̈_R) y + (φ̇_L + φ̇_R) ω × y). Momentum of rotors
+    and gears is left out, as it is of all joints. Moved to the base's frame, M_x = (N_L − N_R) T/2 + N_C c_y,
+    M_y = −N_C c_x, F_z = ΣN; M_z = (F_R − F_L) T/2 and F_x = F_L + F_R give the forces along x that roll the wheels.
 
     The margin is min_i d_i/ρ, d_i the distance of the centre of pressure Σ N_i p_i / ΣN from side i (negative beyond
     it), ρ the inradius. N_i/ΣN are its barycentric coordinates, so d_i/ρ = (N_i/ΣN) (perimeter / side i): 1 at the
     incentre. ΣN <= 0 counts as −1. Loaded wheels share the lateral force, by load.
     """
     links, joints, gravity = ws.links, ws.joints, model.gravity
-    index, base, state = support.index, support.base, support.state
+    index, base, state, carried = support.index, support.base, support.state, support.carried
     W = ZERO_SIX
     for i in range(joints.shape[0]):
         row_rates(model, ws, i, joints[i, ka.QD], joints[i, ka.QDD], gravity[0], gravity[1], gravity[2])
-        mass, centre, inertia = body_inertia(model, ws, i)
-        W = plus(W, inertial_wrench(ws, i, mass, centre, inertia))
+        if carried[i] == 1:
+            mass, centre, inertia = body_inertia(model, ws, i)
+            W = plus(W, inertial_wrench(ws, i, mass, centre, inertia))
     for k in range(ws.counts[ka.ROWS]):
-        # What joins two bodies or two joints is no force from outside.
-        if ws.active[k, ka.ROW_KIND] != ka.JOINT_ROW and ws.active[k, ka.BODY_B] < 0:
-            W = minus_scaled(W, six(ws.rows, k, ka.DIRECTION), ws.rows[k, ka.FORCE])
+        # Forces between two joints are none from outside, nor are those between two of its bodies.
+        if ws.active[k, ka.ROW_KIND] != ka.JOINT_ROW:
+            first, other = ws.active[k, ka.BODY_A], ws.active[k, ka.BODY_B]
+            within = carried[other] if other >= 0 else 0
+            if carried[first] != within:
+                sign = 1.0 if carried[first] == 1 else -1.0
+                W = minus_scaled(W, six(ws.rows, k, ka.DIRECTION), sign * ws.rows[k, ka.FORCE])
     for k in range(loads.table.shape[0]):
-        W = minus_scaled(W, load_wrench(loads, k, t, ws), 1.0)
+        if carried[loads.table[k, LOAD_LINK]] == 1:
+            W = minus_scaled(W, load_wrench(loads, k, t, ws), 1.0)
     b, left, right = index[BODY], index[LEFT], index[RIGHT]
     R, p = rotation(links, b, ka.R), vector(links, b, ka.P)
     axle, w = second_axis(R), vector(links, b, ka.V)
@@ -132,12 +143,12 @@ def ground_reaction(model: ModelArrays, loads: LoadArrays, t, ws: Workspace, sup
         state[MARGIN] = math.inf
         for k in range(3):
             state[MARGIN] = min(state[MARGIN], state[LOADS + k] / fz * base[SHARE + k])
-    carried = max(state[LOADS], 0.0) + max(state[LOADS + 1], 0.0)
+    pressed = max(state[LOADS], 0.0) + max(state[LOADS + 1], 0.0)
     for k in range(2):
         load = state[LOADS + k]
         state[TRACTION + k] = math.nan
         if load > 0.0:
-            lateral = fy * load / carried
+            lateral = fy * load / pressed
             force = math.sqrt(state[LONGITUDINAL + k] ** 2 + lateral * lateral)
             state[TRACTION + k] = force / (base[FRICTION] * load)
 
