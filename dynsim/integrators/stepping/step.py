@@ -220,7 +220,12 @@ def book_contacts(system: System, s: SteppingArrays, ws: Workspace, y_new, h):
                 struck = min(h * force * max(s.turn[k, kt.PUSH], 0.0), max(last[kt.BUDGET], 0.0))
                 if now[kt.SLID] == 0.0 and last[kt.SLID] == 0.0:
                     friction = 0.0
-            if friction != 0.0 or now[kt.SLID] == 1.0:
+            slips = friction != 0.0 or now[kt.SLID] == 1.0
+            if friction > 0.0 and (soft or last[kt.CLOSED] == 1.0):
+                # The mean force of a step in which slip ends or turns round may be along its mean motion. Friction
+                # gives no energy: that is an error of the step.
+                friction = 0.0
+            if slips:
                 x, z = 0.5 * (s.rate[0, r + 1] + s.rate[1, r + 1]), 0.5 * (s.rate[0, r + 2] + s.rate[1, r + 2])
                 y_new[first + kst.SLIP] += h * slip_of_rates(system.contacts.law, k, x, z)
             y_new[first + kst.IMPULSE] += h * force
