@@ -176,31 +176,34 @@ def let_joints_slide(system: System, size, largest):
 
 @internal_kernel
 def release_dependent_joints(system: System, ws: Workspace):
-    """Joints at rest that sliding contacts keep from moving have the constant force of the solution, not a row.
+    """Joints at rest that sliding contacts or stops hold have the constant force of the solution, not a row.
 
     Such a row depends on the normal rows, and how they share a force changes the friction of what slides: no split of
-    the right-hand side is that of the solution. At rest Coulomb's law admits any force within the bound. Rows that
-    depend on those of sticking points and of other joints alone remain, see :mod:`dynsim.dynamics.contact.splits`.
+    the right-hand side is that of the solution. Nor do splits know stops, whose force would go to the row by halves, as
+    much as it may be beyond the bound. At rest Coulomb's law admits any force within the bound. Rows that depend on
+    those of sticking points and of other joints alone remain, see :mod:`dynsim.dynamics.contact.splits`.
     """
     unilateral, W = system.unilateral, ws.small[0]
     table, dry, mode, bare, whole = unilateral.dry_table, unilateral.dry, unilateral.mode, 0, 0
     bare_factor, whole_factor = unilateral.room[ku.SPLIT_MATRIX], unilateral.room[ku.NULL_SPACE]
     bare_row, whole_row = unilateral.index[0], unilateral.index[1]
-    slides = False
+    blocked = False
     for k in range(mode.shape[0]):
-        slides = slides or mode[k, ku.WANTED] == ka.SLIDING
-    if not slides or table.shape[0] == 0:
+        blocked = blocked or mode[k, ku.WANTED] == ka.SLIDING
+    for k in range(unilateral.stop_table.shape[0]):
+        blocked = blocked or unilateral.stop_table[k, ku.STOP_CLOSED] == 1
+    if not blocked or table.shape[0] == 0:
         return
     for r in range(system.couplings.joint.shape[0]):
         bare = extended(bare_factor, W, bare_row, bare, r)
-    for k in range(unilateral.stop_table.shape[0]):
-        if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
-            bare = extended(bare_factor, W, bare_row, bare, unilateral.stop_table[k, ku.STOP_ROW])
     for k in range(mode.shape[0]):
         for s in range(3 if mode[k, ku.WANTED] == ka.STICKING else 0):
             bare = extended(bare_factor, W, bare_row, bare, ws.active[k, ka.FIRST_ROW] + s)
     for i in range(bare):
         whole = extended(whole_factor, W, whole_row, whole, bare_row[i])
+    for k in range(unilateral.stop_table.shape[0]):
+        if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
+            whole = extended(whole_factor, W, whole_row, whole, unilateral.stop_table[k, ku.STOP_ROW])
     for k in range(mode.shape[0]):
         if mode[k, ku.WANTED] == ka.SLIDING:
             whole = extended(whole_factor, W, whole_row, whole, ws.active[k, ka.FIRST_ROW])
