@@ -78,9 +78,9 @@ def _within_limits(model: Model, q: Array, rows: Array, wanted: Array, rigid: Ar
         step = np.zeros(model.n)
         step[free] = _displacement(rows[:, free], wanted, rigid, roots)
         beyond = np.zeros(model.n, dtype=bool)
-        for k, (link, place) in enumerate(zip(robot.links, robot.position_index, strict=True)):
+        for k, (link, index) in enumerate(zip(robot.links, robot.position_index, strict=True)):
             if len(link.row.neutral) == 1:
-                end = q[place] + step[k]
+                end = q[index] + step[k]
                 beyond[k] = (step[k] > 0.0 and end > link.upper + BEYOND) or (
                     step[k] < 0.0 and end < link.lower - BEYOND
                 )
@@ -91,11 +91,11 @@ def _within_limits(model: Model, q: Array, rows: Array, wanted: Array, rigid: Ar
 
 def _displacement(rows: Array, wanted: Array, rigid: Array, roots: Array) -> Array:
     """Least displacement of the free joints: rigid contacts exactly, the others by the springs' least squares."""
-    held, null = np.zeros(rows.shape[1]), np.eye(rows.shape[1])
+    particular, null = np.zeros(rows.shape[1]), np.eye(rows.shape[1])
     if rigid.any():
-        held = np.linalg.lstsq(rows[rigid], wanted[rigid], rcond=RANK)[0]
+        particular = np.linalg.lstsq(rows[rigid], wanted[rigid], rcond=RANK)[0]
         _, sizes, basis = np.linalg.svd(rows[rigid])
         null = basis[int(np.count_nonzero(sizes > RANK * sizes.max(initial=0.0))) :].T
     springs = roots[~rigid, None] * rows[~rigid]
-    left = roots[~rigid] * wanted[~rigid] - springs @ held
-    return np.asarray(held + null @ np.linalg.lstsq(springs @ null, left, rcond=RANK)[0])
+    left = roots[~rigid] * wanted[~rigid] - springs @ particular
+    return np.asarray(particular + null @ np.linalg.lstsq(springs @ null, left, rcond=RANK)[0])

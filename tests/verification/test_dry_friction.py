@@ -426,3 +426,35 @@ def test_joints_rest_where_sliding_elbows_hold_them(tmp_path: Path, friction: fl
         names = next(text for text in run.summary["warnings"] if "shared forces with the dry friction of" in text)
         assert "far: shared forces" in names
         assert "joint_2" in names
+
+
+BESIDE_STOPS = """\
+duration_s: 0.25
+plant:
+  type: serial_arm
+  link: {radius_m: 0.0237}
+  chain:
+  - {axis: x, length_m: 0.0, mass_kg: 0.1446, kind: prismatic, initial_m: 0.0073, friction_N: 0.245}
+  - {axis: y, length_m: 0.24, mass_kg: 0.39, initial_deg: 115.2, friction_N_m: 0.0245}
+  - {axis: y, length_m: 0.156, mass_kg: 0.48, initial_deg: 0.355, friction_N_m: 0.0245, limit_deg: [-1.149, 2.61]}
+  - {axis: y, length_m: 0.269, mass_kg: 0.341, initial_deg: -72.1, friction_N_m: 0.0245, limit_deg: [-73.56, -69.93]}
+  - {axis: z, length_m: 0.154, mass_kg: 0.108, kind: prismatic, initial_m: 0.05, friction_N: 0.245}
+surfaces: {floor: {type: plane, point_m: [0, 0, -0.1935]}}
+contacts:
+  law: unilateral
+  friction: 0.4419
+  points: {elbow: {body: link_4, radius_m: 0.02}}
+integrator: {method: dopri5, rtol: 1.0e-5, atol: 1.0e-7}
+"""
+
+
+def test_a_joint_that_rests_on_its_stop_takes_no_share_of_its_force(tmp_path: Path):
+    """A falling arm lands on its elbow with a joint on its stop: friction within its bound, and no chatter."""
+    path = tmp_path / "stops.yaml"
+    path.write_text(BESIDE_STOPS, encoding="utf-8")
+    record = simulate(load_scenario(path))
+    assert record.time[-1] == pytest.approx(0.25)
+    assert len(record.events) < 200
+    assert record["stop_force"].max() > 0.1
+    assert np.abs(record["joint_friction"]).max(axis=0) == pytest.approx([0.245, 0.0245, 0.0245, 0.0245, 0.245])
+    assert abs(record.summary["energy_residual_relative"]) < 1e-6

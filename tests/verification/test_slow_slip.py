@@ -1,0 +1,72 @@
+"""Points that land while all of them slip so slowly that they are all but at rest."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from dynsim import load_scenario, simulate
+
+# Drawn at random. A push lifts the hand off its ball for a moment. When it lands again both points of the last link
+# slip at 1e-7 to 2e-6 m/s, in directions with which no forces agree; they may stick.
+BRACED = """
+duration_s: 0.21762562632865906
+plant:
+  type: serial_arm
+  link:
+    radius_m: 0.019432554065906774
+    motor: {type: dc, torque_constant_N_m_per_A: 0.0302, resistance_ohm: 0.299, inductance_H: 8.23e-05,
+      rotor_inertia_kg_m2: 1.42e-05, gear_ratio: 113.0, gear_damping_N_m_s_per_rad: 3e-06, voltage_limit_V: 24.0,
+      peak_current_A: 12.0}
+  chain:
+    - {axis: z, length_m: 0.0, mass_kg: 0.47668193820866145, initial_deg: -0.17408081469863035}
+    - {axis: y, length_m: 0.2290316433915182, mass_kg: 0.20756622558177096, initial_deg: 120.92986871812899}
+    - {axis: y, length_m: 0.16509192987515214, mass_kg: 0.3070459539296102, initial_deg: -2.7793672869097747,
+       limit_deg: [-3.925224017684724, -1.0605821907473505]}
+    - {axis: y, length_m: 0.24115489371662263, mass_kg: 0.28024404578625506, initial_deg: -86.55121915463342,
+       limit_deg: [-87.24117312731542, -85.51628819561041]}
+controller:
+  type: joint_pd
+  k_p_V_per_rad: 15.52170723057591
+  k_d_V_s_per_rad: 0.5820640211465966
+  brace: optimal
+  joints:
+    joint_4:
+      times_s: [0.0, 0.10881281316432953, 0.21762562632865906]
+      angles_deg: [-86.55121915463342, -86.55121915463342, -86.55121915463342]
+surfaces:
+  floor: {type: sphere, center_m: [0.3422537247967443, 0.07439740163367127, -0.3189362076445127],
+    radius_m: 0.12457012400351349}
+  ball: {type: sphere, center_m: [0.4945817766027559, -0.0015026842162652618, 0.052378153006256555], radius_m: 0.03}
+contacts:
+  law: unilateral
+  friction: 0.3164072339720011
+  static_friction: 0.5423631616673215
+  stribeck_m_s: 0.01
+  points:
+    elbow: {body: link_4, surface: floor, radius_m: 0.02}
+    hand: {body: link_4, point_m: [0.0, 0.0, 0.24115489371662263], surface: ball, radius_m: 0.02}
+loads:
+  push:
+    type: samples
+    body: link_4
+    times_s: [0.043525125265731816, 0.08705025053146363, 0.15233793843006133]
+    force_N: [[0.0, 0.0, 0.0], [7.374169294714517, -2.734822236798465, -0.13165375699491566], [0.0, 0.0, 0.0]]
+    torque_N_m: [[0.0, 0.0, 0.0], [0.15217842449401586, 0.12644320633301281, 0.28316102948046434], [0.05, 0.0, 0.0]]
+    frame: body
+    interpolation: linear
+    point_m: [0.01, 0.0, 0.05]
+integrator: {rtol: 1.0e-9, atol: 1.0e-11}
+"""
+
+
+@pytest.mark.parametrize("method", ["dopri5", pytest.param("radau5", marks=pytest.mark.long)])
+def test_points_that_land_nearly_at_rest_stick(tmp_path: Path, method: str) -> None:
+    path = tmp_path / "braced.yaml"
+    path.write_text(BRACED.replace("integrator: {", f"integrator: {{method: {method}, "))
+    record = simulate(load_scenario(path))
+    assert record.time[-1] == pytest.approx(0.21762562632865906)
+    assert any(event.kind == "landing" and event.name == "hand" for event in record.events)
+    assert (record["contact_normal_force"] >= -1e-9).all()
+    assert record.summary["energy_residual_relative"] < 1e-6
