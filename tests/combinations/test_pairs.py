@@ -99,7 +99,7 @@ def test_scenes_that_were_wrong_once(name: str, number: int, tmp_path: Path) -> 
     _all_holds(KNOWN[name].assignment, KNOWN_SEED, number, tmp_path, thorough=False, takes=_shares_a_program)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("number", range(len(pairs(SEED))))
 def test_every_pair(number: int, tmp_path: Path) -> None:
     _holds(number, tmp_path)
