@@ -23,8 +23,10 @@ from dynsim.compile.contact_law import joint_stops
 from dynsim.compile.model import Model
 from dynsim.compile.references.teleop import VelocitySource
 from dynsim.compile.tables import check_couplings
+from dynsim.compile.tie_rests import may_have_slid, set_rests
 from dynsim.dynamics import state as kst
 from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.drive.law import take_measured_commands
 from dynsim.dynamics.state import block
 from dynsim.dynamics.tree import loads as kl
@@ -39,7 +41,7 @@ from dynsim.engine.soundness import unstable_loop
 from dynsim.engine.stepped import GUARDS, Snapshot, State, Touch, event_name, own_guards, take_log
 from dynsim.engine.stopping import stopped
 from dynsim.engine.trace import Trace
-from dynsim.errors import ModelError, ScenarioError, brief
+from dynsim.errors import ModelError, ScenarioError, brief, first_few
 from dynsim.integrators import driver
 from dynsim.integrators import run as ki
 from dynsim.integrators.dense import state_within
@@ -168,6 +170,7 @@ class Simulation:
         # As planned: where the base should be is drawn from it, until a wheel is told otherwise.
         self._planned = replace(self._prepared.control, reference=reference._replace(spline=reference.spline.copy()))
         self._base_as_planned = state is None
+        self._said: list[str] = []
         run = self._prepared.run
         if state is not None:
             self._take(state)
@@ -281,7 +284,9 @@ class Simulation:
         if run.count[ki.PENDING] == 1 and self._time > run.clock[ki.TIME]:
             state_within(run, self._time, y)
         q, v, current = (y[block(run.layout, name)] for name in ("q", "v", "current"))
-        return State(self._time, q, v, current)
+        unilateral = self._prepared.system.unilateral
+        ties = unilateral is not None and len(unilateral.tie) > 0
+        return State(self._time, q, v, current, unilateral.tie[:, ku.TIE_REST].copy() if ties else None)
 
     def advance(self, until: float) -> State:
         """Integrate up to a time [s], or to the end of the run when that comes first, and return the state there.
@@ -648,6 +653,7 @@ class Simulation:
             base_as_planned=self._base_as_planned,
             pictured=pictured,
         )
+        record.summary["warnings"] += self._said
         for attendant in self._attendants:
             attendant.add_to(record)
         record.complete = self.finished
@@ -661,6 +667,7 @@ class Simulation:
     def _take(self, state: State) -> None:
         """Start at a given state."""
         run, model = self._prepared.run, self._prepared.model
+        at_start = run.y[block(run.layout, "q")].copy()
         for name in ("q", "v", "current"):
             part = block(run.layout, name)
             values = _finite(name, np.ravel(getattr(state, name)))
@@ -678,6 +685,22 @@ class Simulation:
         if self._prepared.system.unilateral is not None:
             joint_stops(model.robot, q)
         check_start(self._scenario, model, self._prepared.contacts, q)
+        if self._prepared.system.unilateral is not None and model.robot.ties:
+            self._take_ties(at_start, state.tie_rest)
+
+    def _take_ties(self, at_start: Array, rests: Array | None) -> None:
+        """Let ties go on from where they have slid to; at_start: coordinates of the scenario's start, (nq,)."""
+        model, ties = self._prepared.model, self._prepared.model.robot.ties
+        if rests is not None and np.shape(rests) != (len(ties),):
+            raise ModelError(f"the state has {np.size(rests)} values of tie_rest, {model.robot.name} has {len(ties)}")
+        set_rests(model, self._prepared.system.unilateral, at_start, rests)
+        slid = [tie.name for tie in ties if may_have_slid(tie)]
+        if rests is None and slid:
+            self._said.append(
+                f"{first_few(slid)}: the state does not say how far ties have slid beyond their bounds (tie_rest); "
+                "they start as if they never had; go on from Simulation.state, or from a snapshot"
+            )
+            log.warning("%s: %s", self._scenario.title, self._said[-1])
 
     def _reach(self, until: float) -> None:
         """Integrate until the step that would pass a time is pending, or ends there."""
