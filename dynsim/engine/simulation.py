@@ -49,7 +49,7 @@ from dynsim.model.drives import Drive
 from dynsim.record import Event, Record
 from dynsim.record.measures import TIP_OVER
 from dynsim.scenario import Scenario, require_scenario
-from dynsim.scenario.build import check_start
+from dynsim.scenario.build import START_TOLERANCE, check_start
 from dynsim.scenario.combinations import LINEARIZATION, WATCHED_EVENTS
 from dynsim.system import interruption
 from dynsim.system.memo import Memo, remembering
@@ -70,6 +70,8 @@ MOST_TICKS, SHORTEST_PERIOD = 60, 1e-9
 TICK_SLACK = 1e-12
 # End of a run without a given end [s]: finite, and later than any time in use.
 _FAR = 1e300
+# A state under time stepping may be a step of this speed below a surface or beyond a stop [m/s or rad/s].
+FASTEST_LANDING = 5.0
 SERVO_MODES = {"position": ka.POSITION_MODE, "velocity": ka.VELOCITY_MODE, "off": ka.OFF}
 # Buffers into which kernels sample; their sizes change.
 _BUFFERS = {f"run.{field}": field for field in ("sample_time", "sample", "output")}
@@ -682,9 +684,13 @@ class Simulation:
             run.y[part] = values
         q = run.y[block(run.layout, "q")]
         check_couplings(model.robot, q)
+        beyond = START_TOLERANCE
+        if run.method == ki.TIME_STEPPING:
+            # What has landed is below its surface, or beyond its stop, by up to a step of its speed.
+            beyond = max(beyond, float(run.clock[ki.STEP]) * FASTEST_LANDING)
         if self._prepared.system.unilateral is not None:
-            joint_stops(model.robot, q)
-        check_start(self._scenario, model, self._prepared.contacts, q)
+            joint_stops(model.robot, q, beyond)
+        check_start(self._scenario, model, self._prepared.contacts, q, beyond)
         if self._prepared.system.unilateral is not None and model.robot.ties:
             self._take_ties(at_start, state.tie_rest)
 

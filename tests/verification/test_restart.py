@@ -83,3 +83,41 @@ def test_a_state_that_does_not_say_how_far_ties_have_slid_is_said(tmp_path: Path
         said[kind] = [text for text in again.record().summary["warnings"] if "how far ties have slid" in text]
     assert not said["linear"]
     assert said["bound"][0].startswith("tie: the state does not say")
+
+
+LANDED = """
+name: landed
+duration_s: 0.6
+plant:
+  type: serial_arm
+  chain: [{axis: y, length_m: 0.3, mass_kg: 1, initial_deg: 40, limit_deg: [0, 60]}]
+objects:
+  ball: {shape: sphere, radius_m: 0.05, mass_kg: 0.3, position_m: [0.5, 0.4, 0.2]}
+surfaces: {floor: {type: plane}}
+contacts: {law: unilateral, friction: 0.3}
+integrator: {method: time_stepping, step_s: 0.001}
+"""
+
+
+@pytest.mark.parametrize("until", [0.174, 0.2])
+def test_a_run_goes_on_from_what_time_stepping_leaves(until: float, tmp_path: Path):
+    """A ball that has sunk in as it landed, and a joint that has passed its stop by a step."""
+    path = tmp_path / "landed.yaml"
+    path.write_text(LANDED)
+    scenario = load_scenario(path)
+    simulation = Simulation(scenario)
+    simulation.advance(until)
+    before = simulation.record()
+    simulation.advance(scenario.duration_s)
+    again = Simulation(scenario, state=State.of(before))
+    q = again.advance(scenario.duration_s).q
+    # The state does not have what the landing lost, which is what depth is taken back with: it stays.
+    depth = max(-float(before["contact_gap"][-1].min()), 0.0)
+    np.testing.assert_allclose(q[1:4], simulation.state.q[1:4], atol=depth + 1e-6)
+    beyond = max(before["q"][-1, 0] - np.radians(60.0), 0.0)
+    assert q[0] == pytest.approx(simulation.state.q[0], abs=beyond + 1e-6)
+    ending = State.of(before)
+    deep = ending.q.copy()
+    deep[0] = np.radians(61.0)
+    with pytest.raises(ModelError, match="beyond its stop"):
+        Simulation(scenario, state=replace(ending, q=deep))
