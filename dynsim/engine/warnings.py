@@ -120,9 +120,15 @@ def _contact_warnings(record: Record, scenario: Scenario, prepared: Prepared, su
         name = contact["name"]
         if "gap_min_m" in contact and contact["closed_fraction"] == 0.0 and name not in left_out:
             nearest = int(record["contact_gap"][:, columns.index(name)].argmin())
+            time, surface = f"t = {record.time[nearest]:.4g} s", contact["surface"]
+            if contact["gap_min_m"] <= build.START_TOLERANCE:
+                warnings.append(
+                    f"{name}: this brace is on the {surface} at {time}, but never pressed: it carries nothing"
+                )
+                continue
             warnings.append(
-                f"{name}: this brace never touches the {contact['surface']}: it carries nothing; nearest "
-                f"{1e3 * contact['gap_min_m']:.3g} mm at t = {record.time[nearest]:.4g} s"
+                f"{name}: this brace never touches the {surface}: it carries nothing; nearest "
+                f"{1e3 * contact['gap_min_m']:.3g} mm at {time}"
                 f"{'' if name in placed else ' (initial.on_surface lets it start there)'}"
             )
     for brace, since in zip(contacts, prepared.run.extremes[:, ki.LOCAL_SINCE], strict=True):

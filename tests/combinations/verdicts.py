@@ -152,6 +152,16 @@ def _never_touches(match: Match, seen: Observed) -> str:
     return ""
 
 
+def _never_pressed(match: Match, seen: Observed) -> str:
+    touch = _touch(seen, match[1])
+    if touch is None:
+        return "no such contact"
+    if np.abs(touch.normal_force).max(initial=0.0) > 0.0:
+        return f"it carries {touch.normal_force.max():.4g} N"
+    nearest = float(touch.gap.min())
+    return "" if nearest <= 2e-6 else f"it comes as near as {nearest:.4g} m"
+
+
 def _reversed(match: Match, seen: Observed) -> str:
     """W_nn − μ W_nt < 0 for the contact alone, at the sample after the time that is named."""
     touch, since = _touch(seen, match[1]), float(match[2])
@@ -397,6 +407,7 @@ VERIFIERS: dict[str, Callable[[Match, Observed], str]] = {
     rf"^(.+): chatter, more than {NUMBER} contact events within {NUMBER} s": _chatters,
     rf"^(.+): the (.+) pulls on this brace for {NUMBER}(?: %)? of the run, with up to {NUMBER} N": _pulls,
     rf"^(.+): this brace never touches the (.+): it carries nothing; nearest {NUMBER} mm": _never_touches,
+    rf"^(.+): this brace is on the (.+) at t = {NUMBER} s, but never pressed": _never_pressed,
     rf"^(.+): from t = {NUMBER} s on, its friction turns its own force against it": _reversed,
     rf"^friction has put {NUMBER} J into the arm": _friction_gives,
     rf"^(.+): (\S+) at its limit of {NUMBER} \S+(?: m)? for {NUMBER} % of the run": _at_limit,
