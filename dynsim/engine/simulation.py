@@ -180,18 +180,18 @@ class Simulation:
         run.tick[:, [ki.TICK_NEXT, ki.TICK_PHASE]] = start
         self._refill()
         encoded = self._encoded_commands()
-        self._operator = self._attendant(operator)
+        self._operator = self._attendant(operator, state)
         if self._operator is not None:
             self.every(self._operator.period, self._operator)
         elif operator is not None:
             raise ScenarioError("an operator needs a scenario with controller.operator, which says what it moves")
         self._attendants = [attendant for attendant in (encoded, self._operator) if attendant is not None]
 
-    def _attendant(self, source: Any) -> Operator | SnakePilot | None:
+    def _attendant(self, source: Any, state: State | None) -> Operator | SnakePilot | None:
         """Who rewrites references at the ticks of its own, where the scenario has somebody."""
         control = self._prepared.control
         if control.teleop is not None:
-            return Operator(self.model, control.teleop, source)
+            return Operator(self.model, control.teleop, source, state)
         if control.task_space is None:
             return None
         # Imported here: an arm needs nothing of a snake.

@@ -121,3 +121,51 @@ def test_a_run_goes_on_from_what_time_stepping_leaves(until: float, tmp_path: Pa
     deep[0] = np.radians(61.0)
     with pytest.raises(ModelError, match="beyond its stop"):
         Simulation(scenario, state=replace(ending, q=deep))
+
+
+LED = """
+name: led
+duration_s: 0.6
+plant:
+  type: serial_arm
+  gravity_m_s2: [0, 0, 0]
+  link: {mass_kg: 0.3, motor: {type: wang_minami}}
+  chain:
+    - {axis: z, length_m: 0.1, initial_deg: 10}
+    - {axis: y, length_m: 0.3, initial_deg: 60}
+    - {axis: y, length_m: 0.2, initial_deg: 40}
+controller:
+  type: joint_pd
+  k_p_V_per_rad: 500
+  k_d_V_s_per_rad: 20
+  operator:
+    joints: [joint_1, joint_2, joint_3]
+    commands: [{at_s: 0.0, hand: [-0.05, 0.05, 0.08]}, {at_s: 0.4, hand: [0, 0, 0]}]
+integrator: {method: dopri5}
+record: {rate_hz: 500}
+"""
+
+
+def test_an_operator_goes_on_from_the_posture_and_the_time_of_a_state(tmp_path: Path):
+    """The hand is led on from where it is, not back to where the scenario starts, and its script goes on, not anew."""
+    path = tmp_path / "led.yaml"
+    path.write_text(LED)
+    scenario = load_scenario(path)
+    simulation = Simulation(scenario)
+    state = simulation.advance(0.3)
+    simulation.advance(0.6)
+    whole = simulation.record()
+    again = Simulation(scenario, state=state)
+    again.advance(0.6)
+    record = again.record()
+    rest = whole.time >= 0.3 - 1e-9
+    hand, expected = record["hand_position"], whole["hand_position"][rest]
+    led = float(np.linalg.norm(expected[-1] - whole["hand_position"][0]))
+    assert led > 0.015
+    # A state does not have the references: the hand is led on from where it is, without the error that it had.
+    error = np.linalg.norm(whole["target_position"] - whole["hand_position"], axis=1).max()
+    assert np.linalg.norm(hand - expected, axis=1).max() < 3.0 * error < 0.1 * led
+    target = record["target_position"]
+    np.testing.assert_allclose(target[0], hand[0], atol=1e-12)
+    np.testing.assert_allclose(target - target[0], whole["target_position"][rest] - whole["target_position"][rest][0],
+                               atol=error)  # fmt: skip
