@@ -27,6 +27,7 @@ from dynsim.compile.tie_rests import may_have_slid, set_rests
 from dynsim.dynamics import state as kst
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
+from dynsim.dynamics.contact.unilateral import UnilateralArrays
 from dynsim.dynamics.drive.law import take_measured_commands
 from dynsim.dynamics.state import block
 from dynsim.dynamics.tree import loads as kl
@@ -287,8 +288,9 @@ class Simulation:
             state_within(run, self._time, y)
         q, v, current = (y[block(run.layout, name)] for name in ("q", "v", "current"))
         unilateral = self._prepared.system.unilateral
-        ties = unilateral is not None and len(unilateral.tie) > 0
-        return State(self._time, q, v, current, unilateral.tie[:, ku.TIE_REST].copy() if ties else None)
+        if unilateral is None or not len(unilateral.tie):
+            return State(self._time, q, v, current)
+        return State(self._time, q, v, current, unilateral.tie[:, ku.TIE_REST].copy())
 
     def advance(self, until: float) -> State:
         """Integrate up to a time [s], or to the end of the run when that comes first, and return the state there.
@@ -691,15 +693,15 @@ class Simulation:
         if self._prepared.system.unilateral is not None:
             joint_stops(model.robot, q, beyond)
         check_start(self._scenario, model, self._prepared.contacts, q, beyond)
-        if self._prepared.system.unilateral is not None and model.robot.ties:
-            self._take_ties(at_start, state.tie_rest)
+        if (unilateral := self._prepared.system.unilateral) is not None and model.robot.ties:
+            self._take_ties(unilateral, at_start, state.tie_rest)
 
-    def _take_ties(self, at_start: Array, rests: Array | None) -> None:
+    def _take_ties(self, unilateral: UnilateralArrays, at_start: Array, rests: Array | None) -> None:
         """Let ties go on from where they have slid to; at_start: coordinates of the scenario's start, (nq,)."""
         model, ties = self._prepared.model, self._prepared.model.robot.ties
         if rests is not None and np.shape(rests) != (len(ties),):
             raise ModelError(f"the state has {np.size(rests)} values of tie_rest, {model.robot.name} has {len(ties)}")
-        set_rests(model, self._prepared.system.unilateral, at_start, rests)
+        set_rests(model, unilateral, at_start, rests)
         slid = [tie.name for tie in ties if may_have_slid(tie)]
         if rests is None and slid:
             self._said.append(
