@@ -58,16 +58,16 @@ def test_ties_go_on_from_the_state_as_they_were(kind: str, tmp_path: Path):
     state = simulation.advance(HALFWAY)
     simulation.advance(scenario.duration_s)
     whole = simulation.record()
-    rest = whole.time >= HALFWAY - 1e-9
+    later = whole.time >= HALFWAY - 1e-9
     again = Simulation(scenario, state=state)
     again.advance(scenario.duration_s)
     record = again.record()
-    forces, expected = record["tie_force"], whole["tie_force"][rest]
+    forces, expected = record["tie_force"], whole["tie_force"][later]
     change = np.abs(np.diff(expected, axis=0)).max()
     assert np.abs(expected).max() > 20.0 * change
     np.testing.assert_allclose(forces, expected, atol=2.0 * change)
     # The first step does not extrapolate the accelerations of the last one: second order in the step.
-    np.testing.assert_allclose(record["q"], whole["q"][rest], atol=100.0 * STEP**2)
+    np.testing.assert_allclose(record["q"], whole["q"][later], atol=100.0 * STEP**2)
     assert record.summary["warnings"] == []
     with pytest.raises(ModelError, match="2 values of tie_rest"):
         Simulation(scenario, state=replace(state, tie_rest=np.zeros(2)))
@@ -158,8 +158,8 @@ def test_an_operator_goes_on_from_the_posture_and_the_time_of_a_state(tmp_path: 
     again = Simulation(scenario, state=state)
     again.advance(0.6)
     record = again.record()
-    rest = whole.time >= 0.3 - 1e-9
-    hand, expected = record["hand_position"], whole["hand_position"][rest]
+    later = whole.time >= 0.3 - 1e-9
+    hand, expected = record["hand_position"], whole["hand_position"][later]
     led = float(np.linalg.norm(expected[-1] - whole["hand_position"][0]))
     assert led > 0.015
     # A state does not have the references: the hand is led on from where it is, without the error that it had.
@@ -167,5 +167,5 @@ def test_an_operator_goes_on_from_the_posture_and_the_time_of_a_state(tmp_path: 
     assert np.linalg.norm(hand - expected, axis=1).max() < 3.0 * error < 0.1 * led
     target = record["target_position"]
     np.testing.assert_allclose(target[0], hand[0], atol=1e-12)
-    np.testing.assert_allclose(target - target[0], whole["target_position"][rest] - whole["target_position"][rest][0],
+    np.testing.assert_allclose(target - target[0], whole["target_position"][later] - whole["target_position"][later][0],
                                atol=error)  # fmt: skip
