@@ -419,7 +419,7 @@ VERIFIERS: dict[str, Callable[[Match, Observed], str]] = {
     rf"^(.+): chatter, more than {NUMBER} contact events within {NUMBER} s": _chatters,
     rf"^(.+): the (.+) pulls on this brace for {NUMBER}(?: %)? of the run, with up to {NUMBER} N": _pulls,
     rf"^(.+): this brace never touches the (.+): it carries nothing; nearest {NUMBER} mm": _never_touches,
-    rf"^(.+): this brace is on the (.+) at t = {NUMBER} s, but never pressed": _never_pressed,
+    r"^(.+): this brace is on the (.+) at (.+), but never pressed": _never_pressed,
     rf"^(.+): from t = {NUMBER} s on, its friction turns its own force against it": _reversed,
     rf"^friction has put {NUMBER} J into the arm": _friction_gives,
     rf"^(.+): (\S+) at its limit of {NUMBER} \S+(?: m)? for {NUMBER} % of the run": _at_limit,
@@ -441,7 +441,7 @@ VERIFIERS: dict[str, Callable[[Match, Observed], str]] = {
     r"^initial.equilibrium: .*that jumps at the start": _jumps,
     rf"^controller.sample_time_s = {NUMBER} s: the sampled loop is unstable": _unstable,
     r"^the motion is not unique: nothing presses (.+), held by": _unpressed,
-    rf"^initial.equilibrium: (\S+) starts with {NUMBER} \S+ all the same, and contacts.*": _moves_at_once,
+    rf"^initial.equilibrium: (\S+) starts with {NUMBER} \S+ all the same.*": _moves_at_once,
     rf"^initial.equilibrium: the start slips at t = {NUMBER} s": _slips_at_once,
 }
 """Pattern of each warning and its check: the groups and what the run shows → why it is not so, empty if it is."""
