@@ -169,13 +169,17 @@ def contact_laws(robot: Robot, contacts: Sequence[Contact]) -> NDArray[np.float6
     return law
 
 
-def joint_stops(robot: Robot, q: NDArray[np.float64] | None = None) -> list[JointStop]:
+def joint_stops(
+    robot: Robot, q: NDArray[np.float64] | None = None, tolerance: float = START_TOLERANCE
+) -> list[JointStop]:
     """Return the stops of a robot's joints: their finite limits, the lower one first.
 
     Parameters
     ----------
     q : (nq,) ndarray
         Start [rad or m]; default: the robot's initial positions.
+    tolerance : float
+        A joint may start this far beyond its stop [rad or m].
 
     Raises
     ------
@@ -191,7 +195,7 @@ def joint_stops(robot: Robot, q: NDArray[np.float64] | None = None) -> list[Join
         for side, limit in ((1.0, link.lower), (-1.0, link.upper)):
             if np.isfinite(limit):
                 beyond = side * (limit - q[k])
-                if beyond > START_TOLERANCE:
+                if beyond > tolerance:
                     raise ModelError(
                         f"{link.joint}: starts at {format_quantity(q[k], link.units[0])}, beyond its "
                         f"stop at {format_quantity(limit, link.units[0])}; "

@@ -67,18 +67,26 @@ class HandGovernor:
     hindrance : why the hand is slower than it was asked to be; empty where it is not
     """
 
-    def __init__(self, model: Model, options: TeleopOptions, target: Array, axes: Array) -> None:
+    def __init__(self, model: Model, options: TeleopOptions, q: Array, axes: Array) -> None:
         self._options, self._model, self._axes = options, model, axes
         self._arrays = path_arrays(model, options.joints, options.braces)
         self._workspace = workspace(model.n, 0, 0)
-        self._q = reals(model.robot.initial)
+        self._q = reals(q)
         links = {link.joint: link for link in model.robot.links}
         self._low = np.array([links[joint].lower for joint in options.joints])
         self._high = np.array([links[joint].upper for joint in options.joints])
-        self.target, self.velocity = target.copy(), np.zeros(3)
+        self.target = np.array(model.point_position(*model.robot.hand, q), dtype=np.float64)
+        self.velocity = np.zeros(3)
         self.joints = self._q[self._arrays.place].copy()
         self.rates, self.hindrance = np.zeros(len(self.joints)), ""
         self._path = StoppingPath(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, len(self.joints))))
+
+    def begin(self, q: Array, v: Array) -> None:
+        """Begin with the rates that the joints have at coordinates q, (nq,), with rates v, (n,), instead of at rest."""
+        columns = [self._model.joint_names.index(joint) for joint in self._options.joints]
+        self.rates = v[columns].copy()
+        jacobian = self._model.point_jacobian(*self._model.robot.hand, q)[:, columns]
+        self.velocity = self._axes.T @ jacobian @ self.rates
 
     def state(self) -> dict[str, Any]:
         """What the future depends on: values that are replaced, and never written to."""

@@ -29,6 +29,8 @@ from dynsim.model.base_pose import base_pose, base_row
 from dynsim.record import Record
 
 Array = NDArray[np.float64]
+# A state at a tick may be a rounding before it [ticks].
+TICK_SLACK = 1e-9
 _STATE = ("ticks", "_moving", "_angles", "_base_velocity")
 
 
@@ -55,36 +57,51 @@ class Referenced(Protocol):
 class OperatorPath:
     """Where the hand was asked to be: straight lines between the ticks."""
 
-    def __init__(self, rate: float, start: Array) -> None:
-        self.rate = rate
+    def __init__(self, rate: float, start: Array, time: float = 0.0) -> None:
+        self.rate, self.time = rate, time
         self.points = [start.copy()]
 
     def position(self, t: NDArray[np.float64]) -> Array:
         """At times t [s], (T,) → (T, 3) [m]."""
-        points, ticks = np.array(self.points), np.arange(len(self.points)) / self.rate
+        points, ticks = np.array(self.points), self.time + np.arange(len(self.points)) / self.rate
         return np.stack([np.interp(t, ticks, column) for column in points.T], axis=1)
 
 
 class Operator:
-    """Called at the ticks of a simulation."""
+    """Called at the ticks of a simulation, from the scenario's start or from a state, whose posture it takes over."""
 
-    def __init__(self, model: Model, options: TeleopOptions, source: VelocitySource | None = None) -> None:
+    def __init__(
+        self, model: Model, options: TeleopOptions, source: VelocitySource | None = None, state: State | None = None
+    ) -> None:
         robot = model.robot
+        q, time = (robot.initial, 0.0) if state is None else (np.ravel(state.q), state.time)
         self.rate, self.period = options.rate, 1.0 / options.rate
         self.options, self.source = options, options.script if source is None else source
-        self.ticks, self._moving = 0, False
-        self._model, self._start = model, np.array(model.point_position(*robot.hand, robot.initial), dtype=np.float64)
+        # At a state references are still those of the scenario's start: the first tick writes them.
+        self.ticks, self._moving = math.floor(time * self.rate + TICK_SLACK), state is not None
+        self._model, self._start = model, np.array(model.point_position(*robot.hand, q), dtype=np.float64)
         # On a base that drives the target is in the axes of the base, where it has no path in the world.
-        self.path = OperatorPath(options.rate, self._start) if robot.base is None and options.joints else None
+        self.path = OperatorPath(options.rate, self._start, time) if robot.base is None and options.joints else None
         self._angles, axes = np.zeros(2), np.eye(3)
         self._base_velocity = np.zeros(VELOCITIES)[BASE]
         if robot.base is not None:
             first, _ = base_row(robot)
-            self._angles = robot.initial[first : first + 2].copy()
-            heading = float(base_pose(robot, robot.initial[None])[0, 2])
+            self._angles = q[first : first + 2].copy()
+            heading = float(base_pose(robot, q[None])[0, 2])
             c, s = math.cos(heading), math.sin(heading)
             axes = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        self._hand = HandGovernor(model, options, self._start, axes) if options.joints else None
+        self._hand = HandGovernor(model, options, q, axes) if options.joints else None
+        if state is not None:
+            self._go_on(q, np.ravel(state.v))
+
+    def _go_on(self, q: Array, v: Array) -> None:
+        """Let references begin with the rates that joints and wheels have, (n,): at rest their drives would brake."""
+        if self._hand is not None:
+            self._hand.begin(q, v)
+        base, joints = self._model.robot.base, self._model.joint_names
+        if base is not None and set(base.wheels) <= set(joints):
+            rates = wheel_angles(base, np.eye(2)).T
+            self._base_velocity = np.linalg.solve(rates, [v[joints.index(wheel)] for wheel in base.wheels])
 
     @property
     def target(self) -> Array:

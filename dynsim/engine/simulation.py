@@ -23,8 +23,11 @@ from dynsim.compile.contact_law import joint_stops
 from dynsim.compile.model import Model
 from dynsim.compile.references.teleop import VelocitySource
 from dynsim.compile.tables import check_couplings
+from dynsim.compile.tie_rests import may_have_slid, set_rests
 from dynsim.dynamics import state as kst
 from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact import unilateral as ku
+from dynsim.dynamics.contact.unilateral import UnilateralArrays
 from dynsim.dynamics.drive.law import take_measured_commands
 from dynsim.dynamics.state import block
 from dynsim.dynamics.tree import loads as kl
@@ -39,7 +42,7 @@ from dynsim.engine.soundness import unstable_loop
 from dynsim.engine.stepped import GUARDS, Snapshot, State, Touch, event_name, own_guards, take_log
 from dynsim.engine.stopping import stopped
 from dynsim.engine.trace import Trace
-from dynsim.errors import ModelError, ScenarioError, brief
+from dynsim.errors import ModelError, ScenarioError, brief, first_few
 from dynsim.integrators import driver
 from dynsim.integrators import run as ki
 from dynsim.integrators.dense import state_within
@@ -47,7 +50,7 @@ from dynsim.model.drives import Drive
 from dynsim.record import Event, Record
 from dynsim.record.measures import TIP_OVER
 from dynsim.scenario import Scenario, require_scenario
-from dynsim.scenario.build import check_start
+from dynsim.scenario.build import START_TOLERANCE, check_start
 from dynsim.scenario.combinations import LINEARIZATION, WATCHED_EVENTS
 from dynsim.system import interruption
 from dynsim.system.memo import Memo, remembering
@@ -68,6 +71,8 @@ MOST_TICKS, SHORTEST_PERIOD = 60, 1e-9
 TICK_SLACK = 1e-12
 # End of a run without a given end [s]: finite, and later than any time in use.
 _FAR = 1e300
+# A state under time stepping may be a step of this speed below a surface or beyond a stop [m/s or rad/s].
+FASTEST_LANDING = 5.0
 SERVO_MODES = {"position": ka.POSITION_MODE, "velocity": ka.VELOCITY_MODE, "off": ka.OFF}
 # Buffers into which kernels sample; their sizes change.
 _BUFFERS = {f"run.{field}": field for field in ("sample_time", "sample", "output")}
@@ -168,6 +173,7 @@ class Simulation:
         # As planned: where the base should be is drawn from it, until a wheel is told otherwise.
         self._planned = replace(self._prepared.control, reference=reference._replace(spline=reference.spline.copy()))
         self._base_as_planned = state is None
+        self._said: list[str] = []
         run = self._prepared.run
         if state is not None:
             self._take(state)
@@ -175,18 +181,18 @@ class Simulation:
         run.tick[:, [ki.TICK_NEXT, ki.TICK_PHASE]] = start
         self._refill()
         encoded = self._encoded_commands()
-        self._operator = self._attendant(operator)
+        self._operator = self._attendant(operator, state)
         if self._operator is not None:
             self.every(self._operator.period, self._operator)
         elif operator is not None:
             raise ScenarioError("an operator needs a scenario with controller.operator, which says what it moves")
         self._attendants = [attendant for attendant in (encoded, self._operator) if attendant is not None]
 
-    def _attendant(self, source: Any) -> Operator | SnakePilot | None:
+    def _attendant(self, source: Any, state: State | None) -> Operator | SnakePilot | None:
         """Who rewrites references at the ticks of its own, where the scenario has somebody."""
         control = self._prepared.control
         if control.teleop is not None:
-            return Operator(self.model, control.teleop, source)
+            return Operator(self.model, control.teleop, source, state)
         if control.task_space is None:
             return None
         # Imported here: an arm needs nothing of a snake.
@@ -281,7 +287,10 @@ class Simulation:
         if run.count[ki.PENDING] == 1 and self._time > run.clock[ki.TIME]:
             state_within(run, self._time, y)
         q, v, current = (y[block(run.layout, name)] for name in ("q", "v", "current"))
-        return State(self._time, q, v, current)
+        unilateral = self._prepared.system.unilateral
+        if unilateral is None or not len(unilateral.tie):
+            return State(self._time, q, v, current)
+        return State(self._time, q, v, current, unilateral.tie[:, ku.TIE_REST].copy())
 
     def advance(self, until: float) -> State:
         """Integrate up to a time [s], or to the end of the run when that comes first, and return the state there.
@@ -648,6 +657,7 @@ class Simulation:
             base_as_planned=self._base_as_planned,
             pictured=pictured,
         )
+        record.summary["warnings"] += self._said
         for attendant in self._attendants:
             attendant.add_to(record)
         record.complete = self.finished
@@ -661,6 +671,7 @@ class Simulation:
     def _take(self, state: State) -> None:
         """Start at a given state."""
         run, model = self._prepared.run, self._prepared.model
+        at_start = run.y[block(run.layout, "q")].copy()
         for name in ("q", "v", "current"):
             part = block(run.layout, name)
             values = _finite(name, np.ravel(getattr(state, name)))
@@ -675,9 +686,29 @@ class Simulation:
             run.y[part] = values
         q = run.y[block(run.layout, "q")]
         check_couplings(model.robot, q)
+        beyond = START_TOLERANCE
+        if run.method == ki.TIME_STEPPING:
+            # What has landed is below its surface, or beyond its stop, by up to a step of its speed.
+            beyond = max(beyond, float(run.clock[ki.STEP]) * FASTEST_LANDING)
         if self._prepared.system.unilateral is not None:
-            joint_stops(model.robot, q)
-        check_start(self._scenario, model, self._prepared.contacts, q)
+            joint_stops(model.robot, q, beyond)
+        check_start(self._scenario, model, self._prepared.contacts, q, beyond)
+        if (unilateral := self._prepared.system.unilateral) is not None and model.robot.ties:
+            self._take_ties(unilateral, at_start, state.tie_rest)
+
+    def _take_ties(self, unilateral: UnilateralArrays, at_start: Array, rests: Array | None) -> None:
+        """Let ties go on from where they have slid to; at_start: coordinates of the scenario's start, (nq,)."""
+        model, ties = self._prepared.model, self._prepared.model.robot.ties
+        if rests is not None and np.shape(rests) != (len(ties),):
+            raise ModelError(f"the state has {np.size(rests)} values of tie_rest, {model.robot.name} has {len(ties)}")
+        set_rests(model, unilateral, at_start, rests)
+        slid = [tie.name for tie in ties if may_have_slid(tie)]
+        if rests is None and slid:
+            self._said.append(
+                f"{first_few(slid)}: the state does not say how far ties have slid beyond their bounds (tie_rest); "
+                "they start as if they never had; go on from Simulation.state, or from a snapshot"
+            )
+            log.warning("%s: %s", self._scenario.title, self._said[-1])
 
     def _reach(self, until: float) -> None:
         """Integrate until the step that would pass a time is pending, or ends there."""

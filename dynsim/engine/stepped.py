@@ -80,16 +80,18 @@ class State:
     ----------
     time : [s]
     q : (nq,) positions [rad or m]; v : (n,) rates; current : of the motors that have a circuit [A]
+    tie_rest : x_0 of the ties [m or rad], which move beyond a bound; None: as at the start of the scenario
     """
 
     time: float
     q: Array
     v: Array
     current: Array
+    tie_rest: Array | None = None
 
     @classmethod
     def of(cls, record: Record, sample: int = -1) -> State:
-        """The state at a sample of a record, by default the last.
+        """The state at a sample of a record, by default the last; records do not have ``tie_rest``.
 
         Raises
         ------

@@ -30,6 +30,10 @@ from dynsim.scenario.effect import without_effect
 DRIFT_LIMIT_M = 1e-9
 # A larger acceleration of a joint at an equilibrium start is a motion, not rounding [rad/s² or m/s²].
 STARTS_MOVING = 1e-6
+# Smaller accelerations, by the weight's, of a balance that uses less than all friction are roundings of stiff contacts.
+OF_WEIGHT = 1e-4
+# Forces of contacts at the start that differ by more than this, relative or in N, are others than at rest.
+DIFFERS = 1e-3
 # Slip that begins earlier is of the start [s].
 AT_ONCE = 1e-3
 # An unpressed point that sticks for a smaller fraction of the run would read 0.0 %.
@@ -87,7 +91,7 @@ def warnings_of(
         warnings.append(f"contacts drifted by {summary['constraint_drift_max_m']:.1e} m")
     warnings += _undetermined(record, prepared)
     warnings += _unpressed(record, prepared)
-    warnings += _slipping_start(record, prepared)
+    warnings += _slipping_start(record, prepared) or _moving_start(record, prepared)
     warnings += _sunk(record, sunk)
     warnings += _beyond_stops(robot, prepared.stops, prepared.control)
     warnings += without_effect(scenario, bool(robot.motors))
@@ -120,9 +124,15 @@ def _contact_warnings(record: Record, scenario: Scenario, prepared: Prepared, su
         name = contact["name"]
         if "gap_min_m" in contact and contact["closed_fraction"] == 0.0 and name not in left_out:
             nearest = int(record["contact_gap"][:, columns.index(name)].argmin())
+            time, surface = f"t = {record.time[nearest]:.4g} s", contact["surface"]
+            if contact["gap_min_m"] <= build.START_TOLERANCE:
+                warnings.append(
+                    f"{name}: this brace is on the {surface} at {time}, but never pressed: it carries nothing"
+                )
+                continue
             warnings.append(
-                f"{name}: this brace never touches the {contact['surface']}: it carries nothing; nearest "
-                f"{1e3 * contact['gap_min_m']:.3g} mm at t = {record.time[nearest]:.4g} s"
+                f"{name}: this brace never touches the {surface}: it carries nothing; nearest "
+                f"{1e3 * contact['gap_min_m']:.3g} mm at {time}"
                 f"{'' if name in placed else ' (initial.on_surface lets it start there)'}"
             )
     for brace, since in zip(contacts, prepared.run.extremes[:, ki.LOCAL_SINCE], strict=True):
@@ -262,6 +272,33 @@ def _slipping_start(record: Record, prepared: Prepared) -> list[str]:
         f"initial.equilibrium: the start slips at t = {slips:.3g} s, because this posture needs all of the static "
         "friction; raise contacts.friction, or change the posture"
     ]
+
+
+def _moving_start(record: Record, prepared: Prepared) -> list[str]:
+    """An equilibrium that the run leaves at once: the contact law allows rest and motion, as of wedged points."""
+    balance, robot = prepared.balance, prepared.model.robot
+    if balance is None or balance.warnings or not len(record) or record.time[0] != 0.0:
+        return []
+    # A run may have begun from another state.
+    if np.abs(record["v"][0]).max(initial=0.0) > 0.0 or not np.array_equal(record["q"][0], robot.initial):
+        return []
+    size = np.abs(record["vdot"][0])
+    if size.max(initial=0.0) <= OF_WEIGHT * (1.0 + float(np.linalg.norm(robot.gravity))):
+        return []
+    link, acceleration = robot.links[int(size.argmax())], float(record["vdot"][0][size.argmax()])
+    names, touch = record.labels["contact_normal_force"], record["contact_normal_force"][0]
+    other = [
+        f"{name} {touch[names.index(name)]:.4g} N instead of {force:.4g} N"
+        for name, force in balance.normal_forces.items()
+        if abs(touch[names.index(name)] - force) > DIFFERS * (1.0 + abs(force))
+    ]
+    text = f"initial.equilibrium: {link.joint} starts with {acceleration:.4g} {link.units[2]} all the same"
+    if other:
+        text += (
+            f", and contacts with other forces than at rest: {first_few(other)}; the contact law allows both, and the "
+            "run takes the motion; take one of these contacts away, lower its friction, or change the posture"
+        )
+    return [text]
 
 
 def _joints_at_rest(record: Record, prepared: Prepared) -> NDArray[np.bool_]:

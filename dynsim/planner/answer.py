@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from dynsim.engine import named, simulate
-from dynsim.errors import ScenarioError
+from dynsim.errors import ScenarioError, first_few
 from dynsim.planner import planned_scenario
 from dynsim.planner.dense import Dense, nearest
 from dynsim.planner.problem import Candidate, Options, Task, task
@@ -20,6 +20,7 @@ from dynsim.planner.search import Planned, Search, Tally
 from dynsim.planner.verify import Corner, Tolerances, Verdict, Verifier
 from dynsim.record import Record
 from dynsim.scenario import Scenario, require_scenario
+from dynsim.scenario.loads import Payload
 
 # Two rounds agree if their heats differ by less than this share.
 AGREE = 0.01
@@ -380,6 +381,8 @@ def plan_braces(
         problem = task(scenario, options)
         if problem.bare and most > 0:
             warnings.warn(_bare(problem.bare), stacklevel=2)
+        if unplanned := [name for name, load in scenario.config.loads.items() if not isinstance(load, Payload)]:
+            warnings.warn(_unplanned(unplanned), stacklevel=2)
         if not np.any(problem.arm.model.robot.gravity):
             raise ScenarioError("plant.gravity_m_s2 = [0, 0, 0]: without gravity an arm needs no braces")
         search = Search(problem, tell)
@@ -399,6 +402,14 @@ def _bare(names: Sequence[str]) -> str:
         f"plan: candidates {', '.join(names)} have radius 0 (links of a URDF have none, whatever <visual> shows): "
         "braces would lay the axis itself onto the surface; give --radius, or name contacts.points with radius_m as "
         "--candidates"
+    )
+
+
+def _unplanned(names: Sequence[str]) -> str:
+    """Warning of loads that are no payloads."""
+    return (
+        f"plan: loads.{first_few(names)}: planned without, as only payloads are part of a plan; simulated runs have "
+        "them, and refuse plans that they make dearer: give a steady weight as `type: payload`"
     )
 
 

@@ -216,7 +216,9 @@ class SceneSurface:
 
         start, spacing = np.array(self.position), np.array(self.spacing)
         cells = np.stack([(y - start[1]) / spacing[1], (x - start[0]) / spacing[0]])
-        return np.asarray(map_coordinates(np.array(self.heights), cells, order=1, mode="nearest"))
+        # A single point is an array of no dimension, which map_coordinates does not take.
+        heights = map_coordinates(np.array(self.heights), cells.reshape(2, -1), order=1, mode="nearest")
+        return np.asarray(heights).reshape(cells.shape[1:])
 
 
 @dataclass(frozen=True)

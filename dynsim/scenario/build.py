@@ -461,12 +461,17 @@ def _payload(name: str, config: Payload, point: Array, axes: Array) -> Inertia:
 
 
 def check_start(
-    scenario: Scenario, model: Model, touching: Sequence[Contact], q: NDArray[np.float64] | None = None
+    scenario: Scenario,
+    model: Model,
+    touching: Sequence[Contact],
+    q: NDArray[np.float64] | None = None,
+    depth: float = START_TOLERANCE,
 ) -> None:
     """Raise :class:`ModelError` unless every contact is on a body of the robot and starts on its surface.
 
     One error for all that do not: about the first, and with the names and gaps of the others.
     ``q`` : coordinates at the start, (nq,) [rad or m]; default: the robot's initial ones
+    ``depth`` : that a point may have below its surface [m]
     """
     own = q is None
     q = model.robot.initial if q is None else q
@@ -477,7 +482,7 @@ def check_start(
         gap = gap_at(model, contact, q)
         if scenario.config.contacts.law == "unilateral" and gap > (-PRESSED if contact.stiffness > 0.0 else 0.0):
             continue
-        if not abs(gap) <= START_TOLERANCE:
+        if not -depth <= gap <= START_TOLERANCE:
             off.append((contact, declared, keys, gap))
     if off:
         contact, declared, keys, gap = off[0]
@@ -491,10 +496,11 @@ def check_start(
         if contact.left_out:
             remedy = "no joint moves it along the normal: move the surface"
         others = ", ".join(f"{other.name} {its:+.4g} m from {other.surface_name!r}" for other, _, _, its in off[1:])
+        limit = START_TOLERANCE if gap > 0.0 else depth
         raise ModelError(
             f"{dotted(keys)}: {'its point' if declared else contact.name} starts {gap:+.4g} m "
             f"from surface {contact.surface_name!r} "
-            f"(limit {START_TOLERANCE:g} m), at {position.tolist()}{f' (also {others})' if others else ''}; "
+            f"(limit {limit:g} m), at {position.tolist()}{f' (also {others})' if others else ''}; "
             f"{remedy}, or disable the contact",
             keys=keys,
         )

@@ -155,6 +155,9 @@ def equilibrium(seen: Observed) -> Finding:
     # References and torques that jump at the start are reported by a warning.
     if warned(seen, "that jumps at the start all the same") or warned(seen, "the start slips at"):
         return
+    # Wedged points may rest or leave: the run leaves, and says so.
+    if warned(seen, "contacts with other forces than at rest"):
+        return
     size = np.abs(seen.vdot[0])
     # Far below the acceleration of a joint that falls.
     if size.max(initial=0.0) > 1e-4 * (1.0 + np.linalg.norm(seen.bodies.gravity)):

@@ -31,6 +31,7 @@ PARTS = (
     r"^the motion does not determine|^in the samples",
     r"^; while .* slides, other choices may move otherwise",
     r"^f_t = |^friction has put ",
+    r"^, and contacts with other forces than at rest",
     r"^of the start|^stops are enforced",
     r"; a shorter integrator.step_s lets it pass less$|^it is still .* beyond its stop at the end$",
     r"^k_[pv] = ",

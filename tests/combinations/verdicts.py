@@ -152,6 +152,16 @@ def _never_touches(match: Match, seen: Observed) -> str:
     return ""
 
 
+def _never_pressed(match: Match, seen: Observed) -> str:
+    touch = _touch(seen, match[1])
+    if touch is None:
+        return "no such contact"
+    if np.abs(touch.normal_force).max(initial=0.0) > 0.0:
+        return f"it carries {touch.normal_force.max():.4g} N"
+    nearest = float(touch.gap.min())
+    return "" if nearest <= 2e-6 else f"it comes as near as {nearest:.4g} m"
+
+
 def _reversed(match: Match, seen: Observed) -> str:
     """W_nn − μ W_nt < 0 for the contact alone, at the sample after the time that is named."""
     touch, since = _touch(seen, match[1]), float(match[2])
@@ -393,10 +403,23 @@ def _slips_at_once(match: Match, seen: Observed) -> str:
     return "" if moves or early else "nothing slips or moves at the start"
 
 
+def _moves_at_once(match: Match, seen: Observed) -> str:
+    """It has that acceleration, and a contact that would carry at rest does not."""
+    j = seen.joints.index(match[1])
+    if abs(seen.vdot[0, j] - float(match[2])) > DIGITS * abs(seen.vdot[0, j]):
+        return f"{match[1]} starts with {seen.vdot[0, j]:.4g}"
+    for name, now in re.findall(rf"(\S+) {NUMBER} N instead of", match[0]):
+        touch = _touch(seen, name)
+        if touch is None or abs(touch.normal_force[0] - float(now)) > DIGITS * abs(float(now)) + 1e-9:
+            return f"{name} does not carry {now} N"
+    return ""
+
+
 VERIFIERS: dict[str, Callable[[Match, Observed], str]] = {
     rf"^(.+): chatter, more than {NUMBER} contact events within {NUMBER} s": _chatters,
     rf"^(.+): the (.+) pulls on this brace for {NUMBER}(?: %)? of the run, with up to {NUMBER} N": _pulls,
     rf"^(.+): this brace never touches the (.+): it carries nothing; nearest {NUMBER} mm": _never_touches,
+    r"^(.+): this brace is on the (.+) at (.+), but never pressed": _never_pressed,
     rf"^(.+): from t = {NUMBER} s on, its friction turns its own force against it": _reversed,
     rf"^friction has put {NUMBER} J into the arm": _friction_gives,
     rf"^(.+): (\S+) at its limit of {NUMBER} \S+(?: m)? for {NUMBER} % of the run": _at_limit,
@@ -418,6 +441,7 @@ VERIFIERS: dict[str, Callable[[Match, Observed], str]] = {
     r"^initial.equilibrium: .*that jumps at the start": _jumps,
     rf"^controller.sample_time_s = {NUMBER} s: the sampled loop is unstable": _unstable,
     r"^the motion is not unique: nothing presses (.+), held by": _unpressed,
+    rf"^initial.equilibrium: (\S+) starts with {NUMBER} \S+ all the same.*": _moves_at_once,
     rf"^initial.equilibrium: the start slips at t = {NUMBER} s": _slips_at_once,
 }
 """Pattern of each warning and its check: the groups and what the run shows → why it is not so, empty if it is."""

@@ -36,6 +36,20 @@ def test_round_trip_and_unknown_keys():
     assert (scene.surface("s"), scene.surface("none")) == (scene.surfaces[0], None)
 
 
+def test_heights_of_single_points_are_those_of_many():
+    """A posture with one sphere on a field asks at a single point."""
+    zero = (0.0, 0.0, 0.0)
+    heights = ((0.0, 0.1, 0.2), (0.1, 0.2, 0.3))
+    hills = SceneSurface(
+        "s", (zero, zero, zero), zero, 0.0, "height_field", position=zero, spacing=(1.0, 1.0), heights=heights
+    )
+    points = np.array([[0.5, 0.5, 1.0], [1.5, 0.2, 0.5]])
+    np.testing.assert_allclose(hills.value(points), [0.9, 0.33], atol=1e-15)
+    for point, value, normal in zip(points, hills.value(points), hills.normal(points), strict=True):
+        assert hills.value(point) == value
+        np.testing.assert_array_equal(hills.normal(point), normal)
+
+
 def test_bodies_come_after_their_parents():
     with pytest.raises(RecordError, match=r"body 'a' .0. does not come after its parent .0."):
         Scene((Body("a", 0, HINGE),))

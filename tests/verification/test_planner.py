@@ -385,6 +385,27 @@ def test_candidates_without_a_radius_are_warned_of(
     assert all(bare in text and "--radius" in text for text in texts)
 
 
+def test_loads_that_no_plan_knows_are_warned_of(urdf_arm: dynsim.Scenario) -> None:
+    """The plan with a force is that without one; a payload is planned with."""
+    tip = {"body": "tip", "point_m": [0.0, 0.0, 0.0]}
+    pull = {"type": "constant", **tip, "force_N": [0.0, 0.0, -5.0]}
+    loads = {"pull": pull, "weight": {"type": "payload", **tip, "mass_kg": 0.5}}
+    heats, texts = {}, {}
+    for name in ("none", *loads):
+        chosen = {} if name == "none" else {name: loads[name]}
+        path = urdf_arm.source.with_name(f"{name}.yaml")
+        path.write_text(to_yaml({**urdf_arm.config.model_dump(exclude_unset=True), "loads": chosen}), "utf-8")
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            plan = dynsim.plan_braces(dynsim.load_scenario(path), count=(0, 0), starts=1, verify=False)
+        heats[name] = plan.sizes[0].heat
+        texts[name] = [str(warning.message) for warning in caught if "only payloads" in str(warning.message)]
+    assert heats["pull"] == heats["none"] < heats["weight"]
+    assert not texts["none"]
+    assert not texts["weight"]
+    assert texts["pull"][0].startswith("plan: loads.pull: planned without")
+
+
 def test_a_plan_that_costs_less_than_planned_holds() -> None:
     """Braces that stick take less than the friction of creeping that is planned: no reason to refuse the plan.
 

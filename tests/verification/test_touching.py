@@ -63,6 +63,20 @@ def test_a_declared_brace_that_never_touches_is_said(arm):
     assert "initial.on_surface" in warning
 
 
+def test_a_brace_that_leaves_where_it_starts_is_not_said_never_to_touch(arm):
+    """Weight pushes up: the elbow starts on the floor and leaves at once, without a force."""
+    changed = {
+        "controller": None,
+        "initial.equilibrium": False,
+        "plant.gravity_m_s2": [0, 0, 9.81],
+        "duration_s": 0.05,
+    }
+    record = simulate(load_scenario(arm, overrides=changed))
+    (text,) = [text for text in record.summary["warnings"] if text.startswith("elbow: ")]
+    assert text == "elbow: this brace is on the floor at t = 0 s, but never pressed: it carries nothing"
+    assert np.abs(record["contact_normal_force"]).max() == 0.0
+
+
 def test_disabled_points_put_braced_and_free_in_one_posture(arm):
     free = {"contacts.points.elbow.enabled": False, "controller.brace": None, "controller.min_N": 0.5}
     braced, alone = (build.robot(load_scenario(arm, overrides=changed)) for changed in ({}, free))
