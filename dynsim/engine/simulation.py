@@ -25,6 +25,7 @@ from dynsim.compile.references.teleop import VelocitySource
 from dynsim.compile.tables import check_couplings
 from dynsim.dynamics import state as kst
 from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.drive.law import take_measured_commands
 from dynsim.dynamics.state import block
 from dynsim.dynamics.tree import loads as kl
@@ -492,6 +493,8 @@ class Simulation:
             v[j] = 0.0
         armature[j] = BRAKED if closed else self._armature[j]
         self._set_floors()
+        if (law := self._prepared.system.unilateral) is not None:
+            law.dry_table[law.dry_table[:, ku.DRY_JOINT] == j, ku.DRY_BRAKE] = ku.CLOSED if closed else ku.OPENED
         if run.count[ki.MODES_DUE] == 0:
             run.count[ki.MODES_DUE] = ki.AFTER_JUMP
         self._restart()

@@ -61,6 +61,38 @@ def test_brake_closed_at_the_first_tick_keeps_the_posture(tmp_path: Path):
     np.testing.assert_allclose(q[:, 1], 30.0, rtol=0, atol=1e-9)
 
 
+# The load of the second joint swings beyond its friction of 0.1 N m to both sides.
+BRAKED = """
+name: braked
+duration_s: 0.6
+plant:
+  type: serial_arm
+  link: {friction_N_m: 0.1, mass_kg: 0.3, length_m: 0.3, damping_N_m_s_per_rad: 0.02}
+  chain: [{axis: y, initial_deg: 60}, {axis: y, initial_deg: 30}]
+contacts: {law: unilateral}
+record: {rate_hz: 200}
+"""
+
+
+@pytest.mark.parametrize("method", ["dopri5", "radau5", STEPS])
+def test_braked_joint_neither_slips_nor_rubs(tmp_path: Path, method: str):
+    """Friction of a braked joint came to its bound and gave way, though the joint did not move."""
+    path = tmp_path / "scene.yaml"
+    path.write_text(BRAKED, encoding="utf-8")
+    simulation = Simulation(load_scenario(path, None, {"integrator.method": method}))
+    simulation.set_brake("joint_2", closed=True)
+    simulation.advance(0.4)
+    record = simulation.record()
+    assert np.ptp(record["q"][:, 0]) > 1.0
+    assert np.ptp(record["q"][:, 1]) == 0.0
+    assert (record["joint_friction"][:, 1] == 0.0).all()
+    assert not [event for event in record.events if event.name == "joint_2"]
+    simulation.set_brake("joint_2", closed=False)
+    simulation.advance(0.6)
+    friction = simulation.record()["joint_friction"][-20:, 1]
+    assert np.abs(friction).max() == pytest.approx(0.1)
+
+
 # One joint moves the tip at 75° to the normal of a plane that it touches. At μ tan 75° > 1 friction could hold it there
 # whatever the torque; nothing presses it any more when the torque has changed its sign.
 FLAT = """

@@ -137,12 +137,18 @@ def choose(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def hold_slow_joints(unilateral: UnilateralArrays, ws: Workspace):
-    """Dry friction holds the joints that do not move, where they are; the others slide on, as they move."""
+    """Dry friction holds the joints that do not move, where they are; the others slide on, as they move.
+
+    A joint whose brake is closed rests without friction: the brake has all of its load. A row of friction would come to
+    its bound and break loose, and the joint would not move.
+    """
     table, dry = unilateral.dry_table, unilateral.dry
     for k in range(table.shape[0]):
-        rate = ws.joints[table[k, ku.DRY_JOINT], ka.QD]
-        table[k, ku.DRY_HOLDS] = 1 if abs(rate) <= 2.0 * unilateral.number[ku.SLOW] else 0
+        rate, braked = ws.joints[table[k, ku.DRY_JOINT], ka.QD], table[k, ku.DRY_BRAKE] == ku.CLOSED
+        table[k, ku.DRY_HOLDS] = 1 if abs(rate) <= 2.0 * unilateral.number[ku.SLOW] and not braked else 0
         dry[k, ku.DRY_SIDE], dry[k, ku.DRY_AT] = 1.0 if rate > 0.0 else -1.0, ws.joints[table[k, ku.DRY_JOINT], ka.Q]
+        if braked:
+            dry[k, ku.DRY_SIDE] = 0.0
 
 
 @internal_kernel
