@@ -231,6 +231,52 @@ def test_elbow_and_two_joints_start_to_move_at_once(tmp_path: Path):
     np.testing.assert_allclose(events["contact_normal_force"][12], steps["contact_normal_force"][12], rtol=1e-3)
 
 
+# Six joints with dry friction, whose elbow rests on a sphere and whose tip rests on a plane. As joint 1 starts to turn
+# the elbow is pressed no more, and joints start to move with it.
+TWO_SUPPORTS = """
+name: two_supports
+duration_s: 0.02
+plant:
+  type: serial_arm
+  link: {length_m: 0.25, damping_N_m_s_per_rad: 0.05, friction_N_m: 0.163259, motor: {type: wang_minami}}
+  chain:
+    - {axis: z, length_m: 0, mass_kg: 0.2, initial_deg: -2.76443}
+    - {axis: x, mass_kg: 0.565019, initial_deg: 110}
+    - {axis: y, mass_kg: 0.244264, initial_deg: 10}
+    - {axis: y, mass_kg: 0.298156, initial_deg: -45}
+    - {axis: y, mass_kg: 0.280916, initial_deg: 43}
+    - {axis: y, mass_kg: 0.478627, initial_deg: -38}
+controller:
+  type: joint_pd
+  k_p_V_per_rad: 62.3591
+  k_d_V_s_per_rad: 11.5139
+  joints:
+    joint_1: {times_s: [0, 0.3], angles_deg: [-2.76443, -10.9168]}
+    joint_2: {times_s: [0, 0.3], angles_deg: [110, 109.386]}
+surfaces:
+  s: {type: sphere, center_m: [0.0208731, -0.467828, -0.469711], radius_m: 0.3}
+  s2: {type: plane, point_m: [-0.108103, -0.887171, -0.324426], normal: [-0.0710373, -0.0276265, 1]}
+contacts:
+  law: unilateral
+  friction: 0.3
+  points: {elbow: {body: link_4, surface: s}, tip: {body: link_6, surface: s2}}
+initial: {on_surface: [elbow, tip], equilibrium: true}
+record: {rate_hz: 1000}
+"""
+
+
+def test_joints_start_to_move_as_an_elbow_leaves(tmp_path: Path):
+    """Chosen for at full friction joints seemed to rest, by accelerations next to zero; then all stuck again, for ever."""
+    events, steps = (
+        run(tmp_path, TWO_SUPPORTS, integrator__method=method, integrator__step_s=step)
+        for method, step in (("dopri5", None), (STEPS, 1e-4))
+    )
+    leaves = [event.time for event in events.events if event.kind == "lift_off"]
+    assert leaves == [pytest.approx(0.013724, abs=1e-6)]
+    # Of first order in the steps of 0.1 ms: 6e-4 here.
+    np.testing.assert_allclose(events["v"][-1], steps["v"][-1], rtol=0, atol=5e-3 * np.abs(steps["v"][-1]).max())
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("surface", ["plane", "sphere", "cylinder", "bowl"])
 @pytest.mark.parametrize("friction", [0.05, 0.1, 0.2, 0.3, 0.5])
