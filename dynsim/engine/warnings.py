@@ -308,6 +308,8 @@ def _passed_limits(record: Record, robot: Robot, real: bool) -> list[str]:
             continue
         q = record["q"][:, k]
         position, velocity, _, force = link.units
+        if not len(q):
+            continue
         below, above = link.lower - q, q - link.upper
         for quantity, limit, unit, beyond, note in (
             ("lower position", link.lower, position, below, _after_passing(below[-1], position, real)),

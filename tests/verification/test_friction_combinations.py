@@ -93,6 +93,26 @@ def test_braked_joint_neither_slips_nor_rubs(tmp_path: Path, method: str):
     assert np.abs(friction).max() == pytest.approx(0.1)
 
 
+@pytest.mark.parametrize("off", [2e-10, 6e-10, 9e-10])
+def test_joint_that_rests_next_to_its_stop_is_held_at_the_stop(tmp_path: Path, off: float):
+    """Held where it was, up to 1e-9 m from the stop that it touches, friction contradicted the stop and ended runs."""
+    text = f"""
+name: stopped
+duration_s: 0.01
+plant:
+  type: serial_arm
+  gravity_m_s2: [0, 0, 9.81]
+  chain: [{{kind: prismatic, axis: z, length_m: 0.1, mass_kg: 0.2, initial_m: {0.05 - off!r},
+    limit_m: [-0.05, 0.05], friction_N: 0.3}}]
+contacts: {{law: unilateral}}
+"""
+    record = run(tmp_path, text, integrator__method="dopri5")
+    assert not record.events
+    # Projection is to 1e-13 m.
+    np.testing.assert_allclose(record["q"][:, 0], 0.05, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(record["stop_force"] + record["joint_friction"], -0.2 * 9.81, rtol=1e-9)
+
+
 # One joint moves the tip at 75° to the normal of a plane that it touches. At μ tan 75° > 1 friction could hold it there
 # whatever the torque; nothing presses it any more when the torque has changed its sign.
 FLAT = """
@@ -266,7 +286,7 @@ record: {rate_hz: 1000}
 
 
 def test_joints_start_to_move_as_an_elbow_leaves(tmp_path: Path):
-    """Chosen for at full friction joints seemed to rest, by accelerations next to zero; then all stuck again, for ever."""
+    """At full friction the joints seemed to rest, by accelerations next to zero; then all stuck again, for ever."""
     events, steps = (
         run(tmp_path, TWO_SUPPORTS, integrator__method=method, integrator__step_s=step)
         for method, step in (("dopri5", None), (STEPS, 1e-4))

@@ -50,6 +50,8 @@ from dynsim.jit.kernel import internal_kernel
 SLIP_TOLERANCE = 1e-8
 # A friction force this close to the cone, as a fraction, is on it.
 ON_CONE = 1e-7
+# Share of its friction that a joint at rest may have: all of it but a rounding, which tells it from one that slides.
+NEARLY_ALL = 1.0 - 1e-15
 
 
 @internal_kernel
@@ -179,11 +181,18 @@ def release_dependent_joints(system: System, ws: Workspace):
     Such a row depends on the normal rows, and how they share a force changes the friction of what slides: no split of
     the right-hand side is that of the solution. At rest Coulomb's law admits any force within the bound. Rows that
     depend on those of sticking points and of other joints alone remain, see :mod:`dynsim.dynamics.contact.splits`.
+
+    The row of a joint that rests at its stop is that of the stop, and halves of their force would suit neither.
     """
     unilateral, W = system.unilateral, ws.small[0]
-    table, dry, mode, bare, whole = unilateral.dry_table, unilateral.dry, unilateral.mode, 0, 0
+    table, mode, bare, whole = unilateral.dry_table, unilateral.mode, 0, 0
     bare_factor, whole_factor = unilateral.room[ku.SPLIT_MATRIX], unilateral.room[ku.NULL_SPACE]
     bare_row, whole_row = unilateral.index[0], unilateral.index[1]
+    for k in range(unilateral.stop_table.shape[0]):
+        for j in range(table.shape[0]):
+            same = unilateral.stop_table[k, ku.STOP_JOINT] == table[j, ku.DRY_JOINT]
+            if same and unilateral.stop_table[k, ku.STOP_CLOSED] == 1 and table[j, ku.DRY_NEXT] == 1:
+                rest_without_row(unilateral, j)
     slides = False
     for k in range(mode.shape[0]):
         slides = slides or mode[k, ku.WANTED] == ka.SLIDING
@@ -209,11 +218,18 @@ def release_dependent_joints(system: System, ws: Workspace):
         with_bare = extended(bare_factor, W, bare_row, bare, r)
         with_whole = extended(whole_factor, W, whole_row, whole, r)
         if with_bare > bare and with_whole == whole:
-            # Rows of joints come first, so that they are the same in the reduced problem.
-            share = -unilateral.vector[ku.SOLUTION, r] / dry_bound(unilateral, k)
-            table[k, ku.DRY_NEXT], dry[k, ku.DRY_SIDE] = 0, min(max(share, -1.0), 1.0)
+            rest_without_row(unilateral, k)
         else:
             bare, whole = with_bare, with_whole
+
+
+@internal_kernel
+def rest_without_row(unilateral: UnilateralArrays, k):
+    """Joint k of those that rub rests on with the constant force that it has in the solution."""
+    # Rows of joints come first, so that they are the same in the reduced problem.
+    share = -unilateral.vector[ku.SOLUTION, unilateral.dry_table[k, ku.DRY_ROW]] / dry_bound(unilateral, k)
+    unilateral.dry_table[k, ku.DRY_NEXT] = 0
+    unilateral.dry[k, ku.DRY_SIDE] = min(max(share, -NEARLY_ALL), NEARLY_ALL)
 
 
 @internal_kernel
