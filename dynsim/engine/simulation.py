@@ -501,6 +501,8 @@ class Simulation:
             v[j] = 0.0
         armature[j] = BRAKED if closed else self._armature[j]
         self._set_floors()
+        if (law := self._prepared.system.unilateral) is not None:
+            law.dry_table[law.dry_table[:, ku.DRY_JOINT] == j, ku.DRY_BRAKE] = ku.CLOSED if closed else ku.OPENED
         if run.count[ki.MODES_DUE] == 0:
             run.count[ki.MODES_DUE] = ki.AFTER_JUMP
         self._restart()

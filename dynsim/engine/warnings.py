@@ -307,6 +307,9 @@ def _joints_at_rest(record: Record, prepared: Prepared) -> NDArray[np.bool_]:
     if "joint_friction" in record:
         columns = [prepared.model.joint_names.index(joint) for joint in record.signals["joint_friction"].labels]
         rests[:, columns] = np.abs(record["v"][:, columns]) < AT_REST
+        # Their brakes hold some of them, and then there is no friction.
+        braked = prepared.system.unilateral.dry_table[:, ku.DRY_BRAKE] != ku.NEVER_CLOSED
+        rests[:, columns] &= ~braked | (record["joint_friction"] != 0.0)
     return rests
 
 
@@ -342,6 +345,8 @@ def _passed_limits(record: Record, robot: Robot, real: bool) -> list[str]:
             continue
         q = record["q"][:, k]
         position, velocity, _, force = link.units
+        if not len(q):
+            continue
         below, above = link.lower - q, q - link.upper
         for quantity, limit, unit, beyond, note in (
             ("lower position", link.lower, position, below, _after_passing(below[-1], position, real)),

@@ -61,6 +61,58 @@ def test_brake_closed_at_the_first_tick_keeps_the_posture(tmp_path: Path):
     np.testing.assert_allclose(q[:, 1], 30.0, rtol=0, atol=1e-9)
 
 
+# The load of the second joint swings beyond its friction of 0.1 N m to both sides.
+BRAKED = """
+name: braked
+duration_s: 0.6
+plant:
+  type: serial_arm
+  link: {friction_N_m: 0.1, mass_kg: 0.3, length_m: 0.3, damping_N_m_s_per_rad: 0.02}
+  chain: [{axis: y, initial_deg: 60}, {axis: y, initial_deg: 30}]
+contacts: {law: unilateral}
+record: {rate_hz: 200}
+"""
+
+
+@pytest.mark.parametrize("method", ["dopri5", "radau5", STEPS])
+def test_braked_joint_neither_slips_nor_rubs(tmp_path: Path, method: str):
+    """Friction of a braked joint came to its bound and gave way, though the joint did not move."""
+    path = tmp_path / "scene.yaml"
+    path.write_text(BRAKED, encoding="utf-8")
+    simulation = Simulation(load_scenario(path, None, {"integrator.method": method}))
+    simulation.set_brake("joint_2", closed=True)
+    simulation.advance(0.4)
+    record = simulation.record()
+    assert np.ptp(record["q"][:, 0]) > 1.0
+    assert np.ptp(record["q"][:, 1]) == 0.0
+    assert (record["joint_friction"][:, 1] == 0.0).all()
+    assert not [event for event in record.events if event.name == "joint_2"]
+    simulation.set_brake("joint_2", closed=False)
+    simulation.advance(0.6)
+    friction = simulation.record()["joint_friction"][-20:, 1]
+    assert np.abs(friction).max() == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("off", [2e-10, 6e-10, 9e-10])
+def test_joint_that_rests_next_to_its_stop_is_held_at_the_stop(tmp_path: Path, off: float):
+    """Held where it was, up to 1e-9 m from the stop that it touches, friction contradicted the stop and ended runs."""
+    text = f"""
+name: stopped
+duration_s: 0.01
+plant:
+  type: serial_arm
+  gravity_m_s2: [0, 0, 9.81]
+  chain: [{{kind: prismatic, axis: z, length_m: 0.1, mass_kg: 0.2, initial_m: {0.05 - off!r},
+    limit_m: [-0.05, 0.05], friction_N: 0.3}}]
+contacts: {{law: unilateral}}
+"""
+    record = run(tmp_path, text, integrator__method="dopri5")
+    assert not record.events
+    # Projection is to 1e-13 m.
+    np.testing.assert_allclose(record["q"][:, 0], 0.05, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(record["stop_force"] + record["joint_friction"], -0.2 * 9.81, rtol=1e-9)
+
+
 # One joint moves the tip at 75° to the normal of a plane that it touches. At μ tan 75° > 1 friction could hold it there
 # whatever the torque; nothing presses it any more when the torque has changed its sign.
 FLAT = """
@@ -197,6 +249,52 @@ def test_elbow_and_two_joints_start_to_move_at_once(tmp_path: Path):
         assert record["contact_mode"][12, 0] == SLIDING
     # First order of steps of 10 µs.
     np.testing.assert_allclose(events["contact_normal_force"][12], steps["contact_normal_force"][12], rtol=1e-3)
+
+
+# Six joints with dry friction, whose elbow rests on a sphere and whose tip rests on a plane. As joint 1 starts to turn
+# the elbow is pressed no more, and joints start to move with it.
+TWO_SUPPORTS = """
+name: two_supports
+duration_s: 0.02
+plant:
+  type: serial_arm
+  link: {length_m: 0.25, damping_N_m_s_per_rad: 0.05, friction_N_m: 0.163259, motor: {type: wang_minami}}
+  chain:
+    - {axis: z, length_m: 0, mass_kg: 0.2, initial_deg: -2.76443}
+    - {axis: x, mass_kg: 0.565019, initial_deg: 110}
+    - {axis: y, mass_kg: 0.244264, initial_deg: 10}
+    - {axis: y, mass_kg: 0.298156, initial_deg: -45}
+    - {axis: y, mass_kg: 0.280916, initial_deg: 43}
+    - {axis: y, mass_kg: 0.478627, initial_deg: -38}
+controller:
+  type: joint_pd
+  k_p_V_per_rad: 62.3591
+  k_d_V_s_per_rad: 11.5139
+  joints:
+    joint_1: {times_s: [0, 0.3], angles_deg: [-2.76443, -10.9168]}
+    joint_2: {times_s: [0, 0.3], angles_deg: [110, 109.386]}
+surfaces:
+  s: {type: sphere, center_m: [0.0208731, -0.467828, -0.469711], radius_m: 0.3}
+  s2: {type: plane, point_m: [-0.108103, -0.887171, -0.324426], normal: [-0.0710373, -0.0276265, 1]}
+contacts:
+  law: unilateral
+  friction: 0.3
+  points: {elbow: {body: link_4, surface: s}, tip: {body: link_6, surface: s2}}
+initial: {on_surface: [elbow, tip], equilibrium: true}
+record: {rate_hz: 1000}
+"""
+
+
+def test_joints_start_to_move_as_an_elbow_leaves(tmp_path: Path):
+    """At full friction the joints seemed to rest, by accelerations next to zero; then all stuck again, for ever."""
+    events, steps = (
+        run(tmp_path, TWO_SUPPORTS, integrator__method=method, integrator__step_s=step)
+        for method, step in (("dopri5", None), (STEPS, 1e-4))
+    )
+    leaves = [event.time for event in events.events if event.kind == "lift_off"]
+    assert leaves == [pytest.approx(0.013724, abs=1e-6)]
+    # Of first order in the steps of 0.1 ms: 6e-4 here.
+    np.testing.assert_allclose(events["v"][-1], steps["v"][-1], rtol=0, atol=5e-3 * np.abs(steps["v"][-1]).max())
 
 
 @pytest.mark.long

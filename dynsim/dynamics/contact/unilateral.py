@@ -63,7 +63,9 @@ DRY_DRIVE = 2  # whose gear does, -1 for none
 DRY_HOLDS = 3  # 1: it has a row, bounded in time stepping; 0: its force is constant, by the event-driven methods
 DRY_NEXT = 4  # scratch of the choice of modes
 DRY_TOLD = 5  # 1, 0: as the log was last told of it, held or sliding; -1: of nothing yet
-DRY_TABLE_SIZE = 6
+DRY_BRAKE = 6  # of the joint: NEVER_CLOSED, CLOSED, or OPENED again; may be written between steps
+DRY_TABLE_SIZE = 7
+NEVER_CLOSED, CLOSED, OPENED = 0, 1, 2
 # UnilateralArrays.dry: the force of a joint at rest is any up to the sum of both, in motion that against it [N m or N]
 OF_GEAR, OF_JOINT = 0, 1
 DRY_FORCE = 2  # on the joint [N m or N]

@@ -471,7 +471,7 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
     if unilateral is None:
         return
     mode, table = unilateral.mode, unilateral.stop_table
-    happened, by_hand = 0, True
+    happened, by_hand, leaves = 0, True, False
     for e in range(run.event.shape[0]):
         if run.event_table[e, ki.EVENT_KIND] >= NORMAL_GUARD and run.event[e, ki.VALUE] <= 0.0:
             happened += 1
@@ -504,7 +504,7 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
             by_hand = False
         elif kind == NORMAL_GUARD and mode[k, ku.WANTED] == ka.STICKING and unilateral.number[ku.SPLIT] == 1.0:
             # The others may start to slip as it leaves.
-            mode[k, ku.LEAVES], by_hand = 1, False
+            mode[k, ku.LEAVES], by_hand, leaves = 1, False, True
         elif kind == NORMAL_GUARD:
             mode[k, ku.WANTED] = ka.OPEN
             tell(system, run, k, LIFT_OFF)
@@ -532,6 +532,7 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
         tell_joints(unilateral, run)
         rearm(run)
         count_changes(system, run)
-    else:
+    # As one leaves, others that start to slip hardly accelerate yet: with all their friction they would seem to rest.
+    elif not leaves or not solve_reduced(system, ws, run):
         solve_modes(system, ws, run, False)
     run.count[ki.STARTED] = 0

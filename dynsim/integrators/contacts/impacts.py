@@ -109,9 +109,12 @@ def come_down(system: System, ws: Workspace, run: Run):
     A point lands a little below its surface. Where rows depend on each other, as those of a point on a body with one
     degree of freedom, there might be no state at which its normal row and the tangential ones of a foot found above it
     all vanish. What is about to bounce is not held: lifted at each bounce, it would go on for ever.
+
+    Joints that dry friction holds stay where they are, unless that contradicts a stop or a point with which they come
+    down: then friction lets them go, by no more than what touches is off, and holds them where they are afterwards.
     """
     unilateral = system.unilateral
-    mode = unilateral.mode
+    mode, table = unilateral.mode, unilateral.dry_table
     for k in range(mode.shape[0]):
         fast = mode[k, ku.STRUCK] == 1 and ws.contacts[k, ka.GAP_RATE] < -unilateral.tally[k, ku.SETTLE]
         bounces = fast and mode[k, ku.BEFORE] == ka.OPEN and system.contacts.law[k, ka.RESTITUTION] > 0.0
@@ -120,17 +123,33 @@ def come_down(system: System, ws: Workspace, run: Run):
             ka.OPEN if not stays else ka.STICKING if ws.active[k, ka.MODE] == ka.STICKING else ka.SLIDING
         )
     set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
-    before = math.inf
-    for _ in range(kp.PROJECTION_LIMIT):
+    if project_down(system, ws, run) or dry_rows_held(unilateral) == 0:
+        return
+    for k in range(table.shape[0]):
+        table[k, ku.DRY_NEXT], table[k, ku.DRY_HOLDS] = table[k, ku.DRY_HOLDS], 0
+    set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
+    project_down(system, ws, run)
+    for k in range(table.shape[0]):
+        table[k, ku.DRY_HOLDS] = table[k, ku.DRY_NEXT]
+        if table[k, ku.DRY_HOLDS] == 1:
+            unilateral.dry[k, ku.DRY_AT] = ws.joints[table[k, ku.DRY_JOINT], ka.Q]
+
+
+@internal_kernel
+def project_down(system: System, ws: Workspace, run: Run):
+    """Positions onto the active rows, to rounding where they lead there; False when the rows cannot be met."""
+    before = worst = math.inf
+    for trial in range(1 + kp.PROJECTION_LIMIT):
         evaluate(system, ws, run)
         worst = 0.0
         for r in range(ws.counts[ka.ROWS]):
             worst = max(worst, abs(ws.rows[r, ka.ROW_GAP]))
         # Where a point is nearly immobile along its normal, steps only halve the way to where it is quite immobile.
-        if worst <= FOOT_TOLERANCE or SLOWLY * before < worst <= kp.GAP_TOLERANCE:
-            return
+        if worst <= FOOT_TOLERANCE or SLOWLY * before < worst <= kp.GAP_TOLERANCE or trial == kp.PROJECTION_LIMIT:
+            break
         before = worst
         project_level(system, ws, run.y, 0)
+    return worst <= kp.GAP_TOLERANCE
 
 
 @internal_kernel

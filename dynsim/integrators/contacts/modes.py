@@ -53,6 +53,8 @@ SLIP_TOLERANCE = 1e-8
 NEARLY_AT_REST = 1e-5
 # A friction force this close to the cone, as a fraction, is on it.
 ON_CONE = 1e-7
+# Share of its friction that a joint at rest may have: all of it but a rounding, which tells it from one that slides.
+NEARLY_ALL = 1.0 - 1e-15
 
 
 @internal_kernel
@@ -145,12 +147,18 @@ def choose(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def hold_slow_joints(unilateral: UnilateralArrays, ws: Workspace):
-    """Dry friction holds the joints that do not move, where they are; the others slide on, as they move."""
+    """Dry friction holds the joints that do not move, where they are; the others slide on, as they move.
+
+    A joint whose brake is closed rests without friction: the brake has all of its load. A row of friction would come to
+    its bound and break loose, and the joint would not move.
+    """
     table, dry = unilateral.dry_table, unilateral.dry
     for k in range(table.shape[0]):
-        rate = ws.joints[table[k, ku.DRY_JOINT], ka.QD]
-        table[k, ku.DRY_HOLDS] = 1 if abs(rate) <= 2.0 * unilateral.number[ku.SLOW] else 0
+        rate, braked = ws.joints[table[k, ku.DRY_JOINT], ka.QD], table[k, ku.DRY_BRAKE] == ku.CLOSED
+        table[k, ku.DRY_HOLDS] = 1 if abs(rate) <= 2.0 * unilateral.number[ku.SLOW] and not braked else 0
         dry[k, ku.DRY_SIDE], dry[k, ku.DRY_AT] = 1.0 if rate > 0.0 else -1.0, ws.joints[table[k, ku.DRY_JOINT], ka.Q]
+        if braked:
+            dry[k, ku.DRY_SIDE] = 0.0
 
 
 @internal_kernel
@@ -184,7 +192,7 @@ def release_dependent_joints(system: System, ws: Workspace):
     those of sticking points and of other joints alone remain, see :mod:`dynsim.dynamics.contact.splits`.
     """
     unilateral, W = system.unilateral, ws.small[0]
-    table, dry, mode, bare, whole = unilateral.dry_table, unilateral.dry, unilateral.mode, 0, 0
+    table, mode, bare, whole = unilateral.dry_table, unilateral.mode, 0, 0
     bare_factor, whole_factor = unilateral.room[ku.SPLIT_MATRIX], unilateral.room[ku.NULL_SPACE]
     bare_row, whole_row = unilateral.index[0], unilateral.index[1]
     blocked = False
@@ -214,11 +222,18 @@ def release_dependent_joints(system: System, ws: Workspace):
         with_bare = extended(bare_factor, W, bare_row, bare, r)
         with_whole = extended(whole_factor, W, whole_row, whole, r)
         if with_bare > bare and with_whole == whole:
-            # Rows of joints come first, so that they are the same in the reduced problem.
-            share = -unilateral.vector[ku.SOLUTION, r] / dry_bound(unilateral, k)
-            table[k, ku.DRY_NEXT], dry[k, ku.DRY_SIDE] = 0, min(max(share, -1.0), 1.0)
+            rest_without_row(unilateral, k)
         else:
             bare, whole = with_bare, with_whole
+
+
+@internal_kernel
+def rest_without_row(unilateral: UnilateralArrays, k):
+    """Joint k of those that rub rests on with the constant force that it has in the solution."""
+    # Rows of joints come first, so that they are the same in the reduced problem.
+    share = -unilateral.vector[ku.SOLUTION, unilateral.dry_table[k, ku.DRY_ROW]] / dry_bound(unilateral, k)
+    unilateral.dry_table[k, ku.DRY_NEXT] = 0
+    unilateral.dry[k, ku.DRY_SIDE] = min(max(share, -NEARLY_ALL), NEARLY_ALL)
 
 
 @internal_kernel

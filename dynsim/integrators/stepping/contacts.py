@@ -28,7 +28,7 @@ from dynsim.dynamics.contact.cone.problem import approach, draw_near
 from dynsim.dynamics.contact.cone.steps import motion
 from dynsim.dynamics.contact.mobility import moves_along_normal
 from dynsim.dynamics.contact.rows import point_row, set_modes
-from dynsim.dynamics.contact.unilateral import UnilateralArrays, sliding_friction, stop_gap
+from dynsim.dynamics.contact.unilateral import UnilateralArrays, dry_bound, sliding_friction, stop_gap
 from dynsim.dynamics.tables import Workspace
 from dynsim.dynamics.tree.spatial import dot_vector, point_velocity, six, times_number, vector
 from dynsim.integrators.stepping import tables as kt
@@ -321,7 +321,9 @@ def solve_contacts(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Wor
         s.right[r] = s.b[r]
         s.f[r] = s.impulse[start + r] if r < coupled else 0.0
     for k in range(unilateral.dry.shape[0]):
-        s.mu[unilateral.dry_table[k, ku.DRY_ROW]] = h * (unilateral.dry[k, ku.OF_GEAR] + unilateral.dry[k, ku.OF_JOINT])
+        # A closed brake has all of the load of its joint.
+        bound = 0.0 if unilateral.dry_table[k, ku.DRY_BRAKE] == ku.CLOSED else dry_bound(unilateral, k)
+        s.mu[unilateral.dry_table[k, ku.DRY_ROW]] = h * bound
     for k in range(unilateral.stop_table.shape[0]):
         if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
             s.right[unilateral.stop_table[k, ku.STOP_ROW]] -= stop_return(unilateral, s, ws, k, h)
