@@ -209,3 +209,26 @@ def test_coupled_joints_that_rub_slip_when_both_are_at_their_bounds(tmp_path: Pa
     # (0.2 + 1.5² 0.3) kg are pushed by 6 t − 5 N.
     t = record.time[-1] - 5.0 / 6.0
     assert record["v"][-1, 0] == pytest.approx(3.0 * t * t / 0.875, rel=1e-3)
+
+
+@pytest.mark.parametrize("method", ["dopri5", "radau5"])
+def test_a_joint_that_another_moves_slowly_is_not_held_at_rest(tmp_path: Path, method: str):
+    """A finger at 1e-5 times the rate of its leader, with dry friction, as a third one hits its stop: both go on."""
+    thumb = (
+        f'<link name="thumb">{BODY.format(0.2)}</link><joint name="up" type="prismatic"><parent link="base"/>'
+        '<child link="thumb"/><axis xyz="0 1 0"/><limit lower="-1" upper="0.01" effort="10" velocity="10"/></joint>'
+    )
+    (tmp_path / "fingers.urdf").write_text(FINGERS.replace("1.5", "1e-5").replace("</robot>", f"{thumb}</robot>"))
+    push = "{type: constant, body: BODY, force_N: FORCE}"
+    loads = f"loads:\n  push: {push}\n".replace("BODY", "left").replace("FORCE", "[6, 0, 0]")
+    loads += f"  lift: {push}\n".replace("BODY", "thumb").replace("FORCE", "[0, 6, 0]")
+    lines = [
+        line for line in RUBBING.replace("METHOD", method).splitlines() if "push" not in line and "loads" not in line
+    ]
+    path = tmp_path / "fingers.yaml"
+    path.write_text("\n".join(lines).replace("1.0", "0.1") + "\n" + loads)
+    record = simulate(load_scenario(path))
+    assert any(event.kind == "stop_hit" for event in record.events)
+    # (6 − 2 (1 + 1e-5)) N push (0.2 + 0.3e-10) kg.
+    assert record["v"][-1, 0] == pytest.approx(0.1 * 3.99998 / 0.2, rel=1e-6)
+    assert abs(record.summary["energy_residual_relative"]) < 1e-6
