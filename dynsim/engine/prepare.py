@@ -55,6 +55,9 @@ log = logging.getLogger(__name__)
 CLEARLY = 10.0
 # Most steps of an explicit method that the electrical poles may require: a quarter of an hour for ten joints.
 STEPS_LIMIT = 2e8
+# A run whose last MOST_TRIALS steps have come no further than this stands still, unless it is short [s]: it has met
+# events that lie closer than steps of any stiff robot.
+STANDS = 1e-5
 # More steps than any run takes.
 _EVERY_STEP = 1 << 62
 
@@ -207,7 +210,7 @@ def prepare(
         ticks=_ticks(control),
         breaks=_breaks(loads, control, method, options),
         # Those who advance a run themselves may give it no end.
-        least_progress=ki.PROGRESS * min(scenario.duration_s, end or np.inf),
+        least_progress=_least_progress(min(scenario.duration_s, end or np.inf)),
         events=guards(robot, contacts if real else (), stops, dry),
         support=compile_support(robot),
         stepping=stepping,
@@ -318,6 +321,12 @@ def guards(
 def slow_slip(atol: float) -> float:
     """Speed below which the direction of slip is noise of the integration, so that the last one stands [m/s]."""
     return max(1000.0 * atol, 1e-9)
+
+
+def _least_progress(duration: float) -> float:
+    """Return the time by which MOST_TRIALS steps have to come on [s]."""
+    least = ki.PROGRESS * duration
+    return max(least, min(10.0 * least, STANDS))
 
 
 def _breaks(loads: Sequence[Load], control: JointControl, method: int, options: Integrator) -> np.ndarray:

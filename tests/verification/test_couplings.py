@@ -170,3 +170,65 @@ def test_a_follower_starts_where_the_first_reference_of_its_leader_has_it(grippe
     changes = {"initial": {"on_references": True}, "controller.joints": {"left_finger": path}}
     robot = build_model(load_scenario(gripper, overrides=changes)).robot
     np.testing.assert_allclose(robot.initial, [np.radians(70), 0.02, 1.5 * 0.02 + 0.01], rtol=0, atol=1e-15)
+
+
+FINGERS = f"""<robot name="fingers">
+<link name="base"/><link name="left">{BODY.format(0.2)}</link><link name="right">{BODY.format(0.3)}</link>
+<joint name="left_finger" type="prismatic"><parent link="base"/><child link="left"/><axis xyz="1 0 0"/>
+<limit lower="-0.5" upper="0.5" effort="10" velocity="10"/></joint>
+<joint name="right_finger" type="prismatic"><parent link="base"/><child link="right"/><axis xyz="-1 0 0"/>
+<limit lower="-1" upper="1" effort="10" velocity="10"/><mimic joint="left_finger" multiplier="1.5"/></joint>
+</robot>
+"""
+RUBBING = """\
+duration_s: 1.0
+plant: {type: urdf_arm, file: fingers.urdf, friction_N: 2.0}
+contacts: {law: unilateral}
+loads:
+  push: {type: samples, body: left, times_s: [0, 1], force_N: [[0, 0, 0], [6, 0, 0]], interpolation: linear}
+integrator: {method: METHOD}
+"""
+
+
+@pytest.mark.parametrize("method", ["dopri5", "radau5"])
+def test_coupled_joints_that_rub_slip_when_both_are_at_their_bounds(tmp_path: Path, method: str):
+    """A rising push on a finger that another mimics at 1.5 times its rate: it slips at (1 + 1.5) times the friction."""
+    (tmp_path / "fingers.urdf").write_text(FINGERS)
+    path = tmp_path / "fingers.yaml"
+    path.write_text(RUBBING.replace("METHOD", method))
+    record = simulate(load_scenario(path))
+    slips = {event.name: event.time for event in record.events if event.kind == "slip_start"}
+    # The choice of modes is asked with friction less by 1e-5.
+    assert slips == pytest.approx({"left_finger": 5.0 / 6.0, "right_finger": 5.0 / 6.0}, rel=2e-5)
+    friction = record["joint_friction"]
+    assert np.abs(friction).max() <= 2.0 + 1e-6
+    # Coupling and friction hold what pushes, at every time, each within its bound.
+    resting = record.time < 0.83
+    balance = 6.0 * record.time + friction[:, 0] + 1.5 * friction[:, 1]
+    np.testing.assert_allclose(balance[resting], 0.0, rtol=0, atol=1e-9)
+    # (0.2 + 1.5² 0.3) kg are pushed by 6 t − 5 N.
+    t = record.time[-1] - 5.0 / 6.0
+    assert record["v"][-1, 0] == pytest.approx(3.0 * t * t / 0.875, rel=1e-3)
+
+
+@pytest.mark.parametrize("method", ["dopri5", "radau5"])
+def test_a_joint_that_another_moves_slowly_is_not_held_at_rest(tmp_path: Path, method: str):
+    """A finger at 1e-5 times the rate of its leader, with dry friction, as a third one hits its stop: both go on."""
+    thumb = (
+        f'<link name="thumb">{BODY.format(0.2)}</link><joint name="up" type="prismatic"><parent link="base"/>'
+        '<child link="thumb"/><axis xyz="0 1 0"/><limit lower="-1" upper="0.01" effort="10" velocity="10"/></joint>'
+    )
+    (tmp_path / "fingers.urdf").write_text(FINGERS.replace("1.5", "1e-5").replace("</robot>", f"{thumb}</robot>"))
+    push = "{type: constant, body: BODY, force_N: FORCE}"
+    loads = f"loads:\n  push: {push}\n".replace("BODY", "left").replace("FORCE", "[6, 0, 0]")
+    loads += f"  lift: {push}\n".replace("BODY", "thumb").replace("FORCE", "[0, 6, 0]")
+    lines = [
+        line for line in RUBBING.replace("METHOD", method).splitlines() if "push" not in line and "loads" not in line
+    ]
+    path = tmp_path / "fingers.yaml"
+    path.write_text("\n".join(lines).replace("1.0", "0.1") + "\n" + loads)
+    record = simulate(load_scenario(path))
+    assert any(event.kind == "stop_hit" for event in record.events)
+    # (6 − 2 (1 + 1e-5)) N push (0.2 + 0.3e-10) kg.
+    assert record["v"][-1, 0] == pytest.approx(0.1 * 3.99998 / 0.2, rel=1e-6)
+    assert abs(record.summary["energy_residual_relative"]) < 1e-6

@@ -59,7 +59,7 @@ def test_null_spaces_are_orthonormal_and_whole(seed):
     B = rng.normal(size=(p, rank))
     W, N, order = np.zeros((9, 9)), np.full((9, 9), np.nan), np.zeros(9, dtype=int)
     W[:p, :p] = B @ B.T
-    width = null_space(W, p, N, order)
+    width = null_space(W, p, N, order, p)
     assert width == p - rank
     N = N[:p, :width]
     np.testing.assert_allclose(N.T @ N, np.eye(width), atol=1e-14)

@@ -21,6 +21,8 @@ from dynsim.jit.kernel import internal_kernel, noinline_kernel
 NULL_TOLERANCE = 1e-10
 # A unit direction of splits whose part along a normal row is smaller leaves that normal force as it is.
 NORMAL_PART = 1e-6
+# A direction with a smaller square in the leading rows has its other parts alone: of couplings behind closed brakes.
+NO_LEADING = 1e-20
 
 
 @internal_kernel
@@ -77,7 +79,7 @@ def split_forces(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Work
     """The best split of the forces of all that sticks, into FORCE of its rows; its worst margin into BEST_MARGIN."""
     room, index, mu, rows = unilateral.room, unilateral.index, unilateral.vector[0], ws.rows
     first, row = index[0], index[1]
-    points, count, p = find_splits(unilateral, ws)
+    points, count, p, ties = find_splits(unilateral, ws)
     for j in range(points):
         mu[j] = unilateral.number[ku.HOLDING] * contacts.law[ws.active[row[first[j]], ka.OWNER], ka.STATIC]
     j = points
@@ -93,6 +95,12 @@ def split_forces(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Work
     programs = split_room_in(unilateral.split_room, index[3], width, count)
     worst = best_split(force[:p], room[ku.NULL_SPACE], width, first, mu, points, count - points, out[:p], programs)
     unilateral.number[ku.BEST_MARGIN] = worst
+    for i in range(p, p + ties):
+        for c in range(width):
+            part = 0.0
+            for j in range(p):
+                part += room[ku.NULL_SPACE, j, c] * (out[j] - force[j])
+            rows[row[i], ka.FORCE] += room[ku.NULL_SPACE, i, c] * part
     for i in range(p):
         rows[row[i], ka.FORCE] = out[i]
 
@@ -101,11 +109,12 @@ def split_forces(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Work
 def find_splits(unilateral: UnilateralArrays, ws: Workspace):
     """Directions in which the forces of all that sticks may change, into NULL_SPACE, right after ``derivative``.
 
-    index[0] is the first row of each sticking point, then of each held joint, and index[1] the rows in the table.
+    index[0] is the first row of each sticking point, then of each held joint, and index[1] the rows in the table, with
+    those of couplings behind them: their forces change with the others, within no bound.
 
     Returns
     -------
-    points, count, p : sticking points, those and held joints, and their rows
+    points, count, p, ties : sticking points, those and held joints, and their rows; rows of couplings
     """
     room, first, row = unilateral.room, unilateral.index[0], unilateral.index[1]
     count, p = 0, 0
@@ -122,11 +131,18 @@ def find_splits(unilateral: UnilateralArrays, ws: Workspace):
             first[count], row[p] = p, unilateral.dry_table[k, ku.DRY_ROW]
             p += 1
             count += 1
-    for i in range(p):
-        for j in range(p):
+    # Rows of couplings come first in the table, before those of held joints and of closed stops.
+    ties = ws.counts[ka.COUPLED] - (count - points)
+    for k in range(unilateral.stop_table.shape[0]):
+        ties -= unilateral.stop_table[k, ku.STOP_CLOSED]
+    for r in range(ties):
+        row[p + r] = r
+    size = p + ties
+    for i in range(size):
+        for j in range(size):
             room[ku.SPLIT_MATRIX, i, j] = ws.small[0, row[i], row[j]]
-    unilateral.number[ku.WIDTH] = null_space(room[ku.SPLIT_MATRIX], p, room[ku.NULL_SPACE], unilateral.index[2])
-    return points, count, p
+    unilateral.number[ku.WIDTH] = null_space(room[ku.SPLIT_MATRIX], size, room[ku.NULL_SPACE], unilateral.index[2], p)
+    return points, count, p, ties
 
 
 @internal_kernel
@@ -142,14 +158,16 @@ def normal_is_open(unilateral: UnilateralArrays, ws: Workspace, k):
 
 
 @internal_kernel
-def null_space(W, p, N, order):
-    """Orthonormal basis of the null space of W, (p, p), symmetric and positive semidefinite, into N, (p, width).
+def null_space(W, p, N, order, leading):
+    """Basis of the null space of W, (p, p), symmetric and positive semidefinite, into N, (p, width).
+
+    It is orthonormal in its ``leading`` rows.
 
     Cholesky with pivoting, Π W Πᵀ = [L1; L2] [L1; L2]ᵀ; the columns (−L1⁻ᵀ L2ᵀ; 1), orthonormalised. W is overwritten.
 
     Returns
     -------
-    width : p minus the rank
+    width : p minus the rank, less what changes nothing in the leading rows
     """
     largest, rank = 0.0, 0
     for i in range(p):
@@ -172,27 +190,29 @@ def null_space(W, p, N, order):
             for j in range(rank + 1, p):
                 W[order[i], order[j]] -= W[order[i], a] * W[order[j], a]
         rank += 1
-    for c in range(p - rank):
-        free = order[rank + c]
+    width = 0
+    for free in order[rank:p]:
         for i in range(p):
-            N[i, c] = 0.0
-        N[free, c] = 1.0
+            N[i, width] = 0.0
+        N[free, width] = 1.0
         for k in range(rank - 1, -1, -1):
             total = -W[free, order[k]]
             for i in range(k + 1, rank):
-                total -= W[order[i], order[k]] * N[order[i], c]
-            N[order[k], c] = total / W[order[k], order[k]]
+                total -= W[order[i], order[k]] * N[order[i], width]
+            N[order[k], width] = total / W[order[k], order[k]]
         # Twice is enough (Kahan, Parlett).
         for _ in range(2):
-            for b in range(c):
+            for b in range(width):
                 part = 0.0
+                for i in range(leading):
+                    part += N[i, b] * N[i, width]
                 for i in range(p):
-                    part += N[i, b] * N[i, c]
-                for i in range(p):
-                    N[i, c] -= part * N[i, b]
+                    N[i, width] -= part * N[i, b]
         size = 0.0
-        for i in range(p):
-            size += N[i, c] * N[i, c]
-        for i in range(p):
-            N[i, c] /= math.sqrt(size)
-    return p - rank
+        for i in range(leading):
+            size += N[i, width] * N[i, width]
+        if size > NO_LEADING:
+            for i in range(p):
+                N[i, width] /= math.sqrt(size)
+            width += 1
+    return width

@@ -47,7 +47,8 @@ STOP_JOINT = 0  # link whose joint it stops
 STOP_CLOSED = 1
 STOP_ROW = 2  # its row while it is closed
 STOP_BEFORE = 3  # scratch of the choice of modes
-STOP_TABLE_SIZE = 4
+STOP_TOUCHED = 4  # scratch too: STOP_CLOSED before it
+STOP_TABLE_SIZE = 5
 # UnilateralArrays.stop
 SIDE = 0  # 1 for a lower limit, −1 for an upper one
 LIMIT = 1  # SIDE times the limit [rad or m]: the gap is SIDE q − LIMIT
@@ -96,7 +97,8 @@ TIE_SIZE = 29
 WANTED, BEFORE, TOUCHING, STRUCK = 0, 1, 2, 3
 GIVES_WAY = 4  # 1: it has come to its static cone, and the kinetic coefficient holds from now on
 LEAVES = 5  # 1: nothing presses it, and the next choice of modes is without it
-MODE_SIZE = 6
+TOUCHED = 6  # TOUCHING before a choice of modes
+MODE_SIZE = 7
 # UnilateralArrays.vector: three of the splits of forces, then those of the problem that chooses modes
 OFFSET, SOLUTION, CONE_FRICTION, FIRST_PART, SECOND_PART = 3, 4, 5, 6, 7
 VECTORS = 8

@@ -19,6 +19,7 @@ from dynsim.dynamics import state as kst
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.cone import problem as kc
+from dynsim.dynamics.contact.delassus import solve_small
 from dynsim.dynamics.contact.rows import set_modes
 from dynsim.dynamics.contact.splits import NULL_TOLERANCE
 from dynsim.dynamics.contact.unilateral import (
@@ -42,9 +43,9 @@ from dynsim.integrators.contacts.impacts import (
     slip_speed,
     solve_problem,
 )
-from dynsim.integrators.project import project_level
+from dynsim.integrators.project import RATE_TOLERANCE, project_level
 from dynsim.integrators.run import Run
-from dynsim.jit.kernel import internal_kernel
+from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
 # An acceleration along the surface below this fraction of the largest right-hand side is none.
 SLIP_TOLERANCE = 1e-8
@@ -55,6 +56,12 @@ NEARLY_AT_REST = 1e-5
 ON_CONE = 1e-7
 # Share of its friction that a joint at rest may have: all of it but a rounding, which tells it from one that slides.
 NEARLY_ALL = 1.0 - 1e-15
+# Which joints that rub a choice of modes holds: all slow ones; those, unless their rates contradict what else is
+# closed; only those that rest.
+HOLD_SLOW, HOLD_COMPATIBLE, HOLD_RESTING = 0, 1, 2
+# Light joints may change their rates by some times what heavy ones at rest are rid of; the rest was no rest if others,
+# geared to them, lose more than that.
+MOST_CHANGE = 100.0
 
 
 @internal_kernel
@@ -82,9 +89,44 @@ def resolve(system: System, ws: Workspace, run: Run, touch):
 @internal_kernel
 def choose(system: System, ws: Workspace, run: Run):
     """Modes by the accelerations of all that touches; the rates of what is closed are brought to zero."""
+    mode, stops = system.unilateral.mode, system.unilateral.stop_table
+    for k in range(mode.shape[0]):
+        mode[k, ku.TOUCHED] = mode[k, ku.TOUCHING]
+    for k in range(stops.shape[0]):
+        stops[k, ku.STOP_TOUCHED] = stops[k, ku.STOP_CLOSED]
+    if choose_modes(system, ws, run, HOLD_COMPATIBLE):
+        return
+    # A joint that moves ever so slowly, because what touches moves it, does not rest.
+    touch_again(system.unilateral)
+    choose_modes(system, ws, run, HOLD_RESTING)
+    if run.count[ki.STATUS] != ki.RUNNING:
+        run.count[ki.STATUS] = ki.RUNNING
+        touch_again(system.unilateral)
+        choose_modes(system, ws, run, HOLD_SLOW)
+
+
+@internal_kernel
+def touch_again(unilateral: UnilateralArrays):
+    """What touched before a choice that is taken back."""
+    mode, stops = unilateral.mode, unilateral.stop_table
+    for k in range(mode.shape[0]):
+        mode[k, ku.TOUCHING] = mode[k, ku.TOUCHED]
+    for k in range(stops.shape[0]):
+        stops[k, ku.STOP_CLOSED] = stops[k, ku.STOP_TOUCHED]
+
+
+@noinline_kernel
+def choose_modes(system: System, ws: Workspace, run: Run, held):
+    """:func:`choose`, with one of the ways to hold joints that rub; False, and no rates changed, if that is taken back.
+
+    HOLD_COMPATIBLE is taken back where the slow rates of the joints that are held contradict what else is closed, or
+    could only be zero if other joints stopped too.
+    """
     unilateral = system.unilateral
     mode = unilateral.mode
     hold_slow_joints(unilateral, ws)
+    if held == HOLD_RESTING:
+        release_moving_joints(unilateral, ws)
     p = gather(system, ws, run)
     largest = 0.0
     for r in range(p):
@@ -115,7 +157,7 @@ def choose(system: System, ws: Workspace, run: Run):
         # Whoever looks for the cause finds the rows that contradict the law.
         set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
         evaluate(system, ws, run)
-        return
+        return True
     take_solution(system, ws, size, largest)
     release_dependent_joints(system, ws)
     # What is left of rates after an impact that was let settle, and of points that were solved for as if at rest: those
@@ -128,7 +170,14 @@ def choose(system: System, ws: Workspace, run: Run):
     # What was split before says nothing of these modes.
     unilateral.number[ku.REDUNDANT], unilateral.number[ku.SPLIT] = 0.0, 0.0
     evaluate(system, ws, run)
+    if held == HOLD_COMPATIBLE and holds_moving_joint(unilateral, ws) and rates_contradict(ws):
+        return False
     loss = project_level(system, ws, run.y, 1)
+    if held == HOLD_COMPATIBLE and stops_others(unilateral, ws):
+        for i in range(ws.joints.shape[0]):
+            run.y[system.layout.v + i] -= ws.joints[i, ka.QDD]
+        evaluate(system, ws, run)
+        return False
     run.y[system.layout.loss + kst.IMPACT_LOSS] += loss
     evaluate(system, ws, run)
     for k in range(unilateral.dry_table.shape[0]):
@@ -143,6 +192,70 @@ def choose(system: System, ws: Workspace, run: Run):
         mode[k, ku.GIVES_WAY], mode[k, ku.LEAVES] = 0, 0
         starts = mode[k, ku.WANTED] == ka.SLIDING and mode[k, ku.TOUCHING] == ka.STICKING
         unilateral.slide[k, ku.HEADWAY] = max(0.0, -unilateral.slide[k, ku.SPEED]) if starts else 0.0
+    return True
+
+
+@internal_kernel
+def rests(unilateral: UnilateralArrays, ws: Workspace, k):
+    """True if joint k, of those with dry friction, does not move, to the accuracy of projected rates."""
+    return abs(ws.joints[unilateral.dry_table[k, ku.DRY_JOINT], ka.QD]) <= RATE_TOLERANCE
+
+
+@internal_kernel
+def holds_moving_joint(unilateral: UnilateralArrays, ws: Workspace):
+    """True if dry friction holds a joint that still moves."""
+    for k in range(unilateral.dry_table.shape[0]):
+        if unilateral.dry_table[k, ku.DRY_HOLDS] == 1 and not rests(unilateral, ws, k):
+            return True
+    return False
+
+
+@internal_kernel
+def release_moving_joints(unilateral: UnilateralArrays, ws: Workspace):
+    """Let the joints slide that do not quite rest."""
+    for k in range(unilateral.dry_table.shape[0]):
+        if not rests(unilateral, ws, k):
+            unilateral.dry_table[k, ku.DRY_HOLDS] = 0
+
+
+@noinline_kernel
+def rates_contradict(ws: Workspace):
+    """True if no change of rates brings those of all active rows to zero, right after :func:`evaluate`."""
+    rows, p = ws.rows, ws.counts[ka.ROWS]
+    for r in range(p):
+        rows[r, ka.RHS] = rows[r, ka.ROW_RATE]
+        for s in range(p):
+            ws.small[0, r, s] = mobility(ws, r, s)
+    solve_small(ws.small, rows, ws.active, p)
+    for r in range(p):
+        left = rows[r, ka.ROW_RATE]
+        for s in range(p):
+            left -= mobility(ws, r, s) * rows[s, ka.FORCE]
+        fast = 0.0 if ws.active[r, ka.ROW_KIND] == ka.JOINT_ROW else slip_speed(ws, ws.active[r, ka.OWNER])
+        if abs(left) > RATE_TOLERANCE * (1.0 + fast):
+            return True
+    return False
+
+
+@internal_kernel
+def stops_others(unilateral: UnilateralArrays, ws: Workspace):
+    """True if holding slow joints takes far more from the rates than they have, right after :func:`project_level`."""
+    slowly, change = 0.0, 0.0
+    for k in range(unilateral.dry_table.shape[0]):
+        if unilateral.dry_table[k, ku.DRY_HOLDS] == 1:
+            slowly = max(slowly, abs(ws.joints[unilateral.dry_table[k, ku.DRY_JOINT], ka.QD]))
+    for i in range(ws.joints.shape[0]):
+        change = max(change, abs(ws.joints[i, ka.QDD]))
+    return slowly > RATE_TOLERANCE and change > MOST_CHANGE * slowly
+
+
+@internal_kernel
+def mobility(ws: Workspace, r, s):
+    """Change of the rate along row r by a unit impulse along row s."""
+    total = 0.0
+    for i in range(ws.joints.shape[0]):
+        total += ws.column[i, 1 + 2 * r] * ws.column[i, 1 + 2 * s] * ws.links[i, ka.INVERSE_D]
+    return total
 
 
 @internal_kernel
