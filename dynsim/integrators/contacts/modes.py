@@ -116,7 +116,7 @@ def touch_again(unilateral: UnilateralArrays):
 
 
 @noinline_kernel
-def choose_modes(system: System, ws: Workspace, run: Run, held):
+def choose_modes(system: System, ws: Workspace, run: Run, rule):
     """:func:`choose`, with one of the ways to hold joints that rub; False, and no rates changed, if that is taken back.
 
     HOLD_COMPATIBLE is taken back where the slow rates of the joints that are held contradict what else is closed, or
@@ -125,7 +125,7 @@ def choose_modes(system: System, ws: Workspace, run: Run, held):
     unilateral = system.unilateral
     mode = unilateral.mode
     hold_slow_joints(unilateral, ws)
-    if held == HOLD_RESTING:
+    if rule == HOLD_RESTING:
         release_moving_joints(unilateral, ws)
     p = gather(system, ws, run)
     largest = 0.0
@@ -170,10 +170,10 @@ def choose_modes(system: System, ws: Workspace, run: Run, held):
     # What was split before says nothing of these modes.
     unilateral.number[ku.REDUNDANT], unilateral.number[ku.SPLIT] = 0.0, 0.0
     evaluate(system, ws, run)
-    if held == HOLD_COMPATIBLE and holds_moving_joint(unilateral, ws) and rates_contradict(ws):
+    if rule == HOLD_COMPATIBLE and holds_moving_joint(unilateral, ws) and rates_contradict(ws):
         return False
     loss = project_level(system, ws, run.y, 1)
-    if held == HOLD_COMPATIBLE and stops_others(unilateral, ws):
+    if rule == HOLD_COMPATIBLE and stops_others(unilateral, ws):
         for i in range(ws.joints.shape[0]):
             run.y[system.layout.v + i] -= ws.joints[i, ka.QDD]
         evaluate(system, ws, run)
@@ -196,7 +196,7 @@ def choose_modes(system: System, ws: Workspace, run: Run, held):
 
 
 @internal_kernel
-def rests(unilateral: UnilateralArrays, ws: Workspace, k):
+def joint_rests(unilateral: UnilateralArrays, ws: Workspace, k):
     """True if joint k, of those with dry friction, does not move, to the accuracy of projected rates."""
     return abs(ws.joints[unilateral.dry_table[k, ku.DRY_JOINT], ka.QD]) <= RATE_TOLERANCE
 
@@ -205,7 +205,7 @@ def rests(unilateral: UnilateralArrays, ws: Workspace, k):
 def holds_moving_joint(unilateral: UnilateralArrays, ws: Workspace):
     """True if dry friction holds a joint that still moves."""
     for k in range(unilateral.dry_table.shape[0]):
-        if unilateral.dry_table[k, ku.DRY_HOLDS] == 1 and not rests(unilateral, ws, k):
+        if unilateral.dry_table[k, ku.DRY_HOLDS] == 1 and not joint_rests(unilateral, ws, k):
             return True
     return False
 
@@ -214,7 +214,7 @@ def holds_moving_joint(unilateral: UnilateralArrays, ws: Workspace):
 def release_moving_joints(unilateral: UnilateralArrays, ws: Workspace):
     """Let the joints slide that do not quite rest."""
     for k in range(unilateral.dry_table.shape[0]):
-        if not rests(unilateral, ws, k):
+        if not joint_rests(unilateral, ws, k):
             unilateral.dry_table[k, ku.DRY_HOLDS] = 0
 
 
