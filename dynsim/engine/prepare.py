@@ -28,7 +28,7 @@ from dynsim.dynamics.tree import support as ks
 from dynsim.engine import REFERENCES, Progress
 from dynsim.engine.compilation import kernels_logged
 from dynsim.engine.equilibrium import Balance, balanced, pressed, shifted
-from dynsim.engine.method import AUTO, Choice, choose
+from dynsim.engine.method import AUTO, PACE, Choice, choose
 from dynsim.engine.outcome import check_size
 from dynsim.engine.soundness import check_inertia
 from dynsim.errors import ModelError, ScenarioError, SimulationStopped
@@ -204,7 +204,7 @@ def prepare(
         hand=(model.body_index(robot.hand[0]), robot.hand[1]),
         end=scenario.duration_s if end is None else end,
         step=step,
-        step_max=options.step_max_s or np.inf,
+        step_max=min(options.step_max_s or np.inf, _longest_step(method, real)),
         rtol=options.rtol,
         atol=options.atol,
         ticks=_ticks(control),
@@ -327,6 +327,15 @@ def _least_progress(duration: float) -> float:
     """Return the time by which MOST_TRIALS steps have to come on [s]."""
     least = ki.PROGRESS * duration
     return max(least, min(10.0 * least, STANDS))
+
+
+def _longest_step(method: int, real: bool) -> float:
+    """Longest step while forces are watched [s].
+
+    While everything rests, nothing limits the steps of an explicit method, and a force could fall below zero and rise
+    again within one of them. Knots of references are as far apart as this. An implicit method stops at their bends.
+    """
+    return PACE if real and method == ki.DOPRI5 else np.inf
 
 
 def _breaks(loads: Sequence[Load], control: JointControl, method: int, options: Integrator) -> np.ndarray:

@@ -57,6 +57,8 @@ RETURN_TIME, RETURN_STEPS, RETURN_SPEED = 0.02, 10.0, 0.02
 MOST_UNSOLVED = 1e3
 # Gaps by which the scheme itself sways, in units of h |a_n|, are none: feedback on them would feed energy.
 SWAY = 2.0
+# A joint with a mobility below this is behind a closed brake, and nothing moves it back [1/kg or 1/(kg m²)].
+BRAKED_MOBILITY = 1e-20
 
 
 @internal_kernel
@@ -290,10 +292,10 @@ def stop_return(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, 
 
     The impulse of the last step, ``s.f`` of its row, says how much energy this rate needs.
     """
-    loss, rate = unilateral.stop[k, ku.STOP_LOSS], 0.0
-    if loss > 0.0:
+    loss, rate, row = unilateral.stop[k, ku.STOP_LOSS], 0.0, unilateral.stop_table[k, ku.STOP_ROW]
+    if loss > 0.0 and ws.small[0, row, row] > BRAKED_MOBILITY:
         rate = return_rate(min(stop_gap(unilateral, ws, k), 0.0), 0.0, loss, h)
-        impulse = s.f[unilateral.stop_table[k, ku.STOP_ROW]]
+        impulse = s.f[row]
         if rate * impulse > loss:
             rate = loss / impulse
     return rate
