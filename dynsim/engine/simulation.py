@@ -144,7 +144,7 @@ class Simulation:
         if (unstable := unstable_loop(scenario, self._prepared)) is not None:
             # Live sessions may never make a record, whose summary has this warning.
             log.warning("%s: %s", scenario.title, unstable[0])
-        self._time, self._wall = start, 0.0
+        self._time, self._begun, self._wall = start, start, 0.0
         # Of a ring, and of a run that goes on from another, the ledger counts from the first sample on.
         self._relative = trace is not None or state is not None
         self._happened: list[Event] = []
@@ -616,7 +616,7 @@ class Simulation:
             attendant.restore(kept)
 
     def record(self, scenario: Scenario | None = None, *, pictured: bool = True) -> Record:
-        """Record of the trace so far; of a ring, energies and losses count from its first sample on.
+        """Record of the trace so far; of a ring, energies, losses, events and counts are those from its first sample on.
 
         ``complete`` is True for a run that has come to its end.
 
@@ -656,6 +656,7 @@ class Simulation:
             happened=self._happened,
             base_as_planned=self._base_as_planned,
             pictured=pictured,
+            begun=self._begun,
         )
         record.summary["warnings"] += self._said
         for attendant in self._attendants:

@@ -62,6 +62,7 @@ def warnings_of(
     scale: float,
     sunk: Sequence[Sinking],
     motors: Sequence[dict[str, Any]],
+    begun: float = 0.0,
 ) -> list[str]:
     """All warnings of a run, one sentence each.
 
@@ -70,6 +71,7 @@ def warnings_of(
     summary : numbers so far
     scale : turnover of the energy, no less than what the ledger resolves [J]
     sunk : bodies below surfaces; motors : their loads
+    begun : time at which the run began [s]; the samples of a ring begin later
     """
     robot = prepared.model.robot
     unstable = unstable_loop(scenario, prepared)
@@ -78,7 +80,7 @@ def warnings_of(
         *_contact_warnings(record, scenario, prepared, summary),
         *_saturated(record, robot),
         *_passed_limits(record, robot, prepared.system.unilateral is not None),
-        *_base_warnings(record, scenario, prepared),
+        *_base_warnings(record, scenario, prepared, begun),
     ]
     if summary["energy_residual_relative"] > RESIDUAL_LIMIT:
         warnings.append(
@@ -90,7 +92,7 @@ def warnings_of(
     elif summary["constraint_drift_max_m"] > DRIFT_LIMIT_M:
         warnings.append(f"contacts drifted by {summary['constraint_drift_max_m']:.1e} m")
     warnings += _undetermined(record, prepared)
-    warnings += _unpressed(record, prepared)
+    warnings += _unpressed(record, prepared, begun)
     warnings += _slipping_start(record, prepared) or _moving_start(record, prepared)
     warnings += _sunk(record, sunk)
     warnings += _beyond_stops(robot, prepared.stops, prepared.control)
@@ -237,9 +239,10 @@ def _undetermined(record: Record, prepared: Prepared) -> list[str]:
     return warnings
 
 
-def _unpressed(record: Record, prepared: Prepared) -> list[str]:
+def _unpressed(record: Record, prepared: Prepared, begun: float) -> list[str]:
     """Contacts that stick although nothing presses them, which leaves the motion open."""
-    unilateral, time = prepared.system.unilateral, record.time[-1] if len(record) else 0.0
+    # Of a ring, too, the share is that of the whole run: samples do not show what presses.
+    unilateral, time = prepared.system.unilateral, record.time[-1] - begun if len(record) else 0.0
     if unilateral is None or not time > 0.0:
         return []
     shares = unilateral.tally[:, ku.UNPRESSED] / time
@@ -260,7 +263,7 @@ def _unpressed(record: Record, prepared: Prepared) -> list[str]:
 
 def _slipping_start(record: Record, prepared: Prepared) -> list[str]:
     """An equilibrium on the edge of friction cones that slips at the start."""
-    if prepared.balance is None or not prepared.balance.on_edge or not len(record):
+    if prepared.balance is None or not prepared.balance.on_edge or not len(record) or record.time[0] != 0.0:
         return []
     if np.abs(record["vdot"][0]).max(initial=0.0) > STARTS_MOVING:
         slips = 0.0
@@ -406,7 +409,9 @@ def coarse(stepping: dict[str, Any], scale: float) -> list[str]:
 
     scale : turnover of the energy, no less than what the ledger resolves; zero before anything moves [J]
     """
-    step, worst, blurred = (stepping[key] for key in ("step_s", "scheme_loss_worst_J", "half_step_energy_J"))
+    step, worst = stepping["step_s"], stepping["scheme_loss_worst_J"]
+    # Not known of a ring.
+    blurred = stepping.get("half_step_energy_J", 0.0)
     warnings: list[str] = []
     if scale > 0.0 and abs(worst) > SCHEME_LIMIT * scale:
         warnings.append(
@@ -448,7 +453,7 @@ def capped(stepping: dict[str, Any]) -> list[str]:
     ]
 
 
-def _base_warnings(record: Record, scenario: Scenario, prepared: Prepared) -> list[str]:
+def _base_warnings(record: Record, scenario: Scenario, prepared: Prepared, begun: float) -> list[str]:
     """What a mobile base does that a real one could not do."""
     base, run, settle = prepared.model.robot.base, prepared.run, scenario.metrics.settle_s
     if base is None:
@@ -458,6 +463,11 @@ def _base_warnings(record: Record, scenario: Scenario, prepared: Prepared) -> li
     lowest = least_loads(record, run.support.least)
     late = record["tip_margin"][record.time >= settle]
     first = min((event.time for event in record.events if event.kind == TIP_OVER), default=np.inf)
+    # The samples of a ring may begin after it has tipped.
+    tipped = len(record) > 0 and record.time[0] > begun and record["tip_margin"][0] < 0.0
+    if tipped:
+        first = float(record.time[0])
+    tips = "is tipped over" if tipped else "tips over"
     if np.isfinite(first) and not base.stop_on_overturn:
         pulled = ", ".join(
             f"{name} {low:.3g}" for name, low in zip(record.labels["wheel_load"], lowest, strict=True) if low < 0.0
@@ -472,7 +482,7 @@ def _base_warnings(record: Record, scenario: Scenario, prepared: Prepared) -> li
             )
         else:
             warnings.append(
-                f"the base tips over at t = {first:.4f} s, with a tip margin below zero in {beyond}; the run goes on "
+                f"the base {tips} at t = {first:.4f} s, with a tip margin below zero in {beyond}; the run goes on "
                 f"as if it were held down{least}: plant.base.on_overturn: stop ends it there"
             )
     lifted = load.sum(axis=1) <= 0.0
