@@ -590,8 +590,9 @@ class Simulation:
         """What :meth:`restore` needs to go on from here."""
         arrays = {name: array.copy() for name, array in self._arrays().items()}
         attendants = [attendant.remembered() for attendant in self._attendants]
-        trace, happened = self._trace.snapshot(), tuple(self._happened)
-        return Snapshot(self._token, arrays, self._time, trace, happened, self._frozen, attendants)
+        trace, happened, pushed = self._trace.snapshot(), tuple(self._happened), frozenset(self._pushed)
+        shown = (pushed, self._base_as_planned)
+        return Snapshot(self._token, arrays, self._time, trace, happened, *shown, self._frozen, attendants)
 
     def restore(self, snapshot: Snapshot) -> None:
         """Go back to a snapshot of this simulation: the same future, bit for bit.
@@ -612,6 +613,7 @@ class Simulation:
             array[...] = snapshot.arrays[name]
         self._trace.restore(snapshot.trace)
         self._time, self._frozen, self._happened = snapshot.time, snapshot.frozen, list(snapshot.happened)
+        self._pushed, self._base_as_planned = set(snapshot.pushed), snapshot.base_as_planned
         for attendant, kept in zip(self._attendants, snapshot.attendants, strict=True):
             attendant.restore(kept)
 
