@@ -618,7 +618,7 @@ class Simulation:
             attendant.restore(kept)
 
     def record(self, scenario: Scenario | None = None, *, pictured: bool = True) -> Record:
-        """Record of the trace so far; of a ring, energies, losses, events and counts are those from its first sample on.
+        """Record of the trace so far; of a ring, energies, events and counts from its first sample on.
 
         ``complete`` is True for a run that has come to its end.
 

@@ -206,7 +206,7 @@ def _undetermined(record: Record, prepared: Prepared) -> list[str]:
         shared = sharing(prepared.model, contacts, record["q"], record["contact_mode"], rests)
         touching, joints = shared.contacts, shared.joints
         if joints:
-            slides = (record["contact_mode"] == ka.SLIDING) & rests.any(axis=1)[:, None]
+            slides = (record["contact_mode"] == ka.SLIDING) & rests.any(axis=1, keepdims=True)
             sliding = [
                 contact.name
                 for contact, some in zip(contacts, slides.any(axis=0), strict=True)
