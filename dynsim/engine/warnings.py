@@ -77,7 +77,7 @@ def warnings_of(
     unstable = unstable_loop(scenario, prepared)
     warnings = [
         *([] if unstable is None else [unstable[0]]),
-        *_contact_warnings(record, scenario, prepared, summary),
+        *_contact_warnings(record, scenario, prepared, summary, begun),
         *_saturated(record, robot),
         *_passed_limits(record, robot, prepared.system.unilateral is not None),
         *_base_warnings(record, scenario, prepared, begun),
@@ -101,7 +101,9 @@ def warnings_of(
     return warnings if prepared.balance is None else [*warnings, *prepared.balance.warnings]
 
 
-def _contact_warnings(record: Record, scenario: Scenario, prepared: Prepared, summary: dict[str, Any]) -> list[str]:
+def _contact_warnings(
+    record: Record, scenario: Scenario, prepared: Prepared, summary: dict[str, Any], begun: float
+) -> list[str]:
     """Contacts that chatter, pull, carry nothing or turn their own force against them; friction that gives energy."""
     contacts, unilateral, warnings = prepared.contacts, prepared.system.unilateral, list[str]()
     if unilateral is not None:
@@ -122,6 +124,8 @@ def _contact_warnings(record: Record, scenario: Scenario, prepared: Prepared, su
     warnings += build.left_out_warnings(scenario, contacts)
     initial, columns = scenario.config.initial, record.labels["contact_gap"]
     placed = () if initial is None else initial.on_surface
+    # Of a ring, nobody knows what was before it.
+    within = f" from t = {record.time[0]:.4g} s on" if len(record) and record.time[0] > begun else ""
     for contact in summary["contacts"]:
         name = contact["name"]
         if "gap_min_m" in contact and contact["closed_fraction"] == 0.0 and name not in left_out:
@@ -129,11 +133,11 @@ def _contact_warnings(record: Record, scenario: Scenario, prepared: Prepared, su
             time, surface = f"t = {record.time[nearest]:.4g} s", contact["surface"]
             if contact["gap_min_m"] <= build.START_TOLERANCE:
                 warnings.append(
-                    f"{name}: this brace is on the {surface} at {time}, but never pressed: it carries nothing"
+                    f"{name}: this brace is on the {surface} at {time}, but never pressed{within}: it carries nothing"
                 )
                 continue
             warnings.append(
-                f"{name}: this brace never touches the {surface}: it carries nothing; nearest "
+                f"{name}: this brace never touches the {surface}{within}: it carries nothing; nearest "
                 f"{1e3 * contact['gap_min_m']:.3g} mm at {time}"
                 f"{'' if name in placed else ' (initial.on_surface lets it start there)'}"
             )
