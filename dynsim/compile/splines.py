@@ -20,8 +20,8 @@ _DIFFERENCE = np.array([1.0, -6.0, 15.0, -20.0, 15.0, -6.0, 1.0])
 _BESIDE = 6
 # First and second derivatives at a knot, but for their scale, by the five B-splines there.
 _SLOPE, _CURVATURE = np.array([-1.0, -10.0, 0.0, 10.0, 1.0]), np.array([1.0, 2.0, -6.0, 2.0, 1.0])
-# What holds at an end, but would go there by more than this part of its span in a knot, is to stand still. The ringing
-# of a kink falls by 0.43 a knot: to this within ten.
+# Samples that hold at an end are held exactly if the spline through them would move there by more than this part of
+# its span per knot. The ringing of a kink decays by 0.43 per knot, and falls below this within about ten.
 _STANDS = 4e-6
 # Segments that the motion between has at least.
 _FEWEST = 6

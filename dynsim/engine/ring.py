@@ -1,8 +1,8 @@
-"""What a ring of samples says of its own duration, in place of what the kernels count from the beginning of the run.
+"""Tallies of a ring of samples: a run of which only the last samples are kept.
 
-Counts are those of its events; times, fractions and extremes are those of its samples. What neither shows, the losses
-of single contacts and stops and how far half a step would blur the energy, is not a number (NaN), and left out of
-summaries.
+The kernels count from the beginning of the run. Within the ring, events are counted; times, fractions and extremes come
+from the samples. Three numbers cannot be known: the losses of single contacts and of single stops, and how far half a
+step would blur the energy. They are not a number (NaN) here, and are left out of summaries.
 """
 
 from __future__ import annotations
@@ -72,14 +72,14 @@ def counted_within(prepared: Prepared, happened: Sequence[Event]) -> Prepared:
         rigid = np.array([contact.stiffness == 0.0 for contact in prepared.contacts], dtype=bool)
         statistics[kt.PENETRATION] = depths[rigid].max(initial=0.0)
         stepping = stepping._replace(statistics=statistics)
-    # Least loads of a mobile base at all steps: not known.
+    # An empty array says that the least loads of a mobile base between the samples are not known.
     support = run.support._replace(least=np.zeros(0))
     run = run._replace(extremes=extremes, stepping=stepping, support=support)
     return replace(prepared, run=run, system=system)
 
 
 def _extremes(run: ki.Run, force: Array, gaps: Array) -> Array:
-    """Extremes of the samples, (c, EXTREMES_SIZE), by normal forces [N] and gaps of what is closed [m], (T, c)."""
+    """Extremes of the samples, (c, EXTREMES_SIZE), by normal forces [N] and gaps of closed contacts [m], (T, c)."""
     extremes = run.extremes.copy()
     extremes[:, ki.FORCE_MIN], extremes[:, ki.FORCE_MAX] = force.min(axis=0), force.max(axis=0)
     extremes[:, ki.DRIFT_MAX] = np.abs(gaps).max(axis=0)
@@ -94,7 +94,7 @@ def _extremes(run: ki.Run, force: Array, gaps: Array) -> Array:
 
 
 def _shares(times: Array) -> NDArray[np.float64]:
-    """The time that each sample stands for [s]: half of the intervals beside it."""
+    """The time that each sample stands for [s]: half of each interval next to it."""
     halves = 0.5 * np.diff(times)
     return np.append(halves, 0.0) + np.append(0.0, halves)
 
