@@ -258,7 +258,7 @@ _CONTACT_ROWS: tuple[tuple[str, Callable[[Summary], str], bool | None], ...] = (
     ("  sticking [% of time]", _percent("sticking_fraction"), True),
     ("  lift-offs, landings", lambda c: f"{c['lift_offs']}, {c['landings']}", True),
     ("  bounces, slip starts", lambda c: f"{c['bounces']}, {c['slip_starts']}", True),
-    ("  loss at its impacts [J]", lambda c: _number(c["impact_loss_J"], digits=3), True),
+    ("  loss at its impacts [J]", lambda c: _number(c.get("impact_loss_J"), digits=3), True),
 )
 
 
@@ -286,7 +286,7 @@ _STOP_ROWS: tuple[tuple[str, Callable[[Summary], str]], ...] = (
     ("hits", lambda s: str(s["hits"])),
     ("  force, max [{force_unit}]", lambda s: _number(s["force_max"], digits=3)),
     ("  closed [% of time]", _percent("closed_fraction")),
-    ("  loss at its impacts [J]", lambda s: _number(s["impact_loss_J"], digits=3)),
+    ("  loss at its impacts [J]", lambda s: _number(s.get("impact_loss_J"), digits=3)),
 )
 
 

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dynsim.compile.equilibrium import KEYS, holding_torques, touching_contacts
 from dynsim.compile.model import Model
@@ -56,7 +57,7 @@ def pressed_in(
             depths.append(gap + (forces[contact.name] / contact.stiffness if compliant else 0.0))
             rigid.append(not compliant)
             roots.append(np.sqrt(contact.stiffness))
-        step = _within_limits(model, q, np.array(rows), -np.array(depths), np.array(rigid), np.array(roots))
+        step = _within_limits(model, q, np.array(rows), -np.array(depths), np.array(rigid, dtype=bool), np.array(roots))
         change = np.zeros(model.nq)
         positions_along(model.arrays, q, 0, step, change)
         q += change
@@ -70,7 +71,7 @@ def pressed_in(
     )
 
 
-def _within_limits(model: Model, q: Array, rows: Array, wanted: Array, rigid: Array, roots: Array) -> Array:
+def _within_limits(model: Model, q: Array, rows: Array, wanted: Array, rigid: NDArray[np.bool_], roots: Array) -> Array:
     """Displacement of least norm (n,) that changes gaps as wanted, (c,) [m]; joints do not pass their limits."""
     robot, wheels = model.robot, () if model.robot.base is None else model.robot.base.wheels
     free = np.array([link.joint not in wheels for link in robot.links])
@@ -89,11 +90,11 @@ def _within_limits(model: Model, q: Array, rows: Array, wanted: Array, rigid: Ar
         free &= ~beyond
 
 
-def _displacement(rows: Array, wanted: Array, rigid: Array, roots: Array) -> Array:
+def _displacement(rows: Array, wanted: Array, rigid: NDArray[np.bool_], roots: Array) -> Array:
     """Least displacement of the free joints: rigid contacts exactly, the others by the springs' least squares."""
     particular, null = np.zeros(rows.shape[1]), np.eye(rows.shape[1])
     if rigid.any():
-        particular = np.linalg.lstsq(rows[rigid], wanted[rigid], rcond=RANK)[0]
+        particular[:] = np.linalg.lstsq(rows[rigid], wanted[rigid], rcond=RANK)[0]
         _, sizes, basis = np.linalg.svd(rows[rigid])
         null = basis[int(np.count_nonzero(sizes > RANK * sizes.max(initial=0.0))) :].T
     springs = roots[~rigid, None] * rows[~rigid]

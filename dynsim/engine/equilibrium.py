@@ -29,6 +29,8 @@ from dynsim.model.drives import Motor, Servo, TorqueSource
 
 # A reference starts at rest at the joint's position if its offset and its rate are below this [rad or m, rad/s or m/s].
 AT_REST = 1e-4
+# A normal force of less than this part of the robot's weight is none: references that are splines leave as much.
+NO_FORCE = 1e-4
 
 
 @dataclass(frozen=True)
@@ -100,8 +102,7 @@ def balanced(
     else:
         # The plan says what presses; loads it does not know, and the motors carry them.
         torques, forces = load_torques(model, robot.initial, loads), {}
-        touching = touching_contacts(model, contacts, robot.initial, real)
-        if compliant := [contact.name for contact, *_ in touching if contact.stiffness > 0.0]:
+        if compliant := _counted_on(model, contacts, planned[0, :, 0], index, real):
             jumps.append(f"the planned voltages count on {first_few(compliant)}, which deform before they carry")
     for a, (motor, i) in enumerate(zip(motors, index, strict=True)):
         if isinstance(motor, TorqueSource):
@@ -139,6 +140,30 @@ def balanced(
         else ()
     )  # fmt: skip
     return Balance(current, shift, float(resistance @ current**2), forces, said, on_edge)
+
+
+def _counted_on(
+    model: Model, contacts: Sequence[Contact], voltages: Array, index: Sequence[int], real: bool
+) -> list[str]:
+    """Compliant contacts to which planned voltages, (na,), leave a part of the weight.
+
+    ``index`` : joint of each motor
+    """
+    robot = model.robot
+    left = np.asarray(model.bias_forces(robot.initial, np.zeros(model.n)))
+    for motor, i, u in zip(robot.motors, index, voltages, strict=True):
+        if not isinstance(motor, TorqueSource):
+            left[i] -= motor.joint_constant * u / motor.resistance
+    touching = touching_contacts(model, contacts, robot.initial, real)
+    rows = np.array(
+        [normal @ model.point_jacobian(link, point, robot.initial) for _, link, point, normal, _ in touching]
+    )
+    if not len(rows):
+        return []
+    forces = np.linalg.lstsq(rows.T, left, rcond=None)[0]
+    least = NO_FORCE * sum(link.inertia.mass for link in robot.links) * float(np.linalg.norm(robot.gravity))
+    named = zip(touching, forces, strict=True)
+    return [contact.name for (contact, *_), force in named if contact.stiffness > 0.0 and abs(force) > least]
 
 
 def _able(model: Model, control: JointControl) -> list[str]:

@@ -14,6 +14,7 @@ from dynsim.dynamics.tree import support as ks
 from dynsim.engine import summary as metrics
 from dynsim.engine.prepare import Prepared
 from dynsim.engine.provenance import provenance
+from dynsim.engine.ring import counted_within
 from dynsim.integrators import run as ki
 from dynsim.model.base_pose import base_pose
 from dynsim.model.description import Link
@@ -32,6 +33,7 @@ def make_record(
     happened: Sequence[Event] = (),
     base_as_planned: bool = True,
     pictured: bool = True,
+    begun: float = 0.0,
 ) -> Record:
     """Name the columns that the kernels wrote.
 
@@ -39,7 +41,12 @@ def make_record(
     ``happened`` : events of the run
     ``base_as_planned`` : whether the wheels of a base follow what ``prepared.control`` says, and from its start
     ``pictured`` : with the scene, the poses of its bodies, and provenance
+    ``begun`` : time at which the run began [s]; when samples begin later, all but the effort is counted from there
     """
+    count, times = int(prepared.run.count[ki.SAMPLE]), prepared.run.sample_time
+    if count and times[0] > begun:
+        happened = [event for event in happened if event.time >= times[0]]
+        prepared = counted_within(prepared, happened)
     model, run, contacts = prepared.model, prepared.run, prepared.contacts
     robot = model.robot
     rows = int(run.count[ki.SAMPLE])
@@ -104,7 +111,7 @@ def make_record(
     if pictured:
         record.scene = robot_scene(robot, contacts, build.surfaces(scenario))
         add_body_poses(record)
-    record.summary = metrics.summarise(record, scenario, prepared, wall)
+    record.summary = metrics.summarise(record, scenario, prepared, wall, begun)
     return record
 
 

@@ -144,7 +144,7 @@ class Simulation:
         if (unstable := unstable_loop(scenario, self._prepared)) is not None:
             # Live sessions may never make a record, whose summary has this warning.
             log.warning("%s: %s", scenario.title, unstable[0])
-        self._time, self._wall = start, 0.0
+        self._time, self._begun, self._wall = start, start, 0.0
         # Of a ring, and of a run that goes on from another, the ledger counts from the first sample on.
         self._relative = trace is not None or state is not None
         self._happened: list[Event] = []
@@ -592,8 +592,9 @@ class Simulation:
         """What :meth:`restore` needs to go on from here."""
         arrays = {name: array.copy() for name, array in self._arrays().items()}
         attendants = [attendant.remembered() for attendant in self._attendants]
-        trace, happened = self._trace.snapshot(), tuple(self._happened)
-        return Snapshot(self._token, arrays, self._time, trace, happened, self._frozen, attendants)
+        trace, happened, pushed = self._trace.snapshot(), tuple(self._happened), frozenset(self._pushed)
+        shown = (pushed, self._base_as_planned)
+        return Snapshot(self._token, arrays, self._time, trace, happened, *shown, self._frozen, attendants)
 
     def restore(self, snapshot: Snapshot) -> None:
         """Go back to a snapshot of this simulation: the same future, bit for bit.
@@ -614,11 +615,12 @@ class Simulation:
             array[...] = snapshot.arrays[name]
         self._trace.restore(snapshot.trace)
         self._time, self._frozen, self._happened = snapshot.time, snapshot.frozen, list(snapshot.happened)
+        self._pushed, self._base_as_planned = set(snapshot.pushed), snapshot.base_as_planned
         for attendant, kept in zip(self._attendants, snapshot.attendants, strict=True):
             attendant.restore(kept)
 
     def record(self, scenario: Scenario | None = None, *, pictured: bool = True) -> Record:
-        """Record of the trace so far; of a ring, energies and losses count from its first sample on.
+        """Record of the trace so far; of a ring, energies, events and counts from its first sample on.
 
         ``complete`` is True for a run that has come to its end.
 
@@ -658,6 +660,7 @@ class Simulation:
             happened=self._happened,
             base_as_planned=self._base_as_planned,
             pictured=pictured,
+            begun=self._begun,
         )
         record.summary["warnings"] += self._said
         for attendant in self._attendants:

@@ -126,5 +126,7 @@ class Snapshot:
     time: float
     trace: TraceState
     happened: tuple[Event, ...]
+    pushed: frozenset[int]
+    base_as_planned: bool
     frozen: bool
     attendants: list[dict[str, Any]]

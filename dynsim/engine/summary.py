@@ -102,11 +102,15 @@ def gravity_lever(robot: Robot) -> tuple[float, float]:
     return lever * gravity, mass * gravity
 
 
-def summarise(record: Record, scenario: Scenario, prepared: Prepared, wall: float) -> dict[str, Any]:
-    """The content of ``summary.json`` for a run that has taken ``wall`` [s]."""
+def summarise(
+    record: Record, scenario: Scenario, prepared: Prepared, wall: float, begun: float = 0.0
+) -> dict[str, Any]:
+    """The content of ``summary.json`` for a run that has taken ``wall`` [s], and began at ``begun`` [s]."""
     run, robot, contacts = prepared.run, prepared.model.robot, prepared.contacts
     unilateral = prepared.system.unilateral
     duration = float(record.time[-1] - record.time[0]) if len(record) else 0.0
+    # Of a ring, the effort is that of the whole run.
+    elapsed = float(record.time[-1]) - begun if len(record) else 0.0
 
     def final(name: str) -> float:
         return float(record[name][-1]) if len(record) else 0.0
@@ -123,7 +127,7 @@ def summarise(record: Record, scenario: Scenario, prepared: Prepared, wall: floa
         "dynsim_version": __version__,
         "duration_s": duration,
         "integration_wall_s": wall,
-        "real_time_factor": duration / wall if wall > 0.0 else 0.0,
+        "real_time_factor": elapsed / wall if wall > 0.0 else 0.0,
         "method": prepared.choice.method,
         "method_reason": prepared.choice.reason,
         "steps": int(run.count[ki.STEPS]),
@@ -162,7 +166,7 @@ def summarise(record: Record, scenario: Scenario, prepared: Prepared, wall: floa
     if run.stepping is not None:
         summary["time_stepping"] = _time_stepping(run)
     motors = motor_loads(record, robot)
-    summary["warnings"] = warnings_of(record, scenario, prepared, summary, scale, sunk, motors)
+    summary["warnings"] = warnings_of(record, scenario, prepared, summary, scale, sunk, motors, begun)
     summary["motors"] = motors
     if prepared.balance is not None:
         forces = prepared.balance.normal_forces
@@ -230,9 +234,14 @@ def _modes(unilateral: UnilateralArrays, k: int, duration: float) -> dict[str, A
         "landings": int(tally[ku.LANDINGS]),
         "slip_starts": int(tally[ku.SLIP_STARTS]),
         "bounces": int(tally[ku.BOUNCES]),
-        "impact_loss_J": float(tally[ku.LOSS]),
+        **_known("impact_loss_J", tally[ku.LOSS]),
         "penetration_max_m": float(tally[ku.DEEPEST]),
     }
+
+
+def _known(key: str, value: float) -> dict[str, float]:
+    """An entry, unless it is not known (see dynsim.engine.ring)."""
+    return {} if np.isnan(value) else {key: float(value)}
 
 
 def _joint_stops(record: Record, prepared: Prepared, duration: float) -> list[dict[str, Any]]:
@@ -254,7 +263,7 @@ def _joint_stops(record: Record, prepared: Prepared, duration: float) -> list[di
                     "force_unit": units[stop.joint][3],
                     "hits": int(row[ku.HITS]),
                     "closed_fraction": min(float(row[ku.CLOSED_TIME]) / duration, 1.0) if duration > 0.0 else 0.0,
-                    "impact_loss_J": float(row[ku.STOP_LOSS]),
+                    **_known("impact_loss_J", row[ku.STOP_LOSS]),
                 }
             )
     return stops
@@ -273,7 +282,7 @@ def _time_stepping(run: ki.Run) -> dict[str, Any]:
         "residual_max_m_s": float(results[kt.WORST]),
         "limits_unsettled": int(results[kt.UNSETTLED]),
         "scheme_loss_worst_J": float(results[kt.TAKEN]),
-        "half_step_energy_J": float(results[kt.HALF_STEP]),
+        **_known("half_step_energy_J", results[kt.HALF_STEP]),
         "penetration_max_m": float(results[kt.PENETRATION]),
     }
 

@@ -62,6 +62,7 @@ def warnings_of(
     scale: float,
     sunk: Sequence[Sinking],
     motors: Sequence[dict[str, Any]],
+    begun: float = 0.0,
 ) -> list[str]:
     """All warnings of a run, one sentence each.
 
@@ -70,15 +71,16 @@ def warnings_of(
     summary : numbers so far
     scale : turnover of the energy, no less than what the ledger resolves [J]
     sunk : bodies below surfaces; motors : their loads
+    begun : time at which the run began [s]; the samples of a ring begin later
     """
     robot = prepared.model.robot
     unstable = unstable_loop(scenario, prepared)
     warnings = [
         *([] if unstable is None else [unstable[0]]),
-        *_contact_warnings(record, scenario, prepared, summary),
+        *_contact_warnings(record, scenario, prepared, summary, begun),
         *_saturated(record, robot),
         *_passed_limits(record, robot, prepared.system.unilateral is not None),
-        *_base_warnings(record, scenario, prepared),
+        *_base_warnings(record, scenario, prepared, begun),
     ]
     if summary["energy_residual_relative"] > RESIDUAL_LIMIT:
         warnings.append(
@@ -90,7 +92,7 @@ def warnings_of(
     elif summary["constraint_drift_max_m"] > DRIFT_LIMIT_M:
         warnings.append(f"contacts drifted by {summary['constraint_drift_max_m']:.1e} m")
     warnings += _undetermined(record, prepared)
-    warnings += _unpressed(record, prepared)
+    warnings += _unpressed(record, prepared, begun)
     warnings += _slipping_start(record, prepared) or _moving_start(record, prepared)
     warnings += _sunk(record, sunk)
     warnings += _beyond_stops(robot, prepared.stops, prepared.control)
@@ -99,7 +101,9 @@ def warnings_of(
     return warnings if prepared.balance is None else [*warnings, *prepared.balance.warnings]
 
 
-def _contact_warnings(record: Record, scenario: Scenario, prepared: Prepared, summary: dict[str, Any]) -> list[str]:
+def _contact_warnings(
+    record: Record, scenario: Scenario, prepared: Prepared, summary: dict[str, Any], begun: float
+) -> list[str]:
     """Contacts that chatter, pull, carry nothing or turn their own force against them; friction that gives energy."""
     contacts, unilateral, warnings = prepared.contacts, prepared.system.unilateral, list[str]()
     if unilateral is not None:
@@ -120,6 +124,8 @@ def _contact_warnings(record: Record, scenario: Scenario, prepared: Prepared, su
     warnings += build.left_out_warnings(scenario, contacts)
     initial, columns = scenario.config.initial, record.labels["contact_gap"]
     placed = () if initial is None else initial.on_surface
+    # Of a ring, nobody knows what was before it.
+    within = f" from t = {record.time[0]:.4g} s on" if len(record) and record.time[0] > begun else ""
     for contact in summary["contacts"]:
         name = contact["name"]
         if "gap_min_m" in contact and contact["closed_fraction"] == 0.0 and name not in left_out:
@@ -127,11 +133,11 @@ def _contact_warnings(record: Record, scenario: Scenario, prepared: Prepared, su
             time, surface = f"t = {record.time[nearest]:.4g} s", contact["surface"]
             if contact["gap_min_m"] <= build.START_TOLERANCE:
                 warnings.append(
-                    f"{name}: this brace is on the {surface} at {time}, but never pressed: it carries nothing"
+                    f"{name}: this brace is on the {surface} at {time}, but never pressed{within}: it carries nothing"
                 )
                 continue
             warnings.append(
-                f"{name}: this brace never touches the {surface}: it carries nothing; nearest "
+                f"{name}: this brace never touches the {surface}{within}: it carries nothing; nearest "
                 f"{1e3 * contact['gap_min_m']:.3g} mm at {time}"
                 f"{'' if name in placed else ' (initial.on_surface lets it start there)'}"
             )
@@ -204,7 +210,7 @@ def _undetermined(record: Record, prepared: Prepared) -> list[str]:
         shared = sharing(prepared.model, contacts, record["q"], record["contact_mode"], rests)
         touching, joints = shared.contacts, shared.joints
         if joints:
-            slides = (record["contact_mode"] == ka.SLIDING) & rests.any(axis=1)[:, None]
+            slides = (record["contact_mode"] == ka.SLIDING) & rests.any(axis=1, keepdims=True)
             sliding = [
                 contact.name
                 for contact, some in zip(contacts, slides.any(axis=0), strict=True)
@@ -237,9 +243,10 @@ def _undetermined(record: Record, prepared: Prepared) -> list[str]:
     return warnings
 
 
-def _unpressed(record: Record, prepared: Prepared) -> list[str]:
+def _unpressed(record: Record, prepared: Prepared, begun: float) -> list[str]:
     """Contacts that stick although nothing presses them, which leaves the motion open."""
-    unilateral, time = prepared.system.unilateral, record.time[-1] if len(record) else 0.0
+    # Of a ring, too, the share is that of the whole run: samples do not show what presses.
+    unilateral, time = prepared.system.unilateral, record.time[-1] - begun if len(record) else 0.0
     if unilateral is None or not time > 0.0:
         return []
     shares = unilateral.tally[:, ku.UNPRESSED] / time
@@ -260,7 +267,7 @@ def _unpressed(record: Record, prepared: Prepared) -> list[str]:
 
 def _slipping_start(record: Record, prepared: Prepared) -> list[str]:
     """An equilibrium on the edge of friction cones that slips at the start."""
-    if prepared.balance is None or not prepared.balance.on_edge or not len(record):
+    if prepared.balance is None or not prepared.balance.on_edge or not len(record) or record.time[0] != 0.0:
         return []
     if np.abs(record["vdot"][0]).max(initial=0.0) > STARTS_MOVING:
         slips = 0.0
@@ -411,7 +418,9 @@ def coarse(stepping: dict[str, Any], scale: float) -> list[str]:
 
     scale : turnover of the energy, no less than what the ledger resolves; zero before anything moves [J]
     """
-    step, worst, blurred = (stepping[key] for key in ("step_s", "scheme_loss_worst_J", "half_step_energy_J"))
+    step, worst = stepping["step_s"], stepping["scheme_loss_worst_J"]
+    # Not known of a ring.
+    blurred = stepping.get("half_step_energy_J", 0.0)
     warnings: list[str] = []
     if scale > 0.0 and abs(worst) > SCHEME_LIMIT * scale:
         warnings.append(
@@ -453,7 +462,7 @@ def capped(stepping: dict[str, Any]) -> list[str]:
     ]
 
 
-def _base_warnings(record: Record, scenario: Scenario, prepared: Prepared) -> list[str]:
+def _base_warnings(record: Record, scenario: Scenario, prepared: Prepared, begun: float) -> list[str]:
     """What a mobile base does that a real one could not do."""
     base, run, settle = prepared.model.robot.base, prepared.run, scenario.metrics.settle_s
     if base is None:
@@ -463,6 +472,11 @@ def _base_warnings(record: Record, scenario: Scenario, prepared: Prepared) -> li
     lowest = least_loads(record, run.support.least)
     late = record["tip_margin"][record.time >= settle]
     first = min((event.time for event in record.events if event.kind == TIP_OVER), default=np.inf)
+    # The samples of a ring may begin after it has tipped.
+    tipped = len(record) > 0 and record.time[0] > begun and record["tip_margin"][0] < 0.0
+    if tipped:
+        first = float(record.time[0])
+    tips = "is tipped over" if tipped else "tips over"
     if np.isfinite(first) and not base.stop_on_overturn:
         pulled = ", ".join(
             f"{name} {low:.3g}" for name, low in zip(record.labels["wheel_load"], lowest, strict=True) if low < 0.0
@@ -477,7 +491,7 @@ def _base_warnings(record: Record, scenario: Scenario, prepared: Prepared) -> li
             )
         else:
             warnings.append(
-                f"the base tips over at t = {first:.4f} s, with a tip margin below zero in {beyond}; the run goes on "
+                f"the base {tips} at t = {first:.4f} s, with a tip margin below zero in {beyond}; the run goes on "
                 f"as if it were held down{least}: plant.base.on_overturn: stop ends it there"
             )
     lifted = load.sum(axis=1) <= 0.0

@@ -392,7 +392,8 @@ def _foot(foot: Foot, known: Mapping[str, Surface], options: Contacts) -> Contac
 def _rubbed(contact: Contact, factor: float) -> Contact:
     """The contact with its coefficients of friction times a factor."""
     static = None if contact.static_friction is None else factor * contact.static_friction
-    return replace(contact, friction=factor * contact.friction, static_friction=static)
+    viscous = factor * contact.viscous_friction
+    return replace(contact, friction=factor * contact.friction, static_friction=static, viscous_friction=viscous)
 
 
 def _law(options: Contacts, point: ContactPoint) -> dict[str, Any]:

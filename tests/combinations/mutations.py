@@ -165,10 +165,10 @@ def main() -> int:
     missed = 0
     for fault in FAULTS:
         if options.only in (None, fault.name):
-            told = problems_with(fault)
-            missed += not told
-            print(f"{fault.name} ({KNOWN[fault.name].fault}): {'found' if told else 'NOT FOUND'}", flush=True)
-            print("".join(f"    {text[:200]}\n" for text in told[:4]), end="", flush=True)
+            reports = problems_with(fault)
+            missed += not reports
+            print(f"{fault.name} ({KNOWN[fault.name].fault}): {'found' if reports else 'NOT FOUND'}", flush=True)
+            print("".join(f"    {text[:200]}\n" for text in reports[:4]), end="", flush=True)
     return 1 if missed else 0
 
 

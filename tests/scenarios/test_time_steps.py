@@ -186,7 +186,7 @@ def test_wheels_roll_along_their_axis(ratio, axis):
     [
         (
             {"integrator.method": "dopri5", "integrator.step_s": None},
-            "grip: needs .*method: time_stepping; dopri5",
+            r"grip: requires .*method: time_stepping \(here: dopri5\)",
         ),
         ({"contacts.points.foot.grip.axis": [0, 0, 0]}, "no direction"),
         ({"contacts.points.foot.grip.ratio": 1.5}, "ratio"),

@@ -49,6 +49,29 @@ def test_quintics_are_those_of_scipy(count: int) -> None:
     assert between == pytest.approx(expected(times[:-1] + 0.3 * h), rel=0.0, abs=1e-13 * size)
 
 
+def test_samples_that_hold_at_an_end_are_held() -> None:
+    """A motion from 0.1 s to 0.7 s of 0.8 s: the kinks at its ends do not ring into the holds, nor reach t = 0."""
+    times = np.linspace(0.0, 0.8, 41)
+    spacing = float(times[1])
+    moves, begins = (clamped_cubic([at, 0.7], np.array([[0.5], [0.7]]), times) for at in (0.1, 0.0))
+    slope, curvature = quintic_rates(spacing, np.hstack([moves, begins, np.full_like(moves, 0.3)]))
+    assert not slope[:6, 0].any()
+    assert not slope[35:, :2].any()
+    assert not curvature[:6, 0].any()
+    assert not curvature[35:, :2].any()
+    # The motion keeps the speed of its cubic, to what a quintic spline makes of the kinks in its curvature.
+    peak = 1.5 * 0.2 / 0.6
+    assert slope[20, 0] == pytest.approx(peak, rel=1e-3)
+    # Between the knots it is as still, and it goes through all samples.
+    pieces = quintic_coefficients(spacing, moves)
+    assert not pieces[:5, 0, 1:].any()
+    assert np.einsum("scp,p->sc", pieces, spacing ** np.arange(6)) == pytest.approx(moves[1:], rel=0.0, abs=1e-14)
+    # Kinks that are far off reach neither end: the spline is the interpolating one, to the last bit.
+    late = clamped_cubic([0.3, 0.5], np.array([[0.5], [0.7]]), times)
+    expected = make_interp_spline(times, late, k=5)(times, 1)
+    assert quintic_rates(spacing, late)[0] == pytest.approx(expected, rel=0.0, abs=1e-11)
+
+
 @pytest.mark.parametrize("count", [2, 3, 9])
 def test_level_cubics_are_those_of_scipy(count: int) -> None:
     random = np.random.default_rng(count)

@@ -61,6 +61,11 @@ def test_the_controller_does_not_know_the_error() -> None:
     there = build.contacts(wrong)[0]
     assert there.surface.gap(np.zeros(3)) == pytest.approx(0.095, abs=1e-12)
     assert there.friction == pytest.approx(0.6)
+    law = {"static_friction": 0.7, "viscous_friction_s_per_m": 0.1}
+    contacts = {"law": "unilateral", "friction": 0.5, "points": {"tip": {"body": "link_2"}}, **law}
+    rubbed = build.contacts(arm(contacts=contacts, surface_error={"friction_factor": 1.2}))[0]
+    factors = [rubbed.friction, rubbed.static_friction, rubbed.viscous_friction]
+    assert factors == pytest.approx([0.6, 0.84, 0.12])
     assert build.contacts(arm())[0].surface.gap(np.zeros(3)) == pytest.approx(0.1, abs=1e-12)
     # Planned along what is believed: voltages are those without the error.
     planned = {"type": "joint_pd", "joints": arm().resolved["controller"]["joints"], "feed_forward": "dynamics"}

@@ -282,6 +282,15 @@ integrator: {method: time_stepping}
 """
 
 
+@pytest.mark.parametrize(("plan", "counts"), [("feed_forward: gravity", False), ("brace: {elbow: 1.0}", True)])
+def test_only_plans_that_leave_weight_to_a_compliant_contact_count_on_it(tmp_path, plan, counts):
+    path = tmp_path / "compliant.yaml"
+    arm = "".join(line for line in COMPLIANT.splitlines(True) if "thing" not in line and "objects" not in line)
+    path.write_text(arm.replace("k_d_V_s_per_rad: 10}", f"k_d_V_s_per_rad: 10, {plan}}}"))
+    said = [text for text in simulate(load_scenario(path)).summary["warnings"] if "count on elbow" in text]
+    assert bool(said) == counts
+
+
 def test_compliant_contacts_start_pressed_in(tmp_path):
     """An arm on a compliant brace, and a box that four springs carry, of which rigid bodies do not determine the share.
 
