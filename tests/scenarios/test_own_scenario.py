@@ -76,7 +76,8 @@ def test_what_a_run_writes_is_accepted_and_gives_the_same_run(
     path = tmp_path / "scenario.yaml"
     path.write_text(to_yaml(written.resolved), encoding="utf-8")
     again = dynsim.load_scenario(path)
-    assert check(again).warnings == []
+    # Some of the sampled loops are unstable, which both are told.
+    assert check(again).warnings == check(written).warnings
     first, second = dynsim.simulate(written), dynsim.simulate(again)
     for name in ("q", "v", "current", "voltage"):
         np.testing.assert_array_equal(first[name], second[name])
