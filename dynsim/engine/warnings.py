@@ -311,11 +311,12 @@ def _moving_start(record: Record, prepared: Prepared) -> list[str]:
 def _joints_at_rest(record: Record, prepared: Prepared) -> NDArray[np.bool_]:
     """Joints that dry friction keeps at rest, by sample, (T, n)."""
     rests = np.zeros((len(record), prepared.model.n), dtype=bool)
-    if "joint_friction" in record:
+    law = prepared.system.unilateral
+    if law is not None and "joint_friction" in record:
         columns = [prepared.model.joint_names.index(joint) for joint in record.signals["joint_friction"].labels]
         rests[:, columns] = np.abs(record["v"][:, columns]) < AT_REST
         # Their brakes hold some of them, and then there is no friction.
-        braked = prepared.system.unilateral.dry_table[:, ku.DRY_BRAKE] != ku.NEVER_CLOSED
+        braked = law.dry_table[:, ku.DRY_BRAKE] != ku.NEVER_CLOSED
         rests[:, columns] &= ~braked | (record["joint_friction"] != 0.0)
     return rests
 

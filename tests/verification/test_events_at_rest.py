@@ -36,7 +36,7 @@ def scene(kind: str, method: str) -> dict[str, Any]:
 
 @pytest.mark.parametrize("kind", ["stop", "contact", "friction"])
 def test_an_event_while_everything_rests_is_located(kind: str) -> None:
-    """Explicit steps grew to 0.3 s, over the instants at which the link left and came back: forces of the wrong sign."""
+    """Explicit steps grew to 0.3 s, past the instants at which the link left and came back."""
     explicit, implicit = (simulate(scenario_from_resolved(scene(kind, method))) for method in ("dopri5", "radau5"))
     assert len(explicit.events) == len(implicit.events) > 0
     times = [[event.time for event in record.events] for record in (explicit, implicit)]
