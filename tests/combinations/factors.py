@@ -99,7 +99,7 @@ REFUSALS: tuple[Refusal, ...] = (
             friction="grip", method=("auto", "dopri5", "radau5")),
     _refuse(STEPPED, r"stiffness_N_per_m.*: requires integrator.method: time_stepping",
             give="compliant", method=("auto", "dopri5", "radau5")),
-    _refuse(STEPPED, r"ties.*requires integrator.method: time_stepping",
+    _refuse(STEPPED, r"ties.*requires (contacts.law: unilateral|integrator.method: time_stepping)",
             ties=("linear", "torsion", "bounded"), method=("auto", "dopri5", "radau5")),
     _refuse("time stepping solves with articulated sweeps", r"integrator.solver.*requires integrator.method: auto",
             solver="m_star", method="time_stepping"),

@@ -74,7 +74,7 @@ KNOWN = {
     "snake_start": Known(
         "what stands beside a snake moved while its head was raised, before the run",
         {"plant": "snake", "motor": "servo", "controller": "sampled", "objects": "box", "give": "compliant"},
-        (0, 2),
+        (0,),
     ),
     "voltage": Known(
         "the recorded voltage of a sampled loop was that before the tick",

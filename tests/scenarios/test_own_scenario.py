@@ -43,8 +43,8 @@ MOTORS: dict[str, dict[str, Any]] = {
 CONTROLLERS: dict[str, dict[str, Any]] = {
     "hold": {},
     "waypoints": {"joints": {"joint_1": {"times_s": [0.0, 0.02], "angles_deg": [60.0, 61.0]}}},
-    "sampled": {"sample_time_s": 0.001},
-    "operator": {"sample_time_s": 0.002, "operator": {"joints": ["joint_1", "joint_2"], "rate_hz": 100}},
+    "sampled": {"sample_time_s": 5e-5},
+    "operator": {"sample_time_s": 5e-5, "operator": {"joints": ["joint_1", "joint_2"], "rate_hz": 100}},
     "torques": {"torques": {"joint_1": {"times_s": [0.0, 0.02], "torques_N_m": [0.1, 0.2]}}},
 }
 

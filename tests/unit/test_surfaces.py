@@ -126,7 +126,7 @@ def scenario_of(folder: Path, contacts: str, surfaces: str = "{floor: {type: pla
 
 
 def test_candidates_need_the_unilateral_law(tmp_path):
-    with pytest.raises(ScenarioError, match=r"s\.yaml:6: contacts\.candidates.*needs law: unilateral"):
+    with pytest.raises(ScenarioError, match=r"s\.yaml:6: contacts\.candidates.*requires contacts\.law: unilateral"):
         scenario_of(tmp_path, "{candidates: joints}")
 
 

@@ -39,8 +39,15 @@ SELECT = {
 }
 # Branches whose lanes must agree. Where they do not, the lanes are evaluated one by one.
 FALLBACK = {
-    Place("contact/delassus.py", "solve_small", "if p == 1 and small[0, 0, 0] != 0.0:"): CLOSED_FORM,
-    Place("contact/delassus.py", "solve_small", "if abs(determinant) > 1e-3 * (abs(a * d) + abs(b * c)):"): CLOSED_FORM,
+    Place(
+        "contact/delassus.py", "solve_small", "if p == 1 and abs(small[0, 0, 0]) > state[0, ka.ROW_FLOOR]:"
+    ): CLOSED_FORM,
+    Place(
+        "contact/delassus.py", "solve_small", "if p == 1 and abs(small[0, 0, 0]) <= state[0, ka.ROW_FLOOR]:"
+    ): CLOSED_FORM,
+    Place(
+        "contact/delassus.py", "solve_small", "if abs(determinant) > 1e-3 * (abs(a * d) + abs(b * c)) + floors:"
+    ): CLOSED_FORM,
     Place("contact/delassus.py", "eliminate", "if abs(small[1, i, k]) > abs(small[1, best, k]):"): PIVOT,
     Place("contact/delassus.py", "eliminate", "if abs(small[1, best, k]) <= RANK_TOLERANCE * largest:"): DEPENDENT,
     Place(

@@ -88,7 +88,8 @@ def test_the_radius_of_the_published_arm_agrees_with_its_linearization():
     alone = linear.A - linear.B @ gains
     for period, known in ((5e-4, 0.9993), (1e-3, 1.161), (2e-3, 1.961), (5e-3, 9.99)):
         both = expm(np.block([[alone, linear.B], [np.zeros((n, 4 * n))]]) * period)
-        radius = np.abs(np.linalg.eigvals(both[: 3 * n, : 3 * n] + both[: 3 * n, 3 * n :] @ gains)).max()
+        held, commanded = np.split(both[: len(alone)], [len(alone)], axis=1)
+        radius = np.abs(np.linalg.eigvals(held + commanded @ gains)).max()
         sampled = load_scenario("elbow_comparison", "no_elbow", {"controller.sample_time_s": period})
         own = growth_of(sampled, period).radius
         assert own == pytest.approx(radius, rel=2e-3)
