@@ -20,6 +20,8 @@ from dynsim.errors import DynsimError
 SEED = 1
 # Scenes of the default tests: the first of the cover that share the programs which other tests have too.
 FEW = 30
+# Those of them that the default tests run.
+QUICK = 12
 # Scenes among these with a problem that is known and not mended yet, or a check that is too strict for them.
 OPEN = {
     0: "radau5 chatters at 5 ms: dry friction in two joints of a floating robot, links and a sphere",
@@ -100,13 +102,12 @@ def _possible(wanted: dict[str, str], method: str) -> bool:
     )
 
 
-@pytest.mark.parametrize(
-    "number",
-    [
-        pytest.param(number, marks=pytest.mark.xfail(reason=OPEN[number], strict=False) if number in OPEN else ())
-        for number in range(FEW)
-    ],
-)
+def _marks(number: int) -> list[pytest.MarkDecorator]:
+    marks = [pytest.mark.xfail(reason=OPEN[number], strict=False)] if number in OPEN else []
+    return marks if number < QUICK else [*marks, pytest.mark.long]
+
+
+@pytest.mark.parametrize("number", [pytest.param(number, marks=_marks(number)) for number in range(FEW)])
 def test_few_scenes(number: int, tmp_path: Path) -> None:
     _holds(number, tmp_path, takes=_shares_a_program)
 

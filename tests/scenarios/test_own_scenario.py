@@ -61,7 +61,7 @@ def scenario(motor: str, controller: str, plant: str) -> dict[str, Any]:
     }
 
 
-@pytest.mark.parametrize("plant", ["fixed", "mobile"])
+@pytest.mark.parametrize("plant", ["fixed", pytest.param("mobile", marks=pytest.mark.long)])
 @pytest.mark.parametrize("controller", CONTROLLERS)
 @pytest.mark.parametrize("motor", MOTORS)
 def test_what_a_run_writes_is_accepted_and_gives_the_same_run(
