@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.linalg import expm, null_space
 
 from dynsim.compile.model import Model
 from dynsim.compile.shapes import gap_at
@@ -135,6 +134,8 @@ class HeldLoop:
 
     def _over(self, period: float) -> tuple[Array, Array]:
         """x(t + period) = advance x + input u."""
+        from scipy.linalg import expm  # here, because most runs have no sampled loop, and it takes long to load
+
         size, na = self.B.shape
         both = expm(np.block([[self.A, self.B], [np.zeros((na, size + na))]]) * period)
         return both[:size, :size], both[:size, size:]
@@ -151,6 +152,8 @@ def held_loop(model: Model, drives: ka.DriveArrays, q: Array, rows: Array) -> He
 
     Gear friction that is smoothed has its slope at rest.
     """
+    from scipy.linalg import null_space  # as in HeldLoop
+
     free = null_space(rows) if len(rows) else np.eye(model.n)
     f, na = free.shape[1], len(drives.table)
     circuits = np.flatnonzero(drives.table[:, ka.DRIVE_KIND] == ka.DC_MOTOR)
