@@ -160,6 +160,15 @@ class Model:
         """Viscous losses of each joint, D + D_m [N m s/rad], (n,)."""
         return self.arrays.body[:, ka.DAMPING] + self.arrays.body[:, ka.GEAR_DAMPING]
 
+    @property
+    def coupling_rows(self) -> Array:
+        """Rows C of the couplings, C v = 0, (k, n)."""
+        rows = np.zeros((len(self.robot.couplings), self.n))
+        for row, coupling in zip(rows, self.robot.couplings, strict=True):
+            row[self.joint_names.index(coupling.joint)] = 1.0
+            row[self.joint_names.index(coupling.leader)] = -coupling.ratio
+        return rows
+
     def mass_matrix(self, q: ArrayLike) -> Array:
         """M(q), (n, n) [kg m²] ([WM] eq 55)."""
         self._set(q)

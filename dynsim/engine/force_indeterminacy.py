@@ -389,11 +389,7 @@ def sharing(
 
 def _free(model: Model) -> Array:
     """Rates that couplings of joints allow, (n, n − k)."""
-    robot = model.robot
-    rows = np.zeros((len(robot.couplings), model.n))
-    for row, coupling in zip(rows, robot.couplings, strict=True):
-        row[robot.joint_names.index(coupling.joint)] = 1.0
-        row[robot.joint_names.index(coupling.leader)] -= coupling.ratio
+    rows = model.coupling_rows
     return np.linalg.svd(rows)[2][len(rows) :].T
 
 

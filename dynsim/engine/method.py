@@ -74,11 +74,24 @@ def worth_it(n: int) -> float:
     return (20.0 + (2.0 * n + 0.03 * n**2) / 11.0) * 3.3 / 6.0
 
 
-def fastest_rate(model: Model, contacts: Sequence[Contact], drives: ka.DriveArrays) -> float:
-    """Largest |λ| of drives and losses at the start, at rest [1/s]."""
-    n, q = model.n, model.robot.initial
-    circuits = int(model.robot.circuits)
-    # ∂τ/∂(q, v, i) and ∂(di/dt)/∂(q, v, i).
+class DriveSlopes(NamedTuple):
+    """Derivatives of joint torques τ and current rates di/dt by q, v and i, at rest.
+
+    Shapes: torques (n, n), (n, n) and (n, circuits); rates of currents (circuits, n), (circuits, n) and (circuits,
+    circuits). Commands that are held do not follow the state.
+    """
+
+    torque_q: Array
+    torque_v: Array
+    torque_i: Array
+    rate_q: Array
+    rate_v: Array
+    rate_i: Array
+
+
+def drive_slopes(model: Model, drives: ka.DriveArrays) -> DriveSlopes:
+    """Return the derivatives of what drives and the damping of joints do."""
+    n, circuits = model.n, int(model.robot.circuits)
     torque_q, torque_v, torque_i = np.zeros((n, n)), -np.diag(model.damping), np.zeros((n, circuits))
     rate_q, rate_v, rate_i = np.zeros((circuits, n)), np.zeros((circuits, n)), np.zeros((circuits, circuits))
     for a in range(len(drives.table)):
@@ -90,6 +103,13 @@ def fastest_rate(model: Model, contacts: Sequence[Contact], drives: ka.DriveArra
         elif kind == ka.POSITION_SERVO:
             by_q, by_v = servo_block(drives.motor, a, drives.table[a, ka.SERVO_MODE], sampled, 0.0, 0.0)
             torque_q[j, j], torque_v[j, j] = by_q, torque_v[j, j] + by_v
+    return DriveSlopes(torque_q, torque_v, torque_i, rate_q, rate_v, rate_i)
+
+
+def fastest_rate(model: Model, contacts: Sequence[Contact], drives: ka.DriveArrays) -> float:
+    """Largest |λ| of drives and losses at the start, at rest [1/s]."""
+    n, q = model.n, model.robot.initial
+    torque_q, torque_v, torque_i, rate_q, rate_v, rate_i = drive_slopes(model, drives)
     if not (torque_q.any() or torque_v.any() or torque_i.any()):
         return 0.0
     mobility = np.linalg.inv(model.mass_matrix(q) + np.diag(model.armature))
@@ -97,7 +117,7 @@ def fastest_rate(model: Model, contacts: Sequence[Contact], drives: ka.DriveArra
     if len(rows):
         through = mobility @ rows.T
         mobility = mobility - through @ np.linalg.pinv(rows @ through) @ through.T
-    still = np.zeros((n, circuits))
+    still = np.zeros((n, len(rate_i)))
     return _spectral_radius(
         np.block(
             [
@@ -121,8 +141,4 @@ def _spectral_radius(A: Array) -> float:
 def _held(model: Model, contacts: Sequence[Contact], q: Array) -> Array:
     """Rows of what does not move at the start, (p, n): contacts that touch, along their normals, and couplings."""
     gaps, rates = gaps_and_rates(model, contacts, q)
-    joints = {link.joint: i for i, link in enumerate(model.robot.links)}
-    coupled = np.zeros((len(model.robot.couplings), model.n))
-    for row, coupling in zip(coupled, model.robot.couplings, strict=True):
-        row[joints[coupling.joint]], row[joints[coupling.leader]] = 1.0, -coupling.ratio
-    return np.vstack([rates[np.abs(gaps) < TOUCHING], coupled])
+    return np.vstack([rates[np.abs(gaps) < TOUCHING], model.coupling_rows])

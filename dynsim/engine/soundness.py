@@ -24,6 +24,7 @@ from dynsim.compile.shapes import gap_at
 from dynsim.config.problems import listed
 from dynsim.dynamics import tables as ka
 from dynsim.engine.force_indeterminacy import touching_rows
+from dynsim.engine.method import drive_slopes
 from dynsim.errors import ModelError
 from dynsim.model.description import Array, Contact
 from dynsim.scenario import Scenario, build
@@ -155,54 +156,39 @@ def held_loop(model: Model, drives: ka.DriveArrays, q: Array, rows: Array) -> He
     from scipy.linalg import null_space  # as in HeldLoop
 
     free = null_space(rows) if len(rows) else np.eye(model.n)
-    f, na = free.shape[1], len(drives.table)
-    circuits = np.flatnonzero(drives.table[:, ka.DRIVE_KIND] == ka.DC_MOTOR)
-    size = 2 * f + len(circuits)
+    torque_q, torque_v, torque_i, rate_q, rate_v, rate_i = drive_slopes(model, drives)
+    f, na, circuits = free.shape[1], len(drives.table), len(rate_i)
+    size = 2 * f + circuits
     inertia = free.T @ (model.mass_matrix(q) + np.diag(model.armature)) @ free
     A, B = np.zeros((size, size)), np.zeros((size, na))
-    position, rate = np.zeros((na, size)), np.zeros((na, size))
     A[:f, f : 2 * f] = np.eye(f)
-    force, pushed = -free.T @ np.diag(model.damping) @ free, np.zeros((f, na))
-    pulled = np.zeros((f, len(circuits)))
-    gain = np.zeros((na, 2))
+    forces = np.hstack([free.T @ torque_q @ free, free.T @ torque_v @ free, free.T @ torque_i])
+    A[f : 2 * f] = np.linalg.solve(inertia, forces)
+    A[2 * f :] = np.hstack([rate_q @ free, rate_v @ free, rate_i])
+    position, rate = np.zeros((na, size)), np.zeros((na, size))
+    pushed, gain = np.zeros((f, na)), np.zeros((na, 2))
     for a, (table, motor) in enumerate(zip(drives.table, drives.motor, strict=True)):
-        joint = free[table[ka.DRIVEN]]
+        joint, k_m = free[table[ka.DRIVEN]], motor[ka.K_M]
         position[a, :f], rate[a, f : 2 * f] = joint, joint
-        k_m, resistance = motor[ka.K_M], motor[ka.RESISTANCE]
         if table[ka.DRIVE_KIND] == ka.DC_MOTOR:
-            e = int(np.searchsorted(circuits, a))
-            pulled[:, e] = k_m * joint
-            A[2 * f + e, f : 2 * f] = -k_m / motor[ka.INDUCTANCE] * joint
-            A[2 * f + e, 2 * f + e] = -resistance / motor[ka.INDUCTANCE]
-            B[2 * f + e, a] = 1.0 / motor[ka.INDUCTANCE]
-            gain[a] = motor[ka.K_P], motor[ka.K_D]
-        elif table[ka.DRIVE_KIND] == ka.POSITION_SERVO:
-            drag = motor[ka.COULOMB] / motor[ka.COULOMB_SPEED] if motor[ka.COULOMB] > 0.0 else 0.0
-            force -= drag * np.outer(joint, joint)
-            if table[ka.SERVO_MODE] == ka.OFF:
-                continue
-            force -= k_m * k_m / resistance * np.outer(joint, joint)
-            pushed[:, a] = k_m / resistance * joint
+            B[2 * f + table[ka.CIRCUIT], a] = 1.0 / motor[ka.INDUCTANCE]
+            own = motor[ka.K_P], motor[ka.K_D]
+        elif table[ka.DRIVE_KIND] == ka.POSITION_SERVO and table[ka.SERVO_MODE] != ka.OFF:
+            pushed[:, a] = k_m / motor[ka.RESISTANCE] * joint
             velocity = table[ka.SERVO_MODE] == ka.VELOCITY_MODE
-            gain[a] = (0.0, motor[ka.K_V] - k_m) if velocity else (motor[ka.K_P], motor[ka.K_D])
-    A[f : 2 * f, f:] = np.linalg.solve(inertia, np.hstack([force, pulled]))
+            own = (0.0, motor[ka.K_V] - k_m) if velocity else (motor[ka.K_P], motor[ka.K_D])
+        else:
+            continue
+        # Continuous commands are part of A, and those that callers hold do not follow the state.
+        if table[ka.SAMPLED] == ka.AT_TICKS:
+            gain[a] = own
     B[f : 2 * f] = np.linalg.solve(inertia, pushed)
-    # Continuous commands are part of A. Commands that callers hold do not follow the state.
-    follows = drives.table[:, ka.SAMPLED] == ka.CONTINUOUS
-    at_once = np.where(follows[:, None], gain, 0.0)
-    A -= B @ (at_once[:, :1] * position + at_once[:, 1:] * rate)
-    return HeldLoop(A, B, position, rate, np.where((drives.table[:, ka.SAMPLED] == ka.AT_TICKS)[:, None], gain, 0.0))
+    return HeldLoop(A, B, position, rate, gain)
 
 
 def held_rows(model: Model, contacts: Sequence[Contact], real: bool, q: Array) -> Array:
     """Rows of couplings and of the contacts that hold at q: all by the bilateral law, else closed ones, at rest."""
-    robot = model.robot
-    joints = {joint: k for k, joint in enumerate(robot.joint_names)}
-    rows = [np.zeros((0, model.n))]
-    for coupling in robot.couplings:
-        row = np.zeros((1, model.n))
-        row[0, joints[coupling.joint]], row[0, joints[coupling.leader]] = 1.0, -coupling.ratio
-        rows.append(row)
+    rows = [model.coupling_rows]
     for contact in contacts:
         if contact.stiffness > 0.0 or (real and abs(gap_at(model, contact, q)) > build.START_TOLERANCE):
             continue
