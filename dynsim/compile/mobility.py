@@ -7,7 +7,6 @@ left out of the contact problem; in a single posture it carries nothing.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -58,23 +57,23 @@ def moves(model: Model, contact: Contact, configurations: Iterable[Array], *, an
     return False
 
 
-def with_immobile_marked(robot: Robot, contacts: Sequence[Contact]) -> list[Contact]:
-    """Return the contacts, with ``left_out`` set for each that no joint moves along the normal in any posture.
+def immobile(robot: Robot, contacts: Sequence[Contact]) -> list[bool]:
+    """Return for each contact whether no joint moves it along the normal in any posture.
 
     The faces of a box and the slopes of a height field cannot be judged by a few random postures. A point on such a
-    surface is left out only if no joint moves it in any direction.
+    surface is immobile only if no joint moves it in any direction.
     """
     model, configurations = Model(robot), random_configurations(robot)
-    marked = []
+    still = []
     for contact in contacts:
         try:
             robot.attach(contact.body, contact.point)
         except ModelError:  # an unknown or a fixed body: the check of the start names it
-            marked.append(contact)
+            still.append(False)
             continue
         anywhere = not isinstance(contact.surface, Quadric)
-        marked.append(replace(contact, left_out=not moves(model, contact, configurations, anywhere=anywhere)))
-    return marked
+        still.append(not moves(model, contact, configurations, anywhere=anywhere))
+    return still
 
 
 def immobile_at(model: Model, link: int, point: Array, normal: Array, q: Array) -> bool:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from dynsim.compile.equilibrium import KEYS, holding_torques, touching_contacts
 from dynsim.compile.model import Model
+from dynsim.compile.posture import BEYOND
 from dynsim.dynamics.tree.joints import normalise, positions_along
 from dynsim.errors import ModelError, first_few
 from dynsim.model.description import Array, Contact, Load
@@ -27,8 +28,6 @@ DONE = 1e-13
 ITERATIONS = 50
 # Singular values of rows below this part of the largest are zero.
 RANK = 1e-10
-# Rounding by which a joint may pass its limit [rad or m].
-BEYOND = 1e-9
 
 
 def pressed_in(

@@ -53,9 +53,9 @@ def start_of(scenario: Scenario) -> Start:
         points[contact.name] = model.point_position(contact.body, contact.point, q)
     declared = scenario.config.contacts.points
     movable = declared.keys() - {contact.name for contact in contacts if contact.left_out}
-    aloft = [name for name, gap in gaps.items() if name in movable and abs(gap) > build.START_TOLERANCE]
     if piloted is not None:  # a snake, whose joints `initial` does not place
-        aloft = []
+        movable = set()
+    aloft = [name for name, gap in gaps.items() if name in movable and abs(gap) > build.START_TOLERANCE]
     solved = {}
     if scenario.config.initial is not None and scenario.config.initial.on_surface:
         before = build.unposed(scenario).initial

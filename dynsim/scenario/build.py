@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.compile.control import JointControl
-from dynsim.compile.mobility import with_immobile_marked
+from dynsim.compile.mobility import immobile
 from dynsim.compile.model import Model
 from dynsim.compile.posture import on_surfaces
 from dynsim.compile.protocols import BuildContext
@@ -368,8 +368,8 @@ def contacts(scenario: Scenario, described: Robot | None = None) -> list[Contact
         )
     if result:
         places = [contact.geometry for contact in result]
-        marks = recall("left out", lambda: with_immobile_marked(described, result), described, places)
-        result = [replace(contact, left_out=mark.left_out) for contact, mark in zip(result, marks, strict=True)]
+        still = recall("left out", lambda: immobile(described, result), described, places)
+        result = [replace(contact, left_out=left_out) for contact, left_out in zip(result, still, strict=True)]
     if options.candidates != "points":
         law = _law(options, ContactPoint(body=""))
         result += [replace(contact, **law) for contact in candidates(options.candidates, described, known, result)]
@@ -524,12 +524,12 @@ def _check_body(scenario: Scenario, robot: Robot, contact: Contact) -> None:
 
 def left_out_warnings(scenario: Scenario, contacts: Sequence[Contact]) -> list[str]:
     """Return a sentence for each contact that no joint moves along the normal of its surface."""
+    left_out = [contact for contact in contacts if contact.left_out]
+    keys = [_keys_of(scenario, contact) for contact in left_out]
     return [
-        f"{dotted(_keys_of(scenario, contact)[1]) if _keys_of(scenario, contact)[0] else contact.name}: no joint moves "
-        f"this point along the normal of {contact.surface_name}, so its force changes no motion; it is left out of the "
-        "contacts, with a force of zero"
-        for contact in contacts
-        if contact.left_out
+        f"{dotted(key) if declared else contact.name}: no joint moves this point along the normal of "
+        f"{contact.surface_name}, so its force changes no motion; it is left out of the contacts, with a force of zero"
+        for contact, (declared, key) in zip(left_out, keys, strict=True)
     ]
 
 

@@ -68,7 +68,7 @@ FAULTS = (
     Fault(
         "unmoved",
         (
-            ("scenario/build.py", "left_out=mark.left_out)", "left_out=False)"),
+            ("scenario/build.py", "left_out=left_out)", "left_out=False)"),
             (
                 "integrators/contacts/impacts.py",
                 "if near and not moves_along_normal(",
