@@ -31,6 +31,7 @@ from dynsim.engine.equilibrium import Balance, balanced, pressed, shifted
 from dynsim.engine.method import AUTO, PACE, Choice, choose
 from dynsim.engine.outcome import check_size
 from dynsim.engine.soundness import check_inertia
+from dynsim.engine.trace import even_times
 from dynsim.errors import ModelError, ScenarioError, SimulationStopped
 from dynsim.integrators import driver
 from dynsim.integrators import run as ki
@@ -360,10 +361,7 @@ def sample_times(scenario: Scenario, layout: StateLayout, columns: OutputLayout,
     rate = scenario.record.rate_hz
     count = int(np.floor(scenario.duration_s * rate * (1.0 + 1e-12))) + 1
     check_size(scenario, count, layout.size + columns.size + pose_columns(links))
-    times = np.arange(count) / rate
-    if scenario.duration_s - times[-1] > 1e-9 * scenario.duration_s:
-        times = np.append(times, scenario.duration_s)
-    return times
+    return even_times(0.0, scenario.duration_s, rate)
 
 
 def _check_stiffness(method: str, duration: float, robot: Robot) -> None:

@@ -18,6 +18,23 @@ TraceState = tuple[tuple[Rows, ...], int, float, Array | None]
 BLOCK = 256
 
 
+def even_times(start: float, end: float, rate: float, first: int = 0, count: int | None = None) -> Array:
+    """Times of samples [s]: so many from number ``first`` on, or those up to the end, at which there always is one.
+
+    Parameters
+    ----------
+    start, end, rate : first time, end [s] and rate [1/s] of all samples; without an end, ``count`` is needed
+    """
+    if not math.isfinite(end):
+        assert count is not None
+        return start + np.arange(first, first + count) / rate
+    last = math.floor((end - start) * rate * (1.0 + 1e-12))
+    stop = last + 2 if count is None else first + count
+    times = start + np.arange(first, min(stop, last + 1)) / rate
+    apart = end - (start + last / rate) > 1e-9 * (end - start)
+    return np.append(times, end) if apart and first <= last + 1 < stop else times
+
+
 class Trace:
     """Times, states and outputs of samples.
 
@@ -38,7 +55,8 @@ class Trace:
         self._end, self._times = end, None
         if self._keep != 0:
             taken = int(run.count[ki.SAMPLE])
-            times = self._even_times(self._next + taken, len(run.sample_time) - taken)
+            room = len(run.sample_time) - taken
+            times = even_times(self._start, self._end, self._rate, self._next + taken, room)
             run.sample_time[taken:] = np.inf
             run.sample_time[taken : taken + len(times)] = times
 
@@ -89,17 +107,6 @@ class Trace:
         else:
             if math.isfinite(until):
                 count = max(count, int((until - self._start) * self._rate) + 2 - first)
-            times = self._even_times(first, count)
+            times = even_times(self._start, self._end, self._rate, first, count)
         # After the last sample the buffer must not hold steps back.
         return np.append(times, np.inf) if len(times) < count else times
-
-    def _even_times(self, first: int, count: int) -> Array:
-        """So many times from a number on, or those up to the end, which is the last."""
-        start, end, rate = self._start, self._end, self._rate
-        if not math.isfinite(end):
-            return start + np.arange(first, first + count) / rate
-        # As dynsim.engine.prepare.sample_times has it.
-        last = math.floor((end - start) * rate * (1.0 + 1e-12))
-        times = start + np.arange(first, min(first + count, last + 1)) / rate
-        apart = end - (start + last / rate) > 1e-9 * (end - start)
-        return np.append(times, end) if apart and first <= last + 1 < first + count else times
