@@ -11,6 +11,7 @@ the joints that do this. Errors, tracking and ledger refer to the original refer
 
 from __future__ import annotations
 
+import math
 from collections.abc import Container, Sequence
 from dataclasses import dataclass, field
 
@@ -29,6 +30,8 @@ from dynsim.model.drives import Motor, Servo, TorqueSource
 
 # A reference starts at rest at the joint's position if its offset and its rate are below this [rad or m, rad/s or m/s].
 AT_REST = 1e-4
+# Joints that pressing moves by more than this [rad, m] start in another posture than the requested one.
+MOVED = {"rad": math.radians(1.0), "m": 5e-3}
 # A normal force of less than this part of the robot's weight is none: references that are splines leave as much.
 NO_FORCE = 1e-4
 
@@ -139,7 +142,25 @@ def balanced(
         if jumps
         else ()
     )  # fmt: skip
+    said += _moved(model, requested)
     return Balance(current, shift, float(resistance @ current**2), forces, said, on_edge)
+
+
+def _moved(model: Model, requested: Array) -> tuple[str, ...]:
+    """A warning that names the joints which pressing moves far, or none."""
+    robot = model.robot
+    moved = []
+    for link, k in zip(robot.links, robot.position_index, strict=True):
+        unit = link.units[0]
+        way = float(robot.initial[k] - requested[k])
+        if len(link.row.neutral) == 1 and abs(way) > MOVED.get(unit, math.inf):
+            moved.append(f"{link.joint} by {format_quantity(way, unit, 3)}")
+    if not moved:
+        return ()
+    return (
+        f"initial.equilibrium: moves {first_few(moved)} from the requested posture, so that compliant contacts carry: "
+        "they are soft, or press at short levers; raise contacts.stiffness_N_per_m, or change the posture",
+    )
 
 
 def _counted_on(

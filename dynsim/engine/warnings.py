@@ -209,6 +209,11 @@ def _undetermined(record: Record, prepared: Prepared) -> list[str]:
             return []
         shared = sharing(prepared.model, contacts, record["q"], record["contact_mode"], rests)
         touching, joints = shared.contacts, shared.joints
+        if joints and not touching:
+            return [
+                f"{first_few(joints)}: shared forces of the dry friction which keeps these coupled joints at rest; the "
+                "motion does not determine them, and those of the record are one choice of many"
+            ]
         if joints:
             slides = (record["contact_mode"] == ka.SLIDING) & rests.any(axis=1, keepdims=True)
             sliding = [

@@ -62,7 +62,7 @@ def touching(seen: Observed) -> Finding:
                 f"{size[unheld].max():.4g} N"
             )
         if touch.contact.stiffness == 0.0:
-            far = (touch.normal_force > 1e-9) & (touch.gap > _reach(seen, touch))
+            far = (touch.normal_force > 1e-9) & (np.minimum(touch.gap, touch.gap_before) > _reach(seen, touch))
             if far.any():
                 i = int(np.where(far, touch.gap, 0.0).argmax())
                 yield (
@@ -83,7 +83,7 @@ def _reach(seen: Observed, touch: Touch) -> Array:
 
 def _fastest_approach(touch: Touch) -> Array:
     """Largest speed along the normal until each sample, (T,) [m/s]."""
-    return np.asarray(np.maximum.accumulate(np.abs(touch.approach)))
+    return np.asarray(np.maximum.accumulate(np.maximum(np.abs(touch.approach), np.abs(touch.approach_before))))
 
 
 def coefficient(touch: Touch, speed: Array) -> Array:

@@ -18,21 +18,13 @@ from dynsim.model.drives import Motor
 Array = NDArray[np.float64]
 Finding = Iterator[str]
 
-# Terms of the equation of motion cancel to this part of their size: by events the record's accelerations and forces
-# solve one linear system, whose condition costs up to six of sixteen digits.
-BALANCE = 1e-8
-# Forces of a step, and where it puts contacts, from differences of samples: h Δv̇ of rounded rates.
-STEPPED_BALANCE = 1e-7
-
 
 def equation(seen: Observed) -> Finding:
     """Forces of the record move the bodies as the record says: weight, contacts, loads, drives, friction, stops."""
     state = balance(seen)
     if not len(state.rows):
         return
-    share = STEPPED_BALANCE if seen.stepped else BALANCE
-    allowed = share * state.scale.max(axis=1, keepdims=True) + 2.0 * state.slack + 1e-10
-    excess = np.abs(state.left) / allowed
+    excess = state.excess
     if excess.max() > 1.0:
         row, j = np.unravel_index(excess.argmax(), excess.shape)
         names = seen.joints if not seen.robot.couplings else [f"direction {k}" for k in range(state.left.shape[1])]

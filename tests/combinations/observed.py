@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -26,6 +26,13 @@ AT_STEP = 1e-6
 # Samples resolve a circuit if their spacing is below this part of L/R. If not, this time after an event is left out,
 # three of the longest periods of published motors in stiff loops [s].
 RESOLVED, SETTLING = 0.3, 0.03
+# Of what the record does not show [A or N m].
+UNKNOWN = 1e9
+# Terms of the equation of motion cancel to this part of their size: by events the record's accelerations and forces
+# solve one linear system, whose condition costs up to six of sixteen digits.
+BALANCE = 1e-8
+# Forces of a step, and where it puts contacts, from differences of samples: h Δv̇ of rounded rates.
+STEPPED_BALANCE = 1e-7
 
 
 @dataclass(frozen=True)
@@ -35,11 +42,12 @@ class Touch:
     Attributes
     ----------
     contact : its description; body : index of its body
-    position : where it touches, (T, 3) [m]; normal : (T, 3); gap : (T,) [m]
+    position : where it touches, (T, 3) [m]; normal : (T, 3)
+    gap, gap_before : (T,) [m]; the second at the midpoint of the step that ends at the sample, by events the same
     slip, slip_before : (T, 3) tangential velocity [m/s]; the second of the rates at the start of the step that ends at
         the sample, where the bodies are in its middle, as the law of time stepping has it; by events the same
     slip_after : (T, 3) of the rates a step later with the same acceleration: a sample within a step lies between
-    approach : velocity along the normal, (T,) [m/s]
+    approach, approach_before : velocity along the normal, (T,) [m/s]; the second as of the slip before
     turned : by how much the normal has turned since the sample before, or since the midpoint of the step, (T,) [rad]
     force : (T, 3) [N]; normal_force : (T,) as recorded [N]; mode : (T,)
     """
@@ -49,10 +57,12 @@ class Touch:
     position: Array
     normal: Array
     gap: Array
+    gap_before: Array
     slip: Array
     slip_before: Array
     slip_after: Array
     approach: Array
+    approach_before: Array
     turned: Array
     force: Array
     normal_force: Array
@@ -138,11 +148,12 @@ class Observed:
         velocity = motion.velocity(body, position)
         approach = (velocity * normal).sum(axis=1)
         slip = velocity - approach[:, None] * normal
-        before = after = slip
+        gap = midway = far - contact.radius
+        before, after, began = slip, slip, approach
         turned = np.linalg.norm(np.diff(normal, axis=0, prepend=normal[:1]), axis=1)
         if self.stepped and motion is self.motion:
             rates = self.step * self.vdot
-            before, middle = self._at_midpoints(contact, self.v - rates)
+            before, began, middle, midway = self._at_midpoints(contact, self.v - rates)
             turned = np.maximum(turned, np.linalg.norm(normal - middle, axis=1))
             along = np.einsum("tkn,tn->tk", self.bodies.jacobian(motion, body, position), self.v + rates)
             after = along - (along * normal).sum(axis=1, keepdims=True) * normal
@@ -154,11 +165,13 @@ class Observed:
             body,
             position,
             np.asarray(normal, dtype=np.float64),
-            far - contact.radius,
+            gap,
+            midway,
             slip,
             before,
             after,
             approach,
+            began,
             np.asarray(turned, dtype=np.float64),
             record["contact_force"][:, k],
             force,
@@ -167,19 +180,20 @@ class Observed:
 
     @cached_property
     def _middles(self) -> Motion:
-        """Motion of all bodies at the midpoints of the steps that end at the samples, half a step at the first rates."""
+        """Motion of all bodies at the midpoints of the steps that end at samples: half a step at the first rates."""
         began = self.v - self.step * self.vdot
         theta = self.scenario.integrator.theta
         way = 0.5 * began - (began + theta * self.step * self.vdot)
         return self.bodies.motion(self.q + position_rates(self.bodies, self.q, self.step * way), began, self.vdot)
 
-    def _at_midpoints(self, contact: Contact, rates: Array) -> tuple[Array, Array]:
-        """Tangential velocity at these rates [m/s] and normal at the midpoints of steps, (T, 3) each."""
-        body, centre, _, normal = self.place(contact, self._middles)
+    def _at_midpoints(self, contact: Contact, rates: Array) -> tuple[Array, Array, Array, Array]:
+        """At midpoints of steps: velocity at these rates in the surface and along its normal [m/s], normal, gap [m]."""
+        body, centre, far, normal = self.place(contact, self._middles)
         velocity = np.einsum(
             "tkn,tn->tk", self.bodies.jacobian(self._middles, body, centre - contact.radius * normal), rates
         )
-        return np.asarray(velocity - (velocity * normal).sum(axis=1, keepdims=True) * normal), normal
+        along = (velocity * normal).sum(axis=1)
+        return np.asarray(velocity - along[:, None] * normal), along, normal, far - contact.radius
 
     @cached_property
     def loads(self) -> list[Load]:
@@ -214,6 +228,14 @@ class Observed:
         return (self.config.get("controller") or {}).get("sample_time_s")
 
     @cached_property
+    def at_ticks(self) -> NDArray[np.bool_]:
+        """Whether each sample is at a tick, when the controller has just given new commands, (T,)."""
+        period = self.sample_time or (self.config.get("controller") or {}).get("period_s")
+        if period is None:
+            return np.zeros(len(self), dtype=bool)
+        return np.asarray(np.abs(self.time / period - np.round(self.time / period)) < AT_STEP)
+
+    @cached_property
     def constants(self) -> Array:
         """Torque per ampere of each drive; 1 for torque sources, whose current is their torque."""
         return np.array(
@@ -246,14 +268,20 @@ class Observed:
                 spread[:, self.joints.index(joint)] += self.record[name][:, k]
         return spread
 
-    def tie_wrenches(self, motion: Motion) -> list[tuple[int, int, Array, Array, Array]]:
-        """First body, second body, place, force and moment of each tie on the first body."""
+    def tie_wrenches(
+        self, motion: Motion, rows: NDArray[np.int64] | None = None
+    ) -> list[tuple[int, int, Array, Array, Array]]:
+        """First body, second body, place, force and moment of each tie on the first body, where the motion has them.
+
+        rows : the samples of the motion; None: all
+        """
         acting = []
         for k, tie in enumerate(self.robot.ties if "tie_force" in self.record else ()):
             (a, _), (b, other) = self.robot.attach(tie.body, tie.point), self.robot.attach(tie.other, tie.other_point)
             axis = self.robot.attached_axes(tie.body) @ np.asarray(tie.axis) / np.linalg.norm(tie.axis)
             along = times(motion.rotation[a], np.broadcast_to(axis, (len(motion.rotation[a]), 3)))
-            push = along * self.record["tie_force"][:, k : k + 1]
+            recorded = self.record["tie_force"][:, k : k + 1]
+            push = along * (recorded if rows is None else recorded[rows])
             still = np.zeros_like(push)
             force, moment = (still, push) if tie.turns else (push, still)
             acting.append((a, b, motion.point(b, other), force, moment))
@@ -268,12 +296,20 @@ class Balance:
     ----------
     rows : indices of the samples; rest : (len(rows), n) [N m or N]; scale : (len(rows), n), the sum of the sizes
     slack : (len(rows), n), by how much terms may be off that the record does not show exactly
+    share : of the scale that rounding may leave
     """
 
     rows: NDArray[np.int64]
     left: Array
     scale: Array
     slack: Array
+    share: float
+
+    @property
+    def excess(self) -> Array:
+        """What is left, relative to what may be, (len(rows), n)."""
+        allowed = self.share * self.scale.max(axis=1, keepdims=True) + 2.0 * self.slack + 1e-10
+        return np.asarray(np.abs(self.left) / allowed)
 
 
 def balance(seen: Observed) -> Balance:
@@ -290,7 +326,8 @@ def balance(seen: Observed) -> Balance:
     terms = [seen.bodies.along_rows(motion, seen.bodies.wrenches(motion)), seen.bodies.armature * seen.vdot]
     terms += [seen.bodies.damping * seen.v, -seen.driven_torques(seen.record["current"], seen.v)]
     terms += [-seen.joint_signal("joint_friction"), -seen.joint_signal("stop_force")]
-    terms += [*_contact_terms(seen, motion, rows), *_load_terms(seen, motion, seen.time), *_tie_terms(seen, motion)]
+    terms += [*_contact_terms(seen, motion, rows), *_load_terms(seen, motion, seen.time)]
+    terms += _tie_terms(seen, motion, rows)
     return _balanced(seen, rows, terms, np.zeros_like(seen.v))
 
 
@@ -298,7 +335,8 @@ def _stepped_balance(seen: Observed) -> Balance:
     h, theta = seen.step, seen.scenario.integrator.theta
     rows = whole_steps(seen)
     if not len(rows):
-        return Balance(rows, np.zeros((0, seen.bodies.n)), np.zeros((0, seen.bodies.n)), np.zeros((0, seen.bodies.n)))
+        empty = np.zeros((0, seen.bodies.n))
+        return Balance(rows, empty, empty, empty, STEPPED_BALANCE)
     a, v_end, q_end = seen.vdot[rows], seen.v[rows], seen.q[rows]
     v_start = v_end - h * a
     v_theta = v_start + theta * h * a
@@ -311,15 +349,7 @@ def _stepped_balance(seen: Observed) -> Balance:
     terms += [-seen.joint_signal(name)[rows] for name in ("joint_friction", "stop_force")]
     terms += _contact_terms(seen, end, rows)
     terms += _load_terms(seen, middle, seen.time[rows] - h + theta * h)
-    terms += [term[rows] for term in _tie_terms(seen, seen.motion)]
-    # Velocity products use rates extrapolated with the last acceleration, which is far off after an impact, or the
-    # rates of the start if contacts have changed.
-    inertial = terms[0]
-    last = np.where((rows > 1)[:, None], seen.vdot[np.maximum(rows - 1, 0)], 0.0)
-    led = seen.bodies.motion(q_middle, v_start + theta * h * last, a)
-    begun = seen.bodies.motion(q_middle, v_start, a)
-    terms[0], other = (seen.bodies.along_rows(moving, seen.bodies.wrenches(moving)) for moving in (led, begun))
-    slack = slack + np.abs(other - terms[0]) + np.abs(inertial - terms[0])
+    terms += _tie_terms(seen, middle, rows)
     # Contacts act at the middle of the step, and the record has them at its end: that turns them with the normal.
     there, here = seen.touches(middle), seen.touches(end)
     for touch, later in zip(there, here, strict=True):
@@ -331,15 +361,32 @@ def _stepped_balance(seen: Observed) -> Balance:
         # Tangents may turn about the normal as much as that turns.
         angle = np.linalg.norm(later.normal - touch.normal, axis=1, keepdims=True)
         slack = slack + np.abs(_contact_term(seen, middle, touch, angle * np.cross(touch.normal, turned)))
-    return _balanced(seen, rows, terms, slack)
+    # Velocity products are those of the rates that the last acceleration leads to, or of the rates of the start if
+    # contacts have changed.
+    last = np.where((rows > 1)[:, None], seen.vdot[np.maximum(rows - 1, 0)], 0.0)
+    led, begun = (
+        _balanced(seen, rows, [_inertial(seen, q_middle, rates, a), *terms[1:]], slack)
+        for rates in (v_start + theta * h * last, v_start)
+    )
+    better = (led.excess.max(axis=1) < begun.excess.max(axis=1))[:, None]
+    return replace(led, left=np.where(better, led.left, begun.left), scale=np.where(better, led.scale, begun.scale))
+
+
+def _inertial(seen: Observed, q: Array, v: Array, a: Array) -> Array:
+    motion = seen.bodies.motion(q, v, a)
+    return seen.bodies.along_rows(motion, seen.bodies.wrenches(motion))
 
 
 def whole_steps(seen: Observed) -> NDArray[np.int64]:
     """Samples at the end of a step of time stepping at whose start there is one too."""
     h, a = seen.step, seen.vdot[1:]
     change = np.diff(seen.v, axis=0)
-    # Steps end at the beginning and end of a load; later samples may lie between the ends of steps.
+    # Steps end where a load begins or ends; later samples may lie between the ends of steps, which bodies at rest do
+    # not show.
     beside = np.abs(np.diff(seen.time) - h) < AT_STEP * h
+    knots = np.sort(np.concatenate([seen.time[:1], *(load.knots for load in seen.loads)]))
+    since = (seen.time[1:] - knots[np.searchsorted(knots, seen.time[1:] - AT_STEP * h) - 1]) / h
+    beside &= np.abs(since - np.round(since)) < AT_STEP
     moved = np.abs(change - h * a).max(axis=1) <= AT_STEP * (np.abs(change) + h * np.abs(a)).max(axis=1) + 1e-13
     return np.flatnonzero(beside & moved) + 1
 
@@ -351,12 +398,25 @@ def _theta_currents(seen: Observed, rows: NDArray[np.int64], v_theta: Array, the
     used = now - (1.0 - theta) * (now - before)
     slack = np.zeros_like(v_theta)
     for a, motor in enumerate(seen.robot.motors):
+        if isinstance(motor, Motor):
+            continue
         j = seen.joints.index(motor.joint)
-        size = seen.constants[a] * np.abs(now[:, a] - before[:, a])
-        if not isinstance(motor, Motor):
-            # If a limit begins or ends within a step, the law is not linear; held commands jump at ticks.
-            slack[:, j] += size
+        # If a limit begins or ends within a step, the law is not linear. References bend between the ends of a step:
+        # so does all that follows them.
+        off = np.abs(now[:, a] - before[:, a]) + _bends(current[:, a], rows)
+        if isinstance(motor, Servo):
+            q, v = seen.q[:, seen.bodies.places[j]], seen.v[:, j]
+            off = off + (motor.k_p * _bends(q, rows) + (motor.k_d + motor.k_v) * _bends(v, rows)) / motor.resistance
+        # A sample at a tick has the new command.
+        off = np.where(seen.at_ticks[rows], UNKNOWN, off)
+        slack[:, j] += seen.constants[a] * off
     return used, slack
+
+
+def _bends(signal: Array, rows: NDArray[np.int64]) -> Array:
+    """Second differences of a signal about the steps that end at rows."""
+    bend = np.abs(np.diff(signal, n=2, prepend=signal[:1], append=signal[-1:]))
+    return np.maximum(bend[rows], bend[rows - 1])
 
 
 def _contact_terms(seen: Observed, motion: Motion, rows: NDArray[np.int64]) -> list[Array]:
@@ -388,9 +448,9 @@ def _load_terms(seen: Observed, motion: Motion, time: Array) -> list[Array]:
     return terms
 
 
-def _tie_terms(seen: Observed, motion: Motion) -> list[Array]:
+def _tie_terms(seen: Observed, motion: Motion, rows: NDArray[np.int64]) -> list[Array]:
     terms = []
-    for a, b, position, force, moment in seen.tie_wrenches(motion):
+    for a, b, position, force, moment in seen.tie_wrenches(motion, rows):
         on_first = seen.bodies.force_along_rows(motion, a, position, force, moment)
         on_second = seen.bodies.force_along_rows(motion, b, position, -force, -moment)
         terms.append(-(on_first + on_second))
@@ -403,7 +463,7 @@ def _balanced(seen: Observed, rows: NDArray[np.int64], terms: list[Array], slack
     scale = np.sum([np.abs(term) for term in terms], axis=0)
     if seen.robot.couplings:
         left, scale, slack = left @ basis, scale @ np.abs(basis), slack @ np.abs(basis)
-    return Balance(rows, left, scale, slack)
+    return Balance(rows, left, scale, slack, STEPPED_BALANCE if seen.stepped else BALANCE)
 
 
 def warned(seen: Observed, text: str) -> bool:

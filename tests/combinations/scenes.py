@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -68,8 +69,13 @@ class Scene:
             options["solver"] = solver
         settings = {**self.settings, "integrator": {"method": method, **options, "wall_limit_s": WALL_LIMIT_S}}
         if stepped and fixed is STEPPED:
-            # At the end of each step: the checks of steps see all of them.
-            settings["record"] = {**self.settings["record"], "rate_hz": 1.0 / options.get("step_s", DEFAULT_STEP_S)}
+            # At the end of each step: the checks of steps see all of them. Steps divide the time between ticks.
+            step, between = (
+                options.get("step_s", DEFAULT_STEP_S),
+                self.settings.get("controller", {}).get("sample_time_s"),
+            )
+            rate = 1.0 / step if between is None else math.ceil(between / step - 1e-9) / between
+            settings["record"] = {**self.settings["record"], "rate_hz": rate}
         return settings
 
     def load(self, method: str, solver: str = "articulated") -> Scenario:
