@@ -138,10 +138,13 @@ def _real_friction(seen: Observed, touch: Touch) -> Finding:
                 f"{most[i]:.4g} × {f_n[i]:.6g} N"
             )
     power = (tangential * touch.slip).sum(axis=1)
-    # A step in which slip ends may end with some of it turned round.
-    gained = slips & (power > size * (_share(seen, touch) * speed + (SLOW if seen.stepped else 1e-7)) + 1e-12)
+    # A normal that is a little off has a share of the normal force in the surface, which may be all that there is.
+    noise = _share(seen, touch) * np.linalg.norm(touch.force, axis=1) * speed
+    gained = slips & (power > noise + size * (SLOW if seen.stepped else 1e-7) + 1e-12)
     if seen.stepped:
+        # A step in which slip ends may end with some of it turned round; a sample may lie within a step.
         gained &= (tangential * before).sum(axis=1) > 0.0
+        gained &= (tangential * touch.slip_after).sum(axis=1) > 0.0
     if gained.any():
         i = int(np.where(gained, power, 0.0).argmax())
         yield f"{contact.name} at t = {seen.time[i]:.6g} s: friction drives the slip with {power[i]:.4g} W"

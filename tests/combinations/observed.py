@@ -36,8 +36,11 @@ class Touch:
     ----------
     contact : its description; body : index of its body
     position : where it touches, (T, 3) [m]; normal : (T, 3); gap : (T,) [m]
-    slip, slip_before : (T, 3) tangential velocity [m/s]; the second at the start of the step, by events the same
+    slip, slip_before : (T, 3) tangential velocity [m/s]; the second of the rates at the start of the step that ends at
+        the sample, where the bodies are in its middle, as the law of time stepping has it; by events the same
+    slip_after : (T, 3) of the rates a step later with the same acceleration: a sample within a step lies between
     approach : velocity along the normal, (T,) [m/s]
+    turned : by how much the normal has turned since the sample before, or since the midpoint of the step, (T,) [rad]
     force : (T, 3) [N]; normal_force : (T,) as recorded [N]; mode : (T,)
     """
 
@@ -48,15 +51,12 @@ class Touch:
     gap: Array
     slip: Array
     slip_before: Array
+    slip_after: Array
     approach: Array
+    turned: Array
     force: Array
     normal_force: Array
     mode: Array
-
-    @property
-    def turned(self) -> Array:
-        """By how much the normal has turned since the sample before, (T,) [rad]."""
-        return np.asarray(np.linalg.norm(np.diff(self.normal, axis=0, prepend=self.normal[:1]), axis=1))
 
     @property
     def tangential(self) -> Array:
@@ -122,21 +122,30 @@ class Observed:
     def _touches_of_samples(self) -> list[Touch]:
         return [self._touch(k, contact, self.motion) for k, contact in enumerate(self.described_contacts)]
 
-    def _touch(self, k: int, contact: Contact, motion: Motion) -> Touch:
+    def place(self, contact: Contact, motion: Motion) -> tuple[int, Array, Array, Array]:
+        """Return a contact's body, and at each instant the centre nearest to its surface [m], distance and normal."""
         body, point = self.robot.attach(contact.body, contact.point)
         start = motion.point(body, point)
         tip = None if contact.tip is None else motion.point(body, self.robot.attach(contact.body, contact.tip)[1])
         surface = self.shapes[contact.surface_name]
         centre = nearest(surface, start, tip)
         far, normal = surface.look(centre)
+        return body, centre, far, normal
+
+    def _touch(self, k: int, contact: Contact, motion: Motion) -> Touch:
+        body, centre, far, normal = self.place(contact, motion)
         position = centre - contact.radius * normal
         velocity = motion.velocity(body, position)
         approach = (velocity * normal).sum(axis=1)
-        before = velocity
+        slip = velocity - approach[:, None] * normal
+        before = after = slip
+        turned = np.linalg.norm(np.diff(normal, axis=0, prepend=normal[:1]), axis=1)
         if self.stepped and motion is self.motion:
-            before = np.einsum(
-                "tkn,tn->tk", self.bodies.jacobian(motion, body, position), self.v - self.step * self.vdot
-            )
+            rates = self.step * self.vdot
+            before, middle = self._at_midpoints(contact, self.v - rates)
+            turned = np.maximum(turned, np.linalg.norm(normal - middle, axis=1))
+            along = np.einsum("tkn,tn->tk", self.bodies.jacobian(motion, body, position), self.v + rates)
+            after = along - (along * normal).sum(axis=1, keepdims=True) * normal
         record = self.record
         force = record["contact_normal_force"][:, k]
         mode = record["contact_mode"][:, k] if "contact_mode" in record else np.full(len(force), SLIDING)
@@ -146,13 +155,31 @@ class Observed:
             position,
             np.asarray(normal, dtype=np.float64),
             far - contact.radius,
-            velocity - approach[:, None] * normal,
-            before - (before * normal).sum(axis=1, keepdims=True) * normal,
+            slip,
+            before,
+            after,
             approach,
+            np.asarray(turned, dtype=np.float64),
             record["contact_force"][:, k],
             force,
             mode,
         )
+
+    @cached_property
+    def _middles(self) -> Motion:
+        """Motion of all bodies at the midpoints of the steps that end at the samples, half a step at the first rates."""
+        began = self.v - self.step * self.vdot
+        theta = self.scenario.integrator.theta
+        way = 0.5 * began - (began + theta * self.step * self.vdot)
+        return self.bodies.motion(self.q + position_rates(self.bodies, self.q, self.step * way), began, self.vdot)
+
+    def _at_midpoints(self, contact: Contact, rates: Array) -> tuple[Array, Array]:
+        """Tangential velocity at these rates [m/s] and normal at the midpoints of steps, (T, 3) each."""
+        body, centre, _, normal = self.place(contact, self._middles)
+        velocity = np.einsum(
+            "tkn,tn->tk", self.bodies.jacobian(self._middles, body, centre - contact.radius * normal), rates
+        )
+        return np.asarray(velocity - (velocity * normal).sum(axis=1, keepdims=True) * normal), normal
 
     @cached_property
     def loads(self) -> list[Load]:

@@ -32,6 +32,7 @@ GRID, SPACING = 24, 0.1
 # What differs between methods, by the level of precision.
 ADAPTIVE = {"default": {}, "tight": {"rtol": 1e-9, "atol": 1e-11}, "coarse": {"rtol": 1e-5, "atol": 1e-7}}
 STEPPED = {"default": {}, "tight": {"step_s": 2.5e-4}, "coarse": {"step_s": 2e-3, "theta": 1.0}}
+DEFAULT_STEP_S = 1e-3
 # Of a snake, whose control period they divide.
 SNAKE_STEPPED = {"default": {}, "tight": {"step_s": 1.25e-3}, "coarse": {"step_s": 5e-3, "theta": 1.0}}
 
@@ -65,7 +66,11 @@ class Scene:
         options = dict((fixed if stepped else ADAPTIVE)[self.levels["precision"]])
         if solver != "articulated":
             options["solver"] = solver
-        return {**self.settings, "integrator": {"method": method, **options, "wall_limit_s": WALL_LIMIT_S}}
+        settings = {**self.settings, "integrator": {"method": method, **options, "wall_limit_s": WALL_LIMIT_S}}
+        if stepped and fixed is STEPPED:
+            # At the end of each step: the checks of steps see all of them.
+            settings["record"] = {**self.settings["record"], "rate_hz": 1.0 / options.get("step_s", DEFAULT_STEP_S)}
+        return settings
 
     def load(self, method: str, solver: str = "articulated") -> Scenario:
         """Its scenario, read from its file; raises what reading raises."""

@@ -28,12 +28,7 @@ QUICK = {1, 2, 3, 4, 5, 6, 7, 8, 11}
 OPEN = {
     0: "radau5 chatters at 5 ms: dry friction in two joints of a floating robot, links and a sphere",
     8: "radau5: a joint creeps at 4e-5 rad/s with its friction reversed",
-    9: "time stepping: feet sink 1e-6 m",
-    10: "time stepping: friction outside the cone where two contacts land in one step",
-    14: "time stepping: the loss of joints falls by 1e-7 J",
     19: "radau5: the residual by the signals is 1.4e-8, that of the summary 2e-9",
-    27: "time stepping: friction of a foot drives its slip with 5e-4 W",
-    29: "time stepping: friction of two points drives their slip with 3e-6 W",
 }
 # Scenes of the slow study.
 TRIPLES = 1000

@@ -204,6 +204,18 @@ def test_the_ledger_of_random_arms_that_rub(theta):
     assert (np.diff(ledger[:, [GEAR, JOINT]], axis=0) > 0.0).all()
 
 
+@pytest.mark.parametrize("theta", [0.5, 1.0])
+def test_dry_friction_never_gives_energy_where_the_motion_turns_round(theta):
+    """The force of the step's end may be along its mean motion: that work is the scheme's, and the ledger closes."""
+    b, y, _, _ = oscillator(0.5)
+    run = stepped(b, y, np.arange(0.0, 6.0, 5e-3), 5e-3, theta)
+    turns = (np.diff(np.sign(run.states("v")[:, 0])) != 0.0).sum()
+    assert turns >= 10
+    lost = run.states("ledger")[:, GEAR]
+    assert np.diff(lost).min() > -1e-15
+    assert ledger_gap(run).max() < 1e-9
+
+
 METHODS = ("dopri5", "radau5")
 STEPS = "time_stepping"
 

@@ -192,9 +192,13 @@ def book_dry(unilateral: UnilateralArrays, system: System, s: SteppingArrays, ws
         dry, r, a = unilateral.dry[k], unilateral.dry_table[k, ku.DRY_ROW], unilateral.dry_table[k, ku.DRY_DRIVE]
         dry[ku.DRY_FORCE], work = ws.rows[r, ka.FORCE], work_of_row(s, ws, r, h)
         share = dry[ku.OF_GEAR] / (dry[ku.OF_GEAR] + dry[ku.OF_JOINT])
-        y_new[ledger + kst.GEAR] -= share * work
-        y_new[ledger + kst.JOINT] -= (1.0 - share) * work
-        y_new[ledger + kst.MECHANICAL] += share * work
+        # In a step in which the motion turns round, its force may be along the mean motion: an error of the step, as
+        # that of contacts.
+        lost = min(work, 0.0)
+        y_new[system.layout.scheme] -= work - lost
+        y_new[ledger + kst.GEAR] -= share * lost
+        y_new[ledger + kst.JOINT] -= (1.0 - share) * lost
+        y_new[ledger + kst.MECHANICAL] += share * lost
         y_new[ledger + kst.CONSTRAINT] -= work
         if a >= 0:
             ws.motors[a, ka.DRY_DRAG] = -share * dry[ku.DRY_FORCE]
