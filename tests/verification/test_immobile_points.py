@@ -89,7 +89,7 @@ def about_left_out(warnings: Any) -> list[str]:
     return [text for text in warnings if "no joint moves this point" in text]
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", [pytest.param("dopri5", marks=pytest.mark.long), *METHODS[1:]])
 def test_a_point_at_the_shoulder_changes_nothing(tmp_path: Path, method: str) -> None:
     """It began 6e-12 m below its surface: forces of 1e16 N, joints thrown by 1e5 rad, and 11 million steps."""
     touching, free = both(tmp_path, SHOULDER, SLANTED, point=ELBOW, to=40.0, method=method)
