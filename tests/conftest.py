@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import signal
 from collections.abc import Callable, Iterator
@@ -11,6 +12,12 @@ from typing import Any
 import pytest
 from hypothesis import settings
 
+# Each worker has a core: threads of numpy's libraries would wait for each other, for longer than small matrices take.
+# Before anything loads numpy, and for the workers and what they start.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+from support import programs
+
 from dynsim.engine import simulate
 from dynsim.record import Record
 from dynsim.scenario import load_scenario
@@ -18,6 +25,11 @@ from dynsim.scenario import load_scenario
 # The same examples in every run; compiling kernels is not a slow example.
 settings.register_profile("seeded", derandomize=True, deadline=None, max_examples=25)
 settings.load_profile("seeded")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtestloop(session: pytest.Session) -> None:
+    programs.compile_share(len(session.items))
 
 
 @cache

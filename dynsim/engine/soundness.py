@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 NOTHING, CANCELLED = 1e-12, 1e-14
 # Joints up to which the loop is examined: its matrices have three rows each.
 LARGE = 100
+# Rows up to which a loop with the samples of late encoders is: as many as those of LARGE joints.
+LATE = 3 * LARGE
 # Growth of deviations that counts [1/s], and per period: free motions have a double eigenvalue 1 with rounding 1e-8.
 GROWTH, ROUNDING = 1.0, 1e-6
 # Periods of encoders and of the controller must be multiples of each other to this relative accuracy.
@@ -97,7 +99,11 @@ class HeldLoop:
         return _growth(advance + input_ @ law, law, period)
 
     def growth_by_encoders(self, period: float, encoders: Encoders) -> Growth | None:
-        """With positions of encoders and their differences; None where the two periods do not fit each other."""
+        """With positions of encoders and their differences.
+
+        None where the two periods do not fit each other, or the delay holds so many samples that the loop has more than
+        :data:`LATE` rows.
+        """
         between = period if encoders.rate_hz is None else 1.0 / encoders.rate_hz
         ratio = max(period, between) / min(period, between)
         if abs(ratio - round(ratio)) > WHOLE * ratio:
@@ -107,6 +113,8 @@ class HeldLoop:
         kept = math.ceil(encoders.delay_s / between + 1.0 - WHOLE) + 2
         # The vector has the states, the commands, and so many samples, beginning with the last one.
         whole = size + na + kept * na
+        if whole > LATE:
+            return None
         samples = size + na
         advance, input_ = self._over(step)
         product = np.eye(whole)

@@ -180,7 +180,7 @@ SECOND = {
 
 @pytest.mark.parametrize("policy", POLICIES)
 @pytest.mark.parametrize("kind", SECOND)
-@pytest.mark.parametrize("onset", [0.5, 1.7], ids=["MOVE_TO_START", "REPLAY"])
+@pytest.mark.parametrize("onset", [pytest.param(0.5, marks=pytest.mark.long), 1.7], ids=["MOVE_TO_START", "REPLAY"])
 def test_a_second_fault_on_the_way_is_named_and_shows(rig, onset: float, kind: str, policy: str) -> None:
     """One servo overloads, and 80 ms later, while the others slow down, another one fails."""
     first = {"kind": "overload", "id": 1, "at": onset}

@@ -55,8 +55,16 @@ def broadcast_torque_off(run) -> list[float]:
     ]
 
 
-@pytest.mark.parametrize("policy", ["hold", "decelerate", "off"])
-@pytest.mark.parametrize("state", ON_THE_WAY, ids=lambda state: state.name)
+# Each state with one policy, in turn, in the default tests.
+@pytest.mark.parametrize(
+    ("state", "policy"),
+    [
+        pytest.param(state, policy, marks=() if (number + k) % 3 == 0 else pytest.mark.long)
+        for number, state in enumerate(ON_THE_WAY)
+        for k, policy in enumerate(["hold", "decelerate", "off"])
+    ],
+    ids=lambda value: getattr(value, "name", value),
+)
 def test_second_ctrl_c_switches_the_torque_off_at_every_state(rig, state: ReplayState, policy: str) -> None:
     run = interrupted(rig, state, [signal.SIGINT, signal.SIGINT], policy=policy)
     assert len(broadcast_torque_off(run)) >= 3
@@ -104,12 +112,18 @@ UNHEEDED = {
     "SIGURG",
     "SIGWINCH",
 }
+# Those that people and systems send to end a process.
+SENT = {"SIGTERM", "SIGHUP", "SIGQUIT", "SIGXCPU", "SIGUSR1"}
 BROKEN = {"SIGSEGV", "SIGBUS", "SIGILL", "SIGFPE", "SIGABRT", "SIGTRAP", "SIGSYS"}
 
 
 @pytest.mark.parametrize(
     "number",
-    [number for number in signal.Signals if number.name not in {"SIGINT", "SIGRTMIN", "SIGRTMAX"} | UNHEEDED | BROKEN],
+    [
+        pytest.param(number, marks=() if number.name in SENT else pytest.mark.long)
+        for number in signal.Signals
+        if number.name not in {"SIGINT", "SIGRTMIN", "SIGRTMAX"} | UNHEEDED | BROKEN
+    ],
     ids=lambda number: number.name,
 )
 @pytest.mark.usefixtures("hang_ups")

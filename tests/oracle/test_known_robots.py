@@ -162,6 +162,7 @@ REFUSED = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore:.*(moments of inertia that no body can have|has a mass)")
 def test_every_other_robot_of_the_package_is_read_as_pinocchio_reads_it() -> None:
     """Some 60 files of many makers. iCub has moments of −5e-20 kg m² by rounding."""

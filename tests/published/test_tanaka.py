@@ -100,7 +100,13 @@ def test_table_iii_with_estimated_and_with_feedforward_state(state, moved):
     assert np.any(record["phi"][-1] != measured["phi"][-1])  # it did not look where the measured state does
 
 
-@pytest.mark.parametrize(("name", "variant"), [(n, v) for n, vs in SCENARIOS.items() for v in vs])
+def _marks(name: str) -> tuple[pytest.MarkDecorator, ...]:
+    return (pytest.mark.long,) if name == "snake_circle_backward" else ()
+
+
+@pytest.mark.parametrize(
+    ("name", "variant"), [pytest.param(n, v, marks=_marks(n)) for n, vs in SCENARIOS.items() for v in vs]
+)
 def test_limits_and_head_error_of_every_shipped_scenario(simulated, name, variant):
     """Table I: |psi| <= 113 deg, |theta| <= 65 deg; with the joint-limit policy at no cost in head error."""
     record = simulated(name, variant)
@@ -211,6 +217,7 @@ class TestDoor:
         assert forward["waiting_s"] == 0.0
         assert backward["waiting_s"] > 20.0
 
+    @pytest.mark.long
     def test_the_backward_circle_is_completed_with_modes_that_lift_pair_1(self, simulated):
         """Not by the modes of Table II, and not by the real robot: IV.C.5, "the robot cannot ... lift ... the wheel of
         the head of the base part because of a lack of torque"."""

@@ -182,7 +182,7 @@ def test_what_is_drawn_depends_on_the_signals_not_on_the_engine(pendulum: Record
     assert_pngs(figures.draw(record, tmp_path), tmp_path, {"hand_path", "energy_ledger", "posture"})
 
 
-@pytest.mark.parametrize(("kind", "start"), [("pdf", b"%PDF-"), ("svg", b"<?xml")])
+@pytest.mark.parametrize(("kind", "start"), [pytest.param("pdf", b"%PDF-", marks=pytest.mark.long), ("svg", b"<?xml")])
 def test_figures_as_pdf_and_svg(pendulum: Record, tmp_path: Path, kind: str, start: bytes) -> None:
     names = {"hand_path", "energy_ledger", "posture"}
     paths = figures.draw(pendulum, tmp_path / "a", kind)

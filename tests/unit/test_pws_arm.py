@@ -123,12 +123,19 @@ def test_wheels_and_joints_are_exported_with_their_rates(case):
     np.testing.assert_allclose(middle[20:], velocity[1:-1][20:], rtol=0, atol=1e-2)
 
 
-def test_run_and_compare_write_records_and_figures(case, monkeypatch):
+@pytest.mark.long  # draws dozens of figures
+def test_compare_writes_figures(case, monkeypatch):
     case.write_text(f"{GOOD}variants:\n  a: {{}}\n  b: {{plant: {{base: {{mass_kg: 3}}}}}}\n")
-    for arguments in (["run", str(case), "--variant", "a"], ["compare", str(case)]):
-        out = case.parent / arguments[0]
-        assert command(monkeypatch, *arguments, "-q", "--out", str(out)) == 0
-        assert list(out.rglob("posture*.png"))
+    out = case.parent / "compare"
+    assert command(monkeypatch, "compare", str(case), "-q", "--out", str(out)) == 0
+    assert list(out.rglob("posture*.png"))
+
+
+def test_run_writes_a_record_and_figures(case, monkeypatch):
+    case.write_text(GOOD)
+    out = case.parent / "run"
+    assert command(monkeypatch, "run", str(case), "-q", "--out", str(out)) == 0
+    assert list(out.rglob("posture*.png"))
     record = dynsim.Record.load(case.parent / "run" / "record.h5")
     scene: Any = record.scene
     assert [body.name for body in scene.bodies][-2:] == ["base.left.wheel", "base.right.wheel"]

@@ -67,6 +67,7 @@ def test_geometry_is_that_of_the_scene(record):
         snake_geometry(Record(record.time))
 
 
+@pytest.mark.long  # test_figures.py has those of arms
 def test_figures_as_svg(record, tmp_path, monkeypatch):
     monkeypatch.setattr(figures, "FRAMES", 2)
     written = figures.draw(record, tmp_path, "svg")

@@ -111,7 +111,7 @@ def test_depth_of_a_link_is_that_of_its_deepest_point(kind, inside):
             "rod", "joint", None, "revolute", np.array([0.0, 0, 1]), Inertia(1.0), p_PJ=start, radius=0.02, tip=along
         )
         robot = Robot("rod", (link,), (), ("rod", np.zeros(3)))
-        depth = -min(s.gap(start + x * along) for x in np.linspace(0.0, 1.0, 2001))
+        depth = -s.gaps(start + np.linspace(0.0, 1.0, 2001)[:, None] * along).min()
         penetration = sinking(robot, {"s": s}, np.zeros((1, 1)))
         assert bool(penetration) == (depth > 0.02)
         if penetration:

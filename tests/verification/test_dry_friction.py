@@ -460,6 +460,7 @@ integrator: {method: dopri5, rtol: 1.0e-5, atol: 1.0e-7}
 """
 
 
+@pytest.mark.long  # a program of its own to compile
 def test_a_joint_that_rests_on_its_stop_takes_no_share_of_its_force(tmp_path: Path):
     """A falling arm lands on its elbow with a joint on its stop: friction within its bound, and no chatter."""
     path = tmp_path / "stops.yaml"

@@ -161,8 +161,15 @@ def test_the_kinematic_level_has_what_it_had():
     assert scenario_from_resolved(resolved).resolved == resolved
 
 
-@pytest.mark.parametrize("delay", [0.01, 0.2])
-@pytest.mark.parametrize("variant", ["beta", "y"])
+@pytest.mark.parametrize(
+    ("variant", "delay"),
+    [
+        ("beta", 0.2),
+        ("y", 0.01),
+        pytest.param("beta", 0.01, marks=pytest.mark.long),
+        pytest.param("y", 0.2, marks=pytest.mark.long),
+    ],
+)
 def test_measured_feedback_brings_the_head_to_its_target(variant, delay):
     """[T] V.A, Fig 7(b): "converged to the desired value when using the actual value of the controlled variable".
 
@@ -245,7 +252,7 @@ def test_a_snapshot_has_the_same_future():
     np.testing.assert_array_equal(first.v, again.v)
 
 
-@pytest.mark.parametrize("theta", [0.5, 1.0])
+@pytest.mark.parametrize("theta", [0.5, pytest.param(1.0, marks=pytest.mark.long)])
 @pytest.mark.parametrize("gain", [20.0, 100.0])
 def test_stiff_wheel_loops_roll_without_slipping(gain, theta):
     """Limits of their voltage are decided at the end of a step; clipped at its start they spin back and forth."""

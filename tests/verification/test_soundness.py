@@ -79,6 +79,13 @@ def test_deviations_of_a_run_grow_by_the_spectral_radius(link, motor, encoders):
     assert slope == pytest.approx(expected.rate, rel=0.05)
 
 
+def test_loops_with_very_many_samples_under_way_are_not_examined(link):
+    """At a shorter period a delay holds more of them; the search for one that is stable took minutes."""
+    scenario = link(sensors__encoders={"resolution_deg": 0, "delay_s": 0.02})
+    assert growth_of(scenario, 1e-3) is not None
+    assert growth_of(scenario, 2e-5) is None
+
+
 def test_the_radius_of_the_published_arm_agrees_with_its_linearization():
     """Free arm, from the state matrices of the kernels, which have gravity too: three digits."""
     scenario = load_scenario("elbow_comparison", "no_elbow")
