@@ -29,7 +29,6 @@ OPEN = {
     9: "time stepping: feet sink 1e-6 m",
     10: "time stepping: friction outside the cone where two contacts land in one step",
     14: "time stepping: the loss of joints falls by 1e-7 J",
-    19: "radau5: the residual by the signals is 1.4e-8, that of the summary 2e-9",
     27: "time stepping: friction of a foot drives its slip with 5e-4 W",
     29: "time stepping: friction of two points drives their slip with 3e-6 W",
 }
