@@ -65,12 +65,7 @@ def state_of(seen: Observed, values: Mapping[str, Sequence[float]], currents: Ar
     motion = seen.bodies.motion(q[None], v[None], np.zeros((1, len(v))))
     names, rows, slip, friction, static = [], [], [], [], []
     for contact in seen.described_contacts:
-        body, point = seen.robot.attach(contact.body, contact.point)
-        start = motion.point(body, point)
-        tip = None if contact.tip is None else motion.point(body, seen.robot.attach(contact.body, contact.tip)[1])
-        surface = seen.shapes[contact.surface_name]
-        centre = nearest(surface, start, tip)
-        far, normal = surface.look(centre)
+        body, centre, far, normal = seen.place(contact, motion)
         if far[0] - contact.radius > CLOSED:
             continue
         n = np.asarray(normal[0], dtype=np.float64)

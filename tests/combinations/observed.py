@@ -122,13 +122,18 @@ class Observed:
     def _touches_of_samples(self) -> list[Touch]:
         return [self._touch(k, contact, self.motion) for k, contact in enumerate(self.described_contacts)]
 
-    def _touch(self, k: int, contact: Contact, motion: Motion) -> Touch:
+    def place(self, contact: Contact, motion: Motion) -> tuple[int, Array, Array, Array]:
+        """Return a contact's body, and at each instant the centre nearest to its surface [m], distance and normal."""
         body, point = self.robot.attach(contact.body, contact.point)
         start = motion.point(body, point)
         tip = None if contact.tip is None else motion.point(body, self.robot.attach(contact.body, contact.tip)[1])
         surface = self.shapes[contact.surface_name]
         centre = nearest(surface, start, tip)
         far, normal = surface.look(centre)
+        return body, centre, far, normal
+
+    def _touch(self, k: int, contact: Contact, motion: Motion) -> Touch:
+        body, centre, far, normal = self.place(contact, motion)
         position = centre - contact.radius * normal
         velocity = motion.velocity(body, position)
         approach = (velocity * normal).sum(axis=1)

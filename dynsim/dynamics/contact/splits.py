@@ -13,7 +13,13 @@ import math
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.cone.socp import best_split, split_room_in
-from dynsim.dynamics.contact.unilateral import UnilateralArrays, holding_bound, note_dry_forces, note_stop_forces
+from dynsim.dynamics.contact.unilateral import (
+    UnilateralArrays,
+    holding_bound,
+    note_dry_forces,
+    note_stop_forces,
+    rows_of_couplings,
+)
 from dynsim.dynamics.tables import ContactArrays, Workspace
 from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
@@ -131,10 +137,7 @@ def find_splits(unilateral: UnilateralArrays, ws: Workspace):
             first[count], row[p] = p, unilateral.dry_table[k, ku.DRY_ROW]
             p += 1
             count += 1
-    # Rows of couplings come first in the table, before those of held joints and of closed stops.
-    ties = ws.counts[ka.COUPLED] - (count - points)
-    for k in range(unilateral.stop_table.shape[0]):
-        ties -= unilateral.stop_table[k, ku.STOP_CLOSED]
+    ties = rows_of_couplings(unilateral, ws)
     for r in range(ties):
         row[p + r] = r
     size = p + ties

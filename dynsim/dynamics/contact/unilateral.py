@@ -195,6 +195,15 @@ def holding_bound(unilateral: UnilateralArrays, k):
 
 
 @internal_kernel
+def rows_of_couplings(unilateral: UnilateralArrays, ws: Workspace):
+    """Number of rows of couplings: the first in the table, before those of held joints and of closed stops."""
+    rows = ws.counts[ka.COUPLED] - dry_rows_held(unilateral)
+    for k in range(unilateral.stop_table.shape[0]):
+        rows -= unilateral.stop_table[k, STOP_CLOSED]
+    return rows
+
+
+@internal_kernel
 def dry_rows_held(unilateral: UnilateralArrays):
     """Rows of joints that dry friction holds."""
     rows = 0

@@ -14,7 +14,7 @@ from dynsim.dynamics.contact.cone import problem as kc
 from dynsim.dynamics.contact.cone.problem import approach_or_draw_near, solve_cones
 from dynsim.dynamics.contact.mobility import moves_along_normal
 from dynsim.dynamics.contact.rows import row_errors, set_modes
-from dynsim.dynamics.contact.unilateral import UnilateralArrays, dry_rows_held, stop_gap
+from dynsim.dynamics.contact.unilateral import UnilateralArrays, dry_rows_held, holding_bound, stop_gap
 from dynsim.dynamics.derivative import System, derivative
 from dynsim.dynamics.tables import Workspace
 from dynsim.dynamics.tree.articulated import accelerate
@@ -153,12 +153,23 @@ def project_down(system: System, ws: Workspace, run: Run):
 
 
 @internal_kernel
-def kind_of_joint_row(system: System, r):
+def kind_of_joint_row(unilateral: UnilateralArrays, couplings, r):
     """Kind of row r of the contact problem, of a coupling, of dry friction or, behind them, of a joint stop."""
-    couplings = system.couplings.joint.shape[0]
     if r < couplings:
         return kc.BOTH_WAYS
-    return kc.BOX if r < couplings + dry_rows_held(system.unilateral) else kc.ONE_WAY
+    return kc.BOX if r < couplings + dry_rows_held(unilateral) else kc.ONE_WAY
+
+
+@internal_kernel
+def begin_problem(unilateral: UnilateralArrays, couplings, count):
+    """Write the rows of joints, so many, of which the first are of couplings, as the first of a contact problem."""
+    index, vector = unilateral.index, unilateral.vector
+    for r in range(count):
+        index[ku.KINDS, r], index[ku.TABLE_ROW, r] = kind_of_joint_row(unilateral, couplings, r), r
+        vector[ku.CONE_FRICTION, r], vector[ku.FIRST_PART, r], vector[ku.SECOND_PART, r] = 0.0, 0.0, 0.0
+    for k in range(unilateral.dry_table.shape[0]):
+        if unilateral.dry_table[k, ku.DRY_HOLDS] == 1:
+            vector[ku.CONE_FRICTION, unilateral.dry_table[k, ku.DRY_ROW]] = holding_bound(unilateral, k)
 
 
 @internal_kernel
@@ -176,7 +187,7 @@ def gather(system: System, ws: Workspace, run: Run):
     evaluate(system, ws, run)
     p = ws.counts[ka.ROWS]
     for r in range(p):
-        index[ku.KINDS, r] = kind_of_joint_row(system, r)
+        index[ku.KINDS, r] = kind_of_joint_row(unilateral, system.couplings.joint.shape[0], r)
     for k in range(mode.shape[0]):
         if mode[k, ku.WANTED] == ka.STICKING:
             r = ws.active[k, ka.FIRST_ROW]

@@ -12,9 +12,9 @@ from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.cone import problem as kc
 from dynsim.dynamics.contact.splits import find_splits, normal_is_open
-from dynsim.dynamics.contact.unilateral import UnilateralArrays, dry_rows_held, holding_bound
+from dynsim.dynamics.contact.unilateral import UnilateralArrays, rows_of_couplings
 from dynsim.dynamics.tables import ContactArrays, Workspace
-from dynsim.integrators.contacts.impacts import solve_problem
+from dynsim.integrators.contacts.impacts import begin_problem, solve_problem
 from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
 # Starts of the contact problem of all others; a point for which none finds a solution counts as pressed.
@@ -32,19 +32,8 @@ def approach_without_force(contacts: ContactArrays, unilateral: UnilateralArrays
     that leaves falls through zero [m/s²].
     """
     index, vector, active, W = unilateral.index, unilateral.vector, ws.active, ws.small[0]
-    # Rows of joints come first: couplings, dry friction, stops.
-    joints, closed = ws.counts[ka.COUPLED], 0
-    for j in range(unilateral.stop_table.shape[0]):
-        closed += unilateral.stop_table[j, ku.STOP_CLOSED]
-    resting = dry_rows_held(unilateral)
-    couplings = joints - closed - resting
-    for r in range(joints):
-        kind = kc.BOTH_WAYS if r < couplings else kc.BOX if r < couplings + resting else kc.ONE_WAY
-        index[ku.KINDS, r], index[ku.TABLE_ROW, r], vector[ku.CONE_FRICTION, r] = kind, r, 0.0
-    for j in range(unilateral.dry_table.shape[0]):
-        if unilateral.dry_table[j, ku.DRY_HOLDS] == 1:
-            vector[ku.CONE_FRICTION, unilateral.dry_table[j, ku.DRY_ROW]] = holding_bound(unilateral, j)
-    size = joints
+    size = ws.counts[ka.COUPLED]
+    begin_problem(unilateral, rows_of_couplings(unilateral, ws), size)
     for j in range(ws.contacts.shape[0]):
         mode, r = active[j, ka.MODE], active[j, ka.FIRST_ROW]
         if j == k or mode == ka.OPEN:

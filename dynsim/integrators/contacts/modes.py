@@ -34,12 +34,12 @@ from dynsim.dynamics.tables import Workspace
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts.impacts import (
     FORCE_TOLERANCE,
+    begin_problem,
     evaluate,
     find_touching,
     gather,
     impact,
     keep_touching,
-    kind_of_joint_row,
     slip_speed,
     solve_problem,
 )
@@ -131,25 +131,11 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
     largest = 0.0
     for r in range(p):
         largest = max(largest, abs(ws.rows[r, ka.RHS]))
-    solved, size, least = False, 0, 2.0 * unilateral.number[ku.SLOW]
-    for attempt in range(2):
-        if attempt == 1:
-            if solved or least >= NEARLY_AT_REST:
-                break
-            least, run.count[ki.STATUS] = NEARLY_AT_REST, ki.RUNNING
-        for k in range(mode.shape[0]):
-            if mode[k, ku.TOUCHING] == 1:
-                mode[k, ku.WANTED] = ka.SLIDING if begins_sliding(system, ws, k, least) else ka.STICKING
-                mode[k, ku.GIVES_WAY] = 1 if mode[k, ku.GIVES_WAY] == 1 and drops(system, k) else 0
-        # Where static friction gives way to a smaller kinetic one, the others' forces change.
-        for _ in range(1 + mode.shape[0]):
-            size = reduce_rows(system, ws, run, p)
-            if run.count[ki.STATUS] == ki.FORCES_REVERSED:
-                break
-            solved = solve_problem(unilateral, unilateral.room[ku.PROBLEM], size, largest, 0)
-            if not solved or not give_way(system, ws, size, largest):
-                break
-            solved = False
+    least = 2.0 * unilateral.number[ku.SLOW]
+    solved, size = solve_accelerations(system, ws, run, p, largest, least)
+    if not solved and least < NEARLY_AT_REST:
+        least, run.count[ki.STATUS] = NEARLY_AT_REST, ki.RUNNING
+        solved, size = solve_accelerations(system, ws, run, p, largest, least)
     if not solved:
         if run.count[ki.STATUS] != ki.FORCES_REVERSED:
             run.count[ki.STATUS] = ki.NO_CONTACT_FORCES
@@ -193,6 +179,31 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
         starts = mode[k, ku.WANTED] == ka.SLIDING and mode[k, ku.TOUCHING] == ka.STICKING
         unilateral.slide[k, ku.HEADWAY] = max(0.0, -unilateral.slide[k, ku.SPEED]) if starts else 0.0
     return True
+
+
+@noinline_kernel
+def solve_accelerations(system: System, ws: Workspace, run: Run, p, largest, least):
+    """Forces that agree with the law, where what slips slower than ``least`` [m/s] is at rest.
+
+    Returns
+    -------
+    solved, size : whether there are such forces, and the size of their problem
+    """
+    unilateral, mode, size = system.unilateral, system.unilateral.mode, 0
+    for k in range(mode.shape[0]):
+        if mode[k, ku.TOUCHING] == 1:
+            mode[k, ku.WANTED] = ka.SLIDING if begins_sliding(system, ws, k, least) else ka.STICKING
+            mode[k, ku.GIVES_WAY] = 1 if mode[k, ku.GIVES_WAY] == 1 and drops(system, k) else 0
+    # If static friction falls to a smaller kinetic one, the forces of the other contacts change.
+    for _ in range(1 + mode.shape[0]):
+        size = reduce_rows(system, ws, run, p)
+        if run.count[ki.STATUS] == ki.FORCES_REVERSED:
+            return False, size
+        if not solve_problem(unilateral, unilateral.room[ku.PROBLEM], size, largest, 0):
+            return False, size
+        if not give_way(system, ws, size, largest):
+            return True, size
+    return False, size
 
 
 @internal_kernel
@@ -401,12 +412,7 @@ def reduce_rows(system: System, ws: Workspace, run: Run, p):
     for k in range(mode.shape[0] - 1, -1, -1):
         if mode[k, ku.TOUCHING] == 1:
             first = ws.active[k, ka.FIRST_ROW]
-    for r in range(first):
-        index[ku.KINDS, r], vector[ku.CONE_FRICTION, r] = kind_of_joint_row(system, r), 0.0
-        index[ku.TABLE_ROW, r], vector[ku.FIRST_PART, r], vector[ku.SECOND_PART, r] = r, 0.0, 0.0
-    for k in range(unilateral.dry_table.shape[0]):
-        if unilateral.dry_table[k, ku.DRY_HOLDS] == 1:
-            vector[ku.CONE_FRICTION, unilateral.dry_table[k, ku.DRY_ROW]] = holding_bound(unilateral, k)
+    begin_problem(unilateral, system.couplings.joint.shape[0], first)
     size = first
     for k in range(mode.shape[0]):
         if mode[k, ku.TOUCHING] == 0:
