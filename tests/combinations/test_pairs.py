@@ -24,8 +24,6 @@ FEW = 30
 QUICK = 12
 # Scenes among these with a problem that is known and not mended yet, or a check that is too strict for them.
 OPEN = {
-    0: "radau5 chatters at 5 ms: dry friction in two joints of a floating robot, links and a sphere",
-    8: "radau5: a joint creeps at 4e-5 rad/s with its friction reversed",
     9: "time stepping: feet sink 1e-6 m",
     10: "time stepping: friction outside the cone where two contacts land in one step",
     14: "time stepping: the loss of joints falls by 1e-7 J",
