@@ -1,12 +1,12 @@
 """Contact points that no joint moves along the normal of their surface: in any posture, or in one of them.
 
 The force on such a point changes no motion, so no equation determines it. A point that is immobile in every posture is
-left out of the contact problem; in a single posture it carries nothing.
+left out of the contact problem; in a single posture it carries nothing. Joints whose brakes are closed move nothing.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 import numpy as np
 
@@ -25,54 +25,79 @@ SAME = 1e-9
 SHARES = (0.0, 0.3, 0.7, 1.0)
 
 
-def random_configurations(robot: Robot) -> list[Array]:
-    """Return random coordinates, always the same; quaternions are unit."""
-    rng = np.random.default_rng(0)
+def random_configurations(robot: Robot, braked: Collection[int] = (), at: Array | None = None) -> list[Array]:
+    """Return random coordinates, always the same; quaternions are unit.
+
+    braked : joints that stay where they are in coordinates ``at``. A ball joint with a brake on one or two of its three
+        rates still comes to every attitude.
+    """
+    rng, first = np.random.default_rng(0), 0
+    free = set[int]()
+    for i, link in enumerate(robot.links):
+        # Rows without coordinates of their own share those of the first row of their joint.
+        first = i if link.row.neutral else first
+        if i not in braked:
+            free.add(first)
     configurations = []
     for _ in range(CONFIGURATIONS):
         q = np.zeros(robot.nq)
-        for link, k in zip(robot.links, robot.position_index, strict=True):
+        for i, (link, k) in enumerate(zip(robot.links, robot.position_index, strict=True)):
             size = len(link.row.neutral)
             q[k : k + size] = rng.normal(size=size)
             if size == 4:
                 q[k : k + 4] /= np.linalg.norm(q[k : k + 4])
+            if at is not None and i not in free:
+                q[k : k + size] = at[k : k + size]
         configurations.append(q)
     return configurations
 
 
-def moves(model: Model, contact: Contact, configurations: Iterable[Array], *, anywhere: bool = False) -> bool:
+def moves(
+    model: Model,
+    contact: Contact,
+    configurations: Iterable[Array],
+    *,
+    anywhere: bool = False,
+    braked: Collection[int] = (),
+) -> bool:
     """Return whether any joint moves any part of a candidate along the normal.
 
     anywhere : a motion along the surface counts too
+    braked : joints that do not count
     """
+    free = [i for i in range(model.n) if i not in braked]
     points = [contact.point]
     if contact.tip is not None:
         points = [contact.point + share * (contact.tip - contact.point) for share in SHARES]
     for q in configurations:
         for point in points:
             position, jacobian = model.point_position_and_jacobian(contact.body, point, q)
-            rates = jacobian if anywhere else contact.surface.normal(position) @ jacobian
+            rates = (jacobian if anywhere else contact.surface.normal(position) @ jacobian)[..., free]
             if np.abs(rates).max(initial=0.0) > SAME:
                 return True
     return False
 
 
-def immobile(robot: Robot, contacts: Sequence[Contact]) -> list[bool]:
+def immobile(
+    model: Model, contacts: Sequence[Contact], braked: Collection[int] = (), at: Array | None = None
+) -> list[bool]:
     """Return for each contact whether no joint moves it along the normal in any posture.
 
     The faces of a box and the slopes of a height field cannot be judged by a few random postures. A point on such a
     surface is immobile only if no joint moves it in any direction.
+
+    braked : joints that stay where they are in coordinates ``at``
     """
-    model, configurations = Model(robot), random_configurations(robot)
+    configurations = random_configurations(model.robot, braked, at)
     still = []
     for contact in contacts:
         try:
-            robot.attach(contact.body, contact.point)
+            model.robot.attach(contact.body, contact.point)
         except ModelError:  # an unknown or a fixed body: the check of the start names it
             still.append(False)
             continue
         anywhere = not isinstance(contact.surface, Quadric)
-        still.append(not moves(model, contact, configurations, anywhere=anywhere))
+        still.append(not moves(model, contact, configurations, anywhere=anywhere, braked=braked))
     return still
 
 
@@ -87,17 +112,21 @@ def immobile_at(model: Model, link: int, point: Array, normal: Array, q: Array) 
     return bool((np.abs(normal @ jacobian) <= IMMOBILE * scale).all())
 
 
-def mobility_floors(model: Model, contacts: Sequence[Contact]) -> Array:
+def mobility_floors(
+    model: Model, contacts: Sequence[Contact], braked: Collection[int] = (), at: Array | None = None
+) -> Array:
     """Return for each contact the mobility along its normal below which a glued one has no force, (c,) [1/kg].
 
     That is the fraction of a typical mobility below which a row counts as dependent. The typical one is the
     largest of random postures, with the diagonal of the mass matrix in place of the matrix, which makes it up to n
     times too large.
+
+    braked : joints that stay where they are in coordinates ``at``; those of the model are as heavy as their brakes
     """
     floors = np.zeros(len(contacts))
     if not contacts:
         return floors
-    for q in random_configurations(model.robot)[:2]:
+    for q in random_configurations(model.robot, braked, at)[:2]:
         inertia = np.diag(model.mass_matrix(q)) + model.armature
         for k, contact in enumerate(contacts):
             position, jacobian = model.point_position_and_jacobian(contact.body, contact.point, q)

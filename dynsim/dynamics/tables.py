@@ -40,11 +40,14 @@ AXIS = 12  # 3: joint axis in the body's frame, unit length
 MASS = 15  # [kg]
 COM = 16  # 3: centre of mass in B [m]
 INERTIA = 19  # 6: about the centre of mass, in B, xx xy xz yy yz zz [kg m^2]
-ARMATURE = 25  # reflected motor inertia J_m [kg m^2 or kg]
+ARMATURE = 25  # reflected motor inertia J_m, or BRAKED where a brake is closed [kg m^2 or kg]
 DAMPING = 26  # viscous joint loss D [N m s/rad or N s/m]
 GEAR_DAMPING = 27  # viscous gear loss D_m, reflected [N m s/rad or N s/m]
 PARAMETER = 28  # what else a kind of joint needs, such as the lead of a screw
 BODY_SIZE = 29
+# So heavy that loads do not change the joint's position even by rounding, and a contact point that braked joints alone
+# carry stays where it is.
+BRAKED = 1e30
 # Drive kinds, see dynsim.dynamics.drive.
 DC_MOTOR, POSITION_SERVO, OPEN_TORQUE = 0, 1, 2
 # DriveArrays.table, int

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import time as clock
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -78,6 +78,8 @@ class Prepared:
     choice: Choice
     balance: Balance | None = None
     dry: Sequence[DryFriction] = ()
+    # Contacts on their surfaces that brakes have left out, by name: since when [s].
+    behind_brakes: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def kind(self) -> str:

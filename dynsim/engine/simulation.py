@@ -32,6 +32,7 @@ from dynsim.dynamics.drive.law import take_measured_commands
 from dynsim.dynamics.state import block
 from dynsim.dynamics.tree import loads as kl
 from dynsim.engine import attended
+from dynsim.engine.brakes import Brakes
 from dynsim.engine.linearization import Linearization, linearized
 from dynsim.engine.operator import Operator
 from dynsim.engine.outcome import mark_stopped, raise_stopped
@@ -76,9 +77,6 @@ FASTEST_LANDING = 5.0
 SERVO_MODES = {"position": ka.POSITION_MODE, "velocity": ka.VELOCITY_MODE, "off": ka.OFF}
 # Buffers into which kernels sample; their sizes change.
 _BUFFERS = {f"run.{field}": field for field in ("sample_time", "sample", "output")}
-# Inertia of a joint whose brake is closed [kg m² or kg]: so large that loads do not change its position even by
-# rounding, and a contact point carried by braked joints alone stays where it is.
-BRAKED = 1e30
 
 
 class Simulation:
@@ -155,7 +153,7 @@ class Simulation:
         self._calls: list[Callable[[Simulation], None]] = []
         robot = self.robot
         self._guards.extend((kind, subject, None) for kind, subject in own_guards(self._prepared))
-        self._armature = self.model.armature
+        self._brakes = Brakes(scenario, self._prepared)
         self._joints = {link.joint: i for i, link in enumerate(robot.links)}
         self._motors = {motor.joint: a for a, motor in enumerate(robot.motors)}
         first = len(self._prepared.loads) - len(robot.bodies)
@@ -482,14 +480,14 @@ class Simulation:
         A joint that turns is brought to rest by an impulse, Δv = −M⁻¹ e v_j / (eᵀ M⁻¹ e) with e the joint's unit vector
         and M with rotors, and joint losses of the ledger take the kinetic energy, ½ v_j² / (eᵀ M⁻¹ e). Contacts of the
         unilateral law answer with impulses of their own; other constraints are met again by projection, which the
-        ledger does not see.
+        ledger does not see. A contact that braked joints alone would move along its normal is left out meanwhile.
         """
         j = _index(self._joints, joint, "joint")
         if any(joint in (coupling.joint, coupling.leader) for coupling in self.robot.couplings):
             raise ModelError(f"{joint}: a joint that is coupled to another has no brake of its own")
         run, model = self._prepared.run, self._prepared.model
         armature = model.arrays.body[:, ka.ARMATURE]
-        if closed == (armature[j] == BRAKED):
+        if closed == (armature[j] == ka.BRAKED):
             return
         self._settle_now()
         if closed:
@@ -499,20 +497,15 @@ class Simulation:
             run.y[run.layout.ledger + kst.JOINT] += 0.5 * v[j] ** 2 / response[j]
             v -= response * (v[j] / response[j])
             v[j] = 0.0
-        armature[j] = BRAKED if closed else self._armature[j]
-        self._set_floors()
+        armature[j] = ka.BRAKED if closed else self._brakes.armature[j]
+        self._prepared, sentences = self._brakes.leave_contacts_out(self._prepared, self._time)
+        for sentence in sentences:
+            log.warning("%s: %s", self._scenario.title, sentence)
         if (law := self._prepared.system.unilateral) is not None:
             law.dry_table[law.dry_table[:, ku.DRY_JOINT] == j, ku.DRY_BRAKE] = ku.CLOSED if closed else ku.OPENED
         if run.count[ki.MODES_DUE] == 0:
             run.count[ki.MODES_DUE] = ki.AFTER_JUMP
         self._restart()
-
-    def _set_floors(self) -> None:
-        """Let glued contacts have forces at any mobility while a brake is closed: behind brakes all are minute."""
-        workspace, law = self._prepared.workspace, self._prepared.system.contacts.law
-        braked = (self.model.arrays.body[:, ka.ARMATURE] == BRAKED).any()
-        first = workspace.active[: len(law), ka.FIRST_ROW]
-        workspace.rows[first, ka.ROW_FLOOR] = 0.0 if braked else law[:, ka.FLOOR]
 
     def release(self, joint: str) -> None:
         """Give a motor back to the controller and references of the scenario."""
@@ -593,7 +586,7 @@ class Simulation:
         arrays = {name: array.copy() for name, array in self._arrays().items()}
         attendants = [attendant.remembered() for attendant in self._attendants]
         trace, happened, pushed = self._trace.snapshot(), tuple(self._happened), frozenset(self._pushed)
-        shown = (pushed, self._base_as_planned)
+        shown = (pushed, self._base_as_planned, self._prepared.behind_brakes)
         return Snapshot(self._token, arrays, self._time, trace, happened, *shown, self._frozen, attendants)
 
     def restore(self, snapshot: Snapshot) -> None:
@@ -616,6 +609,7 @@ class Simulation:
         self._trace.restore(snapshot.trace)
         self._time, self._frozen, self._happened = snapshot.time, snapshot.frozen, list(snapshot.happened)
         self._pushed, self._base_as_planned = set(snapshot.pushed), snapshot.base_as_planned
+        self._prepared = replace(self._prepared, behind_brakes=snapshot.behind_brakes)
         for attendant, kept in zip(self._attendants, snapshot.attendants, strict=True):
             attendant.restore(kept)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -128,5 +129,6 @@ class Snapshot:
     happened: tuple[Event, ...]
     pushed: frozenset[int]
     base_as_planned: bool
+    behind_brakes: Mapping[str, float]
     frozen: bool
     attendants: list[dict[str, Any]]

@@ -120,8 +120,8 @@ def _contact_warnings(
                 f"{percent(contact['pulling_fraction'])} of the run, with up to "
                 f"{-contact['normal_force_min_N']:.3g} N; a real arm would lift off"
             )
-    left_out = {contact.name for contact in contacts if contact.left_out}
-    warnings += build.left_out_warnings(scenario, contacts)
+    left_out = {contact.name for contact in contacts if contact.left_out} | prepared.behind_brakes.keys()
+    warnings += build.left_out_warnings(scenario, contacts, prepared.behind_brakes)
     initial, columns = scenario.config.initial, record.labels["contact_gap"]
     placed = () if initial is None else initial.on_surface
     # Of a ring, nobody knows what was before it.

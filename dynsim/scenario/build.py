@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
@@ -368,7 +369,7 @@ def contacts(scenario: Scenario, described: Robot | None = None) -> list[Contact
         )
     if result:
         places = [contact.geometry for contact in result]
-        still = recall("left out", lambda: immobile(described, result), described, places)
+        still = recall("left out", lambda: immobile(Model(described), result), described, places)
         result = [replace(contact, left_out=left_out) for contact, left_out in zip(result, still, strict=True)]
     if options.candidates != "points":
         law = _law(options, ContactPoint(body=""))
@@ -522,15 +523,29 @@ def _check_body(scenario: Scenario, robot: Robot, contact: Contact) -> None:
         raise ModelError(f"{dotted(keys)}: {error}", keys=keys) from error
 
 
-def left_out_warnings(scenario: Scenario, contacts: Sequence[Contact]) -> list[str]:
-    """Return a sentence for each contact that no joint moves along the normal of its surface."""
-    left_out = [contact for contact in contacts if contact.left_out]
-    keys = [_keys_of(scenario, contact) for contact in left_out]
-    return [
-        f"{dotted(key) if declared else contact.name}: no joint moves this point along the normal of "
-        f"{contact.surface_name}, so its force changes no motion; it is left out of the contacts, with a force of zero"
-        for contact, (declared, key) in zip(left_out, keys, strict=True)
-    ]
+def left_out_warnings(
+    scenario: Scenario, contacts: Sequence[Contact], behind_brakes: Mapping[str, float] = MappingProxyType({})
+) -> list[str]:
+    """Return a sentence for each contact that no joint moves along the normal of its surface.
+
+    behind_brakes : those that only joints with a closed brake would move, by name, and since when [s]
+    """
+    sentences = []
+    for contact in contacts:
+        declared, keys = _keys_of(scenario, contact)
+        name, surface = dotted(keys) if declared else contact.name, contact.surface_name
+        if contact.left_out:
+            sentences.append(
+                f"{name}: no joint moves this point along the normal of {surface}, so its force changes no motion; "
+                "it is left out of the contacts, with a force of zero"
+            )
+        elif contact.name in behind_brakes:
+            sentences.append(
+                f"{name}: from t = {behind_brakes[contact.name]:.4g} s on, no joint without a closed brake moves this "
+                f"point along the normal of {surface}, so its force changes no motion; it is left out of the contacts, "
+                "with a force of zero, while these brakes are closed"
+            )
+    return sentences
 
 
 def _remedy(scenario: Scenario, off: Sequence[Contact]) -> str:

@@ -1,0 +1,57 @@
+"""Brakes of a stepped simulation: very heavy joints, and the contacts that only these would move."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from dynsim.compile.mobility import immobile, mobility_floors
+from dynsim.compile.shapes import gap_at
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact.rows import set_modes
+from dynsim.dynamics.state import block
+from dynsim.engine.prepare import Prepared
+from dynsim.jit.kernel import integers
+from dynsim.scenario import Scenario, build
+
+
+class Brakes:
+    """What joints and contacts are like without brakes, and which contacts are left out behind brakes.
+
+    Attributes
+    ----------
+    armature : of the joints without brakes, (n,) [kg m² or kg]
+    """
+
+    def __init__(self, scenario: Scenario, prepared: Prepared) -> None:
+        self.armature = prepared.model.armature
+        self._scenario = scenario
+        self._floors = prepared.system.contacts.law[:, ka.FLOOR].copy()
+
+    def leave_contacts_out(self, prepared: Prepared, time: float) -> tuple[Prepared, list[str]]:
+        """Leave out the contacts that only braked joints would move along their normals, and take back the others.
+
+        The force of such a contact would be any share of what the brakes carry. Call it at a time [s] at which brakes
+        have closed or opened. Returns a sentence for each contact on its surface that is left out for the first time.
+        """
+        model, contacts, workspace = prepared.model, prepared.contacts, prepared.workspace
+        table, law = prepared.system.contacts.link, prepared.system.contacts.law
+        braked = set(np.flatnonzero(model.arrays.body[:, ka.ARMATURE] == ka.BRAKED).tolist())
+        q = prepared.run.y[block(prepared.run.layout, "q")]
+        before = table[:, ka.LEFT_OUT].copy()
+        still = immobile(model, contacts, braked, q) if braked else [False] * len(contacts)
+        table[:, ka.LEFT_OUT] = [contact.left_out or now for contact, now in zip(contacts, still, strict=True)]
+        if prepared.system.unilateral is None and contacts:
+            law[:, ka.FLOOR] = mobility_floors(model, contacts, braked, q) if braked else self._floors
+            if (table[:, ka.LEFT_OUT] != before).any():
+                modes = np.where(table[:, ka.LEFT_OUT] == 1, ka.OPEN, ka.SLIDING)
+                set_modes(prepared.system.contacts, prepared.system.couplings, None, workspace, integers(modes))
+            first = workspace.active[: len(contacts), ka.FIRST_ROW]
+            workspace.rows[first, ka.ROW_FLOOR] = law[:, ka.FLOOR]
+        known, since = prepared.behind_brakes, dict[str, float]()
+        for k in np.flatnonzero(table[:, ka.LEFT_OUT] > before):
+            if contacts[k].name not in known and gap_at(model, contacts[k], q) <= build.START_TOLERANCE:
+                since[contacts[k].name] = time
+        sentences = build.left_out_warnings(self._scenario, [c for c in contacts if c.name in since], since)
+        return replace(prepared, behind_brakes={**known, **since}), sentences
