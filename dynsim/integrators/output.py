@@ -14,6 +14,8 @@ from dynsim.dynamics.tree import support as ks
 from dynsim.dynamics.tree.points import point_position
 from dynsim.dynamics.tree.support import ground_reaction
 from dynsim.integrators.run import Run
+from dynsim.integrators.stepping import tables as kt
+from dynsim.integrators.stepping.tables import SteppingArrays
 from dynsim.jit.kernel import internal_kernel
 
 
@@ -33,9 +35,7 @@ def fill_output(system: System, ws: Workspace, run: Run, out):
         out[columns.vdot + i] = joints[i, ka.QDD]
     fill_drives(system, ws, run, out)
     point_position(ws, run.hand_link, run.hand_point, out[columns.hand : columns.hand + 3])
-    out[columns.energy] = kinetic_energy(system.model, ws)
-    out[columns.energy + 1] = potential_energy(system.model, ws)
-    out[columns.energy + 2] = magnetic_energy(system.drives, ws)
+    fill_energies(system, ws, run, out)
     k = columns.contact
     for c in range(state.shape[0]):
         out[k + kst.OUT_FORCE] = state[c, ka.NORMAL_FORCE]
@@ -49,6 +49,15 @@ def fill_output(system: System, ws: Workspace, run: Run, out):
 
 
 @internal_kernel
+def fill_energies(system: System, ws: Workspace, run: Run, out):
+    """Kinetic, potential and magnetic energy of the last sweep and its currents."""
+    energy = run.columns.energy
+    out[energy] = kinetic_energy(system.model, ws)
+    out[energy + 1] = potential_energy(system.model, ws)
+    out[energy + 2] = magnetic_energy(system.drives, ws)
+
+
+@internal_kernel
 def fill_drives(system: System, ws: Workspace, run: Run, out):
     """Currents, voltages and shaft torques of the motors, at the accelerations that are in ``out``."""
     joints, motors, motor, columns = ws.joints, ws.motors, system.drives.motor, run.columns
@@ -56,13 +65,27 @@ def fill_drives(system: System, ws: Workspace, run: Run, out):
         i = system.drives.table[a, ka.DRIVEN]
         out[columns.current + a] = motors[a, ka.CURRENT]
         out[columns.voltage + a] = motors[a, ka.VOLTAGE]
-        out[columns.torque + a] = (
+        steady = (
             motor[a, ka.K_M] * motors[a, ka.CURRENT]
-            - motor[a, ka.J_M] * out[columns.vdot + i]
             - motor[a, ka.D_M] * joints[i, ka.QD]
             - motors[a, ka.DRAG]
             - motors[a, ka.DRY_DRAG]
         )
+        out[columns.torque + a] = with_rotor(run.stepping, steady, motor[a, ka.J_M] * out[columns.vdot + i], a)
+
+
+@internal_kernel
+def with_rotor(stepping: SteppingArrays | None, steady, inertial, a):
+    """Shaft torque of motor a at a constant rate, ``steady``, less what its rotor takes, ``inertial``.
+
+    Impulses are no part of recorded torques. In the steps of an impact, whose accelerations have one in them, the
+    torque is that of the last step without; at the start of a run that of a constant rate.
+    """
+    if stepping is None:  # known to the compiler
+        return steady - inertial
+    if stepping.grid[kt.HELD_STEPS] == 0.0:
+        return steady - inertial
+    return stepping.torque[a] if stepping.torque[a] == stepping.torque[a] else steady
 
 
 @internal_kernel

@@ -148,6 +148,29 @@ def test_a_load_that_jumps_is_in_the_sample_at_its_jump(arm, method):
     assert np.abs(pushed["vdot"][k] - plain["vdot"][k]).max() > 1.0
 
 
+@pytest.mark.parametrize("method", METHODS[3:], ids=ids)
+def test_a_sample_at_which_a_brake_closes_is_from_after_it(arm, method):
+    """Under time stepping it had the rates, energies and losses of before."""
+    simulation = Simulation(arm(**method))
+    simulation.set_reference("joint_2", np.radians(-40.0), 4.0)
+    simulation.advance(0.1)
+    simulation.set_brake("joint_2", True)
+    state = simulation.state
+    simulation.advance(0.2)
+    record = simulation.record()
+    at = int(np.abs(record.time - 0.1).argmin())
+    assert abs(record["v"][at - 1, 1]) > 0.5
+    assert record["v"][at, 1] == 0.0
+    np.testing.assert_allclose(record["v"][at], state.v, rtol=0.0, atol=1e-14)
+    np.testing.assert_allclose(record["q"][at], state.q, rtol=0.0, atol=1e-14)
+    # What the other joint has left, with its rotor of 1.64e-4 kg m² behind a gear of 3; the braked one rests.
+    energy = 0.5 * (simulation.model.mass_matrix(state.q)[0, 0] + 9.0 * 1.64e-4) * state.v[0] ** 2
+    assert record["energy_kinetic"][at] == pytest.approx(energy, rel=1e-12)
+    assert record["loss_joint"][at] > record["loss_joint"][at - 1] + 1e-3
+    # Within one period at rtol 1e-6, and the brake takes some 0.01 J.
+    assert abs(record["energy_residual"][at] - record["energy_residual"][at - 1]) < 1e-7
+
+
 def test_servos_of_a_snake_have_the_commands_of_their_sample():
     """u = k_p (φ_d − φ) + k_d (φ_d' − φ'), k_v (ρ_d' − ρ') + K_m ρ': from the first tick to the end of the run."""
     changes = {"plant.level": "dynamic", "duration_s": 0.3, "record.rate_hz": 200}

@@ -29,7 +29,7 @@ from dynsim.dynamics.contact.cone.steps import motion
 from dynsim.dynamics.contact.mobility import moves_along_normal
 from dynsim.dynamics.contact.rows import point_row, set_modes
 from dynsim.dynamics.contact.unilateral import UnilateralArrays, dry_bound, sliding_friction, stop_gap
-from dynsim.dynamics.tables import Workspace
+from dynsim.dynamics.tables import ModelArrays, Workspace
 from dynsim.dynamics.tree.spatial import dot_vector, point_velocity, six, times_number, vector
 from dynsim.integrators.stepping import tables as kt
 from dynsim.integrators.stepping.compliance import (
@@ -57,8 +57,6 @@ RETURN_TIME, RETURN_STEPS, RETURN_SPEED = 0.02, 10.0, 0.02
 MOST_UNSOLVED = 1e3
 # Gaps by which the scheme itself sways, in units of h |a_n|, are none: feedback on them would feed energy.
 SWAY = 2.0
-# A joint with a mobility below this is behind a closed brake, and nothing moves it back [1/kg or 1/(kg m²)].
-BRAKED_MOBILITY = 1e-20
 
 
 @internal_kernel
@@ -67,15 +65,15 @@ def recall(system, s: SteppingArrays, ws: Workspace, y):
 
     Its rows at y, half a step before the midpoint, stand for those of the last step: h/(h + 0) of what turns. Sweeps.
     """
-    layout, same = system.layout, s.grid[kt.LENGTH_LAST] > 0.0
-    for i in range(s.before.shape[1]):
-        same = same and s.before[kt.V_LAST, i] == y[layout.v + i]
-    if same:
+    layout = system.layout
+    if s.grid[kt.LENGTH_LAST] > 0.0 and not rates_jumped(s, y, layout.v):
         return
-    s.grid[kt.LENGTH_LAST] = 0.0
+    s.grid[kt.LENGTH_LAST], s.grid[kt.HELD_STEPS] = 0.0, 0.0
     place_joints(system, ws, y)
     for i in range(s.before.shape[1]):
         ws.joints[i, ka.QD], ws.joints[i, ka.QDD] = y[layout.v + i], 0.0
+    for a in range(s.torque.shape[0]):
+        s.torque[a] = math.nan
     geometry(system, system.model, ws)
     for k in range(ws.contacts.shape[0]):
         last, state = s.memory[kt.LAST, k], ws.contacts[k]
@@ -94,6 +92,15 @@ def recall(system, s: SteppingArrays, ws: Workspace, y):
         if last[kt.END_RATE] >= -kt.BAD:
             slip = slip_of_rates(system.contacts.law, k, last[kt.END_RATE + 1], last[kt.END_RATE + 2])
             last[kt.LISTED], last[kt.CLOSED], last[kt.SLID] = 1.0, 1.0, 1.0 if slip > kt.BAD else 0.0
+
+
+@internal_kernel
+def rates_jumped(s: SteppingArrays, y, first):
+    """True if the rates, from ``first`` on in y, are not those at the end of the last step."""
+    jumped = False
+    for i in range(s.before.shape[1]):
+        jumped = jumped or s.before[kt.V_LAST, i] != y[first + i]
+    return jumped
 
 
 @internal_kernel
@@ -124,7 +131,7 @@ def list_contacts(system, s: SteppingArrays, ws: Workspace, h):
 
     What was closed stays on the list while its place goes on: over convex surfaces the midpoint is above them.
     """
-    stops, ties = close_stops(system.unilateral, ws), list_ties(system.unilateral, ws)
+    stops, ties = close_stops(system.model, system.unilateral, ws), list_ties(system.unilateral, ws)
     changed = stops or ties
     for k in range(ws.contacts.shape[0]):
         last = s.memory[kt.LAST, k]
@@ -179,11 +186,15 @@ def centre(shapes, state, k):
 
 
 @internal_kernel
-def close_stops(unilateral: UnilateralArrays, ws: Workspace):
-    """Close the joint stops whose gap is not open, open the others; True when one has changed."""
+def close_stops(model: ModelArrays, unilateral: UnilateralArrays, ws: Workspace):
+    """Close the joint stops whose gap is not open, open the others; True when one has changed.
+
+    A closed brake has all of the load of its joint, and a stop none.
+    """
     table, changed = unilateral.stop_table, False
     for k in range(table.shape[0]):
-        closed = 1 if stop_gap(unilateral, ws, k) <= kt.MARGIN else 0
+        braked = model.body[table[k, ku.STOP_JOINT], ka.ARMATURE] >= ka.BRAKED
+        closed = 1 if stop_gap(unilateral, ws, k) <= kt.MARGIN and not braked else 0
         changed = changed or closed != table[k, ku.STOP_CLOSED]
         table[k, ku.STOP_CLOSED] = closed
     return changed
@@ -293,7 +304,7 @@ def stop_return(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, 
     The impulse of the last step, ``s.f`` of its row, says how much energy this rate needs.
     """
     loss, rate, row = unilateral.stop[k, ku.STOP_LOSS], 0.0, unilateral.stop_table[k, ku.STOP_ROW]
-    if loss > 0.0 and ws.small[0, row, row] > BRAKED_MOBILITY:
+    if loss > 0.0:
         rate = return_rate(min(stop_gap(unilateral, ws, k), 0.0), 0.0, loss, h)
         impulse = s.f[row]
         if rate * impulse > loss:
@@ -445,6 +456,27 @@ def slip_ends(s: SteppingArrays, ws: Workspace):
             for m in range(1, 3):
                 s.turn[k, kt.ADDED + m] = s.turn[k, kt.TURNED + m]
     return ends
+
+
+@internal_kernel
+def strikes(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace):
+    """True if a rigid contact, maybe at another place of its body, or a joint stop has struck in this step."""
+    for k in range(unilateral.stop_table.shape[0]):
+        closes = unilateral.stop_table[k, ku.STOP_CLOSED] > unilateral.stop_table[k, ku.STOP_BEFORE]
+        if closes and is_stopped(s, unilateral.stop_table[k, ku.STOP_ROW]):
+            return True
+    for k in range(ws.contacts.shape[0]):
+        begins = s.memory[kt.LAST, k, kt.CLOSED] == 0.0 or s.turn[k, kt.KNOWN] == 0.0
+        rigid = s.memory[kt.NOW, k, kt.LISTED] == 1.0 and law[k, ka.CONTACT_STIFFNESS] == 0.0
+        if begins and rigid and is_stopped(s, ws.active[k, ka.FIRST_ROW]):
+            return True
+    return False
+
+
+@internal_kernel
+def is_stopped(s: SteppingArrays, r):
+    """True if row r came near at the start of the step, and its force has stopped or reversed that."""
+    return s.rate[0, r] < -kt.BAD and s.f[r] > 0.0
 
 
 @internal_kernel

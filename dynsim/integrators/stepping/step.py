@@ -18,17 +18,19 @@ from dynsim.integrators import run as ki
 from dynsim.integrators.contacts import events as ke
 from dynsim.integrators.dense import sampled_now
 from dynsim.integrators.events import take_ticks
-from dynsim.integrators.output import fill_drives, write_output
+from dynsim.integrators.output import fill_drives, fill_energies, write_output
 from dynsim.integrators.run import Run
 from dynsim.integrators.stepping import tables as kt
 from dynsim.integrators.stepping.compliance import book_soft_contact, book_ties
 from dynsim.integrators.stepping.contacts import (
     list_contacts,
     note_contacts,
+    rates_jumped,
     recall,
     remember,
     slip_of_rates,
     solve_contacts,
+    strikes,
     tangent_rows,
 )
 from dynsim.integrators.stepping.discretisation_energy import begin_energy, drive_work, midpoint_work, stored_energy
@@ -265,6 +267,32 @@ def count_step(unilateral: UnilateralArrays, law, s: SteppingArrays, ws: Workspa
 
 
 @internal_kernel
+def keep_torques(system: System, ws: Workspace, run: Run):
+    """Shaft torques of the accepted step, at x_θ, unless it has an impact: before its samples, and ``remember``.
+
+    The mean acceleration of an impact is Δv/h, which has no limit as steps become shorter. So is that of the next step,
+    which makes up for rows of what has landed that turned within the step of the landing.
+    """
+    s, motor, y, y_new, layout = run.stepping, system.drives.motor, run.y, run.y_new, system.layout
+    if strikes(system.contacts.law, system.unilateral, s, ws):
+        s.grid[kt.HELD_STEPS] = 2.0
+    else:
+        s.grid[kt.HELD_STEPS] = max(s.grid[kt.HELD_STEPS] - 1.0, 0.0)
+    if s.grid[kt.HELD_STEPS] > 0.0:
+        return
+    for a in range(ws.motors.shape[0]):
+        i = system.drives.table[a, ka.DRIVEN]
+        v = y[layout.v + i] + s.theta * (y_new[layout.v + i] - y[layout.v + i])
+        s.torque[a] = (
+            motor[a, ka.K_M] * ws.motors[a, ka.CURRENT]
+            - motor[a, ka.J_M] * s.before[kt.ACCELERATION, i]
+            - motor[a, ka.D_M] * v
+            - ws.motors[a, ka.DRAG]
+            - ws.motors[a, ka.DRY_DRAG]
+        )
+
+
+@internal_kernel
 def tell_changes(unilateral: UnilateralArrays, s: SteppingArrays, run: Run):
     """Log and count what the accepted step has changed, at its end; True when the caller is to empty the ke.log.
 
@@ -369,7 +397,7 @@ def commands_due(system: System, ws: Workspace, run: Run):
         take_commands(system.drives, system.reference, run.clock[ki.TIME], ws)
     run.count[ki.TICKED] = due & ~ki.TAKE_COMMANDS
     if due & ki.TAKE_COMMANDS or run.count[ki.STARTED] == 0:
-        rewrite_drives(system, ws, run)
+        rewrite_sample(system, ws, run)
     if run.count[ki.STARTED] == 0:
         run.count[ki.STARTED] = 1
         for i in range(ws.joints.shape[0]):
@@ -378,16 +406,29 @@ def commands_due(system: System, ws: Workspace, run: Run):
 
 
 @internal_kernel
-def rewrite_drives(system: System, ws: Workspace, run: Run):
+def rewrite_sample(system: System, ws: Workspace, run: Run):
     """Currents, voltages and torques of a sample at TIME, recorded at the end of the last step, by the commands from
-    now on. Its accelerations and forces are still the means of that step."""
+    now on; where a brake has closed since, its state too. Accelerations and forces are still the means of that step."""
     if not sampled_now(run):
         return
+    last, columns = run.count[ki.SAMPLE] - 1, run.columns
+    row, out = run.sample[last], run.output[last]
     place_joints(system, ws, run.y)
     for i in range(ws.joints.shape[0]):
         ws.joints[i, ka.QD], ws.joints[i, ka.APPLIED] = run.y[system.layout.v + i], 0.0
     drive(system.drives, system.reference, run.clock[ki.TIME], run.y, system.layout, ws)
-    fill_drives(system, ws, run, run.output[run.count[ki.SAMPLE] - 1])
+    fill_drives(system, ws, run, out)
+    if not rates_jumped(run.stepping, run.y, system.layout.v):
+        return
+    for j in range(row.shape[0]):
+        row[j] = run.y[j]
+    # The next step begins with a sweep of its own.
+    geometry(system, system.model, ws)
+    fill_energies(system, ws, run, out)
+    for k in range(ws.contacts.shape[0]):
+        for m in range(3):
+            at = columns.contact + k * kst.OUTPUTS_PER_CONTACT + kst.OUT_SLIP + m
+            out[at] = ws.contacts[k, ka.SLIP_VELOCITY + m]
 
 
 @internal_kernel
@@ -427,6 +468,7 @@ def advance_moreau(system: System, ws: Workspace, run: Run, limit):
                 return
         count[ki.PENDING] = 0
         watch(ws, run, clock[ki.STEP])
+        keep_torques(system, ws, run)
         count_step(system.unilateral, system.contacts.law, run.stepping, ws, clock[ki.STEP])
         sample_moreau(system, ws, run)
         for j in range(run.y.shape[0]):

@@ -77,9 +77,10 @@ FREE, PER, DIDT_THEN = 0, 1, 2
 START, STOP = 0, 1
 MECHANICAL, MAGNETIC = 0, 1
 # SteppingArrays.grid: time from which steps of one length are counted [s], how many have been since; length of the last
-# accepted step [s], the power of drives and loads in it, and in the step that is tried [W].
-GRID_START, GRID_STEPS, LENGTH_LAST, POWER_LAST, POWER_NOW = 0, 1, 2, 3, 4
-GRID_SIZE = 5
+# accepted step [s], the power of drives and loads in it, and in the step that is tried [W]; for how many steps motors
+# keep their torques because of an impact, the last one included.
+GRID_START, GRID_STEPS, LENGTH_LAST, POWER_LAST, POWER_NOW, HELD_STEPS = 0, 1, 2, 3, 4, 5
+GRID_SIZE = 6
 
 
 class SteppingArrays(NamedTuple):
@@ -89,6 +90,7 @@ class SteppingArrays(NamedTuple):
     body: np.ndarray  # (n, BODY_SIZE) as that of the model, its ARMATURE with what is implicit
     linear: np.ndarray  # (na, BLOCK_SIZE)
     segment: np.ndarray  # (na,) int: which limit holds each drive, see dynsim.dynamics.drive.law.segment_of
+    torque: np.ndarray  # (na,) on the shafts, in the last accepted step without an impact [N m or N]; NaN: none yet
     eliminated: np.ndarray  # (na, 3) i' − i at v' = v, what v' − v adds to it; di/dt at the start
     before: np.ndarray  # (BEFORE_SIZE, n) see V_START and what follows it
     energy: np.ndarray  # (2, 2) at START and STOP of the step: MECHANICAL and MAGNETIC [J]
@@ -126,6 +128,7 @@ def stepping_arrays(
         body=reals(model.body),
         linear=np.zeros((na, ka.BLOCK_SIZE)),
         segment=integers(np.zeros(na)),
+        torque=np.full(na, np.nan),
         eliminated=np.zeros((na, 3)),
         before=np.zeros((BEFORE_SIZE, n)),
         energy=np.full((2, 2), np.nan),
