@@ -15,7 +15,7 @@ from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.cone import problem as kc
 from dynsim.dynamics.contact.cone.socp import split_size
-from dynsim.dynamics.contact.unilateral import UnilateralArrays, kept_size
+from dynsim.dynamics.contact.unilateral import UnilateralArrays, kept_size, share_count
 from dynsim.errors import ModelError
 from dynsim.jit.kernel import integers, reals
 from dynsim.model.description import Contact, Robot, Tie
@@ -73,6 +73,7 @@ def compile_unilateral(
     dry : joints that rub
     """
     c, s, ties = len(contacts), len(stops), robot.ties
+    shares = share_count(len(robot.couplings), c, s, len(dry))
     p = ka.row_limit(c, len(robot.couplings) + s + len(dry) + len(ties))
     stop_table, stop = np.zeros((s, ku.STOP_TABLE_SIZE), dtype=np.int64), np.zeros((s, ku.STOP_SIZE))
     for k, limit in enumerate(stops):
@@ -108,7 +109,8 @@ def compile_unilateral(
         room=reals(np.zeros((ku.ROOM, p, p))),
         split_room=reals(np.zeros(split_size(3 * c + len(dry), c + len(dry)))),
         number=reals(number),
-        kept=reals(np.zeros(kept_size(c, s, len(dry)))),
+        shares=reals(np.zeros(shares)),
+        kept=reals(np.zeros(kept_size(shares, c, s, len(dry)))),
     )
 
 

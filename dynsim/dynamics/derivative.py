@@ -10,12 +10,12 @@ from typing import NamedTuple
 import numpy as np
 
 from dynsim.dynamics import tables as ka
-from dynsim.dynamics.contact.delassus import solve_small
 from dynsim.dynamics.contact.distance import ShapeArrays
 from dynsim.dynamics.contact.m_star import solve_m_star
 from dynsim.dynamics.contact.quadrics import contact_rows, sign_changed
 from dynsim.dynamics.contact.rows import set_modes
 from dynsim.dynamics.contact.shapes import shaped_rows
+from dynsim.dynamics.contact.shares import solve_rows
 from dynsim.dynamics.contact.splits import admissible_forces
 from dynsim.dynamics.contact.unilateral import UnilateralArrays, rub
 from dynsim.dynamics.drive.law import drive
@@ -71,14 +71,14 @@ def new_workspace(system: System) -> Workspace:
 
 
 @internal_kernel
-def constrained_acceleration(model: ModelArrays, ws: Workspace):
+def constrained_acceleration(model: ModelArrays, unilateral: UnilateralArrays | None, ws: Workspace):
     """vdot and row forces of the applied forces, by the articulated solve, into ``ws.joints`` and ``ws.rows``."""
     factor(model, ws)
     p, passes = ws.counts[ka.ROWS], 0
     while p > 0:
         passes += 1
         row_system(model, ws)
-        ws.counts[ka.DEPENDENT] += solve_small(ws.small, ws.rows, ws.active, p)
+        ws.counts[ka.DEPENDENT] += solve_rows(unilateral, ws, p)
         if not sign_changed(ws, passes):
             break
     add_row_forces(model, ws)
@@ -86,7 +86,14 @@ def constrained_acceleration(model: ModelArrays, ws: Workspace):
 
 
 @internal_kernel
-def m_star_acceleration(dense, model: ModelArrays, drives: DriveArrays, ws: Workspace, dependent):
+def m_star_acceleration(
+    dense,
+    model: ModelArrays,
+    drives: DriveArrays,
+    unilateral: UnilateralArrays | None,
+    ws: Workspace,
+    dependent,
+):
     """The same unknowns by the dense M*, where ``dense`` has room for it.
 
     The articulated solve has run before, because projection uses its factors; the rows that it saw depend on others
@@ -96,10 +103,10 @@ def m_star_acceleration(dense, model: ModelArrays, drives: DriveArrays, ws: Work
         return
     ws.counts[ka.DEPENDENT] = dependent
     passes = 1
-    solve_m_star(dense, model, drives, ws)
+    solve_m_star(dense, model, drives, unilateral, ws)
     while sign_changed(ws, passes):
         passes += 1
-        solve_m_star(dense, model, drives, ws)
+        solve_m_star(dense, model, drives, unilateral, ws)
 
 
 @kernel
@@ -128,8 +135,8 @@ def derivative(system: System, t, y, ws: Workspace, dy):
     contact_rows(model, contacts, system.unilateral, ws)
     shaped_rows(system.shapes, system.unilateral, model, contacts, ws)
     dependent = ws.counts[ka.DEPENDENT]
-    constrained_acceleration(model, ws)
-    m_star_acceleration(system.dense, model, drives, ws, dependent)
+    constrained_acceleration(model, system.unilateral, ws)
+    m_star_acceleration(system.dense, model, drives, system.unilateral, ws, dependent)
     admissible_forces(system.contacts, system.unilateral, ws)
 
     if not plain:

@@ -16,6 +16,8 @@ Finding = Iterator[str]
 
 # Share of the turnover above which a ledger must warn.
 RESIDUAL = 1e-6
+# How far ten landings are off together, each being found to 1e-13 m (docs/physics.md) [m].
+LANDINGS_M = 1e-12
 
 
 def ledger(seen: Observed) -> Finding:
@@ -152,8 +154,7 @@ def residual_floor(seen: Observed) -> float:
         np.abs(record["energy_magnetic"]),
     )
     floor = seen.scenario.integrator.rtol * max(lever * g, *(float(store.max(initial=0.0)) for store in stores))
-    # Landings are located to some 1e-10 m (docs/physics.md); ten of them.
-    return max(floor, mass * g * 1e-3 * RESIDUAL) if seen.real and floor == 0.0 else floor
+    return max(floor, mass * g * LANDINGS_M / RESIDUAL) if seen.real else floor
 
 
 def turnover_and_residual(seen: Observed) -> tuple[float, float]:

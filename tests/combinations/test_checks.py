@@ -17,6 +17,7 @@ from support.random_robots import random_positions, random_robot, random_robot_o
 from combinations.accelerations import critical
 from combinations.bodies import Bodies, position_rates
 from combinations.checks import compare, problems
+from combinations.energy import residual_floor
 from combinations.observed import Observed
 from combinations.running import Run
 from combinations.surfaces import nearest, shape
@@ -188,6 +189,18 @@ def test_corrupted_signals_are_found(method: str, fault: str) -> None:
     changes, expected = SPOILT[fault]
     spoilt = _spoilt(_run(method), **changes)
     assert expected <= _kinds(spoilt)
+
+
+def test_the_floor_of_the_residual_is_that_of_the_summary() -> None:
+    """An arm that its dry friction holds turns over less than its ledger resolves."""
+    settings = {**deepcopy(ARM), "duration_s": 0.02, "integrator": {"method": "radau5"}}
+    del settings["objects"], settings["loads"]
+    settings["plant"]["chain"][1]["friction_N_m"] = settings["plant"]["chain"][2]["friction_N_m"] = 10.0
+    run = _simulated(settings)
+    assert problems(settings, run) == []
+    # 1 kg, of which each landing may leave 1e-13 m times the weight, ten of them up to the limit of 1e-6.
+    assert residual_floor(Observed(run)) == pytest.approx(1.0 * 9.81 * 1e-6, rel=1e-3)
+    assert "ledger" in _kinds(_spoilt(run, energy_electrical=_shifted(1e-9, 5)))
 
 
 def _below(data: np.ndarray) -> np.ndarray:

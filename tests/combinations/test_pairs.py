@@ -24,12 +24,6 @@ PAIRS = 188
 FEW = 30
 # Those of them that the default tests run: others take seconds.
 QUICK = {1, 2, 3, 4, 5, 6, 7, 8, 11}
-# Scenes among these with a problem that is known and not mended yet, or a check that is too strict for them.
-OPEN = {
-    0: "radau5 chatters at 5 ms: dry friction in two joints of a floating robot, links and a sphere",
-    8: "radau5: a joint creeps at 4e-5 rad/s with its friction reversed",
-    19: "radau5: the residual by the signals is 1.4e-8, that of the summary 2e-9",
-}
 # Scenes of the slow study.
 TRIPLES = 1000
 # What a few refused levels are completed to a whole scene from.
@@ -103,12 +97,9 @@ def _possible(wanted: dict[str, str], method: str) -> bool:
     )
 
 
-def _marks(number: int) -> list[pytest.MarkDecorator]:
-    marks = [pytest.mark.xfail(reason=OPEN[number], strict=False)] if number in OPEN else []
-    return marks if number in QUICK else [*marks, pytest.mark.long]
-
-
-@pytest.mark.parametrize("number", [pytest.param(number, marks=_marks(number)) for number in range(FEW)])
+@pytest.mark.parametrize(
+    "number", [pytest.param(number, marks=() if number in QUICK else pytest.mark.long) for number in range(FEW)]
+)
 def test_few_scenes(number: int, tmp_path: Path) -> None:
     _holds(number, tmp_path, takes=_shares_a_program)
 

@@ -471,3 +471,33 @@ def test_a_joint_that_rests_on_its_stop_takes_no_share_of_its_force(tmp_path: Pa
     assert record["stop_force"].max() > 0.1
     assert np.abs(record["joint_friction"]).max(axis=0) == pytest.approx([0.245, 0.0245, 0.0245, 0.0245, 0.245])
     assert abs(record.summary["energy_residual_relative"]) < 1e-6
+
+
+LIFTED = """\
+duration_s: 0.8
+plant:
+  type: serial_arm
+  chain: [{axis: y, length_m: 0.5, mass_kg: 1, initial_deg: 90, friction_N_m: 1}]
+surfaces: {floor: {type: plane}}
+contacts:
+  law: unilateral
+  friction: 0
+  points: {tip: {body: link_1, point_m: [0, 0, 0.5]}}
+loads:
+  lift: {type: samples, body: link_1, point_m: [0, 0, 0.5], times_s: [0, 1], force_N: [[0, 0, 0], [0, 0, 10]]}
+integrator: {method: dopri5, rtol: 1.0e-5, atol: 1.0e-6}
+"""
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_friction_goes_on_holding_a_joint_whose_contact_leaves(tmp_path: Path, method: str):
+    """A lever rests on a floor and on its friction, until 10 N/s times half a metre is its weight and that friction."""
+    path = tmp_path / "lifted.yaml"
+    path.write_text(LIFTED, encoding="utf-8")
+    record = simulate(load_scenario(path, None, {"integrator.method": method}))
+    assert [(event.kind, event.name) for event in record.events] == [("lift_off", "tip"), ("slip_start", "joint_1")]
+    breaks = (9.81 * 0.25 + 1.0) / 5.0
+    assert record.events[1].time == pytest.approx(breaks, abs=1e-6)  # the root of a force that is linear in time
+    before = record.time < breaks
+    assert np.abs(record["v"][before]).max() < 1e-12
+    assert np.ptp(record["q"][before]) < 1e-12

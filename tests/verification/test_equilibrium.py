@@ -308,3 +308,16 @@ def test_compliant_contacts_start_pressed_in(tmp_path):
     np.testing.assert_allclose(force[corners], 0.5 * 9.81 / 4.0, rtol=1e-6)
     assert force[names.index("elbow")] > 0.1
     np.testing.assert_allclose(record["q"][-1], record["q"][0], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("stiffness", "moves"), [("2.0e+4", False), ("100", True)])
+def test_a_start_that_pressing_moves_far_is_told(tmp_path, stiffness, moves):
+    """Springs so soft that they press only centimetres deep move the joints of the arm; the warning has the number."""
+    path = tmp_path / "soft.yaml"
+    path.write_text(COMPLIANT.replace("2.0e+4", stiffness))
+    record = simulate(load_scenario(path))
+    (moved,) = np.degrees(record["q"][:1, :2]) - [120.0, -30.0]
+    assert (np.abs(moved).max() > 1.0) == moves
+    said = [text for text in record.summary["warnings"] if "from the requested posture" in text]
+    assert len(said) == moves
+    assert all(f"joint_1 by {moved[0]:.3g}°" in text for text in said)

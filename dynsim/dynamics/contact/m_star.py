@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dynsim.dynamics import tables as ka
-from dynsim.dynamics.contact.delassus import solve_small
+from dynsim.dynamics.contact.shares import solve_rows
+from dynsim.dynamics.contact.unilateral import UnilateralArrays
 from dynsim.dynamics.drive.dc import dc_balance
 from dynsim.dynamics.tables import DriveArrays, ModelArrays, Workspace
 from dynsim.dynamics.tree.sweep import mass_matrix, newton_euler
@@ -11,7 +12,7 @@ from dynsim.jit.kernel import internal_kernel
 
 
 @internal_kernel
-def solve_m_star(K, model: ModelArrays, drives: DriveArrays, ws: Workspace):
+def solve_m_star(K, model: ModelArrays, drives: DriveArrays, unilateral: UnilateralArrays | None, ws: Workspace):
     """Fill M* and b and solve for vdot, contact forces and di/dt.
 
     K : (n + p + k, n + p + k + 1) or more, room for M* with b as its last column; k motors have a circuit.
@@ -65,7 +66,7 @@ def solve_m_star(K, model: ModelArrays, drives: DriveArrays, ws: Workspace):
         state[k, ka.RHS] = K[n + k, size]
         for m in range(p):
             ws.small[0, k, m] = K[n + k, n + m]
-    ws.counts[ka.DEPENDENT] += solve_small(ws.small, state, ws.active, p)
+    ws.counts[ka.DEPENDENT] += solve_rows(unilateral, ws, p)
     for a in range(na):
         row = n + p + drives.table[a, ka.CIRCUIT]
         if row >= n + p:

@@ -116,7 +116,8 @@ SLOW = 3  # below this speed the direction of slip is frozen [m/s]
 LAST_CHANGE, CHANGES = 4, 5  # time of the last change of modes, and how many there were at that time
 HOLDING = 6  # share of the friction at rest that counts where modes are chosen; 1 outside of such a choice
 WIDTH = 7  # number of independent splits of the last evaluation with dependent rows, columns of room[NULL_SPACE]
-NUMBERS = 8
+SHARED = 8  # 1: something slides and rows depend on each other, so that forces go on from ``shares``
+NUMBERS = 9
 
 
 class UnilateralArrays(NamedTuple):
@@ -136,13 +137,19 @@ class UnilateralArrays(NamedTuple):
     room: np.ndarray  # (ROOM, p, p) two matrices of the splits, one of the problem that chooses modes, its scratch
     split_room: np.ndarray  # scratch of the splits
     number: np.ndarray  # (NUMBERS,)
+    shares: np.ndarray  # forces at the last change of modes, see dynsim.dynamics.contact.shares
     kept: np.ndarray  # the tables above that a choice of modes writes, as they were before it
 
 
-def kept_size(contacts: int, stops: int, joints: int) -> int:
+def share_count(couplings: int, contacts: int, stops: int, joints: int) -> int:
+    """Length of ``shares``."""
+    return couplings + stops + joints + ka.MOST_ROWS * contacts
+
+
+def kept_size(shares: int, contacts: int, stops: int, joints: int) -> int:
     """Length of ``kept``, see :mod:`dynsim.integrators.contacts.attempts`."""
     candidate, stop, joint = SLIDE_SIZE + MODE_SIZE + TALLY_SIZE, STOP_TABLE_SIZE + STOP_SIZE, DRY_TABLE_SIZE + DRY_SIZE
-    return contacts * candidate + stops * stop + joints * joint + NUMBERS
+    return contacts * candidate + stops * stop + joints * joint + NUMBERS + shares
 
 
 @internal_kernel

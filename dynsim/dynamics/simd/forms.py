@@ -13,6 +13,7 @@ from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact import uniqueness as kq
 from dynsim.dynamics.contact.delassus import solve_small
 from dynsim.dynamics.contact.quadrics import sign_changed, surface_distance
+from dynsim.dynamics.contact.shares import solve_near_shares, solve_nearest
 from dynsim.dynamics.contact.splits import admissible_forces, look_at_forces
 from dynsim.dynamics.contact.unilateral import slide_direction, sliding_friction
 from dynsim.dynamics.contact.uniqueness import clearly_unique
@@ -76,6 +77,15 @@ def solve_small_lanes(small, state, active, p):
     dependent = 0
     for k in range(lane_count(small)):
         dependent += solve_small(lane(small, k), lane(state, k), active, p)
+    return dependent
+
+
+@form_of(solve_near_shares, any_lanes)
+def solve_near_shares_lanes(unilateral, ws, p):
+    """One by one."""
+    dependent = 0
+    for k in range(lane_count(ws)):
+        dependent += solve_nearest(unilateral, lane(ws, k), p)
     return dependent
 
 

@@ -27,8 +27,8 @@ def keep(unilateral: UnilateralArrays, ws: Workspace, run: Run):
     at = write(kept, at, unilateral.tally)
     at = write(kept, at, unilateral.dry)
     at = write(kept, at, unilateral.stop)
-    for i in range(unilateral.number.shape[0]):
-        kept[at + i] = unilateral.number[i]
+    at = write_numbers(kept, at, unilateral.number)
+    write_numbers(kept, at, unilateral.shares)
     for i in range(run.y.shape[0]):
         run.y_new[i] = run.y[i]
 
@@ -45,8 +45,8 @@ def take_back(system: System, ws: Workspace, run: Run):
     at = read(kept, at, unilateral.tally)
     at = read(kept, at, unilateral.dry)
     at = read(kept, at, unilateral.stop)
-    for i in range(unilateral.number.shape[0]):
-        unilateral.number[i] = kept[at + i]
+    at = read_numbers(kept, at, unilateral.number)
+    read_numbers(kept, at, unilateral.shares)
     for i in range(run.y.shape[0]):
         run.y[i] = run.y_new[i]
     # First with the present rows, for the positions of points, which the earlier rows start from.
@@ -74,3 +74,19 @@ def read(kept, at, table):
             table[i, j] = kept[at]
             at += 1
     return at
+
+
+@internal_kernel
+def write_numbers(kept, at, numbers):
+    """Write numbers into ``kept`` from ``at`` on; returns where the next begin."""
+    for i in range(numbers.shape[0]):
+        kept[at + i] = numbers[i]
+    return at + numbers.shape[0]
+
+
+@internal_kernel
+def read_numbers(kept, at, numbers):
+    """Read numbers from ``kept``; returns where the next begin."""
+    for i in range(numbers.shape[0]):
+        numbers[i] = kept[at + i]
+    return at + numbers.shape[0]

@@ -17,6 +17,7 @@ import math
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.rows import set_modes
+from dynsim.dynamics.contact.shares import keep_shares
 from dynsim.dynamics.contact.splits import dry_margin, margin, normal_is_open
 from dynsim.dynamics.contact.unilateral import UnilateralArrays, dry_rests, dry_rows_held, stop_gap
 from dynsim.dynamics.derivative import System
@@ -25,7 +26,15 @@ from dynsim.integrators import run as ki
 from dynsim.integrators.contacts.attempts import keep, take_back
 from dynsim.integrators.contacts.impacts import evaluate, slip_speed
 from dynsim.integrators.contacts.leaving import approach_without_force, watch_unpressed
-from dynsim.integrators.contacts.modes import begin_slip, drops, note_headway, resolve, slip_on
+from dynsim.integrators.contacts.modes import (
+    begin_slip,
+    drops,
+    hold_free_joints,
+    note_headway,
+    resolve,
+    slip_on,
+    some_rest_without_row,
+)
 from dynsim.integrators.run import Run
 from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
@@ -528,7 +537,10 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
             # Either slip has only turned, or all is to be looked at.
             by_hand = slip_on(unilateral, ws, k, 10.0 * unilateral.number[ku.SLOW]) and by_hand
     if by_hand:
+        keep_shares(unilateral, ws, mode[:, ku.WANTED])
         set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
+        if some_rest_without_row(unilateral):
+            hold_free_joints(system, ws, run)
         tell_joints(unilateral, run)
         rearm(run)
         count_changes(system, run)

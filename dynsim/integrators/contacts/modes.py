@@ -21,10 +21,12 @@ from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.cone import problem as kc
 from dynsim.dynamics.contact.delassus import solve_small
 from dynsim.dynamics.contact.rows import set_modes
+from dynsim.dynamics.contact.shares import even_out, share_slot, some_slide
 from dynsim.dynamics.contact.splits import NULL_TOLERANCE
 from dynsim.dynamics.contact.unilateral import (
     UnilateralArrays,
     dry_bound,
+    dry_rests,
     dry_rows_held,
     holding_bound,
     slide_direction,
@@ -124,6 +126,7 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
     """
     unilateral = system.unilateral
     mode = unilateral.mode
+    unilateral.number[ku.SHARED] = 0.0
     hold_slow_joints(unilateral, ws)
     if rule == HOLD_RESTING:
         release_moving_joints(unilateral, ws)
@@ -145,6 +148,9 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
         evaluate(system, ws, run)
         return True
     take_solution(system, ws, size, largest)
+    for i in range(size):
+        slot = share_slot(unilateral, ws, unilateral.index[ku.TABLE_ROW, i])
+        unilateral.shares[slot] = unilateral.vector[ku.SOLUTION, i]
     release_dependent_joints(system, ws)
     # What is left of rates after an impact that was let settle, and of points that were solved for as if at rest: those
     # that begin to slip would else go against the direction that they are given, and stop, and begin again.
@@ -172,6 +178,10 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
     before = ws.counts[ka.DEPENDENT]
     evaluate(system, ws, run)
     unilateral.number[ku.REDUNDANT] = 1.0 if ws.counts[ka.DEPENDENT] > before else 0.0
+    if unilateral.number[ku.REDUNDANT] == 1.0 and some_slide(mode[:, ku.WANTED]):
+        even_out(unilateral, ws)
+        unilateral.number[ku.SHARED] = 1.0
+        evaluate(system, ws, run)
     for k in range(unilateral.dry_table.shape[0]):
         note_headway(unilateral, ws, k)
     for k in range(mode.shape[0]):
@@ -358,6 +368,62 @@ def rest_without_row(unilateral: UnilateralArrays, k):
     share = -unilateral.vector[ku.SOLUTION, unilateral.dry_table[k, ku.DRY_ROW]] / dry_bound(unilateral, k)
     unilateral.dry_table[k, ku.DRY_NEXT] = 0
     unilateral.dry[k, ku.DRY_SIDE] = min(max(share, -NEARLY_ALL), NEARLY_ALL)
+
+
+@noinline_kernel
+def hold_free_joints(system: System, ws: Workspace, run: Run):
+    """Give rows to the joints that rest with a constant force and that contacts and stops no longer hold.
+
+    After single modes have changed, at the end of an accepted step.
+    """
+    unilateral, y = system.unilateral, run.y
+    table, dry, mode = unilateral.dry_table, unilateral.dry, unilateral.mode
+    W, factor, row = ws.small[0], unilateral.room[ku.SPLIT_MATRIX], unilateral.index[0]
+    for k in range(table.shape[0]):
+        free = (
+            rests_without_row(unilateral, k)
+            and abs(ws.joints[table[k, ku.DRY_JOINT], ka.QD]) <= (unilateral.number[ku.SLOW])
+        )
+        table[k, ku.DRY_NEXT] = 1 if free else 0
+        if free:
+            table[k, ku.DRY_HOLDS], dry[k, ku.DRY_AT] = 1, ws.joints[table[k, ku.DRY_JOINT], ka.Q]
+    set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
+    evaluate(system, ws, run)
+    p, count = ws.counts[ka.ROWS], 0
+    for r in range(p):
+        for s in range(p):
+            W[r, s] = mobility(ws, r, s)
+    # Rows of the joints in question come last.
+    for r in range(p):
+        index = -1
+        for k in range(table.shape[0]):
+            if table[k, ku.DRY_NEXT] == 1 and table[k, ku.DRY_ROW] == r:
+                index = k
+        if index < 0:
+            count = extended(factor, W, row, count, r)
+    for k in range(table.shape[0]):
+        if table[k, ku.DRY_NEXT] == 1:
+            more = extended(factor, W, row, count, table[k, ku.DRY_ROW])
+            table[k, ku.DRY_HOLDS], count = 1 if more > count else 0, more
+    set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
+    evaluate(system, ws, run)
+    y[system.layout.loss + kst.IMPACT_LOSS] += project_level(system, ws, y, 1)
+
+
+@internal_kernel
+def some_rest_without_row(unilateral: UnilateralArrays):
+    """True if a joint rests with a constant force."""
+    resting = 0
+    for k in range(unilateral.dry_table.shape[0]):
+        resting += 1 if rests_without_row(unilateral, k) else 0
+    return resting > 0
+
+
+@internal_kernel
+def rests_without_row(unilateral: UnilateralArrays, k):
+    """True if joint k, of those with dry friction, rests with a constant force and without a closed brake."""
+    table = unilateral.dry_table
+    return table[k, ku.DRY_HOLDS] == 0 and table[k, ku.DRY_BRAKE] != ku.CLOSED and dry_rests(unilateral, k)
 
 
 @internal_kernel

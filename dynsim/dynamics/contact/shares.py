@@ -1,0 +1,109 @@
+"""Forces of dependent rows while contacts slide: the least change from those at the last change of modes.
+
+If rows depend on each other, the equations of motion determine only some sums of their forces. Without sliding contacts
+every split of these sums gives the same motion. A sliding contact has a friction force in proportion to its own normal
+force, so each split gives a different motion. The choice of modes has found forces s that agree with Coulomb's law, and
+the right-hand side continues from them:
+
+    f = s + Δ,   W Δ = b − W s, Δ of least norm.
+
+So forces are continuous at changes of modes. The split of least norm itself may pull at a contact that slides in the
+chosen modes.
+"""
+
+from __future__ import annotations
+
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact import unilateral as ku
+from dynsim.dynamics.contact.delassus import solve_small
+from dynsim.dynamics.contact.splits import find_splits
+from dynsim.dynamics.contact.unilateral import UnilateralArrays
+from dynsim.dynamics.tables import Workspace
+from dynsim.jit.kernel import internal_kernel, noinline_kernel
+
+
+@internal_kernel
+def solve_rows(unilateral: UnilateralArrays | None, ws: Workspace, p):
+    """Forces of the p active rows into FORCE; returns whether they depend on each other, as :func:`solve_small`."""
+    if unilateral is None:  # known to the compiler
+        return solve_small(ws.small, ws.rows, ws.active, p)
+    if unilateral.number[ku.SHARED] == 1.0:
+        return solve_near_shares(unilateral, ws, p)
+    return solve_small(ws.small, ws.rows, ws.active, p)
+
+
+@internal_kernel
+def solve_near_shares(unilateral: UnilateralArrays, ws: Workspace, p):
+    """The forces that are nearest to the shares; on SIMD lanes there is a form of it."""
+    return solve_nearest(unilateral, ws, p)
+
+
+@noinline_kernel
+def solve_nearest(unilateral: UnilateralArrays, ws: Workspace, p):
+    """:func:`solve_near_shares` of one state; the right-hand side stays."""
+    rows, W, share, right = ws.rows, ws.small[0], unilateral.vector[0], unilateral.vector[1]
+    for r in range(p):
+        slot = share_slot(unilateral, ws, r)
+        share[r], right[r] = unilateral.shares[slot] if slot >= 0 else 0.0, rows[r, ka.RHS]
+    for r in range(p):
+        for s in range(p):
+            rows[r, ka.RHS] -= W[r, s] * share[s]
+    dependent = solve_small(ws.small, rows, ws.active, p)
+    for r in range(p):
+        rows[r, ka.FORCE] += share[r]
+        rows[r, ka.RHS] = right[r]
+    return dependent
+
+
+@internal_kernel
+def share_slot(unilateral: UnilateralArrays, ws: Workspace, r):
+    """Index of row r in ``shares``: couplings, stops, joints with dry friction, candidates; −1 for ties."""
+    kind, k = ws.active[r, ka.ROW_KIND], ws.active[r, ka.OWNER]
+    if kind == ka.JOINT_ROW:
+        return k
+    if kind == ka.BODY_ROW:
+        return -1
+    behind = ka.MOST_ROWS * (ws.contacts.shape[0] - k)
+    return unilateral.shares.shape[0] - behind + r - ws.active[k, ka.FIRST_ROW]
+
+
+@internal_kernel
+def keep_shares(unilateral: UnilateralArrays, ws: Workspace, modes):
+    """Keep the present forces as shares, right before ``set_modes`` of ``modes``, (c,).
+
+    Independent rows stay independent when some of them are removed.
+    """
+    if unilateral.number[ku.REDUNDANT] == 0.0:
+        return
+    for r in range(ws.counts[ka.ROWS]):
+        slot = share_slot(unilateral, ws, r)
+        if slot >= 0:
+            unilateral.shares[slot] = ws.rows[r, ka.FORCE]
+    unilateral.number[ku.SHARED] = 1.0 if some_slide(modes) else 0.0
+
+
+@internal_kernel
+def some_slide(modes):
+    """True if a candidate slides."""
+    sliding = 0
+    for k in range(modes.shape[0]):
+        sliding += 1 if modes[k] == ka.SLIDING else 0
+    return sliding > 0
+
+
+@noinline_kernel
+def even_out(unilateral: UnilateralArrays, ws: Workspace):
+    """Remove the part without effect on the motion from the shares of sticking points, right after ``derivative``.
+
+    So their split remains the one of least norm, also if other points slide.
+    """
+    shares, N, row = unilateral.shares, unilateral.room[ku.NULL_SPACE], unilateral.index[1]
+    _, count, p, ties = find_splits(unilateral, ws)
+    if count == 0:
+        return
+    for c in range(int(unilateral.number[ku.WIDTH])):
+        part = 0.0
+        for j in range(p):
+            part += N[j, c] * shares[share_slot(unilateral, ws, row[j])]
+        for j in range(p + ties):
+            shares[share_slot(unilateral, ws, row[j])] -= N[j, c] * part
