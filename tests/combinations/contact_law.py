@@ -192,7 +192,9 @@ def _against_slip(seen: Observed, touch: Touch, slips: NDArray[np.bool_], before
         # The contact's place moves on the body within a step, and the tangent plane turns.
         share = turned / np.maximum(both, 1e-300) + np.abs(high - low) / np.maximum(high, 1e-300) + 1e-3
     else:
-        steady, middle = slips & (speed > SLOW), touch.slip
+        # Slip keeps the direction with which it began up to 1000 times atol; steps may go on to twice that speed.
+        slow = max(2000.0 * seen.scenario.integrator.atol, SLOW)
+        steady, middle = slips & (speed > slow), touch.slip
         share = np.full(len(seen), 1e-3)
     pace = np.maximum(np.linalg.norm(middle, axis=1), 1e-300)
     mu = coefficient(touch, np.linalg.norm(before, axis=1) if seen.stepped else speed)

@@ -501,3 +501,49 @@ def test_friction_goes_on_holding_a_joint_whose_contact_leaves(tmp_path: Path, m
     before = record.time < breaks
     assert np.abs(record["v"][before]).max() < 1e-12
     assert np.ptp(record["q"][before]) < 1e-12
+
+
+LEANING = """\
+duration_s: 0.41
+plant:
+  type: serial_arm
+  chain:
+  - {axis: z, length_m: 0, mass_kg: 0.2, friction_N_m: 0.05, limit_deg: [-30, 0]}
+  - {axis: y, length_m: 0.5, mass_kg: 1, initial_deg: 90}
+surfaces: {floor: {type: plane}}
+contacts:
+  law: unilateral
+  friction: 0.3
+  points: {tip: {body: link_2, point_m: [0, 0, 0.5]}}
+loads:
+  push:
+    type: samples
+    interpolation: linear
+    body: link_2
+    point_m: [0, 0, 0.5]
+    times_s: [0, 0.2, 0.4, 0.5]
+    force_N: [[0, 0, 0], [0, 10, 0], [0, -2, 0], [0, -2, 0]]
+integrator: {method: dopri5}
+"""
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_tip_and_a_joint_on_its_stop_hold_what_only_the_stop_can(tmp_path: Path, method: str):
+    """A yaw joint is pushed onto its stop while its tip rests on the floor, until the push turns back."""
+    path = tmp_path / "leaning.yaml"
+    path.write_text(LEANING, encoding="utf-8")
+    record = simulate(load_scenario(path, None, {"integrator.method": method}))
+    events = [(event.kind, event.name) for event in record.events]
+    assert events[0] == ("stop_hit", "joint_1")
+    assert sorted(events[1:]) == [("slip_start", "joint_1"), ("slip_start", "tip"), ("stop_left", "joint_1")]
+    # Half of the weight presses the tip; friction of tip and joint hold this push either way.
+    most = 0.3 * 0.5 * 9.81 + 0.05 / 0.5
+    times = [event.time for event in record.events]
+    # Both are roots of forces that are linear in time; friction at rest is reduced by 1e-5 for the choice of modes.
+    assert times[0] == pytest.approx(most / 50.0, abs=1e-6)
+    np.testing.assert_allclose(times[1:], 0.2 + (10.0 + most) / 60.0, rtol=0, atol=1e-6)
+    before = record.time < times[1]
+    assert np.ptp(record["q"][before], axis=0).max() < 1e-9
+    assert record["stop_force"].max() <= 1e-9
+    assert np.abs(record["joint_friction"]).max() <= 0.05 * (1.0 + 1e-9)
+    assert np.linalg.norm(record["contact_force"][:, 0, :2], axis=1).max() <= 0.3 * 0.5 * 9.81 * (1.0 + 1e-6)

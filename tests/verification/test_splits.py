@@ -14,7 +14,7 @@ from scipy.optimize import linprog, minimize, minimize_scalar
 
 from dynsim.dynamics.contact.cone.program import cone_program, solve_cone_program
 from dynsim.dynamics.contact.cone.socp import best_split, split_room
-from dynsim.dynamics.contact.splits import null_space
+from dynsim.dynamics.contact.splits import ONE_WAY, null_space
 from dynsim.jit.kernel import integers, reals
 
 seeds = st.integers(0, 2**32 - 1)
@@ -188,17 +188,22 @@ def test_conditions_of_optimality(seed):
 
 @pytest.mark.parametrize("seed", range(20))
 def test_joints_that_rub_share_their_forces_as_a_linear_programme_has_it(seed):
-    """max_z min_j (τ_j − |f_j|), some of the bounds so low that no split holds."""
+    """max_z min_j (τ_j − |f_j|), some of the bounds so low that no split holds; of stops f_j is the margin."""
     rng = np.random.default_rng(seed)
     p, r = int(rng.integers(2, 8)), int(rng.integers(1, 4))
+    stops = int(rng.integers(0, p))
     f0, N, bound = rng.normal(size=p), np.linalg.qr(rng.normal(size=(p, r)))[0], rng.uniform(0.05, 2.0, size=p)
-    out = np.full(p, np.nan)
-    margin = best_split(
-        reals(f0), reals(N), N.shape[1], integers(np.arange(p)), reals(bound), 0, p, out, split_room(r, p)
-    )
+    bound[p - stops :], f0[p - stops :] = 0.0, 2.0 + f0[p - stops :]
+    out, joints = np.full(p, np.nan), p - stops
+    mu = np.append(bound[:joints], np.full(stops, ONE_WAY))
+    margin = best_split(reals(f0), reals(N), N.shape[1], integers(np.arange(p)), reals(mu), 0, p, out, split_room(r, p))
     ones = np.ones((p, 1))
-    rows, limits = np.vstack([np.hstack([N, ones]), np.hstack([-N, ones])]), np.hstack([bound - f0, bound + f0])
+    rows, limits = (
+        np.vstack([np.hstack([N, ones])[:joints], np.hstack([-N, ones])]),
+        np.hstack([(bound - f0)[:joints], bound + f0]),
+    )
     best = linprog(np.append(np.zeros(N.shape[1]), -1.0), rows, limits, bounds=(None, None)).x[-1]
     assert margin == pytest.approx(best, abs=1e-7)
-    assert (bound - np.abs(out)).min() >= min(best, 0.0) - 1e-7
+    assert (bound - np.abs(out))[:joints].min() >= min(best, 0.0) - 1e-7
+    assert out[joints:].min(initial=0.0) >= min(best, 0.0) - 1e-7
     assert np.abs((out - f0) - N @ (N.T @ (out - f0))).max() < 1e-9

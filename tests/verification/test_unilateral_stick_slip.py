@@ -11,6 +11,8 @@ from support.random_robots import CompiledSystem, assemble
 from support.unilateral_checks import events, random_touch, violations
 
 import dynsim
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.state import OUT_VECTOR
 from dynsim.engine.force_indeterminacy import paradox
 from dynsim.errors import SimulationStopped
@@ -170,3 +172,37 @@ def test_a_stop_at_an_event_names_the_contacts_that_touch():
     t, _, words = paradox(b.system, b.ws, run, b.contacts)
     assert t == run.clock[ki.TIME]
     assert words.startswith("Painlevé's paradox at contact_0: ")
+
+
+@pytest.mark.parametrize("method", ["dopri5", "radau5"])
+def test_a_point_that_rows_of_others_stop_keeps_its_direction_of_slip(method: str) -> None:
+    """A plate turns so slowly about one foot that the next one rests too: both stop the far foot, which still slips."""
+    kinds = [
+        ("prismatic", (1.0, 0.0, 0.0)),
+        ("prismatic", (0.0, 1.0, 0.0)),
+        ("prismatic", (0.0, 0.0, 1.0)),
+        ("revolute", (0.0, 0.0, 1.0)),
+    ]
+    names = ["x", "y", "z", "plate"]
+    links = tuple(
+        Link(name, f"to_{name}", names[k - 1] if k else None, kind, np.array(axis), Inertia(1.0, tensor=np.eye(3)))
+        for k, (name, (kind, axis)) in enumerate(zip(names, kinds, strict=True))
+    )
+    feet = [
+        Contact(name, "plate", np.array([x, 0.0, 0.0]), FLOOR, friction=0.3)
+        for name, x in (("still", 0.0), ("near", 0.1), ("far", 1.0))
+    ]
+    slow = 1e-5
+    b = assemble(Robot("plate", links, (), ("plate", np.zeros(3))), feet, real=True, slow=slow)
+    y = b.state(np.zeros(4), np.array([0.0, 0.0, 0.0, 15.0 * slow]))
+    run = b.advance(b.new_run(y, np.array([0.1]), method), 0)
+    slide = b.system.unilateral.slide
+    assert b.ws.active[2, ka.MODE] == ka.SLIDING
+    assert np.abs(run.y[run.layout.v : run.layout.v + 4]).max() < 1e-15
+    assert slide[2, ku.FROZEN] == 1.0
+    np.testing.assert_allclose(slide[2, ku.REFERENCE : ku.REFERENCE + 3], [0.0, 1.0, 0.0], rtol=0, atol=1e-12)
+    # Its friction would turn the plate back; so all feet rest at once.
+    run = b.advance(run)
+    assert run.count[ki.STATUS] == ki.FINISHED
+    assert b.ws.active[:3, ka.MODE].tolist() == [ka.STICKING] * 3
+    assert np.abs(run.states("q")[-1]).max() < 1e-9

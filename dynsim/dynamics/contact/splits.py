@@ -1,4 +1,4 @@
-"""Split of forces among dependent rows of sticking points and held joints, within friction bounds if possible.
+"""Split of forces among dependent rows of sticking points, held joints and stops, within their bounds if possible.
 
 Two sticking braces of a planar arm have dependent lateral rows, points along one body dependent radial rows: only the
 sum of their forces is in the equations of motion. Such a set sticks as long as some split lies in all cones
@@ -29,6 +29,8 @@ NULL_TOLERANCE = 1e-10
 NORMAL_PART = 1e-6
 # A direction with a smaller square in the leading rows has its other parts alone: of couplings behind closed brakes.
 NO_LEADING = 1e-20
+# Instead of a bound: of stops, which push one way.
+ONE_WAY = -1.0
 
 
 @internal_kernel
@@ -61,21 +63,25 @@ def admissible_forces(contacts: ContactArrays, unilateral: UnilateralArrays | No
 @noinline_kernel
 def look_at_forces(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace):
     """:func:`admissible_forces` where there are dependent rows, stops or dry friction."""
-    note_stop_forces(unilateral, ws)
     unilateral.number[ku.SPLIT] = 0.0
     if unilateral.number[ku.REDUNDANT] == 1.0 and beyond_bounds(contacts, unilateral, ws):
         split_forces(contacts, unilateral, ws)
+    note_stop_forces(unilateral, ws)
     note_dry_forces(unilateral, ws)
 
 
 @internal_kernel
 def beyond_bounds(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace):
-    """True where a point or a joint that sticks has more force than its friction can have."""
+    """True if a sticking point or a held joint has more force than its friction can have, or a closed stop pulls."""
     for k in range(ws.contacts.shape[0]):
         if ws.active[k, ka.MODE] == ka.STICKING and margin(contacts, unilateral, ws, k) < 0.0:
             return True
     for k in range(unilateral.dry_table.shape[0]):
         if unilateral.dry_table[k, ku.DRY_HOLDS] == 1 and dry_margin(unilateral, ws, k) < 0.0:
+            return True
+    for k in range(unilateral.stop_table.shape[0]):
+        closed, r = unilateral.stop_table[k, ku.STOP_CLOSED] == 1, unilateral.stop_table[k, ku.STOP_ROW]
+        if closed and ws.rows[r, ka.FORCE] < 0.0:
             return True
     return False
 
@@ -93,6 +99,9 @@ def split_forces(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Work
         if unilateral.dry_table[k, ku.DRY_HOLDS] == 1:
             mu[j] = holding_bound(unilateral, k)
             j += 1
+    for _ in range(count - j):
+        mu[j] = ONE_WAY
+        j += 1
     force, out = unilateral.vector[1], unilateral.vector[2]
     for i in range(p):
         force[i] = rows[row[i], ka.FORCE]
@@ -115,12 +124,12 @@ def split_forces(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Work
 def find_splits(unilateral: UnilateralArrays, ws: Workspace):
     """Directions in which the forces of all that sticks may change, into NULL_SPACE, right after ``derivative``.
 
-    index[0] is the first row of each sticking point, then of each held joint, and index[1] the rows in the table, with
-    those of couplings behind them: their forces change with the others, within no bound.
+    index[0] is the first row of each sticking point, then of each held joint, then of each closed stop, and index[1]
+    the rows in the table, with those of couplings behind them: their forces change with the others, within no bound.
 
     Returns
     -------
-    points, count, p, ties : sticking points, those and held joints, and their rows; rows of couplings
+    points, count, p, ties : sticking points, those with held joints and stops, and their rows; rows of couplings
     """
     room, first, row = unilateral.room, unilateral.index[0], unilateral.index[1]
     count, p = 0, 0
@@ -137,6 +146,11 @@ def find_splits(unilateral: UnilateralArrays, ws: Workspace):
             first[count], row[p] = p, unilateral.dry_table[k, ku.DRY_ROW]
             p += 1
             count += 1
+    for k in range(unilateral.stop_table.shape[0]):
+        if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
+            first[count], row[p] = p, unilateral.stop_table[k, ku.STOP_ROW]
+            p += 1
+            count += 1
     ties = rows_of_couplings(unilateral, ws)
     for r in range(ties):
         row[p + r] = r
@@ -145,6 +159,7 @@ def find_splits(unilateral: UnilateralArrays, ws: Workspace):
         for j in range(size):
             room[ku.SPLIT_MATRIX, i, j] = ws.small[0, row[i], row[j]]
     unilateral.number[ku.WIDTH] = null_space(room[ku.SPLIT_MATRIX], size, room[ku.NULL_SPACE], unilateral.index[2], p)
+    unilateral.number[ku.SPLIT_ROWS] = p
     return points, count, p, ties
 
 
@@ -158,6 +173,21 @@ def normal_is_open(unilateral: UnilateralArrays, ws: Workspace, k):
         if abs(unilateral.room[ku.NULL_SPACE, row, c]) > NORMAL_PART:
             return True
     return False
+
+
+@internal_kernel
+def stops_that_share(unilateral: UnilateralArrays):
+    """Number of closed stops whose forces the splits found last leave undetermined."""
+    sharing, closed = 0, 0
+    for k in range(unilateral.stop_table.shape[0]):
+        closed += unilateral.stop_table[k, ku.STOP_CLOSED]
+    width, size = int(unilateral.number[ku.WIDTH]), int(unilateral.number[ku.SPLIT_ROWS])
+    for i in range(size - closed, size):
+        largest = 0.0
+        for c in range(width):
+            largest = max(largest, abs(unilateral.room[ku.NULL_SPACE, i, c]))
+        sharing += 1 if largest > NORMAL_PART else 0
+    return sharing
 
 
 @internal_kernel

@@ -117,7 +117,8 @@ LAST_CHANGE, CHANGES = 4, 5  # time of the last change of modes, and how many th
 HOLDING = 6  # share of the friction at rest that counts where modes are chosen; 1 outside of such a choice
 WIDTH = 7  # number of independent splits of the last evaluation with dependent rows, columns of room[NULL_SPACE]
 SHARED = 8  # 1: something slides and rows depend on each other, so that forces go on from ``shares``
-NUMBERS = 9
+SPLIT_ROWS = 9  # rows of the last splits, of couplings not counted
+NUMBERS = 10
 
 
 class UnilateralArrays(NamedTuple):

@@ -18,7 +18,7 @@ from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.rows import set_modes
 from dynsim.dynamics.contact.shares import keep_shares
-from dynsim.dynamics.contact.splits import dry_margin, margin, normal_is_open
+from dynsim.dynamics.contact.splits import dry_margin, margin, normal_is_open, stops_that_share
 from dynsim.dynamics.contact.unilateral import UnilateralArrays, dry_rests, dry_rows_held, stop_gap
 from dynsim.dynamics.derivative import System
 from dynsim.dynamics.tables import ContactArrays, Workspace
@@ -75,18 +75,18 @@ def contact_guard(contacts: ContactArrays, unilateral: UnilateralArrays | None, 
     """Value of a guard of the unilateral law, right after ``derivative``."""
     if unilateral is None:  # known to the compiler
         return 1.0
+    best, split = unilateral.number[ku.BEST_MARGIN], unilateral.number[ku.SPLIT] == 1.0
     if kind == STOP_GUARD:
         if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
-            return unilateral.stop[k, ku.STOP_FORCE]
+            return best if split and best > 0.0 else unilateral.stop[k, ku.STOP_FORCE]
         return stop_gap(unilateral, ws, k) + ku.DEPTH
-    best = unilateral.number[ku.BEST_MARGIN]
     if kind == DRY_GUARD:
         if unilateral.dry_table[k, ku.DRY_HOLDS] == 0:
             rate = ws.joints[unilateral.dry_table[k, ku.DRY_JOINT], ka.QD]
             if dry_rests(unilateral, k):
                 return unilateral.number[ku.SLOW] - abs(rate)
             return unilateral.dry[k, ku.DRY_SIDE] * rate + unilateral.dry[k, ku.DRY_HEADWAY] + BACKWARD
-        if unilateral.number[ku.SPLIT] == 1.0 and best > 0.0:
+        if split and best > 0.0:
             return best
         return dry_margin(unilateral, ws, k)
     mode = ws.active[k, ka.MODE]
@@ -104,7 +104,7 @@ def contact_guard(contacts: ContactArrays, unilateral: UnilateralArrays | None, 
     if mode == ka.STICKING:
         # Dependent rows, where the least norm fits no cones: the forces are the least that do, on some cone, and say
         # nothing of what is left. Once none fit, those of the best margin show which contacts give way.
-        if unilateral.number[ku.SPLIT] == 1.0 and best > 0.0:
+        if split and best > 0.0:
             return best
         return margin(contacts, unilateral, ws, k)
     return 1.0
@@ -307,10 +307,14 @@ def split_ends(system: System, ws: Workspace, run: Run):
     """True if the best split of several points and joints that stick together has reached its end.
 
     What then starts to slip, and with which forces, is not continuous: a point or joint by itself would only be one of
-    those that start. A single sticking point without held joints starts by itself, in the direction of its friction.
+    those that start. A single sticking point starts by itself, in the direction of its friction, if it shares its force
+    with no joint or stop.
     """
     unilateral, strongest = system.unilateral, 0.0
-    if unilateral.number[ku.SPLIT] == 0.0 or ws.counts[ka.STUCK] + dry_rows_held(unilateral) < 2:
+    if unilateral.number[ku.SPLIT] == 0.0:
+        return False
+    stops = stops_that_share(unilateral)
+    if ws.counts[ka.STUCK] + dry_rows_held(unilateral) + stops < 2:
         return False
     for k in range(ws.contacts.shape[0]):
         strongest = max(strongest, ws.contacts[k, ka.NORMAL_FORCE])
@@ -319,6 +323,8 @@ def split_ends(system: System, ws: Workspace, run: Run):
         if kind < NORMAL_GUARD or run.event[e, ki.VALUE] > 0.0:
             continue
         if kind == DRY_GUARD and unilateral.dry_table[k, ku.DRY_HOLDS] == 1:
+            return True
+        if kind == STOP_GUARD and unilateral.stop_table[k, ku.STOP_CLOSED] == 1 and stops > 0:
             return True
         # One at the apex of its cone leaves, and one whose friction drops is chosen for at full friction.
         if kind == SLIP_GUARD and ws.active[k, ka.MODE] == ka.STICKING and not drops(system, k):
@@ -491,7 +497,7 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
     if split_ends(system, ws, run) and solve_reduced(system, ws, run):
         run.count[ki.STARTED] = 0
         return
-    strongest = 0.0
+    strongest, split = 0.0, unilateral.number[ku.SPLIT] == 1.0
     for k in range(mode.shape[0]):
         mode[k, ku.WANTED] = ws.active[k, ka.MODE]
         strongest = max(strongest, ws.contacts[k, ka.NORMAL_FORCE])
@@ -501,6 +507,8 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
             continue
         if kind == STOP_GUARD:
             if table[k, ku.STOP_CLOSED] == 1:
+                if split and unilateral.stop[k, ku.STOP_FORCE] > unilateral.number[ku.BEST_MARGIN] + split_slack(ws):
+                    continue
                 table[k, ku.STOP_CLOSED] = 0
                 log(run, ki.STOP_LOG + LOG_KINDS * k + STOP_LEFT)
                 # Friction that was constant beside the stop may hold the joint.

@@ -172,15 +172,21 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
         return False
     run.y[system.layout.loss + kst.IMPACT_LOSS] += loss
     evaluate(system, ws, run)
+    for k in range(mode.shape[0]):
+        rubs = mode[k, ku.WANTED] == ka.SLIDING and system.contacts.law[k, ka.STATIC] > 0.0
+        if rubs and slip_speed(ws, k) < unilateral.number[ku.SLOW]:
+            # Rows of other contacts have stopped it too, and it keeps the direction of slip that it had.
+            unilateral.slide[k, ku.FROZEN] = 1.0
     for k in range(unilateral.dry_table.shape[0]):
         unilateral.dry_table[k, ku.DRY_HOLDS] = unilateral.dry_table[k, ku.DRY_NEXT]
     set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
     before = ws.counts[ka.DEPENDENT]
     evaluate(system, ws, run)
     unilateral.number[ku.REDUNDANT] = 1.0 if ws.counts[ka.DEPENDENT] > before else 0.0
-    if unilateral.number[ku.REDUNDANT] == 1.0 and some_slide(mode[:, ku.WANTED]):
-        even_out(unilateral, ws)
-        unilateral.number[ku.SHARED] = 1.0
+    if unilateral.number[ku.REDUNDANT] == 1.0:
+        if some_slide(mode[:, ku.WANTED]):
+            even_out(unilateral, ws)
+            unilateral.number[ku.SHARED] = 1.0
         evaluate(system, ws, run)
     for k in range(unilateral.dry_table.shape[0]):
         note_headway(unilateral, ws, k)

@@ -49,8 +49,9 @@ def best_split(f0, N, r, contact_first, mu, contacts, joints, out, room: ConePro
     f0 : (p or more,) forces of all rows [N]
     N : (p or more, r or more) directions in which they can be split otherwise; r of them
     contact_first : (contacts + joints or more,) int, normal row of each sticking contact, whose tangential rows follow,
-        then the row of each joint that dry friction holds
-    mu : (contacts + joints or more,) static friction; of joints the bound of their force, whose margin is μ_j − |f_j|
+        then the row of each joint that dry friction holds, and of each closed joint stop; those are the ``joints``
+    mu : (contacts + joints or more,) static friction; of joints the bound of their force, whose margin is μ_j − |f_j|;
+        negative for a stop, whose margin is its force f_j
     out : (p or more,) the force of least norm among those in all cones; without one, that of the best margin
     room : see :func:`split_room`
 
@@ -71,7 +72,7 @@ def best_split(f0, N, r, contact_first, mu, contacts, joints, out, room: ConePro
     for j in range(count):
         i = contact_first[j]
         if j >= contacts:
-            worst = min(worst, (mu[j] - abs(f0[i])) / scale)
+            worst = min(worst, (mu[j] - abs(f0[i]) if mu[j] >= 0.0 else f0[i]) / scale)
             continue
         if mu[j] > 0.0:
             worst = min(worst, (mu[j] * f0[i] - math.hypot(f0[i + 1], f0[i + 2])) / scale)
@@ -132,7 +133,10 @@ def best_split(f0, N, r, contact_first, mu, contacts, joints, out, room: ConePro
 
 @internal_kernel
 def cone_rows(f0, N, r, contact_first, mu, contacts, joints, scale, room: ConeProgram):
-    """The cones in z and the margin, (μ f_n − t, f_t) of contacts, (μ − t, f) of joints; returns how many rows."""
+    """The cones in z and the margin t; returns how many rows.
+
+    (μ f_n − t, f_t) of contacts, (μ − t, f) of joints, f − t of stops.
+    """
     row = 0
     for j in range(contacts):
         i, room.first[j] = contact_first[j], row
@@ -149,6 +153,12 @@ def cone_rows(f0, N, r, contact_first, mu, contacts, joints, scale, room: ConePr
                 row += 1
     for j in range(contacts, contacts + joints):
         i, room.first[j] = contact_first[j], row
+        if mu[j] < 0.0:
+            for k in range(r):
+                room.G[row, k] = N[i, k]
+            room.G[row, r], room.h[row] = -1.0, f0[i] / scale
+            row += 1
+            continue
         for k in range(r):
             room.G[row, k], room.G[row + 1, k] = 0.0, N[i, k]
         room.G[row, r], room.h[row] = -1.0, mu[j] / scale
