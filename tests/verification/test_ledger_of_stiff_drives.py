@@ -1,4 +1,4 @@
-"""The energy ledger of radau5 closes for stiff drives, on a fixed and on a mobile base, and the better the smaller rtol.
+"""The energy ledger of radau5 closes for stiff drives, on fixed and mobile bases, and the better the smaller rtol.
 
 Where a stiff drive holds a joint, the last correction of Newton's method changes the power with the same sign in every
 step: integrals of derivatives from before it missed 5e-5 of the energy at every tolerance.
