@@ -35,8 +35,8 @@ TOUCHING = 1e-6
 """A contact with a gap below this is closed at the start [m]."""
 SMALL = 36
 """Joints up to which Jacobians of RADAU5 cost less than half of its steps."""
-TIGHT = 1e-8
-"""Relative tolerance down to which RADAU5 keeps energy better than DOPRI5."""
+UNDAMPED, LEAST_RTOL = 0.1, 1e-12
+"""Share of the tolerances for steps whose errors nothing damps, so that their sum stays below rtol; not below this."""
 
 DENSE = 300
 """Size of matrices up to which all eigenvalues are found at once; of larger ones only the largest."""
@@ -47,6 +47,8 @@ class Choice(NamedTuple):
 
     method: str
     reason: str
+    sharper: float = 1.0
+    """Tolerances of the steps as a share of the scenario's."""
 
 
 def choose(
@@ -60,8 +62,9 @@ def choose(
     reason = f"fastest rate {rate:.3g} 1/s, steps of {1e3 * pace:.3g} ms"
     if rate * pace > worth_it(model.n):
         return Choice("radau5", f"{reason}: an implicit method is not held by it")
-    if rate == 0.0 and model.n <= SMALL and options.rtol >= TIGHT:
-        return Choice("radau5", "no drive and no loss damps errors: the implicit method keeps energy to the tolerance")
+    if rate == 0.0 and model.n <= SMALL:
+        reason = "no drive and no loss damps errors: the implicit method keeps energy to the tolerance"
+        return Choice("radau5", reason, UNDAMPED if options.rtol * UNDAMPED >= LEAST_RTOL else 1.0)
     return Choice("dopri5", f"{reason}: an explicit method takes them")
 
 

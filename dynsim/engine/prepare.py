@@ -183,7 +183,9 @@ def prepare(
         dense=np.zeros((size, size + 1)) if options.solver == "m_star" else None,
         couplings=compile_couplings(robot),
         shapes=compile_shapes(robot, contacts),
-        unilateral=compile_unilateral(robot, contacts, stops, slow_slip(options.atol), dry) if real else None,
+        unilateral=compile_unilateral(robot, contacts, stops, slow_slip(options.absolute_tolerance), dry)
+        if real
+        else None,
     )
     stepping = None
     if method == ki.TIME_STEPPING and system.unilateral is not None:
@@ -208,8 +210,8 @@ def prepare(
         end=scenario.duration_s if end is None else end,
         step=step,
         step_max=min(options.step_max_s or np.inf, _longest_step(method, real)),
-        rtol=options.rtol,
-        atol=options.atol,
+        rtol=options.rtol * choice.sharper,
+        atol=options.absolute_tolerance * choice.sharper,
         ticks=_ticks(control),
         breaks=_breaks(loads, control, method, options),
         # Those who advance a run themselves may give it no end.
@@ -348,7 +350,7 @@ def _breaks(loads: Sequence[Load], control: JointControl, method: int, options: 
     """
     times = [load.knots for load in loads if len(load.coefficients) and (not load.hold or len(load.coefficients) > 1)]
     if method == ki.RADAU5:
-        tolerances = options.rtol, options.atol
+        tolerances = options.rtol, options.absolute_tolerance
         times.append(recall("bends", lambda: control.bends(*tolerances), control, *tolerances))
     return np.unique(np.concatenate(times)) if times else np.zeros(0)
 

@@ -187,7 +187,12 @@ class Integrator(StrictConfig):
     )
     solver: Literal["articulated", "m_star"] = Field(default="articulated", description="O(n) sweeps or the dense M*")
     rtol: float = Field(default=1e-6, ge=1e-13, le=1e-1)
-    atol: float = Field(default=1e-8, ge=1e-16, le=1e-1)
+    atol: float | None = Field(
+        default=None,
+        ge=1e-16,
+        le=1e-1,
+        description="default: rtol/100, at most 1e-8, so that a smaller rtol has its effect",
+    )
     step_s: Positive | None = Field(
         default=None, description="fixed step of time_stepping (default 0.001), else the first step"
     )
@@ -205,6 +210,11 @@ class Integrator(StrictConfig):
         if value in ("rk4", "rk43"):
             raise ValueError("is no longer there; take dopri5, or time_stepping where steps are to be fixed")
         return value
+
+    @property
+    def absolute_tolerance(self) -> float:
+        """``atol``, or its default: a fixed one would limit the accuracy at small ``rtol``."""
+        return min(1e-8, 1e-2 * self.rtol) if self.atol is None else self.atol
 
 
 class RecordOptions(StrictConfig):

@@ -226,7 +226,7 @@ def _own_error(run: Run, part: float) -> dict[str, tuple[Array, Array]]:
         options["step_s"] = part * float(run.record.summary["time_stepping"]["step_s"])
     else:
         options["rtol"] = max(part * run.resolved.integrator.rtol, 1e-13)
-        options["atol"] = max(part * run.resolved.integrator.atol, 1e-16)
+        options["atol"] = max(part * run.resolved.integrator.absolute_tolerance, 1e-16)
     integrator = run.resolved.integrator.model_copy(update=options)
     config = run.resolved.config.model_copy(update={"integrator": integrator})
     try:

@@ -119,7 +119,7 @@ def integral_error(seen: Observed, value: Array, rate: Array) -> tuple[Array, Ar
     rounding = 1e-12 * np.abs(value).max(axis=0, initial=0.0) + 1e-13
     # Projection of samples and steps' errors move states within tolerances of the integrator.
     config = seen.scenario.integrator
-    drift = 100.0 * (config.atol + config.rtol * np.abs(value[rows]).max(initial=0.0))
+    drift = 100.0 * (config.absolute_tolerance + config.rtol * np.abs(value[rows]).max(initial=0.0))
     # What rings or is cut by a limit between samples shows in how much rates bend around them.
     bend = np.zeros_like(rate)
     bend[1:-1] = np.abs(rate[2:] - 2.0 * rate[1:-1] + rate[:-2])

@@ -79,8 +79,10 @@ def test_long_passive_chains_are_integrated_explicitly() -> None:
     assert chosen(chain(36)) == "radau5"
 
 
-def test_passive_systems_at_the_tightest_tolerances_are_integrated_explicitly() -> None:
-    assert chosen(chain(integrator={"rtol": 1e-10, "atol": 1e-12})) == "dopri5"
+@pytest.mark.parametrize("rtol", [1e-6, 1e-9, 1e-12])
+def test_the_method_for_passive_systems_does_not_depend_on_the_tolerance(rtol: float) -> None:
+    """A smaller rtol must not make the energy worse: the explicit method drifts by 10 to 30 rtol."""
+    assert chosen(chain(integrator={"rtol": rtol})) == "radau5"
 
 
 def test_slow_losses_are_integrated_explicitly() -> None:

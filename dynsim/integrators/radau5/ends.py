@@ -61,23 +61,26 @@ def write_samples_on_lanes(newton, system, ws, run, more):
             newton.count[kn.WAITING] -= 1
             write_sample(system, ws, run)
         else:
-            write_together(newton, system, ws, run)
+            write_together(newton, system, ws, run, 0)
 
 
 @form_of(write_waiting, samples_on_lanes)
 def write_waiting_on_lanes(newton, system, ws, run):
-    """As lanes, even one: how a sample is computed does not depend on where a caller has looked."""
+    """Write even a single sample from lanes: its value must not depend on when a caller looks.
+
+    The first lane keeps the end of a step that is pending.
+    """
     if newton.count[kn.WAITING] > 0:
-        write_together(newton, system, ws, run)
+        write_together(newton, system, ws, run, 1)
 
 
 @internal_kernel
-def write_together(newton: NewtonArrays, system: System, ws: Workspace, run: Run):
-    """Record up to four samples that wait, as lanes."""
-    count = load_samples(newton, run, 0)
-    fill_lanes(newton.lanes, run, count)
+def write_together(newton: NewtonArrays, system: System, ws: Workspace, run: Run, begin):
+    """Record the waiting samples, up to four, from lane ``begin`` on."""
+    count = load_samples(newton, run, begin)
+    fill_lanes(newton.lanes, run, begin + count)
     evaluate_four(newton.lanes, system)
-    take_samples(newton, system, ws, run, 0, count)
+    take_samples(newton, system, ws, run, begin, count)
 
 
 @internal_kernel
@@ -122,14 +125,30 @@ def take_samples(newton: NewtonArrays, system: System, ws: Workspace, run: Run, 
 
 @internal_kernel
 def evaluate_end(newton: NewtonArrays, system: System, ws: Workspace, run: Run):
-    """Derivative at y_new into stage[6]."""
-    evaluate_end_alone(system, ws, run)
+    """Derivatives at the three stages into ``f``, and the last one, which is at y_new, into stage[6] too."""
+    evaluate_two(newton, system, ws, run)
+    evaluate_end_alone(newton, system, ws, run)
 
 
 @internal_kernel
-def evaluate_end_alone(system: System, ws: Workspace, run: Run):
-    """The same without lanes."""
-    derivative(system, run.clock[ki.TIME] + run.clock[ki.STEP], run.y_new, ws, run.stage[6])
+def evaluate_two(newton: NewtonArrays, system: System, ws: Workspace, run: Run):
+    """Derivatives at the first two stages, into ``f``."""
+    for s in range(2):
+        for j in range(newton.kept.shape[1]):
+            run.stage[7, j] = run.y[j] + newton.z[s, j]
+        derivative(system, run.clock[ki.TIME] + kn.NODE_RADAU[s] * run.clock[ki.STEP], run.stage[7], ws, newton.f[s])
+    run.count[ki.EVALUATIONS] += 2
+
+
+@internal_kernel
+def evaluate_end_alone(newton: NewtonArrays, system: System, ws: Workspace, run: Run):
+    """Derivative at y_new into the third row of ``f``, then into stage[6].
+
+    Not the other way round: entries that no derivative writes are zero in ``f``, and scratch in stage[6].
+    """
+    derivative(system, run.clock[ki.TIME] + run.clock[ki.STEP], run.y_new, ws, newton.f[2])
+    for j in range(run.y.shape[0]):
+        run.stage[6, j] = newton.f[2, j]
     run.count[ki.EVALUATIONS] += 1
 
 
@@ -165,24 +184,28 @@ def _on_lanes(newton: Any, system: Any, ws: Any, run: Any, *_: Any) -> bool:
 
 @form_of(evaluate_end, _on_lanes)
 def evaluate_end_on_lanes(newton, system, ws, run):
-    """On the first lane; on the others samples that wait. Guards of events want the workspace of one state."""
-    if run.event.shape[0] > 0:
-        evaluate_end_alone(system, ws, run)
-        return
-    lanes = newton.lanes
-    lanes.t[0] = run.clock[ki.TIME] + run.clock[ki.STEP]
+    """Evaluate y_new on the first lane, the two inner stages on the next, and a waiting sample on the last.
+
+    Guards of events need the workspace of a single state, so they cost another evaluation of y_new.
+    """
+    lanes, t, h = newton.lanes, run.clock[ki.TIME], run.clock[ki.STEP]
+    lanes.t[0], lanes.t[1], lanes.t[2] = t + h, t + kn.NODE_RADAU[0] * h, t + kn.NODE_RADAU[1] * h
     for j in range(run.y.shape[0]):
         lanes.y[j, 0] = run.y_new[j]
-    count = load_samples(newton, run, 1)
-    fill_lanes(lanes, run, 1 + count)
+        lanes.y[j, 1], lanes.y[j, 2] = run.y[j] + newton.z[0, j], run.y[j] + newton.z[1, j]
+    count = load_samples(newton, run, 3)
+    fill_lanes(lanes, run, 3 + count)
     dependent, contradictory = lanes.ws.counts[ka.DEPENDENT], lanes.ws.counts[ka.CONTRADICTORY]
     evaluate_four(lanes, system)
     ws.counts[ka.DEPENDENT] += lanes.ws.counts[ka.DEPENDENT] - dependent
     ws.counts[ka.CONTRADICTORY] += lanes.ws.counts[ka.CONTRADICTORY] - contradictory
-    run.count[ki.EVALUATIONS] += 1
+    run.count[ki.EVALUATIONS] += 3
     for j in range(run.y.shape[0]):
-        run.stage[6, j] = lanes.f[j, 0]
-    take_samples(newton, system, ws, run, 1, count)
+        newton.f[0, j], newton.f[1, j], newton.f[2, j] = lanes.f[j, 1], lanes.f[j, 2], lanes.f[j, 0]
+        run.stage[6, j] = newton.f[2, j]
+    take_samples(newton, system, ws, run, 3, count)
+    if run.event.shape[0] > 0:
+        evaluate_end_alone(newton, system, ws, run)
 
 
 @form_of(end_accepted, _on_lanes)

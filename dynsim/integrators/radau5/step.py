@@ -319,10 +319,7 @@ def step_radau5(system: System, ws: Workspace, run: Run):
         else:
             r.count[kn.STALE] = 1
     r.clock[kn.TRIED] = h
-    for j in range(y.shape[0]):
-        if j >= tracked:
-            for s in range(3):
-                r.z[s, j] = h * (A_RADAU[s, 0] * r.f[0, j] + A_RADAU[s, 1] * r.f[1, j] + A_RADAU[s, 2] * r.f[2, j])
+    for j in range(tracked):
         y_new[j] = y[j] + r.z[2, j]
     error = estimate(system, ws, run, h, run.stage[0])
     if error >= 1.0:
@@ -332,7 +329,22 @@ def step_radau5(system: System, ws: Workspace, run: Run):
         run.count[ki.EVALUATIONS] += 1
         error = estimate(system, ws, run, h, r.f[0])
     evaluate_end(r, system, ws, run)
+    add_up(run, h)
     return max(error, energy_error(system, run, h))
+
+
+@internal_kernel
+def add_up(run: Run, h):
+    """Compute the integrals of the ledger from derivatives at the converged stages.
+
+    The derivatives that Newton's method evaluated belong to the iterate before its last correction. If a stiff motor
+    holds a joint, that correction changes the power with the same sign in every step, and the ledger would not close.
+    """
+    r = run.newton
+    for j in range(r.kept.shape[1], run.y.shape[0]):
+        for s in range(3):
+            r.z[s, j] = h * (A_RADAU[s, 0] * r.f[0, j] + A_RADAU[s, 1] * r.f[1, j] + A_RADAU[s, 2] * r.f[2, j])
+        run.y_new[j] = run.y[j] + r.z[2, j]
 
 
 @internal_kernel
