@@ -160,6 +160,9 @@ def equilibrium(seen: Observed) -> Finding:
         controller.get("joints") or controller.get("hand")
     ):
         return
+    # Planned voltages hold the acceleration too with which references begin.
+    if controller.get("feed_forward") == "dynamics" and (controller.get("joints") or controller.get("hand")):
+        return
     # References and torques that jump at the start are reported by a warning.
     if warned(seen, "that jumps at the start all the same") or warned(seen, "the start slips at"):
         return

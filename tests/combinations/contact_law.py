@@ -193,7 +193,7 @@ def _against_slip(seen: Observed, touch: Touch, slips: NDArray[np.bool_], before
         share = turned / np.maximum(both, 1e-300) + np.abs(high - low) / np.maximum(high, 1e-300) + 1e-3
     else:
         # Slip keeps the direction with which it began up to 1000 times atol; steps may go on to twice that speed.
-        slow = max(2000.0 * seen.scenario.integrator.atol, SLOW)
+        slow = max(2000.0 * seen.scenario.integrator.absolute_tolerance, SLOW)
         steady, middle = slips & (speed > slow), touch.slip
         share = np.full(len(seen), 1e-3)
     pace = np.maximum(np.linalg.norm(middle, axis=1), 1e-300)
