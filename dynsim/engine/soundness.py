@@ -101,8 +101,8 @@ class HeldLoop:
     def growth_by_encoders(self, period: float, encoders: Encoders) -> Growth | None:
         """With positions of encoders and their differences.
 
-        None where the two periods do not fit each other, or the delay holds so many samples that the loop has more than
-        :data:`LATE` rows.
+        None if the two periods do not fit each other, or if the delay spans so many samples that the loop has more
+        than :data:`LATE` rows.
         """
         between = period if encoders.rate_hz is None else 1.0 / encoders.rate_hz
         ratio = max(period, between) / min(period, between)

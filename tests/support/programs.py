@@ -16,16 +16,16 @@ SHARES: tuple[tuple[tuple[str, str | None], ...], ...] = (
     (("block_on_slope", None), ("elbow_comparison_links", None), ("elbow_comparison", "no_elbow")),
     (("falling_arm", None), ("snake_positioning_dynamic", "x"), ("single_pendulum", None)),
 )
-# Tests from which on it is worth it: a few of them may need few programs.
+# With fewer tests than this nothing is compiled in advance: they may need few programs.
 MANY = 1000
 
 
 def compile_share(tests: int) -> None:
-    """Compile the share of this process, where it is a worker of two or more that have so many tests."""
+    """Compile the share of this process, if it is a pytest worker of several and there are many tests."""
     worker = os.environ.get("PYTEST_XDIST_WORKER", "").removeprefix("gw")
     if tests < MANY or not worker or int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")) < len(SHARES):
         return
     for name, variant in SHARES[int(worker)] if int(worker) < len(SHARES) else ():
-        # What is wrong is for the tests to find.
+        # Errors are left to the tests.
         with suppress(Exception):
             simulate(load_scenario(name, variant, {"duration_s": 0.01, "metrics.settle_s": 0.0}))
