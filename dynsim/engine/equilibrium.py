@@ -136,7 +136,7 @@ def balanced(
         elif k_p > 0.0 and abs(rate[a]) > AT_REST:
             jumps.append(f"the reference of {motor.joint} begins with {rate[a]:.3g} {unit[1]}")
     resistance = np.array([getattr(motor, "resistance", 0.0) for motor in motors])
-    said = (
+    said: tuple[str, ...] = (
         ("initial.equilibrium: " + "; ".join(jumps) + ": that jumps at the start all the same; a path that begins at "
          "rest where the hand is does not",)
         if jumps

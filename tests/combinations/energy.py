@@ -96,27 +96,40 @@ def powers(seen: Observed) -> Finding:
         if jumps_at_ticks(seen):
             del work["heat_joule"], work["losses of gears and joints"]
     turnover, _ = turnover_and_residual(seen)
-    turning = _turning(seen) if seen.stepped else {}
+    unlike = _unlike_trapezia(seen) if seen.stepped else {}
     for name, (total, power) in work.items():
-        yield from _integrated(seen, name, total, power, turnover, turning.get(name))
+        yield from _integrated(seen, name, total, power, turnover, unlike.get(name))
 
 
-def _turning(seen: Observed) -> dict[str, Array]:
-    """Powers of friction that turns round in the steps that end at samples, (T,) [W]: of no use for an integral."""
+def _unlike_trapezia(seen: Observed) -> dict[str, Array]:
+    """How far powers at the mean state of a step may be from the mean of those at its ends, (T,) [W].
+
+    Products x y are off by Δx Δy/4. Friction that turns round within the step tells nothing of its mean power.
+    """
     before = seen.v - seen.step * seen.vdot
     turns = seen.v * before < 0.0
     joints = np.where(turns, np.abs(seen.joint_signal("joint_friction")) * (np.abs(seen.v) + np.abs(before)), 0.0)
+    joints += 0.25 * seen.bodies.damping * (seen.v - before) ** 2
     contacts = np.zeros(len(seen))
     for touch in seen.touches():
         slip, earlier = touch.slip, touch.slip_before
         size = np.linalg.norm(touch.tangential, axis=1)
         both = np.linalg.norm(slip, axis=1) + np.linalg.norm(earlier, axis=1)
         contacts = contacts + np.where((slip * earlier).sum(axis=1) < 0.0, size * both, 0.0)
-    return {"losses of gears and joints": joints.sum(axis=1), "heat_friction": contacts}
+    current, voltage = (
+        np.diff(seen.record[name], axis=0, prepend=seen.record[name][:1]) for name in ("current", "voltage")
+    )
+    resistance = np.array([getattr(motor, "resistance", 0.0) for motor in seen.robot.motors])
+    return {
+        "losses of gears and joints": joints.sum(axis=1),
+        "heat_friction": contacts,
+        "heat_joule": 0.25 * current**2 @ resistance,
+        "energy_electrical": 0.25 * np.abs(current * voltage).sum(axis=1),
+    }
 
 
 def _integrated(
-    seen: Observed, name: str, total: Array, power: Array, turnover: float, turning: Array | None
+    seen: Observed, name: str, total: Array, power: Array, turnover: float, unlike: Array | None
 ) -> Finding:
     if not seen.stepped:
         off, allowed, rows = integral_error(seen, total[:, None], power[:, None])
@@ -128,8 +141,8 @@ def _integrated(
         # Power at the mean state of a step: between those of its ends, and as much off as these differ.
         off = np.abs(total[rows] - total[rows - 1] - 0.5 * h * (now + before))[:, None]
         allowed = (h * np.abs(now - before) + 0.02 * h * (np.abs(now) + np.abs(before)) + 1e-6 * turnover)[:, None]
-        if turning is not None:
-            allowed = allowed + h * turning[rows][:, None]
+        if unlike is not None:
+            allowed = allowed + h * unlike[rows][:, None]
         quiet = np.array([(np.abs(seen.event_times - t) > 2.0 * h).all() for t in seen.time[rows]], dtype=bool)
         off = np.where(quiet[:, None], off, 0.0) if len(rows) else off
     if off.size and (off / allowed).max() > 1.0:
