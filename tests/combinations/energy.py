@@ -60,8 +60,8 @@ def losses(seen: Observed) -> Finding:
         names += [name for name in ("loss_impact", "loss_stop") if name in seen.record and not seen.stepped]
     for name in names:
         fall = -np.diff(seen.record[name])
-        # Rates of sticking points are solved to 1e-8 m/s only.
-        allowed = (1e-7 if seen.stepped else 1e-9) * turnover + 1e-12
+        # Rates of sticking points are solved to 1e-8 m/s only; dense output within a step is as accurate as the step.
+        allowed = (1e-7 if seen.stepped else seen.scenario.integrator.rtol) * turnover + 1e-12
         if seen.stepped and name == "heat_friction" and fall.size:
             # Within an impact friction may give what its normal impulse takes: only their sum is a loss.
             fall = fall - np.maximum(np.diff(seen.record["loss_impact"]), 0.0)

@@ -278,6 +278,22 @@ def test_a_joint_stop_takes_the_momentum_of_a_falling_rod():
     assert residual(b, run) < 1e-8
 
 
+def test_a_joint_that_leaves_from_a_little_beyond_its_stop_has_not_hit_it():
+    """Two others hit their stops meanwhile; the first one comes back: after 2 v/a with speed v and acceleration a."""
+    rod = pendulum(limit=0.5 * np.pi).links[0]
+    others = (replace(rod, name=f"rod_{k}", joint=f"hinge_{k}") for k in (1, 2))
+    b = assemble(replace(pendulum(), links=(rod, *others), q0=np.full(3, 0.5 * np.pi)), [], real=True)
+    beyond, speed, pull = 1.25 * ku.DEPTH, 2e-4, 0.8 * G * 0.25 / (0.8 * 0.25 / 3.0)
+    y = b.state(0.5 * np.pi + np.array([beyond, -1e-9, -1.8e-9]), np.array([-speed, 1e-2, 1e-2]))
+    run = b.simulate(y, np.linspace(0.0, 1e-3, 3), "dopri5")
+    assert run.count[ki.STATUS] == ki.FINISHED
+    codes = run.log_event[: run.count[ki.LOGGED]] - ki.STOP_LOG
+    assert codes.tolist() == [ke.LOG_KINDS * k + ke.STOP_HIT for k in (1, 2, 0)]
+    # From and to a little beyond the stop: DEPTH / v is 7 % of that time.
+    assert run.log_time[2] == pytest.approx(2.0 * speed / pull, rel=0.1)
+    np.testing.assert_allclose(run.states("q")[-1], 0.5 * np.pi, rtol=0, atol=1e-9)
+
+
 def test_a_closed_stop_that_pulls_disagrees_with_its_mode():
     """Each of two stops alone, and none that is open."""
     link = replace(pendulum().links[0], lower=-1.0, upper=1.0)

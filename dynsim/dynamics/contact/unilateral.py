@@ -56,7 +56,10 @@ STOP_FORCE = 2  # [N m or N], ≥ 0
 HITS = 3
 STOP_LOSS = 4  # [J]
 CLOSED_TIME = 5  # [s]
-STOP_SIZE = 6
+HIT_AT = (
+    6  # depth beyond the limit at which the joint has hit the stop: DEPTH, or more if it leaves from there [rad or m]
+)
+STOP_SIZE = 7
 # UnilateralArrays.dry_table, int
 DRY_JOINT = 0  # link whose joint rubs
 DRY_ROW = 1

@@ -79,7 +79,7 @@ def contact_guard(contacts: ContactArrays, unilateral: UnilateralArrays | None, 
     if kind == STOP_GUARD:
         if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
             return best if split and best > 0.0 else unilateral.stop[k, ku.STOP_FORCE]
-        return stop_gap(unilateral, ws, k) + ku.DEPTH
+        return stop_gap(unilateral, ws, k) + unilateral.stop[k, ku.HIT_AT]
     if kind == DRY_GUARD:
         if unilateral.dry_table[k, ku.DRY_HOLDS] == 0:
             rate = ws.joints[unilateral.dry_table[k, ku.DRY_JOINT], ka.QD]
@@ -203,6 +203,8 @@ def watch_modes(contacts: ContactArrays, unilateral: UnilateralArrays | None, ws
     for k in range(unilateral.stop.shape[0]):
         if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
             unilateral.stop[k, ku.CLOSED_TIME] += h
+        if unilateral.stop[k, ku.HIT_AT] > ku.DEPTH and stop_gap(unilateral, ws, k) > -ku.DEPTH:
+            unilateral.stop[k, ku.HIT_AT] = ku.DEPTH
 
 
 @internal_kernel

@@ -30,6 +30,7 @@ from dynsim.dynamics.contact.unilateral import (
     dry_rows_held,
     holding_bound,
     slide_direction,
+    stop_gap,
 )
 from dynsim.dynamics.derivative import System
 from dynsim.dynamics.tables import Workspace
@@ -190,6 +191,9 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
         evaluate(system, ws, run)
     for k in range(unilateral.dry_table.shape[0]):
         note_headway(unilateral, ws, k)
+    for k in range(unilateral.stop_table.shape[0]):
+        # A joint that leaves from a little beyond its stop has not hit it again.
+        unilateral.stop[k, ku.HIT_AT] = ku.DEPTH + max(0.0, -stop_gap(unilateral, ws, k))
     for k in range(mode.shape[0]):
         mode[k, ku.GIVES_WAY], mode[k, ku.LEAVES] = 0, 0
         starts = mode[k, ku.WANTED] == ka.SLIDING and mode[k, ku.TOUCHING] == ka.STICKING
