@@ -29,12 +29,12 @@ def random_configurations(robot: Robot, braked: Collection[int] = (), at: Array 
     """Return random coordinates, always the same; quaternions are unit.
 
     braked : joints that stay where they are in coordinates ``at``. A ball joint with a brake on one or two of its three
-        rates still comes to every attitude.
+        rates still reaches every attitude.
     """
     rng, first = np.random.default_rng(0), 0
     free = set[int]()
     for i, link in enumerate(robot.links):
-        # Rows without coordinates of their own share those of the first row of their joint.
+        # A row without coordinates moves by those of the first row of its joint.
         first = i if link.row.neutral else first
         if i not in braked:
             free.add(first)

@@ -32,7 +32,7 @@ class Brakes:
     def leave_contacts_out(self, prepared: Prepared, time: float) -> tuple[Prepared, list[str]]:
         """Leave out the contacts that only braked joints would move along their normals, and take back the others.
 
-        The force of such a contact would be any share of what the brakes carry. Call it at a time [s] at which brakes
+        The force of such a contact would be any share of the load on the brakes. Call it at a time [s] at which brakes
         have closed or opened. Returns a sentence for each contact on its surface that is left out for the first time.
         """
         model, contacts, workspace = prepared.model, prepared.contacts, prepared.workspace

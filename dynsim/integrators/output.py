@@ -78,8 +78,8 @@ def fill_drives(system: System, ws: Workspace, run: Run, out):
 def with_rotor(stepping: SteppingArrays | None, steady, inertial, a):
     """Shaft torque of motor a at a constant rate, ``steady``, less what its rotor takes, ``inertial``.
 
-    Impulses are no part of recorded torques. In the steps of an impact, whose accelerations have one in them, the
-    torque is that of the last step without; at the start of a run that of a constant rate.
+    Recorded torques are without impulses. In the steps of an impact, whose accelerations have one in them, the torque
+    stays as it was in the last step without; at the start of a run it is ``steady``.
     """
     if stepping is None:  # known to the compiler
         return steady - inertial

@@ -130,3 +130,36 @@ def test_a_contact_comes_back_when_brakes_open(tmp_path: Path, law: str, method:
     unbraked = simulation.record()
     assert not left_out(unbraked.summary["warnings"])
     assert column(unbraked, "contact_normal_force", ["elbow_4"]).min() > 10.0
+
+
+@pytest.mark.parametrize("method", ["dopri5", "radau5", "time_stepping"])
+def test_a_stop_has_no_force_behind_a_closed_brake(tmp_path: Path, method: str) -> None:
+    """The brake has all of the load of its joint; time stepping let the stop have it all."""
+    link = {"axis": "y", "length_m": 0.3, "mass_kg": 0.3, "radius_m": 0.02, "motor": {"type": "wang_minami"}}
+    config = {
+        "name": "stopped",
+        "duration_s": 0.3,
+        "plant": {"type": "serial_arm", "chain": [{**link, "initial_deg": 90.0, "limit_deg": [-10, 90]}, link]},
+        "controller": {
+            "type": "joint_pd",
+            "k_p_V_per_rad": 200.0,
+            "k_d_V_s_per_rad": 8.0,
+            "joints": {"joint_1": {"times_s": [0.05, 0.15], "angles_deg": [90, 95]}},
+        },
+        "contacts": {"law": "unilateral"},
+        "integrator": {"method": method},
+        "record": {"rate_hz": 200},
+    }
+    file = tmp_path / "stopped.yaml"
+    file.write_text(json.dumps(config))
+    simulation = dynsim.Simulation(dynsim.load_scenario(str(file)))
+    for until, closed in ((0.1, True), (0.2, False), (0.3, False)):
+        simulation.advance(until)
+        simulation.set_brake("joint_1", closed)
+    record = simulation.record()
+    force, time = record["stop_force"][:, 0], record.time
+    assert not force[(time > 0.105) & (time < 0.195)].any()
+    # Pressed against it by the motor, after the first moments.
+    assert (np.abs(force[(time > 0.06) & (time < 0.095)]) > 1.0).all()
+    assert (np.abs(force[time > 0.21]) > 1.0).all()
+    assert [event.kind for event in record.events] == ["stop_left", "stop_hit"]

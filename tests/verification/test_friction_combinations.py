@@ -6,6 +6,7 @@ problem a step and knows no modes.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -351,3 +352,76 @@ def test_elbow_that_creeps_beside_resting_joints_keeps_its_forces(tmp_path: Path
     events, steps = (run(tmp_path, CREEP, integrator__method=method) for method in ("dopri5", STEPS))
     assert events.time[-1] == pytest.approx(0.95)
     assert steps.summary["electrical_energy_J"] == pytest.approx(events.summary["electrical_energy_J"], rel=1e-2)
+
+
+# A plate with an arm on it falls onto a slope and rests on a foot of each, the joint between at its stop. If both feet
+# stick, that joint cannot turn either: dry friction, stop and feet share forces in two ways.
+PLATE_ON_TWO_FEET = """
+name: plate
+duration_s: 0.6
+plant:
+  type: urdf_arm
+  file: plate.urdf
+  initial_pose:
+    root: {position_m: [0, 0, 0.45], rpy_deg: [-33.97236522683579, -20.250416579536683, -11.350365005671776]}
+surfaces: {ramp: {type: plane, normal: [0.3, 0.2, 1], point_m: [0, 0, -0.02]}, floor: {type: plane}}
+contacts:
+  law: unilateral
+  points:
+    corner: {body: plate, point_m: [0.17664854503435728, -0.1926696722499561, -0.003297931292976654], surface: floor,
+      friction: 0.6750320362111808, restitution: 0.3}
+    arm_foot: {body: arm, point_m: [-0.0676006756783731, 0.16344847243547678, -0.053920206499389736], radius_m: 0.02,
+      surface: ramp, friction: 0.4275153818026888, static_friction: 0.5985215345237642, restitution: 0.3}
+    plate_foot: {body: plate, point_m: [0.035115196085399564, -0.10058033620298722, -0.013983361998443397],
+      surface: ramp, friction: 0.6266830781310992}
+integrator: {rtol: 1.0e-9, atol: 1.0e-11}
+record: {rate_hz: 1000}
+"""
+PLATE_URDF = """<robot name="plate_and_arm">
+  <link name="world"/>
+  <link name="plate"><inertial><origin xyz="0.011564602077909138 0.018949026680163447 -0.0093355945324286"/>
+    <mass value="2"/><inertia ixx="0.02" ixy="0" ixz="0" iyy="0.03" iyz="0" izz="0.04"/></inertial></link>
+  <link name="arm"><inertial><origin xyz="0.018551451341330696 0.09639068310852632 0.06721990416580462"/>
+    <mass value="0.5"/><inertia ixx="0.004" ixy="0" ixz="0" iyy="0.005" iyz="0" izz="0.003"/></inertial></link>
+  <joint name="root" type="floating"><parent link="world"/><child link="plate"/></joint>
+  <joint name="hinge" type="revolute"><parent link="plate"/><child link="arm"/><origin xyz="0 0 0.1"/>
+    <axis xyz="-0.9365477163197146 0.3939383568003809 -0.5240866279019979"/>
+    <limit lower="-0.4" upper="0.3" effort="100" velocity="100"/><dynamics damping="0.01" friction="0.05"/></joint>
+</robot>"""
+
+
+@pytest.mark.parametrize("method", EVENTS)
+def test_joint_at_its_stop_shares_forces_with_feet_that_stick(tmp_path: Path, method: str):
+    """Splits did not know the stop, which kept half of the torque, and friction 10 times its bound: the run stopped, as
+    foot and joint began and ceased to slip every 0.2 µs."""
+    (tmp_path / "plate.urdf").write_text(PLATE_URDF, encoding="utf-8")
+    (tmp_path / "scene.yaml").write_text(PLATE_ON_TWO_FEET, encoding="utf-8")
+    scenario = load_scenario(tmp_path / "scene.yaml", None, {"integrator.method": method})
+    start = Simulation(scenario).state
+    v = [-0.72260532, -0.07269526, 0.44573297, 1.01726545, -3.94269556, 4.55450325, 0.0]
+    simulation = Simulation(scenario, state=replace(start, v=np.array(v)))
+    simulation.advance(0.6)
+    record = simulation.record()
+    # Ten bounces, two landings, and what the joint does.
+    assert len(record.events) < 30
+    held = record.time > 0.575
+    assert held.sum() > 20
+    assert (record["contact_mode"][held, 1:] == STICKING).all()
+    assert np.abs(record["joint_friction"][held]).max() <= 0.05 * (1.0 + 1e-9)
+    assert record["stop_force"][held].min() > 0.5
+    normal, force = record["contact_normal_force"][held], record["contact_force"][held]
+    friction = np.sqrt(np.maximum((force**2).sum(axis=2) - normal**2, 0.0))
+    assert (friction[:, 1:] <= np.array([0.5985215345237642, 0.6266830781310992]) * normal[:, 1:] * (1.0 + 1e-9)).all()
+    # Together they carry what moves the plate and its arm.
+    model, normal_of_ramp = simulation.model, np.array([0.3, 0.2, 1.0]) / np.linalg.norm([0.3, 0.2, 1.0])
+    feet = scenario.config.contacts.points
+    for k in np.flatnonzero(held)[::5]:
+        q, rates = record["q"][k], record["v"][k]
+        supplied = np.zeros(7)
+        supplied[6] = record["stop_force"][k, 0] + record["joint_friction"][k, 0] - 0.01 * rates[6]
+        for c, foot in ((1, feet["arm_foot"]), (2, feet["plate_foot"])):
+            R, _ = model.body_pose(foot.body, q)
+            touching = np.array(foot.point_m) - foot.radius_m * R.T @ normal_of_ramp
+            supplied += model.point_jacobian(foot.body, touching, q).T @ record["contact_force"][k, c]
+        needed = model.inverse_dynamics(q, rates, record["vdot"][k])
+        np.testing.assert_allclose(supplied, needed, rtol=0.0, atol=1e-7)

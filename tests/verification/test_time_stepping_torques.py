@@ -1,4 +1,4 @@
-"""Shaft torques under time stepping: impacts are no part of them, so that they are those of the methods with events."""
+"""Shaft torques under time stepping: without impulses, as by the methods with events."""
 
 from __future__ import annotations
 
