@@ -152,9 +152,9 @@ def _moved(model: Model, requested: Array) -> tuple[str, ...]:
     moved = []
     for link, k in zip(robot.links, robot.position_index, strict=True):
         unit = link.units[0]
-        way = float(robot.initial[k] - requested[k])
-        if len(link.row.neutral) == 1 and abs(way) > MOVED.get(unit, math.inf):
-            moved.append(f"{link.joint} by {format_quantity(way, unit, 3)}")
+        change = float(robot.initial[k] - requested[k])
+        if len(link.row.neutral) == 1 and abs(change) > MOVED.get(unit, math.inf):
+            moved.append(f"{link.joint} by {format_quantity(change, unit, 3)}")
     if not moved:
         return ()
     return (

@@ -65,7 +65,7 @@ def state_of(seen: Observed, values: Mapping[str, Sequence[float]], currents: Ar
     motion = seen.bodies.motion(q[None], v[None], np.zeros((1, len(v))))
     names, rows, slip, friction, static = [], [], [], [], []
     for contact in seen.described_contacts:
-        body, centre, far, normal = seen.place(contact, motion)
+        body, centre, far, normal = seen.nearest_point(contact, motion)
         if far[0] - contact.radius > CLOSED:
             continue
         n = np.asarray(normal[0], dtype=np.float64)

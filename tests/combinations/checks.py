@@ -121,12 +121,12 @@ def start(seen: Observed) -> Finding:
     if initial.get("equilibrium"):
         deepest = max((-float(t.gap[0]) for t in seen.touches() if t.contact.stiffness > 0.0), default=0.0)
     allowed = START + max(deepest, 0.0) / PRESSED_LEVER_M
-    told = np.zeros_like(free)
+    warned_of = np.zeros_like(free)
     for warning in seen.run.warnings:
         if (moved := re.match("initial.equilibrium: moves (.+) from the requested posture", warning)) is not None:
-            for joint, place in places.items():
-                told[place] = told[place] or f"{joint} by " in moved[1]
-    free |= told
+            for joint, index in places.items():
+                warned_of[index] = warned_of[index] or f"{joint} by " in moved[1]
+    free |= warned_of
     if initial.get("on_surface"):
         kept = [places[joint] for joint in initial.get("keep", []) if joint in places]
         free[:] = True
@@ -141,7 +141,7 @@ def start(seen: Observed) -> Finding:
         name = seen.record.labels["q"][k]
         yield f"{name} starts at {seen.q[0, k]:.6g}, asked for {asked[k]:.6g}"
     # Against the posture that the resolved scenario has, where points were to be put on surfaces.
-    off = np.where(told, 0.0, np.abs(seen.q[0] - seen.robot.initial))
+    off = np.where(warned_of, 0.0, np.abs(seen.q[0] - seen.robot.initial))
     if off.max(initial=0.0) > allowed:
         k = int(off.argmax())
         yield f"{seen.record.labels['q'][k]} starts at {seen.q[0, k]:.6g}, the scenario has {seen.robot.initial[k]:.6g}"

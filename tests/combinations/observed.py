@@ -132,7 +132,7 @@ class Observed:
     def _touches_of_samples(self) -> list[Touch]:
         return [self._touch(k, contact, self.motion) for k, contact in enumerate(self.described_contacts)]
 
-    def place(self, contact: Contact, motion: Motion) -> tuple[int, Array, Array, Array]:
+    def nearest_point(self, contact: Contact, motion: Motion) -> tuple[int, Array, Array, Array]:
         """Return a contact's body, and at each instant the centre nearest to its surface [m], distance and normal."""
         body, point = self.robot.attach(contact.body, contact.point)
         start = motion.point(body, point)
@@ -143,7 +143,7 @@ class Observed:
         return body, centre, far, normal
 
     def _touch(self, k: int, contact: Contact, motion: Motion) -> Touch:
-        body, centre, far, normal = self.place(contact, motion)
+        body, centre, far, normal = self.nearest_point(contact, motion)
         position = centre - contact.radius * normal
         velocity = motion.velocity(body, position)
         approach = (velocity * normal).sum(axis=1)
@@ -183,12 +183,12 @@ class Observed:
         """Motion of all bodies at the midpoints of the steps that end at samples: half a step at the first rates."""
         began = self.v - self.step * self.vdot
         theta = self.scenario.integrator.theta
-        way = 0.5 * began - (began + theta * self.step * self.vdot)
-        return self.bodies.motion(self.q + position_rates(self.bodies, self.q, self.step * way), began, self.vdot)
+        rates = 0.5 * began - (began + theta * self.step * self.vdot)
+        return self.bodies.motion(self.q + position_rates(self.bodies, self.q, self.step * rates), began, self.vdot)
 
     def _at_midpoints(self, contact: Contact, rates: Array) -> tuple[Array, Array, Array, Array]:
         """At midpoints of steps: velocity at these rates in the surface and along its normal [m/s], normal, gap [m]."""
-        body, centre, far, normal = self.place(contact, self._middles)
+        body, centre, far, normal = self.nearest_point(contact, self._middles)
         velocity = np.einsum(
             "tkn,tn->tk", self.bodies.jacobian(self._middles, body, centre - contact.radius * normal), rates
         )

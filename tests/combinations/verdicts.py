@@ -430,14 +430,14 @@ def _moves_at_once(match: Match, seen: Observed) -> str:
 
 def _moved_at_the_start(match: Match, seen: Observed) -> str:
     """The first sample differs from the scenario's posture by what is said."""
-    for name, way in re.findall(rf"(\S+) by {NUMBER}", match[1]):
+    for name, angle in re.findall(rf"(\S+) by {NUMBER}", match[1]):
         joint = _joint(seen, name)
         if joint is None:
             return f"no joint {name}"
         k = seen.bodies.places[joint]
         off = float(seen.q[0, k] - seen.robot.initial[k])
         own = np.degrees(off) if seen.robot.links[joint].units[0] == "rad" else off
-        if not _near(own, way):
+        if not _near(own, angle):
             return f"{name} starts {own:.4g} from there"
     return ""
 
@@ -480,6 +480,7 @@ UNVERIFIED: dict[str, str] = {
     r"^contact rows depended on each other in": "the solver's count of evaluations",
     r"with friction, dependent contact rows leave the motion open too": "a range over splits, of which the run has one",
     r"^time stepping: the power changes so fast": "a sum over all steps, of which samples show some",
+    r"no joint without a closed brake moves this point": "of brakes, which these scenes do not close",
     r"has no effect: ": "said of a key of the scenario, not of the run",
     r"^the target waited|^the path is|^feedback and shape points|^the null-space|^joints were clamped|^the robot tips|"
     r"^the support margin|^mode \d+ was|passes its limit by": "for the kinematic snake, which these scenes do not have",

@@ -547,3 +547,29 @@ def test_a_tip_and_a_joint_on_its_stop_hold_what_only_the_stop_can(tmp_path: Pat
     assert record["stop_force"].max() <= 1e-9
     assert np.abs(record["joint_friction"]).max() <= 0.05 * (1.0 + 1e-9)
     assert np.linalg.norm(record["contact_force"][:, 0, :2], axis=1).max() <= 0.3 * 0.5 * 9.81 * (1.0 + 1e-6)
+
+
+PRESSED = """\
+duration_s: 1
+plant:
+  type: serial_arm
+  gravity_m_s2: [0, 0, 0]
+  chain: [{axis: y, length_m: 0.3, mass_kg: 0.3, motor: {type: torque}, friction_N_m: 0.3, limit_deg: [-20, 20]}]
+contacts: {law: unilateral}
+controller: {type: joint_pd, torques: {joint_1: {times_s: [0, 0.4, 0.9, 1], torques_N_m: [1, 1, END, END]}}}
+integrator: {method: METHOD}
+"""
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(("end", "moves"), [("0", False), ("-0.2", False), ("-0.6", True)])
+def test_a_joint_whose_load_fades_leaves_its_stop_once(tmp_path: Path, method: str, end: str, moves: bool):
+    """Where the load falls to what friction holds, the stop carries nothing any more and friction all of the rest."""
+    path = tmp_path / "pressed.yaml"
+    path.write_text(PRESSED.replace("END", end).replace("METHOD", method))
+    run = simulate(load_scenario(path))
+    kinds = [event.kind for event in run.events]
+    assert kinds == ["stop_hit", "slip_stop", "stop_left"] + ["slip_start"] * moves
+    assert [stop["hits"] for stop in run.summary["joint_stops"]] == [1]
+    assert (run["q"][-1, 0] < np.radians(19.0)) == moves
+    assert np.abs(run["joint_friction"]).max() <= 0.3 * (1.0 + 1e-9)

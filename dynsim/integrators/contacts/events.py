@@ -461,15 +461,6 @@ def tell_joint(unilateral: UnilateralArrays, run: Run, k, holds):
 
 
 @internal_kernel
-def rubs_at_rest(unilateral: UnilateralArrays, ws: Workspace, joint):
-    """True for the joint of a link that does not move, with dry friction."""
-    for k in range(unilateral.dry_table.shape[0]):
-        if unilateral.dry_table[k, ku.DRY_JOINT] == joint:
-            return abs(ws.joints[joint, ka.QD]) <= unilateral.number[ku.SLOW]
-    return False
-
-
-@internal_kernel
 def break_loose(unilateral: UnilateralArrays, ws: Workspace, k):
     """Let joint k, which dry friction does not hold any more, slide against it; False where its slip has ended."""
     table, split = unilateral.dry_table, unilateral.number[ku.SPLIT] == 1.0
@@ -513,8 +504,6 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
                     continue
                 table[k, ku.STOP_CLOSED] = 0
                 log(run, ki.STOP_LOG + LOG_KINDS * k + STOP_LEFT)
-                # Friction that was constant beside the stop may hold the joint.
-                by_hand = by_hand and not rubs_at_rest(unilateral, ws, table[k, ku.STOP_JOINT])
             else:
                 by_hand = False
         elif kind == DRY_GUARD:
