@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import dynsim
+from dynsim.scenario import scenario_from_resolved
 
 # Motions of the same equations with other roundings, at rtol 1e-9 [rad; N]: measured up to 4e-12 and 5e-9.
 SAME_MOTION, SAME_FORCE = 1e-9, 1e-7
@@ -163,3 +164,48 @@ def test_a_stop_has_no_force_behind_a_closed_brake(tmp_path: Path, method: str) 
     assert (np.abs(force[(time > 0.06) & (time < 0.095)]) > 1.0).all()
     assert (np.abs(force[time > 0.21]) > 1.0).all()
     assert [event.kind for event in record.events] == ["stop_left", "stop_hit"]
+
+
+def two_links(method: str) -> dynsim.Scenario:
+    """Two links under a shoulder 0.3 m above a floor, with a tip that touches it 0.05 m beside the shoulder."""
+    link = {"axis": "y", "mass_kg": 0.3, "length_m": 0.2}
+    config = {
+        "name": "pole",
+        "duration_s": 0.2,
+        "plant": {
+            "type": "serial_arm",
+            "base": {"position_m": [0, 0, 0.3]},
+            "chain": [{**link, "initial_deg": 130}, {**link, "initial_deg": 81}],
+        },
+        "surfaces": {"floor": {"type": "plane"}},
+        "contacts": {
+            "law": "unilateral",
+            "friction": 0.3,
+            "points": {"tip": {"body": "link_2", "point_m": [0, 0, 0.2]}},
+        },
+        "initial": {"on_surface": ["tip"]},
+        "integrator": {"method": method},
+    }
+    return scenario_from_resolved(config)
+
+
+@pytest.mark.parametrize("method", ["dopri5", "radau5"])
+@pytest.mark.parametrize(("sign", "leaves"), [(1.0, False), (-1.0, True)])
+def test_what_separates_as_a_brake_closes_leaves(method: str, sign: float, leaves: bool) -> None:
+    """A sliding tip that the brake's impulse lifts, where its friction would be beyond Painlevé's limit."""
+    scenario, tip = two_links(method), np.array([0.0, 0.0, 0.2])
+    simulation = dynsim.Simulation(scenario)
+    q = simulation.state.q
+    normal = np.asarray(simulation.model.point_jacobian("link_2", tip, q))[2]
+    along = np.array([normal[1], -normal[0]])
+    simulation = dynsim.Simulation(
+        scenario, state=dynsim.State(0.0, q, sign * along / np.abs(along).max(), np.zeros(0))
+    )
+    simulation.advance(0.01)
+    simulation.set_brake("joint_2", True)
+    state = simulation.state
+    rate = np.asarray(simulation.model.point_jacobian("link_2", tip, state.q))[2] @ state.v
+    assert (rate > 0.01) == leaves
+    simulation.advance(0.1)
+    first = simulation.record().events[0]
+    assert (first.time, first.kind) == (0.01, "lift_off" if leaves else "slip_stop")

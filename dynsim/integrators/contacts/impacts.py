@@ -92,7 +92,7 @@ def find_touching(system: System, ws: Workspace, touch):
 
 @internal_kernel
 def keep_touching(unilateral: UnilateralArrays, ws: Workspace):
-    """After an impact: what leaves faster than SETTLE touches no more."""
+    """What leaves faster than SETTLE touches no more: after an impact, or a brake that has closed."""
     state, mode, table, stop = ws.contacts, unilateral.mode, unilateral.stop_table, unilateral.stop
     for k in range(mode.shape[0]):
         if state[k, ka.GAP_RATE] > unilateral.tally[k, ku.SETTLE]:

@@ -85,7 +85,7 @@ def resolve(system: System, ws: Workspace, run: Run, touch):
         if run.count[ki.STATUS] == ki.NO_CONTACT_FORCES:
             return
         evaluate(system, ws, run)
-        keep_touching(unilateral, ws)
+    keep_touching(unilateral, ws)
     choose(system, ws, run)
 
 
