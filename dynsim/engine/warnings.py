@@ -128,7 +128,9 @@ def _contact_warnings(
     within = f" from t = {record.time[0]:.4g} s on" if len(record) and record.time[0] > begun else ""
     for contact in summary["contacts"]:
         name = contact["name"]
-        if "gap_min_m" in contact and contact["closed_fraction"] == 0.0 and name not in left_out:
+        # What only bounces is closed at no time.
+        never = "gap_min_m" in contact and contact["closed_fraction"] == 0.0 and not contact.get("bounces")
+        if never and name not in left_out:
             nearest = int(record["contact_gap"][:, columns.index(name)].argmin())
             time, surface = f"t = {record.time[nearest]:.4g} s", contact["surface"]
             if contact["gap_min_m"] <= build.START_TOLERANCE:

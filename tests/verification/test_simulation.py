@@ -674,3 +674,27 @@ def test_references_that_end_a_rounding_before_the_run_do_not_cut_its_last_step(
     for name in whole:
         assert whole[name].tobytes() == pieces[name].tobytes(), name
     assert whole.summary["steps"] == pieces.summary["steps"]
+
+
+LIFTED = """
+duration_s: 0.3
+plant:
+  type: serial_arm
+  chain: [{axis: y, mass_kg: 0.8, length_m: 0.3, initial_deg: 60, motor: {type: wang_minami}}]
+controller:
+  type: joint_pd
+  feed_forward: PLAN
+  joints: {joint_1: {times_s: [0, 0.2], angles_deg: [60, 75]}}SAMPLED
+"""
+
+
+@pytest.mark.parametrize("sampled", ["", "\n  sample_time_s: 0.001"])
+@pytest.mark.parametrize("plan", ["gravity", "dynamics"])
+def test_planned_voltages_hold_after_the_end_of_the_scenario(tmp_path, plan, sampled):
+    """As references do: the arm stands where its path ends; its last voltage is that of its weight."""
+    scenario = read(tmp_path, LIFTED.replace("PLAN", plan).replace("SAMPLED", sampled))
+    simulation = dynsim.Simulation(scenario, duration=1.5)
+    simulation.advance(1.5)
+    record = simulation.record()
+    assert np.degrees(record["q"][-1, 0]) == pytest.approx(75.0, abs=0.01)
+    assert abs(record["v"][-1, 0]) < 1e-4

@@ -410,3 +410,10 @@ def test_stops_that_cannot_be(tmp_path, lines, words):
 
     with pytest.raises(DynsimError, match=words):
         simulate(stopped_arm(tmp_path, *lines))
+
+
+def test_what_only_bounces_has_touched():
+    """No warning that a point never touches its surface where each of its landings is a bounce."""
+    record = simulate(load_scenario("bouncing_link", overrides={"duration_s": 0.22}))
+    assert [event.kind for event in record.events] == ["bounce"]
+    assert not [warning for warning in record.summary["warnings"] if "never touches" in warning]

@@ -73,10 +73,10 @@ def command(drives: DriveArrays, ws: Workspace, a):
 
 @internal_kernel
 def fed_forward(voltage, grid, t, a, asked):
-    """The command of a drive with its planned voltage, where there are any."""
+    """The command of a drive with its planned voltage, where there are any: after the plan's end its last value."""
     if voltage.shape[0] == 0:
         return asked
-    x = t - grid[0]
+    x = min(t - grid[0], voltage.shape[0] * grid[1])
     k = min(max(int(x / grid[1]), 0), voltage.shape[0] - 1)
     x -= k * grid[1]
     total = 0.0
