@@ -30,7 +30,8 @@ def even_times(start: float, end: float, rate: float, first: int = 0, count: int
         return start + np.arange(first, first + count) / rate
     last = math.floor((end - start) * rate * (1.0 + 1e-12))
     stop = last + 2 if count is None else first + count
-    times = start + np.arange(first, min(stop, last + 1)) / rate
+    # A sample that rounding puts behind the end would never come.
+    times = np.minimum(start + np.arange(first, min(stop, last + 1)) / rate, end)
     apart = end - (start + last / rate) > 1e-9 * (end - start)
     return np.append(times, end) if apart and first <= last + 1 < stop else times
 

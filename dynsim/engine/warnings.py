@@ -231,6 +231,17 @@ def _undetermined(record: Record, prepared: Prepared) -> list[str]:
             ]
         if not touching:
             return []
+        slides = (record["contact_mode"] == ka.SLIDING).any(axis=0)
+        sliding = [
+            contact.name
+            for contact, some in zip(contacts, slides, strict=True)
+            if some and contact.friction > 0.0 and contact.name in touching
+        ]
+        if sliding:
+            return [
+                f"{', '.join(touching)}: shared forces which the motion does not determine; while {first_few(sliding)} "
+                "slides, other choices may move otherwise; those of the record change least from the last change of modes"
+            ]
         return [
             f"{', '.join(touching)}: shared forces which the motion does not determine, as points that stick do: "
             "they are the split of least norm among those that lie in all friction cones"

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from dynsim import Scenario, Simulation, State, load_scenario
+from dynsim.engine.trace import even_times
 from dynsim.errors import ModelError
 
 HALFWAY = 0.15
@@ -169,3 +170,12 @@ def test_an_operator_goes_on_from_the_posture_and_the_time_of_a_state(tmp_path: 
     np.testing.assert_allclose(target[0], hand[0], atol=1e-12)
     np.testing.assert_allclose(target - target[0], whole["target_position"][later] - whole["target_position"][later][0],
                                atol=error)  # fmt: skip
+
+
+@pytest.mark.parametrize("start", [0.1, 0.2, 0.4])
+@pytest.mark.parametrize("rate", [50.0, 100.0, 200.0, 500.0, 1000.0])
+def test_samples_end_at_the_end_wherever_they_begin(start: float, rate: float) -> None:
+    """0.2 s + 80/200 s rounds to more than 0.6 s; such a sample would never come."""
+    times = even_times(start, 0.6, rate)
+    assert times[-1] == 0.6
+    assert len(times) == 1 + round((0.6 - start) * rate)
