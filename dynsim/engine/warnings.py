@@ -240,7 +240,8 @@ def _undetermined(record: Record, prepared: Prepared) -> list[str]:
         if sliding:
             return [
                 f"{', '.join(touching)}: shared forces which the motion does not determine; while {first_few(sliding)} "
-                "slides, other choices may move otherwise; those of the record change least from the last change of modes"
+                "slides, other choices may move otherwise; those of the record change least from the last change of "
+                "modes"
             ]
         return [
             f"{', '.join(touching)}: shared forces which the motion does not determine, as points that stick do: "
