@@ -30,7 +30,16 @@ from dynsim.dynamics.contact.mobility import moves_along_normal
 from dynsim.dynamics.contact.rows import point_row, set_modes
 from dynsim.dynamics.contact.unilateral import UnilateralArrays, dry_bound, sliding_friction, stop_gap
 from dynsim.dynamics.tables import ModelArrays, Workspace
-from dynsim.dynamics.tree.spatial import dot_vector, point_velocity, six, times_number, vector
+from dynsim.dynamics.tree.spatial import (
+    dot_vector,
+    point_velocity,
+    rotate,
+    rotation,
+    six,
+    times_number,
+    transform,
+    vector,
+)
 from dynsim.integrators.stepping import tables as kt
 from dynsim.integrators.stepping.compliance import (
     accept_ties,
@@ -48,6 +57,8 @@ SAME_ROW = 0.95
 # A place of contact that has moved by more than this times the way of the body there is another one; by less than the
 # second, which the body may have gone as it turned back, it is the same [m].
 SAME_PLACE, SHORT_WAY = 4.0, 1e-4
+# What is no further from the end of an axis, as a part of its length, is the end.
+AT_END = 1e-9
 # What is no further from its surface touches when a run begins, or its rates have jumped [m].
 TOUCHES = 1e-9
 # A gap is closed, and depth taken back, within this time, and no shorter one than so many steps [s]; not faster than
@@ -139,6 +150,7 @@ def list_contacts(system, s: SteppingArrays, ws: Workspace, h):
         s.turn[k, kt.KNOWN] = 1.0 if known else 0.0
         listed = ws.contacts[k, ka.GAP] <= kt.MARGIN or (known and last[kt.CLOSED] == 1.0)
         # Its depth is no reason: it is taken back slowly.
+        listed = listed and not at_axis_end(system, ws, k)
         listed = listed and moves_along_normal(system.model, system.contacts, ws, k, 0.0)
         mode = ka.STICKING if listed else ka.OPEN
         changed = changed or mode != s.modes[k]
@@ -146,6 +158,27 @@ def list_contacts(system, s: SteppingArrays, ws: Workspace, h):
     if changed:
         set_modes(system.contacts, system.couplings, system.unilateral, ws, s.modes)
     return changed
+
+
+@internal_kernel
+def at_axis_end(system, ws: Workspace, k):
+    """True if candidate k is the nearest point of an axis and an end of it, which has a candidate of its own.
+
+    Its radius is smaller, but a step lets points in by more than that: both would carry.
+    """
+    shapes = system.shapes
+    if shapes is None:  # known to the compiler
+        return False
+    if shapes.kind[k, kd.MOVES] == 0:
+        return False
+    i = system.contacts.link[k, ka.LINK]
+    R = rotation(ws.links, i, ka.R)
+    start = transform(vector(ws.links, i, ka.P), R, vector(system.contacts.point, k, ka.POINT))
+    axis, at = rotate(R, vector(shapes.data, k, kd.D)), centre(shapes, ws.contacts[k], k)
+    along, square = 0.0, dot_vector(axis, axis)
+    for m in range(3):
+        along += (at[m] - start[m]) * axis[m]
+    return min(along, square - along) <= AT_END * square
 
 
 @internal_kernel
