@@ -1,4 +1,4 @@
-"""Ends of links touch once by time stepping too, though their spheres and the nearest point of the axis are both near."""
+"""Ends of links touch once by time stepping too, where spheres and the nearest point of the axis are both near."""
 
 from __future__ import annotations
 
