@@ -303,8 +303,6 @@ def test_joints_start_to_move_as_an_elbow_leaves(tmp_path: Path):
 @pytest.mark.parametrize("friction", [0.05, 0.1, 0.2, 0.3, 0.5])
 def test_elbow_and_resting_joints_move_as_by_time_stepping(tmp_path: Path, surface: str, friction: float):
     """Runs of such scenes stopped as Painlevé's paradox, or as chatter."""
-    if (surface, friction) == ("bowl", 0.2):
-        pytest.xfail("event-driven runs stop as chatter at 0.034 s: known, not mended")
     for dry in (0.02, 0.1, 0.3):
         text = elbow_on(surface, friction, dry)
         runs = [run(tmp_path, text, integrator__method=method) for method in ("dopri5", STEPS)]

@@ -479,7 +479,7 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
     if unilateral is None:
         return
     mode, table = unilateral.mode, unilateral.stop_table
-    happened, by_hand, leaves = 0, True, False
+    happened, by_hand, leaves, begins = 0, True, False, False
     for e in range(run.event.shape[0]):
         if run.event_table[e, ki.EVENT_KIND] >= NORMAL_GUARD and run.event[e, ki.VALUE] <= 0.0:
             happened += 1
@@ -507,7 +507,9 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
             else:
                 by_hand = False
         elif kind == DRY_GUARD:
+            held = unilateral.dry_table[k, ku.DRY_HOLDS]
             by_hand = break_loose(unilateral, ws, k) and by_hand
+            begins = begins or unilateral.dry_table[k, ku.DRY_HOLDS] < held
         elif ws.active[k, ka.MODE] == ka.OPEN:
             by_hand = False
         elif kind == NORMAL_GUARD and mode[k, ku.WANTED] == ka.STICKING and unilateral.number[ku.SPLIT] == 1.0:
@@ -530,7 +532,7 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
                 mode[k, ku.GIVES_WAY], by_hand = 1, False
                 continue
             begin_slip(system, ws, k, ws.rows[r + 1, ka.FORCE], ws.rows[r + 2, ka.FORCE])
-            mode[k, ku.WANTED] = ka.SLIDING
+            mode[k, ku.WANTED], begins = ka.SLIDING, True
             tell(system, run, k, SLIP_START)
         elif mode[k, ku.WANTED] == ka.SLIDING:
             # Either slip has only turned, or all is to be looked at.
@@ -539,7 +541,7 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
         keep_shares(unilateral, ws, mode[:, ku.WANTED])
         set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
         if some_rest_without_row(unilateral):
-            hold_free_joints(system, ws, run)
+            hold_free_joints(system, ws, run, begins)
         tell_joints(unilateral, run)
         rearm(run)
         count_changes(system, run)

@@ -381,19 +381,19 @@ def rest_without_row(unilateral: UnilateralArrays, k):
 
 
 @noinline_kernel
-def hold_free_joints(system: System, ws: Workspace, run: Run):
+def hold_free_joints(system: System, ws: Workspace, run: Run, begins):
     """Give rows to the joints that rest with a constant force and that contacts and stops no longer hold.
 
-    After single modes have changed, at the end of an accepted step.
+    After single modes have changed, at the end of an accepted step. If slip ``begins`` somewhere, a joint whose force
+    is all of its friction moves with what has held it: with a row it would stick, and break loose at once.
     """
     unilateral, y = system.unilateral, run.y
     table, dry, mode = unilateral.dry_table, unilateral.dry, unilateral.mode
     W, factor, row = ws.small[0], unilateral.room[ku.SPLIT_MATRIX], unilateral.index[0]
     for k in range(table.shape[0]):
-        free = (
-            rests_without_row(unilateral, k)
-            and abs(ws.joints[table[k, ku.DRY_JOINT], ka.QD]) <= (unilateral.number[ku.SLOW])
-        )
+        rests = abs(ws.joints[table[k, ku.DRY_JOINT], ka.QD]) <= unilateral.number[ku.SLOW]
+        moves = begins and abs(dry[k, ku.DRY_SIDE]) >= 1.0 - FORCE_TOLERANCE
+        free = rests_without_row(unilateral, k) and rests and not moves
         table[k, ku.DRY_NEXT] = 1 if free else 0
         if free:
             table[k, ku.DRY_HOLDS], dry[k, ku.DRY_AT] = 1, ws.joints[table[k, ku.DRY_JOINT], ka.Q]
