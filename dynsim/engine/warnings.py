@@ -20,7 +20,7 @@ from dynsim.errors import first_few
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts import events as ke
 from dynsim.integrators.stepping import tables as kt
-from dynsim.model.description import Robot
+from dynsim.model.description import Contact, Robot
 from dynsim.model.drives import Drive, Motor, Servo, TorqueSource
 from dynsim.record import Record
 from dynsim.record.measures import RESIDUAL_LIMIT, TIP_OVER, least_loads, overturns_settled, percent
@@ -198,6 +198,16 @@ def _limits_of(motor: Drive) -> list[tuple[str, str, float, str]]:
     return limits
 
 
+def _sliding(record: Record, contacts: Sequence[Contact], names: Sequence[str], samples: Any) -> list[str]:
+    """Those of the named contacts that slide with friction in some of the samples, an index of them."""
+    slides = (record["contact_mode"][samples] == ka.SLIDING).any(axis=0)
+    return [
+        contact.name
+        for contact, some in zip(contacts, slides, strict=True)
+        if some and contact.friction > 0.0 and contact.name in names
+    ]
+
+
 def _undetermined(record: Record, prepared: Prepared) -> list[str]:
     """Contact rows that depend on each other: forces, and with friction the motion too, that are one of many."""
     run, system, contacts = prepared.run, prepared.system, prepared.contacts
@@ -217,12 +227,7 @@ def _undetermined(record: Record, prepared: Prepared) -> list[str]:
                 "motion does not determine them, and those of the record are one choice of many"
             ]
         if joints:
-            slides = (record["contact_mode"] == ka.SLIDING) & rests.any(axis=1, keepdims=True)
-            sliding = [
-                contact.name
-                for contact, some in zip(contacts, slides.any(axis=0), strict=True)
-                if some and contact.friction > 0.0 and contact.name in touching
-            ]
+            sliding = _sliding(record, contacts, touching, rests.any(axis=1))
             motion = f"; while {first_few(sliding)} slides, other choices may move otherwise" if sliding else ""
             return [
                 f"{first_few(touching)}: shared forces with the dry friction of {first_few(joints)}, which keeps these "
@@ -231,13 +236,7 @@ def _undetermined(record: Record, prepared: Prepared) -> list[str]:
             ]
         if not touching:
             return []
-        slides = (record["contact_mode"] == ka.SLIDING).any(axis=0)
-        sliding = [
-            contact.name
-            for contact, some in zip(contacts, slides, strict=True)
-            if some and contact.friction > 0.0 and contact.name in touching
-        ]
-        if sliding:
+        if sliding := _sliding(record, contacts, touching, slice(None)):
             return [
                 f"{', '.join(touching)}: shared forces which the motion does not determine; while {first_few(sliding)} "
                 "slides, other choices may move otherwise; those of the record change least from the last change of "

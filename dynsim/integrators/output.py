@@ -65,13 +65,14 @@ def fill_drives(system: System, ws: Workspace, run: Run, out):
         i = system.drives.table[a, ka.DRIVEN]
         out[columns.current + a] = motors[a, ka.CURRENT]
         out[columns.voltage + a] = motors[a, ka.VOLTAGE]
-        steady = (
-            motor[a, ka.K_M] * motors[a, ka.CURRENT]
-            - motor[a, ka.D_M] * joints[i, ka.QD]
-            - motors[a, ka.DRAG]
-            - motors[a, ka.DRY_DRAG]
-        )
+        steady = steady_torque(motor, motors, a, joints[i, ka.QD])
         out[columns.torque + a] = with_rotor(run.stepping, steady, motor[a, ka.J_M] * out[columns.vdot + i], a)
+
+
+@internal_kernel
+def steady_torque(motor, motors, a, v):
+    """Shaft torque of motor a at a constant rate v [N m or N]."""
+    return motor[a, ka.K_M] * motors[a, ka.CURRENT] - motor[a, ka.D_M] * v - motors[a, ka.DRAG] - motors[a, ka.DRY_DRAG]
 
 
 @internal_kernel

@@ -179,12 +179,16 @@ class Observed:
         )
 
     @cached_property
-    def _middles(self) -> Motion:
-        """Motion of all bodies at the midpoints of the steps that end at samples: half a step at the first rates."""
+    def q_middle(self) -> Array:
+        """Coordinates at the midpoints of the steps that end at samples: half a step from their start at its rates."""
         began = self.v - self.step * self.vdot
-        theta = self.scenario.integrator.theta
-        rates = 0.5 * began - (began + theta * self.step * self.vdot)
-        return self.bodies.motion(self.q + position_rates(self.bodies, self.q, self.step * rates), began, self.vdot)
+        back = 0.5 * began - (began + self.scenario.integrator.theta * self.step * self.vdot)
+        return np.asarray(self.q + position_rates(self.bodies, self.q, self.step * back))
+
+    @cached_property
+    def _middles(self) -> Motion:
+        """Motion of all bodies there, at the rates of the start."""
+        return self.bodies.motion(self.q_middle, self.v - self.step * self.vdot, self.vdot)
 
     def _at_midpoints(self, contact: Contact, rates: Array) -> tuple[Array, Array, Array, Array]:
         """At midpoints of steps: velocity at these rates in the surface and along its normal [m/s], normal, gap [m]."""
@@ -340,7 +344,7 @@ def _stepped_balance(seen: Observed) -> Balance:
     a, v_end, q_end = seen.vdot[rows], seen.v[rows], seen.q[rows]
     v_start = v_end - h * a
     v_theta = v_start + theta * h * a
-    q_middle = q_end + position_rates(seen.bodies, q_end, 0.5 * h * v_start - h * v_theta)
+    q_middle = seen.q_middle[rows]
     middle = seen.bodies.motion(q_middle, v_theta, a)
     end = seen.bodies.motion(q_end, v_end, a)
     current, slack = _theta_currents(seen, rows, v_theta, theta)

@@ -56,9 +56,7 @@ STOP_FORCE = 2  # [N m or N], ≥ 0
 HITS = 3
 STOP_LOSS = 4  # [J]
 CLOSED_TIME = 5  # [s]
-HIT_AT = (
-    6  # depth beyond the limit at which the joint has hit the stop: DEPTH, or more if it leaves from there [rad or m]
-)
+HIT_AT = 6  # depth beyond the limit at which the joint hits the stop: DEPTH, or more if it left from there [rad or m]
 STOP_SIZE = 7
 # UnilateralArrays.dry_table, int
 DRY_JOINT = 0  # link whose joint rubs

@@ -149,8 +149,8 @@ def list_contacts(system, s: SteppingArrays, ws: Workspace, h):
         known = last[kt.LISTED] == 1.0 and goes_on(system, last, ws, k, h)
         s.turn[k, kt.KNOWN] = 1.0 if known else 0.0
         listed = ws.contacts[k, ka.GAP] <= kt.MARGIN or (known and last[kt.CLOSED] == 1.0)
-        # Its depth is no reason: it is taken back slowly.
         listed = listed and not at_axis_end(system, ws, k)
+        # Its depth is no reason: it is taken back slowly.
         listed = listed and moves_along_normal(system.model, system.contacts, ws, k, 0.0)
         mode = ka.STICKING if listed else ka.OPEN
         changed = changed or mode != s.modes[k]

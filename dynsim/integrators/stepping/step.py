@@ -18,7 +18,7 @@ from dynsim.integrators import run as ki
 from dynsim.integrators.contacts import events as ke
 from dynsim.integrators.dense import sampled_now
 from dynsim.integrators.events import take_ticks
-from dynsim.integrators.output import fill_drives, fill_energies, write_output
+from dynsim.integrators.output import fill_drives, fill_energies, steady_torque, write_output
 from dynsim.integrators.run import Run
 from dynsim.integrators.stepping import tables as kt
 from dynsim.integrators.stepping.compliance import book_soft_contact, book_ties
@@ -283,13 +283,8 @@ def keep_torques(system: System, ws: Workspace, run: Run):
     for a in range(ws.motors.shape[0]):
         i = system.drives.table[a, ka.DRIVEN]
         v = y[layout.v + i] + s.theta * (y_new[layout.v + i] - y[layout.v + i])
-        s.torque[a] = (
-            motor[a, ka.K_M] * ws.motors[a, ka.CURRENT]
-            - motor[a, ka.J_M] * s.before[kt.ACCELERATION, i]
-            - motor[a, ka.D_M] * v
-            - ws.motors[a, ka.DRAG]
-            - ws.motors[a, ka.DRY_DRAG]
-        )
+        inertial = motor[a, ka.J_M] * s.before[kt.ACCELERATION, i]
+        s.torque[a] = steady_torque(motor, ws.motors, a, v) - inertial
 
 
 @internal_kernel
