@@ -507,9 +507,9 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
             else:
                 by_hand = False
         elif kind == DRY_GUARD:
-            held = unilateral.dry_table[k, ku.DRY_HOLDS]
+            before = unilateral.dry_table[k, ku.DRY_HOLDS]
             by_hand = break_loose(unilateral, ws, k) and by_hand
-            begins = begins or unilateral.dry_table[k, ku.DRY_HOLDS] < held
+            begins = begins or unilateral.dry_table[k, ku.DRY_HOLDS] < before
         elif ws.active[k, ka.MODE] == ka.OPEN:
             by_hand = False
         elif kind == NORMAL_GUARD and mode[k, ku.WANTED] == ka.STICKING and unilateral.number[ku.SPLIT] == 1.0:
