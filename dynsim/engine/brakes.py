@@ -9,11 +9,24 @@ import numpy as np
 from dynsim.compile.mobility import immobile, mobility_floors
 from dynsim.compile.shapes import gap_at
 from dynsim.dynamics import tables as ka
-from dynsim.dynamics.contact.rows import set_modes
+from dynsim.dynamics.contact.rows import row_errors, set_modes
+from dynsim.dynamics.derivative import derivative
 from dynsim.dynamics.state import block
 from dynsim.engine.prepare import Prepared
+from dynsim.integrators.project import project_level
 from dynsim.jit.kernel import integers
 from dynsim.scenario import Scenario, build
+
+
+def projection_loss(prepared: Prepared, time: float) -> float:
+    """Project rates onto the rows of the bilateral law; returns the kinetic energy that they lose [J].
+
+    Steps project rates too, by their own error, which the ledger has to show.
+    """
+    system, workspace, y = prepared.system, prepared.workspace, prepared.run.y
+    derivative(system, time, y, workspace, np.zeros_like(y))
+    row_errors(workspace)
+    return float(project_level(system, workspace, y, 1))
 
 
 class Brakes:

@@ -366,8 +366,8 @@ def sharing(
     shared: set[int] = set()
     order = np.argsort(-rests.sum(axis=1), kind="stable")
     first = order[np.unique(modes[order], axis=0, return_index=True)[1]]
-    closed, sticks = np.count_nonzero(modes != ka.OPEN, axis=1), (modes == ka.STICKING).any(axis=1)
-    several = [t for t in sorted(first) if (closed[t] > 1 and sticks[t]) or (closed[t] > 0 and rests[t].any())]
+    closed = np.count_nonzero(modes != ka.OPEN, axis=1)
+    several = [t for t in sorted(first) if closed[t] > 1 or (closed[t] > 0 and rests[t].any())]
     for t in several[:MOST_SETS]:
         bases, owner = [], []
         for k in np.flatnonzero(modes[t] != ka.OPEN).tolist():

@@ -55,7 +55,7 @@ class Linearization:
     time : [s]
     x, xdot : (x,) the state, at the end of a step, and its rate, which is zero only in an equilibrium
     modes : of each contact point: open, sliding or sticking; under the bilateral law all slide
-    error : largest difference between two estimates of an entry, in parts of the largest entry of its row
+    error : of the least exact entry, in parts of the largest one of its row; estimated, to a factor of about ten
     """
 
     A: Array
@@ -256,7 +256,8 @@ def _jacobian(function: Callable[[Array], Array], size: int) -> tuple[Array, flo
         estimates.append(np.stack(columns, axis=1))
     every = np.stack(estimates)
     changes = np.abs(np.diff(every, axis=0))
-    best = changes.argmin(axis=0)[None]
-    slope, change = (np.take_along_axis(table, best, axis=0)[0] for table in (every[1:], changes))
+    slope = np.take_along_axis(every[1:], changes.argmin(axis=0)[None], axis=0)[0]
+    # The least of all changes is small by chance: the next one is nearer to the error.
+    change = np.sort(changes, axis=0)[1]
     largest = np.abs(slope).max(axis=1, initial=NOTHING, keepdims=True)
     return slope, float((change / largest).max(initial=0.0))

@@ -59,6 +59,9 @@ STEPS_LIMIT = 2e8
 # A run whose last MOST_TRIALS steps have come no further than this stands still, unless it is short [s]: it has met
 # events that lie closer than steps of any stiff robot.
 STANDS = 1e-5
+# Slip slower than this has no direction of its own, however tight the tolerances: the rate at which friction turns slip
+# goes as its inverse, and steps with it; a millisecond of such slip is a nanometre [m/s].
+SLOWEST = 1e-6
 # More steps than any run takes.
 _EVERY_STEP = 1 << 62
 
@@ -325,7 +328,7 @@ def guards(
 
 def slow_slip(atol: float) -> float:
     """Speed below which the direction of slip is noise of the integration, so that the last one stands [m/s]."""
-    return max(1000.0 * atol, 1e-9)
+    return max(1000.0 * atol, SLOWEST)
 
 
 def _least_progress(duration: float) -> float:

@@ -32,7 +32,7 @@ from dynsim.dynamics.drive.law import take_measured_commands
 from dynsim.dynamics.state import block
 from dynsim.dynamics.tree import loads as kl
 from dynsim.engine import attended
-from dynsim.engine.brakes import Brakes
+from dynsim.engine.brakes import Brakes, projection_loss
 from dynsim.engine.linearization import Linearization, linearized
 from dynsim.engine.operator import Operator
 from dynsim.engine.outcome import mark_stopped, raise_stopped
@@ -478,9 +478,9 @@ class Simulation:
         """Close or open the brake that every joint is thought to have: it holds the joint where it is.
 
         A joint that turns is brought to rest by an impulse, Δv = −M⁻¹ e v_j / (eᵀ M⁻¹ e) with e the joint's unit vector
-        and M with rotors, and joint losses of the ledger take the kinetic energy, ½ v_j² / (eᵀ M⁻¹ e). Contacts of the
-        unilateral law answer with impulses of their own; other constraints are met again by projection, which the
-        ledger does not see. A contact that braked joints alone would move along its normal is left out meanwhile.
+        and M with rotors, and joint losses of the ledger take the kinetic energy, ½ v_j² / (eᵀ M⁻¹ e). Contacts and
+        couplings answer with impulses of their own: what these take is impact loss under the unilateral law, joint loss
+        under the bilateral one. A contact that braked joints alone would move along its normal is left out meanwhile.
         """
         j = _index(self._joints, joint, "joint")
         if any(joint in (coupling.joint, coupling.leader) for coupling in self.robot.couplings):
@@ -503,6 +503,8 @@ class Simulation:
             log.warning("%s: %s", self._scenario.title, sentence)
         if (law := self._prepared.system.unilateral) is not None:
             law.dry_table[law.dry_table[:, ku.DRY_JOINT] == j, ku.DRY_BRAKE] = ku.CLOSED if closed else ku.OPENED
+        elif closed:
+            run.y[run.layout.ledger + kst.JOINT] += projection_loss(self._prepared, self._time)
         if run.count[ki.MODES_DUE] == 0:
             run.count[ki.MODES_DUE] = ki.AFTER_JUMP
         self._restart()

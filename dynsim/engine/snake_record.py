@@ -9,12 +9,17 @@ from numpy.typing import NDArray
 
 from dynsim.engine.snake_control import OBSTACLES, SnakeControl
 from dynsim.record import Record
+from dynsim.record.measures import SHORT, percent
 from dynsim.snake import state as ss
 from dynsim.snake.description import COORDINATES, conditioning
 from dynsim.snake.state import SnakeTrace
 
 OUT_OF_REACH = 1.0
 """A target whose motion has waited for this time at the end of a run [s] is reported out of reach."""
+
+
+ASTRAY = 1e-3
+"""A head that is further than this from where its controller takes it to be [m] is reported."""
 
 
 def _wrapped(angle: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -162,10 +167,10 @@ def task_summary(run: SnakeControl, record: Record) -> dict[str, Any]:
 def task_warnings(run: SnakeControl, record: Record, summary: dict[str, Any]) -> list[str]:
     """What a user should know of the control, a line each."""
     warnings = []
-    if summary["waiting_s"] > 0.0:
-        share = 100.0 * summary["waiting_s"] / max(summary["duration_s"], 1e-9)
+    if summary["waiting_s"] >= SHORT * summary["duration_s"] > 0.0:
+        share = percent(min(summary["waiting_s"] / summary["duration_s"], 1.0))
         why = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in summary["waiting_for_s"].items())
-        warnings.append(f"the target waited for {summary['waiting_s']:.2f} s ({share:.0f} % of the run): {why}")
+        warnings.append(f"the target waited for {summary['waiting_s']:.2f} s ({share} of the run): {why}")
     if (gone := summary["out_of_reach"]) is not None:
         target = ", ".join(f"{value:.3f}" for value in record["w_target"][-1])
         warnings.append(
@@ -196,15 +201,20 @@ def task_warnings(run: SnakeControl, record: Record, summary: dict[str, Any]) ->
             "(controller.limit_policy: allocate)"
         )
     if summary["clamped_joint_ticks"]:
+        off = np.linalg.norm(record["w_estimate"][:, :3] - record["w_target"][:, :3], axis=1).max()
         warnings.append(
-            f"joints were clamped at their limits in {summary['clamped_joint_ticks']} joint-ticks: the head is off its "
-            f"target by up to {1e3 * summary['position_error_max_m']:.3g} mm"
+            f"joints were clamped at their limits in {summary['clamped_joint_ticks']} joint-ticks: by the joint angles "
+            f"that the controller knows, the head is off its target by up to {1e3 * off:.3g} mm"
+        )
+    astray = np.linalg.norm(record["w"][:, :3] - record["w_estimate"][:, :3], axis=1).max()
+    if astray > ASTRAY and run.controller.schedule.state_source not in {ss.MEASURED, ss.GIVEN}:
+        warnings.append(
+            f"the head is up to {1e3 * astray:.3g} mm from where the controller takes it to be: servos sag under their "
+            "loads and wheels slip (controller.state: measured sees both)"
         )
     if summary["tipping"]:
-        share = 100.0 * float((record["support_margin"] <= 0.0).mean())
-        warnings.append(
-            f"the robot tips: its centre of mass is outside the support polygon for {share:.1f} % of the run"
-        )
+        share = percent(float((record["support_margin"] <= 0.0).mean()))
+        warnings.append(f"the robot tips: its centre of mass is outside the support polygon for {share} of the run")
     least, margin = run.controller.least_margin, record["support_margin"]
     if least > 0.0 and not summary["tipping"] and margin.min() <= least:
         worst = int(margin.argmin())

@@ -23,7 +23,7 @@ from dynsim.integrators.stepping import tables as kt
 from dynsim.model.description import Contact, Robot
 from dynsim.model.drives import Drive, Motor, Servo, TorqueSource
 from dynsim.record import Record
-from dynsim.record.measures import RESIDUAL_LIMIT, TIP_OVER, least_loads, overturns_settled, percent
+from dynsim.record.measures import RESIDUAL_LIMIT, SHORT, TIP_OVER, least_loads, overturns_settled, percent
 from dynsim.scenario import Scenario, build
 from dynsim.scenario.effect import without_effect
 
@@ -36,8 +36,6 @@ OF_WEIGHT = 1e-4
 DIFFERS = 1e-3
 # Slip that begins earlier is of the start [s].
 AT_ONCE = 1e-3
-# An unpressed point that sticks for a smaller fraction of the run would read 0.0 %.
-SHORT = 5e-4
 # Slower than this a joint with dry friction is at rest [rad/s or m/s].
 AT_REST = 1e-9
 # Negative friction heat of no more than this share of the turnover is rounding.
@@ -91,7 +89,7 @@ def warnings_of(
         warnings += [*capped(stepping), *coarse(stepping, scale)]
     elif summary["constraint_drift_max_m"] > DRIFT_LIMIT_M:
         warnings.append(f"contacts drifted by {summary['constraint_drift_max_m']:.1e} m")
-    warnings += _undetermined(record, prepared)
+    warnings += _undetermined(record, prepared, stepping is not None)
     warnings += _unpressed(record, prepared, begun)
     warnings += _slipping_start(record, prepared) or _moving_start(record, prepared)
     warnings += _sunk(record, sunk)
@@ -150,8 +148,7 @@ def _contact_warnings(
                 "diagonal of J M⁻¹F, Painlevé's paradox at one contact): only the other braces hold it there, and "
                 "whether real ones do depends on their stiffness; lower contacts.friction or take another posture"
             )
-    # Within an impact friction may give what the normal impulse takes: only their sum is a loss.
-    gained = -summary["friction_heat_J"] - max(summary.get("impact_loss_J", 0.0), 0.0)
+    gained = -summary["friction_heat_J"]
     if gained > FRICTION_ROUNDING * summary["energy_turnover_J"]:
         put = f"friction has put {gained:.3g} J into the arm: "
         if unilateral is None:
@@ -180,7 +177,7 @@ def _saturated(record: Record, robot: Robot) -> list[str]:
             if isinstance(motor, Servo):
                 # Without a current its voltage is the back-EMF.
                 saturated &= record["current"][:, a] != 0.0
-            if saturated.any():
+            if saturated.mean() >= SHORT:
                 warnings.append(
                     f"{motor.joint}: {quantity} at its limit of {limit:g} {unit} for "
                     f"{100 * saturated.mean():.1f} % of the run"
@@ -208,44 +205,14 @@ def _sliding(record: Record, contacts: Sequence[Contact], names: Sequence[str], 
     ]
 
 
-def _undetermined(record: Record, prepared: Prepared) -> list[str]:
+def _undetermined(record: Record, prepared: Prepared, stepped: bool) -> list[str]:
     """Contact rows that depend on each other: forces, and with friction the motion too, that are one of many."""
     run, system, contacts = prepared.run, prepared.system, prepared.contacts
     evaluations = int(prepared.workspace.counts[ka.DEPENDENT])
-    rests = _joints_at_rest(record, prepared)
-    if not evaluations and not rests.any():
-        return []
-    # Under the unilateral law rows of what sticks depend on each other, which leaves no motion open.
     if system.unilateral is not None:
-        if not len(record):
-            return []
-        shared = sharing(prepared.model, contacts, record["q"], record["contact_mode"], rests)
-        touching, joints = shared.contacts, shared.joints
-        if joints and not touching:
-            return [
-                f"{first_few(joints)}: shared forces of the dry friction which keeps these coupled joints at rest; the "
-                "motion does not determine them, and those of the record are one choice of many"
-            ]
-        if joints:
-            sliding = _sliding(record, contacts, touching, rests.any(axis=1))
-            motion = f"; while {first_few(sliding)} slides, other choices may move otherwise" if sliding else ""
-            return [
-                f"{first_few(touching)}: shared forces with the dry friction of {first_few(joints)}, which keeps these "
-                "joints at rest; the motion does not determine them, and those of the record are one choice of many"
-                f"{motion}"
-            ]
-        if not touching:
-            return []
-        if sliding := _sliding(record, contacts, touching, slice(None)):
-            return [
-                f"{', '.join(touching)}: shared forces which the motion does not determine; while {first_few(sliding)} "
-                "slides, other choices may move otherwise; those of the record change least from the last change of "
-                "modes"
-            ]
-        return [
-            f"{', '.join(touching)}: shared forces which the motion does not determine, as points that stick do: "
-            "they are the split of least norm among those that lie in all friction cones"
-        ]
+        return _shared_forces(record, prepared, evaluations > 0, stepped)
+    if not evaluations:
+        return []
     warnings = [f"contact rows depended on each other in {evaluations} evaluations: forces are the split of least norm"]
     spread = None
     if len(record) and any(contact.friction > 0.0 for contact in contacts):
@@ -259,6 +226,56 @@ def _undetermined(record: Record, prepared: Prepared) -> list[str]:
             f"that keep their signs (this run: {spread.taken:.4g}); take away braces until the rest are independent"
         )
     return warnings
+
+
+def _shared_forces(record: Record, prepared: Prepared, dependent: bool, stepped: bool) -> list[str]:
+    """Forces of the unilateral law that the motion does not determine. Among points that stick no motion is open.
+
+    dependent : rows have depended on each other; stepped : by time stepping, which does not tell
+    """
+    contacts, rests = prepared.contacts, _joints_at_rest(record, prepared)
+    if not len(record) or not (dependent or stepped or rests.any()):
+        return []
+    shared = sharing(prepared.model, contacts, record["q"], record["contact_mode"], rests)
+    touching, joints = shared.contacts, shared.joints
+    if joints and not touching:
+        return [
+            f"{first_few(joints)}: shared forces of the dry friction which keeps these coupled joints at rest; the "
+            "motion does not determine them, and those of the record are one choice of many"
+        ]
+    if not touching:
+        return []
+    sliding = _sliding(record, contacts, touching, rests.any(axis=1) if joints else slice(None))
+    motion = f"; while {first_few(sliding)} slides, other choices may move otherwise" if sliding else ""
+    if joints:
+        if not sliding and (leaving := _leaving(record, contacts, touching, rests)):
+            motion = f"; where {first_few(leaving)} leaves its surface, other choices may move otherwise"
+        return [
+            f"{first_few(touching)}: shared forces with the dry friction of {first_few(joints)}, which keeps these "
+            "joints at rest; the motion does not determine them, and those of the record are one choice of many"
+            f"{motion}"
+        ]
+    if sliding:
+        choice = "have the least norm" if stepped else "change least from the last change of modes"
+        return [
+            f"{', '.join(touching)}: shared forces which the motion does not determine{motion}; those of the record "
+            f"{choice}"
+        ]
+    return [
+        f"{', '.join(touching)}: shared forces which the motion does not determine, as points that stick do: "
+        "they are the split of least norm among those that lie in all friction cones"
+    ]
+
+
+def _leaving(record: Record, contacts: Sequence[Contact], names: Sequence[str], rests: NDArray[np.bool_]) -> list[str]:
+    """Those of the named contacts that leave their surface from sticking, while dry friction keeps joints at rest."""
+    modes = record["contact_mode"]
+    leaves = (modes[:-1] == ka.STICKING) & (modes[1:] == ka.OPEN) & rests[:-1].any(axis=1, keepdims=True)
+    return [
+        contact.name
+        for contact, some in zip(contacts, leaves.any(axis=0), strict=True)
+        if some and contact.name in names
+    ]
 
 
 def _unpressed(record: Record, prepared: Prepared, begun: float) -> list[str]:
@@ -501,7 +518,7 @@ def _base_warnings(record: Record, scenario: Scenario, prepared: Prepared, begun
             f"{name} {low:.3g}" for name, low in zip(record.labels["wheel_load"], lowest, strict=True) if low < 0.0
         )
         least = f" (least loads [N]: {pulled})" if pulled else ""
-        beyond = f"{100 * (record['tip_margin'] < 0.0).mean():.1f} % of the samples"
+        beyond = f"{percent((record['tip_margin'] < 0.0).mean())} of the samples"
         if late.size and overturns_settled(record, settle) is None:
             warnings.append(
                 f"a jolt of the start takes the tip margin below zero at t = {first:.4f} s, in {beyond}, none from "
@@ -516,7 +533,7 @@ def _base_warnings(record: Record, scenario: Scenario, prepared: Prepared, begun
     lifted = load.sum(axis=1) <= 0.0
     if lifted.any():
         warnings.append(
-            f"the base is lifted: no load on its wheels and caster in {100 * lifted.mean():.1f} % of the samples, "
+            f"the base is lifted: no load on its wheels and caster in {percent(lifted.mean())} of the samples, "
             f"first at t = {record.time[lifted.argmax()]:.4g} s (counts as a tip margin of -1)"
         )
     # Once it has tipped, the loads mean nothing.

@@ -18,6 +18,8 @@ STORES = ("energy_kinetic", "energy_potential", "energy_magnetic")
 
 # Largest residual of the energy ledger without a warning, as a share of the turnover.
 RESIDUAL_LIMIT = 1e-6
+# A share of a run that would read 0.0 %.
+SHORT = 5e-4
 # A share of a run's time below this is rounding error.
 ROUNDED = 1e-9
 

@@ -33,7 +33,7 @@ class Hinge(StrictConfig):
     """What an object turns on."""
 
     axis: Vector3 = Field([0.0, 0.0, 1.0], description="through its centre, in its own axes")
-    friction_N_m: NonNegative = Field(0.0, description="that holds it at rest; time_stepping only")
+    friction_N_m: NonNegative = Field(0.0, description="that holds it at rest; unilateral law")
     damping_N_m_s_per_rad: NonNegative = 0.0
     limits_deg: Annotated[list[float], Field(min_length=2, max_length=2)] | None = Field(
         None, description="lower and upper; default: none"

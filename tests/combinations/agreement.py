@@ -29,9 +29,7 @@ SOLVERS = 1e-8
 SURE = 10.0
 # Samples by which an impact may be early or late.
 JUMPS = 3
-ENERGIES = ("energy_electrical", "heat_joule", "heat_friction", "energy_kinetic", "energy_potential")
-# Methods split what an impact takes between its normal and its friction in their own ways.
-TAKEN = ("heat_friction", "loss_impact")
+ENERGIES = ("energy_electrical", "heat_joule", "heat_friction", "loss_impact", "energy_kinetic", "energy_potential")
 # What a warning says that leaves the motion open.
 NOT_UNIQUE = (
     "leave the motion open",
@@ -136,6 +134,10 @@ def _pair(first: str, run: Run, other: str, second: Run) -> Iterator[tuple[str, 
         yield "methods", f"{first} and {other}: {text}, though finer steps change either by less"
 
 
+def _energies(record: Record) -> list[str]:
+    return [name for name in ENERGIES if name in record]
+
+
 def _measures(record: Record | None) -> list[Measure]:
     """Positions relative to their motion, and energies relative to the largest one."""
     assert record is not None
@@ -143,11 +145,11 @@ def _measures(record: Record | None) -> list[Measure]:
     moved = np.abs(q - q[:1]).max(axis=0, initial=0.0)
     # Errors of joints that barely move are a part of their neighbours' errors.
     measures = [Measure("q", q, np.maximum(moved, max(0.1 * float(moved.max(initial=0.0)), 1e-4)))]
-    parts = [record[name] - (record[name][0] if name == "energy_potential" else 0.0) for name in ENERGIES]
-    parts[2] = sum((record[name] for name in TAKEN if name in record), start=np.zeros(len(record)))
+    named = _energies(record)
+    parts = [record[name] - (record[name][0] if name == "energy_potential" else 0.0) for name in named]
     energies = np.stack(parts, axis=1)
     size = float(np.abs(energies).max(initial=0.0))
-    measures.append(Measure("energy", energies, np.full(len(ENERGIES), max(size, 1e-9))))
+    measures.append(Measure("energy", energies, np.full(len(parts), max(size, 1e-9))))
     return measures
 
 
@@ -201,7 +203,7 @@ def _widest(
             # Its beginning is more useful than its maximum.
             t = int((share.max(axis=1) > min(1.0, 0.999 * worst)).argmax())
             k = int(share[t].argmax())
-            name = first.labels["q"][k] if own.name == "q" else ENERGIES[k]
+            name = first.labels["q"][k] if own.name == "q" else _energies(first)[k]
             text = (
                 f"{own.name} {name} at t = {first.time[i[t]]:.6g} s is {own.values[i[t], k]:.8g} and "
                 f"{other.values[j[t], k]:.8g}, {off[t, k]:.3g} apart (allowed {limit[t, k]:.3g})"

@@ -54,17 +54,15 @@ def losses(seen: Observed) -> Finding:
     names = ["heat_joule", "loss_joint", "loss_gear"]
     restitution = any(touch.contact.restitution > 0.0 for touch in seen.touches())
     signed = any(touch.contact.pulling_friction == "signed" for touch in seen.touches()) and not seen.real
-    if not restitution and not signed:
+    if not signed:
         names += ["heat_friction"]
+    if not restitution and not signed:
         # Energy that moves a point back out of its surface is taken from the impact losses.
         names += [name for name in ("loss_impact", "loss_stop") if name in seen.record and not seen.stepped]
     for name in names:
         fall = -np.diff(seen.record[name])
         # Rates of sticking points are solved to 1e-8 m/s only; dense output within a step is as accurate as the step.
         allowed = (1e-7 if seen.stepped else seen.scenario.integrator.rtol) * turnover + 1e-12
-        if seen.stepped and name == "heat_friction" and fall.size:
-            # Within an impact friction may give what its normal impulse takes: only their sum is a loss.
-            fall = fall - np.maximum(np.diff(seen.record["loss_impact"]), 0.0)
         if fall.size and fall.max() > allowed and not warned(seen, "friction has put"):
             yield f"{name} falls by {fall.max():.3g} J at t = {seen.time[int(fall.argmax()) + 1]:.6g} s"
 

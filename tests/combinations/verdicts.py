@@ -177,8 +177,7 @@ def _reversed(match: Match, seen: Observed) -> str:
 
 
 def _friction_gives(match: Match, seen: Observed) -> str:
-    impact = float(seen.record["loss_impact"][-1]) if "loss_impact" in seen.record else 0.0
-    gained = -float(seen.record["heat_friction"][-1]) - max(impact, 0.0)
+    gained = -float(seen.record["heat_friction"][-1])
     return "" if _near(gained, match[1]) else f"by the signals {gained:.3g} J"
 
 
@@ -483,6 +482,7 @@ UNVERIFIED: dict[str, str] = {
     r"no joint without a closed brake moves this point": "of brakes, which these scenes do not close",
     r"has no effect: ": "said of a key of the scenario, not of the run",
     r"^the target waited|^the path is|^feedback and shape points|^the null-space|^joints were clamped|^the robot tips|"
-    r"^the support margin|^mode \d+ was|passes its limit by": "for the kinematic snake, which these scenes do not have",
+    r"^the support margin|^mode \d+ was|passes its limit by|"
+    r"^the head is up to": "for the kinematic snake, which these scenes do not have",
 }
 """Warnings that nothing outside the engine can tell, each with the reason."""

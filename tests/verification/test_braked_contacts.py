@@ -17,6 +17,7 @@ from dynsim.scenario import scenario_from_resolved
 SAME_MOTION, SAME_FORCE = 1e-9, 1e-7
 INITIAL_DEG = [0.0, 45.0, 90.0, -90.0, 45.0, 45.0, -90.0, 45.0, -45.0, 45.0]
 MOVING = ("joint_1", "joint_6", "joint_9", "joint_10")
+TIP = [0.0, 0.0, 0.2]  # of the two links, in the second
 # Joints 2 and 3 alone move elbow_4 along the normal of the floor.
 BEHIND_BRAKES = [["joint_2", "joint_3"], ["joint_2", "joint_3", "joint_4"], ["joint_1", "joint_2", "joint_3"]]
 MOVABLE = [["joint_5"], ["joint_5", "joint_8"], ["joint_3"]]
@@ -166,7 +167,7 @@ def test_a_stop_has_no_force_behind_a_closed_brake(tmp_path: Path, method: str) 
     assert [event.kind for event in record.events] == ["stop_left", "stop_hit"]
 
 
-def two_links(method: str) -> dynsim.Scenario:
+def two_links(method: str, law: str = "unilateral") -> dynsim.Scenario:
     """Two links under a shoulder 0.3 m above a floor, with a tip that touches it 0.05 m beside the shoulder."""
     link = {"axis": "y", "mass_kg": 0.3, "length_m": 0.2}
     config = {
@@ -179,9 +180,9 @@ def two_links(method: str) -> dynsim.Scenario:
         },
         "surfaces": {"floor": {"type": "plane"}},
         "contacts": {
-            "law": "unilateral",
+            "law": law,
             "friction": 0.3,
-            "points": {"tip": {"body": "link_2", "point_m": [0, 0, 0.2]}},
+            "points": {"tip": {"body": "link_2", "point_m": TIP}},
         },
         "initial": {"on_surface": ["tip"]},
         "integrator": {"method": method},
@@ -189,18 +190,37 @@ def two_links(method: str) -> dynsim.Scenario:
     return scenario_from_resolved(config)
 
 
+def sliding_on(scenario: dynsim.Scenario, speed: float) -> dynsim.Simulation:
+    """The two links, their tip sliding along the floor; the faster joint has this speed [rad/s]."""
+    simulation = dynsim.Simulation(scenario)
+    q = simulation.state.q
+    normal = np.asarray(simulation.model.point_jacobian("link_2", TIP, q))[2]
+    along = np.array([normal[1], -normal[0]])
+    return dynsim.Simulation(scenario, state=dynsim.State(0.0, q, speed * along / np.abs(along).max(), np.zeros(0)))
+
+
+@pytest.mark.parametrize("method", ["dopri5", "radau5"])
+def test_what_a_glued_point_takes_as_a_brake_closes_is_in_the_ledger(method: str) -> None:
+    """Behind the brake one joint is left, which the floor stops: all kinetic energy is lost at that instant."""
+    simulation = sliding_on(two_links(method, "bilateral"), 1.0)
+    state = simulation.advance(0.01)
+    kinetic = 0.5 * state.v @ simulation.model.mass_matrix(state.q) @ state.v
+    before = simulation.record()["loss_joint"][-1]
+    simulation.set_brake("joint_2", True)
+    simulation.advance(0.1)
+    record = simulation.record()
+    assert kinetic > 1e-3
+    assert np.abs(record["v"][record.time > 0.01]).max() < 1e-9
+    assert record["loss_joint"][-1] - before == pytest.approx(kinetic, rel=1e-6)
+    assert record.summary["energy_residual_relative"] < 1e-7
+    assert not any("ledger" in text for text in record.summary["warnings"])
+
+
 @pytest.mark.parametrize("method", ["dopri5", "radau5"])
 @pytest.mark.parametrize(("sign", "leaves"), [(1.0, False), (-1.0, True)])
 def test_what_separates_as_a_brake_closes_leaves(method: str, sign: float, leaves: bool) -> None:
     """A sliding tip that the brake's impulse lifts, where its friction would be beyond Painlevé's limit."""
-    scenario, tip = two_links(method), np.array([0.0, 0.0, 0.2])
-    simulation = dynsim.Simulation(scenario)
-    q = simulation.state.q
-    normal = np.asarray(simulation.model.point_jacobian("link_2", tip, q))[2]
-    along = np.array([normal[1], -normal[0]])
-    simulation = dynsim.Simulation(
-        scenario, state=dynsim.State(0.0, q, sign * along / np.abs(along).max(), np.zeros(0))
-    )
+    simulation, tip = sliding_on(two_links(method), sign), np.array(TIP)
     simulation.advance(0.01)
     simulation.set_brake("joint_2", True)
     state = simulation.state

@@ -51,8 +51,9 @@ def test_a_free_arm_is_that_of_pinocchio_with_its_motors() -> None:
     oracle.model.armature = oracle.to(model.armature)
     motors = model.robot.motors
     K, R, L = (np.array([getattr(m, name) for m in motors]) for name in ("joint_constant", "resistance", "inductance"))
-    tau = K * state.current - model.damping * state.v
-    by_q, by_v, inverse = pin.computeABADerivatives(oracle.model, oracle.data, *map(oracle.to, (state.q, state.v, tau)))
+    q, v, current = parts(linear.x)
+    tau = K * current - model.damping * v
+    by_q, by_v, inverse = pin.computeABADerivatives(oracle.model, oracle.data, *map(oracle.to, (q, v, tau)))
     inverse = np.triu(inverse) + np.triu(inverse, 1).T
     by_q, by_v, inverse = (oracle.back(oracle.back(unit).T).T for unit in (by_q, by_v, inverse))
     positions, rates, currents = parts(A)
@@ -67,12 +68,15 @@ def test_a_free_arm_is_that_of_pinocchio_with_its_motors() -> None:
     assert_near(currents, np.vstack([zero, inverse @ np.diag(K), -by_inductance @ np.diag(R)]), 1e-9)
     assert_near(parts(B, 0)[2], by_inductance @ np.hstack([unit, k_p, k_d]), 1e-9)
     assert not np.vstack(parts(B, 0)[:2]).any()
-    _, jacobian = model.point_position_and_jacobian(*model.robot.hand, state.q)
+    _, jacobian = model.point_position_and_jacobian(*model.robot.hand, q)
     assert_near(C[:3, :n], jacobian, 1e-9)
     assert not C[:3, n:].any()
     assert_near(np.hstack(parts(C[3:])[:2]), -np.hstack([k_p, k_d]), 1e-9)
     assert_near(D[3:], np.hstack([unit, k_p, k_d]), 1e-9)
-    assert linear.error < 1e-7
+    # The error is known to a factor of ten; the rows of currents are linear, and nearly exact.
+    exact = np.hstack([by_q, by_v - inverse @ np.diag(model.damping), inverse @ np.diag(K)])
+    true = (np.abs(A[n : 2 * n] - exact) / np.abs(exact).max(axis=1, keepdims=True)).max()
+    assert 0.1 * true < linear.error < 10.0 * true
     # Of a step that ends there; the state of advance() is between two.
     np.testing.assert_allclose(linear.x, np.concatenate([state.q, state.v, state.current]), atol=1e-5)
 

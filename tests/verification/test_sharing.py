@@ -10,7 +10,7 @@ import pytest
 import dynsim
 from dynsim.dynamics.tables import OPEN, SLIDING, STICKING
 from dynsim.engine.force_indeterminacy import sharing
-from dynsim.scenario import build
+from dynsim.scenario import build, scenario_from_resolved
 
 ARM = """\
 duration_s: 1
@@ -95,3 +95,44 @@ def test_a_compliant_contact_shares_only_friction(tmp_path: Path) -> None:
     assert shared(tmp_path, [SLIDING, OPEN, OPEN], count=4, rests=[0], stiffness=1e4) == []
     assert shared(tmp_path, [OPEN, STICKING, STICKING], stiffness=1e4) == []
     assert shared(tmp_path, [STICKING, STICKING, OPEN], yaw=True, stiffness=1e4) == ["a", "b"]
+
+
+PLATE = """\
+<robot name="plate"><link name="world"/><link name="plate"><inertial>
+<origin xyz="0.02 0.01 0.05"/><mass value="2"/>
+<inertia ixx="0.02" ixy="0" ixz="0" iyy="0.03" iyz="0" izz="0.04"/></inertial></link>
+<joint name="root" type="floating"><parent link="world"/><child link="plate"/></joint></robot>
+"""
+FEET = {"f0": (0.2, 0.15, 0.3), "f1": (0.2, -0.15, 0.2), "f2": (-0.2, 0.15, 0.25), "f3": (-0.2, -0.15, 0.35)}
+
+
+@pytest.mark.parametrize("method", ["dopri5", "radau5", "time_stepping"])
+@pytest.mark.parametrize("feet", [4, 3])
+def test_feet_that_slide_on_one_plate_share_and_leave_the_motion_open(tmp_path: Path, method: str, feet: int) -> None:
+    """Of four normal forces on one rigid body three are determined, and the friction of the four feet differs."""
+    (tmp_path / "plate.urdf").write_text(PLATE)
+    points = {
+        name: {"body": "plate", "point_m": [x, y, -0.05], "friction": friction}
+        for name, (x, y, friction) in list(FEET.items())[:feet]
+    }
+    config = {
+        "duration_s": 0.1,
+        "plant": {
+            "type": "urdf_arm",
+            "file": str(tmp_path / "plate.urdf"),
+            "initial_pose": {"root": {"position_m": [0, 0, 0.05]}},
+        },
+        "surfaces": {"floor": {"type": "plane"}},
+        "contacts": {"law": "unilateral", "points": points},
+        "integrator": {"method": method},
+    }
+    scenario = scenario_from_resolved(config)
+    rest = dynsim.Simulation(scenario).state
+    moving = np.array([1.0, 0.3, 0.0, 0.0, 0.0, 4.0])
+    simulation = dynsim.Simulation(scenario, state=dynsim.State(0.0, rest.q, moving, rest.current))
+    simulation.advance(0.1)
+    warnings = [text for text in simulation.record().summary["warnings"] if "shared forces" in text]
+    assert len(warnings) == (feet == 4)
+    for text in warnings:
+        assert text.startswith("f0, f1, f2, f3: shared forces")
+        assert "other choices may move otherwise" in text

@@ -208,8 +208,11 @@ def book_dry(unilateral: UnilateralArrays, system: System, s: SteppingArrays, ws
 
 @internal_kernel
 def book_contacts(system: System, s: SteppingArrays, ws: Workspace, y_new, h):
-    """What contacts take: normals of what strikes as impact loss, tangents of what slides, or comes to stick, as
-    friction. What is left of held rows is the scheme's; what pushes out of the surface comes from the impact losses."""
+    """What contacts take: all of what strikes as impact loss, tangents of what slides, or comes to stick, as friction.
+
+    In a landing friction may give what the normal impulse takes: only their sum is a loss. What is left of held rows is
+    the scheme's; what pushes out of the surface comes from the impact losses.
+    """
     layout, first = system.layout, system.layout.contact
     for k in range(ws.contacts.shape[0]):
         now, last = s.memory[kt.NOW, k], s.memory[kt.LAST, k]
@@ -227,10 +230,11 @@ def book_contacts(system: System, s: SteppingArrays, ws: Workspace, y_new, h):
                 if now[kt.SLID] == 0.0 and last[kt.SLID] == 0.0:
                     friction = 0.0
             slips = friction != 0.0 or now[kt.SLID] == 1.0
-            if friction > 0.0 and (soft or last[kt.CLOSED] == 1.0):
-                # The mean force of a step in which slip ends or turns round may be along its mean motion. Friction
-                # gives no energy: that is an error of the step.
-                friction = 0.0
+            # The mean force of a step in which slip ends or turns round may be along its mean motion. Friction gives no
+            # energy: that is an error of the step.
+            friction = min(friction, 0.0)
+            if last[kt.CLOSED] == 0.0 and not soft:
+                struck, friction = normal + tangential, 0.0
             if slips:
                 x, z = 0.5 * (s.rate[0, r + 1] + s.rate[1, r + 1]), 0.5 * (s.rate[0, r + 2] + s.rate[1, r + 2])
                 y_new[first + kst.SLIP] += h * slip_of_rates(system.contacts.law, k, x, z)
@@ -242,7 +246,7 @@ def book_contacts(system: System, s: SteppingArrays, ws: Workspace, y_new, h):
             else:
                 y_new[layout.loss + kst.IMPACT_LOSS] -= struck
                 s.turn[k, kt.STRUCK] = -struck
-                y_new[layout.scheme] -= (normal - struck) + (tangential - friction)
+                y_new[layout.scheme] -= normal + tangential - struck - friction
                 y_new[layout.ledger + kst.CONSTRAINT] -= normal + tangential
         if soft:
             book_soft_contact(system.contacts.law, layout, s, ws, k, normal, y_new, h)
