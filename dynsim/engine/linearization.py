@@ -243,9 +243,9 @@ def _chosen(kind: str, names: Sequence[str], families: dict[str, dict[str, Any]]
 def _jacobian(function: Callable[[Array], Array], size: int) -> tuple[Array, float]:
     """Derivative of a function at zero, (m, size), and how far two estimates of its entries differ.
 
-    Central differences of sixth order at several steps; of each entry the estimate that differs least from that of the
-    step before, as Ridders does. (:mod:`scipy.differentiate` goes on halving until an entry agrees in relative terms,
-    which one that is zero never does, and ends in its rounding.)
+    Central differences of sixth order at several steps; of each entry the estimate that differs least from those of the
+    steps before and after, much as Ridders does. (:mod:`scipy.differentiate` goes on halving until an entry agrees in
+    relative terms, which one that is zero never does, and ends in its rounding.)
     """
     estimates = []
     for step in STEPS:
@@ -256,8 +256,9 @@ def _jacobian(function: Callable[[Array], Array], size: int) -> tuple[Array, flo
         estimates.append(np.stack(columns, axis=1))
     every = np.stack(estimates)
     changes = np.abs(np.diff(every, axis=0))
-    slope = np.take_along_axis(every[1:], changes.argmin(axis=0)[None], axis=0)[0]
-    # The least of all changes is small by chance: the next one is nearer to the error.
-    change = np.sort(changes, axis=0)[1]
+    # One change may be small by chance.
+    changes = np.maximum(changes[:-1], changes[1:])
+    best = changes.argmin(axis=0)[None]
+    slope, change = (np.take_along_axis(table, best, axis=0)[0] for table in (every[1:-1], changes))
     largest = np.abs(slope).max(axis=1, initial=NOTHING, keepdims=True)
     return slope, float((change / largest).max(initial=0.0))

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from combinations.observed import OPEN, SLIDING, STICKING, Observed, Touch, warned
+from dynsim.model.surfaces import HeightField
 
 Array = NDArray[np.float64]
 Finding = Iterator[str]
@@ -20,6 +21,8 @@ STOP_SLACK = 1e-6
 CONE = 1e-5
 # What sticks moves no faster: limit of the projection of velocities [m/s]; steps solve contact problems to 1e-8.
 CREEP = 1e-6
+# Beyond this the nearest point of a height field is not looked for everywhere [m].
+FAR = 0.5
 # The direction of slower slip is noise: 1000 times the default atol [m/s].
 SLOW = 1e-4
 
@@ -29,6 +32,9 @@ def touching(seen: Observed) -> Finding:
     for k, touch in enumerate(seen.touches()):
         name = touch.contact.name
         off = np.abs(touch.gap - seen.record["contact_gap"][:, k])
+        # The foot of the perpendicular to waves far below is one of several.
+        if isinstance(touch.contact.surface, HeightField):
+            off[touch.gap > FAR] = 0.0
         # Two searches for a nearest point.
         if off.max() > 1e-8 + 1e-6 * np.abs(touch.gap[off.argmax()]):
             i = int(off.argmax())

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from combinations.newton import integral_error, jumps_at_ticks
-from combinations.observed import STICKING, Observed, warned, whole_steps
+from combinations.observed import OPEN, STICKING, Observed, warned, whole_steps
 from dynsim.model.drives import Motor, Servo, TorqueSource
 
 Array = NDArray[np.float64]
@@ -76,7 +76,11 @@ def powers(seen: Observed) -> Finding:
             heat = heat + motor.resistance * current[:, a] ** 2
     rubbed = np.zeros(len(seen))
     for touch in seen.touches():
-        rubbed = rubbed - np.where(touch.mode == STICKING, 0.0, (touch.tangential * touch.slip).sum(axis=1))
+        rubs = touch.mode != STICKING
+        if seen.stepped and touch.contact.stiffness == 0.0:
+            # What a step with a landing takes is impact loss.
+            rubs[1:] &= touch.mode[:-1] != OPEN
+        rubbed = rubbed - np.where(rubs, (touch.tangential * touch.slip).sum(axis=1), 0.0)
     lost = (seen.bodies.damping * seen.v**2).sum(axis=1) - (seen.joint_signal("joint_friction") * seen.v).sum(axis=1)
     for motor in seen.robot.motors:
         if isinstance(motor, Servo) and motor.coulomb_friction > 0.0 and not seen.real:
@@ -114,6 +118,9 @@ def _unlike_trapezia(seen: Observed) -> dict[str, Array]:
         size = np.linalg.norm(touch.tangential, axis=1)
         both = np.linalg.norm(slip, axis=1) + np.linalg.norm(earlier, axis=1)
         contacts = contacts + np.where((slip * earlier).sum(axis=1) < 0.0, size * both, 0.0)
+        # The normal force of the step is along the normal of its middle.
+        turned = np.linalg.norm(np.diff(touch.normal, axis=0, prepend=touch.normal[:1]), axis=1)
+        contacts = contacts + turned * np.abs(touch.normal_force) * np.linalg.norm(slip, axis=1)
     current, voltage = (
         np.diff(seen.record[name], axis=0, prepend=seen.record[name][:1]) for name in ("current", "voltage")
     )
