@@ -60,8 +60,8 @@ STEPS_LIMIT = 2e8
 # events that lie closer than steps of any stiff robot.
 STANDS = 1e-5
 # Slip slower than this has no direction of its own, however tight the tolerances: the rate at which friction turns slip
-# goes as its inverse, and steps with it; a millisecond of such slip is a nanometre [m/s].
-SLOWEST = 1e-6
+# goes as its inverse, and steps with it; ten milliseconds of such slip are a nanometre [m/s].
+SLOWEST = 1e-7
 # More steps than any run takes.
 _EVERY_STEP = 1 << 62
 

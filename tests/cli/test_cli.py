@@ -174,6 +174,7 @@ def test_plot_keeps_apart_records_of_the_same_variant(tmp_path: Path):
     assert (tmp_path / "figures" / "compare_hand_path.png").is_file()
 
 
+@pytest.mark.long
 def test_figures_in_another_format_replace_those_of_the_run_before(tmp_path: Path):
     arguments = ["run", "single_pendulum", "--set", "duration_s=0.2", "--set", "metrics.settle_s=0.05", "--out", "out"]
     assert dynsim(*arguments, folder=tmp_path).returncode == 0
@@ -332,6 +333,7 @@ def test_check_says_where_it_starts_before_it_refuses(tmp_path: Path):
     assert len(set(moved)) == len(moved) // 4 > 0
 
 
+@pytest.mark.long
 def test_a_list_in_a_pipe_is_lines_with_tabs_and_names_papers(tmp_path: Path):
     environment = {name: value for name, value in os.environ.items() if name != "COLUMNS"}
     listed = dynsim("list", folder=tmp_path, env=environment).stdout
@@ -449,6 +451,7 @@ def test_a_working_directory_that_is_gone(
     assert errors == ["error: the working directory is no longer there; change to another folder"]
 
 
+@pytest.mark.long
 def test_a_terminal_that_knows_ascii_only(tmp_path: Path):
     for arguments in (["list"], ["run", "--help"], ["run", "−.yaml"]):
         result = dynsim(*arguments, folder=tmp_path, env={**os.environ, "PYTHONIOENCODING": "ascii"})

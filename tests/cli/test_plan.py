@@ -30,6 +30,7 @@ def small(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.long
 def test_a_plan_leaves_its_files_and_a_scenario_that_runs(small: Path, tmp_path: Path) -> None:
     out = tmp_path / "plan"
     command = ["plan", str(small), "--count", "0:1", "--starts", "1", "--no-verify", "--out", str(out)]

@@ -17,6 +17,7 @@ def sweep(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300)
 
 
+@pytest.mark.long
 def test_a_sweep_is_named_by_its_scenario(tmp_path: Path):
     content, file = find_scenario("single_pendulum").read_text("utf-8"), tmp_path / "scenario.yaml"
     file.write_text(content.replace("name: single_pendulum", "name: swinging"), encoding="utf-8")
@@ -60,6 +61,7 @@ def test_a_sweep_without_a_good_run_has_failed(tmp_path: Path, limits: str, well
 SHADOWS = ("signal", "json", "pickle", "numpy", "dynsim")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("command", "said"),
     [
@@ -80,6 +82,7 @@ def test_workers_run_nothing_of_the_working_directory(tmp_path: Path, command: l
     assert not (tmp_path / "__pycache__").exists()
 
 
+@pytest.mark.long
 def test_a_number_that_no_run_has_is_refused_and_others_are_drawn_without_runs(tmp_path: Path):
     """What was run is kept: the number is corrected with --resume, which runs nothing again."""
     varied = ["--grid", "contacts.friction=0.1,0.2", "--set", "duration_s=0.1", "--jobs", "1", "--out", "out"]

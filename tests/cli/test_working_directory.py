@@ -10,6 +10,8 @@ import pytest
 
 from dynsim.record import Record
 
+pytestmark = pytest.mark.long
+
 # What dynsim and its libraries import, under the names of the user's own files.
 NAMES = ("json", "signal", "numpy", "random", "resource", "h5py", "io")
 

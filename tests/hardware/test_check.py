@@ -391,6 +391,7 @@ motions = st.lists(
 )
 
 
+@pytest.mark.long
 @given(knots=motions, interval=st.floats(0.05, 0.6), speed=st.floats(0.3, 2.0))
 @settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.filter_too_much, HealthCheck.too_slow])
 def test_what_is_sent_never_violates_a_limit(rig: Rig, knots, interval: float, speed: float) -> None:

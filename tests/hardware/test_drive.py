@@ -32,6 +32,8 @@ from .conftest import TORQUE_ADDRESS, Rig, Run, check_goals_within_limits
 from .output_faults import AFTER, BEFORE, Call, Outputs, watched
 from .test_output_faults import ARMED
 
+pytestmark = pytest.mark.long
+
 STEP = 0.005
 Array = np.ndarray
 Posture = Callable[[float], tuple[Array, Array]]

@@ -26,6 +26,8 @@ from dynsim.teleop.web.servos import PipeFeed
 from .conftest import Rig, Run, check_goals_within_limits
 from .test_lifting import BLEND, CLEARANCE, JOINTS, Oracle, settled, snake_map, with_lifts
 
+pytestmark = pytest.mark.long
+
 RATE = 50.0
 REQUESTS = {150: 4, 300: SWITCHING, 700: FIXING, 860: 2}
 """Requested modes by number of the tick of 5 ms."""

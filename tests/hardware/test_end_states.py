@@ -19,6 +19,8 @@ from dynsim.hardware.servo_map import load_servo_map
 
 from .conftest import Rig, Run
 
+pytestmark = pytest.mark.long
+
 POLICIES = ["hold", "decelerate", "off"]
 OFF = {"hold": "holding", "decelerate": "holding", "off": "off"}
 HEARD = {"hold": "holding", "decelerate": "holding", "off": "limp: off"}

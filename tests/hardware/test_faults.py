@@ -20,6 +20,8 @@ from dynsim.hardware.virtual.servos import PHYSICS_STEP
 
 from .conftest import check_goals_within_limits
 
+pytestmark = pytest.mark.long
+
 SILENCING = ("lost_status", "late_status", "truncated_status", "bad_crc", "drop_off")
 """Faults after which the struck servo cannot report its state."""
 DISABLING = ("reboot", "overload", "overheat", "temperature_ramp")

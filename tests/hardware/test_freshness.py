@@ -18,6 +18,8 @@ from dynsim.hardware.virtual.faults import FaultScript
 from dynsim.hardware.virtual.line import line_for_map
 from dynsim.hardware.virtual.port import VirtualPort
 
+pytestmark = pytest.mark.long
+
 F = MX_106.fields
 PERIOD = 0.01
 LENGTH = STATE_BLOCK[1]

@@ -41,6 +41,8 @@ from dynsim.record import Record
 from dynsim.snake.base_part import Fold, base_part
 from dynsim.snake.lifting import Lifts, lifted
 
+pytestmark = pytest.mark.long
+
 MODES = {1: (3, 6), 2: (6, 7), 3: (5, 6), 4: (4, 5), 5: (3, 4), 6: (2, 3)}  # [T] Table II
 PASSING = [("snake_operator", None), ("snake_positioning", "x"), ("snake_positioning", "y"), ("snake_door_arc", "push")]
 

@@ -70,6 +70,7 @@ def drawn(folder: Path) -> set[str]:
     return {path.stem for path in folder.iterdir()}
 
 
+@pytest.mark.long
 def test_a_measured_record_is_drawn_by_plot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """From simulation to measured figures by the commands, and drawn from the measured file alone."""
     shown = load_scenario("elbow_comparison", "two_elbows", {"duration_s": 0.4})

@@ -23,6 +23,7 @@ DRIVING_AND_TURNING = {
 }
 
 
+@pytest.mark.long
 def test_joints_of_the_arm_are_replayed_and_compared(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

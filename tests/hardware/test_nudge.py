@@ -145,6 +145,7 @@ def answering(monkeypatch, capsys):
     return run
 
 
+@pytest.mark.long
 def test_the_command_asks_about_each_joint_and_writes_on_request(answering, write_map) -> None:
     path = write_map()
     command = ("hw", "calibrate", "--map", path, "--port", "virtual", "--nudge")

@@ -20,6 +20,8 @@ from dynsim.hardware.replay.states import ReplayState, StopRequest
 from .conftest import TORQUE_ADDRESS, Rig, Run, swing
 from .output_faults import AFTER, BEFORE, Call, Outputs, watched
 
+pytestmark = pytest.mark.long
+
 DEAD = {"kind": "drop_off", "id": 2, "at": 1.9}
 ENDINGS: dict[str, dict[str, Any]] = {
     "regular": {},

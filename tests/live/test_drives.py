@@ -19,6 +19,8 @@ from dynsim.snake.description import FIXING, SWITCHING
 from dynsim.teleop.begin import begin
 from dynsim.teleop.session import Command
 
+pytestmark = pytest.mark.long
+
 
 def assert_same(a: Record, b: Record) -> None:
     assert list(a) == list(b)

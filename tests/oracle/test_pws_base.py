@@ -262,6 +262,7 @@ class Driven:
         return np.concatenate([v, vdot, (u - self.R * i - self.K * v[self.index]) / self.L])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("drive", ["voltage", "torque"])
 @pytest.mark.parametrize("duration", [0.25, pytest.param(10.0, marks=pytest.mark.slow)])
 def test_a_run_is_that_of_real_wheels(drive, duration, tmp_path):

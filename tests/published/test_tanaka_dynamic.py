@@ -22,6 +22,7 @@ def ends(simulated):
     return {moved: displacement(simulated(SCENARIO, moved)) for moved in TABLE_III}
 
 
+@pytest.mark.long
 def test_sag_of_table_iii(ends):
     """What the servos' stiffness explains: rms of the twelve Δz, Δβ."""
     off = np.array([ends[moved] - published.mean for moved, published in TABLE_III.items()])
@@ -29,6 +30,7 @@ def test_sag_of_table_iii(ends):
     assert np.sqrt(np.mean(off[:, BETA] ** 2)) <= 0.025
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("moved", TABLE_III)
 def test_signs_of_sag_are_as_measured(ends, moved):
     """Where a mean is more than two standard deviations from zero; Δz of the β-run is 6 mm there and nothing here."""
@@ -38,6 +40,7 @@ def test_signs_of_sag_are_as_measured(ends, moved):
             assert np.sign(ends[moved][i]) == np.sign(published.mean[i])
 
 
+@pytest.mark.long
 def test_what_is_moved_moves(ends):
     """Within a tenth of the target, but for the y-run, of which the paper has 66 mm."""
     for k, (moved, published) in enumerate(TABLE_III.items()):
@@ -45,6 +48,7 @@ def test_what_is_moved_moves(ends):
             assert ends[moved][k] == pytest.approx(published.target[k], rel=0.1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("moved", TABLE_III)
 def test_whole_runs_close_their_ledger_and_solve_their_contacts(simulated, moved):
     """What all energies miss, over the supplied one; at most a thousandth of the contact problems is given up."""
@@ -56,6 +60,7 @@ def test_whole_runs_close_their_ledger_and_solve_their_contacts(simulated, moved
     assert solved["capped_solves"] <= 1e-3 * solved["contact_solves"]
 
 
+@pytest.mark.long
 def test_end_values_hardly_depend_on_the_step(ends):
     """The run that they do most of all, see results/snake/steps.json (``tests/support/snake_steps.py``)."""
     values = np.array([end_values("alpha", 1.0), ends["alpha"], end_values("alpha", 5.0)])
@@ -71,6 +76,7 @@ def test_a_falling_head_is_stepped_in_second_order_and_with_theta_1_in_first():
         assert least < np.sqrt(coarse / fine) < most  # of two halvings
 
 
+@pytest.mark.long
 def test_the_table_has_paper_and_all_three_ways(simulated, tmp_path):
     records = {name: simulated(SCENARIO, name) for name in ("x", "x_kinematic")}
     draw_comparison(records, tmp_path)
@@ -91,6 +97,7 @@ def switched():
     return switching_run(12.0)
 
 
+@pytest.mark.long
 def test_mode_switching_shakes_the_head(switched):
     """[T] V.B, Figs 9, 10: "position error and attitude error were about 30 mm and 0.1 rad"."""
     moved = head_motion(switched)
@@ -101,6 +108,7 @@ def test_mode_switching_shakes_the_head(switched):
     assert np.abs(commanded[-1]).max() < 0.7 * np.abs(commanded[0]).max()  # the base straightens, as in Fig 10
 
 
+@pytest.mark.long
 def test_lifted_wheels_carry_nothing_once_they_are_lifted(switched):
     """In all modes of Table II; what goes down takes 0.25 s, what rises after it as long."""
     assert set(switched["mode"][settled(switched)]) == {1, 2, 3, 4, 5, 6}

@@ -20,6 +20,8 @@ from dynsim.record.measures import percent
 from dynsim.record.scene import Scene
 from dynsim.scenario import load_scenario
 
+pytestmark = pytest.mark.long
+
 TRACK, CASTER = 0.3, 0.15
 ARC = {
     "duration_s": 0.5,

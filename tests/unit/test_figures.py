@@ -617,6 +617,7 @@ def test_contacts_that_never_touch_are_not_drawn(real: Record) -> None:
     assert "surface pulls" not in texts(mixed)
 
 
+@pytest.mark.long
 def test_glued_beside_real(real: Record, braced: Record, tmp_path: Path) -> None:
     figure = drawn(contacts.forces_comparison({"glued": braced, "real": real}))
     assert "glued: pulling" in texts(figure)

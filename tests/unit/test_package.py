@@ -80,6 +80,7 @@ WITH_THEM_OR_NOT = {
 }
 
 
+@pytest.mark.long
 def test_an_arm_runs_where_parts_of_posix_are_not(tmp_path: Path) -> None:
     """Modules and functions that Windows does not have are gone before the first import."""
     done = subprocess.run(

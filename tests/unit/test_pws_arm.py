@@ -131,6 +131,7 @@ def test_compare_writes_figures(case, monkeypatch):
     assert list(out.rglob("posture*.png"))
 
 
+@pytest.mark.long
 def test_run_writes_a_record_and_figures(case, monkeypatch):
     case.write_text(GOOD)
     out = case.parent / "run"

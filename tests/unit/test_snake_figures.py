@@ -17,6 +17,8 @@ from dynsim.scenario import load_scenario
 from dynsim.snake.geometry import snake_geometry
 from dynsim.snake.published import TABLE_III, table_iii, tables
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def record():

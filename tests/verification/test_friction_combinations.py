@@ -390,7 +390,7 @@ PLATE_URDF = """<robot name="plate_and_arm">
 </robot>"""
 
 
-@pytest.mark.parametrize("method", EVENTS)
+@pytest.mark.parametrize("method", [pytest.param("dopri5", marks=pytest.mark.long), "radau5"])
 def test_joint_at_its_stop_shares_forces_with_feet_that_stick(tmp_path: Path, method: str):
     """Splits did not know the stop, which kept half of the torque, and friction 10 times its bound: the run stopped, as
     foot and joint began and ceased to slip every 0.2 µs."""

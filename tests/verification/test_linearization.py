@@ -150,7 +150,11 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+# A program of its own.
+LONG = {"real, slides on a cylinder"}
+
+
+@pytest.mark.parametrize("case", [pytest.param(c, marks=[pytest.mark.long] if c in LONG else []) for c in CASES])
 def test_every_contact_mode_against_differences(case: str) -> None:
     """∂v̇/∂x, and that of the normal forces, to 1e-7 of the largest entry."""
     name, variant, time, modes, smoothing = CASES[case]

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from dynsim import load_scenario, simulate
+from dynsim.scenario import scenario_from_resolved
 
 # Drawn at random. A push lifts the hand off its ball for a moment. When it lands again both points of the last link
 # slip at 1e-7 to 2e-6 m/s, in directions with which no forces agree; they may stick.
@@ -70,3 +71,40 @@ def test_points_that_land_nearly_at_rest_stick(tmp_path: Path, method: str) -> N
     assert any(event.kind == "landing" and event.name == "hand" for event in record.events)
     assert (record["contact_normal_force"] >= -1e-9).all()
     assert record.summary["energy_residual_relative"] < 1e-6
+
+
+def test_slip_that_begins_slowly_takes_no_more_steps_the_tighter_the_tolerances() -> None:
+    """Stribeck's friction falls with the slip, so that a pull that grows lets it begin without a jump of forces.
+
+    Friction turns a slip of speed v at a rate that goes as 1/v: steps went as 1/atol, and runs stopped for it.
+    """
+    axes = [{"kind": "prismatic", "axis": axis, "length_m": 0, "mass_kg": 0.3} for axis in "zxy"]
+    runs = []
+    for rtol in (1e-8, 1e-10):
+        config = {
+            "duration_s": 0.4,
+            "plant": {"type": "serial_arm", "chain": axes},
+            "surfaces": {"floor": {"type": "plane"}},
+            "contacts": {
+                "law": "unilateral",
+                "friction": 0.33,
+                "static_friction": 0.46,
+                "stribeck_m_s": 0.05,
+                "points": {"foot": {"body": "link_3"}},
+            },
+            "loads": {
+                "pull": {
+                    "type": "samples",
+                    "body": "link_3",
+                    "times_s": [0, 0.1, 0.4],
+                    "force_N": [[0, 0, 0], [3.6, 0, 0], [4.2, 2, 0]],
+                    "interpolation": "linear",
+                }
+            },
+            "integrator": {"method": "dopri5", "rtol": rtol, "atol": 1e-2 * rtol},
+        }
+        runs.append(simulate(scenario_from_resolved(config)))
+        assert [event.kind for event in runs[-1].events] == ["slip_start"]
+    loose, tight = runs
+    assert tight["q"][-1] == pytest.approx(loose["q"][-1], abs=1e-6)
+    assert tight.summary["steps"] < 2 * loose.summary["steps"] < 20_000

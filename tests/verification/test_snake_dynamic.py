@@ -164,9 +164,8 @@ def test_the_kinematic_level_has_what_it_had():
 @pytest.mark.parametrize(
     ("variant", "delay"),
     [
-        ("beta", 0.2),
         ("y", 0.01),
-        pytest.param("beta", 0.01, marks=pytest.mark.long),
+        *(pytest.param("beta", delay, marks=pytest.mark.long) for delay in (0.01, 0.2)),
         pytest.param("y", 0.2, marks=pytest.mark.long),
     ],
 )
@@ -253,7 +252,7 @@ def test_a_snapshot_has_the_same_future():
 
 
 @pytest.mark.parametrize("theta", [0.5, pytest.param(1.0, marks=pytest.mark.long)])
-@pytest.mark.parametrize("gain", [20.0, 100.0])
+@pytest.mark.parametrize("gain", [pytest.param(20.0, marks=pytest.mark.long), 100.0])
 def test_stiff_wheel_loops_roll_without_slipping(gain, theta):
     """Limits of their voltage are decided at the end of a step; clipped at its start they spin back and forth."""
     servo = {"type": "mx_28", "k_v_V_s_per_rad": gain}
@@ -287,6 +286,7 @@ def test_left_and_right_carry_the_same_while_it_is_straight(x_run, tree):
     assert np.abs(x_run["contact_force"][-1, :, :2].sum(axis=0)).max() < 0.05
 
 
+@pytest.mark.long
 def test_passive_wheels_without_mass_are_those_that_turn():
     records = [
         simulate(dynamic("gamma", duration_s=6.0, plant__dynamics__passive_wheels=p)) for p in ("bodies", "massless")
