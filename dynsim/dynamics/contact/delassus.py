@@ -14,7 +14,7 @@ from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
 # A pivot below this fraction of the largest entry counts as a dependent row: far above rounding (1e-16 times a few
 # dozen operations), far below what independent elbows give (> 1e-6).
-RANK_TOLERANCE = 1e-11
+RANK_TOLERANCE = 1e-10
 
 
 @internal_kernel

@@ -13,6 +13,7 @@ import math
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.cone.socp import best_split, split_room_in
+from dynsim.dynamics.contact.delassus import RANK_TOLERANCE
 from dynsim.dynamics.contact.unilateral import (
     UnilateralArrays,
     holding_bound,
@@ -23,8 +24,6 @@ from dynsim.dynamics.contact.unilateral import (
 from dynsim.dynamics.tables import ContactArrays, Workspace
 from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
-# A row whose pivot is below this fraction of the largest depends on the others.
-NULL_TOLERANCE = 1e-10
 # A unit direction of splits whose part along a normal row is smaller leaves that normal force as it is.
 NORMAL_PART = 1e-6
 # A direction with a smaller square in the leading rows has its other parts alone: of couplings behind closed brakes.
@@ -211,7 +210,7 @@ def null_space(W, p, N, order, leading):
         for i in range(rank + 1, p):
             if W[order[i], order[i]] > W[order[best], order[best]]:
                 best = i
-        if not W[order[best], order[best]] > NULL_TOLERANCE * largest:
+        if not W[order[best], order[best]] > RANK_TOLERANCE * largest:
             break
         order[rank], order[best] = order[best], order[rank]
         a = order[rank]
