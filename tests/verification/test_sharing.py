@@ -127,9 +127,9 @@ def test_feet_that_slide_on_one_plate_share_and_leave_the_motion_open(tmp_path: 
         "integrator": {"method": method},
     }
     scenario = scenario_from_resolved(config)
-    rest = dynsim.Simulation(scenario).state
+    start = dynsim.Simulation(scenario).state
     moving = np.array([1.0, 0.3, 0.0, 0.0, 0.0, 4.0])
-    simulation = dynsim.Simulation(scenario, state=dynsim.State(0.0, rest.q, moving, rest.current))
+    simulation = dynsim.Simulation(scenario, state=dynsim.State(0.0, start.q, moving, start.current))
     simulation.advance(0.1)
     warnings = [text for text in simulation.record().summary["warnings"] if "shared forces" in text]
     assert len(warnings) == (feet == 4)

@@ -19,10 +19,9 @@ from dynsim.dynamics import state as kst
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.cone import problem as kc
-from dynsim.dynamics.contact.delassus import solve_small
+from dynsim.dynamics.contact.delassus import RANK_TOLERANCE, solve_small
 from dynsim.dynamics.contact.rows import set_modes
 from dynsim.dynamics.contact.shares import even_out, share_slot, some_slide
-from dynsim.dynamics.contact.splits import NULL_TOLERANCE
 from dynsim.dynamics.contact.unilateral import (
     UnilateralArrays,
     dry_bound,
@@ -446,7 +445,7 @@ def extended(factor, W, row, count, r):
             total -= factor[count, j] * factor[i, j]
         factor[count, i] = total / factor[i, i]
         square -= factor[count, i] * factor[count, i]
-    if not square > NULL_TOLERANCE * W[r, r]:
+    if not square > RANK_TOLERANCE * W[r, r]:
         return count
     factor[count, count], row[count] = math.sqrt(square), r
     return count + 1
