@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 # Errors of stable motion: in units of rtol, as a share for time stepping, and in steps.
 ADAPTIVE_SHARE, STEPPED_SHARE, STEPS = 300.0, 0.01, 2.0
 # Difference of the two solvers, which solve the same equations.
-SOLVERS = 1e-8
+SOLVERS = 2e-8
 # Factor on errors estimated by a finer run: an estimate is not a bound.
 SURE = 10.0
 # Samples by which an impact may be early or late.

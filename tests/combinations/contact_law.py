@@ -137,6 +137,9 @@ def _real_friction(seen: Observed, touch: Touch) -> Finding:
     if contact.grip_axis is None:
         over = size - most * f_n
         allowed = _share(seen, touch) * np.linalg.norm(touch.force, axis=1) + 1e-9 * (1.0 + np.abs(f_n).max())
+        if seen.stepped:
+            # Rates are solved to 1e-8 m/s.
+            allowed = allowed + 1e-8 * sum(link.inertia.mass for link in seen.robot.links) / seen.step
         if (closed & (over > allowed)).any():
             i = int(np.where(closed, over - allowed, -np.inf).argmax())
             yield (
@@ -216,6 +219,16 @@ def _against_slip(seen: Observed, touch: Touch, slips: NDArray[np.bool_], before
         )
 
 
+def _at_an_end(seen: Observed, touch: Touch, i: int) -> bool:
+    """Whether the end of its axis, which has a contact of its own, is where a link is nearest to the surface."""
+    return any(
+        other.contact.tip is None
+        and np.linalg.norm(other.position[i] - touch.position[i]) < 1e-4
+        and other.gap[i] < touch.gap[i] + 1e-5
+        for other in seen.touches()
+    )
+
+
 def gaps(seen: Observed) -> Finding:
     """Nothing lies below its surface: by events within what projection leaves, by steps within their way."""
     for touch in seen.touches():
@@ -239,6 +252,11 @@ def gaps(seen: Observed) -> Finding:
             # The gap of the middle of a step decides: until its end a point moves and falls freely.
             fall = 0.5 * seen.step**2 * float(np.linalg.norm(seen.bodies.gravity))
             allowed = 1e-7 + sag + 1.5 * seen.step * float(_fastest_approach(touch)[deepest]) + fall
+            # A step along a surface that curves leads off it, by half of what its normal turns through.
+            way = seen.step * np.linalg.norm(touch.slip, axis=1)
+            allowed += 0.5 * float((touch.turned * way)[touch.mode != OPEN].sum())
+            if contact.tip is not None and _at_an_end(seen, touch, deepest):
+                continue
         if -touch.gap[deepest] > allowed + begun:
             yield (
                 f"{name} at t = {seen.time[deepest]:.6g} s is {-touch.gap[deepest]:.3g} m below its surface "

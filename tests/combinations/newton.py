@@ -60,6 +60,9 @@ def momentum(seen: Observed) -> Finding:
             off = np.abs(both[rows] - both[rows - 1] - seen.step * rate[rows])
             reach = 1.0 + np.linalg.norm(seen.motion.origin[chosen[-1]][rows], axis=1)
             allowed = (seen.step * 0.02 * size[rows] * reach + 1e-12)[:, None]
+        elif seen.sample_time is not None:
+            # Forces jump or bend at ticks, between samples; those of the samples :func:`equation` has.
+            continue
         else:
             off, allowed, rows = integral_error(seen, both, rate)
         if off.size and (off / allowed).max() > 1.0:

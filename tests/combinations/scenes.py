@@ -510,7 +510,7 @@ def _snake(random: Generator, levels: Levels) -> dict[str, Any]:
         controller["paths"] = [{"type": "ramp", "start_s": 0.0, "duration_s": duration, "displacement": step}]
     if random.random() < 0.5:
         # Lifted pairs, the first among them here and there.
-        controller |= {"modes": {1: [1, 4] if random.random() < 0.5 else [3, 6]}, "switching": {"order": [1]}}
+        controller |= {"modes": {1: [2, 5] if random.random() < 0.5 else [3, 6]}, "switching": {"order": [1]}}
     settings["controller"] = controller if level in ("operator", *SAMPLED) else {"type": "joint_pd"}
     own = {"none": 0.0, "high": 1.5}.get(levels["friction"], 0.6)
     settings["contacts"] = {"friction": own}

@@ -322,7 +322,8 @@ def _below(match: Match, seen: Observed) -> str:
             deepest = max(deepest, -float(surface.distance(start + share * (tip - start)).min()))
     if abs(1e3 * deepest - float(match[3])) > 0.02 * abs(1e3 * deepest) + 0.02 + 0.5e3 * spacing:
         return f"it lies {1e3 * deepest:.4g} mm deep"
-    return "" if deepest > own.radius else f"that is within its radius of {own.radius:g} m"
+    # Between the points that are looked at here it may be a little deeper.
+    return "" if deepest > own.radius - 2e-5 else f"that is within its radius of {own.radius:g} m"
 
 
 def _reference_beyond(match: Match, seen: Observed) -> str:
