@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from combinations.accelerations import critical, exists, leaves
-from combinations.observed import OPEN, STICKING, Observed, Touch
+from combinations.observed import OPEN, SLIDING, STICKING, Observed, Touch
 from combinations.running import Run
 from combinations.sampled_loop import loop_growth
 from dynsim.compile.clearance import POINTS
@@ -173,6 +173,10 @@ def _reversed(match: Match, seen: Observed) -> str:
     M = seen.bodies.mass_matrix(seen.q[i])
     own = touch.normal[i] @ J @ np.linalg.solve(M, J.T @ touch.force[i]) / (touch.normal_force[i] or 1.0)
     size = touch.normal[i] @ J @ np.linalg.solve(M, J.T @ touch.normal[i])
+    if touch.mode[i] != SLIDING:
+        # It slid between the samples: in the worst direction.
+        answer = np.linalg.solve(M, J.T @ touch.normal[i]) @ J.T
+        own = min(own, size - touch.contact.friction_at_rest * float(np.linalg.norm(answer - size * touch.normal[i])))
     return "" if own < 0.05 * size else f"the diagonal entry is {own:.3g} of {size:.3g} at t = {seen.time[i]:.4g} s"
 
 
