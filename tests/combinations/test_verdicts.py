@@ -29,7 +29,7 @@ PARTS = (
     r"^use .*, which is stable, or smaller gains",
     r"^the torque of .* begins with|^the reference of .* begins|^the planned voltages count on",
     r"^the motion does not determine|^in the samples",
-    r"^; while .* slides, other choices may move otherwise",
+    r"^; (?:while .* slides|where .* leaves its surface), other choices may move otherwise",
     r"^f_t = |^friction has put ",
     r"^, and contacts with other forces than at rest",
     r"^of the start|^stops are enforced",

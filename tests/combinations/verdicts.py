@@ -467,7 +467,7 @@ VERIFIERS: dict[str, Callable[[Match, Observed], str]] = {
     r"^(.+): the (\S+), rms over the run, is more than nominal": _overloaded,
     rf"^a jolt of the start takes the tip margin below zero.*? in {NUMBER}(?: % of the samples)?[,;]": _tips,
     rf"^the base (?:tips over|is tipped over|1) at t = .*below zero in {NUMBER}(?: % of the samples)?[,;]": _tips,
-    rf"^the base is lifted: no load on its wheels and caster in {NUMBER} % of the samples": _lifted,
+    rf"^the base is lifted: no load on its wheels and caster in {NUMBER}(?: %)? of the samples": _lifted,
     rf"^the (\S+) wheel would slip: it needs up to {NUMBER} times the traction": _would_slip,
     r"^(?:contacts\.points\.)?(.+): no joint moves this point along the normal of": _left_out,
     r"^initial.equilibrium: .*that jumps at the start": _jumps,

@@ -135,7 +135,8 @@ def test_a_jam_takes_the_same_energy_whatever_the_step(tmp_path: Path):
         assert solved["residual_max_m_s"] <= 1e-10
         assert abs(summary["scheme_loss_J"]) < 1e-11
         assert summary["energy_residual_relative"] < 1e-12
-        heat.append(summary["friction_heat_J"])
+        # The tip leaves for a moment in each step, so that each is a landing.
+        heat.append(summary["friction_heat_J"] + summary["impact_loss_J"])
     np.testing.assert_allclose(heat, heat[-1], rtol=1e-2)
     assert heat[-1] > 0.06
 

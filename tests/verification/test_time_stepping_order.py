@@ -90,7 +90,9 @@ def test_landings_are_plastic_and_bounces_are_newtons(restitution, height):
     assert -h * G * fall < z.min() < -1e-5
     assert abs(z[-1]) < 1e-10
     kinetic = 0.5 + G * 0.3
-    assert abs(run.states("loss")[-1, IMPACT_LOSS] - G * 0.3) < 2e-4 * kinetic
+    # Friction takes its part of the first landing.
+    slip = max(1.0 - 0.4 * (1.0 + restitution) * G * fall, 0.0)
+    assert abs(run.states("loss")[-1, IMPACT_LOSS] - (kinetic - 0.5 * slip**2)) < 2e-4 * kinetic
 
 
 def test_times_are_counted_not_summed():
