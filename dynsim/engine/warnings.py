@@ -30,6 +30,8 @@ from dynsim.scenario.effect import without_effect
 DRIFT_LIMIT_M = 1e-9
 # A larger acceleration of a joint at an equilibrium start is a motion, not rounding [rad/s² or m/s²].
 STARTS_MOVING = 1e-6
+# Postures that differ by roundings alone [rad or m].
+SAME_POSTURE = 1e-12
 # Smaller accelerations, by the weight's, of a balance that uses less than all friction are roundings of stiff contacts.
 OF_WEIGHT = 1e-4
 # Forces of contacts at the start that differ by more than this, relative or in N, are others than at rest.
@@ -321,8 +323,9 @@ def _moving_start(record: Record, prepared: Prepared) -> list[str]:
     balance, robot = prepared.balance, prepared.model.robot
     if balance is None or balance.warnings or not len(record) or record.time[0] != 0.0:
         return []
-    # A run may have begun from another state.
-    if np.abs(record["v"][0]).max(initial=0.0) > 0.0 or not np.array_equal(record["q"][0], robot.initial):
+    # A run may have begun from another state. Quaternions have been normalised.
+    there = np.allclose(record["q"][0], robot.initial, rtol=0.0, atol=SAME_POSTURE)
+    if not there or np.abs(record["v"][0]).max(initial=0.0) > 0.0:
         return []
     size = np.abs(record["vdot"][0])
     if size.max(initial=0.0) <= OF_WEIGHT * (1.0 + float(np.linalg.norm(robot.gravity))):
