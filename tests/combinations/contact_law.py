@@ -253,8 +253,8 @@ def gaps(seen: Observed) -> Finding:
             fall = 0.5 * seen.step**2 * float(np.linalg.norm(seen.bodies.gravity))
             allowed = 1e-7 + sag + 1.5 * seen.step * float(_fastest_approach(touch)[deepest]) + fall
             # A step along a surface that curves leads off it, by half of what its normal turns through.
-            way = seen.step * np.linalg.norm(touch.slip, axis=1)
-            allowed += 0.5 * float((touch.turned * way)[touch.mode != OPEN].sum())
+            passed = seen.step * np.linalg.norm(touch.slip, axis=1)
+            allowed += 0.5 * float((touch.turned * passed)[touch.mode != OPEN].sum())
             if contact.tip is not None and _at_an_end(seen, touch, deepest):
                 continue
         if -touch.gap[deepest] > allowed + begun:
