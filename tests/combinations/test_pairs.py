@@ -28,6 +28,10 @@ QUICK = {1, 2, 3, 4, 5, 6, 7, 8, 11}
 FOUND = {
     "an equilibrium of a floating robot that moved without a warning": (271127, 188),
 }
+# Of those the ones that still are.
+OPEN = {
+    "elimination does not see that rows are nearly dependent: 25 kN hold a motion": (271127, 108),
+}
 # Scenes of the slow study.
 TRIPLES = 1000
 # What a few refused levels are completed to a whole scene from.
@@ -113,9 +117,14 @@ def test_scenes_that_were_wrong_once(name: str, number: int, tmp_path: Path) -> 
     _all_holds(KNOWN[name].assignment, KNOWN_SEED, number, tmp_path, thorough=False, takes=_shares_a_program)
 
 
-@pytest.mark.parametrize("name", FOUND)
-def test_fresh_scenes_that_were_wrong_once(name: str, tmp_path: Path) -> None:
-    seed, number = FOUND[name]
+@pytest.mark.parametrize(
+    ("seed", "number"),
+    [
+        *(pytest.param(*drawn, id=name) for name, drawn in FOUND.items()),
+        *(pytest.param(*drawn, id=name, marks=pytest.mark.xfail(reason=name)) for name, drawn in OPEN.items()),
+    ],
+)
+def test_fresh_scenes_that_were_wrong_once(seed: int, number: int, tmp_path: Path) -> None:
     levels = study.assignment("none", seed, number)
     _all_holds(levels, seed, number, tmp_path, thorough=False, takes=_shares_a_program)
 
