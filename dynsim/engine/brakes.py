@@ -24,6 +24,8 @@ def projection_loss(prepared: Prepared, time: float) -> float:
     Steps project rates too, by their own error, which the ledger has to show.
     """
     system, workspace, y = prepared.system, prepared.workspace, prepared.run.y
+    if workspace.counts[ka.ROWS] == 0:
+        return 0.0
     derivative(system, time, y, workspace, np.zeros_like(y))
     row_errors(workspace)
     return float(project_level(system, workspace, y, 1))

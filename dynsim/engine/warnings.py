@@ -200,11 +200,13 @@ def _limits_of(motor: Drive) -> list[tuple[str, str, float, str]]:
 def _sliding(record: Record, contacts: Sequence[Contact], names: Sequence[str], samples: Any) -> list[str]:
     """Those of the named contacts that slide with friction in some of the samples, an index of them."""
     slides = (record["contact_mode"][samples] == ka.SLIDING).any(axis=0)
-    return [
-        contact.name
-        for contact, some in zip(contacts, slides, strict=True)
-        if some and contact.friction > 0.0 and contact.name in names
-    ]
+    slides &= np.array([contact.friction > 0.0 for contact in contacts], dtype=bool)
+    return _named(contacts, slides, names)
+
+
+def _named(contacts: Sequence[Contact], chosen: NDArray[np.bool_], names: Sequence[str]) -> list[str]:
+    """Those of the names whose contacts are chosen, (c,), in the order of the contacts."""
+    return [contact.name for contact, own in zip(contacts, chosen, strict=True) if own and contact.name in names]
 
 
 def _undetermined(record: Record, prepared: Prepared, stepped: bool) -> list[str]:
@@ -273,11 +275,7 @@ def _leaving(record: Record, contacts: Sequence[Contact], names: Sequence[str], 
     """Those of the named contacts that leave their surface from sticking, while dry friction keeps joints at rest."""
     modes = record["contact_mode"]
     leaves = (modes[:-1] == ka.STICKING) & (modes[1:] == ka.OPEN) & rests[:-1].any(axis=1, keepdims=True)
-    return [
-        contact.name
-        for contact, some in zip(contacts, leaves.any(axis=0), strict=True)
-        if some and contact.name in names
-    ]
+    return _named(contacts, leaves.any(axis=0), names)
 
 
 def _unpressed(record: Record, prepared: Prepared, begun: float) -> list[str]:

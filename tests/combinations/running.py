@@ -183,9 +183,9 @@ def faults(scene: Scene, done: Mapping[str, Run], *, thorough: bool = False) -> 
     if (auto := done.get("auto")) is not None and auto.record is not None:
         same = str(auto.record.summary["method"])
         assert auto.resolved is not None
+        differ = _differs(done[same], auto) if same in done else ""
         # Of what nothing damps it sharpens the tolerances.
-        alike = same in done and prepare(auto.resolved).choice.sharper == 1.0
-        if alike and (differ := _differs(done[same], auto)):
+        if differ and prepare(auto.resolved).choice.sharper == 1.0:
             wrong.append(("way", f"auto is not {same}: {differ}"))
     if thorough:
         for name, own in done.items():

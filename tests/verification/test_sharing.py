@@ -136,3 +136,42 @@ def test_feet_that_slide_on_one_plate_share_and_leave_the_motion_open(tmp_path: 
     for text in warnings:
         assert text.startswith("f0, f1, f2, f3: shared forces")
         assert "other choices may move otherwise" in text
+
+
+def test_a_contact_that_leaves_what_joints_at_rest_share_with_it_leaves_the_motion_open(tmp_path: Path) -> None:
+    """A tip comes to rest on a ceiling and leaves it at 0.142 s; time stepping, which splits otherwise, keeps it."""
+    link = {"length_m": 0.25, "mass_kg": 0.3, "com_m": [0.02, 0.01, 0.1], "damping_N_m_s_per_rad": 0.01}
+    chain = [
+        {**link, "axis": [0, 0, 1], "friction_N_m": 0.1212},
+        {**link, "axis": [-0.2729, 1.4381, -0.7874], "friction_N_m": 0.2265, "motor": {"type": "torque"}},
+        {**link, "axis": [1, 0, 0], "friction_N_m": 0.0286, "motor": {"type": "torque"}},
+    ]
+    times = [0.0, 0.1, 0.2]
+    torques = {"joint_2": [0.0164, -0.2729, 0.3113], "joint_3": [-0.6336, -0.3512, 0.61]}
+    config = {
+        "duration_s": 0.16,
+        "plant": {"type": "serial_arm", "chain": chain},
+        "controller": {
+            "type": "joint_pd",
+            "torques": {joint: {"times_s": times, "torques_N_m": values} for joint, values in torques.items()},
+        },
+        "surfaces": {
+            "ceiling": {
+                "type": "plane",
+                "point_m": [0.13929, 0.29507, 0.51059],
+                "normal": [-0.229875, -0.486957, -0.842633],
+            }
+        },
+        "contacts": {
+            "law": "unilateral",
+            "friction": 0.594,
+            "static_friction": 0.772,
+            "points": {"tip": {"body": "link_3", "point_m": [0.02, 0, 0.2], "surface": "ceiling"}},
+        },
+        "integrator": {"method": "dopri5"},
+        "record": {"rate_hz": 200},
+    }
+    record = dynsim.simulate(scenario_from_resolved(config))
+    assert [event.kind for event in record.events if event.name == "tip"] == ["landing", "lift_off"]
+    (warning,) = [text for text in record.summary["warnings"] if "shared forces" in text]
+    assert warning.endswith("where tip leaves its surface, other choices may move otherwise")
