@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from combinations.bodies import position_rates
 from combinations.observed import OPEN, SLIDING, STICKING, Observed, Touch, warned
 from dynsim.model.surfaces import HeightField
 
@@ -223,10 +224,18 @@ def _at_an_end(seen: Observed, touch: Touch, i: int) -> bool:
     """Whether the end of its axis, which has a contact of its own, is where a link is nearest to the surface."""
     return any(
         other.contact.tip is None
-        and np.linalg.norm(other.position[i] - touch.position[i]) < 1e-4
+        and np.linalg.norm(other.position[i] - touch.position[i])
+        < 1e-4 + abs(other.contact.radius - touch.contact.radius)
         and other.gap[i] < touch.gap[i] + 1e-5
         for other in seen.touches()
     )
+
+
+def _turned_gap(seen: Observed, touch: Touch) -> Array:
+    """What the gap changes in the step to each sample at its rates, beyond its rate at the sample, (T,) [m]."""
+    q = seen.q - seen.step * position_rates(seen.bodies, seen.q, seen.v)
+    _, _, far, _ = seen.nearest_point(touch.contact, seen.bodies.motion(q, seen.v, np.zeros_like(seen.v)))
+    return np.asarray(touch.gap - (far - touch.contact.radius) - seen.step * touch.approach)
 
 
 def gaps(seen: Observed) -> Finding:
@@ -252,9 +261,8 @@ def gaps(seen: Observed) -> Finding:
             # The gap of the middle of a step decides: until its end a point moves and falls freely.
             fall = 0.5 * seen.step**2 * float(np.linalg.norm(seen.bodies.gravity))
             allowed = 1e-7 + sag + 1.5 * seen.step * float(_fastest_approach(touch)[deepest]) + fall
-            # A step along a surface that curves leads off it, by half of what its normal turns through.
-            passed = seen.step * np.linalg.norm(touch.slip, axis=1)
-            allowed += 0.5 * float((touch.turned * passed)[touch.mode != OPEN].sum())
+            # Rates are along the surface at the end of a step, so that one that curves is left by half of what they turn.
+            allowed += float(np.abs(_turned_gap(seen, touch))[touch.mode != OPEN].sum())
             if contact.tip is not None and _at_an_end(seen, touch, deepest):
                 continue
         if -touch.gap[deepest] > allowed + begun:

@@ -64,6 +64,8 @@ HOLD_SLOW, HOLD_COMPATIBLE, HOLD_RESTING = 0, 1, 2
 # Light joints may change their rates by some times what heavy ones at rest are rid of; the rest was no rest if others,
 # geared to them, lose more than that.
 MOST_CHANGE = 100.0
+# Share of its mobility that the other rows leave a joint whose row nearly depends on them, and does, but for rounding.
+NEARLY_DEPENDENT, ROUNDING = 1e-6, 1e-12
 
 
 @internal_kernel
@@ -332,7 +334,9 @@ def release_dependent_joints(system: System, ws: Workspace):
     Such a row depends on the normal rows, and how they share a force changes the friction of what slides: no split of
     the right-hand side is that of the solution. Nor do splits know stops, whose force would go to the row by halves, as
     much as it may be beyond the bound. At rest Coulomb's law admits any force within the bound. Rows that depend on
-    those of sticking points and of other joints alone remain, see :mod:`dynsim.dynamics.contact.splits`.
+    those of sticking points and of other joints alone remain, see :mod:`dynsim.dynamics.contact.splits`, but for those
+    that depend on them only nearly: it would take forces beyond all bounds to hold such a joint, and the order of
+    pivots would say whether it is held.
     """
     unilateral, W = system.unilateral, ws.small[0]
     table, mode, bare, whole = unilateral.dry_table, unilateral.mode, 0, 0
@@ -343,7 +347,7 @@ def release_dependent_joints(system: System, ws: Workspace):
         blocked = blocked or mode[k, ku.WANTED] == ka.SLIDING
     for k in range(unilateral.stop_table.shape[0]):
         blocked = blocked or unilateral.stop_table[k, ku.STOP_CLOSED] == 1
-    if not blocked or table.shape[0] == 0:
+    if table.shape[0] == 0:
         return
     for r in range(system.couplings.joint.shape[0]):
         bare = extended(bare_factor, W, bare_row, bare, r)
@@ -363,8 +367,11 @@ def release_dependent_joints(system: System, ws: Workspace):
             continue
         r = table[k, ku.DRY_ROW]
         with_bare = extended(bare_factor, W, bare_row, bare, r)
+        left = what_is_left(bare_factor, W, r, bare)
         with_whole = extended(whole_factor, W, whole_row, whole, r)
-        if with_bare > bare and with_whole == whole:
+        nearly = ROUNDING < left <= NEARLY_DEPENDENT
+        held = blocked and with_bare > bare and what_is_left(whole_factor, W, r, whole) <= NEARLY_DEPENDENT
+        if nearly or held:
             rest_without_row(unilateral, k)
         else:
             bare, whole = with_bare, with_whole
@@ -449,6 +456,15 @@ def extended(factor, W, row, count, r):
         return count
     factor[count, count], row[count] = math.sqrt(square), r
     return count + 1
+
+
+@internal_kernel
+def what_is_left(factor, W, r, count):
+    """Share of the mobility along row r that ``count`` others leave, right after :func:`extended`."""
+    square = W[r, r]
+    for i in range(count):
+        square -= factor[count, i] * factor[count, i]
+    return square / W[r, r]
 
 
 @internal_kernel
