@@ -74,13 +74,14 @@ def powers(seen: Observed) -> Finding:
     for a, motor in enumerate(seen.robot.motors):
         if not isinstance(motor, TorqueSource):
             heat = heat + motor.resistance * current[:, a] ** 2
-    rubbed = np.zeros(len(seen))
+    rubbed, rubbed_before = np.zeros(len(seen)), np.zeros(len(seen))
     for touch in seen.touches():
         rubs = touch.mode != STICKING
         if seen.stepped and touch.contact.stiffness == 0.0:
             # What a step with a landing takes is impact loss.
             rubs[1:] &= touch.mode[:-1] != OPEN
         rubbed = rubbed - np.where(rubs, (touch.tangential * touch.slip).sum(axis=1), 0.0)
+        rubbed_before = rubbed_before - np.where(rubs, (touch.tangential * touch.slip_before).sum(axis=1), 0.0)
     lost = (seen.bodies.damping * seen.v**2).sum(axis=1) - (seen.joint_signal("joint_friction") * seen.v).sum(axis=1)
     for motor in seen.robot.motors:
         if isinstance(motor, Servo) and motor.coulomb_friction > 0.0 and not seen.real:
@@ -96,11 +97,14 @@ def powers(seen: Observed) -> Finding:
     if jumps_at_ticks(seen) or seen.sample_time is not None:
         del work["energy_electrical"]
         if jumps_at_ticks(seen):
-            del work["heat_joule"], work["losses of gears and joints"]
+            # Between samples further apart than ticks power may swing, and samples be all of the same phase.
+            del work["heat_joule"], work["losses of gears and joints"], work["heat_friction"]
     turnover, _ = turnover_and_residual(seen)
     unlike = _unlike_trapezia(seen) if seen.stepped else {}
     for name, (total, power) in work.items():
-        yield from _integrated(seen, name, total, power, turnover, unlike.get(name))
+        # The impulse of a step works on the mean of the rates at its ends.
+        before = rubbed_before if name == "heat_friction" else np.concatenate([power[:1], power[:-1]])
+        yield from _integrated(seen, name, total, (before, power), turnover, unlike.get(name))
 
 
 def _unlike_trapezia(seen: Observed) -> dict[str, Array]:
@@ -134,15 +138,17 @@ def _unlike_trapezia(seen: Observed) -> dict[str, Array]:
 
 
 def _integrated(
-    seen: Observed, name: str, total: Array, power: Array, turnover: float, unlike: Array | None
+    seen: Observed, name: str, total: Array, powers: tuple[Array, Array], turnover: float, unlike: Array | None
 ) -> Finding:
+    """``powers``: at the start of the step that ends at a sample, and at its end, (T,) [W]."""
+    earlier, power = powers
     if not seen.stepped:
         off, allowed, rows = integral_error(seen, total[:, None], power[:, None])
         allowed = allowed + 1e-5 * turnover
         rows = rows + 2
     else:
         rows = whole_steps(seen)
-        h, now, before = seen.step, power[rows], power[rows - 1]
+        h, now, before = seen.step, power[rows], earlier[rows]
         # Power at the mean state of a step: between those of its ends, and as much off as these differ.
         off = np.abs(total[rows] - total[rows - 1] - 0.5 * h * (now + before))[:, None]
         allowed = 1.1 * h * np.abs(now - before) + 0.02 * h * (np.abs(now) + np.abs(before))

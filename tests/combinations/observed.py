@@ -182,8 +182,10 @@ class Observed:
     def q_middle(self) -> Array:
         """Coordinates at the midpoints of the steps that end at samples: half a step from their start at its rates."""
         began = self.v - self.step * self.vdot
-        back = 0.5 * began - (began + self.scenario.integrator.theta * self.step * self.vdot)
-        return np.asarray(self.q + position_rates(self.bodies, self.q, self.step * back))
+        # Back to the start and on from there: turns about axes that differ are not those of the sum of their rates.
+        back = -self.step * (began + self.scenario.integrator.theta * self.step * self.vdot)
+        start = self.q + position_rates(self.bodies, self.q, back)
+        return np.asarray(start + position_rates(self.bodies, start, 0.5 * self.step * began))
 
     @cached_property
     def _middles(self) -> Motion:
