@@ -31,6 +31,8 @@ UNKNOWN = 1e9
 # Terms of the equation of motion cancel to this part of their size: by events the record's accelerations and forces
 # solve one linear system, whose condition costs up to six of sixteen digits.
 BALANCE = 1e-8
+# Rows that count as dependent, though not to the last digit, leave as much where their forces are shared.
+SHARED_BALANCE = 1e-7
 # Forces of a step, and where it puts contacts, from differences of samples: h Δv̇ of rounded rates.
 STEPPED_BALANCE = 1e-7
 
@@ -469,7 +471,8 @@ def _balanced(seen: Observed, rows: NDArray[np.int64], terms: list[Array], slack
     scale = np.sum([np.abs(term) for term in terms], axis=0)
     if seen.robot.couplings:
         left, scale, slack = left @ basis, scale @ np.abs(basis), slack @ np.abs(basis)
-    return Balance(rows, left, scale, slack, STEPPED_BALANCE if seen.stepped else BALANCE)
+    by_events = SHARED_BALANCE if warned(seen, "shared forces") else BALANCE
+    return Balance(rows, left, scale, slack, STEPPED_BALANCE if seen.stepped else by_events)
 
 
 def warned(seen: Observed, text: str) -> bool:

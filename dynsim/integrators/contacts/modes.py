@@ -155,10 +155,11 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
         unilateral.shares[slot] = unilateral.vector[ku.SOLUTION, i]
     release_dependent_joints(system, ws)
     # What is left of rates after an impact that was let settle, and of points that were solved for as if at rest: those
-    # that begin to slip would else go against the direction that they are given, and stop, and begin again.
+    # that begin to slip would else go against the direction that they are given, and stop, and begin again. One that
+    # goes along it keeps its rate: it would never get under way if events of others came too often.
     for k in range(mode.shape[0]):
         starts = mode[k, ku.WANTED] == ka.SLIDING and unilateral.slide[k, ku.FROZEN] == 1.0
-        rests = starts and slip_speed(ws, k) <= least
+        rests = starts and slip_speed(ws, k) <= least and not goes_along(unilateral, ws, k)
         mode[k, ku.TOUCHING] = ka.STICKING if rests else mode[k, ku.WANTED]
     set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.TOUCHING])
     # What was split before says nothing of these modes.
@@ -375,6 +376,15 @@ def release_dependent_joints(system: System, ws: Workspace):
             rest_without_row(unilateral, k)
         else:
             bare, whole = with_bare, with_whole
+
+
+@internal_kernel
+def goes_along(unilateral: UnilateralArrays, ws: Workspace, k):
+    """True if candidate k slips, however slowly, in the direction that it is given."""
+    along = 0.0
+    for s in range(3):
+        along += unilateral.slide[k, ku.REFERENCE + s] * ws.contacts[k, ka.SLIP_VELOCITY + s]
+    return along > 0.0
 
 
 @internal_kernel
