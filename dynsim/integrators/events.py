@@ -67,7 +67,7 @@ def arm_events(system: System, ws: Workspace, run: Run):
         run.event[e, ki.START_VALUE] = value
         if run.event[e, ki.SIDE] == 0.0:
             run.event[e, ki.SIDE] = 1.0 if value > 0.0 else (-1.0 if value < 0.0 else 0.0)
-    note_gaps(ws, run.gaps)
+    note_gaps(system.unilateral, ws, run.gaps)
 
 
 @internal_kernel

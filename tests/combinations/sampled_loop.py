@@ -27,7 +27,7 @@ def loop_growth(seen: Observed) -> float | None:
     first = seen.bodies.motion(seen.robot.initial[None], np.zeros((1, seen.bodies.n)), np.zeros((1, seen.bodies.n)))
     rows = [np.zeros((0, seen.bodies.n))]
     for touch in seen.touches(first):
-        if abs(touch.gap[0]) < 1e-6 and touch.contact.stiffness == 0.0:
+        if abs(touch.gap[0]) < 1e-6 or (touch.contact.stiffness > 0.0 and touch.gap[0] < 0.0):
             J = seen.bodies.jacobian(first, touch.body, touch.position)[0]
             rows.append(J if seen.real and touch.contact.friction > 0.0 else touch.normal[0][None] @ J)
     _, sizes, vectors = np.linalg.svd(np.vstack(rows) @ basis)

@@ -8,18 +8,18 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from dynsim.dynamics import tables as ka
-from dynsim.dynamics.contact.delassus import RANK_TOLERANCE, solve_small
+from dynsim.dynamics.contact.delassus import RANK_TOLERANCE, solve_dependent, solve_small
 
 seeds = st.integers(0, 2**32 - 1)
 
 
-def solve(A: np.ndarray, b: np.ndarray, room: int = 0) -> tuple[np.ndarray, bool]:
+def solve(A: np.ndarray, b: np.ndarray, room: int = 0, solver=solve_small) -> tuple[np.ndarray, bool]:
     """Forces and whether rows depended on each other, with room for more rows than there are."""
     p = len(b)
     ws = ka.workspace(1, 0, 0, p + room)
     ws.small[:], ws.rows[:] = np.nan, np.nan
     ws.small[0, :p, :p], ws.rows[:p, ka.RHS] = A, b
-    dependent = solve_small(ws.small, ws.rows, ws.active, p)
+    dependent = solver(ws.small, ws.rows, ws.active, p)
     assert np.array_equal(ws.small[0, :p, :p], A, equal_nan=True)
     assert np.isnan(ws.rows[p:, ka.FORCE]).all()
     return ws.rows[:p, ka.FORCE].copy(), bool(dependent)
@@ -105,3 +105,24 @@ def test_a_small_pivot_above_the_tolerance_is_independent():
     force, dependent = solve(A, np.array([1.0, 2.0, RANK_TOLERANCE]))
     assert not dependent
     np.testing.assert_allclose(force, [1.0, 2.0, 0.1], rtol=1e-14)
+
+
+@given(seeds)
+def test_rows_that_are_known_to_depend_are_solved_whatever_the_order_of_pivots(seed):
+    """The last pivot is 1/(A⁻¹)_pp, which a null vector with a small last entry makes large."""
+    rng = np.random.default_rng(seed)
+    p = int(rng.integers(3, 9))
+    basis = np.linalg.qr(rng.normal(size=(p, p)))[0]
+    basis[-1, -1] = 1e-3 * rng.normal()
+    basis[:, -1] /= np.linalg.norm(basis[:, -1])
+    null = basis[:, -1:]
+    others = np.linalg.qr(np.hstack([null, basis[:, :-1]]))[0][:, 1:]
+    least = 10.0 ** rng.uniform(-15.0, -5.0)
+    A = (others * 10.0 ** rng.uniform(-2.0, 0.0, size=p - 1)) @ others.T + least * null @ null.T
+    share = least / np.abs(A).max()
+    force, dependent = solve(A, rng.normal(size=p), solver=solve_dependent)
+    if share < 0.1 * RANK_TOLERANCE:
+        assert dependent
+        assert np.abs(force).max() < 1e6
+    elif share > 100.0 * RANK_TOLERANCE:
+        assert not dependent

@@ -186,6 +186,19 @@ def test_conditions_of_optimality(seed):
     assert abs(s @ z) < 1e-9 * scale
 
 
+@pytest.mark.parametrize("seed", range(40))
+def test_a_joint_that_carries_nothing_does_not_end_the_search(seed):
+    """A step past the apex of its cone goes through it exactly, and rounding may hide that it leaves the cone."""
+    rng = np.random.default_rng(seed)
+    idle, slide = rng.choice([0.0, -1.7e-17, 3e-17]), rng.uniform(5.0, 30.0)
+    f0 = np.array([0.4, -0.4, 1.4, -0.005, -0.15 * slide, idle])
+    N = np.array([[0.98854], [0.0], [0.0], [0.0], [0.15094], [0.0]])
+    mu, out = reals(np.array([2.88, 0.234, 0.234, 0.002])), np.full(6, np.nan)
+    margin = best_split(reals(f0), reals(N), 1, integers(np.array([0, 3, 4, 5])), mu, 1, 3, out, split_room(1, 4))
+    assert margin == pytest.approx(0.002, abs=1e-9)
+    assert abs(out[4]) <= 0.234 * (1.0 + 1e-9)
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_joints_that_rub_share_their_forces_as_a_linear_programme_has_it(seed):
     """max_z min_j (τ_j − |f_j|), some of the bounds so low that no split holds; of stops f_j is the margin."""

@@ -51,14 +51,11 @@ def solve_small(small, state, active, p):
 @noinline_kernel
 def eliminate(small, state, active, p):
     """:func:`solve_small` for any number of rows, without the closed forms."""
-    largest = 0.0
+    largest = largest_entry(small, state, p)
     for i in range(p):
         state[i, ka.FORCE] = state[i, ka.RHS]
-        # A row without mobility is dependent even if no other row has more.
-        largest = max(largest, state[i, ka.ROW_FLOOR] / RANK_TOLERANCE)
         for j in range(p):
             small[1, i, j] = small[0, i, j]
-            largest = max(largest, abs(small[0, i, j]))
     for k in range(p):
         best = k
         for i in range(k + 1, p):
@@ -66,8 +63,7 @@ def eliminate(small, state, active, p):
                 best = i
         # Written so that NaN falls through to the plain elimination and is seen by the integrator.
         if abs(small[1, best, k]) <= RANK_TOLERANCE * largest:
-            least_norm(small, state, active, p, largest)
-            return 1
+            return least_norm(small, state, active, p, largest)
         if best != k:
             for j in range(p):
                 small[1, k, j], small[1, best, j] = small[1, best, j], small[1, k, j]
@@ -87,9 +83,31 @@ def eliminate(small, state, active, p):
     return 0
 
 
+@noinline_kernel
+def solve_dependent(small, state, active, p):
+    """:func:`solve_small` of rows that are known to depend on each other.
+
+    Pivots of columns in their order may not show it: the last one is the inverse of an entry of the inverse, large for
+    a row that has next to no part in what is dependent. Forces would be as large as rounding lets them.
+    """
+    return least_norm(small, state, active, p, largest_entry(small, state, p))
+
+
+@internal_kernel
+def largest_entry(small, state, p):
+    """What pivots are compared with."""
+    largest = 0.0
+    for i in range(p):
+        # A row without mobility is dependent even if no other row has more.
+        largest = max(largest, state[i, ka.ROW_FLOOR] / RANK_TOLERANCE)
+        for j in range(p):
+            largest = max(largest, abs(small[0, i, j]))
+    return largest
+
+
 @internal_kernel
 def least_norm(small, state, active, p, largest):
-    """Least-squares solution of least norm.
+    """Least-squares solution of least norm; returns 1 where rows depend on each other, else 0.
 
     Elimination with rook pivoting (the largest entry of its row and of its column) leaves P A Q = [L1; L2] [U1, U2] of
     rank r. With W = L2 L1⁻¹ and Z = U1⁻¹ U2, whose entries such pivots keep small, where those of :func:`eliminate` do
@@ -143,6 +161,7 @@ def least_norm(small, state, active, p, largest):
         part[k] = state[k, ka.FORCE]
     for k in range(p):
         state[active[k, ka.ORDER], ka.FORCE] = part[k]
+    return 1 if d > 0 else 0
 
 
 @internal_kernel

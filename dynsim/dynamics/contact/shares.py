@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
-from dynsim.dynamics.contact.delassus import solve_small
+from dynsim.dynamics.contact.delassus import solve_dependent, solve_small
 from dynsim.dynamics.contact.splits import find_splits
 from dynsim.dynamics.contact.unilateral import UnilateralArrays
 from dynsim.dynamics.tables import Workspace
@@ -29,7 +29,15 @@ def solve_rows(unilateral: UnilateralArrays | None, ws: Workspace, p):
         return solve_small(ws.small, ws.rows, ws.active, p)
     if unilateral.number[ku.SHARED] == 1.0:
         return solve_near_shares(unilateral, ws, p)
+    if unilateral.number[ku.REDUNDANT] == 1.0:
+        return solve_redundant(ws, p)
     return solve_small(ws.small, ws.rows, ws.active, p)
+
+
+@internal_kernel
+def solve_redundant(ws: Workspace, p):
+    """The split of least norm; on SIMD lanes there is a form of it."""
+    return solve_dependent(ws.small, ws.rows, ws.active, p)
 
 
 @internal_kernel
@@ -48,7 +56,7 @@ def solve_nearest(unilateral: UnilateralArrays, ws: Workspace, p):
     for r in range(p):
         for s in range(p):
             rows[r, ka.RHS] -= W[r, s] * share[s]
-    dependent = solve_small(ws.small, rows, ws.active, p)
+    dependent = solve_dependent(ws.small, rows, ws.active, p)
     for r in range(p):
         rows[r, ka.FORCE] += share[r]
         rows[r, ka.RHS] = right[r]

@@ -48,7 +48,8 @@ STOP_CLOSED = 1
 STOP_ROW = 2  # its row while it is closed
 STOP_BEFORE = 3  # scratch of the choice of modes
 STOP_TOUCHED = 4  # scratch too: STOP_CLOSED before it
-STOP_TABLE_SIZE = 5
+STOP_STRUCK = 5  # 1: its joint has just run against it
+STOP_TABLE_SIZE = 6
 # UnilateralArrays.stop
 SIDE = 0  # 1 for a lower limit, −1 for an upper one
 LIMIT = 1  # SIDE times the limit [rad or m]: the gap is SIDE q − LIMIT
@@ -57,7 +58,8 @@ HITS = 3
 STOP_LOSS = 4  # [J]
 CLOSED_TIME = 5  # [s]
 HIT_AT = 6  # depth beyond the limit at which the joint hits the stop: DEPTH, or more if it left from there [rad or m]
-STOP_SIZE = 7
+STOP_GAP_THEN, STOP_RATE_THEN = 7, 8  # at the start of the step [rad, rad/s; m, m/s]
+STOP_SIZE = 9
 # UnilateralArrays.dry_table, int
 DRY_JOINT = 0  # link whose joint rubs
 DRY_ROW = 1
@@ -180,6 +182,12 @@ def stop_gap(unilateral: UnilateralArrays, ws: Workspace, k):
     """What joint stop k leaves its joint to go, ≥ 0 [rad or m]."""
     stop = unilateral.stop
     return stop[k, SIDE] * ws.joints[unilateral.stop_table[k, STOP_JOINT], ka.Q] - stop[k, LIMIT]
+
+
+@internal_kernel
+def stop_rate(unilateral: UnilateralArrays, ws: Workspace, k):
+    """Rate of :func:`stop_gap` [rad/s or m/s]."""
+    return unilateral.stop[k, SIDE] * ws.joints[unilateral.stop_table[k, STOP_JOINT], ka.QD]
 
 
 @internal_kernel

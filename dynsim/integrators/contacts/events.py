@@ -19,7 +19,7 @@ from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.rows import set_modes
 from dynsim.dynamics.contact.shares import keep_shares
 from dynsim.dynamics.contact.splits import dry_margin, margin, normal_is_open, stops_that_share
-from dynsim.dynamics.contact.unilateral import UnilateralArrays, dry_rests, dry_rows_held, stop_gap
+from dynsim.dynamics.contact.unilateral import UnilateralArrays, dry_rests, dry_rows_held, stop_gap, stop_rate
 from dynsim.dynamics.derivative import System
 from dynsim.dynamics.tables import ContactArrays, Workspace
 from dynsim.integrators import run as ki
@@ -114,9 +114,10 @@ def contact_guard(contacts: ContactArrays, unilateral: UnilateralArrays | None, 
 def too_long(contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: Workspace, h, gaps):
     """The fraction of a step to take instead, where it has passed over something; else 1.
 
-    An open candidate may dip below its surface and be out again at the end: the minimum of the cubic through gaps and
-    their rates at both ends, ``gaps``, (c, GAPS_SIZE), at the start. It may have gone through a body: out at its other
-    side, and as far as both gaps together. Or a frozen direction of slip has stood for too long.
+    An open candidate may dip below its surface, or a joint beyond its open stop, and be out again at the end: the
+    minimum of the cubic through gaps and their rates at both ends, ``gaps``, (c, GAPS_SIZE), at the start. It may have
+    gone through a body: out at its other side, and as far as both gaps together. Or a frozen direction of slip has
+    stood for too long.
     """
     fraction = 1.0
     if unilateral is None:  # known to the compiler
@@ -133,19 +134,32 @@ def too_long(contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: W
                 fraction = min(fraction, max(1.5 * slow / speed, 0.01))
         if passes_through(ws, gaps, k):
             fraction = min(fraction, 0.5)
-        if ws.active[k, ka.MODE] != ka.OPEN or gaps[k, RATE_THEN] >= 0.0 or ws.contacts[k, ka.GAP_RATE] <= 0.0:
-            continue
-        g0, g1 = gaps[k, GAP_THEN], ws.contacts[k, ka.GAP]
-        d0, d1 = h * gaps[k, RATE_THEN], h * ws.contacts[k, ka.GAP_RATE]
-        # Hermite: g0 + d0 x + a x² + b x³.
-        a, b = 3.0 * (g1 - g0) - 2.0 * d0 - d1, 2.0 * (g0 - g1) + d0 + d1
-        root = a * a - 3.0 * b * d0
-        if root <= 0.0 or a + math.sqrt(root) == 0.0:
-            continue
-        x = -d0 / (a + math.sqrt(root))
-        if 0.0 < x < 1.0 and g0 + x * (d0 + x * (a + x * b)) < -ku.DEPTH:
-            fraction = min(fraction, x)
+        if ws.active[k, ka.MODE] == ka.OPEN:
+            then, now = h * gaps[k, RATE_THEN], h * ws.contacts[k, ka.GAP_RATE]
+            fraction = min(fraction, dip(gaps[k, GAP_THEN], then, ws.contacts[k, ka.GAP], now, ku.DEPTH))
+    stop = unilateral.stop
+    for k in range(stop.shape[0]):
+        if unilateral.stop_table[k, ku.STOP_CLOSED] == 0:
+            then, now = h * stop[k, ku.STOP_RATE_THEN], h * stop_rate(unilateral, ws, k)
+            deepest = stop[k, ku.HIT_AT]
+            fraction = min(fraction, dip(stop[k, ku.STOP_GAP_THEN], then, stop_gap(unilateral, ws, k), now, deepest))
     return fraction
+
+
+@internal_kernel
+def dip(g0, d0, g1, d1, depth):
+    """Where in a step the cubic through the gaps g and their changes d per step is least, if below −depth; else 1."""
+    if d0 >= 0.0 or d1 <= 0.0:
+        return 1.0
+    # Hermite: g0 + d0 x + a x² + b x³.
+    a, b = 3.0 * (g1 - g0) - 2.0 * d0 - d1, 2.0 * (g0 - g1) + d0 + d1
+    root = a * a - 3.0 * b * d0
+    if root <= 0.0 or a + math.sqrt(root) == 0.0:
+        return 1.0
+    x = -d0 / (a + math.sqrt(root))
+    if 0.0 < x < 1.0 and g0 + x * (d0 + x * (a + x * b)) < -depth:
+        return x
+    return 1.0
 
 
 @internal_kernel
@@ -168,8 +182,13 @@ def passes_through(ws: Workspace, gaps, k):
 
 
 @internal_kernel
-def note_gaps(ws: Workspace, gaps):
+def note_gaps(unilateral: UnilateralArrays | None, ws: Workspace, gaps):
     """Gaps, their rates, normals and positions at the start of a step, for :func:`too_long`."""
+    if unilateral is None:  # known to the compiler
+        return
+    for k in range(unilateral.stop.shape[0]):
+        unilateral.stop[k, ku.STOP_GAP_THEN] = stop_gap(unilateral, ws, k)
+        unilateral.stop[k, ku.STOP_RATE_THEN] = stop_rate(unilateral, ws, k)
     for k in range(gaps.shape[0]):
         gaps[k, GAP_THEN], gaps[k, RATE_THEN] = ws.contacts[k, ka.GAP], ws.contacts[k, ka.GAP_RATE]
         for s in range(3):
@@ -185,7 +204,7 @@ def watch_modes(contacts: ContactArrays, unilateral: UnilateralArrays | None, ws
     if unilateral is None:
         return
     watch_unpressed(contacts, unilateral, ws, h)
-    note_gaps(ws, gaps)
+    note_gaps(unilateral, ws, gaps)
     state, tally, slide = ws.contacts, unilateral.tally, unilateral.slide
     for k in range(state.shape[0]):
         tally[k, ku.TIME_OPEN + ws.active[k, ka.MODE]] += h
@@ -442,6 +461,11 @@ def log_changes(system: System, ws: Workspace, run: Run):
             hit = table[k, ku.STOP_CLOSED] == 1
             unilateral.stop[k, ku.HITS] += 1.0 if hit else 0.0
             log(run, ki.STOP_LOG + LOG_KINDS * k + (STOP_HIT if hit else STOP_LEFT))
+        elif table[k, ku.STOP_STRUCK] == 1 and table[k, ku.STOP_CLOSED] == 0:
+            # What drives the joint takes it away again at once.
+            unilateral.stop[k, ku.HITS] += 1.0
+            log(run, ki.STOP_LOG + LOG_KINDS * k + STOP_HIT)
+            log(run, ki.STOP_LOG + LOG_KINDS * k + STOP_LEFT)
 
 
 @internal_kernel

@@ -14,7 +14,7 @@ from dynsim.dynamics.contact.cone import problem as kc
 from dynsim.dynamics.contact.cone.problem import approach_or_draw_near, solve_cones
 from dynsim.dynamics.contact.mobility import moves_along_normal
 from dynsim.dynamics.contact.rows import row_errors, set_modes
-from dynsim.dynamics.contact.unilateral import UnilateralArrays, dry_rows_held, holding_bound, stop_gap
+from dynsim.dynamics.contact.unilateral import UnilateralArrays, dry_rows_held, holding_bound, stop_gap, stop_rate
 from dynsim.dynamics.derivative import System, derivative
 from dynsim.dynamics.tables import Workspace
 from dynsim.dynamics.tree.articulated import accelerate
@@ -66,7 +66,7 @@ def find_touching(system: System, ws: Workspace, touch):
     lands as soon as it is deeper than it is now.
     """
     unilateral = system.unilateral
-    state, mode, table, stop = ws.contacts, unilateral.mode, unilateral.stop_table, unilateral.stop
+    state, mode, table = ws.contacts, unilateral.mode, unilateral.stop_table
     strikes = False
     for k in range(mode.shape[0]):
         limit = STRIKE * kp.RATE_TOLERANCE * (1.0 + slip_speed(ws, k))
@@ -82,23 +82,24 @@ def find_touching(system: System, ws: Workspace, touch):
         # What lands ever so slowly is stopped too: nothing else would, should it stay open.
         strikes = strikes or (near and state[k, ka.GAP_RATE] < (-limit if closed else 0.0))
     for k in range(table.shape[0]):
-        rate = stop[k, ku.SIDE] * ws.joints[table[k, ku.STOP_JOINT], ka.QD]
+        rate = stop_rate(unilateral, ws, k)
         limit = STRIKE * kp.RATE_TOLERANCE
         near = table[k, ku.STOP_CLOSED] == 1 or (stop_gap(unilateral, ws, k) <= touch and rate <= limit)
         table[k, ku.STOP_CLOSED] = 1 if near else 0
-        strikes = strikes or (near and rate < -limit)
+        if near and rate < -limit:
+            table[k, ku.STOP_STRUCK], strikes = 1, True
     return strikes
 
 
 @internal_kernel
 def keep_touching(unilateral: UnilateralArrays, ws: Workspace):
     """What leaves faster than SETTLE touches no more: after an impact, or a brake that has closed."""
-    state, mode, table, stop = ws.contacts, unilateral.mode, unilateral.stop_table, unilateral.stop
+    state, mode, table = ws.contacts, unilateral.mode, unilateral.stop_table
     for k in range(mode.shape[0]):
         if state[k, ka.GAP_RATE] > unilateral.tally[k, ku.SETTLE]:
             mode[k, ku.TOUCHING] = 0
     for k in range(table.shape[0]):
-        if stop[k, ku.SIDE] * ws.joints[table[k, ku.STOP_JOINT], ka.QD] > STRIKE * kp.RATE_TOLERANCE:
+        if stop_rate(unilateral, ws, k) > STRIKE * kp.RATE_TOLERANCE:
             table[k, ku.STOP_CLOSED] = 0
 
 

@@ -22,6 +22,7 @@ from dynsim.dynamics.contact.cone import problem as kc
 from dynsim.dynamics.contact.delassus import RANK_TOLERANCE, solve_small
 from dynsim.dynamics.contact.rows import set_modes
 from dynsim.dynamics.contact.shares import even_out, share_slot, some_slide
+from dynsim.dynamics.contact.splits import find_splits
 from dynsim.dynamics.contact.unilateral import (
     UnilateralArrays,
     dry_bound,
@@ -80,7 +81,7 @@ def resolve(system: System, ws: Workspace, run: Run, touch):
     for k in range(mode.shape[0]):
         mode[k, ku.BEFORE], mode[k, ku.STRUCK] = ws.active[k, ka.MODE], 0
     for k in range(table.shape[0]):
-        table[k, ku.STOP_BEFORE] = table[k, ku.STOP_CLOSED]
+        table[k, ku.STOP_BEFORE], table[k, ku.STOP_STRUCK] = table[k, ku.STOP_CLOSED], 0
     if find_touching(system, ws, touch):
         impact(system, ws, run)
         if run.count[ki.STATUS] == ki.NO_CONTACT_FORCES:
@@ -185,7 +186,9 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
     set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
     before = ws.counts[ka.DEPENDENT]
     evaluate(system, ws, run)
-    unilateral.number[ku.REDUNDANT] = 1.0 if ws.counts[ka.DEPENDENT] > before else 0.0
+    find_splits(unilateral, ws)
+    redundant = ws.counts[ka.DEPENDENT] > before or unilateral.number[ku.WIDTH] > 0.0
+    unilateral.number[ku.REDUNDANT] = 1.0 if redundant else 0.0
     if unilateral.number[ku.REDUNDANT] == 1.0:
         if some_slide(mode[:, ku.WANTED]):
             even_out(unilateral, ws)
@@ -371,8 +374,8 @@ def release_dependent_joints(system: System, ws: Workspace):
         left = what_is_left(bare_factor, W, r, bare)
         with_whole = extended(whole_factor, W, whole_row, whole, r)
         nearly = ROUNDING < left <= NEARLY_DEPENDENT
-        held = blocked and with_bare > bare and what_is_left(whole_factor, W, r, whole) <= NEARLY_DEPENDENT
-        if nearly or held:
+        blocks = blocked and with_bare > bare and what_is_left(whole_factor, W, r, whole) <= NEARLY_DEPENDENT
+        if nearly or blocks:
             rest_without_row(unilateral, k)
         else:
             bare, whole = with_bare, with_whole

@@ -420,8 +420,10 @@ def longest_step(program: ConeProgram, cones):
 @internal_kernel
 def way_out(u, du, a, end):
     """Where u + α du leaves the cone, the smallest α > 0; infinite if nowhere."""
+    # No further than to the height of the apex: on a way through the apex itself rounding hides the double root below.
+    apex = -u[a] / du[a] if du[a] < 0.0 else math.inf
     if end == a + 1:
-        return -u[a] / du[a] if du[a] < 0.0 else math.inf
+        return apex
     square, product, norm = du[a] * du[a], u[a] * du[a], hyperbolic(u, a, end)
     for i in range(a + 1, end):
         square -= du[i] * du[i]
@@ -429,6 +431,6 @@ def way_out(u, du, a, end):
     constant = norm * norm
     inner = product * product - square * constant
     if inner < 0.0:
-        return math.inf
+        return apex
     below = math.sqrt(inner) - product
-    return constant / below if below > 0.0 else math.inf
+    return min(constant / below, apex) if below > 0.0 else apex
