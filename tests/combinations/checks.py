@@ -161,7 +161,8 @@ def equilibrium(seen: Observed) -> Finding:
     ):
         return
     # Planned voltages hold the acceleration too with which references begin.
-    if controller.get("feed_forward") == "dynamics" and (controller.get("joints") or controller.get("hand")):
+    planned = controller.get("feed_forward") == "dynamics" or controller.get("brace")
+    if planned and (controller.get("joints") or controller.get("hand")):
         return
     # References and torques that jump at the start are reported by a warning.
     if warned(seen, "that jumps at the start all the same") or warned(seen, "the start slips at"):

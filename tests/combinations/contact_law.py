@@ -134,6 +134,9 @@ def _real_friction(seen: Observed, touch: Touch) -> Finding:
     # Steps take μ of their start, the direction of their mean, and rates of before an impact.
     before = touch.slip_before
     speed = np.maximum(speed, np.linalg.norm(before, axis=1))
+    if seen.stepped:
+        # A sample within a step has the force of the step, but rates between those of its ends.
+        speed = np.maximum(speed, np.maximum(np.append(speed[1:], 0.0), np.append(0.0, speed[:-1])))
     most = np.maximum(contact.friction_at_rest, coefficient(touch, speed))
     if contact.grip_axis is None:
         over = size - most * f_n
@@ -185,7 +188,7 @@ def _creep(seen: Observed, touch: Touch) -> Array:
     speed = np.abs(touch.approach) + np.linalg.norm(touch.slip, axis=1)
     soft = 1e-3 if touch.contact.stiffness > 0.0 else 0.0
     spin = np.linalg.norm(seen.motion.spin[touch.body], axis=1)
-    return np.asarray(SLOW + soft + 2.0 * (spin * moved + touch.turned * speed))
+    return np.asarray(SLOW + soft + 2.0 * (spin * moved + touch.turned * speed) + _turned_rows(seen, touch)[1])
 
 
 def _against_slip(seen: Observed, touch: Touch, slips: NDArray[np.bool_], before: Array) -> Finding:
@@ -231,11 +234,15 @@ def _at_an_end(seen: Observed, touch: Touch, i: int) -> bool:
     )
 
 
-def _turned_gap(seen: Observed, touch: Touch) -> Array:
-    """What the gap changes in the step to each sample at its rates, beyond its rate at the sample, (T,) [m]."""
+def _turned_rows(seen: Observed, touch: Touch) -> tuple[Array, Array]:
+    """What a step to each sample changes at the sample's rates: the gap beyond its rate [m], and slip [m/s], (T,)."""
     q = seen.q - seen.step * position_rates(seen.bodies, seen.q, seen.v)
-    _, _, far, _ = seen.nearest_point(touch.contact, seen.bodies.motion(q, seen.v, np.zeros_like(seen.v)))
-    return np.asarray(touch.gap - (far - touch.contact.radius) - seen.step * touch.approach)
+    motion = seen.bodies.motion(q, seen.v, np.zeros_like(seen.v))
+    body, centre, far, normal = seen.nearest_point(touch.contact, motion)
+    velocity = motion.velocity(body, centre - touch.contact.radius * normal)
+    slip = velocity - (velocity * normal).sum(axis=1, keepdims=True) * normal
+    gap = touch.gap - (far - touch.contact.radius) - seen.step * touch.approach
+    return np.asarray(gap), np.linalg.norm(touch.slip - slip, axis=1)
 
 
 def gaps(seen: Observed) -> Finding:
@@ -262,7 +269,7 @@ def gaps(seen: Observed) -> Finding:
             fall = 0.5 * seen.step**2 * float(np.linalg.norm(seen.bodies.gravity))
             allowed = 1e-7 + sag + 1.5 * seen.step * float(_fastest_approach(touch)[deepest]) + fall
             # Rates are along the surface at the end of a step: one that curves is left by half of what they turn.
-            allowed += float(np.abs(_turned_gap(seen, touch))[touch.mode != OPEN].sum())
+            allowed += float(np.abs(_turned_rows(seen, touch)[0])[touch.mode != OPEN].sum())
             if contact.tip is not None and _at_an_end(seen, touch, deepest):
                 continue
         if -touch.gap[deepest] > allowed + begun:

@@ -151,7 +151,7 @@ def _integrated(
         h, now, before = seen.step, power[rows], earlier[rows]
         # Power at the mean state of a step: between those of its ends, and as much off as these differ.
         off = np.abs(total[rows] - total[rows - 1] - 0.5 * h * (now + before))[:, None]
-        allowed = 1.1 * h * np.abs(now - before) + 0.02 * h * (np.abs(now) + np.abs(before))
+        allowed = 1.4 * h * np.abs(now - before) + 0.03 * h * (np.abs(now) + np.abs(before))
         allowed = (allowed + 1e-6 * turnover + 1e-15)[:, None]
         if unlike is not None:
             allowed = allowed + h * unlike[rows][:, None]
