@@ -7,7 +7,6 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from combinations.bodies import position_rates
 from combinations.observed import OPEN, SLIDING, STICKING, Observed, Touch, warned
 from dynsim.model.surfaces import HeightField
 
@@ -236,13 +235,9 @@ def _at_an_end(seen: Observed, touch: Touch, i: int) -> bool:
 
 def _turned_rows(seen: Observed, touch: Touch) -> tuple[Array, Array]:
     """What a step to each sample changes at the sample's rates: the gap beyond its rate [m], and slip [m/s], (T,)."""
-    q = seen.q - seen.step * position_rates(seen.bodies, seen.q, seen.v)
-    motion = seen.bodies.motion(q, seen.v, np.zeros_like(seen.v))
-    body, centre, far, normal = seen.nearest_point(touch.contact, motion)
-    velocity = motion.velocity(body, centre - touch.contact.radius * normal)
-    slip = velocity - (velocity * normal).sum(axis=1, keepdims=True) * normal
-    gap = touch.gap - (far - touch.contact.radius) - seen.step * touch.approach
-    return np.asarray(gap), np.linalg.norm(touch.slip - slip, axis=1)
+    then = next(other for other in seen.touches_before if other.contact.name == touch.contact.name)
+    gap = touch.gap - then.gap - seen.step * touch.approach
+    return np.asarray(gap), np.linalg.norm(touch.slip - then.slip, axis=1)
 
 
 def gaps(seen: Observed) -> Finding:

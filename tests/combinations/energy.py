@@ -81,7 +81,8 @@ def powers(seen: Observed) -> Finding:
             # What a step with a landing takes is impact loss.
             rubs[1:] &= touch.mode[:-1] != OPEN
         rubbed = rubbed - np.where(rubs, (touch.tangential * touch.slip).sum(axis=1), 0.0)
-        rubbed_before = rubbed_before - np.where(rubs, (touch.tangential * touch.slip_before).sum(axis=1), 0.0)
+        earlier = np.concatenate([touch.slip[:1], touch.slip[:-1]])
+        rubbed_before = rubbed_before - np.where(rubs, (touch.tangential * earlier).sum(axis=1), 0.0)
     lost = (seen.bodies.damping * seen.v**2).sum(axis=1) - (seen.joint_signal("joint_friction") * seen.v).sum(axis=1)
     for motor in seen.robot.motors:
         if isinstance(motor, Servo) and motor.coulomb_friction > 0.0 and not seen.real:
@@ -151,12 +152,11 @@ def _integrated(
         h, now, before = seen.step, power[rows], earlier[rows]
         # Power at the mean state of a step: between those of its ends, and as much off as these differ.
         off = np.abs(total[rows] - total[rows - 1] - 0.5 * h * (now + before))[:, None]
-        allowed = 1.4 * h * np.abs(now - before) + 0.03 * h * (np.abs(now) + np.abs(before))
+        allowed = 1.1 * h * np.abs(now - before) + 0.02 * h * (np.abs(now) + np.abs(before))
         allowed = (allowed + 1e-6 * turnover + 1e-15)[:, None]
         if unlike is not None:
             allowed = allowed + h * unlike[rows][:, None]
-        quiet = np.array([(np.abs(seen.event_times - t) > 2.0 * h).all() for t in seen.time[rows]], dtype=bool)
-        off = np.where(quiet[:, None], off, 0.0) if len(rows) else off
+        off = np.where(seen.apart_from_events(2.0 * h)[rows, None], off, 0.0)
     if off.size and (off / allowed).max() > 1.0:
         k = int((off / allowed).argmax())
         yield (

@@ -169,7 +169,7 @@ def _stepped_motion(seen: Observed) -> Finding:
     off = np.abs(change - before - np.clip(share, 0.0, 1.0)[:, None] * bend).max(axis=1)
     allowed = 1e-6 * (np.abs(now) + np.abs(before)).max(axis=1) + 1e-12
     # If a step was cut at the end of a load, three steps may lie between samples.
-    wrong = (off > allowed) & np.array([(np.abs(seen.event_times - t) > 2.0 * h).all() for t in seen.time[beside]])
+    wrong = (off > allowed) & seen.apart_from_events(2.0 * h)[beside]
     if wrong.any():
         k = int(np.where(wrong, off, 0.0).argmax())
         yield (

@@ -134,6 +134,12 @@ class Observed:
     def _touches_of_samples(self) -> list[Touch]:
         return [self._touch(k, contact, self.motion) for k, contact in enumerate(self.described_contacts)]
 
+    @cached_property
+    def touches_before(self) -> list[Touch]:
+        """The contacts a step before each sample, at the rates of the sample."""
+        q = self.q - self.step * position_rates(self.bodies, self.q, self.v)
+        return self.touches(self.bodies.motion(q, self.v, np.zeros_like(self.v)))
+
     def nearest_point(self, contact: Contact, motion: Motion) -> tuple[int, Array, Array, Array]:
         """Return a contact's body, and at each instant the centre nearest to its surface [m], distance and normal."""
         body, point = self.robot.attach(contact.body, contact.point)
@@ -228,6 +234,10 @@ class Observed:
         before = np.searchsorted(self.event_times, self.time[:-count] - self.settling, side="left")
         after = np.searchsorted(self.event_times, self.time[count:], side="right")
         return np.asarray(before == after)
+
+    def apart_from_events(self, span: float) -> NDArray[np.bool_]:
+        """Whether each sample is further than ``span`` [s] from whatever happens, (T,)."""
+        return np.array([(np.abs(self.event_times - t) > span).all() for t in self.time], dtype=bool)
 
     # Sampled loops hold their commands from one tick to the next.
     @property

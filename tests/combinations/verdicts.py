@@ -241,8 +241,7 @@ def _drifted(match: Match, seen: Observed) -> str:
 
 def _scheme(match: Match, seen: Observed) -> str:
     # Within a step at whose end something lands kinetic energy is not between those of the ends.
-    quiet = np.array([(np.abs(seen.event_times - t) > seen.step).all() for t in seen.time], dtype=bool)
-    most = float(np.abs(seen.record["loss_scheme"][quiet]).max(initial=0.0))
+    most = float(np.abs(seen.record["loss_scheme"][seen.apart_from_events(seen.step)]).max(initial=0.0))
     return "" if most <= float(match[1]) * (1.0 + DIGITS) + 1e-12 else f"{most:.3g} J in a sample"
 
 

@@ -17,8 +17,9 @@ from support.lanes import Divergent, Lanes, Notes, Place, select
 
 from dynsim.dynamics import derivative as system
 from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact.delassus import solve_dependent
 from dynsim.dynamics.contact.shapes import shaped_rows
-from dynsim.dynamics.contact.shares import solve_near_shares, solve_redundant
+from dynsim.dynamics.contact.shares import solve_near_shares
 from dynsim.dynamics.contact.splits import admissible_forces
 from dynsim.dynamics.contact.unilateral import slide_direction
 
@@ -77,7 +78,7 @@ TIME = {
 # Lines that no state comes to, as far as is known; they do not branch.
 AGAIN = "M* begins with the signs that the articulated solve has found: only rounding could turn one"
 # Real contact has forms of its own, which test_lanes_compiled runs; bodies that are more than points have no lanes.
-WITHOUT_LANES = (admissible_forces, slide_direction, shaped_rows, solve_near_shares, solve_redundant)
+WITHOUT_LANES = (admissible_forces, slide_direction, shaped_rows, solve_near_shares, solve_dependent)
 UNILATERAL = "the cases here are of the bilateral law"
 NEVER = {
     Place(
@@ -90,7 +91,7 @@ NEVER = {
     Place("contact/shares.py", "solve_rows", "if unilateral.number[ku.SHARED] == 1.0:"): UNILATERAL,
     Place("contact/shares.py", "solve_rows", "return solve_near_shares(unilateral, ws, p)"): UNILATERAL,
     Place("contact/shares.py", "solve_rows", "if unilateral.number[ku.REDUNDANT] == 1.0:"): UNILATERAL,
-    Place("contact/shares.py", "solve_rows", "return solve_redundant(ws, p)"): UNILATERAL,
+    Place("contact/shares.py", "solve_rows", "return solve_dependent(ws.small, ws.rows, ws.active, p)"): UNILATERAL,
     Place("contact/shares.py", "solve_rows", "return solve_small(ws.small, ws.rows, ws.active, p)"): UNILATERAL,
     Place("derivative.py", "m_star_acceleration", "passes += 1"): AGAIN,
     Place("derivative.py", "m_star_acceleration", "solve_m_star(dense, model, drives, unilateral, ws)"): AGAIN,

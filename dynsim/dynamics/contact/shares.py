@@ -30,14 +30,8 @@ def solve_rows(unilateral: UnilateralArrays | None, ws: Workspace, p):
     if unilateral.number[ku.SHARED] == 1.0:
         return solve_near_shares(unilateral, ws, p)
     if unilateral.number[ku.REDUNDANT] == 1.0:
-        return solve_redundant(ws, p)
+        return solve_dependent(ws.small, ws.rows, ws.active, p)
     return solve_small(ws.small, ws.rows, ws.active, p)
-
-
-@internal_kernel
-def solve_redundant(ws: Workspace, p):
-    """The split of least norm; on SIMD lanes there is a form of it."""
-    return solve_dependent(ws.small, ws.rows, ws.active, p)
 
 
 @internal_kernel

@@ -13,7 +13,7 @@ from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact import uniqueness as kq
 from dynsim.dynamics.contact.delassus import solve_dependent, solve_small
 from dynsim.dynamics.contact.quadrics import sign_changed, surface_distance
-from dynsim.dynamics.contact.shares import solve_near_shares, solve_nearest, solve_redundant
+from dynsim.dynamics.contact.shares import solve_near_shares, solve_nearest
 from dynsim.dynamics.contact.splits import admissible_forces, look_at_forces
 from dynsim.dynamics.contact.unilateral import slide_direction, sliding_friction
 from dynsim.dynamics.contact.uniqueness import clearly_unique
@@ -80,13 +80,12 @@ def solve_small_lanes(small, state, active, p):
     return dependent
 
 
-@form_of(solve_redundant, any_lanes)
-def solve_redundant_lanes(ws, p):
+@form_of(solve_dependent, any_lanes)
+def solve_dependent_lanes(small, state, active, p):
     """One by one."""
     dependent = 0
-    for k in range(lane_count(ws)):
-        of_lane = lane(ws, k)
-        dependent += solve_dependent(of_lane.small, of_lane.rows, of_lane.active, p)
+    for k in range(lane_count(small)):
+        dependent += solve_dependent(lane(small, k), lane(state, k), active, p)
     return dependent
 
 

@@ -457,14 +457,13 @@ def log_changes(system: System, ws: Workspace, run: Run):
         elif before == ka.SLIDING and now == ka.STICKING:
             tell(system, run, k, SLIP_STOP)
     for k in range(table.shape[0]):
-        if table[k, ku.STOP_CLOSED] != table[k, ku.STOP_BEFORE]:
-            hit = table[k, ku.STOP_CLOSED] == 1
-            unilateral.stop[k, ku.HITS] += 1.0 if hit else 0.0
-            log(run, ki.STOP_LOG + LOG_KINDS * k + (STOP_HIT if hit else STOP_LEFT))
-        elif table[k, ku.STOP_STRUCK] == 1 and table[k, ku.STOP_CLOSED] == 0:
-            # What drives the joint takes it away again at once.
+        before, closed = table[k, ku.STOP_BEFORE] == 1, table[k, ku.STOP_CLOSED] == 1
+        # What drives a joint may take it away in the instant of its hit.
+        struck = table[k, ku.STOP_STRUCK] == 1
+        if not before and (closed or struck):
             unilateral.stop[k, ku.HITS] += 1.0
             log(run, ki.STOP_LOG + LOG_KINDS * k + STOP_HIT)
+        if not closed and (before or struck):
             log(run, ki.STOP_LOG + LOG_KINDS * k + STOP_LEFT)
 
 

@@ -65,7 +65,8 @@ HOLD_SLOW, HOLD_COMPATIBLE, HOLD_RESTING = 0, 1, 2
 # Light joints may change their rates by some times what heavy ones at rest are rid of; the rest was no rest if others,
 # geared to them, lose more than that.
 MOST_CHANGE = 100.0
-# Share of its mobility that the other rows leave a joint whose row nearly depends on them, and does, but for rounding.
+# What other rows leave of a joint's mobility, as a share: below NEARLY_DEPENDENT no friction could hold the joint by a
+# row; below ROUNDING its row depends on theirs.
 NEARLY_DEPENDENT, ROUNDING = 1e-6, 1e-12
 
 
@@ -186,10 +187,12 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
     set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
     before = ws.counts[ka.DEPENDENT]
     evaluate(system, ws, run)
-    find_splits(unilateral, ws)
-    redundant = ws.counts[ka.DEPENDENT] > before or unilateral.number[ku.WIDTH] > 0.0
+    redundant = ws.counts[ka.DEPENDENT] > before
+    if not redundant:
+        find_splits(unilateral, ws)
+        redundant = unilateral.number[ku.WIDTH] > 0.0
     unilateral.number[ku.REDUNDANT] = 1.0 if redundant else 0.0
-    if unilateral.number[ku.REDUNDANT] == 1.0:
+    if redundant:
         if some_slide(mode[:, ku.WANTED]):
             even_out(unilateral, ws)
             unilateral.number[ku.SHARED] = 1.0
@@ -370,15 +373,13 @@ def release_dependent_joints(system: System, ws: Workspace):
         if table[k, ku.DRY_NEXT] == 0:
             continue
         r = table[k, ku.DRY_ROW]
-        with_bare = extended(bare_factor, W, bare_row, bare, r)
-        left = what_is_left(bare_factor, W, r, bare)
-        with_whole = extended(whole_factor, W, whole_row, whole, r)
-        nearly = ROUNDING < left <= NEARLY_DEPENDENT
-        blocks = blocked and with_bare > bare and what_is_left(whole_factor, W, r, whole) <= NEARLY_DEPENDENT
-        if nearly or blocks:
+        alone = mobility_left(bare_factor, W, bare_row, bare, r) / W[r, r]
+        among_all = mobility_left(whole_factor, W, whole_row, whole, r) / W[r, r]
+        blocks = blocked and alone > RANK_TOLERANCE and among_all <= NEARLY_DEPENDENT
+        if blocks or ROUNDING < alone <= NEARLY_DEPENDENT:
             rest_without_row(unilateral, k)
         else:
-            bare, whole = with_bare, with_whole
+            bare, whole = extended(bare_factor, W, bare_row, bare, r), extended(whole_factor, W, whole_row, whole, r)
 
 
 @internal_kernel
@@ -458,13 +459,7 @@ def rests_without_row(unilateral: UnilateralArrays, k):
 @internal_kernel
 def extended(factor, W, row, count, r):
     """Extend a Cholesky factor of rows ``row[:count]`` of W by row r, unless it depends on them; how many there are."""
-    square = W[r, r]
-    for i in range(count):
-        total = W[r, row[i]]
-        for j in range(i):
-            total -= factor[count, j] * factor[i, j]
-        factor[count, i] = total / factor[i, i]
-        square -= factor[count, i] * factor[count, i]
+    square = mobility_left(factor, W, row, count, r)
     if not square > RANK_TOLERANCE * W[r, r]:
         return count
     factor[count, count], row[count] = math.sqrt(square), r
@@ -472,12 +467,16 @@ def extended(factor, W, row, count, r):
 
 
 @internal_kernel
-def what_is_left(factor, W, r, count):
-    """Share of the mobility along row r that ``count`` others leave, right after :func:`extended`."""
+def mobility_left(factor, W, row, count, r):
+    """What the rows of a factor leave of the mobility W along row r, whose own row of the factor it writes."""
     square = W[r, r]
     for i in range(count):
+        total = W[r, row[i]]
+        for j in range(i):
+            total -= factor[count, j] * factor[i, j]
+        factor[count, i] = total / factor[i, i]
         square -= factor[count, i] * factor[count, i]
-    return square / W[r, r]
+    return square
 
 
 @internal_kernel
