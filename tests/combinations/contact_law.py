@@ -263,7 +263,7 @@ def gaps(seen: Observed) -> Finding:
             # The gap of the middle of a step decides: until its end a point moves and falls freely.
             fall = 0.5 * seen.step**2 * float(np.linalg.norm(seen.bodies.gravity))
             allowed = 1e-7 + sag + 1.5 * seen.step * float(_fastest_approach(touch)[deepest]) + fall
-            # Rates are along the surface at the end of a step: one that curves is left by half of what they turn.
+            # Rates lie along the surface at the end of a step, so on a curve the point leaves it by half their change.
             allowed += float(np.abs(_turned_rows(seen, touch)[0])[touch.mode != OPEN].sum())
             if contact.tip is not None and _at_an_end(seen, touch, deepest):
                 continue
