@@ -2,8 +2,8 @@
 
 The event table has the guard of each event, its value at the last accepted step and on which side of zero that was.
 After a step that error control has accepted the guards are evaluated from the workspace of the right-hand side. If one
-has passed zero the step is repeated, shorter, until it ends within ``event_tolerance`` beyond the root. So the root is
-that of the method's own solution, not of the dense output, whose order is lower.
+has passed zero the step is repeated, shorter, until it ends within ``event_tolerance`` beyond the root. So it is a root
+of the method's own solution, not of the dense output, whose order is lower.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def guard(system: System, t, ws: Workspace, run: Run, e):
 def arm_events(system: System, ws: Workspace, run: Run):
     """Values and sides of all guards at the start of a step, right after ``derivative`` there.
 
-    An event that has just happened keeps the side it has gone to, whatever rounding says of its guard.
+    An event that has just happened keeps the side it has gone to, whatever the rounding of its guard.
     """
     for e in range(run.event.shape[0]):
         value = guard(system, run.clock[ki.TIME], ws, run, e)
@@ -118,8 +118,8 @@ def cut_step(system: System, ws: Workspace, run: Run):
     count[ki.SEARCHING] += 1
     low, high = clock[ki.LOW], clock[ki.HIGH]
     if high - low <= event_tolerance(clock[ki.TIME]) or count[ki.SEARCHING] > SEARCH_LIMIT:
-        # A step of RADAU5 taken again is not the same to the bit, since its Newton method goes by how the last one has
-        # contracted: at HIGH it may miss what had passed zero there, some times or for ever.
+        # A repeated step of RADAU5 is not bit-identical, since its Newton method depends on how the last one has
+        # contracted: at HIGH it may miss a guard that had passed zero there, sometimes or every time.
         if h == high and (hit or count[ki.SEARCHING] > SEARCH_LIMIT):
             if not hit:
                 keep_passed(run)
@@ -140,7 +140,7 @@ def cut_step(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def keep_passed(run: Run):
-    """Events that had passed zero at HIGH keep the value that they had there: whoever does as they say looks at it."""
+    """Keep the values at HIGH of events that had passed zero there: the functions that act on events read them."""
     for e in range(run.event.shape[0]):
         if happened(run, e, run.event[e, ki.AT_HIGH]):
             run.event[e, ki.VALUE] = run.event[e, ki.AT_HIGH]
@@ -148,9 +148,9 @@ def keep_passed(run: Run):
 
 @internal_kernel
 def passes_over(system: System, ws: Workspace, run: Run):
-    """True when a contact has been passed over within the step: STEP is then the one to take instead."""
+    """True when a contact has been passed over within the step: STEP is then the step to take instead."""
     part = too_long(system.contacts, system.unilateral, ws, run.clock[ki.STEP], run.gaps)
-    # What is none, after all, does not shorten steps for ever, nor to nothing.
+    # A false alarm must not shorten steps indefinitely, or to zero.
     shorter = part * run.clock[ki.STEP] > event_tolerance(run.clock[ki.TIME])
     if part < 1.0 and shorter and run.count[ki.GRAZING] < SEARCH_LIMIT:
         run.count[ki.GRAZING] += 1
@@ -162,7 +162,7 @@ def passes_over(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def fire_events(run: Run):
-    """Log the events that the accepted step ends at, and do as they say; True when the caller is to look."""
+    """Log the events that the accepted step ends at, and act on them; True when the run must return to its caller."""
     count, event, look = run.count, run.event, False
     for e in range(event.shape[0]):
         if count[ki.FIRED] == 1 and happened(run, e, event[e, ki.VALUE]):
@@ -198,9 +198,9 @@ def next_tick(run: Run, until):
 
 @internal_kernel
 def take_ticks(run: Run):
-    """Kinds of the ticks that are due, as a sum of their bits; moves them on and TIME exactly to where they are.
+    """Return the kinds of the due ticks, as a sum of their bits; advance them, and move TIME exactly to them.
 
-    At a break the next step starts anew.
+    At a break the method restarts.
     """
     due, clock, tick, k = 0, run.clock, run.tick, run.count[ki.NEXT_BREAK]
     while k < run.breaks.shape[0] and run.breaks[k] - clock[ki.TIME] <= 1e-12 * max(1.0, abs(clock[ki.TIME])):

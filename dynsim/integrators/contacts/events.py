@@ -2,11 +2,11 @@
 
 Each candidate has two guards; each stop and each joint with dry friction has one. The first guard of a candidate is its
 gap if open, its normal force if closed. The second is the margin μ_s f_n − |f_t| if it sticks; if it slides, its speed
-along the slip direction at the start of the step. Guards of joints are alike. An event is a fall through zero.
+along the slip direction at the start of the step. Guards of joints are analogous. An event is a fall through zero.
 
 Forces are continuous at lift-off and at the start of slip, where the complementarity problem is degenerate: the mode of
-that one candidate is set directly. After all other events, and where that is inconsistent, all modes are solved for.
-So they are at the end of the best split of dependent rows, where several points and joints start to slip at once and
+that one candidate is set directly. After all other events, and if that is inconsistent, all modes are solved for. The
+same applies at the end of the best split of dependent rows, where several points and joints start to slip at once and
 forces jump.
 """
 
@@ -40,7 +40,7 @@ from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
 # Kinds of guards, behind those of dynsim.integrators.events.
 NORMAL_GUARD, SLIP_GUARD, STOP_GUARD, DRY_GUARD = 10, 11, 12, 13
-# What is logged of a candidate, of a stop, and (slip alone) of a joint with dry friction.
+# Log entries of a candidate, of a stop, and (slip only) of a joint with dry friction.
 LANDING, LIFT_OFF, SLIP_START, SLIP_STOP, BOUNCE, CHATTERS, STOP_HIT, STOP_LEFT = 0, 1, 2, 3, 4, 5, 6, 7
 LOG_KINDS = 8
 
@@ -51,11 +51,11 @@ GAP_THEN, RATE_THEN, NORMAL_THEN, POSITION_THEN = 0, 1, 2, 5
 TOUCH = 1e-9
 # More events of a candidate than MOST_EVENTS in WINDOW [s] are chatter; SETTLE grows tenfold then, up to MOST_SETTLE.
 WINDOW, MOST_EVENTS, MOST_SETTLE = 1.0, 200, 1e-2
-# So many changes at one instant, or chatter so often at one candidate, end the run.
+# More changes at one instant, which lasts INSTANT [s], or more chatter at one candidate than this end the run.
 MOST_CHANGES, MOST_CHATTER = 60, 100
 INSTANT = 1e-11
-# A point that slips against its direction at less than this has not stopped yet [m/s]: of what begins to slip with next
-# to no acceleration the speed is rounding.
+# A point that slips against its direction at less than this has not stopped yet [m/s]: if a point begins to slip with
+# almost no acceleration, its speed is rounding.
 BACKWARD = 2e-11
 # Forces that contradict their modes by less than this, absolute [N] and of the largest, are rounding.
 FORCE_SLACK = 1e-9
@@ -64,9 +64,9 @@ FORCE_SLACK = 1e-9
 SPLIT_SLACK = 1e-7
 # At the end of the best split sticking is still a solution. So friction at rest is reduced for the choice of modes, by
 # FIRST_REDUCTION and ten times more up to MOST_REDUCTION, until the chosen modes agree with their forces: far above
-# rounding and the tolerances of the choice, far below what friction coefficients are known to.
+# rounding and the tolerances of the choice, far below the uncertainty of friction coefficients.
 FIRST_REDUCTION, MOST_REDUCTION = 1e-5, 2e-3
-# Of the largest force: what counts as none where a point that sticks gives way.
+# Fraction of the largest force below which the normal force of a sticking point at its limit counts as zero.
 NO_FORCE = 1e-8
 
 
@@ -92,7 +92,7 @@ def contact_guard(contacts: ContactArrays, unilateral: UnilateralArrays | None, 
     mode = ws.active[k, ka.MODE]
     if kind == NORMAL_GUARD:
         if mode == ka.STICKING and unilateral.number[ku.SPLIT] == 1.0 and normal_is_open(unilateral, ws, k):
-            # The least of all normal forces that are possible only touches zero.
+            # The least possible normal force only touches zero.
             return approach_without_force(contacts, unilateral, ws, k)
         return (
             ws.contacts[k, ka.GAP] + unilateral.slide[k, ku.LANDS_AT]
@@ -102,8 +102,8 @@ def contact_guard(contacts: ContactArrays, unilateral: UnilateralArrays | None, 
     if mode == ka.SLIDING and contacts.law[k, ka.STATIC] > 0.0:
         return unilateral.slide[k, ku.SPEED] + unilateral.slide[k, ku.HEADWAY] + BACKWARD
     if mode == ka.STICKING:
-        # Dependent rows, where the least norm fits no cones: the forces are the least that do, on some cone, and say
-        # nothing of what is left. Once none fit, those of the best margin show which contacts give way.
+        # Dependent rows whose split of least norm is outside the cones: the forces are the least inside, on some cone,
+        # and do not show the margin left. If none fit, the split of best margin shows which contacts are at the limit.
         if split and best > 0.0:
             return best
         return margin(contacts, unilateral, ws, k)
@@ -112,12 +112,12 @@ def contact_guard(contacts: ContactArrays, unilateral: UnilateralArrays | None, 
 
 @internal_kernel
 def too_long(contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: Workspace, h, gaps):
-    """The fraction of a step to take instead, where it has passed over something; else 1.
+    """Return the fraction of a step to take instead, if it has passed over something, or 1.
 
     An open candidate may dip below its surface, or a joint beyond its open stop, and be out again at the end: the
     minimum of the cubic through gaps and their rates at both ends, ``gaps``, (c, GAPS_SIZE), at the start. It may have
-    gone through a body: out at its other side, and as far as both gaps together. Or a frozen direction of slip has
-    stood for too long.
+    gone through a body: it is out at the other side, having moved at least both gaps together. Or a frozen direction of
+    slip was kept for too long.
     """
     fraction = 1.0
     if unilateral is None:  # known to the compiler
@@ -148,7 +148,7 @@ def too_long(contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: W
 
 @internal_kernel
 def dip(g0, d0, g1, d1, depth):
-    """Where in a step the cubic through the gaps g and their changes d per step is least, if below −depth; else 1."""
+    """Fraction of a step where the cubic through gaps g with changes d per step is least, if below −depth; or 1."""
     if d0 >= 0.0 or d1 <= 0.0:
         return 1.0
     # Hermite: g0 + d0 x + a x² + b x³.
@@ -166,8 +166,8 @@ def dip(g0, d0, g1, d1, depth):
 def passes_through(ws: Workspace, gaps, k):
     """True when open candidate k may have gone through a body within the step.
 
-    A distance changes by no more than what the point has gone, so that has to be both gaps at least; a way that bends
-    by half a turn is π/2 as long as it looks.
+    A distance changes by no more than the path of the point is long, so the path must be at least both gaps together;
+    a path that bends by half a turn is π/2 times as long as its chord.
     """
     state = ws.contacts[k]
     g0, g1 = gaps[k, GAP_THEN], state[ka.GAP]
@@ -183,7 +183,7 @@ def passes_through(ws: Workspace, gaps, k):
 
 @internal_kernel
 def note_gaps(unilateral: UnilateralArrays | None, ws: Workspace, gaps):
-    """Gaps, their rates, normals and positions at the start of a step, for :func:`too_long`."""
+    """Note gaps, their rates, normals and positions at the start of a step, for :func:`too_long`."""
     if unilateral is None:  # known to the compiler
         return
     for k in range(unilateral.stop.shape[0]):
@@ -200,7 +200,7 @@ def note_gaps(unilateral: UnilateralArrays | None, ws: Workspace, gaps):
 
 @internal_kernel
 def watch_modes(contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: Workspace, h, gaps):
-    """At an accepted step, before its samples: times in each mode, depths, gaps and directions of slip at its end."""
+    """Note times in each mode, depths, gaps and slip directions at the end of an accepted step, before its samples."""
     if unilateral is None:
         return
     watch_unpressed(contacts, unilateral, ws, h)
@@ -228,7 +228,7 @@ def watch_modes(contacts: ContactArrays, unilateral: UnilateralArrays | None, ws
 
 @internal_kernel
 def take_directions(unilateral: UnilateralArrays | None, ws: Workspace, run: Run):
-    """After the samples of a step: freeze directions of what has become slow, free those of what is fast again."""
+    """Freeze directions of points that have become slow, free them if fast again; after the samples of a step."""
     if unilateral is None:
         return
     slide, slow = unilateral.slide, unilateral.number[ku.SLOW]
@@ -237,7 +237,7 @@ def take_directions(unilateral: UnilateralArrays | None, ws: Workspace, run: Run
             continue
         fast = slide[k, ku.NEXT_SPEED] >= slow
         if fast and slide[k, ku.FROZEN] == 1.0:
-            # The direction turns a little: the next step starts anew.
+            # The direction turns a little: the method restarts at the next step.
             run.count[ki.STARTED] = 0
         if fast or slide[k, ku.FROZEN] == 0.0:
             for s in range(3):
@@ -251,7 +251,8 @@ def take_directions(unilateral: UnilateralArrays | None, ws: Workspace, run: Run
 def stay_tangential(slide, ws: Workspace, k):
     """Keep a frozen direction along the surface, whose normal turns as the point moves on.
 
-    A point without friction may never have slipped, and has none then, or rounding that was along the normal: zero.
+    A point without friction may never have slipped; its direction is then zero, or rounding along the normal, which is
+    removed.
     """
     state, size, along = ws.contacts, 0.0, 0.0
     for s in range(3):
@@ -259,7 +260,7 @@ def stay_tangential(slide, ws: Workspace, k):
     for s in range(3):
         slide[k, ku.REFERENCE + s] -= along * state[k, ka.NORMAL + s]
         size += slide[k, ku.REFERENCE + s] ** 2
-    # Without friction there may be none yet.
+    # Without friction there may be no direction yet.
     if size > 0.0:
         for s in range(3):
             slide[k, ku.REFERENCE + s] /= math.sqrt(size)
@@ -267,9 +268,9 @@ def stay_tangential(slide, ws: Workspace, k):
 
 @internal_kernel
 def at_limit(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace, k):
-    """True when candidate k, whose guard of slip has fallen through zero, is one that gives way.
+    """True if candidate k, whose guard of slip has fallen through zero, begins to slip or leaves.
 
-    The guards of dependent rows fall together, with the best worst margin. Those with a better one hold.
+    The guards of dependent rows fall together, with the best worst margin. Candidates with a larger margin hold.
     """
     if unilateral.number[ku.SPLIT] == 0.0:
         return True
@@ -311,10 +312,10 @@ def consistent(system: System, ws: Workspace):
 
 @noinline_kernel
 def solve_modes(system: System, ws: Workspace, run: Run, first):
-    """Choose all modes anew, and log what that changes; ``first``: nothing of it is an event."""
+    """Choose all modes again, and log the changes, unless ``first``: none of them is an event then."""
     before = ws.counts[ka.DEPENDENT]
     resolve(system, ws, run, TOUCH)
-    # Of rows that were held together only to see what they do.
+    # Do not count dependent rows that were held together only on trial.
     ws.counts[ka.DEPENDENT] = before
     if not first:
         log_changes(system, ws, run)
@@ -327,9 +328,9 @@ def solve_modes(system: System, ws: Workspace, run: Run, first):
 def split_ends(system: System, ws: Workspace, run: Run):
     """True if the best split of several points and joints that stick together has reached its end.
 
-    What then starts to slip, and with which forces, is not continuous: a point or joint by itself would only be one of
-    those that start. A single sticking point starts by itself, in the direction of its friction, if it shares its force
-    with no joint or stop.
+    The set that then starts to slip, and its forces, are not continuous: a single point or joint would only be a part
+    of that set. A single sticking point starts by itself, in the direction of its friction, if it shares its force with
+    no joint or stop.
     """
     unilateral, strongest = system.unilateral, 0.0
     if unilateral.number[ku.SPLIT] == 0.0:
@@ -347,7 +348,7 @@ def split_ends(system: System, ws: Workspace, run: Run):
             return True
         if kind == STOP_GUARD and unilateral.stop_table[k, ku.STOP_CLOSED] == 1 and stops > 0:
             return True
-        # One at the apex of its cone leaves, and one whose friction drops is chosen for at full friction.
+        # A point at the apex of its cone leaves; modes of a point whose friction drops are chosen at full friction.
         if kind == SLIP_GUARD and ws.active[k, ka.MODE] == ka.STICKING and not drops(system, k):
             pressed = ws.rows[ws.active[k, ka.FIRST_ROW], ka.FORCE] > NO_FORCE * strongest
             if pressed and at_limit(system.contacts, unilateral, ws, k):
@@ -357,9 +358,9 @@ def split_ends(system: System, ws: Workspace, run: Run):
 
 @noinline_kernel
 def solve_reduced(system: System, ws: Workspace, run: Run):
-    """Choose all modes with a little less friction at rest, and log what that changes; False if no choice agrees.
+    """Choose all modes with a little less friction at rest, and log the changes; False if no choice agrees.
 
-    Then everything is as it was before.
+    Everything is then restored.
     """
     number, clock = system.unilateral.number, run.clock
     before, not_unique, reduction = ws.counts[ka.DEPENDENT], clock[ki.NOT_UNIQUE], FIRST_REDUCTION
@@ -394,7 +395,7 @@ def rearm(run: Run):
 
 @internal_kernel
 def count_changes(system: System, run: Run):
-    """End a run whose modes go on changing without time passing."""
+    """End a run whose modes keep changing without time passing."""
     number = system.unilateral.number
     number[ku.CHANGES] = number[ku.CHANGES] + 1.0 if run.clock[ki.TIME] - number[ku.LAST_CHANGE] <= INSTANT else 1.0
     number[ku.LAST_CHANGE] = run.clock[ki.TIME]
@@ -404,7 +405,7 @@ def count_changes(system: System, run: Run):
 
 @internal_kernel
 def log(run: Run, code):
-    """Write an event to the log; what finds no room is lost to the log alone."""
+    """Write an event to the log; an event that does not fit is missing only from the log."""
     count = run.count
     if count[ki.LOGGED] < run.log_time.shape[0]:
         run.log_time[count[ki.LOGGED]], run.log_event[count[ki.LOGGED]] = run.clock[ki.TIME], code
@@ -439,7 +440,7 @@ def tell(system: System, run: Run, k, kind):
 
 @internal_kernel
 def log_changes(system: System, ws: Workspace, run: Run):
-    """Log what a choice of modes has changed."""
+    """Log the changes made by a choice of modes."""
     unilateral, table = system.unilateral, system.unilateral.stop_table
     for k in range(ws.contacts.shape[0]):
         before, now = unilateral.mode[k, ku.BEFORE], ws.active[k, ka.MODE]
@@ -458,7 +459,7 @@ def log_changes(system: System, ws: Workspace, run: Run):
             tell(system, run, k, SLIP_STOP)
     for k in range(table.shape[0]):
         before, closed = table[k, ku.STOP_BEFORE] == 1, table[k, ku.STOP_CLOSED] == 1
-        # What drives a joint may take it away in the instant of its hit.
+        # A joint may be driven away from its stop in the instant of its hit.
         struck = table[k, ku.STOP_STRUCK] == 1
         if not before and (closed or struck):
             unilateral.stop[k, ku.HITS] += 1.0
@@ -469,14 +470,14 @@ def log_changes(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def tell_joints(unilateral: UnilateralArrays, run: Run):
-    """Log which joints dry friction has begun, or ceased, to hold since the log was last told of them."""
+    """Log which joints dry friction has begun, or ceased, to hold since they were last noted in DRY_TOLD."""
     for k in range(unilateral.dry_table.shape[0]):
         tell_joint(unilateral, run, k, 1 if dry_rests(unilateral, k) else 0)
 
 
 @internal_kernel
 def tell_joint(unilateral: UnilateralArrays, run: Run, k, holds):
-    """Log where joint k of those that rub begins or ends to slip; what it is like at the start is no event."""
+    """Log if dry-friction joint k begins or stops slipping; its state at the start is not an event."""
     before = unilateral.dry_table[k, ku.DRY_TOLD]
     unilateral.dry_table[k, ku.DRY_TOLD] = holds
     if before >= 0 and before != holds:
@@ -485,7 +486,7 @@ def tell_joint(unilateral: UnilateralArrays, run: Run, k, holds):
 
 @internal_kernel
 def break_loose(unilateral: UnilateralArrays, ws: Workspace, k):
-    """Let joint k, which dry friction does not hold any more, slide against it; False where its slip has ended."""
+    """Let joint k, which dry friction does not hold any more, slide against it; False if its slip has ended."""
     table, split = unilateral.dry_table, unilateral.number[ku.SPLIT] == 1.0
     if table[k, ku.DRY_HOLDS] == 0:
         return False
@@ -498,7 +499,7 @@ def break_loose(unilateral: UnilateralArrays, ws: Workspace, k):
 
 @noinline_kernel
 def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Workspace, run: Run):
-    """Do what the contact events at the end of the accepted step ask for; the next step starts anew."""
+    """Change modes at the contact events that end the accepted step; the method restarts at the next step."""
     if unilateral is None:
         return
     mode, table = unilateral.mode, unilateral.stop_table
@@ -558,7 +559,7 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
             mode[k, ku.WANTED], begins = ka.SLIDING, True
             tell(system, run, k, SLIP_START)
         elif mode[k, ku.WANTED] == ka.SLIDING:
-            # Either slip has only turned, or all is to be looked at.
+            # Either slip has only turned, or all modes must be chosen.
             by_hand = slip_on(unilateral, ws, k, 10.0 * unilateral.number[ku.SLOW]) and by_hand
     if by_hand:
         keep_shares(unilateral, ws, mode[:, ku.WANTED])
@@ -568,7 +569,7 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
         tell_joints(unilateral, run)
         rearm(run)
         count_changes(system, run)
-    # As one leaves, others that start to slip hardly accelerate yet: with all their friction they would seem to rest.
+    # As one leaves, points that start to slip hardly accelerate yet: with full friction they would seem to be at rest.
     elif not leaves or not solve_reduced(system, ws, run):
         solve_modes(system, ws, run, False)
     run.count[ki.STARTED] = 0

@@ -28,16 +28,16 @@ from dynsim.jit.kernel import internal_kernel
 STRIKE = 3.0
 # Successive impacts at one instant after which restitution is zero.
 MOST_BOUNCES = 30.0
-# Starts of an impact problem with restitution, which has no solution where that contradicts friction.
+# Starts of an impact problem with restitution, which has no solution if restitution contradicts friction.
 BOUNCE_STARTS = 40
-# What begins to touch is brought this close to its surface [m].
+# A point that begins to touch is brought this close to its surface [m].
 FOOT_TOLERANCE = 1e-13
 # Projections that leave more than this part of a gap converge linearly: the point leads to a singular posture.
 SLOWLY = 0.1
-# Of a solution of the cones: residual by the largest entry, and what of the largest force is none.
+# Solution of the cones: residual relative to the largest entry, and fraction of the largest force that counts as zero.
 CONE_TOLERANCE, FORCE_TOLERANCE = 1e-9, 1e-9
-# Where nothing is faster, or accelerated by more, residuals are not compared with it: behind closed brakes a point has
-# motions of 1e-30, and no force upon it is better than none [m/s, m/s²].
+# If all rates or accelerations are smaller, the goal of residuals is relative to this instead: behind closed brakes a
+# point has motions of 1e-30, and no force on it improves on zero force [m/s, m/s²].
 IMMOBILE = 1e-3
 
 
@@ -51,7 +51,7 @@ def slip_speed(ws: Workspace, k):
 
 @internal_kernel
 def evaluate(system: System, ws: Workspace, run: Run):
-    """The right-hand side at the present state, with the present modes, and how its rows are off."""
+    """Evaluate the right-hand side at the present state, with the present modes, and the errors of its rows."""
     derivative(system, run.clock[ki.TIME], run.y, ws, run.stage[0])
     run.count[ki.EVALUATIONS] += 1
     row_errors(ws)
@@ -59,10 +59,10 @@ def evaluate(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def find_touching(system: System, ws: Workspace, touch):
-    """Note what touches and does not leave; True when some of it approaches.
+    """Note candidates and stops that touch and do not leave; True if any of them approaches.
 
-    A point that no joint moves along its normal in this posture does not touch: its force would be anything. Neither
-    does a point that a projection could bring onto its surface only by another posture. Should the posture change it
+    A point that no joint moves along its normal in this posture does not touch: its force would be arbitrary. Neither
+    does a point that a projection could bring onto its surface only by another posture. If the posture changes, it
     lands as soon as it is deeper than it is now.
     """
     unilateral = system.unilateral
@@ -79,7 +79,7 @@ def find_touching(system: System, ws: Workspace, touch):
         mode[k, ku.TOUCHING] = 1 if near else 0
         if near and state[k, ka.GAP_RATE] < -limit:
             mode[k, ku.STRUCK] = 1
-        # What lands ever so slowly is stopped too: nothing else would, should it stay open.
+        # A point that lands, however slowly, is stopped too: nothing else would stop it if it stayed open.
         strikes = strikes or (near and state[k, ka.GAP_RATE] < (-limit if closed else 0.0))
     for k in range(table.shape[0]):
         rate = stop_rate(unilateral, ws, k)
@@ -93,7 +93,7 @@ def find_touching(system: System, ws: Workspace, touch):
 
 @internal_kernel
 def keep_touching(unilateral: UnilateralArrays, ws: Workspace):
-    """What leaves faster than SETTLE touches no more: after an impact, or a brake that has closed."""
+    """Release points that leave faster than SETTLE, and stops that leave, after an impact or the closing of a brake."""
     state, mode, table = ws.contacts, unilateral.mode, unilateral.stop_table
     for k in range(mode.shape[0]):
         if state[k, ka.GAP_RATE] > unilateral.tally[k, ku.SETTLE]:
@@ -105,14 +105,14 @@ def keep_touching(unilateral: UnilateralArrays, ws: Workspace):
 
 @internal_kernel
 def come_down(system: System, ws: Workspace, run: Run):
-    """Bring what touches onto its surface, to rounding, before it is held where it is.
+    """Bring points and joints that touch onto their surfaces and stops, to rounding, before they are held in place.
 
-    A point lands a little below its surface. Where rows depend on each other, as those of a point on a body with one
+    A point lands a little below its surface. If rows depend on each other, like the rows of a point on a body with one
     degree of freedom, there might be no state at which its normal row and the tangential ones of a foot found above it
-    all vanish. What is about to bounce is not held: lifted at each bounce, it would go on for ever.
+    all vanish. A point about to bounce is not held: lifted at each bounce, it would bounce indefinitely.
 
     Joints that dry friction holds stay where they are, unless that contradicts a stop or a point with which they come
-    down: then friction lets them go, by no more than what touches is off, and holds them where they are afterwards.
+    down: then friction lets them move, by no more than the gaps to close, and holds them where they are afterwards.
     """
     unilateral = system.unilateral
     mode, table = unilateral.mode, unilateral.dry_table
@@ -138,14 +138,14 @@ def come_down(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def project_down(system: System, ws: Workspace, run: Run):
-    """Positions onto the active rows, to rounding where they lead there; False when the rows cannot be met."""
+    """Project positions onto the active rows, if possible to rounding; False when the rows cannot be met."""
     before = worst = math.inf
     for trial in range(1 + kp.PROJECTION_LIMIT):
         evaluate(system, ws, run)
         worst = 0.0
         for r in range(ws.counts[ka.ROWS]):
             worst = max(worst, abs(ws.rows[r, ka.ROW_GAP]))
-        # Where a point is nearly immobile along its normal, steps only halve the way to where it is quite immobile.
+        # If a point is nearly immobile along its normal, steps only halve the distance to where it is quite immobile.
         if worst <= FOOT_TOLERANCE or SLOWLY * before < worst <= kp.GAP_TOLERANCE or trial == kp.PROJECTION_LIMIT:
             break
         before = worst
@@ -163,7 +163,7 @@ def kind_of_joint_row(unilateral: UnilateralArrays, couplings, r):
 
 @internal_kernel
 def begin_problem(unilateral: UnilateralArrays, couplings, count):
-    """Write the rows of joints, so many, of which the first are of couplings, as the first of a contact problem."""
+    """Write ``count`` joint rows, the first ``couplings`` of them for couplings, as the first of a contact problem."""
     index, vector = unilateral.index, unilateral.vector
     for r in range(count):
         index[ku.KINDS, r], index[ku.TABLE_ROW, r] = kind_of_joint_row(unilateral, couplings, r), r
@@ -175,9 +175,9 @@ def begin_problem(unilateral: UnilateralArrays, couplings, count):
 
 @internal_kernel
 def gather(system: System, ws: Workspace, run: Run):
-    """Rows along normal and tangents of everything that touches, and their system, into the workspace.
+    """Write rows along normal and tangents of everything that touches, and their system, into the workspace.
 
-    Kinds and table rows of the rows into ``unilateral.index``; returns how many there are.
+    Writes kinds and table rows of the rows into ``unilateral.index``; returns the number of rows.
     """
     unilateral = system.unilateral
     mode, index = unilateral.mode, unilateral.index
@@ -202,8 +202,8 @@ def solve_problem(unilateral: UnilateralArrays, W, size, largest, starts):
 
     Parameters
     ----------
-    largest : of the rates or accelerations that it is to bring to zero
-    starts : of Newton's method, before a problem that may well have no solution is given up; 0: as many as it takes
+    largest : largest of the rates or accelerations to bring to zero
+    starts : starts of Newton's method before a problem that may have no solution is given up; 0: as many as it takes
     """
     vector, room, kind = unilateral.vector, unilateral.room[ku.SCRATCH :], unilateral.index[ku.KINDS]
     b, mu, f, good = vector[ku.OFFSET], vector[ku.CONE_FRICTION], vector[ku.SOLUTION], 1e-2 * CONE_TOLERANCE
@@ -217,7 +217,7 @@ def solve_problem(unilateral: UnilateralArrays, W, size, largest, starts):
 
 @internal_kernel
 def impulses(system: System, ws: Workspace, p, largest, share):
-    """Solve for the impulses of :func:`impact` with so much of the restitutions; the loss of each row into FORCE [J].
+    """Solve for the impulses of :func:`impact` with ``share`` of the restitutions; write row losses into FORCE [J].
 
     False when there is no solution, or one that would create energy.
     """
@@ -231,7 +231,7 @@ def impulses(system: System, ws: Workspace, p, largest, share):
         if mode[k, ku.TOUCHING] == 1:
             r = ws.active[k, ka.FIRST_ROW]
             vector[ku.CONE_FRICTION, r] = system.contacts.law[k, ka.MU]
-            # What was closed had no speed to turn round: a brake or another impact has just given it this one.
+            # A closed point had no speed to reverse: a brake or another impact has just given it this one.
             falls = mode[k, ku.STRUCK] == 1 and mode[k, ku.BEFORE] == ka.OPEN
             if falls and -rows[r, ka.ROW_RATE] > unilateral.tally[k, ku.SETTLE]:
                 vector[ku.OFFSET, r] *= 1.0 + share * system.contacts.law[k, ka.RESTITUTION]
@@ -251,7 +251,7 @@ def impulses(system: System, ws: Workspace, p, largest, share):
 
 @internal_kernel
 def impact(system: System, ws: Workspace, run: Run):
-    """Impulses that stop what approaches: u = W P + b with b = J v and, of normals that strike, (1 + e) n·v.
+    """Apply impulses that stop approaches: u = W P + b with b = J v and, for normals that strike, (1 + e) n·v.
 
     Then v += M⁻¹ Jᵀ P, and the energy −½ P·(J v₋ + J v₊) is booked as impact loss.
     """
@@ -261,9 +261,9 @@ def impact(system: System, ws: Workspace, run: Run):
     largest = 0.0
     for r in range(p):
         largest = max(largest, abs(rows[r, ka.ROW_RATE]))
-    # Newton's restitution may contradict friction: a point that is wedged cannot leave, and some would gain energy.
-    # Those impacts are without restitution, which always has a solution, and a loss. So are those of points that throw
-    # each other back and forth at one instant: what accumulates ends in contact.
+    # Newton's restitution may contradict friction: a wedged point cannot leave, and some impacts would gain energy.
+    # Those impacts are without restitution, which always has a solution, and a loss. The same applies to points that
+    # throw each other back and forth at one instant: impacts that accumulate end in contact.
     bouncing = unilateral.number[ku.CHANGES] <= MOST_BOUNCES and impulses(system, ws, p, largest, 1.0)
     if not bouncing and not impulses(system, ws, p, largest, 0.0):
         run.count[ki.STATUS], run.clock[ki.NOT_UNIQUE] = ki.NO_CONTACT_FORCES, run.clock[ki.TIME]

@@ -1,7 +1,7 @@
 """Contact modes (open, sliding, sticking) from impacts and the complementarity problem of accelerations.
 
-Forces may jump at a start, a landing and the end of slip, so the modes of all that touches are chosen anew. First
-impulses stop what approaches (:mod:`dynsim.integrators.contacts.impacts`); then
+Forces may jump at a start, a landing and the end of slip, so the modes of everything that touches are chosen again.
+First impulses stop approaching points and joints (:mod:`dynsim.integrators.contacts.impacts`); then
 
     0 ≤ f_n ⟂ n·r̈ ≥ 0,   |f_t| ≤ μ_s f_n, and f_t = −μ_s f_n a_t/|a_t| where a_t ≠ 0
 
@@ -50,31 +50,31 @@ from dynsim.integrators.project import RATE_TOLERANCE, project_level
 from dynsim.integrators.run import Run
 from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
-# An acceleration along the surface below this fraction of the largest right-hand side is none.
+# An acceleration along the surface below this fraction of the largest right-hand side counts as zero.
 SLIP_TOLERANCE = 1e-8
-# Where no forces agree with slip slower than this [m/s], it is stopped, as friction without bound would stop it: an
+# If no forces agree with slip slower than this [m/s], the slip is stopped, as unbounded friction would stop it: an
 # impact of 5e-11 J per kilogram. Without it points that land within a step of coming to rest would end a run.
 NEARLY_AT_REST = 1e-5
-# A friction force this close to the cone, as a fraction, is on it.
+# A friction force this close to the cone, as a fraction, counts as on it.
 ON_CONE = 1e-7
-# Share of its friction that a joint at rest may have: all of it but a rounding, which tells it from one that slides.
+# Largest share of its friction that a joint at rest may have: all but a rounding, to distinguish it from a sliding one.
 NEARLY_ALL = 1.0 - 1e-15
-# Which joints that rub a choice of modes holds: all slow ones; those, unless their rates contradict what else is
-# closed; only those that rest.
+# Which joints with dry friction a choice of modes holds: all slow joints; the same, unless their rates contradict other
+# closed rows; only joints at rest.
 HOLD_SLOW, HOLD_COMPATIBLE, HOLD_RESTING = 0, 1, 2
-# Light joints may change their rates by some times what heavy ones at rest are rid of; the rest was no rest if others,
-# geared to them, lose more than that.
+# Holding heavy joints may change the rates of light joints by a multiple of the rate lost; if joints geared to the held
+# ones lose more than this multiple, the held joints were not at rest.
 MOST_CHANGE = 100.0
-# What other rows leave of a joint's mobility, as a share: below NEARLY_DEPENDENT no friction could hold the joint by a
-# row; below ROUNDING its row depends on theirs.
+# Share of a joint's mobility that other rows leave: below NEARLY_DEPENDENT no friction could hold the joint by a row;
+# below ROUNDING its row depends on the other rows.
 NEARLY_DEPENDENT, ROUNDING = 1e-6, 1e-12
 
 
 @internal_kernel
 def resolve(system: System, ws: Workspace, run: Run, touch):
-    """Stop what strikes, and choose the modes of everything that touches: closed, or no further than ``touch`` [m] off.
+    """Stop striking points and joints, and choose modes for all that touch: closed, or at most ``touch`` [m] off.
 
-    ``unilateral.mode`` has the modes BEFORE, and what was STRUCK. Sets STATUS where there is no solution.
+    ``unilateral.mode`` records the modes BEFORE, and the candidates that STRUCK. Sets STATUS if there is no solution.
     """
     unilateral = system.unilateral
     mode, table = unilateral.mode, unilateral.stop_table
@@ -94,7 +94,7 @@ def resolve(system: System, ws: Workspace, run: Run, touch):
 
 @internal_kernel
 def choose(system: System, ws: Workspace, run: Run):
-    """Modes by the accelerations of all that touches; the rates of what is closed are brought to zero."""
+    """Choose modes by the accelerations of everything that touches; bring the rates of closed rows to zero."""
     mode, stops = system.unilateral.mode, system.unilateral.stop_table
     for k in range(mode.shape[0]):
         mode[k, ku.TOUCHED] = mode[k, ku.TOUCHING]
@@ -102,7 +102,7 @@ def choose(system: System, ws: Workspace, run: Run):
         stops[k, ku.STOP_TOUCHED] = stops[k, ku.STOP_CLOSED]
     if choose_modes(system, ws, run, HOLD_COMPATIBLE):
         return
-    # A joint that moves ever so slowly, because what touches moves it, does not rest.
+    # A joint that moves, however slowly, because a contact or stop moves it, is not at rest.
     touch_again(system.unilateral)
     choose_modes(system, ws, run, HOLD_RESTING)
     if run.count[ki.STATUS] != ki.RUNNING:
@@ -113,7 +113,7 @@ def choose(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def touch_again(unilateral: UnilateralArrays):
-    """What touched before a choice that is taken back."""
+    """Restore which candidates and stops touched before a rejected choice."""
     mode, stops = unilateral.mode, unilateral.stop_table
     for k in range(mode.shape[0]):
         mode[k, ku.TOUCHING] = mode[k, ku.TOUCHED]
@@ -123,10 +123,10 @@ def touch_again(unilateral: UnilateralArrays):
 
 @noinline_kernel
 def choose_modes(system: System, ws: Workspace, run: Run, rule):
-    """:func:`choose`, with one of the ways to hold joints that rub; False, and no rates changed, if that is taken back.
+    """:func:`choose` with one rule to hold joints with dry friction; False, without changed rates, if that is rejected.
 
-    HOLD_COMPATIBLE is taken back where the slow rates of the joints that are held contradict what else is closed, or
-    could only be zero if other joints stopped too.
+    HOLD_COMPATIBLE is rejected if the slow rates of the held joints contradict other closed rows, or could only be
+    zero if other joints stopped too.
     """
     unilateral = system.unilateral
     mode = unilateral.mode
@@ -147,7 +147,7 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
         if run.count[ki.STATUS] != ki.FORCES_REVERSED:
             run.count[ki.STATUS] = ki.NO_CONTACT_FORCES
         run.clock[ki.NOT_UNIQUE] = run.clock[ki.TIME]
-        # Whoever looks for the cause finds the rows that contradict the law.
+        # Leave the rows that contradict the law in the workspace, for a search for the cause.
         set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
         evaluate(system, ws, run)
         return True
@@ -156,15 +156,15 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
         slot = share_slot(unilateral, ws, unilateral.index[ku.TABLE_ROW, i])
         unilateral.shares[slot] = unilateral.vector[ku.SOLUTION, i]
     release_dependent_joints(system, ws)
-    # What is left of rates after an impact that was let settle, and of points that were solved for as if at rest: those
-    # that begin to slip would else go against the direction that they are given, and stop, and begin again. One that
-    # goes along it keeps its rate: it would never get under way if events of others came too often.
+    # Remove residual rates after an impact that was allowed to settle, and of points that were solved for as if at
+    # rest: a point that begins to slip could otherwise move against its given direction, stop, and begin again. A point
+    # that moves along it keeps its rate: it would never get under way if events of other points came too often.
     for k in range(mode.shape[0]):
         starts = mode[k, ku.WANTED] == ka.SLIDING and unilateral.slide[k, ku.FROZEN] == 1.0
         rests = starts and slip_speed(ws, k) <= least and not goes_along(unilateral, ws, k)
         mode[k, ku.TOUCHING] = ka.STICKING if rests else mode[k, ku.WANTED]
     set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.TOUCHING])
-    # What was split before says nothing of these modes.
+    # Earlier splits do not apply to these modes.
     unilateral.number[ku.REDUNDANT], unilateral.number[ku.SPLIT] = 0.0, 0.0
     evaluate(system, ws, run)
     if rule == HOLD_COMPATIBLE and holds_moving_joint(unilateral, ws) and rates_contradict(ws):
@@ -211,7 +211,7 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
 
 @noinline_kernel
 def solve_accelerations(system: System, ws: Workspace, run: Run, p, largest, least):
-    """Forces that agree with the law, where what slips slower than ``least`` [m/s] is at rest.
+    """Solve for forces that agree with the law; a point that slips slower than ``least`` [m/s] is at rest.
 
     Returns
     -------
@@ -236,7 +236,7 @@ def solve_accelerations(system: System, ws: Workspace, run: Run, p, largest, lea
 
 @internal_kernel
 def joint_rests(unilateral: UnilateralArrays, ws: Workspace, k):
-    """True if joint k, of those with dry friction, does not move, to the accuracy of projected rates."""
+    """True if dry-friction joint k does not move, to the accuracy of projected rates."""
     return abs(ws.joints[unilateral.dry_table[k, ku.DRY_JOINT], ka.QD]) <= RATE_TOLERANCE
 
 
@@ -251,7 +251,7 @@ def holds_moving_joint(unilateral: UnilateralArrays, ws: Workspace):
 
 @internal_kernel
 def release_moving_joints(unilateral: UnilateralArrays, ws: Workspace):
-    """Let the joints slide that do not quite rest."""
+    """Let joints slide that are not quite at rest."""
     for k in range(unilateral.dry_table.shape[0]):
         if not joint_rests(unilateral, ws, k):
             unilateral.dry_table[k, ku.DRY_HOLDS] = 0
@@ -259,7 +259,7 @@ def release_moving_joints(unilateral: UnilateralArrays, ws: Workspace):
 
 @noinline_kernel
 def rates_contradict(ws: Workspace):
-    """True if no change of rates brings those of all active rows to zero, right after :func:`evaluate`."""
+    """True if no change of joint rates brings the rates of all active rows to zero, right after :func:`evaluate`."""
     rows, p = ws.rows, ws.counts[ka.ROWS]
     for r in range(p):
         rows[r, ka.RHS] = rows[r, ka.ROW_RATE]
@@ -299,10 +299,10 @@ def mobility(ws: Workspace, r, s):
 
 @internal_kernel
 def hold_slow_joints(unilateral: UnilateralArrays, ws: Workspace):
-    """Dry friction holds the joints that do not move, where they are; the others slide on, as they move.
+    """Hold the joints that do not move where they are, by dry friction; the others keep sliding as they move.
 
-    A joint whose brake is closed rests without friction: the brake has all of its load. A row of friction would come to
-    its bound and break loose, and the joint would not move.
+    A joint whose brake is closed rests without friction: the brake carries all of its load. A row of friction would
+    reach its bound and break loose, and the joint would not move.
     """
     table, dry = unilateral.dry_table, unilateral.dry
     for k in range(table.shape[0]):
@@ -315,14 +315,14 @@ def hold_slow_joints(unilateral: UnilateralArrays, ws: Workspace):
 
 @internal_kernel
 def note_headway(unilateral: UnilateralArrays, ws: Workspace, k):
-    """What joint k, of those with dry friction, begins to slide with against its side."""
+    """Note the speed against its side with which dry-friction joint k begins to slide."""
     rate = ws.joints[unilateral.dry_table[k, ku.DRY_JOINT], ka.QD]
     unilateral.dry[k, ku.DRY_HEADWAY] = max(0.0, -unilateral.dry[k, ku.DRY_SIDE] * rate)
 
 
 @internal_kernel
 def let_joints_slide(system: System, size, largest):
-    """Which joints dry friction goes on to hold, into DRY_NEXT, and which ways the others slide."""
+    """Write which joints dry friction still holds into DRY_NEXT, and the directions of the others into DRY_SIDE."""
     unilateral, i = system.unilateral, system.couplings.joint.shape[0]
     table, f = unilateral.dry_table, unilateral.vector[ku.SOLUTION]
     for k in range(table.shape[0]):
@@ -336,14 +336,14 @@ def let_joints_slide(system: System, size, largest):
 
 @internal_kernel
 def release_dependent_joints(system: System, ws: Workspace):
-    """Joints at rest that sliding contacts or stops hold have the constant force of the solution, not a row.
+    """Give joints at rest that sliding contacts or stops hold the constant force of the solution instead of a row.
 
-    Such a row depends on the normal rows, and how they share a force changes the friction of what slides: no split of
-    the right-hand side is that of the solution. Nor do splits know stops, whose force would go to the row by halves, as
-    much as it may be beyond the bound. At rest Coulomb's law admits any force within the bound. Rows that depend on
-    those of sticking points and of other joints alone remain, see :mod:`dynsim.dynamics.contact.splits`, but for those
-    that depend on them only nearly: it would take forces beyond all bounds to hold such a joint, and the order of
-    pivots would say whether it is held.
+    Such a row depends on the normal rows, and how they share a force changes the friction of sliding points: no split
+    of the right-hand side equals the solution. Splits do not account for stops either: half of a stop's force would go
+    to the row, however far beyond the bound. At rest Coulomb's law admits any force within the bound. Rows that depend
+    only on rows of sticking points and other joints remain, see :mod:`dynsim.dynamics.contact.splits`, except rows
+    that depend on them only nearly: holding such a joint would take forces beyond all bounds, and the order of pivots
+    would decide whether it is held.
     """
     unilateral, W = system.unilateral, ws.small[0]
     table, mode, bare, whole = unilateral.dry_table, unilateral.mode, 0, 0
@@ -384,7 +384,7 @@ def release_dependent_joints(system: System, ws: Workspace):
 
 @internal_kernel
 def goes_along(unilateral: UnilateralArrays, ws: Workspace, k):
-    """True if candidate k slips, however slowly, in the direction that it is given."""
+    """True if candidate k slips, however slowly, in its given direction."""
     along = 0.0
     for s in range(3):
         along += unilateral.slide[k, ku.REFERENCE + s] * ws.contacts[k, ka.SLIP_VELOCITY + s]
@@ -393,7 +393,7 @@ def goes_along(unilateral: UnilateralArrays, ws: Workspace, k):
 
 @internal_kernel
 def rest_without_row(unilateral: UnilateralArrays, k):
-    """Joint k of those that rub rests on with the constant force that it has in the solution."""
+    """Keep dry-friction joint k at rest with the constant force that it has in the solution."""
     # Rows of joints come first, so that they are the same in the reduced problem.
     share = -unilateral.vector[ku.SOLUTION, unilateral.dry_table[k, ku.DRY_ROW]] / dry_bound(unilateral, k)
     unilateral.dry_table[k, ku.DRY_NEXT] = 0
@@ -404,8 +404,9 @@ def rest_without_row(unilateral: UnilateralArrays, k):
 def hold_free_joints(system: System, ws: Workspace, run: Run, begins):
     """Give rows to the joints that rest with a constant force and that contacts and stops no longer hold.
 
-    After single modes have changed, at the end of an accepted step. If slip ``begins`` somewhere, a joint whose force
-    is all of its friction moves with what has held it: with a row it would stick, and break loose at once.
+    Called after single modes have changed, at the end of an accepted step. If slip ``begins`` somewhere, a joint whose
+    force is all of its friction moves with the contact or stop that held it: with a row it would stick, and break loose
+    at once.
     """
     unilateral, y = system.unilateral, run.y
     table, dry, mode = unilateral.dry_table, unilateral.dry, unilateral.mode
@@ -451,14 +452,14 @@ def some_rest_without_row(unilateral: UnilateralArrays):
 
 @internal_kernel
 def rests_without_row(unilateral: UnilateralArrays, k):
-    """True if joint k, of those with dry friction, rests with a constant force and without a closed brake."""
+    """True if dry-friction joint k rests with a constant force and without a closed brake."""
     table = unilateral.dry_table
     return table[k, ku.DRY_HOLDS] == 0 and table[k, ku.DRY_BRAKE] != ku.CLOSED and dry_rests(unilateral, k)
 
 
 @internal_kernel
 def extended(factor, W, row, count, r):
-    """Extend a Cholesky factor of rows ``row[:count]`` of W by row r, unless it depends on them; how many there are."""
+    """Extend a Cholesky factor of rows ``row[:count]`` of W by row r, unless it depends on them; return the count."""
     square = mobility_left(factor, W, row, count, r)
     if not square > RANK_TOLERANCE * W[r, r]:
         return count
@@ -468,7 +469,7 @@ def extended(factor, W, row, count, r):
 
 @internal_kernel
 def mobility_left(factor, W, row, count, r):
-    """What the rows of a factor leave of the mobility W along row r, whose own row of the factor it writes."""
+    """Return the mobility W along row r that the rows of a factor leave; write row ``count`` of the factor, for r."""
     square = W[r, r]
     for i in range(count):
         total = W[r, row[i]]
@@ -483,7 +484,7 @@ def mobility_left(factor, W, row, count, r):
 def begins_sliding(system: System, ws: Workspace, k, least):
     """True for a candidate that slides faster than ``least`` [m/s], or without friction; sets its direction."""
     unilateral = system.unilateral
-    # An impact may have turned it.
+    # An impact may have turned its slip.
     if slip_on(unilateral, ws, k, least):
         return True
     if system.contacts.law[k, ka.STATIC] == 0.0:
@@ -494,7 +495,7 @@ def begins_sliding(system: System, ws: Workspace, k, least):
 
 @internal_kernel
 def slip_on(unilateral: UnilateralArrays, ws: Workspace, k, least):
-    """Let candidate k slide along its own slip, v_t/|v_t|, where that is faster than ``least`` [m/s]; True if it is."""
+    """Let candidate k slide along its slip, v_t/|v_t|, if that is faster than ``least`` [m/s]; True if it is."""
     slide, speed = unilateral.slide, slip_speed(ws, k)
     if speed > least:
         slide[k, ku.FROZEN] = 0.0
@@ -505,9 +506,9 @@ def slip_on(unilateral: UnilateralArrays, ws: Workspace, k, least):
 
 @internal_kernel
 def reduce_rows(system: System, ws: Workspace, run: Run, p):
-    """The problem of accelerations in ``unilateral``: a point that slides keeps its normal row alone; returns its size.
+    """Write the problem of accelerations into ``unilateral``, with only normal rows of sliding points; return its size.
 
-    Column of such a row: W (n − μ t). One whose own force would accelerate it against itself sets STATUS (Painlevé).
+    Column of such a row: W (n − μ t). A row that its own force would accelerate against itself sets STATUS (Painlevé).
     """
     unilateral, W = system.unilateral, ws.small[0]
     index, vector, mode, state = unilateral.index, unilateral.vector, unilateral.mode, ws.contacts
@@ -602,10 +603,10 @@ def friction_at_rest(system: System, k):
 
 @internal_kernel
 def give_way(system: System, ws: Workspace, size, largest):
-    """Give what slips over a static coefficient the smaller kinetic one; True if something does.
+    """Give points that exceed static friction and slip the smaller kinetic coefficient; True if there are any.
 
-    It stays a cone: the direction in which it begins to slip is not that of the larger force, unless its mobility is
-    the same in all directions.
+    The constraint stays a cone: the point does not begin to slip in the direction of the larger force, unless its
+    mobility is the same in all directions.
     """
     unilateral = system.unilateral
     index, mode, f = unilateral.index, unilateral.mode, unilateral.vector[ku.SOLUTION]
@@ -624,7 +625,7 @@ def give_way(system: System, ws: Workspace, size, largest):
 
 @internal_kernel
 def take_solution(system: System, ws: Workspace, size, largest):
-    """Modes from the forces of the reduced problem, into WANTED; stops that carry nothing open."""
+    """Write modes from the forces of the reduced problem into WANTED; open stops that carry no force."""
     unilateral = system.unilateral
     index, mode, f = unilateral.index, unilateral.mode, unilateral.vector[ku.SOLUTION]
     strongest = 0.0
@@ -643,12 +644,12 @@ def take_solution(system: System, ws: Workspace, size, largest):
         while index[ku.TABLE_ROW, i] != ws.active[k, ka.FIRST_ROW]:
             i += 1
         if not f[i] > FORCE_TOLERANCE * strongest:
-            # It touches without a force, maybe a little below its surface: only if it goes on does it land.
+            # It touches without a force, maybe a little below its surface: it lands only if it moves deeper.
             mode[k, ku.WANTED], unilateral.slide[k, ku.LANDS_AT] = ka.OPEN, ku.DEPTH
         elif mode[k, ku.WANTED] == ka.STICKING and slips(system, i, size, largest, friction_at_rest(system, k)):
             fx, fy = f[i + 1], f[i + 2]
             if fx == 0.0 and fy == 0.0:
-                # Kinetic friction of zero: nothing holds it where static friction gives way.
+                # Kinetic friction is zero: nothing holds the point once static friction is exceeded.
                 fx, fy = -acceleration(unilateral, i + 1, size), -acceleration(unilateral, i + 2, size)
             begin_slip(system, ws, k, fx, fy)
             mode[k, ku.WANTED] = ka.SLIDING
