@@ -167,14 +167,14 @@ def equilibrium(seen: Observed) -> Finding:
     # References and torques that jump at the start are reported by a warning.
     if warned(seen, "that jumps at the start all the same") or warned(seen, "the start slips at"):
         return
-    # Wedged points may rest or leave: the run leaves, and says so.
+    # Wedged points may rest or leave: in the run they leave, and a warning reports it.
     if warned(seen, "contacts with other forces than at rest"):
         return
     size = np.abs(seen.vdot[0])
     # Far below the acceleration of a joint that falls.
     allowed = 1e-4 * (1.0 + np.linalg.norm(seen.bodies.gravity))
     if seen.stepped and len(seen) > 2:
-        # The mean of the first step: where references begin to move that of the next one is up to three times as large.
+        # The mean of the first step: if references begin to move, the mean of the next is up to three times as large.
         allowed = max(allowed, 0.7 * float(np.abs(seen.vdot[2]).max(initial=0.0)))
     if size.max(initial=0.0) > allowed:
         yield f"{seen.joints[int(size.argmax())]} starts with an acceleration of {size.max():.3g}, from equilibrium"

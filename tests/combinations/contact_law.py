@@ -204,7 +204,7 @@ def _against_slip(seen: Observed, touch: Touch, slips: NDArray[np.bool_], before
         # The contact's place moves on the body within a step, and the tangent plane turns.
         share = turned / np.maximum(both, 1e-300) + np.abs(high - low) / np.maximum(high, 1e-300) + 1e-3
     else:
-        # Slip keeps the direction with which it began up to 1000 times atol; steps may go on to twice that speed.
+        # Slip keeps its initial direction up to 1000 times atol; steps may continue to twice that speed.
         slow = max(2000.0 * seen.scenario.integrator.absolute_tolerance, SLOW)
         steady, middle = slips & (speed > slow), touch.slip
         share = np.full(len(seen), 1e-3)
@@ -223,7 +223,7 @@ def _against_slip(seen: Observed, touch: Touch, slips: NDArray[np.bool_], before
 
 
 def _at_an_end(seen: Observed, touch: Touch, i: int) -> bool:
-    """Whether the end of its axis, which has a contact of its own, is where a link is nearest to the surface."""
+    """Whether a link is nearest to the surface at an end of its axis that has a separate contact."""
     return any(
         other.contact.tip is None
         and np.linalg.norm(other.position[i] - touch.position[i])

@@ -8,18 +8,19 @@ from dataclasses import dataclass
 
 Levels = Mapping[str, str]
 
-# The method is no factor: each scene is run by all that know what is in it, see :func:`methods`.
+# The method is not a factor: each scene is run by all methods that support it, see :func:`methods`.
 FACTORS: dict[str, tuple[str, ...]] = {
-    # With its kinds of joints: revolute; also prismatic; of a file, with a branch; coupled; a free or a planar root.
+    # With its kinds of joints: revolute; also prismatic; from a file, with a branch; coupled; a free or a planar root.
     "plant": ("revolute", "prismatic", "urdf", "mimic", "floating", "planar", "mobile", "snake"),
-    # partly: one joint before the elbow has none, or two; dc: with limits of voltage and current; velocity: a servo in
-    # that mode.
+    # partly: one or two joints before the elbow have no motor; dc: with limits of voltage and current; velocity: a
+    # servo in that mode.
     "motor": ("none", "partly", "published", "dc", "servo", "velocity", "torque"),
     "rubbing": ("nothing", "viscous", "bearing", "gear", "both"),
     "stops": ("none", "far", "reached"),
-    # nothing: glued law, no point; free: unilateral law, no point; then what can touch under the unilateral law.
+    # nothing: glued law, no point; free: unilateral law, no point; then the parts that can touch under
+    # the unilateral law.
     "contact": ("nothing", "free", "glued", "points", "joints", "links"),
-    # Of declared points: the elbow alone; and the hand; and a second of the same link; and a point on the first axis.
+    # Declared points: the elbow alone; also the hand; also a second one on the same link; also one on the first axis.
     "points": ("elbow", "two", "same_link", "unmoved"),
     "shape": ("point", "sphere"),
     # steep: a plane that the elbow leaves at a flat angle.
@@ -49,10 +50,10 @@ class Refusal:
 
     Attributes
     ----------
-    levels : of two or more factors, each a level or several; ``method`` may be among them
+    levels : two or more factors, each with one or several levels; ``method`` may be among them
     reason : why not
-    error : pattern of what dynsim says to a scene that has them; empty: no scene could say it, the levels exclude
-        each other by what they mean
+    error : pattern of dynsim's message for a scene that has them; empty: no scene can have them, because the levels
+        exclude each other by their meaning
     """
 
     levels: tuple[tuple[str, tuple[str, ...]], ...]
@@ -65,7 +66,7 @@ class Refusal:
 
     @property
     def name(self) -> str:
-        """Its levels, in a word."""
+        """Its levels, as one word."""
         return "-".join("|".join(levels) for _, levels in self.levels)
 
     def holds_for(self, method: str) -> bool:
@@ -81,7 +82,7 @@ def _refuse(reason: str, error: str = "", **levels: str | tuple[str, ...]) -> Re
 UNILATERAL = ("free", "points", "joints", "links")
 GLUED = ("nothing", "glued")
 SAMPLED = ("sampled", "encoders", "delayed")
-# What follows references that a whole run has, and what plans voltages along them.
+# Controllers whose references are known for a whole run, with voltages planned along them.
 PLANNED = ("gravity", "pressing")
 DC = ("published", "dc")
 STEPPED = "only time stepping has it"
@@ -155,25 +156,25 @@ REFUSALS: tuple[Refusal, ...] = (
 )  # fmt: skip
 
 
-# What dynsim may say of a start, by its numbers: whether a scene has one it finds out.
+# Errors of a start that depend on its numbers: only dynsim finds out whether a scene has one.
 STARTS = {
     "equilibrium": r"initial\.equilibrium: nothing holds this posture",
     "on_surface": r"the joints that may move do not bring",
-    # A hand may take all joints that have motors.
+    # A hand path may use all joints that have motors.
     "on_references": r"the joints that may move do not bring|no joint has waypoints",
 }
 
 
 def methods(levels: Levels) -> tuple[str, ...]:
-    """The methods that know all that an assignment has; ``auto`` among them."""
+    """The methods that support all levels of an assignment; ``auto`` among them."""
     return tuple(method for method in METHODS if refused(levels, method) is None)
 
 
 def refused(levels: Levels, method: str) -> Refusal | None:
-    """The first refusal that an assignment, which may be partial, meets with a method; None: it is taken."""
+    """The first refusal that an assignment, which may be partial, meets with a method; None: it is accepted."""
     return next((refusal for refusal in REFUSALS if refusal.holds({**levels, METHOD: method})), None)
 
 
 def matches(refusal: Refusal, text: str) -> bool:
-    """Whether an error is the one that a refusal announces."""
+    """Whether an error matches the pattern of a refusal."""
     return bool(refusal.error) and re.search(refusal.error, " ".join(text.split())) is not None

@@ -26,7 +26,7 @@ AT_STEP = 1e-6
 # Samples resolve a circuit if their spacing is below this part of L/R. If not, this time after an event is left out,
 # three of the longest periods of published motors in stiff loops [s].
 RESOLVED, SETTLING = 0.3, 0.03
-# Of what the record does not show [A or N m].
+# Slack for a current, or torque of a torque source, that the record does not show [A or N m].
 UNKNOWN = 1e9
 # Terms of the equation of motion cancel to this part of their size: by events the record's accelerations and forces
 # solve one linear system, whose condition costs up to six of sixteen digits.
@@ -312,9 +312,9 @@ class Balance:
 
     Attributes
     ----------
-    rows : indices of the samples; rest : (len(rows), n) [N m or N]; scale : (len(rows), n), the sum of the sizes
-    slack : (len(rows), n), by how much terms may be off that the record does not show exactly
-    share : of the scale that rounding may leave
+    rows : indices of the samples; left : (len(rows), n) [N m or N]; scale : (len(rows), n), the sum of the sizes
+    slack : (len(rows), n), possible error of the terms that the record does not show exactly
+    share : part of the scale that rounding may leave
     """
 
     rows: NDArray[np.int64]
@@ -325,7 +325,7 @@ class Balance:
 
     @property
     def excess(self) -> Array:
-        """What is left, relative to what may be, (len(rows), n)."""
+        """The residual relative to the allowed residual, (len(rows), n)."""
         allowed = self.share * self.scale.max(axis=1, keepdims=True) + 2.0 * self.slack + 1e-10
         return np.asarray(np.abs(self.left) / allowed)
 
@@ -379,8 +379,8 @@ def _stepped_balance(seen: Observed) -> Balance:
         # Tangents may turn about the normal as much as that turns.
         angle = np.linalg.norm(later.normal - touch.normal, axis=1, keepdims=True)
         slack = slack + np.abs(_contact_term(seen, middle, touch, angle * np.cross(touch.normal, turned)))
-    # Velocity products are those of the rates that the last acceleration leads to, or of the rates of the start if
-    # contacts have changed.
+    # Velocity products use the rates that the last acceleration leads to, or the rates of the start if contacts have
+    # changed.
     last = np.where((rows > 1)[:, None], seen.vdot[np.maximum(rows - 1, 0)], 0.0)
     led, begun = (
         _balanced(seen, rows, [_inertial(seen, q_middle, rates, a), *terms[1:]], slack)

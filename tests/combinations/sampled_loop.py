@@ -1,4 +1,4 @@
-"""How fast a sampled loop grows, by a discretisation of the checks' own: the matrix exponential over one period."""
+"""Growth of a sampled loop, by a separate discretisation of the checks: the matrix exponential over one period."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 
 def loop_growth(seen: Observed) -> float | None:
-    """Logarithm per second of the growth of the slower of two loops; None where no command is sampled.
+    """Logarithm per second of the growth of the slower of two loops; None if no command is sampled.
 
     One with all contacts let go, one with those held that touch at the start: between them lies what contacts do.
     No weight and no velocity products: what grows without them is the loop.
@@ -73,7 +73,7 @@ def _spectral_radius(seen: Observed, basis: Array) -> float:
 
 
 def _gains(controller: Mapping[str, Any], motor: Motor | Servo, number: int) -> tuple[float, float]:
-    """Of a motor; ``number``: that it has among the DC motors, where each has a gain of its own."""
+    """Gains of a motor; ``number``: its index among the DC motors, for gains that are listed by motor."""
     if isinstance(motor, Servo):
         return (0.0, motor.k_v) if motor.velocity_mode else (motor.k_p, motor.k_d)
     gains = []

@@ -31,8 +31,8 @@ NUMBER = r"([-+]?[0-9.]+(?:e[-+]?[0-9]+)?|inf|-inf|nan)"
 AT_REST = 1e-9
 # Rows that depend on each other have a singular value below this part of the largest.
 DEPENDENT = 1e-6
-# A loop is unstable where the logarithm of its states grows by more than this in a second; and it is what ends a run
-# where they have grown by e to this.
+# A loop is unstable if the logarithm of its states grows by more than GROWTH in a second; it explains the end of a run
+# if they have grown by e to the power GROWN.
 GROWTH, GROWN = 1.0, 3.0
 UNSTABLE = "the sampled loop is unstable"
 
@@ -62,7 +62,7 @@ def untrue(scenario: Mapping[str, Any], run: Run, seen: Observed) -> Iterator[st
 
 
 def _stop(stop: SimulationStopped, seen: Observed) -> Iterator[str]:
-    """Whether a stop had to be."""
+    """Whether a stop was necessary."""
     text = f"stops ({stop.kind}) at t = {stop.time:.6g} s"
     if stop.kind not in STOPS:
         yield f"{text}: no check knows this kind of stop"
@@ -434,7 +434,7 @@ def _moves_at_once(match: Match, seen: Observed) -> str:
 
 
 def _moved_at_the_start(match: Match, seen: Observed) -> str:
-    """The first sample differs from the scenario's posture by what is said."""
+    """The first sample differs from the scenario's posture by the reported amounts."""
     for name, angle in re.findall(rf"(\S+) by {NUMBER}", match[1]):
         joint = _joint(seen, name)
         if joint is None:

@@ -96,7 +96,7 @@ class Drive(Teleop):
 
     def ended(self, code: int) -> None:
         assert self.finish() == code, self.said
-        # What multiprocessing has beside it ends when it sees that this one has.
+        # The helper process of multiprocessing ends when it sees that the drive has ended.
         wait_for(self.group_is_gone, failure="a process is left")
 
 
@@ -154,7 +154,7 @@ def check_against_the_simulation(drive: Drive, *, in_trouble: bool = False) -> R
     if in_trouble:
         well = measured["state"][np.isfinite(measured["record_time"])] == ReplayState.REPLAY
         goals, expected = goals[well], expected[well]
-    # Of a chord over 5 ms at the 6.5 rad/s² with which the arm sags at first: 2.0e-5 rad; a tick is 1.5e-3.
+    # Error of a chord over 5 ms at the 6.5 rad/s² with which the arm sags at first: 2.0e-5 rad; a tick is 1.5e-3.
     assert goals == pytest.approx(expected, abs=5e-5)
     again = simulate(load_scenario(drive.folder / "scenario.yaml"))
     for name in simulated:
@@ -418,7 +418,7 @@ def test_a_snake_changes_its_modes(drives: Callable[..., Drive]) -> None:
 
 
 def test_a_map_that_does_not_say_how_wheels_are_lifted_is_refused(tmp_path: Path) -> None:
-    """With their wheels on the ground they would be dragged over it; an arm has none."""
+    """A snake with its wheels on the ground would be dragged over it; an arm has no wheels."""
     for name, table, words in (
         ("snake_operator", "arm", "does not say how"),
         ("six_axis_arm", "snake", "lifts.signal: a live drive has no 'grounded'"),

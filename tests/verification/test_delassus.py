@@ -26,7 +26,7 @@ def solve(A: np.ndarray, b: np.ndarray, room: int = 0, solver=solve_small) -> tu
 
 
 def random_rank(rng: np.random.Generator, p: int, rank: int, spread: float) -> np.ndarray:
-    """A (p, p) of that rank whose singular values spread over so many decades."""
+    """A (p, p) of this rank whose singular values spread over ``spread`` decades."""
     left, right = (np.linalg.qr(rng.normal(size=(p, p)))[0][:, :rank] for _ in range(2))
     return (left * 10.0 ** rng.uniform(-spread, 0.0, size=rank)) @ right.T
 
@@ -36,7 +36,7 @@ def random_rank(rng: np.random.Generator, p: int, rank: int, spread: float) -> n
 @example(12374)
 @example(12685)
 def test_least_norm_least_squares_of_any_rank(seed):
-    """Neither symmetric nor consistent systems; residual and null-space part are those of the pseudo-inverse."""
+    """Neither symmetric nor consistent systems; residual and null-space part agree with the pseudo-inverse."""
     rng = np.random.default_rng(seed)
     p = int(rng.integers(1, 43))
     A, b = random_rank(rng, p, int(rng.integers(0, p + 1)), 3.0), rng.normal(size=p)
@@ -86,7 +86,7 @@ def test_rows_of_unequal_scale(scale):
 
 
 def test_nothing_moves():
-    """Rows that no joint feels have no force, and are said to depend."""
+    """Rows that no joint can move have no force, and are reported as dependent."""
     for p in (1, 2, 3, 5):
         force, dependent = solve(np.zeros((p, p)), np.ones(p))
         assert dependent

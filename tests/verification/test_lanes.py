@@ -39,7 +39,7 @@ SELECT = {
     Place("drive/limit.py", "clipped", "if x.real < -limit:"): LIMIT,
     Place("drive/servo.py", "servo_circuit", "if i != wanted:"): "voltage of a servo at its limit of current",
 }
-# Branches whose lanes must agree. Where they do not, the lanes are evaluated one by one.
+# Branches whose lanes must agree. If they do not, the lanes are evaluated one by one.
 FALLBACK = {
     Place(
         "contact/delassus.py", "solve_small", "if p == 1 and abs(small[0, 0, 0]) > state[0, ka.ROW_FLOOR]:"
@@ -68,16 +68,16 @@ FALLBACK = {
         "if agreement < -NO_FORCE * largest or (agreement <= NO_FORCE * largest and rows[k, ka.SIGN] < 0.0):",
     ): "search for the signs of dissipative friction",
 }
-# Branches on time, which is one number for all lanes. Lanes at times of their own must lie in one segment.
+# Branches on time, which is one number for all lanes. Lanes at separate times must be in one segment.
 TIME = {
     Place("drive/law.py", "evaluate_reference", "segment = min(max(int(x / spacing), 0), c.shape[0] - 1)"): SEGMENT,
     Place("drive/law.py", "fed_forward", "k = min(max(int(x / grid[1]), 0), voltage.shape[0] - 1)"): SEGMENT,
     Place("tree/loads.py", "segment_start", "if t < loads.data[first] or t >= end:"): SEGMENT,
     Place("tree/loads.py", "segment_start", "if loads.data[first + middle * SEGMENT_SIZE] <= t:"): SEGMENT,
 }
-# Lines that no state comes to, as far as is known; they do not branch.
+# Lines that no known state reaches; they do not branch.
 AGAIN = "M* begins with the signs that the articulated solve has found: only rounding could turn one"
-# Real contact has forms of its own, which test_lanes_compiled runs; bodies that are more than points have no lanes.
+# Unilateral contact has separate forms, which test_lanes_compiled runs; bodies larger than points have no lanes.
 WITHOUT_LANES = (admissible_forces, slide_direction, shaped_rows, solve_near_shares, solve_dependent)
 UNILATERAL = "the cases here are of the bilateral law"
 NEVER = {
@@ -124,7 +124,7 @@ FORMS = {
 
 
 def spread(case: Case, rng: np.random.Generator) -> list[np.ndarray]:
-    """N states about that of the case."""
+    """N states around the state of the case."""
     scale = np.where(np.arange(len(case.y)) < case.compiled.system.layout.tracked, case.spread, 0.0)
     return [case.y + scale * rng.normal(size=len(case.y)) for _ in range(N)]
 
@@ -146,7 +146,7 @@ def union(sets: Iterable[set[Any]]) -> set[Any]:
 
 @pytest.mark.parametrize("name", [*CASES, *TIMED])
 def test_a_lane_gets_what_a_run_of_its_own_gets(name):
-    """Derivative and workspace, to the bit, with FORMS in place of what they are selects of."""
+    """Derivative and workspace are bit-identical, with FORMS in place of the kernels that they replace."""
     case = (CASES | TIMED)[name]()
     states = spread(case, np.random.default_rng(99))
     times = [case.t + k * case.t_step for k in range(N)]
@@ -161,7 +161,7 @@ def test_a_lane_gets_what_a_run_of_its_own_gets(name):
 
 
 def test_every_line_of_the_right_hand_side_runs(notes):
-    """So no branch is missing below because no case comes to it."""
+    """So no branch is missing below because no case reaches it."""
     ran = union(note.lines for note in notes.values())
     reached = union(lanes.lines(function) for function in lanes.reached(system.derivative, WITHOUT_LANES))
     assert len(reached) > 500

@@ -1,7 +1,7 @@
 """Sharing of redundant contact forces (splits), and second-order-cone programs: tests of optimality.
 
-A split has the least norm among those in all friction cones; if there is none, it has the largest worst margin
-μ f_n − |f_t|. Results are checked by conditions of optimality and against other solvers.
+A split has the least norm among the splits in all friction cones; if no split is in all cones, it has the largest worst
+margin μ f_n − |f_t|. Results are checked by conditions of optimality and against other solvers.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def random_split(rng: np.random.Generator, r: int, c: int, feasible: bool):
 
 @given(seeds)
 def test_null_spaces_are_orthonormal_and_whole(seed):
-    """Of B Bᵀ with B (p, rank): p − rank columns that W takes to zero; in a room that is too large."""
+    """The null space of B Bᵀ, B (p, rank), has p − rank columns, which W maps to zero; in arrays that are too large."""
     rng = np.random.default_rng(seed)
     p = int(rng.integers(1, 9))
     rank = int(rng.integers(0, p + 1))
@@ -150,7 +150,7 @@ def test_contact_without_friction_takes_no_tangential_force():
 
 
 def test_two_walls_may_be_pressed_apart_without_limit():
-    """An inner force raises both margins for ever: the margin is cut off, the force is the least that holds."""
+    """An inner force raises both margins without limit: the margin is cut off, the force is the least that holds."""
     f0, first, mu = np.array([0.0, 1.0, 0.0, 0.0, 1.0, 0.0]), np.array([0, 3]), np.array([0.5, 0.5])
     margin, out = split(f0, np.array([[1.0, 0, 0, 1.0, 0, 0]]).T, first, mu)
     assert margin == pytest.approx(10.0, rel=1e-9)

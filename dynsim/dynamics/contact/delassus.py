@@ -21,8 +21,8 @@ RANK_TOLERANCE = 1e-10
 def solve_small(small, state, active, p):
     """Solve the leading p×p of ``small[0]`` f = RHS for the constraint forces f, into the FORCE column of ``state``.
 
-    Gaussian elimination with partial pivoting. Where a pivot vanishes, :func:`least_norm` solves the system anew and
-    gives the split of least norm among dependent rows. Returns 1 in that case, else 0.
+    Gaussian elimination with partial pivoting. If a pivot vanishes, :func:`least_norm` solves the system again and
+    gives the split of least norm among dependent rows. Returns 1 in that case, otherwise 0.
 
     Parameters
     ----------
@@ -88,14 +88,14 @@ def solve_dependent(small, state, active, p):
     """:func:`solve_small` of rows that are known to depend on each other.
 
     Pivots of columns in their order may not show it: the last one is the inverse of an entry of the inverse, large for
-    a row that has next to no part in what is dependent. Forces would be as large as rounding lets them.
+    a row with almost no part in the dependence. Forces would be as large as rounding allows.
     """
     return least_norm(small, state, active, p, largest_entry(small, state, p))
 
 
 @internal_kernel
 def largest_entry(small, state, p):
-    """What pivots are compared with."""
+    """Return the size that pivots are compared with."""
     largest = 0.0
     for i in range(p):
         # A row without mobility is dependent even if no other row has more.
@@ -107,15 +107,15 @@ def largest_entry(small, state, p):
 
 @internal_kernel
 def least_norm(small, state, active, p, largest):
-    """Least-squares solution of least norm; returns 1 where rows depend on each other, else 0.
+    """Find the least-squares solution of least norm; return 1 if rows depend on each other, otherwise 0.
 
     Elimination with rook pivoting (the largest entry of its row and of its column) leaves P A Q = [L1; L2] [U1, U2] of
-    rank r. With W = L2 L1⁻¹ and Z = U1⁻¹ U2, whose entries such pivots keep small, where those of :func:`eliminate` do
-    not,
+    rank r. With W = L2 L1⁻¹ and Z = U1⁻¹ U2, whose entries such pivots keep small, unlike the pivots of
+    :func:`eliminate`,
 
         [L1; L2]⁺ b = L1⁻¹ (b1 + N(Wᵀ) (b2 − W b1)),    [U1, U2]⁺ c = (x1, Zᵀ x1),  x1 = s − N(Z) Zᵀ s,  s = U1⁻¹ c
 
-    with N(X) = X (1 + Xᵀ X)⁻¹, and x = Q [U1, U2]⁺ [L1; L2]⁺ P b. Of b elimination leaves L1⁻¹ b1 and b2 − W b1.
+    with N(X) = X (1 + Xᵀ X)⁻¹, and x = Q [U1, U2]⁺ [L1; L2]⁺ P b. Elimination turns b into L1⁻¹ b1 and b2 − W b1.
     """
     matrix, wide, part = small[1], small[2], small[3, p - 1]
     for i in range(p):
@@ -168,9 +168,9 @@ def least_norm(small, state, active, p, largest):
 def eliminate_to_rank(small, state, active, p, largest):
     """Rank of ``small[1]`` by its elimination; multipliers stay below the diagonal.
 
-    ``largest``: of the entries of ``small[0]``.
+    ``largest``: size of the largest entry of ``small[0]``, see :func:`largest_entry`.
 
-    A column without a pivot goes to the end and is done with: what elimination adds to it is no larger.
+    A column without a pivot goes to the end and is finished: elimination would not add larger terms to it.
     """
     matrix = small[1]
     for i in range(p):
@@ -246,7 +246,7 @@ def multiply_transposed(wide, state, r, d):
 def apply_normal(small, state, p, r):
     """X (1 + Xᵀ X)⁻¹ t = (1 + X Xᵀ)⁻¹ X t by the smaller of the two; X: ``small[2]``, (r, p − r), t: FORCE from r on.
 
-    The result, (r,), in the last row of ``small[3]``; that of ``small[2]``, which X leaves free, is scratch.
+    The result, (r,), goes into the last row of ``small[3]``; the last row of ``small[2]``, free of X, is scratch.
     """
     X, gram, x, t, d = small[2], small[3], small[3, p - 1], small[2, p - 1], p - r
     if d == 1:  # as two braces that stick on a planar arm have it

@@ -36,13 +36,13 @@ def solve_rows(unilateral: UnilateralArrays | None, ws: Workspace, p):
 
 @internal_kernel
 def solve_near_shares(unilateral: UnilateralArrays, ws: Workspace, p):
-    """The forces that are nearest to the shares; on SIMD lanes there is a form of it."""
+    """The forces that are nearest to the shares; SIMD lanes use a variant of this kernel."""
     return solve_nearest(unilateral, ws, p)
 
 
 @noinline_kernel
 def solve_nearest(unilateral: UnilateralArrays, ws: Workspace, p):
-    """:func:`solve_near_shares` of one state; the right-hand side stays."""
+    """:func:`solve_near_shares` for one state; the right-hand side is unchanged."""
     rows, W, share, right = ws.rows, ws.small[0], unilateral.vector[0], unilateral.vector[1]
     for r in range(p):
         slot = share_slot(unilateral, ws, r)
@@ -97,7 +97,7 @@ def some_slide(modes):
 def even_out(unilateral: UnilateralArrays, ws: Workspace):
     """Remove the part without effect on the motion from the shares of sticking points, right after ``derivative``.
 
-    So their split remains the one of least norm, also if other points slide.
+    So their split remains the split of least norm, even if other points slide.
     """
     shares, N, row = unilateral.shares, unilateral.room[ku.NULL_SPACE], unilateral.index[1]
     _, count, p, ties = find_splits(unilateral, ws)

@@ -21,8 +21,8 @@ from dynsim.dynamics.tables import ContactArrays, Workspace
 from dynsim.jit.kernel import internal_kernel
 
 # UnilateralArrays.slide
-REFERENCE = 0  # 3: direction of slip at the start of the step; while FROZEN that with which it began; 0 before any
-FROZEN = 3  # 1: slip is too slow to have a direction of its own, that of REFERENCE stands
+REFERENCE = 0  # 3: direction of slip at the start of the step, or while FROZEN at the start of slip; 0 before any slip
+FROZEN = 3  # 1: slip is too slow to define a direction, so REFERENCE is used
 SPEED = 4  # v_t · REFERENCE [m/s]
 NEXT = 5  # 3: direction at the end of the step
 NEXT_SPEED = 8  # |v_t| there [m/s]
@@ -37,7 +37,7 @@ TIME_OPEN, TIME_SLIDING, TIME_STICKING = 0, 1, 2  # in the order of the modes [s
 LIFT_OFFS, LANDINGS, SLIP_STARTS, BOUNCES = 3, 4, 5, 6
 LOSS = 7  # energy that impacts have taken [J]
 SETTLE = 8  # slower than that a touching point counts as at rest along the normal [m/s]
-WINDOW_START, WINDOW_COUNT = 9, 10  # of the count of events that tells chatter
+WINDOW_START, WINDOW_COUNT = 9, 10  # of the count of events that detects chatter
 CHATTERED = 11  # how often SETTLE was raised because of it
 DEEPEST = 12  # largest depth below the surface [m]
 UNPRESSED = 13  # time for which it stuck although nothing pressed it [s]
@@ -66,7 +66,7 @@ DRY_ROW = 1
 DRY_DRIVE = 2  # whose gear does, -1 for none
 DRY_HOLDS = 3  # 1: it has a row, bounded in time stepping; 0: its force is constant, by the event-driven methods
 DRY_NEXT = 4  # scratch of the choice of modes
-DRY_TOLD = 5  # 1, 0: as the log was last told of it, held or sliding; -1: of nothing yet
+DRY_TOLD = 5  # 1, 0: held or sliding, as last reported to the log; -1: nothing reported yet
 DRY_BRAKE = 6  # of the joint: NEVER_CLOSED, CLOSED, or OPENED again; may be written between steps
 DRY_TABLE_SIZE = 7
 NEVER_CLOSED, CLOSED, OPENED = 0, 1, 2
@@ -84,13 +84,13 @@ TIE_KIND = 3  # BOX, ONE_WAY (A is pushed along the axis), or -1 where it does n
 TIE_HOLDS = 4  # 1: it has a row
 TIE_ROW = 5
 TIE_TABLE_SIZE = 6
-# UnilateralArrays.tie; what it may have is written between steps too
+# UnilateralArrays.tie; its parameters may be written between steps too
 TIE_STIFFNESS, TIE_DAMPING = 0, 1  # [N/m, N s/m; N m/rad, N m s/rad]
 TIE_BOUND = 2  # of a BOX [N or N m]
 TIE_AXIS = 3  # 3: in the axes of A
 TIE_POINT, TIE_OTHER_POINT = 6, 9  # 3 each: on A, on B [m]
 TIE_ATTITUDE = 12  # 9: rotation of B in the axes of A where it is not turned
-TIE_REST = 21  # deflection without force [m or rad]; NaN: what it is when the tie begins
+TIE_REST = 21  # deflection without force [m or rad]; NaN: the deflection at which the tie begins
 TIE_FORCE = 22  # on A along or about the axis [N or N m]
 TIE_STORED = 23  # in its spring [J]
 TIE_GIVEN = 24  # how far its rest has moved since it began, there and back [m or rad]
@@ -98,7 +98,7 @@ TIE_REST_NOW, TIE_STORED_NOW, TIE_AT, TIE_IMPLICIT = 25, 26, 27, 28  # of the st
 TIE_SIZE = 29
 # UnilateralArrays.mode, int: columns
 WANTED, BEFORE, TOUCHING, STRUCK = 0, 1, 2, 3
-GIVES_WAY = 4  # 1: it has come to its static cone, and the kinetic coefficient holds from now on
+GIVES_WAY = 4  # 1: it has reached its static cone, and the kinetic coefficient holds from now on
 LEAVES = 5  # 1: nothing presses it, and the next choice of modes is without it
 TOUCHED = 6  # TOUCHING before a choice of modes
 MODE_SIZE = 7
@@ -112,14 +112,14 @@ INDICES = 6
 SPLIT_MATRIX, NULL_SPACE, PROBLEM, SCRATCH = 0, 1, 2, 3
 ROOM = SCRATCH + kc.CONE_ROOM
 # UnilateralArrays.number
-REDUNDANT = 0  # 1: the rows of what sticks depend on each other
+REDUNDANT = 0  # 1: the rows of sticking points, held joints and stops depend on each other
 BEST_MARGIN = 1  # the worst margin of the best split of their forces [N], where the least norm fits no cones
 SPLIT = 2  # 1: BEST_MARGIN counts at this evaluation
 SLOW = 3  # below this speed the direction of slip is frozen [m/s]
 LAST_CHANGE, CHANGES = 4, 5  # time of the last change of modes, and how many there were at that time
 HOLDING = 6  # share of the friction at rest that counts where modes are chosen; 1 outside of such a choice
 WIDTH = 7  # number of independent splits of the last evaluation with dependent rows, columns of room[NULL_SPACE]
-SHARED = 8  # 1: something slides and rows depend on each other, so that forces go on from ``shares``
+SHARED = 8  # 1: a contact slides and rows depend on each other, so that forces continue from ``shares``
 SPLIT_ROWS = 9  # rows of the last splits, of couplings not counted
 NUMBERS = 10
 
@@ -160,8 +160,8 @@ def kept_size(shares: int, contacts: int, stops: int, joints: int) -> int:
 def slide_direction(unilateral: UnilateralArrays, contacts: ContactArrays, k, x, y, z):
     """Direction of slip of candidate k at tangential velocity (x, y, z), and its coefficient of friction there.
 
-    While FROZEN the direction is that of REFERENCE. Else v_t/|v_t|, with the sign of v_t · REFERENCE: through zero it
-    goes on as it was, so that a step that passes the end of slip is smooth, and the end of slip is where
+    While FROZEN the direction is REFERENCE. Otherwise it is v_t/|v_t| with the sign of v_t · REFERENCE: it does not
+    flip when v_t passes through zero, so that a step that passes the end of slip is smooth, and slip ends where
     v_t · REFERENCE is zero.
     """
     slide = unilateral.slide
@@ -179,7 +179,7 @@ def slide_direction(unilateral: UnilateralArrays, contacts: ContactArrays, k, x,
 
 @internal_kernel
 def stop_gap(unilateral: UnilateralArrays, ws: Workspace, k):
-    """What joint stop k leaves its joint to go, ≥ 0 [rad or m]."""
+    """Distance of its joint from joint stop k, ≥ 0 [rad or m]."""
     stop = unilateral.stop
     return stop[k, SIDE] * ws.joints[unilateral.stop_table[k, STOP_JOINT], ka.Q] - stop[k, LIMIT]
 
@@ -201,13 +201,13 @@ def note_stop_forces(unilateral: UnilateralArrays, ws: Workspace):
 
 @internal_kernel
 def dry_bound(unilateral: UnilateralArrays, k):
-    """Dry friction of joint k of those that have it, of gear and bearing together [N m or N]."""
+    """Dry friction of the k-th joint with dry friction, gear and bearing together [N m or N]."""
     return unilateral.dry[k, OF_GEAR] + unilateral.dry[k, OF_JOINT]
 
 
 @internal_kernel
 def holding_bound(unilateral: UnilateralArrays, k):
-    """Dry friction that may hold joint k of those that have it; while modes are chosen a little less [N m or N]."""
+    """Dry friction that may hold the k-th joint with dry friction; a little less while modes are chosen [N m or N]."""
     return unilateral.number[HOLDING] * dry_bound(unilateral, k)
 
 
@@ -237,7 +237,7 @@ def dry_rests(unilateral: UnilateralArrays, k):
 
 @internal_kernel
 def rub(unilateral: UnilateralArrays | None, ws: Workspace):
-    """Dry friction of the joints without a row, onto what is applied; it is constant within a step."""
+    """Add the dry friction of the joints without a row to the applied forces; it is constant within a step."""
     if unilateral is None:  # known to the compiler
         return
     for k in range(unilateral.dry.shape[0]):
@@ -248,7 +248,7 @@ def rub(unilateral: UnilateralArrays | None, ws: Workspace):
 
 @internal_kernel
 def note_dry_forces(unilateral: UnilateralArrays, ws: Workspace):
-    """Dry friction of all joints that have it, and of gears what it takes from shafts."""
+    """Note the dry friction of all joints that have it, and the drag of gears on their shafts."""
     table, dry = unilateral.dry_table, unilateral.dry
     for k in range(table.shape[0]):
         force, a = -dry[k, DRY_SIDE] * dry_bound(unilateral, k), table[k, DRY_DRIVE]

@@ -27,12 +27,12 @@ from dynsim.jit.simd import every, lanes_of, select
 
 
 def any_lanes(*kinds):
-    """True where any argument has lanes."""
+    """True if any argument has lanes."""
     return lanes_of(*kinds) > 0
 
 
 def times(*kinds):
-    """Where there are several times: t is the third argument."""
+    """True if there are several times: t is the third argument."""
     return lanes_of(kinds[2]) > 0
 
 
@@ -62,7 +62,7 @@ def surface_distance_lanes(value, slope, curvature):
 
 @form_of(solve_small, any_lanes)
 def solve_small_lanes(small, state, active, p):
-    """The closed forms where they hold for all lanes; else the kernel's choice for each of them, added up."""
+    """Use the closed forms if they hold for all lanes, else the kernel for each lane; return the sum of its results."""
     if p == 1 and every(abs(small[0, 0, 0]) > state[0, ka.ROW_FLOOR]):
         state[0, ka.FORCE] = state[0, ka.RHS] / small[0, 0, 0]
         return 0
@@ -100,7 +100,7 @@ def solve_near_shares_lanes(unilateral, ws, p):
 
 @form_of(clearly_unique, any_lanes)
 def all_clearly_unique(ws):
-    """True when it is so of every lane."""
+    """True if every lane is clearly unique."""
     small, p = ws.small, ws.counts[ka.ROWS]
     if p == 0 or p > 2:
         return p == 0
@@ -141,7 +141,7 @@ def admissible_forces_lanes(contacts, unilateral, ws):
 
 @form_of(sign_changed, any_lanes)
 def sign_changed_lanes(ws, passes):
-    """True when any lane's signs have changed. The others keep theirs: once they agree they go on agreeing."""
+    """True if any lane's signs have changed. The other lanes keep theirs: once they agree, they remain in agreement."""
     one_way = False
     for k in range(ws.counts[ka.ROWS]):
         if ws.active[k, ka.LAW] == ka.FRICTION_DISSIPATIVE:

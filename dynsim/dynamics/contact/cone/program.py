@@ -28,12 +28,12 @@ GAP_MIN = 1e-16
 CLOSE, PATIENCE = 1e-9, 2
 # Regularises the Newton system along undetermined directions; the optimum is the same.
 REGULAR = 1e-13
-# Of unknowns whose pivots have lost all digits: this part of what they are the difference of.
+# Smallest pivot of an unknown, relative to its diagonal entry before elimination: a smaller one has lost all digits.
 PIVOT_MIN = 1e-14
-# Pivots of equations below this part of what they are the difference of are dependent; and what they are replaced by.
+# An equation is dependent if its pivot is below this part of the sizes of its terms; −HUGE replaces that pivot.
 RANK_TOLERANCE, HUGE = 1e-10, 1e100
-# Part of the way to the boundary of the cones that a step leaves. With a hundredth of it steps end beside the central
-# path, on the edge of a cone, and the next ones creep along it.
+# Part of the way to the boundary of the cones that a step leaves. With a hundredth of it, steps end off the central
+# path, on the edge of a cone, and the next steps creep along that edge.
 ASIDE = 2e-2
 
 
@@ -64,7 +64,7 @@ LAMBDA, RESIDUAL, TARGET, DS, DZ, SCALED_DS, SCALED_DZ = 0, 1, 2, 3, 4, 5, 6
 
 
 def cone_program(n: int, m: int, cones: int, rows: int) -> ConeProgram:
-    """Allocate a :class:`ConeProgram` for n unknowns, m equations and so many cones of ``rows`` rows altogether."""
+    """Allocate a :class:`ConeProgram` for n unknowns, m equations and ``cones`` cones with ``rows`` rows in total."""
     flat, first = reals(np.zeros(program_size(n, m, cones, rows))), integers(np.zeros(cones + 1))
     return laid_out(flat, first, n, m, cones, rows)
 
@@ -120,10 +120,10 @@ def laid_out(flat, first, n, m, cones, rows):
 
 @kernel
 def solve_cone_program(program: ConeProgram, n, m, cones):
-    """Solve the leading n unknowns, m equations and so many cones from ``program.x``, for which all s must be inside.
+    """Solve the leading n unknowns, m equations and ``cones`` cones from ``program.x``, where all s must be inside.
 
-    Solution and multipliers are left in x, y, s and z. Returns the largest error of the conditions of optimality, s · z
-    included; numbers near 1 make it the relative error of the optimum.
+    Solution and multipliers are left in x, y, s and z. Returns the largest residual of the optimality conditions, s · z
+    included; for numbers near 1 it is the relative error of the optimum.
     """
     x, y, s, z, first = program.x, program.y, program.s, program.z, program.first
     work, step = program.work, program.step
@@ -175,7 +175,7 @@ def solve_cone_program(program: ConeProgram, n, m, cones):
 
 @internal_kernel
 def keep(program: ConeProgram, n, m, cones, store):
-    """Store the present unknowns, or take back those that were stored."""
+    """Store the present unknowns, or restore the stored values."""
     kept, rows = program.kept, program.first[cones]
     position = 0
     for table, size in ((program.x, n), (program.y, m), (program.s, rows), (program.z, rows)):
@@ -189,7 +189,7 @@ def keep(program: ConeProgram, n, m, cones, store):
 
 @internal_kernel
 def start(program: ConeProgram, n, m, cones):
-    """The slacks of x, and multipliers on the central path beside them."""
+    """Set s to the slacks of x, y to zero, and z so that s and z are on the central path."""
     s, z, first = program.s, program.z, program.first
     for e in range(m):
         program.y[e] = 0.0
@@ -226,7 +226,7 @@ def equation(program: ConeProgram, n, e):
 
 @internal_kernel
 def conditions(program: ConeProgram, n, m, cones):
-    """What is left of the conditions of optimality, the largest; that of the slacks into ``work``."""
+    """Return the largest residual of the optimality conditions, s · z included; those of slacks go into ``work``."""
     x, s, z, rows = program.x, program.s, program.z, program.first[cones]
     worst, gap = 0.0, 0.0
     for k in range(n):
@@ -293,7 +293,7 @@ def unscale(program: ConeProgram, c, u):
 def factor_kkt(program: ConeProgram, n, m, rows, cones):
     """L D Lᵀ of [H + Gᵀ W⁻² G + Aᵀ A, Aᵀ; A, 0], kept regular; D on the diagonal, L below it.
 
-    Aᵀ A, which the right-hand side makes up for, gives pivots to what only the equations determine.
+    Aᵀ A, which the right-hand side compensates, gives pivots to unknowns that only the equations determine.
     An equation that depends on those before it gets a pivot that stops its multiplier.
     """
     kkt, scaled = program.kkt, program.scaled
