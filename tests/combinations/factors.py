@@ -41,7 +41,7 @@ FACTORS: dict[str, tuple[str, ...]] = {
 }  # fmt: skip
 METHODS = ("auto", "dopri5", "radau5", "time_stepping")
 METHOD = "method"
-"""A factor of refusals beside those of :data:`FACTORS`."""
+"""A factor of refusals in addition to :data:`FACTORS`."""
 
 
 @dataclass(frozen=True)
