@@ -24,7 +24,7 @@ from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from dynsim.studies import worker as messages
-from dynsim.studies.worker import LOOK_S, START, WorkerError, packed
+from dynsim.studies.worker import LOOK_S, START, STOP_LOOK_S, WorkerError, packed
 from dynsim.system import interruption
 from dynsim.system.interruption import STOP_SIGNALS
 
@@ -38,8 +38,9 @@ Result = TypeVar("Result")
 # they do not depend on the duration of its work; they end where the process is stopped, or compiled code never releases
 # the interpreter's lock.
 SILENT_S, START_S = 60.0, 600.0
-# Longest time until a worker confirms Ctrl-C [s]; then it may take any time to return its results.
-_PATIENCE_S = 0.7
+# Longest time until a worker confirms Ctrl-C [s]; then it may take any time to return its results. Its signs of life
+# measure that time, so that no result is lost where the machine is busy; the second is the limit without signs.
+_PATIENCE_S, _STALLED_S = 0.7, 10.0
 # Interval of the checks for signals [s].
 _SIGNAL_S = 0.1
 # Longest task that is sent to a worker still busy [s]: for longer ones another worker may be free sooner.
@@ -82,6 +83,7 @@ class _Worker:
     tasks : what it has, each with how many processes have lost it: the first in hand, the others wait in the pipe
     ready : after its first sign of life
     heard : of Ctrl-C
+    signs : of life that came after Ctrl-C and did not confirm it
     since : when it began with the first task
     took : how long the last one took [s]
     silent : for how long there were no messages from it [s]
@@ -93,6 +95,7 @@ class _Worker:
     tasks: deque[tuple[Any, int]] = field(default_factory=deque)
     ready: bool = False
     heard: bool = False
+    signs: int = 0
     since: float = 0.0
     took: float = math.inf
     silent: float = 0.0
@@ -281,6 +284,8 @@ class _Pool:
                 worker.is_ready()
             case (messages.HEARD,):
                 worker.heard = True
+            case (messages.ALIVE,):
+                worker.signs += self._stopped is not None
             case (messages.LOG, name, level, text):
                 logging.getLogger(name).log(level, "%s", text)
             case (messages.ANSWER, good, content, leaves):
@@ -319,7 +324,7 @@ class _Pool:
             worker.silent += passed
             if worker.silent > (SILENT_S if worker.ready else START_S):
                 kind: type[WorkerLost] = WorkerSilent
-            elif self._stopped is not None and not worker.heard and clock.monotonic() - self._stopped > _PATIENCE_S:
+            elif self._stopped is not None and not worker.heard and self._is_deaf(worker, self._stopped):
                 kind = WorkerInterrupted
             else:
                 continue
@@ -327,6 +332,14 @@ class _Pool:
             worker.process.kill()
             self._dismiss(worker)
             self._take(task, partial(_raise, kind))
+
+    @staticmethod
+    def _is_deaf(worker: _Worker, stopped: float) -> bool:
+        """Whether a worker that has not confirmed Ctrl-C, which came at ``stopped`` [s], has had the time to do so."""
+        waited = clock.monotonic() - stopped
+        if not worker.ready:
+            return waited > _PATIENCE_S
+        return worker.signs * STOP_LOOK_S > _PATIENCE_S or waited > _STALLED_S
 
 
 def _raise(kind: type[WorkerLost]) -> NoReturn:

@@ -44,7 +44,7 @@ TASK, STOP = "task", "stop"
 READY, ALIVE, HEARD, LOG, ANSWER = "ready", "alive", "heard", "log", "answer"
 
 # Between two signs of life of a worker, and between two looks for what is to be told when it shall stop [s].
-LOOK_S, _STOP_LOOK_S = 0.5, 0.05
+LOOK_S, STOP_LOOK_S = 0.5, 0.05
 
 
 class WorkerError(DynsimError):
@@ -189,7 +189,7 @@ def _give_signs(answers: _Answers, stop: threading.Event) -> None:
     while True:
         answers.send(HEARD if stop.is_set() and interruption.is_kept() else ALIVE)
         if stop.is_set():
-            clock.sleep(_STOP_LOOK_S)
+            clock.sleep(STOP_LOOK_S)
         else:
             stop.wait(LOOK_S)
 

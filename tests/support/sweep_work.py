@@ -67,6 +67,18 @@ def deaf(task: tuple[int, str], look: Progress) -> int:
     return number
 
 
+def attentive(task: tuple[int, str], look: Progress) -> int:
+    """Tells its process that it has begun, and returns the number when it shall stop."""
+    number, folder = task
+    Path(folder, f"begun_{os.getpid()}").touch()
+    try:
+        while True:
+            look(0.0)
+            time.sleep(0.05)
+    except KeyboardInterrupt:
+        return number
+
+
 def leaves(number: int, look: Progress) -> int:
     """One task leaves a thread behind that cannot be ended."""
     if number == DEADLY:

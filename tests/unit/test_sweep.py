@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -21,7 +22,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.colors import to_rgb
 from support.processes import started, wait_for
-from support.sweep_work import DEADLY, REFUSED, deaf, hangs, leaves, once_deadly, slow, square, warned
+from support.sweep_work import DEADLY, REFUSED, attentive, deaf, hangs, leaves, once_deadly, slow, square, warned
 
 import dynsim
 from dynsim.cli import sweep as sweep_command
@@ -298,19 +299,41 @@ def test_ctrl_c_does_not_wait_for_who_does_not_look(tmp_path: Path, monkeypatch:
             result()
         taken[task[0]] = None
 
+    assert interrupted(deaf, tmp_path, take, lambda _: os.kill(os.getpid(), signal.SIGINT)) is True
+    assert taken == {0: None, 1: None}
+
+
+def interrupted(
+    work: Callable[[Any, Any], int], folder: Path, take: Callable[..., None], interrupt: Callable[[list[Path]], None]
+) -> bool:
+    """Give four tasks to two workers, and call ``interrupt`` when both have begun."""
+
+    def wait() -> None:
+        wait_for(lambda: len(list(folder.glob("begun_*"))) == 2)
+        interrupt(list(folder.glob("begun_*")))
+
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
-
-    def interrupt() -> None:
-        wait_for(lambda: len(list(tmp_path.glob("begun_*"))) == 2)
-        os.kill(os.getpid(), signal.SIGINT)
-
-    Thread(target=interrupt, daemon=True).start()
+    Thread(target=wait, daemon=True).start()
     try:
-        tasks = [(number, str(tmp_path)) for number in range(4)]
-        assert run_in_processes(deaf, tasks, 2, take) is True
+        return run_in_processes(work, [(number, str(folder)) for number in range(4)], 2, take)
     finally:
         signal.signal(signal.SIGINT, before)
-    assert taken == {0: None, 1: None}
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="no signal stops a process here")
+def test_ctrl_c_waits_for_a_process_that_gets_no_time(tmp_path: Path):
+    """As on a busy machine: one is stopped for two seconds and returns its result then."""
+    taken: dict[int, int] = {}
+
+    def interrupt(begun: list[Path]) -> None:
+        stalled = int(begun[0].name.removeprefix("begun_"))
+        os.kill(stalled, signal.SIGSTOP)
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(2.0)
+        os.kill(stalled, signal.SIGCONT)
+
+    assert interrupted(attentive, tmp_path, lambda task, result: taken.update({task[0]: result()}), interrupt) is True
+    assert taken == {0: 0, 1: 1}
 
 
 def test_a_process_that_leaves_a_thread_behind_is_replaced():
