@@ -92,6 +92,7 @@ def compile_unilateral(
     slide = np.zeros((c, ku.SLIDE_SIZE))
     slide[:, ku.LANDS_AT] = ku.DEPTH
     stop[:, ku.HIT_AT] = ku.DEPTH
+    stop[:, ku.STOP_SETTLE], stop[:, ku.STOP_WINDOW_START] = SETTLE_SPEED, -np.inf
     tally, number = np.zeros((c, ku.TALLY_SIZE)), np.zeros(ku.NUMBERS)
     tally[:, ku.SETTLE], tally[:, ku.WINDOW_START], number[ku.LAST_CHANGE] = SETTLE_SPEED, -np.inf, -np.inf
     number[ku.SLOW], number[ku.HOLDING] = slow, 1.0

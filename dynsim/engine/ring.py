@@ -58,11 +58,13 @@ def counted_within(prepared: Prepared, happened: Sequence[Event]) -> Prepared:
             if event.kind in _COUNTS and event.name in contacts:
                 tally[contacts[event.name], _COUNTS[event.kind]] += 1.0
         count = len(prepared.stops)
-        stop[:, [ku.HITS, ku.STOP_LOSS]] = 0.0, np.nan
+        stop[:, [ku.HITS, ku.STOP_CHATTERED]], stop[:, ku.STOP_LOSS] = 0.0, np.nan
         stop[:count, ku.CLOSED_TIME] = weights @ (run.outputs("stop")[:, :count] > 0.0)
         for event in happened:
             if event.kind == "stop_hit":
                 stop[_struck(prepared, event), ku.HITS] += 1.0
+            elif event.kind == "chatter" and event.name not in contacts:
+                stop[_struck(prepared, event), ku.STOP_CHATTERED] += 1.0
         system = system._replace(unilateral=unilateral._replace(tally=tally, stop=stop))
     stepping = run.stepping
     if stepping is not None:

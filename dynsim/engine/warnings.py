@@ -104,8 +104,9 @@ def warnings_of(
 def _contact_warnings(
     record: Record, scenario: Scenario, prepared: Prepared, summary: dict[str, Any], begun: float
 ) -> list[str]:
-    """Contacts that chatter, pull, carry nothing or turn their own force against them; friction that gives energy."""
+    """What chatters; contacts that pull, carry nothing or turn their force against themselves; friction that drives."""
     contacts, unilateral, warnings = prepared.contacts, prepared.system.unilateral, list[str]()
+    units = {link.joint: link.units for link in prepared.model.robot.links}
     if unilateral is not None:
         for contact, tally in zip(contacts, unilateral.tally, strict=True):
             if tally[ku.CHATTERED]:
@@ -113,6 +114,12 @@ def _contact_warnings(
                     f"{contact.name}: chatter, more than {ke.MOST_EVENTS} contact events within {ke.WINDOW:g} s; "
                     f"what left more slowly than {tally[ku.SETTLE]:.0e} m/s was kept on the surface"
                 )
+        warnings += [
+            f"{stop.joint}: chatter, more than {ke.MOST_EVENTS} events of its stop within {ke.WINDOW:g} s; "
+            f"what left more slowly than {row[ku.STOP_SETTLE]:.0e} {units[stop.joint][1]} was kept on the stop"
+            for stop, row in zip(prepared.stops, unilateral.stop, strict=True)
+            if row[ku.STOP_CHATTERED]
+        ]
     for contact in summary["contacts"]:
         if contact["normal_force_min_N"] < 0.0:
             warnings.append(

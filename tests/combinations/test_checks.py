@@ -323,6 +323,7 @@ FALSE_WARNINGS = (
     "the energy ledger does not close: residual 1.0e-03 of the turnover; tighten integrator.rtol or the step",
     "friction has put 0.3 J into the arm: an error of the integration; shorten integrator.step_s",
     "tip: chatter, more than 200 contact events within 1 s; what left more slowly was kept on the surface",
+    "bend: chatter, more than 200 events of its stop within 1 s; what left more slowly was kept on the stop",
     "joint_1 9 of 2 A: the current, rms over the run, is more than nominal, which a motor does not stand for long",
     "link_2 passes below floor by more than the link's radius: link_2, of 10 mm, by up to 90 mm in the samples, first",
     "an unknown warning",

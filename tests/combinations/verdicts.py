@@ -449,6 +449,7 @@ def _moved_at_the_start(match: Match, seen: Observed) -> str:
 
 VERIFIERS: dict[str, Callable[[Match, Observed], str]] = {
     rf"^(.+): chatter, more than {NUMBER} contact events within {NUMBER} s": _chatters,
+    rf"^(.+): chatter, more than {NUMBER} events of its stop within {NUMBER} s": _chatters,
     rf"^(.+): the (.+) pulls on this brace for {NUMBER}(?: %)? of the run, with up to {NUMBER} N": _pulls,
     rf"^(.+): this brace never touches the (.+): it carries nothing; nearest {NUMBER} mm": _never_touches,
     r"^(.+): this brace is on the (.+) at (.+), but never pressed": _never_pressed,

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog, minimize, minimize_scalar
 
 from dynsim.dynamics.contact.cone.program import cone_program, solve_cone_program
-from dynsim.dynamics.contact.cone.socp import best_split, split_room
+from dynsim.dynamics.contact.cone.socp import best_split, split_room, widest_split
 from dynsim.dynamics.contact.splits import ONE_WAY, null_space
 from dynsim.jit.kernel import integers, reals
 
@@ -197,6 +197,19 @@ def test_a_joint_that_carries_nothing_does_not_end_the_search(seed):
     margin = best_split(reals(f0), reals(N), 1, integers(np.array([0, 3, 4, 5])), mu, 1, 3, out, split_room(1, 4))
     assert margin == pytest.approx(0.002, abs=1e-9)
     assert abs(out[4]) <= 0.234 * (1.0 + 1e-9)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_widest_split_has_the_best_margin(seed):
+    """Of contacts whose friction all suffices: the least force is on some cone, the widest split far from all."""
+    r, c = 3, 3
+    f0, N, first, mu = random_split(np.random.default_rng(seed), r, c, True)
+    best, least = split(f0, N, first, mu)
+    out = np.full(len(f0), np.nan)
+    margin = widest_split(reals(f0), reals(N), r, integers(first), reals(mu), c, 0, out, split_room(r, c))
+    assert margin == pytest.approx(best, rel=1e-12)
+    assert margins(out, first, mu).min() == pytest.approx(margin, rel=1e-5)
+    assert margins(least, first, mu).min() <= margin * (1.0 + 1e-6)
 
 
 @pytest.mark.parametrize("seed", range(20))

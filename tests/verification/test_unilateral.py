@@ -294,6 +294,38 @@ def test_a_joint_that_leaves_from_a_little_beyond_its_stop_has_not_hit_it():
     np.testing.assert_allclose(run.states("q")[-1], 0.5 * np.pi, rtol=0, atol=1e-9)
 
 
+@pytest.mark.parametrize("method", ["dopri5", pytest.param("radau5", marks=pytest.mark.slow)])
+def test_two_masses_that_kick_each_other_off_their_stops_come_to_rest(method):
+    """Mass 1 rests on its stop; mass 2, pushed up from it, hits the stop between them, and both fly, with r v for v.
+
+    Both land, mass 1 stops, and mass 2 leaves the other stop at r v, r = m₂/(m₁ + m₂). So each turn takes 2 r v (1/A +
+    1/a) with the acceleration a of mass 2 alone and A of both: a geometric series.
+    """
+    m1, m2, mass, gap = 0.1, 1.5, 1.6, 1e-4
+    push = 0.5 * (m2 + mass) * G
+    a, A, r = push / m2 - G, G - push / mass, m2 / mass
+    links = tuple(
+        Link(name, f"slide_{name}", parent, "prismatic", np.array([0.0, 0.0, 1.0]), Inertia(m), **limits)
+        for name, parent, m, limits in (("low", None, m1, {"lower": 0.0}), ("high", "low", m2, {"upper": 0.0}))
+    )
+    force = np.zeros((1, 6, 4))
+    force[0, 2, 0] = push
+    load = Load("push", "high", np.zeros(3), False, np.array([0.0, 1.0]), force, True)
+    b = assemble(Robot("masses", links, (), ("high", np.zeros(3))), [], loads=[load], real=True)
+    speed = np.sqrt(2.0 * a * gap)
+    end = speed / a + 2.0 * speed * r / (1.0 - r) * (1.0 / A + 1.0 / a)
+    run = b.simulate(b.state(np.array([0.0, -gap]), np.zeros(2)), np.array([0.0, end, end + 0.01]), method)
+    assert run.count[ki.STATUS] == ki.FINISHED
+    turns = np.log(SETTLE_SPEED / speed) / np.log(r)
+    logged = int(run.count[ki.LOGGED])
+    assert 4.0 * (turns - 3.0) < logged < 4.0 * (turns + 3.0)
+    assert run.log_time[logged - 1] == pytest.approx(end, abs=4.0 * SETTLE_SPEED * r / (1.0 - r) * (1.0 / A + 1.0 / a))
+    np.testing.assert_allclose(run.states("q")[-1], 0.0, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(np.abs(run.outputs("stop")[-1]), [mass * G - push, push - m2 * G], rtol=1e-6)
+    # Each landing is lifted by what it is too deep, ku.DEPTH.
+    assert residual_with_load(b, run) < 2.0 * logged * ku.DEPTH * mass * G
+
+
 def test_a_closed_stop_that_pulls_disagrees_with_its_mode():
     """Each of two stops alone, and none that is open."""
     link = replace(pendulum().links[0], lower=-1.0, upper=1.0)

@@ -59,7 +59,9 @@ STOP_LOSS = 4  # [J]
 CLOSED_TIME = 5  # [s]
 HIT_AT = 6  # depth beyond the limit at which the joint hits the stop: DEPTH, or more if it left from there [rad or m]
 STOP_GAP_THEN, STOP_RATE_THEN = 7, 8  # at the start of the step [rad, rad/s; m, m/s]
-STOP_SIZE = 9
+STOP_SETTLE = 9  # slower than that a joint that an impact drives off its stop stays on it [rad/s or m/s]
+STOP_WINDOW_START, STOP_WINDOW_COUNT, STOP_CHATTERED = 10, 11, 12  # as of a candidate
+STOP_SIZE = 13
 # UnilateralArrays.dry_table, int
 DRY_JOINT = 0  # link whose joint rubs
 DRY_ROW = 1

@@ -29,12 +29,11 @@ from dynsim.integrators.contacts.leaving import approach_without_force, watch_un
 from dynsim.integrators.contacts.modes import (
     begin_slip,
     drops,
-    hold_free_joints,
     note_headway,
     resolve,
     slip_on,
-    some_rest_without_row,
 )
+from dynsim.integrators.contacts.resting import hold_free_joints, some_rest_without_row
 from dynsim.integrators.run import Run
 from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
@@ -49,9 +48,10 @@ GAP_THEN, RATE_THEN, NORMAL_THEN, POSITION_THEN = 0, 1, 2, 5
 
 # A candidate that starts, or comes to rest, this close to its surface touches it [m].
 TOUCH = 1e-9
-# More events of a candidate than MOST_EVENTS in WINDOW [s] are chatter; SETTLE grows tenfold then, up to MOST_SETTLE.
+# More events of a candidate or stop than MOST_EVENTS in WINDOW [s] are chatter; the speed below which impacts settle
+# grows tenfold then, up to MOST_SETTLE [m/s or rad/s].
 WINDOW, MOST_EVENTS, MOST_SETTLE = 1.0, 200, 1e-2
-# More changes at one instant, which lasts INSTANT [s], or more chatter at one candidate than this end the run.
+# More changes at one instant, which lasts INSTANT [s], or more chatter of one candidate or stop than this end the run.
 MOST_CHANGES, MOST_CHATTER = 60, 100
 INSTANT = 1e-11
 # A point that slips against its direction at less than this has not stopped yet [m/s]: if a point begins to slip with
@@ -425,17 +425,38 @@ def tell(system: System, run: Run, k, kind):
         tally[k, ku.SLIP_STARTS] += 1.0
     elif kind == BOUNCE:
         tally[k, ku.BOUNCES] += 1.0
-    if run.clock[ki.TIME] - tally[k, ku.WINDOW_START] > WINDOW:
-        tally[k, ku.WINDOW_START], tally[k, ku.WINDOW_COUNT] = run.clock[ki.TIME], 0.0
-    tally[k, ku.WINDOW_COUNT] += 1.0
-    if tally[k, ku.WINDOW_COUNT] > MOST_EVENTS:
-        if tally[k, ku.CHATTERED] == 0.0:
-            log(run, ki.CONTACT_LOG + LOG_KINDS * k + CHATTERS)
-        tally[k, ku.CHATTERED] += 1.0
-        tally[k, ku.SETTLE] = min(10.0 * tally[k, ku.SETTLE], MOST_SETTLE)
-        tally[k, ku.WINDOW_START], tally[k, ku.WINDOW_COUNT] = run.clock[ki.TIME], 0.0
-        if tally[k, ku.CHATTERED] > MOST_CHATTER:
-            run.count[ki.STATUS] = ki.CHATTER
+    if chatters(run, tally, k, ku.WINDOW_START, ku.WINDOW_COUNT, ku.CHATTERED, ku.SETTLE):
+        log(run, ki.CONTACT_LOG + LOG_KINDS * k + CHATTERS)
+
+
+@internal_kernel
+def tell_stop(system: System, run: Run, k, kind):
+    """Log that a joint hits or leaves stop k, count hits, and watch for chatter."""
+    stop = system.unilateral.stop
+    log(run, ki.STOP_LOG + LOG_KINDS * k + kind)
+    if kind == STOP_HIT:
+        stop[k, ku.HITS] += 1.0
+    if chatters(run, stop, k, ku.STOP_WINDOW_START, ku.STOP_WINDOW_COUNT, ku.STOP_CHATTERED, ku.STOP_SETTLE):
+        log(run, ki.STOP_LOG + LOG_KINDS * k + CHATTERS)
+
+
+@internal_kernel
+def chatters(run: Run, table, k, start, count, chattered, settle):
+    """Count an event of row k, whose columns follow; True if it is the first too many in a WINDOW.
+
+    Each such one lets impacts settle from a higher speed.
+    """
+    if run.clock[ki.TIME] - table[k, start] > WINDOW:
+        table[k, start], table[k, count] = run.clock[ki.TIME], 0.0
+    table[k, count] += 1.0
+    if table[k, count] <= MOST_EVENTS:
+        return False
+    table[k, chattered] += 1.0
+    table[k, settle] = min(10.0 * table[k, settle], MOST_SETTLE)
+    table[k, start], table[k, count] = run.clock[ki.TIME], 0.0
+    if table[k, chattered] > MOST_CHATTER:
+        run.count[ki.STATUS] = ki.CHATTER
+    return table[k, chattered] == 1.0
 
 
 @internal_kernel
@@ -462,10 +483,9 @@ def log_changes(system: System, ws: Workspace, run: Run):
         # A joint may be driven away from its stop in the instant of its hit.
         struck = table[k, ku.STOP_STRUCK] == 1
         if not before and (closed or struck):
-            unilateral.stop[k, ku.HITS] += 1.0
-            log(run, ki.STOP_LOG + LOG_KINDS * k + STOP_HIT)
+            tell_stop(system, run, k, STOP_HIT)
         if not closed and (before or struck):
-            log(run, ki.STOP_LOG + LOG_KINDS * k + STOP_LEFT)
+            tell_stop(system, run, k, STOP_LEFT)
 
 
 @internal_kernel
@@ -527,7 +547,7 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
                 if split and unilateral.stop[k, ku.STOP_FORCE] > unilateral.number[ku.BEST_MARGIN] + split_slack(ws):
                     continue
                 table[k, ku.STOP_CLOSED] = 0
-                log(run, ki.STOP_LOG + LOG_KINDS * k + STOP_LEFT)
+                tell_stop(system, run, k, STOP_LEFT)
             else:
                 by_hand = False
         elif kind == DRY_GUARD:

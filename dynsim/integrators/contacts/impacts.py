@@ -93,13 +93,13 @@ def find_touching(system: System, ws: Workspace, touch):
 
 @internal_kernel
 def keep_touching(unilateral: UnilateralArrays, ws: Workspace):
-    """Release points that leave faster than SETTLE, and stops that leave, after an impact or the closing of a brake."""
+    """Release points and joints that leave faster than they settle, after an impact or the closing of a brake."""
     state, mode, table = ws.contacts, unilateral.mode, unilateral.stop_table
     for k in range(mode.shape[0]):
         if state[k, ka.GAP_RATE] > unilateral.tally[k, ku.SETTLE]:
             mode[k, ku.TOUCHING] = 0
     for k in range(table.shape[0]):
-        if stop_rate(unilateral, ws, k) > STRIKE * kp.RATE_TOLERANCE:
+        if stop_rate(unilateral, ws, k) > unilateral.stop[k, ku.STOP_SETTLE]:
             table[k, ku.STOP_CLOSED] = 0
 
 

@@ -19,14 +19,12 @@ from dynsim.dynamics import state as kst
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.cone import problem as kc
-from dynsim.dynamics.contact.delassus import RANK_TOLERANCE, solve_small
+from dynsim.dynamics.contact.delassus import solve_small
 from dynsim.dynamics.contact.rows import set_modes
 from dynsim.dynamics.contact.shares import even_out, share_slot, some_slide
 from dynsim.dynamics.contact.splits import find_splits
 from dynsim.dynamics.contact.unilateral import (
     UnilateralArrays,
-    dry_bound,
-    dry_rests,
     dry_rows_held,
     holding_bound,
     slide_direction,
@@ -46,6 +44,7 @@ from dynsim.integrators.contacts.impacts import (
     slip_speed,
     solve_problem,
 )
+from dynsim.integrators.contacts.resting import mobility, release_dependent_joints
 from dynsim.integrators.project import RATE_TOLERANCE, project_level
 from dynsim.integrators.run import Run
 from dynsim.jit.kernel import internal_kernel, noinline_kernel
@@ -57,17 +56,12 @@ SLIP_TOLERANCE = 1e-8
 NEARLY_AT_REST = 1e-5
 # A friction force this close to the cone, as a fraction, counts as on it.
 ON_CONE = 1e-7
-# Largest share of its friction that a joint at rest may have: all but a rounding, to distinguish it from a sliding one.
-NEARLY_ALL = 1.0 - 1e-15
 # Which joints with dry friction a choice of modes holds: all slow joints; the same, unless their rates contradict other
 # closed rows; only joints at rest.
 HOLD_SLOW, HOLD_COMPATIBLE, HOLD_RESTING = 0, 1, 2
 # Holding heavy joints may change the rates of light joints by a multiple of the rate lost; if joints geared to the held
 # ones lose more than this multiple, the held joints were not at rest.
 MOST_CHANGE = 100.0
-# Share of a joint's mobility that other rows leave: below NEARLY_DEPENDENT no friction could hold the joint by a row;
-# below ROUNDING its row depends on the other rows.
-NEARLY_DEPENDENT, ROUNDING = 1e-6, 1e-12
 
 
 @internal_kernel
@@ -152,10 +146,10 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
         evaluate(system, ws, run)
         return True
     take_solution(system, ws, size, largest)
+    release_dependent_joints(system, ws, size)
     for i in range(size):
         slot = share_slot(unilateral, ws, unilateral.index[ku.TABLE_ROW, i])
         unilateral.shares[slot] = unilateral.vector[ku.SOLUTION, i]
-    release_dependent_joints(system, ws)
     # Remove residual rates after an impact that was allowed to settle, and of points that were solved for as if at
     # rest: a point that begins to slip could otherwise move against its given direction, stop, and begin again. A point
     # that moves along it keeps its rate: it would never get under way if events of other points came too often.
@@ -289,15 +283,6 @@ def stops_others(unilateral: UnilateralArrays, ws: Workspace):
 
 
 @internal_kernel
-def mobility(ws: Workspace, r, s):
-    """Change of the rate along row r by a unit impulse along row s."""
-    total = 0.0
-    for i in range(ws.joints.shape[0]):
-        total += ws.column[i, 1 + 2 * r] * ws.column[i, 1 + 2 * s] * ws.links[i, ka.INVERSE_D]
-    return total
-
-
-@internal_kernel
 def hold_slow_joints(unilateral: UnilateralArrays, ws: Workspace):
     """Hold the joints that do not move where they are, by dry friction; the others keep sliding as they move.
 
@@ -335,149 +320,12 @@ def let_joints_slide(system: System, size, largest):
 
 
 @internal_kernel
-def release_dependent_joints(system: System, ws: Workspace):
-    """Give joints at rest that sliding contacts or stops hold the constant force of the solution instead of a row.
-
-    Such a row depends on the normal rows, and how they share a force changes the friction of sliding points: no split
-    of the right-hand side equals the solution. Splits do not account for stops either: half of a stop's force would go
-    to the row, however far beyond the bound. At rest Coulomb's law admits any force within the bound. Rows that depend
-    only on rows of sticking points and other joints remain, see :mod:`dynsim.dynamics.contact.splits`, except rows
-    that depend on them only nearly: holding such a joint would take forces beyond all bounds, and the order of pivots
-    would decide whether it is held.
-    """
-    unilateral, W = system.unilateral, ws.small[0]
-    table, mode, bare, whole = unilateral.dry_table, unilateral.mode, 0, 0
-    bare_factor, whole_factor = unilateral.room[ku.SPLIT_MATRIX], unilateral.room[ku.NULL_SPACE]
-    bare_row, whole_row = unilateral.index[0], unilateral.index[1]
-    blocked = False
-    for k in range(mode.shape[0]):
-        blocked = blocked or mode[k, ku.WANTED] == ka.SLIDING
-    for k in range(unilateral.stop_table.shape[0]):
-        blocked = blocked or unilateral.stop_table[k, ku.STOP_CLOSED] == 1
-    if table.shape[0] == 0:
-        return
-    for r in range(system.couplings.joint.shape[0]):
-        bare = extended(bare_factor, W, bare_row, bare, r)
-    for k in range(mode.shape[0]):
-        for s in range(3 if mode[k, ku.WANTED] == ka.STICKING else 0):
-            bare = extended(bare_factor, W, bare_row, bare, ws.active[k, ka.FIRST_ROW] + s)
-    for i in range(bare):
-        whole = extended(whole_factor, W, whole_row, whole, bare_row[i])
-    for k in range(unilateral.stop_table.shape[0]):
-        if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
-            whole = extended(whole_factor, W, whole_row, whole, unilateral.stop_table[k, ku.STOP_ROW])
-    for k in range(mode.shape[0]):
-        if mode[k, ku.WANTED] == ka.SLIDING:
-            whole = extended(whole_factor, W, whole_row, whole, ws.active[k, ka.FIRST_ROW])
-    for k in range(table.shape[0]):
-        if table[k, ku.DRY_NEXT] == 0:
-            continue
-        r = table[k, ku.DRY_ROW]
-        alone = mobility_left(bare_factor, W, bare_row, bare, r) / W[r, r]
-        among_all = mobility_left(whole_factor, W, whole_row, whole, r) / W[r, r]
-        blocks = blocked and alone > RANK_TOLERANCE and among_all <= NEARLY_DEPENDENT
-        if blocks or ROUNDING < alone <= NEARLY_DEPENDENT:
-            rest_without_row(unilateral, k)
-        else:
-            bare, whole = extended(bare_factor, W, bare_row, bare, r), extended(whole_factor, W, whole_row, whole, r)
-
-
-@internal_kernel
 def goes_along(unilateral: UnilateralArrays, ws: Workspace, k):
     """True if candidate k slips, however slowly, in its given direction."""
     along = 0.0
     for s in range(3):
         along += unilateral.slide[k, ku.REFERENCE + s] * ws.contacts[k, ka.SLIP_VELOCITY + s]
     return along > 0.0
-
-
-@internal_kernel
-def rest_without_row(unilateral: UnilateralArrays, k):
-    """Keep dry-friction joint k at rest with the constant force that it has in the solution."""
-    # Rows of joints come first, so that they are the same in the reduced problem.
-    share = -unilateral.vector[ku.SOLUTION, unilateral.dry_table[k, ku.DRY_ROW]] / dry_bound(unilateral, k)
-    unilateral.dry_table[k, ku.DRY_NEXT] = 0
-    unilateral.dry[k, ku.DRY_SIDE] = min(max(share, -NEARLY_ALL), NEARLY_ALL)
-
-
-@noinline_kernel
-def hold_free_joints(system: System, ws: Workspace, run: Run, begins):
-    """Give rows to the joints that rest with a constant force and that contacts and stops no longer hold.
-
-    Called after single modes have changed, at the end of an accepted step. If slip ``begins`` somewhere, a joint whose
-    force is all of its friction moves with the contact or stop that held it: with a row it would stick, and break loose
-    at once.
-    """
-    unilateral, y = system.unilateral, run.y
-    table, dry, mode = unilateral.dry_table, unilateral.dry, unilateral.mode
-    W, factor, row = ws.small[0], unilateral.room[ku.SPLIT_MATRIX], unilateral.index[0]
-    for k in range(table.shape[0]):
-        rests = abs(ws.joints[table[k, ku.DRY_JOINT], ka.QD]) <= unilateral.number[ku.SLOW]
-        moves = begins and abs(dry[k, ku.DRY_SIDE]) >= 1.0 - FORCE_TOLERANCE
-        free = rests_without_row(unilateral, k) and rests and not moves
-        table[k, ku.DRY_NEXT] = 1 if free else 0
-        if free:
-            table[k, ku.DRY_HOLDS], dry[k, ku.DRY_AT] = 1, ws.joints[table[k, ku.DRY_JOINT], ka.Q]
-    set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
-    evaluate(system, ws, run)
-    p, count = ws.counts[ka.ROWS], 0
-    for r in range(p):
-        for s in range(p):
-            W[r, s] = mobility(ws, r, s)
-    # Rows of the joints in question come last.
-    for r in range(p):
-        index = -1
-        for k in range(table.shape[0]):
-            if table[k, ku.DRY_NEXT] == 1 and table[k, ku.DRY_ROW] == r:
-                index = k
-        if index < 0:
-            count = extended(factor, W, row, count, r)
-    for k in range(table.shape[0]):
-        if table[k, ku.DRY_NEXT] == 1:
-            more = extended(factor, W, row, count, table[k, ku.DRY_ROW])
-            table[k, ku.DRY_HOLDS], count = 1 if more > count else 0, more
-    set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
-    evaluate(system, ws, run)
-    y[system.layout.loss + kst.IMPACT_LOSS] += project_level(system, ws, y, 1)
-
-
-@internal_kernel
-def some_rest_without_row(unilateral: UnilateralArrays):
-    """True if a joint rests with a constant force."""
-    resting = 0
-    for k in range(unilateral.dry_table.shape[0]):
-        resting += 1 if rests_without_row(unilateral, k) else 0
-    return resting > 0
-
-
-@internal_kernel
-def rests_without_row(unilateral: UnilateralArrays, k):
-    """True if dry-friction joint k rests with a constant force and without a closed brake."""
-    table = unilateral.dry_table
-    return table[k, ku.DRY_HOLDS] == 0 and table[k, ku.DRY_BRAKE] != ku.CLOSED and dry_rests(unilateral, k)
-
-
-@internal_kernel
-def extended(factor, W, row, count, r):
-    """Extend a Cholesky factor of rows ``row[:count]`` of W by row r, unless it depends on them; return the count."""
-    square = mobility_left(factor, W, row, count, r)
-    if not square > RANK_TOLERANCE * W[r, r]:
-        return count
-    factor[count, count], row[count] = math.sqrt(square), r
-    return count + 1
-
-
-@internal_kernel
-def mobility_left(factor, W, row, count, r):
-    """Return the mobility W along row r that the rows of a factor leave; write row ``count`` of the factor, for r."""
-    square = W[r, r]
-    for i in range(count):
-        total = W[r, row[i]]
-        for j in range(i):
-            total -= factor[count, j] * factor[i, j]
-        factor[count, i] = total / factor[i, i]
-        square -= factor[count, i] * factor[count, i]
-    return square
 
 
 @internal_kernel

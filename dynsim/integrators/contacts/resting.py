@@ -1,0 +1,263 @@
+"""Joints at rest that dry friction holds by a constant force instead of a row, because other rows hold them too.
+
+How such a joint and the others share the load is open. The choice of modes gives one solution; of all with the same
+motion, the joint takes its force from the one with the largest worst margin. At the bound of another joint's friction
+the next change of forces would end the share, and modes would be chosen again without end.
+"""
+
+from __future__ import annotations
+
+import math
+
+from dynsim.dynamics import state as kst
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact import unilateral as ku
+from dynsim.dynamics.contact.cone import problem as kc
+from dynsim.dynamics.contact.cone.socp import split_room_in, widest_split
+from dynsim.dynamics.contact.delassus import RANK_TOLERANCE
+from dynsim.dynamics.contact.rows import set_modes
+from dynsim.dynamics.contact.splits import ONE_WAY, null_space
+from dynsim.dynamics.contact.unilateral import UnilateralArrays, dry_bound, dry_rests, dry_rows_held
+from dynsim.dynamics.derivative import System
+from dynsim.dynamics.tables import Workspace
+from dynsim.integrators.contacts.impacts import FORCE_TOLERANCE, evaluate
+from dynsim.integrators.project import project_level
+from dynsim.integrators.run import Run
+from dynsim.jit.kernel import internal_kernel, noinline_kernel
+
+# Largest share of its friction that a joint at rest may have: all but a rounding, to distinguish it from a sliding one.
+NEARLY_ALL = 1.0 - 1e-15
+# Share of a joint's mobility that other rows leave: below NEARLY_DEPENDENT no friction could hold the joint by a row;
+# below ROUNDING its row depends on the other rows.
+NEARLY_DEPENDENT, ROUNDING = 1e-6, 1e-12
+# In DRY_NEXT: rests without a row from now on.
+RELEASED = 2
+
+
+@internal_kernel
+def release_dependent_joints(system: System, ws: Workspace, size):
+    """Give joints at rest that sliding contacts or stops hold the constant force of the solution instead of a row.
+
+    Such a row depends on the normal rows, and how they share a force changes the friction of sliding points: no split
+    of the right-hand side equals the solution. At rest Coulomb's law admits any force within the bound. Rows that
+    depend only on rows of sticking points and other joints remain, see :mod:`dynsim.dynamics.contact.splits`, except
+    rows that depend on them only nearly: holding such a joint would take forces beyond all bounds, and the order of
+    pivots would decide whether it is held. ``size`` is that of the solved problem.
+    """
+    unilateral, W = system.unilateral, ws.small[0]
+    table, mode, bare, whole = unilateral.dry_table, unilateral.mode, 0, 0
+    bare_factor, whole_factor = unilateral.room[ku.SPLIT_MATRIX], unilateral.room[ku.NULL_SPACE]
+    bare_row, whole_row = unilateral.index[0], unilateral.index[1]
+    blocked, released = False, 0
+    for k in range(mode.shape[0]):
+        blocked = blocked or mode[k, ku.WANTED] == ka.SLIDING
+    for k in range(unilateral.stop_table.shape[0]):
+        blocked = blocked or unilateral.stop_table[k, ku.STOP_CLOSED] == 1
+    if table.shape[0] == 0:
+        return
+    for r in range(system.couplings.joint.shape[0]):
+        bare = extended(bare_factor, W, bare_row, bare, r)
+    for k in range(mode.shape[0]):
+        for s in range(3 if mode[k, ku.WANTED] == ka.STICKING else 0):
+            bare = extended(bare_factor, W, bare_row, bare, ws.active[k, ka.FIRST_ROW] + s)
+    for i in range(bare):
+        whole = extended(whole_factor, W, whole_row, whole, bare_row[i])
+    for k in range(unilateral.stop_table.shape[0]):
+        if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
+            whole = extended(whole_factor, W, whole_row, whole, unilateral.stop_table[k, ku.STOP_ROW])
+    for k in range(mode.shape[0]):
+        if mode[k, ku.WANTED] == ka.SLIDING:
+            whole = extended(whole_factor, W, whole_row, whole, ws.active[k, ka.FIRST_ROW])
+    for k in range(table.shape[0]):
+        if table[k, ku.DRY_NEXT] == 0:
+            continue
+        r = table[k, ku.DRY_ROW]
+        alone = mobility_left(bare_factor, W, bare_row, bare, r) / W[r, r]
+        among_all = mobility_left(whole_factor, W, whole_row, whole, r) / W[r, r]
+        blocks = blocked and alone > RANK_TOLERANCE and among_all <= NEARLY_DEPENDENT
+        if blocks or ROUNDING < alone <= NEARLY_DEPENDENT:
+            table[k, ku.DRY_NEXT], released = RELEASED, released + 1
+        else:
+            bare, whole = extended(bare_factor, W, bare_row, bare, r), extended(whole_factor, W, whole_row, whole, r)
+    if released > 0:
+        take_widest_split(system, ws, size)
+    for k in range(table.shape[0]):
+        if table[k, ku.DRY_NEXT] == RELEASED:
+            rest_without_row(unilateral, k)
+
+
+@noinline_kernel
+def take_widest_split(system: System, ws: Workspace, size):
+    """Replace the solution by the one with the same motion whose worst margin is largest.
+
+    It has ``size`` rows. Forces may change where they act on nothing but each other: of joints at rest, closed stops
+    and sticking points within their bounds, of sliding points along their whole force. Friction that slides, or begins
+    to, stays as it is for its normal force.
+    """
+    unilateral, W, table = system.unilateral, ws.small[0], system.unilateral.dry_table
+    vector, kinds, room = unilateral.vector, unilateral.index[ku.KINDS], unilateral.room
+    f, first, row = vector[ku.SOLUTION], unilateral.index[0], unilateral.index[1]
+    part, other = ku.FIRST_PART, ku.SECOND_PART
+    mu, force, out = vector[0], vector[1], vector[2]
+    couplings, after = system.couplings.joint.shape[0], system.couplings.joint.shape[0] + dry_rows_held(unilateral)
+    count, p = 0, 0
+    for i in range(after, size):
+        if kinds[i] == kc.CONE and f[i] > 0.0 and sticks(unilateral, ws, i):
+            first[count], mu[count] = p, vector[ku.CONE_FRICTION, i]
+            for s in range(3):
+                row[p] = i + s
+                p += 1
+            count += 1
+    points = count
+    for k in range(table.shape[0]):
+        if table[k, ku.DRY_HOLDS] == 1 and table[k, ku.DRY_NEXT] != 0:
+            first[count], mu[count], row[p] = p, vector[ku.CONE_FRICTION, table[k, ku.DRY_ROW]], table[k, ku.DRY_ROW]
+            p += 1
+            count += 1
+    for i in range(after, size):
+        slides = kinds[i] == kc.CONE and not sticks(unilateral, ws, i)
+        if f[i] > 0.0 and (slides or kinds[i] == kc.ONE_WAY):
+            if slides:
+                vector[part, i], vector[other, i] = f[i + 1] / f[i], f[i + 2] / f[i]
+            first[count], mu[count], row[p] = p, ONE_WAY, i
+            p += 1
+            count += 1
+    for i in range(couplings):
+        row[p + i] = i
+    for i in range(p + couplings):
+        for j in range(p + couplings):
+            a, b = unilateral.index[ku.TABLE_ROW, row[i]], unilateral.index[ku.TABLE_ROW, row[j]]
+            total = W[a, b]
+            # A sliding point pushes along its friction too.
+            for s in range(part, other + 1):
+                x, y = vector[s, row[i]], vector[s, row[j]]
+                if x != 0.0:
+                    total += x * W[a + 1 + s - part, b]
+                if y != 0.0:
+                    total += y * W[a, b + 1 + s - part]
+                for t in range(part, other + 1):
+                    if x != 0.0 and vector[t, row[j]] != 0.0:
+                        total += x * vector[t, row[j]] * W[a + 1 + s - part, b + 1 + t - part]
+            room[ku.SPLIT_MATRIX, i, j] = total
+    width = null_space(room[ku.SPLIT_MATRIX], p + couplings, room[ku.NULL_SPACE], unilateral.index[2], p)
+    for i in range(p):
+        force[i] = f[row[i]]
+    programs = split_room_in(unilateral.split_room, unilateral.index[3], width, count)
+    widest_split(force[:p], room[ku.NULL_SPACE], width, first, mu, points, count - points, out[:p], programs)
+    for i in range(p, p + couplings):
+        for c in range(width):
+            change = 0.0
+            for j in range(p):
+                change += room[ku.NULL_SPACE, j, c] * (out[j] - force[j])
+            f[row[i]] += room[ku.NULL_SPACE, i, c] * change
+    for i in range(p):
+        if kinds[row[i]] == kc.CONE and not sticks(unilateral, ws, row[i]):
+            f[row[i] + 1], f[row[i] + 2] = vector[part, row[i]] * out[i], vector[other, row[i]] * out[i]
+        f[row[i]] = out[i]
+
+
+@internal_kernel
+def sticks(unilateral: UnilateralArrays, ws: Workspace, i):
+    """True if row i of the solved problem is the normal row of a candidate that shall stick."""
+    for k in range(unilateral.mode.shape[0]):
+        if unilateral.mode[k, ku.TOUCHING] == 1 and ws.active[k, ka.FIRST_ROW] == unilateral.index[ku.TABLE_ROW, i]:
+            return unilateral.mode[k, ku.WANTED] == ka.STICKING
+    return False
+
+
+@internal_kernel
+def rest_without_row(unilateral: UnilateralArrays, k):
+    """Keep dry-friction joint k at rest with the constant force that it has in the solution."""
+    # Rows of joints come first, so that they are the same in the reduced problem.
+    share = -unilateral.vector[ku.SOLUTION, unilateral.dry_table[k, ku.DRY_ROW]] / dry_bound(unilateral, k)
+    unilateral.dry_table[k, ku.DRY_NEXT] = 0
+    unilateral.dry[k, ku.DRY_SIDE] = min(max(share, -NEARLY_ALL), NEARLY_ALL)
+
+
+@noinline_kernel
+def hold_free_joints(system: System, ws: Workspace, run: Run, begins):
+    """Give rows to the joints that rest with a constant force and that contacts and stops no longer hold.
+
+    Called after single modes have changed, at the end of an accepted step. If slip ``begins`` somewhere, a joint whose
+    force is all of its friction moves with the contact or stop that held it: with a row it would stick, and break loose
+    at once.
+    """
+    unilateral, y = system.unilateral, run.y
+    table, dry, mode = unilateral.dry_table, unilateral.dry, unilateral.mode
+    W, factor, row = ws.small[0], unilateral.room[ku.SPLIT_MATRIX], unilateral.index[0]
+    for k in range(table.shape[0]):
+        rests = abs(ws.joints[table[k, ku.DRY_JOINT], ka.QD]) <= unilateral.number[ku.SLOW]
+        moves = begins and abs(dry[k, ku.DRY_SIDE]) >= 1.0 - FORCE_TOLERANCE
+        free = rests_without_row(unilateral, k) and rests and not moves
+        table[k, ku.DRY_NEXT] = 1 if free else 0
+        if free:
+            table[k, ku.DRY_HOLDS], dry[k, ku.DRY_AT] = 1, ws.joints[table[k, ku.DRY_JOINT], ka.Q]
+    set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
+    evaluate(system, ws, run)
+    p, count = ws.counts[ka.ROWS], 0
+    for r in range(p):
+        for s in range(p):
+            W[r, s] = mobility(ws, r, s)
+    # Rows of the joints in question come last.
+    for r in range(p):
+        index = -1
+        for k in range(table.shape[0]):
+            if table[k, ku.DRY_NEXT] == 1 and table[k, ku.DRY_ROW] == r:
+                index = k
+        if index < 0:
+            count = extended(factor, W, row, count, r)
+    for k in range(table.shape[0]):
+        if table[k, ku.DRY_NEXT] == 1:
+            more = extended(factor, W, row, count, table[k, ku.DRY_ROW])
+            table[k, ku.DRY_HOLDS], count = 1 if more > count else 0, more
+    set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
+    evaluate(system, ws, run)
+    y[system.layout.loss + kst.IMPACT_LOSS] += project_level(system, ws, y, 1)
+
+
+@internal_kernel
+def some_rest_without_row(unilateral: UnilateralArrays):
+    """True if a joint rests with a constant force."""
+    resting = 0
+    for k in range(unilateral.dry_table.shape[0]):
+        resting += 1 if rests_without_row(unilateral, k) else 0
+    return resting > 0
+
+
+@internal_kernel
+def rests_without_row(unilateral: UnilateralArrays, k):
+    """True if dry-friction joint k rests with a constant force and without a closed brake."""
+    table = unilateral.dry_table
+    return table[k, ku.DRY_HOLDS] == 0 and table[k, ku.DRY_BRAKE] != ku.CLOSED and dry_rests(unilateral, k)
+
+
+@internal_kernel
+def extended(factor, W, row, count, r):
+    """Extend a Cholesky factor of rows ``row[:count]`` of W by row r, unless it depends on them; return the count."""
+    square = mobility_left(factor, W, row, count, r)
+    if not square > RANK_TOLERANCE * W[r, r]:
+        return count
+    factor[count, count], row[count] = math.sqrt(square), r
+    return count + 1
+
+
+@internal_kernel
+def mobility_left(factor, W, row, count, r):
+    """Return the mobility W along row r that the rows of a factor leave; write row ``count`` of the factor, for r."""
+    square = W[r, r]
+    for i in range(count):
+        total = W[r, row[i]]
+        for j in range(i):
+            total -= factor[count, j] * factor[i, j]
+        factor[count, i] = total / factor[i, i]
+        square -= factor[count, i] * factor[count, i]
+    return square
+
+
+@internal_kernel
+def mobility(ws: Workspace, r, s):
+    """Change of the rate along row r by a unit impulse along row s."""
+    total = 0.0
+    for i in range(ws.joints.shape[0]):
+        total += ws.column[i, 1 + 2 * r] * ws.column[i, 1 + 2 * s] * ws.links[i, ka.INVERSE_D]
+    return total
