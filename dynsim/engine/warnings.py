@@ -151,7 +151,8 @@ def _contact_warnings(
                 f"{'' if name in placed else ' (initial.on_surface lets it start there)'}"
             )
     for brace, since in zip(contacts, prepared.run.extremes[:, ki.LOCAL_SINCE], strict=True):
-        if np.isfinite(since):
+        # What the end of a refused step shows is the reason of a stop, and no part of the run.
+        if since <= prepared.run.clock[ki.TIME]:
             warnings.append(
                 f"{brace.name}: from t = {since:.4g} s on, its friction turns its own force against it (negative "
                 "diagonal of J M⁻¹F, Painlevé's paradox at one contact): only the other braces hold it there, and "

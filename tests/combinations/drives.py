@@ -114,6 +114,8 @@ def controller(
         if level != "waypoints":
             free = [joint for joint in free if driven[joint.name]["type"] != "torque"]
         section |= _waypoints(random, levels, free, duration)
+    if level == "pressing":
+        _ease(section.get("joints", {}), model)
     return section
 
 
@@ -180,6 +182,45 @@ def _waypoints(random: Generator, levels: Levels, free: Sequence[Joint], duratio
         key = "angles_deg" if joint.turns else "positions_m"
         joints[joint.name] = {"times_s": [0.0, 0.5 * duration, duration], key: ways}
     return {"joints": joints} if joints else {}
+
+
+def _ease(joints: dict[str, Any], model: Model) -> None:
+    """Shorten paths until the motors can follow: a plan beyond their limits is refused.
+
+    Half of the limits is left for what braces press and payloads weigh.
+    """
+    from scipy.interpolate import CubicSpline
+
+    if not joints:
+        return
+    links, motors = list(model.robot.links), {motor.joint: motor for motor in model.robot.motors}
+    own = [motors[link.joint] for link in links]
+    constant, resistance, volts, amperes = (
+        np.array([getattr(motor, key) for motor in own])
+        for key in ("joint_constant", "resistance", "voltage_limit", "current_limit")
+    )
+    rate = {link.joint: k for k, link in enumerate(links)}
+    ways = {name: next(key for key in ("angles_deg", "positions_m") if key in path) for name, path in joints.items()}
+    for _ in range(10):
+        paths = {
+            name: CubicSpline(path["times_s"], path[ways[name]], bc_type="clamped") for name, path in joints.items()
+        }
+        most = 0.0
+        for t in np.linspace(0.0, next(iter(joints.values()))["times_s"][-1], 21):
+            q, v, vdot = np.array(model.robot.initial), np.zeros(model.n), np.zeros(model.n)
+            for name, path in paths.items():
+                unit = np.pi / 180.0 if ways[name] == "angles_deg" else 1.0
+                k = rate[name]
+                q[model.robot.position_index[k]], v[k], vdot[k] = (unit * float(path(t, order)) for order in range(3))
+            torque = (model.mass_matrix(q) + np.diag(model.armature)) @ vdot + model.bias_forces(q, v)
+            current = (torque + model.damping * v) / constant
+            voltage = resistance * current + constant * v
+            most = max(most, float((np.abs(current) / amperes).max()), float((np.abs(voltage) / volts).max()))
+        if most <= 0.5:
+            return
+        for name, path in joints.items():
+            first = path[ways[name]][0]
+            path[ways[name]] = [first + 0.5 * (value - first) for value in path[ways[name]]]
 
 
 def _torques(random: Generator, joints: Sequence[str], model: Model, duration: float) -> dict[str, Any]:

@@ -75,7 +75,8 @@ def _spectral_radius(seen: Observed, basis: Array) -> float:
 def _gains(controller: Mapping[str, Any], motor: Motor | Servo, number: int) -> tuple[float, float]:
     """Gains of a motor; ``number``: its index among the DC motors, for gains that are listed by motor."""
     if isinstance(motor, Servo):
-        return (0.0, motor.k_v) if motor.velocity_mode else (motor.k_p, motor.k_d)
+        # The velocity loop makes up for the back-EMF of the rate that it read: u = k_v (v_d − v) + K_m v.
+        return (0.0, motor.k_v - motor.joint_constant) if motor.velocity_mode else (motor.k_p, motor.k_d)
     gains = []
     for key, default in (("k_p_V_per_rad", 500.0), ("k_d_V_s_per_rad", 20.0)):
         value = controller.get(key, default)

@@ -26,6 +26,8 @@ Array = NDArray[np.float64]
 WALL_LIMIT_S = 60.0
 # Radius of spheres about points [m], and what a declared point of a link with a radius is thicker by.
 SPHERE, THICKER = 0.02, 0.002
+# From the elbow to the shin [m].
+SHIN = 0.05
 # Scenes that are drawn until nothing starts in a surface.
 ATTEMPTS = 4
 # Heights of a grid along each side, and their distance [m].
@@ -299,11 +301,11 @@ class _Touching:
             toward = _unit(end - self._model.point_position(robot.hand[0], self._behind(robot.hand), self._q))
             self._ball("hand", robot.hand, radius, end, -toward)
         elif level == "same_link":
-            spot = (body, [0.0, 0.0, point[2] + 0.05])
+            spot = (body, [0.0, 0.0, point[2] + SHIN])
             there = self._model.point_position(*spot, self._q)
             along = _unit(there - self.elbow)
             normal = _unit(self.normal - (self.normal @ along) * along)
-            self._ball("shin", spot, radius, there, normal)
+            self._ball("shin", spot, radius + self._fan(body), there, normal)
         elif level == "unmoved":
             # The last joint that has its centre on the axis of the first: that moves it by rounding.
             bodies = [joint.body for joint in robot.joints if not joint.name.startswith("base.")]
@@ -316,6 +318,13 @@ class _Touching:
             # Behind the arm.
             toward = _unit(toward) if np.linalg.norm(toward) > 1e-3 else np.array([1.0, 0.0, 0.0])
             self._ball("root", spot, radius, there, _unit(toward + self._random.uniform(-0.3, 0.3, size=3)))
+
+    def _fan(self, body: str) -> float:
+        """How far the axes of a body, where they are capsules, leave its own by the shin: those to its fingers [m]."""
+        if self._levels["contact"] != "links":
+            return 0.0
+        ends = [link.p_PJ for link in self._model.robot.links if link.parent == body]
+        return max((SHIN * math.hypot(end[0], end[1]) / float(np.linalg.norm(end)) for end in ends), default=0.0)
 
     def _behind(self, spot: tuple[str, list[float]]) -> list[float]:
         return [spot[1][0], spot[1][1], spot[1][2] - 0.05]

@@ -33,6 +33,7 @@ FOUND = {
     "a joint that dipped beyond its stop within a step": (271127, 433),
     "a joint that hit its stop and left it at once, of which no event told": (271127, 454),
     "a joint at rest that shared a load with another one at its bound: 25 000 events in a millisecond": (271127, 343),
+    "a warning of a state at the end of a refused step": (271127, 944),
     "two joints that hit each other off their stops for ever": (271127, 404),
 }
 # Scenes of the slow study.

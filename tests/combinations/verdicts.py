@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from combinations.accelerations import critical, exists, leaves
+from combinations.accelerations import critical, exists, leaves, state_of
 from combinations.observed import OPEN, SLIDING, STICKING, Observed, Touch
 from combinations.running import Run
 from combinations.sampled_loop import loop_growth
@@ -164,11 +164,14 @@ def _never_pressed(match: Match, seen: Observed) -> str:
 
 
 def _reversed(match: Match, seen: Observed) -> str:
-    """W_nn − μ W_nt < 0 for the contact alone, at the sample after the time that is named."""
-    touch, since = _touch(seen, match[1]), float(match[2])
+    """W_nn − μ W_nt < 0 for the contact alone, at the sample after the time that is named; without one, at the stop."""
+    touch, since = _touch(seen, match[1]), _at_latest(match[2])
     if touch is None:
         return "no such contact"
-    i = min(int(np.searchsorted(seen.time, since)), len(seen) - 1)
+    i, stop = int(np.searchsorted(seen.time, since)), seen.run.error
+    if i == len(seen) and isinstance(stop, SimulationStopped):
+        return _not_reversed_at(stop, match[1], seen)
+    i = min(i, len(seen) - 1)
     J = seen.bodies.jacobian(seen.motion, touch.body, touch.position)[i]
     M = seen.bodies.mass_matrix(seen.q[i])
     own = touch.normal[i] @ J @ np.linalg.solve(M, J.T @ touch.force[i]) / (touch.normal_force[i] or 1.0)
@@ -178,6 +181,25 @@ def _reversed(match: Match, seen: Observed) -> str:
         answer = np.linalg.solve(M, J.T @ touch.normal[i]) @ J.T
         own = min(own, size - touch.contact.friction_at_rest * float(np.linalg.norm(answer - size * touch.normal[i])))
     return "" if own < 0.05 * size else f"the diagonal entry is {own:.3g} of {size:.3g} at t = {seen.time[i]:.4g} s"
+
+
+def _at_latest(said: str) -> float:
+    """The largest time that is written so, with four digits."""
+    value = float(said)
+    return value + (0.5 * 10.0 ** (np.floor(np.log10(value)) - 3.0) if value > 0.0 else 0.0)
+
+
+def _not_reversed_at(stop: SimulationStopped, name: str, seen: Observed) -> str:
+    state = state_of(seen, stop.state)
+    if name not in state.names:
+        return "it is open at the stop"
+    k = state.names.index(name)
+    rows, slip = state.rows[k], state.slip[k]
+    answer = rows @ np.linalg.solve(state.mass, rows[0])
+    speed = float(np.linalg.norm(slip))
+    along = float(answer[1:] @ slip) / speed if speed > AT_REST else float(np.linalg.norm(answer[1:]))
+    own = float(answer[0]) - state.friction[k] * along
+    return "" if own < 0.05 * answer[0] else f"the diagonal entry is {own:.3g} of {answer[0]:.3g} at the stop"
 
 
 def _friction_gives(match: Match, seen: Observed) -> str:

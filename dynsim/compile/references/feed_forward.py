@@ -136,7 +136,7 @@ def _pressing_torques(
     if solved < len(times):
         raise ModelError(
             f"controller.brace: at t = {times[solved]:.3f} s no forces of {', '.join(braces)} carry the motion within "
-            "the limits of the motors; ask for other forces, go slower, or raise voltage_limit_V",
+            "the limits of the motors; ask for other forces, go slower, or raise a voltage_limit_V or peak_current_A",
             keys=("controller", "brace"),
         )
     return torques
