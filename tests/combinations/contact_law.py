@@ -152,7 +152,8 @@ def _real_friction(seen: Observed, touch: Touch) -> Finding:
     power = (tangential * touch.slip).sum(axis=1)
     # A normal that is a little off has a share of the normal force in the surface, which may be all that there is.
     noise = _share(seen, touch) * np.linalg.norm(touch.force, axis=1) * speed
-    gained = slips & (power > noise + size * (SLOW if seen.stepped else 1e-7) + 1e-12)
+    # Against w friction gives f·u up to |f| |u − w| to slip u.
+    gained = slips & (power > noise + size * (SLOW + touch.lag if seen.stepped else 1e-7) + 1e-12)
     if seen.stepped:
         # A step in which slip ends may end with some of it turned round; a sample may lie within a step.
         gained &= (tangential * before).sum(axis=1) > 0.0
@@ -202,7 +203,10 @@ def _against_slip(seen: Observed, touch: Touch, slips: NDArray[np.bool_], before
         middle = 0.5 * (touch.slip + before)
         low, high = coefficient(touch, np.minimum(speed, earlier)), coefficient(touch, both)
         # The contact's place moves on the body within a step, and the tangent plane turns.
-        share = turned / np.maximum(both, 1e-300) + np.abs(high - low) / np.maximum(high, 1e-300) + 1e-3
+        # Directions of u and w are up to 2 |u − w|/|u| apart.
+        share = (
+            (turned + 2.0 * touch.lag) / np.maximum(both, 1e-300) + np.abs(high - low) / np.maximum(high, 1e-300) + 1e-3
+        )
     else:
         # Slip keeps its initial direction up to 1000 times atol; steps may continue to twice that speed.
         slow = max(2000.0 * seen.scenario.integrator.absolute_tolerance, SLOW)

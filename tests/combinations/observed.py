@@ -50,6 +50,8 @@ class Touch:
         the sample, where the bodies are in its middle, as the law of time stepping has it; by events the same
     slip_after : (T, 3) of the rates a step later with the same acceleration: a sample within a step lies between
     approach, approach_before : velocity along the normal, (T,) [m/s]; the second as of the slip before
+    lag : by how much the slip of the law of time stepping may be off that at the end of its step, (T,) [m/s]: the law
+        has the rows of the midpoint, and half of what they have turned by since the last one, at the rates of the start
     turned : by how much the normal has turned since the sample before, or since the midpoint of the step, (T,) [rad]
     force : (T, 3) [N]; normal_force : (T,) as recorded [N]; mode : (T,)
     """
@@ -66,6 +68,7 @@ class Touch:
     approach: Array
     approach_before: Array
     turned: Array
+    lag: Array
     force: Array
     normal_force: Array
     mode: Array
@@ -158,11 +161,15 @@ class Observed:
         slip = velocity - approach[:, None] * normal
         gap = midway = far - contact.radius
         before, after, began = slip, slip, approach
-        turned = np.linalg.norm(np.diff(normal, axis=0, prepend=normal[:1]), axis=1)
+        turned, lag = np.linalg.norm(np.diff(normal, axis=0, prepend=normal[:1]), axis=1), np.zeros(len(far))
         if self.stepped and motion is self.motion:
             rates = self.step * self.vdot
             before, began, middle, midway = self._at_midpoints(contact, self.v - rates)
             turned = np.maximum(turned, np.linalg.norm(normal - middle, axis=1))
+            lag = np.linalg.norm(slip - self._at_midpoints(contact, self.v)[0], axis=1)
+            lag = lag + 0.5 * np.linalg.norm(
+                before - self._slip_of(contact, self._middles_before, self.v - rates)[0], axis=1
+            )
             along = np.einsum("tkn,tn->tk", self.bodies.jacobian(motion, body, position), self.v + rates)
             after = along - (along * normal).sum(axis=1, keepdims=True) * normal
         record = self.record
@@ -181,6 +188,7 @@ class Observed:
             approach,
             began,
             np.asarray(turned, dtype=np.float64),
+            lag,
             record["contact_force"][:, k],
             force,
             mode,
@@ -200,12 +208,23 @@ class Observed:
         """Motion of all bodies there, at the rates of the start."""
         return self.bodies.motion(self.q_middle, self.v - self.step * self.vdot, self.vdot)
 
+    @cached_property
+    def _middles_before(self) -> Motion:
+        """As :attr:`_middles`, of the step before: of the sample before, or where the rates of the start come from."""
+        began = self.v - self.step * self.vdot
+        q = self.q_middle + position_rates(self.bodies, self.q_middle, -self.step * began)
+        beside = np.flatnonzero(np.abs(np.diff(self.time) - self.step) < AT_STEP * self.step) + 1
+        q[beside] = self.q_middle[beside - 1]
+        return self.bodies.motion(q, began, self.vdot)
+
     def _at_midpoints(self, contact: Contact, rates: Array) -> tuple[Array, Array, Array, Array]:
-        """At midpoints of steps: velocity at these rates in the surface and along its normal [m/s], normal, gap [m]."""
-        body, centre, far, normal = self.nearest_point(contact, self._middles)
-        velocity = np.einsum(
-            "tkn,tn->tk", self.bodies.jacobian(self._middles, body, centre - contact.radius * normal), rates
-        )
+        """As :meth:`_slip_of`, at midpoints of steps."""
+        return self._slip_of(contact, self._middles, rates)
+
+    def _slip_of(self, contact: Contact, motion: Motion, rates: Array) -> tuple[Array, Array, Array, Array]:
+        """Velocity at these rates in the surface and along its normal [m/s], normal, gap [m]."""
+        body, centre, far, normal = self.nearest_point(contact, motion)
+        velocity = np.einsum("tkn,tn->tk", self.bodies.jacobian(motion, body, centre - contact.radius * normal), rates)
         along = (velocity * normal).sum(axis=1)
         return np.asarray(velocity - along[:, None] * normal), along, normal, far - contact.radius
 

@@ -244,6 +244,25 @@ def residual_with_load(b: CompiledSystem, run: ki.Run) -> float:
     return float(np.abs(stored - stored[0] + taken - run.states("load").sum(axis=1)).max())
 
 
+@pytest.mark.parametrize(
+    ("law", "coefficient"),
+    [
+        ({}, 0.2),
+        ({"viscous_friction": 0.4}, 0.2 + 0.4 * 1.5),
+        ({"static_friction": 0.5, "stribeck": 1.0}, 0.2 + 0.3 * np.exp(-(1.5**2))),
+        ({"static_friction": 0.5}, 0.2),
+    ],
+)
+def test_friction_of_an_impact_is_that_of_the_slip_before_it(law, coefficient):
+    mass, speed, fall = 2.0, 1.5, 0.4
+    contact = Contact("foot", "z", np.zeros(3), plane(vector(0, 0, 1)), friction=0.2, pulling_friction="signed", **law)
+    b = assemble(block(mass), [contact], real=True)
+    start, end = np.array([0.0, 0.0, 1e-7]), 2e-6
+    run = b.simulate(b.state(start, np.array([speed, 0.0, -fall])), np.array([0.0, end]), "dopri5")
+    lost = speed - run.states("v")[-1, 0]
+    assert lost == pytest.approx(coefficient * fall, abs=coefficient * 2.0 * G * end)
+
+
 def test_a_carriage_that_slides_askew_stops():
     """After v/(μ g), v²/(2 μ g) along its straight way."""
     mass, mu, speed = 2.0, 0.3, 1.0

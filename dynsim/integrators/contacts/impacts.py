@@ -14,7 +14,14 @@ from dynsim.dynamics.contact.cone import problem as kc
 from dynsim.dynamics.contact.cone.problem import approach_or_draw_near, solve_cones
 from dynsim.dynamics.contact.mobility import moves_along_normal
 from dynsim.dynamics.contact.rows import row_errors, set_modes
-from dynsim.dynamics.contact.unilateral import UnilateralArrays, dry_rows_held, holding_bound, stop_gap, stop_rate
+from dynsim.dynamics.contact.unilateral import (
+    UnilateralArrays,
+    dry_rows_held,
+    holding_bound,
+    sliding_friction,
+    stop_gap,
+    stop_rate,
+)
 from dynsim.dynamics.derivative import System, derivative
 from dynsim.dynamics.tables import Workspace
 from dynsim.dynamics.tree.articulated import accelerate
@@ -216,6 +223,23 @@ def solve_problem(unilateral: UnilateralArrays, W, size, largest, starts):
 
 
 @internal_kernel
+def friction_at_rest(system: System, k):
+    """Coefficient of the cone of candidate k, which is at rest along its surface."""
+    if system.unilateral.mode[k, ku.GIVES_WAY] == 1:
+        return system.contacts.law[k, ka.MU]
+    return system.unilateral.number[ku.HOLDING] * system.contacts.law[k, ka.STATIC]
+
+
+@internal_kernel
+def friction_of_impact(system: System, ws: Workspace, k):
+    """Coefficient of friction of candidate k in an impact: at the slip before it; static for what is at rest."""
+    slip, before = slip_speed(ws, k), system.unilateral.mode[k, ku.BEFORE]
+    if before == ka.STICKING or (before == ka.OPEN and slip <= system.unilateral.number[ku.SLOW]):
+        return friction_at_rest(system, k)
+    return sliding_friction(system.contacts.law, k, slip)
+
+
+@internal_kernel
 def impulses(system: System, ws: Workspace, p, largest, share):
     """Solve for the impulses of :func:`impact` with ``share`` of the restitutions; write row losses into FORCE [J].
 
@@ -230,7 +254,7 @@ def impulses(system: System, ws: Workspace, p, largest, share):
     for k in range(mode.shape[0]):
         if mode[k, ku.TOUCHING] == 1:
             r = ws.active[k, ka.FIRST_ROW]
-            vector[ku.CONE_FRICTION, r] = system.contacts.law[k, ka.MU]
+            vector[ku.CONE_FRICTION, r] = friction_of_impact(system, ws, k)
             # A closed point had no speed to reverse: a brake or another impact has just given it this one.
             falls = mode[k, ku.STRUCK] == 1 and mode[k, ku.BEFORE] == ka.OPEN
             if falls and -rows[r, ka.ROW_RATE] > unilateral.tally[k, ku.SETTLE]:

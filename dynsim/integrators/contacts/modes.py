@@ -38,6 +38,7 @@ from dynsim.integrators.contacts.impacts import (
     begin_problem,
     evaluate,
     find_touching,
+    friction_at_rest,
     gather,
     impact,
     keep_touching,
@@ -439,14 +440,6 @@ def drops(system: System, k):
     """True for a candidate whose friction falls from a static coefficient to a smaller kinetic one when it slips."""
     law = system.contacts.law
     return law[k, ka.STRIBECK] == 0.0 and law[k, ka.STATIC] > law[k, ka.MU]
-
-
-@internal_kernel
-def friction_at_rest(system: System, k):
-    """Coefficient of the cone of candidate k, which is at rest along its surface."""
-    if system.unilateral.mode[k, ku.GIVES_WAY] == 1:
-        return system.contacts.law[k, ka.MU]
-    return system.unilateral.number[ku.HOLDING] * system.contacts.law[k, ka.STATIC]
 
 
 @internal_kernel

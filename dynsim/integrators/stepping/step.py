@@ -49,9 +49,11 @@ def step_moreau(system: System, ws: Workspace, run: Run):
     model = ModelArrays(system.model.tree, s.body, system.model.gravity)
     begin_energy(system, ws, run)
     recall(system, s, ws, y)
+    # The mean acceleration of a step with an impact says nothing about the next one.
+    ahead = 0.0 if s.grid[kt.HELD_STEPS] > 1.0 else s.theta * run.clock[ki.STEP]
     for i in range(ws.joints.shape[0]):
         v0[i] = y[layout.v + i]
-        v_bias[i] = v0[i] + s.theta * run.clock[ki.STEP] * last[i]
+        v_bias[i] = v0[i] + ahead * last[i]
     for tries in range(1, MOST_TRIES + 1):
         take_drives(system, ws, run)
         place_midpoint(system, model, ws, run)
