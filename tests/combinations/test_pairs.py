@@ -36,6 +36,7 @@ FOUND = {
     "a warning of a state at the end of a refused step": (271127, 944),
     "impacts without the viscous part of friction, by the methods with events": (271127, 754),
     "velocity products of an impact that were extrapolated into the next step of time stepping": (271127, 881),
+    "a joint that broke loose by itself, and other forces that jumped for the sign of a rounding": (271127, 900),
     "two joints that hit each other off their stops for ever": (271127, 404),
 }
 # Scenes of the slow study.

@@ -163,15 +163,43 @@ def find_splits(unilateral: UnilateralArrays, ws: Workspace):
 
 
 @internal_kernel
-def normal_is_open(unilateral: UnilateralArrays, ws: Workspace, k):
-    """True if the splits found last leave the normal force of candidate k, which sticks, undetermined."""
+def first_split_row(ws: Workspace, k):
+    """First row of candidate k, which sticks, in the splits found last."""
     row = 0
     for j in range(k):
-        row += 3 if ws.active[j, ka.MODE] == ka.STICKING else 0
+        row += ka.MOST_ROWS if ws.active[j, ka.MODE] == ka.STICKING else 0
+    return row
+
+
+@internal_kernel
+def normal_is_open(unilateral: UnilateralArrays, ws: Workspace, k):
+    """True if the splits found last leave the normal force of candidate k, which sticks, undetermined."""
+    return row_shares(unilateral, first_split_row(ws, k))
+
+
+@internal_kernel
+def point_shares(unilateral: UnilateralArrays, ws: Workspace, k):
+    """True if the splits found last leave a force of candidate k, which sticks, undetermined."""
+    row = first_split_row(ws, k)
+    return row_shares(unilateral, row) or row_shares(unilateral, row + 1) or row_shares(unilateral, row + 2)
+
+
+@internal_kernel
+def joint_shares(unilateral: UnilateralArrays, ws: Workspace, k):
+    """True if the splits found last leave the dry friction that holds joint k undetermined."""
+    row = ka.MOST_ROWS * ws.counts[ka.STUCK]
+    for j in range(k):
+        row += unilateral.dry_table[j, ku.DRY_HOLDS]
+    return row_shares(unilateral, row)
+
+
+@internal_kernel
+def row_shares(unilateral: UnilateralArrays, row):
+    """True if the splits found last leave the force of one of their rows undetermined."""
+    largest = 0.0
     for c in range(int(unilateral.number[ku.WIDTH])):
-        if abs(unilateral.room[ku.NULL_SPACE, row, c]) > NORMAL_PART:
-            return True
-    return False
+        largest = max(largest, abs(unilateral.room[ku.NULL_SPACE, row, c]))
+    return largest > NORMAL_PART
 
 
 @internal_kernel
@@ -180,12 +208,9 @@ def stops_that_share(unilateral: UnilateralArrays):
     sharing, closed = 0, 0
     for k in range(unilateral.stop_table.shape[0]):
         closed += unilateral.stop_table[k, ku.STOP_CLOSED]
-    width, size = int(unilateral.number[ku.WIDTH]), int(unilateral.number[ku.SPLIT_ROWS])
+    size = int(unilateral.number[ku.SPLIT_ROWS])
     for i in range(size - closed, size):
-        largest = 0.0
-        for c in range(width):
-            largest = max(largest, abs(unilateral.room[ku.NULL_SPACE, i, c]))
-        sharing += 1 if largest > NORMAL_PART else 0
+        sharing += 1 if row_shares(unilateral, i) else 0
     return sharing
 
 

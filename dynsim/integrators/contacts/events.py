@@ -18,7 +18,14 @@ from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.rows import set_modes
 from dynsim.dynamics.contact.shares import keep_shares
-from dynsim.dynamics.contact.splits import dry_margin, margin, normal_is_open, stops_that_share
+from dynsim.dynamics.contact.splits import (
+    dry_margin,
+    joint_shares,
+    margin,
+    normal_is_open,
+    point_shares,
+    stops_that_share,
+)
 from dynsim.dynamics.contact.unilateral import UnilateralArrays, dry_rests, dry_rows_held, stop_gap, stop_rate
 from dynsim.dynamics.derivative import System
 from dynsim.dynamics.tables import ContactArrays, Workspace
@@ -344,14 +351,15 @@ def split_ends(system: System, ws: Workspace, run: Run):
         kind, k = run.event_table[e, ki.EVENT_KIND], run.event_table[e, ki.EVENT_INDEX]
         if kind < NORMAL_GUARD or run.event[e, ki.VALUE] > 0.0:
             continue
-        if kind == DRY_GUARD and unilateral.dry_table[k, ku.DRY_HOLDS] == 1:
+        # One that shares its force with none begins to slip by itself, although others share theirs.
+        if kind == DRY_GUARD and unilateral.dry_table[k, ku.DRY_HOLDS] == 1 and joint_shares(unilateral, ws, k):
             return True
         if kind == STOP_GUARD and unilateral.stop_table[k, ku.STOP_CLOSED] == 1 and stops > 0:
             return True
         # A point at the apex of its cone leaves; modes of a point whose friction drops are chosen at full friction.
         if kind == SLIP_GUARD and ws.active[k, ka.MODE] == ka.STICKING and not drops(system, k):
             pressed = ws.rows[ws.active[k, ka.FIRST_ROW], ka.FORCE] > NO_FORCE * strongest
-            if pressed and at_limit(system.contacts, unilateral, ws, k):
+            if pressed and point_shares(unilateral, ws, k) and at_limit(system.contacts, unilateral, ws, k):
                 return True
     return False
 
