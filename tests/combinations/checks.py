@@ -22,7 +22,7 @@ from combinations.observed import Observed, warned
 from combinations.running import Run
 from combinations.verdicts import untrue
 from dynsim.errors import SimulationStopped
-from dynsim.model.drives import Motor
+from dynsim.model.drives import Motor, Servo
 from dynsim.scenario import build
 
 # A start within a micrometre of a surface is projected onto it; this moves the first sample.
@@ -172,12 +172,27 @@ def equilibrium(seen: Observed) -> Finding:
         return
     size = np.abs(seen.vdot[0])
     # Far below the acceleration of a joint that falls.
-    allowed = 1e-4 * (1.0 + np.linalg.norm(seen.bodies.gravity))
+    allowed = 1e-4 * (1.0 + np.linalg.norm(seen.bodies.gravity)) + _misread(seen)
     if seen.stepped and len(seen) > 2:
         # The mean of the first step: if references begin to move, the mean of the next is up to three times as large.
         allowed = max(allowed, 0.7 * float(np.abs(seen.vdot[2]).max(initial=0.0)))
     if size.max(initial=0.0) > allowed:
         yield f"{seen.joints[int(size.argmax())]} starts with an acceleration of {size.max():.3g}, from equilibrium"
+
+
+def _misread(seen: Observed) -> float:
+    """Largest acceleration by what encoders misread at the start: servos have no circuit that would delay it."""
+    encoders = (seen.config.get("sensors") or {}).get("encoders") or {}
+    angle = np.radians(0.5 * encoders.get("resolution_deg", 0.0) + 6.0 * encoders.get("noise_deg", 0.0))
+    servos = [motor for motor in seen.robot.motors if isinstance(motor, Servo)]
+    if not servos or not angle:
+        return 0.0
+    mobility = np.abs(np.linalg.pinv(seen.bodies.mass_matrix(seen.robot.initial)))
+    total = sum(
+        mobility[:, seen.joints.index(servo.joint)] * servo.k_p * angle * servo.joint_constant / servo.resistance
+        for servo in servos
+    )
+    return float(np.max(total))
 
 
 def absurd(seen: Observed) -> Finding:

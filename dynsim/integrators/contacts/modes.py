@@ -25,6 +25,7 @@ from dynsim.dynamics.contact.shares import even_out, share_slot, some_slide
 from dynsim.dynamics.contact.splits import find_splits
 from dynsim.dynamics.contact.unilateral import (
     UnilateralArrays,
+    dry_rests,
     dry_rows_held,
     holding_bound,
     slide_direction,
@@ -95,6 +96,30 @@ def choose(system: System, ws: Workspace, run: Run):
         mode[k, ku.TOUCHED] = mode[k, ku.TOUCHING]
     for k in range(stops.shape[0]):
         stops[k, ku.STOP_TOUCHED] = stops[k, ku.STOP_CLOSED]
+    choose_joints(system, ws, run)
+    # What settles after an impact may move light joints the other way; their friction is then against the new way.
+    if run.count[ki.STATUS] == ki.RUNNING and some_turned_round(system, ws):
+        touch_again(system.unilateral)
+        choose_joints(system, ws, run)
+
+
+@internal_kernel
+def some_turned_round(system: System, ws: Workspace):
+    """True if a joint or point slides, not slowly, against the direction that its friction was chosen for."""
+    unilateral, turned = system.unilateral, False
+    slow = 2.0 * unilateral.number[ku.SLOW]
+    for k in range(unilateral.dry_table.shape[0]):
+        side = 0.0 if dry_rests(unilateral, k) else unilateral.dry[k, ku.DRY_SIDE]
+        turned = turned or side * ws.joints[unilateral.dry_table[k, ku.DRY_JOINT], ka.QD] < -slow
+    for k in range(unilateral.mode.shape[0]):
+        slides = ws.active[k, ka.MODE] == ka.SLIDING and system.contacts.law[k, ka.STATIC] > 0.0
+        turned = turned or (slides and unilateral.slide[k, ku.SPEED] < -slow)
+    return turned
+
+
+@noinline_kernel
+def choose_joints(system: System, ws: Workspace, run: Run):
+    """:func:`choose_modes` with the first rule to hold joints with dry friction that is not rejected."""
     if choose_modes(system, ws, run, HOLD_COMPATIBLE):
         return
     # A joint that moves, however slowly, because a contact or stop moves it, is not at rest.
