@@ -56,11 +56,14 @@ def losses(seen: Observed) -> Finding:
     signed = any(touch.contact.pulling_friction == "signed" for touch in seen.touches()) and not seen.real
     if not signed:
         names += ["heat_friction"]
+    taken = {name: seen.record[name] for name in names}
     if not restitution and not signed:
-        # Energy that moves a point back out of its surface is taken from the impact losses.
-        names += [name for name in ("loss_impact", "loss_stop") if name in seen.record and not seen.stepped]
-    for name in names:
-        fall = -np.diff(seen.record[name])
+        # Of an impact that contacts and stops share, the sum of their parts is a loss. Energy that moves a point out of
+        # its surface again is taken from the impact losses.
+        parts = [seen.record[name] for name in ("loss_impact", "loss_stop") if name in seen.record]
+        taken |= {"loss_impact + loss_stop": sum(parts, np.zeros(len(seen)))} if not seen.stepped else {}
+    for name, loss in taken.items():
+        fall = -np.diff(loss)
         # Rates of sticking points are solved to 1e-8 m/s only; dense output within a step is as accurate as the step.
         allowed = (1e-7 if seen.stepped else seen.scenario.integrator.rtol) * turnover + 1e-12
         if fall.size and fall.max() > allowed and not warned(seen, "friction has put"):

@@ -298,7 +298,9 @@ def _export(own: Run, folder: Path) -> str:
     from dynsim.record.mcap_file import write_mcap
 
     assert own.record is not None
-    export_record(own.record, folder / "run.csv", "csv")
+    # One sample is no motion.
+    if len(own.record) > 1:
+        export_record(own.record, folder / "run.csv", "csv")
     write_mcap(own.record, folder / "run.mcap")
     return ""
 
