@@ -96,9 +96,15 @@ def walled_in(data: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        (walled_in, "on box is never clear of that surface; the base may stand too near to it, or within it"),
+        pytest.param(
+            walled_in,
+            "on box is never clear of that surface; the base may stand too near to it, or within it",
+            marks=pytest.mark.long,
+        ),
         (out_of_reach, "could be brought onto the hand's path"),
-        (weak, "no forces within friction cones and limits of the motors carry the motion"),
+        pytest.param(
+            weak, "no forces within friction cones and limits of the motors carry the motion", marks=pytest.mark.long
+        ),
         (turned_away, "it may be out of reach, or the orientation that it asks for"),
     ],
 )
