@@ -98,7 +98,8 @@ def powers(seen: Observed) -> Finding:
         "heat_friction": (record["heat_friction"], rubbed),
         "energy_electrical": (record["energy_electrical"], drawn),
     }
-    if jumps_at_ticks(seen) or seen.sample_time is not None:
+    # Also those of a controller in task space, whose period has another key.
+    if jumps_at_ticks(seen) or seen.at_ticks.any():
         del work["energy_electrical"]
         if jumps_at_ticks(seen):
             # Between samples further apart than ticks power may swing, and samples be all of the same phase.

@@ -151,7 +151,7 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
     unilateral = system.unilateral
     mode = unilateral.mode
     unilateral.number[ku.SHARED] = 0.0
-    hold_slow_joints(unilateral, ws)
+    hold_slow_joints(unilateral, ws, rule)
     if rule == HOLD_RESTING:
         release_moving_joints(unilateral, ws)
     p = gather(system, ws, run)
@@ -224,7 +224,7 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
         unilateral.stop[k, ku.HIT_AT] = ku.DEPTH + max(0.0, -stop_gap(unilateral, ws, k))
     for k in range(mode.shape[0]):
         mode[k, ku.GIVES_WAY], mode[k, ku.LEAVES] = 0, 0
-        starts = mode[k, ku.WANTED] == ka.SLIDING and mode[k, ku.TOUCHING] == ka.STICKING
+        starts = mode[k, ku.WANTED] == ka.SLIDING and unilateral.slide[k, ku.FROZEN] == 1.0
         unilateral.slide[k, ku.HEADWAY] = max(0.0, -unilateral.slide[k, ku.SPEED]) if starts else 0.0
     return True
 
@@ -309,8 +309,11 @@ def stops_others(unilateral: UnilateralArrays, ws: Workspace):
 
 
 @internal_kernel
-def hold_slow_joints(unilateral: UnilateralArrays, ws: Workspace):
+def hold_slow_joints(unilateral: UnilateralArrays, ws: Workspace, rule):
     """Hold the joints that do not move where they are, by dry friction; the others keep sliding as they move.
+
+    A joint that slides, however slowly, in its direction keeps its rate, as a point does: nothing strikes it, and other
+    joints would have to stop with it.
 
     A joint whose brake is closed rests without friction: the brake carries all of its load. A row of friction would
     reach its bound and break loose, and the joint would not move.
@@ -318,7 +321,9 @@ def hold_slow_joints(unilateral: UnilateralArrays, ws: Workspace):
     table, dry = unilateral.dry_table, unilateral.dry
     for k in range(table.shape[0]):
         rate, braked = ws.joints[table[k, ku.DRY_JOINT], ka.QD], table[k, ku.DRY_BRAKE] == ku.CLOSED
-        table[k, ku.DRY_HOLDS] = 1 if abs(rate) <= 2.0 * unilateral.number[ku.SLOW] and not braked else 0
+        goes = not dry_rests(unilateral, k) and dry[k, ku.DRY_SIDE] * rate > RATE_TOLERANCE and rule != HOLD_SLOW
+        slow = abs(rate) <= 2.0 * unilateral.number[ku.SLOW]
+        table[k, ku.DRY_HOLDS] = 1 if slow and not braked and not goes else 0
         dry[k, ku.DRY_SIDE], dry[k, ku.DRY_AT] = 1.0 if rate > 0.0 else -1.0, ws.joints[table[k, ku.DRY_JOINT], ka.Q]
         if braked:
             dry[k, ku.DRY_SIDE] = 0.0
@@ -347,11 +352,11 @@ def let_joints_slide(system: System, size, largest):
 
 @internal_kernel
 def goes_along(unilateral: UnilateralArrays, ws: Workspace, k):
-    """True if candidate k slips, however slowly, in its given direction."""
+    """True if candidate k does not slip against its given direction, or only by rounding."""
     along = 0.0
     for s in range(3):
         along += unilateral.slide[k, ku.REFERENCE + s] * ws.contacts[k, ka.SLIP_VELOCITY + s]
-    return along > 0.0
+    return along > -RATE_TOLERANCE
 
 
 @internal_kernel
