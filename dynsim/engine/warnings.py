@@ -19,6 +19,7 @@ from dynsim.engine.soundness import unstable_loop
 from dynsim.errors import first_few
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts import events as ke
+from dynsim.integrators.project import RATE_TOLERANCE
 from dynsim.integrators.stepping import tables as kt
 from dynsim.model.description import Contact, Robot
 from dynsim.model.drives import Drive, Motor, Servo, TorqueSource
@@ -331,7 +332,8 @@ def _moving_start(record: Record, prepared: Prepared) -> list[str]:
         return []
     # A run may have begun from another state. Quaternions have been normalised.
     there = np.allclose(record["q"][0], robot.initial, rtol=0.0, atol=SAME_POSTURE)
-    if not there or np.abs(record["v"][0]).max(initial=0.0) > 0.0:
+    # A projection leaves rates of rounding.
+    if not there or np.abs(record["v"][0]).max(initial=0.0) > RATE_TOLERANCE:
         return []
     size = np.abs(record["vdot"][0])
     if size.max(initial=0.0) <= OF_WEIGHT * (1.0 + float(np.linalg.norm(robot.gravity))):

@@ -39,6 +39,7 @@ FOUND = {
     "a joint that broke loose by itself, and other forces that jumped for the sign of a rounding": (271127, 900),
     "what settled after a landing turned a joint round, and its friction drove it": (271127, 995),
     "a joint that slid slowly and was stopped where another slip began, and others with it": (271127, 796),
+    "an equilibrium that moved without a warning, because its rates were 1e-43": (271127, 1218),
     "two joints that hit each other off their stops for ever": (271127, 404),
 }
 # Scenes of the slow study.
