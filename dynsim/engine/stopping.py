@@ -152,9 +152,10 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
             law.mode[:, ku.BEFORE] != law.mode[:, ku.WANTED],
             np.abs(prepared.workspace.contacts[:, ka.GAP]) < START_TOLERANCE,
         )
-        chattered = law.stop[:, ku.STOP_CHATTERED] > 0.0
-        if chattered.any() and not (law.tally[:, ku.CHATTERED] > 0.0).any():
-            joints = dict.fromkeys(stop.joint for stop, own in zip(prepared.stops, chattered, strict=True) if own)
+        joints = dict.fromkeys(
+            stop.joint for stop, row in zip(prepared.stops, law.stop, strict=True) if row[ku.STOP_CHATTERED]
+        )
+        if joints and not law.tally[:, ku.CHATTERED].any():
             return (
                 f"{where}: {', '.join(joints)} hits and leaves its stop without end; "
                 f"take {STEP_OVER if _can_step_over(prepared) else 'a larger integrator.atol'}"

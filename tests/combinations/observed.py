@@ -398,15 +398,15 @@ def _stepped_balance(seen: Observed) -> Balance:
         # Tangents may turn about the normal as much as that turns.
         angle = np.linalg.norm(later.normal - touch.normal, axis=1, keepdims=True)
         slack = slack + np.abs(_contact_term(seen, middle, touch, angle * np.cross(touch.normal, turned)))
-    # Velocity products use the rates that the acceleration of the last step without an impact leads to, or the rates of
-    # the start if contacts have changed.
-    best = _balanced(seen, rows, [_inertial(seen, q_middle, v_start, a), *terms[1:]], slack)
-    for back in (1, 2, 3):
-        earlier = np.where((rows > back)[:, None], seen.vdot[np.maximum(rows - back, 0)], 0.0)
-        led = _balanced(seen, rows, [_inertial(seen, q_middle, v_start + theta * h * earlier, a), *terms[1:]], slack)
-        better = (led.excess.max(axis=1) < best.excess.max(axis=1))[:, None]
-        best = replace(best, left=np.where(better, led.left, best.left), scale=np.where(better, led.scale, best.scale))
-    return best
+    # Velocity products use the rates that the last acceleration leads to, or the rates of the start if contacts have
+    # changed.
+    last = np.where((rows > 1)[:, None], seen.vdot[np.maximum(rows - 1, 0)], 0.0)
+    led, begun = (
+        _balanced(seen, rows, [_inertial(seen, q_middle, rates, a), *terms[1:]], slack)
+        for rates in (v_start + theta * h * last, v_start)
+    )
+    better = (led.excess.max(axis=1) < begun.excess.max(axis=1))[:, None]
+    return replace(led, left=np.where(better, led.left, begun.left), scale=np.where(better, led.scale, begun.scale))
 
 
 def _inertial(seen: Observed, q: Array, v: Array, a: Array) -> Array:

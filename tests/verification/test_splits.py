@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog, minimize, minimize_scalar
 
 from dynsim.dynamics.contact.cone.program import cone_program, solve_cone_program
-from dynsim.dynamics.contact.cone.socp import best_split, split_room, widest_split
+from dynsim.dynamics.contact.cone.socp import best_split, split_room
 from dynsim.dynamics.contact.splits import ONE_WAY, null_space
 from dynsim.jit.kernel import integers, reals
 
@@ -32,7 +32,7 @@ def split(f0, N, first, mu) -> tuple[float, np.ndarray]:
         if table.dtype == np.float64:
             table[:] = np.nan
     out = np.full(len(f0), np.nan)
-    margin = best_split(reals(f0), reals(N), r, integers(first), reals(mu), c, 0, out, room)
+    margin = best_split(reals(f0), reals(N), r, integers(first), reals(mu), c, 0, out, room, True)
     return margin, out
 
 
@@ -194,7 +194,7 @@ def test_a_joint_that_carries_nothing_does_not_end_the_search(seed):
     f0 = np.array([0.4, -0.4, 1.4, -0.005, -0.15 * slide, idle])
     N = np.array([[0.98854], [0.0], [0.0], [0.0], [0.15094], [0.0]])
     mu, out = reals(np.array([2.88, 0.234, 0.234, 0.002])), np.full(6, np.nan)
-    margin = best_split(reals(f0), reals(N), 1, integers(np.array([0, 3, 4, 5])), mu, 1, 3, out, split_room(1, 4))
+    margin = best_split(reals(f0), reals(N), 1, integers(np.array([0, 3, 4, 5])), mu, 1, 3, out, split_room(1, 4), True)
     assert margin == pytest.approx(0.002, abs=1e-9)
     assert abs(out[4]) <= 0.234 * (1.0 + 1e-9)
 
@@ -206,7 +206,7 @@ def test_the_widest_split_has_the_best_margin(seed):
     f0, N, first, mu = random_split(np.random.default_rng(seed), r, c, True)
     best, least = split(f0, N, first, mu)
     out = np.full(len(f0), np.nan)
-    margin = widest_split(reals(f0), reals(N), r, integers(first), reals(mu), c, 0, out, split_room(r, c))
+    margin = best_split(reals(f0), reals(N), r, integers(first), reals(mu), c, 0, out, split_room(r, c), False)
     assert margin == pytest.approx(best, rel=1e-12)
     assert margins(out, first, mu).min() == pytest.approx(margin, rel=1e-5)
     assert margins(least, first, mu).min() <= margin * (1.0 + 1e-6)
@@ -222,7 +222,9 @@ def test_joints_that_rub_share_their_forces_as_a_linear_programme_has_it(seed):
     bound[p - stops :], f0[p - stops :] = 0.0, 2.0 + f0[p - stops :]
     out, joints = np.full(p, np.nan), p - stops
     mu = np.append(bound[:joints], np.full(stops, ONE_WAY))
-    margin = best_split(reals(f0), reals(N), N.shape[1], integers(np.arange(p)), reals(mu), 0, p, out, split_room(r, p))
+    margin = best_split(
+        reals(f0), reals(N), N.shape[1], integers(np.arange(p)), reals(mu), 0, p, out, split_room(r, p), True
+    )
     ones = np.ones((p, 1))
     rows, limits = (
         np.vstack([np.hstack([N, ones])[:joints], np.hstack([-N, ones])]),

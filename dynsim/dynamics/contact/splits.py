@@ -2,8 +2,8 @@
 
 Two sticking braces of a planar arm have dependent lateral rows, points along one body dependent radial rows: only the
 sum of their forces is in the equations of motion. Such a set sticks as long as some split lies in all cones
-|f_t| ≤ μ_s f_n. If the split of least norm does not, the one of least norm among those that do replaces it; if none
-does, the one with the largest worst margin.
+|f_t| ≤ μ_s f_n. If the split of least norm is outside them, the split of least norm inside them replaces it; if no
+split is inside, the split with the largest worst margin does.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def margin(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace,
 
 @internal_kernel
 def dry_margin(unilateral: UnilateralArrays, ws: Workspace, k):
-    """What is left of the dry friction of a joint that it holds [N m or N]."""
+    """Margin of dry friction that holds a joint: its bound minus its force [N m or N]."""
     return holding_bound(unilateral, k) - abs(ws.rows[unilateral.dry_table[k, ku.DRY_ROW], ka.FORCE])
 
 
@@ -50,7 +50,7 @@ def dry_margin(unilateral: UnilateralArrays, ws: Workspace, k):
 def admissible_forces(contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: Workspace):
     """Replace the forces of dependent rows that stick where they are beyond their bounds; note those of joints.
 
-    Accelerations do not change: the rows are their own directions, so what they cannot tell apart moves nothing.
+    Accelerations do not change: the forces change only in the null space of the rows.
     """
     if unilateral is None:  # known to the compiler
         return
@@ -107,16 +107,26 @@ def split_forces(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Work
     width = int(unilateral.number[ku.WIDTH])
     unilateral.number[ku.SPLIT] = 1.0
     programs = split_room_in(unilateral.split_room, index[3], width, count)
-    worst = best_split(force[:p], room[ku.NULL_SPACE], width, first, mu, points, count - points, out[:p], programs)
+    worst = best_split(
+        force[:p], room[ku.NULL_SPACE], width, first, mu, points, count - points, out[:p], programs, True
+    )
     unilateral.number[ku.BEST_MARGIN] = worst
     for i in range(p, p + ties):
-        for c in range(width):
-            part = 0.0
-            for j in range(p):
-                part += room[ku.NULL_SPACE, j, c] * (out[j] - force[j])
-            rows[row[i], ka.FORCE] += room[ku.NULL_SPACE, i, c] * part
+        rows[row[i], ka.FORCE] += change_of_coupling(room[ku.NULL_SPACE], width, i, force, out, p)
     for i in range(p):
         rows[row[i], ka.FORCE] = out[i]
+
+
+@internal_kernel
+def change_of_coupling(N, width, i, force, out, p):
+    """Change of the force of row i, a coupling, when forces of the leading p rows change from ``force`` to ``out``."""
+    total = 0.0
+    for c in range(width):
+        part = 0.0
+        for j in range(p):
+            part += N[j, c] * (out[j] - force[j])
+        total += N[i, c] * part
+    return total
 
 
 @internal_kernel
@@ -128,7 +138,7 @@ def find_splits(unilateral: UnilateralArrays, ws: Workspace):
 
     Returns
     -------
-    points, count, p, ties : sticking points, those with held joints and stops, and their rows; rows of couplings
+    points, count, p, ties : number of sticking points, number of points, held joints and stops, their rows, coupling rows
     """
     room, first, row = unilateral.room, unilateral.index[0], unilateral.index[1]
     count, p = 0, 0

@@ -36,6 +36,7 @@ DEPTH, AT_ROOT = 2e-10, 1e-13
 TIME_OPEN, TIME_SLIDING, TIME_STICKING = 0, 1, 2  # in the order of the modes [s]
 LIFT_OFFS, LANDINGS, SLIP_STARTS, BOUNCES = 3, 4, 5, 6
 LOSS = 7  # energy that impacts have taken [J]
+# The next four are in the same order for stops.
 SETTLE = 8  # slower than that a touching point counts as at rest along the normal [m/s]
 WINDOW_START, WINDOW_COUNT = 9, 10  # of the count of events that detects chatter
 CHATTERED = 11  # how often SETTLE was raised because of it

@@ -433,8 +433,7 @@ def tell(system: System, run: Run, k, kind):
         tally[k, ku.SLIP_STARTS] += 1.0
     elif kind == BOUNCE:
         tally[k, ku.BOUNCES] += 1.0
-    if chatters(run, tally, k, ku.WINDOW_START, ku.WINDOW_COUNT, ku.CHATTERED, ku.SETTLE):
-        log(run, ki.CONTACT_LOG + LOG_KINDS * k + CHATTERS)
+    watch_chatter(run, tally, k, ku.SETTLE, ki.CONTACT_LOG)
 
 
 @internal_kernel
@@ -444,27 +443,28 @@ def tell_stop(system: System, run: Run, k, kind):
     log(run, ki.STOP_LOG + LOG_KINDS * k + kind)
     if kind == STOP_HIT:
         stop[k, ku.HITS] += 1.0
-    if chatters(run, stop, k, ku.STOP_WINDOW_START, ku.STOP_WINDOW_COUNT, ku.STOP_CHATTERED, ku.STOP_SETTLE):
-        log(run, ki.STOP_LOG + LOG_KINDS * k + CHATTERS)
+    watch_chatter(run, stop, k, ku.STOP_SETTLE, ki.STOP_LOG)
 
 
 @internal_kernel
-def chatters(run: Run, table, k, start, count, chattered, settle):
-    """Count an event of row k, whose columns follow; True if it is the first too many in a WINDOW.
+def watch_chatter(run: Run, table, k, settle, first):
+    """Count an event of row k, with SETTLE in column ``settle``; if it is one too many, impacts settle from faster.
 
-    Each such one lets impacts settle from a higher speed.
+    Codes of the log begin at ``first``.
     """
+    start, count, chattered = settle + 1, settle + 2, settle + 3
     if run.clock[ki.TIME] - table[k, start] > WINDOW:
         table[k, start], table[k, count] = run.clock[ki.TIME], 0.0
     table[k, count] += 1.0
     if table[k, count] <= MOST_EVENTS:
-        return False
+        return
+    if table[k, chattered] == 0.0:
+        log(run, first + LOG_KINDS * k + CHATTERS)
     table[k, chattered] += 1.0
     table[k, settle] = min(10.0 * table[k, settle], MOST_SETTLE)
     table[k, start], table[k, count] = run.clock[ki.TIME], 0.0
     if table[k, chattered] > MOST_CHATTER:
         run.count[ki.STATUS] = ki.CHATTER
-    return table[k, chattered] == 1.0
 
 
 @internal_kernel

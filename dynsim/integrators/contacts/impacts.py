@@ -232,7 +232,7 @@ def friction_at_rest(system: System, k):
 
 @internal_kernel
 def friction_of_impact(system: System, ws: Workspace, k):
-    """Coefficient of friction of candidate k in an impact: at the slip before it; static for what is at rest."""
+    """Coefficient of friction of candidate k in an impact: at the slip before it, or static if at rest."""
     slip, before = slip_speed(ws, k), system.unilateral.mode[k, ku.BEFORE]
     if before == ka.STICKING or (before == ka.OPEN and slip <= system.unilateral.number[ku.SLOW]):
         return friction_at_rest(system, k)

@@ -1,8 +1,8 @@
 """Joints at rest that dry friction holds by a constant force instead of a row, because other rows hold them too.
 
-How such a joint and the others share the load is open. The choice of modes gives one solution; of all with the same
-motion, the joint takes its force from the one with the largest worst margin. At the bound of another joint's friction
-the next change of forces would end the share, and modes would be chosen again without end.
+The equations of motion do not determine how such a joint and the others share the load. The choice of modes gives one
+solution; the joint takes its force from the solution with the same motion and the largest worst margin. If another
+joint were at its bound, the next change of forces would end the share, and modes would be chosen again without end.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from dynsim.dynamics import state as kst
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.cone import problem as kc
-from dynsim.dynamics.contact.cone.socp import split_room_in, widest_split
+from dynsim.dynamics.contact.cone.socp import best_split, split_room_in
 from dynsim.dynamics.contact.delassus import RANK_TOLERANCE
 from dynsim.dynamics.contact.rows import set_modes
-from dynsim.dynamics.contact.splits import ONE_WAY, null_space
+from dynsim.dynamics.contact.splits import ONE_WAY, change_of_coupling, null_space
 from dynsim.dynamics.contact.unilateral import UnilateralArrays, dry_bound, dry_rests, dry_rows_held
 from dynsim.dynamics.derivative import System
 from dynsim.dynamics.tables import Workspace
@@ -42,7 +42,7 @@ def release_dependent_joints(system: System, ws: Workspace, size):
     of the right-hand side equals the solution. At rest Coulomb's law admits any force within the bound. Rows that
     depend only on rows of sticking points and other joints remain, see :mod:`dynsim.dynamics.contact.splits`, except
     rows that depend on them only nearly: holding such a joint would take forces beyond all bounds, and the order of
-    pivots would decide whether it is held. ``size`` is that of the solved problem.
+    pivots would decide whether it is held. ``size`` is the size of the solved problem.
     """
     unilateral, W = system.unilateral, ws.small[0]
     table, mode, bare, whole = unilateral.dry_table, unilateral.mode, 0, 0
@@ -94,13 +94,12 @@ def take_widest_split(system: System, ws: Workspace, size):
     and sticking points within their bounds, of sliding points along their whole force. Friction that slides, or begins
     to, stays as it is for its normal force.
     """
-    unilateral, W, table = system.unilateral, ws.small[0], system.unilateral.dry_table
-    vector, kinds, room = unilateral.vector, unilateral.index[ku.KINDS], unilateral.room
+    unilateral, table = system.unilateral, system.unilateral.dry_table
+    vector, kinds, N = unilateral.vector, unilateral.index[ku.KINDS], unilateral.room[ku.NULL_SPACE]
     f, first, row = vector[ku.SOLUTION], unilateral.index[0], unilateral.index[1]
-    part, other = ku.FIRST_PART, ku.SECOND_PART
     mu, force, out = vector[0], vector[1], vector[2]
-    couplings, after = system.couplings.joint.shape[0], system.couplings.joint.shape[0] + dry_rows_held(unilateral)
-    count, p = 0, 0
+    couplings = system.couplings.joint.shape[0]
+    after, count, p = couplings + dry_rows_held(unilateral), 0, 0
     for i in range(after, size):
         if kinds[i] == kc.CONE and f[i] > 0.0 and sticks(unilateral, ws, i):
             first[count], mu[count] = p, vector[ku.CONE_FRICTION, i]
@@ -114,51 +113,55 @@ def take_widest_split(system: System, ws: Workspace, size):
             first[count], mu[count], row[p] = p, vector[ku.CONE_FRICTION, table[k, ku.DRY_ROW]], table[k, ku.DRY_ROW]
             p += 1
             count += 1
+    bounded = p
     for i in range(after, size):
         slides = kinds[i] == kc.CONE and not sticks(unilateral, ws, i)
         if f[i] > 0.0 and (slides or kinds[i] == kc.ONE_WAY):
             if slides:
-                vector[part, i], vector[other, i] = f[i + 1] / f[i], f[i + 2] / f[i]
+                vector[ku.FIRST_PART, i], vector[ku.SECOND_PART, i] = f[i + 1] / f[i], f[i + 2] / f[i]
             first[count], mu[count], row[p] = p, ONE_WAY, i
             p += 1
             count += 1
     for i in range(couplings):
         row[p + i] = i
-    for i in range(p + couplings):
-        for j in range(p + couplings):
-            a, b = unilateral.index[ku.TABLE_ROW, row[i]], unilateral.index[ku.TABLE_ROW, row[j]]
-            total = W[a, b]
-            # A sliding point pushes along its friction too.
-            for s in range(part, other + 1):
-                x, y = vector[s, row[i]], vector[s, row[j]]
-                if x != 0.0:
-                    total += x * W[a + 1 + s - part, b]
-                if y != 0.0:
-                    total += y * W[a, b + 1 + s - part]
-                for t in range(part, other + 1):
-                    if x != 0.0 and vector[t, row[j]] != 0.0:
-                        total += x * vector[t, row[j]] * W[a + 1 + s - part, b + 1 + t - part]
-            room[ku.SPLIT_MATRIX, i, j] = total
-    width = null_space(room[ku.SPLIT_MATRIX], p + couplings, room[ku.NULL_SPACE], unilateral.index[2], p)
+    whole = p + couplings
+    for i in range(whole):
+        for j in range(whole):
+            unilateral.room[ku.SPLIT_MATRIX, i, j] = mobility_along_forces(unilateral, ws, row[i], row[j])
+    width = null_space(unilateral.room[ku.SPLIT_MATRIX], whole, N, unilateral.index[2], p)
     for i in range(p):
         force[i] = f[row[i]]
     programs = split_room_in(unilateral.split_room, unilateral.index[3], width, count)
-    widest_split(force[:p], room[ku.NULL_SPACE], width, first, mu, points, count - points, out[:p], programs)
-    for i in range(p, p + couplings):
-        for c in range(width):
-            change = 0.0
-            for j in range(p):
-                change += room[ku.NULL_SPACE, j, c] * (out[j] - force[j])
-            f[row[i]] += room[ku.NULL_SPACE, i, c] * change
+    best_split(force[:p], N, width, first, mu, points, count - points, out[:p], programs, False)
+    for i in range(p, whole):
+        f[row[i]] += change_of_coupling(N, width, i, force, out, p)
     for i in range(p):
-        if kinds[row[i]] == kc.CONE and not sticks(unilateral, ws, row[i]):
-            f[row[i] + 1], f[row[i] + 2] = vector[part, row[i]] * out[i], vector[other, row[i]] * out[i]
         f[row[i]] = out[i]
+        if i >= bounded and kinds[row[i]] == kc.CONE:
+            f[row[i] + 1], f[row[i] + 2] = (
+                vector[ku.FIRST_PART, row[i]] * out[i],
+                vector[ku.SECOND_PART, row[i]] * out[i],
+            )
+
+
+@internal_kernel
+def mobility_along_forces(unilateral: UnilateralArrays, ws: Workspace, i, j):
+    """Mobility between rows i and j of the solved problem along their whole forces, friction of slip included."""
+    vector, total = unilateral.vector, 0.0
+    a, b = unilateral.index[ku.TABLE_ROW, i], unilateral.index[ku.TABLE_ROW, j]
+    for s in range(3):
+        x = 1.0 if s == 0 else vector[ku.FIRST_PART + s - 1, i]
+        for t in range(3):
+            y = 1.0 if t == 0 else vector[ku.FIRST_PART + t - 1, j]
+            # Rows without parts may be the last of the table.
+            if x != 0.0 and y != 0.0:
+                total += x * y * ws.small[0, a + s, b + t]
+    return total
 
 
 @internal_kernel
 def sticks(unilateral: UnilateralArrays, ws: Workspace, i):
-    """True if row i of the solved problem is the normal row of a candidate that shall stick."""
+    """True if row i of the solved problem is the normal row of a candidate that sticks in the chosen modes."""
     for k in range(unilateral.mode.shape[0]):
         if unilateral.mode[k, ku.TOUCHING] == 1 and ws.active[k, ka.FIRST_ROW] == unilateral.index[ku.TABLE_ROW, i]:
             return unilateral.mode[k, ku.WANTED] == ka.STICKING

@@ -6,9 +6,9 @@ import math
 
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact.cone.program import ConeProgram, cone_program, laid_out, program_size, solve_cone_program
-from dynsim.jit.kernel import internal_kernel, kernel, noinline_kernel
+from dynsim.jit.kernel import internal_kernel, kernel
 
-# Weight of |z|² beside the margin: makes the best split unique where the margin alone does not.
+# Weight of |z|² in the objective with the margin: makes the best split unique where the margin alone does not.
 LEAST_WEIGHT = 1e-13
 # Bound on the margin, in units of the largest given force: pressing two walls apart has no largest margin.
 MARGIN_MAX = 10.0
@@ -17,7 +17,7 @@ FORCE_TOLERANCE = 1e-9
 
 
 def split_room(r: int, count: int) -> ConeProgram:
-    """The room of :func:`best_split` for null spaces of up to r columns and so many contacts."""
+    """The room of :func:`best_split` for null spaces of up to r columns and ``count`` contacts."""
     return cone_program(*split_sizes(r, count))
 
 
@@ -37,11 +37,29 @@ def split_room_in(flat, first, r, count):
     return laid_out(flat, first, r + 1, 2 * count, count + 1, ka.MOST_ROWS * count + 1)
 
 
-@noinline_kernel
-def widest_split(f0, N, r, contact_first, mu, contacts, joints, out, room: ConeProgram):
-    """Like :func:`best_split`, but ``out`` is always the split of the best margin; its z in units of the largest force.
+@kernel
+def best_split(f0, N, r, contact_first, mu, contacts, joints, out, room: ConeProgram, least):
+    """Forces f = f0 + N z of redundant sticking contacts: in all cones if any split is, and then the least, if wanted.
 
-    The room keeps the program.
+    The best margin is max_z min_j (μ_j f_n,j − |f_t,j|). Is it negative, no split holds all contacts. A contact without
+    friction can hold no tangential force: where its own can vanish it is kept at zero, and its margin is f_n,j.
+
+    Parameters
+    ----------
+    f0 : (p or more,) forces of all rows [N]
+    N : (p or more, r or more) directions in which they can be split otherwise; r of them
+    contact_first : (contacts + joints or more,) int, normal row of each sticking contact, whose tangential rows follow,
+        then the ``joints``: the row of each joint that dry friction holds, and of each closed joint stop
+    mu : (contacts + joints or more,) static friction; of joints the bound of their force, whose margin is μ_j − |f_j|;
+        negative for a stop, whose margin is its force f_j
+    out : (p or more,) the force of least norm in all cones; if no force is in all cones, the force of the best margin
+    room : see :func:`split_room`
+    least : False: the split of the best margin in any case
+
+    Returns
+    -------
+    float
+        The best margin [N], at most ten times the largest force in f0.
     """
     p, count = f0.shape[0], contacts + joints
     scale = 0.0
@@ -97,58 +115,21 @@ def widest_split(f0, N, r, contact_first, mu, contacts, joints, out, room: ConeP
     if error > FORCE_TOLERANCE:
         margin = min(margin, -error)
 
+    if least and margin > FORCE_TOLERANCE:
+        # There is room inside the cones: the least force, from the point found.
+        for k in range(r):
+            room.g[k] = 0.0
+            for i in range(p):
+                room.g[k] += N[i, k] * f0[i] / scale
+            for m in range(r):
+                room.H[k, m] = 0.0
+                for i in range(p):
+                    room.H[k, m] += N[i, k] * N[i, m]
+        solve_cone_program(room, r, equations, count)
     for i in range(p):
         for k in range(r):
             out[i] += scale * N[i, k] * x[k]
     return margin * scale
-
-
-@kernel
-def best_split(f0, N, r, contact_first, mu, contacts, joints, out, room: ConeProgram):
-    """Forces f = f0 + N z of redundant sticking contacts: in all cones if any split is, and then the least of those.
-
-    The best margin is max_z min_j (μ_j f_n,j − |f_t,j|). Is it negative, no split holds all contacts. A contact without
-    friction can hold no tangential force: where its own can vanish it is kept at zero, and its margin is f_n,j.
-
-    Parameters
-    ----------
-    f0 : (p or more,) forces of all rows [N]
-    N : (p or more, r or more) directions in which they can be split otherwise; r of them
-    contact_first : (contacts + joints or more,) int, normal row of each sticking contact, whose tangential rows follow,
-        then the row of each joint that dry friction holds, and of each closed joint stop; those are the ``joints``
-    mu : (contacts + joints or more,) static friction; of joints the bound of their force, whose margin is μ_j − |f_j|;
-        negative for a stop, whose margin is its force f_j
-    out : (p or more,) the force of least norm among those in all cones; without one, that of the best margin
-    room : see :func:`split_room`
-
-    Returns
-    -------
-    float
-        The best margin [N], at most ten times the largest force in f0.
-    """
-    margin = widest_split(f0, N, r, contact_first, mu, contacts, joints, out, room)
-    p, x, scale, equations = f0.shape[0], room.x, 0.0, 0
-    for i in range(p):
-        scale = max(scale, abs(f0[i]))
-    if r == 0 or not margin > FORCE_TOLERANCE * scale:
-        return margin
-    # There is room inside the cones: the least force, from the point found.
-    for j in range(contacts):
-        equations += 0 if mu[j] > 0.0 else ka.MOST_ROWS - 1
-    for k in range(r):
-        room.g[k] = 0.0
-        for i in range(p):
-            room.g[k] += N[i, k] * f0[i] / scale
-        for m in range(r):
-            room.H[k, m] = 0.0
-            for i in range(p):
-                room.H[k, m] += N[i, k] * N[i, m]
-    solve_cone_program(room, r, equations, contacts + joints)
-    for i in range(p):
-        out[i] = f0[i]
-        for k in range(r):
-            out[i] += scale * N[i, k] * x[k]
-    return margin
 
 
 @internal_kernel
