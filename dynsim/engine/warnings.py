@@ -1,4 +1,4 @@
-"""Warnings of a dynamics run: sentences with the location, the number, and the remedy."""
+"""Warnings of a dynamics run: sentences with the location, the number, and the fix."""
 
 from __future__ import annotations
 
@@ -29,27 +29,28 @@ from dynsim.scenario import Scenario, build
 from dynsim.scenario.effect import without_effect
 
 DRIFT_LIMIT_M = 1e-9
-# A larger acceleration of a joint at an equilibrium start is a motion, not rounding [rad/s² or m/s²].
+# A larger acceleration of a joint at an equilibrium start is motion, not rounding [rad/s² or m/s²].
 STARTS_MOVING = 1e-6
-# Postures that differ by roundings alone [rad or m].
+# Postures that differ by less are equal except for rounding [rad or m].
 SAME_POSTURE = 1e-12
-# Smaller accelerations, by the weight's, of a balance that uses less than all friction are roundings of stiff contacts.
+# If an equilibrium uses less than all friction, accelerations below this share of gravity are rounding errors of stiff
+# contacts.
 OF_WEIGHT = 1e-4
-# Forces of contacts at the start that differ by more than this, relative or in N, are others than at rest.
+# Contact forces at the start that differ by more than this, relative or in N, differ from the forces at rest.
 DIFFERS = 1e-3
-# Slip that begins earlier is of the start [s].
+# Slip that begins earlier belongs to the start [s].
 AT_ONCE = 1e-3
-# Slower than this a joint with dry friction is at rest [rad/s or m/s].
+# A joint with dry friction that is slower than this is at rest [rad/s or m/s].
 AT_REST = 1e-9
-# Negative friction heat of no more than this share of the turnover is rounding.
+# Negative friction heat below this share of the turnover is rounding.
 FRICTION_ROUNDING = 1e-12
 # Limits in files are rounded: a joint that starts at 1.5707963 = 90° is not beyond it.
 LIMIT_SLACK = 1e-6
-# Part of a limit of current that counts as reached.
+# Relative distance from a current limit within which it counts as reached.
 NEAR_LIMIT = 1e-3
 NOT_ENFORCED = "no law enforces this limit"
-# Time stepping, limits of warnings: energy taken or added by the steps, and change of the energy if all came half a
-# step later, both as shares of the turnover; depth of points below surfaces [m].
+# Warning limits of time stepping: energy that the steps remove or add, and change of the energy if everything happened
+# half a step later, both as shares of the turnover; depth of points below surfaces [m].
 SCHEME_LIMIT = 1e-2
 HALF_STEP_LIMIT = 2e-2
 PENETRATION_LIMIT_M = 1e-3
@@ -65,14 +66,14 @@ def warnings_of(
     motors: Sequence[dict[str, Any]],
     begun: float = 0.0,
 ) -> list[str]:
-    """All warnings of a run, one sentence each.
+    """Return all warnings of a run, each as one sentence.
 
     Parameters
     ----------
-    summary : numbers so far
-    scale : turnover of the energy, no less than what the ledger resolves [J]
-    sunk : bodies below surfaces; motors : their loads
-    begun : time at which the run began [s]; the samples of a ring begin later
+    summary : entries of the summary so far
+    scale : turnover of the energy, at least the resolution of the ledger [J]
+    sunk : bodies below surfaces; motors : loads of the motors
+    begun : time at which the run began [s]; the samples of a ring buffer begin later
     """
     robot = prepared.model.robot
     unstable = unstable_loop(scenario, prepared)
@@ -105,7 +106,7 @@ def warnings_of(
 def _contact_warnings(
     record: Record, scenario: Scenario, prepared: Prepared, summary: dict[str, Any], begun: float
 ) -> list[str]:
-    """What chatters; contacts that pull, carry nothing or turn their force against themselves; friction that drives."""
+    """Warn of chatter, contacts that pull, carry no load or oppose their own force, and friction that adds energy."""
     contacts, unilateral, warnings = prepared.contacts, prepared.system.unilateral, list[str]()
     units = {link.joint: link.units for link in prepared.model.robot.links}
     if unilateral is not None:
@@ -132,11 +133,11 @@ def _contact_warnings(
     warnings += build.left_out_warnings(scenario, contacts, prepared.behind_brakes)
     initial, columns = scenario.config.initial, record.labels["contact_gap"]
     placed = () if initial is None else initial.on_surface
-    # Of a ring, nobody knows what was before it.
+    # A ring buffer does not have the earlier samples.
     within = f" from t = {record.time[0]:.4g} s on" if len(record) and record.time[0] > begun else ""
     for contact in summary["contacts"]:
         name = contact["name"]
-        # What only bounces is closed at no time.
+        # A contact that only bounces is never closed.
         never = "gap_min_m" in contact and contact["closed_fraction"] == 0.0 and not contact.get("bounces")
         if never and name not in left_out:
             nearest = int(record["contact_gap"][:, columns.index(name)].argmin())
@@ -152,7 +153,7 @@ def _contact_warnings(
                 f"{'' if name in placed else ' (initial.on_surface lets it start there)'}"
             )
     for brace, since in zip(contacts, prepared.run.extremes[:, ki.LOCAL_SINCE], strict=True):
-        # What the end of a refused step shows is the reason of a stop, and no part of the run.
+        # The end of a rejected step explains a stop and is not a part of the run.
         if since <= prepared.run.clock[ki.TIME]:
             warnings.append(
                 f"{brace.name}: from t = {since:.4g} s on, its friction turns its own force against it (negative "
@@ -172,21 +173,21 @@ def _contact_warnings(
 
 
 def _saturated(record: Record, robot: Robot) -> list[str]:
-    """Motors at their limits of voltage, current or torque."""
+    """Warn of motors at their limits of voltage, current or torque."""
     warnings = []
     limited = [(a, motor, limits) for a, motor in enumerate(robot.motors) for limits in _limits_of(motor)]
-    # Along samples: a third of the time.
+    # A maximum along contiguous samples needs a third of the time.
     peaks = {
         name: np.abs(record[name].T.copy()).max(axis=1, initial=0.0) for name in {limit[1] for *_, limit in limited}
     }
     for a, motor, (quantity, signal, limit, unit) in limited:
-        # The current of a DC motor comes near to the limit of its driver, and does not reach it.
+        # The current of a DC motor approaches the limit of its driver but does not reach it.
         reached = limit * (1.0 - NEAR_LIMIT) if isinstance(motor, Motor) and quantity == "current" else limit
-        # A run that diverged may have NaN, which hides a peak.
+        # A run that diverged may contain NaN, which hides a peak.
         if not peaks[signal][a] < reached:
             saturated = np.abs(record[signal][:, a]) >= reached
             if isinstance(motor, Servo):
-                # Without a current its voltage is the back-EMF.
+                # Without a current its voltage equals the back-EMF.
                 saturated &= record["current"][:, a] != 0.0
             if saturated.mean() >= SHORT:
                 warnings.append(
@@ -197,7 +198,7 @@ def _saturated(record: Record, robot: Robot) -> list[str]:
 
 
 def _limits_of(motor: Drive) -> list[tuple[str, str, float, str]]:
-    """Limits of a motor: what is limited, its signal, the limit and its unit."""
+    """Return the limits of a motor: the limited quantity, its signal, the limit and its unit."""
     if isinstance(motor, TorqueSource):
         return [("torque", "current", motor.torque_limit, "N m")]
     limits = [("voltage", "voltage", motor.voltage_limit, "V")]
@@ -207,19 +208,19 @@ def _limits_of(motor: Drive) -> list[tuple[str, str, float, str]]:
 
 
 def _sliding(record: Record, contacts: Sequence[Contact], names: Sequence[str], samples: Any) -> list[str]:
-    """Those of the named contacts that slide with friction in some of the samples, an index of them."""
+    """Return the named contacts that slide with friction in at least one of the samples; ``samples`` is an index."""
     slides = (record["contact_mode"][samples] == ka.SLIDING).any(axis=0)
     slides &= np.array([contact.friction > 0.0 for contact in contacts], dtype=bool)
     return _named(contacts, slides, names)
 
 
 def _named(contacts: Sequence[Contact], chosen: NDArray[np.bool_], names: Sequence[str]) -> list[str]:
-    """Those of the names whose contacts are chosen, (c,), in the order of the contacts."""
+    """Return the names whose contacts are chosen, in the order of the contacts; ``chosen`` has shape (c,)."""
     return [contact.name for contact, own in zip(contacts, chosen, strict=True) if own and contact.name in names]
 
 
 def _undetermined(record: Record, prepared: Prepared, stepped: bool) -> list[str]:
-    """Contact rows that depend on each other: forces, and with friction the motion too, that are one of many."""
+    """Warn of dependent contact rows: the forces, and with friction also the motion, are not unique."""
     run, system, contacts = prepared.run, prepared.system, prepared.contacts
     evaluations = int(prepared.workspace.counts[ka.DEPENDENT])
     if system.unilateral is not None:
@@ -242,9 +243,9 @@ def _undetermined(record: Record, prepared: Prepared, stepped: bool) -> list[str
 
 
 def _shared_forces(record: Record, prepared: Prepared, dependent: bool, stepped: bool) -> list[str]:
-    """Forces of the unilateral law that the motion does not determine. Among points that stick no motion is open.
+    """Warn of unilateral forces that the motion does not determine; if all points stick, the motion is unique.
 
-    dependent : rows have depended on each other; stepped : by time stepping, which does not tell
+    dependent : whether rows have depended on each other; stepped : whether time stepping ran, which does not detect it
     """
     contacts, rests = prepared.contacts, _joints_at_rest(record, prepared)
     if not len(record) or not (dependent or stepped or rests.any()):
@@ -281,15 +282,15 @@ def _shared_forces(record: Record, prepared: Prepared, dependent: bool, stepped:
 
 
 def _leaving(record: Record, contacts: Sequence[Contact], names: Sequence[str], rests: NDArray[np.bool_]) -> list[str]:
-    """Those of the named contacts that leave their surface from sticking, while dry friction keeps joints at rest."""
+    """Return the named contacts that leave their surface from sticking while dry friction keeps joints at rest."""
     modes = record["contact_mode"]
     leaves = (modes[:-1] == ka.STICKING) & (modes[1:] == ka.OPEN) & rests[:-1].any(axis=1, keepdims=True)
     return _named(contacts, leaves.any(axis=0), names)
 
 
 def _unpressed(record: Record, prepared: Prepared, begun: float) -> list[str]:
-    """Contacts that stick although nothing presses them, which leaves the motion open."""
-    # Of a ring, too, the share is that of the whole run: samples do not show what presses.
+    """Warn of contacts that stick although no force presses them; then the motion is not unique."""
+    # The share refers to the whole run, even with a ring buffer, because samples do not show the pressing forces.
     unilateral, time = prepared.system.unilateral, record.time[-1] - begun if len(record) else 0.0
     if unilateral is None or not time > 0.0:
         return []
@@ -310,7 +311,7 @@ def _unpressed(record: Record, prepared: Prepared, begun: float) -> list[str]:
 
 
 def _slipping_start(record: Record, prepared: Prepared) -> list[str]:
-    """An equilibrium on the edge of friction cones that slips at the start."""
+    """Warn of an equilibrium on the edge of the friction cones that slips at the start."""
     if prepared.balance is None or not prepared.balance.on_edge or not len(record) or record.time[0] != 0.0:
         return []
     if np.abs(record["vdot"][0]).max(initial=0.0) > STARTS_MOVING:
@@ -326,13 +327,13 @@ def _slipping_start(record: Record, prepared: Prepared) -> list[str]:
 
 
 def _moving_start(record: Record, prepared: Prepared) -> list[str]:
-    """An equilibrium that the run leaves at once: the contact law allows rest and motion, as of wedged points."""
+    """Warn if the run leaves the equilibrium immediately: for wedged points the contact law allows rest and motion."""
     balance, robot = prepared.balance, prepared.model.robot
     if balance is None or balance.warnings or not len(record) or record.time[0] != 0.0:
         return []
-    # A run may have begun from another state. Quaternions have been normalised.
+    # The run may have begun from a different state. Quaternions have been normalised.
     there = np.allclose(record["q"][0], robot.initial, rtol=0.0, atol=SAME_POSTURE)
-    # A projection leaves rates of rounding.
+    # A projection leaves rates of the size of rounding errors.
     if not there or np.abs(record["v"][0]).max(initial=0.0) > RATE_TOLERANCE:
         return []
     size = np.abs(record["vdot"][0])
@@ -355,26 +356,26 @@ def _moving_start(record: Record, prepared: Prepared) -> list[str]:
 
 
 def _joints_at_rest(record: Record, prepared: Prepared) -> NDArray[np.bool_]:
-    """Joints that dry friction keeps at rest, by sample, (T, n)."""
+    """Return whether dry friction keeps each joint at rest, by sample, (T, n)."""
     rests = np.zeros((len(record), prepared.model.n), dtype=bool)
     law = prepared.system.unilateral
     if law is not None and "joint_friction" in record:
         columns = [prepared.model.joint_names.index(joint) for joint in record.signals["joint_friction"].labels]
         rests[:, columns] = np.abs(record["v"][:, columns]) < AT_REST
-        # Their brakes hold some of them, and then there is no friction.
+        # If a brake holds a joint, its dry friction is zero.
         braked = law.dry_table[:, ku.DRY_BRAKE] != ku.NEVER_CLOSED
         rests[:, columns] &= ~braked | (record["joint_friction"] != 0.0)
     return rests
 
 
 def _sunk(record: Record, sunk: Sequence[Sinking]) -> list[str]:
-    """One warning per surface: the bodies that samples of the record show below it, and the one that is deepest."""
+    """Warn once per surface of the bodies below it in samples of the record, with the deepest body."""
     warnings = []
     for surface, below in by_surface(sunk).items():
         deepest = max(below, key=lambda s: s.depth)
         names = ", ".join(s.body for s in below)
         verb = "passes" if len(below) == 1 else "pass"
-        # Bodies from URDF have no radius.
+        # Bodies from URDF do not have a radius.
         thick = any(s.radius > 0.0 for s in below)
         beyond = " by more than the link's radius" if thick else ""
         radius = f", of {1e3 * deepest.radius:g} mm," if thick else ""
@@ -387,10 +388,10 @@ def _sunk(record: Record, sunk: Sequence[Sinking]) -> list[str]:
 
 
 def _passed_limits(record: Record, robot: Robot, real: bool) -> list[str]:
-    """Limits of joints that samples of the record lie beyond.
+    """Warn of joint limits that samples of the record exceed.
 
-    Only stops are enforced, and only under the unilateral law (``real``). Under it time stepping alone lets joints pass
-    their stops: by up to a step at a hit, after which they are moved back.
+    Only stops are enforced, and only under the unilateral law (``real``). Under this law only time stepping lets joints
+    pass their stops, by up to one step of motion at a hit; then it moves them back.
     """
     torque = dict(zip(record.labels["torque"], record["torque"].T, strict=True))
     warnings = []
@@ -425,7 +426,7 @@ def _passed_limits(record: Record, robot: Robot, real: bool) -> list[str]:
 
 
 def _after_passing(left: float, unit: str, real: bool) -> str:
-    """Consequence and fix for a joint that has passed its stop and is ``left`` beyond it at the end [rad or m]."""
+    """Return consequence and fix for a joint that passed its stop and is ``left`` beyond it at the end [rad or m]."""
     if not real:
         return "stops are enforced under contacts.law: unilateral"
     if left > LIMIT_SLACK:
@@ -436,7 +437,7 @@ def _after_passing(left: float, unit: str, real: bool) -> str:
 
 
 def _beyond_stops(robot: Robot, stops: Sequence[JointStop], control: JointControl) -> list[str]:
-    """References that lie beyond a joint stop: the controller will push against it, and miss what it follows."""
+    """Warn of references beyond a joint stop: the controller pushes against the stop and misses the reference."""
     follows = {motor.joint: bool(k_p > 0.0) for motor, k_p in zip(robot.motors, control.k_p, strict=True)}
     places = dict(zip(robot.joint_names, robot.position_index, strict=True))
     units = {link.joint: link.units[0] for link in robot.links}
@@ -461,12 +462,12 @@ def _beyond_stops(robot: Robot, stops: Sequence[JointStop], control: JointContro
 
 
 def coarse(stepping: dict[str, Any], scale: float) -> list[str]:
-    """Steps so long that they take or make energy, blur it, or let points sink in, and the step that would not.
+    """Warn of steps so long that they remove, add or blur energy or let points sink in, and suggest a shorter step.
 
-    scale : turnover of the energy, no less than what the ledger resolves; zero before anything moves [J]
+    scale : turnover of the energy, at least the resolution of the ledger; zero before the first motion [J]
     """
     step, worst = stepping["step_s"], stepping["scheme_loss_worst_J"]
-    # Not known of a ring.
+    # A ring buffer does not have this value.
     blurred = stepping.get("half_step_energy_J", 0.0)
     warnings: list[str] = []
     if scale > 0.0 and abs(worst) > SCHEME_LIMIT * scale:
@@ -493,13 +494,13 @@ def coarse(stepping: dict[str, Any], scale: float) -> list[str]:
 
 
 def _shorter(step: float) -> float:
-    """The step with one digit, rounded down."""
+    """Return the step rounded down to one digit."""
     power = 10.0 ** np.floor(np.log10(step))
     return float(np.floor(step / power) * power)
 
 
 def capped(stepping: dict[str, Any]) -> list[str]:
-    """Contact problems that were not solved; what lies deep in a surface is no drift, but shrinks with the step."""
+    """Warn of unsolved contact problems; penetration is not counted as drift, because it shrinks with the step."""
     if not stepping["capped_solves"]:
         return []
     return [
@@ -510,7 +511,7 @@ def capped(stepping: dict[str, Any]) -> list[str]:
 
 
 def _base_warnings(record: Record, scenario: Scenario, prepared: Prepared, begun: float) -> list[str]:
-    """What a mobile base does that a real one could not do."""
+    """Warn if a mobile base does something that is impossible for a real base."""
     base, run, settle = prepared.model.robot.base, prepared.run, scenario.metrics.settle_s
     if base is None:
         return []
@@ -519,7 +520,7 @@ def _base_warnings(record: Record, scenario: Scenario, prepared: Prepared, begun
     lowest = least_loads(record, run.support.least)
     late = record["tip_margin"][record.time >= settle]
     first = min((event.time for event in record.events if event.kind == TIP_OVER), default=np.inf)
-    # The samples of a ring may begin after it has tipped.
+    # The samples of a ring buffer may begin after the base has tipped.
     tipped = len(record) > 0 and record.time[0] > begun and record["tip_margin"][0] < 0.0
     if tipped:
         first = float(record.time[0])
@@ -547,7 +548,7 @@ def _base_warnings(record: Record, scenario: Scenario, prepared: Prepared, begun
             f"the base is lifted: no load on its wheels and caster in {percent(lifted.mean())} of the samples, "
             f"first at t = {record.time[lifted.argmax()]:.4g} s (counts as a tip margin of -1)"
         )
-    # Once it has tipped, the loads mean nothing.
+    # After the base has tipped, the loads are meaningless.
     standing = record.time < first
     for name, demand in zip(record.labels["traction_demand"], traction[standing].T, strict=True):
         slips = demand > 1.0
@@ -561,7 +562,7 @@ def _base_warnings(record: Record, scenario: Scenario, prepared: Prepared, begun
 
 
 def _overloaded(loads: Sequence[dict[str, Any]]) -> list[str]:
-    """Warnings of motors whose root mean square is above what they can give for ever, the most loaded first."""
+    """Warn of motors whose root mean square load exceeds the nominal value, the most loaded motor first."""
     warnings = []
     for label, quantity, unit in (("current", "current", "A"), ("torque", "torque", "N_m"), ("force", "force", "N")):
         over = []

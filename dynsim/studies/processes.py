@@ -1,7 +1,7 @@
 """Parallel work in worker processes: results in the order of completion, interruption, and loss of workers.
 
-Ctrl-C lets the workers return the results that they have. A worker that is killed, or gives no sign of life, costs only
-the task that it was doing.
+On Ctrl-C the workers return the results that they have. If a worker is killed or sends no sign of life, only the task
+that it was doing is lost.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 # Longest time between signs of life of a worker, and until its first one [s]. A thread of the worker sends them, so
-# they do not depend on the duration of its work; they end where the process is stopped, or compiled code never releases
+# they do not depend on the duration of its work; they end if the process is stopped, or if compiled code never releases
 # the interpreter's lock.
 SILENT_S, START_S = 60.0, 600.0
 # Longest time until a worker confirms Ctrl-C [s]; then it may take any time to return its results. Its signs of life
-# measure that time, so that no result is lost where the machine is busy; the second is the limit without signs.
+# measure that time, so that no result is lost if the machine is busy; the second value is the limit without signs.
 _PATIENCE_S, _STALLED_S = 0.7, 10.0
 # Interval of the checks for signals [s].
 _SIGNAL_S = 0.1
@@ -50,43 +50,44 @@ _LAST_LINES = 12
 
 
 def cores() -> int:
-    """Cores that this process may use."""
+    """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class WorkerLost(Exception):
-    """The process that had a task is gone; the message says how, in a sentence that begins with ``its process``."""
+    """The worker process of a task has ended; the message is a clause that begins with ``its process``."""
 
     def __init__(self, how: str = "its process was ended from outside; is memory short for so many jobs?") -> None:
         super().__init__(how)
 
 
 class WorkerSilent(WorkerLost):
-    """It gave no sign of life any more, and was ended here."""
+    """The parent ended the worker process because it sent no more signs of life."""
 
     def __init__(self) -> None:
         super().__init__(f"its process gave no sign of life for {SILENT_S:g} s and was ended")
 
 
 class WorkerInterrupted(WorkerLost):
-    """It was ended here, because it did not hear of Ctrl-C in what it had just begun with."""
+    """The parent ended the worker process because it did not react to Ctrl-C while it was starting its work."""
 
 
 @dataclass(eq=False)
 class _Worker:
-    """A process and the threads that talk with it: none of its pipes is ever waited for here.
+    """A worker process and the threads that use its pipes, so that the main thread never waits for a pipe.
 
     Attributes
     ----------
-    process : with pipes to all three of its standard streams
-    outbox : messages for it, None: it may end
-    tasks : what it has, each with how many processes have lost it: the first in hand, the others wait in the pipe
-    ready : after its first sign of life
-    heard : of Ctrl-C
-    signs : of life that came after Ctrl-C and did not confirm it
-    since : when it began with the first task
-    took : how long the last one took [s]
-    silent : for how long there were no messages from it [s]
+    process : the process, with pipes to all three of its standard streams
+    outbox : messages to the worker; None allows it to end
+    tasks : tasks sent to it, each with the number of processes that have lost it: the first is being done, the rest
+        wait in the pipe
+    ready : whether it has sent its first sign of life
+    heard : whether it has confirmed Ctrl-C
+    signs : number of signs of life that arrived after Ctrl-C and did not confirm it
+    since : time at which it began the first task [s]
+    took : duration of its last task [s]
+    silent : time since its last message [s]
     said : the last lines of its stderr
     """
 
@@ -104,14 +105,14 @@ class _Worker:
     printing: threading.Lock = field(default_factory=threading.Lock)
 
     def begin(self, inbox: SimpleQueue[tuple[_Worker, tuple[Any, ...] | None]]) -> None:
-        """Start the threads; what it sends comes to the inbox, None at its end."""
+        """Start the threads; they put the worker's messages into the inbox, and None at its end."""
         for talk, *arguments in ((self._send,), (self._receive, inbox), (self._hear,)):
             self.threads.append(threading.Thread(target=talk, args=arguments, name="worker", daemon=True))
             self.threads[-1].start()
 
     def _send(self) -> None:
         assert self.process.stdin is not None
-        # A process that is gone shows when its answer is read.
+        # The thread that reads the answers notices if the process has ended.
         with suppress(OSError), self.process.stdin as stream:
             while (content := self.outbox.get()) is not None:
                 stream.write(content)
@@ -119,14 +120,14 @@ class _Worker:
 
     def _receive(self, inbox: SimpleQueue[tuple[_Worker, tuple[Any, ...] | None]]) -> None:
         assert self.process.stdout is not None
-        # A message that its end has cut off.
+        # The end of the process may cut off a message.
         with suppress(EOFError, OSError, pickle.UnpicklingError), self.process.stdout as stream:
             while True:
                 inbox.put((self, pickle.load(stream)))
         inbox.put((self, None))
 
     def _hear(self) -> None:
-        """What it writes to stderr is written here; until it is ready it is kept, for the error if it never is."""
+        """Forward the worker's stderr; before it is ready, only keep the lines for the error of a failed start."""
         assert self.process.stderr is not None
         with suppress(OSError, ValueError), self.process.stderr as stream:
             for line in stream:
@@ -136,7 +137,7 @@ class _Worker:
                         _print(self.said[-1])
 
     def is_ready(self) -> None:
-        """It has given its first sign of life: what it has written to stderr until then is written too."""
+        """Mark the worker as ready after its first sign of life, and print the stderr lines kept until then."""
         with self.printing:
             self.ready = True
             for line in self.said:
@@ -144,18 +145,18 @@ class _Worker:
 
     @property
     def room(self) -> int:
-        """For how many more tasks: quick ones are there when it has time, so that it need not wait for them."""
+        """Number of further tasks to send; a quick task is sent early, so that the worker need not wait for it."""
         return (2 if self.took < _QUICK_S else 1) - len(self.tasks)
 
     def leave(self) -> None:
-        """Let it end: it has nothing to do, or is gone."""
+        """End the process, which has nothing more to do or has already ended."""
         self.outbox.put(None)
         try:
             self.process.wait(_PATIENCE_S)
         except subprocess.TimeoutExpired:
             self.process.kill()
             self.process.wait()
-        # A process that it has started may have its streams open.
+        # A child process of the worker may still hold its streams open.
         for thread in self.threads:
             thread.join(_PATIENCE_S)
 
@@ -177,13 +178,13 @@ def run_in_processes(
 
     Parameters
     ----------
-    work : of a module; it calls ``look`` often, which raises KeyboardInterrupt when it shall stop
-    tasks : sent to the processes one by one, as they come to have time; of quick ones, one before that
-    jobs : processes
-    take : called here with every task and a function that returns the result or raises what the work raised, or
-        :class:`WorkerLost`; None for a task that Ctrl-C came before, and no call for those that nobody had then. A task
-        whose process was silent is given up at once
-    attempts : how many processes a task may lose before it is given up
+    work : function of an importable module; it calls ``look`` often, which raises KeyboardInterrupt when it must stop
+    tasks : sent to the processes one by one, as these become free; a quick task is sent one ahead
+    jobs : number of processes
+    take : called in this process with every task and a function that returns the result, or raises the exception of the
+        work or :class:`WorkerLost`; the result is None if Ctrl-C came before the task began. Tasks that no process had
+        at Ctrl-C get no call. A task whose process was silent is given up immediately
+    attempts : number of processes that a task may lose before it is given up
 
     Returns
     -------
@@ -193,7 +194,7 @@ def run_in_processes(
     Raises
     ------
     WorkerError
-        A process cannot start, or a task cannot be sent to one.
+        If a process cannot start, or a task cannot be sent to it.
     """
     pool = _Pool(work, tasks, jobs, take, attempts)
     try:
@@ -205,7 +206,7 @@ def run_in_processes(
             pool.collect()
             return True
     except BaseException:
-        # A result that cannot be saved, or a second Ctrl-C: nobody waits for the others.
+        # If a result cannot be saved, or after a second Ctrl-C, do not wait for the other workers.
         for worker in pool.workers:
             worker.process.kill()
         raise
@@ -219,26 +220,26 @@ def run_in_processes(
 
 
 class _Pool:
-    """Workers and what they do, see :func:`run_in_processes`."""
+    """Workers and their tasks, see :func:`run_in_processes`."""
 
     def __init__(self, work: Any, tasks: Iterable[Any], jobs: int, take: Any, attempts: int) -> None:
         self.workers: list[_Worker] = []
         self._jobs, self._take, self._attempts = jobs, take, attempts
         self._beginning = _beginning(work)
         self._waiting = ((task, 0) for task in tasks)
-        # Tasks whose process was lost, and how often: they come before those that nobody has had.
+        # Tasks to retry after a worker died, with the number of losses; they are sent before new tasks.
         self._again: list[tuple[Any, int]] = []
         self._inbox: SimpleQueue[tuple[_Worker, tuple[Any, ...] | None]] = SimpleQueue()
         self._stopped: float | None = None
 
     def stop(self) -> None:
-        """Tell all workers, and hand out no more."""
+        """Send the stop message to all workers, and hand out no more tasks."""
         self._stopped = clock.monotonic()
         for worker in self.workers:
             worker.outbox.put(pickle.dumps((messages.STOP,)))
 
     def collect(self) -> None:
-        """Hand out tasks and take results until there are none to come; signals wait while something is done here."""
+        """Hand out tasks and take results until no more are expected; signals wait while this process works."""
         looked = clock.monotonic()
         while True:
             interruption.keep()
@@ -249,10 +250,10 @@ class _Pool:
                 return
             with suppress(Empty):
                 worker, message = self._inbox.get(timeout=_SIGNAL_S)
-                # Of one that was ended here there may be some left.
+                # A worker that this process has ended may have left messages.
                 if worker in self.workers:
                     self._heed(worker, message)
-            # A process that was stopped for a while, as by Ctrl-Z, has not looked either.
+            # If this process was stopped for a while, for example by Ctrl-Z, it has not looked for messages either.
             passed, looked = min(clock.monotonic() - looked, 2.0 * LOOK_S), clock.monotonic()
             self._give_up(passed)
             interruption.heed()
@@ -277,7 +278,7 @@ class _Pool:
             worker.outbox.put(pickle.dumps((messages.TASK, content)))
 
     def _heed(self, worker: _Worker, message: tuple[Any, ...] | None) -> None:
-        """A message of a worker, None at its end."""
+        """Handle a message of a worker; None at the end of its output."""
         worker.silent = 0.0
         match message:
             case (messages.READY,):
@@ -312,14 +313,14 @@ class _Pool:
             self._take(task, partial(_raise, WorkerLost if worker.ready else WorkerInterrupted))
 
     def _dismiss(self, worker: _Worker) -> None:
-        """It is gone, or will be; what waited in its pipe nobody has begun with."""
+        """Remove a worker that has ended or will end, and send the tasks that wait in its pipe again."""
         self.workers.remove(worker)
         worker.leave()
         self._again.extend(worker.tasks)
         worker.tasks.clear()
 
     def _give_up(self, passed: float) -> None:
-        """End workers that give no sign of life, so long [s] after the last look, or do not hear of Ctrl-C in time."""
+        """End workers that are silent or do not confirm Ctrl-C in time; ``passed`` : time since the last look [s]."""
         for worker in [worker for worker in self.workers if worker.tasks]:
             worker.silent += passed
             if worker.silent > (SILENT_S if worker.ready else START_S):
@@ -335,7 +336,7 @@ class _Pool:
 
     @staticmethod
     def _is_deaf(worker: _Worker, stopped: float) -> bool:
-        """Whether a worker that has not confirmed Ctrl-C, which came at ``stopped`` [s], has had the time to do so."""
+        """Whether a worker has had enough time to confirm Ctrl-C, which came at ``stopped`` [s]."""
         waited = clock.monotonic() - stopped
         if not worker.ready:
             return waited > _PATIENCE_S
@@ -354,9 +355,9 @@ def _result(good: bool, content: bytes) -> Any:
 
 
 def _beginning(work: Any) -> bytes:
-    """The first messages to a worker, see :func:`dynsim.studies.worker.serve`.
+    """Return the first messages to a worker, see :func:`dynsim.studies.worker.serve`.
 
-    dynsim itself is looked for in the working directory last: a ``json.py`` there is not what it means.
+    The worker searches for dynsim in the working directory last, so that a ``json.py`` there does not replace Python's.
     """
     here = ("", os.curdir, os.getcwd() if os.path.isdir(os.curdir) else "")
     path = [folder for folder in sys.path if isinstance(folder, str)]
@@ -389,7 +390,7 @@ def _no_start(worker: _Worker) -> str:
 
 
 def _heard_from() -> int:
-    """Level from which on anybody hears what is logged here: workers need not even make other messages."""
+    """Return the lowest log level for which a handler exists; workers need not create messages below it."""
     library = logging.getLogger("dynsim")
     asked: logging.Logger | None = library
     while asked is not None:
@@ -401,9 +402,10 @@ def _heard_from() -> int:
 
 @contextmanager
 def signals_held() -> Iterator[None]:
-    """Processes started here do not get the Ctrl-C of the terminal, not even while they start; this one gets it after.
+    """Shield processes that start in the block from the terminal's Ctrl-C; this process gets it after the block.
 
-    Only the parent reacts to it, wherever it was sent, and tells the workers. So with the other ``STOP_SIGNALS``.
+    Only the parent reacts to Ctrl-C, wherever it was sent, and informs the workers; the same applies to the other
+    ``STOP_SIGNALS``.
     """
     if not hasattr(signal, "pthread_sigmask"):
         yield

@@ -1,8 +1,8 @@
-"""Worker process for :mod:`dynsim.studies.processes`: carries out tasks until there are no more.
+"""Worker process for :mod:`dynsim.studies.processes`: it carries out tasks until no more arrive.
 
 Messages are pickles in sequence: tasks on the worker's standard input, answers on its standard output.
-Python's own multiprocessing would run the caller's script once more in every worker, and before it a ``signal.py`` of
-the working directory.
+Python's own multiprocessing would run the caller's script again in every worker, and before the script a ``signal.py``
+of the working directory.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from typing import Any, BinaryIO, NoReturn
 from dynsim.errors import DynsimError
 from dynsim.system import interruption
 
-# Program of a new process. Only the worker uses the pipes: output of its tasks goes to stderr. The first message has
-# the folders in which dynsim is searched for.
+# Program of a new process. Only the worker uses the pipes: output of its tasks goes to stderr. The first message lists
+# the folders in which Python searches for dynsim.
 START = """
 import os, pickle, sys
 tasks, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
@@ -43,21 +43,21 @@ serve(tasks, answers)
 TASK, STOP = "task", "stop"
 READY, ALIVE, HEARD, LOG, ANSWER = "ready", "alive", "heard", "log", "answer"
 
-# Between two signs of life of a worker, and between two looks for what is to be told when it shall stop [s].
+# Interval of a worker's signs of life, and their shorter interval after it was asked to stop [s].
 LOOK_S, STOP_LOOK_S = 0.5, 0.05
 
 
 class WorkerError(DynsimError):
-    """No process can be started, or a task or its result cannot be sent from one to the other."""
+    """A process cannot be started, or a task or its result cannot be sent between processes."""
 
 
 def packed(value: Any) -> bytes:
-    """A pickle for another process.
+    """Return a pickle of a value for another process.
 
     Raises
     ------
     WorkerError
-        Something in it cannot be sent, or is of the module that this process runs as its script.
+        If a part of it cannot be sent, or is defined in the module that this process runs as its script.
     """
     stream = io.BytesIO()
     try:
@@ -75,7 +75,7 @@ def _unpacked(content: bytes) -> Any:
 
 
 class _Pickler(pickle.Pickler):
-    """Refuses what another process does not find: it does not run the script."""
+    """Pickler that rejects objects defined in the script, because other processes do not run the script."""
 
     def reducer_override(self, value: Any) -> Any:
         if callable(value) and getattr(value, "__module__", None) == "__main__" and hasattr(value, "__qualname__"):
@@ -87,13 +87,13 @@ class _Pickler(pickle.Pickler):
 
 
 class _Answers:
-    """Messages to the parent, each in one piece whatever thread it comes from."""
+    """Messages to the parent, each written in one piece, whichever thread sends it."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream, self._lock = stream, threading.Lock()
 
     def send(self, *message: Any) -> None:
-        """Nobody reads any more: this process is ended by :func:`_listen`."""
+        """Send a message; ignore a closed pipe, because then :func:`_listen` ends this process."""
         content = pickle.dumps(message, pickle.HIGHEST_PROTOCOL)
         with suppress(OSError), self._lock:
             self._stream.write(content)
@@ -101,7 +101,7 @@ class _Answers:
 
 
 class _Log(logging.Handler):
-    """Hands what is logged to the parent."""
+    """Log handler that sends log messages to the parent."""
 
     def __init__(self, answers: _Answers) -> None:
         super().__init__()
@@ -113,9 +113,10 @@ class _Log(logging.Handler):
 
 @cache
 def keep_memory() -> None:
-    """Let this process keep the memory of a run for the next one: fresh pages for each cost a tenth of it.
+    """Let this process keep the memory of a run for the next one: fresh pages would cost a tenth of each run.
 
-    By glibc's ``mallopt``, see its manual: M_MMAP_THRESHOLD and M_TRIM_THRESHOLD. Other systems do as they do.
+    This uses glibc's ``mallopt`` with M_MMAP_THRESHOLD and M_TRIM_THRESHOLD, see its manual. Without glibc it has no
+    effect.
     """
     if platform.libc_ver()[0] == "glibc":
         library = ctypes.CDLL(None)
@@ -124,14 +125,14 @@ def keep_memory() -> None:
 
 
 def serve(source: BinaryIO, sink: BinaryIO) -> None:
-    """Do tasks until there is nobody to send more."""
-    # A terminal or a service manager sends these to every process of a group: only the parent heeds them.
+    """Do tasks until the parent ends."""
+    # A terminal or a service manager sends these signals to every process of a group; only the parent handles them.
     for number in interruption.STOP_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
     answers, stop, tasks = _Answers(sink), threading.Event(), SimpleQueue[bytes]()
     path, level, content = pickle.load(source)
     work: Callable[[Any, Any], Any] = pickle.loads(content)
-    # Tasks may need modules beside the script. What dynsim and the work import is not looked for there: see above.
+    # Tasks may need modules from the script's folder. Imports of dynsim and of the work do not use it: see above.
     sys.path[:] = path
     keep_memory()
     library = logging.getLogger("dynsim")
@@ -142,7 +143,7 @@ def serve(source: BinaryIO, sink: BinaryIO) -> None:
     threading.Thread(target=_give_signs, args=(answers, stop), daemon=True).start()
 
     def look(time: float, stage: str = "") -> None:
-        # Where Ctrl-C would have stopped it in the parent, with what there is.
+        # Ctrl-C would stop the work here if it ran in the parent, with a partial result.
         if stop.is_set():
             answers.send(HEARD)
             raise KeyboardInterrupt
@@ -158,7 +159,7 @@ def serve(source: BinaryIO, sink: BinaryIO) -> None:
             leaves = interruption.is_left()
         answers.send(ANSWER, good, content, leaves)
         if leaves:
-            # For good: the thread that it cannot end would take the time of others.
+            # End the process: it cannot end the thread in any other way, and the thread would slow other tasks down.
             _end()
 
 
@@ -171,7 +172,7 @@ def _packed_error(error: Exception) -> bytes:
 
 
 def _listen(source: BinaryIO, tasks: SimpleQueue[bytes], stop: threading.Event) -> None:
-    """Messages as they come, so that the parent never waits to send one; without a parent nobody wants an answer."""
+    """Read messages as they arrive, so that the parent never waits to send one; end with the parent."""
     try:
         with suppress(EOFError, OSError, pickle.UnpicklingError):
             while True:
@@ -185,7 +186,7 @@ def _listen(source: BinaryIO, tasks: SimpleQueue[bytes], stop: threading.Event) 
 
 
 def _give_signs(answers: _Answers, stop: threading.Event) -> None:
-    """Signs of life, for as long as it lives. A result that is being made is handed back too."""
+    """Send signs of life as long as the process runs; confirm a stop also while a result is being made."""
     while True:
         answers.send(HEARD if stop.is_set() and interruption.is_kept() else ALIVE)
         if stop.is_set():
@@ -195,7 +196,7 @@ def _give_signs(answers: _Answers, stop: threading.Event) -> None:
 
 
 def _end() -> NoReturn:
-    """At once: there is nothing to be tidied up but what was printed."""
+    """End the process immediately; only printed output needs to be flushed first."""
     for stream in (sys.stdout, sys.stderr):
         with suppress(Exception):
             stream.flush()

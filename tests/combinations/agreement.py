@@ -25,14 +25,15 @@ Array = NDArray[np.float64]
 ADAPTIVE_SHARE, STEPPED_SHARE, STEPS = 300.0, 0.01, 2.0
 # Difference of the two solvers, which solve the same equations.
 SOLVERS = 2e-8
-# Tolerances a little above, and as much below, those of a run: local errors change as rounding changes them.
+# Factor for tolerances slightly above a run's tolerances; 2 - ABOVE is slightly below. Both change local errors as much
+# as rounding does.
 ABOVE = 1.0 + 1e-9
 # Factor on errors estimated by a finer run: an estimate is not a bound.
 SURE = 10.0
 # Samples by which an impact may be early or late.
 JUMPS = 3
 ENERGIES = ("energy_electrical", "heat_joule", "heat_friction", "loss_impact", "energy_kinetic", "energy_potential")
-# What a warning says that leaves the motion open.
+# Parts of warnings that report a motion which is not unique.
 NOT_UNIQUE = (
     "leave the motion open",
     "the motion is not unique",
@@ -40,16 +41,16 @@ NOT_UNIQUE = (
     "chatter",
     "turns its own force against it",
 )
-# Of forces alone, which other methods split in another way; where elbows slide, or bodies
-# land on several points, the motion follows, a little.
+# Part of warnings about shared forces, which methods may split differently; if elbows slide, or bodies
+# land on several points, the split of forces changes the motion a little.
 NOT_UNIQUE_FORCES, SPLIT_SHARE = "shared forces", 0.03
 
 
 @dataclass(frozen=True)
 class Measure:
-    """Something that runs are compared by, over the samples that both have.
+    """A quantity by which runs are compared, over their common samples.
 
-    ``values`` : (T, k); ``size`` : (k,) what changes of it count against
+    ``values`` : (T, k); ``size`` : (k,) reference for relative differences
     """
 
     name: str
@@ -58,7 +59,7 @@ class Measure:
 
 
 def disagreements(scenario: Mapping[str, Any], runs: Mapping[str, Run]) -> Iterator[tuple[str, str]]:
-    """Kind and sentence of each pair of runs that differ more than they may."""
+    """Yield kind and sentence for each pair of runs that differ more than allowed."""
     usable = {name: run for name, run in runs.items() if _is_usable(run)}
     yield from _ends(runs)
     yield from _solvers(usable)
@@ -77,7 +78,7 @@ def _is_usable(run: Run) -> bool:
 
 
 def _ends(runs: Mapping[str, Run]) -> Iterator[tuple[str, str]]:
-    """What one method refuses by a rule of the scene and not of the method, all refuse."""
+    """Yield methods whose integration fails although other methods finish the scene."""
     plain = {name: run for name, run in runs.items() if "/" not in name}
     stopped = {name: run for name, run in plain.items() if isinstance(run.error, SimulationStopped)}
     finished = [name for name, run in plain.items() if run.error is None]
@@ -97,7 +98,7 @@ def _solvers(runs: Mapping[str, Run]) -> Iterator[tuple[str, str]]:
         a, b = _measures(runs[method].record), _measures(run.record)
         worst, text = _widest(runs[method].record, a, run.record, b, _of_solvers(run))
         if worst > 1.0:
-            # What changes far below its tolerance make of each run alone, until each time, is what rounding may make.
+            # Tiny changes of the tolerance show how much rounding may change each run until each time.
             allowed = _grown(
                 _of_solvers(run),
                 [_own_error(own, part) for own in (runs[method], run) for part in (ABOVE, 2.0 - ABOVE)],
@@ -109,7 +110,7 @@ def _solvers(runs: Mapping[str, Run]) -> Iterator[tuple[str, str]]:
 
 
 def _of_solvers(run: Run) -> Any:
-    """What the solvers may differ by: rounding, and what their rounding makes of the steps that tolerances choose."""
+    """Return the allowed difference of the solvers: rounding, and its effect on the steps that tolerances choose."""
     assert run.resolved is not None
     share = SOLVERS + 0.03 * run.resolved.integrator.rtol
 
@@ -134,12 +135,12 @@ def _pair(first: str, run: Run, other: str, second: Run) -> Iterator[tuple[str, 
 
 
 def _grown(allowed: Any, errors: Sequence[dict[str, tuple[Array, Array]]]) -> Any:
-    """What is allowed, and by what runs that were made again in another way differ from themselves until each time."""
+    """Return the limit, increased by the changes until each time of runs that were repeated with other options."""
 
     def grown(measure: Measure, time: Array) -> Array:
         own = np.zeros(len(time))
         for error in errors:
-            # A run that cannot be made again tells nothing of its error.
+            # If a run cannot be repeated, its error is unknown.
             own = own + (np.interp(time, *error[measure.name]) if measure.name in error else np.inf)
         return np.asarray(allowed(measure, time) + SURE * own[:, None] * measure.size)
 
@@ -151,11 +152,11 @@ def _energies(record: Record) -> list[str]:
 
 
 def _measures(record: Record | None) -> list[Measure]:
-    """Positions relative to their motion, and energies relative to the largest one."""
+    """Return positions, relative to their motion, and energies, relative to the largest energy."""
     assert record is not None
     q = record["q"]
     moved = np.abs(q - q[:1]).max(axis=0, initial=0.0)
-    # Errors of joints that barely move are a part of their neighbours' errors.
+    # Errors of joints that barely move depend on the errors of their neighbours.
     measures = [Measure("q", q, np.maximum(moved, max(0.1 * float(moved.max(initial=0.0)), 1e-4)))]
     named = _energies(record)
     parts = [record[name] - (record[name][0] if name == "energy_potential" else 0.0) for name in named]
@@ -184,7 +185,7 @@ def _promised(run: Run, other: Run) -> Any:
         share += SPLIT_SHARE
 
     def allowed(measure: Measure, time: Array) -> Array:
-        # Landings are early or late by a step.
+        # Landings may be early or late by a step.
         late = STEPS * step * speed if measure.name == "q" else 2.0 * STEPPED_SHARE * measure.size * (step > 0.0)
         return np.asarray(share * measure.size + late + 1e-8)[None]
 
@@ -206,13 +207,13 @@ def _widest(
         return worst, text
     for own, other in zip(a, b, strict=True):
         off = _apart(own.values[i], other.values[j], own.name == "energy")
-        # A run that goes astray must not set the scale.
+        # A run that diverges must not set the scale.
         size = np.minimum(own.size, other.size)
         limit = np.broadcast_to(allowed(Measure(own.name, own.values, size), first.time[i]), off.shape)
         share = off / limit
         if share.max() > worst:
             worst = float(share.max())
-            # Its beginning is more useful than its maximum.
+            # The beginning of a difference is more useful than its maximum.
             t = int((share.max(axis=1) > min(1.0, 0.999 * worst)).argmax())
             k = int(share[t].argmax())
             name = first.labels["q"][k] if own.name == "q" else _energies(first)[k]
@@ -224,7 +225,7 @@ def _widest(
 
 
 def _apart(a: Array, b: Array, jumps: bool) -> Array:
-    """Distances of values at samples; for values that jump, from the range of the other near that time."""
+    """Return distances of values at samples; for values that jump, distances from the other run's range nearby."""
     if not jumps:
         return np.asarray(np.abs(a - b))
     around = [b[np.clip(np.arange(len(b)) + shift, 0, len(b) - 1)] for shift in range(-JUMPS, JUMPS + 1)]
@@ -232,7 +233,7 @@ def _apart(a: Array, b: Array, jumps: bool) -> Array:
 
 
 def _own_error(run: Run, part: float) -> dict[str, tuple[Array, Array]]:
-    """By what part of its size each measure has changed until some times when a run is made more finely."""
+    """Return times and the relative change of each measure until then if a run is repeated with other options."""
     assert run.resolved is not None
     options: dict[str, float] = {}
     if run.resolved.integrator.method == "time_stepping":

@@ -50,7 +50,7 @@ Finding = Iterator[str]
 
 
 def problems(scenario: Mapping[str, Any], run: Run) -> list[Problem]:
-    """Everything that is wrong with a run, each check once with its worst sample."""
+    """Return all problems of a run; each check reports its worst sample."""
     listed = [Problem("check", text) for text in started_as_checked(run)]
     if run.record is None or run.resolved is None:
         return listed
@@ -67,12 +67,12 @@ def problems(scenario: Mapping[str, Any], run: Run) -> list[Problem]:
 
 
 def compare(scenario: Mapping[str, Any], runs: Mapping[str, Run]) -> list[Problem]:
-    """Where the runs of one scene by several methods, solvers and ways differ more than they may."""
+    """Return the differences of runs of one scene by several methods, solvers and ways that exceed their limits."""
     return [Problem(kind, text) for kind, text in disagreements(scenario, runs)]
 
 
 def started_as_checked(run: Run) -> Finding:
-    """``check`` refuses a scene if and only if it does not start."""
+    """Check that ``check`` refuses a scene if and only if it does not start."""
     started = run.record is not None or isinstance(run.error, SimulationStopped)
     if started and run.checked is not None:
         yield f"check refuses what runs: {run.checked[:200]}"
@@ -81,7 +81,7 @@ def started_as_checked(run: Run) -> Finding:
 
 
 def finite(run: Run) -> Finding:
-    """All signals are numbers, and the run covers its time unless it stopped."""
+    """Check that all signals are finite, except signals that may be NaN."""
     assert run.record is not None
     for name in run.record:
         data = np.asarray(run.record[name], dtype=np.float64)
@@ -97,7 +97,7 @@ def _starts_softly(seen: Observed) -> bool:
 
 
 def start(seen: Observed) -> Finding:
-    """The first sample is the posture that the scenario asks for, at rest."""
+    """Check that the first sample is the requested posture, at rest."""
     # A soft start settles into another posture.
     if seen.time[0] != 0.0 or _starts_softly(seen):
         return
@@ -115,8 +115,8 @@ def start(seen: Observed) -> Finding:
                 free[places[joint]] = True
         for coupling in seen.robot.couplings:
             asked[places[coupling.joint]] = coupling.ratio * asked[places[coupling.leader]] + coupling.offset
-    # An equilibrium presses compliant contacts in: bodies move about as far, and joints by that over a lever arm, or
-    # further by a warning.
+    # An equilibrium compresses compliant contacts: bodies move by about this depth, and joints by the depth over a
+    # lever arm, or further with a warning.
     deepest = 0.0
     if initial.get("equilibrium"):
         deepest = max((-float(t.gap[0]) for t in seen.touches() if t.contact.stiffness > 0.0), default=0.0)
@@ -140,19 +140,19 @@ def start(seen: Observed) -> Finding:
         k = int(off.argmax())
         name = seen.record.labels["q"][k]
         yield f"{name} starts at {seen.q[0, k]:.6g}, asked for {asked[k]:.6g}"
-    # Against the posture that the resolved scenario has, where points were to be put on surfaces.
+    # Compare with the posture of the resolved scenario, in which points have been placed on surfaces.
     off = np.where(warned_of, 0.0, np.abs(seen.q[0] - seen.robot.initial))
     if off.max(initial=0.0) > allowed:
         k = int(off.argmax())
         yield f"{seen.record.labels['q'][k]} starts at {seen.q[0, k]:.6g}, the scenario has {seen.robot.initial[k]:.6g}"
     fastest = float(np.abs(seen.v[0]).max(initial=0.0))
-    # What starts on its surfaces is at rest; an impact at the start could only take velocities away.
+    # Bodies that start on their surfaces are at rest; an impact at the start could only reduce velocities.
     if fastest > CREEP:
         yield f"{seen.joints[int(np.abs(seen.v[0]).argmax())]} starts with a rate of {fastest:.3g}, not at rest"
 
 
 def equilibrium(seen: Observed) -> Finding:
-    """What starts in equilibrium does not accelerate."""
+    """Check that a scene which starts in equilibrium does not accelerate."""
     initial, controller = seen.config.get("initial") or {}, seen.config.get("controller") or {}
     if not initial.get("equilibrium") or seen.time[0] != 0.0:
         return
@@ -160,7 +160,7 @@ def equilibrium(seen: Observed) -> Finding:
         controller.get("joints") or controller.get("hand")
     ):
         return
-    # Planned voltages hold the acceleration too with which references begin.
+    # Planned voltages include the initial acceleration of the references.
     planned = controller.get("feed_forward") == "dynamics" or controller.get("brace")
     if planned and (controller.get("joints") or controller.get("hand")):
         return
@@ -171,17 +171,17 @@ def equilibrium(seen: Observed) -> Finding:
     if warned(seen, "contacts with other forces than at rest"):
         return
     size = np.abs(seen.vdot[0])
-    # Far below the acceleration of a joint that falls.
+    # The limit is far below the acceleration of a falling joint.
     allowed = 1e-4 * (1.0 + np.linalg.norm(seen.bodies.gravity)) + _misread(seen)
     if seen.stepped and len(seen) > 2:
-        # The mean of the first step: if references begin to move, the mean of the next is up to three times as large.
+        # This is the mean of the first step; if references begin to move, the next mean is up to three times as large.
         allowed = max(allowed, 0.7 * float(np.abs(seen.vdot[2]).max(initial=0.0)))
     if size.max(initial=0.0) > allowed:
         yield f"{seen.joints[int(size.argmax())]} starts with an acceleration of {size.max():.3g}, from equilibrium"
 
 
 def _misread(seen: Observed) -> float:
-    """Largest acceleration by what encoders misread at the start: servos have no circuit that would delay it."""
+    """Return the largest acceleration from encoder errors at the start, which servos pass on without a delay."""
     encoders = (seen.config.get("sensors") or {}).get("encoders") or {}
     angle = np.radians(0.5 * encoders.get("resolution_deg", 0.0) + 6.0 * encoders.get("noise_deg", 0.0))
     servos = [motor for motor in seen.robot.motors if isinstance(motor, Servo)]
@@ -196,7 +196,7 @@ def _misread(seen: Observed) -> float:
 
 
 def absurd(seen: Observed) -> Finding:
-    """No force is beyond what weight, loads, motors and the motion could do."""
+    """Check that weight, loads, motors and motion can explain the size of all forces."""
     weight = sum(link.inertia.mass for link in seen.bodies.robot.links)
     size = weight * (np.linalg.norm(seen.bodies.gravity) + 1.0)
     size += sum(

@@ -1,4 +1,4 @@
-"""Motors and controllers of scenes: gains that hold the arm, references that move it a little."""
+"""Motors and controllers of scenes, with gains that hold the arm and references that move it a little."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from combinations.factors import PLANNED, SAMPLED, Levels
 from combinations.plants import Joint, Plant
 from dynsim import Model
 
-# Controllers whose references are waypoints where a start asks for some.
+# Controllers whose references are waypoints if the start requires references.
 FOLLOWERS = ("hold", "waypoints", "hand_path", *SAMPLED, *PLANNED)
 
 
 def motors(random: Generator, levels: Levels, robot: Plant) -> dict[str, dict[str, Any]]:
-    """A motor for each joint that has one, by its name."""
+    """Return a motor for each motorised joint, with the joint name as key."""
     level = levels["motor"]
     if level == "none":
         return {}
     chosen = {joint.name: _motor(random, level, joint) for joint in robot.joints if joint.name != "base.right"}
     if level == "partly":
-        # Braces carry two of them with friction alone.
+        # Braces can carry two joints without motors by friction alone.
         own = [joint.name for joint in robot.joints if joint.before and joint.name in chosen]
         for k in random.permutation(len(own)).tolist()[: 1 + int(random.integers(2))]:
             del chosen[own[k]]
@@ -53,7 +53,7 @@ def _motor(random: Generator, level: str, joint: Joint) -> dict[str, Any]:
         }
     if level in ("published", "partly") and joint.turns:
         return {"type": "wang_minami"}
-    # Of the size of Maxon's RE 40 with a gear of 113:1, at a slide on a spindle.
+    # The motor has the size of Maxon's RE 40 with a gear of 113:1; for a slide, it drives a spindle.
     return {
         "type": "dc",
         "torque_constant_N_m_per_A": 0.0302,
@@ -69,14 +69,14 @@ def _motor(random: Generator, level: str, joint: Joint) -> dict[str, Any]:
 def controller(
     random: Generator, levels: Levels, robot: Plant, driven: dict[str, dict[str, Any]], model: Model, duration: float
 ) -> dict[str, Any] | None:
-    """The ``controller:`` section; None: there is none."""
+    """Return the ``controller:`` section, or None without a controller."""
     level = levels["controller"]
     if level == "none":
         return None
     section: dict[str, Any] = {"type": "joint_pd", **_gains(random, levels, robot, driven)}
     moved = [joint for joint in robot.joints if joint.name in driven and not joint.name.startswith("base.")]
     if level in ("waypoints", "hand_path", "operator", "torques"):
-        # Those that have no motor are refused.
+        # Scenes that move joints without a motor are refused.
         moved = moved or [joint for joint in robot.joints if not joint.name.startswith("base.")]
     if level in SAMPLED:
         section["sample_time_s"] = float(random.choice((0.0005, 0.001)))
@@ -86,7 +86,7 @@ def controller(
     elif level == "gravity":
         section["feed_forward"] = str(random.choice(("gravity", "dynamics")))
     elif level == "pressing":
-        # Of the declared points all press, or the elbow alone.
+        # Either all declared points press, or only the elbow.
         alone = levels["start"] in ("on_surface", "on_references") and levels["points"] != "elbow"
         section["brace"] = (
             "optimal" if random.random() < 0.5 and not alone else {"elbow": float(random.uniform(1.0, 8.0))}
@@ -120,13 +120,13 @@ def controller(
 
 
 def _gains(random: Generator, levels: Levels, robot: Plant, driven: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """A gain for each DC motor: soft to stiff, softer where commands are held between samples."""
+    """Return gains for each DC motor, from soft to stiff, and softer if commands are held between samples."""
     sampled = levels["controller"] in SAMPLED
     stiff = float(10.0 ** random.uniform(-0.5, 0.3)) * (0.3 if sampled else 1.0)
     k_p: list[float] = []
     k_d: list[float] = []
     for joint in robot.joints:
-        # Both wheels have the motor of the left one.
+        # Both wheels have the motor of the left wheel.
         motor = driven.get("base.left" if joint.name == "base.right" else joint.name)
         if motor is None or motor["type"] not in ("wang_minami", "dc"):
             continue
@@ -141,23 +141,23 @@ def _gains(random: Generator, levels: Levels, robot: Plant, driven: dict[str, di
 
 
 def _followers(random: Generator, levels: Levels, robot: Plant, moved: Sequence[Joint]) -> list[Joint]:
-    """The joints that follow the hand: those behind the elbow, or all; a joint near its stop stays out."""
+    """Return the joints that follow the hand: all, or only joints behind the elbow, without joints near a stop."""
     moved = [joint for joint in moved if joint.name not in robot.limited] or moved
     if levels["plant"] == "mimic":
         moved = [joint for joint in moved if joint.turns]
     behind = [joint for joint in moved if not joint.before and joint.name != "grip"]
     if levels["start"] == "on_references":
-        # One has waypoints.
+        # The last joint has waypoints.
         return moved[:-1] or moved
     return behind if behind and random.random() < 0.5 else [joint for joint in moved if joint.name != "grip"]
 
 
 def _path(random: Generator, robot: Plant, followed: Sequence[Joint], model: Model, duration: float) -> dict[str, Any]:
-    """A line that the joints can follow: to where small turns of theirs take the hand."""
+    """Return a line that the joints can follow: it ends at the hand position after small turns of the joints."""
     q = np.array(model.robot.initial)
     start = model.point_position(*robot.hand, q)
     index = {link.joint: int(k) for link, k in zip(model.robot.links, model.robot.position_index, strict=True)}
-    # Where all turn alike, a planar arm stays bent.
+    # The joints turn in alternate directions, so that a planar arm stays bent.
     for k, joint in enumerate(followed):
         q[index[joint.name]] += (0.02 if not joint.turns else 0.08) * (-1.0) ** k * float(random.uniform(0.5, 1.0))
     end = model.point_position(*robot.hand, q)
@@ -166,12 +166,12 @@ def _path(random: Generator, robot: Plant, followed: Sequence[Joint], model: Mod
 
 
 def _waypoints(random: Generator, levels: Levels, free: Sequence[Joint], duration: float) -> dict[str, Any]:
-    """Waypoints of one joint or two; behind the elbow where that is glued or put on its surface."""
+    """Return waypoints of one or two joints, behind the elbow if the elbow is glued or placed on its surface."""
     held = levels["contact"] == "glued" or levels["start"] == "on_references" or levels["controller"] in PLANNED
     able = [joint for joint in free if not (held and joint.before)]
     if not able and levels["start"] == "on_references":
         able = list(free)
-    # Where they would take a point that presses off its surface, they rest.
+    # The joints rest if they would pull a pressing point off its surface.
     idle = levels["controller"] == "pressing" and levels["points"] in ("two", "same_link")
     joints: dict[str, Any] = {}
     for k in random.permutation(len(able)).tolist()[: 1 + int(random.integers(2))]:
@@ -185,9 +185,9 @@ def _waypoints(random: Generator, levels: Levels, free: Sequence[Joint], duratio
 
 
 def _ease(joints: dict[str, Any], model: Model) -> None:
-    """Shorten paths until the motors can follow: a plan beyond their limits is refused.
+    """Shorten paths until the motors can follow, because a plan beyond their limits is refused.
 
-    Half of the limits is left for what braces press and payloads weigh.
+    Half of each limit is reserved for the forces of braces and the weight of payloads.
     """
     from scipy.interpolate import CubicSpline
 
@@ -224,7 +224,7 @@ def _ease(joints: dict[str, Any], model: Model) -> None:
 
 
 def _torques(random: Generator, joints: Sequence[str], model: Model, duration: float) -> dict[str, Any]:
-    """What holds the weight, and a wave about it that presses and lifts."""
+    """Return torques that hold the weight, plus a wave about them that presses and lifts."""
     weight = model.bias_forces(np.array(model.robot.initial), np.zeros(model.n))
     rates = {link.joint: i for i, link in enumerate(model.robot.links)}
     torques: dict[str, Any] = {}

@@ -1,4 +1,4 @@
-"""Energies on records: stored energies, the ledger as docs/physics.md defines it, losses and heat."""
+"""Checks of energies on records: stored energies, the ledger as defined in docs/physics.md, losses and heat."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ Finding = Iterator[str]
 
 # Share of the turnover above which a ledger must warn.
 RESIDUAL = 1e-6
-# How far ten landings are off together, each being found to 1e-13 m (docs/physics.md) [m].
+# Total error of ten landings, each located to 1e-13 m (docs/physics.md) [m].
 LANDINGS_M = 1e-12
 
 
 def ledger(seen: Observed) -> Finding:
-    """Stored energies agree with the bodies, and the ledger closes unless a warning reports its residual."""
+    """Check that stored energies agree with the bodies, and that the ledger closes or a warning reports it."""
     record = seen.record
     kinetic, potential = seen.bodies.energies(seen.motion, seen.v)
     own = {"energy_kinetic": kinetic, "energy_potential": potential - potential[0] + record["energy_potential"][0]}
@@ -34,7 +34,7 @@ def ledger(seen: Observed) -> Finding:
     for name, values in own.items():
         off = np.abs(record[name] - values)
         scale = np.abs(values).max(initial=0.0) + np.abs(kinetic).max(initial=0.0)
-        # Samples of steps lie on their ends only where these are whole ones.
+        # Samples coincide with the ends of steps only if the steps are whole.
         if off.max() > 1e-8 * scale + 1e-12:
             i = int(off.argmax())
             yield f"{name} at t = {seen.time[i]:.6g} s is {record[name][i]:.9g} J, of the bodies {values[i]:.9g} J"
@@ -49,7 +49,7 @@ def ledger(seen: Observed) -> Finding:
 
 
 def losses(seen: Observed) -> Finding:
-    """Losses never fall."""
+    """Check that losses never decrease."""
     turnover, _ = turnover_and_residual(seen)
     names = ["heat_joule", "loss_joint", "loss_gear"]
     restitution = any(touch.contact.restitution > 0.0 for touch in seen.touches())
@@ -58,8 +58,8 @@ def losses(seen: Observed) -> Finding:
         names += ["heat_friction"]
     taken = {name: seen.record[name] for name in names}
     if not restitution and not signed:
-        # Of an impact that contacts and stops share, the sum of their parts is a loss. Energy that moves a point out of
-        # its surface again is taken from the impact losses.
+        # If contacts and stops share an impact, only the sum of their parts must be a loss. The energy that moves a
+        # point out of its surface again is subtracted from the impact losses.
         parts = [seen.record[name] for name in ("loss_impact", "loss_stop") if name in seen.record]
         taken |= {"loss_impact + loss_stop": sum(parts, np.zeros(len(seen)))} if not seen.stepped else {}
     for name, loss in taken.items():
@@ -71,7 +71,7 @@ def losses(seen: Observed) -> Finding:
 
 
 def powers(seen: Observed) -> Finding:
-    """Heat and losses are the integrals of the powers at the samples."""
+    """Check that heat and losses are the integrals of the powers at the samples."""
     record, current = seen.record, seen.record["current"]
     heat = np.zeros(len(seen))
     for a, motor in enumerate(seen.robot.motors):
@@ -81,7 +81,7 @@ def powers(seen: Observed) -> Finding:
     for touch in seen.touches():
         rubs = touch.mode != STICKING
         if seen.stepped and touch.contact.stiffness == 0.0:
-            # What a step with a landing takes is impact loss.
+            # The energy that a step with a landing removes is impact loss.
             rubs[1:] &= touch.mode[:-1] != OPEN
         rubbed = rubbed - np.where(rubs, (touch.tangential * touch.slip).sum(axis=1), 0.0)
         earlier = np.concatenate([touch.slip[:1], touch.slip[:-1]])
@@ -98,24 +98,24 @@ def powers(seen: Observed) -> Finding:
         "heat_friction": (record["heat_friction"], rubbed),
         "energy_electrical": (record["energy_electrical"], drawn),
     }
-    # Also those of a controller in task space, whose period has another key.
+    # This includes the ticks of a task-space controller, whose period has a different key.
     if jumps_at_ticks(seen) or seen.at_ticks.any():
         del work["energy_electrical"]
         if jumps_at_ticks(seen):
-            # Between samples further apart than ticks power may swing, and samples be all of the same phase.
+            # If samples are further apart than ticks, power may oscillate in between, and all samples have one phase.
             del work["heat_joule"], work["losses of gears and joints"], work["heat_friction"]
     turnover, _ = turnover_and_residual(seen)
     unlike = _unlike_trapezia(seen) if seen.stepped else {}
     for name, (total, power) in work.items():
-        # The impulse of a step works on the mean of the rates at its ends.
+        # The work of a step's impulse uses the mean of the rates at its ends.
         before = rubbed_before if name == "heat_friction" else np.concatenate([power[:1], power[:-1]])
         yield from _integrated(seen, name, total, (before, power), turnover, unlike.get(name))
 
 
 def _unlike_trapezia(seen: Observed) -> dict[str, Array]:
-    """How far powers at the mean state of a step may be from the mean of those at its ends, (T,) [W].
+    """Return the possible difference of power at the mean state of a step and mean power at its ends, (T,) [W].
 
-    Products x y are off by Δx Δy/4. Friction that turns round within the step tells nothing of its mean power.
+    For products x y the difference is Δx Δy/4. If friction reverses within the step, its mean power is unknown.
     """
     before = seen.v - seen.step * seen.vdot
     turns = seen.v * before < 0.0
@@ -127,7 +127,7 @@ def _unlike_trapezia(seen: Observed) -> dict[str, Array]:
         size = np.linalg.norm(touch.tangential, axis=1)
         both = np.linalg.norm(slip, axis=1) + np.linalg.norm(earlier, axis=1)
         contacts = contacts + np.where((slip * earlier).sum(axis=1) < 0.0, size * both, 0.0)
-        # The normal force of the step is along the normal of its middle.
+        # The normal force of the step acts along the normal at its middle.
         turned = np.linalg.norm(np.diff(touch.normal, axis=0, prepend=touch.normal[:1]), axis=1)
         contacts = contacts + turned * np.abs(touch.normal_force) * np.linalg.norm(slip, axis=1)
     current, voltage = (
@@ -145,7 +145,7 @@ def _unlike_trapezia(seen: Observed) -> dict[str, Array]:
 def _integrated(
     seen: Observed, name: str, total: Array, powers: tuple[Array, Array], turnover: float, unlike: Array | None
 ) -> Finding:
-    """``powers``: at the start of the step that ends at a sample, and at its end, (T,) [W]."""
+    """Compare energies with integrals; ``powers``: at start and end of the step that ends at a sample, (T,) [W]."""
     earlier, power = powers
     if not seen.stepped:
         off, allowed, rows = integral_error(seen, total[:, None], power[:, None])
@@ -154,7 +154,7 @@ def _integrated(
     else:
         rows = whole_steps(seen)
         h, now, before = seen.step, power[rows], earlier[rows]
-        # Power at the mean state of a step: between those of its ends, and as much off as these differ.
+        # Power at the mean state of a step lies between the powers at its ends; their difference bounds the error.
         off = np.abs(total[rows] - total[rows - 1] - 0.5 * h * (now + before))[:, None]
         allowed = 1.1 * h * np.abs(now - before) + 0.02 * h * (np.abs(now) + np.abs(before))
         allowed = (allowed + 1e-6 * turnover + 1e-15)[:, None]
@@ -187,7 +187,7 @@ def residual_floor(seen: Observed) -> float:
 
 
 def turnover_and_residual(seen: Observed) -> tuple[float, float]:
-    """Energy that changed hands, and the largest imbalance of the signals [J]."""
+    """Return the turnover of energy, and the largest imbalance of the signals [J]."""
     record = seen.record
     sources = record["energy_electrical"] + record["work_constraint"]
     size = np.abs(record["energy_electrical"]) + np.abs(record["work_constraint"])

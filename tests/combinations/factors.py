@@ -1,4 +1,4 @@
-"""The factors of a scene and their levels, and which levels refuse each other."""
+"""Factors of a scene, their levels, and combinations of levels that are refused."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ Levels = Mapping[str, str]
 
 # The method is not a factor: each scene is run by all methods that support it, see :func:`methods`.
 FACTORS: dict[str, tuple[str, ...]] = {
-    # With its kinds of joints: revolute; also prismatic; from a file, with a branch; coupled; a free or a planar root.
+    # Plants differ in their joints: revolute; also prismatic; from a file with a branch; coupled; free or planar root.
     "plant": ("revolute", "prismatic", "urdf", "mimic", "floating", "planar", "mobile", "snake"),
     # partly: one or two joints before the elbow have no motor; dc: with limits of voltage and current; velocity: a
-    # servo in that mode.
+    # servo in velocity mode.
     "motor": ("none", "partly", "published", "dc", "servo", "velocity", "torque"),
     "rubbing": ("nothing", "viscous", "bearing", "gear", "both"),
     "stops": ("none", "far", "reached"),
-    # nothing: glued law, no point; free: unilateral law, no point; then the parts that can touch under
-    # the unilateral law.
+    # nothing: glued law, no point; free: unilateral law, no point; points, joints, links: the parts that can touch
+    # under the unilateral law.
     "contact": ("nothing", "free", "glued", "points", "joints", "links"),
-    # Declared points: the elbow alone; also the hand; also a second one on the same link; also one on the first axis.
+    # Declared points: only the elbow; also the hand; also a second point on the same link; also one on the first axis.
     "points": ("elbow", "two", "same_link", "unmoved"),
     "shape": ("point", "sphere"),
     # steep: a plane that the elbow leaves at a flat angle.
@@ -51,7 +51,7 @@ class Refusal:
     Attributes
     ----------
     levels : two or more factors, each with one or several levels; ``method`` may be among them
-    reason : why not
+    reason : why they cannot be combined
     error : pattern of dynsim's message for a scene that has them; empty: no scene can have them, because the levels
         exclude each other by their meaning
     """
@@ -61,16 +61,16 @@ class Refusal:
     error: str = ""
 
     def holds(self, levels: Levels) -> bool:
-        """Whether an assignment, which may be partial, has them all."""
+        """Whether an assignment, which may be partial, has all refused levels."""
         return all(levels.get(factor) in refused for factor, refused in self.levels)
 
     @property
     def name(self) -> str:
-        """Its levels, as one word."""
+        """Levels of the refusal, joined to one word."""
         return "-".join("|".join(levels) for _, levels in self.levels)
 
     def holds_for(self, method: str) -> bool:
-        """Whether it is about a method, or about all."""
+        """Whether the refusal concerns this method or all methods."""
         return method in dict(self.levels).get(METHOD, (method,))
 
 
@@ -109,7 +109,7 @@ REFUSALS: tuple[Refusal, ...] = (
             contact=GLUED, method="time_stepping"),
     _refuse("time stepping locates no overturning", r"mobile base",
             plant="mobile", method="time_stepping"),
-    # They would run without tyres, slowly, until contacts contradict each other.
+    # These scenes would run slowly without tyres, until contacts contradict each other.
     _refuse("how the rigid wheels of a snake share its weight is not determined", "",
             plant="snake", method=("auto", "dopri5", "radau5")),
     # Plant × feature.
@@ -126,7 +126,7 @@ REFUSALS: tuple[Refusal, ...] = (
             plant="floating", start="equilibrium", contact=("nothing", "free", "glued")),
     _refuse("nothing holds a free body", r"nothing holds this posture",
             objects=("box", "sphere", "cart"), start="equilibrium", contact=GLUED),
-    # But where friction or braces hold all.
+    # The refusal does not apply if friction or braces hold all joints.
     _refuse("such motors hold no posture", "", motor=("none", "velocity"), start="equilibrium"),
     _refuse("such motors hold no posture", "", controller="none", start="equilibrium"),
     # Motor × controller.
@@ -156,7 +156,7 @@ REFUSALS: tuple[Refusal, ...] = (
 )  # fmt: skip
 
 
-# Errors of a start that depend on its numbers: only dynsim finds out whether a scene has one.
+# Errors of a start that depend on the numbers of a scene, so that only dynsim can find them.
 STARTS = {
     "equilibrium": r"initial\.equilibrium: nothing holds this posture",
     "on_surface": r"the joints that may move do not bring",
@@ -166,12 +166,12 @@ STARTS = {
 
 
 def methods(levels: Levels) -> tuple[str, ...]:
-    """The methods that support all levels of an assignment; ``auto`` among them."""
+    """Return the methods, including ``auto``, that support all levels of an assignment."""
     return tuple(method for method in METHODS if refused(levels, method) is None)
 
 
 def refused(levels: Levels, method: str) -> Refusal | None:
-    """The first refusal that an assignment, which may be partial, meets with a method; None: it is accepted."""
+    """Return the first refusal of a (possibly partial) assignment with a method, or None if it is accepted."""
     return next((refusal for refusal in REFUSALS if refusal.holds({**levels, METHOD: method})), None)
 
 

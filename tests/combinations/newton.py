@@ -20,7 +20,7 @@ Finding = Iterator[str]
 
 
 def equation(seen: Observed) -> Finding:
-    """Forces of the record move the bodies as the record says: weight, contacts, loads, drives, friction, stops."""
+    """Check the equation of motion: weight, contacts, loads, drives, friction and stops cause the accelerations."""
     state = balance(seen)
     if not len(state.rows):
         return
@@ -35,7 +35,7 @@ def equation(seen: Observed) -> Finding:
 
 
 def free_sets(seen: Observed) -> list[list[int]]:
-    """Bodies of each tree that floats; trees tied to each other move as one."""
+    """Return the bodies of each floating tree; ties to other trees count as outside forces."""
     bodies, n = seen.bodies, seen.bodies.n
     root = [bodies.ancestors(i)[-1] for i in range(n)]
     floats = {
@@ -48,7 +48,7 @@ def free_sets(seen: Observed) -> list[list[int]]:
 
 
 def momentum(seen: Observed) -> Finding:
-    """Momentum and angular momentum of every set of free bodies change by the impulses that act on it."""
+    """Check that momentum and angular momentum of every set of free bodies change by the impulses on it."""
     for chosen in free_sets(seen):
         angular, linear = seen.bodies.momentum(seen.motion, chosen)
         moment, force, size = _acting_on(seen, set(chosen))
@@ -61,7 +61,7 @@ def momentum(seen: Observed) -> Finding:
             reach = 1.0 + np.linalg.norm(seen.motion.origin[chosen[-1]][rows], axis=1)
             allowed = (seen.step * 0.02 * size[rows] * reach + 1e-12)[:, None] + _products_jumped(seen, chosen, rows)
         elif seen.sample_time is not None:
-            # Forces jump or bend at ticks, between samples; those of the samples :func:`equation` has.
+            # Forces jump or bend at ticks, between samples; :func:`equation` checks the forces at the samples.
             continue
         else:
             off, allowed, rows = integral_error(seen, both, rate)
@@ -75,10 +75,11 @@ def momentum(seen: Observed) -> Finding:
 
 
 def _products_jumped(seen: Observed, chosen: list[int], rows: NDArray[np.int64]) -> Array:
-    """What rates that jump within steps leave open of the momentum of bodies, (len(rows), 6).
+    """Return the uncertainty of the momentum of bodies from rates that jump within steps, (len(rows), 6).
 
-    Steps have the velocity products of their start, c(v), and bodies move on from the midpoint at other rates: by what
-    an impact of joints changes, h c, the turning of the bodies is late. In smooth motion it is of second order.
+    A step uses the velocity products c(v) of its start, but the bodies leave its midpoint with different rates. After
+    an impact of joints, the rotation of the bodies is therefore late by the change of h c. For smooth motion this
+    change is of second order.
     """
     q, end = seen.q_middle[rows], seen.v[rows]
     start = end - seen.step * seen.vdot[rows]
@@ -91,7 +92,7 @@ def _products_jumped(seen: Observed, chosen: list[int], rows: NDArray[np.int64])
 
 
 def _acting_on(seen: Observed, chosen: set[int], weight: bool = True) -> tuple[Array, Array, Array]:
-    """Moment about the world's origin and force from outside on a set of bodies, and the sum of their sizes."""
+    """Return outside moment (about the world's origin) and force on a set of bodies, and the sum of magnitudes."""
     moment, force, size = np.zeros((len(seen), 3)), np.zeros((len(seen), 3)), np.zeros(len(seen))
 
     def add(at: Array, push: Array, twist: Array | float = 0.0) -> None:
@@ -136,10 +137,10 @@ def integral_error(seen: Observed, value: Array, rate: Array) -> tuple[Array, Ar
     simpson, trapezoid = h / 3.0 * (f0 + 4.0 * f1 + f2), h / 2.0 * (f0 + 2.0 * f1 + f2)
     off = np.abs(value[rows + 2] - value[rows] - simpson)
     rounding = 1e-12 * np.abs(value).max(axis=0, initial=0.0) + 1e-13
-    # Projection of samples and steps' errors move states within tolerances of the integrator.
+    # Projection of samples and errors of steps move states within the tolerances of the integrator.
     config = seen.scenario.integrator
     drift = 100.0 * (config.absolute_tolerance + config.rtol * np.abs(value[rows]).max(initial=0.0))
-    # What rings or is cut by a limit between samples shows in how much rates bend around them.
+    # Oscillations and limits between samples show in the second differences of the rates nearby.
     bend = np.zeros_like(rate)
     bend[1:-1] = np.abs(rate[2:] - 2.0 * rate[1:-1] + rate[:-2])
     reach = (
@@ -151,7 +152,7 @@ def integral_error(seen: Observed, value: Array, rate: Array) -> tuple[Array, Ar
 
 
 def motion(seen: Observed) -> Finding:
-    """Accelerations add up to rates, and rates to positions."""
+    """Check that accelerations integrate to rates, and rates to positions."""
     if seen.stepped:
         yield from _stepped_motion(seen)
         return
@@ -170,9 +171,9 @@ def motion(seen: Observed) -> Finding:
 
 
 def _stepped_motion(seen: Observed) -> Finding:
-    """Between samples a step apart rates change by that of one step or of two, whose accelerations are known."""
+    """Check that rates of samples one step apart change by one or two steps with the recorded accelerations."""
     h = seen.step
-    # Steps end at ticks and where commands come in late: three may lie between samples.
+    # Steps end at ticks and at delayed commands, so that three may lie between samples.
     if seen.sample_time is not None:
         return
     beside = np.flatnonzero(np.abs(np.diff(seen.time) - h) < 1e-6 * h) + 1
@@ -195,13 +196,13 @@ def _stepped_motion(seen: Observed) -> Finding:
 
 
 def jumps_at_ticks(seen: Observed) -> bool:
-    """Whether accelerations jump where commands are taken: those of drives without a circuit, or with a fast one."""
+    """Whether accelerations jump at new commands, because a drive has no circuit or a fast circuit."""
     direct = any(not isinstance(motor, Motor) for motor in seen.robot.motors)
     return seen.sample_time is not None and (direct or seen.settling > 0.0)
 
 
 def circuit(seen: Observed) -> Finding:
-    """L di/dt = u − R i − K v of DC motors."""
+    """Check L di/dt = u − R i − K v for DC motors."""
     if seen.stepped or seen.sample_time is not None:
         return
     current, voltage = seen.record["current"], seen.record["voltage"]
@@ -219,7 +220,7 @@ def circuit(seen: Observed) -> Finding:
 
 
 def support(seen: Observed) -> Finding:
-    """Wheels and caster of a mobile base carry what its own tree of bodies asks of the ground."""
+    """Check that wheels and caster of a mobile base carry the forces that its tree of bodies needs from the ground."""
     base = seen.robot.base
     if base is None:
         return
@@ -229,7 +230,7 @@ def support(seen: Observed) -> Finding:
     tree = {i for i in range(bodies.n) if bodies.ancestors(i)[-1] == root}
     needed = bodies.wrenches(motion)
     moment, force = (sum((needed[i][part] for i in tree), start=np.zeros((len(seen), 3))) for part in (0, 1))
-    # Weight is in what bodies need already.
+    # The forces that the bodies need already include weight.
     acting_moment, acting_force, _ = _acting_on(seen, tree, weight=False)
     moment, force = moment - acting_moment, force - acting_force
     # Wheels spin about an axle that turns with the base.
@@ -245,7 +246,7 @@ def support(seen: Observed) -> Finding:
     levers = np.stack([np.ones(3), feet[:, 1], -feet[:, 0]])
     loads = np.linalg.solve(levers, np.stack([own_force[:, 2], own_moment[:, 0], own_moment[:, 1]])).T
     off = np.abs(loads - seen.record["wheel_load"]).max(axis=1)
-    # Forces of a step belong to its middle, and the samples' accelerations are means.
+    # Forces of a step belong to its middle, and the accelerations of samples are means.
     size = np.abs(loads).max(axis=1) + np.linalg.norm(force, axis=1)
     allowed = (1e-2 if seen.stepped else 1e-6) * size + 1e-9
     if (off > allowed).any():

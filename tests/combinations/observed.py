@@ -28,12 +28,12 @@ AT_STEP = 1e-6
 RESOLVED, SETTLING = 0.3, 0.03
 # Slack for a current, or torque of a torque source, that the record does not show [A or N m].
 UNKNOWN = 1e9
-# Terms of the equation of motion cancel to this part of their size: by events the record's accelerations and forces
-# solve one linear system, whose condition costs up to six of sixteen digits.
+# Residual of the equation of motion relative to its terms: for event-driven methods the recorded accelerations and
+# forces solve one linear system, whose condition costs up to six of sixteen digits.
 BALANCE = 1e-8
-# Rows that count as dependent, though not to the last digit, leave as much where their forces are shared.
+# Relative residual if forces are shared among rows that count as dependent, although not to the last digit.
 SHARED_BALANCE = 1e-7
-# Forces of a step, and where it puts contacts, from differences of samples: h Δv̇ of rounded rates.
+# Relative residual of time stepping: its forces and contact positions follow from differences of rounded rates, h Δv̇.
 STEPPED_BALANCE = 1e-7
 
 
@@ -43,16 +43,17 @@ class Touch:
 
     Attributes
     ----------
-    contact : its description; body : index of its body
-    position : where it touches, (T, 3) [m]; normal : (T, 3)
-    gap, gap_before : (T,) [m]; the second at the midpoint of the step that ends at the sample, by events the same
-    slip, slip_before : (T, 3) tangential velocity [m/s]; the second of the rates at the start of the step that ends at
-        the sample, where the bodies are in its middle, as the law of time stepping has it; by events the same
-    slip_after : (T, 3) of the rates a step later with the same acceleration: a sample within a step lies between
-    approach, approach_before : velocity along the normal, (T,) [m/s]; the second as of the slip before
-    lag : by how much the slip of the law of time stepping may be off that at the end of its step, (T,) [m/s]: the law
-        has the rows of the midpoint, and half of what they have turned by since the last one, at the rates of the start
-    turned : by how much the normal has turned since the sample before, or since the midpoint of the step, (T,) [rad]
+    contact : description of the contact; body : index of its body
+    position : touching point, (T, 3) [m]; normal : (T, 3)
+    gap, gap_before : (T,) [m]; the second at the midpoint of the step that ends at the sample; equal for event-driven
+        methods
+    slip, slip_before : (T, 3) tangential velocity [m/s]; the second with the rates at the start of the step that ends
+        at the sample and the bodies at its midpoint, as in the law of time stepping; equal for event-driven methods
+    slip_after : (T, 3) slip with the rates a step later at the same acceleration; a sample within a step lies between
+    approach, approach_before : velocity along the normal, (T,) [m/s]; the second in the same state as ``slip_before``
+    lag : possible difference of the slip in the law of time stepping and the slip at the end of the step, (T,) [m/s]:
+        the law uses the rows of the midpoint, plus half of their rotation since the last midpoint, at the start's rates
+    turned : angle of the normal since the previous sample, or since the midpoint of the step, (T,) [rad]
     force : (T, 3) [N]; normal_force : (T,) as recorded [N]; mode : (T,)
     """
 
@@ -75,12 +76,12 @@ class Touch:
 
     @property
     def tangential(self) -> Array:
-        """The part of the force in the surface, (T, 3) [N]."""
+        """Component of the force along the surface, (T, 3) [N]."""
         return self.force - (self.force * self.normal).sum(axis=1, keepdims=True) * self.normal
 
 
 class Observed:
-    """What the checks look at, of a run with a record of the dynamics."""
+    """Quantities that the checks use, for a run with a record of the dynamics."""
 
     def __init__(self, run: Run) -> None:
         assert run.record is not None
@@ -121,12 +122,12 @@ class Observed:
 
     @cached_property
     def described_contacts(self) -> list[Contact]:
-        """Contacts of the scenario that the record has, in the record's order."""
+        """Contacts of the scenario that the record contains, in the record's order."""
         by_name = {contact.name: contact for contact in build.contacts(self.scenario, self.robot)}
         return [by_name[name] for name in self.record.labels["contact_gap"]]
 
     def touches(self, motion: Motion | None = None) -> list[Touch]:
-        """The contacts, at the samples or where another motion has them."""
+        """Return the contacts at the samples, or for a given motion."""
         return (
             self._touches_of_samples
             if motion is None
@@ -139,7 +140,7 @@ class Observed:
 
     @cached_property
     def touches_before(self) -> list[Touch]:
-        """The contacts a step before each sample, at the rates of the sample."""
+        """Contacts at the positions one step before each sample, with the rates of the sample."""
         q = self.q - self.step * position_rates(self.bodies, self.q, self.v)
         return self.touches(self.bodies.motion(q, self.v, np.zeros_like(self.v)))
 
@@ -196,21 +197,21 @@ class Observed:
 
     @cached_property
     def q_middle(self) -> Array:
-        """Coordinates at the midpoints of the steps that end at samples: half a step from their start at its rates."""
+        """Coordinates at midpoints of the steps that end at samples: half a step after the start, at its rates."""
         began = self.v - self.step * self.vdot
-        # Back to the start and on from there: turns about axes that differ are not those of the sum of their rates.
+        # Go back to the start, then to the midpoint: rotations about different axes do not add like their rates.
         back = -self.step * (began + self.scenario.integrator.theta * self.step * self.vdot)
         start = self.q + position_rates(self.bodies, self.q, back)
         return np.asarray(start + position_rates(self.bodies, start, 0.5 * self.step * began))
 
     @cached_property
     def _middles(self) -> Motion:
-        """Motion of all bodies there, at the rates of the start."""
+        """Motion of all bodies at the midpoints of steps, with the rates of the start."""
         return self.bodies.motion(self.q_middle, self.v - self.step * self.vdot, self.vdot)
 
     @cached_property
     def _middles_before(self) -> Motion:
-        """As :attr:`_middles`, of the step before: of the sample before, or where the rates of the start come from."""
+        """Motion as in :attr:`_middles`, one step earlier: from the previous sample, or from the rates of the start."""
         began = self.v - self.step * self.vdot
         q = self.q_middle + position_rates(self.bodies, self.q_middle, -self.step * began)
         beside = np.flatnonzero(np.abs(np.diff(self.time) - self.step) < AT_STEP * self.step) + 1
@@ -218,11 +219,11 @@ class Observed:
         return self.bodies.motion(q, began, self.vdot)
 
     def _at_midpoints(self, contact: Contact, rates: Array) -> tuple[Array, Array, Array, Array]:
-        """As :meth:`_slip_of`, at midpoints of steps."""
+        """Return the values of :meth:`_slip_of` at midpoints of steps."""
         return self._slip_of(contact, self._middles, rates)
 
     def _slip_of(self, contact: Contact, motion: Motion, rates: Array) -> tuple[Array, Array, Array, Array]:
-        """Velocity at these rates in the surface and along its normal [m/s], normal, gap [m]."""
+        """Return velocity at these rates along the surface and along its normal [m/s], normal, and gap [m]."""
         body, centre, far, normal = self.nearest_point(contact, motion)
         velocity = np.einsum("tkn,tn->tk", self.bodies.jacobian(motion, body, centre - contact.radius * normal), rates)
         along = (velocity * normal).sum(axis=1)
@@ -230,12 +231,12 @@ class Observed:
 
     @cached_property
     def loads(self) -> list[Load]:
-        """Forces and torques from outside."""
+        """Loads on the robot: outside forces and torques."""
         return build.loads(self.scenario, self.robot)
 
     @cached_property
     def event_times(self) -> Array:
-        """When something happened that may make velocities or accelerations jump [s]."""
+        """Times of events that may make velocities or accelerations jump [s]."""
         instants = [self.time[0] - 1e-12, *(event.time for event in self.record.events)]
         for load in self.loads:
             instants += list(load.knots)
@@ -243,25 +244,25 @@ class Observed:
 
     @cached_property
     def settling(self) -> float:
-        """How long after an event circuits may swing that samples do not resolve [s]."""
+        """Time after an event in which circuits may oscillate faster than samples resolve [s]."""
         spacing = float(np.diff(self.time).max(initial=0.0))
         lags = [motor.inductance / motor.resistance for motor in self.robot.motors if isinstance(motor, Motor)]
         return SETTLING if lags and spacing > RESOLVED * min(lags) else 0.0
 
     def quiet(self, count: int = 1) -> NDArray[np.bool_]:
-        """Whether nothing happens from each sample to the count-th after it, or swings on from before, (T − count,)."""
+        """Return whether no event or settling falls between each sample and the count-th after it, (T − count,)."""
         before = np.searchsorted(self.event_times, self.time[:-count] - self.settling, side="left")
         after = np.searchsorted(self.event_times, self.time[count:], side="right")
         return np.asarray(before == after)
 
     def apart_from_events(self, span: float) -> NDArray[np.bool_]:
-        """Whether each sample is further than ``span`` [s] from whatever happens, (T,)."""
+        """Return whether each sample is further than ``span`` [s] from all events, (T,)."""
         return np.array([(np.abs(self.event_times - t) > span).all() for t in self.time], dtype=bool)
 
     # Sampled loops hold their commands from one tick to the next.
     @property
     def sample_time(self) -> float | None:
-        """Period of the controller [s], None of a continuous one."""
+        """Period of the controller [s]; None if it is continuous."""
         return (self.config.get("controller") or {}).get("sample_time_s")
 
     @cached_property
@@ -280,7 +281,7 @@ class Observed:
         )
 
     def driven_torques(self, current: Array, v: Array) -> Array:
-        """What drives exert on joints at currents (T, na) and rates (T, n), without dry friction that holds, (T, n)."""
+        """Return drive torques at currents (T, na) and rates (T, n), without dry friction of joints at rest, (T, n)."""
         torque = np.zeros_like(v)
         for a, motor in enumerate(self.robot.motors):
             j = self.joints.index(motor.joint)
@@ -298,7 +299,7 @@ class Observed:
         return any(isinstance(motor, Motor) for motor in self.robot.motors)
 
     def joint_signal(self, name: str) -> Array:
-        """A signal of some joints spread over all of them, (T, n)."""
+        """Return a signal of some joints as columns of all joints, with zeros for the rest, (T, n)."""
         spread = np.zeros_like(self.v)
         if name in self.record:
             for k, joint in enumerate(self.record.labels[name]):
@@ -308,9 +309,9 @@ class Observed:
     def tie_wrenches(
         self, motion: Motion, rows: NDArray[np.int64] | None = None
     ) -> list[tuple[int, int, Array, Array, Array]]:
-        """First body, second body, place, force and moment of each tie on the first body, where the motion has them.
+        """Return first body, second body, point, and force and moment on the first body, for each tie and this motion.
 
-        rows : the samples of the motion; None: all
+        rows : samples of the motion; None for all
         """
         acting = []
         for k, tie in enumerate(self.robot.ties if "tie_force" in self.record else ()):
@@ -350,11 +351,11 @@ class Balance:
 
 
 def balance(seen: Observed) -> Balance:
-    """M v̇ + h + D v − τ − Jᵀ f − loads of all samples at which the record shows every term.
+    """Return M v̇ + h + D v − τ − Jᵀ f − loads for all samples at which the record shows every term.
 
-    By events the terms belong to the sample's state. Time stepping has the means of its last step, at the midpoint:
-    the state at the step's start follows from the accelerations, which are means too; contacts act where the step
-    ends.
+    For event-driven methods the terms belong to the sample's state. Time stepping records means of its last step, at
+    the midpoint: the state at the step's start follows from the accelerations, which are means too; contacts act at the
+    end of the step.
     """
     if seen.stepped:
         return _stepped_balance(seen)
@@ -387,7 +388,7 @@ def _stepped_balance(seen: Observed) -> Balance:
     terms += _contact_terms(seen, end, rows)
     terms += _load_terms(seen, middle, seen.time[rows] - h + theta * h)
     terms += _tie_terms(seen, middle, rows)
-    # Contacts act at the middle of the step, and the record has them at its end: that turns them with the normal.
+    # Contacts act at the middle of the step, but the record shows them at its end, rotated with the normal.
     there, here = seen.touches(middle), seen.touches(end)
     for touch, later in zip(there, here, strict=True):
         turned = _turned(touch.force[rows], later.normal, touch.normal)
@@ -395,11 +396,11 @@ def _stepped_balance(seen: Observed) -> Balance:
             slack = slack + np.abs(
                 _contact_term(seen, middle, touch, force) - _contact_term(seen, end, later, later.force[rows])
             )
-        # Tangents may turn about the normal as much as that turns.
+        # Tangents may rotate about the normal by the same angle as the normal.
         angle = np.linalg.norm(later.normal - touch.normal, axis=1, keepdims=True)
         slack = slack + np.abs(_contact_term(seen, middle, touch, angle * np.cross(touch.normal, turned)))
-    # Velocity products use the rates that the last acceleration leads to, or the rates of the start if contacts have
-    # changed.
+    # Velocity products use the rates extrapolated with the last acceleration, or the rates of the start if contacts
+    # have changed.
     last = np.where((rows > 1)[:, None], seen.vdot[np.maximum(rows - 1, 0)], 0.0)
     led, begun = (
         _balanced(seen, rows, [_inertial(seen, q_middle, rates, a), *terms[1:]], slack)
@@ -415,11 +416,11 @@ def _inertial(seen: Observed, q: Array, v: Array, a: Array) -> Array:
 
 
 def whole_steps(seen: Observed) -> NDArray[np.int64]:
-    """Samples at the end of a step of time stepping at whose start there is one too."""
+    """Return the samples at the end of a time step that also has a sample at its start."""
     h, a = seen.step, seen.vdot[1:]
     change = np.diff(seen.v, axis=0)
-    # Steps end where a load begins or ends; later samples may lie between the ends of steps, which bodies at rest do
-    # not show.
+    # Steps end at the beginning and end of a load; later samples may lie between the ends of steps, but this does not
+    # show for bodies at rest.
     beside = np.abs(np.diff(seen.time) - h) < AT_STEP * h
     knots = np.sort(np.concatenate([seen.time[:1], *(load.knots for load in seen.loads)]))
     since = (seen.time[1:] - knots[np.searchsorted(knots, seen.time[1:] - AT_STEP * h) - 1]) / h
@@ -429,7 +430,7 @@ def whole_steps(seen: Observed) -> NDArray[np.int64]:
 
 
 def _theta_currents(seen: Observed, rows: NDArray[np.int64], v_theta: Array, theta: float) -> tuple[Array, Array]:
-    """Currents that went into the steps that end at samples, and by how much torques may be off for them, (·, n)."""
+    """Return the currents of the steps that end at samples, and the resulting uncertainty of torques, (·, n)."""
     current = seen.record["current"]
     now, before = current[rows], current[rows - 1]
     used = now - (1.0 - theta) * (now - before)
@@ -438,20 +439,20 @@ def _theta_currents(seen: Observed, rows: NDArray[np.int64], v_theta: Array, the
         if isinstance(motor, Motor):
             continue
         j = seen.joints.index(motor.joint)
-        # If a limit begins or ends within a step, the law is not linear. References bend between the ends of a step:
-        # so does all that follows them.
+        # If a limit begins or ends within a step, the law is not linear. References bend between the ends of a step,
+        # and signals that follow them bend too.
         off = np.abs(now[:, a] - before[:, a]) + _bends(current[:, a], rows)
         if isinstance(motor, Servo):
             q, v = seen.q[:, seen.bodies.places[j]], seen.v[:, j]
             off = off + (motor.k_p * _bends(q, rows) + (motor.k_d + motor.k_v) * _bends(v, rows)) / motor.resistance
-        # A sample at a tick has the new command.
+        # A sample at a tick already shows the new command.
         off = np.where(seen.at_ticks[rows], UNKNOWN, off)
         slack[:, j] += seen.constants[a] * off
     return used, slack
 
 
 def _bends(signal: Array, rows: NDArray[np.int64]) -> Array:
-    """Second differences of a signal about the steps that end at rows."""
+    """Return second differences of a signal around the steps that end at rows."""
     bend = np.abs(np.diff(signal, n=2, prepend=signal[:1], append=signal[-1:]))
     return np.maximum(bend[rows], bend[rows - 1])
 
@@ -466,7 +467,7 @@ def _contact_term(seen: Observed, motion: Motion, touch: Touch, force: Array) ->
 
 
 def _turned(force: Array, normal: Array, other: Array) -> Array:
-    """Forces turned as a normal turns into another one, the shortest way, (T, 3)."""
+    """Return forces rotated by the shortest rotation from one normal to another, (T, 3)."""
     axis = np.cross(normal, other)
     cosine = (normal * other).sum(axis=1, keepdims=True)
     along = (axis * force).sum(axis=1, keepdims=True)
@@ -505,5 +506,5 @@ def _balanced(seen: Observed, rows: NDArray[np.int64], terms: list[Array], slack
 
 
 def warned(seen: Observed, text: str) -> bool:
-    """Whether a warning of the run has this text in it."""
+    """Whether a warning of the run contains this text."""
     return any(text in warning for warning in seen.run.warnings)

@@ -1,4 +1,4 @@
-"""Runs of a scene: by each method that knows all it has, and in one of several ways."""
+"""Runs of a scene: with each method that supports all of its features, and in one of several ways."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ from dynsim.scenario import Scenario, build, build_model
 from dynsim.scenario.reading import scenario_from_resolved
 
 M_STAR = "m_star"
-# Shares of the duration that a run in pieces stops at: one within the first step, two close together.
+# Shares of the duration at which a run in pieces stops: one within the first step, two close together.
 PIECES = (1e-6, 0.1234, 0.4, 0.400001, 0.77)
 
 
 @dataclass(frozen=True)
 class Run:
-    """A scene run with a method, in one of several ways.
+    """One run of a scene with a method, in one of several ways.
 
     Attributes
     ----------
-    scenario : as a scenario file would have it, with the method
-    resolved : the scenario as dynsim read it; None: it was refused while reading
+    scenario : content of a scenario file, with the method
+    resolved : the scenario as dynsim read it; None if reading failed
     method : ``auto``, ``dopri5``, ``radau5`` or ``time_stepping``
-    way : ``simulate``, ``pieces``, ``snapshot``, ``batch``, or ``m_star``, which is simulated with that solver
-    record : None where there is none: it was refused, or stopped before the first sample
-    error : with which it was refused or stopped
-    warnings : of the record's summary
-    checked : the text with which ``check`` refused it; None: it did not
+    way : ``simulate``, ``pieces``, ``snapshot``, ``batch``, or ``m_star``, a simulation with that solver
+    record : the record; None if the run was refused or stopped before the first sample
+    error : the error that refused or stopped the run
+    warnings : warnings in the record's summary
+    checked : the message with which ``check`` refused the scenario; None if it passed
     """
 
     scenario: Mapping[str, Any]
@@ -54,7 +54,7 @@ class Run:
 
     @property
     def status(self) -> str:
-        """``finished``, ``refused``, the kind of a stop, or the class of an error that is no message."""
+        """``finished``, ``refused``, the kind of a stop, or the class of an error that is not a DynsimError."""
         if self.error is None:
             return "finished"
         if isinstance(self.error, SimulationStopped):
@@ -63,7 +63,7 @@ class Run:
 
 
 def run(scene: Scene, method: str, manner: str = "simulate") -> Run:
-    """Check a scene and run it, whatever becomes of it."""
+    """Check a scene and run it; keep any error in the result."""
     solver = M_STAR if manner == M_STAR else "articulated"
     settings = scene.with_method(method, solver)
     try:
@@ -90,7 +90,7 @@ def run(scene: Scene, method: str, manner: str = "simulate") -> Run:
 
 
 def _simulation(scenario: Scenario) -> Simulation:
-    """As ``simulate`` makes it: one with ticks of Python has no end, where a step would end in another way."""
+    """Return a simulation like that of ``simulate``; with Python ticks it has no end time, which would cut a step."""
     sensors, controller = scenario.config.sensors, scenario.controller
     attended = sensors is not None or getattr(controller, "operator", None) is not None
     attended = attended or getattr(controller, "type", "") == "task_space"
@@ -109,7 +109,7 @@ def _in_pieces(scenario: Scenario) -> Record:
 
 
 def _with_snapshot(scenario: Scenario) -> Record:
-    """Go on from a snapshot, and again from there."""
+    """Continue a simulation, restore an earlier snapshot, and continue from it again."""
     simulation = _simulation(scenario)
     simulation.advance(0.3 * scenario.duration_s)
     snapshot = simulation.snapshot()
@@ -120,11 +120,11 @@ def _with_snapshot(scenario: Scenario) -> Record:
 
 
 def _in_a_batch(scenario: Scenario) -> Record:
-    """Beside a run of the same robot, with which it shares what they have in common."""
+    """Run the scenario in a batch next to an equal scenario, with which it shares data."""
     first, second = simulate_batch([scenario, scenario], keep_records="all")
     for result in (first, second):
         if result.record is None:
-            # The error itself, which a batch tells in words alone.
+            # Raise the error itself, because a batch returns only its message.
             return simulate(scenario)
     assert first.record is not None
     assert second.record is not None
@@ -145,15 +145,15 @@ WAYS = {
 
 
 def runs(scene: Scene, takes: Callable[[str, str], bool] = lambda method, manner: True) -> dict[str, Run]:
-    """A scene by all its methods, by ``METHOD``, and in further ways by ``METHOD/WAY``.
+    """Run a scene with all its methods (key ``METHOD``) and in further ways (key ``METHOD/WAY``).
 
-    ``auto`` takes one of the others, and is run where the scene is to be run in no further way. ``takes`` may leave
-    out methods and ways.
+    ``auto`` chooses one of the methods; it runs only if the scene does not run in a further way. ``takes`` may exclude
+    methods and ways.
     """
     done = {method: run(scene, method) for method in scene.methods if method != "auto" and takes(method, "simulate")}
     if not done:
         return {}
-    # Which method runs in another way, changes from scene to scene.
+    # The method that runs in a further way changes from scene to scene.
     method = sorted(done)[scene.seed % len(done)]
     manner = scene.levels["way"]
     if manner != "simulate":
@@ -168,11 +168,11 @@ def runs(scene: Scene, takes: Callable[[str, str], bool] = lambda method, manner
 
 
 def faults(scene: Scene, done: Mapping[str, Run], *, thorough: bool = False) -> list[tuple[str, str]]:
-    """What is wrong with the way in which runs began, ended and were kept: (kind, what) of each.
+    """Return the faults in the starts, ends and saved results of runs, as (kind, sentence).
 
     Parameters
     ----------
-    thorough : repeat the resolved scenario; save and load the record; draw figures and page; export
+    thorough : whether to repeat the resolved scenario, save and load the record, draw figures and page, and export
     """
     wrong: list[tuple[str, str]] = []
     for name, own in done.items():
@@ -184,7 +184,7 @@ def faults(scene: Scene, done: Mapping[str, Run], *, thorough: bool = False) -> 
         same = str(auto.record.summary["method"])
         assert auto.resolved is not None
         differ = _differs(done[same], auto) if same in done else ""
-        # Of what nothing damps it sharpens the tolerances.
+        # For undamped motion ``auto`` uses tighter tolerances.
         if differ and prepare(auto.resolved).choice.sharper == 1.0:
             wrong.append(("way", f"auto is not {same}: {differ}"))
     if thorough:
@@ -195,7 +195,7 @@ def faults(scene: Scene, done: Mapping[str, Run], *, thorough: bool = False) -> 
 
 
 def _began(scene: Scene, own: Run) -> list[tuple[str, str]]:
-    """``check`` succeeds if and only if the run begins; only what may be refused is; other errors are none."""
+    """Return faults if ``check`` and the run disagree, a valid start is refused, or an unexpected error occurs."""
     refused = isinstance(own.error, DynsimError) and not isinstance(own.error, SimulationStopped)
     if own.error is not None and not isinstance(own.error, DynsimError):
         return [("crash", f"{type(own.error).__name__}: {own.error}")]
@@ -209,7 +209,7 @@ def _began(scene: Scene, own: Run) -> list[tuple[str, str]]:
 
 
 def expected(scene: Scene, text: str) -> bool:
-    """Whether an error is that of a start which a scene may have, by its numbers."""
+    """Whether an error belongs to a start that may fail, depending on the numbers of the scene."""
     import re
 
     pattern = STARTS.get(scene.levels["start"])
@@ -217,7 +217,7 @@ def expected(scene: Scene, text: str) -> bool:
 
 
 def _differs(a: Run, b: Run) -> str:
-    """What differs between runs that are to be the same to the bit; empty: nothing."""
+    """Return the difference of two runs that should be bit-identical; empty if they are."""
     if a.status != b.status:
         return f"{a.status}, {b.status}: {b.error or a.error}"
     if a.record is None or b.record is None:
@@ -227,7 +227,7 @@ def _differs(a: Run, b: Run) -> str:
 
 
 def different(a: Record, b: Record) -> list[str]:
-    """Names of the signals that are not the same to the bit."""
+    """Return the names of the signals that are not bit-identical."""
     names = sorted({*a, *b})
     return [
         name
@@ -239,7 +239,7 @@ def different(a: Record, b: Record) -> list[str]:
 
 
 def _kept(own: Run) -> list[tuple[str, str]]:
-    """The resolved scenario repeats the run; what is saved is what was there; figures, page and exports succeed."""
+    """Return faults in the repeated run of the resolved scenario, the saved record, figures, page and exports."""
     assert own.resolved is not None
     assert own.record is not None
     wrong: list[tuple[str, str]] = []
@@ -298,7 +298,7 @@ def _export(own: Run, folder: Path) -> str:
     from dynsim.record.mcap_file import write_mcap
 
     assert own.record is not None
-    # One sample is no motion.
+    # A motion needs more than one sample.
     if len(own.record) > 1:
         export_record(own.record, folder / "run.csv", "csv")
     write_mcap(own.record, folder / "run.mcap")
@@ -306,7 +306,7 @@ def _export(own: Run, folder: Path) -> str:
 
 
 def _describe(own: Run, folder: Path) -> str:
-    """As URDF, which has no wheels that roll without slip, and as MJCF."""
+    """Convert the model to URDF, which does not support wheels that roll without slip, and to MJCF."""
     assert own.resolved is not None
     model = build_model(own.resolved)
     for text in (model.to_urdf, lambda: model.to_mjcf(build.contacts(own.resolved), build.surfaces(own.resolved))):

@@ -1,4 +1,4 @@
-"""The scenario of an assignment of levels: short, of a robot that people could build, varied by a seed."""
+"""Scenario for an assignment of levels: it is short, its robot could be built, and a seed varies it."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from dynsim.scenario.reading import scenario_from_resolved, to_yaml
 
 Array = NDArray[np.float64]
 
-# Wall time after which a run counts as endless [s].
+# Wall-clock time after which a run counts as endless [s].
 WALL_LIMIT_S = 60.0
-# Radius of spheres about points [m], and what a declared point of a link with a radius is thicker by.
+# Radius of spheres about points [m], and extra radius of declared points on links that have a radius [m].
 SPHERE, THICKER = 0.02, 0.002
-# From the elbow to the shin [m].
+# Distance from the elbow to the shin [m].
 SHIN = 0.05
-# Scenes that are drawn until nothing starts in a surface.
+# Maximum number of scenes drawn until no body starts in a surface.
 ATTEMPTS = 4
-# Heights of a grid along each side, and their distance [m].
+# Number of grid heights along each side, and their spacing [m].
 GRID, SPACING = 24, 0.1
-# What differs between methods, by the level of precision.
+# Integrator options by the level of precision, for adaptive methods and for time stepping.
 ADAPTIVE = {"default": {}, "tight": {"rtol": 1e-9, "atol": 1e-11}, "coarse": {"rtol": 1e-5, "atol": 1e-7}}
 STEPPED = {"default": {}, "tight": {"step_s": 2.5e-4}, "coarse": {"step_s": 2e-3, "theta": 1.0}}
 DEFAULT_STEP_S = 1e-3
-# Of a snake, whose control period they divide.
+# Steps for a snake, which divide its control period.
 SNAKE_STEPPED = {"default": {}, "tight": {"step_s": 1.25e-3}, "coarse": {"step_s": 5e-3, "theta": 1.0}}
 
 
@@ -46,10 +46,10 @@ class Scene:
 
     Attributes
     ----------
-    levels : of all factors
-    seed : that it was drawn with
-    settings : as a scenario file would have it, without ``integrator``
-    folder : of ``scenario.yaml`` and the files that it names
+    levels : levels of all factors
+    seed : seed with which the scene was drawn
+    settings : content of a scenario file, without ``integrator``
+    folder : folder of the scenario files and of the files that they name
     """
 
     levels: Levels
@@ -59,11 +59,11 @@ class Scene:
 
     @property
     def methods(self) -> tuple[str, ...]:
-        """By which it can run; ``auto`` is one of the others."""
+        """Methods that can run the scene; ``auto`` chooses one of the rest."""
         return methods(self.levels)
 
     def with_method(self, method: str, solver: str = "articulated") -> dict[str, Any]:
-        """Its settings with a method: the whole scenario."""
+        """Return the whole scenario: the settings with a method."""
         stepped = method == "time_stepping"
         fixed = SNAKE_STEPPED if self.levels["plant"] == "snake" else STEPPED
         options = dict((fixed if stepped else ADAPTIVE)[self.levels["precision"]])
@@ -71,7 +71,7 @@ class Scene:
             options["solver"] = solver
         settings = {**self.settings, "integrator": {"method": method, **options, "wall_limit_s": WALL_LIMIT_S}}
         if stepped and fixed is STEPPED:
-            # At the end of each step: the checks of steps see all of them. Steps divide the time between ticks.
+            # Record at the end of each step, so that the checks see all steps. Steps divide the time between ticks.
             step, between = (
                 options.get("step_s", DEFAULT_STEP_S),
                 self.settings.get("controller", {}).get("sample_time_s"),
@@ -81,20 +81,20 @@ class Scene:
         return settings
 
     def load(self, method: str, solver: str = "articulated") -> Scenario:
-        """Its scenario, read from its file; raises what reading raises."""
+        """Write the scenario file and return the scenario read from it; errors of reading are passed on."""
         file = self.folder / f"{method}_{solver}.yaml"
         file.write_text(to_yaml(self.with_method(method, solver)), "utf-8")
         return load_scenario(file)
 
     def text(self, method: str = "auto") -> str:
-        """Its scenario file, with the levels above."""
+        """Return the text of the scenario file, with the levels in its first line."""
         levels = ", ".join(f"{factor} {self.levels[factor]}" for factor in FACTORS)
         return f"# seed {self.seed}: {levels}\n{to_yaml(self.with_method(method))}"
 
 
 def scene(levels: Levels, seed: int, folder: Path) -> Scene:
-    """The scene of an assignment; files go to the folder, which must be there."""
-    # The same in every process: Python's own hashes of texts are not.
+    """Return the scene of an assignment; files are written to the folder, which must exist."""
+    # This number is the same in every process, unlike Python's own hashes of strings.
     number = zlib.crc32("/".join(levels[factor] for factor in FACTORS).encode())
     for attempt in range(ATTEMPTS):
         random = np.random.default_rng([seed, number, attempt])
@@ -109,7 +109,7 @@ def scene(levels: Levels, seed: int, folder: Path) -> Scene:
 
 
 def _in_a_surface(drawn: Scene) -> bool:
-    """Whether something beside the declared points starts below a surface: the scene asks for what it need not."""
+    """Whether a part other than the declared points starts below a surface, which the levels do not require."""
     try:
         check(drawn.load(drawn.methods[-1]))
     except DynsimError as error:
@@ -146,7 +146,7 @@ def _arm(random: Generator, levels: Levels, folder: Path) -> dict[str, Any]:
 
 
 def _model(robot: plants.Plant, folder: Path) -> Model:
-    """The robot alone, to see where its points are."""
+    """Return the model of the robot alone, which is used to locate its points."""
     plant = dict(robot.section)
     if "file" in plant:
         plant["file"] = str(folder / plant["file"])
@@ -164,7 +164,7 @@ def _set_stops(random: Generator, levels: Levels, robot: plants.Plant) -> None:
             plants.set_limits(robot, joint, joint.start - reach, joint.start + reach)
         return
     if levels["start"] == "on_references":
-        # The others may start elsewhere.
+        # The remaining joints may start elsewhere.
         able = [joint for joint in able if joint.before]
     for k in random.permutation(len(able)).tolist()[: 1 + int(random.integers(2))]:
         joint = able[k]
@@ -174,7 +174,7 @@ def _set_stops(random: Generator, levels: Levels, robot: plants.Plant) -> None:
 
 
 class _Touching:
-    """What touches what: surfaces under the points of the robot, and objects on a shelf of their own."""
+    """Surfaces under the points of the robot, its contacts, and objects on a separate shelf."""
 
     def __init__(self, random: Generator, levels: Levels, robot: plants.Plant, model: Model, folder: Path) -> None:
         self._random, self._levels, self._robot, self._model, self._folder = random, levels, robot, model, folder
@@ -185,12 +185,12 @@ class _Touching:
         contact, start = levels["contact"], levels["start"]
         radius = SPHERE if levels["shape"] == "sphere" else 0.0
         if contact == "links":
-            # Thicker than the link, which would take its place.
+            # The point is thicker than the link; otherwise the link would touch first.
             radius = robot.radius + THICKER
         gap = {"above": float(random.uniform(1e-3, 6e-3)), "on_surface": float(random.uniform(-2e-3, 2e-3))}.get(
             start, 0.0
         )
-        # Not all of several points can be moved at once.
+        # Several points cannot all be moved onto their surfaces together.
         self.gap = 0.0 if contact == "glued" or start not in ("on_surface", "on_references") else 3e-3
         if contact == "glued" and levels["points"] != "elbow":
             gap = 0.0
@@ -206,7 +206,7 @@ class _Touching:
 
     @property
     def on_surface(self) -> list[str]:
-        """The points that start on their surfaces, those that may start above them left out."""
+        """Names of the points that start on their surfaces, without points that may start above them."""
         if self._levels["contact"] == "glued":
             return list(self.points)
         return ["elbow", *(name for name in self.points if name.startswith("foot"))]
@@ -219,16 +219,16 @@ class _Touching:
         return settings
 
     def _floor(self, radius: float, gap: float) -> None:
-        """The surface below the elbow."""
+        """Add the surface below the elbow."""
         random, kind = self._random, self._levels["surface"]
         wide = self._levels["contact"] in ("joints", "links") or self._levels["objects"] not in ("none", "hinge")
-        # Across the plane of the arm, where the other joints stay as far above it.
+        # Tilt the surface across the plane of the arm, so that the other joints stay equally far above it.
         heading = self._across()
         normal = _unit(np.array([0.0, 0.0, 1.0]) + float(random.uniform(-0.05, 0.05)) * heading)
         if kind in ("sphere", "cylinder") and not wide and random.random() < 0.8:
             normal = _unit(np.array([0.0, 0.0, 1.0]) + float(random.uniform(0.2, 0.8)) * heading)
         if kind == "steep" and self._levels["contact"] == "links":
-            # A link that passes by would be in it.
+            # On a steep plane, a link that passes by would penetrate it.
             kind = "inclined"
         if kind == "steep":
             normal = self._steep(heading)
@@ -265,7 +265,7 @@ class _Touching:
         self.surfaces["floor"] = surface
 
     def _across(self) -> Array:
-        """Horizontal direction across the arm's plane."""
+        """Return a horizontal direction across the plane of the arm."""
         hand = self._model.point_position(*self._robot.hand, self._q) - self.elbow
         along = np.array([hand[0], hand[1], 0.0])
         if np.linalg.norm(along) < 1e-3:
@@ -273,7 +273,7 @@ class _Touching:
         return _unit(np.cross(along, [0.0, 0.0, 1.0])) * float(self._random.choice((-1.0, 1.0)))
 
     def _steep(self, heading: Array) -> Array:
-        """A normal that the elbow's motion about one joint leaves at a flat angle, and that looks up."""
+        """Return an upward normal of a plane that the elbow, turned about one joint, leaves at a flat angle."""
         body, point = self._robot.elbow
         jacobian = self._model.point_jacobian(body, np.array(point), self._q)
         moving = [column for column in jacobian.T if np.linalg.norm(column) > 0.05]
@@ -284,7 +284,7 @@ class _Touching:
         return normal if normal[2] > 0.0 else -normal
 
     def _terrain(self, spot: Array) -> dict[str, Any]:
-        """A hill, which its spline meets but for rounding; its top is below the elbow."""
+        """Return a hill with its top below the elbow; its spline reproduces it except for rounding."""
         x = SPACING * (np.arange(GRID) - 0.5 * (GRID - 1))
         bends = self._random.uniform(0.05, 0.3, size=2)
         np.save(self._folder / "terrain.npy", -np.add.outer(bends[0] * x**2, bends[1] * x**2))
@@ -293,7 +293,7 @@ class _Touching:
         return {"type": "height_field", "file": "terrain.npy", "spacing_m": [SPACING] * 2, "origin_m": origin}
 
     def _more(self, radius: float) -> None:
-        """Further points, each on a small ball of its own where other links do not come."""
+        """Add further points, each on a separate small ball that other links do not reach."""
         level, robot = self._levels["points"], self._robot
         body, point = robot.elbow
         if level == "two":
@@ -307,7 +307,7 @@ class _Touching:
             normal = _unit(self.normal - (self.normal @ along) * along)
             self._ball("shin", spot, radius + self._fan(body), there, normal)
         elif level == "unmoved":
-            # The last joint that has its centre on the axis of the first: that moves it by rounding.
+            # Use the last joint with its centre on the axis of the first joint, which moves it only by rounding.
             bodies = [joint.body for joint in robot.joints if not joint.name.startswith("base.")]
             centres = [self._model.point_position(body, np.zeros(3), self._q) for body in bodies]
             last = max(k for k, centre in enumerate(centres) if np.linalg.norm(centre - centres[0]) < 1e-9)
@@ -315,12 +315,12 @@ class _Touching:
             there = self._model.point_position(*spot, self._q)
             toward = self._model.point_position(*robot.hand, self._q) - there
             toward[2] = 0.0
-            # Behind the arm.
+            # The ball is behind the arm.
             toward = _unit(toward) if np.linalg.norm(toward) > 1e-3 else np.array([1.0, 0.0, 0.0])
             self._ball("root", spot, radius, there, _unit(toward + self._random.uniform(-0.3, 0.3, size=3)))
 
     def _fan(self, body: str) -> float:
-        """How far the axes of a body, where they are capsules, leave its own by the shin: those to its fingers [m]."""
+        """Return how far the capsules from a body to its fingers are off its own axis at the shin [m]."""
         if self._levels["contact"] != "links":
             return 0.0
         ends = [link.p_PJ for link in self._model.robot.links if link.parent == body]
@@ -336,7 +336,7 @@ class _Touching:
         self.points[name] = self._point(spot, f"{name}_ball", radius)
 
     def _feet(self) -> None:
-        """The trunk of a floating robot stands on four feet."""
+        """Add four feet under the trunk of a floating robot."""
         base = self._model.point_position("trunk", np.zeros(3), self._q)
         slab = [*(base[:2]), base[2] - 0.1 - SPHERE]
         self.surfaces["slab"] = {
@@ -348,7 +348,7 @@ class _Touching:
             self.points[f"foot_{k + 1}"] = self._point(("trunk", [x, y, -0.1]), "slab", SPHERE)
 
     def _friction(self) -> None:
-        """The ``contacts:`` section."""
+        """Fill the ``contacts:`` section."""
         random, levels = self._random, self._levels
         law = "bilateral" if levels["contact"] in ("nothing", "glued") else "unilateral"
         level, own = levels["friction"], dict[str, Any]()
@@ -361,7 +361,7 @@ class _Touching:
             own["stiffness_N_per_m"] = float(10.0 ** random.uniform(3.5, 5.0))
             own["damping_N_s_per_m"] = float(random.uniform(10.0, 200.0))
         self.contacts: dict[str, Any] = {"law": law}
-        # Said of the point here and there, instead of all.
+        # In some scenes the values are set for the point instead of for all contacts.
         (self.points["elbow"] if random.random() < 0.3 and level != "stribeck" else self.contacts).update(own)
         if level == "stribeck":
             self.contacts["stribeck_m_s"] = float(random.choice((0.01, 0.1)))
@@ -381,11 +381,11 @@ class _Touching:
         self.contacts["points"] = self.points
 
     def objects(self) -> dict[str, Any]:
-        """A body beside the robot, at rest on a shelf or a little above it."""
+        """Return a body next to the robot, at rest on a shelf or a little above it."""
         random, level = self._random, self._levels["objects"]
         if level == "none":
             return {}
-        # Far from the arm, on the free side of its floor.
+        # The body is far from the arm, on the free side of its floor.
         there = self.elbow + 2.0 * self.normal + self._away()
         if level == "hinge":
             hinge: dict[str, Any] = {"axis": random.normal(size=3).tolist(), "damping_N_m_s_per_rad": 0.01}
@@ -496,7 +496,7 @@ def _sensors(random: Generator, levels: Levels) -> dict[str, Any]:
 
 
 def _snake(random: Generator, levels: Levels) -> dict[str, Any]:
-    """A snake on the ground that moves its head; beside it what the other factors say."""
+    """Return a snake on the ground that moves its head, with the features of the other factors."""
     duration = float(random.uniform(0.3, 0.6))
     settings: dict[str, Any] = {
         "duration_s": duration,
@@ -512,13 +512,13 @@ def _snake(random: Generator, levels: Levels) -> dict[str, Any]:
         speed = [*random.uniform(-0.1, 0.1, size=3).tolist(), 0.0, 0.0, float(random.uniform(-0.2, 0.2))]
         controller["commands"] = [{"at_s": 0.05, "velocity": speed}]
     else:
-        # The others, which a snake's controller is not, are refused.
+        # Scenes with controllers that a snake does not support are refused.
         states = {"sampled": "feedforward", "encoders": "estimated", "delayed": "measured"}
         controller["state"] = states.get(level, "measured")
         step = [*random.uniform(-0.03, 0.03, size=3).tolist(), 0.0, 0.0, 0.0]
         controller["paths"] = [{"type": "ramp", "start_s": 0.0, "duration_s": duration, "displacement": step}]
     if random.random() < 0.5:
-        # Lifted pairs, the first among them here and there.
+        # Some pairs are lifted; in some scenes the first pair is among them.
         controller |= {"modes": {1: [2, 5] if random.random() < 0.5 else [3, 6]}, "switching": {"order": [1]}}
     settings["controller"] = controller if level in ("operator", *SAMPLED) else {"type": "joint_pd"}
     own = {"none": 0.0, "high": 1.5}.get(levels["friction"], 0.6)
@@ -533,7 +533,7 @@ def _snake(random: Generator, levels: Levels) -> dict[str, Any]:
         settings["contacts"]["static_friction"] = 1.3 * own
     if levels["objects"] in ("box", "sphere", "cart", "hinge"):
         shape = {"shape": "sphere", "radius_m": 0.05} if levels["objects"] == "sphere" else {"size_m": [0.1, 0.1, 0.1]}
-        # At rest on the ground, or above it.
+        # The object is at rest on the ground, or above it.
         height = float(random.choice((0.05, 0.25))) if levels["objects"] != "hinge" else 0.4
         thing = {"mass_kg": 0.5, **shape, "position_m": [2.0, 0.5, height]}
         if levels["objects"] == "hinge":

@@ -16,7 +16,7 @@ from dynsim.system import interruption
 
 
 def square(number: int, look: Progress) -> int:
-    """The square of a number; ``DEADLY`` kills the process, ``REFUSED`` raises an error."""
+    """Return the square of a number; ``DEADLY`` kills the process, ``REFUSED`` raises an error."""
     if number == DEADLY:
         os.kill(os.getpid(), signal.SIGKILL)
     if number == REFUSED:
@@ -25,7 +25,7 @@ def square(number: int, look: Progress) -> int:
 
 
 def once_deadly(task: tuple[int, str], look: Progress) -> int:
-    """The square of a number; ``DEADLY`` kills the first process that gets it, which leaves a file for the next."""
+    """Return the square; ``DEADLY`` kills the first process that gets it, which leaves a file for the next process."""
     number, folder = task
     seen = Path(folder, "seen")
     if number == DEADLY and not seen.exists():
@@ -42,7 +42,7 @@ def warned(number: int, look: Progress) -> bool:
 
 
 def hangs(number: int, look: Progress) -> int:
-    """One task holds the interpreter's lock for good, as compiled code does that never ends; one stops its process."""
+    """Hold the interpreter's lock indefinitely (``DEADLY``), like endless compiled code, or stop the process."""
     if number == DEADLY:
         ctypes.PyDLL(None).pause()
     if number == REFUSED:
@@ -51,7 +51,7 @@ def hangs(number: int, look: Progress) -> int:
 
 
 def slow(number: int, look: Progress) -> int:
-    """Longer than what is taken for silent in its test, half of it at work in Python, half of it asleep."""
+    """Take longer than the time limit for silence in the test: half of it in Python code, half of it asleep."""
     end = time.monotonic() + 1.5
     while time.monotonic() < end:
         pass
@@ -60,7 +60,7 @@ def slow(number: int, look: Progress) -> int:
 
 
 def deaf(task: tuple[int, str], look: Progress) -> int:
-    """Tells that it has begun, and never looks whether it shall stop."""
+    """Leave a file to show that the task has begun, and never check for a stop."""
     number, folder = task
     Path(folder, f"begun_{number}").touch()
     time.sleep(1000.0)
@@ -68,7 +68,7 @@ def deaf(task: tuple[int, str], look: Progress) -> int:
 
 
 def attentive(task: tuple[int, str], look: Progress) -> int:
-    """Tells its process that it has begun, and returns the number when it shall stop."""
+    """Leave a file with the process id when the task has begun, and return the number on a stop."""
     number, folder = task
     Path(folder, f"begun_{os.getpid()}").touch()
     try:
@@ -80,29 +80,29 @@ def attentive(task: tuple[int, str], look: Progress) -> int:
 
 
 def leaves(number: int, look: Progress) -> int:
-    """One task leaves a thread behind that cannot be ended."""
+    """Report, for ``DEADLY``, a remaining thread that cannot be ended; return the process id."""
     if number == DEADLY:
         interruption.leave()
     return os.getpid()
 
 
 def pid(number: int, look: Progress) -> int:
-    """Of the process."""
+    """Return the process id."""
     return os.getpid()
 
 
 def named(thing: Any, look: Progress) -> str:
-    """What a thing is called."""
+    """Return the name of an object."""
     return str(thing.name)
 
 
 def unsendable(thing: Any, look: Progress) -> Any:
-    """A result that no other process can have."""
+    """Return a result that cannot be sent to another process."""
     return open(os.devnull)
 
 
 def says(number: int, look: Progress) -> str:
-    """Prints, and reads what is there to be read."""
+    """Print a line, and return the content of standard input."""
     os.write(1, b"printed\n")
     return sys.stdin.read()
 

@@ -1,9 +1,9 @@
-"""Feed-forward voltages along joint references: from full dynamics with brace forces, or from gravity alone.
+"""Feed-forward voltages along joint references, from full dynamics with brace forces or from gravity alone.
 
     K_m i = M v̇ + h + g + J_m v̇ + (D + D_m) v − Jᵀ f,    u = R i + L di/dt + K_m v
 
-f are the brace forces: normal forces, commanded or chosen for least motor heat, and friction where the references slip.
-Gravity alone gives u = R g / K_m. :func:`pressing` makes the tables of the braces, for the brace planner too.
+f are the brace forces: normal forces, commanded or chosen for least motor heat, and friction if the references slip.
+Gravity alone requires u = R g / K_m. :func:`pressing` builds the tables of the braces, also for the brace planner.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ Array = NDArray[np.float64]
 
 # Smoothing speed v_s of planned friction [m/s], μ s/√(s² + v_s²): a jump would make the voltages oscillate.
 SLIP_SCALE = 5e-3
-# Below this slip speed s no friction is planned [m/s].
+# Slip speed s below which the plan contains no friction [m/s].
 SLIP_MIN = 1e-9
-# Largest distance of a brace from its surface, above or below, along the references [m]; beyond it ModelError.
+# Largest distance of a brace from its surface, above or below, along the references [m]; more is a ModelError.
 GAP_MAX = 2e-3
 
 
@@ -39,20 +39,21 @@ def planned_voltages(
     min_N: float = MIN_N,
     whole: bool = True,
 ) -> Array:
-    """Voltages of all motors, (T, na) [V].
+    """Return the voltages of all motors, (T, na) [V].
 
     Parameters
     ----------
-    times : (T,) equally spaced [s]
-    positions : of the moving joints, (T,) [rad or m]; the others hold their initial ones
-    braces : contact and commanded normal force [N] by name; None: the one of least heat, at least ``min_N``
-    whole : the whole dynamics and the circuits; else what holds the weight at rest, i = g / K_m
+    times : (T,) equally spaced instants [s]
+    positions : positions of the moving joints, (T,) [rad or m]; the remaining joints hold their initial positions
+    braces : contact and commanded normal force [N] for each brace; None for the force of least heat, at least ``min_N``
+    whole : True for the whole dynamics and the circuits; False for the currents that hold the weight at rest,
+        i = g / K_m
 
     Raises
     ------
     ModelError
-        Joints without DC motors, a mobile base that is to move, a brace that is no point or that the references take
-        off its surface, or no forces that carry the motion.
+        If a joint has no DC motor, a mobile base must move, a brace is not a point or the references pull it off its
+        surface, or no brace forces carry the motion.
     """
     robot = model.robot
     driven = [motor.joint for motor in robot.motors]
@@ -90,9 +91,9 @@ def pressing(
     min_N: float = MIN_N,
     slip_scale: float = SLIP_SCALE,
 ) -> tuple[BracePlanner, Array]:
-    """Braces that press along references, and their tables for the kernels, (T, c, BRACE_SIZE).
+    """Return the planner of braces that press along references, and their kernel tables, (T, c, BRACE_SIZE).
 
-    Friction against the slip of the references, μ f_n v/√(v² + v_s²), v_s = ``slip_scale`` [m/s].
+    Friction acts against the slip of the references: μ f_n v/√(v² + v_s²), with v_s = ``slip_scale`` [m/s].
     """
     attached = []
     for name, (contact, _) in braces.items():
@@ -115,7 +116,7 @@ def pressing(
         slip = velocity - np.sum(velocity * normals, axis=1, keepdims=True) * normals
         speed = np.linalg.norm(slip, axis=1)
         slip[speed <= SLIP_MIN] = 0.0
-        # A point at rest along the surface is planned without friction: what holds it then, its history decides.
+        # The plan has no friction for a point at rest along the surface: the friction there depends on its history.
         friction = np.where(speed > SLIP_MIN, contact.friction * speed / np.hypot(speed, slip_scale), 0.0)
         tables[:, k] = brace_rows(touching, normals, friction, min_N, np.nan if force is None else force, slip)
     return planner, tables
@@ -130,7 +131,7 @@ def _pressing_torques(
     braces: Mapping[str, tuple[Contact, float | None]],
     min_N: float,
 ) -> Array:
-    """Torques of the motors along the references, (T, n), with braces that press."""
+    """Return the torques of the motors along the references, (T, n), with braces that press."""
     planner, tables = pressing(model, times, q, v, braces, min_N)
     torques, _, solved = planner.least_heat(q, v, vdot, tables)
     if solved < len(times):
@@ -145,12 +146,12 @@ def _pressing_torques(
 def _lowest_points(
     model: Model, attached: tuple[int, Array], offsets: Array, q: Array, v: Array
 ) -> tuple[Array, Array]:
-    """Points of a body off one of its points by vectors in the world: in its frame [m], and their velocities [m/s].
+    """Return a body's points at given offsets from one of its points: in its frame [m], and their velocities [m/s].
 
     Parameters
     ----------
     attached : link, and the point in its frame [m]
-    offsets : (T, 3) [m]
+    offsets : offsets in the world frame, (T, 3) [m]
     """
     link, point = attached
     planner = BracePlanner(model.robot, model.arrays, [link] * 4)
@@ -161,7 +162,7 @@ def _lowest_points(
 
 
 def _check_gaps(name: str, contact: Contact, times: Array, gaps: Array) -> None:
-    """Refuse a brace that the references take off its surface: nothing would carry what is planned for it."""
+    """Raise ModelError if the references pull a brace off its surface, where it cannot carry its planned force."""
     k = int(np.abs(gaps).argmax())
     if abs(gaps[k]) > GAP_MAX:
         raise ModelError(

@@ -138,7 +138,7 @@ def find_splits(unilateral: UnilateralArrays, ws: Workspace):
 
     Returns
     -------
-    points, count, p, ties : number of sticking points, number of points, held joints and stops, their rows, coupling rows
+    points, count, p, ties : sticking points; points, held joints and stops; their rows; rows of couplings
     """
     room, first, row = unilateral.room, unilateral.index[0], unilateral.index[1]
     count, p = 0, 0
