@@ -25,6 +25,8 @@ from dynsim.model.description import Array, Contact, Load
 
 # Displacement that counts as none [rad or m]: of a stiffness of 1e5 N/m it is a force of 1e-8 N.
 DONE = 1e-13
+# Displacement that may be left where the forces of the equilibrium are known no better: 1e-4 N of 1e5 N/m [rad or m].
+NEARLY = 1e-9
 ITERATIONS = 50
 # Singular values of rows below this part of the largest are zero.
 RANK = 1e-10
@@ -47,6 +49,7 @@ def pressed_in(
     names = [contact.name for contact, *_ in touching_contacts(model, contacts, q, real) if contact.stiffness > 0.0]
     if not names:
         return model
+    before = np.inf
     for _ in range(ITERATIONS):
         forces = holding_torques(model, q, contacts, loads, able, real).normal_forces
         rows, depths, rigid, roots = [], [], [], []
@@ -61,8 +64,11 @@ def pressed_in(
         positions_along(model.arrays, q, 0, step, change)
         q += change
         normalise(model.arrays, q, 0)
-        if np.abs(step).max(initial=0.0) <= DONE:
+        size = float(np.abs(step).max(initial=0.0))
+        # Where friction shares the load with normal forces, their split is as accurate as its search.
+        if size <= DONE or before <= size <= NEARLY:
             return Model(replace(robot, q0=q))
+        before = size
     raise ModelError(
         f"initial.equilibrium: no posture near this one presses {first_few(names)} in as deep as their forces need; "
         "raise contacts.stiffness_N_per_m, or remove initial.equilibrium",

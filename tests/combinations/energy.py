@@ -18,6 +18,8 @@ Finding = Iterator[str]
 RESIDUAL = 1e-6
 # Total error of ten landings, each located to 1e-13 m (docs/physics.md) [m].
 LANDINGS_M = 1e-12
+# Rate of a joint at rest that time stepping leaves as rounding [rad/s or m/s].
+RATE_ROUNDING = 1e-10
 
 
 def ledger(seen: Observed) -> Finding:
@@ -121,6 +123,8 @@ def _unlike_trapezia(seen: Observed) -> dict[str, Array]:
     turns = seen.v * before < 0.0
     joints = np.where(turns, np.abs(seen.joint_signal("joint_friction")) * (np.abs(seen.v) + np.abs(before)), 0.0)
     joints += 0.25 * seen.bodies.damping * (seen.v - before) ** 2
+    # The rate of a joint that rests in the middle of a step is known to rounding only.
+    joints += np.abs(seen.joint_signal("joint_friction")) * RATE_ROUNDING
     contacts = np.zeros(len(seen))
     for touch in seen.touches():
         slip, earlier = touch.slip, touch.slip_before

@@ -136,8 +136,10 @@ def _pulls(match: Match, seen: Observed) -> str:
     # Steps between samples may have seen more.
     if least > float(match[4]) * (1.0 + DIGITS):
         return f"with {least:.4g} N in a sample"
-    share = 100.0 * float((touch.normal_force < 0.0).mean())
-    off = 100.0 * 3.0 / len(seen) + 1.0
+    pulling = touch.normal_force < 0.0
+    share = 100.0 * float(pulling.mean())
+    # Where two samples in a row have different signs, it is unknown when the sign changes, and how often.
+    off = 100.0 * (3.0 + np.count_nonzero(pulling[1:] != pulling[:-1])) / len(seen) + 1.0
     return "" if abs(share - float(match[3])) <= off else f"in {share:.3g} % of the samples"
 
 
