@@ -95,6 +95,7 @@ def warnings_of(
         warnings.append(f"contacts drifted by {summary['constraint_drift_max_m']:.1e} m")
     warnings += _undetermined(record, prepared, stepping is not None)
     warnings += _unpressed(record, prepared, begun)
+    warnings += _open_impacts(prepared)
     warnings += _slipping_start(record, prepared) or _moving_start(record, prepared)
     warnings += _sunk(record, sunk)
     warnings += _beyond_stops(robot, prepared.stops, prepared.control)
@@ -307,6 +308,24 @@ def _unpressed(record: Record, prepared: Prepared, begun: float) -> list[str]:
         "without these forces it would leave its surface, which agrees with the contact law too. This run keeps it, as "
         "equally stiff supports would; lower contacts.friction, or model the supports (contacts.stiffness_N_per_m with "
         "integrator.method: time_stepping)"
+    ]
+
+
+def _open_impacts(prepared: Prepared) -> list[str]:
+    """Warn of impacts in which contacts left although the law also has a solution that keeps them."""
+    if prepared.system.unilateral is None:
+        return []
+    left = [
+        f"{contact.name} leaves its surface (first at t = {tally[ku.OPEN_SINCE]:.6g} s)"
+        for contact, tally in zip(prepared.contacts, prepared.system.unilateral.tally, strict=True)
+        if tally[ku.OPEN_IMPACTS]
+    ]
+    if not left:
+        return []
+    return [
+        f"the motion is not unique: in impacts of other points {first_few(left)}, while impulses within the friction "
+        "cones could keep it there, wedged, which agrees with the contact law too; lower contacts.friction, or model "
+        "the supports (contacts.stiffness_N_per_m with integrator.method: time_stepping)"
     ]
 
 

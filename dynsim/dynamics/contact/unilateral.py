@@ -42,7 +42,9 @@ WINDOW_START, WINDOW_COUNT = 9, 10  # of the count of events that detects chatte
 CHATTERED = 11  # how often SETTLE was raised because of it
 DEEPEST = 12  # largest depth below the surface [m]
 UNPRESSED = 13  # time for which it stuck although nothing pressed it [s]
-TALLY_SIZE = 14
+# Impacts in which it left although a solution exists that keeps it, and the time of the first of them [s].
+OPEN_IMPACTS, OPEN_SINCE = 14, 15
+TALLY_SIZE = 16
 # UnilateralArrays.stop_table, int
 STOP_JOINT = 0  # link whose joint it stops
 STOP_CLOSED = 1

@@ -11,7 +11,7 @@ from dynsim.dynamics import state as kst
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.cone import problem as kc
-from dynsim.dynamics.contact.cone.problem import approach_or_draw_near, solve_cones
+from dynsim.dynamics.contact.cone.problem import approach, approach_or_draw_near, solve_cones
 from dynsim.dynamics.contact.mobility import moves_along_normal
 from dynsim.dynamics.contact.rows import row_errors, set_modes
 from dynsim.dynamics.contact.unilateral import (
@@ -46,6 +46,8 @@ CONE_TOLERANCE, FORCE_TOLERANCE = 1e-9, 1e-9
 # If all rates or accelerations are smaller, the goal of residuals is relative to this instead: behind closed brakes a
 # point has motions of 1e-30, and no force on it improves on zero force [m/s, m/s²].
 IMMOBILE = 1e-3
+# The search for another solution of an impact starts with forces that give this fraction of the largest rate.
+OTHER_START = 1e-6
 
 
 @internal_kernel
@@ -259,6 +261,7 @@ def impulses(system: System, ws: Workspace, p, largest, share):
             falls = mode[k, ku.STRUCK] == 1 and mode[k, ku.BEFORE] == ka.OPEN
             if falls and -rows[r, ka.ROW_RATE] > unilateral.tally[k, ku.SETTLE]:
                 vector[ku.OFFSET, r] *= 1.0 + share * system.contacts.law[k, ka.RESTITUTION]
+    forget_rounding(system, ws)
     if not solve_problem(unilateral, ws.small[0], p, largest, BOUNCE_STARTS if share > 0.0 else 0):
         return False
     f, total, turnover = vector[ku.SOLUTION], 0.0, 0.0
@@ -271,6 +274,72 @@ def impulses(system: System, ws: Workspace, p, largest, share):
         total += rows[r, ka.FORCE]
         turnover += abs(rows[r, ka.FORCE])
     return total >= -CONE_TOLERANCE * turnover or share == 0.0
+
+
+@internal_kernel
+def forget_rounding(system: System, ws: Workspace):
+    """Set rates of rows that were closed before the impact to zero in OFFSET where they are within the tolerance.
+
+    An impact may have several solutions, for instance with a wedged point that leaves or stays. From zero forces, the
+    sign of such a rate would decide between them, and that is rounding.
+    """
+    unilateral, offset = system.unilateral, system.unilateral.vector[ku.OFFSET]
+    mode, table = unilateral.mode, unilateral.stop_table
+    for k in range(mode.shape[0]):
+        if mode[k, ku.TOUCHING] == 1 and mode[k, ku.BEFORE] != ka.OPEN:
+            r, limit = ws.active[k, ka.FIRST_ROW], STRIKE * kp.RATE_TOLERANCE * (1.0 + slip_speed(ws, k))
+            for i in range(r, r + 3 if mode[k, ku.BEFORE] == ka.STICKING else r + 1):
+                if abs(offset[i]) <= limit:
+                    offset[i] = 0.0
+    r = system.couplings.joint.shape[0] + dry_rows_held(unilateral)
+    for k in range(table.shape[0]):
+        if table[k, ku.STOP_CLOSED] == 1:
+            if table[k, ku.STOP_BEFORE] == 1 and abs(offset[r]) <= STRIKE * kp.RATE_TOLERANCE:
+                offset[r] = 0.0
+            r += 1
+
+
+@internal_kernel
+def rate_after(ws: Workspace, b, f, p, r):
+    """Rate of row r after impulses f."""
+    rate = b[r]
+    for s in range(p):
+        rate += ws.small[0, r, s] * f[s]
+    return rate
+
+
+@internal_kernel
+def look_for_other(system: System, ws: Workspace, run: Run, p, largest):
+    """Note points that were closed and leave in the impact if another solution keeps them; SOLUTION stays as it is.
+
+    One start near the forces of the wedge finds most of these solutions, not all.
+    """
+    unilateral = system.unilateral
+    mode, tally, vector = unilateral.mode, unilateral.tally, unilateral.vector
+    f, first, b, mu = vector[ku.SOLUTION], vector[ku.FIRST_PART], vector[ku.OFFSET], vector[ku.CONE_FRICTION]
+    for r in range(p):
+        first[r], f[r] = f[r], 0.0
+    any_leaves = False
+    for k in range(mode.shape[0]):
+        if mode[k, ku.TOUCHING] == 1 and mode[k, ku.BEFORE] != ka.OPEN:
+            r = ws.active[k, ka.FIRST_ROW]
+            if mu[r] > 0.0 and rate_after(ws, b, first, p, r) > tally[k, ku.SETTLE]:
+                mobility = max(ws.small[0, r, r], ws.small[0, r + 1, r + 1], ws.small[0, r + 2, r + 2])
+                f[r], any_leaves = OTHER_START * largest / max(mobility, 1e-300), True
+    if any_leaves:
+        good = CONE_TOLERANCE * (1.0 + largest)
+        room, kind = unilateral.room[ku.SCRATCH :], unilateral.index[ku.KINDS]
+        if approach(ws.small[0], b, kind, mu, p, f, room, 1e-2 * CONE_TOLERANCE * max(largest, IMMOBILE), 1) <= good:
+            for k in range(mode.shape[0]):
+                if mode[k, ku.TOUCHING] == 1 and mode[k, ku.BEFORE] != ka.OPEN:
+                    r = ws.active[k, ka.FIRST_ROW]
+                    rate = rate_after(ws, b, first, p, r)
+                    if mu[r] > 0.0 and rate > tally[k, ku.SETTLE] and rate_after(ws, b, f, p, r) < 0.5 * rate:
+                        if tally[k, ku.OPEN_IMPACTS] == 0.0:
+                            tally[k, ku.OPEN_SINCE] = run.clock[ki.TIME]
+                        tally[k, ku.OPEN_IMPACTS] += 1.0
+    for r in range(p):
+        f[r] = first[r]
 
 
 @internal_kernel
@@ -292,6 +361,7 @@ def impact(system: System, ws: Workspace, run: Run):
     if not bouncing and not impulses(system, ws, p, largest, 0.0):
         run.count[ki.STATUS], run.clock[ki.NOT_UNIQUE] = ki.NO_CONTACT_FORCES, run.clock[ki.TIME]
         return
+    look_for_other(system, ws, run, p, largest)
     f = vector[ku.SOLUTION]
     for i in range(ws.joints.shape[0]):
         column[i, 0] = 0.0
