@@ -9,8 +9,8 @@ J(q') v' = J_k v' + c h/(h + h_last) up to O(h²), with c = r − s. The law is 
 
 W = J M⁻¹ Jᵀ stays symmetric, and each step solves one contact problem. For a contact that slides and cannot stop within
 the step friction is along the mean slip: w_t = u_t + u_t'. A contact that lands has no earlier rows: a = 0, or e u_n by
-Newton's restitution. Its penetration is removed slowly, and only as far as the energy lost in the landing allows; a
-joint that has passed its stop at a hit is moved back likewise.
+Newton's restitution, unless that and friction would create energy together. Its penetration is removed slowly, and only
+as far as the energy lost in the landing allows; a joint that has passed its stop at a hit is moved back likewise.
 
 The law on mean rates, J (v + v') = 0, would be simpler but multiplies disturbances by −1: rates alternate undamped.
 """
@@ -52,6 +52,8 @@ from dynsim.integrators.stepping.compliance import (
 from dynsim.integrators.stepping.tables import SteppingArrays, geometry, place_joints
 from dynsim.jit.kernel import internal_kernel
 
+# Share of the energy that passes through the rows of a step, below which a gain is rounding: restitution of 1 has none.
+NO_GAIN = 1e-6
 # cos of the largest angle by which a row turns in a step; beyond it the contact is at a kink, an edge, another place.
 SAME_ROW = 0.95
 # A place of contact that has moved by more than this times the way of the body there is another one; by less than the
@@ -357,7 +359,8 @@ def solve_contacts(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Wor
     """Impulses of all rows, by the last ones as a start, and their mean forces into ``ws.rows``; then ``s.memory``.
 
     Where the slip of a contact that was to slide on ends, or turns back, the law is that of the end after all: at most
-    once for each contact. A problem without solution is solved without what the law adds to the rates: at most once.
+    once for each contact. A problem without solution is solved without what the law adds to the rates, and an impact
+    that would create energy is solved without restitution: at most once each.
     """
     p, coupled, rows = ws.counts[ka.ROWS], ws.counts[ka.COUPLED], ws.rows
     start = 3 * ws.contacts.shape[0]
@@ -374,7 +377,7 @@ def solve_contacts(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Wor
         if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
             s.right[unilateral.stop_table[k, ku.STOP_ROW]] -= stop_return(unilateral, s, ws, k, h)
     soften_ties(unilateral, s, ws, h)
-    rigid = False
+    rigid, elastic = False, True
     for k in range(ws.contacts.shape[0]):
         if ws.active[k, ka.MODE] == ka.STICKING:
             rigid = rigid or law[k, ka.CONTACT_STIFFNESS] == 0.0
@@ -383,7 +386,7 @@ def solve_contacts(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Wor
             for m in range(ka.MOST_ROWS):
                 s.f[r + m] = s.impulse[3 * k + m]
             turn_rows(law, s, ws, k, h)
-    for _ in range(2 + ws.contacts.shape[0]):
+    for _ in range(3 + ws.contacts.shape[0]):
         for k in range(ws.contacts.shape[0]):
             if ws.active[k, ka.MODE] == ka.STICKING:
                 for m in range(ka.MOST_ROWS):
@@ -396,6 +399,10 @@ def solve_contacts(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Wor
         if not residual <= kt.BAD:
             s.statistics[kt.CAPPED] += 1.0
             hold_energy(s, ws.small[0], p)
+        if elastic and gains_energy(law, unilateral, s, ws):
+            elastic = False
+            drop_restitution(law, s, ws)
+            continue
         if not slip_ends(s, ws):
             break
     for r in range(p):
@@ -453,6 +460,49 @@ def drop_turns(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspa
         for r in range(p):
             s.f[r] = 0.0
     return dropped
+
+
+@internal_kernel
+def bounces(law, s: SteppingArrays, ws: Workspace, k):
+    """True if the law adds the restitution of candidate k, which lands, to its normal rate."""
+    lands = ws.active[k, ka.MODE] == ka.STICKING and s.memory[kt.LAST, k, kt.CLOSED] == 0.0
+    rigid = law[k, ka.CONTACT_STIFFNESS] == 0.0
+    return lands and rigid and law[k, ka.RESTITUTION] > 0.0 and s.rate[0, ws.active[k, ka.FIRST_ROW]] < 0.0
+
+
+@internal_kernel
+def gains_energy(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace):
+    """True if contacts and stops together would give energy, p·(u + u')/2 > 0, in a step in which something bounces.
+
+    u' is without what extrapolated rows and returns to the surface add: of closed rows the law rate w itself.
+    """
+    gain, passed, some = 0.0, 0.0, False
+    for k in range(unilateral.stop_table.shape[0]):
+        if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
+            r = unilateral.stop_table[k, ku.STOP_ROW]
+            gain += 0.5 * s.f[r] * (s.rate[0, r] + s.w[r])
+            passed += 0.5 * abs(s.f[r]) * (abs(s.rate[0, r]) + abs(s.w[r]))
+    for k in range(ws.contacts.shape[0]):
+        if ws.active[k, ka.MODE] != ka.STICKING or law[k, ka.CONTACT_STIFFNESS] > 0.0:
+            continue
+        elastic = bounces(law, s, ws, k)
+        some = some or elastic
+        for m in range(3):
+            r = ws.active[k, ka.FIRST_ROW] + m
+            after = s.w[r]
+            if (elastic and m == 0) or (s.turn[k, kt.MEAN] == 1.0 and m > 0):
+                after -= s.turn[k, kt.ADDED + m]
+            gain += 0.5 * s.f[r] * (s.rate[0, r] + after)
+            passed += 0.5 * abs(s.f[r]) * (abs(s.rate[0, r]) + abs(after))
+    return some and gain > NO_GAIN * passed
+
+
+@internal_kernel
+def drop_restitution(law, s: SteppingArrays, ws: Workspace):
+    """Let what lands stay, as event-driven methods do where Newton's restitution contradicts friction."""
+    for k in range(ws.contacts.shape[0]):
+        if bounces(law, s, ws, k):
+            s.turn[k, kt.ADDED] = s.turn[k, kt.TURNED]
 
 
 @internal_kernel
