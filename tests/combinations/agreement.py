@@ -5,6 +5,7 @@ a tenth of the tolerance or half the step: the change is the method's error, eve
 both errors are small and the results differ, the motion is not unique, which a warning must report, or one is wrong.
 Steps that are too long by far do not show their error at half their length: an unstable loop grows, with both, much
 more slowly than it should. So time stepping is repeated with a quarter of the step too before a difference is reported.
+If that changes it by a multiple of what half the step did, shorter steps may change it by that multiple again.
 """
 
 from __future__ import annotations
@@ -134,7 +135,7 @@ def _pair(first: str, run: Run, other: str, second: Run) -> Iterator[tuple[str, 
     errors = [_own_error(run, 0.1), _own_error(second, 0.5 if stepped else 0.1)]
     worst, text = _widest(run.record, a, second.record, b, _grown(allowed, errors))
     if worst > 1.0 and stepped:
-        errors.append(_own_error(second, 0.25))
+        errors.append(_still_growing(errors[-1], _own_error(second, 0.25)))
         worst, text = _widest(run.record, a, second.record, b, _grown(allowed, errors))
     if worst > 1.0:
         yield "methods", f"{first} and {other}: {text}, though finer steps change either by less"
@@ -150,6 +151,17 @@ def _grown(allowed: Any, errors: Sequence[dict[str, tuple[Array, Array]]]) -> An
             own = own + (np.interp(time, *error[measure.name]) if measure.name in error else np.inf)
         return np.asarray(allowed(measure, time) + SURE * own[:, None] * measure.size)
 
+    return grown
+
+
+def _still_growing(
+    half: dict[str, tuple[Array, Array]], quarter: dict[str, tuple[Array, Array]]
+) -> dict[str, tuple[Array, Array]]:
+    """Return the changes by a quarter of the step, times their ratio to those by half of it; 1.5 at first order."""
+    grown = {}
+    for name, (time, change) in quarter.items():
+        before = np.interp(time, *half[name]) if name in half else change
+        grown[name] = time, change * np.maximum(change / np.maximum(before, 1e-12), 1.0)
     return grown
 
 
