@@ -112,3 +112,30 @@ def test_least_norm_ends_at_the_cones():
         # It ends short of the least norm at a cone, and nowhere else.
         assert reached or min(slack) < 1e-6
     assert 0 < ended < 50
+
+
+def test_least_norm_keeps_friction_in_the_cone_of_a_point_that_slides_slowly():
+    """Slip that is not far above the residual of the problem has a direction a little off that of friction."""
+    rng = np.random.default_rng(1)
+    kind, mu = integers([CONE, TANGENT, TANGENT] * 4), np.zeros(12)
+    mu[::3] = 0.4
+    J = np.zeros((12, 5))
+    for k, x in enumerate([-1.0, -0.3, 0.4, 1.0]):
+        J[3 * k, [0, 1]], J[3 * k + 1, 2], J[3 * k + 2, [3, 4]] = [1.0, x], 1.0, [1.0, x]
+    W = J @ np.diag([1.0, 3.0, 1.0, 1.0, 3.0]) @ J.T
+    moved = 0
+    for _ in range(50):
+        f, w = np.zeros(12), np.zeros(12)
+        f[::3] = rng.uniform(0.5, 3.0, size=4)
+        angle = rng.uniform(0.0, 2.0 * np.pi)
+        f[1:3] = mu[0] * f[0] * np.array([np.cos(angle), np.sin(angle)])
+        w[1:3] = -2e-9 * np.array([np.cos(angle + 0.05), np.sin(angle + 0.05)])
+        for k in range(1, 4):
+            f[3 * k + 1 : 3 * k + 3] = rng.uniform(-0.25, 0.25, size=2) * f[3 * k]
+        before, motion = f.copy(), W @ f
+        _selected(W, w, kind, mu, 12, f, np.zeros((CONE_ROOM, 12, 12)))
+        np.testing.assert_allclose(W @ f, motion, atol=1e-9)
+        assert np.linalg.norm(f) <= np.linalg.norm(before) + 1e-12
+        assert min(mu[3 * k] * f[3 * k] - np.linalg.norm(f[3 * k + 1 : 3 * k + 3]) for k in range(4)) > -1e-9
+        moved += np.abs(f - before).max() > 1e-3
+    assert moved

@@ -4,7 +4,11 @@ The motion w = W f + b of a contact problem (dynsim.dynamics.contact.cone.proble
 where rows depend on each other: four legs of a table, three elbows of a straight arm. On the faces of the cones that
 contain f, f = S x; S has a column of length one for each direction in which a force may change:
 
-    n, t1, t2 of a point that sticks (n alone without friction),   n − μ w_t/|w_t| of one that slides,   a one-way row
+    n, t1, t2 of a point that sticks (n alone without friction),   n + f_t/f_n of one that slides,   a one-way row
+
+For a point that slides f_t/f_n is −μ w_t/|w_t|, as exactly as the problem is solved. Slip near STILL has another
+direction by some percent, and a column along it would leave the difference behind where the rest of f is taken away:
+friction without a normal force. Only where there is no force yet, the direction is that of the slip.
 
 There G = Sᵀ W S is singular, and x plus any vector of its null space gives the same motion. The solution of least norm
 is the projection of x on the range of G. Where that is outside a cone, f stops on the way to it at the first cone.
@@ -20,7 +24,8 @@ from dynsim.jit.kernel import internal_kernel
 
 # Blocks of the scratch ``room``: G, its factor, columns S (coefficients on the rows of their block), then vectors.
 MATRIX, FACTOR, COLUMNS, NOW, GOAL, RIGHT, PIVOT, ROW, SIZE = 0, 1, 2, 3, 4, 5, 6, 7, 8
-# A row that separates faster than this has no force; slip slower than this has no direction [m/s].
+# A row that separates faster than this has no force; slip slower than this has no direction, nor has a force that
+# changes the rate of its own row by less [m/s].
 STILL = 1e-9
 # G is singular if a pivot is below SINGULAR times the mean of its diagonal. The projection adds SHIFT times that mean
 # to the diagonal; each refinement multiplies the error by about SHIFT.
@@ -35,7 +40,7 @@ def select_least_norm(W, w, kind, mu, p, f, room):
 
     Leaves f as it is where it is unique.
     """
-    n = changeable(w, kind, mu, p, room)
+    n = changeable(W, w, kind, mu, p, f, room)
     if n < 2:
         return
     G, L, S, row, size = room[MATRIX], room[FACTOR], room[COLUMNS], room[ROW, 0], room[SIZE, 0]
@@ -87,7 +92,7 @@ def select_least_norm(W, w, kind, mu, p, f, room):
 
 
 @internal_kernel
-def changeable(w, kind, mu, p, room):
+def changeable(W, w, kind, mu, p, f, room):
     """The columns S of the rows whose forces may change: coefficients, first row and size; returns their number."""
     S, row, size = room[COLUMNS], room[ROW, 0], room[SIZE, 0]
     n, k = 0, 0
@@ -95,9 +100,9 @@ def changeable(w, kind, mu, p, room):
         if kind[k] == kc.CONE and w[k] <= STILL:
             slip = math.sqrt(w[k + 1] * w[k + 1] + w[k + 2] * w[k + 2])
             if mu[k] > 0.0 and slip > STILL:
-                scale = 1.0 / math.sqrt(1.0 + mu[k] * mu[k])
-                row[n], size[n], S[n, 0] = k, 3.0, scale
-                S[n, 1], S[n, 2] = -scale * mu[k] * w[k + 1] / slip, -scale * mu[k] * w[k + 2] / slip
+                x, y = sliding_share(W, w, mu, f, k, slip)
+                scale = 1.0 / math.sqrt(1.0 + x * x + y * y)
+                row[n], size[n], S[n, 0], S[n, 1], S[n, 2] = k, 3.0, scale, scale * x, scale * y
                 n += 1
             else:
                 for m in range(3 if mu[k] > 0.0 else 1):
@@ -108,6 +113,17 @@ def changeable(w, kind, mu, p, room):
             n += 1
         k += block_size(kind, k)
     return n
+
+
+@internal_kernel
+def sliding_share(W, w, mu, f, k, slip):
+    """Friction per normal force, (x, y), of the point with first row k that slides at ``slip``: within its cone."""
+    if f[k] * W[k, k] <= STILL:
+        return -mu[k] * w[k + 1] / slip, -mu[k] * w[k + 2] / slip
+    x, y = f[k + 1] / f[k], f[k + 2] / f[k]
+    size = math.sqrt(x * x + y * y)
+    part = mu[k] / size if size > mu[k] else 1.0
+    return part * x, part * y
 
 
 @internal_kernel
