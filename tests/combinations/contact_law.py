@@ -60,8 +60,11 @@ def touching(seen: Observed) -> Finding:
             )
         if not seen.real:
             continue
-        if (touch.normal_force < -1e-9 - CONE * size.max()).any():
-            i = int(touch.normal_force.argmin())
+        pulls = touch.normal_force + 1e-9 + CONE * size.max()
+        if seen.stepped:
+            pulls = pulls + _unsolved(seen, float(seen.record.summary["time_stepping"]["residual_max_m_s"]))
+        if (pulls < 0.0).any():
+            i = int(pulls.argmin())
             yield f"{name} at t = {seen.time[i]:.6g} s pulls with {-touch.normal_force[i]:.4g} N"
         unheld = (touch.mode == OPEN) & (size > 1e-9)
         if unheld.any():
@@ -77,6 +80,15 @@ def touching(seen: Observed) -> Finding:
                     f"{name} at t = {seen.time[i]:.6g} s: {touch.normal_force[i]:.4g} N at a gap of {touch.gap[i]:.3g} "
                     f"m"
                 )
+
+
+def _unsolved(seen: Observed, rate: float) -> Array:
+    """Force that gives all links together this rate [m/s] within the step of each sample, (T,) [N].
+
+    Contact problems of time stepping are solved to some rate: mobility times a force outside its cone is no larger.
+    """
+    start, end = seen.steps_around
+    return np.asarray(rate * sum(link.inertia.mass for link in seen.robot.links) / np.maximum(end - start, 1e-12))
 
 
 def _reach(seen: Observed, touch: Touch) -> Array:
@@ -144,22 +156,22 @@ def _real_friction(seen: Observed, touch: Touch) -> Finding:
         allowed = _share(seen, touch) * np.linalg.norm(touch.force, axis=1) + 1e-9 * (1.0 + np.abs(f_n).max())
         if seen.stepped:
             # Rates are solved to 1e-8 m/s.
-            allowed = allowed + 1e-8 * sum(link.inertia.mass for link in seen.robot.links) / seen.step
+            allowed = allowed + _unsolved(seen, 1e-8)
         if (closed & (over > allowed)).any():
             i = int(np.where(closed, over - allowed, -np.inf).argmax())
             yield (
                 f"{contact.name} at t = {seen.time[i]:.6g} s: friction of {size[i]:.6g} N is outside the cone of "
                 f"{most[i]:.4g} × {f_n[i]:.6g} N"
             )
-    power = (tangential * touch.slip).sum(axis=1)
+    # Time stepping has its law at the ends of steps; a sample may lie within one.
+    power = (tangential * touch.slip_after).sum(axis=1)
     # A normal that is a little off has a share of the normal force in the surface, which may be all that there is.
     noise = _share(seen, touch) * np.linalg.norm(touch.force, axis=1) * speed
     # Against w friction gives f·u up to |f| |u − w| to slip u.
     gained = slips & (power > noise + size * (SLOW + touch.lag if seen.stepped else 1e-7) + 1e-12)
     if seen.stepped:
-        # A step in which slip ends may end with some of it turned round; a sample may lie within a step.
+        # A step in which slip ends may end with some of it turned round.
         gained &= (tangential * before).sum(axis=1) > 0.0
-        gained &= (tangential * touch.slip_after).sum(axis=1) > 0.0
     if gained.any():
         i = int(np.where(gained, power, 0.0).argmax())
         yield f"{contact.name} at t = {seen.time[i]:.6g} s: friction drives the slip with {power[i]:.4g} W"
@@ -195,14 +207,14 @@ def _creep(seen: Observed, touch: Touch) -> Array:
 
 def _against_slip(seen: Observed, touch: Touch, slips: NDArray[np.bool_], before: Array) -> Finding:
     """Sliding friction is μ f_n against the slip."""
-    speed, f_n = np.linalg.norm(touch.slip, axis=1), touch.normal_force
+    speed, f_n = np.linalg.norm(touch.slip_after, axis=1), touch.normal_force
     if seen.stepped:
         # If slip begins, ends or turns within a step, its friction is a mean: only steady slip is compared.
         earlier = np.linalg.norm(before, axis=1)
         both = np.maximum(speed, earlier)
-        turned = np.linalg.norm(touch.slip - before, axis=1)
+        turned = np.linalg.norm(touch.slip_after - before, axis=1)
         steady = slips & (np.minimum(speed, earlier) > SLOW) & (turned < 0.2 * both)
-        middle = 0.5 * (touch.slip + before)
+        middle = 0.5 * (touch.slip_after + before)
         low, high = coefficient(touch, np.minimum(speed, earlier)), coefficient(touch, both)
         # The contact's place moves on the body within a step, and the tangent plane turns.
         # Directions of u and w are up to 2 |u − w|/|u| apart.

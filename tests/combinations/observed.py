@@ -45,15 +45,14 @@ class Touch:
     ----------
     contact : description of the contact; body : index of its body
     position : touching point, (T, 3) [m]; normal : (T, 3)
-    gap, gap_before : (T,) [m]; the second at the midpoint of the step that ends at the sample; equal for event-driven
-        methods
-    slip, slip_before : (T, 3) tangential velocity [m/s]; the second with the rates at the start of the step that ends
-        at the sample and the bodies at its midpoint, as in the law of time stepping; equal for event-driven methods
-    slip_after : (T, 3) slip with the rates a step later at the same acceleration; a sample within a step lies between
+    gap, gap_before : (T,) [m]; the second at the midpoint of the sample's step; equal for event-driven methods
+    slip, slip_before : (T, 3) tangential velocity [m/s]; the second with the rates at the start of the sample's step
+        and the bodies at its midpoint, as in the law of time stepping; equal for event-driven methods
+    slip_after : (T, 3) slip at the end of the sample's step: that of the sample, unless it lies within the step
     approach, approach_before : velocity along the normal, (T,) [m/s]; the second in the same state as ``slip_before``
     lag : possible difference of the slip in the law of time stepping and the slip at the end of the step, (T,) [m/s]:
         the law uses the rows of the midpoint, plus half of their rotation since the last midpoint, at the start's rates
-    turned : angle of the normal since the previous sample, or since the midpoint of the step, (T,) [rad]
+    turned : angle of the normal to that of the previous sample, or of the midpoint of the step, (T,) [rad]
     force : (T, 3) [N]; normal_force : (T,) as recorded [N]; mode : (T,)
     """
 
@@ -164,15 +163,12 @@ class Observed:
         before, after, began = slip, slip, approach
         turned, lag = np.linalg.norm(np.diff(normal, axis=0, prepend=normal[:1]), axis=1), np.zeros(len(far))
         if self.stepped and motion is self.motion:
-            rates = self.step * self.vdot
-            before, began, middle, midway = self._at_midpoints(contact, self.v - rates)
+            start, end = self.v_start, self.v_end
+            before, began, middle, midway = self._at_midpoints(contact, start)
             turned = np.maximum(turned, np.linalg.norm(normal - middle, axis=1))
-            lag = np.linalg.norm(slip - self._at_midpoints(contact, self.v)[0], axis=1)
-            lag = lag + 0.5 * np.linalg.norm(
-                before - self._slip_of(contact, self._middles_before, self.v - rates)[0], axis=1
-            )
-            along = np.einsum("tkn,tn->tk", self.bodies.jacobian(motion, body, position), self.v + rates)
-            after = along - (along * normal).sum(axis=1, keepdims=True) * normal
+            after = self._slip_of(contact, self._ends, end)[0]
+            lag = np.linalg.norm(after - self._at_midpoints(contact, end)[0], axis=1)
+            lag = lag + 0.5 * np.linalg.norm(before - self._slip_of(contact, self._middles_before, start)[0], axis=1)
         record = self.record
         force = record["contact_normal_force"][:, k]
         mode = record["contact_mode"][:, k] if "contact_mode" in record else np.full(len(force), SLIDING)
@@ -196,27 +192,65 @@ class Observed:
         )
 
     @cached_property
+    def steps_around(self) -> tuple[Array, Array]:
+        """Start and end of the step of each sample, (T,) [s]: the step that it ends, or lies within.
+
+        Steps of one length follow each other from each beginning and end of a load, and from each tick; the last one
+        before the next is cut there.
+        """
+        h, t, period = self.step, self.time, self.period
+        knots = [t[:1], *(load.knots for load in self.loads)]
+        if period is not None:
+            knots.append(period * np.arange(np.ceil(t[0] / period - AT_STEP), t[-1] / period + 1.0))
+        instants = np.unique(np.concatenate(knots))
+        k = np.maximum(np.searchsorted(instants, t - AT_STEP * h) - 1, 0)
+        whole = np.maximum(np.ceil((t - instants[k]) / h - AT_STEP) - 1.0, 0.0)
+        start = instants[k] + whole * h
+        following = np.append(instants, np.inf)[k + 1]
+        return start, np.maximum(np.minimum(start + h, following), t)
+
+    @cached_property
+    def v_start(self) -> Array:
+        """Rates at the start of the step of each sample, (T, n); between the ends of a step they are linear."""
+        return np.asarray(self.v - (self.time - self.steps_around[0])[:, None] * self.vdot)
+
+    @cached_property
+    def v_end(self) -> Array:
+        """Rates at the end of the step of each sample, (T, n)."""
+        return np.asarray(self.v + (self.steps_around[1] - self.time)[:, None] * self.vdot)
+
+    def _v_theta(self) -> Array:
+        return np.asarray(self.v_start + self.scenario.integrator.theta * (self.v_end - self.v_start))
+
+    @cached_property
     def q_middle(self) -> Array:
-        """Coordinates at midpoints of the steps that end at samples: half a step after the start, at its rates."""
-        began = self.v - self.step * self.vdot
+        """Coordinates at midpoints of the steps of samples: half a step after the start, at its rates."""
+        start, end = self.steps_around
         # Go back to the start, then to the midpoint: rotations about different axes do not add like their rates.
-        back = -self.step * (began + self.scenario.integrator.theta * self.step * self.vdot)
-        start = self.q + position_rates(self.bodies, self.q, back)
-        return np.asarray(start + position_rates(self.bodies, start, 0.5 * self.step * began))
+        back = -(self.time - start)[:, None] * self._v_theta()
+        began = self.q + position_rates(self.bodies, self.q, back)
+        return np.asarray(began + position_rates(self.bodies, began, 0.5 * (end - start)[:, None] * self.v_start))
 
     @cached_property
     def _middles(self) -> Motion:
         """Motion of all bodies at the midpoints of steps, with the rates of the start."""
-        return self.bodies.motion(self.q_middle, self.v - self.step * self.vdot, self.vdot)
+        return self.bodies.motion(self.q_middle, self.v_start, self.vdot)
+
+    @cached_property
+    def _ends(self) -> Motion:
+        """Motion of all bodies at the ends of steps."""
+        ahead = (self.steps_around[1] - self.time)[:, None] * self._v_theta()
+        return self.bodies.motion(self.q + position_rates(self.bodies, self.q, ahead), self.v_end, self.vdot)
 
     @cached_property
     def _middles_before(self) -> Motion:
         """Motion as in :attr:`_middles`, one step earlier: from the previous sample, or from the rates of the start."""
-        began = self.v - self.step * self.vdot
-        q = self.q_middle + position_rates(self.bodies, self.q_middle, -self.step * began)
-        beside = np.flatnonzero(np.abs(np.diff(self.time) - self.step) < AT_STEP * self.step) + 1
+        start, end = self.steps_around
+        q = self.q_middle + position_rates(self.bodies, self.q_middle, -self.step * self.v_start)
+        # The step of the first sample is also that of the next one.
+        beside = np.flatnonzero(np.abs(end[:-1] - start[1:]) < AT_STEP * self.step) + 1
         q[beside] = self.q_middle[beside - 1]
-        return self.bodies.motion(q, began, self.vdot)
+        return self.bodies.motion(q, self.v_start, self.vdot)
 
     def _at_midpoints(self, contact: Contact, rates: Array) -> tuple[Array, Array, Array, Array]:
         """Return the values of :meth:`_slip_of` at midpoints of steps."""
@@ -265,10 +299,15 @@ class Observed:
         """Period of the controller [s]; None if it is continuous."""
         return (self.config.get("controller") or {}).get("sample_time_s")
 
+    @property
+    def period(self) -> float | None:
+        """Period of ticks, at which commands are taken [s]; None if there are none."""
+        return self.sample_time or (self.config.get("controller") or {}).get("period_s")
+
     @cached_property
     def at_ticks(self) -> NDArray[np.bool_]:
         """Whether each sample is at a tick, when the controller has just given new commands, (T,)."""
-        period = self.sample_time or (self.config.get("controller") or {}).get("period_s")
+        period = self.period
         if period is None:
             return np.zeros(len(self), dtype=bool)
         return np.asarray(np.abs(self.time / period - np.round(self.time / period)) < AT_STEP)
