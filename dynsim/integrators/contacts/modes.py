@@ -223,6 +223,10 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
         # A joint that leaves from a little beyond its stop has not hit it again.
         unilateral.stop[k, ku.HIT_AT] = ku.DEPTH + max(0.0, -stop_gap(unilateral, ws, k))
     for k in range(mode.shape[0]):
+        if mode[k, ku.WANTED] == ka.OPEN:
+            # As others come down, a point that leaves may be moved below its surface; it has not landed again there.
+            deepest = ku.AT_ROOT + max(0.0, -ws.contacts[k, ka.GAP])
+            unilateral.slide[k, ku.LANDS_AT] = max(unilateral.slide[k, ku.LANDS_AT], deepest)
         mode[k, ku.GIVES_WAY], mode[k, ku.LEAVES] = 0, 0
         starts = mode[k, ku.WANTED] == ka.SLIDING and unilateral.slide[k, ku.FROZEN] == 1.0
         unilateral.slide[k, ku.HEADWAY] = max(0.0, -unilateral.slide[k, ku.SPEED]) if starts else 0.0
