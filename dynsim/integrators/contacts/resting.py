@@ -211,8 +211,11 @@ def hold_free_joints(system: System, ws: Workspace, run: Run, begins):
             count = extended(factor, W, row, count, r)
     for k in range(table.shape[0]):
         if table[k, ku.DRY_NEXT] == 1:
-            more = extended(factor, W, row, count, table[k, ku.DRY_ROW])
-            table[k, ku.DRY_HOLDS], count = 1 if more > count else 0, more
+            r = table[k, ku.DRY_ROW]
+            # The same limit as for the release of a row, see release_dependent_joints().
+            free = mobility_left(factor, W, row, count, r) > NEARLY_DEPENDENT * W[r, r]
+            table[k, ku.DRY_HOLDS] = 1 if free else 0
+            count = extended(factor, W, row, count, r) if free else count
     set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
     evaluate(system, ws, run)
     y[system.layout.loss + kst.IMPACT_LOSS] += project_level(system, ws, y, 1)
