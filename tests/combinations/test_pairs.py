@@ -40,6 +40,7 @@ FOUND = {
     "a joint that slid slowly and was stopped where another slip began, and others with it": (271127, 796),
     "an equilibrium that moved without a warning, because its rates were 1e-43": (271127, 1218),
     "two joints that hit each other off their stops for ever": (271127, 404),
+    "a joint at rest that got a row which nearly depended on those of feet and an elbow": (271127, 1485),
 }
 # Scenes of the slow study.
 TRIPLES = 1000

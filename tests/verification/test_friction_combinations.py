@@ -14,7 +14,7 @@ import pytest
 from scipy.optimize import brentq
 
 from dynsim import Simulation, load_scenario, simulate
-from dynsim.dynamics.tables import SLIDING, STICKING
+from dynsim.dynamics.tables import OPEN, SLIDING, STICKING
 from dynsim.record import Record
 
 STEPS = "time_stepping"
@@ -425,3 +425,45 @@ def test_joint_at_its_stop_shares_forces_with_feet_that_stick(tmp_path: Path, me
             supplied += model.point_jacobian(foot.body, touching, q).T @ record["contact_force"][k, c]
         needed = model.inverse_dynamics(q, rates, record["vdot"][k])
         np.testing.assert_allclose(supplied, needed, rtol=0.0, atol=1e-7)
+
+
+# A free body on two feet, the right one 1e-10 m above the floor, the left one 9e-10 m: close enough to touch.
+ROCKER_ON_TWO_FEET = """
+name: rocker
+duration_s: 0.001
+plant:
+  type: urdf_arm
+  file: rocker.urdf
+  initial_pose: {root: {position_m: [0, 0, 0.1000000005], rpy_deg: [0, 2.291831e-7, 0]}}
+surfaces: {floor: {type: plane}}
+contacts:
+  law: unilateral
+  friction: 0
+  points:
+    left: {body: rocker, point_m: [-0.1, 0, -0.1], surface: floor}
+    right: {body: rocker, point_m: [0.1, 0, -0.1], surface: floor}
+record: {rate_hz: 10000}
+"""
+ROCKER_URDF = """<robot name="rocker"><link name="world"/><link name="rocker"><inertial><mass value="1"/>
+  <inertia ixx="0.05" ixy="0" ixz="0" iyy="0.05" iyz="0" izz="0.05"/></inertial></link>
+  <joint name="root" type="floating"><parent link="world"/><child link="rocker"/></joint></robot>"""
+
+
+@pytest.mark.parametrize("method", EVENTS)
+def test_foot_moved_below_the_floor_by_another_lands_once(tmp_path: Path, method: str):
+    """As the left foot is brought onto the floor, the right one, which leaves, goes 5e-10 m below it, and does not rise
+    so far before it falls back. It seemed to land there every 1e-13 s, until the run stopped."""
+    (tmp_path / "rocker.urdf").write_text(ROCKER_URDF, encoding="utf-8")
+    (tmp_path / "scene.yaml").write_text(ROCKER_ON_TWO_FEET, encoding="utf-8")
+    scenario = load_scenario(tmp_path / "scene.yaml", None, {"integrator.method": method})
+    # The right foot leaves with 2e-5 m/s, the left one is at rest.
+    rates = np.array([0.0, 0.0, 1e-5, 0.0, -1e-4, 0.0])
+    simulation = Simulation(scenario, state=replace(Simulation(scenario).state, v=rates))
+    simulation.advance(0.001)
+    record = simulation.record()
+    assert record["contact_mode"][0].tolist() == [SLIDING, OPEN]
+    assert (record["contact_mode"][1:] == SLIDING).all()
+    assert [(event.kind, event.name) for event in record.events] == [("landing", "right")]
+    # It turns about the left foot: (I + m a²) dω/dt = −m g a, with a = 0.1 m to either foot.
+    acceleration = 0.2 * 9.81 * 0.1 / (0.05 + 0.1**2)
+    assert record.events[0].time == pytest.approx(2.0 * 2e-5 / acceleration, rel=1e-3)
