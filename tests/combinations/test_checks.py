@@ -286,6 +286,18 @@ def test_a_stop_without_reason_is_found(kind: str) -> None:
     assert "verdict" in _kinds(replace(run, error=stop))
 
 
+@pytest.mark.parametrize(("share", "crawls"), [(0.1, True), (10.0, False)])
+def test_a_run_that_crawls_to_its_wall_limit_is_found(share: float, crawls: bool) -> None:
+    """Half-way, with a last step of that share of the mean one."""
+    run = _run("radau5")
+    assert run.record is not None
+    state = {name: run.record[name][-1].tolist() for name in ("q", "v", "current")}
+    half = 0.5 * float(run.scenario["duration_s"])
+    step = share * half / int(run.record.summary["steps"])
+    stop = SimulationStopped(f"the last step of {step:.1e} s", time=half, state=state, kind="out_of_time")
+    assert ("verdict" in _kinds(replace(run, error=stop))) == crawls
+
+
 def test_critical_friction_finds_a_true_paradox() -> None:
     """Painlevé's rod: slender, sliding on its tip at 60°, μ above the critical 4/3 of I = m l²/12."""
     rod = {

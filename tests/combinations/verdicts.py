@@ -92,6 +92,16 @@ def _unproved(stop: SimulationStopped, seen: Observed) -> str:
     return "nothing shows that it had to"
 
 
+def _crawls(stop: SimulationStopped, seen: Observed) -> str:
+    """Whether the rest would take more steps, as long as the last one, than were taken; otherwise it is only slow."""
+    step = re.search(rf"the last step of {NUMBER} s", str(stop))
+    if step is None:
+        return _unproved(stop, seen)
+    taken, left = float(seen.record.summary["steps"]), float(seen.run.scenario["duration_s"]) - stop.time
+    more = left / float(step[1])
+    return "" if more <= taken else f"after {taken:.3g} steps, {more:.3g} more are left"
+
+
 STOPS: dict[str, Callable[[SimulationStopped, Observed], str]] = {
     "overturned": _not_overturned,
     "forces_reversed": _not_critical,
@@ -104,7 +114,7 @@ STOPS: dict[str, Callable[[SimulationStopped, Observed], str]] = {
     "not_projected": _unproved,
     "chatter": _unproved,
     "no_progress": _unproved,
-    "out_of_time": _unproved,
+    "out_of_time": _crawls,
     "stuck": _unproved,
 }
 """Check of each kind of stop; returns the reason why the stop is wrong, or an empty string."""
