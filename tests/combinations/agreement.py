@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 # Errors of stable motion: in units of rtol, as a share for time stepping, and in steps.
 ADAPTIVE_SHARE, STEPPED_SHARE, STEPS = 300.0, 0.01, 2.0
 # Difference of the two solvers, which solve the same equations.
-SOLVERS = 2e-8
+SOLVERS = 5e-8
 # Factor for tolerances slightly above a run's tolerances; 2 - ABOVE is slightly below. Both change local errors as much
 # as rounding does.
 ABOVE = 1.0 + 1e-9
