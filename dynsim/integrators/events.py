@@ -123,7 +123,11 @@ def cut_step(system: System, ws: Workspace, run: Run):
         if h == high and (hit or count[ki.SEARCHING] > SEARCH_LIMIT):
             if not hit:
                 keep_passed(run)
-            count[ki.SEARCHING], count[ki.FIRED] = 0, 1
+            count[ki.SEARCHING] = 0
+            # Contacts that were passed over before the event come first.
+            if passes_over(system, ws, run):
+                return True
+            count[ki.FIRED] = 1
             return False
         clock[ki.STEP] = high
         return True
