@@ -137,7 +137,7 @@ def derivative(system: System, t, y, ws: Workspace, dy):
     dependent = ws.counts[ka.DEPENDENT]
     constrained_acceleration(model, system.unilateral, ws)
     m_star_acceleration(system.dense, model, drives, system.unilateral, ws, dependent)
-    admissible_forces(system.contacts, system.unilateral, ws)
+    admissible_forces(model, contacts, system.unilateral, ws)
 
     if not plain:
         position_rates(model, ws, dy, layout.q)

@@ -21,7 +21,8 @@ from dynsim.dynamics.contact.unilateral import (
     note_stop_forces,
     rows_of_couplings,
 )
-from dynsim.dynamics.tables import ContactArrays, Workspace
+from dynsim.dynamics.tables import ContactArrays, ModelArrays, Workspace
+from dynsim.dynamics.tree.articulated import change_accelerations
 from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
 # A unit direction of splits whose part along a normal row is smaller leaves that normal force as it is.
@@ -47,24 +48,24 @@ def dry_margin(unilateral: UnilateralArrays, ws: Workspace, k):
 
 
 @internal_kernel
-def admissible_forces(contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: Workspace):
+def admissible_forces(model: ModelArrays, contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: Workspace):
     """Replace the forces of dependent rows that stick where they are beyond their bounds; note those of joints.
 
-    Accelerations do not change: the forces change only in the null space of the rows.
+    The forces change in the null space of the rows: accelerations only change as far as rows are not quite dependent.
     """
     if unilateral is None:  # known to the compiler
         return
     # Small, because it is merged into the right-hand side.
     if unilateral.number[ku.REDUNDANT] == 1.0 or unilateral.stop.shape[0] + unilateral.dry.shape[0] > 0:
-        look_at_forces(contacts, unilateral, ws)
+        look_at_forces(model, contacts, unilateral, ws)
 
 
 @noinline_kernel
-def look_at_forces(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace):
+def look_at_forces(model: ModelArrays, contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace):
     """:func:`admissible_forces` where there are dependent rows, stops or dry friction."""
     unilateral.number[ku.SPLIT] = 0.0
     if unilateral.number[ku.REDUNDANT] == 1.0 and beyond_bounds(contacts, unilateral, ws):
-        split_forces(contacts, unilateral, ws)
+        split_forces(model, contacts, unilateral, ws)
     note_stop_forces(unilateral, ws)
     note_dry_forces(unilateral, ws)
 
@@ -86,8 +87,12 @@ def beyond_bounds(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Wor
 
 
 @noinline_kernel
-def split_forces(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace):
-    """The best split of the forces of all that sticks, into FORCE of its rows; its worst margin into BEST_MARGIN."""
+def split_forces(model: ModelArrays, contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace):
+    """The best split of the forces of all that sticks, into FORCE of its rows; its worst margin into BEST_MARGIN.
+
+    Pivots of J M⁻¹ Jᵀ are squares: rows that count as dependent at a pivot of 1e-10 may differ by 1e-5, and a change of
+    split by as much of the forces. Accelerations take this change, so that they agree with the forces.
+    """
     room, index, mu, rows = unilateral.room, unilateral.index, unilateral.vector[0], ws.rows
     first, row = index[0], index[1]
     points, count, p, ties = find_splits(unilateral, ws)
@@ -111,10 +116,15 @@ def split_forces(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Work
         force[:p], room[ku.NULL_SPACE], width, first, mu, points, count - points, out[:p], programs, True
     )
     unilateral.number[ku.BEST_MARGIN] = worst
-    for i in range(p, p + ties):
-        rows[row[i], ka.FORCE] += change_of_coupling(room[ku.NULL_SPACE], width, i, force, out, p)
-    for i in range(p):
-        rows[row[i], ka.FORCE] = out[i]
+    column = ws.column
+    for m in range(column.shape[0]):
+        column[m, 0] = 0.0
+    for i in range(p + ties):
+        change = out[i] - force[i] if i < p else change_of_coupling(room[ku.NULL_SPACE], width, i, force, out, p)
+        rows[row[i], ka.FORCE] = out[i] if i < p else rows[row[i], ka.FORCE] + change
+        for m in range(column.shape[0]):
+            column[m, 0] += change * column[m, 2 + 2 * row[i]]
+    change_accelerations(model, ws)
 
 
 @internal_kernel

@@ -130,13 +130,13 @@ def slide_direction_lanes(unilateral, contacts, k, x, y, z):
 
 
 @form_of(admissible_forces, any_lanes)
-def admissible_forces_lanes(contacts, unilateral, ws):
+def admissible_forces_lanes(model, contacts, unilateral, ws):
     """One by one, where there is something to look at."""
     if unilateral is None:  # known to the compiler
         return
     if unilateral.number[ku.REDUNDANT] == 1.0 or unilateral.stop.shape[0] + unilateral.dry.shape[0] > 0:
         for k in range(lane_count(ws)):
-            look_at_forces(contacts, unilateral, lane(ws, k))
+            look_at_forces(model, contacts, unilateral, lane(ws, k))
 
 
 @form_of(sign_changed, any_lanes)

@@ -255,6 +255,22 @@ def accelerate(model: ModelArrays, ws: Workspace):
             put_six(links, i, ka.F, A)
 
 
+@noinline_kernel
+def change_accelerations(model: ModelArrays, ws: Workspace):
+    """Add (M + J_m)⁻¹ b to vdot, of the eliminated b in ``ws.column[:, 0]``, as :func:`accelerate` sets it."""
+    tree, links, joints, column = model.tree, ws.links, ws.joints, ws.column
+    A = ZERO_SIX
+    for i in range(tree.shape[0]):
+        j = tree[i, ka.PARENT]
+        if j != i - 1:
+            A = six(links, j, ka.F) if j >= 0 else ZERO_SIX
+        x = column[i, 0] * links[i, ka.INVERSE_D] - dot(six(links, i, ka.U_OVER_D), A)
+        joints[i, ka.QDD] += x
+        A = plus_scaled(A, six(links, i, ka.S), x)
+        if tree[i, ka.BRANCHES] != 0:
+            put_six(links, i, ka.F, A)
+
+
 @kernel
 def forward_dynamics(model: ModelArrays, ws: Workspace):
     """vdot = (M + J_m)⁻¹ (applied − h − g) without contacts: sweep, factor, accelerate. In and out: ``ws.joints``."""
