@@ -73,15 +73,22 @@ def find_touching(system: System, ws: Workspace, touch):
     A point that no joint moves along its normal in this posture does not touch: its force would be arbitrary. Neither
     does a point that a projection could bring onto its surface only by another posture. If the posture changes, it
     lands as soon as it is deeper than it is now.
+
+    As a point leaves that nothing presses, open points that rest at their surfaces stay open, and land if they move
+    deeper: closed, one of them could hold the others in its place, pressed by nothing either, and leave at once.
     """
     unilateral = system.unilateral
     state, mode, table = ws.contacts, unilateral.mode, unilateral.stop_table
-    strikes = False
+    strikes, leaves = False, False
+    for k in range(mode.shape[0]):
+        leaves = leaves or mode[k, ku.LEAVES] == 1
     for k in range(mode.shape[0]):
         limit = STRIKE * kp.RATE_TOLERANCE * (1.0 + slip_speed(ws, k))
         closed = ws.active[k, ka.MODE] != ka.OPEN
         near = closed or (state[k, ka.GAP] <= touch and state[k, ka.GAP_RATE] <= limit)
         near = near and mode[k, ku.LEAVES] == 0
+        if leaves and not closed and state[k, ka.GAP_RATE] >= -limit:
+            near = near and state[k, ka.GAP] + unilateral.slide[k, ku.LANDS_AT] <= 0.0
         if near and not moves_along_normal(system.model, system.contacts, ws, k, state[k, ka.GAP]):
             near = closed = False
             unilateral.slide[k, ku.LANDS_AT] = ku.DEPTH + max(0.0, -state[k, ka.GAP])
