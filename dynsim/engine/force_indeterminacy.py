@@ -147,6 +147,18 @@ class ContactMatrices:
             largest = max(largest, real.max(initial=0.0))
         return 1.0 / largest if largest >= 1.0 else None
 
+    def described(self, solution: Array) -> str:
+        """The normal forces of one of the ``solutions`` at the points that slide.
+
+        A solution appears where the determinant for its signs passes through zero, with forces that have no bound:
+        computed there, they have signs and no size.
+        """
+        sliding = solution[self.owner >= 0]
+        signs = np.where(self.free, np.copysign(1.0, solution), self.signs)
+        if abs(self.determinant(signs)) < NEAR_ZERO:
+            return f"({', '.join('+' if force > 0.0 else '-' for force in sliding)}) without bound"
+        return f"({', '.join(f'{force:.4g}' for force in sliding)}) N"
+
     def reversed(self) -> NDArray[np.bool_]:
         """Rows whose own force alone would accelerate them against it: negative diagonal entries, (p,)."""
         own = np.diag(self.frictionless)
@@ -235,8 +247,7 @@ def paradox(
     named = matrices.owner[turned if turned.any() else sliding]
     names = ", ".join(contacts[k].name for k in named)
     if len(solutions) > 1:
-        solutions = [solution[sliding] for solution in solutions]
-        forces = " and ".join(f"({', '.join(f'{force:.4g}' for force in solution)}) N" for solution in solutions)
+        forces = " and ".join(matrices.described(solution) for solution in solutions)
         count = "two" if len(solutions) == 2 else len(solutions)
         finding = (
             f"{count} consistent solutions (Painlevé's paradox) at {names}: normal forces {forces} agree with "

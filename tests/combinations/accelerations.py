@@ -121,7 +121,11 @@ def critical(seen: Observed, values: Mapping[str, Sequence[float]]) -> bool:
 
 
 def _paradox(state: State, sliding: Sequence[int], inverse: Array, signs: Sequence[float]) -> bool:
-    """Whether det or a diagonal entry of N W (N − μ T)ᵀ falls to zero, for the directions that slip can have."""
+    """Whether det or a diagonal entry of N W (N − μ T)ᵀ falls to zero.
+
+    That is for all directions that slip can have, and for all combinations of the ``signs`` that normal forces can
+    have.
+    """
     choices = []
     for k in sliding:
         speed = float(np.linalg.norm(state.slip[k]))
@@ -143,9 +147,9 @@ def _paradox(state: State, sliding: Sequence[int], inverse: Array, signs: Sequen
         # From rest the static coefficient may hold.
         mu = [max(state.friction[k], state.static[k]) for k in sliding]
         T = np.stack([direction @ state.rows[k][1:] for k, direction in zip(sliding, directions, strict=True)])
-        for sign in signs:
-            # Glued contacts may pull, which turns friction round.
-            A = bare - sign * N @ inverse @ (np.array(mu)[:, None] * T).T
+        # Each glued contact may pull, which turns its own friction round.
+        for turned in itertools.islice(itertools.product(signs, repeat=len(sliding)), 64):
+            A = bare - N @ inverse @ ((np.array(turned) * mu)[:, None] * T).T
             if np.linalg.det(A) < CRITICAL * np.linalg.det(bare) or (np.diag(A) < CRITICAL * np.diag(bare)).any():
                 return True
     return False

@@ -14,7 +14,7 @@ import pytest
 from support.pinocchio_oracle import Oracle
 from support.random_robots import random_positions, random_robot, random_robot_of
 
-from combinations.accelerations import critical
+from combinations.accelerations import State, _paradox, critical
 from combinations.bodies import Bodies, position_rates
 from combinations.checks import compare, problems
 from combinations.energy import residual_floor
@@ -326,6 +326,20 @@ def test_critical_friction_finds_a_true_paradox() -> None:
         paradox[speed] = critical(seen, {"q": seen.robot.initial.tolist(), "v": v.tolist()})
     # In one direction of the slip alone.
     assert sorted(paradox.values()) == [False, True]
+
+
+def test_critical_friction_has_a_sign_for_each_glued_contact() -> None:
+    """Two points whose determinant vanishes only if one of them pulls and the other is pushed."""
+    bare = np.array([[0.0976, 0.0689], [0.0689, 0.1714]])
+    friction = np.array([[-0.0120, -0.0279], [0.0556, 0.0306]])
+    normals = np.linalg.cholesky(bare)
+    tangents = np.linalg.solve(normals, friction).T
+    rows = [np.stack([n, t, np.zeros(2)]) for n, t in zip(normals, tangents, strict=True)]
+    slip, ones, none = [np.array([1.0, 0.0])] * 2, [1.0, 1.0], np.zeros(2)
+    state = State(none, none, none, np.eye(2), ["a", "b"], rows, slip, ones, ones, [], [], none)
+    assert _paradox(state, [0, 1], np.eye(2), (1.0, -1.0))
+    for sign in (1.0, -1.0):
+        assert not _paradox(state, [0, 1], np.eye(2), (sign,))
 
 
 FALSE_WARNINGS = (
