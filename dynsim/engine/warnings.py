@@ -316,16 +316,17 @@ def _open_impacts(prepared: Prepared) -> list[str]:
     if prepared.system.unilateral is None:
         return []
     left = [
-        f"{contact.name} leaves its surface (first at t = {tally[ku.OPEN_SINCE]:.6g} s)"
+        f"{contact.name} ({tally[ku.OPEN_SINCE]:.6g} s)"
         for contact, tally in zip(prepared.contacts, prepared.system.unilateral.tally, strict=True)
         if tally[ku.OPEN_IMPACTS]
     ]
     if not left:
         return []
     return [
-        f"the motion is not unique: in impacts of other points {first_few(left)}, while impulses within the friction "
-        "cones could keep it there, wedged, which agrees with the contact law too; lower contacts.friction, or model "
-        "the supports (contacts.stiffness_N_per_m with integrator.method: time_stepping)"
+        "the motion is not unique: impacts of other points, the first at the time in brackets, lift "
+        f"{first_few(left)} off, while impulses within the friction cones could keep the contact closed, wedged, which "
+        "agrees with the contact law too; lower contacts.friction, or model the supports (contacts.stiffness_N_per_m "
+        "with integrator.method: time_stepping)"
     ]
 
 

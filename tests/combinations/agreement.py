@@ -157,11 +157,14 @@ def _grown(allowed: Any, errors: Sequence[dict[str, tuple[Array, Array]]]) -> An
 def _still_growing(
     half: dict[str, tuple[Array, Array]], quarter: dict[str, tuple[Array, Array]]
 ) -> dict[str, tuple[Array, Array]]:
-    """Return the changes by a quarter of the step, times their ratio to those by half of it; 1.5 at first order."""
+    """Return the changes by a quarter of the step, times the share by which they exceed those of first order.
+
+    At first order they are 1.5 times those by half of the step, which are the estimate already.
+    """
     grown = {}
     for name, (time, change) in quarter.items():
         before = np.interp(time, *half[name]) if name in half else change
-        grown[name] = time, change * np.maximum(change / np.maximum(before, 1e-12), 1.0)
+        grown[name] = time, change * np.maximum(change / (1.5 * np.maximum(before, 1e-12)) - 1.0, 0.0)
     return grown
 
 

@@ -40,6 +40,13 @@ FOUND = {
     "a joint that slid slowly and was stopped where another slip began, and others with it": (271127, 796),
     "an equilibrium that moved without a warning, because its rates were 1e-43": (271127, 1218),
     "two joints that hit each other off their stops for ever": (271127, 404),
+    "an impact with two solutions, between which rounding chose": (271127, 1994),
+    "a landing of time stepping that made energy by restitution and friction": (271127, 1228),
+    "a force of least norm beyond the cone of a point that slid slowly": (271127, 1368),
+    "a direction of slip that stayed frozen until the event at the end of the step": (271127, 2008),
+    "accelerations that did not follow a new split of forces of nearly dependent rows": (271127, 1344),
+    "a point that left and came down below its surface with another, and landed for ever": (271127, 1392),
+    "two points that left in turns at one instant": (271127, 1894),
     "a joint at rest that got a row which nearly depended on those of feet and an elbow": (271127, 1485),
 }
 # Scenes of the slow study.
