@@ -48,6 +48,7 @@ FOUND = {
     "a point that left and came down below its surface with another, and landed for ever": (271127, 1392),
     "two points that left in turns at one instant": (271127, 1894),
     "a joint at rest that got a row which nearly depended on those of feet and an elbow": (271127, 1485),
+    "a joint at rest, an elbow that rolled off a crest, and rows that came to contradict each other": (271127, 1801),
 }
 # Scenes of the slow study.
 TRIPLES = 1000

@@ -26,14 +26,22 @@ from dynsim.dynamics.contact.splits import (
     point_shares,
     stops_that_share,
 )
-from dynsim.dynamics.contact.unilateral import UnilateralArrays, dry_rests, dry_rows_held, stop_gap, stop_rate
+from dynsim.dynamics.contact.unilateral import (
+    UnilateralArrays,
+    dry_bound,
+    dry_rests,
+    dry_rows_held,
+    stop_gap,
+    stop_rate,
+)
 from dynsim.dynamics.derivative import System
 from dynsim.dynamics.tables import ContactArrays, Workspace
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts.attempts import keep, take_back
-from dynsim.integrators.contacts.impacts import evaluate, slip_speed
+from dynsim.integrators.contacts.impacts import IMMOBILE, evaluate, slip_speed
 from dynsim.integrators.contacts.leaving import approach_without_force, watch_unpressed
 from dynsim.integrators.contacts.modes import (
+    SLIP_TOLERANCE,
     begin_slip,
     drops,
     note_headway,
@@ -93,9 +101,7 @@ def contact_guard(contacts: ContactArrays, unilateral: UnilateralArrays | None, 
             if dry_rests(unilateral, k):
                 return unilateral.number[ku.SLOW] - abs(rate)
             return unilateral.dry[k, ku.DRY_SIDE] * rate + unilateral.dry[k, ku.DRY_HEADWAY] + BACKWARD
-        if split and best > 0.0:
-            return best
-        return dry_margin(unilateral, ws, k)
+        return min(force_margin(unilateral, ws, k), dry_bound(unilateral, k) * rest_margin(unilateral, ws, k))
     mode = ws.active[k, ka.MODE]
     if kind == NORMAL_GUARD:
         if mode == ka.STICKING and unilateral.number[ku.SPLIT] == 1.0 and normal_is_open(unilateral, ws, k):
@@ -115,6 +121,37 @@ def contact_guard(contacts: ContactArrays, unilateral: UnilateralArrays | None, 
             return best
         return margin(contacts, unilateral, ws, k)
     return 1.0
+
+
+@internal_kernel
+def rest_margin(unilateral: UnilateralArrays, ws: Workspace, k):
+    """1 where dry-friction joint k, which is held, does not accelerate; below 0 if its row cannot hold it any more.
+
+    Rows may depend on each other in one posture only, such as a joint and a point at the crest of a surface. When they
+    leave it they contradict each other, at first by less than the rank of their system shows, and the solution of least
+    squares leaves accelerations along them. With modes chosen again the joint slides. It counts as accelerated by the
+    limit of that choice; if the choice has held it nevertheless, by twice what was left then.
+    """
+    if unilateral.number[ku.REDUNDANT] == 0.0:
+        return 1.0
+    largest = IMMOBILE
+    for r in range(ws.counts[ka.ROWS]):
+        largest = max(largest, abs(ws.rows[r, ka.RHS]))
+    limit = max(SLIP_TOLERANCE * largest, 2.0 * unilateral.dry[k, ku.DRY_LEFT])
+    return 1.0 - abs(ws.joints[unilateral.dry_table[k, ku.DRY_JOINT], ka.QDD]) / limit
+
+
+@internal_kernel
+def force_margin(unilateral: UnilateralArrays, ws: Workspace, k):
+    """Margin of the force of dry-friction joint k, which is held, or of the best split of dependent rows [N m or N]."""
+    best = unilateral.number[ku.BEST_MARGIN]
+    return best if unilateral.number[ku.SPLIT] == 1.0 and best > 0.0 else dry_margin(unilateral, ws, k)
+
+
+@internal_kernel
+def moves_held(unilateral: UnilateralArrays, ws: Workspace, k):
+    """True if the event of dry-friction joint k, which is held, is that it accelerates, not that its force is full."""
+    return dry_bound(unilateral, k) * rest_margin(unilateral, ws, k) < force_margin(unilateral, ws, k)
 
 
 @internal_kernel
@@ -560,6 +597,9 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
                 by_hand = False
         elif kind == DRY_GUARD:
             before = unilateral.dry_table[k, ku.DRY_HOLDS]
+            if before == 1 and moves_held(unilateral, ws, k):
+                by_hand = False
+                continue
             by_hand = break_loose(unilateral, ws, k) and by_hand
             begins = begins or unilateral.dry_table[k, ku.DRY_HOLDS] < before
         elif ws.active[k, ka.MODE] == ka.OPEN:

@@ -219,6 +219,8 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
         evaluate(system, ws, run)
     for k in range(unilateral.dry_table.shape[0]):
         note_headway(unilateral, ws, k)
+        holds = unilateral.dry_table[k, ku.DRY_HOLDS] == 1
+        unilateral.dry[k, ku.DRY_LEFT] = abs(ws.joints[unilateral.dry_table[k, ku.DRY_JOINT], ka.QDD]) if holds else 0.0
     for k in range(unilateral.stop_table.shape[0]):
         # A joint that leaves from a little beyond its stop has not hit it again.
         unilateral.stop[k, ku.HIT_AT] = ku.DEPTH + max(0.0, -stop_gap(unilateral, ws, k))
