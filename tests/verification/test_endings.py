@@ -44,13 +44,20 @@ def test_an_arm_on_a_pipe_comes_to_its_end():
 
 # ---- Loops of the driver, as plain Python
 
+# A system without contacts.
+BARE = SimpleNamespace(unilateral=None, contacts=None)
+
 
 def table(count: int = 1) -> Any:
     """The moving part of a run with so many events, as far as the search for their roots reads it."""
     event, event_table = np.zeros((count, ki.EVENT_SIZE)), np.zeros((count, ki.EVENT_TABLE_SIZE), dtype=int)
     event[:, ki.SIDE] = event[:, ki.START_VALUE] = 1.0
     return SimpleNamespace(
-        clock=np.zeros(ki.CLOCK_SIZE), count=np.zeros(ki.COUNT_SIZE, dtype=int), event=event, event_table=event_table
+        clock=np.zeros(ki.CLOCK_SIZE),
+        count=np.zeros(ki.COUNT_SIZE, dtype=int),
+        event=event,
+        event_table=event_table,
+        gaps=None,
     )
 
 
@@ -67,7 +74,7 @@ def test_a_search_ends_whatever_its_trials_say(monkeypatch: pytest.MonkeyPatch, 
 
     monkeypatch.setattr(events, "guard", guard)
     trials = 1
-    while events.cut_step(None, None, run):
+    while events.cut_step(BARE, None, run):
         trials += 1
         assert trials < 2 * events.SEARCH_LIMIT
     assert run.count[ki.FIRED] == 1
@@ -82,7 +89,7 @@ def test_a_step_that_never_passes_again_ends_the_search_all_the_same(monkeypatch
     run.clock[ki.STEP] = 1e-3
     monkeypatch.setattr(events, "guard", lambda *_: next(values, 1e-15))
     trials = 1
-    while events.cut_step(None, None, run):
+    while events.cut_step(BARE, None, run):
         trials += 1
         assert trials < 2 * events.SEARCH_LIMIT
     assert (run.count[ki.FIRED], run.clock[ki.STEP]) == (1, 1e-3)
@@ -91,10 +98,10 @@ def test_a_step_that_never_passes_again_ends_the_search_all_the_same(monkeypatch
 
 def test_what_seems_to_be_passed_over_for_ever_does_not_shorten_steps_to_nothing(monkeypatch: pytest.MonkeyPatch):
     run = table()
-    run.clock[ki.STEP], run.gaps = 1e-3, None
+    run.clock[ki.STEP] = 1e-3
     monkeypatch.setattr(events, "too_long", lambda *_: 0.01)
     trials = 0
-    while events.passes_over(SimpleNamespace(unilateral=None, contacts=None), None, run):
+    while events.passes_over(BARE, None, run):
         trials += 1
         assert trials <= events.SEARCH_LIMIT
     assert run.clock[ki.STEP] > events.event_tolerance(0.0)
