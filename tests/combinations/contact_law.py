@@ -51,7 +51,7 @@ def touching(seen: Observed) -> Finding:
             yield f"{name} at t = {seen.time[i]:.6g} s: slip {slip[i]} m/s, own {touch.slip[i]}"
         along = (touch.force * touch.normal).sum(axis=1)
         size = np.linalg.norm(touch.force, axis=1)
-        off = np.abs(along - touch.normal_force) - _share(seen, touch) * size
+        off = np.abs(along - touch.normal_force) - _share(seen, touch) * size - _tilted_friction(seen, touch)
         if (off > 1e-9).any():
             i = int(off.argmax())
             yield (
@@ -194,6 +194,23 @@ def _share(seen: Observed, touch: Touch) -> Array:
     return CONE + touch.turned if seen.stepped else np.full(len(seen), CONE)
 
 
+def _tilted_friction(seen: Observed, touch: Touch) -> Array:
+    """Part of friction along the normal, (T,) [N]: the direction of slow slip stands in a step, and the normal turns.
+
+    The direction is along the surface at the start of the step, which the previous sample mostly precedes.
+    """
+    if seen.stepped or not seen.real:
+        return np.zeros(len(seen))
+    slow = (touch.mode == SLIDING) & (np.linalg.norm(touch.slip, axis=1) <= _slow_slip(seen))
+    before = np.concatenate([touch.normal[:1], touch.normal[:-1]])
+    return np.asarray(np.where(slow, np.abs((touch.tangential * before).sum(axis=1)), 0.0))
+
+
+def _slow_slip(seen: Observed) -> float:
+    """Slip keeps its initial direction up to 1000 times atol [m/s]; steps may continue to twice that speed."""
+    return max(2.0 * OF_ATOL * seen.scenario.integrator.absolute_tolerance, SLOW)
+
+
 def _creep(seen: Observed, touch: Touch) -> Array:
     """Largest slip of a sticking contact, (T,) [m/s]: time stepping adds the turn of the surface in a step."""
     if not seen.stepped:
@@ -222,9 +239,7 @@ def _against_slip(seen: Observed, touch: Touch, slips: NDArray[np.bool_], before
             (turned + 2.0 * touch.lag) / np.maximum(both, 1e-300) + np.abs(high - low) / np.maximum(high, 1e-300) + 1e-3
         )
     else:
-        # Slip keeps its initial direction up to 1000 times atol; steps may continue to twice that speed.
-        slow = max(2.0 * OF_ATOL * seen.scenario.integrator.absolute_tolerance, SLOW)
-        steady, middle = slips & (speed > slow), touch.slip
+        steady, middle = slips & (speed > _slow_slip(seen)), touch.slip
         share = np.full(len(seen), 1e-3)
     pace = np.maximum(np.linalg.norm(middle, axis=1), 1e-300)
     mu = coefficient(touch, np.linalg.norm(before, axis=1) if seen.stepped else speed)
