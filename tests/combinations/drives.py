@@ -142,14 +142,15 @@ def _gains(random: Generator, levels: Levels, robot: Plant, driven: dict[str, di
 
 def _followers(random: Generator, levels: Levels, robot: Plant, moved: Sequence[Joint]) -> list[Joint]:
     """Return the joints that follow the hand: all, or only joints behind the elbow, without joints near a stop."""
-    moved = [joint for joint in moved if joint.name not in robot.limited] or moved
+    able = [joint for joint in moved if joint.name != "grip"]
+    moved = [joint for joint in able if joint.name not in robot.limited] or able
     if levels["plant"] == "mimic":
         moved = [joint for joint in moved if joint.turns]
-    behind = [joint for joint in moved if not joint.before and joint.name != "grip"]
+    behind = [joint for joint in moved if not joint.before]
     if levels["start"] == "on_references":
         # The last joint has waypoints.
         return moved[:-1] or moved
-    return behind if behind and random.random() < 0.5 else [joint for joint in moved if joint.name != "grip"]
+    return behind if behind and random.random() < 0.5 else moved
 
 
 def _path(
