@@ -438,15 +438,25 @@ def _stepped_balance(seen: Observed) -> Balance:
         # Tangents may rotate about the normal by the same angle as the normal.
         angle = np.linalg.norm(later.normal - touch.normal, axis=1, keepdims=True)
         slack = slack + np.abs(_contact_term(seen, middle, touch, angle * np.cross(touch.normal, turned)))
-    # Velocity products use the rates extrapolated with the last acceleration, or the rates of the start if contacts
-    # have changed.
-    last = np.where((rows > 1)[:, None], seen.vdot[np.maximum(rows - 1, 0)], 0.0)
-    led, begun = (
-        _balanced(seen, rows, [_inertial(seen, q_middle, rates, a), *terms[1:]], slack)
-        for rates in (v_start + theta * h * last, v_start)
-    )
-    better = (led.excess.max(axis=1) < begun.excess.max(axis=1))[:, None]
-    return replace(led, left=np.where(better, led.left, begun.left), scale=np.where(better, led.scale, begun.scale))
+    # Velocity products use the rates extrapolated with the last acceleration, after an impact that of the last step
+    # without one, or the rates of the start if contacts have changed.
+    best = _balanced(seen, rows, [_inertial(seen, q_middle, v_start, a), *terms[1:]], slack)
+    smooth = _without_impact(seen)
+    for last in (rows - 1, smooth[rows - 1]):
+        earlier = np.where((last > 0)[:, None], seen.vdot[last], 0.0)
+        led = _balanced(seen, rows, [_inertial(seen, q_middle, v_start + theta * h * earlier, a), *terms[1:]], slack)
+        better = (led.excess.max(axis=1) < best.excess.max(axis=1))[:, None]
+        best = replace(best, left=np.where(better, led.left, best.left), scale=np.where(better, led.scale, best.scale))
+    return best
+
+
+def _without_impact(seen: Observed) -> NDArray[np.int64]:
+    """Return for each sample the last one until then whose step had no impact, (T,); 0 if there is none."""
+    index = np.arange(len(seen))
+    for event in seen.record.events:
+        if event.kind in ("landing", "stop_hit"):
+            index[np.searchsorted(seen.time, event.time - AT_STEP * seen.step) : len(seen)][:1] = 0
+    return np.maximum.accumulate(index)
 
 
 def _inertial(seen: Observed, q: Array, v: Array, a: Array) -> Array:

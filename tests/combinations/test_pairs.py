@@ -36,6 +36,7 @@ FOUND = {
     "a joint at rest in a corner of the admissible forces: no split with the same motion had a margin": (271127, 1534),
     "a warning of a state at the end of a refused step": (271127, 944),
     "impacts without the viscous part of friction, by the methods with events": (271127, 754),
+    "velocity products of an impact that were extrapolated into the next step of time stepping": (271127, 881),
     "a joint that broke loose by itself, and other forces that jumped for the sign of a rounding": (271127, 900),
     "what settled after a landing turned a joint round, and its friction drove it": (271127, 995),
     "a joint that slid slowly and was stopped where another slip began, and others with it": (271127, 796),

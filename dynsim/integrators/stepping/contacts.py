@@ -81,7 +81,7 @@ def recall(system, s: SteppingArrays, ws: Workspace, y):
     layout = system.layout
     if s.grid[kt.LENGTH_LAST] > 0.0 and not rates_jumped(s, y, layout.v):
         return
-    s.grid[kt.LENGTH_LAST], s.grid[kt.HELD_STEPS] = 0.0, 0.0
+    s.grid[kt.LENGTH_LAST], s.grid[kt.HELD_STEPS], s.grid[kt.IMPACT_LAST] = 0.0, 0.0, 0.0
     place_joints(system, ws, y)
     for i in range(s.before.shape[1]):
         ws.joints[i, ka.QD], ws.joints[i, ka.QDD] = y[layout.v + i], 0.0
@@ -542,14 +542,17 @@ def slip_ends(s: SteppingArrays, ws: Workspace):
 
 
 @internal_kernel
-def strikes(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace):
-    """True if a rigid contact, maybe at another place of its body, or a joint stop has struck in this step."""
+def strikes(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, elsewhere):
+    """True if a rigid contact or a joint stop has struck in this step.
+
+    ``elsewhere``: also a closed contact that has come to another place of its body.
+    """
     for k in range(unilateral.stop_table.shape[0]):
         closes = unilateral.stop_table[k, ku.STOP_CLOSED] > unilateral.stop_table[k, ku.STOP_BEFORE]
         if closes and is_stopped(s, unilateral.stop_table[k, ku.STOP_ROW]):
             return True
     for k in range(ws.contacts.shape[0]):
-        begins = s.memory[kt.LAST, k, kt.CLOSED] == 0.0 or s.turn[k, kt.KNOWN] == 0.0
+        begins = s.memory[kt.LAST, k, kt.CLOSED] == 0.0 or (elsewhere and s.turn[k, kt.KNOWN] == 0.0)
         rigid = s.memory[kt.NOW, k, kt.LISTED] == 1.0 and law[k, ka.CONTACT_STIFFNESS] == 0.0
         if begins and rigid and is_stopped(s, ws.active[k, ka.FIRST_ROW]):
             return True

@@ -49,9 +49,11 @@ def step_moreau(system: System, ws: Workspace, run: Run):
     model = ModelArrays(system.model.tree, s.body, system.model.gravity)
     begin_energy(system, ws, run)
     recall(system, s, ws, y)
+    # The mean acceleration of an impact says nothing about the next step; that of the last step without one does.
+    known = s.before[kt.SMOOTH] if s.grid[kt.IMPACT_LAST] == 1.0 else last
     for i in range(ws.joints.shape[0]):
         v0[i] = y[layout.v + i]
-        v_bias[i] = v0[i] + s.theta * run.clock[ki.STEP] * last[i]
+        v_bias[i] = v0[i] + s.theta * run.clock[ki.STEP] * known[i]
     for tries in range(1, MOST_TRIES + 1):
         take_drives(system, ws, run)
         place_midpoint(system, model, ws, run)
@@ -278,7 +280,11 @@ def keep_torques(system: System, ws: Workspace, run: Run):
     which makes up for rows of what has landed that turned within the step of the landing.
     """
     s, motor, y, y_new, layout = run.stepping, system.drives.motor, run.y, run.y_new, system.layout
-    if strikes(system.contacts.law, system.unilateral, s, ws):
+    s.grid[kt.IMPACT_LAST] = 1.0 if strikes(system.contacts.law, system.unilateral, s, ws, False) else 0.0
+    if s.grid[kt.IMPACT_LAST] == 0.0:
+        for i in range(ws.joints.shape[0]):
+            s.before[kt.SMOOTH, i] = s.before[kt.ACCELERATION, i]
+    if strikes(system.contacts.law, system.unilateral, s, ws, True):
         s.grid[kt.HELD_STEPS] = 2.0
     else:
         s.grid[kt.HELD_STEPS] = max(s.grid[kt.HELD_STEPS] - 1.0, 0.0)
@@ -400,7 +406,7 @@ def commands_due(system: System, ws: Workspace, run: Run):
     if run.count[ki.STARTED] == 0:
         run.count[ki.STARTED] = 1
         for i in range(ws.joints.shape[0]):
-            run.stepping.before[kt.ACCELERATION, i] = 0.0
+            run.stepping.before[kt.ACCELERATION, i] = run.stepping.before[kt.SMOOTH, i] = 0.0
     return run.count[ki.TICKED] != 0
 
 

@@ -68,9 +68,10 @@ TURN_SIZE = 12
 WORST, CAPPED, PENETRATION, SOLVES, LONG_SOLVES, TAKEN, UNSETTLED, HALF_STEP, DROPPED = 0, 1, 2, 3, 4, 5, 6, 7, 8
 STATISTICS_SIZE = 9
 # SteppingArrays.before: rates at the start; rates of the velocity products; acceleration of the last step, and then of
-# this one; what is applied at the start, without loads; rates at the end of the last accepted step.
-V_START, V_BIAS, ACCELERATION, APPLIED_THEN, V_LAST = 0, 1, 2, 3, 4
-BEFORE_SIZE = 5
+# this one; what is applied at the start, without loads; rates at the end of the last accepted step; acceleration of the
+# last step without an impact.
+V_START, V_BIAS, ACCELERATION, APPLIED_THEN, V_LAST, SMOOTH = 0, 1, 2, 3, 4, 5
+BEFORE_SIZE = 6
 # SteppingArrays.eliminated
 FREE, PER, DIDT_THEN = 0, 1, 2
 # SteppingArrays.energy
@@ -78,9 +79,9 @@ START, STOP = 0, 1
 MECHANICAL, MAGNETIC = 0, 1
 # SteppingArrays.grid: time from which steps of one length are counted [s], how many have been since; length of the last
 # accepted step [s], the power of drives and loads in it, and in the step that is tried [W]; for how many steps motors
-# keep their torques because of an impact, the last one included.
-GRID_START, GRID_STEPS, LENGTH_LAST, POWER_LAST, POWER_NOW, HELD_STEPS = 0, 1, 2, 3, 4, 5
-GRID_SIZE = 6
+# keep their torques because of an impact, the last one included; 1: the last accepted step had an impact.
+GRID_START, GRID_STEPS, LENGTH_LAST, POWER_LAST, POWER_NOW, HELD_STEPS, IMPACT_LAST = 0, 1, 2, 3, 4, 5, 6
+GRID_SIZE = 7
 
 
 class SteppingArrays(NamedTuple):
