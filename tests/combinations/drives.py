@@ -96,7 +96,7 @@ def controller(
         followed = _followers(random, levels, robot, moved)
         section["hand"] = {
             "joints": [joint.name for joint in followed],
-            **_path(random, robot, followed, model, duration, exact=levels["start"] != "on_surface"),
+            **_path(random, robot, followed, model, duration),
         }
         if levels["contact"] == "glued" and any(joint.before for joint in followed):
             section["hand"]["braces"] = ["elbow"]
@@ -153,12 +153,10 @@ def _followers(random: Generator, levels: Levels, robot: Plant, moved: Sequence[
     return behind if behind and random.random() < 0.5 else moved
 
 
-def _path(
-    random: Generator, robot: Plant, followed: Sequence[Joint], model: Model, duration: float, *, exact: bool
-) -> dict[str, Any]:
+def _path(random: Generator, robot: Plant, followed: Sequence[Joint], model: Model, duration: float) -> dict[str, Any]:
     """Return a line that the joints can follow: it ends at the hand position after small turns of the joints.
 
-    It is not ``exact`` if the start moves joints that may not be among them, and the hand with them.
+    They may leave it in between, and more if the start moves joints that are not among them, and the hand with them.
     """
     q = np.array(model.robot.initial)
     start = model.point_position(*robot.hand, q)
@@ -168,7 +166,7 @@ def _path(
         q[index[joint.name]] += (0.02 if not joint.turns else 0.08) * (-1.0) ** k * float(random.uniform(0.5, 1.0))
     end = model.point_position(*robot.hand, q)
     path = {"type": "line", "from_m": start.tolist(), "to_m": end.tolist(), "duration_s": duration}
-    return {"path": path, "tolerance_m": 1e-6 if exact and len(followed) >= 3 else 0.05}
+    return {"path": path, "tolerance_m": 0.05}
 
 
 def _waypoints(random: Generator, levels: Levels, free: Sequence[Joint], duration: float) -> dict[str, Any]:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,8 @@ WALL_LIMIT_S = 60.0
 SPHERE, THICKER = 0.02, 0.002
 # Distance from the elbow to the shin [m].
 SHIN = 0.05
+# Radius of the balls that single points touch [m].
+BALL_M = 0.03
 # Maximum number of scenes drawn until no body starts in a surface.
 ATTEMPTS = 4
 # Number of grid heights along each side, and their spacing [m].
@@ -315,9 +318,14 @@ class _Touching:
             there = self._model.point_position(*spot, self._q)
             toward = self._model.point_position(*robot.hand, self._q) - there
             toward[2] = 0.0
-            # The ball is behind the arm.
+            # The ball is behind the arm, or where a folded arm leaves most room for it.
             toward = _unit(toward) if np.linalg.norm(toward) > 1e-3 else np.array([1.0, 0.0, 0.0])
-            self._ball("root", spot, radius, there, _unit(toward + self._random.uniform(-0.3, 0.3, size=3)))
+            behind = _unit(toward + self._random.uniform(-0.3, 0.3, size=3))
+            ends = [*centres[last:], self._model.point_position(*robot.hand, self._q)]
+            sides = [behind, *(np.array([x, y, 0.0]) for x, y in ((0.0, 1.0), (0.0, -1.0), (-1.0, 0.0), (1.0, 0.0)))]
+            room = [_distance(there - (radius + BALL_M) * side, ends) for side in sides]
+            side = 0 if room[0] > BALL_M or self._levels["contact"] not in ("links", "joints") else int(np.argmax(room))
+            self._ball("root", spot, radius, there, sides[side])
 
     def _fan(self, body: str) -> float:
         """Return how far the capsules from a body to its fingers are off its own axis at the shin [m]."""
@@ -330,7 +338,7 @@ class _Touching:
         return [spot[1][0], spot[1][1], spot[1][2] - 0.05]
 
     def _ball(self, name: str, spot: tuple[str, list[float]], radius: float, there: Array, normal: Array) -> None:
-        size = 0.03
+        size = BALL_M
         centre = (there - (radius + size + self.gap) * normal).tolist()
         self.surfaces[f"{name}_ball"] = {"type": "sphere", "center_m": centre, "radius_m": size}
         self.points[name] = self._point(spot, f"{name}_ball", radius)
@@ -426,6 +434,15 @@ class _Touching:
     def _away(self) -> Array:
         side = np.cross(self.normal, [0.0, 0.0, 1.0])
         return _unit(side) if np.linalg.norm(side) > 0.1 else np.array([1.0, 0.0, 0.0])
+
+
+def _distance(point: Array, ends: Sequence[Array]) -> float:
+    """Return the distance of a point from the segments between the ends [m]."""
+    least = math.inf
+    for a, b in pairwise(ends):
+        share = float((point - a) @ (b - a)) / max(float((b - a) @ (b - a)), 1e-12)
+        least = min(least, float(np.linalg.norm(point - a - np.clip(share, 0.0, 1.0) * (b - a))))
+    return least
 
 
 def _unit(vector: Array) -> Array:
