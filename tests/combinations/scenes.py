@@ -32,7 +32,7 @@ SHIN = 0.05
 # Radius of the balls that single points touch [m].
 BALL_M = 0.03
 # Maximum number of scenes drawn until no body starts in a surface.
-ATTEMPTS = 4
+ATTEMPTS = 12
 # Number of grid heights along each side, and their spacing [m].
 GRID, SPACING = 24, 0.1
 # Integrator options by the level of precision, for adaptive methods and for time stepping.
