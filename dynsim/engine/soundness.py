@@ -27,6 +27,7 @@ from dynsim.engine.force_indeterminacy import touching_rows
 from dynsim.engine.method import drive_slopes
 from dynsim.errors import ModelError
 from dynsim.model.description import Array, Contact
+from dynsim.record import Record
 from dynsim.scenario import Scenario, build
 from dynsim.scenario.sensors import Encoders
 
@@ -247,6 +248,23 @@ def unstable_loop(scenario: Scenario, prepared: Prepared, q: Array | None = None
         f"{'of the start' if q is None else 'reached'}, deviations grow {math.exp(growth.rate * period):.4g} times per "
         f"period (most at {prepared.model.robot.motors[growth.motor].joint}, {gains}); {remedy}"
     ), growth
+
+
+def unstable_end(scenario: Scenario, prepared: Prepared, record: Record) -> str:
+    """The sentence of a loop that is stable at the start, but not in the last posture, and has grown until then.
+
+    Empty where it is not so: in the time in which deviations grow by e³, the kinetic energy has grown by e³ or more.
+    """
+    if prepared.control.sample_time is None or len(record) < 2:
+        return ""
+    energy, time = record["energy_kinetic"], record.time
+    verdict = unstable_loop(scenario, prepared, record["q"][-1])
+    if verdict is None or time[-1] - time[0] < GROWN / verdict[1].rate:
+        return ""
+    before = float(np.interp(time[-1] - GROWN / verdict[1].rate, time, energy))
+    if not energy[-1] > math.exp(GROWN) * max(before, float(energy[0])):
+        return ""
+    return f"{verdict[0]}; the kinetic energy has grown to {energy[-1]:.3g} J"
 
 
 def unstable_stop(scenario: Scenario, prepared: Prepared, q: Array, v: Array, elapsed: float) -> str:

@@ -89,7 +89,7 @@ def _ends(runs: Mapping[str, Run]) -> Iterator[tuple[str, str]]:
         if finished and not isinstance(run.error, type(None)):
             error = run.error
             assert isinstance(error, SimulationStopped)
-            if error.kind in ("not_finite", "not_projected"):
+            if error.kind in ("not_finite", "not_projected") and "the sampled loop is unstable" not in str(error):
                 yield "ends", f"{name} stops ({error.kind}) where {', '.join(finished)} go on: {str(error)[:200]}"
 
 

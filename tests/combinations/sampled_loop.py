@@ -14,17 +14,18 @@ from dynsim.model.drives import Motor, Servo, TorqueSource
 Array = NDArray[np.float64]
 
 
-def loop_growth(seen: Observed) -> float | None:
+def loop_growth(seen: Observed, q: Array | None = None) -> float | None:
     """Logarithm per second of the growth of the slower of two loops; None if no command is sampled.
 
-    One with all contacts let go, one with those held that touch at the start: between them lies what contacts do.
-    No weight and no velocity products: what grows without them is the loop.
+    One with all contacts let go, one with those held that touch: between them lies what contacts do. No weight and no
+    velocity products: what grows without them is the loop. At the start, or at coordinates q (nq,).
     """
     period = seen.sample_time
     if period is None or not seen.robot.motors or seen.config.get("sensors"):
         return None
     basis = seen.bodies.free_directions()
-    first = seen.bodies.motion(seen.robot.initial[None], np.zeros((1, seen.bodies.n)), np.zeros((1, seen.bodies.n)))
+    q = seen.robot.initial if q is None else q
+    first = seen.bodies.motion(q[None], np.zeros((1, seen.bodies.n)), np.zeros((1, seen.bodies.n)))
     rows = [np.zeros((0, seen.bodies.n))]
     for touch in seen.touches(first):
         if abs(touch.gap[0]) < 1e-6 or (touch.contact.stiffness > 0.0 and touch.gap[0] < 0.0):
@@ -32,17 +33,17 @@ def loop_growth(seen: Observed) -> float | None:
             rows.append(J if seen.real and touch.contact.friction > 0.0 else touch.normal[0][None] @ J)
     _, sizes, vectors = np.linalg.svd(np.vstack(rows) @ basis)
     rank = int((sizes > 1e-9).sum())
-    radii = [_spectral_radius(seen, free) for free in (basis, basis @ vectors[rank:].T) if free.shape[1]]
+    radii = [_spectral_radius(seen, q, free) for free in (basis, basis @ vectors[rank:].T) if free.shape[1]]
     return float(np.log(max(min(radii), 1e-300))) / period if radii else None
 
 
-def _spectral_radius(seen: Observed, basis: Array) -> float:
-    """Largest eigenvalue over one period of the motions in a basis, (n, k)."""
+def _spectral_radius(seen: Observed, q: Array, basis: Array) -> float:
+    """Largest eigenvalue over one period of the motions in a basis, (n, k), at coordinates q (nq,)."""
     from scipy.linalg import expm
 
     period, controller = seen.sample_time, seen.config.get("controller") or {}
     n, motors = seen.bodies.n, seen.robot.motors
-    M = basis.T @ seen.bodies.mass_matrix(seen.robot.initial) @ basis
+    M = basis.T @ seen.bodies.mass_matrix(q) @ basis
     k = basis.shape[1]
     circuits = [motor for motor in motors if isinstance(motor, Motor)]
     size = 2 * k + len(circuits)

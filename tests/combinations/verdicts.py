@@ -67,9 +67,14 @@ def _stop(stop: SimulationStopped, seen: Observed) -> Iterator[str]:
     if stop.kind not in STOPS:
         yield f"{text}: no check knows this kind of stop"
         return
-    # An unstable loop with time to grow explains a stop of any kind.
-    rate = loop_growth(seen)
-    if rate is not None and rate > GROWTH and rate * stop.time > GROWN:
+    # An unstable loop with time to grow, in any posture, explains a stop of any kind.
+    for q in (None, *seen.q) if UNSTABLE in str(stop) else (None,):
+        rate = loop_growth(seen, q)
+        if rate is not None and rate > GROWTH and rate * stop.time > GROWN:
+            return
+    energy = seen.record["energy_kinetic"]
+    # Of loops with encoders there is no own model, but their growth.
+    if UNSTABLE in str(stop) and seen.config.get("sensors") and energy[-1] > 100.0 * energy[: len(seen) // 2].max():
         return
     if reason := STOPS[stop.kind](stop, seen):
         yield f"{text}: {reason}; {str(stop)[:200]}"
@@ -433,7 +438,7 @@ def _unstable(match: Match, seen: Observed) -> str:
     if seen.config.get("sensors"):
         # Of encoders with their delay there is no own model; with true positions it is the slower loop.
         return ""
-    rate = loop_growth(seen)
+    rate = loop_growth(seen, seen.q[-1] if "in the posture reached" in match.string else None)
     return "" if rate is not None and rate > 0.9 * GROWTH else f"it grows with {rate} 1/s"
 
 
