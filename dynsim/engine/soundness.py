@@ -49,6 +49,10 @@ WHOLE = 1e-9
 HALVINGS = 8
 # Logarithm of the growth of deviations up to a stop, from which on it is the reason of the stop: a factor of 20.
 GROWN = 3.0
+# Postures of a record in which a sampled loop is examined.
+POSTURES = 10
+# Postures that differ by less have the same growth [rad or m].
+SAME_POSTURE = 0.02
 
 
 @dataclass(frozen=True)
@@ -250,21 +254,28 @@ def unstable_loop(scenario: Scenario, prepared: Prepared, q: Array | None = None
     ), growth
 
 
-def unstable_end(scenario: Scenario, prepared: Prepared, record: Record) -> str:
-    """The sentence of a loop that is stable at the start, but not in the last posture, and has grown until then.
+def unstable_later(scenario: Scenario, prepared: Prepared, record: Record) -> str:
+    """The sentence of a loop that is unstable in later postures for as long as deviations need to grow by e³.
 
-    Empty where it is not so: in the time in which deviations grow by e³, the kinetic energy has grown by e³ or more.
+    Some postures of the record are examined, at equal distances in time. Empty if none is, or only for a moment.
     """
-    if prepared.control.sample_time is None or len(record) < 2:
+    period, time = prepared.control.sample_time, record.time
+    if period is None or len(record) < 2:
         return ""
-    energy, time = record["energy_kinetic"], record.time
-    verdict = unstable_loop(scenario, prepared, record["q"][-1])
-    if verdict is None or time[-1] - time[0] < GROWN / verdict[1].rate:
-        return ""
-    before = float(np.interp(time[-1] - GROWN / verdict[1].rate, time, energy))
-    if not energy[-1] > math.exp(GROWN) * max(before, float(energy[0])):
-        return ""
-    return f"{verdict[0]}; the kinetic energy has grown to {energy[-1]:.3g} J"
+    grown, first, before, at, growth = 0.0, -1, 0, np.full(prepared.model.nq, np.inf), None
+    for k in np.unique(np.linspace(0.0, len(record) - 1, POSTURES + 1).astype(int)).tolist()[1:]:
+        if not np.abs(record["q"][k] - at).max() < SAME_POSTURE:
+            at = record["q"][k]
+            growth = loop_growth(scenario, prepared, at, period)
+        if growth is None or not growth.unstable:
+            grown, first = 0.0, -1
+        else:
+            first = k if first < 0 else first
+            grown += growth.rate * float(time[k] - time[before])
+            if grown >= GROWN and (verdict := unstable_loop(scenario, prepared, record["q"][first])) is not None:
+                return f"{verdict[0]}; from t = {time[first]:.3g} s on deviations have had the time to grow 20 times"
+        before = k
+    return ""
 
 
 def unstable_stop(scenario: Scenario, prepared: Prepared, q: Array, v: Array, elapsed: float) -> str:

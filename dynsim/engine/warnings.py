@@ -15,7 +15,7 @@ from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.engine.force_indeterminacy import motion_spread, sharing
 from dynsim.engine.prepare import Prepared
-from dynsim.engine.soundness import unstable_end, unstable_loop
+from dynsim.engine.soundness import unstable_later, unstable_loop
 from dynsim.errors import first_few
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts import events as ke
@@ -77,7 +77,7 @@ def warnings_of(
     """
     robot = prepared.model.robot
     unstable = unstable_loop(scenario, prepared)
-    growing = unstable_end(scenario, prepared, record) if unstable is None else unstable[0]
+    growing = unstable_later(scenario, prepared, record) if unstable is None else unstable[0]
     warnings = [
         *([growing] if growing else []),
         *_contact_warnings(record, scenario, prepared, summary, begun),

@@ -25,7 +25,7 @@ SOURCES = {
 PARTS = (
     r"^joint .* moves no inertia in this posture",
     r"^plant: ",
-    r"; the kinetic energy has grown to",
+    r"; the kinetic energy has grown to|; from t = 1 s on deviations have had the time to grow",
     r"^use .*, which is stable, or smaller gains",
     r"^the torque of .* begins with|^the reference of .* begins|^the planned voltages count on",
     r"^the motion does not determine|^in the samples",

@@ -438,7 +438,10 @@ def _unstable(match: Match, seen: Observed) -> str:
     if seen.config.get("sensors"):
         # Of encoders with their delay there is no own model; with true positions it is the slower loop.
         return ""
-    rate = loop_growth(seen, seen.q[-1] if "in the posture reached" in match.string else None)
+    from_then_on = re.search(rf"from t = {NUMBER} s on", match.string)
+    rate = loop_growth(
+        seen, None if from_then_on is None else seen.q[np.abs(seen.time - float(from_then_on[1])).argmin()]
+    )
     return "" if rate is not None and rate > 0.9 * GROWTH else f"it grows with {rate} 1/s"
 
 

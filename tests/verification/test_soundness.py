@@ -139,6 +139,34 @@ def test_a_run_and_a_stop_name_the_unstable_loop():
     assert any("sampled loop is unstable" in text for text in raised.value.record.summary["warnings"])
 
 
+FOLDED = """
+duration_s: 1.0
+plant:
+  type: serial_arm
+  link: {length_m: 0.3, mass_kg: 0.5, motor: {type: wang_minami}}
+  chain: [{count: 1}, {count: 1, initial_deg: 170}]
+  gravity_m_s2: [0, 0, 0]
+controller:
+  type: joint_pd
+  k_p_V_per_rad: 200
+  k_d_V_s_per_rad: 5
+  sample_time_s: 0.006
+  joints: {joint_2: {times_s: [0, 0.5], angles_deg: [170, END]}}
+metrics: {settle_s: 0}
+"""
+
+
+@pytest.mark.parametrize(("end", "unstable"), [("160", False), ("0", True)])
+def test_a_run_warns_of_a_loop_that_is_unstable_in_a_later_posture_only(end, unstable, tmp_path):
+    """Straight, the arm sways by up to 49 J, and the run ends in a posture in which the loop is stable again."""
+    path = tmp_path / "folded.yaml"
+    path.write_text(FOLDED.replace("END", end))
+    scenario = load_scenario(path)
+    assert not [text for text in check(scenario).warnings if "sampled loop is unstable" in text]
+    warnings = [text for text in simulate(scenario).summary["warnings"] if "sampled loop is unstable" in text]
+    assert [("in the posture reached" in text, "from t = 0." in text) for text in warnings] == [(True, True)] * unstable
+
+
 def test_a_session_logs_the_unstable_loop_when_it_starts(caplog):
     scenario = load_scenario("elbow_comparison", "two_elbows", {"controller.sample_time_s": 0.001})
     Simulation(scenario)
