@@ -14,8 +14,8 @@ from dynsim.model.drives import Motor, Servo, TorqueSource
 Array = NDArray[np.float64]
 
 
-def loop_growth(seen: Observed, q: Array | None = None) -> float | None:
-    """Logarithm per second of the growth of the slower of two loops; None if no command is sampled.
+def loop_growth(seen: Observed, q: Array | None = None, *, most: bool = False) -> float | None:
+    """Logarithm per second of the growth of the slower of two loops, or the faster; None if no command is sampled.
 
     One with all contacts let go, one with those held that touch: between them lies what contacts do. No weight and no
     velocity products: what grows without them is the loop. At the start, or at coordinates q (nq,).
@@ -34,7 +34,7 @@ def loop_growth(seen: Observed, q: Array | None = None) -> float | None:
     _, sizes, vectors = np.linalg.svd(np.vstack(rows) @ basis)
     rank = int((sizes > 1e-9).sum())
     radii = [_spectral_radius(seen, q, free) for free in (basis, basis @ vectors[rank:].T) if free.shape[1]]
-    return float(np.log(max(min(radii), 1e-300))) / period if radii else None
+    return float(np.log(max((max if most else min)(radii), 1e-300))) / period if radii else None
 
 
 def _spectral_radius(seen: Observed, q: Array, basis: Array) -> float:
