@@ -81,7 +81,7 @@ DRY_FORCE = 2  # on the joint [N m or N]
 DRY_SIDE = 3  # sign of the rate at which it slides; between −1 and 1 at rest, where the force is that part of the bound
 DRY_AT = 4  # where it is held [rad or m]
 DRY_HEADWAY = 5  # what it began to slide with against its side, because the rows could not take it away
-DRY_LEFT = 6  # acceleration that dependent rows left it at the last choice of modes, although held [rad/s² or m/s²]
+DRY_LEFT = 6  # acceleration_left() of rows that depended on each other at the last choice of modes [rad/s² or m/s²]
 DRY_SIZE = 7
 # UnilateralArrays.tie_table, int
 TIE_A, TIE_B = 0, 1  # links

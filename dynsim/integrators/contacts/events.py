@@ -43,6 +43,7 @@ from dynsim.integrators.contacts.impacts import IMMOBILE, evaluate, slip_speed
 from dynsim.integrators.contacts.leaving import approach_without_force, watch_unpressed
 from dynsim.integrators.contacts.modes import (
     SLIP_TOLERANCE,
+    acceleration_left,
     begin_slip,
     drops,
     note_headway,
@@ -136,7 +137,7 @@ def rest_margin(unilateral: UnilateralArrays, ws: Workspace, k):
     for r in range(ws.counts[ka.ROWS]):
         largest = max(largest, abs(ws.rows[r, ka.RHS]))
     limit = max(SLIP_TOLERANCE * largest, 2.0 * unilateral.dry[k, ku.DRY_LEFT])
-    return 1.0 - abs(ws.joints[unilateral.dry_table[k, ku.DRY_JOINT], ka.QDD]) / limit
+    return 1.0 - acceleration_left(unilateral, ws, k) / limit
 
 
 @internal_kernel

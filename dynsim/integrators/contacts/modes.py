@@ -53,6 +53,8 @@ from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
 # An acceleration along the surface below this fraction of the largest right-hand side counts as zero.
 SLIP_TOLERANCE = 1e-8
+# A joint with a smaller share than this in the accelerations that contradicting rows leave has no part in them.
+LEAST_SHARE = 1e-3
 # If no forces agree with slip slower than this [m/s], the slip is stopped, as unbounded friction would stop it: an
 # impact of 5e-11 J per kilogram. Without it points that land within a step of coming to rest would end a run.
 NEARLY_AT_REST = 1e-5
@@ -219,8 +221,8 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
         evaluate(system, ws, run)
     for k in range(unilateral.dry_table.shape[0]):
         note_headway(unilateral, ws, k)
-        holds = unilateral.dry_table[k, ku.DRY_HOLDS] == 1
-        unilateral.dry[k, ku.DRY_LEFT] = abs(ws.joints[unilateral.dry_table[k, ku.DRY_JOINT], ka.QDD]) if holds else 0.0
+        holds = redundant and unilateral.dry_table[k, ku.DRY_HOLDS] == 1
+        unilateral.dry[k, ku.DRY_LEFT] = acceleration_left(unilateral, ws, k) if holds else 0.0
     for k in range(unilateral.stop_table.shape[0]):
         # A joint that leaves from a little beyond its stop has not hit it again.
         unilateral.stop[k, ku.HIT_AT] = ku.DEPTH + max(0.0, -stop_gap(unilateral, ws, k))
@@ -340,6 +342,25 @@ def note_headway(unilateral: UnilateralArrays, ws: Workspace, k):
     """Note the speed against its side with which dry-friction joint k begins to slide."""
     rate = ws.joints[unilateral.dry_table[k, ku.DRY_JOINT], ka.QD]
     unilateral.dry[k, ku.DRY_HEADWAY] = max(0.0, -unilateral.dry[k, ku.DRY_SIDE] * rate)
+
+
+@internal_kernel
+def acceleration_left(unilateral: UnilateralArrays, ws: Workspace, k):
+    """Acceleration of dry-friction joint k, which is held, if its row alone gave way, right after :func:`evaluate`.
+
+    Rows J v̇ = b that contradict each other along one combination w, wᵀ J = 0, are left with the accelerations
+    r = w (w·b) / |w|² by least squares: the joint has only a share, which may be small where a point has most. With the
+    joint sliding, as in a choice of modes, all other rows hold, and it takes the whole: w·b / w_k = |r|² / r_k.
+    """
+    rows, p, squares, largest = ws.rows, ws.counts[ka.ROWS], 0.0, 0.0
+    for r in range(p):
+        left = rows[r, ka.RHS]
+        for s in range(p):
+            left -= ws.small[0, r, s] * rows[s, ka.FORCE]
+        squares += left * left
+        largest = max(largest, abs(left))
+    share = abs(ws.joints[unilateral.dry_table[k, ku.DRY_JOINT], ka.QDD])
+    return squares / share if share > LEAST_SHARE * largest else share
 
 
 @internal_kernel
