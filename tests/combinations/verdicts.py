@@ -439,9 +439,8 @@ def _unstable(match: Match, seen: Observed) -> str:
         # Of encoders with their delay there is no own model; with true positions it is the slower loop.
         return ""
     from_then_on = re.search(rf"from t = {NUMBER} s on", match.string)
-    rate = loop_growth(
-        seen, None if from_then_on is None else seen.q[np.abs(seen.time - float(from_then_on[1])).argmin()]
-    )
+    q = None if from_then_on is None else seen.q[np.abs(seen.time - float(from_then_on[1])).argmin()]
+    rate = loop_growth(seen, q, most=True)
     return "" if rate is not None and rate > 0.9 * GROWTH else f"it grows with {rate} 1/s"
 
 
