@@ -33,7 +33,6 @@ FOUND = {
     "a joint that dipped beyond its stop within a step": (271127, 433),
     "a joint that hit its stop and left it at once, of which no event told": (271127, 454),
     "a joint at rest that shared a load with another one at its bound: 25 000 events in a millisecond": (271127, 343),
-    "a joint at rest in a corner of the admissible forces: no split with the same motion had a margin": (271127, 1534),
     "a warning of a state at the end of a refused step": (271127, 944),
     "impacts without the viscous part of friction, by the methods with events": (271127, 754),
     "velocity products of an impact that were extrapolated into the next step of time stepping": (271127, 881),

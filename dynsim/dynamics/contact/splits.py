@@ -29,9 +29,6 @@ from dynsim.jit.kernel import internal_kernel, noinline_kernel
 NORMAL_PART = 1e-6
 # A direction with a smaller square in the leading rows has its other parts alone: of couplings behind closed brakes.
 NO_LEADING = 1e-20
-# Margins of a split that differ by less, as a fraction of its largest force, are the same: the accuracy of the program
-# that finds the best split.
-SPLIT_SLACK = 1e-7
 # Instead of a bound: of stops, which push one way.
 ONE_WAY = -1.0
 

@@ -19,7 +19,6 @@ from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.rows import set_modes
 from dynsim.dynamics.contact.shares import keep_shares
 from dynsim.dynamics.contact.splits import (
-    SPLIT_SLACK,
     dry_margin,
     joint_shares,
     margin,
@@ -76,6 +75,9 @@ INSTANT = 1e-11
 BACKWARD = 2e-11
 # Forces that contradict their modes by less than this, absolute [N] and of the largest, are rounding.
 FORCE_SLACK = 1e-9
+# Margins of a split that differ by less, as a fraction of its largest force, are the same: the accuracy of the program
+# that finds the best split.
+SPLIT_SLACK = 1e-7
 # At the end of the best split sticking is still a solution. So friction at rest is reduced for the choice of modes, by
 # FIRST_REDUCTION and ten times more up to MOST_REDUCTION, until the chosen modes agree with their forces: far above
 # rounding and the tolerances of the choice, far below the uncertainty of friction coefficients.

@@ -2,9 +2,7 @@
 
 The equations of motion do not determine how such a joint and the others share the load. The choice of modes gives one
 solution; the joint takes its force from the solution with the same motion and the largest worst margin. If another
-joint were at its bound, the next change of forces would end the share, and modes would be chosen again without end. If
-no solution with the same motion has a margin, it is taken from those with the same accelerations along all rows: they
-have the same modes, but other normal forces of sliding points, whose friction moves the joints that slide differently.
+joint were at its bound, the next change of forces would end the share, and modes would be chosen again without end.
 """
 
 from __future__ import annotations
@@ -18,7 +16,7 @@ from dynsim.dynamics.contact.cone import problem as kc
 from dynsim.dynamics.contact.cone.socp import best_split, split_room_in
 from dynsim.dynamics.contact.delassus import RANK_TOLERANCE
 from dynsim.dynamics.contact.rows import set_modes
-from dynsim.dynamics.contact.splits import ONE_WAY, SPLIT_SLACK, change_of_coupling, null_space
+from dynsim.dynamics.contact.splits import ONE_WAY, change_of_coupling, null_space
 from dynsim.dynamics.contact.unilateral import UnilateralArrays, dry_bound, dry_rests, dry_rows_held
 from dynsim.dynamics.derivative import System
 from dynsim.dynamics.tables import Workspace
@@ -90,12 +88,11 @@ def release_dependent_joints(system: System, ws: Workspace, size):
 
 @noinline_kernel
 def take_widest_split(system: System, ws: Workspace, size):
-    """Replace the solution by the one with the same motion whose worst margin is largest, or with the same modes.
+    """Replace the solution by the one with the same motion whose worst margin is largest.
 
     It has ``size`` rows. Forces may change where they act on nothing but each other: of joints at rest, closed stops
     and sticking points within their bounds, of sliding points along their whole force. Friction that slides, or begins
-    to, stays as it is for its normal force. If none of these solutions has a margin, as where the choice of modes ends
-    in a corner of the admissible forces, they may change where they accelerate nothing along the rows of the problem.
+    to, stays as it is for its normal force.
     """
     unilateral, table = system.unilateral, system.unilateral.dry_table
     vector, kinds, N = unilateral.vector, unilateral.index[ku.KINDS], unilateral.room[ku.NULL_SPACE]
@@ -128,23 +125,14 @@ def take_widest_split(system: System, ws: Workspace, size):
     for i in range(couplings):
         row[p + i] = i
     whole = p + couplings
-    largest = 0.0
+    for i in range(whole):
+        for j in range(whole):
+            unilateral.room[ku.SPLIT_MATRIX, i, j] = mobility_along_forces(unilateral, ws, row[i], row[j])
+    width = null_space(unilateral.room[ku.SPLIT_MATRIX], whole, N, unilateral.index[2], p)
     for i in range(p):
         force[i] = f[row[i]]
-        largest = max(largest, abs(force[i]))
-    worst, width = 0.0, 0
-    for same_motion in (True, False):
-        if not same_motion and worst > SPLIT_SLACK * (1.0 + largest):
-            break
-        if same_motion:
-            for i in range(whole):
-                for j in range(whole):
-                    unilateral.room[ku.SPLIT_MATRIX, i, j] = mobility_along_forces(unilateral, ws, row[i], row[j])
-        else:
-            mobility_in_rows(unilateral, ws, row, whole, size)
-        width = null_space(unilateral.room[ku.SPLIT_MATRIX], whole, N, unilateral.index[2], p)
-        programs = split_room_in(unilateral.split_room, unilateral.index[3], width, count)
-        worst = best_split(force[:p], N, width, first, mu, points, count - points, out[:p], programs, False)
+    programs = split_room_in(unilateral.split_room, unilateral.index[3], width, count)
+    best_split(force[:p], N, width, first, mu, points, count - points, out[:p], programs, False)
     for i in range(p, whole):
         f[row[i]] += change_of_coupling(N, width, i, force, out, p)
     for i in range(p):
@@ -157,50 +145,17 @@ def take_widest_split(system: System, ws: Workspace, size):
 
 
 @internal_kernel
-def mobility_in_rows(unilateral: UnilateralArrays, ws: Workspace, row, whole, size):
-    """Write the mobility along the whole forces of ``row[:whole]``, without the motion that no row feels.
-
-    Into SPLIT_MATRIX: Yᵀ Y with L Lᵀ = W of the ``size`` rows of the solved problem and L Y = the accelerations along
-    them by unit forces. Its null space does not accelerate them. Friction that slides moves other joints.
-    """
-    W, factor, Y = ws.small[0], unilateral.room[ku.SCRATCH], unilateral.room[ku.SCRATCH + 1]
-    base, rank = unilateral.index[2], 0
-    for i in range(size):
-        rank = extended(factor, W, base, rank, unilateral.index[ku.TABLE_ROW, i])
-    for i in range(whole):
-        for r in range(rank):
-            total = along_force(unilateral, ws, base[r], row[i])
-            for s in range(r):
-                total -= factor[r, s] * Y[i, s]
-            Y[i, r] = total / factor[r, r]
-    for i in range(whole):
-        for j in range(whole):
-            total = 0.0
-            for r in range(rank):
-                total += Y[i, r] * Y[j, r]
-            unilateral.room[ku.SPLIT_MATRIX, i, j] = total
-
-
-@internal_kernel
-def along_force(unilateral: UnilateralArrays, ws: Workspace, a, j):
-    """Mobility between row a of the table and row j of the solved problem along its whole force."""
-    vector, b, total = unilateral.vector, unilateral.index[ku.TABLE_ROW, j], 0.0
-    for t in range(3):
-        y = 1.0 if t == 0 else vector[ku.FIRST_PART + t - 1, j]
-        # Rows without parts may be the last of the table.
-        if y != 0.0:
-            total += y * ws.small[0, a, b + t]
-    return total
-
-
-@internal_kernel
 def mobility_along_forces(unilateral: UnilateralArrays, ws: Workspace, i, j):
     """Mobility between rows i and j of the solved problem along their whole forces, friction of slip included."""
-    vector, a, total = unilateral.vector, unilateral.index[ku.TABLE_ROW, i], 0.0
+    vector, total = unilateral.vector, 0.0
+    a, b = unilateral.index[ku.TABLE_ROW, i], unilateral.index[ku.TABLE_ROW, j]
     for s in range(3):
         x = 1.0 if s == 0 else vector[ku.FIRST_PART + s - 1, i]
-        if x != 0.0:
-            total += x * along_force(unilateral, ws, a + s, j)
+        for t in range(3):
+            y = 1.0 if t == 0 else vector[ku.FIRST_PART + t - 1, j]
+            # Rows without parts may be the last of the table.
+            if x != 0.0 and y != 0.0:
+                total += x * y * ws.small[0, a + s, b + t]
     return total
 
 
