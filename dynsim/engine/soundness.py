@@ -51,8 +51,8 @@ HALVINGS = 8
 GROWN = 3.0
 # Postures of a record in which a sampled loop is examined.
 POSTURES = 10
-# Postures that differ by less have the same growth [rad or m].
-SAME_POSTURE = 0.02
+# Postures that differ by less have nearly the same growth [rad or m].
+NEAR_POSTURE = 0.02
 
 
 @dataclass(frozen=True)
@@ -264,7 +264,7 @@ def unstable_later(scenario: Scenario, prepared: Prepared, record: Record) -> st
         return ""
     grown, first, before, at, growth = 0.0, -1, 0, np.full(prepared.model.nq, np.inf), None
     for k in np.unique(np.linspace(0.0, len(record) - 1, POSTURES + 1).astype(int)).tolist()[1:]:
-        if not np.abs(record["q"][k] - at).max() < SAME_POSTURE:
+        if not np.abs(record["q"][k] - at).max() < NEAR_POSTURE:
             at = record["q"][k]
             growth = loop_growth(scenario, prepared, at, period)
         if growth is None or not growth.unstable:

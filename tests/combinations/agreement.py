@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from combinations.running import Run
+from combinations.sampled_loop import UNSTABLE
 from dynsim import simulate
 from dynsim.errors import DynsimError, SimulationStopped
 from dynsim.record import Record
@@ -27,7 +28,7 @@ Array = NDArray[np.float64]
 # Errors of stable motion: in units of rtol, as a share for time stepping, and in steps.
 ADAPTIVE_SHARE, STEPPED_SHARE, STEPS = 300.0, 0.01, 2.0
 # Difference of the two solvers, which solve the same equations.
-SOLVERS = 5e-8
+SOLVERS = 2e-8
 # Factor for tolerances slightly above a run's tolerances; 2 - ABOVE is slightly below. Both change local errors as much
 # as rounding does.
 ABOVE = 1.0 + 1e-9
@@ -89,7 +90,7 @@ def _ends(runs: Mapping[str, Run]) -> Iterator[tuple[str, str]]:
         if finished and not isinstance(run.error, type(None)):
             error = run.error
             assert isinstance(error, SimulationStopped)
-            if error.kind in ("not_finite", "not_projected") and "the sampled loop is unstable" not in str(error):
+            if error.kind in ("not_finite", "not_projected") and UNSTABLE not in str(error):
                 yield "ends", f"{name} stops ({error.kind}) where {', '.join(finished)} go on: {str(error)[:200]}"
 
 

@@ -20,6 +20,7 @@ from combinations.energy import ledger, losses, powers
 from combinations.newton import circuit, equation, momentum, motion, support
 from combinations.observed import Observed, warned
 from combinations.running import Run
+from combinations.sampled_loop import UNSTABLE
 from combinations.verdicts import untrue
 from dynsim.errors import SimulationStopped
 from dynsim.model.drives import Motor, Servo
@@ -62,7 +63,7 @@ def problems(scenario: Mapping[str, Any], run: Run) -> list[Problem]:
     if listed or not len(run.record) or "vdot" not in run.record:
         return listed
     seen = Observed(run)
-    if not (np.abs(seen.v).max(initial=0.0) > ROUNDED and "the sampled loop is unstable" in str(run.error)):
+    if not (np.abs(seen.v).max(initial=0.0) > ROUNDED and UNSTABLE in str(run.error)):
         for name, check in CHECKS.items():
             listed += [Problem(name, text) for text in check(seen)]
     listed += [Problem("verdict", text) for text in untrue(scenario, run, seen)]
@@ -213,7 +214,7 @@ def absurd(seen: Observed) -> Finding:
         if most > ABSURD * size:
             yield f"{name} reaches {most:.3g}, but weight, loads and motors only {size:.3g}"
     # Scenes of a few kilograms do not reach such speeds, unless motors without a limit follow an unstable loop.
-    if warned(seen, "the sampled loop is unstable"):
+    if warned(seen, UNSTABLE):
         return
     if np.abs(seen.v).max(initial=0.0) > 1e5 or np.abs(seen.q).max(initial=0.0) > 1e6:
         yield f"rates reach {np.abs(seen.v).max():.3g}, positions reach {np.abs(seen.q).max():.3g}"

@@ -455,7 +455,9 @@ def _without_impact(seen: Observed) -> NDArray[np.int64]:
     index = np.arange(len(seen))
     for event in seen.record.events:
         if event.kind in ("landing", "stop_hit"):
-            index[np.searchsorted(seen.time, event.time - AT_STEP * seen.step) : len(seen)][:1] = 0
+            k = int(np.searchsorted(seen.time, event.time - AT_STEP * seen.step))
+            if k < len(seen):
+                index[k] = 0
     return np.maximum.accumulate(index)
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from combinations.accelerations import critical, exists, leaves, state_of
 from combinations.observed import OPEN, SLIDING, STICKING, Observed, Touch
 from combinations.running import Run
-from combinations.sampled_loop import loop_growth
+from combinations.sampled_loop import UNSTABLE, loop_growth
 from dynsim.compile.clearance import POINTS
 from dynsim.errors import SimulationStopped
 from dynsim.model.drives import Motor, Servo
@@ -34,7 +34,6 @@ DEPENDENT = 1e-6
 # A loop is unstable if the logarithm of its states grows by more than GROWTH in a second; it explains the end of a run
 # if they have grown by e to the power GROWN.
 GROWTH, GROWN = 1.0, 3.0
-UNSTABLE = "the sampled loop is unstable"
 
 
 def untrue(scenario: Mapping[str, Any], run: Run, seen: Observed) -> Iterator[str]:
@@ -72,9 +71,10 @@ def _stop(stop: SimulationStopped, seen: Observed) -> Iterator[str]:
         rate = loop_growth(seen, q)
         if rate is not None and rate > GROWTH and rate * stop.time > GROWN:
             return
-    energy = seen.record["energy_kinetic"]
     # Of loops with encoders there is no own model, but their growth.
-    if UNSTABLE in str(stop) and seen.config.get("sensors") and energy[-1] > 100.0 * energy[: len(seen) // 2].max():
+    energy = seen.record["energy_kinetic"]
+    grows = energy[-1] > 100.0 * energy[: max(1, len(seen) // 2)].max()
+    if UNSTABLE in str(stop) and seen.config.get("sensors") and grows:
         return
     if reason := STOPS[stop.kind](stop, seen):
         yield f"{text}: {reason}; {str(stop)[:200]}"

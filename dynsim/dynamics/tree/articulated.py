@@ -28,7 +28,7 @@ from dynsim.dynamics.tree.spatial import (
     times,
 )
 from dynsim.dynamics.tree.sweep import body_inertia, forward_sweep, inertial_wrench
-from dynsim.jit.kernel import internal_kernel, kernel, noinline_kernel
+from dynsim.jit.kernel import inline_kernel, internal_kernel, kernel, noinline_kernel
 
 
 @internal_kernel
@@ -235,11 +235,11 @@ def add_row_forces(model: ModelArrays, ws: Workspace):
             i = tree[i, ka.PARENT]
 
 
-@internal_kernel
-def accelerate(model: ModelArrays, ws: Workspace):
+@inline_kernel
+def sweep_accelerations(model: ModelArrays, ws: Workspace, onto):
     """Forward sweep: vdot = (M + J_m)⁻¹ b from the eliminated b in ``ws.column[:, 0]``. Uses F as scratch.
 
-    vdot_i = column_i / D − (U/D)·a_p, a_i = a_p + S vdot_i.
+    vdot_i = column_i / D − (U/D)·a_p, a_i = a_p + S vdot_i. It is added to what vdot was if ``onto`` is True.
     """
     tree, links, joints, column = model.tree, ws.links, ws.joints, ws.column
     # The acceleration of link i − 1 stays in registers; it is read back only where the tree branches.
@@ -249,26 +249,22 @@ def accelerate(model: ModelArrays, ws: Workspace):
         if j != i - 1:
             A = six(links, j, ka.F) if j >= 0 else ZERO_SIX
         x = column[i, 0] * links[i, ka.INVERSE_D] - dot(six(links, i, ka.U_OVER_D), A)
-        joints[i, ka.QDD] = x
+        joints[i, ka.QDD] = joints[i, ka.QDD] + x if onto else x
         A = plus_scaled(A, six(links, i, ka.S), x)
         if tree[i, ka.BRANCHES] != 0:
             put_six(links, i, ka.F, A)
+
+
+@internal_kernel
+def accelerate(model: ModelArrays, ws: Workspace):
+    """Set vdot = (M + J_m)⁻¹ b, see :func:`sweep_accelerations`."""
+    sweep_accelerations(model, ws, False)
 
 
 @noinline_kernel
 def change_accelerations(model: ModelArrays, ws: Workspace):
-    """Add (M + J_m)⁻¹ b to vdot, of the eliminated b in ``ws.column[:, 0]``, as :func:`accelerate` sets it."""
-    tree, links, joints, column = model.tree, ws.links, ws.joints, ws.column
-    A = ZERO_SIX
-    for i in range(tree.shape[0]):
-        j = tree[i, ka.PARENT]
-        if j != i - 1:
-            A = six(links, j, ka.F) if j >= 0 else ZERO_SIX
-        x = column[i, 0] * links[i, ka.INVERSE_D] - dot(six(links, i, ka.U_OVER_D), A)
-        joints[i, ka.QDD] += x
-        A = plus_scaled(A, six(links, i, ka.S), x)
-        if tree[i, ka.BRANCHES] != 0:
-            put_six(links, i, ka.F, A)
+    """Add (M + J_m)⁻¹ b to vdot, see :func:`sweep_accelerations`."""
+    sweep_accelerations(model, ws, True)
 
 
 @kernel

@@ -38,7 +38,7 @@ from dynsim.dynamics.derivative import System
 from dynsim.dynamics.tables import ContactArrays, Workspace
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts.attempts import keep, take_back
-from dynsim.integrators.contacts.impacts import IMMOBILE, evaluate, slip_speed
+from dynsim.integrators.contacts.impacts import IMMOBILE, evaluate, largest_right_side, slip_speed
 from dynsim.integrators.contacts.leaving import approach_without_force, watch_unpressed
 from dynsim.integrators.contacts.modes import (
     SLIP_TOLERANCE,
@@ -135,10 +135,7 @@ def rest_margin(unilateral: UnilateralArrays, ws: Workspace, k):
     """
     if unilateral.number[ku.REDUNDANT] == 0.0:
         return 1.0
-    largest = IMMOBILE
-    for r in range(ws.counts[ka.ROWS]):
-        largest = max(largest, abs(ws.rows[r, ka.RHS]))
-    limit = max(SLIP_TOLERANCE * largest, 2.0 * unilateral.dry[k, ku.DRY_LEFT])
+    limit = max(SLIP_TOLERANCE * max(largest_right_side(ws), IMMOBILE), 2.0 * unilateral.dry[k, ku.DRY_LEFT])
     return 1.0 - acceleration_left(unilateral, ws, k) / limit
 
 

@@ -67,6 +67,21 @@ def evaluate(system: System, ws: Workspace, run: Run):
 
 
 @internal_kernel
+def largest_right_side(ws: Workspace):
+    """Largest right-hand side of all rows [m/s² or rad/s²]."""
+    largest = 0.0
+    for r in range(ws.counts[ka.ROWS]):
+        largest = max(largest, abs(ws.rows[r, ka.RHS]))
+    return largest
+
+
+@internal_kernel
+def strike_limit(ws: Workspace, k):
+    """Rate along the normal below which candidate k does not strike [m/s]."""
+    return STRIKE * kp.RATE_TOLERANCE * (1.0 + slip_speed(ws, k))
+
+
+@internal_kernel
 def find_touching(system: System, ws: Workspace, touch):
     """Note candidates and stops that touch and do not leave; True if any of them approaches.
 
@@ -83,7 +98,7 @@ def find_touching(system: System, ws: Workspace, touch):
     for k in range(mode.shape[0]):
         leaves = leaves or mode[k, ku.LEAVES] == 1
     for k in range(mode.shape[0]):
-        limit = STRIKE * kp.RATE_TOLERANCE * (1.0 + slip_speed(ws, k))
+        limit = strike_limit(ws, k)
         closed = ws.active[k, ka.MODE] != ka.OPEN
         near = closed or (state[k, ka.GAP] <= touch and state[k, ka.GAP_RATE] <= limit)
         near = near and mode[k, ku.LEAVES] == 0
@@ -293,8 +308,8 @@ def forget_rounding(system: System, ws: Workspace):
     unilateral, offset = system.unilateral, system.unilateral.vector[ku.OFFSET]
     mode, table = unilateral.mode, unilateral.stop_table
     for k in range(mode.shape[0]):
-        if mode[k, ku.TOUCHING] == 1 and mode[k, ku.BEFORE] != ka.OPEN:
-            r, limit = ws.active[k, ka.FIRST_ROW], STRIKE * kp.RATE_TOLERANCE * (1.0 + slip_speed(ws, k))
+        if stays_or_leaves(unilateral, k):
+            r, limit = ws.active[k, ka.FIRST_ROW], strike_limit(ws, k)
             for i in range(r, r + 3 if mode[k, ku.BEFORE] == ka.STICKING else r + 1):
                 if abs(offset[i]) <= limit:
                     offset[i] = 0.0
@@ -304,6 +319,12 @@ def forget_rounding(system: System, ws: Workspace):
             if table[k, ku.STOP_BEFORE] == 1 and abs(offset[r]) <= STRIKE * kp.RATE_TOLERANCE:
                 offset[r] = 0.0
             r += 1
+
+
+@internal_kernel
+def stays_or_leaves(unilateral: UnilateralArrays, k):
+    """True if candidate k takes part in an impact and was closed before it."""
+    return unilateral.mode[k, ku.TOUCHING] == 1 and unilateral.mode[k, ku.BEFORE] != ka.OPEN
 
 
 @internal_kernel
@@ -322,13 +343,13 @@ def look_for_other(system: System, ws: Workspace, run: Run, p, largest):
     One start near the forces of the wedge finds most of these solutions, not all.
     """
     unilateral = system.unilateral
-    mode, tally, vector = unilateral.mode, unilateral.tally, unilateral.vector
+    tally, vector = unilateral.tally, unilateral.vector
     f, first, b, mu = vector[ku.SOLUTION], vector[ku.FIRST_PART], vector[ku.OFFSET], vector[ku.CONE_FRICTION]
     for r in range(p):
         first[r], f[r] = f[r], 0.0
     any_leaves = False
-    for k in range(mode.shape[0]):
-        if mode[k, ku.TOUCHING] == 1 and mode[k, ku.BEFORE] != ka.OPEN:
+    for k in range(tally.shape[0]):
+        if stays_or_leaves(unilateral, k):
             r = ws.active[k, ka.FIRST_ROW]
             if mu[r] > 0.0 and rate_after(ws, b, first, p, r) > tally[k, ku.SETTLE]:
                 mobility = max(ws.small[0, r, r], ws.small[0, r + 1, r + 1], ws.small[0, r + 2, r + 2])
@@ -337,8 +358,8 @@ def look_for_other(system: System, ws: Workspace, run: Run, p, largest):
         good = CONE_TOLERANCE * (1.0 + largest)
         room, kind = unilateral.room[ku.SCRATCH :], unilateral.index[ku.KINDS]
         if approach(ws.small[0], b, kind, mu, p, f, room, 1e-2 * CONE_TOLERANCE * max(largest, IMMOBILE), 1) <= good:
-            for k in range(mode.shape[0]):
-                if mode[k, ku.TOUCHING] == 1 and mode[k, ku.BEFORE] != ka.OPEN:
+            for k in range(tally.shape[0]):
+                if stays_or_leaves(unilateral, k):
                     r = ws.active[k, ka.FIRST_ROW]
                     rate = rate_after(ws, b, first, p, r)
                     if mu[r] > 0.0 and rate > tally[k, ku.SETTLE] and rate_after(ws, b, f, p, r) < 0.5 * rate:

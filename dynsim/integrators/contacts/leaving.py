@@ -14,7 +14,7 @@ from dynsim.dynamics.contact.cone import problem as kc
 from dynsim.dynamics.contact.splits import find_splits, normal_is_open
 from dynsim.dynamics.contact.unilateral import UnilateralArrays, rows_of_couplings
 from dynsim.dynamics.tables import ContactArrays, Workspace
-from dynsim.integrators.contacts.impacts import begin_problem, solve_problem
+from dynsim.integrators.contacts.impacts import begin_problem, largest_right_side, solve_problem
 from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
 # Starts of the contact problem of all others; a point for which none finds a solution counts as pressed.
@@ -43,9 +43,7 @@ def approach_without_force(contacts: ContactArrays, unilateral: UnilateralArrays
             index[ku.KINDS, size] = kc.ONE_WAY if mode == ka.SLIDING else kc.CONE if s == 0 else kc.TANGENT
             index[ku.TABLE_ROW, size] = r + s
             size += 1
-    largest, first = 0.0, active[k, ka.FIRST_ROW]
-    for r in range(ws.counts[ka.ROWS]):
-        largest = max(largest, abs(ws.rows[r, ka.RHS]))
+    largest, first = largest_right_side(ws), active[k, ka.FIRST_ROW]
     for i in range(size):
         a = index[ku.TABLE_ROW, i]
         vector[ku.OFFSET, i], vector[ku.SOLUTION, i] = -ws.rows[a, ka.RHS], 0.0

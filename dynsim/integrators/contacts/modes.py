@@ -43,6 +43,7 @@ from dynsim.integrators.contacts.impacts import (
     gather,
     impact,
     keep_touching,
+    largest_right_side,
     slip_speed,
     solve_problem,
 )
@@ -157,9 +158,7 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
     if rule == HOLD_RESTING:
         release_moving_joints(unilateral, ws)
     p = gather(system, ws, run)
-    largest = 0.0
-    for r in range(p):
-        largest = max(largest, abs(ws.rows[r, ka.RHS]))
+    largest = largest_right_side(ws)
     least = 2.0 * unilateral.number[ku.SLOW]
     solved, size = solve_accelerations(system, ws, run, p, largest, least)
     if not solved and least < NEARLY_AT_REST:

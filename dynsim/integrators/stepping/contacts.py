@@ -377,7 +377,7 @@ def solve_contacts(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Wor
         if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
             s.right[unilateral.stop_table[k, ku.STOP_ROW]] -= stop_return(unilateral, s, ws, k, h)
     soften_ties(unilateral, s, ws, h)
-    rigid, elastic = False, True
+    rigid, elastic = False, False
     for k in range(ws.contacts.shape[0]):
         if ws.active[k, ka.MODE] == ka.STICKING:
             rigid = rigid or law[k, ka.CONTACT_STIFFNESS] == 0.0
@@ -386,6 +386,7 @@ def solve_contacts(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Wor
             for m in range(ka.MOST_ROWS):
                 s.f[r + m] = s.impulse[3 * k + m]
             turn_rows(law, s, ws, k, h)
+            elastic = elastic or bounces(law, s, ws, k)
     for _ in range(3 + ws.contacts.shape[0]):
         for k in range(ws.contacts.shape[0]):
             if ws.active[k, ka.MODE] == ka.STICKING:
@@ -472,11 +473,11 @@ def bounces(law, s: SteppingArrays, ws: Workspace, k):
 
 @internal_kernel
 def gains_energy(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace):
-    """True if contacts and stops together would give energy, p·(u + u')/2 > 0, in a step in which something bounces.
+    """True if contacts and stops together would give energy, p·(u + u')/2 > 0.
 
     u' is without what extrapolated rows and returns to the surface add: of closed rows the law rate w itself.
     """
-    gain, passed, some = 0.0, 0.0, False
+    gain, passed = 0.0, 0.0
     for k in range(unilateral.stop_table.shape[0]):
         if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
             r = unilateral.stop_table[k, ku.STOP_ROW]
@@ -485,16 +486,14 @@ def gains_energy(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Works
     for k in range(ws.contacts.shape[0]):
         if ws.active[k, ka.MODE] != ka.STICKING or law[k, ka.CONTACT_STIFFNESS] > 0.0:
             continue
-        elastic = bounces(law, s, ws, k)
-        some = some or elastic
         for m in range(3):
             r = ws.active[k, ka.FIRST_ROW] + m
             after = s.w[r]
-            if (elastic and m == 0) or (s.turn[k, kt.MEAN] == 1.0 and m > 0):
+            if (m == 0 and bounces(law, s, ws, k)) or (s.turn[k, kt.MEAN] == 1.0 and m > 0):
                 after -= s.turn[k, kt.ADDED + m]
             gain += 0.5 * s.f[r] * (s.rate[0, r] + after)
             passed += 0.5 * abs(s.f[r]) * (abs(s.rate[0, r]) + abs(after))
-    return some and gain > NO_GAIN * passed
+    return gain > NO_GAIN * passed
 
 
 @internal_kernel

@@ -280,11 +280,12 @@ def keep_torques(system: System, ws: Workspace, run: Run):
     which makes up for rows of what has landed that turned within the step of the landing.
     """
     s, motor, y, y_new, layout = run.stepping, system.drives.motor, run.y, run.y_new, system.layout
-    s.grid[kt.IMPACT_LAST] = 1.0 if strikes(system.contacts.law, system.unilateral, s, ws, False) else 0.0
-    if s.grid[kt.IMPACT_LAST] == 0.0:
+    impact = strikes(system.contacts.law, system.unilateral, s, ws, False)
+    s.grid[kt.IMPACT_LAST] = 1.0 if impact else 0.0
+    if not impact:
         for i in range(ws.joints.shape[0]):
             s.before[kt.SMOOTH, i] = s.before[kt.ACCELERATION, i]
-    if strikes(system.contacts.law, system.unilateral, s, ws, True):
+    if impact or strikes(system.contacts.law, system.unilateral, s, ws, True):
         s.grid[kt.HELD_STEPS] = 2.0
     else:
         s.grid[kt.HELD_STEPS] = max(s.grid[kt.HELD_STEPS] - 1.0, 0.0)
