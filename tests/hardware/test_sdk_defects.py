@@ -16,6 +16,7 @@ import pytest
 import serial
 from dynamixel_sdk import (
     COMM_PORT_BUSY,
+    COMM_RX_TIMEOUT,
     COMM_SUCCESS,
     GroupSyncRead,
     GroupSyncWrite,
@@ -26,6 +27,7 @@ from dynamixel_sdk import (
 from dynsim.hardware.bus.control_table import BROADCAST_ID, MX_106, STATE_BLOCK
 from dynsim.hardware.bus.dynamixel_bus import WRITE_TIMEOUT, DynamixelBus, open_serial_port
 from dynsim.hardware.bus.packet import STATUS, Decoder, Packet, encode
+from dynsim.hardware.bus.protocol import NoAnswer
 from dynsim.hardware.errors import PortError
 from dynsim.hardware.virtual.port import VirtualPort
 
@@ -254,3 +256,38 @@ def test_6_missing_ports_and_bit_rates_are_one_clear_line() -> None:
         serial.Serial("/dev/ttyDoesNotExist")
     os.close(slave)
     os.close(master)
+
+
+class LatePort(ScriptedPort):
+    """A port whose answer to each request comes 80 ms after it."""
+
+    def __init__(self, answer: bytes) -> None:
+        super().__init__()
+        self.answer = answer
+        self.requests = 0
+
+    def writePort(self, packet: list[int]) -> int:
+        self.requests += 1
+        self.sent = self.milliseconds
+        self.incoming.extend(self.answer)
+        return super().writePort(packet)
+
+    def getBytesAvailable(self) -> int:
+        return len(self.incoming) if self.milliseconds > self.sent + 80.0 else 0
+
+    def readPort(self, length: int) -> bytes:
+        return super().readPort(min(length, self.getBytesAvailable()))
+
+
+def test_7_single_reads_and_writes_wait_34_ms_only(stock) -> None:
+    data = encode(Packet(1, STATUS, b"\x01"))
+    _, result, _ = stock.readTxRx(LatePort(data), 1, 64, 1)
+    assert result == COMM_RX_TIMEOUT
+
+    late = LatePort(data)
+    assert DynamixelBus(late, latency=0.2).read(1, F["torque_enable"]) == 1
+    written = LatePort(encode(Packet(1, STATUS)))
+    DynamixelBus(written, latency=0.2).write(1, F["torque_enable"], 1)
+    assert (late.requests, written.requests) == (1, 1)
+    with pytest.raises(NoAnswer):
+        DynamixelBus(LatePort(b"")).write(1, F["torque_enable"], 1)

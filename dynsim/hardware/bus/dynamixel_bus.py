@@ -10,8 +10,8 @@ when one of its tests fails, the library was repaired and the workaround can be 
 - Group reads drop the error byte: the decoder keeps it.
 - Byte stuffing of requests is lost, some stuffed answers are mangled: a request whose body holds FF FF FD is rejected
   here, answers of a wrong length count as garbled, and Fast Sync Read is never used.
-- Its read of one servo accepts any status of that servo as the answer, whatever its length: answers to single reads,
-  too, are received and checked here.
+- Its read of one servo accepts any status of that servo as the answer, whatever its length, and its reads and writes
+  of one servo wait 34 ms for an answer, whatever the adapter needs: those answers, too, are received and checked here.
 - ``getData`` returns no negative numbers: fields are decoded here.
 - A dead port raises termios.error or OSError beside SerialException; a stalled one blocks: all become PortError, and
   writes wait here. pyserial's write time-out also counts time in which this process was suspended.
@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import Any
 
 import serial
-from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS, PortHandler, Protocol2PacketHandler
+from dynamixel_sdk import COMM_SUCCESS, PortHandler, Protocol2PacketHandler
 
 from dynsim.hardware.bus.control_table import BROADCAST_ID, Field
 from dynsim.hardware.bus.packet import ALERT, HEADER, STATUS, Decoder, Packet, StatusError
@@ -47,6 +47,10 @@ MARKS = 16
 """Number of reads after which a missed answer is no longer expected."""
 RETRIES = 2
 """Further attempts of a single read or write; the timed loop makes none."""
+SINGLE_LATENCY = 0.034
+"""Least latency that a single read or write allows, as in the library: the timed loop makes none of them [s]."""
+STATUS_BYTES = 11
+"""Bytes of an answer beside its parameters."""
 TORQUE_ENABLE = 64
 
 
@@ -213,8 +217,8 @@ class DynamixelBus:
             asked = marks.choose(length)
             with self._transaction():
                 result = self._library.readTx(self.port, id_, address, asked)
-                if result != COMM_SUCCESS:
-                    raise PortError(f"{self.name}: {self._library.getTxRxResult(result)}")
+                self._raise_unsent(result)
+                self._wait_at_most(1, asked, max(self.latency, SINGLE_LATENCY))
                 answers, others, garbage = self._receive((id_,), asked)
             if id_ in answers:
                 packet = answers[id_]
@@ -230,11 +234,13 @@ class DynamixelBus:
         self._reject_header(bytes([field.address & 0xFF, field.address >> 8, *data]))
         for _ in range(RETRIES + 1):
             with self._transaction():
-                result, error = self._library.writeTxRx(self.port, id_, field.address, field.size, data)
-            if result == COMM_SUCCESS:
-                self._raise_refusal(id_, error)
+                self._raise_unsent(self._library.writeTxOnly(self.port, id_, field.address, field.size, data))
+                self._wait_at_most(1, 0, max(self.latency, SINGLE_LATENCY))
+                answers, others, garbage = self._receive((id_,), 0)
+            if id_ in answers:
+                self._raise_refusal(id_, answers[id_].error)
                 return
-        raise NoAnswer(id_, garbled=result != COMM_RX_TIMEOUT)
+        raise NoAnswer(id_, garbled=bool(others) or garbage > 0)
 
     def sync_write(self, field: Field, values: dict[int, int]) -> None:
         body = b"".join(bytes([id_]) + field.encode(value) for id_, value in values.items())
@@ -242,8 +248,7 @@ class DynamixelBus:
         self._reject_header(head + body)
         with self._transaction():
             result = self._library.syncWriteTxOnly(self.port, field.address, field.size, list(body), len(body))
-        if result != COMM_SUCCESS:
-            raise PortError(f"{self.name}: {self._library.getTxRxResult(result)}")
+        self._raise_unsent(result)
 
     def sync_read(self, ids: Sequence[int], address: int, length: int) -> BlockRead:
         marks = self._marks.setdefault(("address", address), Marks())
@@ -251,11 +256,8 @@ class DynamixelBus:
         with self._transaction():
             stray = self.port.getBytesAvailable()
             result = self._library.syncReadTx(self.port, address, asked, list(ids), len(ids), False)
-            if result != COMM_SUCCESS:
-                raise PortError(f"{self.name}: {self._library.getTxRxResult(result)}")
-            milliseconds = self.port.tx_time_per_byte * (len(ids) * (11 + asked) + 14 + len(ids))
-            milliseconds += 1e3 * (len(ids) * (self.return_delay + 50e-6) + self.latency)
-            self.port.setPacketTimeoutMillis(milliseconds)
+            self._raise_unsent(result)
+            self._wait_at_most(len(ids), asked, self.latency)
             answers, others, garbage = self._receive(ids, asked)
         if len(answers) < len(ids):
             marks.miss(asked)
@@ -265,6 +267,16 @@ class DynamixelBus:
         outdated = (id_ for id_, packet in others.items() if length <= len(packet.parameters) < length + MARKS)
         return BlockRead(replies, stray + garbage, frozenset(outdated))
 
+    def _raise_unsent(self, result: int) -> None:
+        if result != COMM_SUCCESS:
+            raise PortError(f"{self.name}: {self._library.getTxRxResult(result)}")
+
+    def _wait_at_most(self, servos: int, length: int, latency: float) -> None:
+        """Set the time-out for answers of so many servos, each with parameters of ``length`` bytes."""
+        milliseconds = self.port.tx_time_per_byte * (servos * (STATUS_BYTES + length) + 14 + servos)
+        milliseconds += 1e3 * (servos * (self.return_delay + 50e-6) + latency)
+        self.port.setPacketTimeoutMillis(milliseconds)
+
     def _receive(self, ids: Sequence[int], asked: int) -> tuple[dict[int, Packet], dict[int, Packet], int]:
         """Until all have answered, or the time-out: status packets by ID, and bytes of garbage.
 
@@ -272,7 +284,7 @@ class DynamixelBus:
         """
         answers: dict[int, Packet] = {}
         others: dict[int, Packet] = {}
-        decoder, asked_of, total = Decoder(), frozenset(ids), len(ids) * (11 + asked)
+        decoder, asked_of, total = Decoder(), frozenset(ids), len(ids) * (STATUS_BYTES + asked)
 
         def sort_in(packets: Iterable[Packet]) -> None:
             for packet in packets:
