@@ -177,11 +177,19 @@ def equilibrium(seen: Observed) -> Finding:
     size = np.abs(seen.vdot[0])
     # The limit is far below the acceleration of a falling joint.
     allowed = 1e-4 * (1.0 + np.linalg.norm(seen.bodies.gravity)) + _misread(seen)
-    if seen.stepped and len(seen) > 2:
+    if seen.stepped and len(seen) > 2 and _begins_to_move(seen):
         # This is the mean of the first step; if references begin to move, the next mean is up to three times as large.
         allowed = max(allowed, 0.7 * float(np.abs(seen.vdot[2]).max(initial=0.0)))
     if size.max(initial=0.0) > allowed:
         yield f"{seen.joints[int(size.argmax())]} starts with an acceleration of {size.max():.3g}, from equilibrium"
+
+
+def _begins_to_move(seen: Observed) -> bool:
+    """Whether references or loads may change in the first steps."""
+    controller = seen.config.get("controller") or {}
+    if any(controller.get(key) for key in ("joints", "hand", "operator", "torques")):
+        return True
+    return any(np.ptp(load.components(seen.time[:3]), axis=0).any() for load in seen.loads)
 
 
 def _misread(seen: Observed) -> float:

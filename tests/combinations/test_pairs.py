@@ -51,6 +51,8 @@ FOUND = {
     "a joint at rest that got a row which nearly depended on those of feet and an elbow": (271127, 1485),
     "a joint at rest, an elbow that rolled off a crest, and rows that came to contradict each other": (271127, 1801),
     "a joint with a small share in rows that came to contradict each other as an elbow rolled": (271127, 2570),
+    "an equilibrium on compliant wheels and feet that first had to deflect their tangents": (271127, 1548),
+    "the same of an elbow in a pipe, whose tangents have little mobility": (271127, 2413),
 }
 # Scenes of the slow study.
 TRIPLES = 1000

@@ -120,6 +120,24 @@ def test_four_feet_on_a_floor_that_gives_way_share_the_load():
     assert run.stepping.statistics[WORST] < 1e-6
 
 
+@pytest.mark.parametrize("slope", [0.2, 0.8])
+def test_a_start_has_the_friction_that_it_needs_and_a_shorter_step_too(slope: float):
+    """A mass pressed in as its weight presses: it rests where friction of 0.5 holds it, else slides in closed form.
+
+    The last step is shorter by half: forces go on, not impulses.
+    """
+    body = Link("mass", "root", None, "floating", Z, Inertia(MASS, np.zeros(3), 1e-3 * np.eye(3)))
+    contact = Contact("foot", "mass", np.zeros(3), plane(Z), friction=0.5, stiffness=STIFFNESS, damping=DAMPING)
+    robot = Robot("mass", tuple(floating(body)), (), ("mass", np.zeros(3)), gravity=G * vector(slope, 0.0, -1.0))
+    b, times, q = assemble(robot, [contact], real=True), np.array([0.0, 1e-3, 2e-3, 9e-3, 0.0105]), np.zeros(7)
+    q[2], q[3] = -MASS * G / STIFFNESS, 1.0
+    run = stepped(b, b.state(q, np.zeros(6)), times, 1e-3, 0.5)
+    v, expected = run.states("v"), np.zeros((len(times), 6))
+    expected[:, 0] = max(slope - 0.5, 0.0) * G * times
+    np.testing.assert_allclose(v, expected, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(np.abs(balance(run)), 0.0, atol=1e-12)
+
+
 def pair(ties: tuple[Tie, ...], *, mass: float = 1.0, loads: Sequence[Load] = ()) -> tuple[CompiledSystem, np.ndarray]:
     """Two free bodies without weight, each a tree of its own, 0.3 m apart along x."""
     links = []

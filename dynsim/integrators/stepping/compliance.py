@@ -55,6 +55,8 @@ RETURN_STEPS = 2.0
 # ε of the tangents of a contact that gives way, in mobilities of theirs: a spring 1/(h² ε) that no step resolves, some
 # 1e9 N/m where it holds a kilogram.
 TANGENTIAL = 1e-4
+# How often the first step of a run is solved again with tangential impulses of its own as those of the last step.
+MOST_LOADED = 30
 
 
 @internal_kernel
@@ -85,6 +87,27 @@ def soften_contact(law, s: SteppingArrays, ws: Workspace, k, h):
         more = TANGENTIAL * W[i, i]
         W[i, i] += more
         s.b[i] -= more * s.f[i]
+
+
+@internal_kernel
+def load_tangents(law, s: SteppingArrays, ws: Workspace):
+    """Take tangential impulses of compliant contacts as those of the last step; True if the law changes by that.
+
+    A start has no last step. With p_last = 0 all of its static friction would first have to deflect the tangents, which
+    lets a body that rests accelerate by ε p/h. What the tangents carry at a start they have carried before.
+    """
+    changes = False
+    for k in range(ws.contacts.shape[0]):
+        if ws.active[k, ka.MODE] != ka.STICKING or law[k, ka.CONTACT_STIFFNESS] == 0.0:
+            continue
+        for m in range(1, ka.MOST_ROWS):
+            i = ws.active[k, ka.FIRST_ROW] + m
+            # W has ε already.
+            more = TANGENTIAL / (1.0 + TANGENTIAL) * ws.small[0, i, i] * (s.f[i] - s.impulse[3 * k + m])
+            s.b[i] -= more
+            s.impulse[3 * k + m] = s.f[i]
+            changes = changes or abs(more) > kt.GOOD
+    return changes
 
 
 @internal_kernel

@@ -42,8 +42,10 @@ from dynsim.dynamics.tree.spatial import (
 )
 from dynsim.integrators.stepping import tables as kt
 from dynsim.integrators.stepping.compliance import (
+    MOST_LOADED,
     accept_ties,
     list_ties,
+    load_tangents,
     place_ties,
     soften_contact,
     soften_ties,
@@ -364,6 +366,7 @@ def solve_contacts(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Wor
     """
     p, coupled, rows = ws.counts[ka.ROWS], ws.counts[ka.COUPLED], ws.rows
     start = 3 * ws.contacts.shape[0]
+    scale_impulses(s, h)
     for r in range(p):
         # RHS = − J M⁻¹ (applied − bias), TARGET being zero.
         s.b[r] = s.rate[0, r] - h * rows[r, ka.RHS]
@@ -387,7 +390,8 @@ def solve_contacts(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Wor
                 s.f[r + m] = s.impulse[3 * k + m]
             turn_rows(law, s, ws, k, h)
             elastic = elastic or bounces(law, s, ws, k)
-    for _ in range(3 + ws.contacts.shape[0]):
+    loads = MOST_LOADED if s.grid[kt.LENGTH_LAST] == 0.0 else 0
+    for _ in range(3 + ws.contacts.shape[0] + loads):
         for k in range(ws.contacts.shape[0]):
             if ws.active[k, ka.MODE] == ka.STICKING:
                 for m in range(ka.MOST_ROWS):
@@ -404,8 +408,11 @@ def solve_contacts(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Wor
             elastic = False
             drop_restitution(law, s, ws)
             continue
-        if not slip_ends(s, ws):
+        if slip_ends(s, ws):
+            continue
+        if loads == 0 or not residual <= kt.BAD or not load_tangents(law, s, ws):
             break
+        loads -= 1
     for r in range(p):
         rows[r, ka.FORCE] = s.f[r] / h
         if r < coupled:
@@ -414,6 +421,16 @@ def solve_contacts(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Wor
         listed, r = ws.active[k, ka.MODE] == ka.STICKING, ws.active[k, ka.FIRST_ROW]
         for m in range(ka.MOST_ROWS):
             s.impulse[3 * k + m] = s.f[r + m] if listed else 0.0
+
+
+@internal_kernel
+def scale_impulses(s: SteppingArrays, h):
+    """Turn the impulses of the last step into those that the same forces have in a step of length h."""
+    before = s.grid[kt.IMPULSE_STEP]
+    if before > 0.0 and before != h:
+        for j in range(s.impulse.shape[0]):
+            s.impulse[j] *= h / before
+    s.grid[kt.IMPULSE_STEP] = h
 
 
 @internal_kernel

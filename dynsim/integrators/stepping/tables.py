@@ -79,9 +79,10 @@ START, STOP = 0, 1
 MECHANICAL, MAGNETIC = 0, 1
 # SteppingArrays.grid: time from which steps of one length are counted [s], how many have been since; length of the last
 # accepted step [s], the power of drives and loads in it, and in the step that is tried [W]; for how many steps motors
-# keep their torques because of an impact, the last one included; 1: the last accepted step had an impact.
-GRID_START, GRID_STEPS, LENGTH_LAST, POWER_LAST, POWER_NOW, HELD_STEPS, IMPACT_LAST = 0, 1, 2, 3, 4, 5, 6
-GRID_SIZE = 7
+# keep their torques because of an impact, the last one included; 1: the last accepted step had an impact; length of the
+# step that ``impulse`` belongs to, zero before the first one [s].
+GRID_START, GRID_STEPS, LENGTH_LAST, POWER_LAST, POWER_NOW, HELD_STEPS, IMPACT_LAST, IMPULSE_STEP = range(8)
+GRID_SIZE = 8
 
 
 class SteppingArrays(NamedTuple):
