@@ -324,7 +324,7 @@ def _open_impacts(prepared: Prepared) -> list[str]:
     if not left:
         return []
     return [
-        "the motion is not unique: impacts of other points, the first at the time in brackets, lift "
+        "the motion is not unique: impacts of other points or joint stops, the first at the time in brackets, lift "
         f"{first_few(left)} off, while impulses within the friction cones could keep the contact closed, wedged, which "
         "agrees with the contact law too; lower contacts.friction, or model the supports (contacts.stiffness_N_per_m "
         "with integrator.method: time_stepping)"

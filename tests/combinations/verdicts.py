@@ -525,7 +525,7 @@ VERIFIERS: dict[str, Callable[[Match, Observed], str]] = {
     r"^initial.equilibrium: .*that jumps at the start": _jumps,
     rf"^controller.sample_time_s = {NUMBER} s: the sampled loop is unstable": _unstable,
     r"^the motion is not unique: nothing presses (.+), held by": _unpressed,
-    r"^the motion is not unique: impacts of other points, .+?, lift (.+) off, while impulses": _leaves_in_impact,
+    r"^the motion is not unique: impacts of other points or joint stops, .+?, lift (.+) off, while": _leaves_in_impact,
     r"^initial.equilibrium: moves (.+) from the requested posture": _moved_at_the_start,
     rf"^initial.equilibrium: (\S+) starts with {NUMBER} \S+ all the same.*": _moves_at_once,
     rf"^initial.equilibrium: the start slips at t = {NUMBER} s": _slips_at_once,
