@@ -21,6 +21,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.unilateral import UnilateralArrays
 from dynsim.dynamics.derivative import System, derivative
 from dynsim.dynamics.drive.law import take_commands
@@ -66,6 +67,7 @@ def start_contacts(unilateral: UnilateralArrays | None, system: System, ws: Work
     due, first = run.count[ki.MODES_DUE] > 0, run.count[ki.MODES_DUE] == ki.AT_START
     if due:
         run.count[ki.MODES_DUE] = 0
+        hold_here(unilateral, run.y, system.layout.q)
         solve_modes(system, ws, run, first)
     if run.count[ki.STATUS] != ki.RUNNING or not settle(system, run.clock[ki.TIME], run.y, ws, run.stage[0], run):
         return False
@@ -73,6 +75,13 @@ def start_contacts(unilateral: UnilateralArrays | None, system: System, ws: Work
         return True
     solve_modes(system, ws, run, first)
     return run.count[ki.STATUS] == ki.RUNNING and settle(system, run.clock[ki.TIME], run.y, ws, run.stage[0], run)
+
+
+@internal_kernel
+def hold_here(unilateral: UnilateralArrays, y, q):
+    """Let dry friction hold joints where they are: an impact comes before the modes that say which ones it holds."""
+    for k in range(unilateral.dry_table.shape[0]):
+        unilateral.dry[k, ku.DRY_AT] = y[q + unilateral.dry_table[k, ku.DRY_JOINT]]
 
 
 @inline_kernel

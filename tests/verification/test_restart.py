@@ -179,3 +179,29 @@ def test_samples_end_at_the_end_wherever_they_begin(start: float, rate: float) -
     times = even_times(start, 0.6, rate)
     assert times[-1] == 0.6
     assert len(times) == 1 + round((0.6 - start) * rate)
+
+
+RUBBING = """
+name: rubbing
+duration_s: 0.2
+plant:
+  type: serial_arm
+  chain: [{axis: y, length_m: 0.3, mass_kg: 1.0, initial_deg: 90, friction_N_m: 0.3}]
+surfaces: {floor: {type: plane}}
+contacts: {law: unilateral, friction: 0.2, points: {tip: {body: link_1, point_m: [0, 0, 0.3]}}}
+"""
+
+
+@pytest.mark.parametrize("rate", [1e-16, 0.5])
+@pytest.mark.parametrize("method", ["dopri5", "radau5"])
+def test_a_joint_that_rubs_starts_where_it_is_though_its_link_strikes(method: str, rate: float, tmp_path: Path) -> None:
+    """A link that lies on the floor, at 90°, and is pushed into it: an impact comes before contact modes are chosen."""
+    path = tmp_path / "rubbing.yaml"
+    path.write_text(f"{RUBBING}integrator: {{method: {method}}}\n")
+    scenario = load_scenario(path)
+    state = State(time=0.0, q=np.array([np.pi / 2]), v=np.array([rate]), current=np.zeros(0))
+    simulation = Simulation(scenario, state=state)
+    simulation.advance(scenario.duration_s)
+    record = simulation.record()
+    np.testing.assert_allclose(record["q"], np.pi / 2, atol=1e-9)
+    np.testing.assert_allclose(record["v"], 0.0, atol=1e-12)
