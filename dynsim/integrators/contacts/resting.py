@@ -28,8 +28,10 @@ from dynsim.jit.kernel import internal_kernel, noinline_kernel
 # Largest share of its friction that a joint at rest may have: all but a rounding, to distinguish it from a sliding one.
 NEARLY_ALL = 1.0 - 1e-15
 # Share of a joint's mobility that other rows leave: below NEARLY_DEPENDENT no friction could hold the joint by a row;
-# below ROUNDING its row depends on the other rows.
+# below ROUNDING, or below what rounding makes of it, its row depends on the other rows.
 NEARLY_DEPENDENT, ROUNDING = 1e-6, 1e-12
+# Relative error of mobilities: some roundings, because they are sums over joints.
+ROUNDINGS = 1e-15
 # In DRY_NEXT: rests without a row from now on.
 RELEASED = 2
 
@@ -73,9 +75,10 @@ def release_dependent_joints(system: System, ws: Workspace, size):
             continue
         r = table[k, ku.DRY_ROW]
         alone = mobility_left(bare_factor, W, bare_row, bare, r) / W[r, r]
+        noise = rounding_left(bare_factor, W, bare_row, bare, r) / W[r, r]
         among_all = mobility_left(whole_factor, W, whole_row, whole, r) / W[r, r]
-        blocks = blocked and alone > RANK_TOLERANCE and among_all <= NEARLY_DEPENDENT
-        if blocks or ROUNDING < alone <= NEARLY_DEPENDENT:
+        blocks = blocked and alone > max(RANK_TOLERANCE, noise) and among_all <= NEARLY_DEPENDENT
+        if blocks or max(ROUNDING, noise) < alone <= NEARLY_DEPENDENT:
             table[k, ku.DRY_NEXT], released = RELEASED, released + 1
         else:
             bare, whole = extended(bare_factor, W, bare_row, bare, r), extended(whole_factor, W, whole_row, whole, r)
@@ -241,7 +244,7 @@ def rests_without_row(unilateral: UnilateralArrays, k):
 def extended(factor, W, row, count, r):
     """Extend a Cholesky factor of rows ``row[:count]`` of W by row r, unless it depends on them; return the count."""
     square = mobility_left(factor, W, row, count, r)
-    if not square > RANK_TOLERANCE * W[r, r]:
+    if not square > max(RANK_TOLERANCE * W[r, r], rounding_left(factor, W, row, count, r)):
         return count
     factor[count, count], row[count] = math.sqrt(square), r
     return count + 1
@@ -258,6 +261,24 @@ def mobility_left(factor, W, row, count, r):
         factor[count, i] = total / factor[i, i]
         square -= factor[count, i] * factor[count, i]
     return square
+
+
+@internal_kernel
+def rounding_left(factor, W, row, count, r):
+    """Return how far rounding may change what :func:`mobility_left`, called right before, has returned.
+
+    That is w·W w of the combination w = (−x, 1) of the rows and row r, with x the forces along the rows that hold what
+    a unit force along row r moves. An error δ √(W_ii W_jj) of each entry changes it by δ (Σ |w_i| √W_ii)²: much where
+    the rows nearly depend on each other, because x is large then. The part of the factor above its diagonal is scratch.
+    """
+    size = math.sqrt(W[r, r])
+    for i in range(count - 1, -1, -1):
+        total = factor[count, i]
+        for j in range(i + 1, count):
+            total -= factor[j, i] * factor[j, count]
+        factor[i, count] = total / factor[i, i]
+        size += abs(factor[i, count]) * math.sqrt(W[row[i], row[i]])
+    return ROUNDINGS * size * size
 
 
 @internal_kernel
