@@ -57,6 +57,7 @@ FOUND = {
         271127,
         2728,
     ),
+    "a joint at rest in a corner of the admissible forces: no split with the same motion had a margin": (271127, 1534),
 }
 # Scenes of the slow study.
 TRIPLES = 1000

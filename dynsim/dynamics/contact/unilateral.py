@@ -127,7 +127,11 @@ HOLDING = 6  # share of the friction at rest that counts where modes are chosen;
 WIDTH = 7  # number of independent splits of the last evaluation with dependent rows, columns of room[NULL_SPACE]
 SHARED = 8  # 1: a contact slides and rows depend on each other, so that forces continue from ``shares``
 SPLIT_ROWS = 9  # rows of the last splits, of couplings not counted
-NUMBERS = 10
+SEARCH = 10  # of the choice of modes: FROM_ZERO, NEAR or LAST
+CORNER = 11  # 1: that choice ended in a corner of the admissible forces, and was given up
+NUMBERS = 12
+# Where a choice of modes starts to look for forces: at none; near those before it; at none, and it takes any solution.
+FROM_ZERO, NEAR, LAST = 0.0, 1.0, 2.0
 
 
 class UnilateralArrays(NamedTuple):

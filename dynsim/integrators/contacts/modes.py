@@ -25,6 +25,7 @@ from dynsim.dynamics.contact.shares import even_out, share_slot, some_slide
 from dynsim.dynamics.contact.splits import find_splits
 from dynsim.dynamics.contact.unilateral import (
     UnilateralArrays,
+    dry_bound,
     dry_rests,
     dry_rows_held,
     holding_bound,
@@ -59,6 +60,9 @@ LEAST_SHARE = 1e-3
 # If no forces agree with slip slower than this [m/s], the slip is stopped, as unbounded friction would stop it: an
 # impact of 5e-11 J per kilogram. Without it points that land within a step of coming to rest would end a run.
 NEARLY_AT_REST = 1e-5
+# Forces whose worst margin is below this share of the largest are a corner of the admissible ones: the accuracy of the
+# program that finds the best split.
+NO_MARGIN = 1e-7
 # A friction force this close to the cone, as a fraction, counts as on it.
 ON_CONE = 1e-7
 # Which joints with dry friction a choice of modes holds: all slow joints; the same, unless their rates contradict other
@@ -82,6 +86,7 @@ def resolve(system: System, ws: Workspace, run: Run, touch):
         mode[k, ku.BEFORE], mode[k, ku.STRUCK] = ws.active[k, ka.MODE], 0
     for k in range(table.shape[0]):
         table[k, ku.STOP_BEFORE], table[k, ku.STOP_STRUCK] = table[k, ku.STOP_CLOSED], 0
+    note_forces(system, ws)
     if find_touching(system, ws, touch):
         impact(system, ws, run)
         if run.count[ki.STATUS] == ki.NO_CONTACT_FORCES:
@@ -123,15 +128,74 @@ def some_turned_round(system: System, ws: Workspace):
 @noinline_kernel
 def choose_joints(system: System, ws: Workspace, run: Run):
     """:func:`choose_modes` with the first rule to hold joints with dry friction that is not rejected."""
-    if choose_modes(system, ws, run, HOLD_COMPATIBLE):
+    if search_modes(system, ws, run, HOLD_COMPATIBLE):
         return
     # A joint that moves, however slowly, because a contact or stop moves it, is not at rest.
     touch_again(system.unilateral)
-    choose_modes(system, ws, run, HOLD_RESTING)
+    search_modes(system, ws, run, HOLD_RESTING)
     if run.count[ki.STATUS] != ki.RUNNING:
         run.count[ki.STATUS] = ki.RUNNING
         touch_again(system.unilateral)
-        choose_modes(system, ws, run, HOLD_SLOW)
+        search_modes(system, ws, run, HOLD_SLOW)
+
+
+@internal_kernel
+def search_modes(system: System, ws: Workspace, run: Run, rule):
+    """:func:`choose_modes` from no forces, or near the forces before the event if that would end in a corner.
+
+    If joints at rest share forces with sliding points, the solutions are a polygon or a body with more corners, and
+    each moves differently. Newton's method ends in one of the corners, where a joint is at its bound and a point on its
+    cone, and neither moves: the next change of forces ends that, and modes would be chosen again without end. The
+    forces before the event belong to the polygon or lie next to it, and solutions near them move as before.
+    """
+    number, search, chosen, not_unique = system.unilateral.number, ku.FROM_ZERO, False, run.clock[ki.NOT_UNIQUE]
+    while search <= ku.LAST:
+        number[ku.SEARCH], number[ku.CORNER] = search, 0.0
+        chosen = choose_modes(system, ws, run, rule)
+        if number[ku.CORNER] == 0.0 and (search != ku.NEAR or run.count[ki.STATUS] == ki.RUNNING):
+            break
+        run.count[ki.STATUS], run.clock[ki.NOT_UNIQUE] = ki.RUNNING, not_unique
+        touch_again(system.unilateral)
+        search += 1.0
+    return chosen
+
+
+@noinline_kernel
+def note_forces(system: System, ws: Workspace):
+    """Note the present forces of all that touches or rubs in ``shares``, right after :func:`evaluate`.
+
+    A choice of modes may start near them, and overwrites them by those that it has chosen.
+    """
+    unilateral, rows, state = system.unilateral, ws.rows, ws.contacts
+    shares, first = unilateral.shares, system.couplings.joint.shape[0] + unilateral.stop_table.shape[0]
+    for slot in range(shares.shape[0]):
+        shares[slot] = 0.0
+    for r in range(ws.counts[ka.ROWS]):
+        slot = share_slot(unilateral, ws, r)
+        if slot >= 0:
+            shares[slot] = rows[r, ka.FORCE]
+    for k in range(unilateral.dry_table.shape[0]):
+        if unilateral.dry_table[k, ku.DRY_HOLDS] == 0:
+            shares[first + k] = -unilateral.dry[k, ku.DRY_SIDE] * dry_bound(unilateral, k)
+    for k in range(state.shape[0]):
+        if ws.active[k, ka.MODE] == ka.SLIDING:
+            r = ws.active[k, ka.FIRST_ROW]
+            x, y = sliding_parts(system, ws, k)
+            slot = share_slot(unilateral, ws, r)
+            shares[slot + 1], shares[slot + 2] = x * rows[r, ka.FORCE], y * rows[r, ka.FORCE]
+
+
+@internal_kernel
+def sliding_parts(system: System, ws: Workspace, k):
+    """Friction along both tangents of candidate k, which slides, per unit of its normal force."""
+    state = ws.contacts
+    x, y, z = state[k, ka.SLIP_VELOCITY], state[k, ka.SLIP_VELOCITY + 1], state[k, ka.SLIP_VELOCITY + 2]
+    tx, ty, tz, mu = slide_direction(system.unilateral, system.contacts, k, x, y, z)
+    a, b = ka.FIRST_TANGENT, ka.SECOND_TANGENT
+    return (
+        -mu * (tx * state[k, a] + ty * state[k, a + 1] + tz * state[k, a + 2]),
+        -mu * (tx * state[k, b] + ty * state[k, b + 1] + tz * state[k, b + 2]),
+    )
 
 
 @internal_kernel
@@ -173,7 +237,10 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
         evaluate(system, ws, run)
         return True
     take_solution(system, ws, size, largest)
-    release_dependent_joints(system, ws, size)
+    margin = release_dependent_joints(system, ws, size)
+    if unilateral.number[ku.SEARCH] != ku.LAST and margin <= NO_MARGIN:
+        unilateral.number[ku.CORNER] = 1.0
+        return False
     for i in range(size):
         slot = share_slot(unilateral, ws, unilateral.index[ku.TABLE_ROW, i])
         unilateral.shares[slot] = unilateral.vector[ku.SOLUTION, i]
@@ -416,7 +483,7 @@ def reduce_rows(system: System, ws: Workspace, run: Run, p):
     Column of such a row: W (n − μ t). A row that its own force would accelerate against itself sets STATUS (Painlevé).
     """
     unilateral, W = system.unilateral, ws.small[0]
-    index, vector, mode, state = unilateral.index, unilateral.vector, unilateral.mode, ws.contacts
+    index, vector, mode = unilateral.index, unilateral.vector, unilateral.mode
     size, first = 0, p
     for k in range(mode.shape[0] - 1, -1, -1):
         if mode[k, ku.TOUCHING] == 1:
@@ -429,11 +496,7 @@ def reduce_rows(system: System, ws: Workspace, run: Run, p):
         r = ws.active[k, ka.FIRST_ROW]
         index[ku.TABLE_ROW, size], vector[ku.FIRST_PART, size], vector[ku.SECOND_PART, size] = r, 0.0, 0.0
         if mode[k, ku.WANTED] == ka.SLIDING:
-            x, y, z = state[k, ka.SLIP_VELOCITY], state[k, ka.SLIP_VELOCITY + 1], state[k, ka.SLIP_VELOCITY + 2]
-            tx, ty, tz, mu = slide_direction(unilateral, system.contacts, k, x, y, z)
-            a, b = ka.FIRST_TANGENT, ka.SECOND_TANGENT
-            vector[ku.FIRST_PART, size] = -mu * (tx * state[k, a] + ty * state[k, a + 1] + tz * state[k, a + 2])
-            vector[ku.SECOND_PART, size] = -mu * (tx * state[k, b] + ty * state[k, b + 1] + tz * state[k, b + 2])
+            vector[ku.FIRST_PART, size], vector[ku.SECOND_PART, size] = sliding_parts(system, ws, k)
             index[ku.KINDS, size] = kc.ONE_WAY
             size += 1
         else:
@@ -445,6 +508,8 @@ def reduce_rows(system: System, ws: Workspace, run: Run, p):
     for i in range(size):
         a = index[ku.TABLE_ROW, i]
         vector[ku.OFFSET, i], vector[ku.SOLUTION, i] = -ws.rows[a, ka.RHS], 0.0
+        if unilateral.number[ku.SEARCH] == ku.NEAR:
+            vector[ku.SOLUTION, i] = unilateral.shares[share_slot(unilateral, ws, a)]
         for j in range(size):
             b = index[ku.TABLE_ROW, j]
             value = W[a, b]

@@ -45,6 +45,10 @@ def release_dependent_joints(system: System, ws: Workspace, size):
     depend only on rows of sticking points and other joints remain, see :mod:`dynsim.dynamics.contact.splits`, except
     rows that depend on them only nearly: holding such a joint would take forces beyond all bounds, and the order of
     pivots would decide whether it is held. ``size`` is the size of the solved problem.
+
+    Returns
+    -------
+    margin : the worst margin of the solution taken, as a share of its largest force; infinite if no joint was released
     """
     unilateral, W = system.unilateral, ws.small[0]
     table, mode, bare, whole = unilateral.dry_table, unilateral.mode, 0, 0
@@ -56,7 +60,7 @@ def release_dependent_joints(system: System, ws: Workspace, size):
     for k in range(unilateral.stop_table.shape[0]):
         blocked = blocked or unilateral.stop_table[k, ku.STOP_CLOSED] == 1
     if table.shape[0] == 0:
-        return
+        return math.inf
     for r in range(system.couplings.joint.shape[0]):
         bare = extended(bare_factor, W, bare_row, bare, r)
     for k in range(mode.shape[0]):
@@ -82,11 +86,11 @@ def release_dependent_joints(system: System, ws: Workspace, size):
             table[k, ku.DRY_NEXT], released = RELEASED, released + 1
         else:
             bare, whole = extended(bare_factor, W, bare_row, bare, r), extended(whole_factor, W, whole_row, whole, r)
-    if released > 0:
-        take_widest_split(system, ws, size)
+    margin = take_widest_split(system, ws, size) if released > 0 else math.inf
     for k in range(table.shape[0]):
         if table[k, ku.DRY_NEXT] == RELEASED:
             rest_without_row(unilateral, k)
+    return margin
 
 
 @noinline_kernel
@@ -95,7 +99,7 @@ def take_widest_split(system: System, ws: Workspace, size):
 
     It has ``size`` rows. Forces may change where they act on nothing but each other: of joints at rest, closed stops
     and sticking points within their bounds, of sliding points along their whole force. Friction that slides, or begins
-    to, stays as it is for its normal force.
+    to, stays as it is for its normal force. Returns that margin as a share of the largest force.
     """
     unilateral, table = system.unilateral, system.unilateral.dry_table
     vector, kinds, N = unilateral.vector, unilateral.index[ku.KINDS], unilateral.room[ku.NULL_SPACE]
@@ -132,10 +136,12 @@ def take_widest_split(system: System, ws: Workspace, size):
         for j in range(whole):
             unilateral.room[ku.SPLIT_MATRIX, i, j] = mobility_along_forces(unilateral, ws, row[i], row[j])
     width = null_space(unilateral.room[ku.SPLIT_MATRIX], whole, N, unilateral.index[2], p)
+    largest = 0.0
     for i in range(p):
         force[i] = f[row[i]]
+        largest = max(largest, abs(force[i]))
     programs = split_room_in(unilateral.split_room, unilateral.index[3], width, count)
-    best_split(force[:p], N, width, first, mu, points, count - points, out[:p], programs, False)
+    worst = best_split(force[:p], N, width, first, mu, points, count - points, out[:p], programs, False)
     for i in range(p, whole):
         f[row[i]] += change_of_coupling(N, width, i, force, out, p)
     for i in range(p):
@@ -145,6 +151,7 @@ def take_widest_split(system: System, ws: Workspace, size):
                 vector[ku.FIRST_PART, row[i]] * out[i],
                 vector[ku.SECOND_PART, row[i]] * out[i],
             )
+    return worst / largest if largest > 0.0 else math.inf
 
 
 @internal_kernel
