@@ -214,16 +214,21 @@ def test_six_ties_hold_a_body_as_one_and_slide_at_their_bounds():
             assert run.states("elastic")[-1, DAMPED] == pytest.approx(bound * down[-1], rel=0.05)
 
 
-def test_a_tie_about_an_axis_swings_as_a_torsion_spring():
-    """The rotation vector, not its sine: period of a large angle between two bodies."""
+@pytest.mark.parametrize("swing", [0.0, 5.0, 12.0])
+def test_a_tie_about_an_axis_swings_as_a_torsion_spring(swing: float):
+    """The rotation vector, not its sine, and over several turns: large angles between two bodies."""
     stiffness, inertia, start = 0.2, 1.0 / (1.0 / 2.5e-3 + 1.0 / 7.5e-3), 0.8
+    rate = np.sqrt(stiffness / inertia)
     b, q = pair((Tie("torsion", "one", "two", Z, stiffness, turns=True),))
     q[3], q[6] = np.cos(0.5 * start), np.sin(0.5 * start)
-    times = np.linspace(0.0, 1.0, 41)
-    run = stepped(b, b.state(q, np.zeros(12)), times, 2.5e-4, 0.5)
-    angles = [2.0 * np.arctan2(run.states("q")[:, i + 6], run.states("q")[:, i + 3]) for i in (0, 7)]
-    np.testing.assert_allclose(angles[0] - angles[1], start * np.cos(np.sqrt(stiffness / inertia) * times), atol=2e-3)
-    assert np.abs(balance(run)).max() < 1e-9
+    v = np.zeros(12)
+    v[5], v[11] = 0.75 * swing * rate, -0.25 * swing * rate
+    times = np.linspace(0.0, 1.0, 401)
+    run = stepped(b, b.state(q, v), times, 2.5e-4, 0.5)
+    angles = [np.unwrap(2.0 * np.arctan2(run.states("q")[:, i + 6], run.states("q")[:, i + 3])) for i in (0, 7)]
+    expected = start * np.cos(rate * times) + swing * np.sin(rate * times)
+    np.testing.assert_allclose(angles[0] - angles[1], expected, atol=2e-3 * (1.0 + swing))
+    assert np.abs(balance(run)).max() < 1e-9 * (1.0 + swing**2)
 
 
 def test_a_one_sided_tie_pushes_and_does_not_pull():

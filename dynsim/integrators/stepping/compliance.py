@@ -153,7 +153,8 @@ def list_ties(unilateral: UnilateralArrays, ws: Workspace):
             table[k, ku.TIE_HOLDS], changed = holds, True
             if holds == 1:
                 begin_tie(unilateral, ws, k)
-                x = tie_deflection(unilateral, ws, k) - tie[k, ku.TIE_REST]
+                tie[k, ku.TIE_TURNED] = tie_deflection(unilateral, ws, k)
+                x = tie[k, ku.TIE_TURNED] - tie[k, ku.TIE_REST]
                 tie[k, ku.TIE_STORED], tie[k, ku.TIE_GIVEN] = 0.5 * tie[k, ku.TIE_STIFFNESS] * x * x, 0.0
                 if table[k, ku.TIE_KIND] == kc.ONE_WAY:
                     tie[k, ku.TIE_STORED] = spring_energy(tie[k, ku.TIE_STIFFNESS], x)
@@ -218,7 +219,11 @@ def place_ties(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace):
         for j in range(6):
             rows[r, ka.DIRECTION + j] = rows[r, ka.ROW + j]
         rows[r, ka.TARGET], s.kind[r] = 0.0, table[k, ku.TIE_KIND]
-        tie[k, ku.TIE_AT] = tie_deflection(unilateral, ws, k) - tie[k, ku.TIE_REST]
+        turned = tie_deflection(unilateral, ws, k)
+        # Rotation vectors are at most half a turn long and go on at the other side; the rest goes with them.
+        if table[k, ku.TIE_TURNS] == 1 and abs(turned - tie[k, ku.TIE_TURNED]) > math.pi:
+            tie[k, ku.TIE_REST] += math.copysign(2.0 * math.pi, turned - tie[k, ku.TIE_TURNED])
+        tie[k, ku.TIE_TURNED], tie[k, ku.TIE_AT] = turned, turned - tie[k, ku.TIE_REST]
 
 
 @internal_kernel
