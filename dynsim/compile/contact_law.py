@@ -62,7 +62,12 @@ def format_quantity(value: float, unit: str, digits: int = 5) -> str:
 
 
 def compile_unilateral(
-    robot: Robot, contacts: Sequence[Contact], stops: Sequence[JointStop], slow: float, dry: Sequence[DryFriction] = ()
+    robot: Robot,
+    contacts: Sequence[Contact],
+    stops: Sequence[JointStop],
+    slow: float,
+    dry: Sequence[DryFriction] = (),
+    creep: float | None = None,
 ) -> UnilateralArrays:
     """Tables of the unilateral law.
 
@@ -71,6 +76,7 @@ def compile_unilateral(
     stops : what joints come up against
     slow : speed below which slip has no direction of its own [m/s]
     dry : joints that rub
+    creep : rate below which such a joint may be at rest [rad/s or m/s]; default: ``slow``
     """
     c, s, ties = len(contacts), len(stops), robot.ties
     shares = share_count(len(robot.couplings), c, s, len(dry))
@@ -96,6 +102,7 @@ def compile_unilateral(
     tally, number = np.zeros((c, ku.TALLY_SIZE)), np.zeros(ku.NUMBERS)
     tally[:, ku.SETTLE], tally[:, ku.WINDOW_START], number[ku.LAST_CHANGE] = SETTLE_SPEED, -np.inf, -np.inf
     number[ku.SLOW], number[ku.HOLDING] = slow, 1.0
+    number[ku.CREEP] = slow if creep is None else creep
     return UnilateralArrays(
         slide=reals(slide),
         mode=integers(np.zeros((c, ku.MODE_SIZE))),

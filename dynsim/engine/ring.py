@@ -70,6 +70,7 @@ def counted_within(prepared: Prepared, happened: Sequence[Event]) -> Prepared:
     if stepping is not None:
         statistics, scheme = stepping.statistics.copy(), run.states("scheme")[:, 0]
         statistics[kt.TAKEN] = scheme[np.abs(scheme).argmax()]
+        statistics[kt.MADE] = (np.maximum.accumulate(scheme) - scheme).max()
         statistics[kt.HALF_STEP] = np.nan
         rigid = np.array([contact.stiffness == 0.0 for contact in prepared.contacts], dtype=bool)
         statistics[kt.PENETRATION] = depths[rigid].max(initial=0.0)

@@ -164,7 +164,7 @@ def summarise(
     if unilateral is not None:
         summary["joint_stops"] = _joint_stops(record, prepared, duration)
     if run.stepping is not None:
-        summary["time_stepping"] = _time_stepping(run)
+        summary["time_stepping"] = _time_stepping(run, "loss_damper" in record)
     motors = motor_loads(record, robot)
     summary["warnings"] = warnings_of(record, scenario, prepared, summary, scale, sunk, motors, begun)
     summary["motors"] = motors
@@ -269,8 +269,11 @@ def _joint_stops(record: Record, prepared: Prepared, duration: float) -> list[di
     return stops
 
 
-def _time_stepping(run: ki.Run) -> dict[str, Any]:
-    """How well time stepping has solved its contact problems, and how deep points came to lie."""
+def _time_stepping(run: ki.Run, springs: bool) -> dict[str, Any]:
+    """How well time stepping has solved its contact problems, and how deep points came to lie.
+
+    springs : contacts give way, or there are ties
+    """
     assert run.stepping is not None
     results = run.stepping.statistics
     return {
@@ -282,6 +285,11 @@ def _time_stepping(run: ki.Run) -> dict[str, Any]:
         "residual_max_m_s": float(results[kt.WORST]),
         "limits_unsettled": int(results[kt.UNSETTLED]),
         "scheme_loss_worst_J": float(results[kt.TAKEN]),
+        **(
+            {"scheme_gain_J": float(results[kt.MADE]), "spring_rate_rad_per_s": float(results[kt.STIFFEST]) ** 0.5}
+            if springs
+            else {}
+        ),
         **_known("half_step_energy_J", results[kt.HALF_STEP]),
         "penetration_max_m": float(results[kt.PENETRATION]),
     }

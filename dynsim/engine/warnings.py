@@ -52,6 +52,8 @@ NOT_ENFORCED = "no law enforces this limit"
 # Warning limits of time stepping: energy that the steps remove or add, and change of the energy if everything happened
 # half a step later, both as shares of the turnover; depth of points below surfaces [m].
 SCHEME_LIMIT = 1e-2
+# Energy that the steps make where contacts give way: a spring that is met within a step stores more than it has taken.
+GAIN_LIMIT = 1e-3
 HALF_STEP_LIMIT = 2e-2
 PENETRATION_LIMIT_M = 1e-3
 
@@ -490,8 +492,18 @@ def coarse(stepping: dict[str, Any], scale: float) -> list[str]:
     step, worst = stepping["step_s"], stepping["scheme_loss_worst_J"]
     # A ring buffer does not have this value.
     blurred = stepping.get("half_step_energy_J", 0.0)
+    # Only where contacts give way, or bodies are tied.
+    made = stepping.get("scheme_gain_J", 0.0)
     warnings: list[str] = []
-    if scale > 0.0 and abs(worst) > SCHEME_LIMIT * scale:
+    if scale > 0.0 and made > GAIN_LIMIT * scale:
+        warnings.append(
+            f"time stepping: contacts or ties that give way get {made:.3g} J from the steps themselves, "
+            f"{100 * made / scale:.2g} % of the turnover (limit {100 * GAIN_LIMIT:g} %); "
+            f"integrator.step_s is {step:g}: take {_shorter(_resolving(stepping, made / scale)):g}"
+        )
+    # What steps have made counts once.
+    another = worst > 0.0 or made <= GAIN_LIMIT * scale
+    if scale > 0.0 and another and abs(worst) > SCHEME_LIMIT * scale:
         warnings.append(
             f"time stepping: the steps themselves {'took' if worst > 0.0 else 'made'} up to {abs(worst):.3g} J, "
             f"{100 * abs(worst) / scale:.2g} % of the turnover (limit {100 * SCHEME_LIMIT:g} %); "
@@ -514,10 +526,26 @@ def coarse(stepping: dict[str, Any], scale: float) -> list[str]:
     return warnings
 
 
+def _resolving(stepping: dict[str, Any], share: float) -> float:
+    """Return a step with which landings on springs make less than GAIN_LIMIT of the energy; now it is ``share``.
+
+    A step at whose middle the spring is not met yet has no force, and one at whose middle it is has all of it. Of
+    the kinetic energy of a landing that makes up to z/4 and on average z/12, by the place in the step, z = (ω h)²:
+    with z = GAIN_LIMIT four landings at worst, and twelve on average, make no more than the limit. The share that one
+    run has made is no measure for it: it depends on these places, and has no order where z > 1.
+    """
+    step, pulsation = float(stepping["step_s"]), stepping["spring_rate_rad_per_s"]
+    # What else makes energy, of the method's order or of first order, is in the share.
+    shorter = step * GAIN_LIMIT / share
+    # Ties may be dampers alone.
+    return min(GAIN_LIMIT**0.5 / pulsation, step * (GAIN_LIMIT / share) ** 0.5) if pulsation > 0.0 else shorter
+
+
 def _shorter(step: float) -> float:
     """Return the step rounded down to one digit."""
     power = 10.0 ** np.floor(np.log10(step))
-    return float(np.floor(step / power) * power)
+    # Just below a power of ten its logarithm rounds up to a whole number.
+    return float(max(np.floor(step / power), 1.0) * power)
 
 
 def capped(stepping: dict[str, Any]) -> list[str]:

@@ -26,6 +26,8 @@ Match = re.Match[str]
 
 # Numbers in sentences have three digits.
 DIGITS = 0.006
+# Share of the turnover above which steps may make no energy without a warning where contacts give way.
+GAIN = 1e-3
 NUMBER = r"([-+]?[0-9.]+(?:e[-+]?[0-9]+)?|inf|-inf|nan)"
 # Slip and rates below this count as rest in the sentences of the engine [m/s, rad/s].
 AT_REST = 1e-9
@@ -284,6 +286,21 @@ def _scheme(match: Match, seen: Observed) -> str:
     return "" if most <= float(match[1]) * (1.0 + DIGITS) + 1e-12 else f"{most:.3g} J in a sample"
 
 
+def _gains(match: Match, seen: Observed) -> str:
+    """Something gives way, and the number is a share of the turnover and no less than a fall of the samples' loss."""
+    from combinations.energy import residual_floor, turnover_and_residual
+
+    if not seen.robot.ties and all(touch.contact.stiffness == 0.0 for touch in seen.touches()):
+        return "nothing gives way"
+    stated = float(match[1]) * (1.0 + DIGITS)
+    if stated < GAIN * max(turnover_and_residual(seen)[0], residual_floor(seen)):
+        return f"{match[1]} J are less than {GAIN:g} of the turnover"
+    # As for the scheme's whole share.
+    loss = seen.record["loss_scheme"][seen.apart_from_events(seen.step)]
+    made = float((np.maximum.accumulate(loss) - loss).max(initial=0.0))
+    return "" if made <= stated + 1e-12 else f"{made:.3g} J between samples"
+
+
 def _sinks(match: Match, seen: Observed) -> str:
     deepest = max((-1e3 * float(touch.gap.min(initial=0.0)) for touch in seen.touches()), default=0.0)
     return "" if deepest <= float(match[1]) * (1.0 + DIGITS) + 1e-3 else f"{deepest:.3g} mm in a sample"
@@ -510,6 +527,7 @@ VERIFIERS: dict[str, Callable[[Match, Observed], str]] = {
     r"^the energy ledger does not close": _does_not_close,
     rf"^contacts drifted by {NUMBER} m": _drifted,
     rf"^time stepping: the steps themselves \S+ up to {NUMBER} J": _scheme,
+    rf"^time stepping: contacts or ties that give way get {NUMBER} J from the steps": _gains,
     rf"^time stepping: points sink up to {NUMBER} mm": _sinks,
     r"^(.*): shared forces with the dry friction of (.+), which keeps? these joints": _shared,
     r"^(.+): shared forces of the dry friction which keeps these coupled joints at rest": _shared_by_joints,

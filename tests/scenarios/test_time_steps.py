@@ -251,6 +251,11 @@ def test_steps_that_are_too_long_are_told():
         "penetration_max_m": 0.0,
     }
     assert coarse(stepping, 1.0) == []
+    stepping |= {"scheme_loss_worst_J": -0.05, "scheme_gain_J": 0.05, "spring_rate_rad_per_s": 1e-3**0.5 / 1e-4}
+    (gain,) = coarse(stepping, 1.0)
+    assert "give way get 0.05 J from the steps themselves, 5 % of the turnover (limit 0.1 %)" in gain
+    # Rounding of a logarithm made 0 of what is just below a power of ten.
+    assert gain.endswith("take 0.0001")
 
 
 def test_the_energy_of_a_run_is_known_to_what_half_a_step_of_its_power_says():

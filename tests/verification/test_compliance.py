@@ -13,10 +13,12 @@ from support.stepping_systems import plane, stepped
 from dynsim import load_scenario, simulate
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.state import CONSTRAINT, DAMPED, FRICTION, STORED
+from dynsim.engine.warnings import GAIN_LIMIT
 from dynsim.errors import ModelError, ScenarioError
 from dynsim.integrators.stepping.tables import CAPPED, WORST
 from dynsim.model.description import Contact, Inertia, Link, Load, Robot, Tie, vector
 from dynsim.model.joints.ball import floating
+from dynsim.scenario import scenario_from_resolved
 
 G, MASS, STIFFNESS, DAMPING = 9.81, 2.0, 2e4, 40.0
 Z = vector(0, 0, 1)
@@ -298,3 +300,32 @@ def test_ties_that_cannot_be_are_refused():
     ):
         with pytest.raises(ModelError, match=words):
             pair((tie,))
+
+
+@pytest.mark.parametrize(("stiffness", "damping"), [(2e4, 20.0), (2e5, 63.0), (1e6, 141.0)])
+def test_energy_that_steps_make_at_landings_is_warned_of_with_a_step_that_is_enough(stiffness: float, damping: float):
+    """A step in which a spring is met has its force for none or all of it: up to z/4 of the energy that lands.
+
+    z is h² k/m: 1 %, 10 % and 50 % here. The rest of a fall of several landings is lost before.
+    """
+    foot = {"body": "link_1", "stiffness_N_per_m": stiffness, "damping_N_s_per_m": damping}
+    link = {"kind": "prismatic", "axis": "z", "length_m": 0, "mass_kg": MASS, "initial_m": 0.05}
+    config = {
+        "duration_s": 1.0,
+        "plant": {"type": "serial_arm", "chain": [link]},
+        "surfaces": {"floor": {"type": "plane"}},
+        "contacts": {"law": "unilateral", "points": {"foot": foot}},
+    }
+
+    def drop(step: float):
+        return simulate(scenario_from_resolved(config | {"integrator": {"method": "time_stepping", "step_s": step}}))
+
+    record = drop(1e-3)
+    (told,) = [text for text in record.summary["warnings"] if "give way get" in text]
+    made = record.summary["time_stepping"]["scheme_gain_J"]
+    assert f"get {made:.3g} J from the steps themselves" in told
+    turnover = record.summary["energy_turnover_J"]
+    assert GAIN_LIMIT * turnover < made < 0.25 * turnover
+    finer = drop(float(told.rsplit(" ", 1)[1]))
+    assert finer.summary["time_stepping"]["scheme_gain_J"] <= GAIN_LIMIT * finer.summary["energy_turnover_J"]
+    assert not [text for text in finer.summary["warnings"] if "give way get" in text]

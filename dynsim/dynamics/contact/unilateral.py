@@ -130,7 +130,8 @@ SHARED = 8  # 1: a contact slides and rows depend on each other, so that forces 
 SPLIT_ROWS = 9  # rows of the last splits, of couplings not counted
 SEARCH = 10  # of the choice of modes: FROM_ZERO, NEAR or LAST
 CORNER = 11  # 1: that choice ended in a corner of the admissible forces, and was given up
-NUMBERS = 12
+CREEP = 12  # below this rate a joint with dry friction may be at rest [rad/s or m/s]
+NUMBERS = 13
 # Where a choice of modes starts to look for forces: at none; near those before it; at none, and it takes any solution.
 FROM_ZERO, NEAR, LAST = 0.0, 1.0, 2.0
 

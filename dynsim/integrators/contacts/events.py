@@ -100,7 +100,7 @@ def contact_guard(contacts: ContactArrays, unilateral: UnilateralArrays | None, 
         if unilateral.dry_table[k, ku.DRY_HOLDS] == 0:
             rate = ws.joints[unilateral.dry_table[k, ku.DRY_JOINT], ka.QD]
             if dry_rests(unilateral, k):
-                return unilateral.number[ku.SLOW] - abs(rate)
+                return unilateral.number[ku.CREEP] - abs(rate)
             return unilateral.dry[k, ku.DRY_SIDE] * rate + unilateral.dry[k, ku.DRY_HEADWAY] + BACKWARD
         return min(force_margin(unilateral, ws, k), dry_bound(unilateral, k) * rest_margin(unilateral, ws, k))
     mode = ws.active[k, ka.MODE]

@@ -118,7 +118,8 @@ def some_turned_round(system: System, ws: Workspace):
     slow = 2.0 * unilateral.number[ku.SLOW]
     for k in range(unilateral.dry_table.shape[0]):
         side = 0.0 if dry_rests(unilateral, k) else unilateral.dry[k, ku.DRY_SIDE]
-        turned = turned or side * ws.joints[unilateral.dry_table[k, ku.DRY_JOINT], ka.QD] < -slow
+        rate = ws.joints[unilateral.dry_table[k, ku.DRY_JOINT], ka.QD]
+        turned = turned or side * rate < -2.0 * unilateral.number[ku.CREEP]
     for k in range(unilateral.mode.shape[0]):
         slides = ws.active[k, ka.MODE] == ka.SLIDING and system.contacts.law[k, ka.STATIC] > 0.0
         turned = turned or (slides and unilateral.slide[k, ku.SPEED] < -slow)
@@ -396,7 +397,7 @@ def hold_slow_joints(unilateral: UnilateralArrays, ws: Workspace, rule):
     for k in range(table.shape[0]):
         rate, braked = ws.joints[table[k, ku.DRY_JOINT], ka.QD], table[k, ku.DRY_BRAKE] == ku.CLOSED
         goes = not dry_rests(unilateral, k) and dry[k, ku.DRY_SIDE] * rate > RATE_TOLERANCE and rule != HOLD_SLOW
-        slow = abs(rate) <= 2.0 * unilateral.number[ku.SLOW]
+        slow = abs(rate) <= 2.0 * unilateral.number[ku.CREEP]
         table[k, ku.DRY_HOLDS] = 1 if slow and not braked and not goes else 0
         dry[k, ku.DRY_SIDE], dry[k, ku.DRY_AT] = 1.0 if rate > 0.0 else -1.0, ws.joints[table[k, ku.DRY_JOINT], ka.Q]
         if braked:

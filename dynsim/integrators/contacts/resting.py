@@ -199,7 +199,7 @@ def hold_free_joints(system: System, ws: Workspace, run: Run, begins):
     table, dry, mode = unilateral.dry_table, unilateral.dry, unilateral.mode
     W, factor, row = ws.small[0], unilateral.room[ku.SPLIT_MATRIX], unilateral.index[0]
     for k in range(table.shape[0]):
-        rests = abs(ws.joints[table[k, ku.DRY_JOINT], ka.QD]) <= unilateral.number[ku.SLOW]
+        rests = abs(ws.joints[table[k, ku.DRY_JOINT], ka.QD]) <= unilateral.number[ku.CREEP]
         moves = begins and abs(dry[k, ku.DRY_SIDE]) >= 1.0 - FORCE_TOLERANCE
         free = rests_without_row(unilateral, k) and rests and not moves
         table[k, ku.DRY_NEXT] = 1 if free else 0

@@ -80,6 +80,7 @@ def soften_contact(law, s: SteppingArrays, ws: Workspace, k, h):
         return
     r, turn, W = ws.active[k, ka.FIRST_ROW], s.turn[k], ws.small[0]
     turn[kt.PRESSED_IN] = ws.contacts[k, ka.GAP] - 0.5 * h * s.rate[0, r]
+    s.statistics[kt.STIFFEST] = max(s.statistics[kt.STIFFEST], stiffness * W[r, r])
     phi, more, added = give_way(stiffness, damping, W[r, r], turn[kt.PRESSED_IN], s.rate[0, r], h, s.theta)
     W[r, r] += more
     turn[kt.IMPLICIT], turn[kt.ADDED] = phi, added
@@ -236,6 +237,7 @@ def soften_ties(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, 
         r = table[k, ku.TIE_ROW]
         s.mu[r], s.f[r] = h * tie[k, ku.TIE_BOUND], h * tie[k, ku.TIE_FORCE]
         tie[k, ku.TIE_AT] -= 0.5 * h * s.rate[0, r]
+        s.statistics[kt.STIFFEST] = max(s.statistics[kt.STIFFEST], tie[k, ku.TIE_STIFFNESS] * W[r, r])
         tie[k, ku.TIE_IMPLICIT], more, added = give_way(
             tie[k, ku.TIE_STIFFNESS], tie[k, ku.TIE_DAMPING], W[r, r], tie[k, ku.TIE_AT], s.rate[0, r], h, s.theta
         )

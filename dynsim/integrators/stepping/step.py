@@ -169,6 +169,8 @@ def book(system: System, ws: Workspace, run: Run):
     y_new[layout.scheme] -= stored + (s.energy[kt.STOP, kt.MECHANICAL] - s.energy[kt.START, kt.MECHANICAL])
     if abs(y_new[layout.scheme]) > abs(s.statistics[kt.TAKEN]):
         s.statistics[kt.TAKEN] = y_new[layout.scheme]
+    s.statistics[kt.MOST_TAKEN] = max(s.statistics[kt.MOST_TAKEN], y_new[layout.scheme])
+    s.statistics[kt.MADE] = max(s.statistics[kt.MADE], s.statistics[kt.MOST_TAKEN] - y_new[layout.scheme])
 
 
 @internal_kernel

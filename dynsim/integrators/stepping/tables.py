@@ -66,7 +66,10 @@ TURN_SIZE = 12
 # steps whose limits of drives contradict each other; energy that would be another one if all came half a step later
 # [J]; solves without what the law adds to the rates, because with it there was no solution.
 WORST, CAPPED, PENETRATION, SOLVES, LONG_SOLVES, TAKEN, UNSETTLED, HALF_STEP, DROPPED = 0, 1, 2, 3, 4, 5, 6, 7, 8
-STATISTICS_SIZE = 9
+# Most energy that steps have taken until any time, and most that they have made since [J].
+MOST_TAKEN, MADE = 9, 10
+STIFFEST = 11  # largest stiffness times mobility of a row that gives way [1/s²]
+STATISTICS_SIZE = 12
 # SteppingArrays.before: rates at the start; rates of the velocity products; acceleration of the last step, and then of
 # this one; what is applied at the start, without loads; rates at the end of the last accepted step; acceleration of the
 # last step without an impact.
