@@ -27,13 +27,26 @@ def even_times(start: float, end: float, rate: float, first: int = 0, count: int
     """
     if not math.isfinite(end):
         assert count is not None
-        return start + np.arange(first, first + count) / rate
+        return _times(start, rate, np.arange(first, first + count))
     last = math.floor((end - start) * rate * (1.0 + 1e-12))
     stop = last + 2 if count is None else first + count
     # A sample that rounding puts behind the end would never come.
-    times = np.minimum(start + np.arange(first, min(stop, last + 1)) / rate, end)
+    times = np.minimum(_times(start, rate, np.arange(first, min(stop, last + 1))), end)
     apart = end - (start + last / rate) > 1e-9 * (end - start)
     return np.append(times, end) if apart and first <= last + 1 < stop else times
+
+
+def _times(start: float, rate: float, numbers: Array) -> Array:
+    """Times [s] of samples by number; of a run that goes on from a sample of another one, exactly those of that one.
+
+    A load may jump at such a time. 0.35 + 0.05 is before 0.4.
+    """
+    before = round(start * rate)
+    if abs(start * rate - before) > 1e-9:
+        return start + numbers / rate
+    times = (before + numbers) / rate
+    times[numbers == 0] = start
+    return times
 
 
 class Trace:

@@ -172,7 +172,8 @@ def faults(scene: Scene, done: Mapping[str, Run], *, thorough: bool = False) -> 
 
     Parameters
     ----------
-    thorough : whether to repeat the resolved scenario, save and load the record, draw figures and page, and export
+    thorough : whether to repeat the resolved scenario, go on from a state, save and load the record, draw figures and
+        page, and export
     """
     wrong: list[tuple[str, str]] = []
     for name, own in done.items():
@@ -239,13 +240,15 @@ def different(a: Record, b: Record) -> list[str]:
 
 
 def _kept(own: Run) -> list[tuple[str, str]]:
-    """Return faults in the repeated run of the resolved scenario, the saved record, figures, page and exports."""
+    """Return faults in runs of the resolved scenario and from a state, the saved record, figures, page and exports."""
     assert own.resolved is not None
     assert own.record is not None
     wrong: list[tuple[str, str]] = []
     again = _again(own)
     if differ := _differs(own, again):
         wrong.append(("repeat", f"its resolved scenario: {differ}"))
+    if said := _goes_on(own):
+        wrong.append(("state", said))
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         for name, keep in KEPT.items():
@@ -256,6 +259,22 @@ def _kept(own: Run) -> list[tuple[str, str]]:
             if said:
                 wrong.append((name, said))
     return wrong
+
+
+def _goes_on(own: Run) -> str:
+    """Start another simulation from the state of one in the middle of its run: it begins where that one is."""
+    assert own.resolved is not None
+    duration = own.resolved.duration_s
+    try:
+        state = _simulation(own.resolved).advance(0.4 * duration)
+        simulation = Simulation(own.resolved, state=state)
+        simulation.advance(0.41 * duration)
+    except DynsimError:
+        # The run itself may stop, and not every controller goes on from a state.
+        return ""
+    # Time stepping takes joints back to stops, and points to surfaces, that they have passed.
+    off = float(np.abs(simulation.record()["q"][0] - state.q).max(initial=0.0))
+    return f"a run from its state at {state.time:.6g} s begins {off:.3g} off" if off > 1e-6 else ""
 
 
 def _again(own: Run) -> Run:

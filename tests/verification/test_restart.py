@@ -175,10 +175,11 @@ def test_an_operator_goes_on_from_the_posture_and_the_time_of_a_state(tmp_path: 
 @pytest.mark.parametrize("start", [0.1, 0.2, 0.4])
 @pytest.mark.parametrize("rate", [50.0, 100.0, 200.0, 500.0, 1000.0])
 def test_samples_end_at_the_end_wherever_they_begin(start: float, rate: float) -> None:
-    """0.2 s + 80/200 s rounds to more than 0.6 s; such a sample would never come."""
+    """0.2 s + 80/200 s rounds to more than 0.6 s; such a sample would never come. They are those of the whole run."""
     times = even_times(start, 0.6, rate)
     assert times[-1] == 0.6
     assert len(times) == 1 + round((0.6 - start) * rate)
+    np.testing.assert_array_equal(times, even_times(0.0, 0.6, rate)[-len(times) :])
 
 
 RUBBING = """
