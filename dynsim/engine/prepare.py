@@ -330,7 +330,7 @@ def guards(
 
 
 def slow_slip(atol: float) -> float:
-    """Speed below which the direction of slip is noise of the integration, so that the last one stands [m/s]."""
+    """Speed below which the direction of slip is noise of the integration, and turns as fast as at this one [m/s]."""
     return max(1000.0 * atol, SLOWEST)
 
 

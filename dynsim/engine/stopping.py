@@ -14,6 +14,7 @@ from dynsim.dynamics.state import block
 from dynsim.engine.force_indeterminacy import paradox
 from dynsim.engine.prepare import Prepared
 from dynsim.engine.soundness import moving_nothing, unstable_stop
+from dynsim.engine.turning_friction import held_up
 from dynsim.errors import SimulationStopped
 from dynsim.integrators import project as kp
 from dynsim.integrators import run as ki
@@ -136,9 +137,10 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
             "they are fixed"
         )
     if status == ki.OUT_OF_TIME:
+        because = held_up(prepared)
         return (
             f"{where}: the wall limit, integrator.wall_limit_s = {scenario.integrator.wall_limit_s:g} s, is over, the "
-            f"last step of {run.clock[ki.STEP]:.1e} s{_doing(prepared)}"
+            f"last step of {run.clock[ki.STEP]:.1e} s{_doing(prepared)}{'; ' if because else ''}{because}"
         )
     if status == ki.STUCK:
         return (

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 import pytest
+import yaml
 from support.pinocchio_oracle import Oracle
 from support.random_robots import random_positions, random_robot, random_robot_of
 
@@ -296,6 +299,23 @@ def test_a_run_that_crawls_to_its_wall_limit_is_found(share: float, crawls: bool
     step = share * half / int(run.record.summary["steps"])
     stop = SimulationStopped(f"the last step of {step:.1e} s", time=half, state=state, kind="out_of_time")
     assert ("verdict" in _kinds(replace(run, error=stop))) == crawls
+
+
+@pytest.mark.parametrize("wrong", ["", "time", "speed", "step", "method"])
+def test_a_run_that_turning_friction_holds_up_is_true_to_its_words(wrong: str) -> None:
+    settings = yaml.safe_load((Path(__file__).parents[1] / "data" / "endless" / "creeping_block.yaml").read_text())
+    run = _simulated(settings)
+    stop = run.error
+    assert isinstance(stop, SimulationStopped)
+    assert stop.kind == "out_of_time"
+    text, summary = str(stop), run.record.summary if run.record is not None else {}
+    if wrong == "method":
+        summary["method"] = "radau5"
+    elif wrong:
+        after = {"time": "within ", "speed": "slips at ", "step": "as short as "}[wrong]
+        text = re.sub(f"(?<={after})\\S+", lambda found: f"{2.5 * float(found[0]):.3g}", text)
+    said = SimulationStopped(text, time=stop.time, state=stop.state, kind=stop.kind)
+    assert ("verdict" in _kinds(replace(run, error=said))) == bool(wrong)
 
 
 def test_critical_friction_finds_a_true_paradox() -> None:

@@ -17,6 +17,7 @@ from combinations.accelerations import critical, exists, leaves, state_of
 from combinations.observed import OPEN, SLIDING, STICKING, Observed, Touch
 from combinations.running import Run
 from combinations.sampled_loop import UNSTABLE, loop_growth
+from combinations.surfaces import nearest
 from dynsim.compile.clearance import POINTS
 from dynsim.errors import SimulationStopped
 from dynsim.model.drives import Motor, Servo
@@ -100,13 +101,80 @@ def _unproved(stop: SimulationStopped, seen: Observed) -> str:
 
 
 def _crawls(stop: SimulationStopped, seen: Observed) -> str:
-    """Whether the rest would take more steps, as long as the last one, than were taken; otherwise it is only slow."""
+    """Whether the rest would take more steps, as long as the last one, than were taken; otherwise it is only slow.
+
+    Steps that are short for a reason that is true may be as many as they like.
+    """
+    if (match := re.search(TURNS, str(stop))) is not None:
+        return _not_turning(match, stop, seen)
     step = re.search(rf"the last step of {NUMBER} s", str(stop))
     if step is None:
         return _unproved(stop, seen)
     taken, left = float(seen.record.summary["steps"]), float(seen.run.scenario["duration_s"]) - stop.time
     more = left / float(step[1])
     return "" if more <= taken else f"after {taken:.3g} steps, {more:.3g} more are left"
+
+
+TURNS = (
+    rf"steps are as short as {NUMBER} s because (\S+) slips at {NUMBER} m/s and its friction changes direction within "
+    rf"{NUMBER} s; integrator.method: radau5"
+)
+# Explicit steps that the turning of friction holds up, in its time constants: the limit of stability of DOPRI5 is 3.3,
+# and steps go up to it, are rejected, and go up again.
+HELD_UP = (1.0, 5.0)
+# Slip below 1000 atol, or this [m/s], turns friction as fast as at this speed (docs/physics.md).
+SLOWEST = 1e-7
+# Forces and modes are those of the last sample, the state is that of the stop: the forces may have changed by this.
+SINCE = 1.3
+
+
+def _not_turning(match: Match, stop: SimulationStopped, seen: Observed) -> str:
+    """Why friction of slow slip does not turn as fast as is said, by an explicit method whose steps that holds up.
+
+    τ = v / (μ f W), W the mobility across the slip: that of the bodies less what the rows R of all that is closed leave
+    none of, whose forces have the directions F, with friction.
+    """
+    if seen.record.summary["method"] != "dopri5" or not seen.real:
+        return "its method is not explicit, or its contacts are glued"
+    state, touch = state_of(seen, stop.state), _touch(seen, match[2])
+    if touch is None or match[2] not in state.names or touch.mode[-1] != SLIDING:
+        return f"{match[2]} does not slide"
+    speed = float(np.linalg.norm(state.slip[state.names.index(match[2])]))
+    if abs(speed - float(match[3])) > DIGITS * speed + AT_REST:
+        return f"{match[2]} slips at {speed:.3g} m/s"
+    identity, free = np.eye(len(state.v)), seen.bodies.free_directions()
+    rows = [*np.linalg.svd(free)[0].T[free.shape[1] :]]
+    for name in ("joint_friction", "stop_force"):
+        for k, joint in enumerate(seen.record.labels[name] if name in seen.record else ()):
+            j = seen.joints.index(joint)
+            if seen.record[name][-1, k] != 0.0 and abs(seen.v[-1, j]) < AT_REST:
+                rows.append(identity[j])
+    forces, across, pressed = list(rows), np.zeros(0), 0.0
+    for other in seen.touches():
+        if other.mode[-1] == OPEN:
+            continue
+        J = seen.bodies.jacobian(seen.motion, other.body, other.position)[-1]
+        n, friction = other.normal[-1], other.tangential[-1]
+        if other.mode[-1] == STICKING:
+            rows += [*J]
+            forces += [*J]
+            continue
+        rows.append(n @ J)
+        forces.append((n + friction / float(other.normal_force[-1] or np.inf)) @ J)
+        if other is touch:
+            pressed = float(np.linalg.norm(friction))
+            across = np.cross(n, friction / (pressed or np.inf)) @ J
+    R, F = np.array(rows), np.array(forces)
+    W = np.linalg.inv(state.mass)
+    left = across @ (W - W @ F.T @ np.linalg.pinv(R @ W @ F.T, rcond=1e-9) @ R @ W) @ across
+    slow = max(1000.0 * seen.scenario.integrator.absolute_tolerance, SLOWEST)
+    turning = max(speed, slow) / max(pressed * float(left), 1e-300)
+    if not 1.0 / SINCE < turning / float(match[4]) < SINCE:
+        return f"its friction turns within {turning:.3g} s"
+    low, high = HELD_UP
+    if not low < float(match[1]) / float(match[4]) < high:
+        return f"steps of {match[1]} s are not those that this holds up"
+    return ""
 
 
 STOPS: dict[str, Callable[[SimulationStopped, Observed], str]] = {
@@ -166,9 +234,9 @@ def _never_touches(match: Match, seen: Observed) -> str:
         return "no such contact"
     if np.abs(touch.normal_force).max(initial=0.0) > 0.0:
         return f"it carries {touch.normal_force.max():.4g} N"
-    nearest = 1e3 * float(touch.gap.min())
-    if abs(nearest - float(match[3])) > DIGITS * abs(nearest) + 1e-5:
-        return f"it comes as near as {nearest:.4g} mm"
+    near = 1e3 * float(touch.gap.min())
+    if abs(near - float(match[3])) > DIGITS * abs(near) + 1e-5:
+        return f"it comes as near as {near:.4g} mm"
     return ""
 
 
@@ -178,8 +246,8 @@ def _never_pressed(match: Match, seen: Observed) -> str:
         return "no such contact"
     if np.abs(touch.normal_force).max(initial=0.0) > 0.0:
         return f"it carries {touch.normal_force.max():.4g} N"
-    nearest = float(touch.gap.min())
-    return "" if nearest <= 2e-6 else f"it comes as near as {nearest:.4g} m"
+    near = float(touch.gap.min())
+    return "" if near <= 2e-6 else f"it comes as near as {near:.4g} m"
 
 
 def _reversed(match: Match, seen: Observed) -> str:
@@ -381,6 +449,8 @@ def _below(match: Match, seen: Observed) -> str:
         spacing = max(spacing, float(np.linalg.norm(end)) / POINTS)
         for share in np.linspace(0.0, 1.0, 65):
             deepest = max(deepest, -float(surface.distance(start + share * (tip - start)).min()))
+        # A tangent point of a small ball lies between these: the least distance, not that of one of them.
+        deepest = max(deepest, -float(surface.distance(nearest(surface, start, tip)).min()))
     if abs(1e3 * deepest - float(match[3])) > 0.02 * abs(1e3 * deepest) + 0.02 + 0.5e3 * spacing:
         return f"it lies {1e3 * deepest:.4g} mm deep"
     # Between the points that are looked at here it may be a little deeper.

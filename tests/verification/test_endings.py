@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import threading
 import time
@@ -24,6 +25,7 @@ from dynsim.integrators.radau5 import tables as kn
 from dynsim.system import interruption
 
 ENDLESS = Path(__file__).parents[1] / "data" / "endless" / "arm.yaml"
+CREEPING = ENDLESS.with_name("creeping_block.yaml")
 
 
 @pytest.fixture(autouse=True)
@@ -223,6 +225,32 @@ def test_the_wall_limit_of_a_simulation_is_that_of_all_its_pieces():
 
     with pytest.raises(SimulationStopped, match="wall limit"):
         advance()
+
+
+def test_a_stop_says_which_friction_holds_explicit_steps_up():
+    """A block that creeps down a slope, see the file: its friction turns within m s/(μ f), and W = 1/m."""
+    with pytest.raises(SimulationStopped, match="wall limit") as raised:
+        dynsim.simulate(dynsim.load_scenario(CREEPING))
+    said = re.search(
+        r"; steps are as short as (\S+) s because foot slips at (\S+) m/s and its friction changes direction within "
+        r"(\S+) s; integrator\.method: radau5 follows that with longer steps$",
+        str(raised.value),
+    )
+    assert said is not None
+    step, speed, within = map(float, said.groups())
+    v = raised.value.state["v"]
+    force = 2.0 * 9.81 / np.hypot(1.0, 0.4 * (1.0 + 4e-4))
+    assert speed == pytest.approx(np.linalg.norm(v), rel=5e-3)
+    assert within == pytest.approx(2.0 * 1e-7 / (0.4 * force), rel=5e-3)
+    # Of DOPRI5, up to a rejected step.
+    assert 1.0 < step / within < 5.0
+
+
+def test_an_implicit_method_is_not_held_up_by_friction_that_turns():
+    short = {"integrator.method": "radau5", "duration_s": 0.002, "integrator.wall_limit_s": None}
+    record = dynsim.simulate(dynsim.load_scenario(CREEPING, overrides=short))
+    # Steps of 3.3 times 0.027 µs would be 22 000.
+    assert record.summary["steps"] < 1000
 
 
 def test_the_wall_limit_ends_a_snake():

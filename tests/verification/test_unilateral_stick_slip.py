@@ -206,3 +206,47 @@ def test_a_point_that_rows_of_others_stop_keeps_its_direction_of_slip(method: st
     assert run.count[ki.STATUS] == ki.FINISHED
     assert b.ws.active[:3, ka.MODE].tolist() == [ka.STICKING] * 3
     assert np.abs(run.states("q")[-1]).max() < 1e-9
+
+
+@pytest.mark.parametrize("method", ["dopri5", "radau5"])
+def test_friction_of_slow_slip_turns_with_the_forces(method: str) -> None:
+    """A block creeps along x against damping D, slower than slip has a direction, while a force F along y grows.
+
+    Friction balances F, so it turns by asin(F / μ N), and v_x = (F_x − √((μ N)² − F²)) / D. A direction that does not
+    turn leaves F to drive the block along y, past the limit within 0.1 ms, over and over again.
+    """
+    slow, speed, damping, friction, pull_time = 1e-5, 3e-6, 2e5, KINETIC * MASS * G, 0.1
+    links = tuple(
+        Link(
+            name,
+            f"joint_{name}",
+            "wxyz"[k] if k else None,
+            "prismatic",
+            np.eye(3)[k],
+            Inertia(MASS if k == 2 else 0.0),
+            damping=damping if k == 0 else 0.0,
+        )
+        for k, name in enumerate("xyz")
+    )
+    none = np.zeros(3)
+    load = pull(
+        "z",
+        np.array([friction + damping * speed, 0.0, 0.0, 0.0, 0.0, 0.0]),
+        np.array([0.0, 0.6 * friction / pull_time, 0.0, 0.0, 0.0, 0.0]),
+    )
+    touch = Contact("foot", "z", none, FLOOR, friction=KINETIC)
+    b = assemble(Robot("block", links, (), ("z", none)), [touch], loads=[load], real=True, slow=slow)
+    times = np.linspace(0.0, pull_time, 21)
+    run = b.simulate(b.state(none, np.array([speed, 0.0, 0.0])), times, method)
+    assert events(run) == []
+    # Stable explicit steps are at most 3.3 times the time constant of the direction, m s / (μ N).
+    stable = 3.3 * MASS * slow / friction
+    assert run.count[ki.STEPS] < (200 if method == "radau5" else 2.0 * pull_time / stable)
+    sideways = 0.6 * friction * times / pull_time
+    along = np.sqrt(friction**2 - sideways**2)
+    held = run.outputs("contact")[1:, 0, OUT_VECTOR : OUT_VECTOR + 2]
+    np.testing.assert_allclose(held, -np.transpose([along, sideways])[1:], rtol=0.0, atol=2e-3 * friction)
+    v = run.states("v")[1:]
+    np.testing.assert_allclose(v[:, 0], speed + (friction - along[1:]) / damping, rtol=0.0, atol=0.01 * slow)
+    # Slip across the direction that was taken last is slower than TURNED times the limit.
+    assert np.abs(v[:, 1] - v[:, 0] * (sideways / along)[1:]).max() < ke.TURNED * slow

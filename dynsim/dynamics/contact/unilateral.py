@@ -21,8 +21,8 @@ from dynsim.dynamics.tables import ContactArrays, Workspace
 from dynsim.jit.kernel import internal_kernel
 
 # UnilateralArrays.slide
-REFERENCE = 0  # 3: direction of slip at the start of the step, or while FROZEN at the start of slip; 0 before any slip
-FROZEN = 3  # 1: slip is too slow to define a direction, so REFERENCE is used
+REFERENCE = 0  # 3: direction of slip at the start of the step, or while FROZEN as last taken; 0 before any slip
+FROZEN = 3  # 1: slip is too slow to define a direction, so friction is near REFERENCE, see slide_direction
 SPEED = 4  # v_t · REFERENCE [m/s]
 NEXT = 5  # 3: direction at the end of the step
 NEXT_SPEED = 8  # |v_t| there [m/s]
@@ -122,7 +122,7 @@ ROOM = SCRATCH + kc.CONE_ROOM
 REDUNDANT = 0  # 1: the rows of sticking points, held joints and stops depend on each other
 BEST_MARGIN = 1  # the worst margin of the best split of their forces [N], where the least norm fits no cones
 SPLIT = 2  # 1: BEST_MARGIN counts at this evaluation
-SLOW = 3  # below this speed the direction of slip is frozen [m/s]
+SLOW = 3  # slip along REFERENCE below this speed does not define a direction [m/s]
 LAST_CHANGE, CHANGES = 4, 5  # time of the last change of modes, and how many there were at that time
 HOLDING = 6  # share of the friction at rest that counts where modes are chosen; 1 outside of such a choice
 WIDTH = 7  # number of independent splits of the last evaluation with dependent rows, columns of room[NULL_SPACE]
@@ -172,17 +172,29 @@ def kept_size(shares: int, contacts: int, stops: int, joints: int) -> int:
 def slide_direction(unilateral: UnilateralArrays, contacts: ContactArrays, k, x, y, z):
     """Direction of slip of candidate k at tangential velocity (x, y, z), and its coefficient of friction there.
 
-    While FROZEN the direction is REFERENCE. Otherwise it is v_t/|v_t| with the sign of v_t · REFERENCE: it does not
-    flip when v_t passes through zero, so that a step that passes the end of slip is smooth, and slip ends where
-    v_t · REFERENCE is zero.
+    The direction is v_t/|v_t| with the sign of v_t · REFERENCE: it does not flip when v_t passes through zero, so that
+    a step that passes the end of slip is smooth, and slip ends where v_t · REFERENCE is zero.
+
+    While FROZEN, with r = REFERENCE and s = SLOW, it is that of w = v_t + max(0, s − v_t·r) r: of v_t itself if the
+    point slides along r at s or faster. A direction that did not follow slip across r would drive it: friction off the
+    direction in which forces balance accelerates the point to s at once, however slowly it slides along r. Instead the
+    direction turns until they balance, at a slip of s tan(angle) across r; its time constant has s in place of |v_t|.
     """
     slide = unilateral.slide
     a, b, c = slide[k, REFERENCE], slide[k, REFERENCE + 1], slide[k, REFERENCE + 2]
     along = x * a + y * b + z * c
-    size = math.sqrt(x * x + y * y + z * z)
     slide[k, SPEED] = along
     speed = along
-    if slide[k, FROZEN] == 0.0 and size > 0.0:
+    if slide[k, FROZEN] == 1.0:
+        more = max(0.0, unilateral.number[SLOW] - along)
+        u, v, w = x + more * a, y + more * b, z + more * c
+        size = math.sqrt(u * u + v * v + w * w)
+        if size > 0.0:
+            a, b, c = u / size, v / size, w / size
+            speed = x * a + y * b + z * c
+        return a, b, c, sliding_friction(contacts.law, k, speed)
+    size = math.sqrt(x * x + y * y + z * z)
+    if size > 0.0:
         scale = 1.0 / size if along >= 0.0 else -1.0 / size
         a, b, c = x * scale, y * scale, z * scale
         speed = size if along >= 0.0 else -size

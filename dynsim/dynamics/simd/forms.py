@@ -119,8 +119,15 @@ def slide_direction_lanes(unilateral, contacts, k, x, y, z):
     slide = unilateral.slide
     a, b, c = slide[k, ku.REFERENCE], slide[k, ku.REFERENCE + 1], slide[k, ku.REFERENCE + 2]
     along = x * a + y * b + z * c
-    speed = along
-    if slide[k, ku.FROZEN] == 0.0:
+    if slide[k, ku.FROZEN] == 1.0:
+        slow = unilateral.number[ku.SLOW]
+        more = select(along < slow, slow - along, 0.0)
+        u, v, w = x + more * a, y + more * b, z + more * c
+        size = math.sqrt(u * u + v * v + w * w)
+        moves = size > 0.0
+        a, b, c = select(moves, u / size, a), select(moves, v / size, b), select(moves, w / size, c)
+        speed = x * a + y * b + z * c
+    else:
         size = math.sqrt(x * x + y * y + z * z)
         moves, on = size > 0.0, along >= 0.0
         scale = select(on, 1.0 / size, -1.0 / size)

@@ -36,6 +36,7 @@ from dynsim.dynamics.contact.unilateral import (
 )
 from dynsim.dynamics.derivative import System
 from dynsim.dynamics.tables import ContactArrays, Workspace
+from dynsim.dynamics.tree.spatial import dot_vector
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts.attempts import keep, take_back
 from dynsim.integrators.contacts.impacts import IMMOBILE, evaluate, largest_right_side, slip_speed
@@ -73,6 +74,8 @@ INSTANT = 1e-11
 # A point that slips against its direction at less than this has not stopped yet [m/s]: if a point begins to slip with
 # almost no acceleration, its speed is rounding.
 BACKWARD = 2e-11
+# A frozen direction of slip is taken anew where friction has turned from it by the angle with this tangent.
+TURNED = 0.5
 # Forces that contradict their modes by less than this, absolute [N] and of the largest, are rounding.
 FORCE_SLACK = 1e-9
 # Margins of a split that differ by less, as a fraction of its largest force, are the same: the accuracy of the program
@@ -158,8 +161,8 @@ def too_long(contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: W
 
     An open candidate may dip below its surface, or a joint beyond its open stop, and be out again at the end: the
     minimum of the cubic through gaps and their rates at both ends, ``gaps``, (c, GAPS_SIZE), at the start. It may have
-    gone through a body: it is out at the other side, having moved at least both gaps together. Or a frozen direction of
-    slip was kept for too long.
+    gone through a body: it is out at the other side, having moved at least both gaps together. Or a point with a frozen
+    direction of slip has become fast across it, where friction would be along its slip.
     """
     fraction = 1.0
     if unilateral is None:  # known to the compiler
@@ -172,7 +175,7 @@ def too_long(contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: W
             and contacts.law[k, ka.STATIC] > 0.0
         ):
             speed = slip_speed(ws, k)
-            if speed > 2.0 * slow:
+            if speed > 2.0 * slow and unilateral.slide[k, ku.SPEED] < slow:
                 fraction = min(fraction, max(1.5 * slow / speed, 0.01))
         if passes_through(ws, gaps, k):
             fraction = min(fraction, 0.5)
@@ -270,20 +273,27 @@ def watch_modes(contacts: ContactArrays, unilateral: UnilateralArrays | None, ws
 
 @internal_kernel
 def take_directions(unilateral: UnilateralArrays | None, ws: Workspace, run: Run):
-    """Freeze directions of points that have become slow, free them if fast again; after the samples of a step."""
+    """Freeze directions of points that have become slow, free them if fast again; after the samples of a step.
+
+    Friction is the same before and after: a direction is frozen along the slip, and freed where it is along the slip.
+    """
     if unilateral is None:
         return
     slide, slow = unilateral.slide, unilateral.number[ku.SLOW]
     for k in range(slide.shape[0]):
         if ws.active[k, ka.MODE] != ka.SLIDING:
             continue
-        fast = slide[k, ku.NEXT_SPEED] >= slow
-        if fast and slide[k, ku.FROZEN] == 1.0:
-            # The direction turns a little: the method restarts at the next step.
-            run.count[ki.STARTED] = 0
-        if fast or slide[k, ku.FROZEN] == 0.0:
+        frozen, speed = slide[k, ku.FROZEN] == 1.0, slide[k, ku.NEXT_SPEED]
+        along = speed * dot_vector(slide[k, ku.REFERENCE :], slide[k, ku.NEXT :]) if frozen else speed
+        fast = along >= slow
+        if fast or not frozen:
             for s in range(3):
                 slide[k, ku.REFERENCE + s] = slide[k, ku.NEXT + s]
+        elif speed * speed > along * along + (TURNED * slow) ** 2:
+            # Take the direction of friction, see slide_direction. Slip across it relaxes: the method restarts.
+            for s in range(3):
+                slide[k, ku.REFERENCE + s] = (slow - along) * slide[k, ku.REFERENCE + s] + speed * slide[k, ku.NEXT + s]
+            run.count[ki.STARTED] = 0
         slide[k, ku.FROZEN] = 0.0 if fast else 1.0
         if not fast:
             stay_tangential(slide, ws, k)

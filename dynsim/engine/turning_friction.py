@@ -1,0 +1,83 @@
+"""How fast friction turns slow slip into the direction in which forces balance: why explicit steps are short.
+
+A contact slips at speed v along t, e is across t on the surface, and friction is −μ f t. Slip across t at speed w turns
+t by w/v towards e; below the limit of slow slip s, by w/s (dynsim.dynamics.contact.unilateral.slide_direction). So
+
+    dw/dt = −w/τ,    τ = max(v, s) / (μ f W),    W = e J M⁻¹ (1 − F (R M⁻¹ F)⁻¹ R M⁻¹) Jᵀ eᵀ
+
+with all closed rows R v̇ = const. and the directions F of their forces: n − μ t of a point that slides. An explicit
+method is stable up to about 3 τ; an implicit one is at any step.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact import unilateral as ku
+from dynsim.dynamics.derivative import derivative
+from dynsim.dynamics.state import block
+from dynsim.engine.force_indeterminacy import touching_rows
+from dynsim.engine.prepare import Prepared
+from dynsim.integrators import run as ki
+
+Array = NDArray[np.float64]
+
+# Steps of an explicit method at the limit of stability, in time constants: 3.3 by DOPRI5 [Hairer and Wanner], shorter
+# after a rejected step, longer before one.
+LEAST, MOST = 1.0, 5.0
+
+
+def held_up(prepared: Prepared) -> str:
+    """A clause about the contact whose friction turns so fast that explicit steps have to be this short, or ""."""
+    run, unilateral = prepared.run, prepared.system.unilateral
+    step = float(run.clock[ki.STEP])
+    if run.method != ki.DOPRI5 or unilateral is None or not prepared.contacts or not np.isfinite(run.y).all():
+        return ""
+    found = [(tau, speed, k) for k, (tau, speed) in time_constants(prepared).items() if LEAST < step / tau < MOST]
+    if not found:
+        return ""
+    tau, speed, k = min(found)
+    return (
+        f"steps are as short as {step:.1e} s because {prepared.contacts[k].name} slips at {speed:.3g} m/s and its "
+        f"friction changes direction within {tau:.3g} s; integrator.method: radau5 follows that with longer steps"
+    )
+
+
+def time_constants(prepared: Prepared) -> dict[int, tuple[float, float]]:
+    """τ [s] and speed [m/s] of each contact that slides, at the state of the run."""
+    system, run, ws, model = prepared.system, prepared.run, prepared.workspace, prepared.model
+    unilateral = system.unilateral
+    assert unilateral is not None
+    q = run.y[block(run.layout, "q")]
+    derivative(system, float(run.clock[ki.TIME]), run.y, ws, np.zeros_like(run.y))
+    identity = np.eye(model.n)
+    still = [identity[table[ku.STOP_JOINT]][None] for table in unilateral.stop_table if table[ku.STOP_CLOSED] == 1]
+    still += [identity[table[ku.DRY_JOINT]][None] for table in unilateral.dry_table if table[ku.DRY_HOLDS] == 1]
+    rows, forces = [model.coupling_rows, *still], [model.coupling_rows, *still]
+    sliding: list[tuple[int, Array, float, float]] = []
+    for k, contact in enumerate(prepared.contacts):
+        mode, state = int(ws.active[k, ka.MODE]), ws.contacts[k]
+        if mode == ka.OPEN:
+            continue
+        own = touching_rows(model, contact, q, mode == ka.STICKING)
+        rows.append(own)
+        if mode == ka.STICKING:
+            forces.append(own)
+            continue
+        along, point = state[ka.TANGENT : ka.TANGENT + 3], touching_rows(model, contact, q, True)
+        mu = float(ws.rows[ws.active[k, ka.FIRST_ROW], ka.ROW_MU])
+        forces.append(own - mu * along @ point)
+        across = np.cross(state[ka.NORMAL : ka.NORMAL + 3], along) @ point
+        speed = float(np.linalg.norm(state[ka.SLIP_VELOCITY : ka.SLIP_VELOCITY + 3]))
+        sliding.append((k, across, mu * float(state[ka.NORMAL_FORCE]), speed))
+    R, F = np.vstack(rows), np.vstack(forces)
+    inverse = np.linalg.inv(model.mass_matrix(q) + np.diag(model.armature))
+    left = inverse - inverse @ F.T @ np.linalg.pinv(R @ inverse @ F.T, rcond=1e-9) @ R @ inverse
+    slow, constants = float(unilateral.number[ku.SLOW]), {}
+    for k, across, friction, speed in sliding:
+        stiffness = friction * float(across @ left @ across)
+        if stiffness > 0.0:
+            constants[k] = max(speed, slow) / stiffness, speed
+    return constants
