@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from combinations.bodies import Bodies, Motion, position_rates, times
 from combinations.running import Run
@@ -356,13 +357,27 @@ class Observed:
         for k, tie in enumerate(self.robot.ties if "tie_force" in self.record else ()):
             (a, _), (b, other) = self.robot.attach(tie.body, tie.point), self.robot.attach(tie.other, tie.other_point)
             axis = self.robot.attached_axes(tie.body) @ np.asarray(tie.axis) / np.linalg.norm(tie.axis)
-            along = times(motion.rotation[a], np.broadcast_to(axis, (len(motion.rotation[a]), 3)))
+            axes = np.broadcast_to(axis, (len(motion.rotation[a]), 3))
+            if tie.turns:
+                axes = self._turning_axes(motion, a, b, axis)
+            along = times(motion.rotation[a], axes)
             recorded = self.record["tie_force"][:, k : k + 1]
             push = along * (recorded if rows is None else recorded[rows])
             still = np.zeros_like(push)
             force, moment = (still, push) if tie.turns else (push, still)
             acting.append((a, b, motion.point(b, other), force, moment))
         return acting
+
+    def _turning_axes(self, motion: Motion, a: int, b: int, axis: Array) -> Array:
+        """Return by differences how turns of b against a change the part along an axis of a of its rotation vector."""
+        start = self.motion.rotation[a][0].T @ self.motion.rotation[b][0]
+        turned = Rotation.from_matrix(np.swapaxes(motion.rotation[a], 1, 2) @ motion.rotation[b] @ start.T)
+        little = 1e-5 * np.eye(3)
+        parts = [
+            ((Rotation.from_rotvec(d) * turned).as_rotvec() - (Rotation.from_rotvec(-d) * turned).as_rotvec()) @ axis
+            for d in little
+        ]
+        return np.stack(parts, axis=1) / 2e-5
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,7 @@ from dynsim.dynamics.tables import Workspace
 from dynsim.dynamics.tree.spatial import (
     ZERO_VECTOR,
     compose,
+    cross,
     dot_vector,
     first_axis,
     put_rotation,
@@ -40,6 +41,7 @@ from dynsim.dynamics.tree.spatial import (
     rotation,
     second_axis,
     third_axis,
+    times_number,
     transform,
     vector,
     wrench_at,
@@ -189,16 +191,48 @@ def tie_deflection(unilateral: UnilateralArrays, ws: Workspace, k):
     table, tie = unilateral.tie_table, unilateral.tie
     a, b, axis = table[k, ku.TIE_A], table[k, ku.TIE_B], vector(tie, k, ku.TIE_AXIS)
     if table[k, ku.TIE_TURNS] == 1:
-        R = rotation(tie, k, ku.TIE_ATTITUDE)
-        E = compose(relative_attitude(ws, a, b), (R[0], R[3], R[6], R[1], R[4], R[7], R[2], R[5], R[8]))
-        twice = E[7] - E[5], E[2] - E[6], E[3] - E[1]
-        sine = 0.5 * math.sqrt(dot_vector(twice, twice))
-        angle = math.atan2(sine, 0.5 * (E[0] + E[4] + E[8] - 1.0))
-        return -0.5 * dot_vector(axis, twice) * (angle / sine if sine > 1e-9 else 1.0)
+        return -dot_vector(axis, tie_turn(unilateral, ws, k))
     A, B = rotation(ws.links, a, ka.R), rotation(ws.links, b, ka.R)
     at = transform(vector(ws.links, a, ka.P), A, vector(tie, k, ku.TIE_POINT))
     other = transform(vector(ws.links, b, ka.P), B, vector(tie, k, ku.TIE_OTHER_POINT))
     return dot_vector(rotate(A, axis), (at[0] - other[0], at[1] - other[1], at[2] - other[2]))
+
+
+@internal_kernel
+def tie_turn(unilateral: UnilateralArrays, ws: Workspace, k):
+    """Rotation vector of B against A since tie k began, in the axes of A, at most half a turn long [rad]."""
+    table, R = unilateral.tie_table, rotation(unilateral.tie, k, ku.TIE_ATTITUDE)
+    E = compose(
+        relative_attitude(ws, table[k, ku.TIE_A], table[k, ku.TIE_B]),
+        (R[0], R[3], R[6], R[1], R[4], R[7], R[2], R[5], R[8]),
+    )
+    twice = E[7] - E[5], E[2] - E[6], E[3] - E[1]
+    sine = 0.5 * math.sqrt(dot_vector(twice, twice))
+    angle = math.atan2(sine, 0.5 * (E[0] + E[4] + E[8] - 1.0))
+    return times_number(twice, 0.5 * (angle / sine if sine > 1e-9 else 1.0))
+
+
+@internal_kernel
+def turning_axis(axis, turn):
+    """Direction along which angular velocity changes the part along an axis of a rotation vector, which is ``turn``.
+
+    With the rotation vector φ it is a + ½ φ × a + c φ × (φ × a), c = 1/φ² − (1 + cos φ)/(2 φ sin φ): the axis itself
+    if the bodies turn about it alone. A torque along the axis would not be the gradient of ½ k x² otherwise, and turns
+    to and fro would make energy.
+    """
+    square = dot_vector(turn, turn)
+    size = math.sqrt(square)
+    c = 1.0 / 12.0 + square / 720.0
+    if size > 1e-2:
+        half = 0.5 * size
+        c = (1.0 - half * math.cos(half) / math.sin(half)) / square
+    once = cross(turn, axis)
+    again = cross(turn, once)
+    return (
+        axis[0] + 0.5 * once[0] + c * again[0],
+        axis[1] + 0.5 * once[1] + c * again[1],
+        axis[2] + 0.5 * once[2] + c * again[2],
+    )
 
 
 @internal_kernel
@@ -208,15 +242,15 @@ def place_ties(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace):
     for k in range(table.shape[0]):
         if table[k, ku.TIE_HOLDS] == 0:
             continue
-        r, b = table[k, ku.TIE_ROW], table[k, ku.TIE_B]
-        axis = rotate(rotation(ws.links, table[k, ku.TIE_A], ka.R), vector(tie, k, ku.TIE_AXIS))
+        r, b, axis = table[k, ku.TIE_ROW], table[k, ku.TIE_B], vector(tie, k, ku.TIE_AXIS)
+        A = rotation(ws.links, table[k, ku.TIE_A], ka.R)
         if table[k, ku.TIE_TURNS] == 1:
-            put_vector(rows, r, ka.ROW, axis)
+            put_vector(rows, r, ka.ROW, rotate(A, turning_axis(axis, tie_turn(unilateral, ws, k))))
             put_vector(rows, r, ka.ROW + 3, ZERO_VECTOR)
         else:
             R = rotation(ws.links, b, ka.R)
             at = transform(vector(ws.links, b, ka.P), R, vector(tie, k, ku.TIE_OTHER_POINT))
-            put_six(rows, r, ka.ROW, wrench_at(at, axis, ZERO_VECTOR))
+            put_six(rows, r, ka.ROW, wrench_at(at, rotate(A, axis), ZERO_VECTOR))
         for j in range(6):
             rows[r, ka.DIRECTION + j] = rows[r, ka.ROW + j]
         rows[r, ka.TARGET], s.kind[r] = 0.0, table[k, ku.TIE_KIND]
