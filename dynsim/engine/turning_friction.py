@@ -1,15 +1,19 @@
 """How fast friction turns slow slip into the direction in which forces balance: why explicit steps are short.
 
 A contact slips at speed v along t, e is across t on the surface, and friction is −μ f t. Slip across t at speed w turns
-t by w/v towards e; below the limit of slow slip s, by w/s (dynsim.dynamics.contact.unilateral.slide_direction). So
+t by w/v towards e; below the limit of slow slip s, by w/s (dynsim.dynamics.contact.unilateral.slide_direction). So for
+all contacts that slide
 
-    dw/dt = −w/τ,    τ = max(v, s) / (μ f W),    W = e J M⁻¹ (1 − F (R M⁻¹ F)⁻¹ R M⁻¹) Jᵀ eᵀ
+    dw/dt = −A w,    A_ij = e_i J_i M⁻¹ (1 − F (R M⁻¹ F)⁻¹ R M⁻¹) J_jᵀ e_jᵀ (μ f)_j / max(v_j, s)
 
-with all closed rows R v̇ = const. and the directions F of their forces: n − μ t of a point that slides. An explicit
-method is stable up to about 3 τ; an implicit one is at any step.
+with all closed rows R v̇ = const. and the directions F of their forces: n − μ t of a point that slides. The shortest
+time constant τ is one over the spectral radius of A, and an explicit method is stable up to about 3 τ; an implicit one
+is at any step.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,18 +39,27 @@ def held_up(prepared: Prepared) -> str:
     step = float(run.clock[ki.STEP])
     if run.method != ki.DOPRI5 or unilateral is None or not prepared.contacts or not np.isfinite(run.y).all():
         return ""
-    found = [(tau, speed, k) for k, (tau, speed) in time_constants(prepared).items() if LEAST < step / tau < MOST]
-    if not found:
+    turning = fastest(prepared)
+    if turning is None or not LEAST < step / turning.within < MOST:
         return ""
-    tau, speed, k = min(found)
     return (
-        f"steps are as short as {step:.1e} s because {prepared.contacts[k].name} slips at {speed:.3g} m/s and its "
-        f"friction changes direction within {tau:.3g} s; integrator.method: radau5 follows that with longer steps"
+        f"steps are as short as {step:.1e} s because {turning.contact} slips at {turning.speed:.3g} m/s and its "
+        f"friction changes direction within {turning.within:.3g} s; integrator.method: radau5 follows that with longer "
+        "steps"
     )
 
 
-def time_constants(prepared: Prepared) -> dict[int, tuple[float, float]]:
-    """τ [s] and speed [m/s] of each contact that slides, at the state of the run."""
+@dataclass(frozen=True)
+class Turning:
+    """The contact whose friction turns fastest by itself, its slip [m/s], and τ of all together [s]."""
+
+    contact: str
+    speed: float
+    within: float
+
+
+def fastest(prepared: Prepared) -> Turning | None:
+    """The fastest turning of friction at the state of the run; None if none turns."""
     system, run, ws, model = prepared.system, prepared.run, prepared.workspace, prepared.model
     unilateral = system.unilateral
     assert unilateral is not None
@@ -75,9 +88,10 @@ def time_constants(prepared: Prepared) -> dict[int, tuple[float, float]]:
     R, F = np.vstack(rows), np.vstack(forces)
     inverse = np.linalg.inv(model.mass_matrix(q) + np.diag(model.armature))
     left = inverse - inverse @ F.T @ np.linalg.pinv(R @ inverse @ F.T, rcond=1e-9) @ R @ inverse
-    slow, constants = float(unilateral.number[ku.SLOW]), {}
-    for k, across, friction, speed in sliding:
-        stiffness = friction * float(across @ left @ across)
-        if stiffness > 0.0:
-            constants[k] = max(speed, slow) / stiffness, speed
-    return constants
+    slow = float(unilateral.number[ku.SLOW])
+    E = np.array([across for _, across, _, _ in sliding]).reshape(-1, model.n)
+    A = E @ left @ E.T * np.array([friction / max(speed, slow) for _, _, friction, speed in sliding])
+    if not np.isfinite(A).all() or not A.any():
+        return None
+    k, _, _, speed = sliding[int(A.diagonal().argmax())]
+    return Turning(prepared.contacts[k].name, speed, 1.0 / float(np.abs(np.linalg.eigvals(A)).max()))

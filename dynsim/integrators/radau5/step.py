@@ -23,12 +23,15 @@ from numba.core import types
 
 from dynsim.dynamics import state as kst
 from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact import unilateral as ku
+from dynsim.dynamics.contact.unilateral import UnilateralArrays
 from dynsim.dynamics.derivative import System, derivative
 from dynsim.dynamics.drive.law import drive_block
 from dynsim.dynamics.simd.system import StageLanes, evaluate_four, take_rows
 from dynsim.dynamics.tables import Workspace
 from dynsim.dynamics.tree.joints import displace
 from dynsim.integrators import run as ki
+from dynsim.integrators.contacts.impacts import slip_speed
 from dynsim.integrators.radau5 import tables as kn
 from dynsim.integrators.radau5.ends import evaluate_end
 from dynsim.integrators.radau5.linear_systems import factor_both, solve_both
@@ -53,6 +56,8 @@ MOST_ITERATIONS, GOOD_CONTRACTION = 8, 0.05
 # In steps shorter than this errors of rates and currents that are near zero count by what they do until its end [s].
 # Less where rtol is smaller than this: there all steps are short.
 SHORT, SLACK_RTOL = 0.005, 1e-6
+# Change of rates for differences, as a part of the slowest slip: its square is rounding of slip at 1e-7 m/s.
+SMALL = 1e-4
 # What a step whose Newton's method diverges is said to be in error by: half of it is tried next.
 NO_STAGES = 10.5
 
@@ -68,6 +73,7 @@ def differentiate(system: System, ws: Workspace, run: Run):
     derivative(system, t, y, ws, base)
     for a in range(ws.motors.shape[0]):
         drive_block(system.drives, ws, a, r.linear[a])
+    r.clock[kn.CHANGE] = largest_change(system.unilateral, ws)
     columns(r.lanes, system, ws, t, y, x, base, r)
     run.count[ki.EVALUATIONS] += r.along.shape[0] + 1
     r.count[kn.JACOBIANS] += 1
@@ -77,8 +83,28 @@ def differentiate(system: System, ws: Workspace, run: Run):
 
 
 @internal_kernel
-def displaced(system: System, ws: Workspace, y, s, x):
-    """x = y but for number s of the rates' displacements, the rates and the currents; returns by how much."""
+def largest_change(unilateral: UnilateralArrays | None, ws: Workspace):
+    """Return the largest change of rates for differences, right after ``derivative`` [rad/s or m/s].
+
+    A change δ along a slip v and across it turns its friction, and differences are in error by δ/2v of what they are,
+    in directions in which friction does not change: with 1/τ of friction that turns within τ, Newton's method diverges
+    beyond steps of some 2v/δ τ. A point that slides slowly takes SMALL of its slip, far above rounding.
+    """
+    change = math.inf
+    if unilateral is None:  # known to the compiler
+        return change
+    for k in range(ws.contacts.shape[0]):
+        if ws.active[k, ka.MODE] == ka.SLIDING:
+            change = min(change, SMALL * max(slip_speed(ws, k), unilateral.number[ku.SLOW]))
+    return change
+
+
+@internal_kernel
+def displaced(system: System, ws: Workspace, y, s, x, change):
+    """x = y but for number s of the rates' displacements, the rates, by ``change`` at most, and the currents.
+
+    Returns by how much it differs.
+    """
     n, layout = ws.joints.shape[0], system.layout
     for j in range(y.shape[0]):
         x[j] = y[j]
@@ -88,7 +114,8 @@ def displaced(system: System, ws: Workspace, y, s, x):
         displace(system.model, ws, x, layout.q)
         return 1e-7
     j = layout.q + s if s < n else layout.v + s - n if s < 2 * n else layout.current + s - 2 * n
-    delta = 1e-3 if s >= 2 * n else 1e-8 * max(abs(y[j]), 0.1) if s >= n else 1e-7 * max(abs(y[j]), 1.0)
+    rate = min(1e-8 * max(abs(y[j]), 0.1), change)
+    delta = 1e-3 if s >= 2 * n else rate if s >= n else 1e-7 * max(abs(y[j]), 1.0)
     x[j] = y[j] + delta
     return x[j] - y[j]
 
@@ -98,7 +125,7 @@ def columns(lanes: StageLanes | None, system: System, ws: Workspace, t, y, x, ba
     """Finite differences of v̇ into ``r.along``, right after ``derivative`` at y, which is ``base``; x (m,) is room."""
     v = system.layout.v
     for s in range(r.along.shape[0]):
-        delta = displaced(system, ws, y, s, x)
+        delta = displaced(system, ws, y, s, x, r.clock[kn.CHANGE])
         derivative(system, t, x, ws, r.f[0])
         r.count[kn.COLUMNS] += 1
         for i in range(r.along.shape[1]):
@@ -126,7 +153,7 @@ def columns_on_lanes(lanes, system, ws, t, y, x, base, r):
     for first in range(0, last + 1, 4):
         for k in range(4):
             lanes.t[k] = t
-            lanes.delta[k] = displaced(system, ws, y, min(first + k, last), lanes.y[:, k])
+            lanes.delta[k] = displaced(system, ws, y, min(first + k, last), lanes.y[:, k], r.clock[kn.CHANGE])
         evaluate_four(lanes, system)
         r.count[kn.COLUMNS] += 4
         for k in range(4):

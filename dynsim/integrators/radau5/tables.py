@@ -43,9 +43,9 @@ ERROR_RADAU = np.array([-(13 + 7 * _ROOT) / 3, (-13 + 7 * _ROOT) / 3, -1 / 3])
 
 # NewtonArrays.clock: step that the factors are of, that the stages are of, that the extrapolation is of [s];
 # contraction of Newton's method, and what it says of the error of the last iterate; the error
-# that the last one may have, per tolerance.
-FACTORED, TRIED, KEPT, CONTRACTION, LEVER, CLOSE = 0, 1, 2, 3, 4, 5
-NEWTON_CLOCK_SIZE = 6
+# that the last one may have, per tolerance; largest change of rates for a Jacobian's differences [rad/s or m/s].
+FACTORED, TRIED, KEPT, CONTRACTION, LEVER, CLOSE, CHANGE = 0, 1, 2, 3, 4, 5, 6
+NEWTON_CLOCK_SIZE = 7
 # Without circuits nothing may damp what is left of it, and it adds up over the steps.
 CLOSE_ENOUGH, CLOSE_UNDAMPED = 0.03, 0.003
 # NewtonArrays.count, int: the Jacobian must be made anew; accepted steps when it was made, and when the stages were
