@@ -247,10 +247,10 @@ def test_a_stop_says_which_friction_holds_explicit_steps_up():
 
 
 def test_an_implicit_method_is_not_held_up_by_friction_that_turns():
-    short = {"integrator.method": "radau5", "duration_s": 0.002, "integrator.wall_limit_s": None}
-    record = dynsim.simulate(dynsim.load_scenario(CREEPING, overrides=short))
-    # Steps of 3.3 times 0.027 µs would be 22 000.
-    assert record.summary["steps"] < 1000
+    """Steps of 3.3 τ would be 1e7; with differences of 1e-9 m/s Newton's method held them at 13 µs, 75 000 a second."""
+    implicit = {"integrator.method": "radau5", "integrator.wall_limit_s": None}
+    record = dynsim.simulate(dynsim.load_scenario(CREEPING, overrides=implicit))
+    assert record.summary["steps"] < 100
 
 
 def test_the_wall_limit_ends_a_snake():
