@@ -26,7 +26,7 @@ from dynsim.dynamics.contact.unilateral import UnilateralArrays
 from dynsim.dynamics.derivative import System, derivative
 from dynsim.dynamics.drive.law import take_commands
 from dynsim.dynamics.tables import Workspace
-from dynsim.dynamics.tree.joints import normalise
+from dynsim.dynamics.tree.joints import normalise, read_positions
 from dynsim.dynamics.tree.support import watch_support
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts.events import consistent, solve_modes, switch_contacts, take_directions, watch_modes
@@ -67,7 +67,8 @@ def start_contacts(unilateral: UnilateralArrays | None, system: System, ws: Work
     due, first = run.count[ki.MODES_DUE] > 0, run.count[ki.MODES_DUE] == ki.AT_START
     if due:
         run.count[ki.MODES_DUE] = 0
-        hold_here(unilateral, run.y, system.layout.q)
+        read_positions(system.model, run.y, system.layout.q, ws)
+        hold_here(unilateral, ws)
         solve_modes(system, ws, run, first)
     if run.count[ki.STATUS] != ki.RUNNING or not settle(system, run.clock[ki.TIME], run.y, ws, run.stage[0], run):
         return False
@@ -78,10 +79,10 @@ def start_contacts(unilateral: UnilateralArrays | None, system: System, ws: Work
 
 
 @internal_kernel
-def hold_here(unilateral: UnilateralArrays, y, q):
+def hold_here(unilateral: UnilateralArrays, ws: Workspace):
     """Let dry friction hold joints where they are: an impact comes before the modes that say which ones it holds."""
     for k in range(unilateral.dry_table.shape[0]):
-        unilateral.dry[k, ku.DRY_AT] = y[q + unilateral.dry_table[k, ku.DRY_JOINT]]
+        unilateral.dry[k, ku.DRY_AT] = ws.joints[unilateral.dry_table[k, ku.DRY_JOINT], ka.Q]
 
 
 @inline_kernel

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from combinations.accelerations import critical, exists, leaves, state_of
-from combinations.observed import OPEN, SLIDING, STICKING, Observed, Touch
+from combinations.observed import AT_STEP, OPEN, SLIDING, STICKING, Observed, Touch
 from combinations.running import Run
 from combinations.sampled_loop import UNSTABLE, loop_growth
 from combinations.surfaces import nearest
@@ -354,9 +354,13 @@ def _drifted(match: Match, seen: Observed) -> str:
     return "" if worst <= float(match[1]) * (1.0 + DIGITS) + 1e-9 else f"by {worst:.2g} m in a sample"
 
 
+def _at_step_ends(seen: Observed) -> NDArray[np.bool_]:
+    """Samples at ends of steps: within a step states and energies are linear, and the scheme has what does not fit."""
+    return np.abs(seen.steps_around[1] - seen.time) < AT_STEP * seen.step
+
+
 def _scheme(match: Match, seen: Observed) -> str:
-    # Within a step at whose end something lands kinetic energy is not between those of the ends.
-    most = float(np.abs(seen.record["loss_scheme"][seen.apart_from_events(seen.step)]).max(initial=0.0))
+    most = float(np.abs(seen.record["loss_scheme"][_at_step_ends(seen)]).max(initial=0.0))
     return "" if most <= float(match[1]) * (1.0 + DIGITS) + 1e-12 else f"{most:.3g} J in a sample"
 
 
@@ -369,8 +373,7 @@ def _gains(match: Match, seen: Observed) -> str:
     stated = float(match[1]) * (1.0 + DIGITS)
     if stated < GAIN * max(turnover_and_residual(seen)[0], residual_floor(seen)):
         return f"{match[1]} J are less than {GAIN:g} of the turnover"
-    # As for the scheme's whole share.
-    loss = seen.record["loss_scheme"][seen.apart_from_events(seen.step)]
+    loss = seen.record["loss_scheme"][_at_step_ends(seen)]
     made = float((np.maximum.accumulate(loss) - loss).max(initial=0.0))
     return "" if made <= stated + 1e-12 else f"{made:.3g} J between samples"
 
