@@ -372,7 +372,7 @@ def sharing(
     modes : of the contacts in them, (T, c), dynsim.dynamics.tables: OPEN, SLIDING, STICKING
     rests : which joints dry friction keeps at rest in them, (T, n)
     """
-    free = _free(model)
+    free = free_rates(model)
     rests = np.zeros((len(modes), model.n), dtype=bool) if rests is None else rests
     shared: set[int] = set()
     order = np.argsort(-rests.sum(axis=1), kind="stable")
@@ -398,10 +398,22 @@ def sharing(
     )
 
 
-def _free(model: Model) -> Array:
+def free_rates(model: Model) -> Array:
     """Rates that couplings of joints allow, (n, n − k)."""
     rows = model.coupling_rows
     return np.linalg.svd(rows)[2][len(rows) :].T
+
+
+def contact_point(model: Model, contact: Contact, q: Array) -> tuple[Array, Array]:
+    """Normal of the surface, (3,), and Jacobian of the point that is nearest to it, (3, n)."""
+    body, point = model.robot.attach(contact.body, contact.point)
+    if contact.tip is not None:
+        end = model.robot.attach(contact.body, contact.tip)[1]
+        start, other = (model.point_position(body, at, q) for at in (point, end))
+        point = point + share_of_axis(contact, start, other) * (end - point)
+    normal = contact.surface.normal(model.point_position(body, point, q))
+    rotation, _ = model.body_pose(body, q)
+    return normal, model.point_jacobian(body, point - contact.radius * (rotation.T @ normal), q)
 
 
 def touching_rows(model: Model, contact: Contact, q: Array, sticks: bool) -> Array:
@@ -410,14 +422,7 @@ def touching_rows(model: Model, contact: Contact, q: Array, sticks: bool) -> Arr
     A point that sticks has three, one that slides the normal force. The depth of a compliant contact determines its
     normal force: it has those across the normal, or none.
     """
-    body, point = model.robot.attach(contact.body, contact.point)
-    if contact.tip is not None:
-        end = model.robot.attach(contact.body, contact.tip)[1]
-        start, other = (model.point_position(body, at, q) for at in (point, end))
-        point = point + share_of_axis(contact, start, other) * (end - point)
-    normal = contact.surface.normal(model.point_position(body, point, q))
-    rotation, _ = model.body_pose(body, q)
-    jacobian = model.point_jacobian(body, point - contact.radius * (rotation.T @ normal), q)
+    normal, jacobian = contact_point(model, contact, q)
     if contact.stiffness > 0.0:
         return (np.eye(3) - np.outer(normal, normal)) @ jacobian if sticks else np.zeros((0, jacobian.shape[1]))
     return jacobian if sticks else (normal @ jacobian)[None]

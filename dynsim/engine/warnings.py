@@ -16,6 +16,7 @@ from dynsim.dynamics.contact import unilateral as ku
 from dynsim.engine.force_indeterminacy import motion_spread, sharing
 from dynsim.engine.prepare import Prepared
 from dynsim.engine.soundness import unstable_later, unstable_loop
+from dynsim.engine.wedging import wedges
 from dynsim.errors import first_few
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts import events as ke
@@ -99,6 +100,7 @@ def warnings_of(
     warnings += _undetermined(record, prepared, stepping is not None)
     warnings += _unpressed(record, prepared, begun)
     warnings += _open_impacts(prepared)
+    warnings += _wedged(record, prepared)
     warnings += _slipping_start(record, prepared) or _moving_start(record, prepared)
     warnings += _sunk(record, sunk)
     warnings += _beyond_stops(robot, prepared.stops, prepared.control)
@@ -330,6 +332,25 @@ def _open_impacts(prepared: Prepared) -> list[str]:
         f"{first_few(left)} off, while impulses within the friction cones could keep the contact closed, wedged, which "
         "agrees with the contact law too; lower contacts.friction, or model the supports (contacts.stiffness_N_per_m "
         "with integrator.method: time_stepping)"
+    ]
+
+
+def _wedged(record: Record, prepared: Prepared) -> list[str]:
+    """Warn of contacts that friction can wedge against their surface by itself."""
+    if prepared.system.unilateral is None:
+        return []
+    names = [
+        f"{wedge.contact.name} against {wedge.contact.surface_name} from a coefficient of {wedge.least:.4g} on (it has "
+        f"{wedge.friction:.4g}, t = {wedge.time:.6g} s)"
+        for wedge in wedges(prepared.model, prepared.contacts, record)
+    ]
+    if not names:
+        return []
+    return [
+        f"the motion is not unique: friction can wedge {first_few(names)} by itself, without a load: no joint moves "
+        "the point along some direction inside its friction cone, so that a force of any size along it can hold the "
+        "point, or none, and both agree with the contact law; lower contacts.friction, or model the surface "
+        "(contacts.stiffness_N_per_m with integrator.method: time_stepping)"
     ]
 
 

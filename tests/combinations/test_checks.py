@@ -24,6 +24,7 @@ from combinations.energy import residual_floor
 from combinations.observed import Observed
 from combinations.running import Run
 from combinations.surfaces import nearest, shape
+from combinations.verdicts import untrue
 from dynsim import check, simulate
 from dynsim.errors import DynsimError, SimulationStopped
 from dynsim.record import Record
@@ -313,7 +314,7 @@ def test_a_run_that_turning_friction_holds_up_is_true_to_its_words(wrong: str) -
         summary["method"] = "radau5"
     elif wrong:
         after = {"time": "within ", "speed": "slips at ", "step": "as short as "}[wrong]
-        text = re.sub(f"(?<={after})\\S+", lambda found: f"{2.5 * float(found[0]):.3g}", text)
+        text = re.sub(f"(?<={after})\\S+", lambda match: f"{2.5 * float(match[0]):.3g}", text)
     said = SimulationStopped(text, time=stop.time, state=stop.state, kind=stop.kind)
     assert ("verdict" in _kinds(replace(run, error=said))) == bool(wrong)
 
@@ -445,3 +446,40 @@ def test_own_nearest_points_are_nearest() -> None:
         many = [surface.distance(start + u * (end - start)) for u in np.linspace(0.0, 1.0, 2001)]
         outside = np.min(many, axis=0) > 0.0
         assert (far[outside] <= np.min(many, axis=0)[outside] + 1e-9).all()
+
+
+# A body that slides along x and z on a plane that leans sideways by 1 in 2: friction wedges it from 2 on.
+WEDGE = {
+    "name": "wedge",
+    "duration_s": 0.05,
+    "plant": {
+        "type": "serial_arm",
+        "gravity_m_s2": [30, 0, -10],
+        "link": {"length_m": 0},
+        "chain": [{"kind": "prismatic", "axis": "x", "mass_kg": 0}, {"kind": "prismatic", "axis": "z", "mass_kg": 1}],
+    },
+    "surfaces": {"slope": {"type": "plane", "normal": [0, 1, 2]}},
+    "contacts": {
+        "law": "unilateral",
+        "points": {"foot": {"body": "link_2", "point_m": [0, 0, 0], "surface": "slope"}},
+    },
+    "integrator": {"method": "time_stepping"},
+}
+
+
+def test_warnings_of_wedging_are_checked_both_ways() -> None:
+    settings = deepcopy(WEDGE)
+    settings["contacts"]["friction"] = 2.1
+    run = _simulated(settings)
+    seen = Observed(run)
+    assert not list(untrue(settings, run, seen))
+    (missing,) = untrue(settings, replace(run, warnings=[]), seen)
+    assert "foot can wedge itself against slope, without a warning" in missing
+    (wrong,) = untrue(
+        settings, replace(run, warnings=[run.warnings[0].replace("coefficient of 2 ", "coefficient of 1.9 ")]), seen
+    )
+    assert "foot can wedge itself from a coefficient of 2 on" in wrong
+    settings["contacts"]["friction"] = 1.9
+    run = _simulated(settings)
+    assert not run.warnings
+    assert not list(untrue(settings, run, Observed(run)))

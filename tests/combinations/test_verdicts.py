@@ -35,6 +35,7 @@ PARTS = (
     r"^of the start|^stops are enforced",
     r"; a shorter integrator.step_s lets it pass less$|^it is still .* beyond its stop at the end$",
     r"^k_[pv] = ",
+    r"^\S+ against \S+ from a coefficient of",
 )
 LEAST_WORDS = 5
 

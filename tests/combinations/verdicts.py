@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import null_space
 
 from combinations.accelerations import critical, exists, leaves, state_of
 from combinations.observed import AT_STEP, OPEN, SLIDING, STICKING, Observed, Touch
@@ -34,6 +35,12 @@ NUMBER = r"([-+]?[0-9.]+(?:e[-+]?[0-9]+)?|inf|-inf|nan)"
 AT_REST = 1e-9
 # Rows that depend on each other have a singular value below this part of the largest.
 DEPENDENT = 1e-6
+# Share of a contact's force by which the engine may see it differently inside its cone, for lack of digits.
+UNDECIDED = 1e-3
+# Part of the warning of contacts that wedge themselves.
+WEDGED = "friction can wedge"
+# Samples in which a contact is looked at for wedging, and directions of its cone.
+LOOKED, ROUND = 41, 7201
 # A loop is unstable if the logarithm of its states grows by more than GROWTH in a second; it explains the end of a run
 # if they have grown by e to the power GROWN.
 GROWTH, GROWN = 1.0, 3.0
@@ -59,6 +66,10 @@ def untrue(scenario: Mapping[str, Any], run: Run, seen: Observed) -> Iterator[st
     rate = loop_growth(seen)
     if rate is not None and rate > 1.1 * GROWTH and not any(UNSTABLE in warning for warning in run.warnings):
         yield f"the sampled loop grows with {rate:.3g} 1/s, without a warning"
+    if seen.real and not any(WEDGED in warning for warning in run.warnings):
+        for touch in seen.touches():
+            if _often_wedged(touch, seen):
+                yield f"{touch.contact.name} can wedge itself against {touch.contact.surface_name}, without a warning"
     if isinstance(run.error, SimulationStopped):
         yield from _stop(run.error, seen)
 
@@ -561,6 +572,68 @@ def _leaves_in_impact(match: Match, seen: Observed) -> str:
     return ""
 
 
+def _wedged(match: Match, seen: Observed) -> str:
+    """Each contact is closed at its time, can wedge itself from the coefficient on, and nothing else decides there."""
+    said = rf"(\S+) against \S+ from a coefficient of {NUMBER} on \(it has {NUMBER}, t = {NUMBER} s\)"
+    entries = re.findall(said, match[1])
+    for name, least, friction, time in entries:
+        touch = _touch(seen, name)
+        if touch is None or not seen.real:
+            return f"no contact {name} that can open"
+        if not _near(touch.contact.friction_at_rest, friction):
+            return f"{name} has a coefficient of {touch.contact.friction_at_rest:g}"
+        own, undecided = _wedges(touch, seen, int(np.abs(seen.time - float(time)).argmin()), -UNDECIDED)
+        if not _near(own, least):
+            return f"{name} can wedge itself from a coefficient of {own:.4g} on"
+        if not undecided:
+            return f"{name} sticks there by its load alone"
+    return "" if entries else "it names no contact"
+
+
+def _often_wedged(touch: Touch, seen: Observed) -> bool:
+    """Whether a contact can wedge itself in a tenth of the samples in which it is closed, one after another."""
+    mu, contact = touch.contact.friction_at_rest, touch.contact
+    closed = np.flatnonzero(touch.mode != OPEN)
+    if contact.stiffness > 0.0 or contact.grip_axis is not None or mu == 0.0 or not len(closed):
+        return False
+    looked = closed[np.linspace(0, len(closed) - 1, LOOKED).astype(int)].tolist()
+    in_row = 0
+    for i in looked:
+        least, undecided = _wedges(touch, seen, i, UNDECIDED)
+        in_row = in_row + 1 if undecided and least < mu * (1.0 - DIGITS) else 0
+        if in_row > LOOKED // 10:
+            return True
+    return False
+
+
+def _wedges(touch: Touch, seen: Observed, i: int, margin: float) -> tuple[float, bool]:
+    """The least coefficient with which a contact wedges itself in a sample, and whether its load leaves that open.
+
+    Forces that no joint feels are looked for among all directions of the cone's axis and of a circle around it. The
+    load decides if forces without them, along the normal and along possible slip, are in the cone, but for a ``margin``
+    that is a share of the force.
+    """
+    n, closed = touch.normal[i], touch.mode[i] != OPEN
+    rows = seen.bodies.jacobian(seen.motion, touch.body, touch.position)[i] @ seen.bodies.free_directions()
+    values, vectors = np.linalg.eigh(rows @ rows.T)
+    null = vectors[:, values <= DEPENDENT**2 * values[-1]]
+    if not closed or not null.shape[1] or np.linalg.norm(n @ rows) <= DEPENDENT * np.sqrt(values[-1]):
+        return np.inf, False
+    angles = np.linspace(0.0, 2.0 * np.pi, ROUND)
+    across = np.array([np.cos(angles), np.sin(angles)])[: null.shape[1]]
+    directions = null @ (across if null.shape[1] == 2 else np.array([[-1.0, 1.0]]))
+    along = np.maximum(n @ directions, DEPENDENT)
+    least = float((np.sqrt(np.maximum(1.0 - along**2, 0.0)) / along).min())
+    # Slip keeps the point on its surface.
+    still = null_space(np.array([n @ rows])) if rows.shape[1] > 1 else np.zeros((rows.shape[1], 0))
+    u, sizes, _ = np.linalg.svd(rows @ still)
+    slips = u[:, : int((sizes > DEPENDENT * np.sqrt(values[-1])).sum())]
+    needed = np.linalg.lstsq(rows.T @ np.column_stack([n, slips]), rows.T @ touch.force[i], rcond=None)[0]
+    edge = touch.contact.friction_at_rest * needed[0] - float(np.linalg.norm(needed[1:]))
+    outside = min(needed[0], edge) < -margin * float(np.linalg.norm(touch.force[i])) - 1e-9 * np.sign(margin)
+    return least, bool(touch.mode[i] == SLIDING or outside)
+
+
 def _slips_at_once(match: Match, seen: Observed) -> str:
     moves = float(np.abs(seen.vdot[0]).max(initial=0.0)) > 1e-6
     early = any(event.kind == "slip_start" and event.time <= 2e-3 for event in seen.record.events)
@@ -623,6 +696,7 @@ VERIFIERS: dict[str, Callable[[Match, Observed], str]] = {
     rf"^controller.sample_time_s = {NUMBER} s: the sampled loop is unstable": _unstable,
     r"^the motion is not unique: nothing presses (.+), held by": _unpressed,
     r"^the motion is not unique: impacts of other points or joint stops, .+?, lift (.+) off, while": _leaves_in_impact,
+    r"^the motion is not unique: friction can wedge (.+) by itself, without a load": _wedged,
     r"^initial.equilibrium: moves (.+) from the requested posture": _moved_at_the_start,
     rf"^initial.equilibrium: (\S+) starts with {NUMBER} \S+ all the same.*": _moves_at_once,
     rf"^initial.equilibrium: the start slips at t = {NUMBER} s": _slips_at_once,

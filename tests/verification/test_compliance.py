@@ -337,11 +337,11 @@ def test_energy_that_steps_make_at_landings_is_warned_of_with_a_step_that_is_eno
         return simulate(scenario_from_resolved(config | {"integrator": {"method": "time_stepping", "step_s": step}}))
 
     record = drop(1e-3)
-    (told,) = [text for text in record.summary["warnings"] if "give way get" in text]
+    (warning,) = [text for text in record.summary["warnings"] if "give way get" in text]
     made = record.summary["time_stepping"]["scheme_gain_J"]
-    assert f"get {made:.3g} J from the steps themselves" in told
+    assert f"get {made:.3g} J from the steps themselves" in warning
     turnover = record.summary["energy_turnover_J"]
     assert GAIN_LIMIT * turnover < made < 0.25 * turnover
-    finer = drop(float(told.rsplit(" ", 1)[1]))
+    finer = drop(float(warning.rsplit(" ", 1)[1]))
     assert finer.summary["time_stepping"]["scheme_gain_J"] <= GAIN_LIMIT * finer.summary["energy_turnover_J"]
     assert not [text for text in finer.summary["warnings"] if "give way get" in text]
