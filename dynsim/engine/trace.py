@@ -36,7 +36,7 @@ def even_times(start: float, end: float, rate: float, first: int = 0, count: int
     return np.append(times, end) if apart and first <= last + 1 < stop else times
 
 
-def _times(start: float, rate: float, numbers: Array) -> Array:
+def _times(start: float, rate: float, numbers: NDArray[np.int64]) -> Array:
     """Times [s] of samples by number; of a run that goes on from a sample of another one, exactly those of that one.
 
     A load may jump at such a time. 0.35 + 0.05 is before 0.4.
