@@ -76,7 +76,8 @@ def test_points_that_land_nearly_at_rest_stick(tmp_path: Path, method: str) -> N
 def test_slip_that_begins_slowly_takes_no_more_steps_the_tighter_the_tolerances() -> None:
     """Stribeck's friction falls with the slip, so that a pull that grows lets it begin without a jump of forces.
 
-    Friction turns a slip of speed v at a rate that goes as 1/v: steps went as 1/atol, and runs stopped for it.
+    Friction turns a slip of speed v at a rate that goes as 1/v: steps went as 1/atol, and runs stopped for it. Below
+    the limit of slow slip it turns as fast as at the limit, which costs an explicit method steps once, at the start.
     """
     axes = [{"kind": "prismatic", "axis": axis, "length_m": 0, "mass_kg": 0.3} for axis in "zxy"]
     runs = []
@@ -107,4 +108,4 @@ def test_slip_that_begins_slowly_takes_no_more_steps_the_tighter_the_tolerances(
         assert [event.kind for event in runs[-1].events] == ["slip_start"]
     loose, tight = runs
     assert tight["q"][-1] == pytest.approx(loose["q"][-1], abs=1e-6)
-    assert tight.summary["steps"] < 2 * loose.summary["steps"] < 20_000
+    assert tight.summary["steps"] < 2 * loose.summary["steps"] < 40_000
