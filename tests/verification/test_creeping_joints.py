@@ -57,6 +57,7 @@ def dragged(method: str, rtol: float) -> Record:
     return simulate(scenario_from_resolved(config))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("rtol", "reference"), [(1e-6, 1e-8), (1e-7, 1e-9)])
 @pytest.mark.parametrize("method", ["dopri5", "radau5"])
 def test_energies_where_elbows_slide_and_joints_rub_are_within_five_rtol(method: str, rtol: float, reference: float):

@@ -62,7 +62,8 @@ integrator: {rtol: 1.0e-9, atol: 1.0e-11}
 """
 
 
-@pytest.mark.parametrize("method", ["dopri5", pytest.param("radau5", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("method", ["dopri5", "radau5"])
 def test_points_that_land_nearly_at_rest_stick(tmp_path: Path, method: str) -> None:
     path = tmp_path / "braced.yaml"
     path.write_text(BRACED.replace("integrator: {", f"integrator: {{method: {method}, "))
