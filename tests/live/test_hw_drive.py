@@ -378,6 +378,8 @@ for patient in (
     ("rate: 200 ", "rate: 50 "),
     ("watchdog: 0.2 ", "watchdog: 2.0 "),
     ("policy: decelerate", "missed_cycles: 25\n  late_cycles: 25\n  following_cycles: 25\n  policy: decelerate"),
+    # A key that seems to be released for a moment stops the wheels.
+    ("limits: {velocity: 5.0, torque: 1.8}", "limits: {velocity: 5.0, torque: 1.8, shaking: 20.0}"),
 ):
     assert patient[0] in SNAKE
     SNAKE = SNAKE.replace(*patient)
