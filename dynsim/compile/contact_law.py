@@ -66,8 +66,8 @@ def compile_unilateral(
     contacts: Sequence[Contact],
     stops: Sequence[JointStop],
     slow: float,
+    creep: float,
     dry: Sequence[DryFriction] = (),
-    creep: float | None = None,
 ) -> UnilateralArrays:
     """Tables of the unilateral law.
 
@@ -75,8 +75,8 @@ def compile_unilateral(
     ----------
     stops : what joints come up against
     slow : speed below which slip has no direction of its own [m/s]
+    creep : rate below which a joint that rubs may be at rest [rad/s or m/s]
     dry : joints that rub
-    creep : rate below which such a joint may be at rest [rad/s or m/s]; default: ``slow``
     """
     c, s, ties = len(contacts), len(stops), robot.ties
     shares = share_count(len(robot.couplings), c, s, len(dry))
@@ -101,8 +101,7 @@ def compile_unilateral(
     stop[:, ku.STOP_SETTLE], stop[:, ku.STOP_WINDOW_START] = SETTLE_SPEED, -np.inf
     tally, number = np.zeros((c, ku.TALLY_SIZE)), np.zeros(ku.NUMBERS)
     tally[:, ku.SETTLE], tally[:, ku.WINDOW_START], number[ku.LAST_CHANGE] = SETTLE_SPEED, -np.inf, -np.inf
-    number[ku.SLOW], number[ku.HOLDING] = slow, 1.0
-    number[ku.CREEP] = slow if creep is None else creep
+    number[ku.SLOW], number[ku.CREEP], number[ku.HOLDING] = slow, creep, 1.0
     return UnilateralArrays(
         slide=reals(slide),
         mode=integers(np.zeros((c, ku.MODE_SIZE))),

@@ -382,11 +382,11 @@ def sharing(
     for t in several[:MOST_SETS]:
         bases, owner = [], []
         for k in np.flatnonzero(modes[t] != ka.OPEN).tolist():
-            basis = _basis(touching_rows(model, contacts[k], q[t], bool(modes[t, k] == ka.STICKING)) @ free)
+            basis = row_basis(touching_rows(model, contacts[k], q[t], bool(modes[t, k] == ka.STICKING)) @ free)
             bases.append(basis)
             owner += [k] * len(basis)
         for k in np.flatnonzero(rests[t]).tolist():
-            bases.append(_basis(np.eye(model.n)[k][None] @ free))
+            bases.append(row_basis(np.eye(model.n)[k][None] @ free))
             owner += [len(contacts) + k] * len(bases[-1])
         left, sizes, _ = np.linalg.svd(np.vstack(bases))
         rank = int(np.count_nonzero(sizes > DEPENDENT))
@@ -428,7 +428,7 @@ def touching_rows(model: Model, contact: Contact, q: Array, sticks: bool) -> Arr
     return jacobian if sticks else (normal @ jacobian)[None]
 
 
-def _basis(rows: Array) -> Array:
+def row_basis(rows: Array) -> Array:
     """Orthonormal basis of the space of some rows, (r, n)."""
     _, sizes, basis = np.linalg.svd(rows, full_matrices=False)
     # A row of zeros has rounding of its size.

@@ -188,7 +188,7 @@ def prepare(
         couplings=compile_couplings(robot),
         shapes=compile_shapes(robot, contacts),
         unilateral=compile_unilateral(
-            robot, contacts, stops, slow_slip(options.absolute_tolerance), dry, creep(options.absolute_tolerance)
+            robot, contacts, stops, slow_slip(options.absolute_tolerance), creep(options.absolute_tolerance), dry
         )
         if real
         else None,

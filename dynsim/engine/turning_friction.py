@@ -22,7 +22,7 @@ from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.derivative import derivative
 from dynsim.dynamics.state import block
-from dynsim.engine.force_indeterminacy import touching_rows
+from dynsim.engine.force_indeterminacy import contact_point
 from dynsim.engine.prepare import Prepared
 from dynsim.integrators import run as ki
 
@@ -74,15 +74,15 @@ def fastest(prepared: Prepared) -> Turning | None:
         mode, state = int(ws.active[k, ka.MODE]), ws.contacts[k]
         if mode == ka.OPEN:
             continue
-        own = touching_rows(model, contact, q, mode == ka.STICKING)
-        rows.append(own)
+        normal, point = contact_point(model, contact, q)
         if mode == ka.STICKING:
-            forces.append(own)
+            rows.append(point)
+            forces.append(point)
             continue
-        along, point = state[ka.TANGENT : ka.TANGENT + 3], touching_rows(model, contact, q, True)
-        mu = float(ws.rows[ws.active[k, ka.FIRST_ROW], ka.ROW_MU])
-        forces.append(own - mu * along @ point)
-        across = np.cross(state[ka.NORMAL : ka.NORMAL + 3], along) @ point
+        along, mu = state[ka.TANGENT : ka.TANGENT + 3], float(ws.rows[ws.active[k, ka.FIRST_ROW], ka.ROW_MU])
+        rows.append((normal @ point)[None])
+        forces.append(((normal - mu * along) @ point)[None])
+        across = np.cross(normal, along) @ point
         speed = float(np.linalg.norm(state[ka.SLIP_VELOCITY : ka.SLIP_VELOCITY + 3]))
         sliding.append((k, across, mu * float(state[ka.NORMAL_FORCE]), speed))
     R, F = np.vstack(rows), np.vstack(forces)

@@ -557,9 +557,9 @@ def _resolving(stepping: dict[str, Any], share: float) -> float:
     """
     step, pulsation = float(stepping["step_s"]), stepping["spring_rate_rad_per_s"]
     # What else makes energy, of the method's order or of first order, is in the share.
-    shorter = step * GAIN_LIMIT / share
-    # Ties may be dampers alone.
-    return min(GAIN_LIMIT**0.5 / pulsation, step * (GAIN_LIMIT / share) ** 0.5) if pulsation > 0.0 else shorter
+    if pulsation == 0.0:  # ties that are dampers alone
+        return step * GAIN_LIMIT / share
+    return float(min(GAIN_LIMIT**0.5 / pulsation, step * (GAIN_LIMIT / share) ** 0.5))
 
 
 def _shorter(step: float) -> float:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from dynsim.compile.model import Model
 from dynsim.dynamics import tables as ka
-from dynsim.engine.force_indeterminacy import DEPENDENT, contact_point, free_rates
+from dynsim.engine.force_indeterminacy import DEPENDENT, contact_point, free_rates, row_basis
 from dynsim.model.description import Contact
 from dynsim.record import Record
 
@@ -30,8 +30,6 @@ Array = NDArray[np.float64]
 
 # Samples in which a contact is examined, at equal distances among those in which it is closed.
 POSTURES = 20
-# Points that joints move by less are immobile [m/rad or 1].
-IMMOBILE = 1e-9
 # A force that leaves its cone by less, relative or in N, lies on it except for rounding.
 ON_CONE = 1e-6
 
@@ -79,11 +77,9 @@ def least_coefficient(jacobian: Array, normal: Array) -> tuple[float, Array]:
 
     A point that joints do not move along the normal carries nothing, and has none either.
     """
-    directions, sizes, _ = np.linalg.svd(jacobian)
-    largest = sizes.max(initial=0.0)
-    rank = int(np.count_nonzero(sizes > DEPENDENT * largest)) if largest > IMMOBILE else 0
-    moving, blocked = directions[:, :rank], directions[:, rank:]
-    own, other = float(np.linalg.norm(normal @ moving)), float(np.linalg.norm(normal @ blocked))
+    moving = row_basis(jacobian.T).T
+    along = normal @ moving
+    own, other = float(np.linalg.norm(along)), float(np.linalg.norm(normal - moving @ along))
     # Blocked directions are known up to DEPENDENT: what is less is a direction across the normal.
     if own <= DEPENDENT or other <= DEPENDENT:
         return np.inf, moving

@@ -328,7 +328,7 @@ def assemble(
         dense=np.zeros((size, size + 1)) if m_star else None,
         couplings=compile_couplings(robot),
         shapes=compile_shapes(robot, contacts or []),
-        unilateral=compile_unilateral(robot, contacts or [], stops, slow, rubbing) if real else None,
+        unilateral=compile_unilateral(robot, contacts or [], stops, slow, slow, rubbing) if real else None,
     )
     return CompiledSystem(robot, system, new_workspace(system), tuple(contacts or ()) if real else (), tuple(stops))
 

@@ -101,7 +101,7 @@ TIE_FORCE = 22  # on A along or about the axis [N or N m]
 TIE_STORED = 23  # in its spring [J]
 TIE_GIVEN = 24  # how far its rest has moved since it began, there and back [m or rad]
 TIE_REST_NOW, TIE_STORED_NOW, TIE_AT, TIE_IMPLICIT = 25, 26, 27, 28  # of the step that is tried
-TIE_TURNED = 29  # its rotation vector along the axis, or deflection, at the last step [rad or m]
+TIE_TURNED = 29  # of a torsion: its rotation vector along the axis at the last step [rad]
 TIE_SIZE = 30
 # UnilateralArrays.mode, int: columns
 WANTED, BEFORE, TOUCHING, STRUCK = 0, 1, 2, 3

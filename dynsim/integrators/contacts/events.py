@@ -43,6 +43,7 @@ from dynsim.integrators.contacts.impacts import IMMOBILE, evaluate, largest_righ
 from dynsim.integrators.contacts.leaving import approach_without_force, watch_unpressed
 from dynsim.integrators.contacts.modes import (
     SLIP_TOLERANCE,
+    SPLIT_SLACK,
     acceleration_left,
     begin_slip,
     drops,
@@ -78,9 +79,6 @@ BACKWARD = 2e-11
 TURNED = 0.5
 # Forces that contradict their modes by less than this, absolute [N] and of the largest, are rounding.
 FORCE_SLACK = 1e-9
-# Margins of a split that differ by less, as a fraction of its largest force, are the same: the accuracy of the program
-# that finds the best split.
-SPLIT_SLACK = 1e-7
 # At the end of the best split sticking is still a solution. So friction at rest is reduced for the choice of modes, by
 # FIRST_REDUCTION and ten times more up to MOST_REDUCTION, until the chosen modes agree with their forces: far above
 # rounding and the tolerances of the choice, far below the uncertainty of friction coefficients.

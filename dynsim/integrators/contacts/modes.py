@@ -60,9 +60,9 @@ LEAST_SHARE = 1e-3
 # If no forces agree with slip slower than this [m/s], the slip is stopped, as unbounded friction would stop it: an
 # impact of 5e-11 J per kilogram. Without it points that land within a step of coming to rest would end a run.
 NEARLY_AT_REST = 1e-5
-# Forces whose worst margin is below this share of the largest are a corner of the admissible ones: the accuracy of the
-# program that finds the best split.
-NO_MARGIN = 1e-7
+# Margins of a split that differ by less, as a fraction of its largest force, are the same, and forces with no more of a
+# margin are a corner of the admissible ones: the accuracy of the program that finds the best split.
+SPLIT_SLACK = 1e-7
 # A friction force this close to the cone, as a fraction, counts as on it.
 ON_CONE = 1e-7
 # Which joints with dry friction a choice of modes holds: all slow joints; the same, unless their rates contradict other
@@ -239,7 +239,7 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
         return True
     take_solution(system, ws, size, largest)
     margin = release_dependent_joints(system, ws, size)
-    if unilateral.number[ku.SEARCH] != ku.LAST and margin <= NO_MARGIN:
+    if unilateral.number[ku.SEARCH] != ku.LAST and margin <= SPLIT_SLACK:
         unilateral.number[ku.CORNER] = 1.0
         return False
     for i in range(size):

@@ -245,20 +245,23 @@ def place_ties(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace):
         r, b, axis = table[k, ku.TIE_ROW], table[k, ku.TIE_B], vector(tie, k, ku.TIE_AXIS)
         A = rotation(ws.links, table[k, ku.TIE_A], ka.R)
         if table[k, ku.TIE_TURNS] == 1:
-            put_vector(rows, r, ka.ROW, rotate(A, turning_axis(axis, tie_turn(unilateral, ws, k))))
+            turn = tie_turn(unilateral, ws, k)
+            put_vector(rows, r, ka.ROW, rotate(A, turning_axis(axis, turn)))
             put_vector(rows, r, ka.ROW + 3, ZERO_VECTOR)
+            x = -dot_vector(axis, turn)
+            # Rotation vectors are at most half a turn long and go on at the other side; the rest goes with them.
+            if abs(x - tie[k, ku.TIE_TURNED]) > math.pi:
+                tie[k, ku.TIE_REST] += math.copysign(2.0 * math.pi, x - tie[k, ku.TIE_TURNED])
+            tie[k, ku.TIE_TURNED] = x
         else:
             R = rotation(ws.links, b, ka.R)
             at = transform(vector(ws.links, b, ka.P), R, vector(tie, k, ku.TIE_OTHER_POINT))
             put_six(rows, r, ka.ROW, wrench_at(at, rotate(A, axis), ZERO_VECTOR))
+            x = tie_deflection(unilateral, ws, k)
         for j in range(6):
             rows[r, ka.DIRECTION + j] = rows[r, ka.ROW + j]
         rows[r, ka.TARGET], s.kind[r] = 0.0, table[k, ku.TIE_KIND]
-        turned = tie_deflection(unilateral, ws, k)
-        # Rotation vectors are at most half a turn long and go on at the other side; the rest goes with them.
-        if table[k, ku.TIE_TURNS] == 1 and abs(turned - tie[k, ku.TIE_TURNED]) > math.pi:
-            tie[k, ku.TIE_REST] += math.copysign(2.0 * math.pi, turned - tie[k, ku.TIE_TURNED])
-        tie[k, ku.TIE_TURNED], tie[k, ku.TIE_AT] = turned, turned - tie[k, ku.TIE_REST]
+        tie[k, ku.TIE_AT] = x - tie[k, ku.TIE_REST]
 
 
 @internal_kernel
