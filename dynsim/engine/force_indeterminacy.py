@@ -411,8 +411,8 @@ def contact_point(model: Model, contact: Contact, q: Array) -> tuple[Array, Arra
         end = model.robot.attach(contact.body, contact.tip)[1]
         start, other = (model.point_position(body, at, q) for at in (point, end))
         point = point + share_of_axis(contact, start, other) * (end - point)
-    normal = contact.surface.normal(model.point_position(body, point, q))
-    rotation, _ = model.body_pose(body, q)
+    rotation, origin = model.body_pose(body, q)
+    normal = contact.surface.normal(origin + rotation @ point)
     return normal, model.point_jacobian(body, point - contact.radius * (rotation.T @ normal), q)
 
 

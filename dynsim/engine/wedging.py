@@ -50,7 +50,7 @@ def wedges(model: Model, contacts: Sequence[Contact], record: Record) -> list[We
     Springs decide the normal forces of compliant contacts. Friction that depends on direction (``grip``) is left out:
     it has another cone, and does not oppose slip.
     """
-    result, free = list[Wedge](), free_rates(model)
+    result, free, q = list[Wedge](), free_rates(model), record["q"]
     for k, contact in enumerate(contacts):
         friction = contact.friction_at_rest
         if contact.stiffness > 0.0 or contact.grip_axis is not None or friction == 0.0:
@@ -58,9 +58,9 @@ def wedges(model: Model, contacts: Sequence[Contact], record: Record) -> list[We
         mode, own = record["contact_mode"][:, k], list[Wedge]()
         closed = np.flatnonzero(mode != ka.OPEN)
         for t in closed[np.unique(np.linspace(0, len(closed) - 1, min(POSTURES, len(closed))).astype(int))].tolist():
-            if not np.isfinite(record["q"][t]).all():
+            if not np.isfinite(q[t]).all():
                 continue
-            normal, jacobian = contact_point(model, contact, record["q"][t])
+            normal, jacobian = contact_point(model, contact, q[t])
             least, moving = least_coefficient(jacobian @ free, normal)
             if least > friction:
                 continue
