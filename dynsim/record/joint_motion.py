@@ -42,9 +42,11 @@ def export_record(record: Record, path: Path, format_: Format, *, rate: float | 
     Raises
     ------
     RecordError
-        No joint angles in the record, or the file cannot be written.
+        No joint angles in the record, only one sample, or the file cannot be written.
     """
     joints, time, position, velocity = joint_motion(record)
+    if len(time) < 2:
+        raise RecordError("the record has only one sample; a motion needs two")
     if rate is not None:
         if not 0 < rate < np.inf:
             raise RecordError(f"--rate must be positive, not {rate}")
@@ -75,7 +77,7 @@ def joint_motion(
     Raises
     ------
     RecordError
-        The record holds none, only one sample, or a value that is not finite.
+        The record holds none, no sample, or a value that is not finite.
     """
     joints: list[str] = []
     angles, rates = [], []
@@ -88,8 +90,8 @@ def joint_motion(
     if not joints:
         pairs = ", ".join(f"{name} with {rate}" for name, rate in RATES.items())
         raise RecordError(f"the record holds no joint motion ({pairs}); it has {', '.join(record)}")
-    if len(record) < 2:
-        raise RecordError(f"the record has {len(record)} samples; a motion needs two")
+    if not len(record):
+        raise RecordError("the record has no samples")
     position, velocity = np.hstack(angles), np.hstack(rates)
     for quantity, values in (("position", position), ("rate", velocity)):
         for sample, joint in np.argwhere(~np.isfinite(values))[:1]:

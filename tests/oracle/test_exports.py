@@ -18,6 +18,8 @@ from dynsim.model.description import Coupling, Inertia, Link, Robot, Tie
 from dynsim.model.drives import Motor
 from dynsim.model.joints.ball import ball, floating
 from dynsim.model.joints.planar import planar
+from dynsim.record.joint_motion import export_record
+from dynsim.record.mcap_file import write_mcap
 from dynsim.record.poses import poses_at
 from dynsim.record.scene import Shape
 from dynsim.record.urdf_text import scene_urdf
@@ -290,6 +292,19 @@ def test_rosbags_reads_the_file_too(bag: tuple[dynsim.Record, Path]) -> None:
             if item.topic == "/joint_states"
         ]
     np.testing.assert_array_equal(actual, record["q"])
+
+
+def test_a_run_that_stopped_after_its_first_sample_is_a_bag_too(tmp_path: Path) -> None:
+    """Figures and the page take one sample; formats of a motion need two, and say so."""
+    pytest.importorskip("mcap")
+    scenario = load_scenario("elbow_comparison_floor", "two_elbows")
+    simulation = dynsim.Simulation(scenario)
+    simulation.advance(1e-6)
+    record = simulation.record(scenario)
+    assert len(record) == 1
+    assert write_mcap(record, tmp_path / "run.mcap").stat().st_size > 1000
+    with pytest.raises(dynsim.errors.RecordError, match="only one sample"):
+        export_record(record, tmp_path / "run.csv", "csv")
 
 
 def test_the_description_in_the_bag_is_the_scene_in_pinocchio(bag: tuple[dynsim.Record, Path]) -> None:
