@@ -454,10 +454,10 @@ def _stepped_balance(seen: Observed) -> Balance:
         angle = np.linalg.norm(later.normal - touch.normal, axis=1, keepdims=True)
         slack = slack + np.abs(_contact_term(seen, middle, touch, angle * np.cross(touch.normal, turned)))
     # Velocity products use the rates extrapolated with the last acceleration, after an impact that of the last step
-    # without one, or the rates of the start if contacts have changed.
+    # without one, or the rates of the start if contacts have changed. A landing that is too slow is no impact.
     best = _balanced(seen, rows, [_inertial(seen, q_middle, v_start, a), *terms[1:]], slack)
     smooth = _without_impact(seen)
-    for last in (rows - 1, smooth[rows - 1]):
+    for last in (rows - 1, rows - 2, rows - 3, smooth[rows - 1]):
         earlier = np.where((last > 0)[:, None], seen.vdot[last], 0.0)
         led = _balanced(seen, rows, [_inertial(seen, q_middle, v_start + theta * h * earlier, a), *terms[1:]], slack)
         better = (led.excess.max(axis=1) < best.excess.max(axis=1))[:, None]
