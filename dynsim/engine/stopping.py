@@ -14,7 +14,7 @@ from dynsim.dynamics.state import block
 from dynsim.engine.force_indeterminacy import paradox
 from dynsim.engine.prepare import Prepared
 from dynsim.engine.soundness import moving_nothing, unstable_stop
-from dynsim.engine.turning_friction import held_up
+from dynsim.engine.stiff_friction import held_up
 from dynsim.errors import SimulationStopped
 from dynsim.integrators import project as kp
 from dynsim.integrators import run as ki

@@ -302,9 +302,11 @@ def test_a_run_that_crawls_to_its_wall_limit_is_found(share: float, crawls: bool
     assert ("verdict" in _kinds(replace(run, error=stop))) == crawls
 
 
+@pytest.mark.parametrize("law", ["unilateral", "bilateral"])
 @pytest.mark.parametrize("wrong", ["", "time", "speed", "step", "method"])
-def test_a_run_that_turning_friction_holds_up_is_true_to_its_words(wrong: str) -> None:
+def test_a_run_that_stiff_friction_holds_up_is_true_to_its_words(law: str, wrong: str) -> None:
     settings = yaml.safe_load((Path(__file__).parents[1] / "data" / "endless" / "creeping_block.yaml").read_text())
+    settings["contacts"] |= {"law": law} | ({"slip_smoothing_m_s": 1e-7} if law == "bilateral" else {})
     run = _simulated(settings)
     stop = run.error
     assert isinstance(stop, SimulationStopped)
