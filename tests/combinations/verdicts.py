@@ -127,8 +127,8 @@ def _crawls(stop: SimulationStopped, seen: Observed) -> str:
 
 
 HOLDS_UP = (
-    rf"steps are as short as {NUMBER} s because (\S+) slips at {NUMBER} m/s and its friction changes within {NUMBER} s; "
-    rf"integrator.method: radau5"
+    rf"steps are as short as {NUMBER} s because (\S+) slips at {NUMBER} m/s and its friction changes within {NUMBER} "
+    rf"s; integrator.method: radau5"
 )
 # Explicit steps that stiff friction holds up, in its time constants: the limit of stability of DOPRI5 is 3.3,
 # and steps go up to it, are rejected, and go up again.
