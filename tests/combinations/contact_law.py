@@ -94,11 +94,15 @@ def _unsolved(seen: Observed, rate: float) -> Array:
 def _reach(seen: Observed, touch: Touch) -> Array:
     """Largest gap of a contact with a force, (T,) [m]; time stepping adds the motion of a step along the normal.
 
-    A point that starts within a micrometre of its surface counts as closed.
+    A point that starts within a micrometre of its surface counts as closed. While it is closed, its rate along the
+    normal is zero at the end of each step, so that it leaves the surface by half the change of that rate in a step.
     """
     if not seen.stepped:
         return np.full(len(seen), 10.0 * DRIFT)
-    return 1e-6 + seen.step * (_fastest_approach(touch) + np.linalg.norm(touch.slip, axis=1))
+    closed = touch.mode != OPEN
+    left = np.cumsum(np.where(closed, np.abs(_turned_rows(seen, touch)[0]), 0.0))
+    left = left - np.maximum.accumulate(np.where(closed, 0.0, left))
+    return np.asarray(1e-6 + left + seen.step * (_fastest_approach(touch) + np.linalg.norm(touch.slip, axis=1)))
 
 
 def _fastest_approach(touch: Touch) -> Array:
