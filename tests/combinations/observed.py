@@ -199,9 +199,9 @@ class Observed:
         Steps of one length follow each other from each beginning and end of a load, and from each tick; the last one
         before the next is cut there.
         """
-        h, t, period = self.step, self.time, self.period
+        h, t = self.step, self.time
         knots = [t[:1], *(load.knots for load in self.loads)]
-        if period is not None:
+        for period in self.periods:
             knots.append(period * np.arange(np.ceil(t[0] / period - AT_STEP), t[-1] / period + 1.0))
         instants = np.unique(np.concatenate(knots))
         k = np.maximum(np.searchsorted(instants, t - AT_STEP * h) - 1, 0)
@@ -301,17 +301,20 @@ class Observed:
         return (self.config.get("controller") or {}).get("sample_time_s")
 
     @property
-    def period(self) -> float | None:
-        """Period of ticks, at which commands are taken [s]; None if there are none."""
-        return self.sample_time or (self.config.get("controller") or {}).get("period_s")
+    def periods(self) -> list[float]:
+        """Periods of ticks, at which commands of a controller or an operator are taken [s]."""
+        controller = self.config.get("controller") or {}
+        operator = controller.get("operator")
+        periods = [self.sample_time, controller.get("period_s"), 1.0 / operator["rate_hz"] if operator else None]
+        return [period for period in periods if period is not None]
 
     @cached_property
     def at_ticks(self) -> NDArray[np.bool_]:
         """Whether each sample is at a tick, when the controller has just given new commands, (T,)."""
-        period = self.period
-        if period is None:
-            return np.zeros(len(self), dtype=bool)
-        return np.asarray(np.abs(self.time / period - np.round(self.time / period)) < AT_STEP)
+        at = np.zeros(len(self), dtype=bool)
+        for period in self.periods:
+            at |= np.abs(self.time / period - np.round(self.time / period)) < AT_STEP
+        return at
 
     @cached_property
     def constants(self) -> Array:
