@@ -193,17 +193,27 @@ def _begins_to_move(seen: Observed) -> bool:
 
 
 def _misread(seen: Observed) -> float:
-    """Return the largest acceleration from encoder errors at the start, which servos pass on without a delay."""
+    """Return the largest acceleration from encoder errors at the start.
+
+    Servos pass errors on without a delay. Circuits follow the voltage with L/R, of which the first time step sees a
+    part.
+    """
     encoders = (seen.config.get("sensors") or {}).get("encoders") or {}
     angle = np.radians(0.5 * encoders.get("resolution_deg", 0.0) + 6.0 * encoders.get("noise_deg", 0.0))
-    servos = [motor for motor in seen.robot.motors if isinstance(motor, Servo)]
-    if not servos or not angle:
+    if not angle:
         return 0.0
     mobility = np.abs(np.linalg.pinv(seen.bodies.mass_matrix(seen.robot.initial)))
-    total = sum(
-        mobility[:, seen.joints.index(servo.joint)] * servo.k_p * angle * servo.joint_constant / servo.resistance
-        for servo in servos
-    )
+    gains = np.broadcast_to((seen.config.get("controller") or {}).get("k_p_V_per_rad", 0.0), len(seen.robot.motors))
+    total = np.zeros(len(mobility))
+    for motor, gain in zip(seen.robot.motors, gains, strict=True):
+        if isinstance(motor, Servo):
+            voltage, share = motor.k_p * angle, 1.0
+        elif isinstance(motor, Motor) and seen.stepped:
+            voltage, share = gain * angle, min(seen.step * motor.resistance / motor.inductance, 1.0)
+        else:
+            continue
+        torque = share * motor.joint_constant * voltage / motor.resistance
+        total += mobility[:, seen.joints.index(motor.joint)] * torque
     return float(np.max(total))
 
 
