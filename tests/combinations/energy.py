@@ -90,7 +90,7 @@ def powers(seen: Observed) -> Finding:
         rubbed_before = rubbed_before - np.where(rubs, (touch.tangential * earlier).sum(axis=1), 0.0)
     lost = (seen.bodies.damping * seen.v**2).sum(axis=1) - (seen.joint_signal("joint_friction") * seen.v).sum(axis=1)
     for motor in seen.robot.motors:
-        if isinstance(motor, Servo) and motor.coulomb_friction > 0.0 and not seen.real:
+        if isinstance(motor, Servo) and motor.coulomb_friction > 0.0 and seen.smoothed(motor):
             rate = seen.v[:, seen.joints.index(motor.joint)]
             lost = lost + motor.coulomb_friction * rate**2 / np.hypot(rate, motor.coulomb_speed or 1e-2)
     drawn = (current * record["voltage"]).sum(axis=1)

@@ -329,12 +329,13 @@ class Observed:
         for a, motor in enumerate(self.robot.motors):
             j = self.joints.index(motor.joint)
             torque[:, j] += self.constants[a] * current[:, a]
-            if isinstance(motor, Servo) and motor.coulomb_friction > 0.0 and self._smoothed(motor):
+            if isinstance(motor, Servo) and motor.coulomb_friction > 0.0 and self.smoothed(motor):
                 speed = 1e-2 if motor.coulomb_speed is None else motor.coulomb_speed
                 torque[:, j] -= motor.coulomb_friction * v[:, j] / np.hypot(v[:, j], speed)
         return torque
 
-    def _smoothed(self, motor: Servo) -> bool:
+    def smoothed(self, motor: Servo) -> bool:
+        """Whether the dry friction of a servo is a smooth function of its rate."""
         return motor.coulomb_speed is not None or not self.real
 
     def has_circuits(self) -> bool:
