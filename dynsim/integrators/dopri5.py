@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from dynsim.dynamics import state as kst
 from dynsim.dynamics.derivative import System, derivative
 from dynsim.dynamics.tables import Workspace
 from dynsim.integrators import run as ki
 from dynsim.integrators.run import Run
-from dynsim.integrators.steps import error_norm
+from dynsim.integrators.steps import energy_norm, error_norm
 from dynsim.jit.kernel import inline_kernel, internal_kernel
 
 # Stage rows a_ij, with the solution as the last row, whose derivative is the next step's first stage.
@@ -53,4 +54,9 @@ def step_dopri5(system: System, ws: Workspace, run: Run):
     for j in range(y.shape[0]):
         k[7, j] = 0.0
     combine(k[7], h, ERROR_DOPRI5, 7, k, k[7])
-    return error_norm(system, ws, run, k[7], 1.0)
+    error = error_norm(system, ws, run, k[7], 1.0)
+    if system.layout.circuits < ws.motors.shape[0]:
+        # Currents of circuits are states: their errors show those of the power.
+        for j in (system.layout.ledger + kst.ELECTRICAL, system.layout.ledger + kst.JOULE):
+            error = max(error, energy_norm(run, j, k[7, j]))
+    return error

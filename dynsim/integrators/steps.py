@@ -35,6 +35,16 @@ def error_norm(system: System, ws: Workspace, run: Run, error, slack):
     return math.sqrt(total / size)
 
 
+@internal_kernel
+def energy_norm(run: Run, j, error):
+    """Error of integral j of the ledger in a step, relative to what its value and its change allow.
+
+    Where motors push against what holds, nothing but their power changes, and the error of the state does not show it.
+    """
+    then, now = run.y[j], run.y_new[j]
+    return abs(error) / (run.clock[ki.ATOL] + run.clock[ki.RTOL] * (abs(now) + abs(now - then)))
+
+
 @kernel
 def finite(values):
     """True when no element is NaN or infinite."""

@@ -45,3 +45,23 @@ def test_an_event_while_everything_rests_is_located(kind: str) -> None:
     np.testing.assert_allclose(explicit["q"], implicit["q"], rtol=0, atol=1e-4)
     if kind == "contact":
         assert explicit["contact_normal_force"].min() >= -1e-6
+
+
+@pytest.mark.parametrize("method", ["dopri5", "radau5"])
+def test_the_heat_of_a_servo_that_pushes_against_a_stop_is_right(method: str) -> None:
+    """Its voltage follows the reference into the limit and out again; ∫ u²/R from the samples of the voltage.
+
+    Nothing moves, and the currents of servos are no states: dopri5 missed 2e-4 of this heat, and up to 2e-3, at any rtol.
+    """
+    servo = {"type": "servo", "voltage_V": 12, "stall_torque_N_m": 10, "no_load_speed_rad_per_s": 6, "k_p_V_per_rad": 30}
+    data = scene("stop", method)
+    data["plant"]["chain"][0]["motor"] = servo
+    data["controller"] = {"type": "joint_pd", "joints": {"joint_1": {"times_s": [0, 0.5, 1], "angles_deg": [0, 60, 0]}}}
+    record = simulate(scenario_from_resolved(data | {"record": {"rate_hz": 20_000}}))
+    assert np.abs(record["q"]).max() < 1e-9
+    voltage = record["voltage"][:, 0]
+    assert voltage.max() == 12.0
+    power = record["current"][:, 0] * voltage
+    heat = float(np.sum(0.5 * (power[1:] + power[:-1]) * np.diff(record.time)))
+    np.testing.assert_allclose(record["heat_joule"][-1], heat, rtol=2e-5)
+    np.testing.assert_allclose(record["energy_electrical"][-1], heat, rtol=2e-5)

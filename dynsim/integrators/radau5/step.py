@@ -47,7 +47,7 @@ from dynsim.integrators.radau5.tables import (
     NewtonArrays,
 )
 from dynsim.integrators.run import Run
-from dynsim.integrators.steps import error_norm
+from dynsim.integrators.steps import energy_norm, error_norm
 from dynsim.jit.compiler import form_of
 from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
@@ -303,19 +303,14 @@ def estimate(system: System, ws: Workspace, run: Run, h, slope):
 
 @internal_kernel
 def energy_error(system: System, run: Run, h):
-    """Norm of the error of electrical energy and Joule heat, by the formula of :func:`estimate` without a Jacobian.
-
-    Where motors push against what holds, only currents move, and those of long steps are right at their ends though the
-    heat between them is not.
-    """
+    """Norm of the error of electrical energy and Joule heat, by the formula of :func:`estimate` without a Jacobian."""
     r, largest = run.newton, 0.0
     for e in range(2):
         j = system.layout.ledger + (kst.ELECTRICAL if e == 0 else kst.JOULE)
         error = h * run.stage[0, j]
         for s in range(3):
             error += ERROR_RADAU[s] * r.z[s, j]
-        allowed = run.clock[ki.ATOL] + run.clock[ki.RTOL] * (abs(run.y_new[j]) + abs(r.z[2, j]))
-        largest = max(largest, abs(error) / (GAMMA_RADAU * allowed))
+        largest = max(largest, energy_norm(run, j, error / GAMMA_RADAU))
     return largest
 
 
