@@ -64,6 +64,25 @@ def test_a_growing_push_breaks_it_loose_when_it_reaches_the_friction(theta):
     assert errors[1] < (1e-5 if theta == 0.5 else 1e-2)
 
 
+@pytest.mark.parametrize("mass", [2e7, 1e10])
+def test_a_heavy_joint_moves_where_its_friction_is_exceeded(mass):
+    """x = (F − R) t²/2m beside a weight on the floor, whose g the acceleration is as good as zero to."""
+    links = (
+        Link("slide", "guide", None, "prismatic", vector(1, 0, 0), Inertia(mass), friction=FRICTION),
+        Link("foot", "rail", "slide", "prismatic", vector(0, 0, 1), Inertia(MASS)),
+    )
+    powers = np.zeros((1, 6, 4))
+    powers[0, 0, 0] = FRICTION + 1.0
+    push = Load("push", "foot", np.zeros(3), False, np.array([0.0, 10.0]), powers, True)
+    foot = Contact("foot", "foot", np.zeros(3), plane(vector(0, 0, 1)), friction=0.0)
+    b = assemble(Robot("cart", links, (), ("foot", np.zeros(3))), [foot], loads=[push], real=True, dry=True)
+    run = b.simulate(b.state(np.zeros(2), np.zeros(2)), np.linspace(0.0, 2.0, 3), rtol=1e-10)
+    # It slides from the start: that is no event.
+    assert run.count[ki.LOGGED] == 0
+    assert run.outputs("dry")[-1] == pytest.approx(-FRICTION)
+    assert run.states("q")[-1, 0] == pytest.approx(2.0 / (mass + MASS), rel=1e-6)
+
+
 def oscillator(start: float, friction: float = 0.4) -> tuple[CompiledSystem, np.ndarray, float, float]:
     """A wheel on a servo that is a spring of 20 N m/rad and a little damping; its state, stiffness and damping."""
     k_m, resistance, stiffness = 0.1, 2.0, 20.0

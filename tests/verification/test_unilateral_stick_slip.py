@@ -37,11 +37,11 @@ def foot(body: str, point: np.ndarray) -> Contact:
     return Contact("foot", body, point, FLOOR, friction=KINETIC, static_friction=STATIC, pulling_friction="signed")
 
 
-def sledge(force: np.ndarray, rate: np.ndarray) -> CompiledSystem:
+def sledge(force: np.ndarray, rate: np.ndarray, cart: float = CART) -> CompiledSystem:
     """A block on the floor under a pull F + F' t; along x it takes a cart with it that runs on rails."""
     links = tuple(
         Link(name, f"joint_{name}", "wxyz"[k] if k else None, "prismatic", np.eye(3)[k], Inertia(mass))
-        for k, (name, mass) in enumerate({"x": CART, "y": 0.0, "z": MASS}.items())
+        for k, (name, mass) in enumerate({"x": cart, "y": 0.0, "z": MASS}.items())
     )
     none = np.zeros(3)
     load = pull("z", np.append(force, none), np.append(rate, none))
@@ -115,6 +115,21 @@ def test_slip_begins_in_the_direction_of_kinetic_friction(grows):
     if not grows:
         x = 0.5 * 0.1**2 * (force[0] - friction * np.cos(angle)) / (MASS + CART)
         np.testing.assert_allclose(run.states("q")[2, :2], [x, x * np.tan(angle)], rtol=1e-7)
+
+
+@pytest.mark.parametrize("grows", [False, True])
+@pytest.mark.parametrize("cart", [2e7, 1e9, 5e9])
+def test_a_block_that_hardly_accelerates_slips_where_its_static_friction_is_exceeded(cart, grows):
+    """a = (F − μ_k N)/(M + cart), which is as good as zero beside g: forces show the slip, not accelerations."""
+    along, least = np.array([1.0, 0.0, 0.0]), STATIC * MASS * G
+    force, rate, excess, onset = (0.0, 2.0 * least, 0.0, 0.5) if grows else (least + 1.0, 0.0, 1.0, 0.0)
+    b = sledge(force * along, rate * along, cart)
+    run = b.simulate(b.state(np.zeros(3), np.zeros(3)), np.linspace(0.0, onset + 1.0, 4), rtol=1e-10)
+    assert [kind for _, _, kind in events(run)] == ([ke.SLIP_START] if grows else [])
+    held = run.outputs("contact")[-1, 0, OUT_VECTOR]
+    assert held == pytest.approx(-KINETIC * MASS * G, abs=1e-6)
+    x = (0.5 * ((STATIC - KINETIC) * MASS * G + excess) + rate / 6.0) / (MASS + cart)
+    assert run.states("q")[-1, 0] == pytest.approx(x, rel=1e-6)
 
 
 @pytest.mark.parametrize("seed", [23, 92, 472, 556])

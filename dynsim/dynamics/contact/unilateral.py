@@ -73,7 +73,8 @@ DRY_HOLDS = 3  # 1: it has a row, bounded in time stepping; 0: its force is cons
 DRY_NEXT = 4  # scratch of the choice of modes
 DRY_TOLD = 5  # 1, 0: held or sliding, as last reported to the log; -1: nothing reported yet
 DRY_BRAKE = 6  # of the joint: NEVER_CLOSED, CLOSED, or OPENED again; may be written between steps
-DRY_TABLE_SIZE = 7
+DRY_OVERLOADED = 7  # scratch of the choice of modes, as OVERLOADED
+DRY_TABLE_SIZE = 8
 NEVER_CLOSED, CLOSED, OPENED = 0, 1, 2
 # UnilateralArrays.dry: the force of a joint at rest is any up to the sum of both, in motion that against it [N m or N]
 OF_GEAR, OF_JOINT = 0, 1
@@ -108,7 +109,8 @@ WANTED, BEFORE, TOUCHING, STRUCK = 0, 1, 2, 3
 GIVES_WAY = 4  # 1: it has reached its static cone, and the kinetic coefficient holds from now on
 LEAVES = 5  # 1: nothing presses it, and the next choice of modes is without it
 TOUCHED = 6  # TOUCHING before a choice of modes
-MODE_SIZE = 7
+OVERLOADED = 7  # 1: held at rest it would have more force than its friction, however little it is accelerated
+MODE_SIZE = 8
 # UnilateralArrays.vector: three of the splits of forces, then those of the problem that chooses modes
 OFFSET, SOLUTION, CONE_FRICTION, FIRST_PART, SECOND_PART = 3, 4, 5, 6, 7
 VECTORS = 8

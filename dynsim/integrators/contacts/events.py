@@ -47,6 +47,7 @@ from dynsim.integrators.contacts.modes import (
     acceleration_left,
     begin_slip,
     drops,
+    force_slack,
     note_headway,
     resolve,
     slip_on,
@@ -77,8 +78,6 @@ INSTANT = 1e-11
 BACKWARD = 2e-11
 # A frozen direction of slip is taken anew where friction has turned from it by the angle with this tangent.
 TURNED = 0.5
-# Forces that contradict their modes by less than this, absolute [N] and of the largest, are rounding.
-FORCE_SLACK = 1e-9
 # At the end of the best split sticking is still a solution. So friction at rest is reduced for the choice of modes, by
 # FIRST_REDUCTION and ten times more up to MOST_REDUCTION, until the chosen modes agree with their forces: far above
 # rounding and the tolerances of the choice, far below the uncertainty of friction coefficients.
@@ -340,10 +339,7 @@ def split_slack(ws: Workspace):
 def consistent(system: System, ws: Workspace):
     """True when all forces agree with their modes, right after ``derivative``."""
     unilateral, table = system.unilateral, system.unilateral.stop_table
-    slack = 0.0
-    for k in range(ws.contacts.shape[0]):
-        slack = max(slack, abs(ws.contacts[k, ka.NORMAL_FORCE]))
-    slack = FORCE_SLACK * (1.0 + slack)
+    slack = force_slack(ws)
     for k in range(table.shape[0]):
         if table[k, ku.STOP_CLOSED] == 1 and unilateral.stop[k, ku.STOP_FORCE] < -slack:
             return False

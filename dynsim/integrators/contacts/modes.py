@@ -22,7 +22,7 @@ from dynsim.dynamics.contact.cone import problem as kc
 from dynsim.dynamics.contact.delassus import solve_small
 from dynsim.dynamics.contact.rows import set_modes
 from dynsim.dynamics.contact.shares import even_out, share_slot, some_slide
-from dynsim.dynamics.contact.splits import find_splits
+from dynsim.dynamics.contact.splits import dry_margin, find_splits, margin, point_shares
 from dynsim.dynamics.contact.unilateral import (
     UnilateralArrays,
     dry_bound,
@@ -55,6 +55,8 @@ from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
 # An acceleration along the surface below this fraction of the largest right-hand side counts as zero.
 SLIP_TOLERANCE = 1e-8
+# Forces that contradict their modes by less than this, absolute [N] and of the largest, are rounding.
+FORCE_SLACK = 1e-9
 # A joint with a smaller share than this in the accelerations that contradicting rows leave has no part in them.
 LEAST_SHARE = 1e-3
 # If no forces agree with slip slower than this [m/s], the slip is stopped, as unbounded friction would stop it: an
@@ -99,16 +101,66 @@ def resolve(system: System, ws: Workspace, run: Run, touch):
 @internal_kernel
 def choose(system: System, ws: Workspace, run: Run):
     """Choose modes by the accelerations of everything that touches; bring the rates of closed rows to zero."""
-    mode, stops = system.unilateral.mode, system.unilateral.stop_table
+    mode, stops, dry = system.unilateral.mode, system.unilateral.stop_table, system.unilateral.dry_table
     for k in range(mode.shape[0]):
         mode[k, ku.TOUCHED] = mode[k, ku.TOUCHING]
+        mode[k, ku.OVERLOADED] = 0
     for k in range(stops.shape[0]):
         stops[k, ku.STOP_TOUCHED] = stops[k, ku.STOP_CLOSED]
+    for k in range(dry.shape[0]):
+        dry[k, ku.DRY_OVERLOADED] = 0
     choose_joints(system, ws, run)
     # What settles after an impact may move light joints the other way; their friction is then against the new way.
     if run.count[ki.STATUS] == ki.RUNNING and some_turned_round(system, ws):
         touch_again(system.unilateral)
         choose_joints(system, ws, run)
+    # Each time there is at least one more of them.
+    while run.count[ki.STATUS] == ki.RUNNING and note_overloaded(system, ws):
+        touch_again(system.unilateral)
+        choose_joints(system, ws, run)
+    for k in range(mode.shape[0]):
+        mode[k, ku.GIVES_WAY], mode[k, ku.LEAVES] = 0, 0
+
+
+@internal_kernel
+def note_overloaded(system: System, ws: Workspace):
+    """Note points and joints that the chosen modes hold with more force than their friction; True if there are more.
+
+    A point or joint that other rows leave little mobility, or that takes a heavy body with it, is hardly accelerated
+    where its friction is exceeded: by less than the solution shows, see ``slips``. Its force shows that it slips. Held,
+    it would break loose at once, and be held again, without end.
+    """
+    unilateral, more = system.unilateral, False
+    mode, dry, number = unilateral.mode, unilateral.dry_table, unilateral.number
+    if number[ku.SPLIT] == 1.0 and number[ku.BEST_MARGIN] > 0.0:
+        return False
+    if number[ku.REDUNDANT] == 1.0:
+        find_splits(unilateral, ws)
+    slack = force_slack(ws)
+    for k in range(mode.shape[0]):
+        if ws.active[k, ka.MODE] == ka.STICKING and mode[k, ku.OVERLOADED] == 0:
+            left = margin(system.contacts, unilateral, ws, k)
+            # One that has given way is held by kinetic friction; forces that are shared may be split otherwise.
+            alone = number[ku.REDUNDANT] == 0.0 or not point_shares(unilateral, ws, k)
+            if mode[k, ku.GIVES_WAY] == 1 and alone:
+                law = system.contacts.law
+                left += (law[k, ka.MU] - number[ku.HOLDING] * law[k, ka.STATIC]) * ws.contacts[k, ka.NORMAL_FORCE]
+            if left < -slack:
+                mode[k, ku.OVERLOADED], more = 1, True
+    for k in range(dry.shape[0]):
+        holds = dry[k, ku.DRY_HOLDS] == 1 and dry[k, ku.DRY_OVERLOADED] == 0
+        if holds and dry_margin(unilateral, ws, k) < -slack:
+            dry[k, ku.DRY_OVERLOADED], more = 1, True
+    return more
+
+
+@internal_kernel
+def force_slack(ws: Workspace):
+    """Size below which forces that contradict their modes are rounding [N or N m]."""
+    strongest = 0.0
+    for k in range(ws.contacts.shape[0]):
+        strongest = max(strongest, abs(ws.contacts[k, ka.NORMAL_FORCE]))
+    return FORCE_SLACK * (1.0 + strongest)
 
 
 @internal_kernel
@@ -298,7 +350,6 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
             # As others come down, a point that leaves may be moved below its surface; it has not landed again there.
             deepest = ku.AT_ROOT + max(0.0, -ws.contacts[k, ka.GAP])
             unilateral.slide[k, ku.LANDS_AT] = max(unilateral.slide[k, ku.LANDS_AT], deepest)
-        mode[k, ku.GIVES_WAY], mode[k, ku.LEAVES] = 0, 0
         starts = mode[k, ku.WANTED] == ka.SLIDING and unilateral.slide[k, ku.FROZEN] == 1.0
         unilateral.slide[k, ku.HEADWAY] = max(0.0, -unilateral.slide[k, ku.SPEED]) if starts else 0.0
     return True
@@ -439,6 +490,7 @@ def let_joints_slide(system: System, size, largest):
         table[k, ku.DRY_NEXT] = table[k, ku.DRY_HOLDS]
         if table[k, ku.DRY_HOLDS] == 1:
             moves = abs(acceleration(unilateral, i, size)) > SLIP_TOLERANCE * largest
+            moves = moves or table[k, ku.DRY_OVERLOADED] == 1
             if moves and abs(f[i]) >= holding_bound(unilateral, k) * (1.0 - ON_CONE):
                 table[k, ku.DRY_NEXT], unilateral.dry[k, ku.DRY_SIDE] = 0, -1.0 if f[i] > 0.0 else 1.0
             i += 1
@@ -532,13 +584,15 @@ def acceleration(unilateral: UnilateralArrays, i, size):
 
 
 @internal_kernel
-def slips(system: System, i, size, largest, mu):
-    """True when the contact at row i of the reduced problem, on its cone, is accelerated along its surface."""
+def slips(system: System, k, i, size, largest):
+    """True when candidate k, at row i of the reduced problem, is on its cone and accelerated along its surface."""
     unilateral = system.unilateral
     f = unilateral.vector[ku.SOLUTION]
     friction = math.sqrt(f[i + 1] * f[i + 1] + f[i + 2] * f[i + 2])
-    if friction < mu * f[i] * (1.0 - ON_CONE):
+    if friction < friction_at_rest(system, k) * f[i] * (1.0 - ON_CONE):
         return False
+    if unilateral.mode[k, ku.OVERLOADED] == 1:
+        return True
     a, b = acceleration(unilateral, i + 1, size), acceleration(unilateral, i + 2, size)
     return math.sqrt(a * a + b * b) > SLIP_TOLERANCE * largest
 
@@ -580,7 +634,7 @@ def give_way(system: System, ws: Workspace, size, largest):
         while index[ku.TABLE_ROW, i] != ws.active[k, ka.FIRST_ROW]:
             i += 1
         holds = mode[k, ku.WANTED] == ka.STICKING and mode[k, ku.GIVES_WAY] == 0 and f[i] > 0.0
-        if holds and drops(system, k) and slips(system, i, size, largest, friction_at_rest(system, k)):
+        if holds and drops(system, k) and slips(system, k, i, size, largest):
             mode[k, ku.GIVES_WAY] = 1
             changed = True
     return changed
@@ -609,7 +663,7 @@ def take_solution(system: System, ws: Workspace, size, largest):
         if not f[i] > FORCE_TOLERANCE * strongest:
             # It touches without a force, maybe a little below its surface: it lands only if it moves deeper.
             mode[k, ku.WANTED], unilateral.slide[k, ku.LANDS_AT] = ka.OPEN, ku.DEPTH
-        elif mode[k, ku.WANTED] == ka.STICKING and slips(system, i, size, largest, friction_at_rest(system, k)):
+        elif mode[k, ku.WANTED] == ka.STICKING and slips(system, k, i, size, largest):
             fx, fy = f[i + 1], f[i + 2]
             if fx == 0.0 and fy == 0.0:
                 # Kinetic friction is zero: nothing holds the point once static friction is exceeded.
