@@ -59,6 +59,7 @@ FOUND = {
     ),
     "a joint at rest in a corner of the admissible forces: no split with the same motion had a margin": (271127, 1534),
     "a point beyond its static friction that hardly accelerated, and was held and broke loose for ever": (271127, 3158),
+    "an elbow that slid slowly and took another direction of friction with each choice of modes": (271127, 3363),
 }
 # Scenes of the slow study.
 TRIPLES = 1000

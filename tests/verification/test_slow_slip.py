@@ -4,9 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
+from support.random_robots import assemble
+from support.stepping_systems import plane
 
 from dynsim import load_scenario, simulate
+from dynsim.dynamics.contact import unilateral as ku
+from dynsim.dynamics.state import OUT_FORCE, OUT_VECTOR
+from dynsim.model.description import Contact, Inertia, Link, Load, Robot, vector
 from dynsim.scenario import scenario_from_resolved
 
 # Drawn at random. A push lifts the hand off its ball for a moment. When it lands again both points of the last link
@@ -110,3 +116,40 @@ def test_slip_that_begins_slowly_takes_no_more_steps_the_tighter_the_tolerances(
     loose, tight = runs
     assert tight["q"][-1] == pytest.approx(loose["q"][-1], abs=1e-6)
     assert tight.summary["steps"] < 2 * loose.summary["steps"] < 40_000
+
+
+@pytest.mark.parametrize("method", ["dopri5", "radau5"])
+@pytest.mark.parametrize("share", [0.7, 1.5])
+def test_friction_is_against_slow_slip_where_a_joint_breaks_loose(method: str, share: float) -> None:
+    """A foot slides along x at a share of the limit of slow slip; a gust pushes it along y, and a disc on it turns.
+
+    The disc breaks loose, so all modes are chosen again. The foot slides on: its friction is still μ m g along x.
+    """
+    mu, weight, slow, start = 0.4, 3.0 * 9.81, 1e-5, 0.01
+    first, then = 5.0 * slow, share * slow
+    links = (
+        Link("up", "joint_z", None, "prismatic", vector(0, 0, 1), Inertia(0.0)),
+        Link("along", "joint_x", "up", "prismatic", vector(1, 0, 0), Inertia(0.0)),
+        Link("foot", "joint_y", "along", "prismatic", vector(0, 1, 0), Inertia(2.0)),
+        Link("disc", "axle", "foot", "revolute", vector(0, 0, 1), Inertia(1.0, tensor=0.01 * np.eye(3)), friction=0.1),
+    )
+    coefficients = np.zeros((2, 6, 4))
+    coefficients[:, 0, 0] = mu * weight - 3.0 * (first - then) / start
+    gust, twist = coefficients.copy(), np.zeros((2, 6, 4))
+    gust[1, 1, 0], twist[1, 5, 0] = 2.0 * mu * weight, 0.2
+    knots = np.array([0.0, start, 1.0])
+    loads = [
+        Load("gust", "foot", np.zeros(3), False, knots, gust, True),
+        Load("twist", "disc", np.zeros(3), False, knots, twist, True),
+    ]
+    foot = Contact("foot", "foot", np.zeros(3), plane(vector(0, 0, 1)), friction=mu)
+    robot = Robot("foot", links, (), ("foot", np.zeros(3)))
+    b = assemble(robot, [foot], loads=loads, real=True, dry=True, slow=slow)
+    y = b.state(np.zeros(4), np.array([0.0, first, 0.0, 0.0]))
+    run = b.new_run(y, np.array([0.0, start]), method, rtol=1e-8)
+    b.finish(run._replace(breaks=np.array([start])))
+    assert b.system.unilateral.dry_table[0, ku.DRY_HOLDS] == 0
+    assert run.states("v")[-1, :3] == pytest.approx([0.0, then, 0.0], abs=1e-6 * slow)
+    output = run.outputs("contact")[-1, 0]
+    assert output[OUT_FORCE] == pytest.approx(weight)
+    assert output[OUT_VECTOR : OUT_VECTOR + 3] == pytest.approx([-mu * weight, 0.0, weight], rel=1e-6, abs=1e-6)

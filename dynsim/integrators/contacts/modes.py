@@ -59,8 +59,9 @@ SLIP_TOLERANCE = 1e-8
 FORCE_SLACK = 1e-9
 # A joint with a smaller share than this in the accelerations that contradicting rows leave has no part in them.
 LEAST_SHARE = 1e-3
-# If no forces agree with slip slower than this [m/s], the slip is stopped, as unbounded friction would stop it: an
-# impact of 5e-11 J per kilogram. Without it points that land within a step of coming to rest would end a run.
+# If no forces agree with slip slower than this, or than twice SLOW [m/s], the slip is stopped, as unbounded friction
+# would stop it: an impact of 5e-11 J per kilogram at 1e-5 m/s. Without it points that land within a step of coming to
+# rest would end a run.
 NEARLY_AT_REST = 1e-5
 # Margins of a split that differ by less, as a fraction of its largest force, are the same, and forces with no more of a
 # margin are a corner of the admissible ones: the accuracy of the program that finds the best split.
@@ -277,10 +278,10 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
     p = gather(system, ws, run)
     largest = largest_right_side(ws)
     least = 2.0 * unilateral.number[ku.SLOW]
-    solved, size = solve_accelerations(system, ws, run, p, largest, least)
-    if not solved and least < NEARLY_AT_REST:
-        least, run.count[ki.STATUS] = NEARLY_AT_REST, ki.RUNNING
-        solved, size = solve_accelerations(system, ws, run, p, largest, least)
+    solved, size = solve_accelerations(system, ws, run, p, largest, least, True)
+    if not solved:
+        least, run.count[ki.STATUS] = max(least, NEARLY_AT_REST), ki.RUNNING
+        solved, size = solve_accelerations(system, ws, run, p, largest, least, False)
     if not solved:
         if run.count[ki.STATUS] != ki.FORCES_REVERSED:
             run.count[ki.STATUS] = ki.NO_CONTACT_FORCES
@@ -302,7 +303,7 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
     # that moves along it keeps its rate: it would never get under way if events of other points came too often.
     for k in range(mode.shape[0]):
         starts = mode[k, ku.WANTED] == ka.SLIDING and unilateral.slide[k, ku.FROZEN] == 1.0
-        rests = starts and slip_speed(ws, k) <= least and not goes_along(unilateral, ws, k)
+        rests = starts and slip_speed(ws, k) <= least and slip_along(unilateral, ws, k) <= -RATE_TOLERANCE
         mode[k, ku.TOUCHING] = ka.STICKING if rests else mode[k, ku.WANTED]
     set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.TOUCHING])
     # Earlier splits do not apply to these modes.
@@ -356,8 +357,10 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
 
 
 @noinline_kernel
-def solve_accelerations(system: System, ws: Workspace, run: Run, p, largest, least):
+def solve_accelerations(system: System, ws: Workspace, run: Run, p, largest, least, slides_on):
     """Solve for forces that agree with the law; a point that slips slower than ``least`` [m/s] is at rest.
+
+    With ``slides_on`` it is not if it slides already, see :func:`keeps_sliding`.
 
     Returns
     -------
@@ -366,7 +369,8 @@ def solve_accelerations(system: System, ws: Workspace, run: Run, p, largest, lea
     unilateral, mode, size = system.unilateral, system.unilateral.mode, 0
     for k in range(mode.shape[0]):
         if mode[k, ku.TOUCHING] == 1:
-            mode[k, ku.WANTED] = ka.SLIDING if begins_sliding(system, ws, k, least) else ka.STICKING
+            slides = (slides_on and keeps_sliding(unilateral, ws, k)) or begins_sliding(system, ws, k, least)
+            mode[k, ku.WANTED] = ka.SLIDING if slides else ka.STICKING
             mode[k, ku.GIVES_WAY] = 1 if mode[k, ku.GIVES_WAY] == 1 and drops(system, k) else 0
     # If static friction falls to a smaller kinetic one, the forces of the other contacts change.
     for _ in range(1 + mode.shape[0]):
@@ -497,12 +501,26 @@ def let_joints_slide(system: System, size, largest):
 
 
 @internal_kernel
-def goes_along(unilateral: UnilateralArrays, ws: Workspace, k):
-    """True if candidate k does not slip against its given direction, or only by rounding."""
+def slip_along(unilateral: UnilateralArrays, ws: Workspace, k):
+    """Slip of candidate k along its given direction [m/s]."""
     along = 0.0
     for s in range(3):
         along += unilateral.slide[k, ku.REFERENCE + s] * ws.contacts[k, ka.SLIP_VELOCITY + s]
-    return along > -RATE_TOLERANCE
+    return along
+
+
+@internal_kernel
+def keeps_sliding(unilateral: UnilateralArrays, ws: Workspace, k):
+    """True for a candidate that slides, however slowly, in its direction: its friction is that of the right-hand side.
+
+    It keeps its slip, and with it its friction: at rest it could be given another, and the forces of the modes would
+    not be those of the choice.
+    """
+    if unilateral.mode[k, ku.BEFORE] != ka.SLIDING:
+        return False
+    if unilateral.slide[k, ku.FROZEN] == 0.0:
+        return slip_on(unilateral, ws, k, unilateral.number[ku.SLOW])
+    return slip_along(unilateral, ws, k) > RATE_TOLERANCE
 
 
 @internal_kernel
