@@ -102,8 +102,8 @@ def _solvers(runs: Mapping[str, Run]) -> Iterator[tuple[str, str]]:
         a, b = _measures(runs[method].record), _measures(run.record)
         worst, text = _widest(runs[method].record, a, run.record, b, _of_solvers(run))
         if worst > 1.0:
-            # Tiny changes of the tolerance show how much rounding may change each run until each time. If it changes the
-            # steps, for example where nothing moves and their errors are rounding, the runs differ by these errors.
+            # Tiny changes of the tolerance show how much rounding may change each run until each time. If it changes
+            # the steps, for example where nothing moves and their errors are rounding, the runs differ by these errors.
             parts = (ABOVE, 2.0 - ABOVE) if _steps(run) == _steps(runs[method]) else (0.1,)
             errors = [_own_error(own, part) for own in (runs[method], run) for part in parts]
             allowed = _grown(_of_solvers(run), errors)

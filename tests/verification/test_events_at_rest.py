@@ -51,9 +51,10 @@ def test_an_event_while_everything_rests_is_located(kind: str) -> None:
 def test_the_heat_of_a_servo_that_pushes_against_a_stop_is_right(method: str) -> None:
     """Its voltage follows the reference into the limit and out again; ∫ u²/R from the samples of the voltage.
 
-    Nothing moves, and the currents of servos are no states: dopri5 missed 2e-4 of this heat, and up to 2e-3, at any rtol.
+    Nothing moves, and the currents of servos are no states: dopri5 missed 2e-4 of this heat at any rtol.
     """
-    servo = {"type": "servo", "voltage_V": 12, "stall_torque_N_m": 10, "no_load_speed_rad_per_s": 6, "k_p_V_per_rad": 30}
+    servo = {"type": "servo", "voltage_V": 12, "stall_torque_N_m": 10, "no_load_speed_rad_per_s": 6}
+    servo |= {"k_p_V_per_rad": 30}
     data = scene("stop", method)
     data["plant"]["chain"][0]["motor"] = servo
     data["controller"] = {"type": "joint_pd", "joints": {"joint_1": {"times_s": [0, 0.5, 1], "angles_deg": [0, 60, 0]}}}
