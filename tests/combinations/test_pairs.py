@@ -51,6 +51,10 @@ FOUND = {
     "a joint at rest that got a row which nearly depended on those of feet and an elbow": (271127, 1485),
     "a joint at rest, an elbow that rolled off a crest, and rows that came to contradict each other": (271127, 1801),
     "a joint with a small share in rows that came to contradict each other as an elbow rolled": (271127, 2570),
+    "a joint at rest, an elbow that rolled off a flat spot, and rows whose rates came to contradict each other first": (
+        271127,
+        3370,
+    ),
     "an equilibrium on compliant wheels and feet that first had to deflect their tangents": (271127, 1548),
     "the same of an elbow in a pipe, whose tangents have little mobility": (271127, 2413),
     "joints at rest whose rows nearly depended on those of two points by rounding alone, by the dense solver": (

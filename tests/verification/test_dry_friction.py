@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.random_robots import CompiledSystem, assemble, random_robot
+from support.stepping_cases import sphere
 from support.stepping_systems import plane, stepped
 
 from dynsim import load_scenario, simulate
@@ -288,6 +289,37 @@ def test_events_roll_a_wheel_down_a_slope_against_its_bearing(method):
         x, _, angle = run.states("q")[-1]
         assert x == pytest.approx(0.5 * acceleration, rel=1e-7, abs=1e-11)
         assert run.states("ledger")[-1, JOINT] == pytest.approx(drag_torque * angle, rel=1e-7, abs=1e-11)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_joint_at_rest_follows_a_wheel_that_slowly_rolls_off_a_crest(method):
+    """At the crest the normal row of the wheel and the row of the joint that lifts it are the same.
+
+    ½ (m + I/r²) ds² − ½ (m + I/r²) v² = (m g − F) h along the path s of the axle, h = ρ (1 − cos s/ρ), whose slowness
+    shows no contradicting accelerations. The joint may rest until the rows are off each other by a tenth of a
+    nanometre, with any friction in its bound.
+    """
+    radius, crest, mass, inertia, friction, speed, off = 0.05, 20.0, 1.2, 2e-3, 3.0, 1e-3, 1e-10
+    links = (
+        Link("x", "along", None, "prismatic", vector(1, 0, 0), Inertia(0.0)),
+        Link("z", "up", "x", "prismatic", vector(0, 0, 1), Inertia(0.2), friction=friction),
+        Link("wheel", "axle", "z", "revolute", vector(0, 1, 0), Inertia(1.0, tensor=inertia * np.eye(3))),
+    )
+    surface = sphere(-crest * vector(0, 0, 1), crest, 1.0)
+    contact = Contact("tyre", "wheel", np.zeros(3), surface, friction=0.8, radius=radius)
+    robot = Robot("wheel", links, (), ("wheel", np.zeros(3)), gravity=-9.81 * vector(0, 0, 1))
+    b = assemble(robot, [contact], real=True, dry=True)
+    y = b.state(np.array([0.0, radius, 0.0]), np.array([speed, 0.0, speed / radius]))
+    run = b.simulate(y, np.linspace(0.0, 3.0, 31), method, rtol=1e-9, atol=1e-13)
+    path, bend = radius * run.states("q")[:, 2], crest + radius
+    drop = 2.0 * bend * np.sin(0.5 * path / bend) ** 2
+    assert drop[-1] > 1e-7
+    np.testing.assert_allclose(run.states("q")[:, 1], radius - drop, rtol=0, atol=off)
+    heavy = mass + inertia / radius**2
+    energy = 0.5 * heavy * (radius * run.states("v")[:, 2]) ** 2
+    exact = 0.5 * heavy * speed**2 + (mass * 9.81 - friction) * drop
+    np.testing.assert_allclose(energy, exact, rtol=1e-8, atol=2.0 * friction * off)
+    assert run.log_event[: int(run.count[ki.LOGGED])].tolist() == [ki.DRY_LOG + SLIP_START]
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -42,6 +42,7 @@ from dynsim.integrators.contacts.attempts import keep, take_back
 from dynsim.integrators.contacts.impacts import IMMOBILE, evaluate, largest_right_side, slip_speed
 from dynsim.integrators.contacts.leaving import approach_without_force, watch_unpressed
 from dynsim.integrators.contacts.modes import (
+    BACKWARD,
     SLIP_TOLERANCE,
     SPLIT_SLACK,
     acceleration_left,
@@ -53,6 +54,7 @@ from dynsim.integrators.contacts.modes import (
     slip_on,
 )
 from dynsim.integrators.contacts.resting import hold_free_joints, some_rest_without_row
+from dynsim.integrators.contacts.yielding import left_margin, let_joint_go
 from dynsim.integrators.run import Run
 from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
@@ -73,9 +75,6 @@ WINDOW, MOST_EVENTS, MOST_SETTLE = 1.0, 200, 1e-2
 # More changes at one instant, which lasts INSTANT [s], or more chatter of one candidate or stop than this end the run.
 MOST_CHANGES, MOST_CHATTER = 60, 100
 INSTANT = 1e-11
-# A point that slips against its direction at less than this has not stopped yet [m/s]: if a point begins to slip with
-# almost no acceleration, its speed is rounding.
-BACKWARD = 2e-11
 # A frozen direction of slip is taken anew where friction has turned from it by the angle with this tangent.
 TURNED = 0.5
 # At the end of the best split sticking is still a solution. So friction at rest is reduced for the choice of modes, by
@@ -131,12 +130,13 @@ def rest_margin(unilateral: UnilateralArrays, ws: Workspace, k):
     Rows may depend on each other in one posture only, such as a joint and a point at the crest of a surface. When they
     leave it they contradict each other, at first by less than the rank of their system shows, and the solution of least
     squares leaves accelerations along them. With modes chosen again the joint slides. It counts as accelerated by the
-    limit of that choice; if the choice has held it nevertheless, by twice what was left then.
+    limit of that choice; if the choice has held it nevertheless, by twice what was left then. Where that is less, rates
+    and gaps along the rows show the contradiction in time.
     """
     if unilateral.number[ku.REDUNDANT] == 0.0:
         return 1.0
     limit = max(SLIP_TOLERANCE * max(largest_right_side(ws), IMMOBILE), 2.0 * unilateral.dry[k, ku.DRY_LEFT])
-    return 1.0 - acceleration_left(unilateral, ws, k) / limit
+    return min(1.0 - acceleration_left(unilateral, ws, k) / limit, left_margin(unilateral, ws, k))
 
 
 @internal_kernel
@@ -578,6 +578,10 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
         return
     # Samples may have left another state in the workspace.
     evaluate(system, ws, run)
+    if let_joint_go(system, ws, run):
+        solve_modes(system, ws, run, False)
+        run.count[ki.STARTED] = 0
+        return
     if split_ends(system, ws, run) and solve_reduced(system, ws, run):
         run.count[ki.STARTED] = 0
         return

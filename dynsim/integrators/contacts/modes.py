@@ -57,6 +57,9 @@ from dynsim.jit.kernel import internal_kernel, noinline_kernel
 SLIP_TOLERANCE = 1e-8
 # Forces that contradict their modes by less than this, absolute [N] and of the largest, are rounding.
 FORCE_SLACK = 1e-9
+# A point or joint that slips against its direction at less than this has not stopped yet, and one that slips along it
+# faster goes on [m/s or rad/s]: if it begins to slip with almost no acceleration, its speed is rounding.
+BACKWARD = 2e-11
 # A joint with a smaller share than this in the accelerations that contradicting rows leave has no part in them.
 LEAST_SHARE = 1e-3
 # If no forces agree with slip slower than this, or than twice SLOW [m/s], the slip is stopped, as unbounded friction
@@ -451,7 +454,7 @@ def hold_slow_joints(unilateral: UnilateralArrays, ws: Workspace, rule):
     table, dry = unilateral.dry_table, unilateral.dry
     for k in range(table.shape[0]):
         rate, braked = ws.joints[table[k, ku.DRY_JOINT], ka.QD], table[k, ku.DRY_BRAKE] == ku.CLOSED
-        goes = not dry_rests(unilateral, k) and dry[k, ku.DRY_SIDE] * rate > RATE_TOLERANCE and rule != HOLD_SLOW
+        goes = not dry_rests(unilateral, k) and dry[k, ku.DRY_SIDE] * rate > BACKWARD and rule != HOLD_SLOW
         slow = abs(rate) <= 2.0 * unilateral.number[ku.CREEP]
         table[k, ku.DRY_HOLDS] = 1 if slow and not braked and not goes else 0
         dry[k, ku.DRY_SIDE], dry[k, ku.DRY_AT] = 1.0 if rate > 0.0 else -1.0, ws.joints[table[k, ku.DRY_JOINT], ka.Q]
