@@ -328,7 +328,8 @@ def _at_limit(match: Match, seen: Observed) -> str:
         return "no such motor"
     a, limit = seen.robot.motors.index(motor), float(match[3])
     signal = seen.record["voltage" if match[2] == "voltage" else "current"][:, a]
-    near = limit * (1.0 - (2e-3 if isinstance(motor, Motor) and match[2] == "current" else 1e-5))
+    # Currents of circuits approach their limit without reaching it: the last thousandth counts.
+    near = limit * (1.0 - (1e-3 if isinstance(motor, Motor) and match[2] == "current" else 1e-5))
     reached = np.abs(signal) >= near
     if isinstance(motor, Servo):
         reached &= seen.record["current"][:, a] != 0.0
