@@ -164,7 +164,9 @@ def motion(seen: Observed) -> Finding:
     if seen.stepped:
         yield from _stepped_motion(seen)
         return
-    if jumps_at_ticks(seen):
+    between = seen.sample_time is not None and seen.sample_time < 0.99 * np.diff(seen.time).max(initial=0.0)
+    # What a command does from a tick to the next one shows in no sample.
+    if jumps_at_ticks(seen) or between:
         return
     speeds = position_rates(seen.bodies, seen.q, seen.v)
     for label, value, rate in (("v", seen.v, seen.vdot), ("q", seen.q, speeds)):
