@@ -565,12 +565,13 @@ def _unstable(match: Match, seen: Observed) -> str:
 
 def _unpressed(match: Match, seen: Observed) -> str:
     """Each contact sticks somewhere, and would leave there if it had no force."""
-    for name, _ in re.findall(rf"(\S+) \({NUMBER} % of the run\)", match[1]):
+    for name, share in re.findall(rf"(\S+) \({NUMBER} % of the run\)", match[1]):
         touch = _touch(seen, name)
         if touch is None:
             return f"no contact {name}"
-        rows = np.flatnonzero(touch.mode == STICKING)
-        if not any(leaves(seen, name, int(i)) for i in rows[:: max(len(rows) // 20, 1)]):
+        rows, samples = np.flatnonzero(touch.mode == STICKING), int(0.01 * float(share) * len(seen))
+        # It may be between two samples.
+        if samples > 0 and not any(leaves(seen, name, int(i)) for i in rows[:: max(min(len(rows) // 20, samples), 1)]):
             return f"{name} is pressed wherever it sticks"
     return ""
 
