@@ -10,6 +10,7 @@ If that changes it by a multiple of what half the step did, shorter steps may ch
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -118,13 +119,23 @@ def _steps(run: Run) -> tuple[int, int]:
     return run.record.summary["steps"], run.record.summary["steps_rejected"]
 
 
+def _of_rounding(run: Run, time: Array) -> Array:
+    """Return the share by which rounding changes a run with a sampled loop that is unstable, until each time, (T,)."""
+    match = re.search(rf"{UNSTABLE}.*?deviations grow (\S+) times per period", " ".join(run.warnings))
+    if match is None or run.resolved is None:
+        return np.zeros(len(time))
+    ticks = time / run.resolved.resolved["controller"]["sample_time_s"]
+    return np.asarray(np.finfo(float).eps * np.minimum(float(match[1]) ** np.minimum(ticks, 1e3), 1e18))
+
+
 def _of_solvers(run: Run) -> Any:
     """Return the allowed difference of the solvers: rounding, and its effect on the steps that tolerances choose."""
     assert run.resolved is not None
     share = SOLVERS + 0.03 * run.resolved.integrator.rtol
 
     def allowed(measure: Measure, time: Array) -> Array:
-        return np.asarray(SOLVERS + share * measure.size)[None]
+        grown = SURE * _of_rounding(run, time)[:, None] * measure.size
+        return np.asarray(SOLVERS + share * measure.size + grown)
 
     return allowed
 
@@ -234,7 +245,8 @@ def _promised(run: Run, other: Run) -> Any:
     def allowed(measure: Measure, time: Array) -> Array:
         # Landings may be early or late by a step.
         late = STEPS * step * speed if measure.name == "q" else 2.0 * STEPPED_SHARE * measure.size * (step > 0.0)
-        return np.asarray(share * measure.size + late + 1e-8)[None]
+        grown = SURE * sum(_of_rounding(own, time) for own in (run, other))[:, None] * measure.size
+        return np.asarray(share * measure.size + late + 1e-8 + grown)
 
     return allowed
 
