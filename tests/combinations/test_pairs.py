@@ -62,6 +62,10 @@ FOUND = {
         2728,
     ),
     "a joint at rest in a corner of the admissible forces: no split with the same motion had a margin": (271127, 1534),
+    "joints at rest between contacts whose gaps contradicted each other from the landing on, let go for ever": (
+        271127,
+        4945,
+    ),
     "a point beyond its static friction that hardly accelerated, and was held and broke loose for ever": (271127, 3158),
     "an elbow that slid slowly and took another direction of friction with each choice of modes": (271127, 3363),
 }

@@ -133,7 +133,8 @@ SPLIT_ROWS = 9  # rows of the last splits, of couplings not counted
 SEARCH = 10  # of the choice of modes: FROM_ZERO, NEAR or LAST
 CORNER = 11  # 1: that choice ended in a corner of the admissible forces, and was given up
 CREEP = 12  # below this rate a joint with dry friction may be at rest [rad/s or m/s]
-NUMBERS = 13
+LEFT = 13  # share of its tolerances that projection left after the last choice of modes, see contacts.yielding
+NUMBERS = 14
 # Where a choice of modes starts to look for forces: at none; near those before it; at none, and it takes any solution.
 FROM_ZERO, NEAR, LAST = 0.0, 1.0, 2.0
 

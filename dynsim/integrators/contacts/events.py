@@ -54,7 +54,7 @@ from dynsim.integrators.contacts.modes import (
     slip_on,
 )
 from dynsim.integrators.contacts.resting import hold_free_joints, some_rest_without_row
-from dynsim.integrators.contacts.yielding import left_margin, let_joint_go
+from dynsim.integrators.contacts.yielding import left_margin, let_joint_go, note_left
 from dynsim.integrators.run import Run
 from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
@@ -361,6 +361,7 @@ def solve_modes(system: System, ws: Workspace, run: Run, first):
     """Choose all modes again, and log the changes, unless ``first``: none of them is an event then."""
     before = ws.counts[ka.DEPENDENT]
     resolve(system, ws, run, TOUCH)
+    note_left(system.unilateral, ws)
     # Do not count dependent rows that were held together only on trial.
     ws.counts[ka.DEPENDENT] = before
     if not first:
@@ -423,6 +424,7 @@ def solve_reduced(system: System, ws: Workspace, run: Run):
         reduction *= 10.0
     number[ku.HOLDING], ws.counts[ka.DEPENDENT] = 1.0, before
     if agrees:
+        note_left(system.unilateral, ws)
         log_changes(system, ws, run)
         tell_joints(system.unilateral, run)
         rearm(run)

@@ -25,9 +25,24 @@ from dynsim.integrators.project import GAP_TOLERANCE, RATE_TOLERANCE, project_le
 from dynsim.integrators.run import Run
 from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
-# Share of the tolerances of projection that errors which it cannot remove may reach. Above the second share joints are
-# let go at any event: rounding changes the value that an event has been located by.
-MOST_LEFT, ENOUGH_LEFT = 0.5, 0.25
+# Share of the tolerances of projection that errors which it cannot remove may reach, and the share below which a sum of
+# errors need not be looked at.
+MOST_LEFT, LITTLE_LEFT = 0.5, 0.25
+
+
+@internal_kernel
+def note_left(unilateral: UnilateralArrays, ws: Workspace):
+    """Note what projection leaves right after a choice of modes: where nothing moves, it stays as it is."""
+    left = 0.0
+    if unilateral.number[ku.REDUNDANT] == 1.0:
+        left, _ = contradiction(unilateral, ws)
+    unilateral.number[ku.LEFT] = left
+
+
+@internal_kernel
+def most_left(unilateral: UnilateralArrays):
+    """Share of the tolerances at which a joint is let go: half of what they have left for errors that grow."""
+    return unilateral.number[ku.LEFT] + MOST_LEFT * (1.0 - unilateral.number[ku.LEFT])
 
 
 @internal_kernel
@@ -37,7 +52,7 @@ def left_margin(unilateral: UnilateralArrays, ws: Workspace, k):
         if unilateral.dry_table[j, ku.DRY_HOLDS] == 1:
             return 1.0
     left, _ = contradiction(unilateral, ws)
-    return 1.0 - left / MOST_LEFT
+    return 1.0 - left / most_left(unilateral)
 
 
 @noinline_kernel
@@ -55,7 +70,7 @@ def contradiction(unilateral: UnilateralArrays, ws: Workspace):
     for r in range(p):
         off += (rows[r, ka.ROW_GAP] / GAP_TOLERANCE) ** 2 + (rows[r, ka.ROW_RATE] / RATE_TOLERANCE) ** 2
     # Least squares leave no more than there is.
-    if off <= ENOUGH_LEFT * ENOUGH_LEFT:
+    if off <= LITTLE_LEFT * LITTLE_LEFT:
         return most, gives
     force, right, errors = unilateral.vector[0], unilateral.vector[1], unilateral.vector[2]
     for r in range(p):
@@ -117,7 +132,8 @@ def let_joint_go(system: System, ws: Workspace, run: Run):
     if unilateral.number[ku.REDUNDANT] == 0.0:
         return False
     left, k = contradiction(unilateral, ws)
-    if k < 0 or left < ENOUGH_LEFT:
+    # Half of what has grown: rounding changes the value that an event has been located by.
+    if k < 0 or left < 0.5 * (unilateral.number[ku.LEFT] + most_left(unilateral)):
         return False
     unilateral.dry_table[k, ku.DRY_HOLDS] = 0
     for j in range(mode.shape[0]):
