@@ -354,10 +354,11 @@ def _least_progress(duration: float) -> float:
 def _longest_step(method: int, real: bool) -> float:
     """Longest step while forces are watched [s].
 
-    While everything rests, nothing limits the steps of an explicit method, and a force could fall below zero and rise
-    again within one of them. Knots of references are as far apart as this. An implicit method stops at their bends.
+    While everything rests, nothing limits the steps, and a force could fall below zero and rise again within one of
+    them. Knots of references are as far apart as this. An implicit method stops at their bends, but a force may pass
+    its bound between two of them, which changes the motion where contacts are real.
     """
-    return PACE if real and method == ki.DOPRI5 else np.inf
+    return PACE if method == ki.DOPRI5 or (real and method == ki.RADAU5) else np.inf
 
 
 def _breaks(loads: Sequence[Load], control: JointControl, method: int, options: Integrator) -> np.ndarray:
@@ -365,11 +366,15 @@ def _breaks(loads: Sequence[Load], control: JointControl, method: int, options: 
 
     Of an implicit method also those at which references do, whose knots are nearer than its steps are long.
     """
-    times = [load.knots for load in loads if len(load.coefficients) and (not load.hold or len(load.coefficients) > 1)]
+    times = [load.knots for load in loads if len(load.coefficients) and (not load.hold or _varies(load))]
     if method == ki.RADAU5:
         tolerances = options.rtol, options.absolute_tolerance
         times.append(recall("bends", lambda: control.bends(*tolerances), control, *tolerances))
     return np.unique(np.concatenate(times)) if times else np.zeros(0)
+
+
+def _varies(load: Load) -> bool:
+    return len(load.coefficients) > 1 or bool(load.coefficients[:, :, 1:].any())
 
 
 def _push(body: str) -> Load:

@@ -9,9 +9,11 @@ from support.random_robots import ADAPTIVE, CompiledSystem, assemble
 
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.state import FRICTION, OUT_FORCE
+from dynsim.engine import simulate
 from dynsim.integrators.run import DRIFT_MAX
 from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot
 from dynsim.model.drives import Motor
+from dynsim.scenario.reading import scenario_from_resolved
 
 G = 9.81
 X, Y, Z = np.eye(3)
@@ -124,3 +126,22 @@ def test_bead_on_a_cylinder_without_weight_runs_along_a_helix(method):
     expected = np.stack([radius * np.cos(angle), radius * np.sin(angle), along * t], axis=1)
     np.testing.assert_allclose(run.states("q"), expected, rtol=0, atol=1e-8)  # a hundred tolerances
     np.testing.assert_allclose(run.outputs("contact")[:, 0, OUT_FORCE], -mass * around**2 / radius, rtol=1e-8)
+
+
+@pytest.mark.parametrize("apart", [0.004, 0.01, 0.03])
+def test_a_torque_reference_passes_through_waypoints_that_are_near_each_other(apart: float) -> None:
+    """Nearer than two knots of ``knot_spacing_s`` they came out as 0.4 to 4.9 for 5."""
+    times, torques = [0.0, 0.4, 0.4 + apart, 0.4 + 2 * apart, 1.0], [0.0, 0.0, 5.0, 0.0, 0.0]
+    data = {
+        "name": "pulse",
+        "duration_s": 1.0,
+        "plant": {
+            "type": "serial_arm",
+            "gravity_m_s2": [0, 0, 0],
+            "chain": [{"axis": "y", "length_m": 0.3, "mass_kg": 1.0, "motor": {"type": "torque"}}],
+        },
+        "controller": {"type": "joint_pd", "torques": {"joint_1": {"times_s": times, "torques_N_m": torques}}},
+        "record": {"rate_hz": 10_000},
+    }
+    record = simulate(scenario_from_resolved(data))
+    assert np.interp(times[1:4], record.time, record["torque"][:, 0]) == pytest.approx([0.0, 5.0, 0.0], abs=0.02)

@@ -36,6 +36,8 @@ BasePathChoice: Any = families.union("base_path")
 
 # Most segments of the reference splines: half a gigabyte for each joint.
 SEGMENTS_MAX = 10_000_000
+# Knots from one waypoint to the next, at least; and how many times finer than ``knot_spacing_s`` they become at most.
+KNOTS_BETWEEN, MOST_FINER = 5.0, 100.0
 # Largest turn of a base between two knots [rad]; with more the spline would deviate from the path.
 TURN_MAX = 0.2
 
@@ -199,7 +201,7 @@ def build(config: Config, context: BuildContext) -> JointControl:
     times, positions = np.zeros(0), dict[str, NDArray[np.float64]]()
     planned = config.brace is not None or config.feed_forward != "none"
     if config.joints or config.torques or path is not None or base_path is not None or planned:
-        times = _knots(config.knot_spacing_s, context.duration)
+        times = _knots(_spacing(config), context.duration)
         for name, joint in config.joints.items():
             positions[name] = joint.positions(times)
         for name, torque in config.torques.items():
@@ -318,6 +320,16 @@ def _check_base(robot: Robot, keys: tuple[str, ...]) -> None:
             raise ModelError(f"{key}: {wheel!r} has no motor; set plant.base.wheel.motor", keys=keys)
         if isinstance(motors[wheel], TorqueSource):
             raise ModelError(f"{key}: {wheel!r} has a motor of type torque, which follows no path", keys=keys)
+
+
+def _spacing(config: Config) -> float:
+    """Spacing of the knots [s]: the controller's, or less where waypoints are too near each other to be followed.
+
+    Splines through knots that are as far apart as waypoints miss these by up to half of their change.
+    """
+    given = [reference.times_s for reference in (*config.joints.values(), *config.torques.values())]
+    nearest = min((float(np.diff(times).min()) for times in given if len(times) > 1), default=np.inf)
+    return min(config.knot_spacing_s, max(nearest / KNOTS_BETWEEN, config.knot_spacing_s / MOST_FINER))
 
 
 def _knots(spacing: float, duration: float) -> NDArray[np.float64]:
