@@ -152,11 +152,11 @@ def _pair(first: str, run: Run, other: str, second: Run) -> Iterator[tuple[str, 
     errors = [_own_error(run, 0.1), _own_error(second, 0.5 if stepped else 0.1)]
     worst, text = _widest(run.record, a, second.record, b, _grown(allowed, errors))
     if worst > 1.0 and stepped:
-        errors.append(_still_growing(errors[-1], _own_error(second, 0.25)))
+        errors.append(_still_growing(errors[1], _own_error(second, 0.25), 1.5))
         worst, text = _widest(run.record, a, second.record, b, _grown(allowed, errors))
     if worst > 1.0 and stepped:
         # Circuits that are faster than the step may need a tenth of it before anything shows.
-        errors.append(_own_error(second, 0.1))
+        errors[2] = _still_growing(errors[1], _own_error(second, 0.1), 1.8)
         worst, text = _widest(run.record, a, second.record, b, _grown(allowed, errors))
     if worst > 1.0 and (exact := (_with_exact_encoders(run), _with_exact_encoders(second))) != (run, second):
         # An encoder may read the next of its steps: the same scene must agree without them.
@@ -196,16 +196,16 @@ def _grown(allowed: Any, errors: Sequence[dict[str, tuple[Array, Array]]]) -> An
 
 
 def _still_growing(
-    half: dict[str, tuple[Array, Array]], quarter: dict[str, tuple[Array, Array]]
+    half: dict[str, tuple[Array, Array]], finer: dict[str, tuple[Array, Array]], first_order: float
 ) -> dict[str, tuple[Array, Array]]:
-    """Return the changes by a quarter of the step, times the share by which they exceed those of first order.
+    """Return the changes by a finer step, times the share by which they exceed those of first order.
 
-    At first order they are 1.5 times those by half of the step, which are the estimate already.
+    At first order they are ``first_order`` times those by half of the step, which are the estimate already.
     """
     grown = {}
-    for name, (time, change) in quarter.items():
+    for name, (time, change) in finer.items():
         before = np.interp(time, *half[name]) if name in half else change
-        grown[name] = time, change * np.maximum(change / (1.5 * np.maximum(before, 1e-12)) - 1.0, 0.0)
+        grown[name] = time, change * np.maximum(change / (first_order * np.maximum(before, 1e-12)) - 1.0, 0.0)
     return grown
 
 

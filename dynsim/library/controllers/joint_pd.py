@@ -327,8 +327,8 @@ def _spacing(config: Config) -> float:
 
     Splines through knots that are as far apart as waypoints miss these by up to half of their change.
     """
-    given = [path.times_s for path in config.joints.values()] + [path.times_s for path in config.torques.values()]
-    nearest = min((float(np.diff(times).min()) for times in given if len(times) > 1), default=np.inf)
+    waypoints = [path.times_s for path in config.joints.values()] + [path.times_s for path in config.torques.values()]
+    nearest = min((float(np.diff(times).min()) for times in waypoints if len(times) > 1), default=np.inf)
     return min(config.knot_spacing_s, max(nearest / KNOTS_BETWEEN, config.knot_spacing_s / MOST_FINER))
 
 
