@@ -10,7 +10,7 @@ with RESERVED of μ_s if that is enough: on the edge of a cone rounding decides 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,6 +27,8 @@ from dynsim.model.drives import Servo
 # Contacts nearer than this are closed at the start [m].
 TOUCHING = 1e-6
 KEYS = ("initial", "equilibrium")
+# A contact, its link, the point on it [m], the normal in the world, and the gap [m].
+Touching = tuple[Contact, int, Array, Array, float]
 # Fraction of the static friction that an equilibrium uses if it can.
 RESERVED = 0.9
 
@@ -50,7 +52,13 @@ class Rest:
 
 
 def holding_torques(
-    model: Model, q: Array, contacts: Sequence[Contact], loads: Sequence[Load], able: Sequence[str], real: bool
+    model: Model,
+    q: Array,
+    contacts: Sequence[Contact],
+    loads: Sequence[Load],
+    able: Sequence[str],
+    real: bool,
+    springs: Mapping[str, float] | None = None,
 ) -> Rest:
     """Least-heat torques that hold a posture.
 
@@ -61,6 +69,8 @@ def holding_torques(
     loads : as they are at t = 0
     able : joints whose motors can give a torque at rest
     real : the unilateral law
+    springs : by contact that carries, the normal force of its spring [N], NaN of a rigid one. Compliant contacts have
+        these forces if that is possible, or else the nearest, with any torques; default: contacts that touch, all rigid
 
     Raises
     ------
@@ -70,21 +80,27 @@ def holding_torques(
     robot = model.robot
     if robot.couplings:
         raise ModelError("initial.equilibrium: not for robots with coupled joints, which share a motor", keys=KEYS)
-    touching = touching_contacts(model, contacts, q, real)
+    touching = touching_contacts(model, contacts, q, real, springs)
     # Frictionless first, then with a reserve, then all that Coulomb allows; each with a least force first, so that what
     # presses goes on to press.
-    attempts = [(0.0, 0.0)]
+    attempts = [(0.0, 0.0, False)]
     if real and touching:
-        attempts = [(share, least) for share in (0.0, RESERVED, 1.0) for least in (MIN_N, 0.0)]
+        ways = (False,) if springs is None else (True, False)
+        attempts = [(share, least, given) for share in (0.0, RESERVED, 1.0) for given in ways for least in (MIN_N, 0.0)]
     pushes = [
         _row(link, point, push, 0.0, 0.0, float(np.linalg.norm(push)))
         for link, point, push in load_forces(model, q, loads)
     ]
     driven = replace(robot, motors=tuple(motor for motor in robot.motors if motor.joint in able))
-    for share, least in attempts:
+    for share, least, given in attempts:
         rows = []
         for contact, link, point, normal, _ in touching:
-            rows.append(_row(link, point, normal, share * contact.friction_at_rest, least))
+            # The force of its spring is given, or one near it is sought.
+            spring = np.nan if springs is None else springs[contact.name]
+            commanded = spring if given else np.nan
+            rows.append(_row(link, point, normal, share * contact.friction_at_rest, least, commanded))
+            if not (given or np.isnan(spring)):
+                rows[-1][1][[kb.NEAR, kb.COMPLIANCE]] = spring, 1.0 / contact.stiffness
             if not real:
                 rows.append(_row(link, point, -normal, 0.0, 0.0))
         planner = BracePlanner(driven, model.arrays, [link for link, _ in (*rows, *pushes)])
@@ -102,11 +118,15 @@ def holding_torques(
 
 
 def touching_contacts(
-    model: Model, contacts: Sequence[Contact], q: Array, real: bool
-) -> list[tuple[Contact, int, Array, Array, float]]:
-    """Contacts that touch and can carry, each with its link, point on it [m], normal in the world, and gap [m]."""
+    model: Model, contacts: Sequence[Contact], q: Array, real: bool, named: Container[str] | None = None
+) -> list[Touching]:
+    """Contacts that touch and can carry, or only those that are named, wherever they are."""
     touching = [(contact, *_touching_point(model, contact, q)) for contact in contacts]
-    touching = [contact for contact in touching if abs(contact[-1]) <= TOUCHING or (real and contact[-1] < 0.0)]
+    touching = [
+        entry
+        for entry in touching
+        if (abs(entry[-1]) <= TOUCHING or (real and entry[-1] < 0.0) if named is None else entry[0].name in named)
+    ]
     # A point that no joint moves along its normal carries nothing, see dynsim.integrators.contacts.impacts.
     return [
         entry for entry in touching if not (entry[0].left_out or immobile_at(model, entry[1], entry[2], entry[3], q))

@@ -12,7 +12,7 @@ the joints that do this. Errors, tracking and ledger refer to the original refer
 from __future__ import annotations
 
 import math
-from collections.abc import Container, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -21,8 +21,7 @@ from dynsim.compile.contact_law import format_quantity
 from dynsim.compile.control import JointControl
 from dynsim.compile.equilibrium import holding_torques, load_torques, touching_contacts
 from dynsim.compile.model import Model
-from dynsim.compile.pressing import pressed_in
-from dynsim.compile.shapes import gap_at
+from dynsim.compile.pressing import pressed_in, spring_forces
 from dynsim.dynamics.tables import ReferenceArrays
 from dynsim.errors import first_few
 from dynsim.model.description import Array, Contact, Load
@@ -99,9 +98,11 @@ def balanced(
     jumps: list[str] = []
     planned = control.reference.voltage
     if not len(planned):
-        balance = holding_torques(model, robot.initial, contacts, loads, _able(model, control), real)
+        touching = touching_contacts(model, contacts, robot.initial, real)
+        springs = spring_forces([entry for entry in touching if entry[0].stiffness == 0.0 or entry[-1] < 0.0])
+        balance = holding_torques(model, robot.initial, contacts, loads, _able(model, control), real, springs)
         torques, on_edge = balance.torques, balance.on_edge
-        forces = {**balance.normal_forces, **_of_springs(model, contacts, balance.normal_forces)}
+        forces = {contact.name: balance.normal_forces.get(contact.name, 0.0) for contact, *_ in touching}
     else:
         # The plan says what presses; loads it does not know, and the motors carry them.
         torques, forces = load_torques(model, robot.initial, loads), {}
@@ -195,15 +196,6 @@ def _able(model: Model, control: JointControl) -> list[str]:
         if isinstance(motor, TorqueSource) or (isinstance(motor, Servo) and not motor.velocity_mode)
         or (isinstance(motor, Motor) and k_p > 0.0)
     ]  # fmt: skip
-
-
-def _of_springs(model: Model, contacts: Sequence[Contact], names: Container[str]) -> dict[str, float]:
-    """Normal forces of compliant contacts by their depth [N]: rigid bodies may not determine how they share a load."""
-    return {
-        contact.name: contact.stiffness * max(-gap_at(model, contact, model.robot.initial), 0.0)
-        for contact in contacts
-        if contact.stiffness > 0.0 and contact.name in names
-    }
 
 
 def shifted(reference: ReferenceArrays, shift: Array) -> ReferenceArrays:

@@ -28,8 +28,6 @@ from dynsim.scenario import build
 
 # A start within a micrometre of a surface is projected onto it; this moves the first sample.
 START = 1e-5
-# Shortest lever arm by which a joint presses a compliant contact in [m].
-PRESSED_LEVER_M = 0.05
 # A force above this multiple of weight, loads and motor torques at a lever of 5 cm is absurd.
 ABSURD, LEVER_M = 1e6, 0.05
 # Rates above which rounding of positions spoils what is computed from them; only unstable loops get there [rad/s, m/s].
@@ -119,12 +117,12 @@ def start(seen: Observed) -> Finding:
                 free[places[joint]] = True
         for coupling in seen.robot.couplings:
             asked[places[coupling.joint]] = coupling.ratio * asked[places[coupling.leader]] + coupling.offset
-    # An equilibrium compresses compliant contacts: bodies move by about this depth, and joints by the depth over a
-    # lever arm, or further with a warning.
-    deepest = 0.0
+    # An equilibrium compresses compliant contacts, and moves bodies and joints no further than that needs, or with a
+    # warning.
+    deepest, allowed = 0.0, START
     if initial.get("equilibrium"):
         deepest = max((-float(t.gap[0]) for t in seen.touches() if t.contact.stiffness > 0.0), default=0.0)
-    allowed = START + max(deepest, 0.0) / PRESSED_LEVER_M
+        allowed += _pressed_by(seen)
     warned_of = np.zeros_like(free)
     for warning in seen.run.warnings:
         if (moved := re.match("initial.equilibrium: moves (.+) from the requested posture", warning)) is not None:
@@ -136,7 +134,7 @@ def start(seen: Observed) -> Finding:
         free[:] = True
         free[kept] = False
         for touch in seen.touches():
-            presses = allowed if touch.contact.stiffness > 0.0 else START
+            presses = START + max(deepest, 0.0) if touch.contact.stiffness > 0.0 else START
             if touch.contact.name in initial["on_surface"] and abs(touch.gap[0]) > presses:
                 yield f"{touch.contact.name} starts {touch.gap[0]:+.3g} m from its surface, not on it"
     off = np.where(free, 0.0, np.abs(seen.q[0] - asked))
@@ -153,6 +151,26 @@ def start(seen: Observed) -> Finding:
     # Bodies that start on their surfaces are at rest; an impact at the start could only reduce velocities.
     if fastest > CREEP:
         yield f"{seen.joints[int(np.abs(seen.v[0]).argmax())]} starts with a rate of {fastest:.3g}, not at rest"
+
+
+def _pressed_by(seen: Observed) -> float:
+    """Return how far joints may move to press compliant contacts in as deep as they begin [rad or m].
+
+    To first order the least displacement d changes the gaps g of contacts that touch by J d = g − g_0; the posture may
+    differ by as much again, since J changes on the way and a search has several steps.
+    """
+    motion = seen.bodies.motion(seen.robot.initial[None], *np.zeros((2, 1, len(seen.joints))))
+    rows, changes = [], []
+    for touch in seen.touches():
+        if touch.gap[0] > START:
+            continue
+        body, centre, far, normal = seen.nearest_point(touch.contact, motion)
+        position = centre - touch.contact.radius * normal
+        rows.append(normal[0] @ seen.bodies.jacobian(motion, body, position)[0])
+        changes.append(touch.gap[0] - (far[0] - touch.contact.radius))
+    if not rows or all(touch.contact.stiffness == 0.0 for touch in seen.touches()):
+        return 0.0
+    return 2.0 * float(np.abs(np.linalg.lstsq(np.array(rows), np.array(changes), rcond=1e-10)[0]).max())
 
 
 def equilibrium(seen: Observed) -> Finding:

@@ -67,6 +67,9 @@ FOUND = {
         4945,
     ),
     "a point beyond its static friction that hardly accelerated, and was held and broke loose for ever": (271127, 3158),
+    "an equilibrium whose forces torque motors do not determine, so that each posture had others": (271127, 4859),
+    "an equilibrium that had another share of forces with and without a point that only touches": (271127, 4749),
+    "an arm between a rigid and a compliant brace, which an equilibrium turned until neither touched": (271127, 4663),
     "an elbow that slid slowly and took another direction of friction with each choice of modes": (271127, 3363),
 }
 # Scenes of the slow study.

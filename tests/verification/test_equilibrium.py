@@ -321,3 +321,55 @@ def test_a_start_that_pressing_moves_far_is_told(tmp_path, stiffness, moves):
     said = [text for text in record.summary["warnings"] if "from the requested posture" in text]
     assert len(said) == moves
     assert all(f"joint_1 by {moved[0]:.3g}°" in text for text in said)
+
+
+def compliant_arm(tmp_path, replacements, **overrides):
+    """A start at rest of the arm of COMPLIANT without the box, which holds still on what it presses in."""
+    text = COMPLIANT.replace("objects:\n", "").replace(
+        "  thing: {mass_kg: 0.5, size_m: [0.2, 0.1, 0.1], position_m: [2, 0, 0.05]}\n", ""
+    )
+    for old, new in replacements.items():
+        assert old in text
+        text = text.replace(old, new)
+    path = tmp_path / "arm.yaml"
+    path.write_text(text, encoding="utf-8")
+    record = simulate(load_scenario(path, overrides=overrides))
+    assert np.abs(record["vdot"]).max() < STILL
+    gap, force = record["contact_gap"][0], record["contact_normal_force"][0]
+    elbow = record.labels["contact_gap"].index("elbow")
+    assert force[elbow] == pytest.approx(2e4 * max(-gap[elbow], 0.0), abs=1e-6)
+    return record
+
+
+def test_forces_that_no_heat_determines_stay_as_they_are_pressed_in(tmp_path):
+    """Torque motors have no heat: the least of it does not say how hard the elbow presses."""
+    record = compliant_arm(
+        tmp_path,
+        {"{type: wang_minami}": "{type: torque, limit_N_m: 80}", ", k_p_V_per_rad: 300, k_d_V_s_per_rad: 10": ""},
+    )
+    assert record["contact_normal_force"][0, 0] > 0.1
+
+
+def test_a_rigid_contact_opens_where_it_would_wedge_an_arm_that_presses_another_in(tmp_path):
+    """Weight turns the first joint, which has no motor, until the spring of the elbow carries: moments about it vanish.
+
+    A rigid stop above the first link begins closed; the elbow cannot be pressed in without that it opens.
+    """
+    stop = "tip: {body: link_1, point_m: [0, 0, 0.29], surface: ceiling}"
+    replacements = {
+        "- {axis: y, initial_deg: 120, motor: {type: wang_minami}}": "- {axis: y, initial_deg: 120}",
+        "{type: plane}": "{type: plane}, ceiling: {type: plane, point_m: [0, 0, 0.005], normal: [0, 0, -1]}",
+        "  stiffness_N_per_m: 2.0e+4\n": "",
+        "friction: 0.4": "friction: 0.0",
+        "surface: floor}": f"surface: floor, stiffness_N_per_m: 2.0e+4}}, {stop}",
+    }
+    record = compliant_arm(tmp_path, replacements)
+    names = record.labels["contact_gap"]
+    elbow, tip = names.index("elbow"), names.index("tip")
+    first, second = record["q"][0, 0], record["q"][0, :2].sum()
+    levers = 0.15 * np.sin(first) + 0.3 * np.sin(first) + 0.15 * np.sin(second)
+    force = 0.4 * 9.81 * levers / (0.3 * np.sin(first))
+    assert record["contact_normal_force"][0, elbow] == pytest.approx(force, rel=1e-9)
+    assert record["contact_gap"][0, elbow] == pytest.approx(-force / 2e4, rel=1e-9)
+    assert record["contact_gap"][0, tip] == pytest.approx(0.29 / 0.3 * force / 2e4, rel=1e-9)
+    assert record["q"][0, 1] == pytest.approx(np.radians(-30.0), abs=1e-6)

@@ -6,6 +6,8 @@ subject to lower ≤ tau ≤ upper (both zero for a joint without a motor), |f_t
 cone program. Each brace has f = (f_n, f_1, f_2) along its normal n and two tangents; the rows of B map rates to the
 velocities of its point along them. A sliding brace has f_t = −μ f_n d, d the direction of slip; a commanded f_n is
 given. So the unknowns of a brace are f if it is held, f_n if it slides or has no friction, without f_n if commanded.
+Where braces have a force that they shall stay near, the program minimises how far they are off, see ``NEAR`` of
+:mod:`dynsim.dynamics.contact.braces.tables`.
 """
 
 from __future__ import annotations
@@ -412,11 +414,17 @@ def holds_with_least(braces: BraceArrays, j):
 
 @internal_kernel
 def least_heat(braces: BraceArrays, unknowns, equations, cones, scale):
-    """The forces of least heat, in units of it: H = B w Bᵀ, g = −B w free."""
+    """The forces of least heat, in units of it: H = B w Bᵀ, g = −B w free; or those nearest to given ones."""
     program, B, motors, n = braces.program, braces.B, braces.motors, braces.free.shape[0]
     clear_objective(program, unknowns)
     largest = 0.0
-    for k in range(unknowns):
+    for j in range(braces.link.shape[0]):
+        compliance, k = braces.table[j, kb.COMPLIANCE], braces.first[j]
+        if compliance > 0.0:
+            program.H[k, k], program.g[k] = compliance, -compliance * braces.table[j, kb.NEAR] / scale
+            largest = max(largest, compliance)
+    near = largest > 0.0
+    for k in range(0 if near else unknowns):
         for m in range(k + 1):
             total = 0.0
             for j in range(n):

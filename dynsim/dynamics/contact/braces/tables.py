@@ -17,7 +17,10 @@ SLIP = 12  # 2: unit direction of sliding along the tangents, zero for a brace t
 FRICTION = 14
 LEAST = 15  # min_N
 COMMANDED = 16  # [N], NaN for none
-BRACE_SIZE = 17
+# Of a brace whose normal force shall stay near one: that force [N], and how much each newton off it counts [m/N]; zero
+# for the others. Where there is such a brace, forces minimise Σ compliance (f_n − near)² instead of the heat.
+NEAR, COMPLIANCE = 17, 18
+BRACE_SIZE = 19
 # BraceArrays.motors: a torque source has K_m = 1 and no resistance, a joint without a motor K_m = 1 and no current
 HEAT = 0  # w = R / K_m² [W/(N m)²]
 LOWER = 1  # torque limits at the present joint rate [N m], infinite for none; both zero without a motor
