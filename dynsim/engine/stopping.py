@@ -130,11 +130,11 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
             "other); lower contacts.friction, or take another posture"
         )
     if status == ki.NO_PROGRESS:
+        other = STEP_OVER if _can_step_over(prepared) else "another integrator.method"
+        because = held_up(prepared) or f"take {other}, or longer steps where they are fixed"
         return (
             f"{where}: no progress, the last {ki.MOST_TRIALS} steps came no further than "
-            f"{run.clock[ki.LEAST_PROGRESS]:.1e} s, the last of {run.clock[ki.STEP]:.1e} s{_doing(prepared)}; "
-            f"take {STEP_OVER if _can_step_over(prepared) else 'another integrator.method'}, or longer steps where "
-            "they are fixed"
+            f"{run.clock[ki.LEAST_PROGRESS]:.1e} s, the last of {run.clock[ki.STEP]:.1e} s{_doing(prepared)}; {because}"
         )
     if status == ki.OUT_OF_TIME:
         because = held_up(prepared)

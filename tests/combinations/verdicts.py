@@ -126,6 +126,12 @@ def _crawls(stop: SimulationStopped, seen: Observed) -> str:
     return "" if more <= taken else f"after {taken:.3g} steps, {more:.3g} more are left"
 
 
+def _stands(stop: SimulationStopped, seen: Observed) -> str:
+    """Whether friction that changes as fast as is said lets steps be no longer; else nothing shows that it had to."""
+    match = re.search(HOLDS_UP, str(stop))
+    return _unproved(stop, seen) if match is None else _not_changing(match, stop, seen)
+
+
 HOLDS_UP = (
     rf"steps are as short as {NUMBER} s because (\S+) slips at {NUMBER} m/s and its friction changes within {NUMBER} "
     rf"s; integrator.method: radau5"
@@ -216,7 +222,7 @@ STOPS: dict[str, Callable[[SimulationStopped, Observed], str]] = {
     # The scene gives no reason for runs that do not end.
     "not_projected": _unproved,
     "chatter": _unproved,
-    "no_progress": _unproved,
+    "no_progress": _stands,
     "out_of_time": _crawls,
     "stuck": _unproved,
 }

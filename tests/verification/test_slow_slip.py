@@ -153,3 +153,30 @@ def test_friction_is_against_slow_slip_where_a_joint_breaks_loose(method: str, s
     output = run.outputs("contact")[-1, 0]
     assert output[OUT_FORCE] == pytest.approx(weight)
     assert output[OUT_VECTOR : OUT_VECTOR + 3] == pytest.approx([-mu * weight, 0.0, weight], rel=1e-6, abs=1e-6)
+
+
+@pytest.mark.parametrize("method", ["dopri5", "radau5"])
+@pytest.mark.parametrize("share", [-1.5, 0.1, 0.7])
+def test_friction_of_a_point_that_begins_to_slip_is_that_of_the_choice(method: str, share: float) -> None:
+    """A foot that creeps along y, at a share of the limit of slow slip, is pushed along x beyond its friction.
+
+    Modes are chosen as if it were at rest: its friction is μ m g along x, whatever it creeps, and then along its slip.
+    """
+    mu, mass, slow, end = 0.4, 2.0, 1e-5, 1e-3
+    weight = 9.81 * mass
+    links = (
+        Link("up", "joint_z", None, "prismatic", vector(0, 0, 1), Inertia(0.0)),
+        Link("along", "joint_x", "up", "prismatic", vector(1, 0, 0), Inertia(0.0)),
+        Link("foot", "joint_y", "along", "prismatic", vector(0, 1, 0), Inertia(mass)),
+    )
+    coefficients = np.zeros((1, 6, 4))
+    coefficients[0, 0, 0] = 2.0 * mu * weight
+    push = Load("push", "foot", np.zeros(3), False, np.array([0.0, 1.0]), coefficients, True)
+    foot = Contact("foot", "foot", np.zeros(3), plane(vector(0, 0, 1)), friction=mu)
+    b = assemble(Robot("foot", links, (), ("foot", np.zeros(3))), [foot], loads=[push], real=True, slow=slow)
+    y = b.state(np.zeros(3), np.array([0.0, 0.0, share * slow]))
+    run = b.finish(b.new_run(y, np.array([0.0, end]), method, rtol=1e-8))
+    outputs, rates = run.outputs("contact")[:, 0], run.states("v")
+    assert outputs[0, OUT_VECTOR : OUT_VECTOR + 3] == pytest.approx([-mu * weight, 0.0, weight], rel=1e-9, abs=1e-9)
+    assert rates[-1, 1] == pytest.approx(mu * 9.81 * end, rel=1e-2)
+    assert abs(rates[-1, 2]) < abs(share) * slow

@@ -110,7 +110,8 @@ GIVES_WAY = 4  # 1: it has reached its static cone, and the kinetic coefficient 
 LEAVES = 5  # 1: nothing presses it, and the next choice of modes is without it
 TOUCHED = 6  # TOUCHING before a choice of modes
 OVERLOADED = 7  # 1: held at rest it would have more force than its friction, however little it is accelerated
-MODE_SIZE = 8
+BEGINS = 8  # scratch of the choice of modes; 1: its friction is along REFERENCE now, see contacts.modes.aim
+MODE_SIZE = 9
 # UnilateralArrays.vector: three of the splits of forces, then those of the problem that chooses modes
 OFFSET, SOLUTION, CONE_FRICTION, FIRST_PART, SECOND_PART = 3, 4, 5, 6, 7
 VECTORS = 8

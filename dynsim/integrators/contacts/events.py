@@ -46,6 +46,7 @@ from dynsim.integrators.contacts.modes import (
     SLIP_TOLERANCE,
     SPLIT_SLACK,
     acceleration_left,
+    aim,
     begin_slip,
     drops,
     force_slack,
@@ -632,6 +633,7 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
                 mode[k, ku.GIVES_WAY], by_hand = 1, False
                 continue
             begin_slip(system, ws, k, ws.rows[r + 1, ka.FORCE], ws.rows[r + 2, ka.FORCE])
+            aim(unilateral, ws, k)
             mode[k, ku.WANTED], begins = ka.SLIDING, True
             tell(system, run, k, SLIP_START)
         elif mode[k, ku.WANTED] == ka.SLIDING:

@@ -71,6 +71,8 @@ NEARLY_AT_REST = 1e-5
 SPLIT_SLACK = 1e-7
 # A friction force this close to the cone, as a fraction, counts as on it.
 ON_CONE = 1e-7
+# Halvings of the interval of a direction of slip: to rounding.
+MOST_HALVINGS = 60
 # Which joints with dry friction a choice of modes holds: all slow joints; the same, unless their rates contradict other
 # closed rows; only joints at rest.
 HOLD_SLOW, HOLD_COMPATIBLE, HOLD_RESTING = 0, 1, 2
@@ -324,9 +326,11 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
     evaluate(system, ws, run)
     for k in range(mode.shape[0]):
         rubs = mode[k, ku.WANTED] == ka.SLIDING and system.contacts.law[k, ka.STATIC] > 0.0
-        if rubs and slip_speed(ws, k) < unilateral.number[ku.SLOW]:
-            # Rows of other contacts have stopped it too, and it keeps the direction of slip that it had.
-            unilateral.slide[k, ku.FROZEN] = 1.0
+        if rubs and unilateral.slide[k, ku.FROZEN] == 0.0 and slip_speed(ws, k) < unilateral.number[ku.SLOW]:
+            # Rows of other contacts have stopped it too, and its friction keeps the direction that it had.
+            unilateral.slide[k, ku.FROZEN], mode[k, ku.BEGINS] = 1.0, 1
+        if mode[k, ku.WANTED] == ka.SLIDING and mode[k, ku.BEGINS] == 1:
+            aim(unilateral, ws, k)
     for k in range(unilateral.dry_table.shape[0]):
         unilateral.dry_table[k, ku.DRY_HOLDS] = unilateral.dry_table[k, ku.DRY_NEXT]
     set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
@@ -633,6 +637,35 @@ def begin_slip(system: System, ws: Workspace, k, fx, fy):
 
 
 @internal_kernel
+def aim(unilateral: UnilateralArrays, ws: Workspace, k):
+    """Turn the reference of candidate k so that its friction is along d, its present REFERENCE, at the slip v it has.
+
+    A point that was solved for as at rest begins to slip along d, but may have some slip across d left, which turns its
+    friction, see ``slide_direction``. That would not be the friction of the choice: a joint that is driven the other
+    way by it would stop at once, and begin again, for ever. With v = a d + b and b across d, the reference is
+    r = (u d − b)/√(u² + b²), and v + (s − v·r) r, with s = SLOW, is along d if (a + u) u = s √(u² + b²).
+    """
+    slide, state = unilateral.slide, ws.contacts
+    along, across, slow = slip_along(unilateral, ws, k), 0.0, unilateral.number[ku.SLOW]
+    for s in range(3):
+        across += (state[k, ka.SLIP_VELOCITY + s] - along * slide[k, ku.REFERENCE + s]) ** 2
+    if across == 0.0:
+        return
+    # (a + u) u / √(u² + b²) grows with u, from zero at the first of these to s or more at the second.
+    low, high = max(0.0, -along), slow + abs(along) + math.sqrt(across)
+    for _ in range(MOST_HALVINGS):
+        middle = 0.5 * (low + high)
+        if (along + middle) * middle < slow * math.sqrt(middle * middle + across):
+            low = middle
+        else:
+            high = middle
+    size = math.sqrt(high * high + across)
+    for s in range(3):
+        off = state[k, ka.SLIP_VELOCITY + s] - along * slide[k, ku.REFERENCE + s]
+        slide[k, ku.REFERENCE + s] = (high * slide[k, ku.REFERENCE + s] - off) / size
+
+
+@internal_kernel
 def drops(system: System, k):
     """True for a candidate whose friction falls from a static coefficient to a smaller kinetic one when it slips."""
     law = system.contacts.law
@@ -676,6 +709,7 @@ def take_solution(system: System, ws: Workspace, size, largest):
             unilateral.stop_table[k, ku.STOP_CLOSED] = 1 if f[i] > FORCE_TOLERANCE * strongest else 0
             i += 1
     for k in range(mode.shape[0]):
+        mode[k, ku.BEGINS] = 0
         if mode[k, ku.TOUCHING] == 0:
             mode[k, ku.WANTED] = ka.OPEN
             continue
@@ -690,4 +724,4 @@ def take_solution(system: System, ws: Workspace, size, largest):
                 # Kinetic friction is zero: nothing holds the point once static friction is exceeded.
                 fx, fy = -acceleration(unilateral, i + 1, size), -acceleration(unilateral, i + 2, size)
             begin_slip(system, ws, k, fx, fy)
-            mode[k, ku.WANTED] = ka.SLIDING
+            mode[k, ku.WANTED], mode[k, ku.BEGINS] = ka.SLIDING, 1
