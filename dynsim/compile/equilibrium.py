@@ -86,20 +86,25 @@ def holding_torques(
     attempts = [(0.0, 0.0, False)]
     if real and touching:
         ways = (False,) if springs is None else (True, False)
-        attempts = [(share, least, taken) for share in (0.0, RESERVED, 1.0) for taken in ways for least in (MIN_N, 0.0)]
+        attempts = [
+            (share, least, follow_springs)
+            for share in (0.0, RESERVED, 1.0)
+            for follow_springs in ways
+            for least in (MIN_N, 0.0)
+        ]
     pushes = [
         _row(link, point, push, 0.0, 0.0, float(np.linalg.norm(push)))
         for link, point, push in load_forces(model, q, loads)
     ]
     driven = replace(robot, motors=tuple(motor for motor in robot.motors if motor.joint in able))
-    for share, least, taken in attempts:
+    for share, least, follow_springs in attempts:
         rows = []
         for contact, link, point, normal, _ in touching:
-            # The force of its spring is taken, or one near it is sought.
+            # The force of its spring is given, or one near it is sought.
             spring = np.nan if springs is None else springs[contact.name]
-            commanded = spring if taken else np.nan
+            commanded = spring if follow_springs else np.nan
             rows.append(_row(link, point, normal, share * contact.friction_at_rest, least, commanded))
-            if not (taken or np.isnan(spring)):
+            if not (follow_springs or np.isnan(spring)):
                 rows[-1][1][[kb.NEAR, kb.COMPLIANCE]] = spring, 1.0 / contact.stiffness
             if not real:
                 rows.append(_row(link, point, -normal, 0.0, 0.0))

@@ -71,9 +71,9 @@ def pressed_in(
     if (q := _search(model, contacts, real, names, forces, holding)) is None:
         # A rigid contact that need not carry may keep a compliant one from being pressed in: it may open.
         for name in [name for name in names if name not in compliant]:
-            rest = [other for other in names if other != name]
-            if (without := holding(model.robot.initial, dict.fromkeys(rest, np.nan))) is not None:
-                names, forces = rest, without
+            others = [other for other in names if other != name]
+            if (without := holding(model.robot.initial, dict.fromkeys(others, np.nan))) is not None:
+                names, forces = others, without
         q = _search(model, contacts, real, names, forces, holding)
     if q is None:
         raise ModelError(
@@ -109,11 +109,11 @@ def _search(
         carrying = [c.name for c, *_ in touching if not c.stiffness or forces[c.name] > NEARLY * c.stiffness]
         for named in ([*carrying, *meeting], [*names, *meeting]):
             touching = touching_contacts(model, contacts, q, real, named)
-            if (found := holding(q, spring_forces(touching))) is not None:
+            if (next_forces := holding(q, spring_forces(touching))) is not None:
                 break
         else:
             return None
-        forces = found
+        forces = next_forces
         # Where friction shares the load with normal forces, their split is as accurate as its search.
         if size <= DONE or before <= size <= NEARLY:
             lacking = [abs(forces[c.name] / c.stiffness + gap) for c, *_, gap in touching if c.stiffness > 0.0]
