@@ -71,7 +71,6 @@ FOUND = {
     "an equilibrium that had another share of forces with and without a point that only touches": (271127, 4749),
     "an arm between a rigid and a compliant brace, which an equilibrium turned until neither touched": (271127, 4663),
     "an elbow that slid slowly and took another direction of friction with each choice of modes": (271127, 3363),
-    "a glued elbow whose slip stopped under 1e8 N: its friction let explicit steps make no progress": (271127, 4746),
     "a foot that began to slip with slip across it left, which turned its friction, and a joint driven back by it": (
         271127,
         4687,
