@@ -69,7 +69,7 @@ def fastest(prepared: Prepared) -> Changing | None:
         rows, forces = [*rows, *still], [*forces, *still]
     slides: list[tuple[int, Array, Array]] = []
     for k, contact in enumerate(prepared.contacts):
-        mode, state = int(ws.active[k, ka.MODE]), ws.contacts[k]
+        mode = int(ws.active[k, ka.MODE])
         if unilateral is not None and mode == ka.OPEN:
             continue
         normal, point = contact_point(model, contact, q)
@@ -77,22 +77,9 @@ def fastest(prepared: Prepared) -> Changing | None:
             rows.append(point)
             forces.append(point)
             continue
-        slip, pressed = state[ka.SLIP_VELOCITY : ka.SLIP_VELOCITY + 3], float(state[ka.NORMAL_FORCE])
-        if unilateral is None:
-            smooth = float(np.hypot(np.linalg.norm(slip), contact.slip_smoothing))
-            size = pressed if contact.pulling_friction == "signed" else abs(pressed)
-            along = np.sign(size * pressed) * slip / smooth
-            tangents = np.linalg.svd(normal[None])[2][1:]
-            across = tangents @ slip / smooth
-            damping = contact.friction * size / smooth * (np.eye(2) - np.outer(across, across))
-            mu = contact.friction
-        else:
-            along, mu = state[ka.TANGENT : ka.TANGENT + 3], float(ws.rows[ws.active[k, ka.FIRST_ROW], ka.ROW_MU])
-            tangents = np.cross(normal, along)[None]
-            speed = max(float(np.linalg.norm(slip)), float(unilateral.number[ku.SLOW]))
-            damping = np.array([[mu * pressed / speed]])
+        along, tangents, damping = _friction(prepared, k, normal)
         rows.append((normal @ point)[None])
-        forces.append(((normal - mu * along) @ point)[None])
+        forces.append(((normal - along) @ point)[None])
         slides.append((k, tangents @ point, damping))
     if not slides:
         return None
@@ -105,5 +92,27 @@ def fastest(prepared: Prepared) -> Changing | None:
         return None
     own = [float(np.trace(row @ left @ row.T @ damping)) for _, row, damping in slides]
     k = slides[int(np.argmax(own))][0]
-    speed = float(np.linalg.norm(ws.contacts[k, ka.SLIP_VELOCITY : ka.SLIP_VELOCITY + 3]))
+    speed = float(np.linalg.norm(_slip(prepared, k)))
     return Changing(prepared.contacts[k].name, speed, 1.0 / float(np.abs(np.linalg.eigvals(A)).max()))
+
+
+def _slip(prepared: Prepared, k: int) -> Array:
+    return np.asarray(prepared.workspace.contacts[k, ka.SLIP_VELOCITY : ka.SLIP_VELOCITY + 3])
+
+
+def _friction(prepared: Prepared, k: int, normal: Array) -> tuple[Array, Array, Array]:
+    """Friction of contact k that slips: minus its force per normal force, (3,); the rows of E on the surface; and D."""
+    ws, unilateral, contact = prepared.workspace, prepared.system.unilateral, prepared.contacts[k]
+    slip = _slip(prepared, k)
+    pressed = float(ws.contacts[k, ka.NORMAL_FORCE])
+    if unilateral is not None:
+        along = ws.contacts[k, ka.TANGENT : ka.TANGENT + 3]
+        mu = float(ws.rows[ws.active[k, ka.FIRST_ROW], ka.ROW_MU])
+        speed = max(float(np.linalg.norm(slip)), float(unilateral.number[ku.SLOW]))
+        return mu * along, np.cross(normal, along)[None], np.array([[mu * pressed / speed]])
+    smooth = float(np.hypot(np.linalg.norm(slip), contact.slip_smoothing))
+    size = contact.friction * (pressed if contact.pulling_friction == "signed" else abs(pressed))
+    tangents = np.linalg.svd(normal[None])[2][1:]
+    across = tangents @ slip / smooth
+    damping = size / smooth * (np.eye(2) - np.outer(across, across))
+    return contact.friction * np.sign(size * pressed) * slip / smooth, tangents, damping

@@ -39,7 +39,7 @@ def error_norm(system: System, ws: Workspace, run: Run, error, slack):
 def energy_norm(run: Run, j, error):
     """Error of integral j of the ledger in a step, relative to what its value and its change allow.
 
-    Where motors push against what holds, nothing but their power changes, and the error of the state does not show it.
+    If motors push against a fixed obstacle, only their power changes, and the error of the state does not show that.
     """
     then, now = run.y[j], run.y_new[j]
     return abs(error) / (run.clock[ki.ATOL] + run.clock[ki.RTOL] * (abs(now) + abs(now - then)))
@@ -87,7 +87,7 @@ def first_step(system: System, ws: Workspace, run: Run):
     clock, y, k = run.clock, run.y, run.stage
     size, slope = 0.0, 0.0
     if system.layout.extra > 0:
-        # A guess that is the same for every attitude: of a quaternion only its rotation counts.
+        # A guess that is the same for every attitude: only the rotation of a quaternion counts.
         for j in range(y.shape[0]):
             run.y_new[j] = y[j]
         size, slope = error_norm(system, ws, run, y, 1.0) ** 2, error_norm(system, ws, run, k[0], 1.0) ** 2

@@ -33,6 +33,9 @@ SOLVERS = 2e-8
 # Factor for tolerances slightly above a run's tolerances; 2 - ABOVE is slightly below. Both change local errors as much
 # as rounding does.
 ABOVE = 1.0 + 1e-9
+# Parts of the step of time stepping beyond its half, and how much more they change at first order. Circuits that are
+# faster than the step may need a tenth of it before anything shows.
+FINER = ((0.25, 1.5), (0.1, 1.8))
 # Factor on errors estimated by a finer run: an estimate is not a bound.
 SURE = 10.0
 # Samples by which an impact may be early or late.
@@ -104,7 +107,7 @@ def _solvers(runs: Mapping[str, Run]) -> Iterator[tuple[str, str]]:
         worst, text = _widest(runs[method].record, a, run.record, b, _of_solvers(run))
         if worst > 1.0:
             # Tiny changes of the tolerance show how much rounding may change each run until each time. If it changes
-            # the steps, for example where nothing moves and their errors are rounding, the runs differ by these errors.
+            # the steps, because nothing moves and errors are rounding, the runs differ by these errors.
             parts = (ABOVE, 2.0 - ABOVE) if _steps(run) == _steps(runs[method]) else (0.1,)
             errors = [_own_error(own, part) for own in (runs[method], run) for part in parts]
             allowed = _grown(_of_solvers(run), errors)
@@ -151,13 +154,10 @@ def _pair(first: str, run: Run, other: str, second: Run) -> Iterator[tuple[str, 
     stepped = "time_stepping" in other
     errors = [_own_error(run, 0.1), _own_error(second, 0.5 if stepped else 0.1)]
     worst, text = _widest(run.record, a, second.record, b, _grown(allowed, errors))
-    if worst > 1.0 and stepped:
-        errors.append(_still_growing(errors[1], _own_error(second, 0.25), 1.5))
-        worst, text = _widest(run.record, a, second.record, b, _grown(allowed, errors))
-    if worst > 1.0 and stepped:
-        # Circuits that are faster than the step may need a tenth of it before anything shows.
-        errors[2] = _still_growing(errors[1], _own_error(second, 0.1), 1.8)
-        worst, text = _widest(run.record, a, second.record, b, _grown(allowed, errors))
+    for part, first_order in FINER if stepped else ():
+        if worst > 1.0:
+            errors[2:] = [_still_growing(errors[1], _own_error(second, part), first_order)]
+            worst, text = _widest(run.record, a, second.record, b, _grown(allowed, errors))
     if worst > 1.0 and (exact := (_with_exact_encoders(run), _with_exact_encoders(second))) != (run, second):
         # An encoder may read the next of its steps: the same scene must agree without them.
         yield from _pair(first, exact[0], other, exact[1])
@@ -173,13 +173,19 @@ def _with_exact_encoders(run: Run) -> Run:
     if encoders is None or max(encoders.resolution_deg, encoders.resolution_m) == 0.0:
         return run
     exact = encoders.model_copy(update={"resolution_deg": 0.0, "resolution_m": 0.0})
-    sensors = config.sensors.model_copy(update={"encoders": exact})
-    scenario = replace(run.resolved, config=config.model_copy(update={"sensors": sensors}))
+    return _repeated(run, sensors=config.sensors.model_copy(update={"encoders": exact}))
+
+
+def _repeated(run: Run, **update: Any) -> Run:
+    """Return a run of the same scenario with other parts of its configuration."""
+    assert run.resolved is not None
+    scenario = replace(run.resolved, config=run.resolved.config.model_copy(update=update))
     try:
-        record, error = simulate(scenario), None
+        return replace(run, resolved=scenario, record=simulate(scenario), error=None)
     except SimulationStopped as stop:
-        record, error = stop.record, stop
-    return replace(run, resolved=scenario, record=record, error=error)
+        return replace(run, resolved=scenario, record=stop.record, error=stop)
+    except DynsimError as error:
+        return replace(run, resolved=scenario, record=None, error=error)
 
 
 def _grown(allowed: Any, errors: Sequence[dict[str, tuple[Array, Array]]]) -> Any:
@@ -305,14 +311,7 @@ def _own_error(run: Run, part: float) -> dict[str, tuple[Array, Array]]:
     else:
         options["rtol"] = max(part * run.resolved.integrator.rtol, 1e-13)
         options["atol"] = max(part * run.resolved.integrator.absolute_tolerance, 1e-16)
-    integrator = run.resolved.integrator.model_copy(update=options)
-    config = run.resolved.config.model_copy(update={"integrator": integrator})
-    try:
-        finer: Record | None = simulate(replace(run.resolved, config=config))
-    except SimulationStopped as stop:
-        finer = stop.record
-    except DynsimError:
-        finer = None
+    finer = _repeated(run, integrator=run.resolved.integrator.model_copy(update=options)).record
     if finer is None or len(finer) < 2 or run.record is None:
         return {}
     errors = {}

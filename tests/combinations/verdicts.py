@@ -28,7 +28,7 @@ Match = re.Match[str]
 
 # Numbers in sentences have three digits.
 DIGITS = 0.006
-# Share of the turnover above which steps may make no energy without a warning where contacts give way.
+# Share of the turnover above which steps must not make energy without a warning if contacts are compliant.
 GAIN = 1e-3
 NUMBER = r"([-+]?[0-9.]+(?:e[-+]?[0-9]+)?|inf|-inf|nan)"
 # Slip and rates below this count as rest in the sentences of the engine [m/s, rad/s].
@@ -127,7 +127,7 @@ def _crawls(stop: SimulationStopped, seen: Observed) -> str:
 
 
 def _stands(stop: SimulationStopped, seen: Observed) -> str:
-    """Whether friction that changes as fast as is said lets steps be no longer; else nothing shows that it had to."""
+    """Whether friction that changes as fast as the message says limits the steps; otherwise the stop is unproved."""
     match = re.search(HOLDS_UP, str(stop))
     return _unproved(stop, seen) if match is None else _not_changing(match, stop, seen)
 
@@ -141,7 +141,7 @@ HOLDS_UP = (
 HELD_UP = (1.0, 5.0)
 # Slip below 1000 atol, or this [m/s], turns friction as fast as at this speed (docs/physics.md).
 SLOWEST = 1e-7
-# Forces and modes are those of the last sample, the state is that of the stop: the forces may have changed by this.
+# Forces and modes come from the last sample, but the state from the stop: the forces may have changed by this.
 SINCE = 1.3
 
 
@@ -170,7 +170,8 @@ def _not_changing(match: Match, stop: SimulationStopped, seen: Observed) -> str:
             j = seen.joints.index(joint)
             if seen.record[name][-1, k] != 0.0 and abs(seen.v[-1, j]) < AT_REST:
                 rows.append(identity[j])
-    forces, slips, damped, blocks = list(rows), [], [], []
+    forces, slips, damped = list(rows), [], []
+    blocks: dict[str, slice] = {}
     slow = max(1000.0 * seen.scenario.integrator.absolute_tolerance, SLOWEST)
     for other in seen.touches():
         if seen.real and other.mode[-1] == OPEN:
@@ -193,7 +194,7 @@ def _not_changing(match: Match, stop: SimulationStopped, seen: Observed) -> str:
             size = contact.friction * (pressed if contact.pulling_friction == "signed" else abs(pressed))
             E = (np.eye(3) - np.outer(n, n)) @ J
             D = size / smooth * (np.eye(3) - np.outer(slip, slip) / smooth**2)
-        blocks.append((contact.name == match[2], len(slips), len(slips) + len(E)))
+        blocks[contact.name] = slice(len(slips), len(slips) + len(E))
         slips += [*E]
         damped += [*(D @ E)]
     R, F, E, W = np.array(rows), np.array(forces), np.array(slips), np.linalg.inv(state.mass)
@@ -201,7 +202,7 @@ def _not_changing(match: Match, stop: SimulationStopped, seen: Observed) -> str:
     fastest = float(np.abs(np.linalg.eigvals(A)).max())
     if not 1.0 / SINCE < fastest * float(match[4]) < SINCE:
         return f"friction changes within {1.0 / max(fastest, 1e-300):.3g} s"
-    own = max(float(A.diagonal()[start:end].sum()) for named, start, end in blocks if named)
+    own = float(A.diagonal()[blocks[match[2]]].sum())
     # The largest of the traces of the blocks is at least the mean of the eigenvalues.
     if own * len(blocks) * SINCE < fastest:
         return f"that is not by {match[2]}, whose friction alone changes within {1.0 / max(own, 1e-300):.3g} s"
@@ -257,7 +258,7 @@ def _pulls(match: Match, seen: Observed) -> str:
         return f"with {least:.4g} N in a sample"
     pulling = touch.normal_force < 0.0
     share = 100.0 * float(pulling.mean())
-    # Where two samples in a row have different signs, it is unknown when the sign changes, and how often.
+    # If two samples in a row have different signs, it is unknown when the sign changes, and how often.
     off = 100.0 * (3.0 + np.count_nonzero(pulling[1:] != pulling[:-1])) / len(seen) + 1.0
     return "" if abs(share - float(match[3])) <= off else f"in {share:.3g} % of the samples"
 

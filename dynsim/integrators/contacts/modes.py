@@ -19,7 +19,6 @@ from dynsim.dynamics import state as kst
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.cone import problem as kc
-from dynsim.dynamics.contact.delassus import solve_small
 from dynsim.dynamics.contact.rows import set_modes
 from dynsim.dynamics.contact.shares import even_out, share_slot, some_slide
 from dynsim.dynamics.contact.splits import dry_margin, find_splits, margin, point_shares
@@ -48,7 +47,7 @@ from dynsim.integrators.contacts.impacts import (
     slip_speed,
     solve_problem,
 )
-from dynsim.integrators.contacts.resting import mobility, release_dependent_joints
+from dynsim.integrators.contacts.resting import leave_least, release_dependent_joints
 from dynsim.integrators.project import RATE_TOLERANCE, project_level
 from dynsim.integrators.run import Run
 from dynsim.jit.kernel import internal_kernel, noinline_kernel
@@ -58,7 +57,7 @@ SLIP_TOLERANCE = 1e-8
 # Forces that contradict their modes by less than this, absolute [N] and of the largest, are rounding.
 FORCE_SLACK = 1e-9
 # A point or joint that slips against its direction at less than this has not stopped yet, and one that slips along it
-# faster goes on [m/s or rad/s]: if it begins to slip with almost no acceleration, its speed is rounding.
+# faster continues [m/s or rad/s]: if it begins to slip with almost no acceleration, its speed is rounding.
 BACKWARD = 2e-11
 # A joint with a smaller share than this in the accelerations that contradicting rows leave has no part in them.
 LEAST_SHARE = 1e-3
@@ -223,7 +222,7 @@ def search_modes(system: System, ws: Workspace, run: Run, rule):
 def note_forces(system: System, ws: Workspace):
     """Note the present forces of all that touches or rubs in ``shares``, right after :func:`evaluate`.
 
-    A choice of modes may start near them, and overwrites them by those that it has chosen.
+    A choice of modes may start near them, and overwrites them by its choice.
     """
     unilateral, rows, state = system.unilateral, ws.rows, ws.contacts
     shares, first = unilateral.shares, system.couplings.joint.shape[0] + unilateral.stop_table.shape[0]
@@ -314,7 +313,7 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
     # Earlier splits do not apply to these modes.
     unilateral.number[ku.REDUNDANT], unilateral.number[ku.SPLIT] = 0.0, 0.0
     evaluate(system, ws, run)
-    if rule == HOLD_COMPATIBLE and holds_moving_joint(unilateral, ws) and rates_contradict(ws):
+    if rule == HOLD_COMPATIBLE and holds_moving_joint(unilateral, ws) and rates_contradict(unilateral, ws):
         return False
     loss = project_level(system, ws, run.y, 1)
     if rule == HOLD_COMPATIBLE and stops_others(unilateral, ws):
@@ -355,7 +354,7 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
         unilateral.stop[k, ku.HIT_AT] = ku.DEPTH + max(0.0, -stop_gap(unilateral, ws, k))
     for k in range(mode.shape[0]):
         if mode[k, ku.WANTED] == ka.OPEN:
-            # As others come down, a point that leaves may be moved below its surface; it has not landed again there.
+            # A point that leaves may be moved below its surface as others come down; this is not another landing.
             deepest = ku.AT_ROOT + max(0.0, -ws.contacts[k, ka.GAP])
             unilateral.slide[k, ku.LANDS_AT] = max(unilateral.slide[k, ku.LANDS_AT], deepest)
         starts = mode[k, ku.WANTED] == ka.SLIDING and unilateral.slide[k, ku.FROZEN] == 1.0
@@ -415,20 +414,13 @@ def release_moving_joints(unilateral: UnilateralArrays, ws: Workspace):
 
 
 @noinline_kernel
-def rates_contradict(ws: Workspace):
+def rates_contradict(unilateral: UnilateralArrays, ws: Workspace):
     """True if no change of joint rates brings the rates of all active rows to zero, right after :func:`evaluate`."""
-    rows, p = ws.rows, ws.counts[ka.ROWS]
-    for r in range(p):
-        rows[r, ka.RHS] = rows[r, ka.ROW_RATE]
-        for s in range(p):
-            ws.small[0, r, s] = mobility(ws, r, s)
-    solve_small(ws.small, rows, ws.active, p)
-    for r in range(p):
-        left = rows[r, ka.ROW_RATE]
-        for s in range(p):
-            left -= mobility(ws, r, s) * rows[s, ka.FORCE]
+    left = unilateral.vector[2]
+    leave_least(ws, ws.small, ka.ROW_RATE, left)
+    for r in range(ws.counts[ka.ROWS]):
         fast = 0.0 if ws.active[r, ka.ROW_KIND] == ka.JOINT_ROW else slip_speed(ws, ws.active[r, ka.OWNER])
-        if abs(left) > RATE_TOLERANCE * (1.0 + fast):
+        if abs(left[r]) > RATE_TOLERANCE * (1.0 + fast):
             return True
     return False
 
@@ -518,7 +510,7 @@ def slip_along(unilateral: UnilateralArrays, ws: Workspace, k):
 
 @internal_kernel
 def keeps_sliding(unilateral: UnilateralArrays, ws: Workspace, k):
-    """True for a candidate that slides, however slowly, in its direction: its friction is that of the right-hand side.
+    """True for a candidate that slides, however slowly, in its direction, with the friction of the right-hand side.
 
     It keeps its slip, and with it its friction: at rest it could be given another, and the forces of the modes would
     not be those of the choice.
@@ -642,7 +634,7 @@ def aim(unilateral: UnilateralArrays, ws: Workspace, k):
 
     A point that was solved for as at rest begins to slip along d, but may have some slip across d left, which turns its
     friction, see ``slide_direction``. That would not be the friction of the choice: a joint that is driven the other
-    way by it would stop at once, and begin again, for ever. With v = a d + b and b across d, the reference is
+    way by it would stop at once and begin again, without end. With v = a d + b and b across d, the reference is
     r = (u d − b)/√(u² + b²), and v + (s − v·r) r, with s = SLOW, is along d if (a + u) u = s √(u² + b²).
     """
     slide, state = unilateral.slide, ws.contacts

@@ -14,7 +14,7 @@ from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.cone import problem as kc
 from dynsim.dynamics.contact.cone.socp import best_split, split_room_in
-from dynsim.dynamics.contact.delassus import RANK_TOLERANCE
+from dynsim.dynamics.contact.delassus import RANK_TOLERANCE, solve_small
 from dynsim.dynamics.contact.rows import set_modes
 from dynsim.dynamics.contact.splits import ONE_WAY, change_of_coupling, null_space
 from dynsim.dynamics.contact.unilateral import UnilateralArrays, dry_bound, dry_rests, dry_rows_held
@@ -295,3 +295,21 @@ def mobility(ws: Workspace, r, s):
     for i in range(ws.joints.shape[0]):
         total += ws.column[i, 1 + 2 * r] * ws.column[i, 1 + 2 * s] * ws.links[i, ka.INVERSE_D]
     return total
+
+
+@internal_kernel
+def leave_least(ws: Workspace, small, column, errors):
+    """Write what projection leaves of a column of the rows, their gaps or rates, right after ``derivative``.
+
+    RHS and FORCE of the rows, and ``small``, are scratch.
+    """
+    rows, p = ws.rows, ws.counts[ka.ROWS]
+    for r in range(p):
+        rows[r, ka.RHS] = rows[r, column]
+        for s in range(p):
+            small[0, r, s] = mobility(ws, r, s)
+    solve_small(small, rows, ws.active, p)
+    for r in range(p):
+        errors[r] = rows[r, column]
+        for s in range(p):
+            errors[r] -= small[0, r, s] * rows[s, ka.FORCE]

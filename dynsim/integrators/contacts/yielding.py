@@ -1,4 +1,4 @@
-"""Joints that dry friction holds although other rows have come to turn them: they are let go.
+"""Release of joints that dry friction holds although other rows have begun to turn them.
 
 The row of a joint may depend on other rows in one posture only, such as that of a point at the crest of a surface. As
 the point rolls off it the rows contradict each other, at first by so little that neither the rank of their system nor
@@ -13,14 +13,13 @@ import math
 from dynsim.dynamics import state as kst
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
-from dynsim.dynamics.contact.delassus import solve_small
 from dynsim.dynamics.contact.rows import row_errors, set_modes
 from dynsim.dynamics.contact.unilateral import UnilateralArrays, dry_bound
 from dynsim.dynamics.derivative import System
 from dynsim.dynamics.tables import Workspace
 from dynsim.integrators.contacts.impacts import evaluate
 from dynsim.integrators.contacts.modes import LEAST_SHARE
-from dynsim.integrators.contacts.resting import mobility
+from dynsim.integrators.contacts.resting import leave_least
 from dynsim.integrators.project import GAP_TOLERANCE, RATE_TOLERANCE, project_level
 from dynsim.integrators.run import Run
 from dynsim.jit.kernel import internal_kernel, noinline_kernel
@@ -32,7 +31,7 @@ MOST_LEFT, LITTLE_LEFT = 0.5, 0.25
 
 @internal_kernel
 def note_left(unilateral: UnilateralArrays, ws: Workspace):
-    """Note what projection leaves right after a choice of modes: where nothing moves, it stays as it is."""
+    """Note the error that projection leaves right after a choice of modes; it does not grow if nothing moves."""
     left = 0.0
     if unilateral.number[ku.REDUNDANT] == 1.0:
         left, _ = contradiction(unilateral, ws)
@@ -41,7 +40,7 @@ def note_left(unilateral: UnilateralArrays, ws: Workspace):
 
 @internal_kernel
 def most_left(unilateral: UnilateralArrays):
-    """Share of the tolerances at which a joint is let go: half of what they have left for errors that grow."""
+    """Share of the tolerances at which a joint is released: growing errors may use half of the remaining tolerance."""
     return unilateral.number[ku.LEFT] + MOST_LEFT * (1.0 - unilateral.number[ku.LEFT])
 
 
@@ -63,20 +62,21 @@ def contradiction(unilateral: UnilateralArrays, ws: Workspace):
 
     Returns
     -------
-    left, joint : its norm as a share of the tolerance, the larger of both levels; the joint that gives way, or −1
+    left, joint : its norm as a share of the tolerance, the larger of both levels; the joint to release, or −1
     """
     rows, p, off, most, gives = ws.rows, ws.counts[ka.ROWS], 0.0, 0.0, -1
     row_errors(ws)
     for r in range(p):
         off += (rows[r, ka.ROW_GAP] / GAP_TOLERANCE) ** 2 + (rows[r, ka.ROW_RATE] / RATE_TOLERANCE) ** 2
-    # Least squares leave no more than there is.
+    # The remainder of least squares is no larger than the errors themselves.
     if off <= LITTLE_LEFT * LITTLE_LEFT:
         return most, gives
     force, right, errors = unilateral.vector[0], unilateral.vector[1], unilateral.vector[2]
+    small = unilateral.room[ku.PROBLEM :]
     for r in range(p):
         force[r], right[r] = rows[r, ka.FORCE], rows[r, ka.RHS]
     for level in range(2):
-        leave_least(unilateral, ws, ka.ROW_GAP if level == 0 else ka.ROW_RATE, errors)
+        leave_least(ws, small, ka.ROW_GAP if level == 0 else ka.ROW_RATE, errors)
         norm = 0.0
         for r in range(p):
             norm += errors[r] * errors[r]
@@ -90,23 +90,8 @@ def contradiction(unilateral: UnilateralArrays, ws: Workspace):
 
 
 @internal_kernel
-def leave_least(unilateral: UnilateralArrays, ws: Workspace, column, errors):
-    """Write what projection leaves of this column of the rows; RHS and FORCE are scratch."""
-    rows, p, small = ws.rows, ws.counts[ka.ROWS], unilateral.room[ku.PROBLEM :]
-    for r in range(p):
-        rows[r, ka.RHS] = rows[r, column]
-        for s in range(p):
-            small[0, r, s] = mobility(ws, r, s)
-    solve_small(small, rows, ws.active, p)
-    for r in range(p):
-        errors[r] = rows[r, column]
-        for s in range(p):
-            errors[r] -= small[0, r, s] * rows[s, ka.FORCE]
-
-
-@internal_kernel
 def first_to_yield(unilateral: UnilateralArrays, errors, norm):
-    """The held joint that gives way first as forces against these errors grow; −1 if none has a part in them.
+    """Return the held joint that slips first as forces against these errors grow; −1 if none has a part in them.
 
     The errors are along the one combination w of rows with wᵀ J = 0, so that their forces may change along w without
     another motion. Forces against the errors grow until one of them is at the bound that opposes its error.
@@ -132,7 +117,7 @@ def let_joint_go(system: System, ws: Workspace, run: Run):
     if unilateral.number[ku.REDUNDANT] == 0.0:
         return False
     left, k = contradiction(unilateral, ws)
-    # Half of what has grown: rounding changes the value that an event has been located by.
+    # Half of the growth is enough: rounding changes the value by which an event has been located.
     if k < 0 or left < 0.5 * (unilateral.number[ku.LEFT] + most_left(unilateral)):
         return False
     unilateral.dry_table[k, ku.DRY_HOLDS] = 0

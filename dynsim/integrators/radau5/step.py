@@ -53,8 +53,8 @@ from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
 # Newton's method: most iterations, and the contraction below which the Jacobian stays.
 MOST_ITERATIONS, GOOD_CONTRACTION = 8, 0.05
-# In steps shorter than this errors of rates and currents that are near zero count by what they do until its end [s].
-# Less where rtol is smaller than this: there all steps are short.
+# In steps shorter than this [s], errors of rates and currents near zero count by their effect until the end of the
+# step. This slack is smaller if rtol is smaller than SLACK_RTOL, because then all steps are short.
 SHORT, SLACK_RTOL = 0.005, 1e-6
 # Change of rates for differences, as a part of the slowest slip: its square is rounding of slip at 1e-7 m/s.
 SMALL = 1e-4
@@ -86,7 +86,7 @@ def differentiate(system: System, ws: Workspace, run: Run):
 def largest_change(unilateral: UnilateralArrays | None, ws: Workspace):
     """Return the largest change of rates for differences, right after ``derivative`` [rad/s or m/s].
 
-    A change δ along a slip v and across it turns its friction, and differences are in error by δ/2v of what they are,
+    A change δ along a slip v and across it turns its friction, and differences have a relative error of δ/2v
     in directions in which friction does not change: with 1/τ of friction that turns within τ, Newton's method diverges
     beyond steps of some 2v/δ τ. A point that slides slowly takes SMALL of its slip, far above rounding.
     """
@@ -147,7 +147,7 @@ def _given(lanes: Any, *_: Any) -> bool:
 
 @form_of(columns, _given)
 def columns_on_lanes(lanes, system, ws, t, y, x, base, r):
-    """Four columns at a time; the last ones once more where their number is no multiple."""
+    """Four columns at a time; if their number is not a multiple of four, the last one is repeated."""
     v, last = system.layout.v, r.along.shape[0] - 1
     take_rows(ws, lanes.ws)
     for first in range(0, last + 1, 4):
@@ -265,7 +265,7 @@ def solve_stages(system: System, ws: Workspace, run: Run, h):
             r.w[2, j] += r.two[j].imag
             for s in range(3):
                 r.z[s, j] = T_RADAU[s, 0] * r.w[0, j] + T_RADAU[s, 1] * r.w[1, j] + T_RADAU[s, 2] * r.w[2, j]
-        # The ledger adds up the derivatives of the last iterate but one: where nothing was known before, one more.
+        # The ledger adds up the derivatives of the last iterate but one: steps without a guess take one more.
         if lever * change <= r.clock[kn.CLOSE] and k >= least:
             r.clock[kn.LEVER] = lever
             return True
@@ -278,8 +278,9 @@ def slack(system: System, h, rtol):
 
     An error e of a rate moves a joint by h e within the step. Circuits that ring after a start do so for milliseconds
     in steps of 0.1 ms: a rate that is wrong by 50 atol there moves its joint no further than one that is wrong by atol
-    in a step of 5 ms, and motors damp it. Where there are none it would stay. So would, for a while, what impacts make
-    of it, after which steps are shorter still: who asks for an rtol below 1e-6 has less slack, at 1e-8 as good as none.
+    in a step of 5 ms, and motors damp it. Without motors the error would stay. The effect of impacts on it would stay
+    for a while, and steps after impacts are even shorter: below an rtol of 1e-6 the slack is smaller, and almost zero
+    at 1e-8.
     """
     if system.layout.circuits == 0:
         return 1.0
@@ -305,8 +306,7 @@ def estimate(system: System, ws: Workspace, run: Run, h, slope):
 def energy_error(system: System, run: Run, h):
     """Norm of the error of electrical energy and Joule heat, by the formula of :func:`estimate` without a Jacobian."""
     r, largest = run.newton, 0.0
-    for e in range(2):
-        j = system.layout.ledger + (kst.ELECTRICAL if e == 0 else kst.JOULE)
+    for j in (system.layout.ledger + kst.ELECTRICAL, system.layout.ledger + kst.JOULE):
         error = h * run.stage[0, j]
         for s in range(3):
             error += ERROR_RADAU[s] * r.z[s, j]
