@@ -4,8 +4,8 @@
 
 with the external wrenches W and the forces f of the contacts that touch. The bilateral law has no friction at rest, and
 normal forces of either sign. Under the unilateral law f_n ≥ 0 and |f_t| ≤ μ_s f_n: forces without friction are tried
-first, which leave all friction as a reserve against slip; those with friction only where there is no other equilibrium,
-with RESERVED of μ_s if that is enough: on the edge of a cone rounding decides whether a point sticks.
+first, which leave all friction as a reserve against slip. Forces with friction are tried only if there is no other
+equilibrium, with RESERVED of μ_s if that is enough: on the edge of a cone rounding decides whether a point sticks.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from dynsim.errors import ModelError, first_few
 from dynsim.model.description import Array, Contact, Load
 from dynsim.model.drives import Servo
 
-# Contacts nearer than this are closed at the start [m].
+# Contacts with a gap below this are closed at the start [m].
 TOUCHING = 1e-6
 KEYS = ("initial", "equilibrium")
 # A contact, its link, the point on it [m], the normal in the world, and the gap [m].
@@ -39,9 +39,9 @@ class Rest:
 
     Attributes
     ----------
-    torques : (n,) of the motors [N m or N], zero of joints without one that can
-    normal_forces : of the contacts that touch, by name [N]; negative: the surface pulls
-    forces : of the same on the arm: index of the link, point in its frame [m], force in the world [N]
+    torques : (n,) motor torques [N m or N], zero for joints without a motor that can give a torque at rest
+    normal_forces : normal force of each contact that touches, keyed by its name [N]; negative: the surface pulls
+    forces : forces of these contacts on the arm: index of the link, point in its frame [m], force in the world [N]
     on_edge : True if only all of the static friction holds it
     """
 
@@ -60,29 +60,31 @@ def holding_torques(
     real: bool,
     springs: Mapping[str, float] | None = None,
 ) -> Rest:
-    """Least-heat torques that hold a posture.
+    """Return the torques of least heat that hold a posture.
 
     Parameters
     ----------
     q : (nq,) the posture
-    contacts : all of them; those that touch carry
-    loads : as they are at t = 0
+    contacts : all contacts; only contacts that touch carry
+    loads : external loads, evaluated at t = 0
     able : joints whose motors can give a torque at rest
-    real : the unilateral law
-    springs : by contact that carries, the normal force of its spring [N], NaN of a rigid one. Compliant contacts have
-        these forces if that is possible, or else the nearest, with any torques; default: contacts that touch, all rigid
+    real : True for the unilateral law
+    springs : normal force of the spring of each contact that carries [N], NaN for a rigid contact. Compliant contacts
+        have these forces if that is possible, otherwise the nearest forces, with any torques; default: contacts that
+        touch, all rigid
 
     Raises
     ------
     ModelError
-        Nothing holds it; the message names joints that would have to give more than they can. Coupled joints.
+        If no torques hold the posture; the message names joints whose motors would have to give more than they can.
+        If the robot has coupled joints.
     """
     robot = model.robot
     if robot.couplings:
         raise ModelError("initial.equilibrium: not for robots with coupled joints, which share a motor", keys=KEYS)
     touching = touching_contacts(model, contacts, q, real, springs)
-    # Frictionless first, then with a reserve, then all that Coulomb allows; each with a least force first, so that what
-    # presses goes on to press.
+    # Frictionless first, then with a reserve, then with all friction that Coulomb allows; each with a minimum force
+    # first, so that contacts that press keep pressing.
     attempts = [(0.0, 0.0, False)]
     if real and touching:
         ways = (False,) if springs is None else (True, False)
@@ -100,7 +102,7 @@ def holding_torques(
     for share, least, follow_springs in attempts:
         rows = []
         for contact, link, point, normal, _ in touching:
-            # The force of its spring is given, or one near it is sought.
+            # The force of its spring is given, or a force near it is sought.
             spring = np.nan if springs is None else springs[contact.name]
             commanded = spring if follow_springs else np.nan
             rows.append(_row(link, point, normal, share * contact.friction_at_rest, least, commanded))
@@ -125,7 +127,7 @@ def holding_torques(
 def touching_contacts(
     model: Model, contacts: Sequence[Contact], q: Array, real: bool, named: Container[str] | None = None
 ) -> list[Touching]:
-    """Contacts that touch and can carry, or only those that are named, wherever they are."""
+    """Return the contacts that touch and can carry, or only the named contacts, whatever their gaps."""
     touching = [(contact, *_touching_point(model, contact, q)) for contact in contacts]
     touching = [
         entry
@@ -139,7 +141,7 @@ def touching_contacts(
 
 
 def _touching_point(model: Model, contact: Contact, q: Array) -> tuple[int, Array, Array, float]:
-    """Link, point in its frame [m] where a contact touches, normal there in the world, and gap [m]."""
+    """Return the link, the point in its frame [m] where a contact touches, the normal in the world and the gap [m]."""
     robot = model.robot
     position, point = model.point_position(contact.body, contact.point, q), contact.point
     if contact.tip is not None:
@@ -157,12 +159,12 @@ def _touching_point(model: Model, contact: Contact, q: Array) -> tuple[int, Arra
 def _row(
     link: int, point: Array, normal: Array, friction: float, least: float, force: float = np.nan
 ) -> tuple[int, Array]:
-    """A brace for the kernels, held: link and row of its table."""
+    """Return a held brace for the kernels: its link and the row of its table."""
     return link, brace_rows(point, normal[None], np.array([friction]), least, force, np.zeros((1, 3)))[0]
 
 
 def load_torques(model: Model, q: Array, loads: Sequence[Load]) -> Array:
-    """What holds loads as they are at t = 0, −J_wᵀ W, (n,) [N m or N]."""
+    """Return the torques that hold the loads at t = 0, −J_wᵀ W, (n,) [N m or N]."""
     torques = np.zeros(model.n)
     for link, point, force in load_forces(model, q, loads):
         torques -= model.point_jacobian(link, point, q).T @ force
@@ -170,7 +172,7 @@ def load_torques(model: Model, q: Array, loads: Sequence[Load]) -> Array:
 
 
 def load_forces(model: Model, q: Array, loads: Sequence[Load]) -> list[tuple[int, Array, Array]]:
-    """Loads at t = 0 as forces alone: link, point in its frame [m], force in the world [N].
+    """Return the loads at t = 0 as pure forces: link, point in its frame [m], force in the world [N].
 
     A torque M is the couple of M × d and −M × d at ±d/2, with d a unit vector across M.
     """
@@ -191,7 +193,7 @@ def load_forces(model: Model, q: Array, loads: Sequence[Load]) -> list[tuple[int
 
 
 def _why(model: Model, limits: Array, needed: Array, braces: Sequence[str]) -> str:
-    """Which joints cannot give what weight and loads ask for."""
+    """Return a text that names the joints that cannot give the torques needed for weight and loads."""
     robot = model.robot
     motors = {motor.joint: motor for motor in robot.motors}
     weak = []
@@ -217,13 +219,15 @@ def _why(model: Model, limits: Array, needed: Array, braces: Sequence[str]) -> s
 
 
 def static_margin(model: Model, q: Array, forces: Sequence[tuple[int, Array, Array]] = ()) -> float:
-    """Tip margin of a base at rest, see :mod:`dynsim.dynamics.tree.support`: 1 at the incentre, 0 tips, −1 lifted.
+    """Return the tip margin of a base at rest: 1 at the incentre, 0 tips, −1 lifted.
+
+    See :mod:`dynsim.dynamics.tree.support`.
 
     Parameters
     ----------
     q : (nq,) coordinates
-    forces : from outside beside the weight: index of the link, point in its frame [m], force in the world [N]; those on
-        objects beside the base do not count, as their weights do not
+    forces : external forces in addition to the weight: index of the link, point in its frame [m], force in the world
+        [N]; forces on objects next to the base do not count, and neither do the weights of these objects
     """
     robot, base = model.robot, model.robot.base
     assert base is not None
@@ -235,7 +239,7 @@ def static_margin(model: Model, q: Array, forces: Sequence[tuple[int, Array, Arr
             continue
         force += push
         moment += np.cross(model.point_position(link, point, q) - origin, push)
-    # What the ground gives back, in the axes of the base.
+    # Reaction of the ground, in the axes of the base.
     pressed, (turn_x, turn_y) = -float(axes[:, 2] @ force), (-axes.T @ moment)[:2]
     if pressed <= 0.0:
         return -1.0

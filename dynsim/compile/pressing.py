@@ -1,16 +1,16 @@
 """Postures in which compliant contacts are as deep in their surfaces as the forces of an equilibrium need.
 
 At rest a compliant contact carries its stiffness times its depth, f_n = −k g. Bodies displaced by d change the gaps by
-J d; the generalised forces of an equilibrium with normal forces f are those of the springs where
+J d; the generalised forces of an equilibrium with normal forces f equal the generalised forces of the springs if
 
     Jᵀ K J d = Jᵀ (f + K g),    the least squares of K^½ J d = −K^(−½) (f + K g)
 
 so that supports which rigid bodies do not determine share their load as the springs do. Rigid contacts stay
-closed; one that need not carry may open where compliant ones cannot be pressed in otherwise.
+closed; a rigid contact that need not carry may open if compliant contacts cannot be pressed in otherwise.
 
-The first forces are those of least heat in the initial posture. Where motors can hold different forces, the next ones
-are those nearest to what the springs already carry: least heat may determine forces to few digits, or not at all, and
-may ask for more than can be pressed in: an arm wedged between a rigid and a compliant brace.
+The first forces have the least heat in the initial posture. If motors can hold different forces, the next forces are
+nearest to the forces that the springs already carry: least heat may determine forces to few digits or leave them open,
+and may need more than can be pressed in, for example if an arm is wedged between a rigid and a compliant brace.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from dynsim.dynamics.tree.joints import normalise, positions_along
 from dynsim.errors import ModelError, first_few
 from dynsim.model.description import Array, Contact, Load
 
-# Displacement that counts as none [rad or m]: of a stiffness of 1e5 N/m it is a force of 1e-8 N.
+# Displacement that counts as zero [rad or m]: with a stiffness of 1e5 N/m it is a force of 1e-8 N.
 DONE = 1e-13
-# Displacement that may be left where the forces of the equilibrium are known no better: 1e-4 N of 1e5 N/m [rad or m].
+# Displacement that may remain if the equilibrium forces are not known better: 1e-4 N at 1e5 N/m [rad or m].
 NEARLY = 1e-9
 ITERATIONS = 50
-# A step is damped more where a gap differs by more than this part of the largest change from what the Jacobian says.
+# A step is damped more if a gap differs from its linear prediction by more than this part of the largest change.
 AGREES = 0.5
-# Damping of the springs' least squares, in parts of its largest singular value. The last step is taken as it is.
+# Damping of the springs' least squares, in parts of its largest singular value. The last step is accepted unchanged.
 DAMPINGS = (0.0, *4.0 ** np.arange(-5, 7))
 # Singular values of rows below this part of the largest are zero.
 RANK = 1e-10
@@ -45,15 +45,15 @@ RANK = 1e-10
 def pressed_in(
     model: Model, contacts: Sequence[Contact], loads: Sequence[Load], able: Sequence[str], real: bool
 ) -> Model:
-    """The model in the posture nearest to its initial one whose compliant contacts carry what an equilibrium needs.
+    """Return the model in the nearest posture whose compliant contacts carry the forces that an equilibrium needs.
 
-    The model itself if no compliant contact touches. Parameters are those of
+    Nearest to the initial posture. The model itself if no compliant contact touches. For the parameters see
     :func:`dynsim.compile.equilibrium.holding_torques`.
 
     Raises
     ------
     ModelError
-        Nothing holds the posture, or none is near in which the contacts carry their forces.
+        If no torques hold the posture, or if no near posture is found in which the contacts carry their forces.
     """
     touching = touching_contacts(model, contacts, model.robot.initial, real)
     names = [contact.name for contact, *_ in touching]
@@ -92,19 +92,20 @@ def _search(
     forces: Mapping[str, float],
     holding: Callable[[Array, Mapping[str, float]], dict[str, float] | None],
 ) -> Array | None:
-    """The posture (nq,), or None.
+    """Return the posture (nq,), or None.
 
     Parameters
     ----------
     names : contacts that carry at first, with these forces [N]
-    holding : forces of an equilibrium near those of springs, or None, see
+    holding : function that returns forces of an equilibrium near the forces of springs, or None, see
         :func:`dynsim.compile.equilibrium.holding_torques`
     """
     q, before = model.robot.initial, np.inf
     touching = touching_contacts(model, contacts, q, real, names)
     for _ in range(ITERATIONS):
         q, size = _step(model, q, touching, forces)
-        # What carries may open within a step. What carried nothing carries only if nothing else holds the posture.
+        # A contact that carries may open within a step. A contact that carried nothing carries only if the posture
+        # cannot be held otherwise.
         meeting = [c.name for c, *_, gap in touching_contacts(model, contacts, q, real) if not c.stiffness or gap < 0.0]
         carrying = [c.name for c, *_ in touching if not c.stiffness or forces[c.name] > NEARLY * c.stiffness]
         for named in ([*carrying, *meeting], [*names, *meeting]):
@@ -114,7 +115,7 @@ def _search(
         else:
             return None
         forces = next_forces
-        # Where friction shares the load with normal forces, their split is as accurate as its search.
+        # If friction shares the load with normal forces, the split between them is as accurate as its search.
         if size <= DONE or before <= size <= NEARLY:
             lacking = [abs(forces[c.name] / c.stiffness + gap) for c, *_, gap in touching if c.stiffness > 0.0]
             # Rigid contacts or limits may keep joints from pressing springs in further.
@@ -127,7 +128,7 @@ def _search(
 
 
 def spring_forces(touching: Sequence[Touching]) -> dict[str, float]:
-    """Normal forces of compliant contacts by their depths [N], and NaN for rigid ones, by name."""
+    """Return normal forces keyed by contact: from the depth for compliant contacts [N], NaN for rigid contacts."""
     return {
         contact.name: max(-contact.stiffness * gap, 0.0) if contact.stiffness > 0.0 else np.nan
         for contact, *_, gap in touching
@@ -135,10 +136,10 @@ def spring_forces(touching: Sequence[Touching]) -> dict[str, float]:
 
 
 def _step(model: Model, q: Array, touching: Sequence[Touching], forces: Mapping[str, float]) -> tuple[Array, float]:
-    """The posture in which these forces press contacts in, by the Jacobian, and the largest displacement to it.
+    """Return the posture in which these forces press contacts in, by the Jacobian, and the largest displacement to it.
 
-    It is damped until the gaps change about as the Jacobian says: a spring that only a large turn would press in, as
-    that of a wedged arm, is not pressed in as deep.
+    The step is damped until the gaps change about as the Jacobian predicts: a spring that only a large turn would press
+    in, for example at a wedged arm, is not pressed in as deep.
     """
     rigid = np.array([contact.stiffness == 0.0 for contact, *_ in touching])
     roots = np.sqrt([contact.stiffness for contact, *_ in touching])
@@ -162,7 +163,7 @@ def _step(model: Model, q: Array, touching: Sequence[Touching], forces: Mapping[
 def _within_limits(
     model: Model, q: Array, rows: Array, wanted: Array, rigid: NDArray[np.bool_], roots: Array, damping: float
 ) -> Array:
-    """Displacement of least norm (n,) that changes gaps as wanted, (c,) [m]; joints do not pass their limits."""
+    """Return the displacement of least norm (n,) that changes gaps as wanted, (c,) [m]; joints keep their limits."""
     robot, wheels = model.robot, () if model.robot.base is None else model.robot.base.wheels
     free = np.array([link.joint not in wheels for link in robot.links])
     while True:
@@ -181,7 +182,7 @@ def _within_limits(
 
 
 def _displacement(rows: Array, wanted: Array, rigid: NDArray[np.bool_], roots: Array, damping: float) -> Array:
-    """Least displacement of the free joints: rigid contacts exactly, springs by damped least squares."""
+    """Return the smallest displacement of the free joints: rigid contacts exactly, springs by damped least squares."""
     particular, null = np.zeros(rows.shape[1]), np.eye(rows.shape[1])
     if rigid.any():
         particular[:] = np.linalg.lstsq(rows[rigid], wanted[rigid], rcond=RANK)[0]

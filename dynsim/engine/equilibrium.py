@@ -27,11 +27,11 @@ from dynsim.errors import first_few
 from dynsim.model.description import Array, Contact, Load
 from dynsim.model.drives import Motor, Servo, TorqueSource
 
-# A reference starts at rest at the joint's position if its offset and its rate are below this [rad or m, rad/s or m/s].
+# A reference starts at rest and without offset if its offset and its rate are below this [rad or m, rad/s or m/s].
 AT_REST = 1e-4
 # Joints that pressing moves by more than this [rad, m] start in another posture than the requested one.
 MOVED = {"rad": math.radians(1.0), "m": 5e-3}
-# A normal force of less than this part of the robot's weight is none: references that are splines leave as much.
+# A normal force below this part of the weight of the robot counts as zero: spline references leave forces of this size.
 NO_FORCE = 1e-4
 
 
@@ -41,10 +41,10 @@ class Balance:
 
     Attributes
     ----------
-    current : (na,) of the motors [A; N m of a torque source]
-    shift : (na,) of their references [rad or m; N m of a torque source]
+    current : (na,) motor currents [A; N m for a torque source]
+    shift : (na,) shifts of their references [rad or m; N m for a torque source]
     heat : Σ R i² [W]
-    normal_forces : by contact that touches [N]; empty where the controller plans them
+    normal_forces : normal force of each contact that touches [N]; empty if the controller plans them
     warnings : jumps that remain at the start
     on_edge : True if only all of the static friction holds the posture
     """
@@ -60,9 +60,9 @@ class Balance:
 def pressed(
     model: Model, contacts: Sequence[Contact], loads: Sequence[Load], control: JointControl, real: bool
 ) -> Model:
-    """The model in the posture that its start at rest has; parameters and errors are those of :func:`balanced`.
+    """Return the model in the posture of its start at rest; for parameters and errors see :func:`balanced`.
 
-    Only compliant contacts change it, which carry nothing unless they are pressed in.
+    Only compliant contacts change the posture: they carry no load unless they are pressed in.
     """
     if len(control.reference.voltage):
         return model
@@ -77,18 +77,18 @@ def balanced(
     real: bool,
     requested: Array | None = None,
 ) -> Balance:
-    """The start at rest of a robot under its controller.
+    """Return the start at rest of a robot under its controller.
 
     Parameters
     ----------
-    loads : those of the scenario, as they are at t = 0
-    real : the unilateral law
+    loads : loads of the scenario, evaluated at t = 0
+    real : True for the unilateral law
     requested : (nq,) posture before :func:`pressed`, in which references begin; default: the initial one
 
     Raises
     ------
     ModelError
-        Nothing holds the posture.
+        If no torques hold the posture.
     """
     robot, motors = model.robot, model.robot.motors
     requested = robot.initial if requested is None else requested
@@ -104,7 +104,7 @@ def balanced(
         torques, on_edge = balance.torques, balance.on_edge
         forces = {contact.name: balance.normal_forces.get(contact.name, 0.0) for contact, *_ in touching}
     else:
-        # The plan says what presses; loads it does not know, and the motors carry them.
+        # The plan determines the contact forces; it does not include loads, which the motors carry.
         torques, forces = load_torques(model, robot.initial, loads), {}
         if compliant := _counted_on(model, contacts, planned[0, :, 0], index, real):
             jumps.append(f"the planned voltages count on {first_few(compliant)}, which deform before they carry")
@@ -148,7 +148,7 @@ def balanced(
 
 
 def _moved(model: Model, requested: Array) -> tuple[str, ...]:
-    """A warning that names the joints which pressing moves far, or none."""
+    """Return a warning that names the joints which pressing moves far, or an empty tuple."""
     robot = model.robot
     moved = []
     for link, k in zip(robot.links, robot.position_index, strict=True):
@@ -167,7 +167,7 @@ def _moved(model: Model, requested: Array) -> tuple[str, ...]:
 def _counted_on(
     model: Model, contacts: Sequence[Contact], voltages: Array, index: Sequence[int], real: bool
 ) -> list[str]:
-    """Compliant contacts to which planned voltages, (na,), leave a part of the weight.
+    """Return the compliant contacts to which planned voltages, (na,), leave a part of the weight.
 
     ``index`` : joint of each motor
     """
@@ -189,7 +189,7 @@ def _counted_on(
 
 
 def _able(model: Model, control: JointControl) -> list[str]:
-    """Joints whose motors can give a torque at rest."""
+    """Return the joints whose motors can give a torque at rest."""
     return [
         motor.joint
         for motor, k_p in zip(model.robot.motors, control.k_p, strict=True)
@@ -199,7 +199,7 @@ def _able(model: Model, control: JointControl) -> list[str]:
 
 
 def shifted(reference: ReferenceArrays, shift: Array) -> ReferenceArrays:
-    """References, each moved by a constant."""
+    """Return the references, each shifted by a constant."""
     coefficients = reference.coefficients.copy()
     for a, column in enumerate(reference.spline):
         if column >= 0:
@@ -208,7 +208,7 @@ def shifted(reference: ReferenceArrays, shift: Array) -> ReferenceArrays:
 
 
 def _begin(reference: ReferenceArrays, motors: int) -> tuple[Array, Array]:
-    """Values and rates of the references at their beginning, (na,) each."""
+    """Return values and rates of the references at their beginning, both (na,)."""
     begin, rate = reference.held.copy(), np.zeros(motors)
     for a, column in enumerate(reference.spline):
         if column >= 0:

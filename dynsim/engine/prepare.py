@@ -55,13 +55,13 @@ log = logging.getLogger(__name__)
 # A run is refused if its estimated time exceeds the wall limit by this factor: estimates of small systems are too long
 # by up to that factor.
 CLEARLY = 10.0
-# Most steps of an explicit method that the electrical poles may require: a quarter of an hour for ten joints.
+# Maximum number of explicit steps that the electrical poles may require: a quarter of an hour for ten joints.
 STEPS_LIMIT = 2e8
-# A run whose last MOST_TRIALS steps have come no further than this stands still, unless it is short [s]: it has met
-# events that lie closer than steps of any stiff robot.
+# A run whose last MOST_TRIALS steps advanced by no more than this makes no progress, unless it is short [s]: it has met
+# events that are closer together than the steps of any stiff robot.
 STANDS = 1e-5
-# Slip slower than this has no direction of its own, however tight the tolerances: the rate at which friction turns slip
-# goes as its inverse, and steps with it; ten milliseconds of such slip are a nanometre [m/s].
+# Slip slower than this has no defined direction, however tight the tolerances: the rate at which friction turns slip is
+# proportional to its inverse, which limits the steps; ten milliseconds of such slip are a nanometre [m/s].
 SLOWEST = 1e-7
 # More steps than any run takes.
 _EVERY_STEP = 1 << 62
@@ -82,12 +82,12 @@ class Prepared:
     choice: Choice
     balance: Balance | None = None
     dry: Sequence[DryFriction] = ()
-    # Contacts on their surfaces that brakes have left out, by name: since when [s].
+    # Contacts on their surfaces that are left out because of brakes: name and time since when [s].
     behind_brakes: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def kind(self) -> str:
-        """What its kernels are compiled for, in words."""
+        """Text that describes the system for which the kernels are compiled."""
         system, stepped = self.system, self.run.method == ki.TIME_STEPPING
         parts = [self.choice.method]
         if self.contacts or self.stops:
@@ -111,22 +111,22 @@ def prepare(
 ) -> Prepared:
     """Compile a scenario; references that take long report to ``progress``.
 
-    Whoever changes tables of a run prepares it within a memo of its own.
+    A caller that changes tables of a run must prepare it within a separate memo.
 
     Parameters
     ----------
-    pushable : with an external wrench on every body, zero at first, after those of the scenario
-    times : of samples [s]; default: those of the whole record
-    end : of the run [s]; default: the scenario's duration
-    motors : instead of those of the plant
-    starts : False for a run from a state, whose posture its caller checks instead of the scenario's
+    pushable : add an external wrench on every body, zero at first, after the loads of the scenario
+    times : sample times [s]; default: the sample times of the whole record
+    end : end of the run [s]; default: ``duration_s`` of the scenario
+    motors : motors to use instead of the motors of the plant
+    starts : False for a run from a state: the caller checks its posture instead of the initial posture of the scenario
 
     Raises
     ------
     ModelError, UnreachableReference
         See :func:`dynsim.engine.simulate`.
     ScenarioError
-        The record would be larger than ``record.size_limit_GB``, or the explicit method would need too many steps.
+        If the record would be larger than ``record.size_limit_GB``, or the explicit method would need too many steps.
     """
     described, contacts, piloted = at_start(scenario)
     if motors is not None:
@@ -220,7 +220,7 @@ def prepare(
         atol=options.absolute_tolerance * choice.sharper,
         ticks=_ticks(control),
         breaks=_breaks(loads, control, method, options),
-        # Those who advance a run themselves may give it no end.
+        # Callers that advance a run step by step may leave its end open.
         least_progress=_least_progress(min(scenario.duration_s, end or np.inf)),
         events=guards(robot, contacts if real else (), stops, dry),
         support=compile_support(robot),
@@ -234,7 +234,7 @@ def at_start(scenario: Scenario) -> tuple[Robot, list[Contact], JointControl | N
     """The robot in the posture in which its run begins, its contacts, and a snake's control (None: another robot)."""
     described, contacts = build.robot_and_contacts(scenario)
     if type(described) is not Robot:
-        # The snake's modules wait until there is a snake.
+        # Import the modules of the snake only for a snake.
         from dynsim.compile.snake_tree import SnakeTree
         from dynsim.engine.snake_start import begun
 
@@ -245,7 +245,7 @@ def at_start(scenario: Scenario) -> tuple[Robot, list[Contact], JointControl | N
 
 
 def _check_sensors(scenario: Scenario, control: JointControl) -> None:
-    """Refuse sensors that the controller of an arm does not read."""
+    """Raise an error for sensors that the controller of an arm does not read."""
     sensors = scenario.config.sensors
     if sensors is None:
         return
@@ -266,14 +266,14 @@ def _check_sensors(scenario: Scenario, control: JointControl) -> None:
 
 
 def follow_lines(scenario: Scenario, q: Array, phases: Sequence[Phase]) -> Array:
-    """Coordinates (nq,) that a robot comes to from rest at q, whose servos follow lines; see :data:`Phase`.
+    """Return the coordinates (nq,) that a robot reaches from rest at q when servos follow lines; see :data:`Phase`.
 
     Raises
     ------
     SimulationStopped
-        It diverges.
+        If the motion diverges.
     """
-    # Tables that are written to are nobody else's.
+    # A separate memo: the tables written to below must not be shared with other runs.
     with remembering(Memo()):
         prepared = prepare(scenario, times=np.full(1, np.inf), end=phases[-1][0])
     run, system, since = prepared.run, prepared.system, 0.0
@@ -297,7 +297,7 @@ def follow_lines(scenario: Scenario, q: Array, phases: Sequence[Phase]) -> Array
 
 
 def _ticks(control: JointControl) -> tuple[np.ndarray, np.ndarray] | None:
-    """The tick at which commands are taken, for a sampled controller."""
+    """Return the ticks at which commands are updated, for a sampled controller."""
     if control.sample_time is None:
         return None
     tick = np.zeros((1, ki.TICK_SIZE))
@@ -308,9 +308,9 @@ def _ticks(control: JointControl) -> tuple[np.ndarray, np.ndarray] | None:
 def guards(
     robot: Robot, contacts: Sequence[Contact], stops: Sequence[JointStop], dry: Sequence[DryFriction] = ()
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """The events that a run watches for by itself, and what they do: those of a base, then of the unilateral law.
+    """Return the events that a run watches for by default, and their actions: base events, then unilateral contacts.
 
-    Of a mobile base the margin falls through zero; of contacts, stops and dry friction see
+    A mobile base has an event when its margin falls through zero; for contacts, stops and dry friction see
     dynsim.integrators.contacts.events.
     """
     rows = []
@@ -324,35 +324,35 @@ def guards(
     if not rows:
         return None
     event = np.zeros((len(rows), ki.EVENT_SIZE))
-    # It stood before the run: what begins beyond zero happens at once.
+    # Every value counts as positive before the run: an event that begins beyond zero happens at once.
     event[:, ki.SIDE] = 1.0
     return event, np.array(rows)
 
 
 def slow_slip(atol: float) -> float:
-    """Speed below which the direction of slip is noise of the integration, and turns as fast as at this one [m/s]."""
+    """Return the speed below which the direction of slip is integration noise and turns as fast as at it [m/s]."""
     return max(1000.0 * atol, SLOWEST)
 
 
 def creep(atol: float) -> float:
-    """Rate below which a joint with dry friction may be at rest [rad/s or m/s].
+    """Return the rate below which a joint with dry friction may be at rest [rad/s or m/s].
 
     A joint that contacts hold, and that has no row, is known to move by its rate only. Until the rate exceeds this
-    limit its friction is the constant one of rest, not all of it: the energy is wrong in proportion to the limit, by
-    two to three times it per turnover where a surface that turns begins to move the joint. At 100 atol, rtol by
-    default, that is a few rtol. What limits it from below is the rate that projections leave in rows that hold.
+    limit its friction is the constant friction of rest, not all of it: the energy error is proportional to the limit,
+    two to three times it per turnover when a surface that turns begins to move the joint. At 100 atol, rtol by
+    default, that is a few rtol. The limit is bounded from below by the rate that projections leave in rows that hold.
     """
     return max(100.0 * atol, RATE_TOLERANCE)
 
 
 def _least_progress(duration: float) -> float:
-    """Return the time by which MOST_TRIALS steps have to come on [s]."""
+    """Return the time by which MOST_TRIALS steps must advance [s]."""
     least = ki.PROGRESS * duration
     return max(least, min(10.0 * least, STANDS))
 
 
 def _longest_step(method: int, real: bool) -> float:
-    """Longest step while forces are watched [s].
+    """Return the longest step while forces are watched [s].
 
     While everything rests, nothing limits the steps, and a force could fall below zero and rise again within one of
     them. Knots of references are as far apart as this. An implicit method stops at their bends, but a force may pass
@@ -362,9 +362,9 @@ def _longest_step(method: int, real: bool) -> float:
 
 
 def _breaks(loads: Sequence[Load], control: JointControl, method: int, options: Integrator) -> np.ndarray:
-    """Times at which loads jump or bend [s]: a step that passed over them would not see a short push at all.
+    """Return the times at which loads jump or bend [s]: a step across them could miss a short push completely.
 
-    Of an implicit method also those at which references do, whose knots are nearer than its steps are long.
+    For an implicit method also the times at which references bend: their knots are closer than its steps are long.
     """
     times = [load.knots for load in loads if len(load.coefficients) and (not load.hold or _varies(load))]
     if method == ki.RADAU5:
@@ -378,12 +378,12 @@ def _varies(load: Load) -> bool:
 
 
 def _push(body: str) -> Load:
-    """A wrench on a body that only its caller writes."""
+    """Return a wrench on a body that only the caller writes."""
     return Load(body, body, np.zeros(3), False, np.zeros(1), np.zeros((0, 6, 4)), False)
 
 
 def sample_times(scenario: Scenario, layout: StateLayout, columns: OutputLayout, links: int) -> np.ndarray:
-    """Times of a whole record of a robot with so many links, (T,) [s]; ScenarioError when it would be too large."""
+    """Return the times of a whole record of a robot with ``links`` links, (T,) [s]; ScenarioError if too large."""
     rate = scenario.record.rate_hz
     count = int(np.floor(scenario.duration_s * rate * (1.0 + 1e-12))) + 1
     check_size(scenario, count, layout.size + columns.size + pose_columns(links))
@@ -391,7 +391,7 @@ def sample_times(scenario: Scenario, layout: StateLayout, columns: OutputLayout,
 
 
 def _check_stiffness(method: str, duration: float, robot: Robot) -> None:
-    """Refuse an explicit method where the circuits' own poles R/L already ask for too many steps."""
+    """Raise an error for an explicit method if the poles R/L of the circuits alone require too many steps."""
     circuits = [motor for motor in robot.motors if isinstance(motor, Motor)]
     if method != "dopri5" or not circuits:
         return
@@ -408,9 +408,9 @@ def _check_stiffness(method: str, duration: float, robot: Robot) -> None:
 
 
 def right_hand_side(n: int, p: int, *, dense: bool) -> float:
-    """About how long a right-hand side of n joints with p rows takes [s].
+    """Return the estimated time of a right-hand side of n joints with p rows [s].
 
-    Measured from 10 to 1000 links with up to 250 contacts, right to a factor of two: the sweeps, the p × p system of
+    Measured from 10 to 1000 links with up to 250 contacts, accurate to a factor of two: the sweeps, the p × p system of
     chains as long as n, its elimination, twice that for dependent rows (p > n always are).
     """
     seconds = 1e-7 * n + 4e-10 * n * p**2 + (4e-10 if p > n else 2e-10) * p**3
@@ -418,16 +418,16 @@ def right_hand_side(n: int, p: int, *, dense: bool) -> float:
 
 
 def _check_work(scenario: Scenario, n: int, p: int, method: str) -> None:
-    """Refuse what would integrate for clearly longer than ``integrator.wall_limit_s``, by an estimate from its size.
+    """Raise an error if the estimated time of the integration clearly exceeds ``integrator.wall_limit_s``.
 
-    While the method is not chosen yet, ``auto``, the estimate is that of the quicker one.
+    The estimate is made from the size. While the method is not chosen yet (``auto``), it is for the quicker method.
     """
     options = scenario.integrator
     if options.wall_limit_s is None:
         return
     seconds = right_hand_side(n, p, dense=options.solver == "m_star")
-    # Motors and friction hold the explicit methods' steps at about a millisecond; an implicit one takes steps of some
-    # hundredths of a second, of three iterations, with a Jacobian by differences and its factors now and then.
+    # Motors and friction limit the steps of explicit methods to about a millisecond; an implicit method takes steps of
+    # some hundredths of a second, with three iterations, and occasionally a Jacobian by differences and its factors.
     step = options.step_s if options.step_s and method == "time_stepping" else 1e-3
     explicit, implicit = 4.0 * seconds / step, ((2 * n + 14) * seconds + 3e-9 * n**3) / 1e-2
     rate = {"radau5": implicit, AUTO: min(explicit, implicit)}.get(method, explicit)
@@ -457,7 +457,7 @@ def _control(scenario: Scenario, model: Model, contacts: Sequence[Contact], prog
 
 
 def _check_references(scenario: Scenario, model: Model, contacts: Sequence[Contact], control: JointControl) -> None:
-    """Refuse references that, followed exactly, would take a contact point off the surface that holds it."""
+    """Raise an error if references, followed exactly, would pull a contact point off the surface that holds it."""
     robot, tolerance = model.robot, scenario.config.contacts.reference_tolerance_m
     places = [contact.geometry for contact in contacts]
 
@@ -468,7 +468,7 @@ def _check_references(scenario: Scenario, model: Model, contacts: Sequence[Conta
 
 
 def _check_held(model: Model, contacts: Sequence[Contact], control: JointControl, tolerance: float) -> None:
-    """See :func:`_check_references`."""
+    """Check references against contacts that are held, see :func:`_check_references`."""
     robot = model.robot
     links = {link.name: link for link in robot.links}
     motor_of = {motor.joint: a for a, motor in enumerate(robot.motors)}
@@ -483,8 +483,8 @@ def _check_held(model: Model, contacts: Sequence[Contact], control: JointControl
             if parent is None:
                 break
             body = parent
-        # A joint that follows nothing gives way, so the references do not say where the point is. Where no reference
-        # moves, the point stays where it starts, which has its own check.
+        # A joint that does not follow a reference yields, so the references do not determine the position of the point.
+        # If no reference moves, the point stays at its initial position, which has a separate check.
         follows = all(a >= 0 and control.k_p[a] > 0.0 for a in chain)
         if follows and any(control.reference.spline[a] >= 0 for a in chain):
             followed.setdefault(carrier, []).append((contact, point))

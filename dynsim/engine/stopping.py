@@ -40,11 +40,11 @@ _MODES = {ka.SLIDING: "slides", ka.STICKING: "sticks"}
 
 
 def stopped(scenario: Scenario, prepared: Prepared) -> SimulationStopped:
-    """The exception for a run whose STATUS shows that it stopped before its end."""
+    """Return the exception for a run whose STATUS shows that it stopped before its end."""
     run = prepared.run
     status, time = int(run.count[ki.STATUS]), float(run.clock[ki.TIME])
     kind = KINDS[status]
-    if status != ki.STOPPED:  # a base that tips over does so whatever the reason
+    if status != ki.STOPPED:  # a base that tips over does so for any reason
         q, v = (run.y[block(run.layout, name)] for name in ("q", "v"))
         elapsed = float((run.tick_table[:, ki.TICK_COUNT] * run.tick[:, ki.TICK_PERIOD]).max(initial=0.0))
         if unstable := unstable_stop(scenario, prepared, q, v, elapsed):
@@ -63,7 +63,7 @@ def stopped(scenario: Scenario, prepared: Prepared) -> SimulationStopped:
 
 
 def last_state(prepared: Prepared, y: np.ndarray) -> dict[str, Sequence[float]]:
-    """Positions, rates and currents by name, for a message."""
+    """Return positions, rates and currents for a message, keyed by their names."""
     return {name: y[block(prepared.system.layout, name)].tolist() for name in ("q", "v", "current")}
 
 
@@ -76,7 +76,7 @@ def _listed(prepared: Prepared, *choices: NDArray[np.bool_]) -> str:
 
 
 def _doing(prepared: Prepared) -> str:
-    """What the contacts of the unilateral law do, for a sentence to end with."""
+    """Return the modes of the unilateral contacts as text for the end of a sentence."""
     if prepared.system.unilateral is None or not prepared.contacts:
         return ""
     modes = prepared.workspace.active[: len(prepared.contacts), ka.MODE]
@@ -91,7 +91,7 @@ def _doing(prepared: Prepared) -> str:
 
 
 def _can_step_over(prepared: Prepared) -> bool:
-    """Whether time stepping takes this system: real contacts, and no mobile base (see dynsim.engine.prepare)."""
+    """Return whether time stepping supports this system: real contacts, and no mobile base (dynsim.engine.prepare)."""
     events = prepared.system.unilateral is not None and prepared.run.stepping is None
     return events and bool(prepared.contacts) and prepared.model.robot.base is None
 

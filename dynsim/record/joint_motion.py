@@ -32,17 +32,17 @@ def export_record(record: Record, path: Path, format_: Format, *, rate: float | 
     ``csv``: one row per sample, columns "time [s]", "<joint> [rad]", "<joint> [rad/s]", with the units of the record
     ("rad or m" where it has joints of both kinds). ``joint-trajectory``: the fields of a ROS
     trajectory_msgs/JointTrajectory as YAML, for a joint trajectory controller. ``urdf-log``: one JSON object per line,
-    {"time", "position": {joint: rad or m}, "velocity": {joint: rad/s or m/s}}, joint names being those of the URDF.
+    {"time", "position": {joint: rad or m}, "velocity": {joint: rad/s or m/s}}, with the joint names of the URDF.
 
     Parameters
     ----------
     rate : float, optional
-        Resample to this rate [Hz] (cubic Hermite); the record's own samples if not given.
+        Resample to this rate [Hz] (cubic Hermite); the samples of the record if not given.
 
     Raises
     ------
     RecordError
-        No joint angles in the record, only one sample, or the file cannot be written.
+        If the record has no joint angles or only one sample, or if the file cannot be written.
     """
     joints, time, position, velocity = joint_motion(record)
     if len(time) < 2:
@@ -50,7 +50,7 @@ def export_record(record: Record, path: Path, format_: Format, *, rate: float | 
     if rate is not None:
         if not 0 < rate < np.inf:
             raise RecordError(f"--rate must be positive, not {rate}")
-        # One of the heavy libraries, which wait until somebody needs them.
+        # A heavy library, which is imported only when it is needed.
         from scipy.interpolate import CubicHermiteSpline
 
         between = CubicHermiteSpline(time, position, velocity)
@@ -72,12 +72,12 @@ def export_record(record: Record, path: Path, format_: Format, *, rate: float | 
 def joint_motion(
     record: Record,
 ) -> tuple[list[str], Array, Array, Array]:
-    """Joint names, time from 0 [s], positions and rates [rad, rad/s; m, m/s] of a record.
+    """Return joint names, time from 0 [s], positions and rates [rad, rad/s; m, m/s] of a record.
 
     Raises
     ------
     RecordError
-        The record holds none, no sample, or a value that is not finite.
+        If the record has no joint motion, no samples, or a value that is not finite.
     """
     joints: list[str] = []
     angles, rates = [], []
@@ -103,8 +103,8 @@ def joint_motion(
 
 
 def _in_both(record: Record, name: str, rate: str) -> list[str]:
-    """Joints with a column in both signals: the coordinates of a mobile base in the plane, or of a ball joint, have no
-    rate of their own."""
+    """Return joints with a column in both signals: coordinates of a planar mobile base, or of a ball joint, have no
+    rate column with the same name."""
     for signal in (name, rate):
         if record[signal].ndim != 2 or len(record[signal]) != len(record):
             raise RecordError(
@@ -139,7 +139,7 @@ def _write_joint_trajectory(file: TextIO, joints: list[str], time: Array, q: Arr
 
 
 def _yaml_text(joint: str) -> str:
-    """A name as it is, if YAML takes it for one; else in quotes, which YAML reads like JSON."""
+    """Return a name unchanged if YAML reads it as text, otherwise in quotes, which YAML reads like JSON."""
     return joint if re.fullmatch(r"[A-Za-z_][\w.-]*", joint) and joint.lower() not in _YAML_WORDS else json.dumps(joint)
 
 

@@ -85,7 +85,7 @@ def touching(seen: Observed) -> Finding:
 def _unsolved(seen: Observed, rate: float) -> Array:
     """Force that gives all links together this rate [m/s] within the step of each sample, (T,) [N].
 
-    Contact problems of time stepping are solved to some rate: mobility times a force outside its cone is no larger.
+    Contact problems of time stepping are solved to some rate: mobility times a force outside its cone is at most this.
     """
     start, end = seen.steps_around
     return np.asarray(rate * sum(link.inertia.mass for link in seen.robot.links) / np.maximum(end - start, 1e-12))
@@ -384,10 +384,10 @@ def dry(seen: Observed) -> Finding:
 
 
 def _rests_with_constant_torque(seen: Observed, torque: Array, rate: Array) -> Array:
-    """Samples at which a joint may be at rest that contacts hold, nearly, without a row of its own.
+    """Return samples at which a joint without a separate row may be at rest because contacts hold it, nearly.
 
-    Its torque is constant from one choice of modes to the next. The contacts may turn it as slowly as slip has no
-    direction of its own, before the modes are chosen again: 1000 times atol.
+    Its torque is constant from one choice of modes to the next. The contacts may turn it at rates so low that slip has
+    no defined direction, before the modes are chosen again: 1000 times atol.
     """
     same = np.abs(np.diff(torque)) <= 1e-12 * np.abs(torque[1:])
     constant = np.append(same, False) | np.insert(same, 0, False)

@@ -134,7 +134,7 @@ def _unlike_trapezia(seen: Observed) -> dict[str, Array]:
         # The normal force of the step acts along the normal at its middle.
         turned = np.linalg.norm(np.diff(touch.normal, axis=0, prepend=touch.normal[:1]), axis=1)
         contacts = contacts + turned * np.abs(touch.normal_force) * np.linalg.norm(slip, axis=1)
-        # The heat of a step is that of the slip in its law.
+        # The heat of a step is computed from the slip in its law.
         contacts = contacts + size * touch.lag
     current, voltage = (
         np.diff(seen.record[name], axis=0, prepend=seen.record[name][:1]) for name in ("current", "voltage")

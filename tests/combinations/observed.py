@@ -458,7 +458,7 @@ def _stepped_balance(seen: Observed) -> Balance:
         angle = np.linalg.norm(later.normal - touch.normal, axis=1, keepdims=True)
         slack = slack + np.abs(_contact_term(seen, middle, touch, angle * np.cross(touch.normal, turned)))
     # Velocity products use the rates extrapolated with the last acceleration, after an impact that of the last step
-    # without one, or the rates of the start if contacts have changed. A landing that is too slow is no impact.
+    # without one, or the rates of the start if contacts have changed. A landing that is too slow is not an impact.
     best = _balanced(seen, rows, [_inertial(seen, q_middle, v_start, a), *terms[1:]], slack)
     smooth = _without_impact(seen)
     for last in (rows - 1, rows - 2, rows - 3, smooth[rows - 1]):
@@ -470,7 +470,7 @@ def _stepped_balance(seen: Observed) -> Balance:
 
 
 def _without_impact(seen: Observed) -> NDArray[np.int64]:
-    """Return for each sample the last one until then whose step had no impact, (T,); 0 if there is none."""
+    """Return for each sample the last one until then whose step had no impact, (T,); 0 if no such sample exists."""
     index = np.arange(len(seen))
     for event in seen.record.events:
         if event.kind in ("landing", "stop_hit"):

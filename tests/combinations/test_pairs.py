@@ -18,11 +18,11 @@ from dynsim.engine.prepare import prepare
 from dynsim.errors import DynsimError
 
 SEED = 1
-# Scenes of its cover, which takes seconds to find: no test has to be collected to know how many there are.
+# Number of scenes of its cover, which takes seconds to find: this constant avoids the search at test collection.
 PAIRS = 188
-# Scenes of the default tests: the first of the cover that share the programs which other tests have too.
+# Scenes of the default tests: the first of the cover that share their programs with other tests.
 FEW = 30
-# Those of them that the default tests run: others take seconds.
+# Scenes among these that the default tests run: the remaining scenes take seconds.
 QUICK = {1, 2, 3, 4, 5, 6, 7, 8, 11}
 # Scenes of fresh seeds that were wrong once: (seed, number).
 FOUND = {
@@ -78,7 +78,7 @@ FOUND = {
 }
 # Scenes of the slow study.
 TRIPLES = 1000
-# What a few refused levels are completed to a whole scene from.
+# Levels with which a few refused levels are completed to a whole scene.
 TRIES = 2000
 
 
@@ -121,7 +121,7 @@ def test_scenes_are_the_same_for_ever(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("refusal", [r for r in REFUSALS if r.error], ids=lambda r: r.name)
 def test_what_is_refused_is_said(refusal: Refusal, tmp_path: Path) -> None:
-    """The scene of an assignment that meets this refusal alone; dynsim says what the table says."""
+    """The scene of an assignment that meets only this refusal; the message of dynsim matches the table."""
     for k in range(TRIES):
         levels = draw(SEED, k)
         levels.update({factor: refused[k % len(refused)] for factor, refused in refusal.levels if factor != METHOD})
@@ -195,7 +195,7 @@ def _all_holds(levels: dict[str, str], seed: int, number: int, folder: Path, **o
 
 
 def _shares_a_program(drawn: Scene, method: str, manner: str) -> bool:
-    """Whether the default tests have its program: those of docs/dev/tests.md."""
+    """Return whether the default tests of docs/dev/tests.md compile its program."""
     if method == "time_stepping":
         return True
     if method == "auto" or manner == M_STAR:

@@ -295,7 +295,7 @@ def test_rosbags_reads_the_file_too(bag: tuple[dynsim.Record, Path]) -> None:
 
 
 def test_a_run_that_stopped_after_its_first_sample_is_a_bag_too(tmp_path: Path) -> None:
-    """Figures and the page take one sample; formats of a motion need two, and say so."""
+    """Figures and the page accept one sample; motion formats need two samples and raise an error otherwise."""
     pytest.importorskip("mcap")
     scenario = load_scenario("elbow_comparison_floor", "two_elbows")
     simulation = dynsim.Simulation(scenario)

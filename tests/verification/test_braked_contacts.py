@@ -1,4 +1,4 @@
-"""Contact points behind closed brakes: a braked joint is a locked one, and what only such joints move is left out."""
+"""Contact points behind closed brakes: a braked joint is locked, and points that only such joints move are left out."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from dynsim.scenario import scenario_from_resolved
 SAME_MOTION, SAME_FORCE = 1e-9, 1e-7
 INITIAL_DEG = [0.0, 45.0, 90.0, -90.0, 45.0, 45.0, -90.0, 45.0, -45.0, 45.0]
 MOVING = ("joint_1", "joint_6", "joint_9", "joint_10")
-TIP = [0.0, 0.0, 0.2]  # of the two links, in the second
+TIP = [0.0, 0.0, 0.2]  # tip of the two links, in the frame of the second
 # Joints 2 and 3 alone move elbow_4 along the normal of the floor.
 BEHIND_BRAKES = [["joint_2", "joint_3"], ["joint_2", "joint_3", "joint_4"], ["joint_1", "joint_2", "joint_3"]]
 MOVABLE = [["joint_5"], ["joint_5", "joint_8"], ["joint_3"]]
@@ -136,7 +136,7 @@ def test_a_contact_comes_back_when_brakes_open(tmp_path: Path, law: str, method:
 
 @pytest.mark.parametrize("method", ["dopri5", "radau5", "time_stepping"])
 def test_a_stop_has_no_force_behind_a_closed_brake(tmp_path: Path, method: str) -> None:
-    """The brake has all of the load of its joint; time stepping let the stop have it all."""
+    """The brake carries all of the load of its joint; in time stepping the stop used to carry all of it."""
     link = {"axis": "y", "length_m": 0.3, "mass_kg": 0.3, "radius_m": 0.02, "motor": {"type": "wang_minami"}}
     config = {
         "name": "stopped",
@@ -168,7 +168,7 @@ def test_a_stop_has_no_force_behind_a_closed_brake(tmp_path: Path, method: str) 
 
 
 def two_links(method: str, law: str = "unilateral") -> dynsim.Scenario:
-    """Two links under a shoulder 0.3 m above a floor, with a tip that touches it 0.05 m beside the shoulder."""
+    """Two links under a shoulder 0.3 m above a floor, whose tip touches it 0.05 m to the side of the shoulder."""
     link = {"axis": "y", "mass_kg": 0.3, "length_m": 0.2}
     config = {
         "name": "pole",

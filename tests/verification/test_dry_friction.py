@@ -51,7 +51,7 @@ def test_a_bearing_holds_up_to_its_friction_and_no_further():
 
 @pytest.mark.parametrize("theta", [0.5, 1.0])
 def test_a_growing_push_breaks_it_loose_when_it_reaches_the_friction(theta):
-    """At t_0 = F/r of a push r t; then x = r (t − t_0)³/6m, and all that friction takes is F x."""
+    """At t_0 = F/r of a push r t; then x = r (t − t_0)³/6m, and the work of friction is F x."""
     rate, until = 4.0, 1.75
     moved, errors = rate * (until - FRICTION / rate) ** 3 / (6.0 * MASS), []
     for step in (1e-2, 5e-3):
@@ -67,7 +67,7 @@ def test_a_growing_push_breaks_it_loose_when_it_reaches_the_friction(theta):
 
 @pytest.mark.parametrize("mass", [2e7, 1e10])
 def test_a_heavy_joint_moves_where_its_friction_is_exceeded(mass):
-    """x = (F − R) t²/2m beside a weight on the floor, whose g the acceleration is as good as zero to."""
+    """x = (F − R) t²/2m next to a weight on the floor; the acceleration is almost zero compared with its g."""
     links = (
         Link("slide", "guide", None, "prismatic", vector(1, 0, 0), Inertia(mass), friction=FRICTION),
         Link("foot", "rail", "slide", "prismatic", vector(0, 0, 1), Inertia(MASS)),
@@ -78,7 +78,7 @@ def test_a_heavy_joint_moves_where_its_friction_is_exceeded(mass):
     foot = Contact("foot", "foot", np.zeros(3), plane(vector(0, 0, 1)), friction=0.0)
     b = assemble(Robot("cart", links, (), ("foot", np.zeros(3))), [foot], loads=[push], real=True, dry=True)
     run = b.simulate(b.state(np.zeros(2), np.zeros(2)), np.linspace(0.0, 2.0, 3), rtol=1e-10)
-    # It slides from the start: that is no event.
+    # It slides from the start, which does not count as an event.
     assert run.count[ki.LOGGED] == 0
     assert run.outputs("dry")[-1] == pytest.approx(-FRICTION)
     assert run.states("q")[-1, 0] == pytest.approx(2.0 / (mass + MASS), rel=1e-6)
@@ -115,7 +115,7 @@ def test_a_spring_is_held_where_its_force_is_below_the_friction():
 
 
 def test_a_spring_with_dry_friction_comes_to_rest_in_closed_form():
-    """Each half swing is about the place ±τ/k where spring and friction balance; it ends within that band, for ever."""
+    """Each half swing is about the place ±τ/k where spring and friction balance; it ends and stays within that band."""
     b, y, stiffness, damping = oscillator(0.5)
     x, swings = rest_of(0.5, stiffness, damping)
     assert swings == 12
@@ -200,7 +200,7 @@ def test_joint_torques_have_the_friction_of_their_gear_in_them():
 
 
 def ledger_gap(run) -> np.ndarray:
-    """What the ledger of a system without contacts does not explain, of the largest change of energy or of 1 J."""
+    """Return the energy missing in the ledger without contacts, relative to the largest change of energy or 1 J."""
     ledger, stored = run.states("ledger"), run.outputs("energy").sum(axis=1)
     used = ledger[:, JOULE] + ledger[:, GEAR] + ledger[:, JOINT] + run.states("scheme")[:, 0]
     change = stored - stored[0]
@@ -226,7 +226,7 @@ def test_the_ledger_of_random_arms_that_rub(theta):
 
 @pytest.mark.parametrize("theta", [0.5, 1.0])
 def test_dry_friction_never_gives_energy_where_the_motion_turns_round(theta):
-    """The force of the step's end may be along its mean motion: that work is the scheme's, and the ledger closes."""
+    """The force at the step end may be along its mean motion: that work is due to the scheme; the ledger closes."""
     b, y, _, _ = oscillator(0.5)
     run = stepped(b, y, np.arange(0.0, 6.0, 5e-3), 5e-3, theta)
     turns = (np.diff(np.sign(run.states("v")[:, 0])) != 0.0).sum()
@@ -259,9 +259,9 @@ def test_events_find_where_a_push_breaks_a_bearing_loose(method):
 
 @pytest.mark.parametrize(("method", "late"), [("dopri5", 1e-8), ("radau5", 1e-8), ("time_stepping", 1e-3)])
 def test_begin_and_end_of_slip_of_a_joint_are_in_the_log(method, late):
-    """A push 2 F − F t slides the mass off at once, which is no event; it stops at 2 s and is pushed back from 3 s on.
+    """A push 2 F − F t slides the mass at once, which is not an event; it stops at 2 s and is pushed back from 3 s on.
 
-    Time stepping tells it at the ends of the steps that show it, here of 1 ms.
+    Time stepping logs these events at the ends of the steps in which they occur, here of 1 ms.
     """
     b = sliding(np.array([2.0 * FRICTION, -FRICTION]))
     y, times = b.state(np.zeros(1), np.zeros(1)), np.array([0.0, 4.0])
@@ -354,7 +354,7 @@ def leaning(rate: float) -> tuple[CompiledSystem, np.ndarray]:
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize(("rate", "modes"), [(200.0, {2, 0}), (-200.0, {2, 1, 0}), (-60.0, {2})])
 def test_joints_and_a_tip_that_hold_together_share_forces_that_are_open(method, rate, modes):
-    """They hold while any split of their forces is within all bounds, and break loose as time stepping has it."""
+    """They hold while any split of their forces is within all bounds, and break loose as in time stepping."""
     times = np.linspace(0.0, 1.0, 11)
     b, y = leaning(rate)
     run = b.simulate(y, times, method, rtol=1e-8, atol=1e-10)
@@ -369,14 +369,14 @@ def test_joints_and_a_tip_that_hold_together_share_forces_that_are_open(method, 
 
 
 def test_each_joint_is_held_or_slides_by_its_own_force():
-    """Of those that are held, which are the rows of the problem: the one at its bound that is accelerated slides."""
+    """Among the held joints, which are the rows of the problem, the accelerated joint at its bound slides."""
     b = assemble(arm(0.8), real=True, dry=True)
     table, dry, vector = b.system.unilateral.dry_table, b.system.unilateral.dry, b.system.unilateral.vector
     for holds in ((1, 1, 1), (1, 0, 1), (0, 1, 1)):
         rows = [k for k in range(3) if holds[k] == 1]
         for at_bound in rows:
             table[:, ku.DRY_HOLDS] = holds
-            # Along every row the same, so that bounds alone decide; and no joint is at its own but that.
+            # The same along every row, so that only bounds decide; and only this joint is at its bound.
             vector[ku.OFFSET], b.system.unilateral.room[ku.PROBLEM] = 1.0, 0.0
             for i, k in enumerate(rows):
                 vector[ku.SOLUTION, i] = 0.8 if k == at_bound else -0.3
@@ -470,7 +470,7 @@ def test_joints_rest_where_sliding_elbows_hold_them(tmp_path: Path, friction: fl
     """A yaw joint drags two elbows over a floor: their normal rows hold the pitch joints, which are at rest.
 
     Contact forces and dry friction of these joints are not determined, and with another split of them the friction of
-    the elbows is another: both methods with events take the same, time stepping another one.
+    the elbows differs: both methods with events choose the same split, time stepping a different one.
     """
     path = tmp_path / "drag.yaml"
     path.write_text(TWO_ELBOWS.replace("  friction: 0.3", f"  friction: {friction}"), encoding="utf-8")
@@ -511,7 +511,7 @@ integrator: {method: dopri5, rtol: 1.0e-5, atol: 1.0e-7}
 """
 
 
-@pytest.mark.long  # a program of its own to compile
+@pytest.mark.long  # compiles a separate program
 def test_a_joint_that_rests_on_its_stop_takes_no_share_of_its_force(tmp_path: Path):
     """A falling arm lands on its elbow with a joint on its stop: friction within its bound, and no chatter."""
     path = tmp_path / "stops.yaml"
@@ -615,7 +615,7 @@ integrator: {method: METHOD}
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize(("end", "moves"), [("0", False), ("-0.2", False), ("-0.6", True)])
 def test_a_joint_whose_load_fades_leaves_its_stop_once(tmp_path: Path, method: str, end: str, moves: bool):
-    """Where the load falls to what friction holds, the stop carries nothing any more and friction all of the rest."""
+    """When the load falls to a load that friction holds, the stop carries nothing and friction carries all of it."""
     path = tmp_path / "pressed.yaml"
     path.write_text(PRESSED.replace("END", end).replace("METHOD", method))
     run = simulate(load_scenario(path))

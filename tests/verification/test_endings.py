@@ -30,7 +30,7 @@ CREEPING = ENDLESS.with_name("creeping_block.yaml")
 
 @pytest.fixture(autouse=True)
 def nothing_is_left(monkeypatch: pytest.MonkeyPatch):
-    """Clear the flag of steps that were left running in a thread: those of these tests end on their own."""
+    """Clear the flag of steps that were left running in a thread: the steps of these tests end without help."""
     monkeypatch.setattr(interruption, "_left", False)
 
 
@@ -51,7 +51,7 @@ BARE = SimpleNamespace(unilateral=None, contacts=None)
 
 
 def table(count: int = 1) -> Any:
-    """The moving part of a run with so many events, as far as the search for their roots reads it."""
+    """Return the changing part of a run with ``count`` events: only the fields that the root search reads."""
     event, event_table = np.zeros((count, ki.EVENT_SIZE)), np.zeros((count, ki.EVENT_TABLE_SIZE), dtype=int)
     event[:, ki.SIDE] = event[:, ki.START_VALUE] = 1.0
     return SimpleNamespace(
@@ -65,7 +65,7 @@ def table(count: int = 1) -> Any:
 
 @pytest.mark.parametrize("seed", range(20))
 def test_a_search_ends_whatever_its_trials_say(monkeypatch: pytest.MonkeyPatch, seed: int):
-    """A root at 0.3 of the step, known to 1e-12 only: closer trials lie on either side of it, as they like."""
+    """A root at 0.3 of the step, known to 1e-12 only: closer trials are on either side of it at random."""
     random = np.random.default_rng(seed)
     run = table(2)
     run.clock[ki.STEP] = 1e-3
@@ -81,7 +81,7 @@ def test_a_search_ends_whatever_its_trials_say(monkeypatch: pytest.MonkeyPatch, 
         assert trials < 2 * events.SEARCH_LIMIT
     assert run.count[ki.FIRED] == 1
     assert run.clock[ki.STEP] == pytest.approx(0.3e-3, abs=1e-11)
-    # Whoever does what the event asks for sees that it has passed.
+    # The code that handles the event finds that it has passed.
     assert events.happened(run, 0, run.event[0, ki.VALUE])
     assert not events.happened(run, 1, run.event[1, ki.VALUE])
 
@@ -154,7 +154,7 @@ TINY = {"record.rate_hz": 10, "metrics.settle_s": 0}
 
 @pytest.mark.parametrize("method", ["radau5", "dopri5", "time_stepping"])
 def test_steps_that_come_nowhere_end_a_run(method: str):
-    """By every method: of 10 s they come on by 1e-9 s at a time."""
+    """With every method: in a run of 10 s, the counted steps advance by 1e-9 s at a time."""
     step = "step_s" if method == "time_stepping" else "step_max_s"
     overrides = {**TINY, "integrator.method": method, f"integrator.{step}": 1e-13}
     with pytest.raises(SimulationStopped) as raised:
@@ -164,7 +164,7 @@ def test_steps_that_come_nowhere_end_a_run(method: str):
     assert stop.time < 1e-8
     message = "no progress, the last 10000 steps came no further than 1.0e-05 s, the last of 1.0e-13 s; elbow_4 s"
     assert message in str(stop)
-    # Contact and mode; what a step of time stepping begins with is its own.
+    # Contact and mode; a step of time stepping begins with different modes.
     assert method == "time_stepping" or "; elbow_4 slides, elbow_7 sticks; " in str(stop)
     assert stop.record is not None
     assert not stop.record.complete
@@ -173,7 +173,7 @@ def test_steps_that_come_nowhere_end_a_run(method: str):
 
 
 def test_steps_are_counted_from_where_they_last_came_on():
-    """A run of so many steps that comes on is none of those that stand."""
+    """A run with more than MOST_TRIALS steps that advances does not count as a run without progress."""
     overrides = {**TINY, "integrator.step_max_s": 1e-5, "duration_s": 0.5, "integrator.method": "dopri5"}
     record = dynsim.simulate(dynsim.load_scenario("single_pendulum", overrides=overrides))
     assert record.summary["rhs_evaluations"] > 6 * 2 * ki.MOST_TRIALS
@@ -190,7 +190,7 @@ def test_a_simulation_that_comes_nowhere_stops_with_its_trace():
 
 @pytest.mark.parametrize(("duration", "least"), [(0.35, 3.5e-6), (10.0, 1e-5), (3600.0, 3.6e-3)])
 def test_short_runs_have_to_come_on_by_more_of_their_duration(duration: float, least: float):
-    """Slip that ended at every 5.5e-10 s of a run of 0.35 s went on for ever: 10 000 steps came 9e-7 s further."""
+    """Slip that ended every 5.5e-10 s in a run of 0.35 s never finished: 10 000 steps advanced by 9e-7 s."""
     scenario = dynsim.load_scenario("single_pendulum", overrides={**TINY, "duration_s": duration})
     assert prepare(scenario).run.clock[ki.LEAST_PROGRESS] == pytest.approx(least)
 
@@ -238,7 +238,7 @@ def test_the_wall_limit_of_a_simulation_is_that_of_all_its_pieces():
 def test_a_stop_says_which_friction_holds_explicit_steps_up(law: str, ending: str, settings: dict[str, object]):
     """A block that creeps down a slope, see the file: its friction changes within m s/(μ f), and W = 1/m.
 
-    s is the limit of slow slip, 1e-7 m/s, or, of a glued contact, √(v² + v_s²).
+    s is the limit of slow slip, 1e-7 m/s, or √(v² + v_s²) for a glued contact.
     """
     smooth = {"contacts.slip_smoothing_m_s": 1e-7} if law == "bilateral" else {}
     with pytest.raises(SimulationStopped, match=ending) as raised:
@@ -255,7 +255,7 @@ def test_a_stop_says_which_friction_holds_explicit_steps_up(law: str, ending: st
     assert speed == pytest.approx(np.linalg.norm(v), rel=5e-3)
     slow = np.hypot(speed, 1e-7) if law == "bilateral" else 1e-7
     assert within == pytest.approx(2.0 * slow / (0.4 * force), rel=5e-3)
-    # Of DOPRI5, up to a rejected step.
+    # Value for DOPRI5, up to a rejected step.
     assert 1.0 < step / within < 5.0
 
 
@@ -281,17 +281,17 @@ def test_a_method_that_was_removed_is_told_with_its_replacement():
             dynsim.load_scenario("single_pendulum", overrides={"integrator.method": method})
 
 
-# ---- Who listens while compiled code runs
+# ---- Interrupts while compiled code runs
 
 
 def floor() -> dynsim.Scenario:
-    """Of the unilateral law, whose steps may take long."""
+    """Return a scenario with the unilateral law, whose steps may take long."""
     overrides = {"duration_s": 0.5, "metrics.settle_s": 0}
     return dynsim.load_scenario("elbow_comparison_floor", "two_elbows", overrides)
 
 
 class Stands:
-    """In the stead of the compiled driver: a step that does not end until it is let go, and heeds nobody."""
+    """Stand-in for the compiled driver: a step that does not end until it is released, and ignores interrupts."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, after: int = 0) -> None:
         self.inside, self.released, self.left = threading.Event(), threading.Event(), after
@@ -309,7 +309,7 @@ class Stands:
 
 
 def interrupt_when(event: threading.Event) -> None:
-    """Ctrl-C to this process once something has happened."""
+    """Send Ctrl-C to this process once the event is set."""
 
     def wait() -> None:
         event.wait(60.0)
@@ -321,7 +321,7 @@ def interrupt_when(event: threading.Event) -> None:
 
 @pytest.fixture
 def ctrl_c():
-    """Where tests run in the background SIGINT is ignored."""
+    """Enable Ctrl-C: SIGINT is ignored if tests run in the background."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
@@ -353,7 +353,7 @@ def test_a_step_that_does_not_end_is_stuck(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_steps_that_take_long_are_not_stuck(monkeypatch: pytest.MonkeyPatch):
-    """Each step of a run longer than half of what is taken for stuck: it goes on, because it comes on."""
+    """Each step of a run takes more than half of STUCK_S: the run continues, because it advances."""
     monkeypatch.setattr(attended, "STUCK_S", 0.4)
     advance = driver.advance
 

@@ -35,7 +35,7 @@ def still(scenario):
 )
 def test_nothing_jumps_glued_free_and_on_a_real_floor(name, variant):
     record = still(load_scenario(name, variant, HOLD))
-    # The statics say what the simulation finds.
+    # The statics agree with the simulation.
     forces = [value for key, value in record.summary["equilibrium"].items() if key.endswith("normal_force_N")]
     np.testing.assert_allclose(record["contact_normal_force"][0], forces, rtol=0, atol=1e-8)
     assert record["current"][0].any()
@@ -150,13 +150,13 @@ def test_a_path_that_begins_elsewhere_jumps_and_is_said():
         "from where it stands" in text and "jumps at the start all the same" in text
         for text in record.summary["warnings"]
     )
-    # Less than a start without currents all the same.
+    # Still less than a start without currents.
     plain = simulate(load_scenario("elbow_comparison", "two_elbows", {"duration_s": 0.2}))
     assert np.abs(record["vdot"][0]).max() < np.abs(plain["vdot"][0]).max()
 
 
 def test_an_operator_takes_over_from_the_start_at_rest():
-    """Still until the first command, and no sag when references are rewritten at it: the hand goes where it is told."""
+    """Still until the first command, and no sag when it rewrites references: the hand follows the command."""
     operator = {"joints": ["joint_1", "joint_9", "joint_10"], "commands": [{"at_s": 0.1, "hand": [0.0, 0.0, 0.01]}]}
     controller = {"type": "joint_pd", "operator": operator}
     overrides = {"controller": controller, "initial": {"equilibrium": True}, "duration_s": 0.6}
@@ -178,9 +178,9 @@ def mobile(variant="two_elbows", **overrides):
 
 
 def test_a_base_does_not_tip_for_a_jolt_of_the_start_alone():
-    """A path that begins elsewhere tips it at once, which is not said of the rest of the run.
+    """A path that begins elsewhere tips it at once; the rest of the run is not reported as tipping.
 
-    A start at rest does not tip, and what check says of it is what the run has.
+    A start at rest does not tip, and the margin that check reports equals the margin of the run.
     """
     jolted = simulate(load_scenario("mobile_elbow_comparison", "two_elbows", {"duration_s": 2.5}))
     base, warnings = jolted.summary["base"], " ".join(jolted.summary["warnings"])
@@ -292,9 +292,9 @@ def test_only_plans_that_leave_weight_to_a_compliant_contact_count_on_it(tmp_pat
 
 
 def test_compliant_contacts_start_pressed_in(tmp_path):
-    """An arm on a compliant brace, and a box that four springs carry, of which rigid bodies do not determine the share.
+    """An arm on a compliant brace, and a box on four springs, whose shares rigid bodies do not determine.
 
-    The force of each is its stiffness times its depth, the weight of the box that of all four, and nothing accelerates.
+    The force of each is its stiffness times its depth, all four carry the weight of the box, and nothing accelerates.
     """
     path = tmp_path / "compliant.yaml"
     path.write_text(COMPLIANT)
@@ -324,7 +324,7 @@ def test_a_start_that_pressing_moves_far_is_told(tmp_path, stiffness, moves):
 
 
 def compliant_arm(tmp_path, replacements, **overrides):
-    """A start at rest of the arm of COMPLIANT without the box, which holds still on what it presses in."""
+    """A start at rest of the arm of COMPLIANT without the box, which rests on the contacts that it presses in."""
     text = COMPLIANT.replace("objects:\n", "").replace(
         "  thing: {mass_kg: 0.5, size_m: [0.2, 0.1, 0.1], position_m: [2, 0, 0.05]}\n", ""
     )
@@ -342,7 +342,7 @@ def compliant_arm(tmp_path, replacements, **overrides):
 
 
 def test_forces_that_no_heat_determines_stay_as_they_are_pressed_in(tmp_path):
-    """Torque motors have no heat: the least of it does not say how hard the elbow presses."""
+    """Torque motors have no heat: least heat does not determine how hard the elbow presses."""
     record = compliant_arm(
         tmp_path,
         {"{type: wang_minami}": "{type: torque, limit_N_m: 80}", ", k_p_V_per_rad: 300, k_d_V_s_per_rad: 10": ""},
@@ -353,7 +353,7 @@ def test_forces_that_no_heat_determines_stay_as_they_are_pressed_in(tmp_path):
 def test_a_rigid_contact_opens_where_it_would_wedge_an_arm_that_presses_another_in(tmp_path):
     """Weight turns the first joint, which has no motor, until the spring of the elbow carries: moments about it vanish.
 
-    A rigid stop above the first link begins closed; the elbow cannot be pressed in without that it opens.
+    A rigid stop above the first link begins closed; the elbow cannot be pressed in unless the stop opens.
     """
     stop = "tip: {body: link_1, point_m: [0, 0, 0.29], surface: ceiling}"
     replacements = {

@@ -79,7 +79,7 @@ def test_a_force_that_passes_its_bound_between_two_waypoints_is_seen(method: str
 @pytest.mark.parametrize("law", ["bilateral", "unilateral"])
 @pytest.mark.parametrize("method", ["dopri5", "radau5"])
 def test_the_mean_force_under_a_load_of_two_samples_is_right(law: str, method: str) -> None:
-    """Its ramp is between them, and the load goes on after the second; nothing else limits the steps."""
+    """Its ramp is between them, and the load continues after the second; nothing else limits the steps."""
     data = block(law, method)
     ramp = {"times_s": [1.3, 1.7], "force_N": [[0, 0, 0], [0, 0, -30]], "interpolation": "linear", "hold": True}
     data["loads"] = {"press": {"type": "samples", "body": "link_2"} | ramp}
@@ -107,7 +107,7 @@ def test_explicit_steps_see_the_pull_of_a_glued_contact_that_nothing_moves() -> 
 def test_the_heat_of_a_servo_that_pushes_against_a_stop_is_right(method: str) -> None:
     """Its voltage follows the reference into the limit and out again; ∫ u²/R from the samples of the voltage.
 
-    Nothing moves, and the currents of servos are no states: dopri5 missed 2e-4 of this heat at any rtol.
+    Nothing moves, and the currents of servos are not states: dopri5 missed 2e-4 of this heat at any rtol.
     """
     servo = {"type": "servo", "voltage_V": 12, "stall_torque_N_m": 10, "no_load_speed_rad_per_s": 6}
     servo |= {"k_p_V_per_rad": 30}

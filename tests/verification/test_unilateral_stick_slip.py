@@ -55,7 +55,7 @@ def whisk(stiffness: float, speed: float) -> CompiledSystem:
         Link("lift", "rail", None, "prismatic", np.array([0.0, 0.0, 1.0]), Inertia(0.0)),
         Link("bar", "hinge", "lift", "revolute", np.array([0.0, 0.0, 1.0]), Inertia(MASS, end)),
     )
-    # A servo with next to no back-EMF is a spring to where it starts; the moment is what moving its end does.
+    # A servo with almost no back-EMF is a spring to its initial angle; the moment is the effect of moving its end.
     spring = Servo("hinge", torque_constant=1e-6, resistance=1.0, k_p=1e6 * stiffness)
     moment = pull("bar", np.zeros(6), np.append(np.zeros(5), stiffness * speed))
     return assemble(Robot("whisk", links, (spring,), ("bar", end)), [foot("bar", end)], loads=[moment], real=True)
@@ -77,7 +77,7 @@ def test_a_block_dragged_through_a_spring_sticks_and_slips():
     times = np.array([t for t, _, _ in happened]).reshape(-1, 2)
     np.testing.assert_allclose(times[:, 0], first + cycle * (stick + slip), rtol=0.0, atol=1e-7)
     np.testing.assert_allclose(times[:, 1], times[:, 0] + slip, rtol=0.0, atol=1e-7)
-    # Where it rests the spring is as long as it was about to slip, less 2 A.
+    # While it rests, the spring is as long as it was about to slip, less 2 A.
     x = run.states("q")[:, 1]
     rests = speed * times[:, 1] - (KINETIC * MASS * G / stiffness - swing)
     for k in range(3):
@@ -94,7 +94,7 @@ def test_a_block_dragged_through_a_spring_sticks_and_slips():
 
 @pytest.mark.parametrize("grows", [False, True])
 def test_slip_begins_in_the_direction_of_kinetic_friction(grows):
-    """Heavier along x than along y: the acceleration (F − μ_k N t)/M is along t, and t is not that of the pull."""
+    """Heavier along x than along y: the acceleration (F − μ_k N t)/M is along t, not along the pull."""
     direction = np.array([np.cos(0.8), np.sin(0.8), 0.0])
     least = STATIC * MASS * G * direction
     b = sledge(np.zeros(3), 2.0 * least) if grows else sledge(1.2 * least, np.zeros(3))
@@ -120,7 +120,7 @@ def test_slip_begins_in_the_direction_of_kinetic_friction(grows):
 @pytest.mark.parametrize("grows", [False, True])
 @pytest.mark.parametrize("cart", [2e7, 1e9, 5e9])
 def test_a_block_that_hardly_accelerates_slips_where_its_static_friction_is_exceeded(cart, grows):
-    """a = (F − μ_k N)/(M + cart), which is as good as zero beside g: forces show the slip, not accelerations."""
+    """a = (F − μ_k N)/(M + cart), which is almost zero compared with g: forces show the slip, not accelerations."""
     along, least = np.array([1.0, 0.0, 0.0]), STATIC * MASS * G
     force, rate, excess, onset = (0.0, 2.0 * least, 0.0, 0.5) if grows else (least + 1.0, 0.0, 1.0, 0.0)
     b = sledge(force * along, rate * along, cart)
@@ -161,7 +161,7 @@ contacts:
 
 
 def test_the_paradox_names_contact_time_and_state(tmp_path: Path):
-    """A rod is flung over its foot, which comes to slip where 1 + 3 s (s − μ c) < 0: it would do with less friction."""
+    """A rod is flung over its foot, which begins to slip where 1 + 3 s (s − μ c) < 0: less friction avoids this."""
     path = tmp_path / "rod.yaml"
     path.write_text(ROD)
     with pytest.raises(SimulationStopped, match="Painlevé's paradox at tip: det J M⁻¹F is negative") as stop:

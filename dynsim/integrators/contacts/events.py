@@ -76,7 +76,7 @@ WINDOW, MOST_EVENTS, MOST_SETTLE = 1.0, 200, 1e-2
 # More changes at one instant, which lasts INSTANT [s], or more chatter of one candidate or stop than this end the run.
 MOST_CHANGES, MOST_CHATTER = 60, 100
 INSTANT = 1e-11
-# A frozen direction of slip is taken anew where friction has turned from it by the angle with this tangent.
+# A frozen direction of slip is updated when friction has turned from it by the angle with this tangent.
 TURNED = 0.5
 # At the end of the best split sticking is still a solution. So friction at rest is reduced for the choice of modes, by
 # FIRST_REDUCTION and ten times more up to MOST_REDUCTION, until the chosen modes agree with their forces: far above
@@ -131,8 +131,8 @@ def rest_margin(unilateral: UnilateralArrays, ws: Workspace, k):
     Rows may depend on each other in one posture only, such as a joint and a point at the crest of a surface. When they
     leave it they contradict each other, at first by less than the rank of their system shows, and the solution of least
     squares leaves accelerations along them. With modes chosen again the joint slides. It counts as accelerated by the
-    limit of that choice; if the choice has held it nevertheless, by twice what was left then. Where that is less, rates
-    and gaps along the rows show the contradiction in time.
+    limit of that choice, or by twice the acceleration left then if the choice has held it nevertheless. Below this
+    limit, rates and gaps along the rows show the contradiction in time.
     """
     if unilateral.number[ku.REDUNDANT] == 0.0:
         return 1.0

@@ -407,7 +407,7 @@ def impact(system: System, ws: Workspace, run: Run):
             y[layout.contact + kst.CONTACT_SIZE * k + kst.IMPULSE] += f[r]
     r = system.couplings.joint.shape[0] + dry_rows_held(unilateral)
     for s in range(r):
-        # Of a brake that closes, which stops its joint as a coupling.
+        # Loss of a brake that closes, which stops its joint as a coupling does.
         y[layout.loss + kst.IMPACT_LOSS] += rows[s, ka.FORCE]
     for k in range(unilateral.stop_table.shape[0]):
         if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:

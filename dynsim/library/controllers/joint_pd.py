@@ -34,9 +34,9 @@ ENGINE = "dynamics"
 PathChoice: Any = families.union("path")
 BasePathChoice: Any = families.union("base_path")
 
-# Most segments of the reference splines: half a gigabyte for each joint.
+# Maximum number of segments of the reference splines: half a gigabyte for each joint.
 SEGMENTS_MAX = 10_000_000
-# Knots from one waypoint to the next, at least; and how many times finer than ``knot_spacing_s`` they become at most.
+# Minimum number of knots from one waypoint to the next; maximum factor by which they are finer than ``knot_spacing_s``.
 KNOTS_BETWEEN, MOST_FINER = 5.0, 100.0
 # Largest turn of a base between two knots [rad]; with more the spline would deviate from the path.
 TURN_MAX = 0.2
@@ -73,7 +73,7 @@ class BaseReference(StrictConfig):
 
 
 class JointPath(StrictConfig):
-    """Waypoints of one joint: a cubic spline, at rest at both ends and held beyond them."""
+    """Waypoints of one joint: a cubic spline with zero rate at both ends, constant beyond them."""
 
     times_s: list[float] = Field(min_length=2)
     angles_deg: list[float] | None = Field(default=None, min_length=2, description="of a revolute joint")
@@ -101,7 +101,7 @@ class JointPath(StrictConfig):
 
 
 class TorquePath(StrictConfig):
-    """Waypoints of one torque: a cubic spline with level ends, held beyond them."""
+    """Waypoints of one torque: a cubic spline with zero slope at both ends, constant beyond them."""
 
     times_s: list[float] = Field(min_length=2)
     torques_N_m: list[float] = Field(min_length=2, description="N at a prismatic joint")
@@ -115,7 +115,7 @@ class TorquePath(StrictConfig):
 class Config(StrictConfig):
     """Gains for all DC motors or one per DC motor; joints without a reference hold their initial position.
 
-    Servos follow the same references with gains of their own; torque sources have ``torques``.
+    Servos follow the same references with the gains of their motors; torque sources follow ``torques``.
     """
 
     type: Literal["joint_pd"]
@@ -148,7 +148,7 @@ class Config(StrictConfig):
     @field_validator("brace", mode="before")
     @classmethod
     def _check_brace(cls, value: Any) -> Any:
-        """One message for what is neither of the two, and one that names the force that is none."""
+        """Raise one error for a value of neither type, and another that names the invalid force."""
         if isinstance(value, Mapping) and value:
             for name, force in value.items():
                 if isinstance(force, bool) or not isinstance(force, int | float) or not 0.0 < force < np.inf:
@@ -184,9 +184,9 @@ def build(config: Config, context: BuildContext) -> JointControl:
     Raises
     ------
     ModelError
-        A named joint does not exist or has no motor, or there are not as many gains as motors.
+        If a named joint does not exist or has no motor, or if the number of gains differs from the number of motors.
     UnreachableReference
-        The hand cannot follow its path.
+        If the hand cannot follow its path.
     """
     model = context.model
     robot = model.robot
@@ -253,7 +253,7 @@ def _teleop(operator: OperatorConfig, context: BuildContext) -> TeleopOptions:
 def _planned(
     config: Config, context: BuildContext, times: NDArray[np.float64], positions: dict[str, NDArray[np.float64]]
 ) -> NDArray[np.float64]:
-    """Voltages of the motors along the references, (T, na)."""
+    """Return the voltages of the motors along the references, (T, na)."""
     if config.brace is None:
         return planned_voltages(context.model, times, positions, {}, whole=config.feed_forward == "dynamics")
     forces = dict.fromkeys(context.declared) if config.brace == "optimal" else dict(config.brace)
@@ -273,7 +273,7 @@ def _contact(context: BuildContext, name: str, key: str) -> Contact:
 
 
 def _check_names(config: Config, model: Model) -> None:
-    """Refuse references of what is no joint, has no motor, or one of another kind."""
+    """Raise ModelError if a reference names an unknown joint, or one without a motor or with another kind of motor."""
     robot = model.robot
     driven = [motor.joint for motor in robot.motors]
     in_hand = config.hand.joints if config.hand else config.operator.joints if config.operator else []
@@ -311,7 +311,7 @@ def _check_names(config: Config, model: Model) -> None:
 
 
 def _check_base(robot: Robot, keys: tuple[str, ...]) -> None:
-    """Refuse to move a base that there is not, or whose wheels follow no reference."""
+    """Raise ModelError if the plant has no base to move, or if the wheels of the base cannot follow references."""
     key, motors = ".".join(keys), {motor.joint: motor for motor in robot.motors}
     if robot.base is None:
         raise ModelError(f"{key}: the plant has no mobile base; pws_arm has one", keys=keys)
@@ -323,9 +323,9 @@ def _check_base(robot: Robot, keys: tuple[str, ...]) -> None:
 
 
 def _spacing(config: Config) -> float:
-    """Spacing of the knots [s]: the controller's, or less where waypoints are too near each other to be followed.
+    """Return the knot spacing [s]: ``knot_spacing_s``, or less if waypoints are too close together to be followed.
 
-    Splines through knots that are as far apart as waypoints miss these by up to half of their change.
+    Splines whose knots are as far apart as the waypoints miss the waypoints by up to half of their change.
     """
     waypoints = [path.times_s for path in config.joints.values()] + [path.times_s for path in config.torques.values()]
     nearest = min((float(np.diff(times).min()) for times in waypoints if len(times) > 1), default=np.inf)
@@ -333,7 +333,7 @@ def _spacing(config: Config) -> float:
 
 
 def _knots(spacing: float, duration: float) -> NDArray[np.float64]:
-    """Times of the samples of the reference splines [s]."""
+    """Return the times of the samples of the reference splines [s]."""
     segments = duration / spacing
     if segments > SEGMENTS_MAX:
         raise ModelError(
@@ -352,7 +352,7 @@ def _base_path(base: BaseReference, context: BuildContext) -> BasePath:
 
 
 def _wheel_angles(robot: Robot, path: BasePath, times: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
-    """References of the two wheels [rad]; none where the base does not move, so that they hold."""
+    """Return references of the two wheels [rad]; empty if the base does not move, so that the wheels hold."""
     assert robot.base is not None
     keys = ("controller", "base", "path")
     motion = np.asarray(path.motion(times), dtype=np.float64)
@@ -376,7 +376,7 @@ def _wheel_angles(robot: Robot, path: BasePath, times: NDArray[np.float64]) -> d
 def _base_coordinates(
     robot: Robot, positions: dict[str, NDArray[np.float64]], times: NDArray[np.float64]
 ) -> NDArray[np.float64] | None:
-    """Wheel angles [rad], x and y [m] of the base at the times of its references, (T, 4); None where it holds."""
+    """Return wheel angles [rad], x and y [m] of the base at its reference times, (T, 4); None if the base holds."""
     if robot.base is None or not any(wheel in positions for wheel in robot.base.wheels):
         return None
     first, _ = base_row(robot)
@@ -394,7 +394,7 @@ _GAINS = {"k_p": ("k_p_V_per_rad", 500.0), "k_d": ("k_d_V_s_per_rad", 20.0)}
 
 
 def _gains(config: Config, robot: Robot, name: str) -> NDArray[np.float64]:
-    """One gain of every motor, (na,): the controller's for DC motors, a servo's own, 0 for a torque source."""
+    """Return one gain of every motor, (na,): from the controller for DC motors, from a servo, 0 for a torque source."""
     (key, default), motors = _GAINS[name], robot.motors
     gain, circuits = getattr(config, key), [isinstance(motor, Motor) for motor in motors]
     if gain is None:

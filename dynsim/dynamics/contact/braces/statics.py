@@ -1,4 +1,4 @@
-"""Brace forces of least motor heat for a given motion, their ranges, and certificates where there are none.
+"""Brace forces of least motor heat for a given motion, their ranges, and certificates if no forces are possible.
 
     tau = M vdot + h + g + J_m vdot + (D + D_m) v − Bᵀ f,    minimise Σ w_j tau_j²,  w = R / K_m²
 
@@ -6,7 +6,7 @@ subject to lower ≤ tau ≤ upper (both zero for a joint without a motor), |f_t
 cone program. Each brace has f = (f_n, f_1, f_2) along its normal n and two tangents; the rows of B map rates to the
 velocities of its point along them. A sliding brace has f_t = −μ f_n d, d the direction of slip; a commanded f_n is
 given. So the unknowns of a brace are f if it is held, f_n if it slides or has no friction, without f_n if commanded.
-Where braces have a force that they shall stay near, the program minimises how far they are off, see ``NEAR`` of
+If braces have a target force, the program minimises the deviation from it instead of the heat, see ``NEAR`` of
 :mod:`dynsim.dynamics.contact.braces.tables`.
 """
 
@@ -27,22 +27,22 @@ from dynsim.jit.kernel import internal_kernel, kernel
 # Tolerance of the largest margin to the constraints, in units of the force scale [1]: below −SLACK there is no
 # solution, within ±SLACK the solution has no interior.
 SLACK = 1e-9
-# Where all torques are this share of the force scale within their limits, no program maximises the margin.
+# If all torques are within their limits by this share of the force scale, no program maximises the margin.
 AMPLE = 1e-6
-# Intervals are open where forces this many times their scale are still possible.
+# An interval is open if forces of this multiple of their scale are still possible.
 FAR = 1e4
-# Weight of the forces beside the heat: keeps those finite that no motor feels.
+# Weight of the forces in the objective, in addition to the heat: keeps forces finite that do not load any motor.
 LEAST_WEIGHT = 1e-14
 
 
 @kernel
 def brace_motion(model: ModelArrays, ws: Workspace, braces: BraceArrays, q, v, positions, velocities):
-    """Positions and velocities of the points of braces along a motion.
+    """Compute positions and velocities of the points of braces along a motion.
 
     Parameters
     ----------
     q, v : (T, nq), (T, n)
-    positions, velocities : (T, c, 3) [m, m/s], overwritten; points are those of ``braces.table``
+    positions, velocities : (T, c, 3) [m, m/s], overwritten; the points are given by ``braces.table``
     """
     jacobian, n = braces.jacobian, braces.free.shape[0]
     for t in range(q.shape[0]):
@@ -62,17 +62,17 @@ def brace_motion(model: ModelArrays, ws: Workspace, braces: BraceArrays, q, v, p
 def brace_statics(
     model: ModelArrays, ws: Workspace, braces: BraceArrays, q, v, vdot, tables, torques, normal, intervals
 ):
-    """Least-heat forces along a motion; the last instant's forces, and intervals if they are wanted, into ``braces``.
+    """Compute forces of least heat along a motion; the last forces, and intervals if wanted, go to ``braces``.
 
-    Returns the number of instants with a solution: it ends where nothing fulfils all constraints. Then ``certificate``
-    is a vector ω (n,) of joint rates that shows it: for all torques within their limits and all forces of the braces,
-    ω·(tau + Bᵀ f) < ω·free, which would have to be equal.
+    Returns the number of instants with a solution: it stops at the first instant at which no forces fulfil all
+    constraints. Then ``certificate`` is a vector ω (n,) of joint rates that proves it: for all torques within their
+    limits and all forces of the braces, ω·(tau + Bᵀ f) < ω·free, although both sides would have to be equal.
 
     Parameters
     ----------
     q, v, vdot : (T, nq), (T, n), (T, n)
     tables : (T, c, BRACE_SIZE), the braces at each instant
-    torques, normal : (T, n) of the motors [N m] and (T, c) normal forces [N], overwritten
+    torques, normal : (T, n) motor torques [N m] and (T, c) normal forces [N], overwritten
     """
     for t in range(q.shape[0]):
         for k in range(braces.link.shape[0]):
@@ -91,7 +91,7 @@ def brace_statics(
 
 @internal_kernel
 def set_motion(model: ModelArrays, ws: Workspace, q, v, vdot):
-    """Coordinates, rates and accelerations into the workspace."""
+    """Write coordinates, rates and accelerations to the workspace."""
     read_positions(model, q, 0, ws)
     for j in range(v.shape[0]):
         ws.joints[j, ka.QD], ws.joints[j, ka.QDD] = v[j], vdot[j]
@@ -99,9 +99,9 @@ def set_motion(model: ModelArrays, ws: Workspace, q, v, vdot):
 
 @internal_kernel
 def torque_limits(braces: BraceArrays, ws: Workspace):
-    """Least and largest torque of each motor at a steady current: |R i + K_m v| ≤ U, |i| ≤ I.
+    """Compute the torque limits of each motor at a steady current: |R i + K_m v| ≤ U, |i| ≤ I.
 
-    A motor that is driven faster than its voltage allows brakes with all it has.
+    A motor that is driven faster than its voltage allows brakes with its maximum torque.
     """
     motors = braces.motors
     for j in range(motors.shape[0]):
@@ -116,7 +116,7 @@ def torque_limits(braces: BraceArrays, ws: Workspace):
 
 @internal_kernel
 def least_heat_forces(model: ModelArrays, ws: Workspace, braces: BraceArrays, intervals):
-    """Torques, forces and intervals of one instant into ``braces``; False, and a certificate, where there are none."""
+    """Write torques, forces and intervals of one instant to ``braces``; False and a certificate without a solution."""
     results, table, motors = braces.results, braces.table, braces.motors
     c, n, first, x = braces.link.shape[0], braces.free.shape[0], braces.first, braces.program.x
     scale = brace_rows(model, ws, braces)
@@ -127,14 +127,14 @@ def least_heat_forces(model: ModelArrays, ws: Workspace, braces: BraceArrays, in
         limited |= not (math.isinf(motors[j, kb.LOWER]) and math.isinf(motors[j, kb.UPPER]))
     best = False
     if passive == 0:
-        # The optimum without limits is that within them where it keeps them: mostly.
+        # The optimum without limits is also the optimum within limits if it keeps them, which it does in most cases.
         equations, cones = constraints(braces, scale, False, False)
         middle_forces(braces, scale)
         least_heat(braces, unknowns, equations, cones, scale)
         keep(braces, scale)
         best = not limited or ample(braces, scale)
     if limited and (intervals or not best):
-        # Equations that contradict each other have no margin: first with torques of passive joints that may be off.
+        # Equations that contradict each other have no margin: first allow the torques of passive joints to be off.
         if passive > 0:
             equations, cones = constraints(braces, scale, True, True)
             if largest_margin(braces, equations, cones, scale) < -SLACK:
@@ -169,7 +169,7 @@ def least_heat_forces(model: ModelArrays, ws: Workspace, braces: BraceArrays, in
 
 @internal_kernel
 def keep(braces: BraceArrays, scale):
-    """Torques and forces of the unknowns x into ``braces``."""
+    """Write torques and forces of the unknowns x to ``braces``."""
     for j in range(braces.free.shape[0]):
         torque = braces.free[j]
         for k in range(braces.first[braces.link.shape[0]]):
@@ -181,7 +181,7 @@ def keep(braces: BraceArrays, scale):
 
 @internal_kernel
 def brace_forces(braces: BraceArrays, k, scale):
-    """The force of brace k from the unknowns, along its axes and in the world."""
+    """Compute the force of brace k from the unknowns, along its axes and in the world."""
     table, results, x, at = braces.table, braces.results, braces.program.x, braces.first[k]
     normal = table[k, kb.COMMANDED]
     if normal != normal:
@@ -200,7 +200,7 @@ def brace_forces(braces: BraceArrays, k, scale):
 
 @internal_kernel
 def ample(braces: BraceArrays, scale):
-    """Whether all torques keep their limits and there is room for more."""
+    """Return whether all torques keep their limits with room to spare."""
     for j in range(braces.free.shape[0]):
         torque, room = braces.torques[j], AMPLE * scale
         if torque - braces.motors[j, kb.LOWER] < room or braces.motors[j, kb.UPPER] - torque < room:
@@ -210,7 +210,7 @@ def ample(braces: BraceArrays, scale):
 
 @internal_kernel
 def middle_forces(braces: BraceArrays, scale):
-    """Forces to start from, along the normals: inside the cones of all braces."""
+    """Set the initial forces, along the normals: inside the cones of all braces."""
     table, x, first = braces.table, braces.program.x, braces.first
     for k in range(braces.link.shape[0]):
         for i in range(first[k], first[k + 1]):
@@ -221,7 +221,7 @@ def middle_forces(braces: BraceArrays, scale):
 
 @internal_kernel
 def largest_margin(braces: BraceArrays, equations, cones, scale):
-    """A point x inside all constraints; returns the worst margin there, the largest possible, at most 1."""
+    """Find a point x inside all constraints; returns the worst margin there, the largest possible, at most 1."""
     program, unknowns = braces.program, braces.first[braces.link.shape[0]]
     x, rows = program.x, program.first[cones]
     clear_objective(program, unknowns + 1)
@@ -237,7 +237,7 @@ def largest_margin(braces: BraceArrays, equations, cones, scale):
 
 @internal_kernel
 def brace_rows(model: ModelArrays, ws: Workspace, braces: BraceArrays):
-    """Torques without the unknown forces, and the rows B of those; returns a scale of the forces [N]."""
+    """Compute the torques without the unknown forces, and the rows B of these forces; returns a force scale [N]."""
     newton_euler(model, ws, 1.0, 1.0, 1.0)
     table, B, jacobian, first, n = braces.table, braces.B, braces.jacobian, braces.first, braces.free.shape[0]
     torque, lever, scale = 0.0, 0.0, 1e-3
@@ -273,16 +273,16 @@ def brace_rows(model: ModelArrays, ws: Workspace, braces: BraceArrays):
 
 @internal_kernel
 def along(table, jacobian, k, j, e):
-    """Velocity of the point of brace k along its axis e for each unit of rate j."""
+    """Return the velocity of the point of brace k along its axis e per unit of rate j."""
     at = kb.AXES + 3 * e
     return table[k, at] * jacobian[0, j] + table[k, at + 1] * jacobian[1, j] + table[k, at + 2] * jacobian[2, j]
 
 
 @internal_kernel
 def constraints(braces: BraceArrays, scale, limits, relaxed):
-    """Equations and cones in the forces over ``scale``; their numbers.
+    """Set up equations and cones in the forces divided by ``scale``; returns their numbers.
 
-    ``limits`` : those of the torques are among them; ``relaxed`` : passive joints are in cones, not in equations
+    ``limits`` : include the torque limits; ``relaxed`` : passive joints are in cones, not in equations
     """
     program, table, B, motors = braces.program, braces.table, braces.B, braces.motors
     A, b, G, h, first = program.A, program.b, program.G, program.h, program.first
@@ -333,7 +333,7 @@ def constraints(braces: BraceArrays, scale, limits, relaxed):
 
 @internal_kernel
 def clear_objective(program: ConeProgram, unknowns):
-    """Nothing to minimise but, with little weight, the unknowns."""
+    """Set the objective to only the unknowns, with a small weight."""
     for k in range(unknowns):
         program.g[k] = 0.0
         for m in range(unknowns):
@@ -342,7 +342,7 @@ def clear_objective(program: ConeProgram, unknowns):
 
 @internal_kernel
 def worst_margin(program: ConeProgram, unknowns, cones):
-    """Least distance of x to the boundary of a cone, negative outside."""
+    """Return the smallest distance of x to the boundary of a cone, negative outside."""
     worst = math.inf
     for c in range(cones):
         head, square = 0.0, 0.0
@@ -360,9 +360,9 @@ def worst_margin(program: ConeProgram, unknowns, cones):
 
 @internal_kernel
 def contradiction(braces: BraceArrays, equations, cones, relaxed):
-    """The multipliers of torques as joint rates, from those of the margin that is negative at best."""
+    """Write multipliers of the torques as joint rates, from the multipliers of a best margin that is negative."""
     program, motors = braces.program, braces.motors
-    # Torques are the last of the equations and of the cones: backwards.
+    # Torques are the last of the equations and of the cones: loop backwards.
     e, i = equations - 1, program.first[cones] - 1
     for j in range(braces.free.shape[0] - 1, -1, -1):
         low, high = motors[j, kb.LOWER], motors[j, kb.UPPER]
@@ -381,7 +381,7 @@ def contradiction(braces: BraceArrays, equations, cones, relaxed):
 
 @internal_kernel
 def extreme_force(braces: BraceArrays, unknowns, equations, cones, j, end, scale):
-    """The least (end 0) or largest (end 1) normal force of brace j within all constraints [N], from a point inside."""
+    """Return the smallest (end 0) or largest (end 1) possible normal force of brace j [N]; x must start inside."""
     program, k, x = braces.program, braces.first[j], braces.program.x
     if end == 0 and equations == 0 and holds_with_least(braces, j):
         return braces.table[j, kb.LEAST]
@@ -399,7 +399,7 @@ def extreme_force(braces: BraceArrays, unknowns, equations, cones, j, end, scale
 
 @internal_kernel
 def holds_with_least(braces: BraceArrays, j):
-    """Whether the forces found stay possible when that of brace j is shortened to the least that it may be."""
+    """Return whether the forces found stay possible when the force of brace j is shortened to its minimum."""
     results, k, least = braces.results, braces.first[j], braces.table[j, kb.LEAST]
     shorter = results[j, kb.FORCES] - least
     share = shorter / results[j, kb.FORCES] if shorter > 0.0 else 0.0
@@ -414,7 +414,7 @@ def holds_with_least(braces: BraceArrays, j):
 
 @internal_kernel
 def least_heat(braces: BraceArrays, unknowns, equations, cones, scale):
-    """The forces of least heat, in units of it: H = B w Bᵀ, g = −B w free; or those nearest to given ones."""
+    """Find the forces of least heat, in units of ``scale``: H = B w Bᵀ, g = −B w free; or forces nearest to targets."""
     program, B, motors, n = braces.program, braces.B, braces.motors, braces.free.shape[0]
     clear_objective(program, unknowns)
     largest = 0.0

@@ -17,8 +17,8 @@ SLIP = 12  # 2: unit direction of sliding along the tangents, zero for a brace t
 FRICTION = 14
 LEAST = 15  # min_N
 COMMANDED = 16  # [N], NaN for none
-# Of a brace whose normal force shall stay near one: that force [N], and how much each newton off it counts [m/N]; zero
-# for the others. Where there is such a brace, forces minimise Σ compliance (f_n − near)² instead of the heat.
+# Target of the normal force of a brace [N], and its weight (compliance) [m/N]; zero for braces without a target.
+# If any brace has a target, forces minimise Σ compliance (f_n − near)² instead of the heat.
 NEAR, COMPLIANCE = 17, 18
 BRACE_SIZE = 19
 # BraceArrays.motors: a torque source has K_m = 1 and no resistance, a joint without a motor K_m = 1 and no current
@@ -33,7 +33,7 @@ RESULT_SIZE = 5
 
 
 class BraceArrays(NamedTuple):
-    """Braces, motors, what results, and the room for it."""
+    """Braces, motors, results and workspace."""
 
     link: np.ndarray  # (c,) int
     table: np.ndarray  # (c, BRACE_SIZE)
