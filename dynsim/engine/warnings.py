@@ -143,8 +143,9 @@ def _contact_warnings(
     within = f" from t = {record.time[0]:.4g} s on" if len(record) and record.time[0] > begun else ""
     for contact in summary["contacts"]:
         name = contact["name"]
-        # A contact that only bounces is never closed.
-        never = "gap_min_m" in contact and contact["closed_fraction"] == 0.0 and not contact.get("bounces")
+        # A contact that only bounces is never closed, and a run that ends in its first step gives it no time to be.
+        pressed = contact["closed_fraction"] > 0.0 or contact.get("bounces") or contact["normal_force_max_N"] > 0.0
+        never = "gap_min_m" in contact and not pressed
         if never and name not in left_out:
             nearest = int(record["contact_gap"][:, columns.index(name)].argmin())
             time, surface = f"t = {record.time[nearest]:.4g} s", contact["surface"]

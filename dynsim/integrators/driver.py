@@ -91,7 +91,7 @@ def accept(system: System, ws: Workspace, run: Run):
     t, h = run.clock[ki.TIME], run.clock[ki.STEP]
     if not end_accepted(run.newton, system, ws, run):
         return
-    watch_modes(system.contacts, system.unilateral, ws, h, run.gaps)
+    watch_modes(system.model, system.contacts, system.unilateral, ws, h, run.gaps)
     # The event of tipping has asked for the ground's reaction at the end of this step.
     if run.event.shape[0] > 0:
         watch_support(run.support)

@@ -67,7 +67,7 @@ def arm_events(system: System, ws: Workspace, run: Run):
         run.event[e, ki.START_VALUE] = value
         if run.event[e, ki.SIDE] == 0.0:
             run.event[e, ki.SIDE] = 1.0 if value > 0.0 else (-1.0 if value < 0.0 else 0.0)
-    note_gaps(system.unilateral, ws, run.gaps)
+    note_gaps(system.model, system.contacts, system.unilateral, ws, run.gaps)
 
 
 @internal_kernel
@@ -152,8 +152,8 @@ def keep_passed(run: Run):
 
 @internal_kernel
 def passes_over(system: System, ws: Workspace, run: Run):
-    """True when a contact has been passed over within the step: STEP is then the step to take instead."""
-    part = too_long(system.contacts, system.unilateral, ws, run.clock[ki.STEP], run.gaps)
+    """True when the step has passed over a contact or a turn of slip: STEP is then the step to take instead."""
+    part = too_long(system.model, system.contacts, system.unilateral, ws, run.clock[ki.STEP], run.gaps)
     # A false alarm must not shorten steps indefinitely, or to zero.
     shorter = part * run.clock[ki.STEP] > event_tolerance(run.clock[ki.TIME])
     if part < 1.0 and shorter and run.count[ki.GRAZING] < SEARCH_LIMIT:

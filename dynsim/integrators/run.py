@@ -63,7 +63,7 @@ TICK_KIND, TICK_COUNT = 0, 1
 TICK_TABLE_SIZE = 2
 TAKE_COMMANDS, CALLER = 1, 2
 LOG_LENGTH = 1024
-GAPS_SIZE = 8
+GAPS_SIZE = 10
 # Entries of Run.log_event from these numbers on are of contacts, of joint stops, and of joints with dry friction, see
 # contact_events.
 CONTACT_LOG, STOP_LOG, DRY_LOG = 1 << 20, 1 << 40, 1 << 50
@@ -99,7 +99,7 @@ class Run(NamedTuple):
     log_time: np.ndarray  # (LOG_LENGTH,) of events [s]
     log_event: np.ndarray  # (LOG_LENGTH,) int: which
     hand: np.ndarray  # (3,) room
-    gaps: np.ndarray  # (c, GAPS_SIZE) gaps, their rates, normals and places at the start of the step
+    gaps: np.ndarray  # (c, GAPS_SIZE) gaps, their rates, normals, positions and slip at the start of the step
     support: SupportArrays
     columns: OutputLayout
     output: np.ndarray  # (T, columns.size)

@@ -75,6 +75,8 @@ FOUND = {
         271127,
         4687,
     ),
+    "a joint that turned round twice within a step, and was driven by its friction between": (271127, 7047),
+    "an elbow that slid back and forth within a step, and was driven by its friction between": (271127, 5698),
 }
 # Scenes of the slow study.
 TRIPLES = 1000

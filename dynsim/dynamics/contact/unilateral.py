@@ -83,7 +83,8 @@ DRY_SIDE = 3  # sign of the rate at which it slides; between −1 and 1 at rest,
 DRY_AT = 4  # where it is held [rad or m]
 DRY_HEADWAY = 5  # what it began to slide with against its side, because the rows could not take it away
 DRY_LEFT = 6  # acceleration_left() of rows that depended on each other at the last choice of modes [rad/s² or m/s²]
-DRY_SIZE = 7
+DRY_RATE_THEN, DRY_ACCELERATION_THEN = 7, 8  # at the start of the step [rad/s, rad/s²; m/s, m/s²]
+DRY_SIZE = 9
 # UnilateralArrays.tie_table, int
 TIE_A, TIE_B = 0, 1  # links
 TIE_TURNS = 2  # 1: about its axis, 0: along it

@@ -35,8 +35,8 @@ from dynsim.dynamics.contact.unilateral import (
     stop_rate,
 )
 from dynsim.dynamics.derivative import System
-from dynsim.dynamics.tables import ContactArrays, Workspace
-from dynsim.dynamics.tree.spatial import dot_vector
+from dynsim.dynamics.tables import ContactArrays, ModelArrays, Workspace
+from dynsim.dynamics.tree.spatial import dot_vector, plus_scaled, point_acceleration, six, vector
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts.attempts import keep, take_back
 from dynsim.integrators.contacts.impacts import IMMOBILE, evaluate, largest_right_side, slip_speed
@@ -65,8 +65,9 @@ NORMAL_GUARD, SLIP_GUARD, STOP_GUARD, DRY_GUARD = 10, 11, 12, 13
 LANDING, LIFT_OFF, SLIP_START, SLIP_STOP, BOUNCE, CHATTERS, STOP_HIT, STOP_LEFT = 0, 1, 2, 3, 4, 5, 6, 7
 LOG_KINDS = 8
 
-# Run.gaps: gap, its rate, normal and position of a candidate at the start of the step.
-GAP_THEN, RATE_THEN, NORMAL_THEN, POSITION_THEN = 0, 1, 2, 5
+# Run.gaps: gap, its rate, normal and position of a candidate at the start of the step, its slip along REFERENCE and the
+# rate of that slip.
+GAP_THEN, RATE_THEN, NORMAL_THEN, POSITION_THEN, SLIP_THEN, SLIP_RATE_THEN = 0, 1, 2, 5, 8, 9
 
 # A candidate that starts, or comes to rest, this close to its surface touches it [m].
 TOUCH = 1e-9
@@ -154,17 +155,25 @@ def moves_held(unilateral: UnilateralArrays, ws: Workspace, k):
 
 
 @internal_kernel
-def too_long(contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: Workspace, h, gaps):
+def too_long(model: ModelArrays, contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: Workspace, h, gaps):
     """Return the fraction of a step to take instead, if it has passed over something, or 1.
 
     An open candidate may dip below its surface, or a joint beyond its open stop, and be out again at the end: the
-    minimum of the cubic through gaps and their rates at both ends, ``gaps``, (c, GAPS_SIZE), at the start. It may have
+    minimum of the cubic through gaps and their rates at both ends, ``gaps``, (c, GAPS_SIZE), at the start. In the same
+    way the slip of a point, or the rate of a joint with dry friction, may have turned round twice. A candidate may have
     gone through a body: it is out at the other side, having moved at least both gaps together. Or a point with a frozen
     direction of slip has become fast across it, where friction would be along its slip.
     """
     fraction = 1.0
     if unilateral is None:  # known to the compiler
         return fraction
+    dry = unilateral.dry
+    for k in range(dry.shape[0]):
+        if unilateral.dry_table[k, ku.DRY_HOLDS] == 0 and not dry_rests(unilateral, k):
+            joint, side = unilateral.dry_table[k, ku.DRY_JOINT], dry[k, ku.DRY_SIDE]
+            then, now = h * side * dry[k, ku.DRY_ACCELERATION_THEN], h * side * ws.joints[joint, ka.QDD]
+            before, after = side * dry[k, ku.DRY_RATE_THEN], side * ws.joints[joint, ka.QD]
+            fraction = min(fraction, dip(before, then, after, now, dry[k, ku.DRY_HEADWAY] + BACKWARD))
     for k in range(gaps.shape[0]):
         slow = unilateral.number[ku.SLOW]
         if (
@@ -175,6 +184,10 @@ def too_long(contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: W
             speed = slip_speed(ws, k)
             if speed > 2.0 * slow and unilateral.slide[k, ku.SPEED] < slow:
                 fraction = min(fraction, max(1.5 * slow / speed, 0.01))
+        if slips_along(contacts, ws, k):
+            then, now = h * gaps[k, SLIP_RATE_THEN], h * slip_rate(model, contacts, unilateral, ws, k)
+            slack = unilateral.slide[k, ku.HEADWAY] + BACKWARD
+            fraction = min(fraction, dip(gaps[k, SLIP_THEN], then, unilateral.slide[k, ku.SPEED], now, slack))
         if passes_through(ws, gaps, k):
             fraction = min(fraction, 0.5)
         if ws.active[k, ka.MODE] == ka.OPEN:
@@ -187,6 +200,27 @@ def too_long(contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: W
             deepest = stop[k, ku.HIT_AT]
             fraction = min(fraction, dip(stop[k, ku.STOP_GAP_THEN], then, stop_gap(unilateral, ws, k), now, deepest))
     return fraction
+
+
+@internal_kernel
+def slips_along(contacts: ContactArrays, ws: Workspace, k):
+    """True if candidate k slides with friction, whose direction the slip along REFERENCE decides."""
+    return ws.active[k, ka.MODE] == ka.SLIDING and contacts.law[k, ka.STATIC] > 0.0
+
+
+@internal_kernel
+def slip_rate(model: ModelArrays, contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace, k):
+    """Acceleration along REFERENCE of the point of the body where candidate k touches [m/s²]."""
+    i, at = contacts.link[k, ka.LINK], vector(ws.contacts, k, ka.POSITION)
+    # A is that at vdot = 0 and carries -g from its root.
+    V, A, j = six(ws.links, i, ka.V), six(ws.links, i, ka.A), i
+    while j >= 0:
+        A = plus_scaled(A, six(ws.links, j, ka.S), ws.joints[j, ka.QDD])
+        j = model.tree[j, ka.PARENT]
+    a, along = point_acceleration(A, V, at), 0.0
+    for s in range(3):
+        along += (a[s] + model.gravity[s]) * unilateral.slide[k, ku.REFERENCE + s]
+    return along
 
 
 @internal_kernel
@@ -225,10 +259,14 @@ def passes_through(ws: Workspace, gaps, k):
 
 
 @internal_kernel
-def note_gaps(unilateral: UnilateralArrays | None, ws: Workspace, gaps):
-    """Note gaps, their rates, normals and positions at the start of a step, for :func:`too_long`."""
+def note_gaps(model: ModelArrays, contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: Workspace, gaps):
+    """Note gaps, slip, rates of joints, normals and positions at the start of a step, for :func:`too_long`."""
     if unilateral is None:  # known to the compiler
         return
+    for k in range(unilateral.dry.shape[0]):
+        joint = unilateral.dry_table[k, ku.DRY_JOINT]
+        unilateral.dry[k, ku.DRY_RATE_THEN] = ws.joints[joint, ka.QD]
+        unilateral.dry[k, ku.DRY_ACCELERATION_THEN] = ws.joints[joint, ka.QDD]
     for k in range(unilateral.stop.shape[0]):
         unilateral.stop[k, ku.STOP_GAP_THEN] = stop_gap(unilateral, ws, k)
         unilateral.stop[k, ku.STOP_RATE_THEN] = stop_rate(unilateral, ws, k)
@@ -239,15 +277,20 @@ def note_gaps(unilateral: UnilateralArrays | None, ws: Workspace, gaps):
                 ws.contacts[k, ka.NORMAL + s],
                 ws.contacts[k, ka.POSITION + s],
             )
+        if slips_along(contacts, ws, k):
+            gaps[k, SLIP_THEN] = unilateral.slide[k, ku.SPEED]
+            gaps[k, SLIP_RATE_THEN] = slip_rate(model, contacts, unilateral, ws, k)
 
 
 @internal_kernel
-def watch_modes(contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: Workspace, h, gaps):
+def watch_modes(
+    model: ModelArrays, contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: Workspace, h, gaps
+):
     """Note times in each mode, depths, gaps and slip directions at the end of an accepted step, before its samples."""
     if unilateral is None:
         return
     watch_unpressed(contacts, unilateral, ws, h)
-    note_gaps(unilateral, ws, gaps)
+    note_gaps(model, contacts, unilateral, ws, gaps)
     state, tally, slide = ws.contacts, unilateral.tally, unilateral.slide
     for k in range(state.shape[0]):
         tally[k, ku.TIME_OPEN + ws.active[k, ka.MODE]] += h
