@@ -39,6 +39,8 @@ DEPENDENT = 1e-6
 UNDECIDED = 1e-3
 # Part of the warning of contacts that wedge themselves.
 WEDGED = "friction can wedge"
+# The rounding of an angle above this is 1e-3 rad: it has no direction with the digits of a sentence [rad].
+LOST = 1e13
 # Samples in which a contact is looked at for wedging, and directions of its cone.
 LOOKED, ROUND = 41, 7201
 # A loop is unstable if the logarithm of its states grows by more than GROWTH in a second; it explains the end of a run
@@ -48,6 +50,7 @@ GROWTH, GROWN = 1.0, 3.0
 
 def untrue(scenario: Mapping[str, Any], run: Run, seen: Observed) -> Iterator[str]:
     """Yield a sentence for each wrong warning or stop, and for a warning that is missing."""
+    lost = len(seen) > 0 and np.abs(seen.q).max() > LOST
     for warning in run.warnings:
         # The stop itself, in the words of its error.
         if warning.startswith("incomplete: "):
@@ -58,6 +61,8 @@ def untrue(scenario: Mapping[str, Any], run: Run, seen: Observed) -> Iterator[st
         for pattern, verifier in VERIFIERS.items():
             if (match := re.search(pattern, warning)) is not None:
                 answered = True
+                if lost:
+                    break
                 if reason := verifier(match, seen):
                     yield f"{warning[:160]!r}: {reason}"
                 break
