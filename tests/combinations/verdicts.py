@@ -414,7 +414,9 @@ def _gains(match: Match, seen: Observed) -> str:
 
 
 def _sinks(match: Match, seen: Observed) -> str:
-    deepest = max((-1e3 * float(touch.gap.min(initial=0.0)) for touch in seen.touches()), default=0.0)
+    # A compliant surface gives way by f/k, whatever the steps.
+    rigid = [touch for touch in seen.touches() if touch.contact.stiffness == 0.0]
+    deepest = max((-1e3 * float(touch.gap.min(initial=0.0)) for touch in rigid), default=0.0)
     return "" if deepest <= float(match[1]) * (1.0 + DIGITS) + 1e-3 else f"{deepest:.3g} mm in a sample"
 
 
