@@ -31,6 +31,7 @@ from dynsim.dynamics.contact.unilateral import UnilateralArrays
 from dynsim.dynamics.drive.law import take_measured_commands
 from dynsim.dynamics.state import block
 from dynsim.dynamics.tree import loads as kl
+from dynsim.dynamics.tree.joints import normalise
 from dynsim.engine import attended
 from dynsim.engine.brakes import Brakes, projection_loss
 from dynsim.engine.linearization import Linearization, linearized
@@ -284,6 +285,9 @@ class Simulation:
         y = run.y.copy()
         if run.count[ki.PENDING] == 1 and self._time > run.clock[ki.TIME]:
             state_within(run, self._time, y)
+            if run.layout.extra > 0:
+                # Between the ends of a step it is a polynomial, also of quaternions.
+                normalise(self._prepared.system.model, y, run.layout.q)
         q, v, current = (y[block(run.layout, name)] for name in ("q", "v", "current"))
         unilateral = self._prepared.system.unilateral
         if unilateral is None or not len(unilateral.tie):

@@ -176,6 +176,26 @@ def test_bodies_without_a_fixed_base_can_be_pushed(tmp_path, kind):
         simulation.set_wrench("brick.x", force=[1.0, 0.0, 0.0])
 
 
+@pytest.mark.parametrize("method", ["dopri5", "time_stepping"])
+def test_a_state_within_a_step_has_unit_quaternions(tmp_path, method):
+    """A brick turns at 6 rad/s about z: its quaternion is that of the angle ω t, not a mean of two."""
+    (tmp_path / "brick.urdf").write_text(FREE.replace("KIND", "floating"))
+    text = "duration_s: 1\nplant: {type: urdf_arm, file: brick.urdf, gravity_m_s2: [0, 0, 0]}\nMETHOD"
+    keys = (
+        "contacts: {law: unilateral}\nintegrator: {method: time_stepping, step_s: 0.002}"
+        if method == "time_stepping"
+        else ""
+    )
+    scenario = read(tmp_path, text.replace("METHOD", keys))
+    q, v = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]), np.array([0.0, 0.0, 0.0, 0.0, 0.0, 6.0])
+    simulation = dynsim.Simulation(scenario, state=dynsim.State(0.0, q, v, np.zeros(0)))
+    for t in (0.0313, 0.3001, 0.4129):
+        turned = simulation.advance(t).q[3:]
+        assert np.linalg.norm(turned) == pytest.approx(1.0, abs=1e-15)
+        # Steps of time stepping turn by 2 atan(ω h/2): half the angle is (ω h)²/12 of itself off, 1.5e-5 in the end.
+        np.testing.assert_allclose(turned, [math.cos(3.0 * t), 0.0, 0.0, math.sin(3.0 * t)], rtol=0.0, atol=2e-5)
+
+
 def test_going_on_from_a_record_with_motors_that_have_no_circuit(tmp_path):
     servo = "{type: servo, voltage_V: 12, stall_torque_N_m: 8, no_load_speed_rad_per_s: 5, k_p_V_per_rad: 40}"
     scenario = read(
