@@ -47,7 +47,7 @@ def test_an_arm_on_a_pipe_comes_to_its_end():
 # ---- Loops of the driver, as plain Python
 
 # A system without contacts.
-BARE = SimpleNamespace(unilateral=None, contacts=None)
+BARE = SimpleNamespace(model=None, unilateral=None, contacts=None)
 
 
 def table(count: int = 1) -> Any:
