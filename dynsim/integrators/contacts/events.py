@@ -173,7 +173,9 @@ def too_long(model: ModelArrays, contacts: ContactArrays, unilateral: Unilateral
             joint, side = unilateral.dry_table[k, ku.DRY_JOINT], dry[k, ku.DRY_SIDE]
             then, now = h * side * dry[k, ku.DRY_ACCELERATION_THEN], h * side * ws.joints[joint, ka.QDD]
             before, after = side * dry[k, ku.DRY_RATE_THEN], side * ws.joints[joint, ka.QD]
-            fraction = min(fraction, dip(before, then, after, now, dry[k, ku.DRY_HEADWAY] + BACKWARD))
+            # A joint slower than CREEP hardly moves, and searching for its turns makes some contacts chatter.
+            slack = dry[k, ku.DRY_HEADWAY] + unilateral.number[ku.CREEP]
+            fraction = min(fraction, dip(before, then, after, now, slack))
     for k in range(gaps.shape[0]):
         slow = unilateral.number[ku.SLOW]
         if (
@@ -186,7 +188,8 @@ def too_long(model: ModelArrays, contacts: ContactArrays, unilateral: Unilateral
                 fraction = min(fraction, max(1.5 * slow / speed, 0.01))
         if slips_along(contacts, ws, k):
             then, now = h * gaps[k, SLIP_RATE_THEN], h * slip_rate(model, contacts, unilateral, ws, k)
-            slack = unilateral.slide[k, ku.HEADWAY] + BACKWARD
+            # Slower slip hardly has a direction, and searching for its turns makes some contacts chatter.
+            slack = unilateral.slide[k, ku.HEADWAY] + slow
             fraction = min(fraction, dip(gaps[k, SLIP_THEN], then, unilateral.slide[k, ku.SPEED], now, slack))
         if passes_through(ws, gaps, k):
             fraction = min(fraction, 0.5)
