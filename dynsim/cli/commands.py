@@ -174,7 +174,7 @@ def check(
     ],
     overrides: SetOption = None,
 ) -> None:
-    """Validate scenarios without running them: schema, model, contacts at the start, reachable references.
+    """Validate scenarios without running them: schema, model, contacts and forces at the start, reachable references.
 
     Prints where hand and contact points start, in full digits, to be copied into a surface or a path, how far contacts
     are from their surfaces, the joints that initial.on_surface has moved, and the tip margin of a base at rest.

@@ -107,7 +107,7 @@ def note_warnings(scenario: Scenario, record: Record | None) -> None:
 
 
 def check(scenario: Scenario, started: Callable[[Start], None] | None = None) -> Start:
-    """Do everything that comes before the first step: model, contacts at the start, references, size of the record.
+    """Do all that comes before the first step: model, contacts and their forces, references, size of the record.
 
     ``started`` : called with what is returned, but for ``off_path``, before contacts and references are looked at
 
@@ -119,6 +119,8 @@ def check(scenario: Scenario, started: Callable[[Start], None] | None = None) ->
     Raises
     ------
     ModelError, UnreachableReference, ScenarioError
+    SimulationStopped
+        If contact forces at the start do not exist or cannot last (Painlevé's paradox).
     """
     with named(scenario), remembering():
         start: Start = _module(scenario).check(scenario, started or (lambda start: None))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -11,13 +12,17 @@ from dynsim.compile.clearance import by_surface, sinking
 from dynsim.compile.equilibrium import holding_torques, load_forces, static_margin
 from dynsim.compile.model import Model
 from dynsim.compile.shapes import gap_at
-from dynsim.engine import Start
-from dynsim.engine.prepare import at_start, prepare
+from dynsim.engine import Start, attended
+from dynsim.engine.prepare import Prepared, at_start, prepare
 from dynsim.engine.soundness import unstable_loop
+from dynsim.engine.stopping import stopped
 from dynsim.errors import ModelError
+from dynsim.integrators import driver
+from dynsim.integrators import run as ki
 from dynsim.model.description import Contact, Robot
 from dynsim.scenario import Scenario, build
 from dynsim.scenario.effect import without_effect
+from dynsim.system import interruption
 from dynsim.system.memo import recall
 
 # A joint that the solution of the posture moves by less than this counts as unmoved [rad or m].
@@ -35,7 +40,31 @@ def check(scenario: Scenario, started: Callable[[Start], None]) -> Start:
     if control.path is not None and control.teleop is None:
         begin = control.path.position(np.zeros(1))[0]
         start = replace(start, off_path=float(np.linalg.norm(begin - start.hand)))
+    _begin(scenario, prepared)
     return start
+
+
+def _begin(scenario: Scenario, prepared: Prepared) -> None:
+    """Choose contact modes and find forces at t = 0, as a run does before its first step.
+
+    Not where Python code gives the first commands: an operator, the controller of a snake, encoders.
+
+    Raises
+    ------
+    SimulationStopped
+        If there are none, or none that can last.
+    """
+    control, sensors = prepared.control, scenario.config.sensors
+    encoded = sensors is not None and sensors.encoders is not None
+    if not prepared.contacts or control.teleop is not None or control.task_space is not None or encoded:
+        return
+    attended.load(prepared)
+    work = partial(driver.advance, prepared.system, prepared.workspace, prepared.run, 0)
+    _, raised = attended.attend(work, lambda: None, interruption.check)
+    if raised is not None:
+        raise raised
+    if prepared.run.count[ki.STATUS] not in (ki.RUNNING, ki.FINISHED):
+        raise stopped(scenario, prepared)
 
 
 def start_of(scenario: Scenario) -> Start:

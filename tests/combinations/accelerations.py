@@ -86,7 +86,9 @@ def state_of(seen: Observed, values: Mapping[str, Sequence[float]], currents: Ar
     bound = np.array([link.friction + gears.get(link.joint, 0.0) for link in seen.robot.links]) * seen.real
     resting = [int(j) for j in np.flatnonzero((bound > 0.0) & (np.abs(v) < RESTS))]
     rubbing = np.where((bound > 0.0) & (np.abs(v) >= RESTS), -bound * np.sign(v), 0.0)
-    current = seen.record["current"][-1].copy() if currents is None else currents
+    recorded = seen.record["current"]
+    # Without a sample the run has not begun, and no current flows.
+    current = currents if currents is not None else recorded[-1].copy() if len(seen) else np.zeros(recorded.shape[1])
     circuits = [a for a, motor in enumerate(seen.robot.motors) if isinstance(motor, Motor)]
     if circuits and currents is None and len(values.get("current", ())) == len(circuits):
         # Those of circuits are of the state, the others' those of the last sample.

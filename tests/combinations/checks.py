@@ -21,7 +21,7 @@ from combinations.newton import circuit, equation, momentum, motion, support
 from combinations.observed import Observed, warned
 from combinations.running import Run
 from combinations.sampled_loop import UNSTABLE
-from combinations.verdicts import WEDGED, untrue
+from combinations.verdicts import WEDGED, untrue, untrue_start
 from dynsim.errors import SimulationStopped
 from dynsim.model.drives import Motor, Servo
 from dynsim.scenario import build
@@ -57,7 +57,7 @@ def problems(scenario: Mapping[str, Any], run: Run) -> list[Problem]:
         return listed
     listed += [Problem("finite", text) for text in finite(run)]
     if isinstance(run.error, SimulationStopped) and not len(run.record):
-        listed.append(Problem("verdict", f"stops ({run.error.kind}) before anything moves: {str(run.error)[:200]}"))
+        listed += [Problem("verdict", text) for text in untrue_start(run.error, Observed(run))]
     if listed or not len(run.record) or "vdot" not in run.record:
         return listed
     seen = Observed(run)
@@ -75,7 +75,7 @@ def compare(scenario: Mapping[str, Any], runs: Mapping[str, Run]) -> list[Proble
 
 def started_as_checked(run: Run) -> Finding:
     """Check that ``check`` refuses a scene if and only if it does not start."""
-    started = run.record is not None or isinstance(run.error, SimulationStopped)
+    started = run.record is not None and len(run.record) > 0
     if started and run.checked is not None:
         yield f"check refuses what runs: {run.checked[:200]}"
     if not started and run.checked is None:

@@ -197,14 +197,16 @@ def faults(scene: Scene, done: Mapping[str, Run], *, thorough: bool = False) -> 
 
 def _began(scene: Scene, own: Run) -> list[tuple[str, str]]:
     """Return faults if ``check`` and the run disagree, a valid start is refused, or an unexpected error occurs."""
-    refused = isinstance(own.error, DynsimError) and not isinstance(own.error, SimulationStopped)
+    # A run that stops before its first sample has not begun.
+    stopped = isinstance(own.error, SimulationStopped)
+    refused = isinstance(own.error, DynsimError) and not (stopped and own.record is not None and len(own.record))
     if own.error is not None and not isinstance(own.error, DynsimError):
         return [("crash", f"{type(own.error).__name__}: {own.error}")]
     if own.checked is None and refused:
         return [("check", f"passes, but the run says: {own.error}")]
     if own.checked is not None and not refused:
         return [("check", f"the run begins, but check says: {own.checked}")]
-    if refused and not expected(scene, str(own.error)):
+    if refused and not stopped and not expected(scene, str(own.error)):
         return [("refused", str(own.error))]
     return []
 

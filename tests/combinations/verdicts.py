@@ -79,6 +79,12 @@ def untrue(scenario: Mapping[str, Any], run: Run, seen: Observed) -> Iterator[st
         yield from _stop(run.error, seen)
 
 
+def untrue_start(stop: SimulationStopped, seen: Observed) -> Iterator[str]:
+    """Yield a sentence if a run that stops before its first sample had forces to start with."""
+    if reason := _not_critical(stop, seen) and _has_forces(stop, seen):
+        yield f"stops ({stop.kind}) before anything moves: {reason}; {str(stop)[:200]}"
+
+
 def _stop(stop: SimulationStopped, seen: Observed) -> Iterator[str]:
     """Whether a stop was necessary."""
     text = f"stops ({stop.kind}) at t = {stop.time:.6g} s"
