@@ -51,7 +51,7 @@ def touching(seen: Observed) -> Finding:
             yield f"{name} at t = {seen.time[i]:.6g} s: slip {slip[i]} m/s, own {touch.slip[i]}"
         along = (touch.force * touch.normal).sum(axis=1)
         size = np.linalg.norm(touch.force, axis=1)
-        off = np.abs(along - touch.normal_force) - _share(seen, touch) * size - _tilted_friction(seen, touch)
+        off = np.abs(along - touch.normal_force) - _share(seen, touch) * size
         if (off > 1e-9).any():
             i = int(off.argmax())
             yield (
@@ -196,18 +196,6 @@ def _real_friction(seen: Observed, touch: Touch) -> Finding:
 def _share(seen: Observed, touch: Touch) -> Array:
     """Part of a force by which its parts may be off, (T,): by steps it belongs to the normal of half a step before."""
     return CONE + touch.turned if seen.stepped else np.full(len(seen), CONE)
-
-
-def _tilted_friction(seen: Observed, touch: Touch) -> Array:
-    """Part of friction along the normal, (T,) [N]: the direction of slow slip stands in a step, and the normal turns.
-
-    The direction is along the surface at the start of the step, which the previous sample mostly precedes.
-    """
-    if seen.stepped or not seen.real:
-        return np.zeros(len(seen))
-    slow = (touch.mode == SLIDING) & (np.linalg.norm(touch.slip, axis=1) <= _slow_slip(seen))
-    before = np.concatenate([touch.normal[:1], touch.normal[:-1]])
-    return np.asarray(np.where(slow, np.abs((touch.tangential * before).sum(axis=1)), 0.0))
 
 
 def _slow_slip(seen: Observed) -> float:

@@ -78,6 +78,7 @@ FOUND = {
     "a joint that turned round twice within a step, and was driven by its friction between": (271127, 7047),
     "an elbow that slid back and forth within a step, and was driven by its friction between": (271127, 5698),
     "a run that stopped in its first step, and an elbow that was said never to press in it": (271127, 5761),
+    "friction of slow slip that left the surface as its normal turned within a step": (271127, 5589),
     "a paradox at the start, of which check knew nothing": (271127, 5731),
 }
 # Scenes of the slow study.

@@ -81,11 +81,9 @@ AGAIN = "M* begins with the signs that the articulated solve has found: only rou
 WITHOUT_LANES = (admissible_forces, slide_direction, shaped_rows, solve_near_shares, solve_dependent)
 UNILATERAL = "the cases here are of the bilateral law"
 NEVER = {
-    Place(
-        "contact/quadrics.py",
-        "contact_rows",
-        "x, y, z, mu = slide_direction(unilateral, contacts, k, slip[0], slip[1], slip[2])",
-    ): UNILATERAL,
+    Place("contact/quadrics.py", "contact_rows", "x, y, z, mu = slide_direction(unilateral, contacts, k, slip, n)"): (
+        UNILATERAL
+    ),
     Place("contact/quadrics.py", "contact_rows", "t = x, y, z"): UNILATERAL,
     Place("contact/quadrics.py", "contact_rows", "rows[m, ka.ROW_MU] = mu"): UNILATERAL,
     Place("contact/shares.py", "solve_rows", "if unilateral.number[ku.SHARED] == 1.0:"): UNILATERAL,

@@ -93,7 +93,7 @@ def contact_rows(model: ModelArrays, contacts: ContactArrays, unilateral: Unilat
                 slip, 1.0 / math.sqrt(dot_vector(slip, slip) + contacts.law[k, ka.V_S] * contacts.law[k, ka.V_S])
             )
         else:
-            x, y, z, mu = slide_direction(unilateral, contacts, k, slip[0], slip[1], slip[2])
+            x, y, z, mu = slide_direction(unilateral, contacts, k, slip, n)
             t = x, y, z
             rows[m, ka.ROW_MU] = mu
         state[k, ka.GAP], state[k, ka.GAP_RATE] = gap, rate

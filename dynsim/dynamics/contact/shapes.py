@@ -112,7 +112,7 @@ def shaped_row(
             slip, 1.0 / math.sqrt(dot_vector(slip, slip) + contacts.law[k, ka.V_S] * contacts.law[k, ka.V_S])
         )
     else:
-        tx, ty, tz, rows[m, ka.ROW_MU] = slide_direction(unilateral, contacts, k, slip[0], slip[1], slip[2])
+        tx, ty, tz, rows[m, ka.ROW_MU] = slide_direction(unilateral, contacts, k, slip, n)
         t = tx, ty, tz
     state[k, ka.GAP], state[k, ka.GAP_RATE], rows[m, ka.TARGET] = far - radius, rate, -second
     put_vector(state, k, ka.POSITION, c)

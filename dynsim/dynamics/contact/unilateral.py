@@ -174,24 +174,26 @@ def kept_size(shares: int, contacts: int, stops: int, joints: int) -> int:
 
 
 @internal_kernel
-def slide_direction(unilateral: UnilateralArrays, contacts: ContactArrays, k, x, y, z):
-    """Direction of slip of candidate k at tangential velocity (x, y, z), and its coefficient of friction there.
+def slide_direction(unilateral: UnilateralArrays, contacts: ContactArrays, k, slip, n):
+    """Direction of slip of candidate k at tangential velocity ``slip`` and normal n, and its friction there.
 
     The direction is v_t/|v_t| with the sign of v_t · REFERENCE: it does not flip when v_t passes through zero, so that
     a step that passes the end of slip is smooth, and slip ends where v_t · REFERENCE is zero.
 
-    While FROZEN, with r = REFERENCE and s = SLOW, it is that of w = v_t + max(0, s − v_t·r) r: of v_t itself if the
-    point slides along r at s or faster. A direction that did not follow slip across r would drive it: friction off the
-    direction in which forces balance accelerates the point to s at once, however slowly it slides along r. Instead the
-    direction turns until they balance, at a slip of s tan(angle) across r; its time constant has s in place of |v_t|.
+    While FROZEN, with r = REFERENCE along the surface, whose normal turns within a step, and s = SLOW, it is that of
+    w = v_t + max(0, s − v_t·r) r: of v_t itself if the point slides along r at s or faster. A direction that did not
+    follow slip across r would drive it: friction off the direction in which forces balance accelerates the point to s
+    at once, however slowly it slides along r. Instead the direction turns until they balance, at a slip of s tan(angle)
+    across r; its time constant has s in place of |v_t|.
     """
-    slide = unilateral.slide
+    slide, (x, y, z) = unilateral.slide, slip
     a, b, c = slide[k, REFERENCE], slide[k, REFERENCE + 1], slide[k, REFERENCE + 2]
     along = x * a + y * b + z * c
     slide[k, SPEED] = along
     speed = along
     if slide[k, FROZEN] == 1.0:
-        more = max(0.0, unilateral.number[SLOW] - along)
+        more, up = max(0.0, unilateral.number[SLOW] - along), a * n[0] + b * n[1] + c * n[2]
+        a, b, c = a - up * n[0], b - up * n[1], c - up * n[2]
         u, v, w = x + more * a, y + more * b, z + more * c
         size = math.sqrt(u * u + v * v + w * w)
         if size > 0.0:

@@ -114,14 +114,15 @@ def all_clearly_unique(ws):
 
 
 @form_of(slide_direction, any_lanes)
-def slide_direction_lanes(unilateral, contacts, k, x, y, z):
+def slide_direction_lanes(unilateral, contacts, k, slip, n):
     """Each lane's own direction; ``unilateral.slide`` keeps the speed of the last state that was evaluated alone."""
-    slide = unilateral.slide
+    slide, (x, y, z) = unilateral.slide, slip
     a, b, c = slide[k, ku.REFERENCE], slide[k, ku.REFERENCE + 1], slide[k, ku.REFERENCE + 2]
     along = x * a + y * b + z * c
     if slide[k, ku.FROZEN] == 1.0:
-        slow = unilateral.number[ku.SLOW]
+        slow, up = unilateral.number[ku.SLOW], a * n[0] + b * n[1] + c * n[2]
         more = select(along < slow, slow - along, 0.0)
+        a, b, c = a - up * n[0], b - up * n[1], c - up * n[2]
         u, v, w = x + more * a, y + more * b, z + more * c
         size = math.sqrt(u * u + v * v + w * w)
         moves = size > 0.0

@@ -33,6 +33,7 @@ from dynsim.dynamics.contact.unilateral import (
 )
 from dynsim.dynamics.derivative import System
 from dynsim.dynamics.tables import Workspace
+from dynsim.dynamics.tree.spatial import vector
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts.impacts import (
     FORCE_TOLERANCE,
@@ -247,8 +248,8 @@ def note_forces(system: System, ws: Workspace):
 def sliding_parts(system: System, ws: Workspace, k):
     """Friction along both tangents of candidate k, which slides, per unit of its normal force."""
     state = ws.contacts
-    x, y, z = state[k, ka.SLIP_VELOCITY], state[k, ka.SLIP_VELOCITY + 1], state[k, ka.SLIP_VELOCITY + 2]
-    tx, ty, tz, mu = slide_direction(system.unilateral, system.contacts, k, x, y, z)
+    slip, n = vector(state, k, ka.SLIP_VELOCITY), vector(state, k, ka.NORMAL)
+    tx, ty, tz, mu = slide_direction(system.unilateral, system.contacts, k, slip, n)
     a, b = ka.FIRST_TANGENT, ka.SECOND_TANGENT
     return (
         -mu * (tx * state[k, a] + ty * state[k, a + 1] + tz * state[k, a + 2]),
