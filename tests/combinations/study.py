@@ -45,6 +45,7 @@ class Outcome:
     status : by run, see :attr:`combinations.running.Run.status`
     problems : kind and text of each
     said : texts of stops and refusals, by run
+    solves, given_up : contact problems of its runs by time stepping, and those that were given up
     wall_s : of all its runs [s]
     """
 
@@ -54,6 +55,8 @@ class Outcome:
     status: dict[str, str] = field(default_factory=dict)
     problems: list[tuple[str, str]] = field(default_factory=list)
     said: dict[str, str] = field(default_factory=dict)
+    solves: int = 0
+    given_up: int = 0
     wall_s: float = 0.0
 
     @property
@@ -88,6 +91,7 @@ def look_at(
     done = runs(drawn, partial(takes, drawn))
     problems = faults(drawn, done, thorough=number % THOROUGH == 0 if thorough is None else thorough)
     problems += _checked(drawn, done)
+    stepped = [own.record.summary.get("time_stepping", {}) for own in done.values() if own.record is not None]
     return Outcome(
         number,
         seed,
@@ -95,6 +99,8 @@ def look_at(
         {name: own.status for name, own in done.items()},
         problems,
         {name: " ".join(str(own.error).split()) for name, own in done.items() if own.error is not None},
+        sum(counts.get("contact_solves", 0) for counts in stepped),
+        sum(counts.get("capped_solves", 0) for counts in stepped),
         time.monotonic() - began,
     )
 
@@ -176,6 +182,8 @@ def account(outcomes: Sequence[Outcome]) -> dict[str, Any]:
         "by_status": dict(ended.most_common()),
         "refused_pairs_share": refused_share(),
         "failing": sum(outcome.failed for outcome in outcomes),
+        "contact_problems": sum(outcome.solves for outcome in outcomes),
+        "given_up": sum(outcome.given_up for outcome in outcomes),
         "problems": {
             kind: {
                 "scenes": count,
