@@ -172,7 +172,9 @@ def _real_friction(seen: Observed, touch: Touch) -> Finding:
     # A normal that is a little off has a share of the normal force in the surface, which may be all that there is.
     noise = _share(seen, touch) * np.linalg.norm(touch.force, axis=1) * speed
     # Against w friction gives f·u up to |f| |u − w| to slip u.
-    gained = slips & (power > noise + size * (SLOW + touch.lag if seen.stepped else 1e-7) + 1e-12)
+    # A slip that begins against its direction by what integration does not know, a few times atol, goes on so.
+    unknown = SLOW + touch.lag if seen.stepped else max(1e-7, 10.0 * seen.scenario.integrator.absolute_tolerance)
+    gained = slips & (power > noise + size * unknown + 1e-12)
     if seen.stepped:
         # A step in which slip ends may end with some of it turned round.
         gained &= (tangential * before).sum(axis=1) > 0.0
