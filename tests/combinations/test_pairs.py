@@ -78,6 +78,7 @@ FOUND = {
     "a joint that turned round twice within a step, and was driven by its friction between": (271127, 7047),
     "an elbow that slid back and forth within a step, and was driven by its friction between": (271127, 5698),
     "a last step of time stepping that ended with the run, which the checks took for a whole one": (271127, 7761),
+    "a wheel that turned as its slip ended within a step, and was driven by its friction": (271127, 6350),
 }
 # Scenes of the slow study.
 TRIPLES = 1000
