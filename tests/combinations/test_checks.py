@@ -453,7 +453,7 @@ def test_own_nearest_points_are_nearest() -> None:
 
 def test_the_last_step_ends_with_the_run() -> None:
     """A shorter last step has a middle of its own, along whose normal its forces are."""
-    settings = deepcopy(ARM)
+    settings: dict[str, Any] = deepcopy(ARM)
     settings |= {"duration_s": 0.1008, "record": {"rate_hz": 2000.0}}
     settings["surfaces"] = {"floor": {"type": "sphere", "center_m": [0.4, 0.0, -0.33], "radius_m": 0.25}}
     settings["contacts"]["friction"] = 0.0
