@@ -149,9 +149,10 @@ def contact_laws(robot: Robot, contacts: Sequence[Contact]) -> NDArray[np.float6
     ModelError
         Static friction below the kinetic one, negative numbers, or restitution above one.
     """
-    # Without an axis friction is isotropic; tangents follow one that is seldom along a normal.
     law = np.ones((len(contacts), ka.CONTACT_LAW_SIZE))
-    law[:, ka.FLOOR] = 0.0
+    # Isotropic friction has no axis: tangents that turned with the body would turn the rates of a step, and those that
+    # it has stopped with them.
+    law[:, [ka.FLOOR, ka.GRIP_AXIS, ka.GRIP_AXIS + 1, ka.GRIP_AXIS + 2]] = 0.0
     for row, contact in zip(law, contacts, strict=True):
         where = f"contact {contact.name}"
         if not contact.friction >= 0.0:
@@ -173,7 +174,7 @@ def contact_laws(robot: Robot, contacts: Sequence[Contact]) -> NDArray[np.float6
         if not (stiffness >= 0.0 and damping >= 0.0) or (damping > 0.0 and stiffness == 0.0):
             raise ModelError(f"{where}: stiffness and damping must not be negative, and damping needs a stiffness")
         row[[ka.CONTACT_STIFFNESS, ka.CONTACT_DAMPING]] = stiffness, damping
-        if contact.grip_axis is not None:
+        if contact.grip_axis is not None and contact.grip != 1.0:
             row[ka.GRIP] = contact.grip
             row[ka.GRIP_AXIS : ka.GRIP_AXIS + 3] = robot.attached_axes(contact.body) @ contact.grip_axis
     return law

@@ -197,10 +197,10 @@ class Observed:
         """Start and end of the step of each sample, (T,) [s]: the step that it ends, or lies within.
 
         Steps of one length follow each other from each beginning and end of a load, and from each tick; the last one
-        before the next is cut there.
+        before the next is cut there, and at the end of the run.
         """
         h, t = self.step, self.time
-        knots = [t[:1], *(load.knots for load in self.loads)]
+        knots = [t[:1], np.array([self.scenario.duration_s]), *(load.knots for load in self.loads)]
         for period in self.periods:
             knots.append(period * np.arange(np.ceil(t[0] / period - AT_STEP), t[-1] / period + 1.0))
         instants = np.unique(np.concatenate(knots))

@@ -451,6 +451,29 @@ def test_own_nearest_points_are_nearest() -> None:
         assert (far[outside] <= np.min(many, axis=0)[outside] + 1e-9).all()
 
 
+def test_the_last_step_ends_with_the_run() -> None:
+    """A shorter last step has a middle of its own, along whose normal its forces are."""
+    settings: dict[str, Any] = deepcopy(ARM)
+    settings |= {"duration_s": 0.1008, "record": {"rate_hz": 2000.0}}
+    settings["surfaces"] = {"floor": {"type": "sphere", "center_m": [0.4, 0.0, -0.33], "radius_m": 0.25}}
+    settings["contacts"]["friction"] = 0.0
+    settings["initial"] = {"on_surface": ["tip"]}
+    # Steps end where constant loads do, which is the end of the run too.
+    del settings["plant"]["link"]["motor"], settings["controller"], settings["loads"]
+    settings["integrator"] = {"method": "time_stepping", "step_s": 0.001}
+    seen = Observed(_simulated(settings))
+    start, end = seen.steps_around
+    np.testing.assert_allclose(seen.time[-3:], [0.1, 0.1005, 0.1008])
+    np.testing.assert_allclose(start[-3:], [0.099, 0.1, 0.1], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(end[-3:], [0.1, 0.1008, 0.1008], rtol=0, atol=1e-12)
+    (touch,) = (touch for touch in seen.touches() if touch.contact.name == "tip")
+    normal = seen._at_midpoints(touch.contact, seen.v_start)[2]
+    # Within the step the normal turns by far more than what is allowed.
+    assert touch.normal_force[-1] > 1.0
+    assert touch.turned[-1] > 1e-3
+    np.testing.assert_allclose(touch.force, touch.normal_force[:, None] * normal, rtol=0, atol=1e-9)
+
+
 # A body that slides along x and z on a plane that leans sideways by 1 in 2: friction wedges it from 2 on.
 WEDGE = {
     "name": "wedge",

@@ -80,6 +80,8 @@ FOUND = {
     "a run that stopped in its first step, and an elbow that was said never to press in it": (271127, 5761),
     "friction of slow slip that left the surface as its normal turned within a step": (271127, 5589),
     "a paradox at the start, of which check knew nothing": (271127, 5731),
+    "a last step of time stepping that ended with the run, which the checks took for a whole one": (271127, 7761),
+    "a wheel that turned as its slip ended within a step, and was driven by its friction": (271127, 6350),
 }
 # Scenes of the slow study.
 TRIPLES = 1000

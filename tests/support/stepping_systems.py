@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from dynsim.dynamics import tables as ka
 from dynsim.integrators.run import Run
 from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot
 from dynsim.model.drives import Servo
@@ -15,10 +14,9 @@ from support.random_robots import CompiledSystem, assemble
 def stepped(
     b: CompiledSystem, y: np.ndarray, times: np.ndarray, step: float, theta: float, law: dict | None = None
 ) -> Run:
-    """A run by time stepping, tangents along x of the bodies; law: columns of the contacts' law."""
+    """A run by time stepping; law: columns of the contacts' law."""
     b = b.with_shapes()
     run = b.new_run(y, times, "time_stepping", step=step, theta=theta)
-    b.system.contacts.law[:, ka.GRIP_AXIS : ka.GRIP_AXIS + 3] = 1.0, 0.0, 0.0
     for column, value in (law or {}).items():
         b.system.contacts.law[:, column] = value
     return b.finish(run)

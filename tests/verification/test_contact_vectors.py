@@ -2,7 +2,7 @@
 
 Bodies that are free to move in all directions are the objects, the snake, and arms whose first joints are prismatic,
 along x, y and z, without motor and friction. Of these Σ contact forces + loads + weight is the change of Σ m v. In
-records of time stepping the force of a sample is the mean of the step that ends there.
+records of time stepping the force of a sample is the mean of the step that ends there, or in which it lies.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ from dynsim.snake.published import wheel_table
 
 H = 2.5e-4
 MU = 0.4
+# Step of the point in a bowl [s], and the bowl's radius [m].
+H_BOWL, RADIUS = 2e-3, 0.3
 PUSH = (2.0, 3.0, 0.0)
 SURFACES: dict[str, dict[str, Any]] = {
     "plane": {"type": "plane", "normal": [0.1, -0.05, 1.0]},
@@ -209,6 +211,57 @@ def test_time_stepping_records_the_forces_that_move_objects(surface, soft, tmp_p
             # For a single body the scheme has the momentum exactly; ten thousand roundings of v / h.
             assert left.max() < 1e-10 * np.abs(recorded).max()
     assert (friction_of(record) - MU * record["contact_normal_force"]).max() < 1e-6 * record["contact_force"].max()
+
+
+@pytest.mark.parametrize("theta", [0.5, 1.0])
+@pytest.mark.parametrize("driven", [False, True])
+def test_a_frictionless_point_in_a_bowl_is_pushed_along_the_normal_at_the_midpoint_of_its_step(theta, driven, tmp_path):
+    """At every sample of a step, also of the last one, which is shorter, and of those that a limit has taken again."""
+    steps, last = 150, 0.7  # the last step is shorter
+    chain = [{"kind": "prismatic", "length_m": 0, "mass_kg": 0, "axis": axis} for axis in "xyz"]
+    chain[2] |= {"mass_kg": 0.5}
+    for link, position in zip(chain, (0.1, 0.05, -0.28), strict=True):
+        link["initial_m"] = position
+    bowl = {"type": "sphere", "center_m": [0, 0, 0], "radius_m": RADIUS, "inside": True}
+    tip = {"body": "link_3", "point_m": [0, 0, 0], "surface": "bowl"}
+    scenario: dict[str, Any] = {
+        "name": "bowl",
+        "duration_s": (steps + last) * H_BOWL,
+        "plant": {"type": "serial_arm", "chain": chain},
+        "surfaces": {"bowl": bowl},
+        "contacts": {"law": "unilateral", "friction": 0, "points": {"tip": tip}},
+        "initial": {"on_surface": ["tip"]},
+        "record": {"rate_hz": 2.0 / H_BOWL},
+        "integrator": {"method": "time_stepping", "step_s": H_BOWL, "theta": theta},
+    }
+    if driven:
+        motor = {"torque_constant_N_m_per_A": 0.03, "resistance_ohm": 0.3, "inductance_H": 1e-4, "gear_ratio": 100}
+        chain[0]["motor"] = {"type": "dc", "rotor_inertia_kg_m2": 1e-6, "voltage_limit_V": 2.0, **motor}
+        joints = {"joint_1": {"times_s": [0, 0.1, 0.2, 0.3], "positions_m": [0.1, -0.1, 0.1, -0.1]}}
+        scenario["controller"] = {"type": "joint_pd", "k_p_V_per_rad": 100, "k_d_V_s_per_rad": 1, "joints": joints}
+    path = tmp_path / "bowl.yaml"
+    path.write_text(json.dumps(scenario))
+    record = dynsim.simulate(dynsim.load_scenario(path))
+    t, q, v = record.time, record["q"], record["v"]
+    f_n, force = record["contact_normal_force"][:, 0], record["contact_force"][:, 0]
+    # Two samples in each step: its middle and its end; of the last step its end too.
+    first = np.searchsorted(t, H_BOWL * np.maximum(np.ceil(t / H_BOWL - 1e-6) - 1.0, 0.0) - 1e-9)
+    h = np.minimum(H_BOWL, t[-1] - t[first])
+    assert h[-1] == pytest.approx(last * H_BOWL)
+    assert list(first[-2:]) == [2 * steps] * 2
+    middle = q[first] + 0.5 * h[:, None] * v[first]
+    normal = -middle / np.linalg.norm(middle, axis=1)[:, None]
+    assert f_n.min() > 0.2
+    np.testing.assert_allclose(force, f_n[:, None] * normal, rtol=0, atol=1e-12)
+    if driven:
+        # Steps begin and end at the limit: those are solved more than once.
+        limited = np.abs(record["voltage"][:, 0]) > 2.0 - 1e-9
+        assert np.count_nonzero(limited[1:] != limited[:-1]) > 2
+    else:
+        # The mean force of a step is its change of momentum, to roundings of v / h.
+        ends = np.append(np.arange(2, 2 * steps + 1, 2), len(t) - 1)
+        change = 0.5 * (v[ends] - v[first[ends]]) / h[ends, None]
+        np.testing.assert_allclose(change, force[ends] + [0.0, 0.0, -0.5 * 9.81], rtol=0, atol=1e-11)
 
 
 def test_wheels_of_the_snake_record_the_forces_that_move_it():

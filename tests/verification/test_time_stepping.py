@@ -116,6 +116,29 @@ def test_what_slides_comes_to_rest_where_it_should():
     assert np.abs(run.states("v")[-1]).max() < 1e-9
 
 
+def test_what_turns_as_it_slides_is_stopped_in_a_straight_line():
+    """A point under the centre of a body has friction without moment: the body turns on for ever, its point stops.
+
+    The law of the step in which it stops is on the slip of its end, which tangents that turn with the body would turn.
+    """
+    mu, rate, speed, inertia = 0.2, 10.0, 0.5, Inertia(2.0, np.zeros(3), np.diag([0.01, 0.01, 0.02]))
+    places = ["x", "y", "z"]
+    links = [
+        Link(a, f"j{a}", places[k - 1] if k else None, "prismatic", np.eye(3)[k], Inertia(0.0))
+        for k, a in enumerate(places)
+    ]
+    links.append(Link("top", "jtop", "z", "revolute", np.eye(3)[2], inertia))
+    foot = Contact("foot", "top", np.zeros(3), plane(np.eye(3)[2]), friction=mu)
+    b = assemble(Robot("top", tuple(links), (), ("top", np.zeros(3))), [foot], real=True)
+    start = b.state(np.zeros(4), np.array([speed, 0.0, 0.0, rate]))
+    run = b.simulate(start, np.linspace(0.0, 0.5, 51), "time_stepping", step=1e-2)
+    q, v = run.states("q"), run.states("v")
+    np.testing.assert_allclose(q[-1], [speed**2 / (2.0 * mu * G), 0.0, 0.0, 0.5 * rate], rtol=0, atol=1e-4)
+    assert np.abs(q[:, 1]).max() < 1e-12
+    assert np.abs(v[:, 1]).max() < 1e-11
+    np.testing.assert_allclose(v[-1], [0.0, 0.0, 0.0, rate], rtol=0, atol=1e-11)
+
+
 def test_friction_that_differs_along_and_across():
     """Two runs, each along one axis: friction along it alone; then both, in the direction of the ellipse's normal."""
     mu, ratio, law = 0.4, 0.25, {ka.GRIP: 0.25, ka.GRIP_AXIS: 1.0}

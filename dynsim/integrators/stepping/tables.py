@@ -186,7 +186,10 @@ def place_joints(system, ws: Workspace, y):
 
 @internal_kernel
 def geometry(system, model: ModelArrays, ws: Workspace):
-    """Poses, gaps and rows at the positions and rates in ``ws.joints``; tangents along and across the grip axis."""
+    """Poses, gaps and rows at the positions and rates in ``ws.joints``; tangents along and across the grip axis.
+
+    Without one they are functions of the normal: isotropic friction does not turn with the body.
+    """
     forward_sweep(model, ws, 1.0, 0.0, 1.0)
     contact_rows(model, system.contacts, system.unilateral, ws)
     shaped_rows(system.shapes, system.unilateral, model, system.contacts, ws)
@@ -197,7 +200,7 @@ def geometry(system, model: ModelArrays, ws: Workspace):
         across = dot_vector(t, n)
         t = t[0] - across * n[0], t[1] - across * n[1], t[2] - across * n[2]
         length = math.sqrt(dot_vector(t, t))
-        if not length > 1e-6:  # the axis is along the normal: any direction does
+        if not length > 1e-6:  # there is no axis, or it is along the normal: any direction does
             t = (0.0, n[2], -n[1]) if abs(n[0]) < 0.7 else (-n[2], 0.0, n[0])
             length = math.sqrt(dot_vector(t, t))
         t = t[0] / length, t[1] / length, t[2] / length
