@@ -191,8 +191,7 @@ def _displacement(rows: Array, wanted: Array, rigid: NDArray[np.bool_], roots: A
     springs = roots[~rigid, None] * rows[~rigid]
     left = roots[~rigid] * wanted[~rigid] - springs @ particular
     from_left, sizes, to_right = np.linalg.svd(springs @ null, full_matrices=False)
-    largest = sizes.max(initial=0.0)
-    inverse = np.divide(
-        sizes, sizes**2 + (damping * largest) ** 2, out=np.zeros_like(sizes), where=sizes > RANK * largest
-    )
+    # Rows of springs that closed rigid contacts keep as they are consist of rounding errors.
+    least, largest = RANK * float(np.linalg.norm(springs)), sizes.max(initial=0.0)
+    inverse = np.divide(sizes, sizes**2 + (damping * largest) ** 2, out=np.zeros_like(sizes), where=sizes > least)
     return np.asarray(particular + null @ (to_right.T @ (inverse * (from_left.T @ left))))

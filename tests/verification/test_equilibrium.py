@@ -373,3 +373,18 @@ def test_a_rigid_contact_opens_where_it_would_wedge_an_arm_that_presses_another_
     assert record["contact_gap"][0, elbow] == pytest.approx(-force / 2e4, rel=1e-9)
     assert record["contact_gap"][0, tip] == pytest.approx(0.29 / 0.3 * force / 2e4, rel=1e-9)
     assert record["q"][0, 1] == pytest.approx(np.radians(-30.0), abs=1e-6)
+
+
+def test_a_rigid_contact_keeps_a_compliant_one_from_being_pressed_in_deeper(tmp_path):
+    """A rigid stop 20 µm below the floor of a compliant elbow: the spring carries what 20 µm are, the stop the rest."""
+    replacements = {
+        "  chain:\n": "  chain:\n    - {axis: z, length_m: 0, initial_deg: 20, motor: {type: wang_minami}}\n",
+        "{type: plane}": "{type: plane}, lower: {type: plane, point_m: [0, 0, -2.0e-5]}",
+        "  stiffness_N_per_m: 2.0e+4\n": "",
+        "{body: link_2, surface: floor}": "{body: link_3, surface: floor, stiffness_N_per_m: 2.0e+4}, "
+        "stop: {body: link_3, surface: lower}",
+    }
+    record = compliant_arm(tmp_path, replacements)
+    np.testing.assert_allclose(record["contact_gap"][0], [-2e-5, 0.0], rtol=0, atol=1e-12)
+    assert record["contact_normal_force"][0, 1] > 0.5
+    assert record["q"][0, 0] == pytest.approx(np.radians(20.0), abs=1e-12)
