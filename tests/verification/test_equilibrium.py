@@ -388,3 +388,38 @@ def test_a_rigid_contact_keeps_a_compliant_one_from_being_pressed_in_deeper(tmp_
     np.testing.assert_allclose(record["contact_gap"][0], [-2e-5, 0.0], rtol=0, atol=1e-12)
     assert record["contact_normal_force"][0, 1] > 0.5
     assert record["q"][0, 0] == pytest.approx(np.radians(20.0), abs=1e-12)
+
+
+GANTRY = """
+duration_s: 0.01
+plant:
+  type: serial_arm
+  link: {mass_kg: 1, length_m: 0.1}
+  base: {position_m: [0, 0, 0.5]}
+  chain:
+    - {axis: x, kind: prismatic, length_m: 0, motor: {type: wang_minami}}
+    - {axis: z, kind: prismatic, motor: {type: wang_minami}}
+controller: {type: joint_pd, k_p_V_per_rad: 3000, k_d_V_s_per_rad: 100}
+surfaces:
+  floor: {type: plane, point_m: [0, 0, 0.5]}
+  ball: {type: sphere, center_m: [-0.00005, 0, 0.6009987492], radius_m: 0.001}
+contacts:
+  law: unilateral
+  stiffness_N_per_m: 2.0e+4
+  points: {foot: {body: link_2, surface: floor}, tip: {body: link_2, point_m: [0, 0, 0.1], surface: ball}}
+initial: {equilibrium: true}
+integrator: {method: time_stepping}
+"""
+
+
+def test_a_contact_that_opens_leaves_no_displacement(tmp_path):
+    """As its foot is pressed in, a gantry sinks off a small ball above it: nothing moves it along the floor."""
+    path = tmp_path / "gantry.yaml"
+    path.write_text(GANTRY, encoding="utf-8")
+    record = simulate(load_scenario(path))
+    assert np.abs(record["vdot"]).max() < STILL
+    (foot, tip), depth = record["contact_normal_force"][0], -record["q"][0, 1]
+    assert foot == pytest.approx(2e4 * depth, rel=1e-9)
+    assert foot > 0.5
+    assert tip == 0.0
+    assert record["q"][0, 0] == pytest.approx(0.0, abs=1e-12)
