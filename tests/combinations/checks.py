@@ -161,18 +161,27 @@ def _pressed_by(seen: Observed) -> float:
     To first order the least displacement d changes the gaps g of contacts that touch by J d = g − g_0. J changes on the
     way, on a ball of 3 cm within millimetres: a step is good if gaps change by half of J d, so that 2 d may be needed.
     """
+    if all(touch.contact.stiffness == 0.0 for touch in seen.touches()):
+        return 0.0
     motion = seen.bodies.motion(seen.robot.initial[None], *np.zeros((2, 1, len(seen.joints))))
-    rows, changes = [], []
+    rows, before, after = [], [], []
     for touch in seen.touches():
-        if touch.gap[0] > START:
-            continue
         body, centre, far, normal = seen.nearest_point(touch.contact, motion)
         position = centre - touch.contact.radius * normal
         rows.append(normal[0] @ seen.bodies.jacobian(motion, body, position)[0])
-        changes.append(touch.gap[0] - (far[0] - touch.contact.radius))
-    if not rows or all(touch.contact.stiffness == 0.0 for touch in seen.touches()):
-        return 0.0
-    return 2.0 * float(np.abs(np.linalg.lstsq(np.array(rows), np.array(changes), rcond=1e-10)[0]).max())
+        before.append(far[0] - touch.contact.radius)
+        after.append(touch.gap[0])
+    J, gaps, ends = np.array(rows), np.array(before), np.array(after)
+    kept = ends <= START
+    # Contacts that end open may have to be lifted, but no further than until they touch.
+    ends[~kept] = 0.0
+    while kept.any():
+        least = np.linalg.lstsq(J[kept], (ends - gaps)[kept], rcond=1e-10)[0]
+        pressed = np.where(kept, 0.0, gaps + J @ least)
+        if pressed.min() >= -START:
+            return 2.0 * float(np.abs(least).max())
+        kept[pressed.argmin()] = True
+    return 0.0
 
 
 def equilibrium(seen: Observed) -> Finding:

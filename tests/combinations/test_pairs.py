@@ -79,6 +79,7 @@ FOUND = {
     "an elbow that slid back and forth within a step, and was driven by its friction between": (271127, 5698),
     "an equilibrium that pressed a spring against rigid links, which moved joints by a million": (271127, 8322),
     "an equilibrium that kept the displacement for a hand which opened on the way": (271127, 6126),
+    "an equilibrium that lifts an elbow off its surface while feet are pressed in": (271127, 13119),
     "an equilibrium with an operator whose target moves from the first tick on": (271127, 6313),
 }
 # Scenes of the slow study.
