@@ -25,7 +25,7 @@ from dynsim.compile.equilibrium import KEYS, Touching, holding_torques, touching
 from dynsim.compile.model import Model
 from dynsim.compile.posture import BEYOND
 from dynsim.compile.shapes import gap_at
-from dynsim.dynamics.tree.joints import normalise, positions_along
+from dynsim.dynamics.tree.joints import normalise, positions_along, rates_across
 from dynsim.errors import ModelError, first_few
 from dynsim.model.description import Array, Contact, Load
 
@@ -36,6 +36,8 @@ NEARLY = 1e-9
 ITERATIONS = 50
 # A step is damped more if a gap differs from its linear prediction by more than this part of the largest change.
 AGREES = 0.5
+# The search is repeated at most so often, as long as it ends nearer to the initial posture by this factor.
+REPEATS, NEARER = 4, 0.9
 # Damping of the springs' least squares, in parts of its largest singular value. The last step is accepted unchanged.
 DAMPINGS = (0.0, *4.0 ** np.arange(-5, 7))
 # Singular values of rows below this part of the largest are zero.
@@ -68,20 +70,35 @@ def pressed_in(
             return None
 
     forces = holding_torques(model, model.robot.initial, contacts, loads, able, real).normal_forces
-    if (q := _search(model, contacts, real, names, forces, holding)) is None:
+    if (found := _search(model, contacts, real, names, forces, holding)) is None:
         # A rigid contact that need not carry may keep a compliant one from being pressed in: it may open.
         for name in [name for name in names if name not in compliant]:
             others = [other for other in names if other != name]
             if (without := holding(model.robot.initial, dict.fromkeys(others, np.nan))) is not None:
                 names, forces = others, without
-        q = _search(model, contacts, real, names, forces, holding)
-    if q is None:
+        found = _search(model, contacts, real, names, forces, holding)
+    if found is None:
         raise ModelError(
             f"initial.equilibrium: no posture near this one presses {first_few(compliant)} in as deep as their forces "
             "need; raise contacts.stiffness_N_per_m, or remove initial.equilibrium",
             keys=KEYS,
         )
+    # Steps for forces that were given up, or for contacts that have opened, leave displacements that the equilibrium
+    # does not need. A search from the initial posture that begins with the forces found does not make them.
+    q, forces = found
+    for _ in range(REPEATS):
+        again = _search(model, contacts, real, list(forces), forces, holding)
+        if again is None or _distance(model, again[0]) >= NEARER * _distance(model, q):
+            break
+        q, forces = again
     return Model(replace(model.robot, q0=q))
+
+
+def _distance(model: Model, q: Array) -> float:
+    """Return the norm of the displacement from the initial posture."""
+    moved = np.zeros(model.n)
+    rates_across(model.arrays, q, 0, q - model.robot.initial, moved)
+    return float(np.linalg.norm(moved))
 
 
 def _search(
@@ -91,8 +108,8 @@ def _search(
     names: Sequence[str],
     forces: Mapping[str, float],
     holding: Callable[[Array, Mapping[str, float]], dict[str, float] | None],
-) -> Array | None:
-    """Return the posture (nq,), or None.
+) -> tuple[Array, dict[str, float]] | None:
+    """Return the posture (nq,) and the normal forces of contacts that carry [N], or None.
 
     Parameters
     ----------
@@ -103,7 +120,7 @@ def _search(
     q, before = model.robot.initial, np.inf
     touching = touching_contacts(model, contacts, q, real, names)
     for _ in range(ITERATIONS):
-        q, size = _step(model, q, touching, forces)
+        q, size = _step(model, q, touching, forces) if touching else (q, 0.0)
         # A contact that carries may open within a step. A contact that carried nothing carries only if the posture
         # cannot be held otherwise.
         meeting = [c.name for c, *_, gap in touching_contacts(model, contacts, q, real) if not c.stiffness or gap < 0.0]
@@ -120,7 +137,7 @@ def _search(
             lacking = [abs(forces[c.name] / c.stiffness + gap) for c, *_, gap in touching if c.stiffness > 0.0]
             # Rigid contacts or limits may keep joints from pressing springs in further.
             if max(lacking, default=0.0) <= NEARLY:
-                return q
+                return q, forces
             if size <= DONE:
                 return None
         before = size
@@ -191,8 +208,7 @@ def _displacement(rows: Array, wanted: Array, rigid: NDArray[np.bool_], roots: A
     springs = roots[~rigid, None] * rows[~rigid]
     left = roots[~rigid] * wanted[~rigid] - springs @ particular
     from_left, sizes, to_right = np.linalg.svd(springs @ null, full_matrices=False)
-    largest = sizes.max(initial=0.0)
-    inverse = np.divide(
-        sizes, sizes**2 + (damping * largest) ** 2, out=np.zeros_like(sizes), where=sizes > RANK * largest
-    )
+    # Rows of springs that closed rigid contacts keep as they are consist of rounding errors.
+    least, largest = RANK * float(np.linalg.norm(springs)), sizes.max(initial=0.0)
+    inverse = np.divide(sizes, sizes**2 + (damping * largest) ** 2, out=np.zeros_like(sizes), where=sizes > least)
     return np.asarray(particular + null @ (to_right.T @ (inverse * (from_left.T @ left))))

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from combinations.agreement import disagreements
 from combinations.commands import commands
@@ -47,6 +48,7 @@ class Problem:
     detail: str
 
 
+Array = NDArray[np.float64]
 Finding = Iterator[str]
 
 
@@ -156,21 +158,30 @@ def start(seen: Observed) -> Finding:
 def _pressed_by(seen: Observed) -> float:
     """Return how far joints may move to press compliant contacts in as deep as they begin [rad or m].
 
-    To first order the least displacement d changes the gaps g of contacts that touch by J d = g − g_0; the posture may
-    differ by as much again, since J changes on the way and a search has several steps.
+    To first order the least displacement d changes the gaps g of contacts that touch by J d = g − g_0. J changes on the
+    way, on a ball of 3 cm within millimetres: a step is good if gaps change by half of J d, so that 2 d may be needed.
     """
+    if all(touch.contact.stiffness == 0.0 for touch in seen.touches()):
+        return 0.0
     motion = seen.bodies.motion(seen.robot.initial[None], *np.zeros((2, 1, len(seen.joints))))
-    rows, changes = [], []
+    rows, before, after = [], [], []
     for touch in seen.touches():
-        if touch.gap[0] > START:
-            continue
         body, centre, far, normal = seen.nearest_point(touch.contact, motion)
         position = centre - touch.contact.radius * normal
         rows.append(normal[0] @ seen.bodies.jacobian(motion, body, position)[0])
-        changes.append(touch.gap[0] - (far[0] - touch.contact.radius))
-    if not rows or all(touch.contact.stiffness == 0.0 for touch in seen.touches()):
-        return 0.0
-    return 2.0 * float(np.abs(np.linalg.lstsq(np.array(rows), np.array(changes), rcond=1e-10)[0]).max())
+        before.append(far[0] - touch.contact.radius)
+        after.append(touch.gap[0])
+    J, gaps, ends = np.array(rows), np.array(before), np.array(after)
+    kept = ends <= START
+    # Contacts that end open may have to be lifted, but no further than until they touch.
+    ends[~kept] = 0.0
+    while kept.any():
+        least = np.linalg.lstsq(J[kept], (ends - gaps)[kept], rcond=1e-10)[0]
+        pressed = np.where(kept, 0.0, gaps + J @ least)
+        if pressed.min() >= -START:
+            return 2.0 * float(np.abs(least).max())
+        kept[pressed.argmin()] = True
+    return 0.0
 
 
 def equilibrium(seen: Observed) -> Finding:
@@ -194,10 +205,10 @@ def equilibrium(seen: Observed) -> Finding:
         return
     size = np.abs(seen.vdot[0])
     # The limit is far below the acceleration of a falling joint.
-    allowed = 1e-4 * (1.0 + np.linalg.norm(seen.bodies.gravity)) + _misread(seen)
+    allowed = 1e-4 * (1.0 + float(np.linalg.norm(seen.bodies.gravity))) + _misread(seen)
     if seen.stepped and len(seen) > 2 and _begins_to_move(seen):
         # This is the mean of the first step; if references begin to move, the next mean is up to three times as large.
-        allowed = max(allowed, 0.7 * float(np.abs(seen.vdot[2]).max(initial=0.0)))
+        allowed = max(allowed, 0.7 * float(np.abs(seen.vdot[2]).max(initial=0.0)), _led(seen))
     if size.max(initial=0.0) > allowed:
         yield f"{seen.joints[int(size.argmax())]} starts with an acceleration of {size.max():.3g}, from equilibrium"
 
@@ -211,28 +222,59 @@ def _begins_to_move(seen: Observed) -> bool:
 
 
 def _misread(seen: Observed) -> float:
-    """Return the largest acceleration from encoder errors at the start.
-
-    Servos pass errors on without a delay. Circuits follow the voltage with L/R, of which the first time step sees a
-    part.
-    """
+    """Return the largest acceleration from encoder errors at the start."""
     encoders = (seen.config.get("sensors") or {}).get("encoders") or {}
     angle = np.radians(0.5 * encoders.get("resolution_deg", 0.0) + 6.0 * encoders.get("noise_deg", 0.0))
     if not angle:
         return 0.0
-    mobility = np.abs(np.linalg.pinv(seen.bodies.mass_matrix(seen.robot.initial)))
-    gains = np.broadcast_to((seen.config.get("controller") or {}).get("k_p_V_per_rad", 0.0), len(seen.robot.motors))
-    total = np.zeros(len(mobility))
-    for motor, gain in zip(seen.robot.motors, gains, strict=True):
+    controller = seen.config.get("controller") or {}
+    gains = np.broadcast_to(controller.get("k_p_V_per_rad", 0.0), len(seen.robot.motors))
+    servos = [motor.k_p if isinstance(motor, Servo) else 0.0 for motor in seen.robot.motors]
+    # Errors have any signs.
+    return float((np.abs(_mobility(seen)) @ _jolts(seen, gains * angle, np.multiply(servos, angle))).max())
+
+
+def _led(seen: Observed) -> float:
+    """Return the largest acceleration from an operator at the start.
+
+    From the first tick on references have a rate, the least with which the joints follow the hand's target; commands of
+    motors jump by its multiple k_d.
+    """
+    controller = seen.config.get("controller") or {}
+    operator = controller.get("operator")
+    if not operator or not operator.get("joints") or seen.robot.hand is None or seen.robot.base is not None:
+        return 0.0
+    target, columns = seen.record["target_position"], [seen.joints.index(joint) for joint in operator["joints"]]
+    body, point = seen.robot.attach(*seen.robot.hand)
+    J = seen.bodies.jacobian(seen.motion, body, seen.motion.point(body, point))[0]
+    rates = np.zeros(len(seen.joints))
+    speed = (target[1] - target[0]) / (seen.time[1] - seen.time[0])
+    rates[columns] = np.linalg.lstsq(J[:, columns], speed, rcond=1e-10)[0]
+    gains = np.broadcast_to(controller.get("k_d_V_s_per_rad", 0.0), len(seen.robot.motors))
+    driven = np.array([rates[seen.joints.index(motor.joint)] for motor in seen.robot.motors])
+    return float(np.abs(_mobility(seen) @ _jolts(seen, gains * driven, np.zeros(len(gains)))).max())
+
+
+def _mobility(seen: Observed) -> Array:
+    """Return the accelerations of unit torques at the start, (n, n)."""
+    return np.asarray(np.linalg.pinv(seen.bodies.mass_matrix(seen.robot.initial)))
+
+
+def _jolts(seen: Observed, commands_V: Array, servos_V: Array) -> Array:
+    """Return the torques (n,) if commands of motors and voltages of servos jump by so much at the start, (na,).
+
+    Servos pass voltages on without a delay. Circuits follow with L/R, of which the first time step sees a part.
+    """
+    torques = np.zeros(len(seen.joints))
+    for motor, command, servo in zip(seen.robot.motors, commands_V, servos_V, strict=True):
         if isinstance(motor, Servo):
-            voltage, share = motor.k_p * angle, 1.0
+            voltage, share = servo, 1.0
         elif isinstance(motor, Motor) and seen.stepped:
-            voltage, share = gain * angle, min(seen.step * motor.resistance / motor.inductance, 1.0)
+            voltage, share = command, min(seen.step * motor.resistance / motor.inductance, 1.0)
         else:
             continue
-        torque = share * motor.joint_constant * voltage / motor.resistance
-        total += mobility[:, seen.joints.index(motor.joint)] * torque
-    return float(np.max(total))
+        torques[seen.joints.index(motor.joint)] += share * motor.joint_constant * voltage / motor.resistance
+    return torques
 
 
 def absurd(seen: Observed) -> Finding:

@@ -82,6 +82,10 @@ FOUND = {
     "a paradox at the start, of which check knew nothing": (271127, 5731),
     "a last step of time stepping that ended with the run, which the checks took for a whole one": (271127, 7761),
     "a wheel that turned as its slip ended within a step, and was driven by its friction": (271127, 6350),
+    "an equilibrium that pressed a spring against rigid links, which moved joints by a million": (271127, 8322),
+    "an equilibrium that kept the displacement for a hand which opened on the way": (271127, 6126),
+    "an equilibrium that lifts an elbow off its surface while feet are pressed in": (271127, 13119),
+    "an equilibrium with an operator whose target moves from the first tick on": (271127, 6313),
 }
 # Scenes of the slow study.
 TRIPLES = 1000

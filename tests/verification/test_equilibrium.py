@@ -373,3 +373,53 @@ def test_a_rigid_contact_opens_where_it_would_wedge_an_arm_that_presses_another_
     assert record["contact_gap"][0, elbow] == pytest.approx(-force / 2e4, rel=1e-9)
     assert record["contact_gap"][0, tip] == pytest.approx(0.29 / 0.3 * force / 2e4, rel=1e-9)
     assert record["q"][0, 1] == pytest.approx(np.radians(-30.0), abs=1e-6)
+
+
+def test_a_rigid_contact_keeps_a_compliant_one_from_being_pressed_in_deeper(tmp_path):
+    """A rigid stop 20 µm below the floor of a compliant elbow: the spring carries what 20 µm are, the stop the rest."""
+    replacements = {
+        "  chain:\n": "  chain:\n    - {axis: z, length_m: 0, initial_deg: 20, motor: {type: wang_minami}}\n",
+        "{type: plane}": "{type: plane}, lower: {type: plane, point_m: [0, 0, -2.0e-5]}",
+        "  stiffness_N_per_m: 2.0e+4\n": "",
+        "{body: link_2, surface: floor}": "{body: link_3, surface: floor, stiffness_N_per_m: 2.0e+4}, "
+        "stop: {body: link_3, surface: lower}",
+    }
+    record = compliant_arm(tmp_path, replacements)
+    np.testing.assert_allclose(record["contact_gap"][0], [-2e-5, 0.0], rtol=0, atol=1e-12)
+    assert record["contact_normal_force"][0, 1] > 0.5
+    assert record["q"][0, 0] == pytest.approx(np.radians(20.0), abs=1e-12)
+
+
+GANTRY = """
+duration_s: 0.01
+plant:
+  type: serial_arm
+  link: {mass_kg: 1, length_m: 0.1}
+  base: {position_m: [0, 0, 0.5]}
+  chain:
+    - {axis: x, kind: prismatic, length_m: 0, motor: {type: wang_minami}}
+    - {axis: z, kind: prismatic, motor: {type: wang_minami}}
+controller: {type: joint_pd, k_p_V_per_rad: 3000, k_d_V_s_per_rad: 100}
+surfaces:
+  floor: {type: plane, point_m: [0, 0, 0.5]}
+  ball: {type: sphere, center_m: [-0.00005, 0, 0.6009987492], radius_m: 0.001}
+contacts:
+  law: unilateral
+  stiffness_N_per_m: 2.0e+4
+  points: {foot: {body: link_2, surface: floor}, tip: {body: link_2, point_m: [0, 0, 0.1], surface: ball}}
+initial: {equilibrium: true}
+integrator: {method: time_stepping}
+"""
+
+
+def test_a_contact_that_opens_leaves_no_displacement(tmp_path):
+    """As its foot is pressed in, a gantry sinks off a small ball above it: nothing moves it along the floor."""
+    path = tmp_path / "gantry.yaml"
+    path.write_text(GANTRY, encoding="utf-8")
+    record = simulate(load_scenario(path))
+    assert np.abs(record["vdot"]).max() < STILL
+    (foot, tip), depth = record["contact_normal_force"][0], -record["q"][0, 1]
+    assert foot == pytest.approx(2e4 * depth, rel=1e-9)
+    assert foot > 0.5
+    assert tip == 0.0
+    assert record["q"][0, 0] == pytest.approx(0.0, abs=1e-12)
