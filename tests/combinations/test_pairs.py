@@ -77,6 +77,15 @@ FOUND = {
     ),
     "a joint that turned round twice within a step, and was driven by its friction between": (271127, 7047),
     "an elbow that slid back and forth within a step, and was driven by its friction between": (271127, 5698),
+    "a point that an impact left leaving slowly, kept on its surface where no forces could keep it": (271127, 5193),
+    "no forces at feet and a root of which some slide, where an iteration diverged to NaN": (271127, 8213),
+    "a glued elbow in a violent motion, whose friction turns faster at the stop than in the last sample": (
+        271127,
+        4746,
+    ),
+    "a glued arm that friction of pulling contacts drives to infinite rates": (271127, 6321),
+    "the same, with motors": (271127, 7037),
+    "two points in the paradox, beside an object on four others": (271127, 7921),
 }
 # Scenes of the slow study.
 TRIPLES = 1000
