@@ -9,11 +9,13 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from combinations.bodies import position_rates, times
+from combinations.coulomb import Point, Rest, forces_exist, parts
 from combinations.observed import Observed
 from combinations.surfaces import nearest
 from dynsim.model.drives import Motor
@@ -22,6 +24,8 @@ Array = NDArray[np.float64]
 
 # Largest gap of a closed contact [m]; largest rate at rest [m/s, rad/s].
 CLOSED, RESTS = 1e-5, 1e-5
+# Largest gap and rate along the normal of what stays closed: tolerances of projection [m, m/s].
+MET, STAYS = 1e-9, 3e-8
 # Determinants and diagonals below this part of the frictionless ones are as good as zero: a step ends just before.
 CRITICAL = 0.02
 # Most joints and contacts whose combinations are looked at one by one.
@@ -30,6 +34,8 @@ FEW = 8
 DRIFT_STEP = 1e-4
 # Sweeps and damping of the projected iteration, and the relative violation that counts as zero.
 SWEEPS, DAMPING, SOLVED = 20000, 0.7, 1e-7
+# Relative changes above this are those of an iteration that diverges, which says nothing about forces.
+DIVERGED = 1e12
 
 
 @dataclass(frozen=True)
@@ -41,7 +47,9 @@ class State:
     q, v, current : positions, rates and currents
     mass : M + J_m, (n, n)
     names : closed contacts; rows : normal and two tangents of each, (3, n); slip : (2,) along the tangents [m/s]
-    friction : coefficient of each; resting : joints at rest that rub, with their bounds
+    gaps : of each [m]; friction : coefficient of each; smoothing : speed below which that of a glued one fades [m/s]
+    resting : joints at rest that rub, with their bounds
+    stops : joints at rest on a stop, each with the sign of the rate with which it leaves
     """
 
     q: Array
@@ -50,12 +58,15 @@ class State:
     mass: Array
     names: list[str]
     rows: list[Array]
+    gaps: list[float]
     slip: list[Array]
     friction: list[float]
+    smoothing: list[float]
     static: list[float]
     resting: list[int]
     bounds: list[float]
     rubbing: Array
+    stops: list[tuple[int, float]]
 
 
 def state_of(seen: Observed, values: Mapping[str, Sequence[float]], currents: Array | None = None) -> State:
@@ -63,10 +74,10 @@ def state_of(seen: Observed, values: Mapping[str, Sequence[float]], currents: Ar
     q = np.array(values["q"]) if "q" in values else seen.q[-1]
     v = np.array(values["v"]) if "v" in values else seen.v[-1]
     motion = seen.bodies.motion(q[None], v[None], np.zeros((1, len(v))))
-    names, rows, slip, friction, static = [], [], [], [], []
+    names, rows, gaps, slip, friction, smoothing, static = [], [], [], [], [], [], []
     for contact in seen.described_contacts:
         body, centre, far, normal = seen.nearest_point(contact, motion)
-        if far[0] - contact.radius > CLOSED:
+        if seen.real and far[0] - contact.radius > CLOSED:
             continue
         n = np.asarray(normal[0], dtype=np.float64)
         along = np.cross(n, np.eye(3)[np.abs(n).argmin()])
@@ -75,12 +86,14 @@ def state_of(seen: Observed, values: Mapping[str, Sequence[float]], currents: Ar
         J = frame @ seen.bodies.jacobian(motion, body, centre - contact.radius * normal)[0]
         names.append(contact.name)
         rows.append(J)
+        gaps.append(float(far[0] - contact.radius))
         slip.append((J @ v)[1:])
         speed = float(np.linalg.norm(slip[-1]))
         mu = contact.friction + contact.viscous_friction * speed
         if contact.stribeck > 0.0:
             mu += (contact.friction_at_rest - contact.friction) * float(np.exp(-((speed / contact.stribeck) ** 2)))
         friction.append(mu)
+        smoothing.append(contact.slip_smoothing)
         static.append(contact.friction_at_rest)
     gears = {motor.joint: getattr(motor, "dry_friction", 0.0) for motor in seen.robot.motors}
     bound = np.array([link.friction + gears.get(link.joint, 0.0) for link in seen.robot.links]) * seen.real
@@ -94,8 +107,15 @@ def state_of(seen: Observed, values: Mapping[str, Sequence[float]], currents: Ar
         # Those of circuits are of the state, the others' those of the last sample.
         current[circuits] = values["current"]
     mass = seen.bodies.mass_matrix(q)
+    bounds = [float(bound[j]) for j in resting]
+    stops = []
+    for j, link in enumerate(seen.robot.links if seen.real else ()):
+        place = q[seen.bodies.places[j]]
+        for gap, side in ((place - link.lower, 1.0), (link.upper - place, -1.0)):
+            if gap < MET and abs(v[j]) < STAYS:
+                stops.append((j, side))
     return State(
-        q, v, current, mass, names, rows, slip, friction, static, resting, [float(bound[j]) for j in resting], rubbing
+        q, v, current, mass, names, rows, gaps, slip, friction, smoothing, static, resting, bounds, rubbing, stops
     )
 
 
@@ -104,8 +124,22 @@ def critical(seen: Observed, values: Mapping[str, Sequence[float]]) -> bool:
 
     A contact that slides has its slip's direction, or, from rest, any.
     """
-    state = state_of(seen, values)
-    basis = seen.bodies.free_directions()
+    whole, basis = state_of(seen, values), seen.bodies.free_directions()
+    identity, count = np.eye(len(whole.v)), len(whole.names)
+    rows = np.vstack([np.zeros((0, len(whole.v))), *whole.rows, *(identity[j][None] for j in whole.resting)])
+    W = rows @ basis @ np.linalg.solve(basis.T @ whole.mass @ basis, basis.T @ rows.T)
+    blocks = [[3 * k, 3 * k + 1, 3 * k + 2] for k in range(count)]
+    blocks += [[3 * count + m] for m in range(len(whole.resting))]
+    # A part in which all contacts slide has no other modes to choose from, whatever the rest does.
+    for part in parts(W, blocks):
+        if max(part) < count and all(float(np.linalg.norm(whole.slip[k])) > RESTS for k in part):
+            inverse = basis @ np.linalg.solve(basis.T @ whole.mass @ basis, basis.T)
+            if _paradox(whole, part, inverse, (1.0,) if seen.real else (1.0, -1.0)):
+                return True
+    return _some_modes_critical(whole, basis, real=seen.real)
+
+
+def _some_modes_critical(state: State, basis: Array, *, real: bool) -> bool:
     for held_joints in _subsets(state.resting):
         for mode in _modes(len(state.names)):
             sliding = [k for k, m in enumerate(mode) if m == 1]
@@ -117,7 +151,7 @@ def critical(seen: Observed, values: Mapping[str, Sequence[float]]) -> bool:
             if free.shape[1] == 0:
                 continue
             inverse = free @ np.linalg.solve(free.T @ state.mass @ free, free.T)
-            if _paradox(state, sliding, inverse, (1.0,) if seen.real else (1.0, -1.0)):
+            if _paradox(state, sliding, inverse, (1.0,) if real else (1.0, -1.0)):
                 return True
     return False
 
@@ -158,8 +192,30 @@ def _paradox(state: State, sliding: Sequence[int], inverse: Array, signs: Sequen
 
 
 def exists(seen: Observed, values: Mapping[str, Sequence[float]], time: float) -> bool:
-    """Whether there are contact forces that agree with Coulomb's law at a state, by a damped projected iteration."""
-    return _solved(seen, state_of(seen, values), time)[0]
+    """Whether there are contact forces that agree with Coulomb's law at a state, by an exact decision.
+
+    Forces act where a gap stays closed: not where a contact is still on its way to the surface, or leaves it.
+    """
+    state = state_of(seen, values)
+    speeds = [abs(float(rows[0] @ state.v)) / (1.0 + float(np.linalg.norm(slip)))
+              for rows, slip in zip(state.rows, state.slip, strict=True)]  # fmt: skip
+    state = _only(state, [k for k, speed in enumerate(speeds) if state.gaps[k] < MET and speed < STAYS])
+    W, free = _problem(seen, state, time)[:2]
+    points = []
+    for k, slip in enumerate(state.slip):
+        speed = float(np.linalg.norm(slip))
+        points.append(Point(3 * k, state.friction[k], slip / speed) if speed > RESTS else Point(3 * k, state.static[k]))
+    c = 3 * len(state.names)
+    rests = [Rest(c + m, bound) for m, bound in enumerate(state.bounds)]
+    stops = [Point(c + len(rests) + m, 0.0) for m in range(len(state.stops))]
+    return forces_exist(W, free, [*points, *stops], rests)
+
+
+def _only(state: State, kept: Sequence[int]) -> State:
+    """A state with only these contacts."""
+    lists = ("names", "rows", "gaps", "slip", "friction", "smoothing", "static")
+    kept_lists: dict[str, Any] = {key: [getattr(state, key)[k] for k in kept] for key in lists}
+    return replace(state, **kept_lists)
 
 
 def leaves(seen: Observed, name: str, i: int) -> bool:
@@ -168,27 +224,18 @@ def leaves(seen: Observed, name: str, i: int) -> bool:
     if name not in state.names:
         return True
     k = state.names.index(name)
-    without = replace(
-        state,
-        **{key: [entry for m, entry in enumerate(getattr(state, key)) if m != k] for key in
-           ("names", "rows", "slip", "friction", "static")},
-    )  # fmt: skip
-    solved, acceleration = _solved(seen, without, float(seen.time[i]))
+    others = [m for m in range(len(state.names)) if m != k]
+    solved, acceleration = _solved(seen, _only(replace(state, stops=[]), others), float(seen.time[i]))
     drift = _drifts(seen, state)[k][0]
     gain = float(state.rows[k][0] @ acceleration + drift)
     return solved and gain > -1e-6 * (np.abs(acceleration).max(initial=0.0) + 1.0)
 
 
 def _solved(seen: Observed, state: State, time: float) -> tuple[bool, Array]:
-    """Whether there are forces by Coulomb's law at a state, and the accelerations with them, (n,)."""
-    if not state.names and not state.resting:
-        return True, np.linalg.solve(state.mass, _applied(seen, state, time))
-    push = _applied(seen, state, time)
-    inverse = np.linalg.inv(state.mass)
-    rows = np.vstack([*state.rows, *(np.eye(len(state.v))[j][None] for j in state.resting)])
-    drift = _drifts(seen, state)
-    free = rows @ inverse @ push + np.concatenate([drift.ravel(), np.zeros(len(state.resting))])
-    W = rows @ inverse @ rows.T
+    """Whether a damped projected iteration finds forces by Coulomb's law, and the accelerations with them, (n,)."""
+    W, free, rows, inverse, push = _problem(seen, state, time)
+    if not len(rows):
+        return True, inverse @ push
     c = len(state.names)
     f = np.zeros(len(rows))
     scale = np.abs(free).max(initial=0.0) + 1e-9
@@ -200,9 +247,39 @@ def _solved(seen: Observed, state: State, time: float) -> tuple[bool, Array]:
             r = 3 * c + m
             wanted = f[r] - (W[r] @ f + free[r]) / W[r, r]
             f[r] += DAMPING * (np.clip(wanted, -bound, bound) - f[r])
-        if np.abs(W @ (f - before)).max() < 1e-13 * scale:
+        change = float(np.abs(W @ (f - before)).max())
+        if change < 1e-13 * scale or not change < DIVERGED * scale:
             break
     return _violation(state, W, free, f) < SOLVED * scale, inverse @ (push + rows.T @ f)
+
+
+def _problem(seen: Observed, state: State, time: float) -> tuple[Array, Array, Array, Array, Array]:
+    """W and b of the accelerations W f + b along the rows of contacts, resting joints and stops; rows, M⁻¹, push."""
+    push, n = _applied(seen, state, time), len(state.v)
+    basis = seen.bodies.free_directions()
+    inverse = basis @ np.linalg.solve(basis.T @ state.mass @ basis, basis.T)
+    joints = [np.eye(n)[j][None] for j in state.resting] + [side * np.eye(n)[j][None] for j, side in state.stops]
+    rows = np.vstack([np.zeros((0, n)), *state.rows, *joints])
+    free = rows @ inverse @ push + np.concatenate([_drifts(seen, state).ravel(), np.zeros(len(joints))])
+    return rows @ inverse @ rows.T, free, rows, inverse, push
+
+
+def glued_forces(seen: Observed, values: Mapping[str, Sequence[float]], time: float) -> tuple[State, Array]:
+    """The state of a stop and the normal forces of its glued contacts, whose friction is smoothed, (c,) [N]."""
+    state = replace(state_of(seen, values), resting=[], stops=[])
+    W, free = _problem(seen, state, time)[:2]
+    by_name = {contact.name: contact for contact in seen.described_contacts}
+    signed = np.array([by_name[name].pulling_friction == "signed" for name in state.names])
+    f: Array = np.ones(len(state.names))
+    # Dissipative friction has the sign of its force, which the forces before tell.
+    for _ in range(1 if signed.all() else FEW):
+        F = np.zeros((len(W), len(f)))
+        for k, slip in enumerate(state.slip):
+            smooth = float(np.hypot(np.linalg.norm(slip), state.smoothing[k]))
+            F[3 * k, k] = 1.0
+            F[3 * k + 1 : 3 * k + 3, k] = -state.friction[k] * (1.0 if signed[k] else np.sign(f[k])) * slip / smooth
+        f = np.asarray(np.linalg.lstsq((W @ F)[::3], -free[::3], rcond=1e-12)[0], dtype=np.float64)
+    return state, f
 
 
 def _contact(state: State, k: int, W: Array, free: Array, f: Array) -> None:
@@ -229,7 +306,9 @@ def _contact(state: State, k: int, W: Array, free: Array, f: Array) -> None:
 
 
 def _violation(state: State, W: Array, free: Array, f: Array) -> float:
-    """Largest violation of the law by the acceleration of a contact or resting joint."""
+    """Largest violation of the law by the acceleration of a contact or resting joint; infinite if f is not finite."""
+    if not np.isfinite(f).all():
+        return np.inf
     a, worst = W @ f + free, 0.0
     for k in range(len(state.names)):
         own, force = a[3 * k : 3 * k + 3], f[3 * k : 3 * k + 3]
@@ -269,7 +348,8 @@ def _drifts(seen: Observed, state: State) -> Array:
 
     From the places of gaps and the velocities of touching points, before and after at constant rates.
     """
-    steps = np.array([-DRIFT_STEP, 0.0, DRIFT_STEP])
+    step = DRIFT_STEP / max(1.0, float(np.abs(state.v).max(initial=0.0)))
+    steps = np.array([-step, 0.0, step])
     q = np.stack([state.q + h * position_rates(seen.bodies, state.q[None], state.v[None])[0] for h in steps])
     motion = seen.bodies.motion(q, np.repeat(state.v[None], 3, axis=0), np.zeros((3, len(state.v))))
     drifts = []
@@ -282,11 +362,11 @@ def _drifts(seen: Observed, state: State) -> Array:
         centre = nearest(surface, motion.point(body, point), tip)
         far, normal = surface.look(centre)
         velocity = motion.velocity(body, centre - contact.radius * normal)
-        rate = (velocity[2] - velocity[0]) / (2.0 * DRIFT_STEP)
+        rate = (velocity[2] - velocity[0]) / (2.0 * step)
         n = np.asarray(normal[1])
         along = np.cross(n, np.eye(3)[np.abs(n).argmin()])
         along /= np.linalg.norm(along)
-        bend = (far[2] - 2.0 * far[1] + far[0]) / DRIFT_STEP**2
+        bend = (far[2] - 2.0 * far[1] + far[0]) / step**2
         drifts.append([bend, along @ rate, np.cross(n, along) @ rate])
     return np.array(drifts).reshape(-1, 3)
 

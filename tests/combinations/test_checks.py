@@ -360,7 +360,8 @@ def test_critical_friction_has_a_sign_for_each_glued_contact() -> None:
     tangents = np.linalg.solve(normals, friction).T
     rows = [np.stack([n, t, np.zeros(2)]) for n, t in zip(normals, tangents, strict=True)]
     slip, ones, none = [np.array([1.0, 0.0])] * 2, [1.0, 1.0], np.zeros(2)
-    state = State(none, none, none, np.eye(2), ["a", "b"], rows, slip, ones, ones, [], [], none)
+    gaps = [0.0, 0.0]
+    state = State(none, none, none, np.eye(2), ["a", "b"], rows, gaps, slip, ones, gaps, ones, [], [], none, [])
     assert _paradox(state, [0, 1], np.eye(2), (1.0, -1.0))
     for sign in (1.0, -1.0):
         assert not _paradox(state, [0, 1], np.eye(2), (sign,))

@@ -86,6 +86,15 @@ FOUND = {
     "an equilibrium that kept the displacement for a hand which opened on the way": (271127, 6126),
     "an equilibrium that lifts an elbow off its surface while feet are pressed in": (271127, 13119),
     "an equilibrium with an operator whose target moves from the first tick on": (271127, 6313),
+    "a point that an impact left leaving slowly, kept on its surface where no forces could keep it": (271127, 5193),
+    "no forces at feet and a root of which some slide, where an iteration diverged to NaN": (271127, 8213),
+    "a glued elbow in a violent motion, whose friction turns faster at the stop than in the last sample": (
+        271127,
+        4746,
+    ),
+    "a glued arm that friction of pulling contacts drives to infinite rates": (271127, 6321),
+    "the same, with motors": (271127, 7037),
+    "two points in the paradox, beside an object on four others": (271127, 7921),
 }
 # Scenes of the slow study.
 TRIPLES = 1000

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import null_space
 
-from combinations.accelerations import critical, exists, leaves, state_of
+from combinations.accelerations import critical, exists, glued_forces, leaves, state_of
 from combinations.observed import AT_STEP, OPEN, SLIDING, STICKING, Observed, Touch
 from combinations.running import Run
 from combinations.sampled_loop import UNSTABLE, loop_growth
@@ -152,7 +152,7 @@ HOLDS_UP = (
 HELD_UP = (1.0, 5.0)
 # Slip below 1000 atol, or this [m/s], turns friction as fast as at this speed (docs/physics.md).
 SLOWEST = 1e-7
-# Forces and modes come from the last sample, but the state from the stop: the forces may have changed by this.
+# Forces of real contacts come from the last sample, but the state from the stop: they may have changed by this.
 SINCE = 1.3
 
 
@@ -181,6 +181,7 @@ def _not_changing(match: Match, stop: SimulationStopped, seen: Observed) -> str:
             j = seen.joints.index(joint)
             if seen.record[name][-1, k] != 0.0 and abs(seen.v[-1, j]) < AT_REST:
                 rows.append(identity[j])
+    glued = {} if seen.real else _glued(stop, seen)
     forces, slips, damped = list(rows), [], []
     blocks: dict[str, slice] = {}
     slow = max(1000.0 * seen.scenario.integrator.absolute_tolerance, SLOWEST)
@@ -189,6 +190,10 @@ def _not_changing(match: Match, stop: SimulationStopped, seen: Observed) -> str:
             continue
         J = seen.bodies.jacobian(seen.motion, other.body, other.position)[-1]
         n, friction, pressed = other.normal[-1], other.tangential[-1], float(other.normal_force[-1])
+        if not seen.real:
+            at = now[other.contact.name]
+            J, n = seen.bodies.jacobian(motion, at.body, at.position)[0], at.normal[0]
+            friction, pressed = glued[other.contact.name]
         if other.mode[-1] == STICKING and seen.real:
             rows += [*J]
             forces += [*J]
@@ -211,11 +216,12 @@ def _not_changing(match: Match, stop: SimulationStopped, seen: Observed) -> str:
     R, F, E, W = np.array(rows), np.array(forces), np.array(slips), np.linalg.inv(state.mass)
     A = E @ (W - W @ F.T @ np.linalg.pinv(R @ W @ F.T, rcond=1e-9) @ R @ W) @ np.array(damped).T
     fastest = float(np.abs(np.linalg.eigvals(A)).max())
-    if not 1.0 / SINCE < fastest * float(match[4]) < SINCE:
+    since = SINCE if seen.real else 1.0 + 2.0 * DIGITS
+    if not 1.0 / since < fastest * float(match[4]) < since:
         return f"friction changes within {1.0 / max(fastest, 1e-300):.3g} s"
     own = float(A.diagonal()[blocks[match[2]]].sum())
     # The largest of the traces of the blocks is at least the mean of the eigenvalues.
-    if own * len(blocks) * SINCE < fastest:
+    if own * len(blocks) * since < fastest:
         return f"that is not by {match[2]}, whose friction alone changes within {1.0 / max(own, 1e-300):.3g} s"
     low, high = HELD_UP
     if not low < float(match[1]) / float(match[4]) < high:
@@ -223,12 +229,48 @@ def _not_changing(match: Match, stop: SimulationStopped, seen: Observed) -> str:
     return ""
 
 
+def _glued(stop: SimulationStopped, seen: Observed) -> dict[str, tuple[Array, float]]:
+    """Friction of each glued contact at a stop, (3,), and its normal force."""
+    state, f = glued_forces(seen, stop.state, stop.time)
+    motion = seen.bodies.motion(state.q[None], state.v[None], np.zeros((1, len(state.v))))
+    forces = dict(zip(state.names, zip(f.tolist(), state.friction, strict=True), strict=True))
+    result = {}
+    for touch in seen.touches(motion):
+        pressed, mu = forces[touch.contact.name]
+        size = pressed if touch.contact.pulling_friction == "signed" else abs(pressed)
+        slip = touch.slip[0]
+        result[touch.contact.name] = (
+            -mu * size * slip / np.hypot(np.linalg.norm(slip), touch.contact.slip_smoothing), pressed,
+        )  # fmt: skip
+    return result
+
+
+def _does_not_run_away(stop: SimulationStopped, seen: Observed) -> str:
+    """Why steps need not be so short: nothing is critical, and friction does not drive the arm to infinite rates.
+
+    Friction that reverses with a pulling glued contact may feed the motion. Fast motion has forces ∝ v², so that the
+    power P ∝ v³ and dT/dt = P make the rates infinite after 2 T/P: no step goes beyond that. With an error of at least
+    third order in its share of that time a step that is refused takes at least rtol^(1/3) of it.
+    """
+    if not (reason := _not_critical(stop, seen)) or seen.real:
+        return reason
+    state = state_of(seen, stop.state)
+    motion = seen.bodies.motion(state.q[None], state.v[None], np.zeros((1, len(state.v))))
+    frictions, step = _glued(stop, seen), re.search(rf"the step size fell to {NUMBER} s", str(stop))
+    power = sum(float(frictions[touch.contact.name][0] @ touch.slip[0]) for touch in seen.touches(motion))
+    energy = 0.5 * float(state.v @ state.mass @ state.v)
+    share = float(step[1]) * power / (2.0 * energy) if step is not None and energy > 0.0 else 0.0
+    if share > seen.scenario.integrator.rtol ** (1.0 / 3.0):
+        return ""
+    return f"{reason}, and a step is {share:.2g} of the time in which friction could make the rates infinite"
+
+
 STOPS: dict[str, Callable[[SimulationStopped, Observed], str]] = {
     "overturned": _not_overturned,
     "forces_reversed": _not_critical,
     "several_forces": _not_critical,
     "no_forces": _not_critical,
-    "step_too_small": _not_critical,
+    "step_too_small": _does_not_run_away,
     "not_finite": _not_critical,
     "no_contact_forces": _has_forces,
     # The scene gives no reason for runs that do not end.

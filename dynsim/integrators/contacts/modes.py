@@ -30,6 +30,7 @@ from dynsim.dynamics.contact.unilateral import (
     holding_bound,
     slide_direction,
     stop_gap,
+    stop_rate,
 )
 from dynsim.dynamics.derivative import System
 from dynsim.dynamics.tables import Workspace
@@ -37,6 +38,7 @@ from dynsim.dynamics.tree.spatial import vector
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts.impacts import (
     FORCE_TOLERANCE,
+    STRIKE,
     begin_problem,
     evaluate,
     find_touching,
@@ -47,6 +49,7 @@ from dynsim.integrators.contacts.impacts import (
     largest_right_side,
     slip_speed,
     solve_problem,
+    strike_limit,
 )
 from dynsim.integrators.contacts.resting import leave_least, release_dependent_joints
 from dynsim.integrators.project import RATE_TOLERANCE, project_level
@@ -186,6 +189,35 @@ def some_turned_round(system: System, ws: Workspace):
 
 @noinline_kernel
 def choose_joints(system: System, ws: Workspace, run: Run):
+    """Choose modes, and if there are no forces, once more without what leaves.
+
+    An impact may leave rates that are too slow to count as leaving. They are taken to be zero, which is no law: where
+    that has no solution, what leaves has no force.
+    """
+    not_unique = run.clock[ki.NOT_UNIQUE]
+    choose_rule(system, ws, run)
+    if run.count[ki.STATUS] != ki.RUNNING and release_leaving(system, ws):
+        run.count[ki.STATUS], run.clock[ki.NOT_UNIQUE] = ki.RUNNING, not_unique
+        touch_again(system.unilateral)
+        choose_rule(system, ws, run)
+
+
+@internal_kernel
+def release_leaving(system: System, ws: Workspace):
+    """Release what leaves more slowly than an impact settles, but by more than rounding; True if there is any."""
+    unilateral, any_leaves = system.unilateral, False
+    mode, table = unilateral.mode, unilateral.stop_table
+    for k in range(mode.shape[0]):
+        if mode[k, ku.TOUCHED] == 1 and ws.contacts[k, ka.GAP_RATE] > strike_limit(ws, k):
+            mode[k, ku.TOUCHED], any_leaves = 0, True
+    for k in range(table.shape[0]):
+        if table[k, ku.STOP_TOUCHED] == 1 and stop_rate(unilateral, ws, k) > STRIKE * RATE_TOLERANCE:
+            table[k, ku.STOP_TOUCHED], any_leaves = 0, True
+    return any_leaves
+
+
+@internal_kernel
+def choose_rule(system: System, ws: Workspace, run: Run):
     """:func:`choose_modes` with the first rule to hold joints with dry friction that is not rejected."""
     if search_modes(system, ws, run, HOLD_COMPATIBLE):
         return
