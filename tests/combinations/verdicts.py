@@ -182,7 +182,9 @@ def _not_changing(match: Match, stop: SimulationStopped, seen: Observed) -> str:
             if seen.record[name][-1, k] != 0.0 and abs(seen.v[-1, j]) < AT_REST:
                 rows.append(identity[j])
     glued = {} if seen.real else _glued(stop, seen)
-    forces, slips, damped = list(rows), [], []
+    forces: list[Array] = list(rows)
+    slips: list[Array] = []
+    damped: list[Array] = []
     blocks: dict[str, slice] = {}
     slow = max(1000.0 * seen.scenario.integrator.absolute_tolerance, SLOWEST)
     for other in seen.touches():
