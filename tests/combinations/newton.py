@@ -12,15 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from combinations.bodies import position_rates
-from combinations.observed import OPEN, Observed, balance, warned, whole_steps
+from combinations.observed import OPEN, STICKING, Observed, balance, warned, whole_steps
 from dynsim.model.drives import Motor
 
 Array = NDArray[np.float64]
 Finding = Iterator[str]
 
-# Rates of closed rows that are left as they are; projection takes larger ones away at once [m/s or rad/s]. Where rows
-# nearly depend on each other, joints change by a few times as much.
-PROJECTED = 3e-8
+# Rates of closed rows that are left as they are; projection takes larger ones away at once [m/s or rad/s].
+PROJECTED = 1e-8
 
 
 def equation(seen: Observed) -> Finding:
@@ -176,7 +175,7 @@ def motion(seen: Observed) -> Finding:
     for label, value, rate in (("v", seen.v, seen.vdot), ("q", seen.q, speeds)):
         off, allowed, rows = integral_error(seen, value, rate)
         if label == "v" and any((touch.mode != OPEN).any() for touch in seen.touches()):
-            allowed = allowed + PROJECTED
+            allowed = allowed + np.array([_projected(seen, i) for i in rows])
         if off.size and (off / allowed).max() > 1.0:
             k, j = np.unravel_index((off / allowed).argmax(), off.shape)
             yield (
@@ -184,6 +183,21 @@ def motion(seen: Observed) -> Finding:
                 f"off the "
                 f"integral of its rate (allowed {allowed[k, j]:.3g})"
             )
+
+
+def _projected(seen: Observed, i: int) -> Array:
+    """Change of rates by projection near a sample, (n,): of the least norm that takes PROJECTED from each closed row.
+
+    Where rows nearly depend on each other that is many times as much. Directions of joints count too, so that it is
+    PROJECTED at least.
+    """
+    rows = []
+    for touch in seen.touches():
+        if touch.mode[i] != OPEN:
+            J = seen.bodies.jacobian(seen.motion, touch.body, touch.position)[i]
+            rows += [*J] if touch.mode[i] == STICKING else [touch.normal[i] @ J]
+    inverse = np.linalg.pinv(np.array(rows), rcond=1e-9) if rows else np.zeros((seen.v.shape[1], 0))
+    return np.asarray(PROJECTED * (1.0 + np.abs(inverse).sum(axis=1)))
 
 
 def _stepped_motion(seen: Observed) -> Finding:
