@@ -94,6 +94,7 @@ FOUND = {
     ),
     "a glued arm that friction of pulling contacts drives to infinite rates": (271127, 6321),
     "the same, with motors": (271127, 7037),
+    "a split of forces of nearly dependent rows that turned a joint at rest": (271127, 6947),
     "two points in the paradox, beside an object on four others": (271127, 7921),
 }
 # Scenes of the slow study.

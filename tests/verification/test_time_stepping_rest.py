@@ -8,7 +8,7 @@ from support.random_robots import CompiledSystem, assemble
 from support.stepping_systems import plane, stepped
 
 from dynsim.dynamics.contact.cone.least_norm import select_least_norm
-from dynsim.dynamics.contact.cone.problem import CONE, CONE_ROOM, TANGENT
+from dynsim.dynamics.contact.cone.problem import BOX, CONE, CONE_ROOM, ONE_WAY, TANGENT
 from dynsim.dynamics.state import FRICTION, IMPACT_LOSS, OUT_FORCE
 from dynsim.integrators.run import LOGGED
 from dynsim.jit.kernel import integers, kernel
@@ -80,6 +80,18 @@ def test_a_table_that_is_dropped_rocks_to_rest():
 @kernel
 def _selected(W, w, kind, mu, p, f, room):
     select_least_norm(W, w, kind, mu, p, f, room)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-7, 4e-6, 4e-4, 1e-2])
+def test_least_norm_leaves_the_motion_as_it_is(angle):
+    """Two one-way rows at a small angle, and a joint that only turns when their forces differ."""
+    J = np.array([[1.0, 0.0], [1.0, angle], [0.0, 1.0]])
+    W, kind, f = J @ J.T, integers([ONE_WAY, ONE_WAY, BOX]), np.array([2.0, 0.0, 0.1])
+    before = f.copy()
+    _selected(W, np.zeros(3), kind, np.ones(3), 3, f, np.zeros((CONE_ROOM, 3, 3)))
+    np.testing.assert_allclose(W @ f, W @ before, rtol=0.0, atol=1.01e-9)
+    if angle == 0.0:
+        np.testing.assert_allclose(f, [1.0, 1.0, 0.1], atol=1e-6)
 
 
 def test_least_norm_ends_at_the_cones():

@@ -11,7 +11,9 @@ direction by some percent, and a column along it would leave the difference behi
 friction without a normal force. Only where there is no force yet, the direction is that of the slip.
 
 There G = Sᵀ W S is singular, and x plus any vector of its null space gives the same motion. The solution of least norm
-is the projection of x on the range of G. Where that is outside a cone, f stops on the way to it at the first cone.
+is the projection of x on the range of G. Where that is outside a cone, f stops on the way to it at the first cone; and
+where it would change the motion by more than STILL, before that: an eigenvalue λ that counts as zero may be none, and
+forces along its eigenvector give other rows rates of the order of √λ.
 """
 
 from __future__ import annotations
@@ -85,10 +87,22 @@ def select_least_norm(W, w, kind, mu, p, f, room):
             else:
                 high = share
         share = low
+    step = room[PIVOT, 0]
+    for r in range(p):
+        step[r] = 0.0
     for i in range(n):
         a = int(row[i])
         for k in range(int(size[i])):
-            f[a + k] += share * (goal[i] - now[i]) * S[i, k]
+            step[a + k] += share * (goal[i] - now[i]) * S[i, k]
+    change = 0.0
+    for r in range(p):
+        total = 0.0
+        for k in range(p):
+            total += W[r, k] * step[k]
+        change = max(change, abs(total))
+    part = 1.0 if change <= STILL else STILL / change
+    for r in range(p):
+        f[r] += part * step[r]
 
 
 @internal_kernel
