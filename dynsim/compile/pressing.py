@@ -70,14 +70,14 @@ def pressed_in(
             return None
 
     forces = holding_torques(model, model.robot.initial, contacts, loads, able, real).normal_forces
-    if (found := _search(model, contacts, real, names, forces, holding)) is None:
+    if (balance := _search(model, contacts, real, names, forces, holding)) is None:
         # A rigid contact that need not carry may keep a compliant one from being pressed in: it may open.
         for name in [name for name in names if name not in compliant]:
             others = [other for other in names if other != name]
             if (without := holding(model.robot.initial, dict.fromkeys(others, np.nan))) is not None:
                 names, forces = others, without
-        found = _search(model, contacts, real, names, forces, holding)
-    if found is None:
+        balance = _search(model, contacts, real, names, forces, holding)
+    if balance is None:
         raise ModelError(
             f"initial.equilibrium: no posture near this one presses {first_few(compliant)} in as deep as their forces "
             "need; raise contacts.stiffness_N_per_m, or remove initial.equilibrium",
@@ -85,7 +85,7 @@ def pressed_in(
         )
     # Steps for forces that were given up, or for contacts that have opened, leave displacements that the equilibrium
     # does not need. A search from the initial posture that begins with the forces found does not make them.
-    q, forces = found
+    q, forces = balance
     for _ in range(REPEATS):
         again = _search(model, contacts, real, list(forces), forces, holding)
         if again is None or _distance(model, again[0]) >= NEARER * _distance(model, q):

@@ -50,8 +50,8 @@ class Start:
     tip_margin : of a mobile base at rest under weight and loads alone; None: it stands fixed or floats
     tip_margin_braced : the same with the contacts that touch, whose forces cost the motors least heat; None: there are
         none, or they do not hold the arm
-    warnings : keys of the scenario that change nothing, bodies that begin below surfaces, and contact points that no
-        joint moves along the normal
+    warnings : keys of the scenario that change nothing, bodies that begin below surfaces, contact points that no joint
+        moves along the normal, an unstable sampled loop, and what jumps or moves at a start in equilibrium
     off_path : how far the hand is from where its path begins [m]; None: it has none
     """
 

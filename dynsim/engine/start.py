@@ -19,7 +19,7 @@ from dynsim.engine.stopping import stopped
 from dynsim.errors import ModelError
 from dynsim.integrators import driver
 from dynsim.integrators import run as ki
-from dynsim.model.description import Contact, Robot
+from dynsim.model.description import Array, Contact, Robot
 from dynsim.scenario import Scenario, build
 from dynsim.scenario.effect import without_effect
 from dynsim.system import interruption
@@ -34,7 +34,13 @@ def check(scenario: Scenario, started: Callable[[Start], None]) -> Start:
     start = start_of(scenario)
     started(start)
     prepared = prepare(scenario)
-    control = prepared.control
+    control, model = prepared.control, prepared.model
+    if prepared.balance is not None:
+        # Compliant contacts are pressed in, which moves joints.
+        points, gaps = _touching(model, prepared.contacts)
+        hand = model.point_position(*model.robot.hand, model.robot.initial)
+        said = [*start.warnings, *prepared.balance.warnings]
+        start = replace(start, hand=hand, contacts=points, gaps=gaps, warnings=said)
     if (unstable := unstable_loop(scenario, prepared)) is not None:
         start = replace(start, warnings=[*start.warnings, unstable[0]])
     if control.path is not None and control.teleop is None:
@@ -72,14 +78,7 @@ def start_of(scenario: Scenario) -> Start:
     described, contacts, piloted = at_start(scenario)
     model = recall("model", lambda: Model(described), described)
     robot = model.robot
-    q, points = robot.initial, {}
-    gaps: dict[str, float] = {}
-    for contact in contacts:
-        try:
-            gaps[contact.name] = gap_at(model, contact, q)
-        except ModelError:  # a body that there is not: the check of contacts says where
-            continue
-        points[contact.name] = model.point_position(contact.body, contact.point, q)
+    q, (points, gaps) = robot.initial, _touching(model, contacts)
     declared = scenario.config.contacts.points
     movable = declared.keys() - {contact.name for contact in contacts if contact.left_out}
     if piloted is not None:  # a snake, whose joints `initial` does not place
@@ -102,6 +101,18 @@ def start_of(scenario: Scenario) -> Start:
         *build.left_out_warnings(scenario, contacts),
     ]
     return Start(hand, points, gaps, key, solved, *_margins(scenario, model, contacts), warnings)
+
+
+def _touching(model: Model, contacts: Sequence[Contact]) -> tuple[dict[str, Array], dict[str, float]]:
+    """Positions (3,) of contact points at the start, and their gaps [m]."""
+    points, gaps, q = dict[str, Array](), dict[str, float](), model.robot.initial
+    for contact in contacts:
+        try:
+            gaps[contact.name] = gap_at(model, contact, q)
+        except ModelError:  # a body that there is not: the check of contacts says where
+            continue
+        points[contact.name] = model.point_position(contact.body, contact.point, q)
+    return points, gaps
 
 
 def _below(scenario: Scenario, robot: Robot) -> list[str]:

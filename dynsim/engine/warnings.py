@@ -159,9 +159,9 @@ def _contact_warnings(
                 f"{1e3 * contact['gap_min_m']:.3g} mm at {time}"
                 f"{'' if name in placed else ' (initial.on_surface lets it start there)'}"
             )
-    for brace, since in zip(contacts, prepared.run.extremes[:, ki.LOCAL_SINCE], strict=True):
-        # The end of a rejected step explains a stop and is not a part of the run.
-        if since <= prepared.run.clock[ki.TIME]:
+    for k, (brace, since) in enumerate(zip(contacts, prepared.run.extremes[:, ki.LOCAL_SINCE], strict=True)):
+        # The end of a rejected step explains a stop and is not a part of the run. Without another brace the run stops.
+        if since <= prepared.run.clock[ki.TIME] and _others_closed(record, k, since):
             warnings.append(
                 f"{brace.name}: from t = {since:.4g} s on, its friction turns its own force against it (negative "
                 "diagonal of J M⁻¹F, Painlevé's paradox at one contact): only the other braces hold it there, and "
@@ -267,10 +267,12 @@ def _shared_forces(record: Record, prepared: Prepared, dependent: bool, stepped:
     if not touching:
         return []
     sliding = _sliding(record, contacts, touching, rests.any(axis=1) if joints else slice(None))
-    motion = f"; while {first_few(sliding)} slides, other choices may move otherwise" if sliding else ""
+    verb = "slides" if len(sliding) == 1 else "slide"
+    motion = f"; while {first_few(sliding)} {verb}, other choices may move otherwise" if sliding else ""
     if joints:
         if not sliding and (leaving := _leaving(record, contacts, touching, rests)):
-            motion = f"; where {first_few(leaving)} leaves its surface, other choices may move otherwise"
+            leave = "leaves its surface" if len(leaving) == 1 else "leave their surfaces"
+            motion = f"; where {first_few(leaving)} {leave}, other choices may move otherwise"
         return [
             f"{first_few(touching)}: shared forces with the dry friction of {first_few(joints)}, which keeps these "
             "joints at rest; the motion does not determine them, and those of the record are one choice of many"
@@ -286,6 +288,15 @@ def _shared_forces(record: Record, prepared: Prepared, dependent: bool, stepped:
         f"{', '.join(touching)}: shared forces which the motion does not determine, as points that stick do: "
         "they are the split of least norm among those that lie in all friction cones"
     ]
+
+
+def _others_closed(record: Record, k: int, since: float) -> bool:
+    """Return whether a contact other than the k-th is closed at some sample from a time on, or at the last one."""
+    if "contact_mode" not in record:
+        return len(record.labels["contact_gap"]) > 1
+    first = min(int(np.searchsorted(record.time, since)), len(record) - 1)
+    others = np.delete(record["contact_mode"][first:], k, axis=1)
+    return bool((others != ka.OPEN).any())
 
 
 def _leaving(record: Record, contacts: Sequence[Contact], names: Sequence[str], rests: NDArray[np.bool_]) -> list[str]:

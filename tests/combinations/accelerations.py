@@ -110,8 +110,8 @@ def state_of(seen: Observed, values: Mapping[str, Sequence[float]], currents: Ar
     bounds = [float(bound[j]) for j in resting]
     stops = []
     for j, link in enumerate(seen.robot.links if seen.real else ()):
-        place = q[seen.bodies.places[j]]
-        for gap, side in ((place - link.lower, 1.0), (link.upper - place, -1.0)):
+        position = q[seen.bodies.places[j]]
+        for gap, side in ((position - link.lower, 1.0), (link.upper - position, -1.0)):
             if gap < MET and abs(v[j]) < STAYS:
                 stops.append((j, side))
     return State(

@@ -72,7 +72,7 @@ def forces_exist(W: Array, b: Array, points: Sequence[Point], rests: Sequence[Re
 def parts(W: Array, blocks: Sequence[Sequence[int]]) -> list[list[int]]:
     """Sets of blocks of rows, of which no force along one moves another set."""
     sizes = np.sqrt(np.abs(np.diag(W)))
-    found, left = [], set(range(len(blocks)))
+    result, left = [], set(range(len(blocks)))
     while left:
         part: list[int] = []
         ahead = [left.pop()]
@@ -83,17 +83,17 @@ def parts(W: Array, blocks: Sequence[Sequence[int]]) -> list[list[int]]:
                 if (np.abs(W[both]) > 1e-12 * np.outer(sizes[blocks[k]], sizes[blocks[m]])).any():
                     left.remove(m)
                     ahead.append(m)
-        found.append(sorted(part))
-    return found
+        result.append(sorted(part))
+    return result
 
 
 def _part_has_forces(W: Array, b: Array, members: Sequence[Point | Rest]) -> bool:
     rows = [r for m in members for r in _rows(m)]
-    place = {r: i for i, r in enumerate(rows)}
+    index = {r: i for i, r in enumerate(rows)}
     # Rows and forces in units with a diagonal and a right-hand side of one.
     units = np.ones(len(rows))
     for m in members:
-        own = [place[r] for r in _rows(m)]
+        own = [index[r] for r in _rows(m)]
         units[own] = 1.0 / np.sqrt(max(float(np.mean(np.diag(W)[[rows[i] for i in own]])), 1e-300))
     scaled = units[:, None] * W[np.ix_(rows, rows)] * units
     right = units * b[rows]
@@ -102,9 +102,9 @@ def _part_has_forces(W: Array, b: Array, members: Sequence[Point | Rest]) -> boo
         return True
     right = right / size
     own_members: list[Point | Rest] = [
-        Point(place[m.row], m.friction, m.direction)
+        Point(index[m.row], m.friction, m.direction)
         if isinstance(m, Point)
-        else Rest(place[m.row], m.bound / (units[place[m.row]] * size))
+        else Rest(index[m.row], m.bound / (units[index[m.row]] * size))
         for m in members
     ]
     # What is said of the first members; the others may have any mode.
@@ -219,11 +219,11 @@ def _solve(program: _Program, lower: Array) -> Array | None:
         return np.zeros(0) if held else None
     G, g = [np.array([entry[i] for entry in program.upper]) for i in (0, 1)]
     E, e = [np.array([entry[i] for entry in program.equal]) for i in (0, 1)]
-    found = linprog(
+    solution = linprog(
         np.zeros(len(lower)),
         A_ub=G if len(G) else None, b_ub=g if len(G) else None,
         A_eq=E if len(E) else None, b_eq=e if len(E) else None,
         bounds=[(low, None) for low in lower],
         method="highs",
     )  # fmt: skip
-    return np.asarray(found.x) if found.status == 0 else None
+    return np.asarray(solution.x) if solution.status == 0 else None

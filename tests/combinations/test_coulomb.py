@@ -41,7 +41,7 @@ def test_a_point_at_rest_that_can_only_slip() -> None:
 def test_sliding_contacts_as_by_enumeration() -> None:
     """Sets of contacts that carry, one by one: f = −A⁻¹ b there, not negative, and A f + b elsewhere."""
     random = np.random.default_rng(3)
-    found = []
+    exist = []
     for _ in range(60):
         J = random.normal(size=(9, 12))
         W, b = J @ J.T / 12.0, random.normal(size=9)
@@ -57,15 +57,15 @@ def test_sliding_contacts_as_by_enumeration() -> None:
             f[on] = np.linalg.solve(A[np.ix_(on, on)], -c[on])
             some = some or bool((f >= 0.0).all() and ((A @ f + c)[~on] >= 0.0).all())
         assert forces_exist(W, b, points, []) is some
-        found.append(some)
-    assert 5 < sum(found) < 55
+        exist.append(some)
+    assert 5 < sum(exist) < 55
 
 
 def test_joints_at_rest_and_stops() -> None:
     """A joint of unit inertia holds with at most its bound or moves; between two stops that close in nothing exists."""
-    one = np.ones((1, 1))
-    assert forces_exist(one, np.array([0.5]), [], [Rest(0, 1.0)])
-    assert forces_exist(one, np.array([-3.0]), [], [Rest(0, 1.0)])
+    unit = np.ones((1, 1))
+    assert forces_exist(unit, np.array([0.5]), [], [Rest(0, 1.0)])
+    assert forces_exist(unit, np.array([-3.0]), [], [Rest(0, 1.0)])
     both = np.array([[1.0, -1.0], [-1.0, 1.0]])
     assert forces_exist(both, np.array([-1.0, 1.0]), [Point(0, 0.0), Point(1, 0.0)], [])
     assert not forces_exist(both, np.array([-1.0, -1.0]), [Point(0, 0.0), Point(1, 0.0)], [])

@@ -25,11 +25,11 @@ SOURCES = {
 PARTS = (
     r"^joint .* moves no inertia in this posture",
     r"^plant: ",
-    r"; the kinetic energy has grown to|; from t = 1 s on deviations have had the time to grow",
+    r"; until then they could grow by a factor|; from t = 1 s on deviations have had the time to grow",
     r"^use .*, which is stable, or smaller gains",
     r"^the torque of .* begins with|^the reference of .* begins|^the planned voltages count on",
     r"^the motion does not determine|^in the samples",
-    r"^; (?:while .* slides|where .* leaves its surface), other choices may move otherwise",
+    r"^; (?:while|where) .*, other choices may move otherwise",
     r"^f_t = |^friction has put ",
     r"^, and contacts with other forces than at rest",
     r"^of the start|^stops are enforced",

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import dynsim
-from dynsim import load_scenario, simulate
+from dynsim import check, load_scenario, simulate
 from dynsim.dynamics.tables import SLIDING, STICKING
 from dynsim.engine.prepare import prepare
 from dynsim.errors import ModelError
@@ -146,10 +146,10 @@ def test_a_path_that_begins_elsewhere_jumps_and_is_said():
     record = simulate(
         load_scenario("elbow_comparison", "two_elbows", {"initial": {"equilibrium": True}, "duration_s": 0.2})
     )
-    assert any(
-        "from where it stands" in text and "jumps at the start all the same" in text
-        for text in record.summary["warnings"]
-    )
+    (jumps,) = [text for text in record.summary["warnings"] if "jumps at the start all the same" in text]
+    assert "from where it stands" in jumps
+    changed = {"initial": {"equilibrium": True}, "duration_s": 0.2}
+    assert jumps in check(load_scenario("elbow_comparison", "two_elbows", changed)).warnings
     # Still less than a start without currents.
     plain = simulate(load_scenario("elbow_comparison", "two_elbows", {"duration_s": 0.2}))
     assert np.abs(record["vdot"][0]).max() < np.abs(plain["vdot"][0]).max()
@@ -321,6 +321,10 @@ def test_a_start_that_pressing_moves_far_is_told(tmp_path, stiffness, moves):
     said = [text for text in record.summary["warnings"] if "from the requested posture" in text]
     assert len(said) == moves
     assert all(f"joint_1 by {moved[0]:.3g}°" in text for text in said)
+    start = check(load_scenario(path))
+    assert [text for text in start.warnings if "from the requested posture" in text] == said
+    np.testing.assert_allclose(start.hand, record["hand_position"][0], rtol=0, atol=1e-12)
+    assert start.gaps["elbow"] == pytest.approx(record["contact_gap"][0, record.labels["contact_gap"].index("elbow")])
 
 
 def compliant_arm(tmp_path, replacements, **overrides):

@@ -7,6 +7,7 @@ import pytest
 
 from dynsim import build_model, load_scenario, simulate
 from dynsim.compile.bracing import Brace
+from dynsim.errors import SimulationStopped
 from dynsim.scenario import build
 
 ARM = """
@@ -98,3 +99,29 @@ def test_a_glued_sphere_stays_a_radius_up(arm):
     heights = [model.point_position("link_3", [0, 0, 0], q)[2] for q in record["q"]]
     np.testing.assert_allclose(heights, 0.03, rtol=0, atol=1e-9)
     assert record.summary["energy_residual_relative"] < 1e-6
+
+
+ALONE = """
+duration_s: 2
+plant:
+  type: serial_arm
+  base: {position_m: [0, 0, 0.75]}
+  link: {mass_kg: 0.3, length_m: 0.45, motor: {type: wang_minami}}
+  chain:
+    - {axis: y, initial_deg: 120}
+    - {axis: y, initial_deg: 30}
+    - {axis: y, initial_deg: -60, length_m: 0.3}
+controller: {type: joint_pd, sample_time_s: 0.005}
+surfaces: {floor: {type: plane}}
+contacts: {law: unilateral, friction: 2.5, points: {elbow: {body: link_3}}}
+initial: {on_surface: [elbow], equilibrium: true}
+"""
+
+
+def test_an_elbow_that_is_alone_is_not_said_to_be_held_by_others(tmp_path):
+    """It ends in the paradox, which the stop tells; there are no other braces that could hold it."""
+    path = tmp_path / "alone.yaml"
+    path.write_text(ALONE, encoding="utf-8")
+    with pytest.raises(SimulationStopped) as raised:
+        simulate(load_scenario(path))
+    assert not [text for text in raised.value.record.summary["warnings"] if "only the other braces" in text]

@@ -180,8 +180,8 @@ def test_the_paradox_names_contact_time_and_state(tmp_path: Path):
 
 
 def test_a_stop_at_an_event_names_the_contacts_that_touch():
-    """A bounce of another point starts the slip of one that has no force to answer to it."""
-    b, y = random_touch(458)
+    """A run that stops at an event is in the paradox at the time that it has reached, with the modes chosen there."""
+    b, y = random_touch(1226)
     run = b.advance(b.new_run(y, np.linspace(0.0, 1.0, 51), "dopri5", rtol=1e-8), 5_000)
     assert run.count[ki.STATUS] == ki.FORCES_REVERSED
     t, _, words = paradox(b.system, b.ws, run, b.contacts)
