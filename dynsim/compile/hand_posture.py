@@ -40,7 +40,7 @@ def hand_turns(model: Kinematics, q: Array, orientation: Array) -> Array:
     """Angles between the hand's orientation and a wanted one, postures (T, nq) → (T,) [rad]."""
     from scipy.spatial.transform import Rotation  # takes a third of a second
 
-    body, axes = model.robot.attach(*model.robot.hand)[0], model.robot.attached_axes(model.robot.hand[0])
+    body, axes = model.robot.attach(*model.robot.hand)[0], model.robot.hand_axes
     R = np.array([model.body_pose(body, row)[0] for row in q]).reshape(-1, 3, 3)
     return np.asarray(Rotation.from_matrix(orientation.T @ R @ axes).magnitude())
 
@@ -63,7 +63,7 @@ def hand_posture(
     lower, upper = (np.array([getattr(link, side) for link in robot.links]) for side in ("lower", "upper"))
     revolute = np.array([link.units[0] == "rad" for link in robot.links])
     movable = np.array([moving is None or link.joint in moving for link in robot.links])
-    hand, axes = robot.attach(*robot.hand)[0], robot.attached_axes(robot.hand[0])
+    hand, axes = robot.attach(*robot.hand)[0], robot.hand_axes
     q = np.clip(q, lower, upper)
     error = np.zeros(0)
     for _ in range(ITERATIONS):

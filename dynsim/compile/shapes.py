@@ -63,9 +63,11 @@ def gap_at(model: Model, contact: Contact, q: Array) -> float:
 
 def contact_gap(contact: Contact, start: Array, end: Array | None = None) -> float:
     """Gap [m] of a contact whose point is at ``start``, (3,), and the other end of whose axis is at ``end``."""
-    if end is None:
-        return contact.surface.gap(start) - contact.radius
-    return contact.surface.gap(start + share_of_axis(contact, start, end) * (end - start)) - contact.radius
+    nearest = start if end is None else start + share_of_axis(contact, start, end) * (end - start)
+    try:
+        return contact.surface.gap(nearest) - contact.radius
+    except ModelError as error:
+        raise ModelError(f"contact {contact.name} {error}") from None
 
 
 def share_of_axis(contact: Contact, start: Array, end: Array) -> float:

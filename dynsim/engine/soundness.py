@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 # The inertia of a joint counts as zero below this part of Σ m l² + tr I of the bodies that it moves, and below this
 # part of their Σ m r² about the world's origin, which is rounding of the sweep.
 NOTHING, CANCELLED = 1e-12, 1e-14
+# The rounding of the sweep is at most this part of Σ m l² + tr I, or the inertia of a joint is not known.
+KNOWN = 1e-3
 # Joints up to which the loop is examined: its matrices have three rows each.
 LARGE = 100
 # Rows up to which a loop with the samples of late encoders is: as many as those of LARGE joints.
@@ -314,7 +316,10 @@ def without_inertia(model: Model, q: Array) -> list[int]:
     lever = ((centres[None] - origins[:, None]) ** 2).sum(axis=2)
     about_joint = np.where(slides, behind @ mass, (behind * (mass * lever + own)).sum(axis=1)) + model.armature
     about_origin = behind @ (mass * (centres**2).sum(axis=1))
-    none = felt <= np.maximum(NOTHING * about_joint, np.where(slides, 0.0, CANCELLED * about_origin))
+    rounding = np.where(slides, 0.0, CANCELLED * about_origin)
+    # Of bodies that have run far away nothing is known.
+    known = rounding <= KNOWN * about_joint
+    none = (felt <= np.maximum(NOTHING * about_joint, rounding)) & (known | (about_joint == 0.0))
     return [k for k in np.flatnonzero(none).tolist() if np.count_nonzero(none & behind[k]) == 1]
 
 

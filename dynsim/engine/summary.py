@@ -60,6 +60,8 @@ SCHEME = "energy that the steps of time stepping take; negative: that they make"
 # the ledger, and here ten of them reach the limit of its residual.
 RESOLVED_M = 10.0 * ku.AT_ROOT / RESIDUAL_LIMIT
 
+# Pulling forces of unilateral contacts below this part of their largest force are the tolerance of lift-off.
+PULLS = 1e-3
 _LOSS_KEYS = {"impact_loss": "loss_impact", "stop_loss": "loss_stop"}
 
 
@@ -202,18 +204,25 @@ def _contact(
     """What a contact has done; of a declared point under the unilateral law also how near it came."""
     force, run, unilateral = record["contact_normal_force"][:, k], prepared.run, prepared.system.unilateral
     real = {} if unilateral is None else _modes(unilateral, k, duration)
-    # Under the unilateral law a force ends at zero; what lies below is the tolerance of that event.
-    least = -np.inf if unilateral is None else 0.0
     extremes = run.extremes[k] if run.count[ki.STEPS] else np.zeros(ki.EXTREMES_SIZE)
+    # Under the unilateral law a force ends at zero; what lies below is the tolerance of that event, up to PULLS.
+    most = max(float(extremes[ki.FORCE_MAX]), float(force.max(initial=0.0)))
+    lowest = float(min(extremes[ki.FORCE_MIN], force.min(initial=np.inf)))
+    if unilateral is not None and lowest >= -PULLS * most:
+        lowest = max(lowest, 0.0)
+    # Steps may be longer than the time for which a contact pulls: samples within them show it too.
+    pulling = float(extremes[ki.PULLING]) / duration if duration > 0.0 else 0.0
+    if len(force):
+        pulling = max(pulling, float(np.mean(force < 0.0)))
     # Extremes are those of every accepted step, which are closer together than the samples, and of the samples.
     return {
         "name": contact.name,
         "surface": contact.surface_name,
-        "normal_force_min_N": max(float(min(extremes[ki.FORCE_MIN], force.min(initial=np.inf))), least),
+        "normal_force_min_N": lowest,
         "normal_force_mean_N": float(record["contact_impulse"][-1, k] / duration) if duration > 0 else 0.0,
         "normal_force_max_N": float(max(extremes[ki.FORCE_MAX], force.max(initial=-np.inf))),
         "closed_fraction": 1.0,
-        "pulling_fraction": min(float(extremes[ki.PULLING]) / duration, 1.0) if duration > 0.0 else 0.0,
+        "pulling_fraction": min(pulling, 1.0),
         "slip_distance_m": float(record["contact_slip_distance"][-1, k]) if len(record) else 0.0,
         **real,
         **({"gap_min_m": float(record["contact_gap"][:, k].min())} if real and declared and len(record) else {}),

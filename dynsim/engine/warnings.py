@@ -129,7 +129,12 @@ def _contact_warnings(
             if row[ku.STOP_CHATTERED]
         ]
     for contact in summary["contacts"]:
-        if contact["normal_force_min_N"] < 0.0:
+        if contact["normal_force_min_N"] < 0.0 and unilateral is not None:
+            warnings.append(
+                f"{contact['name']}: pulls with up to {-contact['normal_force_min_N']:.3g} N within a step, where it "
+                "would leave its surface and land again; make integrator.step_max_s shorter"
+            )
+        elif contact["normal_force_min_N"] < 0.0:
             warnings.append(
                 f"{contact['name']}: the {contact['surface']} pulls on this brace for "
                 f"{percent(contact['pulling_fraction'])} of the run, with up to "

@@ -373,10 +373,11 @@ class Load:
 class Robot:
     """A tree of links with its motors.
 
-    ``hand``: the controlled point (body name, point in its frame [m]); ``q0``: initial configuration [rad or m], zero
-    unless given; ``frames``: further names to attach points to; ``fixed_shapes``, ``fixed_inertia``: what stands still
-    in the world; ``couplings`` of joints to joints; ``ties`` of bodies to bodies; ``base``: what it drives on, None: it
-    stands fixed or floats; ``feet``: what of it is made to touch, such as wheels.
+    ``hand``: the controlled point (body name, point in its frame [m]); ``hand_frame``: (3, 3) axes, in those of that
+    body, of the frame that was named for the hand, whose orientation is that of the frame; ``q0``: initial
+    configuration [rad or m], zero unless given; ``frames``: further names to attach points to; ``fixed_shapes``,
+    ``fixed_inertia``: what stands still in the world; ``couplings`` of joints to joints; ``ties`` of bodies to bodies;
+    ``base``: what it drives on, None: it stands fixed or floats; ``feet``: what of it is made to touch, such as wheels.
     """
 
     name: str
@@ -392,6 +393,12 @@ class Robot:
     base: MobileBase | None = None
     fixed_inertia: Inertia = field(default_factory=lambda: Inertia(0.0))
     feet: tuple[Foot, ...] = ()
+    hand_frame: Array = field(default_factory=lambda: np.eye(3))
+
+    @property
+    def hand_axes(self) -> Array:
+        """Axes of the hand in those of the body that carries it, (3, 3)."""
+        return np.asarray(self.attached_axes(self.hand[0]) @ self.hand_frame)
 
     @property
     def bodies(self) -> tuple[str, ...]:

@@ -63,6 +63,11 @@ class Quadric:
 
         gradient = self.Q @ position + self.b
         slope = float(np.linalg.norm(gradient))
+        if slope == 0.0:
+            raise ModelError(
+                "is at the centre, or on the axis, of its surface, where no point of that is the nearest; move it by a "
+                "micrometre"
+            )
         normal = gradient / slope
         value = float(0.5 * position @ self.Q @ position + self.b @ position + self.c)
         return float(surface_distance(value, slope, float(normal @ self.Q @ normal)))

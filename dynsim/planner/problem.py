@@ -168,7 +168,7 @@ class Task:
         if hand.orientation is None:
             return targets
         robot = self.arm.model.robot
-        axes = (hand.orientation.matrix() @ robot.attached_axes(robot.hand[0]).T)[:, [2, 0]].T
+        axes = (hand.orientation.matrix() @ robot.hand_axes.T)[:, [2, 0]].T
         return np.hstack([targets, np.tile(axes.ravel(), (len(targets), 1))])
 
     @property

@@ -318,6 +318,15 @@ def _pulls(match: Match, seen: Observed) -> str:
     return "" if abs(share - float(match[3])) <= off else f"in {share:.3g} % of the samples"
 
 
+def _pulls_between(match: Match, seen: Observed) -> str:
+    """Whether a contact that leaves its surface does not pull; steps between samples may have seen more."""
+    touch = _touch(seen, match[1])
+    if touch is None or not seen.real:
+        return "no such contact that leaves its surface"
+    least = -float(touch.normal_force.min(initial=0.0))
+    return f"with {least:.4g} N in a sample" if least > float(match[2]) * (1.0 + DIGITS) else ""
+
+
 def _never_touches(match: Match, seen: Observed) -> str:
     touch = _touch(seen, match[1])
     if touch is None:
@@ -747,6 +756,7 @@ VERIFIERS: dict[str, Callable[[Match, Observed], str]] = {
     rf"^(.+): chatter, more than {NUMBER} contact events within {NUMBER} s": _chatters,
     rf"^(.+): chatter, more than {NUMBER} events of its stop within {NUMBER} s": _chatters,
     rf"^(.+): the (.+) pulls on this brace for {NUMBER}(?: %)? of the run, with up to {NUMBER} N": _pulls,
+    rf"^(.+): pulls with up to {NUMBER} N within a step": _pulls_between,
     rf"^(.+): this brace never touches the (.+): it carries nothing; nearest {NUMBER} mm": _never_touches,
     r"^(.+): this brace is on the (.+) at (.+), but never pressed": _never_pressed,
     rf"^(.+): from t = {NUMBER} s on, its friction turns its own force against it": _reversed,

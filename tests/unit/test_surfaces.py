@@ -252,3 +252,21 @@ def test_a_carriage_without_mass_and_length_is_no_body_of_its_own(tmp_path):
     ):
         file.write_text(base + carriage.replace("MASS", str(mass)) + rod + floor)
         assert [(contact.name, contact.radius) for contact in build.contacts(dynsim.load_scenario(file))] == expected
+
+
+def test_a_ball_on_the_axis_of_a_pipe_is_refused_by_name(tmp_path):
+    """It has no nearest point there; the error was a division by zero."""
+    text = """
+duration_s: 1
+plant: {type: serial_arm, chain: [{axis: y}]}
+contacts: {law: unilateral}
+surfaces: {pipe: {type: cylinder, point_m: [0, 0, 0], axis: [1, 0, 0], radius_m: 0.15, inside: true}}
+objects: {ball: {mass_kg: 0.5, shape: sphere, radius_m: 0.05, position_m: [0, 0, HEIGHT]}}
+"""
+    file = tmp_path / "pipe.yaml"
+    file.write_text(text.replace("HEIGHT", "0"))
+    with pytest.raises(ModelError, match=r"pipe\.yaml: contact ball\.pipe is at the centre, or on the axis"):
+        dynsim.check(dynsim.load_scenario(file))
+    file.write_text(text.replace("HEIGHT", "1e-6"))
+    start = dynsim.check(dynsim.load_scenario(file))
+    assert start.gaps["ball.pipe"] == pytest.approx(0.1 - 1e-6)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from support.planner_scenes import scene
 
 import dynsim
-from dynsim.compile.hand_posture import turn_error
+from dynsim.compile.hand_posture import hand_turns, turn_error
 from dynsim.errors import ModelError, UnreachableReference
 from dynsim.scenario import build
 from dynsim.scenario.reading import scenario_from_resolved
@@ -105,3 +106,30 @@ def test_a_hand_path_keeps_the_orientation_that_it_asks_for() -> None:
 def test_an_orientation_out_of_reach_says_when() -> None:
     with pytest.raises(UnreachableReference, match=r"controller\.hand\.orientation says: at t = "):
         dynsim.simulate(turned_arm([180.0, 0.0, 90.0]))
+
+
+TURNED = """<robot name="turned">
+  <link name="base"/>
+  <link name="upper"><inertial><mass value="1"/><inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/></inertial></link>
+  <link name="fore"><inertial><mass value="1"/><inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/></inertial></link>
+  <link name="wrist"><inertial><mass value="1"/><inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/></inertial></link>
+  <link name="TOOL"/>
+  <joint name="a" type="revolute"><parent link="base"/><child link="upper"/><axis xyz="0 1 0"/><limit lower="-3" upper="3" effort="1" velocity="1"/></joint>
+  <joint name="b" type="revolute"><parent link="upper"/><child link="fore"/><origin xyz="0 0 0.4"/><axis xyz="0 1 0"/><limit lower="-3" upper="3" effort="1" velocity="1"/></joint>
+  <joint name="c" type="revolute"><parent link="fore"/><child link="wrist"/><origin xyz="0 0 0.3"/><axis xyz="0 1 0"/><limit lower="-3" upper="3" effort="1" velocity="1"/></joint>
+  <joint name="d" type="fixed"><parent link="wrist"/><child link="TOOL"/><origin xyz="0 0 0.1" rpy="0.3 0.6 -0.2"/></joint>
+</robot>"""  # noqa: E501
+
+
+@pytest.mark.parametrize(("tool", "named"), [("flange", True), ("hand", False)])
+def test_the_orientation_of_a_turned_frame_is_that_of_the_hand(tmp_path, tool, named) -> None:  # type: ignore[no-untyped-def]
+    """Of a frame behind a turned fixed joint, named as the hand or called so; it was that of its body."""
+    (tmp_path / "turned.urdf").write_text(TURNED.replace("TOOL", tool))
+    plant = {"type": "urdf_arm", "file": str(tmp_path / "turned.urdf")} | ({"hand": {"body": tool}} if named else {})
+    model = dynsim.build_model(scenario_from_resolved({"name": "turned", "duration_s": 1.0, "plant": plant}))
+    there = np.array([0.4, 0.5, -0.3])
+    turn = Rotation.from_euler("y", there.sum()) * Rotation.from_euler("xyz", [0.3, 0.6, -0.2])
+    target = model.point_position(*model.robot.hand, there)
+    q = model.inverse_kinematics(target, there + 0.1, orientation=turn.as_matrix())
+    np.testing.assert_allclose(q, there, rtol=0.0, atol=1e-8)
+    assert hand_turns(model, q[None], turn.as_matrix())[0] < 1e-7

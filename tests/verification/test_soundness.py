@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from dynsim import Simulation, State, load_scenario, simulate
+from dynsim import Simulation, State, build_model, load_scenario, simulate
 from dynsim.compile.model import Model
 from dynsim.engine import check
 from dynsim.engine.prepare import prepare
 from dynsim.engine.soundness import loop_growth, moving_nothing, without_inertia
 from dynsim.errors import ModelError, SimulationStopped
 from dynsim.model.description import Inertia, Link, Robot
+from dynsim.scenario.reading import scenario_from_resolved
 
 LINK = """
 duration_s: 10
@@ -251,3 +252,22 @@ def test_rates_are_logarithms_of_radii():
     scenario = load_scenario("elbow_comparison", "no_elbow", {"controller.sample_time_s": 1e-3})
     growth = growth_of(scenario, 1e-3)
     assert growth.rate == pytest.approx(math.log(growth.radius) / 1e-3)
+
+
+def test_bodies_that_have_run_away_are_not_said_to_have_no_inertia():
+    """At 1e9 m the sweep's rounding exceeds the inertia of a box about its centre, of which nothing is known then."""
+    scenario = scenario_from_resolved(
+        {
+            "name": "far",
+            "duration_s": 1.0,
+            "plant": {"type": "serial_arm", "chain": [{"axis": "y", "mass_kg": 1.0, "length_m": 0.1}]},
+            "contacts": {"law": "unilateral"},
+            "objects": {"box": {"mass_kg": 0.5, "size_m": [0.1, 0.2, 0.05], "position_m": [0.0, 0.0, 1.0]}},
+        }
+    )
+    model = build_model(scenario)
+    q = model.robot.initial.copy()
+    assert moving_nothing(model, q) == ""
+    for distance in (1e3, 1e6, 1e9, 1e12):
+        q[1:4] = distance
+        assert moving_nothing(model, q) == ""

@@ -131,13 +131,13 @@ def build(config: Config, context: BuildContext) -> Robot:
     chosen = {
         link.joint: config.motors.get(link.joint, None if link.joint in followers else config.motor) for link in single
     }
-    hand = robot.hand
+    hand, axes = robot.hand, robot.hand_frame
     if config.hand is not None:
         try:
             body, point = robot.attach(config.hand.body, np.array(config.hand.point_m))
         except ModelError as error:
             raise ModelError(f"plant.hand.body: {error}") from None
-        hand = robot.links[body].name, point
+        hand, axes = (robot.links[body].name, point), robot.attached_axes(config.hand.body)
     return dataclasses.replace(
         robot,
         links=links,
@@ -147,6 +147,7 @@ def build(config: Config, context: BuildContext) -> Robot:
             if motor is not None
         ),
         hand=hand,
+        hand_frame=axes,
         gravity=np.array(config.gravity_m_s2),
         q0=_initial(robot, initial, config.initial_pose),
     )

@@ -86,11 +86,13 @@ def read_urdf(path: Path, lock: Mapping[str, float] | None = None) -> Robot:
         for joint in locked.joints.values()
         if joint.mimics is not None and joint.kind in MOVING
     )
+    hand = _hand(tree, places)
     return Robot(
         name=tree.name,
         links=rows,
         motors=(),
-        hand=_hand(tree, places),
+        hand=(str(hand.body), hand.p),
+        hand_frame=hand.R,
         frames=tuple(frames),
         couplings=couplings,
         fixed_shapes=_shapes(locked, places).get(None, ()),
@@ -242,12 +244,12 @@ def _shapes(tree: UrdfTree, places: Mapping[str, _Place]) -> dict[str | None, tu
     return drawn
 
 
-def _hand(tree: UrdfTree, places: Mapping[str, _Place]) -> tuple[str, Array]:
+def _hand(tree: UrdfTree, places: Mapping[str, _Place]) -> _Place:
     """The controlled point: the link ``hand`` if it moves, else the tip of the deepest chain, the first of equals."""
     tip = max(tree.links, key=lambda name: (places[name].moving, places[name].joints))
     if HAND in places and places[HAND].moving > 0:
         tip = HAND
-    return str(places[tip].body), places[tip].p
+    return places[tip]
 
 
 def _warn(tree: UrdfTree, places: Mapping[str, _Place], links: tuple[Link, ...]) -> None:

@@ -64,8 +64,7 @@ def write_urdf(robot: Robot) -> str:
             ElementTree.SubElement(joint, "mimic", {"joint": coupling.leader, **law})
     if HAND not in taken:
         carrier, point = robot.hand
-        turned = (f.R for f in robot.frames if f.name == HAND and f.body == carrier and np.array_equal(f.p, point))
-        frames.append(Frame(HAND, carrier, next(turned, np.eye(3)), point))
+        frames.append(Frame(HAND, carrier, robot.hand_axes, point))
     joints = {link.joint for link in links}
     for frame in frames:
         if frame.name == base:
