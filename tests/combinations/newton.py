@@ -175,7 +175,7 @@ def motion(seen: Observed) -> Finding:
     for label, value, rate in (("v", seen.v, seen.vdot), ("q", seen.q, speeds)):
         off, allowed, rows = integral_error(seen, value, rate)
         if label == "v" and any((touch.mode != OPEN).any() for touch in seen.touches()):
-            allowed = allowed + np.array([_projected(seen, i) for i in rows])
+            allowed = allowed + np.reshape([_projected(seen, i) for i in rows], allowed.shape)
         if off.size and (off / allowed).max() > 1.0:
             k, j = np.unravel_index((off / allowed).argmax(), off.shape)
             yield (

@@ -311,6 +311,9 @@ def _pulls(match: Match, seen: Observed) -> str:
     # Steps between samples may have seen more.
     if least > float(match[4]) * (1.0 + DIGITS):
         return f"with {least:.4g} N in a sample"
+    # Commands of an unstable loop alternate from tick to tick, and samples may see each second one.
+    if any(UNSTABLE in warning for warning in seen.run.warnings):
+        return ""
     pulling = touch.normal_force < 0.0
     share = 100.0 * float(pulling.mean())
     # If two samples in a row have different signs, it is unknown when the sign changes, and how often.
