@@ -8,6 +8,7 @@ from dynsim.dynamics import state as kst
 from dynsim.dynamics.derivative import System, derivative
 from dynsim.dynamics.tables import Workspace
 from dynsim.integrators import run as ki
+from dynsim.integrators.events import note_inside
 from dynsim.integrators.run import Run
 from dynsim.integrators.steps import energy_norm, error_norm
 from dynsim.jit.kernel import inline_kernel, internal_kernel
@@ -50,6 +51,9 @@ def step_dopri5(system: System, ws: Workspace, run: Run):
     for s in range(1, 7):
         combine(y, h, A_DOPRI5[s], s, k, y_new)
         derivative(system, t + NODE_DOPRI5[s] * h, y_new, ws, k[s])
+        # The stages at 0.3 and 0.8 of the step.
+        if run.event.shape[0] > 0 and 2 <= s <= 3:
+            note_inside(system, ws, run, s - 2, NODE_DOPRI5[s])
     run.count[ki.EVALUATIONS] += 6
     for j in range(y.shape[0]):
         k[7, j] = 0.0

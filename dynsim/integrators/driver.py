@@ -34,7 +34,7 @@ from dynsim.integrators.dense import rewrite_sample, sample_step, write_waiting
 from dynsim.integrators.dopri5 import step_dopri5
 from dynsim.integrators.events import arm_events, cut_step, fire_events, take_ticks
 from dynsim.integrators.project import settle
-from dynsim.integrators.radau5.ends import end_accepted
+from dynsim.integrators.radau5.ends import end_accepted, end_workspace
 from dynsim.integrators.radau5.step import after_step, step_radau5
 from dynsim.integrators.radau5.tables import forget
 from dynsim.integrators.run import Run
@@ -110,7 +110,7 @@ def accept(system: System, ws: Workspace, run: Run):
 def take_step(system: System, ws: Workspace, run: Run, error):
     """What becomes of a step that has been taken: True when it is accepted by error control, events and HOLD."""
     clock, count = run.clock, run.count
-    if run.event.shape[0] > 0 and cut_step(system, ws, run):
+    if run.event.shape[0] > 0 and cut_step(system, end_workspace(run.newton, system, ws, run), run):
         return False
     clock[ki.ERROR] = error
     if clock[ki.TIME] + clock[ki.STEP] > clock[ki.HOLD]:

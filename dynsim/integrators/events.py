@@ -4,6 +4,9 @@ The event table has the guard of each event, its value at the last accepted step
 After a step that error control has accepted the guards are evaluated from the workspace of the right-hand side. If one
 has passed zero the step is repeated, shorter, until it ends within ``event_tolerance`` beyond the root. So it is a root
 of the method's own solution, not of the dense output, whose order is lower.
+
+A guard may also pass zero twice within a step. Those of this file are noted at two inner stages, where the derivative
+is evaluated anyway: the cubic through these values and those at the ends shows it, and the step is taken until there.
 """
 
 from __future__ import annotations
@@ -15,7 +18,7 @@ from dynsim.dynamics.tree.points import point_position
 from dynsim.dynamics.tree.support import tip_margin
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts import events as ke
-from dynsim.integrators.contacts.events import contact_guard, note_gaps, too_long
+from dynsim.integrators.contacts.events import contact_guard, lowest, note_gaps, too_long
 from dynsim.integrators.run import Run
 from dynsim.jit.kernel import internal_kernel
 
@@ -28,6 +31,11 @@ TIP_MARGIN = 9
 # Most trial steps for a root; regula falsi with halving (Illinois) needs about eight. After FALSI_LIMIT trials the
 # bracket is bisected, for guards that jump (forces do where their split changes); after SEARCH_LIMIT one more is taken.
 SEARCH_LIMIT, FALSI_LIMIT = 60, 16
+# Of what a guard turns back by within a step, the part by which it may stay short of zero and the step ends there all
+# the same: the cubic is not exact. The next step shows more, as its ends are next to the turn.
+SHORT_OF_ZERO = 0.1
+# A guard that turns back by less than this part of its level, or of its unit, is at rest but for rounding.
+ROUNDING = 1e-12
 
 
 @internal_kernel
@@ -54,6 +62,54 @@ def guard(system: System, t, ws: Workspace, run: Run, e):
         point_position(ws, run.hand_link, run.hand_point, run.hand)
         value = run.hand[kind - HAND_X]
     return value - run.event[e, ki.EVENT_LEVEL]
+
+
+@internal_kernel
+def note_inside(system: System, ws: Workspace, run: Run, place, x):
+    """Note the guards at part x of the step that is being taken, right after ``derivative`` there, for `turns_within`.
+
+    Those of the unilateral law are looked at by :func:`too_long`.
+    """
+    run.clock[ki.INNER + place] = x
+    for e in range(run.event.shape[0]):
+        if run.event_table[e, ki.EVENT_KIND] < ke.NORMAL_GUARD:
+            t = run.clock[ki.TIME] + x * run.clock[ki.STEP]
+            run.event[e, ki.INNER_VALUE + place] = guard(system, t, ws, run, e)
+
+
+@internal_kernel
+def rounding(run: Run, e):
+    """Value of the guard of event e that may be rounding."""
+    return ROUNDING * max(1.0, abs(run.event[e, ki.EVENT_LEVEL]))
+
+
+@internal_kernel
+def turns_within(run: Run):
+    """Return the fraction of the step just taken at which a guard turns beyond zero and comes back, or 1.
+
+    By the cubic through its values at both ends and at two stages. In which direction it counts does not matter: of two
+    passages one does.
+    """
+    fraction, event, a, b = 1.0, run.event, run.clock[ki.INNER], run.clock[ki.INNER + 1]
+    for e in range(event.shape[0]):
+        if run.event_table[e, ki.EVENT_KIND] >= ke.NORMAL_GUARD:
+            continue
+        side = event[e, ki.SIDE] if event[e, ki.SIDE] != 0.0 else (1.0 if event[e, ki.VALUE] > 0.0 else -1.0)
+        g0, g1 = side * event[e, ki.START_VALUE], side * event[e, ki.VALUE]
+        ga, gb = side * event[e, ki.INNER_VALUE], side * event[e, ki.INNER_VALUE + 1]
+        # Newton's divided differences, then powers of x.
+        first, between = (ga - g0) / a, (gb - ga) / (b - a)
+        second = (between - first) / b
+        third = ((g1 - gb) / (1.0 - b) - between) / (1.0 - a) - second
+        slope, bend = first - a * (second - b * third), second - (a + b) * third
+        x = lowest(slope, bend, third)
+        nearest, least = min(g0, g1), g0 + x * (slope + x * (bend + x * third))
+        back = nearest - least
+        # Where the end is far beyond zero the guard has passed once, in the direction that does not count.
+        passes = least < SHORT_OF_ZERO * back and nearest > -SHORT_OF_ZERO * back
+        if x < 1.0 and back > rounding(run, e) and passes:
+            fraction = min(fraction, x)
+    return fraction
 
 
 @internal_kernel
@@ -124,7 +180,7 @@ def cut_step(system: System, ws: Workspace, run: Run):
             if not hit:
                 keep_passed(run)
             count[ki.SEARCHING] = 0
-            # Contacts that were passed over before the event come first.
+            # What was passed over before the event comes first.
             if passes_over(system, ws, run):
                 return True
             count[ki.FIRED] = 1
@@ -135,7 +191,9 @@ def cut_step(system: System, ws: Workspace, run: Run):
     for e in range(event.shape[0]):
         a, b = event[e, ki.AT_LOW], event[e, ki.AT_HIGH]
         if happened(run, e, b) and not happened(run, e, a):
-            trial = min(trial, low + (high - low) * a / (a - b))
+            # From the root that has just been found a secant leads back to it, where rounding decides.
+            known = low == 0.0 and run.event_table[e, ki.EVENT_KIND] < ke.NORMAL_GUARD and abs(a) <= rounding(run, e)
+            trial = min(trial, low + (high - low) * (0.5 if known else a / (a - b)))
     if not low < trial < high or count[ki.SEARCHING] > FALSI_LIMIT:
         trial = 0.5 * (low + high)
     clock[ki.STEP] = trial
@@ -152,8 +210,9 @@ def keep_passed(run: Run):
 
 @internal_kernel
 def passes_over(system: System, ws: Workspace, run: Run):
-    """True when the step has passed over a contact or a turn of slip: STEP is then the step to take instead."""
+    """True when the step has passed over a contact, a turn of slip or a level: STEP is then the one to take instead."""
     part = too_long(system.model, system.contacts, system.unilateral, ws, run.clock[ki.STEP], run.gaps)
+    part = min(part, turns_within(run))
     # A false alarm must not shorten steps indefinitely, or to zero.
     shorter = part * run.clock[ki.STEP] > event_tolerance(run.clock[ki.TIME])
     if part < 1.0 and shorter and run.count[ki.GRAZING] < SEARCH_LIMIT:

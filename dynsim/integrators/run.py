@@ -34,7 +34,8 @@ NOT_UNIQUE = 7  # end of the step at which the contact forces were not unique, w
 HOLD, PROPOSED, ERROR, LOW, HIGH = 8, 9, 10, 11, 12
 # Time at which trials were last counted from zero, and the least that MOST_TRIALS of them have to come on by [s].
 COUNTED_SINCE, LEAST_PROGRESS = 13, 14
-CLOCK_SIZE = 15
+INNER = 15  # 2: the parts of the step at which guards are noted within it
+CLOCK_SIZE = 17
 # Run.count, int
 STEPS, REJECTED, EVALUATIONS, PROJECTIONS, SAMPLE, STATUS, STARTED = 0, 1, 2, 3, 4, 5, 6
 # A step waits to be accepted; trials of a root; which end of the bracket moved last; the step ends at an event; it ends
@@ -42,7 +43,7 @@ STEPS, REJECTED, EVALUATIONS, PROJECTIONS, SAMPLE, STATUS, STARTED = 0, 1, 2, 3,
 PENDING, SEARCHING, TURNED_BACK, FIRED, TRIMMED, LOGGED, TICKED = 7, 8, 9, 10, 11, 12, 13
 NEXT_BREAK = 14  # index of the first of Run.breaks that is not past
 MODES_DUE = 15  # contact modes are to be chosen at the next start, which is that of the run, or follows a jump of rates
-GRAZING = 16  # how often the step was shortened because it passed over a contact
+GRAZING = 16  # how often the step was shortened because it passed over something
 TRIALS = 17  # steps tried, accepted or not, since COUNTED_SINCE
 ASKED = 18  # written by another thread: the piece is to end at the next step
 COUNT_SIZE = 19
@@ -51,7 +52,8 @@ MOST_TRIALS, PROGRESS = 10_000, 1e-6
 AT_START, AFTER_JUMP = 1, 2
 # Run.event, and Run.event_table, int
 EVENT_LEVEL, SIDE, START_VALUE, VALUE, AT_LOW, AT_HIGH = 0, 1, 2, 3, 4, 5
-EVENT_SIZE = 6
+INNER_VALUE = 6  # 2: at INNER
+EVENT_SIZE = 8
 EVENT_KIND, EVENT_INDEX, DIRECTION, ON_EVENT = 0, 1, 2, 3
 EVENT_TABLE_SIZE = 4
 # What an event does besides being logged: nothing, the caller looks, the run ends.

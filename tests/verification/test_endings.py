@@ -54,8 +54,11 @@ def table(count: int = 1) -> Any:
     """Return the changing part of a run with ``count`` events: only the fields that the root search reads."""
     event, event_table = np.zeros((count, ki.EVENT_SIZE)), np.zeros((count, ki.EVENT_TABLE_SIZE), dtype=int)
     event[:, ki.SIDE] = event[:, ki.START_VALUE] = 1.0
+    event[:, ki.INNER_VALUE : ki.INNER_VALUE + 2] = 1.0
+    clock = np.zeros(ki.CLOCK_SIZE)
+    clock[ki.INNER : ki.INNER + 2] = 0.3, 0.8
     return SimpleNamespace(
-        clock=np.zeros(ki.CLOCK_SIZE),
+        clock=clock,
         count=np.zeros(ki.COUNT_SIZE, dtype=int),
         event=event,
         event_table=event_table,
@@ -107,6 +110,60 @@ def test_what_seems_to_be_passed_over_for_ever_does_not_shorten_steps_to_nothing
         trials += 1
         assert trials <= events.SEARCH_LIMIT
     assert run.clock[ki.STEP] > events.event_tolerance(0.0)
+
+
+@pytest.mark.parametrize(
+    ("roots", "side", "direction", "part"),
+    [
+        ((0.4, 0.6), 1, 0, 0.5),
+        ((0.4, 0.6), -1, 0, 0.5),
+        # Whatever the direction: of two passages one counts.
+        ((0.4, 0.6), 1, 1, 0.5),
+        ((0.05, 0.07), 1, -1, 0.06),
+        # From a root that has just been found, and to the one at which the step ends.
+        ((0.0, 0.5), 1, -1, 0.25),
+        # A guard at zero has the side of the end.
+        ((0.0, 0.5), 0, 0, 0.25),
+        # It only touches zero, or turns outside the step, or has passed once.
+        ((0.5, 0.5), 1, 0, 0.5),
+        ((-0.2, -0.1), 1, 0, 1.0),
+        ((0.7, 2.0), 1, 1, 1.0),
+    ],
+)
+def test_a_guard_that_passes_twice_within_a_step_ends_it_where_it_turns(roots, side, direction, part):
+    """Of a parabola, which the cubic through four of its values is."""
+    run, sign = table(), -1.0 if side < 0 else 1.0
+    nodes = np.array([0.0, 0.3, 0.8, 1.0])
+    start, first, second, end = sign * (nodes - roots[0]) * (nodes - roots[1])
+    run.event[0, [ki.SIDE, ki.START_VALUE, ki.VALUE]] = side, start, end
+    run.event[0, ki.INNER_VALUE : ki.INNER_VALUE + 2] = first, second
+    run.event_table[0, ki.DIRECTION] = direction
+    assert events.turns_within(run) == pytest.approx(part, abs=1e-12)
+
+
+def test_a_guard_that_stays_away_from_zero_or_at_it_ends_no_step():
+    """It turns 0.2 off zero by 0.25, or by rounding alone."""
+    nodes = np.array([0.0, 0.3, 0.8, 1.0])
+    for scale, lift in ((1.0, 0.2), (1e-13, 0.0)):
+        run = table()
+        start, first, second, end = scale * (nodes - 0.5) ** 2 + lift - 0.1 * scale * (lift == 0.0)
+        run.event[0, [ki.START_VALUE, ki.VALUE]] = start, end
+        run.event[0, ki.INNER_VALUE : ki.INNER_VALUE + 2] = first, second
+        assert events.turns_within(run) == 1.0
+
+
+def test_the_next_root_is_not_the_one_just_found(monkeypatch: pytest.MonkeyPatch):
+    """Near the root at the start of the step the guard is rounding, and may be beyond zero again."""
+    run = table()
+    run.clock[ki.STEP], run.event[0, ki.START_VALUE] = 1e-3, 1e-17
+
+    def guard(system: Any, t: float, ws: Any, run: Any, e: int) -> float:
+        return t * (0.4e-3 - t) - (1e-16 if t < 1e-12 else 0.0)
+
+    monkeypatch.setattr(events, "guard", guard)
+    while events.cut_step(BARE, None, run):
+        pass
+    assert run.clock[ki.STEP] == pytest.approx(0.4e-3, abs=1e-12)
 
 
 def test_steps_that_are_always_refused_are_too_small_in_the_end():

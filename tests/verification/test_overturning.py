@@ -388,6 +388,38 @@ def test_a_run_that_is_to_stop_where_it_tips_ends_there_with_all_that_it_has(tmp
     assert stepped.value.record["q"].tobytes() == record["q"].tobytes()
 
 
+PUSHED = """
+duration_s: 3.0
+plant:
+  type: pws_arm
+  base: {on_overturn: OVERTURN, wheel: {damping_N_m_s_per_rad: 0.05}}
+  arm: {type: serial_arm, chain: [{axis: z, mass_kg: 0.5, length_m: 0.2, damping_N_m_s_per_rad: 0.1}]}
+loads:
+  push:
+    type: samples
+    body: base
+    times_s: [1.0, 1.1, 1.5, 1.6]
+    torque_N_m: [[0, 0, 0], [0, 3.6, 0], [0, 3.6, 0], [0, 0, 0]]
+"""
+
+
+def test_a_base_that_tips_and_comes_back_within_one_step_tips(tmp_path):
+    """From 1.18 s to 1.42 s, which radau5 passes over in a step; at the time that short steps of dopri5 find."""
+    path, times = tmp_path / "case.yaml", []
+    for overrides in ({"method": "radau5"}, {"method": "dopri5"}, {"method": "dopri5", "step_max_s": 1e-3}):
+        path.write_text(PUSHED.replace("OVERTURN", "stop"))
+        with pytest.raises(SimulationStopped, match="the base tips over") as stop:
+            dynsim.simulate(dynsim.load_scenario(path, overrides={f"integrator.{k}": overrides[k] for k in overrides}))
+        times.append(stop.value.time)
+        assert stop.value.record["tip_margin"].min() > 0.0
+    assert times == pytest.approx([times[-1]] * 3, abs=1e-9)
+    path.write_text(PUSHED.replace("OVERTURN", "warn"))
+    record = dynsim.simulate(dynsim.load_scenario(path))
+    assert record.summary["base"]["overturns_at_s"] == times[0]
+    below = record.time[record["tip_margin"] < 0.0]
+    assert 0.0 < below[0] - times[0] < record.time[1] - record.time[0]
+
+
 def test_a_stepper_records_the_same_and_watches_margins(tmp_path):
     scenario = read(tmp_path, SWINGING, TIPPING)
     whole, simulation = dynsim.simulate(scenario), dynsim.Simulation(scenario)

@@ -442,6 +442,43 @@ def test_the_time_of_an_event_is_that_of_the_closed_form(tmp_path, method):
     assert [event.time for event in record.events] == times
 
 
+THROW = """
+duration_s: 2.0
+plant: {type: serial_arm, chain: [{kind: prismatic, axis: z, mass_kg: 1.0, length_m: 0.1}]}
+integrator: {method: METHOD}
+"""
+
+
+@pytest.mark.parametrize("above", [1e-6, 1e-4, 1e-2])
+@pytest.mark.parametrize("method", ["dopri5", "radau5"])
+def test_a_level_just_below_the_top_of_a_throw_is_passed_twice(tmp_path, method, above):
+    """At (v ∓ √(2 g a))/g, a below the top: within one step of a method whose steps are much longer."""
+    scenario, speed = read(tmp_path, THROW.replace("METHOD", method)), 5.0
+    begin = dynsim.State(0.0, np.zeros(1), np.array([speed]), np.zeros(0))
+    level, half = speed**2 / (2.0 * G) - above, math.sqrt(2.0 * above / G)
+    height = float(dynsim.simulate(scenario)["hand_position"][0, 2])
+    # The rate at the level makes of rounding of the position one of the time.
+    close = 1e-13 + 1e-14 / (G * half)
+    simulation = dynsim.Simulation(scenario, state=begin)
+    simulation.watch("joint_position", "joint_1", level)
+    simulation.watch("hand_position", "z", height + level, direction=-1)
+    simulation.advance(1.0)
+    times = [(event.kind, event.time) for event in simulation.happened]
+    rises, falls = speed / G - half, speed / G + half
+    assert sorted(kind for kind, _ in times) == ["hand_position", "joint_position", "joint_position"]
+    assert [time for kind, time in times if kind == "joint_position"] == pytest.approx([rises, falls], abs=close)
+    assert [time for kind, time in times if kind == "hand_position"] == pytest.approx([falls], abs=close)
+    stopped = dynsim.Simulation(scenario, state=begin)
+    stopped.watch("joint_position", "joint_1", level, direction=1, stop=True)
+    assert stopped.advance(2.0).time == pytest.approx(rises, abs=close)
+    pieces = dynsim.Simulation(scenario, state=begin)
+    pieces.watch("joint_position", "joint_1", level)
+    pieces.watch("hand_position", "z", height + level, direction=-1)
+    for t in np.linspace(0.1, 1.0, 7):
+        pieces.advance(t)
+    assert [(event.kind, event.time) for event in pieces.happened] == times
+
+
 def test_events_have_a_direction_call_back_and_stop(tmp_path):
     scenario = read(tmp_path, PENDULUM.replace("METHOD", "dopri5"))
     simulation, seen = dynsim.Simulation(scenario), []

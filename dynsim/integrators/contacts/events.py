@@ -233,13 +233,21 @@ def dip(g0, d0, g1, d1, depth):
         return 1.0
     # Hermite: g0 + d0 x + a x² + b x³.
     a, b = 3.0 * (g1 - g0) - 2.0 * d0 - d1, 2.0 * (g0 - g1) + d0 + d1
-    root = a * a - 3.0 * b * d0
-    if root <= 0.0 or a + math.sqrt(root) == 0.0:
-        return 1.0
-    x = -d0 / (a + math.sqrt(root))
-    if 0.0 < x < 1.0 and g0 + x * (d0 + x * (a + x * b)) < -depth:
-        return x
-    return 1.0
+    x = lowest(d0, a, b)
+    return x if x < 1.0 and g0 + x * (d0 + x * (a + x * b)) < -depth else 1.0
+
+
+@internal_kernel
+def lowest(d0, a, b):
+    """Where d0 x + a x² + b x³ has a minimum between 0 and 1, or 1."""
+    root, x = a * a - 3.0 * b * d0, 1.0
+    if root > 0.0:
+        # Of two forms of the same root the one without cancellation.
+        if d0 < 0.0 and a + math.sqrt(root) != 0.0:
+            x = -d0 / (a + math.sqrt(root))
+        elif d0 >= 0.0 and a < 0.0 and b > 0.0:
+            x = (math.sqrt(root) - a) / (3.0 * b)
+    return x if 0.0 < x < 1.0 else 1.0
 
 
 @internal_kernel

@@ -18,6 +18,7 @@ from dynsim.dynamics.simd.tables import as_lanes, lane, tables_as_lanes
 from dynsim.dynamics.tables import Workspace
 from dynsim.integrators import run as ki
 from dynsim.integrators.dense import write_sample, write_samples, write_waiting
+from dynsim.integrators.events import note_inside
 from dynsim.integrators.output import fill_output
 from dynsim.integrators.project import off_surface, settle
 from dynsim.integrators.radau5 import tables as kn
@@ -137,6 +138,8 @@ def evaluate_two(newton: NewtonArrays, system: System, ws: Workspace, run: Run):
         for j in range(newton.kept.shape[1]):
             run.stage[7, j] = run.y[j] + newton.z[s, j]
         derivative(system, run.clock[ki.TIME] + kn.NODE_RADAU[s] * run.clock[ki.STEP], run.stage[7], ws, newton.f[s])
+        if run.event.shape[0] > 0:
+            note_inside(system, ws, run, s, kn.NODE_RADAU[s])
     run.count[ki.EVALUATIONS] += 2
 
 
@@ -150,6 +153,12 @@ def evaluate_end_alone(newton: NewtonArrays, system: System, ws: Workspace, run:
     for j in range(run.y.shape[0]):
         run.stage[6, j] = newton.f[2, j]
     run.count[ki.EVALUATIONS] += 1
+
+
+@internal_kernel
+def end_workspace(newton: NewtonArrays | None, system: System, ws: Workspace, run: Run):
+    """The workspace of the end of the step just taken."""
+    return ws
 
 
 @internal_kernel
@@ -184,10 +193,7 @@ def _on_lanes(newton: Any, system: Any, ws: Any, run: Any, *_: Any) -> bool:
 
 @form_of(evaluate_end, _on_lanes)
 def evaluate_end_on_lanes(newton, system, ws, run):
-    """Evaluate y_new on the first lane, the two inner stages on the next, and a waiting sample on the last.
-
-    Guards of events need the workspace of a single state, so they cost another evaluation of y_new.
-    """
+    """Evaluate y_new on the first lane, the two inner stages on the next, and a waiting sample on the last."""
     lanes, t, h = newton.lanes, run.clock[ki.TIME], run.clock[ki.STEP]
     lanes.t[0], lanes.t[1], lanes.t[2] = t + h, t + kn.NODE_RADAU[0] * h, t + kn.NODE_RADAU[1] * h
     for j in range(run.y.shape[0]):
@@ -205,13 +211,20 @@ def evaluate_end_on_lanes(newton, system, ws, run):
         run.stage[6, j] = newton.f[2, j]
     take_samples(newton, system, ws, run, 3, count)
     if run.event.shape[0] > 0:
-        evaluate_end_alone(newton, system, ws, run)
+        for s in range(2):
+            note_inside(system, lane(tables_as_lanes(lanes.ws), 1 + s), run, s, kn.NODE_RADAU[s])
 
 
 @form_of(end_accepted, _on_lanes)
 def end_accepted_on_lanes(newton, system, ws, run):
-    """By what the first lane has left, where the end was evaluated there, unless it must be projected."""
-    end, on_lanes = lane(tables_as_lanes(newton.lanes.ws), 0), run.event.shape[0] == 0
-    if on_lanes and not off_surface(end):
+    """By what the first lane has left, unless the end must be projected."""
+    end = lane(tables_as_lanes(newton.lanes.ws), 0)
+    if not off_surface(end):
         return end_watched(system, end, run)
-    return end_settled(system, ws, run, on_lanes or off_surface(ws)) and end_watched(system, ws, run)
+    return end_settled(system, ws, run, True) and end_watched(system, ws, run)
+
+
+@form_of(end_workspace, _on_lanes)
+def end_workspace_on_lanes(newton, system, ws, run):
+    """The first lane."""
+    return lane(tables_as_lanes(newton.lanes.ws), 0)
