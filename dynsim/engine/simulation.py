@@ -147,7 +147,10 @@ class Simulation:
         # Of a ring, and of a run that goes on from another, the ledger counts from the first sample on.
         self._relative = trace is not None or state is not None
         self._happened: list[Event] = []
-        self._calling, self._token = False, object()
+        self._token = object()
+        # Callbacks that are due at the present time, in the order of their calls; the one that is called now.
+        self._due: list[Callable[[Simulation], None]] = []
+        self._calling: Callable[[Simulation], None] | None = None
         self._loaded, self._watch = False, attended.WallWatch(scenario.integrator.wall_limit_s)
         self._kernel = driver.direct(self._prepared.run)
         self._guards: list[tuple[str, str, Callable[[Simulation], None] | None]] = []
@@ -160,7 +163,9 @@ class Simulation:
         first = len(self._prepared.loads) - len(robot.bodies)
         self._pushes = {body: first + k for k, body in enumerate(robot.bodies)}
         self._splines = self._prepared.system.reference.spline.copy()
-        self._frozen = not math.isfinite(self._prepared.control.end)
+        # As planned: a motor whose reference is rewritten now may be given back later.
+        self._references_end = self._prepared.control.end
+        self._frozen = not math.isfinite(self._references_end)
         self._pushed: set[int] = set()
         times = None
         if state is None and self._end == scenario.duration_s and trace is None:
@@ -186,6 +191,7 @@ class Simulation:
         elif operator is not None:
             raise ScenarioError("an operator needs a scenario with controller.operator, which says what it moves")
         self._attendants = [attendant for attendant in (encoded, self._operator) if attendant is not None]
+        self._own_calls = tuple(self._calls)
 
     def _attendant(self, source: Any, state: State | None) -> Operator | SnakePilot | None:
         """Who rewrites references at the ticks of its own, where the scenario has somebody."""
@@ -297,7 +303,9 @@ class Simulation:
     def advance(self, until: float) -> State:
         """Integrate up to a time [s], or to the end of the run when that comes first, and return the state there.
 
-        Callbacks of :meth:`every` and :meth:`watch` are called on the way.
+        Callbacks of :meth:`every` and :meth:`watch` are called on the way, also those due at ``until``. An error that
+        one raises ends the call; the simulation stands at its time, and can be advanced again: that callback is not
+        called again, and what else is due at that time is called first.
 
         Raises
         ------
@@ -309,12 +317,14 @@ class Simulation:
             Ctrl-C, within a second. The simulation stands at a step on the way, and can be advanced again, unless that
             step would have taken longer.
         """
-        if self._calling:
+        if self._calling is not None:
             raise ScenarioError("a callback cannot advance the simulation that calls it")
         if not isinstance(until, (int, float, np.number)) or not until >= self._time:
             raise ScenarioError(f"cannot advance to t = {brief(until)} s: the simulation is at {self._time:g} s")
+        # What a snapshot, or an error in a callback, has left over.
+        self._call_due()
         until = min(float(until), self._end)
-        last = self._prepared.control.end
+        last = self._references_end
         # References of the whole run may end a rounding before it, where nothing is to be rewritten.
         if not self._frozen and until > last + TICK_SLACK * max(1.0, abs(last)):
             self._reach(max(last, self._time))
@@ -338,7 +348,9 @@ class Simulation:
     def every(self, period: float, call: Callable[[Simulation], None], *, first: float | None = None) -> None:
         """Call back every ``period`` [s] from ``first`` on (default: now): a sampled controller.
 
-        Steps end there, and what ``call`` rewrites holds until it is rewritten again.
+        Steps end there, and what ``call`` rewrites holds until it is rewritten again. Callbacks that are due at one
+        time are called in this order: those of :meth:`watch`; encoders, controller and operator of the scenario; then
+        the others, as they were added.
         """
         first = self._time if first is None else float(first)
         if not (period >= SHORTEST_PERIOD and math.isfinite(period) and first >= self._time):
@@ -348,11 +360,12 @@ class Simulation:
             )
         if len(self._calls) == MOST_TICKS:
             raise ScenarioError(f"a simulation has at most {MOST_TICKS} ticks; call several functions at one")
+        # First: callbacks on the way may add ticks of their own.
+        self._settle_now()
         run = self._prepared.run
         tick = np.zeros((1, ki.TICK_SIZE))
         tick[0, [ki.TICK_PERIOD, ki.TICK_NEXT, ki.TICK_PHASE]] = period, first, first
         table = np.array([[ki.CALLER << len(self._calls), 0]])
-        self._settle_now()
         self._calls.append(call)
         self._swap(tick=np.vstack([run.tick, tick]), tick_table=np.vstack([run.tick_table, table]))
 
@@ -395,12 +408,12 @@ class Simulation:
         choices["axis"] = {"x": 0, "y": 1, "z": 2}
         index = _index(choices[family], subject, family)
         action = ki.STOP if stop else ki.LOG if call is None else ki.RETURN
-        run = self._prepared.run
         event = np.zeros((1, ki.EVENT_SIZE))
         event[0, ki.EVENT_LEVEL] = _finite("level", [level])[0]
         axis = family == "axis"
         table = np.array([[number + (index if axis else 0), 0 if axis else index, int(np.sign(direction)), action]])
         self._settle_now()
+        run = self._prepared.run
         self._guards.append((kind, subject, call))
         self._swap(event=np.vstack([run.event, event]), event_table=np.vstack([run.event_table, table]))
         self._restart()
@@ -489,11 +502,12 @@ class Simulation:
         j = _index(self._joints, joint, "joint")
         if any(joint in (coupling.joint, coupling.leader) for coupling in self.robot.couplings):
             raise ModelError(f"{joint}: a joint that is coupled to another has no brake of its own")
-        run, model = self._prepared.run, self._prepared.model
+        model = self._prepared.model
         armature = model.arrays.body[:, ka.ARMATURE]
         if closed == (armature[j] == ka.BRAKED):
             return
         self._settle_now()
+        run = self._prepared.run
         if closed:
             v = run.y[block(run.layout, "v")]
             inertia = model.mass_matrix(run.y[block(run.layout, "q")]) + np.diag(model.armature)
@@ -577,23 +591,44 @@ class Simulation:
         """
         if conflict := LINEARIZATION.conflict(self.scenario.config):
             raise ScenarioError(f"Simulation.linearize {LINEARIZATION.message(conflict)}")
-        before = self.snapshot()
+        before = self._kept()
         try:
-            self._settle_now()
+            self._settle_now(calling=False)
             if self._prepared.run.count[ki.STARTED] == 0:
                 # Modes of contacts are chosen where a step starts; none is taken.
                 driver.advance(self._prepared.system, self._prepared.workspace, self._prepared.run, 0)
             return linearized(self._prepared, inputs, outputs)
         finally:
-            self.restore(before)
+            self._go_back(before)
 
     def snapshot(self) -> Snapshot:
-        """What :meth:`restore` needs to go on from here."""
+        """What :meth:`restore` needs to go on from here.
+
+        A snapshot is of the moment at which it is taken, also within a callback: what the callback has done before is
+        in it; what it does afterwards is not, and does not happen again, as the callback is not called again. Other
+        callbacks that are due at this time and have not been called yet are called by the next :meth:`advance`. What
+        callbacks keep themselves is not in the snapshot.
+
+        Raises
+        ------
+        ScenarioError
+            Within the tick of the scenario's own operator, of which half would be lost.
+        """
+        if any(self._calling is call for call in self._own_calls):
+            raise ScenarioError(
+                "an operator, or the source of its commands, cannot take a snapshot of the simulation that asks it; "
+                "take it in a callback of Simulation.every, or between two calls of advance"
+            )
+        return self._kept()
+
+    def _kept(self) -> Snapshot:
+        """The snapshot; of the middle of an operator's tick only to go back to at once."""
         arrays = {name: array.copy() for name, array in self._arrays().items()}
         attendants = [attendant.remembered() for attendant in self._attendants]
         trace, happened, pushed = self._trace.snapshot(), tuple(self._happened), frozenset(self._pushed)
         shown = (pushed, self._base_as_planned, self._prepared.behind_brakes)
-        return Snapshot(self._token, arrays, self._time, trace, happened, *shown, self._frozen, attendants)
+        due = tuple(self._due)
+        return Snapshot(self._token, arrays, self._time, trace, happened, *shown, self._frozen, attendants, due)
 
     def restore(self, snapshot: Snapshot) -> None:
         """Go back to a snapshot of this simulation: the same future, bit for bit.
@@ -601,14 +636,22 @@ class Simulation:
         Raises
         ------
         ScenarioError
-            Events or ticks were added since, or the snapshot is of another simulation.
+            Events or ticks were added since, or the snapshot is of another simulation; within a callback.
         """
+        if self._calling is not None:
+            raise ScenarioError(
+                "a callback cannot restore the simulation that calls it; restore it after advance has returned"
+            )
         if not isinstance(snapshot, Snapshot):
             raise ScenarioError(f"a simulation is restored from its snapshot, not from {brief(snapshot)}")
         own = self._arrays()
         sizes = ({k: a.shape for k, a in arrays.items() if k not in _BUFFERS} for arrays in (own, snapshot.arrays))
         if snapshot.owner is not self._token or next(sizes) != next(sizes):
             raise ScenarioError("the snapshot is of another simulation, or ticks or events were added since")
+        self._go_back(snapshot)
+
+    def _go_back(self, snapshot: Snapshot) -> None:
+        """Take everything from a snapshot that fits."""
         self._swap(**{field: snapshot.arrays[name].copy() for name, field in _BUFFERS.items()})
         for name, array in self._arrays().items():
             array[...] = snapshot.arrays[name]
@@ -618,6 +661,7 @@ class Simulation:
         self._prepared = replace(self._prepared, behind_brakes=snapshot.behind_brakes)
         for attendant, kept in zip(self._attendants, snapshot.attendants, strict=True):
             attendant.restore(kept)
+        self._due = list(snapshot.due)
 
     def record(self, scenario: Scenario | None = None, *, pictured: bool = True) -> Record:
         """Record of the trace so far; of a ring, energies, events and counts from its first sample on.
@@ -633,12 +677,14 @@ class Simulation:
         if (count[ki.PENDING] == 1 or count[ki.STARTED] == 0) and not self.finished:
             # Samples up to the present time lie in the step that is kept back, or the last one wants what has been set
             # at its time: end the step here, begin the next one, and take that back.
-            before = self.snapshot()
-            self._settle_now()
-            if self._loaded:
-                self._kernel(self._prepared.system, self._prepared.workspace, self._prepared.run, 0)
-            times, states, outputs = self._trace.rows(self._prepared.run)
-            self.restore(before)
+            before = self._kept()
+            try:
+                self._settle_now(calling=False)
+                if self._loaded:
+                    self._kernel(self._prepared.system, self._prepared.workspace, self._prepared.run, 0)
+                times, states, outputs = self._trace.rows(self._prepared.run)
+            finally:
+                self._go_back(before)
         else:
             times, states, outputs = self._trace.rows(self._prepared.run)
         run = self._prepared.run
@@ -715,50 +761,42 @@ class Simulation:
             )
             log.warning("%s: %s", self._scenario.title, self._said[-1])
 
-    def _reach(self, until: float) -> None:
+    def _reach(self, asked: float) -> None:
         """Integrate until the step that would pass a time is pending, or ends there."""
-        run = self._prepared.run
-        # A tick that differs from the time asked for by roundings is not left for later.
-        near = run.tick[:, ki.TICK_NEXT] if len(self._calls) else np.zeros(0)
-        near = near[np.abs(near - until) <= TICK_SLACK * max(1.0, abs(until))]
-        until = min(max(until, float(near.max(initial=until))), self._end)
+        until = asked = min(asked, self._end)
         while not self.finished and self._time < until:
-            if run.count[ki.PENDING] == 1 and run.clock[ki.TIME] + run.clock[ki.STEP] > until:
+            run = self._prepared.run
+            # A tick that differs from the time asked for by roundings is not left for later.
+            slack = TICK_SLACK * max(1.0, abs(asked))
+            near = run.tick[:, ki.TICK_NEXT] if len(self._calls) else np.zeros(0)
+            near = near[np.abs(near - asked) <= slack]
+            until = min(max(until, float(near.max(initial=until))), self._end)
+            beyond = until + slack if len(near) else until
+            if run.count[ki.PENDING] == 1 and run.clock[ki.TIME] + run.clock[ki.STEP] > beyond:
                 break
             self._piece(until)
             run = self._prepared.run
             if run.count[ki.STARTED] == 1 and run.clock[ki.TIME] >= until:
                 break
-        if not self.finished and run.clock[ki.TIME] >= self._end:
+        while not self.finished and self._prepared.run.clock[ki.TIME] >= self._end:
             # A tick at the end came before the end itself.
-            self._attended(1, interruption.check)
-        self._time = min(until, self._end) if not self.finished else float(run.clock[ki.TIME])
+            self._piece(self._end)
+        self._time = until if not self.finished else float(self._prepared.run.clock[ki.TIME])
 
     def _piece(self, until: float) -> None:
         """One compiled piece, and what it wants its caller to look at."""
-        prepared = self._prepared
-        run = prepared.run
+        run = self._prepared.run
         if run.count[ki.PENDING] == 1:
             self._refill(run.clock[ki.TIME] + run.clock[ki.STEP])
             run = self._prepared.run
         run.clock[ki.HOLD] = min(until, run.sample_time[-1])
         begun = clock.perf_counter()
         raised = self._attended(_PIECE, interruption.check)
-        run = self._prepared.run
         self._wall += clock.perf_counter() - begun
-        self._take_events()
-        if self._failed() and raised is None:
-            self._time = float(run.clock[ki.TIME])
-            raise_stopped(stopped(self._scenario, self._prepared), self.record())
-        due = int(run.count[ki.TICKED])
-        # Before the calls, whose snapshots must not call again.
-        run.count[ki.TICKED] = 0
-        if due:
-            self._time = float(run.clock[ki.TIME])
-            for k, call in enumerate(self._calls):
-                if due & (ki.CALLER << k):
-                    self._call(call)
+        self._take_due(raised)
+        self._call_due()
         if raised is not None:
+            self._time = max(self._time, float(self._prepared.run.clock[ki.TIME]))
             raise raised
 
     def _attended(self, limit: int, look: Callable[[], None]) -> BaseException | None:
@@ -769,25 +807,38 @@ class Simulation:
         self._prepared, raised = attended.advance(self._prepared, limit, self._watch, look, self._kernel)
         return raised
 
-    def _call(self, call: Callable[[Simulation], None]) -> None:
-        self._calling = True
-        try:
-            call(self)
-        finally:
-            self._calling = False
+    def _take_due(self, raised: BaseException | None) -> None:
+        """Empty the log of the kernels, and note what is due at the present end of the run.
 
-    def _take_events(self) -> None:
-        """Empty the log of the kernels."""
+        All before the first call: a snapshot in a callback has what happened, and what is due, at the same time.
+        """
         run = self._prepared.run
         for time, e in take_log(run):
-            if named := event_name(self._prepared, e):
-                self._happened.append(Event(time, *named))
-                continue
-            kind, subject, call = self._guards[e]
+            named = event_name(self._prepared, e)
+            kind, subject, call = self._guards[e] if named is None else (*named, None)
             self._happened.append(Event(time, kind, subject))
             if call is not None:
-                self._time = time
-                self._call(call)
+                self._due.append(call)
+        ticked = int(run.count[ki.TICKED])
+        run.count[ki.TICKED] = 0
+        if not self._failed():
+            self._due += [call for k, call in enumerate(self._calls) if ticked & (ki.CALLER << k)]
+        elif raised is None:
+            self._due.append(Simulation._say_stopped)
+        if self._due:
+            self._time = float(run.clock[ki.TIME])
+
+    def _call_due(self) -> None:
+        """Call what is due, each once, whatever it raises."""
+        while self._due:
+            self._calling = self._due.pop(0)
+            try:
+                self._calling(self)
+            finally:
+                self._calling = None
+
+    def _say_stopped(self) -> None:
+        raise_stopped(stopped(self._scenario, self._prepared), self.record())
 
     def _failed(self) -> bool:
         """True for a run that has ended, and not where it was to end."""
@@ -800,48 +851,55 @@ class Simulation:
         base = self.robot.base
         if base is None or not base.stop_on_overturn or self._prepared.run.count[ki.STATUS] != ki.STOPPED:
             return False
-        return self._happened[-1].kind == TIP_OVER
+        return any(event.kind == TIP_OVER for event in self._happened)
 
-    def _settle_now(self) -> None:
-        """End a step at the present time, when it lies within one."""
-        run = self._prepared.run
+    def _settle_now(self, *, calling: bool = True) -> None:
+        """End a step at the present time, when it lies within one.
+
+        Parameters
+        ----------
+        calling : with callbacks at events that only the shorter steps find, at their times; False: it is undone
+        """
+        run, now = self._prepared.run, self._time
         if run.count[ki.PENDING] == 0 or self.finished:
             return
-        clock_, count = run.clock, run.count
-        count[[ki.PENDING, ki.SEARCHING, ki.FIRED]] = 0
-        step = clock_[ki.STEP] = max(clock_[ki.PROPOSED], clock_[ki.STEP])
-        if self._time > clock_[ki.TIME]:
-            raised = self._go_to(self._time)
+        run.count[[ki.PENDING, ki.SEARCHING, ki.FIRED]] = 0
+        step = run.clock[ki.STEP] = max(run.clock[ki.PROPOSED], run.clock[ki.STEP])
+        if now > run.clock[ki.TIME]:
+            self._go_to(now, calling)
             # Where a piece was left alone there are copies.
             run = self._prepared.run
-            clock_, count = run.clock, run.count
-            clock_[ki.END] = self._end
-            if raised is not None:
-                if count[ki.STATUS] == ki.FINISHED:
-                    count[ki.STATUS] = ki.RUNNING
-                raise raised
-            self._take_events()
-            if count[ki.STATUS] == ki.STOPPED and not self._overturned():
+            if self.finished:
+                self._time = float(run.clock[ki.TIME])
                 return
-            if count[ki.STATUS] != ki.FINISHED:
-                raise_stopped(stopped(self._scenario, self._prepared), self.record())
-            count[ki.STATUS] = ki.RUNNING
-            clock_[ki.TIME] = self._time
-            clock_[ki.STEP] = max(clock_[ki.STEP], step)
+            self._time = run.clock[ki.TIME] = now
+            run.clock[ki.STEP] = max(run.clock[ki.STEP], step)
 
-    def _go_to(self, until: float) -> BaseException | None:
-        """Integrate until a time that ends the run; what a signal has raised on the way."""
-        self._prepared.run.clock[ki.END] = until
-        raised: BaseException | None = None
-        while self._prepared.run.count[ki.STATUS] == ki.RUNNING and raised is None:
+    def _go_to(self, until: float, calling: bool) -> None:
+        """Integrate until a time as if the run ended there, or until it ends before."""
+        reached = False
+        while not (reached or self.finished):
             run = self._prepared.run
             if run.count[ki.PENDING] == 1:
                 self._refill(run.clock[ki.TIME] + run.clock[ki.STEP])
                 run = self._prepared.run
-            run.clock[ki.HOLD] = run.sample_time[-1]
+            run.clock[ki.HOLD], run.clock[ki.END] = run.sample_time[-1], until
             # What comes to its end here is half of something: signals that wait go on waiting.
             raised = self._attended(_PIECE, lambda: None)
-        return raised
+            # Callbacks, and their snapshots, know nothing of this end.
+            run = self._prepared.run
+            run.clock[ki.END] = self._end
+            reached = bool(run.count[ki.STATUS] == ki.FINISHED)
+            if reached:
+                run.count[ki.STATUS] = ki.RUNNING
+            self._take_due(raised)
+            if calling:
+                self._call_due()
+            elif self._failed() and raised is None:
+                self._say_stopped()
+            if raised is not None:
+                self._time = float(run.clock[ki.TIME])
+                raise raised
 
     def _restart(self) -> None:
         """Derivatives have jumped: the next step starts anew from the present state, with the step size that it had."""
@@ -849,6 +907,8 @@ class Simulation:
 
     def _freeze(self) -> None:
         """Let moving references hold where they end."""
+        # First: a snapshot in a callback on the way is of before.
+        self._settle_now()
         self._frozen = True
         for joint, a in self._motors.items():
             if self._prepared.system.reference.spline[a] >= 0:

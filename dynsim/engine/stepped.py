@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -132,3 +132,4 @@ class Snapshot:
     behind_brakes: Mapping[str, float]
     frozen: bool
     attendants: list[dict[str, Any]]
+    due: tuple[Callable[[Any], None], ...]

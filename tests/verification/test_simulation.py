@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -755,3 +757,285 @@ def test_planned_voltages_hold_after_the_end_of_the_scenario(tmp_path, plan, sam
     record = simulation.record()
     assert np.degrees(record["q"][-1, 0]) == pytest.approx(75.0, abs=0.01)
     assert abs(record["v"][-1, 0]) < 1e-4
+
+
+TWO_LINKS = """
+duration_s: 1.0
+plant:
+  type: serial_arm
+  chain:
+  - {axis: y, initial_deg: 60, length_m: 0.5, mass_kg: 1.0, motor: {type: wang_minami}}
+  - {axis: y, length_m: 0.4, mass_kg: 0.5, motor: {type: wang_minami}}
+integrator: {method: METHOD}
+"""
+# Turns at 1 rad/s; at t = 0.1 s it passes 0.1 rad.
+TURNING = """
+duration_s: 1.0
+plant: {type: serial_arm, gravity_m_s2: [0, 0, 0], chain: [{axis: z, mass_kg: 0.8, length_m: 0.3}]}
+"""
+DRIVEN_TO = """
+controller:
+  type: joint_pd
+  k_p_V_per_rad: 200
+  k_d_V_s_per_rad: 5
+  joints: {joint_1: {times_s: [0, 1], angles_deg: [60, 90]}}SAMPLED
+"""
+OPERATED = """
+controller:
+  type: joint_pd
+  k_p_V_per_rad: 200
+  k_d_V_s_per_rad: 5
+  operator: {joints: [joint_1, joint_2], rate_hz: 50, commands: [{at_s: 0.05, hand: [0, 0, 0.1]}]}
+"""
+
+
+def turning(folder: Path) -> dynsim.Simulation:
+    scenario = read(folder, TURNING)
+    return dynsim.Simulation(scenario, state=dynsim.State(0.0, np.zeros(1), np.ones(1), np.zeros(0)))
+
+
+def swing(s: dynsim.Simulation) -> None:
+    s.set_command("joint_1", 20.0 * math.sin(30.0 * s.time) - 2.0 * s.state.v[0] + (100.0 if s.time < 0.11 else 0.0))
+
+
+def push(s: dynsim.Simulation) -> None:
+    s.set_wrench("link_2", force=[0.0, 0.0, 10.0 * math.cos(20.0 * s.time)])
+
+
+def assert_same_futures(simulation: dynsim.Simulation, kept: list, calls: list, until: float) -> None:
+    """Of all snapshots, each with the number of calls before it; ``calls`` are filled by the callbacks."""
+    end, happened, before = simulation.advance(until), simulation.happened, list(calls)
+    record = simulation.record(pictured=False)
+    assert kept
+    for snapshot, number in list(kept):
+        calls.clear()
+        simulation.restore(snapshot)
+        again = simulation.advance(until)
+        np.testing.assert_array_equal(again.q, end.q)
+        np.testing.assert_array_equal(again.v, end.v)
+        assert calls == before[number:]
+        assert simulation.happened == happened
+        assert same(simulation.record(pictured=False), record)
+
+
+@pytest.mark.parametrize(
+    ("method", "order"),
+    [
+        *(("dopri5", order) for order in itertools.permutations(("keep", "swing", "push"))),
+        ("radau5", ("swing", "keep", "push")),
+        ("time_stepping", ("swing", "keep", "push")),
+    ],
+)
+def test_a_snapshot_in_a_callback_knows_what_else_is_due(tmp_path, method, order):
+    """In every order of callbacks; of two snapshots in one tick too."""
+    law = "contacts: {law: unilateral}\n" if method == "time_stepping" else ""
+    simulation = dynsim.Simulation(read(tmp_path, TWO_LINKS.replace("METHOD", method) + law))
+    kept, calls = [], []
+
+    def called(name: str, s: dynsim.Simulation) -> None:
+        calls.append((name, s.time))
+        if name != "keep":
+            {"swing": swing, "push": push}[name](s)
+        elif 0.09 < s.time < 0.13 and len(kept) < 4:
+            kept.extend((s.snapshot(), len(calls)) for _ in range(2))
+
+    for name in order:
+        simulation.every(0.02, partial(called, name))
+    assert_same_futures(simulation, kept, calls, 0.3)
+
+
+def test_a_snapshot_at_an_event_knows_the_other_events_and_ticks_of_that_time(tmp_path):
+    """Two guards with callbacks, one that is only logged, and two ticks, all at one time."""
+    simulation, kept, calls = turning(tmp_path), [], []
+
+    def called(name: str, s: dynsim.Simulation) -> None:
+        calls.append((name, s.time))
+        s.set_wrench("link_1", torque=[0.0, 0.0, 0.01 * len(name) * s.time])
+        if 0.09 < s.time < 0.11:
+            assert [event.kind for event in s.happened] == ["joint_position"] * 3
+            kept.append((s.snapshot(), len(calls)))
+
+    # A tick and an event are at one time within 1e-12 s.
+    simulation.every(0.1, partial(called, "tick"), first=0.1 + 5e-13)
+    simulation.every(0.1, partial(called, "other tick"), first=0.1 + 5e-13)
+    simulation.watch("joint_position", "joint_1", 0.1, call=partial(called, "event"))
+    simulation.watch("joint_position", "joint_1", 0.1, call=partial(called, "other event"))
+    simulation.watch("joint_position", "joint_1", 0.1)
+    assert_same_futures(simulation, kept, calls, 0.35)
+    # Four, and after each of them those that were still to come.
+    assert len(kept) == 4 + 3 + 2 + 1
+    simulation.restore(kept[0][0])
+    calls.clear()
+    simulation.advance(simulation.time)
+    assert [name for name, _ in calls] == ["other event"]
+    simulation.advance(0.15)
+    assert [name for name, _ in calls] == ["other event", "tick", "other tick"]
+
+
+def test_what_a_callback_does_after_its_snapshot_is_not_in_it(tmp_path):
+    simulation, kept = turning(tmp_path), []
+
+    def keep(s: dynsim.Simulation) -> None:
+        s.set_wrench("link_1", torque=[0.0, 0.0, 1.0])
+        kept.append(s.snapshot())
+        s.set_wrench("link_1", torque=[0.0, 0.0, -1.0])
+
+    simulation.every(10.0, keep, first=0.1)
+    assert simulation.advance(0.5).v[0] < 1.0
+    simulation.restore(kept[0])
+    assert simulation.advance(0.5).v[0] > 1.0
+    assert len(kept) == 1
+
+
+@pytest.mark.parametrize("trace", [None, 3])
+def test_snapshots_in_callbacks_of_a_sampled_controller_with_encoders(tmp_path, trace):
+    """Encoders, controller, then callbacks, which read the record, brake, give motors back, and end the samples."""
+    encoders = "sensors: {seed: 3, encoders: {rate_hz: 200, delay_s: 0.004, noise_deg: 0.01}}\n"
+    text = TWO_LINKS.replace("METHOD", "dopri5") + DRIVEN_TO.replace("SAMPLED", "\n  sample_time_s: 0.01") + encoders
+    simulation, kept, calls = dynsim.Simulation(read(tmp_path, text), duration=2.0, trace=trace), [], []
+
+    def keep(s: dynsim.Simulation) -> None:
+        calls.append(("keep", s.time))
+        if round(s.time / 0.1) in (3, 10) and len(kept) < 4:
+            kept.append((s.snapshot(), len(calls)))
+
+    def act(s: dynsim.Simulation) -> None:
+        k = round(s.time / 0.1)
+        calls.append(("act", s.time))
+        if k == 3:
+            s.record(pictured=False)
+        if k in (1, 4):
+            s.set_brake("joint_2", k == 1)
+        if k == 2:
+            s.set_reference("joint_1", 1.2, 0.1)
+        if k == 5:
+            s.release("joint_1")
+        if k == 6:
+            s.end_samples(1.05)
+        push(s)
+
+    for call in (keep, act, keep):
+        simulation.every(0.1, call)
+    assert_same_futures(simulation, kept, calls, 1.2)
+
+
+def test_an_error_in_a_callback_leaves_the_others_due(tmp_path):
+    simulation, calls = turning(tmp_path), []
+
+    def fail(s: dynsim.Simulation) -> None:
+        calls.append("fail")
+        raise ZeroDivisionError
+
+    simulation.every(10.0, fail, first=0.1)
+    simulation.every(10.0, lambda s: calls.append(s.time), first=0.1)
+    with pytest.raises(ZeroDivisionError):
+        simulation.advance(0.5)
+    assert simulation.time == 0.1
+    snapshot = simulation.snapshot()
+    assert simulation.advance(0.5).q[0] == pytest.approx(0.5, abs=1e-12)
+    assert calls == ["fail", 0.1]
+    simulation.restore(snapshot)
+    simulation.advance(0.5)
+    assert calls == ["fail", 0.1, 0.1]
+
+
+def test_a_callback_cannot_restore_the_simulation_that_calls_it(tmp_path):
+    simulation = turning(tmp_path)
+    before = simulation.snapshot()
+    simulation.watch("joint_position", "joint_1", 0.2)
+    simulation.every(0.1, lambda s: s.restore(before))
+    with pytest.raises(ScenarioError, match="a callback cannot restore the simulation that calls it; restore it after"):
+        simulation.advance(0.5)
+    with pytest.raises(ScenarioError, match="ticks or events were added since"):
+        simulation.restore(before)
+
+
+def test_a_tick_added_in_a_callback_is_called_at_that_time(tmp_path):
+    simulation, times, kept = turning(tmp_path), [], []
+
+    def add(s: dynsim.Simulation) -> None:
+        kept.append(s.snapshot())
+        s.every(0.2, lambda s: times.append(s.time))
+        s.watch("joint_position", "joint_1", 0.4, call=lambda s: times.append(s.state.q[0]))
+        kept.append(s.snapshot())
+
+    simulation.every(10.0, add, first=0.1)
+    for _ in range(2):
+        times.clear()
+        simulation.advance(0.45)
+        np.testing.assert_allclose(times, [0.1, 0.3, 0.4], atol=1e-12)
+        simulation.restore(kept[1])
+    with pytest.raises(ScenarioError, match="ticks or events were added since"):
+        simulation.restore(kept[0])
+
+
+def test_the_source_of_an_operator_cannot_take_a_snapshot(tmp_path):
+    """Half of its tick would be lost; a record it may take."""
+    scenario = read(tmp_path, TWO_LINKS.replace("METHOD", "dopri5") + OPERATED)
+    simulations, asked = [], []
+
+    class Source:
+        def read(self, tick: int) -> np.ndarray:
+            script = scenario_script.read(tick)
+            if simulations and tick == 3:
+                simulations[0].record(pictured=False)
+                asked.append(tick)
+                simulations[0].snapshot()
+            return script
+
+    scenario_script = dynsim.Simulation(scenario).operator.source
+    simulations.append(dynsim.Simulation(scenario, operator=Source()))
+    with pytest.raises(ScenarioError, match="source of its commands, cannot take a snapshot"):
+        simulations[0].advance(0.5)
+    assert asked == [3]
+
+
+@pytest.mark.parametrize("until", [0.3, 0.6, 0.7])
+def test_a_tick_a_rounding_after_the_time_asked_for_is_not_lost(until):
+    """3 × 0.1 is beyond 0.3: the tick came in no piece of the run when something was rewritten there."""
+    simulation, times = dynsim.Simulation(dynsim.load_scenario("single_pendulum")), []
+    simulation.every(0.1, lambda s: times.append(s.time))
+    simulation.advance(until)
+    assert len(times) == round(until / 0.1) + 1
+    simulation.set_wrench("link_1", force=[0.0, 0.0, 0.1])
+    simulation.advance(1.0)
+    np.testing.assert_allclose(times, 0.1 * np.arange(11), atol=1e-14)
+
+
+def test_references_hold_at_their_end_in_whatever_pieces_a_run_is_advanced(tmp_path):
+    """Also where every motor followed something else when a piece began."""
+    text = TWO_LINKS.replace("METHOD", "dopri5") + DRIVEN_TO.replace("SAMPLED", "")
+    ends = []
+    for pieces in ([1.5], [0.15, 1.5]):
+        simulation = dynsim.Simulation(read(tmp_path, text), duration=2.0)
+        simulation.every(10.0, lambda s: s.set_reference("joint_1", 1.0), first=0.1)
+        simulation.every(10.0, lambda s: s.release("joint_1"), first=0.2)
+        ends.append([simulation.advance(until) for until in pieces][-1])
+    np.testing.assert_array_equal(ends[0].q, ends[1].q)
+
+
+def test_an_event_that_only_a_shortened_step_finds_is_called_at_its_time(tmp_path):
+    """q = t − t²: a long step passes the level and comes back; something is rewritten in between, at the top."""
+    simulation, seen, kept = turning(tmp_path), [], []
+    inertia = simulation.model.mass_matrix(np.zeros(1))[0, 0]
+    simulation.set_wrench("link_1", torque=[0.0, 0.0, -2.0 * inertia])
+
+    def call(s: dynsim.Simulation) -> None:
+        seen.append(s.state)
+        kept.append(s.snapshot())
+
+    simulation.watch("joint_position", "joint_1", 0.2499, call=call)
+    simulation.advance(0.5)
+    assert not seen
+    simulation.record()
+    assert not seen
+    simulation.set_wrench("link_1")
+    assert simulation.time == 0.5
+    assert simulation.state.q[0] == pytest.approx(0.25, abs=1e-12)
+    (state,) = seen
+    assert state.time == pytest.approx(0.49, abs=1e-9)
+    assert state.q[0] == pytest.approx(0.2499, abs=1e-12)
+    assert [event.time for event in simulation.happened] == [state.time]
+    # It knows nothing of the step that was to end at 0.5 s.
+    simulation.restore(kept[0])
+    assert simulation.advance(1.0).q[0] == pytest.approx(0.0, abs=1e-9)
