@@ -11,7 +11,11 @@ is evaluated anyway: the cubic through these values and those at the ends shows 
 
 from __future__ import annotations
 
+import math
+
 from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact import unilateral as ku
+from dynsim.dynamics.contact.unilateral import UnilateralArrays
 from dynsim.dynamics.derivative import System
 from dynsim.dynamics.tables import Workspace
 from dynsim.dynamics.tree.points import point_position
@@ -68,13 +72,25 @@ def guard(system: System, t, ws: Workspace, run: Run, e):
 def note_inside(system: System, ws: Workspace, run: Run, place, x):
     """Note the guards at part x of the step that is being taken, right after ``derivative`` there, for `turns_within`.
 
-    Those of the unilateral law are looked at by :func:`too_long`.
+    Of the unilateral law only forces of closed contacts: :func:`too_long` looks at gaps, slip and rates. NaN for others.
     """
     run.clock[ki.INNER + place] = x
     for e in range(run.event.shape[0]):
-        if run.event_table[e, ki.EVENT_KIND] < ke.NORMAL_GUARD:
+        value = math.nan
+        if run.event_table[e, ki.EVENT_KIND] < ke.NORMAL_GUARD or presses(system.unilateral, ws, run, e):
             t = run.clock[ki.TIME] + x * run.clock[ki.STEP]
-            run.event[e, ki.INNER_VALUE + place] = guard(system, t, ws, run, e)
+            value = guard(system, t, ws, run, e)
+        run.event[e, ki.INNER_VALUE + place] = value
+
+
+@internal_kernel
+def presses(unilateral: UnilateralArrays | None, ws: Workspace, run: Run, e):
+    """True if event e is that a closed contact loses its force, which the motion determines."""
+    if unilateral is None:  # known to the compiler
+        return False
+    if run.event_table[e, ki.EVENT_KIND] != ke.NORMAL_GUARD or unilateral.number[ku.SPLIT] == 1.0:
+        return False
+    return ws.active[run.event_table[e, ki.EVENT_INDEX], ka.MODE] != ka.OPEN
 
 
 @internal_kernel
@@ -92,7 +108,7 @@ def turns_within(run: Run):
     """
     fraction, event, a, b = 1.0, run.event, run.clock[ki.INNER], run.clock[ki.INNER + 1]
     for e in range(event.shape[0]):
-        if run.event_table[e, ki.EVENT_KIND] >= ke.NORMAL_GUARD:
+        if math.isnan(event[e, ki.INNER_VALUE]) or math.isnan(event[e, ki.INNER_VALUE + 1]):
             continue
         side = event[e, ki.SIDE] if event[e, ki.SIDE] != 0.0 else (1.0 if event[e, ki.VALUE] > 0.0 else -1.0)
         g0, g1 = side * event[e, ki.START_VALUE], side * event[e, ki.VALUE]
