@@ -72,7 +72,7 @@ def guard(system: System, t, ws: Workspace, run: Run, e):
 def note_inside(system: System, ws: Workspace, run: Run, place, x):
     """Note the guards at part x of the step that is being taken, right after ``derivative`` there, for `turns_within`.
 
-    Of the unilateral law only forces of closed contacts: :func:`too_long` looks at gaps, slip and rates. NaN for others.
+    Of the unilateral law only forces of closed contacts: :func:`too_long` looks at gaps and slip. Others are NaN.
     """
     run.clock[ki.INNER + place] = x
     for e in range(run.event.shape[0]):
