@@ -210,10 +210,10 @@ def _contact(
     lowest = float(min(extremes[ki.FORCE_MIN], force.min(initial=np.inf)))
     if unilateral is not None and lowest >= -PULLS * most:
         lowest = max(lowest, 0.0)
-    # Steps may be longer than the time for which a contact pulls: samples within them show it too.
-    pulling = float(extremes[ki.PULLING]) / duration if duration > 0.0 else 0.0
-    if len(force):
-        pulling = max(pulling, float(np.mean(force < 0.0)))
+    # Steps may be longer than the time for which a contact pulls: then samples within them show it.
+    pulling, sampled = float(extremes[ki.PULLING]) / duration if duration > 0.0 else 0.0, int((force < 0.0).sum())
+    if sampled > pulling * len(force) + 2.0:
+        pulling = sampled / len(force)
     # Extremes are those of every accepted step, which are closer together than the samples, and of the samples.
     return {
         "name": contact.name,

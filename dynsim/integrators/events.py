@@ -69,18 +69,18 @@ def guard(system: System, t, ws: Workspace, run: Run, e):
 
 
 @internal_kernel
-def note_inside(system: System, ws: Workspace, run: Run, place, x):
+def note_inside(system: System, ws: Workspace, run: Run, inner, x):
     """Note the guards at part x of the step that is being taken, right after ``derivative`` there, for `turns_within`.
 
     Of the unilateral law only forces of closed contacts: :func:`too_long` looks at gaps and slip. Others are NaN.
     """
-    run.clock[ki.INNER + place] = x
+    run.clock[ki.INNER + inner] = x
     for e in range(run.event.shape[0]):
         value = math.nan
         if run.event_table[e, ki.EVENT_KIND] < ke.NORMAL_GUARD or presses(system.unilateral, ws, run, e):
             t = run.clock[ki.TIME] + x * run.clock[ki.STEP]
             value = guard(system, t, ws, run, e)
-        run.event[e, ki.INNER_VALUE + place] = value
+        run.event[e, ki.INNER_VALUE + inner] = value
 
 
 @internal_kernel

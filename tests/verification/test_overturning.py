@@ -388,7 +388,7 @@ def test_a_run_that_is_to_stop_where_it_tips_ends_there_with_all_that_it_has(tmp
     assert stepped.value.record["q"].tobytes() == record["q"].tobytes()
 
 
-PUSHED = """
+TIPPED = """
 duration_s: 3.0
 plant:
   type: pws_arm
@@ -407,13 +407,13 @@ def test_a_base_that_tips_and_comes_back_within_one_step_tips(tmp_path):
     """From 1.18 s to 1.42 s, which radau5 passes over in a step; at the time that short steps of dopri5 find."""
     path, times = tmp_path / "case.yaml", []
     for overrides in ({"method": "radau5"}, {"method": "dopri5"}, {"method": "dopri5", "step_max_s": 1e-3}):
-        path.write_text(PUSHED.replace("OVERTURN", "stop"))
+        path.write_text(TIPPED.replace("OVERTURN", "stop"))
         with pytest.raises(SimulationStopped, match="the base tips over") as stop:
             dynsim.simulate(dynsim.load_scenario(path, overrides={f"integrator.{k}": overrides[k] for k in overrides}))
         times.append(stop.value.time)
         assert stop.value.record["tip_margin"].min() > 0.0
     assert times == pytest.approx([times[-1]] * 3, abs=1e-9)
-    path.write_text(PUSHED.replace("OVERTURN", "warn"))
+    path.write_text(TIPPED.replace("OVERTURN", "warn"))
     record = dynsim.simulate(dynsim.load_scenario(path))
     assert record.summary["base"]["overturns_at_s"] == times[0]
     below = record.time[record["tip_margin"] < 0.0]

@@ -1017,7 +1017,7 @@ def test_references_hold_at_their_end_in_whatever_pieces_a_run_is_advanced(tmp_p
     np.testing.assert_array_equal(ends[0].q, ends[1].q)
 
 
-def test_an_event_that_only_a_shortened_step_finds_is_called_at_its_time(tmp_path):
+def test_an_event_within_a_step_that_is_shortened_is_called_once_at_its_time(tmp_path):
     """q = t − t²: a long step passes the level and comes back; something is rewritten in between, at the top."""
     simulation, seen, kept = turning(tmp_path), [], []
     inertia = simulation.model.mass_matrix(np.zeros(1))[0, 0]
@@ -1029,9 +1029,8 @@ def test_an_event_that_only_a_shortened_step_finds_is_called_at_its_time(tmp_pat
 
     simulation.watch("joint_position", "joint_1", 0.2499, call=call)
     simulation.advance(0.5)
-    assert not seen
+    assert len(seen) == 1
     simulation.record()
-    assert not seen
     simulation.set_wrench("link_1")
     assert simulation.time == 0.5
     assert simulation.state.q[0] == pytest.approx(0.25, abs=1e-12)
