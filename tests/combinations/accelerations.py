@@ -127,16 +127,21 @@ def critical(seen: Observed, values: Mapping[str, Sequence[float]]) -> bool:
     whole, basis = state_of(seen, values), seen.bodies.free_directions()
     identity, count = np.eye(len(whole.v)), len(whole.names)
     rows = np.vstack([np.zeros((0, len(whole.v))), *whole.rows, *(identity[j][None] for j in whole.resting)])
-    W = rows @ basis @ np.linalg.solve(basis.T @ whole.mass @ basis, basis.T @ rows.T)
+    inverse = _mobility(whole, basis)
+    W = rows @ inverse @ rows.T
     blocks = [[3 * k, 3 * k + 1, 3 * k + 2] for k in range(count)]
     blocks += [[3 * count + m] for m in range(len(whole.resting))]
     # A part in which all contacts slide has no other modes to choose from, whatever the rest does.
     for part in parts(W, blocks):
-        if max(part) < count and all(float(np.linalg.norm(whole.slip[k])) > RESTS for k in part):
-            inverse = basis @ np.linalg.solve(basis.T @ whole.mass @ basis, basis.T)
-            if _paradox(whole, part, inverse, (1.0,) if seen.real else (1.0, -1.0)):
-                return True
+        slides = max(part) < count and all(float(np.linalg.norm(whole.slip[k])) > RESTS for k in part)
+        if slides and _paradox(whole, part, inverse, (1.0,) if seen.real else (1.0, -1.0)):
+            return True
     return _some_modes_critical(whole, basis, real=seen.real)
+
+
+def _mobility(state: State, basis: Array) -> Array:
+    """Accelerations of unit forces in the free directions of a basis, (n, n)."""
+    return np.asarray(basis @ np.linalg.solve(basis.T @ state.mass @ basis, basis.T))
 
 
 def _some_modes_critical(state: State, basis: Array, *, real: bool) -> bool:
@@ -150,8 +155,7 @@ def _some_modes_critical(state: State, basis: Array, *, real: bool) -> bool:
             free = _null_space(np.vstack(fixed) @ basis, basis) if fixed else basis
             if free.shape[1] == 0:
                 continue
-            inverse = free @ np.linalg.solve(free.T @ state.mass @ free, free.T)
-            if _paradox(state, sliding, inverse, (1.0,) if real else (1.0, -1.0)):
+            if _paradox(state, sliding, _mobility(state, free), (1.0,) if real else (1.0, -1.0)):
                 return True
     return False
 
@@ -256,8 +260,7 @@ def _solved(seen: Observed, state: State, time: float) -> tuple[bool, Array]:
 def _problem(seen: Observed, state: State, time: float) -> tuple[Array, Array, Array, Array, Array]:
     """W and b of the accelerations W f + b along the rows of contacts, resting joints and stops; rows, M⁻¹, push."""
     push, n = _applied(seen, state, time), len(state.v)
-    basis = seen.bodies.free_directions()
-    inverse = basis @ np.linalg.solve(basis.T @ state.mass @ basis, basis.T)
+    inverse = _mobility(state, seen.bodies.free_directions())
     joints = [np.eye(n)[j][None] for j in state.resting] + [side * np.eye(n)[j][None] for j, side in state.stops]
     rows = np.vstack([np.zeros((0, n)), *state.rows, *joints])
     free = rows @ inverse @ push + np.concatenate([_drifts(seen, state).ravel(), np.zeros(len(joints))])

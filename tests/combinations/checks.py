@@ -77,10 +77,9 @@ def compare(scenario: Mapping[str, Any], runs: Mapping[str, Run]) -> list[Proble
 
 def started_as_checked(run: Run) -> Finding:
     """Check that ``check`` refuses a scene if and only if it does not start."""
-    started = run.record is not None and len(run.record) > 0
-    if started and run.checked is not None:
+    if run.begun and run.checked is not None:
         yield f"check refuses what runs: {run.checked[:200]}"
-    if not started and run.checked is None:
+    if not run.begun and run.checked is None:
         yield f"check passes what does not start: {str(run.error)[:200]}"
 
 

@@ -175,7 +175,7 @@ def motion(seen: Observed) -> Finding:
     for label, value, rate in (("v", seen.v, seen.vdot), ("q", seen.q, speeds)):
         off, allowed, rows = integral_error(seen, value, rate)
         if label == "v" and any((touch.mode != OPEN).any() for touch in seen.touches()):
-            allowed = allowed + np.reshape([_projected(seen, i) for i in rows], allowed.shape)
+            allowed = allowed + _projected(seen, rows)
         if off.size and (off / allowed).max() > 1.0:
             k, j = np.unravel_index((off / allowed).argmax(), off.shape)
             yield (
@@ -185,19 +185,23 @@ def motion(seen: Observed) -> Finding:
             )
 
 
-def _projected(seen: Observed, i: int) -> Array:
-    """Change of rates by projection near a sample, (n,): of the least norm that takes PROJECTED from each closed row.
+def _projected(seen: Observed, samples: NDArray[np.int_]) -> Array:
+    """Changes of rates by projection, (samples, n): of the least norm that takes PROJECTED from each closed row.
 
     Where rows nearly depend on each other that is many times as much. Directions of joints count too, so that it is
     PROJECTED at least.
     """
-    rows = []
-    for touch in seen.touches():
-        if touch.mode[i] != OPEN:
-            J = seen.bodies.jacobian(seen.motion, touch.body, touch.position)[i]
-            rows += [*J] if touch.mode[i] == STICKING else [touch.normal[i] @ J]
-    inverse = np.linalg.pinv(np.array(rows), rcond=1e-9) if rows else np.zeros((seen.v.shape[1], 0))
-    return np.asarray(PROJECTED * (1.0 + np.abs(inverse).sum(axis=1)))
+    touches = [touch for touch in seen.touches() if (touch.mode != OPEN).any()]
+    jacobians = [seen.bodies.jacobian(seen.motion, touch.body, touch.position) for touch in touches]
+    changes = np.full((len(samples), seen.v.shape[1]), PROJECTED)
+    for change, i in zip(changes, samples, strict=True):
+        rows = []
+        for touch, J in zip(touches, jacobians, strict=True):
+            if touch.mode[i] != OPEN:
+                rows += [*J[i]] if touch.mode[i] == STICKING else [touch.normal[i] @ J[i]]
+        if rows:
+            change *= 1.0 + np.abs(np.linalg.pinv(np.array(rows), rcond=1e-9)).sum(axis=1)
+    return changes
 
 
 def _stepped_motion(seen: Observed) -> Finding:

@@ -53,6 +53,11 @@ class Run:
     checked: str | None = None
 
     @property
+    def begun(self) -> bool:
+        """Whether there is a sample: a run that stops before its first one has not begun."""
+        return self.record is not None and len(self.record) > 0
+
+    @property
     def status(self) -> str:
         """``finished``, ``refused``, the kind of a stop, or the class of an error that is not a DynsimError."""
         if self.error is None:
@@ -197,9 +202,8 @@ def faults(scene: Scene, done: Mapping[str, Run], *, thorough: bool = False) -> 
 
 def _began(scene: Scene, own: Run) -> list[tuple[str, str]]:
     """Return faults if ``check`` and the run disagree, a valid start is refused, or an unexpected error occurs."""
-    # A run that stops before its first sample has not begun.
     stopped = isinstance(own.error, SimulationStopped)
-    refused = isinstance(own.error, DynsimError) and not (stopped and own.record is not None and len(own.record))
+    refused = isinstance(own.error, DynsimError) and not (stopped and own.begun)
     if own.error is not None and not isinstance(own.error, DynsimError):
         return [("crash", f"{type(own.error).__name__}: {own.error}")]
     if own.checked is None and refused:
