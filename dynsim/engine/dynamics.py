@@ -12,7 +12,7 @@ from dynsim.engine.outcome import interrupted, raise_stopped
 from dynsim.engine.prepare import Prepared, prepare, sample_times
 from dynsim.engine.recording import make_record
 from dynsim.engine.soundness import unstable_loop
-from dynsim.engine.start import check
+from dynsim.engine.start import check, commanded_by_python
 from dynsim.engine.stepped import event_name, own_guards, take_log
 from dynsim.engine.stopping import last_state, stopped
 from dynsim.errors import SimulationStopped
@@ -38,8 +38,7 @@ def simulate(scenario: Scenario, progress: Progress | None = None, *, pictured: 
         # Not prepared twice: that raises the head of a snake.
         return _stepped(scenario, progress, pictured)
     prepared = prepare(scenario, progress)
-    sensors = scenario.config.sensors
-    if prepared.control.teleop is not None or (sensors is not None and sensors.encoders is not None):
+    if commanded_by_python(scenario, prepared.control):
         return _stepped(scenario, progress, pictured)
     size = prepared.model.n, len(prepared.contacts), len(prepared.stops)
     # Loading or compiling the kernels is no integration time.

@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 
 from dynsim.compile.clearance import by_surface, sinking
+from dynsim.compile.control import JointControl
 from dynsim.compile.equilibrium import holding_torques, load_forces, static_margin
 from dynsim.compile.model import Model
 from dynsim.compile.shapes import gap_at
@@ -50,19 +51,24 @@ def check(scenario: Scenario, started: Callable[[Start], None]) -> Start:
     return start
 
 
+def commanded_by_python(scenario: Scenario, control: JointControl) -> bool:
+    """Return whether Python code gives commands at ticks: an operator, the controller of a snake, or encoders."""
+    sensors = scenario.config.sensors
+    encoded = sensors is not None and sensors.encoders is not None
+    return encoded or control.teleop is not None or control.task_space is not None
+
+
 def _begin(scenario: Scenario, prepared: Prepared) -> None:
     """Choose contact modes and find forces at t = 0, as a run does before its first step.
 
-    Not where Python code gives the first commands: an operator, the controller of a snake, encoders.
+    Not if Python code gives the first commands.
 
     Raises
     ------
     SimulationStopped
         If there are none, or none that can last.
     """
-    control, sensors = prepared.control, scenario.config.sensors
-    encoded = sensors is not None and sensors.encoders is not None
-    if not prepared.contacts or control.teleop is not None or control.task_space is not None or encoded:
+    if not prepared.contacts or commanded_by_python(scenario, prepared.control):
         return
     attended.load(prepared)
     work = partial(driver.advance, prepared.system, prepared.workspace, prepared.run, 0)

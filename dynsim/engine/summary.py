@@ -206,9 +206,9 @@ def _contact(
     real = {} if unilateral is None else _modes(unilateral, k, duration)
     extremes = run.extremes[k] if run.count[ki.STEPS] else np.zeros(ki.EXTREMES_SIZE)
     # Under the unilateral law a force ends at zero; what lies below is the tolerance of that event, up to PULLS.
-    most = max(float(extremes[ki.FORCE_MAX]), float(force.max(initial=0.0)))
+    largest = float(max(extremes[ki.FORCE_MAX], force.max(initial=-np.inf)))
     lowest = float(min(extremes[ki.FORCE_MIN], force.min(initial=np.inf)))
-    if unilateral is not None and lowest >= -PULLS * most:
+    if unilateral is not None and lowest >= -PULLS * max(largest, 0.0):
         lowest = max(lowest, 0.0)
     # Steps may be longer than the time for which a contact pulls: then samples within them show it.
     pulling, sampled = float(extremes[ki.PULLING]) / duration if duration > 0.0 else 0.0, int((force < 0.0).sum())
@@ -220,7 +220,7 @@ def _contact(
         "surface": contact.surface_name,
         "normal_force_min_N": lowest,
         "normal_force_mean_N": float(record["contact_impulse"][-1, k] / duration) if duration > 0 else 0.0,
-        "normal_force_max_N": float(max(extremes[ki.FORCE_MAX], force.max(initial=-np.inf))),
+        "normal_force_max_N": largest,
         "closed_fraction": 1.0,
         "pulling_fraction": min(pulling, 1.0),
         "slip_distance_m": float(record["contact_slip_distance"][-1, k]) if len(record) else 0.0,
