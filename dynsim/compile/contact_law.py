@@ -150,8 +150,8 @@ def contact_laws(robot: Robot, contacts: Sequence[Contact]) -> NDArray[np.float6
         Static friction below the kinetic one, negative numbers, or restitution above one.
     """
     law = np.ones((len(contacts), ka.CONTACT_LAW_SIZE))
-    # Isotropic friction has no axis: tangents that turned with the body would turn the rates of a step, and those that
-    # it has stopped with them.
+    # Isotropic friction has no axis: tangents that turned with the body would turn the rates of a step, also rates
+    # that it has stopped.
     law[:, [ka.FLOOR, ka.GRIP_AXIS, ka.GRIP_AXIS + 1, ka.GRIP_AXIS + 2]] = 0.0
     for row, contact in zip(law, contacts, strict=True):
         where = f"contact {contact.name}"

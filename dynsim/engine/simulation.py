@@ -148,7 +148,7 @@ class Simulation:
         self._relative = trace is not None or state is not None
         self._happened: list[Event] = []
         self._token = object()
-        # Callbacks that are due at the present time, in the order of their calls; the one that is called now.
+        # Callbacks that are due at the present time, in the order of their calls; the callback that is called now.
         self._due: list[Callable[[Simulation], None]] = []
         self._calling: Callable[[Simulation], None] | None = None
         self._loaded, self._watch = False, attended.WallWatch(scenario.integrator.wall_limit_s)
@@ -360,7 +360,7 @@ class Simulation:
             )
         if len(self._calls) == MOST_TICKS:
             raise ScenarioError(f"a simulation has at most {MOST_TICKS} ticks; call several functions at one")
-        # First: callbacks on the way may add ticks of their own.
+        # First, since callbacks on the way may add ticks.
         self._settle_now()
         run = self._prepared.run
         tick = np.zeros((1, ki.TICK_SIZE))
@@ -602,12 +602,11 @@ class Simulation:
             self._go_back(before)
 
     def snapshot(self) -> Snapshot:
-        """What :meth:`restore` needs to go on from here.
+        """Return everything that :meth:`restore` needs to continue from here.
 
-        A snapshot is of the moment at which it is taken, also within a callback: what the callback has done before is
-        in it; what it does afterwards is not, and does not happen again, as the callback is not called again. Other
-        callbacks that are due at this time and have not been called yet are called by the next :meth:`advance`. What
-        callbacks keep themselves is not in the snapshot.
+        A callback may take a snapshot too. It contains the changes that the callback has made before, but not its later
+        ones, and :meth:`restore` does not call that callback again. Other callbacks that are due at this time and have
+        not been called yet are called by the next :meth:`advance`. Variables of callbacks are not in the snapshot.
 
         Raises
         ------
@@ -616,13 +615,13 @@ class Simulation:
         """
         if any(self._calling is call for call in self._own_calls):
             raise ScenarioError(
-                "an operator, or the source of its commands, cannot take a snapshot of the simulation that asks it; "
-                "take it in a callback of Simulation.every, or between two calls of advance"
+                "an operator, or the source of its commands, cannot take a snapshot of the simulation that asks it: "
+                "only callbacks of Simulation.every can, or the caller between two calls of advance"
             )
         return self._kept()
 
     def _kept(self) -> Snapshot:
-        """The snapshot; of the middle of an operator's tick only to go back to at once."""
+        """Return the snapshot; one from the middle of an operator's tick is only good to go back to at once."""
         arrays = {name: array.copy() for name, array in self._arrays().items()}
         attendants = [attendant.remembered() for attendant in self._attendants]
         trace, happened, pushed = self._trace.snapshot(), tuple(self._happened), frozenset(self._pushed)
@@ -808,9 +807,9 @@ class Simulation:
         return raised
 
     def _take_due(self, raised: BaseException | None) -> None:
-        """Empty the log of the kernels, and note what is due at the present end of the run.
+        """Empty the log of the kernels, and note the callbacks that are due at the present end of the run.
 
-        All before the first call: a snapshot in a callback has what happened, and what is due, at the same time.
+        All before the first call, so that a snapshot in a callback has all events and due callbacks of this time.
         """
         run = self._prepared.run
         for time, e in take_log(run):
@@ -829,7 +828,7 @@ class Simulation:
             self._time = float(run.clock[ki.TIME])
 
     def _call_due(self) -> None:
-        """Call what is due, each once, whatever it raises."""
+        """Call all due callbacks, each once, even if it raises."""
         while self._due:
             self._calling = self._due.pop(0)
             try:

@@ -66,7 +66,7 @@ def _begin(scenario: Scenario, prepared: Prepared) -> None:
     Raises
     ------
     SimulationStopped
-        If there are none, or none that can last.
+        If forces do not exist, or cannot last.
     """
     if not prepared.contacts or commanded_by_python(scenario, prepared.control):
         return
@@ -115,7 +115,7 @@ def _touching(model: Model, contacts: Sequence[Contact]) -> tuple[dict[str, Arra
     for contact in contacts:
         try:
             gaps[contact.name] = gap_at(model, contact, q)
-        except ModelError:  # a body that there is not: the check of contacts says where
+        except ModelError:  # an unknown body, of which the check of contacts gives the line
             continue
         points[contact.name] = model.point_position(contact.body, contact.point, q)
     return points, gaps

@@ -205,7 +205,7 @@ def _contact(
     force, run, unilateral = record["contact_normal_force"][:, k], prepared.run, prepared.system.unilateral
     real = {} if unilateral is None else _modes(unilateral, k, duration)
     extremes = run.extremes[k] if run.count[ki.STEPS] else np.zeros(ki.EXTREMES_SIZE)
-    # Under the unilateral law a force ends at zero; what lies below is the tolerance of that event, up to PULLS.
+    # Under the unilateral law a force ends at zero; less is the tolerance of that event, up to PULLS.
     largest = float(max(extremes[ki.FORCE_MAX], force.max(initial=-np.inf)))
     lowest = float(min(extremes[ki.FORCE_MIN], force.min(initial=np.inf)))
     if unilateral is not None and lowest >= -PULLS * max(largest, 0.0):

@@ -35,8 +35,8 @@ TIP_MARGIN = 9
 # Most trial steps for a root; regula falsi with halving (Illinois) needs about eight. After FALSI_LIMIT trials the
 # bracket is bisected, for guards that jump (forces do where their split changes); after SEARCH_LIMIT one more is taken.
 SEARCH_LIMIT, FALSI_LIMIT = 60, 16
-# Of what a guard turns back by within a step, the part by which it may stay short of zero and the step ends there all
-# the same: the cubic is not exact. The next step shows more, as its ends are next to the turn.
+# A step also ends at a turn that stays short of zero by this part of the way back, since the cubic is not exact. The
+# next step shows more, as its ends are next to the turn.
 SHORT_OF_ZERO = 0.1
 # A guard that turns back by less than this part of its level, or of its unit, is at rest but for rounding.
 ROUNDING = 1e-12
@@ -103,8 +103,8 @@ def rounding(run: Run, e):
 def turns_within(run: Run):
     """Return the fraction of the step just taken at which a guard turns beyond zero and comes back, or 1.
 
-    By the cubic through its values at both ends and at two stages. In which direction it counts does not matter: of two
-    passages one does.
+    By the cubic through its values at both ends and at two stages. The event's direction does not matter, since one of
+    two passages has it.
     """
     fraction, event, a, b = 1.0, run.event, run.clock[ki.INNER], run.clock[ki.INNER + 1]
     for e in range(event.shape[0]):
@@ -121,7 +121,7 @@ def turns_within(run: Run):
         x = lowest(slope, bend, third)
         nearest, least = min(g0, g1), g0 + x * (slope + x * (bend + x * third))
         back = nearest - least
-        # Where the end is far beyond zero the guard has passed once, in the direction that does not count.
+        # If the end is far beyond zero the guard has passed once, in the direction that does not count.
         passes = least < SHORT_OF_ZERO * back and nearest > -SHORT_OF_ZERO * back
         if x < 1.0 and back > rounding(run, e) and passes:
             fraction = min(fraction, x)
@@ -196,7 +196,7 @@ def cut_step(system: System, ws: Workspace, run: Run):
             if not hit:
                 keep_passed(run)
             count[ki.SEARCHING] = 0
-            # What was passed over before the event comes first.
+            # Contacts and turns that were passed over before the event come first.
             if passes_over(system, ws, run):
                 return True
             count[ki.FIRED] = 1

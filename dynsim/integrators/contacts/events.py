@@ -242,7 +242,7 @@ def lowest(d0, a, b):
     """Where d0 x + a x² + b x³ has a minimum between 0 and 1, or 1."""
     root, x = a * a - 3.0 * b * d0, 1.0
     if root > 0.0:
-        # Of two forms of the same root the one without cancellation.
+        # The form of the root that has no cancellation.
         if d0 < 0.0 and a + math.sqrt(root) != 0.0:
             x = -d0 / (a + math.sqrt(root))
         elif d0 >= 0.0 and a < 0.0 and b > 0.0:

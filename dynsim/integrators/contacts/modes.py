@@ -189,10 +189,10 @@ def some_turned_round(system: System, ws: Workspace):
 
 @noinline_kernel
 def choose_joints(system: System, ws: Workspace, run: Run):
-    """Choose modes, and if there are no forces, once more without what leaves.
+    """Choose modes, and if there are no forces, again without the points and stops that leave.
 
-    An impact may leave rates that are too slow to count as leaving. They are taken to be zero, which is no law: where
-    that has no solution, what leaves has no force.
+    An impact may leave rates that are too slow to count as leaving. They are taken to be zero, by a convention and not
+    by the law: if that has no solution, these points and stops have no force.
     """
     not_unique = run.clock[ki.NOT_UNIQUE]
     choose_rule(system, ws, run)
@@ -204,7 +204,7 @@ def choose_joints(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def release_leaving(system: System, ws: Workspace):
-    """Release what leaves more slowly than an impact settles, but by more than rounding; True if there is any."""
+    """Release points and stops that leave more slowly than impacts settle, but not by rounding; True if any do."""
     unilateral, any_leaves = system.unilateral, False
     mode, table = unilateral.mode, unilateral.stop_table
     for k in range(mode.shape[0]):
