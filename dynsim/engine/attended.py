@@ -156,11 +156,12 @@ def _short_steps(prepared: Prepared) -> int:
 
     They are taken in the caller's own thread: to hand a short run to another one costs some hundredths of its time.
     None under the unilateral law, where one step may take a minute; but steps of one length, whose contact problems
-    are given up after so many rounds.
+    are given up after so many rounds. So many are hardly ever needed, and a thread for each tick of a controller would
+    double the time of a snake: they may take as long as code that was asked to return.
     """
     if prepared.system.unilateral is not None:
         rows = max(prepared.workspace.small.shape[1], 1)
-        return int(LOOK_S / (kt.MOST_ROUNDS * ROUND * rows**3)) if prepared.run.stepping is not None else 0
+        return int(PATIENCE_S / (kt.MOST_ROUNDS * ROUND * rows**3)) if prepared.run.stepping is not None else 0
     n, p = len(prepared.workspace.joints), prepared.workspace.small.shape[1]
     seconds = right_hand_side(n, p, dense=prepared.system.dense is not None)
     # Of RADAU5 with a Jacobian and its factors.

@@ -145,6 +145,7 @@ def prepare(
     stops = joint_stops(robot) if real else []
     stepped = scenario.integrator.method == "time_stepping"
     dry = dry_frictions(robot) if real else []
+    watched = real and bool(contacts or stops or dry)
     check_robot(scenario.config, robot)
     gives = bool(robot.ties) or any(contact.stiffness > 0.0 for contact in contacts)
     sizes = kst.LOSSES if real else 0, 1 if stepped else 0, kst.ELASTIC_SIZE if gives else 0
@@ -215,7 +216,7 @@ def prepare(
         hand=(model.body_index(robot.hand[0]), robot.hand[1]),
         end=scenario.duration_s if end is None else end,
         step=step,
-        step_max=min(options.step_max_s or np.inf, _longest_step(method, real)),
+        step_max=min(options.step_max_s or np.inf, _longest_step(method, watched=watched)),
         rtol=options.rtol * choice.sharper,
         atol=options.absolute_tolerance * choice.sharper,
         ticks=_ticks(control),
@@ -351,14 +352,14 @@ def _least_progress(duration: float) -> float:
     return max(least, min(10.0 * least, STANDS))
 
 
-def _longest_step(method: int, real: bool) -> float:
-    """Return the longest step while forces are watched [s].
+def _longest_step(method: int, *, watched: bool) -> float:
+    """Return the longest step, of implicit methods where forces of contacts, stops or dry friction are watched [s].
 
     While everything rests, nothing limits the steps, and a force could fall below zero and rise again within one of
     them. Knots of references are as far apart as this. An implicit method stops at their bends, but a force may pass
-    its bound between two of them, which changes the motion where contacts are real.
+    its bound between two of them, which changes the motion.
     """
-    return PACE if method == ki.DOPRI5 or (real and method == ki.RADAU5) else np.inf
+    return PACE if method == ki.DOPRI5 or (watched and method == ki.RADAU5) else np.inf
 
 
 def _breaks(loads: Sequence[Load], control: JointControl, method: int, options: Integrator) -> np.ndarray:

@@ -466,6 +466,20 @@ def test_a_simulation_whose_step_did_not_end_does_not_go_on(monkeypatch: pytest.
     assert "does not end" in record.summary["warnings"][-1]
 
 
+def test_ticks_of_a_snake_are_run_without_a_thread_each(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A thread for each tick took more than half of the time."""
+    handed_over = []
+
+    def attend(work: Any, *others: Any) -> Any:
+        handed_over.append(1)
+        return attend_to(work, *others)
+
+    attend_to = attended.attend
+    monkeypatch.setattr(attended, "attend", attend)
+    dynsim.simulate(dynsim.load_scenario("snake_positioning_dynamic", "x", {"duration_s": 0.1}))
+    assert handed_over == [1]  # the loading of kernels
+
+
 def test_what_the_work_raises_is_raised():
     def work() -> None:
         raise ValueError("of the work")
