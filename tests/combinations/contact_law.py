@@ -301,6 +301,14 @@ def gaps(seen: Observed) -> Finding:
             )
 
 
+def _spent(seen: Observed, joint: str, limit: float, beyond: float) -> bool:
+    """Whether what hits on the stop have taken does not suffice to push the joint back against its largest force."""
+    for stop in seen.record.summary["joint_stops"]:
+        if stop["joint"] == joint and stop["limit"] == limit:
+            return bool(stop.get("impact_loss_J", np.inf) < stop["force_max"] * beyond)
+    return False
+
+
 def stops(seen: Observed) -> Finding:
     """Joints stay within their stops, and steps take back what one let pass; a stop pushes only at its end."""
     if not seen.real:
@@ -322,7 +330,7 @@ def stops(seen: Observed) -> Finding:
             late = seen.time >= seen.time[deepest] + 0.2 + 2.0 * max(float(beyond[deepest]), 0.0) / 0.02
             if beyond[deepest] > 10.0 * STOP_SLACK and late.any():
                 still = float(beyond[late].min())
-                if still > 0.5 * beyond[deepest]:
+                if still > 0.5 * beyond[deepest] and not _spent(seen, link.joint, limit, still):
                     since = seen.time[-1] - seen.time[deepest]
                     yield f"{link.joint} is {still:.3g} beyond its stop for {since:.3g} s and does not come back"
     if "stop_force" in seen.record:

@@ -359,7 +359,7 @@ def _reversed(match: Match, seen: Observed) -> str:
         return "no such contact"
     i, stop = int(np.searchsorted(seen.time, since)), seen.run.error
     if i == len(seen) and isinstance(stop, SimulationStopped):
-        return _not_reversed_at(stop, match[1], seen)
+        return _not_reversed_at(stop, match[1], seen, since)
     i = min(i, len(seen) - 1)
     J = seen.bodies.jacobian(seen.motion, touch.body, touch.position)[i]
     M = seen.bodies.mass_matrix(seen.q[i])
@@ -378,15 +378,22 @@ def _at_latest(said: str) -> float:
     return value + (0.5 * 10.0 ** (np.floor(np.log10(value)) - 3.0) if value > 0.0 else 0.0)
 
 
-def _not_reversed_at(stop: SimulationStopped, name: str, seen: Observed) -> str:
+# A runaway (8584: 5e9 rad/s at its stop) had another posture when it was warned of, which no sample shows [rad or m].
+ANOTHER_POSTURE = 0.1
+
+
+def _not_reversed_at(stop: SimulationStopped, name: str, seen: Observed, since: float) -> str:
     state = state_of(seen, stop.state)
+    if float(np.abs(stop.state["v"]).max()) * (stop.time - since) > ANOTHER_POSTURE:
+        return ""
     if name not in state.names:
         return "it is open at the stop"
     k = state.names.index(name)
     rows, slip = state.rows[k], state.slip[k]
     answer = rows @ np.linalg.solve(state.mass, rows[0])
     speed = float(np.linalg.norm(slip))
-    along = float(answer[1:] @ slip) / speed if speed > AT_REST else float(np.linalg.norm(answer[1:]))
+    slides = speed > AT_REST and stop.time <= since
+    along = float(answer[1:] @ slip) / speed if slides else float(np.linalg.norm(answer[1:]))
     own = float(answer[0]) - state.friction[k] * along
     return "" if own < 0.05 * answer[0] else f"the diagonal entry is {own:.3g} of {answer[0]:.3g} at the stop"
 
