@@ -18,7 +18,7 @@ from dynsim.dynamics.contact.cone.socp import split_size
 from dynsim.dynamics.contact.unilateral import UnilateralArrays, kept_size, share_count
 from dynsim.errors import ModelError
 from dynsim.jit.kernel import integers, reals
-from dynsim.model.description import Contact, Robot, Tie
+from dynsim.model.description import WORLD, Contact, Robot, Tie
 from dynsim.model.drives import TorqueSource
 
 # A joint may start this far beyond its stop [rad or m].
@@ -127,7 +127,8 @@ def _compile_tie(robot: Robot, tie: Tie, table: NDArray[np.int64], row: NDArray[
     where = f"tie {tie.name}"
     if not (tie.stiffness >= 0.0 and tie.damping >= 0.0 and tie.stiffness + tie.damping > 0.0 and tie.bound > 0.0):
         raise ModelError(f"{where}: needs a stiffness or a damping, neither negative, and a positive bound")
-    (a, point), (b, other) = robot.attach(tie.body, tie.point), robot.attach(tie.other, tie.other_point)
+    a, point = robot.attach(tie.body, tie.point)
+    b, other = (-1, tie.other_point) if tie.other == WORLD else robot.attach(tie.other, tie.other_point)
     if a == b:
         raise ModelError(f"{where}: both ends are on {robot.links[a].name}")
     length = float(np.linalg.norm(tie.axis))
@@ -138,7 +139,7 @@ def _compile_tie(robot: Robot, tie: Tie, table: NDArray[np.int64], row: NDArray[
     row[[ku.TIE_STIFFNESS, ku.TIE_DAMPING, ku.TIE_BOUND, ku.TIE_REST]] = tie.stiffness, tie.damping, tie.bound, tie.rest
     row[ku.TIE_AXIS : ku.TIE_AXIS + 3] = robot.attached_axes(tie.body) @ np.asarray(tie.axis) / length
     row[ku.TIE_POINT : ku.TIE_POINT + 3], row[ku.TIE_OTHER_POINT : ku.TIE_OTHER_POINT + 3] = point, other
-    row[ku.TIE_ATTITUDE : ku.TIE_ATTITUDE + 9] = np.eye(3).ravel()
+    row[ku.TIE_ATTITUDE : ku.TIE_ATTITUDE + 9] = tie.attitude.ravel()
 
 
 def contact_laws(robot: Robot, contacts: Sequence[Contact]) -> NDArray[np.float64]:

@@ -24,8 +24,9 @@ from numpy.typing import NDArray
 from dynsim.compile.model import Model
 from dynsim.compile.scene import BODY_RADIUS, snake_tube, snake_wheel
 from dynsim.errors import ModelError
-from dynsim.model.description import Array, Foot, Inertia, Link, Robot
+from dynsim.model.description import Array, Foot, Inertia, Link, Robot, Tie
 from dynsim.model.drives import Drive, Servo
+from dynsim.model.gripper import Gripper
 from dynsim.model.joints.ball import floating
 from dynsim.snake.base_part import BasePart
 from dynsim.snake.description import SnakeDescription
@@ -50,6 +51,7 @@ class SnakeTree(Robot):
     lifts : how high and how fast wheel pairs are lifted
     sag_compensation : of lifted pairs: their pitch joints are told by so much more as their servos give way
     raised : a run begins with the head raised from below; False: with the head let go in its posture, nothing sags yet
+    gripper : on its head
     """
 
     description: SnakeDescription = field(kw_only=True)
@@ -57,6 +59,11 @@ class SnakeTree(Robot):
     lifts: Lifts = field(kw_only=True)
     sag_compensation: bool = field(kw_only=True)
     raised: bool = field(kw_only=True)
+    gripper: Gripper = field(kw_only=True)
+
+    def holding(self, held: str) -> list[Tie]:
+        """Ties by which the gripper can hold the object of that name."""
+        return self.gripper.ties(held)
 
     @property
     def lifting_joints(self) -> tuple[str, ...]:
@@ -99,6 +106,7 @@ def snake_tree(
     lifts: Lifts,
     sag_compensation: bool,
     raised: bool,
+    gripper: Gripper,
 ) -> SnakeTree:
     """The tree of a snake in its initial posture, all wheels on the ground z = 0.
 
@@ -107,6 +115,7 @@ def snake_tree(
     joint_servo, wheel_servo : the servo of a joint by its name
     wheel_inertia : about its axle, of each wheel without its servo [kg m²]
     bearing_drag : viscous drag of each wheel [N m s/rad]
+    gripper : its tip ahead of the head point
     massless_wheels : wheels without servo are no bodies: they have no friction along their way, and no drag
 
     Raises
@@ -199,6 +208,7 @@ def snake_tree(
         lifts=lifts,
         sag_compensation=sag_compensation,
         raised=raised,
+        gripper=replace(gripper, body=HEAD, tip=np.array([l, 0.0, 0.0]) + gripper.tip),
     )
     return replace(robot, q0=configuration(robot, np.asarray(d.initial_joints), np.zeros(d.pairs)))
 

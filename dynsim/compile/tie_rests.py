@@ -6,6 +6,8 @@ A run from its own start leaves this to its first step, ``begin_tie`` in
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from dynsim.compile.model import Model
@@ -22,16 +24,16 @@ def set_rests(model: Model, unilateral: UnilateralArrays, at_start: Array, rests
     at_start : (nq,) coordinates at which the scenario starts
     rests : (e,) x_0 in the state [m or rad]; NaN, or None: as at the scenario's start
     """
-    for k, (tie, ints, row) in enumerate(zip(model.robot.ties, unilateral.tie_table, unilateral.tie, strict=True)):
+    for k, (tie, row) in enumerate(zip(model.robot.ties, unilateral.tie, strict=True)):
         if not tie.holds:
             continue
-        (A, at), (B, other) = (model.body_pose(int(ints[end]), at_start) for end in (ku.TIE_A, ku.TIE_B))
         if np.isnan(tie.rest) and tie.turns:
+            (A, _), (B, _) = _ends(model, unilateral, k, at_start)
             row[ku.TIE_ATTITUDE : ku.TIE_ATTITUDE + 9] = (A.T @ B).ravel()
             row[ku.TIE_REST] = 0.0
         elif np.isnan(tie.rest):
-            axis, point, other_point = (row[c : c + 3] for c in (ku.TIE_AXIS, ku.TIE_POINT, ku.TIE_OTHER_POINT))
-            row[ku.TIE_REST] = (A @ axis) @ (at + A @ point - other - B @ other_point)
+            row[ku.TIE_REST] = 0.0
+            row[ku.TIE_REST] = deflection(model, unilateral, k, at_start)
         if rests is not None and not np.isnan(rests[k]):
             row[ku.TIE_REST] = rests[k]
 
@@ -39,3 +41,31 @@ def set_rests(model: Model, unilateral: UnilateralArrays, at_start: Array, rests
 def may_have_slid(tie: Tie) -> bool:
     """Whether x_0 of a tie may have moved since its run began."""
     return tie.holds and not tie.pushes and tie.stiffness > 0.0 and bool(np.isfinite(tie.bound))
+
+
+def deflection(model: Model, unilateral: UnilateralArrays, k: int, q: Array) -> float:
+    """x − x_0 of tie k at coordinates (nq,), of a torsion within half a turn [m or rad]."""
+    row = unilateral.tie[k]
+    (A, at), (B, other) = _ends(model, unilateral, k, q)
+    axis = row[ku.TIE_AXIS : ku.TIE_AXIS + 3]
+    if unilateral.tie_table[k, ku.TIE_TURNS] == 1:
+        turned = A.T @ B @ row[ku.TIE_ATTITUDE : ku.TIE_ATTITUDE + 9].reshape(3, 3).T
+        x = -axis @ rotation_vector(turned)
+    else:
+        point, other_point = row[ku.TIE_POINT : ku.TIE_POINT + 3], row[ku.TIE_OTHER_POINT : ku.TIE_OTHER_POINT + 3]
+        x = (A @ axis) @ (at + A @ point - other - B @ other_point)
+    return float(x - row[ku.TIE_REST])
+
+
+def _ends(model: Model, unilateral: UnilateralArrays, k: int, q: Array) -> tuple[tuple[Array, Array], ...]:
+    """Rotation and origin of both bodies of tie k; the second may be the world."""
+    a, b = unilateral.tie_table[k, [ku.TIE_A, ku.TIE_B]].tolist()
+    return model.body_pose(a, q), (np.eye(3), np.zeros(3)) if b < 0 else model.body_pose(b, q)
+
+
+def rotation_vector(R: Array) -> Array:
+    """Axis times angle of a rotation, at most half a turn long, (3, 3) → (3,) [rad]."""
+    twice = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    sine = 0.5 * float(np.linalg.norm(twice))
+    angle = math.atan2(sine, 0.5 * (float(np.trace(R)) - 1.0))
+    return 0.5 * twice * (angle / sine if sine > 1e-9 else 1.0)

@@ -47,8 +47,18 @@ class Referenced(Protocol):
         """See :attr:`dynsim.engine.simulation.Simulation.touching`."""
         ...
 
+    @property
+    def tie_force(self) -> dict[str, float]:
+        """See :attr:`dynsim.engine.simulation.Simulation.tie_force`."""
+        ...
+
     def set_references(self, lines: Mapping[str, tuple[float, float]]) -> None:
         """See :meth:`dynsim.engine.simulation.Simulation.set_references`."""
+
+    def set_tie(
+        self, name: str, *, holds: bool | None = None, stiffness: float | None = None, damping: float | None = None
+    ) -> None:
+        """See :meth:`dynsim.engine.simulation.Simulation.set_tie`."""
 
     def set_lines(self, motors: NDArray[np.int64], lines: Array) -> None:
         """See :meth:`dynsim.engine.simulation.Simulation.set_lines`."""

@@ -23,10 +23,11 @@ from dynsim.compile.contact_law import joint_stops
 from dynsim.compile.model import Model
 from dynsim.compile.references.teleop import VelocitySource
 from dynsim.compile.tables import check_couplings
-from dynsim.compile.tie_rests import may_have_slid, set_rests
+from dynsim.compile.tie_rests import deflection, may_have_slid, set_rests
 from dynsim.dynamics import state as kst
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
+from dynsim.dynamics.contact.cone import problem as kc
 from dynsim.dynamics.contact.unilateral import UnilateralArrays
 from dynsim.dynamics.drive.law import take_measured_commands
 from dynsim.dynamics.state import block
@@ -263,6 +264,15 @@ class Simulation:
             )
             for contact, row in zip(self._prepared.contacts, rows, strict=True)
         }
+
+    @property
+    def tie_force(self) -> dict[str, float]:
+        """Forces on the first bodies of ties in the last step [N or N m]; zero where a tie does not hold."""
+        unilateral = self._prepared.system.unilateral
+        if unilateral is None:
+            return {}
+        forces = np.where(unilateral.tie_table[:, ku.TIE_HOLDS] == 1, unilateral.tie[:, ku.TIE_FORCE], 0.0)
+        return dict(zip((tie.name for tie in self.robot.ties), forces.tolist(), strict=True))
 
     @property
     def operator(self) -> Operator | SnakePilot | None:
@@ -525,6 +535,62 @@ class Simulation:
             run.y[run.layout.ledger + kst.JOINT] += projection_loss(self._prepared, self._time)
         if run.count[ki.MODES_DUE] == 0:
             run.count[ki.MODES_DUE] = ki.AFTER_JUMP
+        self._restart()
+
+    def set_tie(
+        self,
+        name: str,
+        *,
+        holds: bool | None = None,
+        stiffness: float | None = None,
+        damping: float | None = None,
+    ) -> None:
+        """Let a tie begin or end, or change its spring and damper; what is not given stays as it is.
+
+        A tie that begins has no force where its bodies are then, unless the scenario states its rest. What is added to
+        a spring is not deflected yet, x_0 moves so that the force stays, as in a gripper that hardens in the shape
+        that it has; what is taken from a spring takes its force with it. Both take energy from the spring, which
+        counts as lost in its damper, and so does all of it when a tie ends.
+
+        >>> simulation.set_tie("grip", holds=True)
+
+        Parameters
+        ----------
+        name : a key of the scenario's ``ties``
+        stiffness, damping : [N/m, N s/m; N m/rad, N m s/rad]
+
+        Raises
+        ------
+        ModelError
+            No such tie, a negative value, or neither a stiffness nor a damping.
+        """
+        ties = {tie.name: k for k, tie in enumerate(self.robot.ties)}
+        k = _index(ties, name, "tie")
+        given = {"stiffness": stiffness, "damping": damping}
+        values = {key: _finite(key, [value])[0] for key, value in given.items() if value is not None}
+        unilateral = self._prepared.system.unilateral
+        assert unilateral is not None  # ties need that law
+        before, c = unilateral.tie[k, [ku.TIE_STIFFNESS, ku.TIE_DAMPING]]
+        after = values.get("stiffness", float(before))
+        if min(values.values(), default=0.0) < 0.0 or not after + values.get("damping", float(c)) > 0.0:
+            raise ModelError(f"tie {name}: needs a stiffness or a damping, neither negative")
+        self._settle_now()
+        prepared, tie = self._prepared, self.robot.ties[k]
+        assert prepared.system.unilateral is not None
+        table, row = prepared.system.unilateral.tie_table[k], prepared.system.unilateral.tie[k]
+        if table[ku.TIE_HOLDS] == 1 and after != before:
+            y, layout, stored = prepared.run.y, prepared.run.layout, float(row[ku.TIE_STORED])
+            left = stored * (before / after if after > before else after / before)
+            if after > before:
+                x = deflection(prepared.model, prepared.system.unilateral, k, y[block(layout, "q")])
+                row[ku.TIE_REST] += x * (1.0 - before / after)
+            row[ku.TIE_STORED] = left
+            y[layout.elastic + kst.STORED] -= stored - left
+            y[layout.elastic + kst.DAMPED] += stored - left
+        row[ku.TIE_STIFFNESS], row[ku.TIE_DAMPING] = after, values.get("damping", float(c))
+        if holds is not None and holds != (table[ku.TIE_KIND] >= 0):
+            table[ku.TIE_KIND] = (kc.ONE_WAY if tie.pushes else kc.BOX) if holds else -1
+            row[ku.TIE_REST] = tie.rest
         self._restart()
 
     def release(self, joint: str) -> None:

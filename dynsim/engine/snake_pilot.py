@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 
 from dynsim.compile.model import Model
-from dynsim.compile.snake_tree import HEAD, SnakeTree
+from dynsim.compile.snake_tree import HEAD, ROOT, SnakeTree
+from dynsim.engine.gripper import STATES, Grip
 from dynsim.engine.operator import Referenced
 from dynsim.engine.sensing import SampledSensor
 from dynsim.engine.snake_control import OBSTACLES, SnakeControl, copy_of
@@ -40,6 +41,8 @@ from dynsim.snake.ticks import command_tick, record_row
 _ROOT_COORDINATES = 7
 # How often somebody looks whether the head lies on the ground, and how long it does until the run ends [s].
 OVERLOAD_LOOK, LIES_FOR = 0.1, 0.5
+# The head is far below its target by more than this [m], and the robot has fallen over at this tilt [rad] (assumed).
+SAGS, OVERTURNED = 0.05, 0.8
 # Attributes of the switcher and of the pilot that a snapshot keeps: their values are replaced, never modified in place.
 _SWITCHER = ("row", "switching", "next_switch", "switches", "_place")
 _OWN = (
@@ -89,7 +92,7 @@ class SnakePilot(SnakeControl):
         super().__init__(d, d.arrays(), controller, chosen, ticks, stride)
         self.believed, self.tree, self.robot = believed, model, robot
         self.period, self.rate = schedule.period, 1.0 / schedule.period
-        self._joints = _places(robot, d.joint_names)
+        self._joints, self._root = _places(robot, d.joint_names), model.body_index(ROOT)
         # Motors that are told lines: of joints, of the pitch joints that only lift, and of wheels.
         joints = (*d.joint_names, *robot.lifting_joints[1:])
         motors = [motor.joint for motor in robot.motors]
@@ -113,6 +116,8 @@ class SnakePilot(SnakeControl):
         self._overload_ticks = max(1, round(OVERLOAD_LOOK / self.period))
         self._lies_since: float | None = None
         self.sensors = self._sensors(sensors or Sensors())
+        objects = tuple(frame.name.rpartition(".")[0] for frame in robot.frames if frame.name.endswith(".grasp"))
+        self.grip = Grip(model, robot.gripper, objects, self.period) if objects else None
         self._next_look = self._commanded = 0
         self._seen: Any = None
         self.read_commands(waiting=False)
@@ -145,6 +150,8 @@ class SnakePilot(SnakeControl):
         self._refuse_overload(simulation)
         self._look()
         self.begin_period()
+        if self.grip is not None:
+            self.grip.step(self.time, bool(self.gripper[self.tick]), simulation)
         state, row = self.state, self.tick // self.stride if self.tick % self.stride == 0 else -1
         time, phi = self.time, state.phi.copy()
         mode = int(state.counts[ss.MODE])
@@ -170,23 +177,29 @@ class SnakePilot(SnakeControl):
         self._tell(simulation, time, phi)
 
     def _refuse_overload(self, simulation: Referenced) -> None:
-        """Stop where the head has come to lie on the ground because a servo can do no more."""
+        """Stop where the robot falls over, or where a servo can do no more and the head stays far below its target."""
         if self.tick % self._overload_ticks:
             return
-        touch, overloaded = simulation.touching.get(HEAD), list[str]()
-        if touch is not None and touch.force > 0.0:
-            off = self._volts_per_rad * (self.state.phi - self._seen.q[self._joints])
-            names = self.description.joint_names
-            overloaded = [names[j] for j in np.flatnonzero(np.abs(off) >= self._volts)]
-        if not overloaded:
+        q, time = self._seen.q, self.time
+        R, _ = self.tree.body_pose(self._root, q)
+        tilt = float(np.arccos(np.clip(R[2, 2], -1.0, 1.0)))
+        if tilt > OVERTURNED:
+            text = f"overturned: {ROOT}, which carries the head, is tilted by {np.degrees(tilt):.0f}° at t = {time:g} s"
+            raise SimulationStopped(text, time=time, state=self.postures())
+        off = np.abs(self._volts_per_rad * (self.state.phi - q[self._joints]))
+        overloaded = [name for name, most in zip(self.description.joint_names, off >= self._volts, strict=True) if most]
+        touch, below = simulation.touching.get(HEAD), float(self.state.w_target[2] - self.head_pose(q)[2])
+        lies = touch is not None and touch.force > 0.0
+        if not overloaded or not (lies or below > SAGS):
             self._lies_since = None
         elif self._lies_since is None:
-            self._lies_since = self.time
-        elif self.time - self._lies_since >= LIES_FOR:
+            self._lies_since = time
+        elif time - self._lies_since >= LIES_FOR:
+            how = "the head lies on the ground" if lies else f"the head is {1e3 * below:.0f} mm below its target"
             raise SimulationStopped(
-                f"too_heavy: the head lies on the ground from t = {self._lies_since:g} s on, "
-                f"{', '.join(overloaded)} at the limit of its voltage",
-                time=self.time,
+                f"too_heavy: {how} at t = {time:g} s, since t = {self._lies_since:g} s with {', '.join(overloaded)} at "
+                "the limit of its voltage",
+                time=time,
                 state=self.postures(),
             )
 
@@ -264,6 +277,7 @@ class SnakePilot(SnakeControl):
             "sensors": [sensor.remembered() for sensor in self.sensors],
             "switcher": {name: getattr(switcher, name) for name in _SWITCHER} | {"refusals": list(switcher.refusals)},
             "own": {name: getattr(self, name) for name in _OWN},
+            "grip": None if self.grip is None else self.grip.remembered(),
         }
 
     def restore(self, kept: dict[str, Any]) -> None:
@@ -280,6 +294,8 @@ class SnakePilot(SnakeControl):
             setattr(self.switcher, name, list(value) if name == "refusals" else value)
         for name, value in kept["own"].items():
             setattr(self, name, value)
+        if self.grip is not None:
+            self.grip.restore(kept["grip"])
 
     def add_to(self, record: Record) -> None:
         """Signals and summary of the control, and of the snake as such: joints and wheels by their columns."""
@@ -328,8 +344,23 @@ class SnakePilot(SnakeControl):
         add("phi_dot_command", trace.u[:, :columns], "rad/s", labels=names, description=f"joint {text}")
         add("rho_dot_command", trace.u[:, columns:], "rad/s", labels=d.wheel_names, description=f"wheel {text}")
         add_task(record, self, trace, w, np.array(points))
+        if self.grip is not None:
+            self._add_grip(record)
         summary = {**record.summary, **task_summary(self, record)}
         record.summary = {**summary, "warnings": [*summary["warnings"], *task_warnings(self, record, summary)]}
+
+    def _add_grip(self, record: Record) -> None:
+        """What the gripper did."""
+        assert self.grip is not None
+        state, share, distance = self.grip.columns(np.floor(record.time / self.period + 1e-6).astype(int))
+        text = ", ".join(f"{k} {name}" for k, name in enumerate(STATES))
+        record.add("gripper_state", state, "1", description=text)
+        record.add("gripper_share", share, "1", description="of the springs of the hardened gripper that it has")
+        record.add(
+            "grasp_distance", distance, "m", description="from the tip of the gripper to the nearest grasp frame"
+        )
+        for event in self.grip.events:
+            record.add_event(event.time, event.kind, event.name, value=event.value)
 
     def _polyline(self, q: Array) -> Array:
         """Controlled point, joints and axles to the tail at coordinates (nq,), (points, 3) [m]."""

@@ -308,7 +308,7 @@ class Tie:
 
     The force on ``body``, along the axis or about it, and its opposite on ``other`` is f = −k (x − x_0) − c dx/dt
     within its bound, x = axis · (point − other point), or the part along the axis of the rotation of ``body`` against
-    ``other``. Beyond the bound x_0 moves. Bodies may be of different trees.
+    ``other``. Beyond the bound x_0 moves. Bodies may be of different trees; ``other`` may be the world.
 
     Attributes
     ----------
@@ -319,6 +319,7 @@ class Tie:
     turns : about the axis, not along it
     pushes : one-sided: it only pushes ``body`` along the axis, without a bound
     rest : x_0 [m or rad]; NaN: x when the tie begins
+    attitude : (3, 3) of ``other`` in the axes of ``body`` where a torsion whose rest is a number is not turned
     holds : from the start on
     """
 
@@ -334,6 +335,7 @@ class Tie:
     turns: bool = False
     pushes: bool = False
     rest: float = 0.0
+    attitude: Array = field(default_factory=lambda: np.eye(3))
     holds: bool = True
 
 
@@ -394,6 +396,10 @@ class Robot:
     fixed_inertia: Inertia = field(default_factory=lambda: Inertia(0.0))
     feet: tuple[Foot, ...] = ()
     hand_frame: Array = field(default_factory=lambda: np.eye(3))
+
+    def holding(self, _: str) -> list[Tie]:
+        """Ties by which a gripper of the robot can hold the object of that name: none."""
+        return []
 
     @property
     def hand_axes(self) -> Array:

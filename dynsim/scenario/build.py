@@ -111,6 +111,8 @@ def _with_objects(scenario: Scenario, built: Robot) -> Robot:
             text = f"objects.{name}: the robot has a body, joint or frame of that name"
             raise ModelError(text, keys=("objects", name))
     context = BuildContext(scenario.duration_s)
+    ties = [tie for name, body in objects.items() for tie in body.ties(name)]
+    ties += [tie for name, body in objects.items() if body.grasp is not None for tie in built.holding(name)]
     touching = surfaces if scenario.config.contacts.law == "unilateral" else []
     return replace(
         built,
@@ -118,6 +120,8 @@ def _with_objects(scenario: Scenario, built: Robot) -> Robot:
         motors=(*built.motors, *(motor for name, body in objects.items() for motor in body.motors(name, context))),
         q0=np.concatenate([built.initial, *(body.start() for body in objects.values())]),
         feet=(*built.feet, *(foot for name, body in objects.items() for foot in body.feet(name, touching))),
+        ties=(*built.ties, *ties),
+        frames=(*built.frames, *(frame for name, body in objects.items() for frame in body.frames(name))),
     )
 
 
@@ -126,6 +130,8 @@ def _tied(scenario: Scenario, built: Robot) -> Robot:
     ties = {name: config.tie(name) for name, config in scenario.config.ties.items()}
     for name, tie in ties.items():
         for key, body in (("body", tie.body), ("other", tie.other)):
+            if key == "other" and body == WORLD:
+                continue
             try:
                 built.attach(body, tie.point)
             except ModelError as error:

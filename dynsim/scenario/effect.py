@@ -87,7 +87,7 @@ def _of_contacts(config: Any) -> Iterator[tuple[Keys, str]]:
         yield ("contacts", "reference_tolerance_m"), "it is of law: bilateral; real braces may leave their surfaces"
     has_feet = getattr(config.plant, "level", "") == "dynamic"
     # Free objects touch with their corners and wheels.
-    touches = contacts.law == "unilateral" and any(body.hinge is None for body in config.objects.values())
+    touches = contacts.law == "unilateral" and any(body.joint is None for body in config.objects.values())
     if not contacts.points and contacts.candidates == "points" and not has_feet and not touches:
         for key in type(contacts).model_fields:
             if key not in ("law", "candidates", "points", "reference_tolerance_m"):

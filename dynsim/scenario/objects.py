@@ -3,9 +3,11 @@
     objects:
       box: {mass_kg: 0.3, size_m: [0.06, 0.06, 0.06], position_m: [0.4, 0.0, 0.03]}
       valve: {mass_kg: 1.0, shape: sphere, radius_m: 0.1, position_m: [0.5, 0, 0.4], hinge: {friction_N_m: 0.5}}
+      door:
+        {mass_kg: 5, size_m: [0.04, 0.4, 0.8], position_m: [1, 0.2, 0.4], hinge: {point_m: [0, 0.2, 0]}}
 
-A free object can touch all surfaces, with its corners or as a sphere, and roll on wheels; one on a hinge turns about
-its centre and touches nothing. There is no contact between bodies.
+A free object can touch all surfaces, with its corners or as a sphere, and roll on wheels; one on a hinge or on a rail
+touches nothing. There is no contact between bodies. A gripper holds an object at its grasp frame.
 """
 
 from __future__ import annotations
@@ -21,29 +23,185 @@ from dynsim.compile.protocols import BuildContext
 from dynsim.compile.scene import WHEEL_WIDTH, turn_from_z
 from dynsim.config.base import NonNegative, Positive, StrictConfig, Vector3, error_at, unit_vector
 from dynsim.library.families import build, union
-from dynsim.model.description import Array, Foot, Inertia, Link
+from dynsim.model.description import WORLD, Array, Foot, Frame, Inertia, Link, Tie
 from dynsim.model.drives import Drive
 from dynsim.model.joints.ball import floating
-from dynsim.record.scene import Shape, quaternion
+from dynsim.record.scene import HERE, Shape, quaternion
 
 Edges = Annotated[list[Positive], Field(min_length=3, max_length=3)]
+
+
+Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
 
 
 class Hinge(StrictConfig):
     """What an object turns on."""
 
-    axis: Vector3 = Field([0.0, 0.0, 1.0], description="through its centre, in its own axes")
+    axis: Vector3 = Field([0.0, 0.0, 1.0], description="in the object's own axes")
+    point_m: Vector3 = Field(
+        [0.0, 0.0, 0.0], description="of the axis, from the object's centre; origin of the body then"
+    )
     friction_N_m: NonNegative = Field(0.0, description="that holds it at rest; unilateral law")
     damping_N_m_s_per_rad: NonNegative = 0.0
-    limits_deg: Annotated[list[float], Field(min_length=2, max_length=2)] | None = Field(
-        None, description="lower and upper; default: none"
+    limits_deg: Pair | None = Field(None, description="lower and upper; default: none")
+    spring_N_m_per_rad: NonNegative = Field(0.0, description="of a closer; time stepping only")
+    rest_deg: float = Field(0.0, gt=-180.0, lt=180.0, description="angle at which the spring has no torque")
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        unit_vector(self.axis, "axis")
+        _ordered(self.limits_deg, "limits_deg")
+        return self
+
+    def joint(self, link: Link) -> Link:
+        """The link on this joint."""
+        lower, upper = np.deg2rad(self.limits_deg).tolist() if self.limits_deg else (-math.inf, math.inf)
+        return replace(
+            link,
+            kind="revolute",
+            axis=unit_vector(self.axis, "axis"),
+            damping=self.damping_N_m_s_per_rad,
+            friction=self.friction_N_m,
+            lower=lower,
+            upper=upper,
+        )
+
+    def spring(self, name: str, link: Link) -> Tie | None:
+        """Its closer, between the link and the world."""
+        rest = math.radians(self.rest_deg)
+        law = self.spring_N_m_per_rad, 0.0
+        tie = Tie(f"{name}.spring", link.name, WORLD, link.axis, *law, turns=True, rest=rest, attitude=link.R_PJ.T)
+        return tie if self.spring_N_m_per_rad > 0.0 else None
+
+
+class Slide(StrictConfig):
+    """Rails on which an object moves along a straight line, as a drawer does."""
+
+    axis: Vector3 = Field([1.0, 0.0, 0.0], description="in the object's own axes")
+    friction_N: NonNegative = Field(0.0, description="that holds it at rest; unilateral law")
+    damping_N_s_per_m: NonNegative = 0.0
+    limits_m: Pair | None = Field(None, description="lower and upper; default: none")
+    spring_N_per_m: NonNegative = Field(0.0, description="time stepping only")
+    rest_m: float = Field(0.0, description="displacement at which the spring has no force")
+
+    @property
+    def point_m(self) -> list[float]:
+        """Where the joint is: at the centre."""
+        return [0.0, 0.0, 0.0]
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        unit_vector(self.axis, "axis")
+        _ordered(self.limits_m, "limits_m")
+        return self
+
+    def joint(self, link: Link) -> Link:
+        """The link on this joint."""
+        lower, upper = self.limits_m if self.limits_m else (-math.inf, math.inf)
+        return replace(
+            link,
+            kind="prismatic",
+            axis=unit_vector(self.axis, "axis"),
+            damping=self.damping_N_s_per_m,
+            friction=self.friction_N,
+            lower=lower,
+            upper=upper,
+        )
+
+    def spring(self, name: str, link: Link) -> Tie | None:
+        """Its spring, between the link and the world."""
+        law, at = (self.spring_N_per_m, 0.0), link.p_PJ
+        tie = Tie(f"{name}.spring", link.name, WORLD, link.axis, *law, other_point=at, rest=self.rest_m)
+        return tie if self.spring_N_per_m > 0.0 else None
+
+
+def _ordered(limits: list[float] | None, key: str) -> None:
+    if limits is not None and not limits[0] < limits[1]:
+        raise error_at(key, "the lower limit must be below the upper one")
+
+
+class Solid(StrictConfig):
+    """A shape with mass: a box, a sphere, or a cylinder along its own z axis."""
+
+    mass_kg: Positive
+    shape: Literal["box", "sphere", "cylinder"] = "box"
+    size_m: Edges | None = Field(None, description="edges of a box along its axes")
+    radius_m: Positive | None = Field(None, description="of a sphere or a cylinder")
+    length_m: Positive | None = Field(None, description="of a cylinder, along its z axis")
+
+    @model_validator(mode="after")
+    def _check_size(self) -> Self:
+        _check_sizes(self)
+        return self
+
+    @property
+    def inertia(self) -> Inertia:
+        """Of the solid about its centre: box I_x = m (b² + c²)/12, sphere I = 2 m r²/5, cylinder I_z = m r²/2."""
+        if self.size_m is not None:
+            squares = np.array(self.size_m) ** 2
+            return Inertia(self.mass_kg, np.zeros(3), np.diag(self.mass_kg * (squares.sum() - squares) / 12.0))
+        radius = float(self.radius_m or 0.0)
+        if self.length_m is None:
+            return Inertia.solid_sphere(self.mass_kg, radius, np.zeros(3))
+        return replace(Inertia.solid_cylinder(self.mass_kg, radius, self.length_m), com=np.zeros(3))
+
+    @property
+    def solid(self) -> Shape:
+        """What it looks like."""
+        if self.size_m is not None:
+            return Shape("box", tuple(self.size_m))
+        radius = float(self.radius_m or 0.0)
+        return Shape("sphere", (radius,)) if self.length_m is None else Shape("cylinder", (radius, self.length_m))
+
+    @property
+    def spheres(self) -> tuple[Array, float]:
+        """Centres (k, 3) and radius of what touches surfaces [m]: corners, the sphere, or both ends of a cylinder.
+
+        Ends of a cylinder are spheres within it: a pipe that lies touches as it should, one that stands stands on a
+        sphere.
+        """
+        if self.size_m is not None:
+            signs = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+            return signs * self.size_m, 0.0
+        radius = float(self.radius_m or 0.0)
+        if self.length_m is None:
+            return np.zeros((1, 3)), radius
+        end = max(0.5 * self.length_m - radius, 0.0)
+        return np.array([[0.0, 0.0, -end], [0.0, 0.0, end]]), radius
+
+
+SIZES = {"box": ("size_m",), "sphere": ("radius_m",), "cylinder": ("radius_m", "length_m")}
+
+
+def _check_sizes(solid: Solid | SceneObject) -> None:
+    """Raise an error for a size that the shape needs and has not, or has and does not need."""
+    needed = SIZES[solid.shape]
+    for key in ("size_m", "radius_m", "length_m"):
+        if (getattr(solid, key) is None) == (key in needed):
+            text = f"is needed for a {solid.shape}" if key in needed else f"is none of a {solid.shape}; remove it"
+            raise error_at(key, text)
+
+
+class Part(Solid):
+    """One of several solids of which an object is made."""
+
+    position_m: Vector3 = Field([0.0, 0.0, 0.0], description="of its centre, in the object's axes")
+    rpy_deg: Vector3 = Field([0.0, 0.0, 0.0], description="attitude in the object's axes, Rz(yaw) Ry(pitch) Rx(roll)")
+
+
+class Grasp(StrictConfig):
+    """Where and from where a gripper can hold an object."""
+
+    position_m: Vector3 = Field(
+        [0.0, 0.0, 0.0], description="where the tip of the gripper is then, in the object's axes from its centre"
+    )
+    axis: Vector3 = Field(
+        [1.0, 0.0, 0.0], description="direction in which the gripper points then, in the object's axes"
     )
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         unit_vector(self.axis, "axis")
-        if self.limits_deg is not None and not self.limits_deg[0] < self.limits_deg[1]:
-            raise error_at("limits_deg", "the lower limit must be below the upper one")
         return self
 
 
@@ -83,75 +241,102 @@ class ObjectWheel(StrictConfig):
 
 
 class SceneObject(StrictConfig):
-    """A solid box or sphere."""
+    """A solid box, sphere or cylinder, or a body of several parts."""
 
-    mass_kg: Positive
-    shape: Literal["box", "sphere"] = "box"
+    mass_kg: Positive | None = Field(None, description="default: the sum of those of its parts")
+    shape: Literal["box", "sphere", "cylinder", "parts"] = "box"
     size_m: Edges | None = Field(None, description="edges of a box along its axes")
-    radius_m: Positive | None = Field(None, description="of a sphere")
-    position_m: Vector3 = Field(description="of its centre at the start, in the world")
+    radius_m: Positive | None = Field(None, description="of a sphere or a cylinder")
+    length_m: Positive | None = Field(None, description="of a cylinder, along its z axis")
+    parts: Annotated[dict[str, Part], Field(min_length=1)] | None = Field(
+        None, description="solids by name, fixed to each other, of `shape: parts`"
+    )
+    position_m: Vector3 = Field(description="of its centre at the start, in the world; of parts: of their origin")
     rpy_deg: Vector3 = Field([0.0, 0.0, 0.0], description="attitude at the start, Rz(yaw) Ry(pitch) Rx(roll)")
     hinge: Hinge | None = Field(None, description="default: it is free")
+    slide: Slide | None = Field(None, description="default: it is free")
     wheels: dict[str, ObjectWheel] = Field({}, description="wheels of a free one, by name")
+    grasp: Grasp | None = Field(None, description="where a gripper can hold it; default: nowhere")
 
     @model_validator(mode="after")
     def _check_size(self) -> Self:
-        if self.hinge is not None and self.wheels:
-            raise error_at("wheels", "are of free objects, this one is on a hinge; remove one of the two")
-        needed, other = ("size_m", "radius_m") if self.shape == "box" else ("radius_m", "size_m")
-        if getattr(self, needed) is None:
-            raise error_at(needed, f"is needed for a {self.shape}")
-        if getattr(self, other) is not None:
-            raise error_at(other, f"is none of a {self.shape}; remove it")
+        if self.hinge is not None and self.slide is not None:
+            raise error_at("slide", "this object is on a hinge already; remove one of the two")
+        if self.joint is not None and self.wheels:
+            on = "hinge" if self.hinge is not None else "slide"
+            raise error_at("wheels", f"are of free objects, this one is on a {on}; remove one of the two")
+        if self.shape == "parts":
+            for key in ("mass_kg", "size_m", "radius_m", "length_m"):
+                if getattr(self, key) is not None:
+                    raise error_at(key, "is none of an object of parts: each part has its own; remove it")
+            if self.parts is None:
+                raise error_at("parts", "is needed for shape: parts")
+            return self
+        if self.parts is not None:
+            raise error_at("parts", f"is none of a {self.shape}; remove it, or set shape: parts")
+        if self.mass_kg is None:
+            raise error_at("mass_kg", f"is needed for a {self.shape}")
+        _check_sizes(self)
         return self
 
     @property
+    def joint(self) -> Hinge | Slide | None:
+        """What it is fixed to the world by; None: it is free."""
+        return self.hinge if self.hinge is not None else self.slide
+
+    @property
+    def solids(self) -> dict[str, Part]:
+        """Its parts; of a single solid that one."""
+        if self.parts is not None:
+            return self.parts
+        keys = ("mass_kg", "shape", "size_m", "radius_m", "length_m")
+        return {"": Part.model_construct(**{key: getattr(self, key) for key in keys})}
+
+    @property
     def inertia(self) -> Inertia:
-        """Of the solid about its centre: box I_x = m (b² + c²)/12, sphere I = 2 m r²/5."""
-        if self.size_m is None:
-            return Inertia.solid_sphere(self.mass_kg, self.radius_m or 0.0, np.zeros(3))
-        squares = np.array(self.size_m) ** 2
-        return Inertia(self.mass_kg, np.zeros(3), np.diag(self.mass_kg * (squares.sum() - squares) / 12.0))
+        """Of all parts about the origin of the object."""
+        parts = [(part, _turn(part.rpy_deg), np.array(part.position_m)) for part in self.solids.values()]
+        return Inertia.merged([part.inertia.placed(R, p) for part, R, p in parts])
 
     @property
-    def solid(self) -> Shape:
-        """What it looks like."""
-        if self.size_m is None:
-            return Shape("sphere", (float(self.radius_m or 0.0),))
-        return Shape("box", tuple(self.size_m))
+    def shapes(self) -> tuple[Shape, ...]:
+        """What it looks like, in its axes from its centre."""
+        parts = self.solids.values()
+        return tuple(part.solid.placed(part.position_m, quaternion(_turn(part.rpy_deg))) for part in parts)
 
     @property
-    def _turn(self) -> Array:
-        # The reader of URDF waits until somebody turns something.
-        from dynsim.model.urdf.reader import rotation
-
-        return rotation(*np.deg2rad(self.rpy_deg))
+    def _origin(self) -> Array:
+        """Origin of its body, in its axes from its centre: on its hinge [m]."""
+        return np.zeros(3) if self.joint is None else np.array(self.joint.point_m)
 
     def links(self, name: str) -> tuple[Link, ...]:
         """Its tree; joint and body have the name of the object."""
-        link = Link(name, name, None, "revolute", np.array([0.0, 0.0, 1.0]), self.inertia, shapes=(self.solid,))
-        if self.hinge is None:
+        back = -self._origin
+        shapes = tuple(shape.placed(back, HERE) for shape in self.shapes)
+        inertia = self.inertia.placed(np.eye(3), back)
+        link = Link(name, name, None, "revolute", np.array([0.0, 0.0, 1.0]), inertia, shapes=shapes)
+        if self.joint is None:
             return (*floating(link), *(wheel.link(f"{name}.{own}", name) for own, wheel in self.wheels.items()))
-        hinge = self.hinge
-        lower, upper = np.deg2rad(hinge.limits_deg).tolist() if hinge.limits_deg else (-math.inf, math.inf)
-        return (
-            replace(
-                link,
-                axis=unit_vector(hinge.axis, "axis"),
-                R_PJ=self._turn,
-                p_PJ=np.array(self.position_m),
-                damping=hinge.damping_N_m_s_per_rad,
-                friction=hinge.friction_N_m,
-                lower=lower,
-                upper=upper,
-            ),
-        )
+        R = _turn(self.rpy_deg)
+        return (replace(self.joint.joint(link), R_PJ=R, p_PJ=np.array(self.position_m) + R @ self._origin),)
+
+    def ties(self, name: str) -> list[Tie]:
+        """The spring of its hinge or rails."""
+        spring = None if self.joint is None else self.joint.spring(name, self.links(name)[0])
+        return [] if spring is None else [spring]
+
+    def frames(self, name: str) -> list[Frame]:
+        """Its grasp frame, whose x axis is the direction in which a gripper points."""
+        if self.grasp is None:
+            return []
+        R = frame_along(unit_vector(self.grasp.axis, "axis"))
+        return [Frame(f"{name}.grasp", name, R, np.array(self.grasp.position_m) - self._origin)]
 
     def start(self) -> list[float]:
         """Its coordinates at the start."""
-        if self.hinge is not None:
+        if self.joint is not None:
             return [0.0]
-        return [*self.position_m, *quaternion(self._turn), *(0.0 for _ in self.wheels)]
+        return [*self.position_m, *quaternion(_turn(self.rpy_deg)), *(0.0 for _ in self.wheels)]
 
     def motors(self, name: str, context: BuildContext) -> list[Drive]:
         """Those of its wheels."""
@@ -160,21 +345,39 @@ class SceneObject(StrictConfig):
 
     def feet(self, name: str, surfaces: list[str]) -> list[Foot]:
         """With what it can touch each of these surfaces."""
-        if self.hinge is not None:
+        if self.joint is not None:
             return []
-        if self.size_m is None:
-            points, radius = np.zeros((1, 3)), float(self.radius_m or 0.0)
-        else:
-            signs = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-            points, radius = signs * self.size_m, 0.0
-        several = len(points) > 1
+        touching: list[tuple[str, Array, float]] = []
+        for own, part in self.solids.items():
+            points, radius = part.spheres
+            R, p = _turn(part.rpy_deg), np.array(part.position_m)
+            stem, several = f"{name}.{own}" if own else name, len(points) > 1
+            touching += [(f"{stem}{k + 1 if several else ''}", p + R @ x, radius) for k, x in enumerate(points)]
         feet = [
-            Foot(f"{name}{k + 1 if several else ''}.{surface}", name, point, radius, surface)
+            Foot(f"{point_name}.{surface}", name, point, radius, surface)
             for surface in surfaces
-            for k, point in enumerate(points)
+            for point_name, point, radius in touching
         ]
         return feet + [
             Foot(f"{name}.{own}.{surface}", f"{name}.{own}", np.zeros(3), wheel.radius_m, surface)
             for own, wheel in self.wheels.items()
             for surface in surfaces
         ]
+
+
+def _turn(rpy_deg: list[float]) -> Array:
+    # The reader of URDF waits until somebody turns something.
+    if not any(rpy_deg):
+        return np.eye(3)
+    from dynsim.model.urdf.reader import rotation
+
+    return rotation(*np.deg2rad(rpy_deg))
+
+
+def frame_along(axis: Array) -> Array:
+    """Rotation (3, 3) whose x axis is a unit vector, with its y axis level if it can be."""
+    side = np.cross([0.0, 0.0, 1.0], axis)
+    if np.linalg.norm(side) < 1e-9:
+        side = np.array([0.0, 1.0, 0.0])
+    side = side / np.linalg.norm(side)
+    return np.column_stack([axis, side, np.cross(axis, side)])

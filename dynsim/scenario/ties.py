@@ -24,9 +24,10 @@ class TieConfig(StrictConfig):
     LAW: ClassVar[tuple[str, str, str]]
 
     body: str = Field(description="name of a body, or of a frame fixed on one")
-    other: str = Field(description="the same, of the other end")
+    other: str = Field(description="the same, of the other end, or `world`")
     axis: Vector3 = Field(description="in the axes of body")
     pushes: bool = Field(default=False, description="it only pushes body along the axis, away from other")
+    holds: bool = Field(default=True, description="from the start on; `Simulation.set_tie` changes it")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -45,7 +46,7 @@ class TieConfig(StrictConfig):
         stiffness, damping, bound = (getattr(self, key) for key in self.LAW)
         bound = math.inf if bound is None else bound
         ends = self.body, self.other, np.array(self.axis)
-        return Tie(name, *ends, stiffness, damping, bound, pushes=self.pushes, rest=math.nan)
+        return Tie(name, *ends, stiffness, damping, bound, pushes=self.pushes, rest=math.nan, holds=self.holds)
 
 
 class Linear(TieConfig):

@@ -178,9 +178,25 @@ def begin_tie(unilateral: UnilateralArrays, ws: Workspace, k):
 
 
 @internal_kernel
+def axes_of(ws: Workspace, b):
+    """Rotation of body b, or of the world, −1."""
+    if b < 0:
+        return 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0
+    return rotation(ws.links, b, ka.R)
+
+
+@internal_kernel
+def origin_of(ws: Workspace, b):
+    """Origin of body b, or of the world, −1."""
+    if b < 0:
+        return ZERO_VECTOR
+    return vector(ws.links, b, ka.P)
+
+
+@internal_kernel
 def relative_attitude(ws: Workspace, a, b):
     """Rotation of body b in the axes of body a."""
-    A, B = rotation(ws.links, a, ka.R), rotation(ws.links, b, ka.R)
+    A, B = rotation(ws.links, a, ka.R), axes_of(ws, b)
     x, y, z = rotate_back(A, first_axis(B)), rotate_back(A, second_axis(B)), rotate_back(A, third_axis(B))
     return x[0], y[0], z[0], x[1], y[1], z[1], x[2], y[2], z[2]
 
@@ -192,9 +208,9 @@ def tie_deflection(unilateral: UnilateralArrays, ws: Workspace, k):
     a, b, axis = table[k, ku.TIE_A], table[k, ku.TIE_B], vector(tie, k, ku.TIE_AXIS)
     if table[k, ku.TIE_TURNS] == 1:
         return -dot_vector(axis, tie_turn(unilateral, ws, k))
-    A, B = rotation(ws.links, a, ka.R), rotation(ws.links, b, ka.R)
+    A = rotation(ws.links, a, ka.R)
     at = transform(vector(ws.links, a, ka.P), A, vector(tie, k, ku.TIE_POINT))
-    other = transform(vector(ws.links, b, ka.P), B, vector(tie, k, ku.TIE_OTHER_POINT))
+    other = transform(origin_of(ws, b), axes_of(ws, b), vector(tie, k, ku.TIE_OTHER_POINT))
     return dot_vector(rotate(A, axis), (at[0] - other[0], at[1] - other[1], at[2] - other[2]))
 
 
@@ -254,8 +270,7 @@ def place_ties(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace):
                 tie[k, ku.TIE_REST] += math.copysign(2.0 * math.pi, x - tie[k, ku.TIE_TURNED])
             tie[k, ku.TIE_TURNED] = x
         else:
-            R = rotation(ws.links, b, ka.R)
-            at = transform(vector(ws.links, b, ka.P), R, vector(tie, k, ku.TIE_OTHER_POINT))
+            at = transform(origin_of(ws, b), axes_of(ws, b), vector(tie, k, ku.TIE_OTHER_POINT))
             put_six(rows, r, ka.ROW, wrench_at(at, rotate(A, axis), ZERO_VECTOR))
             x = tie_deflection(unilateral, ws, k)
         for j in range(6):

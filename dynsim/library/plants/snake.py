@@ -19,6 +19,7 @@ from dynsim.config.base import NonNegative, Positive, StrictConfig
 from dynsim.errors import ModelError
 from dynsim.library import families
 from dynsim.model.drives import Drive
+from dynsim.model.gripper import Gripper
 from dynsim.snake.description import SnakeDescription
 from dynsim.snake.lifting import Lifts
 
@@ -63,6 +64,42 @@ class Dynamics(StrictConfig):
     )
 
 
+class GripperConfig(StrictConfig):
+    """The soft gripper that hardens around an object; all values are assumed, see docs/snake.md."""
+
+    capture_m: Positive = Field(0.015, description="it captures an object whose grasp frame is within this")
+    capture_deg: Positive = Field(23.0, lt=180, description="and whose axis is within this of its own")
+    hardening_s: Positive = 1.0
+    softening_s: Positive = 0.5
+    stiffness_N_per_m: Positive = Field(5e3, description="hardened, along each axis")
+    damping_N_s_per_m: Positive = 20.0
+    bound_N: Positive = Field(20.0, description="beyond it the object slips")
+    turning_stiffness_N_m_per_rad: Positive = Field(5.0, description="hardened, about each axis")
+    turning_damping_N_m_s_per_rad: Positive = 0.05
+    turning_bound_N_m: Positive = Field(0.8, description="beyond it the object slips")
+    lost_m: Positive = Field(0.015, description="an object that has slipped further is lost")
+    lost_deg: Positive = Field(29.0, lt=180)
+
+    def gripper(self, length: float) -> Gripper:
+        """The gripper, its tip that far ahead of the head point [m]."""
+        return Gripper(
+            "head",
+            np.array([length, 0.0, 0.0]),
+            self.capture_m,
+            float(np.deg2rad(self.capture_deg)),
+            self.hardening_s,
+            self.softening_s,
+            self.stiffness_N_per_m,
+            self.damping_N_s_per_m,
+            self.bound_N,
+            self.turning_stiffness_N_m_per_rad,
+            self.turning_damping_N_m_s_per_rad,
+            self.turning_bound_N_m,
+            self.lost_m,
+            float(np.deg2rad(self.lost_deg)),
+        )
+
+
 class Config(StrictConfig):
     """The ``plant:`` section of a scenario; SI units where the key names no other."""
 
@@ -85,6 +122,7 @@ class Config(StrictConfig):
     )
     limits_deg: JointLimits = Field(default_factory=JointLimits)
     gripper_length_m: NonNegative = Field(0.09, description="gripper tip ahead of the head point [m] ([T] IV.B)")
+    gripper: GripperConfig = Field(default_factory=GripperConfig, description="how it holds objects")
     mass_kg: Positive = Field(10.0, description="of the whole robot [kg], spread evenly over its links (assumed)")
     controlled_point: Literal["head", "gripper"] = Field(
         "head", description="head point ([T] V.A) or gripper tip ([T] V.D)"
@@ -150,6 +188,7 @@ def build(config: Config, context: BuildContext) -> SnakeDescription | SnakeTree
         ),
         sag_compensation=lifting.sag_compensation,
         raised=dynamics.start == "soft",
+        gripper=config.gripper.gripper(config.gripper_length_m),
     )
 
 

@@ -1,0 +1,212 @@
+"""The gripper in a run: soft, hardening, hardened, softening; what it captures, how that slips, and why a run ends.
+
+It hardens when it is told to close. What is captured is held as it is then: springs begin without force, and what is
+added to them while the gripper hardens is not deflected yet.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynsim.compile.model import Model
+from dynsim.compile.tie_rests import rotation_vector
+from dynsim.engine.operator import Referenced
+from dynsim.errors import SimulationStopped
+from dynsim.model.description import Array
+from dynsim.model.gripper import DIRECTIONS, Gripper, grasp_frame, tie_name
+from dynsim.record import Event
+
+SOFT, HARDENING, HARDENED, SOFTENING = range(4)
+STATES = ("soft", "hardening", "hardened", "softening")
+# Least share of its springs that a gripper has while it holds something: ties need some.
+LEAST_SHARE = 0.01
+# Slips below this are none: ties that hold give way by their springs alone [m, rad].
+SLIPPED = np.array([1e-3, 2e-2])
+# A tie is at its bound when less than this share of it is missing.
+AT_BOUND = 1e-3
+# A held object on a hinge or rails that moves no faster is at rest [rad/s or m/s], and stuck after this time [s].
+AT_REST, STUCK_FOR = 1e-3, 1.0
+
+
+@dataclass(frozen=True)
+class Held:
+    """An object in the gripper: the placement of its grasp frame in that of the gripper at its capture."""
+
+    name: str
+    R: Array
+    p: Array
+
+
+@dataclass
+class Grip:
+    """A gripper and the objects that it can hold.
+
+    Attributes
+    ----------
+    objects : names of the objects that have a grasp frame
+    period : of its control [s]
+    mode : one of :data:`STATES`; share : of the springs of a hardened one that it has
+    slipping : a slip of the present object was told; stuck_since : time since which that does not give way [s]
+    """
+
+    model: Model
+    gripper: Gripper
+    objects: tuple[str, ...]
+    period: float
+    mode: int = SOFT
+    share: float = 0.0
+    held: Held | None = None
+    slipping: bool = False
+    stuck_since: float | None = None
+    events: tuple[Event, ...] = ()
+    trace: list[tuple[int, float, float]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        robot = self.model.robot
+        self._body = self.model.body_index(self.gripper.body)
+        self._grasps = {name: _attached(self.model, grasp_frame(name)) for name in self.objects}
+        # Of objects on hinges or rails: their rates.
+        joints = [link.joint for link in robot.links]
+        self._rate = {name: joints.index(name) for name in self.objects if name in joints}
+
+    def remembered(self) -> Grip:
+        """A copy of what the future depends on, and of what was recorded."""
+        return replace(self, trace=list(self.trace))
+
+    def restore(self, kept: Grip) -> None:
+        """Go back to what :meth:`remembered` gave."""
+        for name in ("mode", "share", "held", "slipping", "stuck_since", "events"):
+            setattr(self, name, getattr(kept, name))
+        self.trace = list(kept.trace)
+
+    def placement(self, name: str, q: Array) -> tuple[Array, Array]:
+        """Rotation and origin of an object's grasp frame in that of the gripper, whose origin is its tip."""
+        R, p = self.model.body_pose(self._body, q)
+        body, A, at = self._grasps[name]
+        B, other = self.model.body_pose(body, q)
+        return R.T @ B @ A, R.T @ (other + B @ at - p) - self.gripper.tip
+
+    def nearest(self, q: Array) -> tuple[str, float, float]:
+        """The nearest object, its distance [m], and the angle between its axis and the gripper's [rad]."""
+        found = []
+        for name in self.objects:
+            R, p = self.placement(name, q)
+            found.append((float(np.linalg.norm(p)), name, float(np.arccos(np.clip(R[0, 0], -1.0, 1.0)))))
+        distance, name, angle = min(found)
+        return name, distance, angle
+
+    def step(self, time: float, closed: bool, simulation: Referenced) -> None:
+        """One control period.
+
+        Raises
+        ------
+        SimulationStopped
+            ``too_far``: it closes, and nothing is within capture; ``lost``: an object has slipped out; ``too_stiff``:
+            one on a hinge or rails does not give way.
+        """
+        q = simulation.state.q
+        if closed and self.mode in {SOFT, SOFTENING}:
+            if self.held is None:
+                self._capture(time, q, simulation)
+            self.mode = HARDENING
+        elif not closed and self.mode in {HARDENING, HARDENED}:
+            self.mode = SOFTENING
+        self._harden(time, simulation)
+        if self.held is not None:
+            self._look(time, q, simulation)
+        self.trace.append((self.mode, self.share, self.nearest(q)[1]))
+
+    def _capture(self, time: float, q: Array, simulation: Referenced) -> None:
+        name, distance, angle = self.nearest(q)
+        g = self.gripper
+        if distance > g.capture_distance or angle > g.capture_angle:
+            raise SimulationStopped(
+                f"too_far: the gripper closes at t = {time:g} s, {1e3 * distance:.3g} mm and {angle:.3g} rad from the "
+                f"grasp frame of {name}; it captures within {1e3 * g.capture_distance:g} mm and "
+                f"{g.capture_angle:g} rad (plant.gripper)",
+                time=time,
+            )
+        self.held, self.slipping, self.stuck_since = Held(name, *self.placement(name, q)), False, None
+        self._tell(time, "gripper captures", name, distance)
+        for direction in DIRECTIONS:
+            simulation.set_tie(tie_name(name, direction), holds=True)
+
+    def _harden(self, time: float, simulation: Referenced) -> None:
+        """Let the springs grow or fade, and let go of what is held when they are gone."""
+        before = self.share
+        if self.mode == HARDENING:
+            self.share = min(self.share + self.period / self.gripper.hardening, 1.0)
+            self.mode = HARDENED if self.share >= 1.0 - 1e-9 else HARDENING
+        elif self.mode == SOFTENING:
+            self.share = max(self.share - self.period / self.gripper.softening, 0.0)
+            self.mode = SOFT if self.share <= 1e-9 else SOFTENING
+        if self.held is None or self.share == before:
+            return
+        name, share = self.held.name, max(self.share, LEAST_SHARE)
+        for k, direction in enumerate(DIRECTIONS):
+            stiffness, damping, _ = self.gripper.laws[k // 3]
+            simulation.set_tie(
+                tie_name(name, direction), stiffness=share * stiffness, damping=share * damping, holds=self.mode != SOFT
+            )
+        if self.mode == SOFT:
+            self.held = None
+            self._tell(time, "gripper releases", name)
+
+    def _look(self, time: float, q: Array, simulation: Referenced) -> None:
+        """Whether what is held slips, is lost, or does not give way."""
+        assert self.held is not None
+        name, g = self.held.name, self.gripper
+        R, p = self.placement(name, q)
+        moved = float(np.linalg.norm(p - self.held.p)), float(np.linalg.norm(rotation_vector(self.held.R.T @ R)))
+        force = simulation.tie_force
+        loads = np.array([abs(force[tie_name(name, direction)]) for direction in DIRECTIONS])
+        bounds = np.repeat([g.bound, g.turning_bound], 3)
+        bound = loads >= (1.0 - AT_BOUND) * bounds
+        # Springs give way by bound/stiffness in each direction; the rest is slip.
+        springs = np.array([g.bound / g.stiffness, g.turning_bound / g.turning_stiffness])
+        if not self.slipping and bound.any() and (np.array(moved) > springs + SLIPPED).any():
+            self.slipping = True
+            self._tell(time, "gripper slips", name, moved[0])
+        still = name in self._rate and abs(float(simulation.state.v[self._rate[name]])) < AT_REST
+        if not (still and bound.any()):
+            self.stuck_since = None
+        elif self.stuck_since is None:
+            self.stuck_since = time
+        lost = moved[0] > g.lost_distance or moved[1] > g.lost_angle
+        slipped = (
+            f"{name} has slipped by {1e3 * moved[0]:.3g} mm and {moved[1]:.3g} rad in the gripper at t = {time:g} s"
+        )
+        if lost:
+            self._tell(time, "gripper loses", name, moved[0])
+        if self.stuck_since is not None and (lost or time - self.stuck_since >= STUCK_FOR):
+            worst = DIRECTIONS[int((loads / bounds).argmax())]
+            direction = f"along {worst}" if len(worst) == 1 else f"about {worst[1]}"
+            raise SimulationStopped(
+                f"too_stiff: {name} does not give way from t = {self.stuck_since:g} s on, the gripper is at its bound "
+                f"{direction}; {slipped} (plant.gripper)",
+                time=time,
+            )
+        if lost:
+            raise SimulationStopped(
+                f"lost: {slipped}; it holds {g.bound:g} N and {g.turning_bound:g} N m (plant.gripper)", time=time
+            )
+
+    def _tell(self, time: float, kind: str, name: str, value: float | None = None) -> None:
+        self.events = (*self.events, Event(time, kind, name, value))
+
+    def columns(self, ticks: NDArray[np.int64]) -> tuple[Array, Array, Array]:
+        """State, share of its springs, and distance of the nearest grasp frame [m] at ticks, (T,) each."""
+        if not self.trace:
+            return tuple(np.zeros(len(ticks)) for _ in range(3))  # type: ignore[return-value]
+        rows = np.array(self.trace)[np.minimum(ticks, len(self.trace) - 1)]
+        return rows[:, 0].astype(np.int64), rows[:, 1], rows[:, 2]
+
+
+def _attached(model: Model, frame: str) -> tuple[int, Array, Array]:
+    """Body of a frame, and its rotation and origin in the body's."""
+    robot = model.robot
+    body, at = robot.attach(frame, np.zeros(3))
+    return body, robot.attached_axes(frame), at
