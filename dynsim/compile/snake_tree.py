@@ -145,6 +145,9 @@ def snake_tree(
             p_PJ=np.array([x, 0.0, 0.0]),
             lower=float(lower),
             upper=float(upper),
+            radius=BODY_RADIUS * d.wheel_radius,
+            # What the head carries ahead is its gripper.
+            tip=np.array([end + float(gripper.tip[0]) if name == HEAD else start + end, 0.0, 0.0]),
             shapes=(snake_tube(d, start, end),),
         )
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from dynsim.compile.model import Model
-from dynsim.compile.snake_tree import HEAD, ROOT, SnakeTree
+from dynsim.compile.snake_tree import GROUND, HEAD, ROOT, SnakeTree
 from dynsim.engine.gripper import STATES, Grip
 from dynsim.engine.operator import Referenced
 from dynsim.engine.sensing import SampledSensor
@@ -93,6 +93,9 @@ class SnakePilot(SnakeControl):
         self.believed, self.tree, self.robot = believed, model, robot
         self.period, self.rate = schedule.period, 1.0 / schedule.period
         self._joints, self._root = _places(robot, d.joint_names), model.body_index(ROOT)
+        # Those on the ground. The last joint of the head part is at the axle of wheel pair 1.
+        ends = (HEAD, f"{HEAD}_end", *d.joint_names[: d.head_joints - 1])
+        self._head_contacts = frozenset([*ends, *(f"{name}_{GROUND}" for name in ends)])
         # Motors that are told lines: of joints, of the pitch joints that only lift, and of wheels.
         joints = (*d.joint_names, *robot.lifting_joints[1:])
         motors = [motor.joint for motor in robot.motors]
@@ -188,8 +191,8 @@ class SnakePilot(SnakeControl):
             raise SimulationStopped(text, time=time, state=self.postures())
         off = np.abs(self._volts_per_rad * (self.state.phi - q[self._joints]))
         overloaded = [name for name, most in zip(self.description.joint_names, off >= self._volts, strict=True) if most]
-        touch, below = simulation.touching.get(HEAD), float(self.state.w_target[2] - self.head_pose(q)[2])
-        lies = touch is not None and touch.force > 0.0
+        below = float(self.state.w_target[2] - self.head_pose(q)[2])
+        lies = any(touch.force > 0.0 for name, touch in simulation.touching.items() if name in self._head_contacts)
         if not overloaded or not (lies or below > SAGS):
             self._lies_since = None
         elif self._lies_since is None:

@@ -148,7 +148,7 @@ def section_defaults(plant: Mapping[str, Any], sections: Mapping[str, Any]) -> d
         return {}
     defaults: dict[str, Any] = {
         "surfaces": {GROUND: {"type": "plane"}},
-        "contacts": {"law": "unilateral", "friction": 0.6},
+        "contacts": {"law": "unilateral", "friction": 0.6, "candidates": "links"},
     }
     integrator, contacts = sections.get("integrator"), sections.get("contacts")
     if not isinstance(integrator, Mapping) or integrator.get("method", "time_stepping") == "time_stepping":
