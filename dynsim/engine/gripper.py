@@ -6,6 +6,7 @@ added to them while the gripper hardens is not deflected yet.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -91,12 +92,7 @@ class Grip:
 
     def nearest(self, q: Array) -> tuple[str, float, float]:
         """The nearest object, its distance [m], and the angle between its axis and the gripper's [rad]."""
-        found = []
-        for name in self.objects:
-            R, p = self.placement(name, q)
-            found.append((float(np.linalg.norm(p)), name, float(np.arccos(np.clip(R[0, 0], -1.0, 1.0)))))
-        distance, name, angle = min(found)
-        return name, distance, angle
+        return nearest_of({name: self.placement(name, q) for name in self.objects})
 
     def step(self, time: float, closed: bool, simulation: Referenced) -> None:
         """One control period.
@@ -121,14 +117,8 @@ class Grip:
 
     def _capture(self, time: float, q: Array, simulation: Referenced) -> None:
         name, distance, angle = self.nearest(q)
-        g = self.gripper
-        if distance > g.capture_distance or angle > g.capture_angle:
-            raise SimulationStopped(
-                f"too_far: the gripper closes at t = {time:g} s, {1e3 * distance:.3g} mm and {angle:.3g} rad from the "
-                f"grasp frame of {name}; it captures within {1e3 * g.capture_distance:g} mm and "
-                f"{g.capture_angle:g} rad (plant.gripper)",
-                time=time,
-            )
+        if (stop := too_far(self.gripper, time, name, distance, angle)) is not None:
+            raise stop
         self.held, self.slipping, self.stuck_since = Held(name, *self.placement(name, q)), False, None
         self._tell(time, "gripper captures", name, distance)
         for direction in DIRECTIONS:
@@ -203,6 +193,27 @@ class Grip:
             return tuple(np.zeros(len(ticks)) for _ in range(3))  # type: ignore[return-value]
         rows = np.array(self.trace)[np.minimum(ticks, len(self.trace) - 1)]
         return rows[:, 0].astype(np.int64), rows[:, 1], rows[:, 2]
+
+
+def nearest_of(placements: Mapping[str, tuple[Array, Array]]) -> tuple[str, float, float]:
+    """The object whose grasp frame is the nearest, its distance [m], and the angle between its axis and the gripper's.
+
+    ``placements`` : rotation and origin of grasp frames in that of the gripper, by object
+    """
+    distance, name = min((float(np.linalg.norm(p)), name) for name, (_, p) in placements.items())
+    return name, distance, float(np.arccos(np.clip(placements[name][0][0, 0], -1.0, 1.0)))
+
+
+def too_far(gripper: Gripper, time: float, name: str, distance: float, angle: float) -> SimulationStopped | None:
+    """What ends a run in which the gripper closes so far from the nearest object [m, rad]; None if it captures that."""
+    if distance <= gripper.capture_distance and angle <= gripper.capture_angle:
+        return None
+    return SimulationStopped(
+        f"too_far: the gripper closes at t = {time:g} s, {1e3 * distance:.3g} mm and {np.degrees(angle):.3g}° from the "
+        f"grasp frame of {name}; it captures within {1e3 * gripper.capture_distance:g} mm and "
+        f"{np.degrees(gripper.capture_angle):g}° (plant.gripper)",
+        time=time,
+    )
 
 
 def _attached(model: Model, frame: str) -> tuple[int, Array, Array]:

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dynsim.compile.scene import snake_scene
 from dynsim.engine import Progress, Start
 from dynsim.engine.compilation import kernels_logged
+from dynsim.engine.kinematic_objects import CarriedObjects
 from dynsim.engine.kinematic_record import make_record
 from dynsim.engine.kinematic_run import SnakeRun
 from dynsim.engine.outcome import check_size, interrupted, raise_stopped
@@ -53,6 +54,10 @@ def prepare(scenario: Scenario, source: CommandSource | None = None) -> SnakeRun
     rows, bodies = -(-ticks // stride) + 1, len(snake_scene(description).bodies)
     check_size(scenario, rows, sum(array[0].size for array in new_trace(model, 1)) + pose_columns(bodies))
     run = SnakeRun(description, model, controller, controller.source if source is None else source, ticks, stride)
+    if scenario.config.objects:
+        plant = scenario.plant
+        ahead = plant.gripper_length_m - description.point_offset
+        run.objects = CarriedObjects(scenario, plant.gripper.gripper(plant.gripper_length_m), ahead, period)
     run.read_commands(waiting=False)
     return run
 

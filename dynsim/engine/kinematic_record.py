@@ -47,8 +47,11 @@ def make_record(run: SnakeRun, scenario: Scenario, wall: float, pictured: bool =
     add("phi_dot", trace.u[:, :joints], "rad/s", labels=names, description="joint rates held from this time on")
     add("rho_dot", trace.u[:, joints:], "rad/s", labels=wheels, description="wheel rates held from this time on")
     add_task(record, run, trace, trace.w, points)
+    if run.objects is not None:
+        run.objects.add_to(record, trace.w, np.rint(time / period).astype(np.int64))
     if pictured:
-        record.scene = snake_scene(description)
+        scene = snake_scene(description)
+        record.scene = scene if run.objects is None else run.objects.beside(scene)
         add_body_poses(record)
     summary = {
         "scenario": scenario.name,

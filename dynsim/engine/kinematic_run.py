@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import numpy as np
+
+from dynsim.engine.kinematic_objects import CarriedObjects
 from dynsim.engine.snake_control import SnakeControl, copy_of
 from dynsim.snake.state import new_trace
 from dynsim.snake.ticks import record_row, run_ticks
@@ -11,6 +14,8 @@ CHUNK = 500  # ticks between two checks for signals and updates of the bar: abou
 
 class SnakeRun(SnakeControl):
     """The control of a snake whose joints follow their rates exactly, and whose base moves as its wheels roll."""
+
+    objects: CarriedObjects | None = None
 
     def load_kernels(self) -> None:
         """Compile or load the kernels: that is no simulation time."""
@@ -29,6 +34,12 @@ class SnakeRun(SnakeControl):
         """
         self.begin_period()
         periods = min(self.periods(), CHUNK)
+        if self.objects is not None:
+            now, block = self.tick, self.block.gripper[self.tick - self.block_start :]
+            w, _, _ = self.posture()
+            self.objects.command(now, bool(block[0]), w)
+            changes = np.flatnonzero(block != block[0])
+            periods = min([periods, *changes[:1].tolist()])
         done, blocked = run_ticks(
             self.model,
             self.controller.law,

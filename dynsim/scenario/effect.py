@@ -65,7 +65,7 @@ def _of_kinematics(config: Any) -> Iterator[tuple[Keys, str]]:
         part = getattr(config, section)
         for key in () if part is None else type(part).model_fields:
             yield (section, key), f"plant {config.plant.type} is kinematic"
-    for section in ("loads", "objects", "ties", "sensors"):
+    for section in ("loads", "ties", "sensors"):
         yield (section,), f"plant {config.plant.type} is kinematic"
     if hasattr(config.plant, "dynamics"):
         yield ("plant", "dynamics"), "plant.level is kinematic"

@@ -1,0 +1,176 @@
+"""Objects of a kinematic snake: they have no forces, stay where they are, and follow the gripper while it holds them.
+
+What is on a hinge turns with the gripper about its axis, what is on rails slides with it along them. An object that is
+let go stays where it is then.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynsim.compile.model import Model
+from dynsim.compile.scene import robot_scene
+from dynsim.compile.tie_rests import rotation_vector
+from dynsim.engine.gripper import HARDENED, HARDENING, SOFT, SOFTENING, nearest_of, too_far
+from dynsim.engine.snake_record import attitude
+from dynsim.model.description import Array, Robot
+from dynsim.model.gripper import Gripper, grasp_frame
+from dynsim.record import Event, Record
+from dynsim.record.scene import Scene, quaternion
+from dynsim.scenario import Scenario
+from dynsim.scenario.objects import SceneObject
+
+# A grasp frame that is nearer to the axis of its hinge tells no angle: the turning of the gripper does [m].
+ON_AXIS = 0.01
+
+
+@dataclass
+class Hold:
+    """Object ``name`` in the gripper from one tick to another; R, p place it in the gripper's frame.
+
+    ``start``, ``end`` : ticks; ``tip`` : pose of the gripper, rotation and position, and ``q`` coordinates at the start
+    """
+
+    name: str
+    start: int
+    end: float
+    tip: tuple[Array, Array]
+    q: Array
+
+
+class CarriedObjects:
+    """The objects of a run, and when the gripper held which.
+
+    Parameters
+    ----------
+    gripper : of the snake; ahead : its tip ahead of the controlled point [m]
+    period : of the control [s]
+    """
+
+    def __init__(self, scenario: Scenario, gripper: Gripper, ahead: float, period: float) -> None:
+        self.objects: dict[str, SceneObject] = scenario.config.objects
+        self.gripper, self._ahead, self._period = gripper, ahead, period
+        links = [link for name, body in self.objects.items() for link in body.links(name)]
+        frames = [frame for name, body in self.objects.items() for frame in body.frames(name)]
+        start = np.concatenate([body.start() for body in self.objects.values()])
+        first = next(iter(self.objects))
+        self.robot = Robot("objects", tuple(links), (), (first, np.zeros(3)), q0=start, frames=tuple(frames))
+        self.model, self.q = Model(self.robot), start.copy()
+        # Where the coordinates of each object are.
+        sizes = [len(body.start()) for body in self.objects.values()]
+        ends = np.cumsum(sizes).tolist()
+        self._part = {name: slice(end - size, end) for name, size, end in zip(self.objects, sizes, ends, strict=True)}
+        self.graspable = tuple(name for name, body in self.objects.items() if body.grasp is not None)
+        self.holds: list[Hold] = []
+        self.events: list[Event] = []
+        self._closed = False
+
+    def tip(self, w: Array) -> tuple[Array, Array]:
+        """Rotation and position of the gripper's tip at a pose (6,) of the controlled point."""
+        R = attitude(w[None])[0]
+        return R, w[:3] + self._ahead * R[:, 0]
+
+    def command(self, tick: int, closed: bool, w: Array) -> None:
+        """The gripper is told to be closed or open from a tick on, with the controlled point at w (6,).
+
+        Raises
+        ------
+        SimulationStopped
+            It closes, and nothing is within capture.
+        """
+        if closed == self._closed or not self.graspable:
+            self._closed = closed
+            return
+        self._closed, time = closed, tick * self._period
+        held = self.holds[-1] if self.holds and self.holds[-1].end > tick else None
+        if not closed:
+            if held is not None:
+                held.end = tick + self.gripper.softening / self._period
+                self.events.append(Event(held.end * self._period, "gripper releases", held.name))
+            return
+        if held is not None:  # it was still softening
+            held.end = np.inf
+            self.events.pop()
+            return
+        R, p = self.tip(w)
+        self._move_to(tick, w)
+        placements = {name: self._placement(name, R, p) for name in self.graspable}
+        name, distance, angle = nearest_of(placements)
+        if (stop := too_far(self.gripper, time, name, distance, angle)) is not None:
+            raise stop
+        self.holds.append(Hold(name, tick, np.inf, (R, p), self.q.copy()))
+        self.events.append(Event(time, "gripper captures", name, distance))
+
+    def _placement(self, name: str, R: Array, p: Array) -> tuple[Array, Array]:
+        body, at = self.robot.attach(grasp_frame(name), np.zeros(3))
+        B, other = self.model.body_pose(body, self.q)
+        return R.T @ B @ self.robot.attached_axes(grasp_frame(name)), R.T @ (other + B @ at - p)
+
+    def _move_to(self, tick: int, w: Array) -> None:
+        """Bring what is held at a tick to where the gripper is then."""
+        for hold in self.holds:
+            if hold.start <= tick <= hold.end:
+                part = self._part[hold.name]
+                self.q[part] = self._followed(hold, *self.tip(w))
+
+    def _followed(self, hold: Hold, R: Array, p: Array) -> Array:
+        """Coordinates of a held object with the gripper at R, p."""
+        body, (R0, p0), joint = self.objects[hold.name], hold.tip, self.objects[hold.name].joint
+        index, at = self.robot.attach(grasp_frame(hold.name), np.zeros(3))
+        B, origin = self.model.body_pose(index, hold.q)
+        before = hold.q[self._part[hold.name]]
+        if joint is None:
+            turn = R @ R0.T
+            return np.array([*(p + turn @ (origin - p0)), *quaternion(turn @ B), *before[7:]])
+        axis = B @ self.robot.links[index].axis
+        if body.slide is not None:
+            return before + axis @ (p - p0)
+        # In the plane of the hinge: where the grasp frame was seen from the axis, and where it has gone with the tip.
+        was = B @ at - axis * (axis @ B @ at)
+        if np.linalg.norm(was) < ON_AXIS:
+            return before + axis @ rotation_vector(R @ R0.T)
+        now = was + (p - p0) - axis * (axis @ (p - p0))
+        return before + np.arctan2(axis @ np.cross(was, now), was @ now)
+
+    def add_to(self, record: Record, w: Array, ticks: NDArray[np.int64]) -> None:
+        """Coordinates of objects as the signal ``q``, and what the gripper did, at poses (T, 6) and ticks (T,)."""
+        self.q, rows = self.robot.initial.copy(), []
+        state, distance = np.zeros(len(ticks), dtype=np.int64), np.zeros(len(ticks))
+        for row, tick in enumerate(ticks.tolist()):
+            self._move_to(tick, w[row])
+            rows.append(self.q.copy())
+            if self.graspable:
+                distance[row] = nearest_of({k: self._placement(k, *self.tip(w[row])) for k in self.graspable})[1]
+        for hold in self.holds:
+            since, left = (ticks - hold.start) * self._period, (hold.end - ticks) * self._period
+            state[since >= 0.0] = HARDENING
+            state[since >= self.gripper.hardening] = HARDENED
+            state[(since >= 0.0) & (left <= self.gripper.softening)] = SOFTENING
+            state[left < 0.0] = SOFT
+        labels = self._labels
+        record.add("q", np.array(rows), "rad or m", labels=labels, description="coordinates of objects")
+        if self.graspable:
+            record.add("gripper_state", state, "1", description="0 soft, 1 hardening, 2 hardened, 3 softening")
+            text = "from the tip of the gripper to the nearest grasp frame"
+            record.add("grasp_distance", distance, "m", description=text)
+        for event in self.events:
+            if event.time <= float(record.time[-1]):
+                record.add_event(event.time, event.kind, event.name, value=event.value)
+
+    @property
+    def _labels(self) -> tuple[str, ...]:
+        return tuple(name for link in self.robot.links for name in link.coordinates)
+
+    def beside(self, scene: Scene) -> Scene:
+        """The scene with the objects in it."""
+        own = robot_scene(self.robot, (), {})
+        assert own is not None
+        shifted = len(scene.bodies)
+        bodies = [
+            body if body.parent < 0 else type(body)(body.name, body.parent + shifted, body.joint, body.shapes)
+            for body in own.bodies
+        ]
+        return type(scene)((*scene.bodies, *bodies), scene.surfaces, scene.points, scene.fixed, scene.supports)
