@@ -98,3 +98,98 @@ def test_names_and_sizes_are_checked():
         with pytest.raises((ScenarioError, ValueError), match=says):
             scene({"box": BOX | change})
     assert "objects" not in scene({}).resolved
+
+
+def test_a_door_with_a_closer_swings_about_its_hinge():
+    """θ = θ_r (1 − cos ω t), ω² = k/I, I = m (a² + b²)/12 + m d² about the hinge beside the door."""
+    hinge = {"point_m": [0.0, -0.4, 0.0], "spring_N_m_per_rad": 2.0, "rest_deg": -30.0}
+    door = {"mass_kg": 5.0, "size_m": [0.04, 0.8, 1.0], "position_m": [1.0, 0.4, 0.0], "hinge": hinge}
+    record = dynsim.simulate(scene({"door": door}, duration=3.0))
+    inertia = 5.0 * (0.04**2 + 0.8**2) / 12.0 + 5.0 * 0.4**2
+    expected = np.radians(-30.0) * (1.0 - np.cos(np.sqrt(2.0 / inertia) * record.time))
+    np.testing.assert_allclose(record["q"][:, record.labels["q"].index("door")], expected, atol=1e-6)
+    assert record.summary["energy_residual_relative"] < 1e-12
+
+
+def test_a_drawer_slides_along_its_rails():
+    """x = x_0 (1 − cos ω t), x_0 = rest + m g sin 30°/k, on rails that go down by 30° after a turn about z."""
+    slide = {"axis": [1.0, 0.0, 0.0], "spring_N_per_m": 50.0, "rest_m": 0.05}
+    drawer = {"mass_kg": 2.0, "size_m": [0.3, 0.3, 0.1], "position_m": [1.0, 0.4, 0.0], "rpy_deg": [0, 30, 90]}
+    record = dynsim.simulate(scene({"drawer": drawer | {"slide": slide}}, duration=2.0))
+    expected = (0.05 + 2.0 * G * 0.5 / 50.0) * (1.0 - np.cos(5.0 * record.time))
+    np.testing.assert_allclose(record["q"][:, record.labels["q"].index("drawer")], expected, atol=1e-5)
+
+
+def test_friction_of_rails_holds_a_drawer_and_its_stop_ends_its_way():
+    drawer = {"mass_kg": 2.0, "size_m": [0.3, 0.3, 0.1], "position_m": [1.0, 0.4, 0.0]}
+    for force, end in ((4.0, 0.0), (30.0, 0.1)):
+        pull = {"type": "constant", "body": "drawer", "force_N": [force, 0.0, 0.0]}
+        slide = {"friction_N": 5.0, "limits_m": [0.0, 0.1]}
+        record = dynsim.simulate(scene({"drawer": drawer | {"slide": slide}}, loads={"pull": pull}))
+        assert record["q"][-1, record.labels["q"].index("drawer")] == pytest.approx(end, abs=1e-9)
+
+
+PIPE = {
+    "shape": "parts",
+    "position_m": [1.0, 0.0, -0.98],
+    "parts": {
+        "run": {"mass_kg": 0.2, "shape": "cylinder", "radius_m": 0.02, "length_m": 0.2, "rpy_deg": [90, 0, 0]},
+        "branch": {
+            "mass_kg": 0.1,
+            "shape": "cylinder",
+            "radius_m": 0.02,
+            "length_m": 0.1,
+            "position_m": [0.05, 0.0, 0.0],
+            "rpy_deg": [0, 90, 0],
+        },
+    },
+}
+
+
+def test_the_inertia_of_parts_is_that_of_many_points():
+    """Of points spread over both cylinders: mass, centre and moments, to the accuracy of the sum."""
+    body = build.robot(scene({"pipe": PIPE})).links[-1].inertia
+    count, points, masses = 40, [], []
+    for mass, length, along, offset in ((0.2, 0.2, 1, 0.0), (0.1, 0.1, 0, 0.05)):
+        z = (np.arange(count) + 0.5) / count * length - 0.5 * length
+        radius = 0.02 * np.sqrt((np.arange(count) + 0.5) / count)
+        angle = 2.0 * np.pi * np.arange(count) / count
+        r, a, h = (grid.ravel() for grid in np.meshgrid(radius, angle, z))
+        columns = [r * np.cos(a), r * np.sin(a)]
+        columns.insert(along, h)
+        points.append(np.column_stack(columns) + np.array([offset, 0.0, 0.0]))
+        masses.append(np.full(len(h), mass / len(h)))
+    x, m = np.vstack(points), np.concatenate(masses)
+    centre = m @ x / m.sum()
+    apart = x - centre
+    tensor = np.einsum(
+        "k,kij->ij", m, np.einsum("ka,ka,ij->kij", apart, apart, np.eye(3)) - np.einsum("ki,kj->kij", apart, apart)
+    )
+    assert body.mass == pytest.approx(0.3)
+    np.testing.assert_allclose(body.com, centre, atol=1e-9)
+    np.testing.assert_allclose(body.tensor, tensor, rtol=2e-3, atol=1e-9)
+
+
+def test_a_pipe_joint_lies_on_its_three_ends():
+    record = dynsim.simulate(scene({"pipe": PIPE}, contacts=WITH_A_TIP))
+    names = record.labels["contact_normal_force"]
+    assert {"pipe.run1.floor", "pipe.run2.floor", "pipe.branch2.floor"} <= set(names)
+    assert record["contact_normal_force"][-1].sum() == pytest.approx(0.3 * G, rel=1e-9)
+    assert record["q"][-1, record.labels["q"].index("pipe.z")] == pytest.approx(-0.98, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("change", "key"),
+    [
+        ({"mass_kg": 1.0}, "mass_kg"),
+        ({"radius_m": 0.1}, "radius_m"),
+        ({"parts": None}, "parts"),
+        ({"shape": "box"}, "parts"),
+        ({"hinge": {}, "slide": {}}, "slide"),
+        ({"slide": {"limits_m": [0.1, 0.1]}}, "limits_m"),
+        ({"grasp": {"axis": [0, 0, 0]}}, "axis"),
+    ],
+)
+def test_wrong_objects_are_refused_with_the_key(change, key):
+    with pytest.raises(ValueError, match=key):
+        scene({"pipe": PIPE | change})

@@ -1,0 +1,175 @@
+"""The tasks of [T] V.D on both levels: pick up a pipe joint, turn a valve, open a door; and why they fail."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dynsim import Simulation, load_scenario, simulate
+from dynsim.engine.gripper import HARDENED, SOFT
+from dynsim.errors import SimulationStopped
+from dynsim.record import Record
+from dynsim.snake.description import CommandBlock
+
+G = 9.81
+
+
+def column(record: Record, name: str) -> np.ndarray:
+    """Coordinate of an object over time."""
+    return record["q"][:, record.labels["q"].index(name)]
+
+
+def events(record: Record) -> list[tuple[str, str]]:
+    """Kinds and names of what the gripper did."""
+    return [(event.kind.removeprefix("gripper "), event.name) for event in record.events if "gripper" in event.kind]
+
+
+def stopped(name: str, variant: str, **changes: Any) -> SimulationStopped:
+    """The end of a task that fails."""
+    with pytest.raises(SimulationStopped) as caught:
+        simulate(load_scenario(name, variant, {key.replace("__", "."): value for key, value in changes.items()}))
+    return caught.value
+
+
+@pytest.mark.parametrize(
+    ("name", "variant", "coordinate", "end"),
+    [
+        ("snake_pick_up", "lifts", "pipe.z", 0.186),
+        ("snake_valve", "turns", "valve", np.pi / 2),
+        ("snake_door", "push", "door", np.pi / 3),
+        ("snake_door", "pull_switching", "door", -0.42),
+    ],
+)
+def test_on_the_kinematic_level_objects_follow_the_gripper(
+    name: str, variant: str, coordinate: str, end: float
+) -> None:
+    record = simulate(load_scenario(name, variant, {"plant.level": "kinematic"}))
+    moved = column(record, coordinate)
+    assert moved[-1] == pytest.approx(end, abs=0.02)
+    held = record["gripper_state"] == HARDENED
+    # What is held stays where it was captured, which is in the plane of a hinge only.
+    assert np.ptp(record["grasp_distance"][held]) < 1e-3
+    before = record.time < 6.0
+    assert np.ptp(moved[before]) == 0.0
+    assert events(record)[0][0] == "captures"
+
+
+@pytest.mark.parametrize("name", ["snake_pick_up", "snake_valve", "snake_door"])
+@pytest.mark.parametrize("level", ["kinematic", "dynamic"])
+def test_a_gripper_that_closes_beside_its_object_ends_the_run(name: str, level: str) -> None:
+    stop = stopped(name, "too_far", plant__level=level)
+    assert str(stop).startswith("too_far: the gripper closes at t = ")
+    assert stop.record is not None
+    assert stop.record.time[-1] == pytest.approx(stop.time)
+    assert not events(stop.record)
+
+
+def test_the_pipe_is_picked_up() -> None:
+    """Ledger, impulses against the weight, and the force of the gripper against that of the pipe."""
+    scenario = load_scenario("snake_pick_up", "lifts")
+    simulation = Simulation(scenario)
+    simulation.advance(scenario.duration_s)
+    record, model = simulation.record(), simulation.model
+    assert column(record, "pipe.z")[-1] - 0.03 > 0.14
+    assert events(record) == [("captures", "pipe")]
+    supplied = record["energy_electrical_supply"][-1]
+    assert np.abs(record["energy_residual"]).max() < 1e-5 * supplied
+    # Impulses of the ground, all upwards, and the change of momentum are those of the weight.
+    q, v = record["q"][-1], record["v"][-1]
+    up = mass = 0.0
+    for k, link in enumerate(model.robot.links):
+        jacobian = model.point_jacobian(k, link.inertia.com, q)
+        up += link.inertia.mass * float(jacobian[2] @ v)
+        mass += link.inertia.mass
+    first = record["contact_impulse"][0].sum()
+    impulse = record["contact_impulse"][-1].sum() - first
+    # Steps keep momentum to second order: 1e-8 with 2.5 ms, 2e-9 with half of that.
+    assert impulse == pytest.approx(mass * G * record.time[-1] + up, rel=2e-8)
+    # While it hangs the six ties carry the pipe: its weight, and what its slow motion needs.
+    force = record["tie_force"][record.time > 22.0][:, :3]
+    assert np.linalg.norm(force, axis=1) == pytest.approx(0.2 * G, rel=0.1)
+
+
+def test_a_load_that_is_too_heavy_ends_with_reason_and_time() -> None:
+    stop = stopped("snake_pick_up", "too_heavy")
+    assert str(stop).startswith("too_heavy: the head is ")
+    assert "psi2 at the limit of its voltage" in str(stop)
+    assert 15.0 < stop.time < 21.0
+
+
+@pytest.mark.long
+def test_the_valve_is_turned_by_its_friction_over_the_stiffness_less_than_the_head() -> None:
+    record = simulate(load_scenario("snake_valve", "turns"))
+    turned = record.time < 17.9
+    head, valve = record["w"][turned, 3][-1], column(record, "valve")[turned][-1]
+    assert head - valve == pytest.approx(0.3 / 5.0, abs=0.01)
+    assert events(record) == [("captures", "valve"), ("releases", "valve")]
+    assert record["gripper_state"][-1] == SOFT
+    # It stays where it was let go.
+    assert np.ptp(column(record, "valve")[record.time > 18.6]) < 1e-9
+    assert np.abs(record["energy_residual"]).max() < 1e-5 * record["energy_electrical_supply"][-1]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("variant", "angle"), [("push", 60.0), ("pull_switching", -24.0)])
+def test_the_door_is_opened(variant: str, angle: float) -> None:
+    record = simulate(load_scenario("snake_door", variant))
+    assert np.degrees(column(record, "door")[-1]) == pytest.approx(angle, abs=2.0)
+    assert np.abs(record["energy_residual"]).max() < 1e-5 * record["energy_electrical_supply"][-1]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["snake_valve", "snake_door"])
+def test_what_does_not_give_way_ends_with_reason_and_time(name: str) -> None:
+    stop = stopped(name, "too_stiff")
+    assert str(stop).startswith("too_stiff: ")
+    assert "does not give way from t = " in str(stop)
+    assert stop.record is not None
+    assert ("slips", name.removeprefix("snake_")) in events(stop.record)
+
+
+@pytest.mark.long
+def test_an_object_that_slips_out_is_lost() -> None:
+    """A gripper that holds 1 N lifts a pipe of 2 N."""
+    stop = stopped("snake_pick_up", "lifts", plant__gripper__bound_N=1.0)
+    assert str(stop).startswith("lost: pipe has slipped by 15")
+    assert stop.record is not None
+    assert events(stop.record)[-1] == ("loses", "pipe")
+
+
+@pytest.mark.long
+def test_a_robot_that_is_thrown_over_ends_as_overturned() -> None:
+    push = {"type": "constant", "body": "pair1", "force_N": [0.0, 150.0, 40.0]}
+    stop = stopped("snake_valve", "turns", loads={"push": push})
+    assert str(stop).startswith("overturned: pair1, which carries the head, is tilted by ")
+
+
+class Pilot:
+    """What a joystick does: the same as the script of ``snake_valve``, a period at a time."""
+
+    def read(self, first: int, left: int, period: float, feedback: Any) -> CommandBlock:
+        """One period."""
+        time = first * period
+        velocity = np.zeros((1, 6))
+        if 1.0 <= time < 5.0:
+            velocity[0, 0] = 0.05 / 4.0
+        if 9.0 <= time < 13.0:
+            velocity[0, 3] = 0.1
+        closed = int(time >= 7.0)
+        return CommandBlock(velocity, np.full(1, -1), np.full(1, closed))
+
+
+@pytest.mark.long
+def test_a_pilot_turns_the_valve_and_a_snapshot_continues_the_grip() -> None:
+    simulation = Simulation(load_scenario("snake_valve", "turns"), operator=Pilot())
+    simulation.advance(8.5)
+    kept = simulation.snapshot()
+    first = simulation.advance(13.0)
+    turned = simulation.record()
+    simulation.restore(kept)
+    again = simulation.advance(13.0)
+    np.testing.assert_array_equal(first.q, again.q)
+    assert column(turned, "valve")[-1] > 0.3
+    np.testing.assert_array_equal(simulation.record()["gripper_state"], turned["gripper_state"])
