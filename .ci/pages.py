@@ -715,6 +715,24 @@ def observed(key: str) -> Any:
     return data("snake/observations.json")[key]
 
 
+def snake_tasks() -> str:
+    """What came of each task, by level; forces and torques of the gripper, and energy, on the dynamic one."""
+    runs = data("snake/tasks.json")["runs"]
+    lines = [
+        "| task | kinematic | dynamic | gripper, largest | supplied |",
+        "|---|---|---|---|---|",
+    ]
+    for by_level in zip(runs[::2], runs[1::2], strict=True):
+        moved = [
+            f"{round(run['moved'], 1) + 0.0:.1f} {run['unit']}{', ' * bool(run['end'])}{run['end']}" for run in by_level
+        ]
+        dynamic = by_level[1]
+        held = f"{dynamic['force_N']:.3g} N, {dynamic['torque_N_m']:.2g} N m" if dynamic["force_N"] else NONE
+        name = f"`{dynamic['scenario']}` `{dynamic['variant']}`"
+        lines.append(f"| {name} | {moved[0]} | {moved[1]} | {held} | {dynamic['supplied_J']:.0f} J |")
+    return "\n".join(lines) + "\n"
+
+
 def converged(key: str) -> float:
     """Largest error of the head with measured feedback, of both runs."""
     return max(run[key] for run in observed("measured_feedback").values())
@@ -907,7 +925,7 @@ TABLES: dict[str, Callable[[], str]] = {
         elbows_in_short, elbows, glued_and_real, overturning_holds, overturning_drives, assumptions, ledger,
         snake_table_iii, time_stepping, endings, right_hand_side, ratios, job, precision, sweeps, snake_bench,
         combinations, comparison, faults, planned_arm, planned_gains, planned_scenes, snake_positioning, snake_limits,
-        snake_ways, snake_circles, snake_order, snake_areas, snake_on_servos,
+        snake_ways, snake_circles, snake_order, snake_areas, snake_on_servos, snake_tasks,
     )
 }  # fmt: skip
 
@@ -1103,6 +1121,7 @@ NUMBERS |= {
     "snake_dz_mm": lambda: fixed(1e3 * sag_error("dz_m"), 1),
     "snake_steps_mm": lambda: fixed(steps()["spread_mm"], 2),
     "snake_steps_mrad": lambda: fixed(steps()["spread_mrad"], 2),
+    "tasks_ledger": lambda: small(max(run.get("ledger", 0.0) for run in data("snake/tasks.json")["runs"]), 0),
     "snake_measured_mm": lambda: fixed(converged("position_mm"), 1),
     "snake_measured_mrad": lambda: fixed(converged("attitude_mrad"), 1),
     "snake_y_paper_y": lambda: fixed(1e3 * TABLE_III["y"].mean[1], 0),
