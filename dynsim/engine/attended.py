@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from dynsim.dynamics import tables as ka
 from dynsim.engine.compilation import kernels_logged
 from dynsim.engine.prepare import Prepared, right_hand_side
 from dynsim.integrators import driver
@@ -33,6 +34,8 @@ LOOK_S, PATIENCE_S = 0.1, 0.5
 # A run whose present step takes longer than this is stuck [s]. The longest step observed took 80 s: of 24 contacts
 # whose forces no method of the solver finds.
 STUCK_S = 600.0
+# Most steps of time stepping in the caller's own thread: contacts may close within them.
+MOST_SHORT = 50
 # Time of one iteration of the contact solver, divided by the cube of the number of rows [s].
 ROUND = 2e-9
 
@@ -156,12 +159,14 @@ def _short_steps(prepared: Prepared) -> int:
 
     They are taken in the caller's own thread: to hand a short run to another one costs some hundredths of its time.
     None under the unilateral law, where one step may take a minute; but steps of one length, whose contact problems
-    are given up after so many rounds. So many are hardly ever needed, and a thread for each tick of a controller would
-    double the time of a snake: they may take as long as code that was asked to return.
+    are given up after so many rounds: as many as take no longer than code that was asked to return, with the rows of
+    the last step. So many rounds are hardly ever needed, and a thread for each tick of a controller would double the
+    time of a snake.
     """
     if prepared.system.unilateral is not None:
-        rows = max(prepared.workspace.small.shape[1], 1)
-        return int(PATIENCE_S / (kt.MOST_ROUNDS * ROUND * rows**3)) if prepared.run.stepping is not None else 0
+        rows = max(int(prepared.workspace.counts[ka.ROWS]), 1)
+        few = min(int(PATIENCE_S / (kt.MOST_ROUNDS * ROUND * rows**3)), MOST_SHORT)
+        return few if prepared.run.stepping is not None else 0
     n, p = len(prepared.workspace.joints), prepared.workspace.small.shape[1]
     seconds = right_hand_side(n, p, dense=prepared.system.dense is not None)
     # Of RADAU5 with a Jacobian and its factors.
