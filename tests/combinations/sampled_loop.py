@@ -36,8 +36,10 @@ def loop_growth(seen: Observed, q: Array | None = None, *, most: bool = False) -
             rows.append(J if seen.real and touch.contact.friction > 0.0 else touch.normal[0][None] @ J)
     _, sizes, vectors = np.linalg.svd(np.vstack(rows) @ basis)
     rank = int((sizes > 1e-9).sum())
-    radii = [_spectral_radius(seen, q, free) for free in (basis, basis @ vectors[rank:].T) if free.shape[1]]
-    return float(np.log(max((max if most else min)(radii), 1e-300))) / period if radii else None
+    # Contacts that let nothing move hold every loop (8831).
+    loops = (basis, basis @ vectors[rank:].T)
+    radii = [_spectral_radius(seen, q, free) if free.shape[1] else 0.0 for free in loops]
+    return float(np.log(max((max if most else min)(radii), 1e-300))) / period
 
 
 def _spectral_radius(seen: Observed, q: Array, basis: Array) -> float:
