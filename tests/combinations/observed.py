@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from combinations.bodies import Bodies, Motion, position_rates, times
 from combinations.running import Run
 from combinations.surfaces import Shape, nearest, shape
-from dynsim.model.description import Contact, Load, Robot
+from dynsim.model.description import WORLD, Contact, Load, Robot
 from dynsim.model.drives import Motor, Servo, TorqueSource
 from dynsim.model.surfaces import HeightField
 from dynsim.record import Record
@@ -359,7 +359,10 @@ class Observed:
         """
         acting = []
         for k, tie in enumerate(self.robot.ties if "tie_force" in self.record else ()):
-            (a, _), (b, other) = self.robot.attach(tie.body, tie.point), self.robot.attach(tie.other, tie.other_point)
+            a, _ = self.robot.attach(tie.body, tie.point)
+            # The world is body −1.
+            fixed = tie.other == WORLD
+            b, other = (-1, tie.other_point) if fixed else self.robot.attach(tie.other, tie.other_point)
             axis = self.robot.attached_axes(tie.body) @ np.asarray(tie.axis) / np.linalg.norm(tie.axis)
             axes = np.broadcast_to(axis, (len(motion.rotation[a]), 3))
             if tie.turns:
@@ -369,13 +372,16 @@ class Observed:
             push = along * (recorded if rows is None else recorded[rows])
             still = np.zeros_like(push)
             force, moment = (still, push) if tie.turns else (push, still)
-            acting.append((a, b, motion.point(b, other), force, moment))
+            acting.append(
+                (a, b, np.broadcast_to(other, push.shape) if fixed else motion.point(b, other), force, moment)
+            )
         return acting
 
     def _turning_axes(self, motion: Motion, a: int, b: int, axis: Array) -> Array:
         """Return by differences how turns of b against a change the part along an axis of a of its rotation vector."""
-        start = self.motion.rotation[a][0].T @ self.motion.rotation[b][0]
-        turned = Rotation.from_matrix(np.swapaxes(motion.rotation[a], 1, 2) @ motion.rotation[b] @ start.T)
+        still = np.eye(3) if b < 0 else self.motion.rotation[b][0]
+        start, second = self.motion.rotation[a][0].T @ still, np.eye(3) if b < 0 else motion.rotation[b]
+        turned = Rotation.from_matrix(np.swapaxes(motion.rotation[a], 1, 2) @ second @ start.T)
         little = 1e-5 * np.eye(3)
         parts = [
             ((Rotation.from_rotvec(d) * turned).as_rotvec() - (Rotation.from_rotvec(-d) * turned).as_rotvec()) @ axis
@@ -560,8 +566,9 @@ def _tie_terms(seen: Observed, motion: Motion, rows: NDArray[np.int64]) -> list[
     terms = []
     for a, b, position, force, moment in seen.tie_wrenches(motion, rows):
         on_first = seen.bodies.force_along_rows(motion, a, position, force, moment)
-        on_second = seen.bodies.force_along_rows(motion, b, position, -force, -moment)
-        terms.append(-(on_first + on_second))
+        if b >= 0:
+            on_first = on_first + seen.bodies.force_along_rows(motion, b, position, -force, -moment)
+        terms.append(-on_first)
     return terms
 
 

@@ -95,14 +95,20 @@ class Scene:
         return f"# seed {self.seed}: {levels}\n{to_yaml(self.with_method(method))}"
 
 
-def scene(levels: Levels, seed: int, folder: Path) -> Scene:
-    """Return the scene of an assignment; files are written to the folder, which must exist."""
+def scene(
+    levels: Levels, seed: int, folder: Path, change: Callable[[dict[str, Any]], None] = lambda settings: None
+) -> Scene:
+    """Return the scene of an assignment; files are written to the folder, which must exist.
+
+    ``change`` : its sections, as they would be written
+    """
     # This number is the same in every process, unlike Python's own hashes of strings.
     number = zlib.crc32("/".join(levels[factor] for factor in FACTORS).encode())
     for attempt in range(ATTEMPTS):
         random = np.random.default_rng([seed, number, attempt])
         draft = _snake(random, levels) if levels["plant"] == "snake" else _arm(random, levels, folder)
         draft["name"] = "combined"
+        change(draft)
         for section in [key for key, value in draft.items() if value is None or value == {}]:
             del draft[section]
         drawn = Scene(levels, seed, draft, folder)

@@ -79,15 +79,18 @@ def look_at(
     *,
     thorough: bool | None = None,
     takes: Callable[[Scene, str, str], bool] = lambda drawn, method, manner: True,
+    change: Callable[[dict[str, Any]], None] = lambda settings: None,
 ) -> Outcome:
     """Run a scene by all its methods, or by those that ``takes`` lets through, and look at everything.
+
+    ``change`` : sections of the scene that are changed
 
     Raises
     ------
     SimulationInterrupted
     """
     began = time.monotonic()
-    drawn = scene(levels, seed + number, folder)
+    drawn = scene(levels, seed + number, folder, change)
     done = runs(drawn, partial(takes, drawn))
     problems = faults(drawn, done, thorough=number % THOROUGH == 0 if thorough is None else thorough)
     problems += _checked(drawn, done)
