@@ -22,6 +22,7 @@ from dynsim.record import Event
 
 SOFT, HARDENING, HARDENED, SOFTENING = range(4)
 STATES = ("soft", "hardening", "hardened", "softening")
+STATES_TEXT = ", ".join(f"{number} {name}" for number, name in enumerate(STATES))
 # Least share of its springs that a gripper has while it holds something: ties need some.
 LEAST_SHARE = 0.01
 # Slips below this are none: ties that hold give way by their springs alone [m, rad].
@@ -72,6 +73,11 @@ class Grip:
         # Of objects on hinges or rails: their rates.
         joints = [link.joint for link in robot.links]
         self._rate = {name: joints.index(name) for name in self.objects if name in joints}
+
+    @property
+    def told(self) -> str:
+        """Its state in words, for a pilot."""
+        return STATES[self.mode] + (f" around {self.held.name}" if self.held is not None else "")
 
     def remembered(self) -> Grip:
         """A copy of what the future depends on, and of what was recorded."""

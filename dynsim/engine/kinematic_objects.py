@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from dynsim.compile.model import Model
 from dynsim.compile.scene import robot_scene
 from dynsim.compile.tie_rests import rotation_vector
-from dynsim.engine.gripper import HARDENED, HARDENING, SOFT, SOFTENING, nearest_of, too_far
+from dynsim.engine.gripper import HARDENED, HARDENING, SOFT, SOFTENING, STATES, STATES_TEXT, nearest_of, too_far
 from dynsim.engine.snake_record import attitude
 from dynsim.model.description import Array, Robot
 from dynsim.model.gripper import Gripper, grasp_frame
@@ -135,6 +135,23 @@ class CarriedObjects:
         now = was + (p - p0) - axis * (axis @ (p - p0))
         return before + np.arctan2(axis @ np.cross(was, now), was @ now)
 
+    def told(self, tick: int) -> str:
+        """State of the gripper at a tick in words, for a pilot."""
+        hold = next((hold for hold in reversed(self.holds) if hold.start <= tick <= hold.end), None)
+        return STATES[self._state(hold, tick)] + (f" around {hold.name}" if hold is not None else "")
+
+    def positions(self, tick: int, w: Array) -> dict[str, float]:
+        """Coordinates of the objects by name, with the controlled point at w (6,) at the present tick."""
+        self._move_to(tick, w)
+        return dict(zip(self._labels, self.q.tolist(), strict=True))
+
+    def _state(self, hold: Hold | None, tick: float) -> int:
+        if hold is None:
+            return SOFT
+        if (hold.end - tick) * self._period <= self.gripper.softening:
+            return SOFTENING
+        return HARDENED if (tick - hold.start) * self._period >= self.gripper.hardening else HARDENING
+
     def add_to(self, record: Record, w: Array, ticks: NDArray[np.int64]) -> None:
         """Coordinates of objects as the signal ``q``, and what the gripper did, at poses (T, 6) and ticks (T,)."""
         self.q, rows = self.robot.initial.copy(), []
@@ -145,15 +162,12 @@ class CarriedObjects:
             if self.graspable:
                 distance[row] = nearest_of({k: self._placement(k, *self.tip(w[row])) for k in self.graspable})[1]
         for hold in self.holds:
-            since, left = (ticks - hold.start) * self._period, (hold.end - ticks) * self._period
-            state[since >= 0.0] = HARDENING
-            state[since >= self.gripper.hardening] = HARDENED
-            state[(since >= 0.0) & (left <= self.gripper.softening)] = SOFTENING
-            state[left < 0.0] = SOFT
+            held = np.flatnonzero((ticks >= hold.start) & (ticks <= hold.end))
+            state[held] = [self._state(hold, tick) for tick in ticks[held].tolist()]
         labels = self._labels
         record.add("q", np.array(rows), "rad or m", labels=labels, description="coordinates of objects")
         if self.graspable:
-            record.add("gripper_state", state, "1", description="0 soft, 1 hardening, 2 hardened, 3 softening")
+            record.add("gripper_state", state, "1", description=STATES_TEXT)
             text = "from the tip of the gripper to the nearest grasp frame"
             record.add("grasp_distance", distance, "m", description=text)
         for event in self.events:

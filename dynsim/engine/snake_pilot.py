@@ -20,7 +20,7 @@ import numpy as np
 
 from dynsim.compile.model import Model
 from dynsim.compile.snake_tree import GROUND, HEAD, ROOT, SnakeTree
-from dynsim.engine.gripper import STATES, Grip
+from dynsim.engine.gripper import STATES_TEXT, Grip
 from dynsim.engine.operator import Referenced
 from dynsim.engine.sensing import SampledSensor
 from dynsim.engine.snake_control import OBSTACLES, SnakeControl, copy_of
@@ -356,8 +356,7 @@ class SnakePilot(SnakeControl):
         """What the gripper did."""
         assert self.grip is not None
         state, share, distance = self.grip.columns(np.floor(record.time / self.period + 1e-6).astype(int))
-        text = ", ".join(f"{k} {name}" for k, name in enumerate(STATES))
-        record.add("gripper_state", state, "1", description=text)
+        record.add("gripper_state", state, "1", description=STATES_TEXT)
         record.add("gripper_share", share, "1", description="of the springs of the hardened gripper that it has")
         record.add(
             "grasp_distance", distance, "m", description="from the tip of the gripper to the nearest grasp frame"

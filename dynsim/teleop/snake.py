@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from dynsim.compile.scene import snake_scene
 from dynsim.engine.compilation import kernels_logged
 from dynsim.engine.kinematic import prepare
 from dynsim.engine.kinematic_record import make_record
@@ -60,7 +59,8 @@ class SnakeSession:
         run.load_kernels()
         self._run = run
         self.still = make_record(run, self._scenario, 0.0)
-        self._scene: Scene = snake_scene(run.description)
+        assert self.still.scene is not None
+        self._scene: Scene = self.still.scene
 
     @property
     def ticks(self) -> int:
@@ -117,6 +117,7 @@ class SnakeSession:
                 "wheels": run.controller.law.grounded[row].tolist(),
                 "gripper": int(self._command.closed),
                 "mode": run.mode,
+                **self._grip(),
             },
             touching=self._touching(),
         )
@@ -124,11 +125,21 @@ class SnakeSession:
     def _positions(self) -> Mapping[str, Mapping[str, float]]:
         """Positions of the joints of the scene, by signal and label."""
         run, state = self._run, self._run.state
-        return {
+        objects = (
+            {}
+            if self._kinematic.objects is None
+            else {"q": self._kinematic.objects.positions(run.tick, run.posture()[0])}
+        )
+        return objects | {
             "base_pose": dict(zip(("x", "y", "yaw"), state.base.tolist(), strict=True)),
             "phi": dict(zip(run.description.joint_names, state.phi.tolist(), strict=True)),
             "rho": dict(zip(run.description.wheel_names, state.rho.tolist(), strict=True)),
         }
+
+    def _grip(self) -> dict[str, str]:
+        """State of the gripper in words, where there are objects that it can hold."""
+        objects = self._kinematic.objects
+        return {} if objects is None else {"grip": objects.told(self.ticks)}
 
     def _touching(self) -> Mapping[str, Touch]:
         return {}
@@ -186,6 +197,10 @@ class DynamicSnakeSession(SnakeSession):
     def _positions(self) -> Mapping[str, Mapping[str, float]]:
         q = self._simulation.state.q.tolist()
         return {"q": dict(zip(self._simulation.robot.position_names, q, strict=True))}
+
+    def _grip(self) -> dict[str, str]:
+        grip = self._pilot(self._simulation).grip
+        return {} if grip is None else {"grip": grip.told}
 
     def _touching(self) -> Mapping[str, Touch]:
         return self._simulation.touching

@@ -11,7 +11,9 @@ from dynsim import Simulation, load_scenario, simulate
 from dynsim.engine.gripper import HARDENED, SOFT
 from dynsim.errors import SimulationStopped
 from dynsim.record import Record
-from dynsim.snake.description import CommandBlock
+from dynsim.scenario import scenario_from_resolved
+from dynsim.teleop.begin import begin
+from dynsim.teleop.session import NO_REQUEST, Command
 
 G = 9.81
 
@@ -146,30 +148,40 @@ def test_a_robot_that_is_thrown_over_ends_as_overturned() -> None:
     assert str(stop).startswith("overturned: pair1, which carries the head, is tilted by ")
 
 
-class Pilot:
-    """What a joystick does: the same as the script of ``snake_valve``, a period at a time."""
-
-    def read(self, first: int, left: int, period: float, feedback: Any) -> CommandBlock:
-        """One period."""
-        time = first * period
-        velocity = np.zeros((1, 6))
+def driven(session: Any, end: float) -> Record:
+    """What a pilot does: as the script of ``snake_valve``, tick by tick."""
+    while session.time < end:
+        time, velocity = session.time, [0.0] * 6
         if 1.0 <= time < 5.0:
-            velocity[0, 0] = 0.05 / 4.0
+            velocity[0] = 0.05 / 4.0
         if 9.0 <= time < 13.0:
-            velocity[0, 3] = 0.1
-        closed = int(time >= 7.0)
-        return CommandBlock(velocity, np.full(1, -1), np.full(1, closed))
+            velocity[3] = 0.1
+        session.tick(Command(tuple(velocity), NO_REQUEST, time >= 7.0))
+    record = session.record()
+    assert isinstance(record, Record)
+    return record
+
+
+@pytest.mark.parametrize("level", ["kinematic", pytest.param("dynamic", marks=pytest.mark.long)])
+def test_a_pilot_turns_the_valve_and_leaves_a_script_that_does_so_again(level: str) -> None:
+    scenario = load_scenario("snake_valve", "turns", {"plant.level": level})
+    session = begin(scenario, longest=30.0)
+    record = driven(session, 13.0)
+    assert session.frame().extra["grip"] == "hardened around valve"
+    assert column(record, "valve")[-1] == pytest.approx(0.4, abs=0.08)
+    again = simulate(scenario_from_resolved(record.provenance["scenario"]))
+    np.testing.assert_array_equal(again["q"], record["q"])
+    assert events(again) == events(record) == [("captures", "valve")]
 
 
 @pytest.mark.long
-def test_a_pilot_turns_the_valve_and_a_snapshot_continues_the_grip() -> None:
-    simulation = Simulation(load_scenario("snake_valve", "turns"), operator=Pilot())
-    simulation.advance(8.5)
+def test_a_snapshot_continues_the_grip() -> None:
+    simulation = Simulation(load_scenario("snake_valve", "turns"))
+    simulation.advance(7.5)
     kept = simulation.snapshot()
-    first = simulation.advance(13.0)
+    first = simulation.advance(10.0)
     turned = simulation.record()
     simulation.restore(kept)
-    again = simulation.advance(13.0)
+    again = simulation.advance(10.0)
     np.testing.assert_array_equal(first.q, again.q)
-    assert column(turned, "valve")[-1] > 0.3
     np.testing.assert_array_equal(simulation.record()["gripper_state"], turned["gripper_state"])

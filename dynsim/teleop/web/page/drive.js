@@ -257,7 +257,7 @@ class Drive {
     this.roleButton.disabled = this.ended || (this.role !== "pilot" && !this.free);
     this.grips.textContent = this.closed ? "open gripper" : "close gripper";
     if (!f) return;
-    this.timing.textContent = `${f.time.toFixed(1)} s` + (f.mode === undefined ? "" : ` · mode ${f.mode}`)
+    this.timing.textContent = `${f.time.toFixed(1)} s` + (f.mode === undefined ? "" : ` · mode ${f.mode}`) + (f.grip ? ` · gripper ${f.grip}` : "")
       + (Number.isNaN(this.trip) || this.role !== "pilot" ? "" : ` · round trip ${this.trip.toFixed(0)} ms`);
     this.lateBox.textContent = f.lost > 0.1 || f.late > 50 ? `late ${f.late.toFixed(0)} ms · ${f.lost.toFixed(1)} s behind real time` : "";
   }
