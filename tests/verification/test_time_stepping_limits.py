@@ -54,7 +54,7 @@ def test_a_stiff_velocity_loop_rolls(gain, theta):
 
 @pytest.mark.parametrize("limits", [{"voltage_limit": 12.0}, {"current_limit": 2.08}])
 def test_a_light_wheel_at_the_wrong_limit_comes_to_rest(limits):
-    """It is told to stand still, and spins at its limit from the step before. Under either limit it passes zero in a step.
+    """It is told to stand still, and spins at its limit from the step before. Under either it passes zero in a step.
 
     It spun on for ever, on power from the steps themselves.
     """
