@@ -706,6 +706,27 @@ def snake_table_iii() -> str:
     return lines(heads, rows, left=2)
 
 
+def snake_pushes(file: str) -> str:
+    """Table IV or V of the paper on the snake, and the same simulated."""
+    heads = ("posture", "direction", "[T] mean [N]", "[T] SD [N]", "simulated [N]", "target in the plate [mm]")
+    rows = [
+        (
+            f"({row['posture']})", row["direction"], row["paper_mean"], row["paper_sd"],
+            f"{float(row['simulated']):.1f}", f"{1e3 * float(row['depth_m']):.0f}",
+        )
+        for row in table_of(f"snake/{file}.csv")
+    ]  # fmt: skip
+    return lines(heads, rows, left=2)
+
+
+def snake_table_iv() -> str:
+    return snake_pushes("table_iv")
+
+
+def snake_table_v() -> str:
+    return snake_pushes("table_v")
+
+
 def steps() -> Any:
     return data("snake/steps.json")
 
@@ -923,8 +944,9 @@ TABLES: dict[str, Callable[[], str]] = {
     table.__name__: table
     for table in (
         elbows_in_short, elbows, glued_and_real, overturning_holds, overturning_drives, assumptions, ledger,
-        snake_table_iii, time_stepping, endings, right_hand_side, ratios, job, precision, sweeps, snake_bench,
-        combinations, comparison, faults, planned_arm, planned_gains, planned_scenes, snake_positioning, snake_limits,
+        snake_table_iii, snake_table_iv, snake_table_v, time_stepping, endings, right_hand_side, ratios, job, precision,
+        sweeps, snake_bench, combinations, comparison, faults, planned_arm, planned_gains, planned_scenes,
+        snake_positioning, snake_limits,
         snake_ways, snake_circles, snake_order, snake_areas, snake_on_servos, snake_tasks,
     )
 }  # fmt: skip

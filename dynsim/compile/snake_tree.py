@@ -100,6 +100,8 @@ def snake_tree(
     joint_servo: Callable[[str], Drive],
     wheel_servo: Callable[[str], Drive],
     *,
+    yaw_stop: float,
+    pitch_stop: float,
     wheel_inertia: float,
     bearing_drag: float,
     massless_wheels: bool,
@@ -113,6 +115,7 @@ def snake_tree(
     Parameters
     ----------
     joint_servo, wheel_servo : the servo of a joint by its name
+    yaw_stop, pitch_stop : mechanical stops of the joints, on both sides of zero [rad]
     wheel_inertia : about its axle, of each wheel without its servo [kg m²]
     bearing_drag : viscous drag of each wheel [N m s/rad]
     gripper : its tip ahead of the head point
@@ -124,8 +127,6 @@ def snake_tree(
         A servo that does not follow positions (joints) or rates (wheels).
     """
     l, n_h = d.link_length, d.head_joints
-    limits = dict(zip(d.joint_names, np.column_stack([d.lower, d.upper]), strict=True))
-    pitch_limit = float(d.upper[1])  # every pitch joint has that of the head's
     masses = d.link_mass  # head to tail
     floating_root = Link(
         ROOT, "base", None, "floating", _X, _link_inertia(masses[n_h], l, -1.0), shapes=(snake_tube(d, -l, 0.0),)
@@ -133,7 +134,7 @@ def snake_tree(
     links = list(floating(floating_root))
 
     def link(name: str, joint: str, parent: str, axis: Array, x: float, mass: float, ahead: float) -> Link:
-        lower, upper = limits.get(joint, (-pitch_limit, pitch_limit))
+        stop = pitch_stop if axis[1] else yaw_stop
         start, end = (0.0, l) if ahead > 0.0 else (-l, 0.0)
         return Link(
             name,
@@ -143,8 +144,8 @@ def snake_tree(
             axis,
             _link_inertia(mass, l, ahead),
             p_PJ=np.array([x, 0.0, 0.0]),
-            lower=float(lower),
-            upper=float(upper),
+            lower=-stop,
+            upper=stop,
             radius=BODY_RADIUS * d.wheel_radius,
             # What the head carries ahead is its gripper.
             tip=np.array([end + float(gripper.tip[0]) if name == HEAD else start + end, 0.0, 0.0]),

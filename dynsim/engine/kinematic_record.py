@@ -63,6 +63,20 @@ def make_record(run: SnakeRun, scenario: Scenario, wall: float, pictured: bool =
         "steps": int(state.counts[ss.TICKS]),
         **task_summary(run, record),
     }
-    summary["warnings"] = [*task_warnings(run, record, summary), *without_effect(scenario)]
+    warnings = [*task_warnings(run, record, summary), *_passed_limits(run, record)]
+    summary["warnings"] = [*warnings, *without_effect(scenario)]
     record.summary = summary
     return record
+
+
+def _passed_limits(run: SnakeRun, record: Record) -> list[str]:
+    """Warn of the joint that passes its limit furthest: this level has no stops, as the dynamic one has."""
+    d = run.description
+    beyond = np.maximum(record["phi"] - d.upper, d.lower - record["phi"]).max(axis=0)
+    worst = int(beyond.argmax())
+    if beyond[worst] <= 1e-9:  # rounding
+        return []
+    return [
+        f"{d.joint_names[worst]} passes its limit by {beyond[worst]:.3f} rad; a real one would stop "
+        "(controller.limit_policy: allocate)"
+    ]

@@ -193,13 +193,6 @@ def task_warnings(run: SnakeControl, record: Record, summary: dict[str, Any]) ->
             f"the null-space motion was reduced for {summary['null_space_reduced_s']:.2f} s to keep the rate limit: "
             "the cost falls slower there (controller.null_gain)"
         )
-    if summary["joint_limit_violation_max_rad"] > 1e-9:  # less is rounding
-        beyond = np.maximum(record["phi"] - run.description.upper, run.description.lower - record["phi"]).max(axis=0)
-        worst = int(beyond.argmax())
-        warnings.append(
-            f"{run.description.joint_names[worst]} passes its limit by {beyond[worst]:.3f} rad; a real one would stop "
-            "(controller.limit_policy: allocate)"
-        )
     if summary["clamped_joint_ticks"]:
         off = np.linalg.norm(record["w_estimate"][:, :3] - record["w_target"][:, :3], axis=1).max()
         warnings.append(

@@ -12,8 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from dynsim.record import Record
-from dynsim.snake.description import COORDINATES
+from dynsim.snake.description import COORDINATES, SnakeDescription
 from dynsim.snake.geometry import snake_geometry
+from dynsim.snake.kinematics import pose_of_point
 
 Table = list[list[str]]  # headings first
 
@@ -101,6 +102,124 @@ def table_iii_dynamic(records: Mapping[str, Record]) -> Table:
             ]
             numbers = [f"{published.mean[i]:.4g}", f"{published.deviation[i]:.3g}"]
             rows.append([moved, f"d{coordinate}_{unit}", *numbers, *simulated])
+    return rows
+
+
+class Push(NamedTuple):
+    """Posture of a push test, and the contact forces f_x, f_y, f_z that the head exerted on a plate.
+
+    height, beside : z_h, y_h, of the head point [m]
+    l_shape : the base part is bent by 90 degrees, not straight
+    mean, deviation : of five runs [N]
+    """
+
+    height: float
+    beside: float
+    l_shape: bool
+    mean: tuple[float, float, float]
+    deviation: tuple[float, float, float]
+
+
+# [T] Table IV, heights z_h differ.
+TABLE_IV: dict[str, Push] = {
+    "i": Push(0.40, 0.0, False, (16.9, 5.71, 15.7), (0.3, 0.22, 0.3)),
+    "ii": Push(0.35, 0.0, False, (24.0, 8.60, 12.1), (1.1, 0.20, 0.1)),
+    "iii": Push(0.30, 0.0, False, (30.4, 9.72, 10.1), (1.7, 0.33, 0.2)),
+    "iv": Push(0.40, 0.0, True, (14.9, 5.41, 15.5), (0.3, 0.36, 0.2)),
+    "v": Push(0.35, 0.0, True, (21.4, 7.1, 11.3), (0.5, 0.5, 0.2)),
+    "vi": Push(0.30, 0.0, True, (26.3, 9.94, 10.3), (1.1, 0.35, 0.2)),
+}
+# [T] Table V, y_h differ; it gives f_y of posture (v) with a digit more.
+TABLE_V: dict[str, Push] = {
+    "ii": TABLE_IV["ii"],
+    "vii": Push(0.35, 0.1, False, (20.4, 11.1, 13.2), (0.4, 0.5, 0.2)),
+    "viii": Push(0.35, 0.2, False, (15.0, 10.1, 15.5), (0.5, 0.9, 0.3)),
+    "v": Push(0.35, 0.0, True, (21.4, 7.12, 11.3), (0.5, 0.48, 0.2)),
+    "ix": Push(0.35, 0.1, True, (19.2, 12.7, 13.5), (1.1, 0.6, 0.4)),
+    "x": Push(0.35, 0.2, True, (13.5, 14.9, 16.1), (0.5, 1.1, 0.2)),
+}
+# By the coordinate of a variant's name: the way in which the head pushes.
+PUSHES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, -1.0)}
+# Name of the contact point that touches the plate.
+PLATE = "plate"
+# f_z is taken where the target is this far within the plate; the paper does not say how far it was [m].
+DEPTH_Z = 0.07
+# Target of the last pitch joint of the head part, [T] IV.C.3 [rad].
+LAST_PITCH = np.deg2rad(110.0)
+# Starts of the search for a posture; twenty find all that 300 find.
+STARTS = 60
+
+
+def push_posture(d: SnakeDescription, push: Push) -> np.ndarray | None:
+    """Joint angles (n_phi,) [rad] of a posture of the push tests, or None if none was found.
+
+    The paper gives z_h, y_h and the form of the base part only. The head is level and looks along x, psi3 is at its
+    target, and the bend is shared by the two joints in the middle of the base part (assumed). Five head joints are
+    left for five coordinates. Of several solutions within the limits the one with the smallest angles is taken.
+    """
+    from scipy.optimize import least_squares  # here, because it takes long to load
+
+    model, base = d.arrays(), np.zeros(d.base_joints)
+    if push.l_shape:
+        base[[2, 3]] = np.pi / 4.0
+    wanted = np.array([push.beside, push.height, 0.0, 0.0, 0.0])
+
+    def posture(angles: np.ndarray) -> np.ndarray:
+        return np.concatenate([angles, [LAST_PITCH], base])
+
+    def off(angles: np.ndarray) -> np.ndarray:
+        w = np.zeros(6)
+        pose_of_point(model, np.zeros(3), posture(angles), np.zeros((3, 3)), w)
+        return w[1:] - wanted
+
+    random, best = np.random.default_rng(0), None
+    lower, upper = d.lower[:5], d.upper[:5]
+    for _ in range(STARTS):
+        found = least_squares(
+            off, random.uniform(lower, upper), bounds=(lower, upper), xtol=1e-14, ftol=1e-14, gtol=1e-14
+        )
+        if np.abs(found.fun).max() < 1e-9 and (best is None or found.x @ found.x < best @ best - 1e-9):
+            best = found.x
+    return None if best is None else posture(best)
+
+
+class Pushed(NamedTuple):
+    """What a push test has given.
+
+    force : of the plate against the push [N]
+    depth : of the target within the plate when it was taken [m]
+    stop_acted : a mechanical stop of a joint carried force while the head pushed
+    """
+
+    force: float
+    depth: float
+    stop_acted: bool
+
+
+def pushed(record: Record, coordinate: str) -> Pushed:
+    """f_x and f_y, largest of the run; f_z where the target is :data:`DEPTH_Z` within the plate, or at its deepest."""
+    plate = record.labels["contact_normal_force"].index(PLATE)
+    force, gap = record["contact_normal_force"][:, plate], record["contact_gap"][0, plate]
+    target = record["w_target"][:, :3]
+    depth = (target - target[0]) @ np.array(PUSHES[coordinate]) - gap
+    at = int(np.argmax(depth >= min(DEPTH_Z, depth.max()) - 1e-9)) if coordinate == "z" else int(force.argmax())
+    touching = force > 0.0
+    return Pushed(float(force[at]), float(depth[at]), bool(record["stop_force"][touching].any()))
+
+
+def push_table(published: Mapping[str, Push], records: Mapping[str, Record]) -> Table:
+    """Table IV or V beside what was simulated; only pushes that were run."""
+    rows = [["posture", "direction", "paper_mean", "paper_sd", "simulated", "depth_m", "start", "stop_acted"]]
+    for posture, push in published.items():
+        for k, coordinate in enumerate(PUSHES):
+            record = records.get(f"{posture}_{coordinate}")
+            if record is None:
+                continue
+            result = pushed(record, coordinate)
+            numbers = [f"{push.mean[k]:.4g}", f"{push.deviation[k]:.3g}", f"{result.force:.3f}", f"{result.depth:.4f}"]
+            start = record.provenance["scenario"]["plant"]["dynamics"]["start"]
+            direction = "-z" if coordinate == "z" else coordinate
+            rows.append([posture, direction, *numbers, start, "yes" if result.stop_acted else "no"])
     return rows
 
 
@@ -323,6 +442,8 @@ def tables(scenario: str, records: Mapping[str, Record]) -> dict[str, Table]:
             "wheels": wheel_table(records),
             "energy": energy_table(records),
         }
+    elif scenario == "snake_push":
+        results = {"table_iv": push_table(TABLE_IV, records), "table_v": push_table(TABLE_V, records)}
     elif scenario == "snake_joint_limits":
         results = {"joint_limits": statements(JOINT_LIMITS, records), "policies": policies(records)}
     elif scenario == "snake_door_arc":

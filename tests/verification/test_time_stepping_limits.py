@@ -52,6 +52,25 @@ def test_a_stiff_velocity_loop_rolls(gain, theta):
     assert run.stepping.statistics[UNSETTLED] == 0
 
 
+@pytest.mark.parametrize("limits", [{"voltage_limit": 12.0}, {"current_limit": 2.08}])
+def test_a_light_wheel_at_the_wrong_limit_comes_to_rest(limits):
+    """It is told to stand still, and spins at its limit from the step before. Under either it passes zero in a step.
+
+    It spun on for ever, on power from the steps themselves.
+    """
+    constant = 12.0 / 5.76
+    servo = Servo("axle", constant, 12.0 * constant / 2.5, 0.0, k_v=20.0, velocity_mode=True, armature=2e-4, **limits)
+    wheel = Link("wheel", "axle", None, "revolute", Y, Inertia(0.1, np.zeros(3), 4e-5 * np.eye(3)))
+    b = assemble(Robot("wheel", (wheel,), (servo,), ("wheel", np.zeros(3))), held=np.zeros(1), real=True)
+    b = b.with_shapes()
+    for segment in (-1, 1, -2, 2):
+        run = b.new_run(b.state([0.0], [5.4]), np.array([0.0, 1.0]), "time_stepping", step=2.5e-3, theta=0.5)
+        run.stepping.segment[0] = segment
+        run = b.finish(run)
+        assert abs(run.states("v")[-1, 0]) < 1e-9
+        assert run.stepping.statistics[UNSETTLED] == 0
+
+
 def stiff_arm(limit: float, current: float = np.inf) -> tuple[CompiledSystem, np.ndarray]:
     """Three joints with gains that ask for a thousand volts; at rest, and away from where they should be."""
     links = [

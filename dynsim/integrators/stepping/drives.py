@@ -68,11 +68,19 @@ def drive_at_theta(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def limits_agree(system: System, ws: Workspace, run: Run, tries):
-    """True when the drives at x_θ, after :func:`drive_at_theta`, lie on their segments; else puts them there."""
+    """True when the drives at x_θ, after :func:`drive_at_theta`, lie on their segments; else puts them there.
+
+    From one limit to the opposite one a drive goes by the unlimited segment, which lies between: a light wheel passes
+    it within a step under either limit, and each would ask for the other. Between the current limits of a motor with
+    inductance lie those of its voltage instead.
+    """
     s, agree = run.stepping, True
     t = run.clock[ki.TIME] + s.theta * run.clock[ki.STEP]
     for a in range(ws.motors.shape[0]):
         segment = segment_of(system.drives, system.reference, t, ws, a)
+        direct = system.drives.table[a, ka.DRIVE_KIND] == ka.DC_MOTOR and abs(segment) == 2
+        if segment == -s.segment[a] and not direct:
+            segment = 0
         if segment != s.segment[a] and (agree or tries < ALL_AT_ONCE):
             s.segment[a], agree = segment, False
     return agree

@@ -40,6 +40,13 @@ class JointLimits(StrictConfig):
     pitch: Positive = Field(113.0, lt=180, description="[deg]")
 
 
+class JointStops(StrictConfig):
+    """Mechanical stops of the joints, symmetric about zero; default: at the limits of the command."""
+
+    yaw: Positive | None = Field(None, lt=180, description="[deg]")
+    pitch: Positive | None = Field(None, lt=180, description="[deg]")
+
+
 class Lifting(StrictConfig):
     """How wheel pairs are lifted."""
 
@@ -57,6 +64,9 @@ class Dynamics(StrictConfig):
     bearing_drag_N_m_s_per_rad: NonNegative = Field(1e-4, description="of each wheel (assumed)")
     passive_wheels: Literal["bodies", "massless"] = Field(
         "bodies", description="massless: no friction along their way, instead of bodies that turn"
+    )
+    stops_deg: JointStops = Field(
+        default_factory=JointStops, description="mechanical stops, no narrower than limits_deg, which are the command's"
     )
     lifting: Lifting = Field(default_factory=Lifting)
     start: Literal["soft", "released"] = Field(
@@ -120,7 +130,7 @@ class Config(StrictConfig):
     driven_side: DrivenSide | list[DrivenSide] | None = Field(
         None, description="side of the active wheel of each pair. Default (assumed): left, right, left, ..."
     )
-    limits_deg: JointLimits = Field(default_factory=JointLimits)
+    limits_deg: JointLimits = Field(default_factory=JointLimits, description="of the command; see dynamics.stops_deg")
     gripper_length_m: NonNegative = Field(0.09, description="gripper tip ahead of the head point [m] ([T] IV.B)")
     gripper: GripperConfig = Field(default_factory=GripperConfig, description="how it holds objects")
     mass_kg: Positive = Field(10.0, description="of the whole robot [kg], spread evenly over its links (assumed)")
@@ -166,7 +176,13 @@ def section_defaults(plant: Mapping[str, Any], sections: Mapping[str, Any]) -> d
 
 
 def build(config: Config, context: BuildContext) -> SnakeDescription | SnakeTree:
-    """The configured robot: its description, or the tree of its bodies; raises what :func:`describe` raises."""
+    """The configured robot: its description, or the tree of its bodies.
+
+    Raises
+    ------
+    ModelError
+        What :func:`describe` raises; stops that are narrower than the limits of the command.
+    """
     description = describe(config)
     if config.level == "kinematic":
         return description
@@ -180,6 +196,8 @@ def build(config: Config, context: BuildContext) -> SnakeDescription | SnakeTree
         description,
         lambda joint: servo(dynamics.joint_servo, joint),
         lambda joint: servo(dynamics.wheel_servo, joint),
+        yaw_stop=_stop("yaw", dynamics.stops_deg.yaw, config.limits_deg.yaw),
+        pitch_stop=_stop("pitch", dynamics.stops_deg.pitch, config.limits_deg.pitch),
         wheel_inertia=dynamics.wheel_inertia_kg_m2,
         bearing_drag=dynamics.bearing_drag_N_m_s_per_rad,
         massless_wheels=dynamics.passive_wheels == "massless",
@@ -190,6 +208,19 @@ def build(config: Config, context: BuildContext) -> SnakeDescription | SnakeTree
         raised=dynamics.start == "soft",
         gripper=config.gripper.gripper(config.gripper_length_m),
     )
+
+
+def _stop(kind: str, stop_deg: float | None, limit_deg: float) -> float:
+    """Angle [rad] at which joints of a kind stop mechanically; ModelError if that is within the command's limit."""
+    if stop_deg is None:
+        return float(np.deg2rad(limit_deg))
+    if stop_deg < limit_deg:
+        raise ModelError(
+            f"plant.dynamics.stops_deg.{kind} = {stop_deg:g} is narrower than plant.limits_deg.{kind} = {limit_deg:g}: "
+            "the command would go beyond the stop",
+            keys=("plant", "dynamics", "stops_deg", kind),
+        )
+    return float(np.deg2rad(stop_deg))
 
 
 def describe(config: Config) -> SnakeDescription:
