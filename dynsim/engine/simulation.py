@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dynsim.compile.contact_law import joint_stops
+from dynsim.compile.control import END_SLACK
 from dynsim.compile.model import Model
 from dynsim.compile.references.teleop import VelocitySource
 from dynsim.compile.tables import check_couplings
@@ -69,7 +70,7 @@ Array = NDArray[np.float64]
 _PIECE = 1 << 62
 # Limits on ticks of callers: their number (kinds are bits of an integer), and their period [s].
 MOST_TICKS, SHORTEST_PERIOD = 60, 1e-9
-# Ticks, and ends of references, within this of the requested time count as at it, relative to that time.
+# Ticks within this of the requested time count as at it, relative to that time.
 TICK_SLACK = 1e-12
 # End of a run without a given end [s]: finite, and later than any time in use.
 _FAR = 1e300
@@ -326,7 +327,7 @@ class Simulation:
         until = min(float(until), self._end)
         last = self._references_end
         # References of the whole run may end a rounding before it, where nothing is to be rewritten.
-        if not self._frozen and until > last + TICK_SLACK * max(1.0, abs(last)):
+        if not self._frozen and until > last + END_SLACK * max(1.0, abs(last)):
             self._reach(max(last, self._time))
             if not self.finished:
                 self._freeze()

@@ -759,6 +759,19 @@ def test_planned_voltages_hold_after_the_end_of_the_scenario(tmp_path, plan, sam
     assert abs(record["v"][-1, 0]) < 1e-4
 
 
+def test_the_target_of_the_hand_holds_where_the_references_do(tmp_path):
+    """A path that goes on after the scenario: a quarter of a circle in 1 s, then the hand and its target stand."""
+    scenario = arm(duration_s=1.0, **{"record.rate_hz": 100})
+    simulation = dynsim.Simulation(scenario, duration=2.0)
+    simulation.advance(2.0)
+    record = simulation.record()
+    whole = dynsim.simulate(scenario)
+    assert record["target_position"][:101].tobytes() == whole["target_position"].tobytes()
+    target = record["target_position"]
+    assert np.abs(target[100] - target[90]).max() > 1e-3
+    np.testing.assert_allclose(target[101:], np.tile(target[100], (100, 1)), rtol=0.0, atol=1e-12)
+
+
 TWO_LINKS = """
 duration_s: 1.0
 plant:
