@@ -163,8 +163,9 @@ class Simulation:
         self._motors = {motor.joint: a for a, motor in enumerate(robot.motors)}
         first = len(self._prepared.loads) - len(robot.bodies)
         self._pushes = {body: first + k for k, body in enumerate(robot.bodies)}
-        self._splines = self._prepared.system.reference.spline.copy()
         # As planned: a motor whose reference is rewritten now may be given back later.
+        self._splines = self._prepared.system.reference.spline.copy()
+        self._voltages = self._prepared.system.reference.voltage.copy()
         self._references_end = self._prepared.control.end
         self._frozen = not math.isfinite(self._references_end)
         self._pushed: set[int] = set()
@@ -423,7 +424,8 @@ class Simulation:
         """From now on the motor of a joint follows q_d(t) = position + rate (t − now) [rad, rad/s; m, m/s].
 
         Of an open torque ``position`` is the torque [N m]. What ``initial.equilibrium`` has moved the references by is
-        added.
+        added. Voltages that ``feed_forward`` or ``brace`` has planned for this motor belong to its planned reference:
+        they do not act until :meth:`release`.
         """
         self.set_references({joint: (position, rate)})
 
@@ -439,6 +441,7 @@ class Simulation:
         if (balance := self._prepared.balance) is not None:
             values[:, 0] += balance.shift[motors]
         self._follow_lines(motors, values)
+        self._plan_voltages(motors, 0.0)
         self._leave_plan(self.robot.motors[a].joint for a in motors)
 
     def _follow_lines(self, motors: NDArray[np.int64], values: Array) -> None:
@@ -449,6 +452,11 @@ class Simulation:
         drives.input[motors, ka.LINE_START : ka.LINE_RATE + 1] = values
         drives.input[motors, ka.LINE_SINCE] = self._time
         self._restart()
+
+    def _plan_voltages(self, motors: NDArray[np.int64], share: float) -> None:
+        """Let a share of the planned voltages act on motors: 1 along their planned references, 0 along others."""
+        if len(planned := self._voltages):
+            self._prepared.system.reference.voltage[:, motors] = share * planned[:, motors]
 
     def set_command(self, joint: str, command: float) -> None:
         """Hold the command of a motor: the voltage of a motor or servo [V], the torque of an open torque [N m]."""
@@ -533,6 +541,7 @@ class Simulation:
         a = self._motor(joint)
         self._settle_now()
         self._prepared.system.reference.spline[a] = self._splines[a]
+        self._plan_voltages(np.array([a]), 1.0)
         self._prepared.system.drives.table[a, ka.SAMPLED] = self._sampled[a]
         if self._frozen and self._splines[a] >= 0:
             self._hold_at_end(joint)

@@ -759,6 +759,33 @@ def test_planned_voltages_hold_after_the_end_of_the_scenario(tmp_path, plan, sam
     assert abs(record["v"][-1, 0]) < 1e-4
 
 
+@pytest.mark.parametrize("sampled", ["", "\n  sample_time_s: 0.001"])
+def test_a_rewritten_reference_has_no_planned_voltages(tmp_path, sampled):
+    """Turning at a constant rate the plan is the back-EMF; a joint that is told to stand is free of it.
+
+    Without gravity it comes to rest at its reference. Given back, it has the bits of its plan again.
+    """
+    text = WHEEL.replace("SAMPLED", "\n  feed_forward: dynamics" + sampled).replace(
+        "duration_s: 0.5", "duration_s: 4.0"
+    )
+    scenario = read(
+        tmp_path, text.replace("times_s: [0, 0.4], angles_deg: [0, 60]", "times_s: [0, 4], angles_deg: [0, 600]")
+    )
+    simulation = dynsim.Simulation(scenario)
+    simulation.advance(1.0)
+    before = simulation.snapshot()
+    simulation.set_reference("joint_1", 2.0)
+    assert simulation.advance(3.5).q[0] == pytest.approx(2.0, abs=1e-6)
+    simulation.restore(before)
+    simulation.set_reference("joint_1", 2.0)
+    simulation.release("joint_1")
+    untouched = dynsim.Simulation(scenario)
+    untouched.advance(1.0)
+    # The same restart, with nothing rewritten.
+    untouched.release("joint_1")
+    np.testing.assert_array_equal(simulation.advance(3.5).q, untouched.advance(3.5).q)
+
+
 def test_the_target_of_the_hand_holds_where_the_references_do(tmp_path):
     """A path that goes on after the scenario: a quarter of a circle in 1 s, then the hand and its target stand."""
     scenario = arm(duration_s=1.0, **{"record.rate_hz": 100})
