@@ -582,7 +582,9 @@ class Simulation:
         """Linear equations of the whole system about the present state: δẋ = A δx + B δu, δy = C δx + D δu.
 
         x is q, v and the currents of motors with a circuit; contacts, stops and couplings are held as they are now, and
-        the controller is part of the system. The simulation stays as it is.
+        the controller is part of the system. A sampled one counts as continuous: its period, and the delay, resolution
+        and rates of encoders, are left out. Commands that the caller holds, and the references of an operator or of a
+        snake's controller, stay as they are. The simulation stays as it is.
 
         >>> A, B, C, D = simulation.linearize(inputs=["reference"], outputs=["hand_position", "contact_normal_force"])
 
