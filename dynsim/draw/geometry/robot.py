@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dynsim.errors import RecordError
 from dynsim.record import Record
 from dynsim.record.measures import hand_target
-from dynsim.record.poses import ORIENTATION, POSITION, point_positions
+from dynsim.record.poses import ORIENTATION, POSITION, point_positions, touching_positions
 from dynsim.record.scene import NOT_BELOW, WORLD, Point, Scene, Vector3
 
 Array = NDArray[np.float64]
@@ -204,8 +204,7 @@ def contacts(robot: DrawnRobot, rows: NDArray[np.intp] | slice = slice(None)) ->
         mode = record["contact_mode"][rows, k] if "contact_mode" in record else None
         if mode is not None and not mode.any():
             continue
-        positions = np.asarray(point_positions(record, point, rows), dtype=np.float64)
-        normal = surface.normal(positions)
+        normal = surface.normal(np.asarray(touching_positions(record, point, rows), dtype=np.float64))
         force = np.asarray(record["contact_normal_force"][rows, k], dtype=np.float64)
         tangent = None
         if "contact_force" in record:
