@@ -1012,6 +1012,38 @@ def test_a_tick_added_in_a_callback_is_called_at_that_time(tmp_path):
         simulation.restore(kept[0])
 
 
+RAIL = """
+duration_s: 4.0
+plant:
+  type: serial_arm
+  gravity_m_s2: [0, 0, 0]
+  chain:
+  - {kind: prismatic, axis: x, mass_kg: 1, length_m: 0.1, limit_m: [-0.5, 0.1],
+     motor: {type: wang_minami, gear_ratio: 20}}
+controller:
+  type: joint_pd
+  k_p_V_per_rad: 200
+  k_d_V_s_per_rad: 5
+  operator: {joints: [joint_1], commands: [{at_s: 0.5, hand: [SPEED, 0, 0]}, {at_s: 2.5, hand: [0, 0, 0]}]}
+"""
+
+
+def test_an_operator_says_what_of_its_way_was_not_carried_out(tmp_path):
+    """Told to go 0.4 m along a rail that ends after 0.1 m; the other way there is room for all of it."""
+    record = dynsim.simulate(read(tmp_path, RAIL.replace("SPEED", "0.2")))
+    moved = record["target_position"][-1, 0] - record["target_position"][0, 0]
+    assert 0.09 < moved <= 0.1
+    said = [line for line in record.summary["warnings"] if line.startswith("operator:")]
+    assert len(said) == 1
+    assert (
+        f"operator: {0.4 - moved:.3g} m of the 0.4 m that the hand was commanded to go were not carried out" in said[0]
+    )
+    assert "(joint_1 is at its limit)" in said[0]
+    record = dynsim.simulate(read(tmp_path, RAIL.replace("SPEED", "-0.2")))
+    assert record["target_position"][-1, 0] - record["target_position"][0, 0] == pytest.approx(-0.4, abs=1e-9)
+    assert not record.summary["warnings"]
+
+
 def test_the_source_of_an_operator_cannot_take_a_snapshot(tmp_path):
     """Half of its tick would be lost; a record it may take."""
     scenario = read(tmp_path, TWO_LINKS.replace("METHOD", "dopri5") + OPERATED)
