@@ -49,7 +49,9 @@ def plan(
     ] = None,
     weight: Annotated[
         list[str] | None,
-        typer.Option(metavar="peak=VALUE", help="Cost of the greatest torque beside the heat [W/(N m)]."),
+        typer.Option(
+            metavar="peak=VALUE", help="Cost of the greatest torque of revolute joints beside the heat [W/(N m)]."
+        ),
     ] = None,
     clearance: Annotated[
         float, typer.Option(metavar="M", min=0.0, help="Clearance of joints that are not braced [m].")

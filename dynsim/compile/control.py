@@ -30,6 +30,9 @@ _PIECE = 4096
 # Knots that the longest steps of an implicit method straddle (of 20 ms; 55 ms in the published arm).
 _STRADDLED = 3.0
 
+# Times within this of the end of references count as at it, relative to that time.
+END_SLACK = 1e-12
+
 # Keys of a controller that plan for a whole run, which an operator does not know.
 PLANNED = ("hand", "base", "joints", "torques", "feed_forward", "brace")
 
@@ -242,8 +245,16 @@ class JointControl:
         return base_pose(robot, q)
 
     def target(self, t: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Target of the hand at times t, (T, 3) [m]; None without a path."""
-        return None if self.path is None else targets_on(self.path, t)
+        """Target of the hand at times t, (T, 3) [m]; None without a path.
+
+        It holds where the references end, as they do.
+        """
+        if self.path is None:
+            return None
+        end = self.end
+        # References of a whole run may end a rounding before it, where the target is that of its last sample.
+        held = t > end + END_SLACK * max(1.0, abs(end))
+        return targets_on(self.path, np.where(held, end, t) if held.any() else t)
 
 
 def targets_on(path: HandPath, t: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -79,3 +79,17 @@ def share_of_axis(contact: Contact, start: Array, end: Array) -> float:
     u = np.zeros(1)
     kd.nearest_points(shapes, np.array(start, dtype=np.float64)[None], along[None].copy(), u)
     return float(u[0])
+
+
+def touching_points(contact: Contact, starts: Array, ends: Array | None = None) -> Array:
+    """Where the surface touches a sphere or capsule, and its force acts, (T, 3) [m]; see dynamics.contact.shapes.
+
+    ``starts``, ``ends`` : (T, 3) of the axis [m]; no ends: of the centre
+    """
+    nearest = np.array(starts, dtype=np.float64)
+    if ends is not None and moves(contact):
+        along, u = ends - nearest, np.zeros(len(nearest))
+        shapes = shape_arrays([(contact.surface, contact.radius, np.zeros(3), True)])
+        kd.nearest_points(shapes, nearest, np.ascontiguousarray(along), u)
+        nearest = nearest + u[:, None] * along
+    return np.asarray(nearest - contact.radius * contact.surface.normals(nearest))

@@ -114,8 +114,10 @@ def balanced(
             if control.reference.spline[a] < 0:
                 shift[a] = torques[i] - begin[a]
             elif abs(torques[i] - begin[a]) > AT_REST:
+                force = robot.links[i].units[3]
                 jumps.append(
-                    f"the torque of {motor.joint} begins with {begin[a]:.4g} N m, at rest it would be {torques[i]:.4g}"
+                    f"the {'torque' if force == 'N m' else 'force'} of {motor.joint} begins with {begin[a]:.4g} "
+                    f"{force}, at rest it would be {torques[i]:.4g}"
                 )
             continue
         drop = motor.resistance * torques[i] / motor.joint_constant

@@ -3,7 +3,8 @@
     δẋ = A δx + B δu,   δy = C δx + D δu,   x = (q, v, i)
 
 Bodies, motors with their controller, loads and active constraints are one right-hand side; contact modes stay those of
-the instant, so the equations hold until the next event. Constraints are part of A at the level of accelerations: each
+the instant, so the equations hold until the next event. A sampled controller is taken as the continuous one of its law:
+its loop is closed, and what sampling adds is left out. Constraints are part of A at the level of accelerations: each
 row that is held adds two eigenvalues at zero, for motions that violate it, which the simulation does not make.
 """
 
@@ -120,6 +121,9 @@ class _Frozen:
         self.time = float(run.clock[ki.TIME])
         self._system, self._workspace, self._y = copied(prepared.system), copied(prepared.workspace), run.y.copy()
         self._tracked = run.layout.tracked
+        # Commands that are held from tick to tick would leave the loop open; those that callers give are held.
+        table = self._system.drives.table
+        table[table[:, ka.SAMPLED] == ka.AT_TICKS, ka.SAMPLED] = ka.CONTINUOUS
         self.x = self._y[: self._tracked].copy()
         self._evaluate(self.x, self._system)
         drives, reference = self._system.drives, self._system.reference

@@ -31,7 +31,9 @@ from dynsim.record import Record
 Array = NDArray[np.float64]
 # A state at a tick may be a rounding before it [ticks].
 TICK_SLACK = 1e-9
-_STATE = ("ticks", "_moving", "_angles", "_base_velocity")
+# Part of the commanded way that may be lost without a warning: limits of joints make starts a little slower.
+MISSED = 0.01
+_STATE = ("ticks", "_moving", "_angles", "_base_velocity", "_free", "_commanded", "_missed")
 
 
 class Referenced(Protocol):
@@ -101,6 +103,10 @@ class Operator:
             c, s = math.cos(heading), math.sin(heading)
             axes = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         self._hand = HandGovernor(model, options, q, axes) if options.joints else None
+        # What the hand would do without limits of its joints and its reach: its velocity, and the way that this is [m].
+        self._free, self._commanded = np.zeros(3), 0.0
+        # How much of the way it has not gone, and since when, by what was in the way.
+        self._missed: dict[str, tuple[float, float]] = {}
         if state is not None:
             self._go_on(q, np.ravel(state.v))
 
@@ -108,6 +114,7 @@ class Operator:
         """Let references begin with the rates that joints and wheels have, (n,): at rest their drives would brake."""
         if self._hand is not None:
             self._hand.begin(q, v)
+            self._free = self._hand.velocity.copy()
         base, joints = self._model.robot.base, self._model.joint_names
         if base is not None and set(base.wheels) <= set(joints):
             rates = wheel_angles(base, np.eye(2)).T
@@ -130,7 +137,15 @@ class Operator:
         return {name: getattr(self, name) for name in _STATE} | {"points": points, "hand": hand}
 
     def add_to(self, record: Record) -> None:
-        """Nothing: what it does is in the references."""
+        """A warning where the hand has not gone all of the way that it was told to; the rest is in the references."""
+        missed = sum(way for way, _ in self._missed.values())
+        if missed > MISSED * self._commanded:
+            reason, (_, since) = max(self._missed.items(), key=lambda item: item[1][0])
+            record.summary["warnings"].append(
+                f"operator: {missed:.3g} m of the {self._commanded:.3g} m that the hand was commanded to go were not "
+                f"carried out, mostly from t = {since:.4g} s on ({reason}); its target waited, and its errors are "
+                "against that"
+            )
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go back to a state of this operator."""
@@ -156,11 +171,25 @@ class Operator:
         hand, options = self._hand, self.options
         if hand is None:
             return {}
-        begin = hand.joints
-        hand.go(_eased(hand.velocity, wanted, options.hand_acceleration / options.rate))
+        begin, change = hand.joints, options.hand_acceleration / options.rate
+        hand.go(_eased(hand.velocity, wanted, change))
+        self._free = _eased(self._free, wanted, change)
+        self._count(hand)
         if self.path is not None:
             self.path.points.append(hand.target.copy())
         return dict(zip(options.joints, zip(begin.tolist(), hand.rates.tolist(), strict=True), strict=True))
+
+    def _count(self, hand: HandGovernor) -> None:
+        """Add a tick to the commanded way, and to what of it was not gone."""
+        self._commanded += float(np.linalg.norm(self._free)) / self.rate
+        missed = float(np.linalg.norm(self._free - hand.velocity)) / self.rate
+        if missed > 0.0:
+            # Without a hindrance it is still catching up after the last one.
+            reason = hand.hindrance or next(reversed(self._missed), "limits")
+            before, since = self._missed.get(reason, (0.0, (self.ticks - 1) / self.rate))
+            # The latest last.
+            others = {key: value for key, value in self._missed.items() if key != reason}
+            self._missed = others | {reason: (before + missed, since)}
 
     def _wheel_lines(self, wanted: Array) -> dict[str, tuple[float, float]]:
         """Position and rate of each wheel of the base."""

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from dynsim.compile.hand_posture import hand_turns
 from dynsim.compile.scene import robot_scene
+from dynsim.compile.shapes import touching_points
 from dynsim.dynamics import state as kst
 from dynsim.dynamics.tree import support as ks
 from dynsim.engine import summary as metrics
@@ -17,10 +18,11 @@ from dynsim.engine.provenance import provenance
 from dynsim.engine.ring import counted_within
 from dynsim.integrators import run as ki
 from dynsim.model.base_pose import base_pose
-from dynsim.model.description import Link
+from dynsim.model.description import Contact, Link, Robot
 from dynsim.model.mobile_base import SUPPORTS, MobileBase
 from dynsim.record import Event, Record
-from dynsim.record.poses import add_body_poses
+from dynsim.record.poses import TOUCHING, add_body_poses, point_positions
+from dynsim.record.scene import Point, vector3
 from dynsim.scenario import Scenario, build
 
 
@@ -110,7 +112,8 @@ def make_record(
         record.add_event(event.time, event.kind, event.name)
     if pictured:
         record.scene = robot_scene(robot, contacts, build.surfaces(scenario))
-        add_body_poses(record)
+        if add_body_poses(record):
+            _add_touching_points(record, robot, contacts)
     record.summary = metrics.summarise(record, scenario, prepared, wall, begun)
     return record
 
@@ -143,6 +146,26 @@ def _add_unilateral(record: Record, prepared: Prepared) -> None:
         unit = " or ".join(dict.fromkeys("N m" if tie.turns else "N" for tie in robot.ties))
         names = tuple(tie.name for tie in robot.ties)
         record.add("tie_force", run.outputs("tie"), unit, labels=names, description="on the first body of each tie")
+
+
+def _add_touching_points(record: Record, robot: Robot, contacts: Sequence[Contact]) -> None:
+    """Where forces act on spheres and capsules, in single precision as the poses; on points it is where they are."""
+    shaped = [contact for contact in contacts if contact.radius > 0.0 or contact.tip is not None]
+    if not shaped:
+        return
+    places = np.empty((len(record), len(shaped), 3), dtype=np.float32)
+    # The last samples of a run that diverged may be beyond all bounds.
+    with np.errstate(over="ignore", invalid="ignore"):
+        for k, contact in enumerate(shaped):
+            ends = [
+                point_positions(record, Point(contact.name, "contact", body, vector3(at)))
+                for body, at in (
+                    robot.attach(contact.body, end) for end in (contact.point, contact.tip) if end is not None
+                )
+            ]
+            places[:, k] = touching_points(contact, *ends)
+    names = tuple(contact.name for contact in shaped)
+    record.add(TOUCHING, places, "m", labels=names, description="where forces act on spheres and capsules")
 
 
 def _add_base(record: Record, prepared: Prepared, base: MobileBase, as_planned: bool) -> None:

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dynsim.compile.contact_law import joint_stops
+from dynsim.compile.control import END_SLACK
 from dynsim.compile.model import Model
 from dynsim.compile.references.teleop import VelocitySource
 from dynsim.compile.tables import check_couplings
@@ -70,7 +71,7 @@ Array = NDArray[np.float64]
 _PIECE = 1 << 62
 # Limits on ticks of callers: their number (kinds are bits of an integer), and their period [s].
 MOST_TICKS, SHORTEST_PERIOD = 60, 1e-9
-# Ticks, and ends of references, within this of the requested time count as at it, relative to that time.
+# Ticks within this of the requested time count as at it, relative to that time.
 TICK_SLACK = 1e-12
 # End of a run without a given end [s]: finite, and later than any time in use.
 _FAR = 1e300
@@ -163,8 +164,9 @@ class Simulation:
         self._motors = {motor.joint: a for a, motor in enumerate(robot.motors)}
         first = len(self._prepared.loads) - len(robot.bodies)
         self._pushes = {body: first + k for k, body in enumerate(robot.bodies)}
-        self._splines = self._prepared.system.reference.spline.copy()
         # As planned: a motor whose reference is rewritten now may be given back later.
+        self._splines = self._prepared.system.reference.spline.copy()
+        self._voltages = self._prepared.system.reference.voltage.copy()
         self._references_end = self._prepared.control.end
         self._frozen = not math.isfinite(self._references_end)
         self._pushed: set[int] = set()
@@ -336,7 +338,7 @@ class Simulation:
         until = min(float(until), self._end)
         last = self._references_end
         # References of the whole run may end a rounding before it, where nothing is to be rewritten.
-        if not self._frozen and until > last + TICK_SLACK * max(1.0, abs(last)):
+        if not self._frozen and until > last + END_SLACK * max(1.0, abs(last)):
             self._reach(max(last, self._time))
             if not self.finished:
                 self._freeze()
@@ -432,7 +434,8 @@ class Simulation:
         """From now on the motor of a joint follows q_d(t) = position + rate (t − now) [rad, rad/s; m, m/s].
 
         Of an open torque ``position`` is the torque [N m]. What ``initial.equilibrium`` has moved the references by is
-        added.
+        added. Voltages that ``feed_forward`` or ``brace`` has planned for this motor belong to its planned reference:
+        they do not act until :meth:`release`.
         """
         self.set_references({joint: (position, rate)})
 
@@ -448,6 +451,7 @@ class Simulation:
         if (balance := self._prepared.balance) is not None:
             values[:, 0] += balance.shift[motors]
         self._follow_lines(motors, values)
+        self._plan_voltages(motors, 0.0)
         self._leave_plan(self.robot.motors[a].joint for a in motors)
 
     def _follow_lines(self, motors: NDArray[np.int64], values: Array) -> None:
@@ -458,6 +462,11 @@ class Simulation:
         drives.input[motors, ka.LINE_START : ka.LINE_RATE + 1] = values
         drives.input[motors, ka.LINE_SINCE] = self._time
         self._restart()
+
+    def _plan_voltages(self, motors: NDArray[np.int64], share: float) -> None:
+        """Let a share of the planned voltages act on motors: 1 along their planned references, 0 along others."""
+        if len(planned := self._voltages):
+            self._prepared.system.reference.voltage[:, motors] = share * planned[:, motors]
 
     def set_command(self, joint: str, command: float) -> None:
         """Hold the command of a motor: the voltage of a motor or servo [V], the torque of an open torque [N m]."""
@@ -598,6 +607,7 @@ class Simulation:
         a = self._motor(joint)
         self._settle_now()
         self._prepared.system.reference.spline[a] = self._splines[a]
+        self._plan_voltages(np.array([a]), 1.0)
         self._prepared.system.drives.table[a, ka.SAMPLED] = self._sampled[a]
         if self._frozen and self._splines[a] >= 0:
             self._hold_at_end(joint)
@@ -638,7 +648,9 @@ class Simulation:
         """Linear equations of the whole system about the present state: δẋ = A δx + B δu, δy = C δx + D δu.
 
         x is q, v and the currents of motors with a circuit; contacts, stops and couplings are held as they are now, and
-        the controller is part of the system. The simulation stays as it is.
+        the controller is part of the system. A sampled one counts as continuous: its period, and the delay, resolution
+        and rates of encoders, are left out. Commands that the caller holds, and the references of an operator or of a
+        snake's controller, stay as they are. The simulation stays as it is.
 
         >>> A, B, C, D = simulation.linearize(inputs=["reference"], outputs=["hand_position", "contact_normal_force"])
 

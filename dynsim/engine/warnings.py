@@ -187,7 +187,10 @@ def _contact_warnings(
 def _saturated(record: Record, robot: Robot) -> list[str]:
     """Warn of motors at their limits of voltage, current or torque."""
     warnings = []
-    limited = [(a, motor, limits) for a, motor in enumerate(robot.motors) for limits in _limits_of(motor)]
+    units = {link.joint: link.units[3] for link in robot.links}
+    limited = [
+        (a, motor, limits) for a, motor in enumerate(robot.motors) for limits in _limits_of(motor, units[motor.joint])
+    ]
     # A maximum along contiguous samples needs a third of the time.
     peaks = {
         name: np.abs(record[name].T.copy()).max(axis=1, initial=0.0) for name in {limit[1] for *_, limit in limited}
@@ -209,10 +212,13 @@ def _saturated(record: Record, robot: Robot) -> list[str]:
     return warnings
 
 
-def _limits_of(motor: Drive) -> list[tuple[str, str, float, str]]:
-    """Return the limits of a motor: the limited quantity, its signal, the limit and its unit."""
+def _limits_of(motor: Drive, unit: str) -> list[tuple[str, str, float, str]]:
+    """Return the limits of a motor: the limited quantity, its signal, the limit and its unit.
+
+    ``unit`` : of the joint's torque, or force
+    """
     if isinstance(motor, TorqueSource):
-        return [("torque", "current", motor.torque_limit, "N m")]
+        return [("torque" if unit == "N m" else "force", "current", motor.torque_limit, unit)]
     limits = [("voltage", "voltage", motor.voltage_limit, "V")]
     if isinstance(motor, Servo) or np.isfinite(motor.current_limit):
         limits.append(("current", "current", motor.greatest_current, "A"))

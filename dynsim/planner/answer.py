@@ -224,7 +224,8 @@ def _row(task: Task, size: Size) -> dict[str, Any]:
         "electrical_energy_J": _number(nominal.electrical_J),
         "joint_rate_max": _number(nominal.rate_max),
         "closed_least": min(nominal.closed.values(), default=None),
-        "peak_torque_N_m": dense.peak,
+        "peak_torque_N_m": dense.peak_torque,
+        "peak_force_N": dense.peak_force,
         "torque_share": _torque_share(task, dense),
         "normal_force_min_N": float(dense.forces.min()) if size.count else None,
         "normal_force_max_N": float(dense.forces.max()) if size.count else None,
@@ -264,7 +265,8 @@ def _size_json(task: Task, size: Size) -> dict[str, Any]:
         "reason": size.reason,
         "k_p_V_per_rad": size.k_p,
         "heat_at_knots_W": size.planned.local.heat,
-        "peak_torque_N_m": dense.peak,
+        "peak_torque_N_m": dense.peak_torque,
+        "peak_force_N": dense.peak_force,
         "clearance": {"distance_m": _number(distance), "of": part, "at_s": when},
         "rounds": size.rounds,
         "rounds_that_found_it": size.agreed,
@@ -341,7 +343,7 @@ def plan_braces(
     radius_m : of candidates; default: that of their links
     count : least and greatest number of braces
     surfaces : that may be leaned on; default: all
-    peak_W_per_N_m : cost of the greatest torque beside the heat
+    peak_W_per_N_m : cost of the greatest torque of revolute joints beside the heat; forces of prismatic ones have none
     clearance_m : of joints that are not braced
     min_N : least normal force of a brace
     verify : run the corners of ``tolerances`` and choose gains that bear them

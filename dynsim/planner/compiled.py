@@ -69,6 +69,7 @@ class Arm(NamedTuple):
     axis: np.ndarray  # (n, 3)
     mass: np.ndarray  # (n,) [kg]
     com: np.ndarray  # (n, 3) centre of mass in the body's frame [m]
+    # Of a prismatic joint forces stand for torques, and metres for radians.
     losses: np.ndarray  # (n,) D + D_m [N m s/rad]
     heat: np.ndarray  # (n,) R / K_m² [W/(N m)²]
     greatest: np.ndarray  # (n,) greatest torque at rest [N m], inf for none
@@ -510,13 +511,16 @@ def settle(arm: Arm, points: Points, course: Course, work: Work, Q, F, least, fo
 def costs(arm: Arm, course: Course, work: Work, Q, peak):
     """Cost and heat [W] of the torques in the workspace; weights and pull of the cost's quadratic model.
 
-    Torques near their limits are dear; ``peak`` : cost of the greatest torque [W/(N m)], by a mean of high power.
+    Torques near their limits are dear; ``peak`` : cost of the greatest torque of revolute joints [W/(N m)], by a mean
+    of high power. Forces of prismatic joints are no torques.
     """
     E, n = work.torque.shape
-    heat, cost, largest, mean = 0.0, 0.0, 0.0, 0.0
-    for e in range(E):
-        for j in range(n):
-            largest = max(largest, abs(work.torque[e, j]))
+    heat, cost, largest, mean, revolute = 0.0, 0.0, 0.0, 0.0, 0
+    for j in range(n):
+        if not arm.prismatic[j]:
+            revolute += 1
+            for e in range(E):
+                largest = max(largest, abs(work.torque[e, j]))
     for e in range(E):
         for j in range(n):
             torque, w, share = work.torque[e, j], arm.heat[j], course.share[e]
@@ -527,14 +531,18 @@ def costs(arm: Arm, course: Course, work: Work, Q, peak):
                 cost += share * DEAR * w * over * over
                 work.weight[e, j] += DEAR * w
                 work.pull[e, j] += DEAR * w * math.copysign(over, torque)
-            if peak > 0.0 and largest > 0.0:
-                mean += (abs(torque) / largest) ** PEAK_POWER / (E * n)
+            if peak > 0.0 and largest > 0.0 and not arm.prismatic[j]:
+                mean += (abs(torque) / largest) ** PEAK_POWER / (E * revolute)
     if mean > 0.0:
         cost += peak * largest * mean ** (1.0 / PEAK_POWER)
         for e in range(E):
             for j in range(n):
+                if arm.prismatic[j]:
+                    continue
                 torque = abs(work.torque[e, j])
-                slope = peak * mean ** (1.0 / PEAK_POWER - 1.0) * (torque / largest) ** (PEAK_POWER - 1) / (E * n)
+                slope = (
+                    peak * mean ** (1.0 / PEAK_POWER - 1.0) * (torque / largest) ** (PEAK_POWER - 1) / (E * revolute)
+                )
                 slope *= 0.5 / course.share[e]
                 work.pull[e, j] += math.copysign(slope, work.torque[e, j])
                 work.weight[e, j] += (PEAK_POWER - 1) * slope / max(torque, 1e-9)

@@ -36,8 +36,9 @@ class Dense:
     times : (T,) of the waypoints, over the whole path [s]; q: (T, n) [rad or m]
     rests : whether the references begin and end at rest
     fine : (M,) times at which the statics hold [s]
-    torques : (M, n) of the moved joints [N m]; forces: (M, c) normal ones [N]
-    heat : mean of all motors [W]; peak: greatest torque [N m]
+    torques : (M, n) of the moved joints [N m; N of prismatic ones]; forces: (M, c) normal ones [N]
+    heat : mean of all motors [W]
+    peak_torque, peak_force : greatest of revolute joints [N m], and of prismatic ones [N]; None without such joints
     """
 
     times: Array
@@ -47,7 +48,8 @@ class Dense:
     torques: Array
     forces: Array
     heat: float
-    peak: float
+    peak_torque: float | None
+    peak_force: float | None
 
 
 def references(task: Task, braces: tuple[Candidate, ...], knots: Array, Q: Array, factor: int = 1) -> Dense | str:
@@ -123,7 +125,9 @@ def statics(task: Task, braces: tuple[Candidate, ...], times: Array, q: Array, r
     weights = planner.arrays.motors[:, kb.HEAT]
     heat = float(np.trapezoid(torques**2 @ weights, fine) / task.duration)
     moved = torques[:, list(arm.links)]
-    return Dense(times, q, rests, fine, moved, forces, heat, float(np.abs(moved).max()))
+    peaks = [np.abs(moved[:, arm.tables.prismatic == kind]) for kind in (0, 1)]
+    peak_torque, peak_force = (float(peak.max()) if peak.size else None for peak in peaks)
+    return Dense(times, q, rests, fine, moved, forces, heat, peak_torque, peak_force)
 
 
 def nearest(

@@ -30,7 +30,7 @@ class Problem:
     Attributes
     ----------
     work : results, until another problem with the same room is evaluated
-    peak : cost of the greatest torque [W/(N m)]
+    peak : cost of the greatest torque of revolute joints [W/(N m)]
     """
 
     arm: Arm

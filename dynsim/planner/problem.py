@@ -103,7 +103,7 @@ class Options:
     radius_m : of candidates; None: that of their links, and of declared points what they say
     count : least and greatest number of braces
     surfaces : that may be leaned on; empty: all
-    peak : cost of the greatest torque [W/(N m)]
+    peak : cost of the greatest torque of revolute joints [W/(N m)]
     clearance_m : of joints that are not braced; links between them must not touch
     min_N : least normal force of a brace
     starts : postures that the search begins with

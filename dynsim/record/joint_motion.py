@@ -37,7 +37,7 @@ def export_record(record: Record, path: Path, format_: Format, *, rate: float | 
     Parameters
     ----------
     rate : float, optional
-        Resample to this rate [Hz] (cubic Hermite); the samples of the record if not given.
+        Resample to this rate [Hz] (cubic Hermite), with a last row at the end of the record; its samples if not given.
 
     Raises
     ------
@@ -54,7 +54,10 @@ def export_record(record: Record, path: Path, format_: Format, *, rate: float | 
         from scipy.interpolate import CubicHermiteSpline
 
         between = CubicHermiteSpline(time, position, velocity)
-        time = np.arange(0.0, time[-1] + 0.5 / rate, 1.0 / rate).clip(max=time[-1])
+        end = float(time[-1])
+        # A motion ends where the record ends, be it within a period.
+        time = np.arange(np.ceil(end * rate * (1.0 - 1e-9))) / rate
+        time = np.append(time, end)
         position, velocity = between(time), between(time, 1)
     writers: dict[str, Callable[..., None]] = {
         "csv": partial(_write_csv, record),

@@ -2,7 +2,8 @@
 
 Topics: ``/joint_states``, ``/tf`` and ``/tf_static`` (each body in the frame of the one that carries it, the root is
 ``world``), ``/robot_description`` (see :mod:`dynsim.record.urdf_text`), and ``/contacts/NAME`` for each contact point:
-the force of its surface on it, in a frame ``contact_NAME`` that moves with the point and keeps the axes of the world.
+the force of its surface on it, in a frame ``contact_NAME`` at the place where the force acts, so that it has no torque
+there; of a sphere or capsule that is where it touches. The frame keeps the axes of the world.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from dynsim._version import __version__
 from dynsim.errors import RecordError
 from dynsim.record.joint_motion import joint_motion
-from dynsim.record.poses import point_positions, relative_pose
+from dynsim.record.poses import relative_pose, touching_positions
 from dynsim.record.record import Record
 from dynsim.record.scene import WORLD
 from dynsim.record.urdf_text import WORLD_LINK, scene_urdf
@@ -132,7 +133,7 @@ def _frames(record: Record, bag: _Bag, stamps: list[int]) -> list[tuple[int, str
             moving.append((parent, body.name, p, q))
     unturned = np.array([1.0, 0.0, 0.0, 0.0])
     for point in scene.contacts if "body_position" in record else ():
-        at = point_positions(record, point).T
+        at = touching_positions(record, point).T
         turn = np.broadcast_to(unturned[:, None], (4, len(stamps)))
         moving.append((WORLD_LINK, f"contact_{point.name}", at, turn))
     if fixed:

@@ -12,7 +12,7 @@ from dynsim.record.quaternion import Array, continuous, of_turn, product, rotate
 from dynsim.record.record import Record
 from dynsim.record.scene import HERE, WORLD, Body, Joint, Point, Scene
 
-POSITION, ORIENTATION = "body_position", "body_orientation"
+POSITION, ORIENTATION, TOUCHING = "body_position", "body_orientation", "contact_position"
 
 
 def add_body_poses(record: Record) -> bool:
@@ -94,6 +94,21 @@ def point_positions(record: Record, point: Point, rows: slice | int | NDArray[np
         return np.broadcast_to(where, (*origin.shape[:-2], 3))
     q = turn[..., point.body, :].astype(np.float64)
     return np.asarray(origin[..., point.body, :] + np.moveaxis(rotated(np.moveaxis(q, -1, 0), where), 0, -1))
+
+
+def touching_positions(record: Record, point: Point, rows: slice | int | NDArray[np.intp] = slice(None)) -> Array:
+    """Where forces act on a contact point, (…, 3) [m]: of a sphere or capsule where it is nearest to its surface.
+
+    Records of before know only the centre of a sphere, and one end of a capsule.
+
+    Raises
+    ------
+    MissingEntry
+        The record has no body poses.
+    """
+    if TOUCHING in record and point.name in record.labels[TOUCHING]:
+        return np.asarray(record[TOUCHING][rows, record.labels[TOUCHING].index(point.name)], dtype=np.float64)
+    return point_positions(record, point, rows)
 
 
 def _recorded(record: Record, joint: Joint) -> bool:

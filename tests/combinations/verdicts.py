@@ -762,6 +762,32 @@ def _moved_at_the_start(match: Match, seen: Observed) -> str:
     return ""
 
 
+def _not_carried_out(match: Match, seen: Observed) -> str:
+    """By the script with the limit on the hand's acceleration alone, and by where its target has got to."""
+    operator = (seen.config.get("controller") or {}).get("operator")
+    if operator is None:
+        return "there is no operator"
+    rate, most = operator["rate_hz"], operator["hand_acceleration_m_s2"] / operator["rate_hz"]
+    commands = [command for command in operator["commands"] if command["hand"] is not None]
+    velocity, moved, way = np.zeros(3), np.zeros(3), 0.0
+    for tick in range(int(seen.time[-1] * rate + 1e-6) + 1):
+        begun = [command["hand"] for command in commands if command["at_s"] * rate <= tick + 1e-6]
+        change = np.array(begun[-1] if begun else [0.0, 0.0, 0.0]) - velocity
+        velocity = velocity + change * min(1.0, most / max(float(np.linalg.norm(change)), 1e-300))
+        moved, way = moved + velocity / rate, way + float(np.linalg.norm(velocity)) / rate
+    missed, asked = float(match[1]), float(match[2])
+    # Three digits are said, and a tick at the end may count.
+    near = DIGITS * way + max(float(np.linalg.norm(command["hand"])) for command in commands) / rate
+    if abs(asked - way) > near:
+        return f"it was commanded to go {way:.3g} m"
+    # By the triangle inequality the ways add up to no less than the distance, nor to more than both ways together.
+    least = 0.0
+    if "target_position" in seen.record:
+        target = seen.record["target_position"]
+        least = float(np.linalg.norm(moved - (target[-1] - target[0])))
+    return "" if least - near <= missed <= 2.0 * way + near else f"it ended {least:.3g} m from there"
+
+
 VERIFIERS: dict[str, Callable[[Match, Observed], str]] = {
     rf"^(.+): chatter, more than {NUMBER} contact events within {NUMBER} s": _chatters,
     rf"^(.+): chatter, more than {NUMBER} events of its stop within {NUMBER} s": _chatters,
@@ -797,6 +823,7 @@ VERIFIERS: dict[str, Callable[[Match, Observed], str]] = {
     r"^initial.equilibrium: moves (.+) from the requested posture": _moved_at_the_start,
     rf"^initial.equilibrium: (\S+) starts with {NUMBER} \S+ all the same.*": _moves_at_once,
     rf"^initial.equilibrium: the start slips at t = {NUMBER} s": _slips_at_once,
+    rf"^operator: {NUMBER} m of the {NUMBER} m that the hand was commanded to go were not": _not_carried_out,
 }
 """Pattern of each warning and its check: the groups and what the run shows → why it is not so, empty if it is."""
 

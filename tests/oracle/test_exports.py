@@ -273,6 +273,53 @@ def _position(frames: dict[str, object], name: str) -> np.ndarray:
     return point
 
 
+SHAPES = """
+duration_s: 0.5
+plant:
+  type: serial_arm
+  base: {position_m: [0, 0, 5]}
+  chain: [{axis: y, length_m: 0.6, radius_m: 0.03, mass_kg: 1.0, initial_deg: 60}]
+objects: {ball: {mass_kg: 1, shape: sphere, radius_m: 0.2, position_m: [-0.0894427190999916, 0, 0.178885438199983]}}
+surfaces:
+  ramp: {type: plane, normal: [-0.5, 0, 1]}
+  bar: {type: cylinder, point_m: [0.3, 0, 5.0], axis: [0, 1, 0], radius_m: 0.05}
+contacts: {law: unilateral, friction: 0.8, candidates: links}
+record: {rate_hz: 100}
+"""
+
+
+def test_wrenches_of_spheres_and_capsules_are_whole_in_their_frames(tmp_path: Path) -> None:
+    """A ball rolls down a slope, a link falls onto a bar, which it touches between its ends.
+
+    Of a ball the force has the moment r f = 2/7 m g r sin α about its centre; on a bar it acts on the bar's surface.
+    """
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
+
+    scenario, file = tmp_path / "shapes.yaml", tmp_path / "shapes.mcap"
+    scenario.write_text(SHAPES)
+    record = dynsim.simulate(load_scenario(scenario))
+    write_mcap(record, file)
+    frames, wrenches = {}, {}
+    with file.open("rb") as stream:
+        for _, channel, _, content in make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
+            if channel.topic == "/tf":
+                frames |= {item.child_frame_id: item for item in content.transforms}
+            elif channel.topic.startswith("/contacts/"):
+                wrenches[content.header.frame_id] = content.wrench
+
+    def of(vector: object) -> np.ndarray:
+        return np.array([vector.x, vector.y, vector.z])
+
+    name = "contact_ball.ramp"
+    force, torque = of(wrenches[name].force), of(wrenches[name].torque)
+    moment = np.cross(_position(frames, name) - record["q"][-1, 1:4], force) + torque
+    np.testing.assert_allclose(moment, [0.0, -2.0 / 7.0 * 9.81 * 0.2 / np.sqrt(5.0), 0.0], atol=1e-5)
+    assert of(wrenches["contact_link_1_bar"].force)[2] > 1.0
+    x, _, z = _position(frames, "contact_link_1_bar") - [0.3, 0.0, 5.0]
+    assert np.hypot(x, z) == pytest.approx(0.05, abs=1e-5)
+
+
 def test_rosbags_reads_the_file_too(bag: tuple[dynsim.Record, Path]) -> None:
     from rosbags.highlevel import AnyReader
 

@@ -308,6 +308,18 @@ def test_supports_are_apart_from_the_points_that_older_versions_know(braced: Rec
     assert older.base == ()
 
 
+@pytest.mark.parametrize(("rate", "times"), [(1.0, [0.0, 1.0, 1.1]), (2.5, [0.0, 0.4, 0.8, 1.1]), (10.0, None)])
+def test_a_resampled_motion_ends_where_its_record_ends(rate: float, times: list[float] | None, tmp_path: Path) -> None:
+    """q = t³ over 1.1 s, which cubic Hermite polynomials have exactly."""
+    t = np.linspace(0.0, 1.1, 12)
+    record = Record(t)
+    record.add("q", t[:, None] ** 3, "rad", labels=("a",))
+    record.add("v", 3.0 * t[:, None] ** 2, "rad/s", labels=("a",))
+    rows = np.loadtxt(export_record(record, tmp_path / "a.csv", "csv", rate=rate), delimiter=",", skiprows=1)
+    wanted = t if times is None else np.array(times)
+    np.testing.assert_allclose(rows, np.stack([wanted, wanted**3, 3.0 * wanted**2], axis=1), atol=1e-8)
+
+
 def test_export_has_the_joints_that_have_rates(braced: Record, tmp_path: Path) -> None:
     joints, _, position, velocity = joint_motion(braced)
     assert tuple(joints) == braced.labels["v"]

@@ -276,3 +276,21 @@ def test_all_methods_and_solvers_move_all_kinds_of_drives_alike(mixed, integrato
         for options in ({**tight, "method": "dopri5"}, tight | integrator)
     )
     np.testing.assert_allclose(other, first, rtol=0, atol=1e-7)
+
+
+def test_a_force_at_its_limit_is_in_newtons(tmp_path):
+    """Of a motor that pushes a prismatic joint, within its limit and where a start in equilibrium jumps."""
+    path = tmp_path / "pushed.yaml"
+    path.write_text(
+        """
+duration_s: 0.5
+plant:
+  type: serial_arm
+  chain: [{kind: prismatic, axis: x, length_m: 0.1, mass_kg: 1, motor: {type: torque, limit_N_m: 0.5}}]
+controller: {type: joint_pd, torques: {joint_1: {times_s: [0, 0.5], torques_N_m: [2, 2]}}}
+initial: {equilibrium: true}
+"""
+    )
+    warnings = "\n".join(simulate(load_scenario(path)).summary["warnings"])
+    assert "joint_1: force at its limit of 0.5 N for" in warnings
+    assert "the force of joint_1 begins with 2 N, at rest it would be 0" in warnings

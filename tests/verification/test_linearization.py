@@ -200,6 +200,35 @@ def test_pushes_and_commands_act_as_they_do_in_the_simulation() -> None:
     assert_near(linear.B[:, 4], column, 1e-8)
 
 
+@pytest.mark.parametrize("encoders", [False, True])
+def test_a_sampled_controller_is_the_continuous_one_of_its_law(encoders: bool) -> None:
+    """L di/dt = k_p (q_d − q) + k_d (v_d − v) − R i − K_m v; a command that the caller holds follows nothing."""
+    sampled: dict[str, object] = {"controller.sample_time_s": 1e-3}
+    if encoders:
+        sampled["sensors"] = {"encoders": {"resolution_deg": 0.01, "delay_s": 1e-3}}
+    simulations = [Simulation(load_scenario("elbow_comparison", "no_elbow", more)) for more in ({}, sampled)]
+    state = simulations[0].advance(0.1)
+    assert np.abs(state.v).max() > 0.01
+    linear = []
+    for simulation in simulations:
+        simulation = Simulation(simulation.scenario, state=state)
+        simulation.set_command("joint_2", 1.0)
+        linear.append(simulation.linearize(["command", "reference", "reference_rate"], ["voltage"]))
+    for continuous, held in zip(*linear, strict=True):
+        np.testing.assert_array_equal(held, continuous)
+    options, motors = simulations[1].scenario.controller, simulations[1].robot.motors
+    follows = np.array([motor.joint != "joint_2" for motor in motors])
+    L = np.array([motor.inductance for motor in motors])
+    k_p, k_d = (np.diag(follows * gain / L) for gain in (options.k_p_V_per_rad, options.k_d_V_s_per_rad))
+    back_emf = np.diag([motor.joint_constant for motor in motors] / L)
+    positions, rates, _ = parts(parts(linear[1].A, 0)[2])
+    assert_near(positions, -k_p, 1e-9)
+    assert_near(rates, -(k_d + back_emf), 1e-9)
+    by_command, by_reference, _ = parts(parts(linear[1].B, 0)[2])
+    assert_near(by_command, np.diag(1.0 / L), 1e-9)
+    assert_near(by_reference, k_p, 1e-9)
+
+
 def test_the_simulation_goes_on_as_if_nobody_had_looked() -> None:
     records = []
     for looked in (False, True):

@@ -19,7 +19,8 @@ from dynsim.jit.kernel import integers, reals
 from dynsim.model.surfaces import Box, HeightField, Quadric, shape_arrays
 from dynsim.planner.answer import BracePlan, Size
 from dynsim.planner.compiled import Arm, Course, Points
-from dynsim.planner.local import Problem, workspace
+from dynsim.planner.dense import references
+from dynsim.planner.local import Problem, solve, workspace
 from dynsim.planner.problem import FINAL_SLIP_SCALE, Options, task
 from dynsim.planner.search import Search, Tally
 from dynsim.planner.verify import Corner, Tolerances, Verdict, Verifier
@@ -136,10 +137,12 @@ MOTOR = {
 }  # fmt: skip
 
 
-def level_arm(masses: list[float], along: float) -> dynsim.Scenario:
-    """Links of 1 m along x whose hand stays, and a floor that spheres of 5 cm reach."""
+def level_arm(masses: list[float], lift: float | None = None) -> dynsim.Scenario:
+    """Links of 1 m along x whose hand stays, on a lift of some mass, and a floor that spheres of 5 cm reach."""
     link = {"length_m": 1.0, "radius_m": 0.01, "motor": MOTOR}
     chain = [link | {"mass_kg": mass, "initial_deg": 90.0 if k == 0 else 0.0} for k, mass in enumerate(masses)]
+    if lift is not None:
+        chain.insert(0, link | {"kind": "prismatic", "axis": "z", "length_m": 0.0, "mass_kg": lift})
     hand = [float(len(masses)), 0.0, 0.0]
     path = {"type": "waypoints", "times_s": [0.0, 1.0, 2.0], "points_m": [hand, hand, hand]}
     return scenario_from_resolved(
@@ -147,7 +150,7 @@ def level_arm(masses: list[float], along: float) -> dynsim.Scenario:
             "name": "level",
             "duration_s": 2.0,
             "plant": {"type": "serial_arm", "chain": chain},
-            "controller": {"type": "joint_pd", "hand": {"joints": [f"joint_{len(masses)}"], "path": path}},
+            "controller": {"type": "joint_pd", "hand": {"joints": [f"joint_{len(chain)}"], "path": path}},
             "surfaces": {"floor": {"type": "plane", "point_m": [0.0, 0.0, -0.05], "normal": [0.0, 0.0, 1.0]}},
             "contacts": {"law": "unilateral", "friction": 0.0},
         }
@@ -156,7 +159,7 @@ def level_arm(masses: list[float], along: float) -> dynsim.Scenario:
 
 def heat_at(masses: list[float], link: int, share: float) -> tuple[float, float]:
     """Heat [W] and force [N] of an arm that lies level with one brace at a share of one link."""
-    scenario = level_arm(masses, share)
+    scenario = level_arm(masses)
     options = Options(candidates=(f"link_{link}",), along=(share,), radius_m=0.05, count=(1, 1), clearance_m=0.0)
     problem = task(scenario, options)
     brace = next(candidate for candidate in problem.candidates if candidate.name.endswith(f"_at_{share:g}"))
@@ -182,6 +185,22 @@ def test_two_links_are_best_braced_where_the_moment_vanishes() -> None:
     assert heat == pytest.approx(0.0, abs=1e-12)
     assert force == pytest.approx((0.5 * m1 + m2) * 9.81, rel=1e-9)
     assert min(heat_at([m1, m2], 2, share)[0] for share in (0.2, 0.3)) > 1e-3
+
+
+def test_torques_and_forces_have_peaks_of_their_own() -> None:
+    """A lift of 2 kg carries a level link of 1 kg and 1 m: 3 g newtons and g/2 newton metres.
+
+    The weight of the peak is of torques: W/(N m) times g/2, whatever the force.
+    """
+    problem = task(level_arm([1.0], lift=2.0), Options(count=(0, 0), peak=0.5))
+    at = np.array([[0.0, np.pi / 2]])
+    dense = references(problem, (), np.array([0.0, 1.0]), np.tile(at, (2, 1)))
+    assert not isinstance(dense, str), dense
+    assert dense.peak_force == pytest.approx(3.0 * 9.81, rel=1e-9)
+    assert dense.peak_torque == pytest.approx(0.5 * 9.81, rel=1e-9)
+    local = solve(problem.problem((), 1), at, turns=0)
+    assert local is not None
+    assert local.cost - local.heat == pytest.approx(0.5 * dense.peak_torque, rel=1e-9)
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from scipy.optimize import minimize, minimize_scalar
 from support.random_robots import CompiledSystem, assemble, random_robot, random_rotation, random_unit
 
 from dynsim.compile.model import Model
-from dynsim.compile.shapes import compile_shapes, contact_gap, moves
+from dynsim.compile.shapes import compile_shapes, contact_gap, moves, touching_points
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact.rows import set_modes
 from dynsim.dynamics.state import OUT_FORCE
@@ -139,6 +139,19 @@ def test_gaps_are_distances_found_by_other_means(kind, shape):
         # A simplex finds the distance to the square of its tolerance; so does a bracketed minimum (1e-8) but at a kink.
         assert gap == pytest.approx(brute_gap(contact, start, end), abs=2e-8 if shape == "capsule" else 1e-9)
         assert contact_gap(contact, start, end) == pytest.approx(gap, abs=1e-12)
+
+
+@pytest.mark.parametrize(("kind", "shape"), CASES)
+def test_forces_act_where_a_shape_is_nearest_to_its_surface(kind, shape):
+    """Records place them where the kernels let them act."""
+    for seed in range(6):
+        b, contact, q, v, _ = random_case(kind, shape, seed)
+        b.derivative(b.state(q, v))
+        ends = [
+            Model(b.robot).point_position("body_5", end, q) for end in (contact.point, contact.tip) if end is not None
+        ]
+        at = touching_points(contact, *(np.array([end, end]) for end in ends))
+        np.testing.assert_allclose(at, np.tile(b.ws.contacts[0, ka.POSITION : ka.POSITION + 3], (2, 1)), atol=1e-12)
 
 
 def test_capsules_over_edges_of_a_box():

@@ -759,6 +759,46 @@ def test_planned_voltages_hold_after_the_end_of_the_scenario(tmp_path, plan, sam
     assert abs(record["v"][-1, 0]) < 1e-4
 
 
+@pytest.mark.parametrize("sampled", ["", "\n  sample_time_s: 0.001"])
+def test_a_rewritten_reference_has_no_planned_voltages(tmp_path, sampled):
+    """Turning at a constant rate the plan is the back-EMF; a joint that is told to stand is free of it.
+
+    Without gravity it comes to rest at its reference. Given back, it has the bits of its plan again.
+    """
+    text = WHEEL.replace("SAMPLED", "\n  feed_forward: dynamics" + sampled).replace(
+        "duration_s: 0.5", "duration_s: 4.0"
+    )
+    scenario = read(
+        tmp_path, text.replace("times_s: [0, 0.4], angles_deg: [0, 60]", "times_s: [0, 4], angles_deg: [0, 600]")
+    )
+    simulation = dynsim.Simulation(scenario)
+    simulation.advance(1.0)
+    before = simulation.snapshot()
+    simulation.set_reference("joint_1", 2.0)
+    assert simulation.advance(3.5).q[0] == pytest.approx(2.0, abs=1e-6)
+    simulation.restore(before)
+    simulation.set_reference("joint_1", 2.0)
+    simulation.release("joint_1")
+    untouched = dynsim.Simulation(scenario)
+    untouched.advance(1.0)
+    # The same restart, with nothing rewritten.
+    untouched.release("joint_1")
+    np.testing.assert_array_equal(simulation.advance(3.5).q, untouched.advance(3.5).q)
+
+
+def test_the_target_of_the_hand_holds_where_the_references_do(tmp_path):
+    """A path that goes on after the scenario: a quarter of a circle in 1 s, then the hand and its target stand."""
+    scenario = arm(duration_s=1.0, **{"record.rate_hz": 100})
+    simulation = dynsim.Simulation(scenario, duration=2.0)
+    simulation.advance(2.0)
+    record = simulation.record()
+    whole = dynsim.simulate(scenario)
+    assert record["target_position"][:101].tobytes() == whole["target_position"].tobytes()
+    target = record["target_position"]
+    assert np.abs(target[100] - target[90]).max() > 1e-3
+    np.testing.assert_allclose(target[101:], np.tile(target[100], (100, 1)), rtol=0.0, atol=1e-12)
+
+
 TWO_LINKS = """
 duration_s: 1.0
 plant:
@@ -970,6 +1010,38 @@ def test_a_tick_added_in_a_callback_is_called_at_that_time(tmp_path):
         simulation.restore(kept[1])
     with pytest.raises(ScenarioError, match="ticks or events were added since"):
         simulation.restore(kept[0])
+
+
+RAIL = """
+duration_s: 4.0
+plant:
+  type: serial_arm
+  gravity_m_s2: [0, 0, 0]
+  chain:
+  - {kind: prismatic, axis: x, mass_kg: 1, length_m: 0.1, limit_m: [-0.5, 0.1],
+     motor: {type: wang_minami, gear_ratio: 20}}
+controller:
+  type: joint_pd
+  k_p_V_per_rad: 200
+  k_d_V_s_per_rad: 5
+  operator: {joints: [joint_1], commands: [{at_s: 0.5, hand: [SPEED, 0, 0]}, {at_s: 2.5, hand: [0, 0, 0]}]}
+"""
+
+
+def test_an_operator_says_what_of_its_way_was_not_carried_out(tmp_path):
+    """Told to go 0.4 m along a rail that ends after 0.1 m; the other way there is room for all of it."""
+    record = dynsim.simulate(read(tmp_path, RAIL.replace("SPEED", "0.2")))
+    moved = record["target_position"][-1, 0] - record["target_position"][0, 0]
+    assert 0.09 < moved <= 0.1
+    said = [line for line in record.summary["warnings"] if line.startswith("operator:")]
+    assert len(said) == 1
+    assert (
+        f"operator: {0.4 - moved:.3g} m of the 0.4 m that the hand was commanded to go were not carried out" in said[0]
+    )
+    assert "(joint_1 is at its limit)" in said[0]
+    record = dynsim.simulate(read(tmp_path, RAIL.replace("SPEED", "-0.2")))
+    assert record["target_position"][-1, 0] - record["target_position"][0, 0] == pytest.approx(-0.4, abs=1e-9)
+    assert not record.summary["warnings"]
 
 
 def test_the_source_of_an_operator_cannot_take_a_snapshot(tmp_path):

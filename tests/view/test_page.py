@@ -68,6 +68,30 @@ def test_bodies_are_where_the_record_has_them(kind: str, request: pytest.Fixture
         np.testing.assert_allclose(shown["hand"], hand, atol=NEAR)
 
 
+ROLLING = """
+duration_s: 0.5
+plant:
+  type: serial_arm
+  base: {position_m: [0, 0, 1]}
+  chain: [{axis: y, length_m: 0.3, mass_kg: 0.1, initial_deg: 30}]
+objects: {ball: {mass_kg: 1, shape: sphere, radius_m: 0.2, position_m: [-0.12, 0, 0.16]}}
+surfaces: {ramp: {type: plane, normal: [-0.6, 0, 0.8]}}
+contacts: {law: unilateral, friction: 0.8}
+"""
+
+
+def test_a_ball_is_pushed_where_it_touches(opened: Opens, tmp_path: Path) -> None:
+    """The arrow stands on the slope below the centre, wherever the ball has turned to."""
+    (tmp_path / "rolling.yaml").write_text(ROLLING)
+    record = dynsim.simulate(load_scenario(tmp_path / "rolling.yaml"))
+    centre = record["q"][-1, [record.labels["q"].index(f"ball.{axis}") for axis in "xyz"]]
+    assert centre[0] < -0.3
+    page = opened({"one": record})
+    page.seek(0.5)
+    at = page.js("dynsim.app.actors[0].contacts.find((c) => c.name.startsWith('ball')).at.toArray()")
+    np.testing.assert_allclose(at, centre - 0.2 * np.array([-0.6, 0.0, 0.8]), atol=NEAR)
+
+
 def test_between_samples_bodies_are_where_the_model_has_them(braced: Record, opened: Opens) -> None:
     model = build_model(load_scenario("elbow_comparison", "two_elbows"))
     page = opened({"one": braced})

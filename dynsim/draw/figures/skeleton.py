@@ -14,7 +14,7 @@ from dynsim.draw.geometry.shapes import Faces, corners_of
 from dynsim.draw.geometry.surfaces import box_about
 from dynsim.record import Record
 from dynsim.record.measures import hand_target
-from dynsim.record.poses import POSITION, point_positions
+from dynsim.record.poses import POSITION, point_positions, touching_positions
 from dynsim.record.scene import WORLD, Joint, Point, Scene, SceneSurface
 
 # Number of postures drawn faintly, at even intervals of the run, besides the last one.
@@ -96,7 +96,7 @@ class Skeleton:
             surface = self.scene.surface(point.surface)
             if surface is None or point.name in untouched:
                 continue
-            position, force = point_positions(record, point, len(record) - 1), float(forces.get(point.name, np.nan))
+            position, force = touching_positions(record, point, len(record) - 1), float(forces.get(point.name, np.nan))
             if abs(force) > 0.0:
                 position = position - surface.gap(position) * surface.normal(position)
             contacts.append((point, surface, position, force))

@@ -344,7 +344,10 @@ class Painter:
 
         Returns the force in words, where to write it [pixel], and its colour; None where there is none.
         """
-        at = _on(contact.point.body, np.array(contact.point.position), position, turn)
+        if contact.at is None:
+            at = _on(contact.point.body, np.array(contact.point.position), position, turn)
+        else:
+            at = _between(contact.at, row, share)
         force = float(_between(contact.force, row, share))
         mode, text = None if contact.mode is None else int(contact.mode[row]), None
         x, y, _ = self.camera.project(at)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dynsim.errors import RecordError
 from dynsim.record import Record
 from dynsim.record.measures import hand_target
-from dynsim.record.poses import ORIENTATION, POSITION, point_positions
+from dynsim.record.poses import ORIENTATION, POSITION, TOUCHING, point_positions, touching_positions
 from dynsim.record.scene import NOT_BELOW, WORLD, Point, Scene, Vector3
 
 Array = NDArray[np.float64]
@@ -179,6 +179,7 @@ class DrawnContact:
     force : normal force, positive where the surface pushes, (T,) [N]
     tangent : the rest of its force, (T, 3) [N], None where it was not recorded
     mode : 0 open, 1 slips, 2 sticks, (T,), under the unilateral law
+    at : where the force acts on a sphere or capsule, (T, 3) [m]; None: at the point of its body
     """
 
     point: Point
@@ -187,6 +188,7 @@ class DrawnContact:
     force: Array
     tangent: Array | None
     mode: Array | None
+    at: Array | None
 
 
 def contacts(robot: DrawnRobot, rows: NDArray[np.intp] | slice = slice(None)) -> list[DrawnContact]:
@@ -204,13 +206,15 @@ def contacts(robot: DrawnRobot, rows: NDArray[np.intp] | slice = slice(None)) ->
         mode = record["contact_mode"][rows, k] if "contact_mode" in record else None
         if mode is not None and not mode.any():
             continue
-        positions = np.asarray(point_positions(record, point, rows), dtype=np.float64)
-        normal = surface.normal(positions)
+        at = np.asarray(touching_positions(record, point, rows), dtype=np.float64)
+        normal = surface.normal(at)
         force = np.asarray(record["contact_normal_force"][rows, k], dtype=np.float64)
         tangent = None
         if "contact_force" in record:
             tangent = record["contact_force"][rows, k] - force[:, None] * normal
-        result.append(DrawnContact(point, _friction(record, point.name), normal, force, tangent, mode))
+        shaped = TOUCHING in record and point.name in record.labels[TOUCHING]
+        friction = _friction(record, point.name)
+        result.append(DrawnContact(point, friction, normal, force, tangent, mode, at if shaped else None))
     return result
 
 

@@ -126,7 +126,7 @@ def _record(name: str, robot: DrawnRobot, blocks: Blocks, meshes: Meshes, low: A
 
 
 def _contacts(robot: DrawnRobot, blocks: Blocks) -> list[dict[str, Any]]:
-    """Every contact point: on which body, its normal, normal force and friction over time, mode where there is one."""
+    """Every contact point: on which body, its normal, normal force and friction over time; mode and place if known."""
     entries = []
     for contact in contacts(robot, robot.rows):
         point = contact.point
@@ -143,6 +143,8 @@ def _contacts(robot: DrawnRobot, blocks: Blocks) -> list[dict[str, Any]]:
             entry["tangent"] = blocks.add(contact.tangent)
         if contact.mode is not None:
             entry["mode"] = blocks.add(contact.mode)
+        if contact.at is not None:
+            entry["at"] = blocks.add(contact.at)
         entries.append(entry)
     return entries
 

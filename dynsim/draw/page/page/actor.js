@@ -17,7 +17,7 @@ class Actor {
     this.orientation = table(data.orientation);
     this.size = Math.max(0.13 * data.reach, 3 * data.radius);
     this.contactTables = data.contacts.map((c) => ({ force: table(c.force), normal: table(c.normal),
-      tangent: c.tangent && table(c.tangent), mode: c.mode && table(c.mode) }));
+      tangent: c.tangent && table(c.tangent), mode: c.mode && table(c.mode), at: c.at && table(c.at) }));
     this.depths = data.sunk.map((one) => table(one.depth));
     this.wheelTable = data.wheels && table(data.wheels.down);
     this.pressureTable = data.pressure && table(data.pressure.at);
@@ -130,6 +130,7 @@ class Actor {
       const one = out.contacts[m];
       one.force = mix(c.force, 0);
       one.mode = c.mode ? Math.round(c.mode.value(held, 0)) : null;
+      one.at = c.at ? [0, 1, 2].map((k) => mix(c.at, k)) : null;
       for (let k = 0; k < 3; k++) {
         one.normal[k] = mix(c.normal, k);
         one.tangent[k] = c.tangent ? mix(c.tangent, k) : 0;

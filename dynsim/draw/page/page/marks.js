@@ -61,10 +61,12 @@ M.Contact = class {
     parent.add(this.dot, this.cone);
   }
 
-  // force [N] along the normal, tangent (x, y, z) [N], mode 0 open, 1 slides, 2 sticks or null.
+  // force [N] along the normal, tangent (x, y, z) [N], mode 0 open, 1 slides, 2 sticks or null; at: where the force of a
+  // sphere or capsule acts, else it is at the point of its body.
   show(body, now, scale, layers, colours) {
     const { force, mode } = now;
-    this.at.set(...this.contact.p).applyQuaternion(body.quaternion).add(body.position);
+    if (now.at) this.at.set(...now.at);
+    else this.at.set(...this.contact.p).applyQuaternion(body.quaternion).add(body.position);
     this.normal.set(...now.normal).normalize();
     const open = mode === 0 || !Number.isFinite(force), pulls = force < 0;
     const slip = Math.hypot(...now.tangent), shown = layers.forces && !open && force !== 0;
