@@ -672,21 +672,47 @@ class Simulation:
         scenario : that the record is said to be of, where it was found on the way; default: what is simulated
         pictured : with scene and poses of bodies
         """
-        count = self._prepared.run.count
-        if (count[ki.PENDING] == 1 or count[ki.STARTED] == 0) and not self.finished:
-            # Samples up to the present time lie in the step that is kept back, or the last one wants what has been set
-            # at its time: end the step here, begin the next one, and take that back.
+        if self.finished:
+            record = self._record_now(scenario, pictured)
+        else:
+            # Samples, tallies and events are to be of one time, and that may lie in the step that is kept back: end the
+            # step here, begin the next one, and take that back.
             before = self._kept()
             try:
-                self._settle_now(calling=False)
-                if self._loaded:
-                    self._kernel(self._prepared.system, self._prepared.workspace, self._prepared.run, 0)
-                times, states, outputs = self._trace.rows(self._prepared.run)
+                self._end_here()
+                record = self._record_now(scenario, pictured)
             finally:
                 self._go_back(before)
-        else:
-            times, states, outputs = self._trace.rows(self._prepared.run)
+        record.complete = self.finished
+        if self._failed():
+            mark_stopped(stopped(self._scenario, self._prepared), record)
+        return record
+
+    def _end_here(self) -> None:
+        """End a step at the present time, and record the sample there; to be taken back."""
+        self._settle_now(calling=False)
+        if not self._loaded:
+            return
         run = self._prepared.run
+        if run.count[ki.SAMPLE] == len(run.sample_time):
+            self._refill()
+            run = self._prepared.run
+        row, now = int(run.count[ki.SAMPLE]), float(run.clock[ki.TIME])
+        # Time stepping has recorded it.
+        late = run.stepping is None and abs(run.sample_time[row] - now) <= TICK_SLACK * max(1.0, abs(now))
+        if late:
+            # A step that ends a rounding before a sample leaves it to the next one. At a start, the sample at this time
+            # is written again, whatever is there.
+            run.count[ki.SAMPLE], run.count[ki.STARTED], run.sample[row] = row + 1, 0, np.nan
+        self._kernel(self._prepared.system, self._prepared.workspace, run, 0)
+        if late and np.isnan(run.sample[row]).any():
+            # There is no start from here.
+            run.count[ki.SAMPLE] = row
+
+    def _record_now(self, scenario: Scenario | None, pictured: bool) -> Record:
+        """Record of the arrays as they are."""
+        run = self._prepared.run
+        times, states, outputs = self._trace.rows(run)
         if len(times) and self._relative:
             states = states.copy()
             integrals = slice(run.layout.tracked, run.layout.size)
@@ -710,9 +736,6 @@ class Simulation:
         record.summary["warnings"] += self._said
         for attendant in self._attendants:
             attendant.add_to(record)
-        record.complete = self.finished
-        if self._failed():
-            mark_stopped(stopped(self._scenario, self._prepared), record)
         return record
 
     def _motor(self, joint: str) -> int:
