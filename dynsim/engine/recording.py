@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,9 @@ from dynsim.record.poses import TOUCHING, add_body_poses, point_positions
 from dynsim.record.scene import Point, vector3
 from dynsim.scenario import Scenario, build
 
+# A last sample within this part of the run before its end counts as at it, see dynsim.engine.trace.even_times.
+SAME_END = 1e-9
+
 
 def make_record(
     scenario: Scenario,
@@ -46,8 +50,9 @@ def make_record(
     ``begun`` : time at which the run began [s]; when samples begin later, all but the effort is counted from there
     """
     count, times = int(prepared.run.count[ki.SAMPLE]), prepared.run.sample_time
-    if count and times[0] > begun:
-        happened = [event for event in happened if event.time >= times[0]]
+    lost = count > 0 and times[0] > begun
+    if lost:
+        happened = [event for event in happened if times[0] <= event.time <= times[count - 1]]
         prepared = counted_within(prepared, happened)
     model, run, contacts = prepared.model, prepared.run, prepared.contacts
     robot = model.robot
@@ -77,6 +82,53 @@ def make_record(
     if prepared.control.orientation is not None:
         turned = hand_turns(model, run.states("q"), prepared.control.orientation)
         record.add("hand_turn_error", turned, "rad", description="angle between the hand's orientation and its target")
+    _add_energies(record, prepared, pushed)
+    for store, name in zip(_by_column(run.outputs("energy")), metrics.STORES, strict=True):
+        record.add(name, store, "J", description=f"{name.removeprefix('energy_')} energy")
+    record.add("energy_residual", metrics.energy_residual(record), "J", description="what the ledger does not explain")
+    touch = run.outputs("contact")
+    vector, slip = slice(kst.OUT_VECTOR, kst.OUT_VECTOR + 3), slice(kst.OUT_SLIP, kst.OUT_SLIP + 3)
+    record.add(
+        "contact_normal_force", touch[:, :, kst.OUT_FORCE], "N", labels=names, description="f_n; negative: pulling"
+    )
+    record.add("contact_force", touch[:, :, vector], "N", labels=names, description="normal and friction force, W")
+    record.add("contact_gap", touch[:, :, kst.OUT_GAP], "m", labels=names, description="distance from the surface")
+    record.add("contact_slip_velocity", touch[:, :, slip], "m/s", labels=names)
+    _add_touch(record, prepared)
+    if prepared.system.unilateral is not None:
+        _add_unilateral(record, prepared)
+    for event in happened:
+        record.add_event(event.time, event.kind, event.name)
+    if pictured:
+        record.scene = robot_scene(robot, contacts, build.surfaces(scenario))
+        if add_body_poses(record):
+            _add_touching_points(record, robot, contacts)
+    end = _end(record, prepared, pushed, begun, within=lost)
+    record.summary = metrics.summarise(record, end, scenario, prepared, wall, begun)
+    return record
+
+
+def _end(record: Record, prepared: Prepared, pushed: Sequence[int] | None, begun: float, *, within: bool) -> Record:
+    """All integrals at the end of what the summary is of, as a record of one sample.
+
+    That is the whole run, whose tallies count up to its present time, which may be later than the last sample; of a
+    ring that has lost samples (``within``) it is what it has.
+    """
+    run, rows = prepared.run, len(record)
+    time, state = float(run.clock[ki.TIME]), run.y
+    if rows and (within or time - record.time[-1] <= SAME_END * (time - begun)):
+        time, state = float(record.time[-1]), run.sample[rows - 1]
+    count = run.count.copy()
+    count[ki.SAMPLE] = 1
+    prepared, end = replace(prepared, run=run._replace(sample=state[None], count=count)), Record(np.array([time]))
+    _add_energies(end, prepared, pushed)
+    _add_touch(end, prepared)
+    return end
+
+
+def _add_energies(record: Record, prepared: Prepared, pushed: Sequence[int] | None) -> None:
+    """Integrals of powers, and energies of impacts and of the scheme."""
+    run, robot = prepared.run, prepared.model.robot
     for integral, (name, text) in zip(_by_column(run.states("ledger")), metrics.INTEGRALS.items(), strict=True):
         record.add(name, integral, "J", description=text)
     if prepared.system.unilateral is not None:
@@ -92,30 +144,14 @@ def make_record(
     if shown:
         labels = tuple(prepared.loads[k].name for k in shown)
         record.add("work_loads", run.states("load")[:, shown], "J", labels=labels, description="∫ W·V dt of each load")
-    for store, name in zip(_by_column(run.outputs("energy")), metrics.STORES, strict=True):
-        record.add(name, store, "J", description=f"{name.removeprefix('energy_')} energy")
-    record.add("energy_residual", metrics.energy_residual(record), "J", description="what the ledger does not explain")
-    touch = run.outputs("contact")
-    vector, slip = slice(kst.OUT_VECTOR, kst.OUT_VECTOR + 3), slice(kst.OUT_SLIP, kst.OUT_SLIP + 3)
-    record.add(
-        "contact_normal_force", touch[:, :, kst.OUT_FORCE], "N", labels=names, description="f_n; negative: pulling"
-    )
-    record.add("contact_force", touch[:, :, vector], "N", labels=names, description="normal and friction force, W")
-    record.add("contact_gap", touch[:, :, kst.OUT_GAP], "m", labels=names, description="distance from the surface")
-    record.add("contact_slip_velocity", touch[:, :, slip], "m/s", labels=names)
-    integrals = run.states("contact").reshape(rows, len(contacts), kst.CONTACT_SIZE)
+
+
+def _add_touch(record: Record, prepared: Prepared) -> None:
+    """Integrals of forces and slip of the contacts."""
+    names, rows = tuple(contact.name for contact in prepared.contacts), len(record)
+    integrals = prepared.run.states("contact").reshape(rows, len(names), kst.CONTACT_SIZE)
     record.add("contact_impulse", integrals[:, :, kst.IMPULSE], "N s", labels=names, description="∫ f_n dt")
     record.add("contact_slip_distance", integrals[:, :, kst.SLIP], "m", labels=names, description="∫ |v_t| dt")
-    if prepared.system.unilateral is not None:
-        _add_unilateral(record, prepared)
-    for event in happened:
-        record.add_event(event.time, event.kind, event.name)
-    if pictured:
-        record.scene = robot_scene(robot, contacts, build.surfaces(scenario))
-        if add_body_poses(record):
-            _add_touching_points(record, robot, contacts)
-    record.summary = metrics.summarise(record, scenario, prepared, wall, begun)
-    return record
 
 
 def _by_column(table: NDArray[np.float64]) -> NDArray[np.float64]:

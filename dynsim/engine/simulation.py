@@ -78,8 +78,9 @@ _FAR = 1e300
 # A state under time stepping may be a step of this speed below a surface or beyond a stop [m/s or rad/s].
 FASTEST_LANDING = 5.0
 SERVO_MODES = {"position": ka.POSITION_MODE, "velocity": ka.VELOCITY_MODE, "off": ka.OFF}
-# Buffers into which kernels sample; their sizes change.
+# Buffers into which kernels sample; their sizes change. So do the tables of callbacks, to which more may be added.
 _BUFFERS = {f"run.{field}": field for field in ("sample_time", "sample", "output")}
+_TABLES = {f"run.{field}": field for field in ("tick", "tick_table", "event", "event_table")}
 
 
 class Simulation:
@@ -181,6 +182,9 @@ class Simulation:
         self._planned = replace(self._prepared.control, reference=reference._replace(spline=reference.spline.copy()))
         self._base_as_planned = state is None
         self._said: list[str] = []
+        # Where samples are to end [s]; once a step has passed that, what there was, and the wall time until then [s].
+        self._samples_end: float = math.inf
+        self._window: tuple[Snapshot, float] | None = None
         run = self._prepared.run
         if state is not None:
             self._take(state)
@@ -348,13 +352,20 @@ class Simulation:
     def end_samples(self, time: float) -> None:
         """Let the samples end with one at a time [s], as those of a run that ends there do; the simulation goes on.
 
+        Later records are those of a run that ends there: their events and summary too.
+
         Raises
         ------
         ScenarioError
-            A time that is past.
+            A time that is past, or samples that have ended already.
         """
         if not time >= self._time:
             raise ScenarioError(f"samples cannot end at t = {brief(time)} s: the simulation is at {self._time:g} s")
+        if self._window is not None:
+            raise ScenarioError(
+                f"samples have ended at t = {self._samples_end:g} s and cannot go on; restore a snapshot of before"
+            )
+        self._samples_end = float(time)
         self._trace.end_at(float(time), self._prepared.run)
 
     def every(self, period: float, call: Callable[[Simulation], None], *, first: float | None = None) -> None:
@@ -704,8 +715,8 @@ class Simulation:
         attendants = [attendant.remembered() for attendant in self._attendants]
         trace, happened, pushed = self._trace.snapshot(), tuple(self._happened), frozenset(self._pushed)
         shown = (pushed, self._base_as_planned, self._prepared.behind_brakes)
-        due = tuple(self._due)
-        return Snapshot(self._token, arrays, self._time, trace, happened, *shown, self._frozen, attendants, due)
+        due, window = tuple(self._due), (self._samples_end, self._window)
+        return Snapshot(self._token, arrays, self._time, trace, happened, *shown, self._frozen, attendants, due, window)
 
     def restore(self, snapshot: Snapshot) -> None:
         """Go back to a snapshot of this simulation: the same future, bit for bit.
@@ -729,7 +740,7 @@ class Simulation:
 
     def _go_back(self, snapshot: Snapshot) -> None:
         """Take everything from a snapshot that fits."""
-        self._swap(**{field: snapshot.arrays[name].copy() for name, field in _BUFFERS.items()})
+        self._swap(**{field: snapshot.arrays[name].copy() for name, field in (_BUFFERS | _TABLES).items()})
         for name, array in self._arrays().items():
             array[...] = snapshot.arrays[name]
         self._trace.restore(snapshot.trace)
@@ -739,9 +750,10 @@ class Simulation:
         for attendant, kept in zip(self._attendants, snapshot.attendants, strict=True):
             attendant.restore(kept)
         self._due = list(snapshot.due)
+        self._samples_end, self._window = snapshot.window
 
     def record(self, scenario: Scenario | None = None, *, pictured: bool = True) -> Record:
-        """Record of the trace so far; of a ring, energies, events and counts from its first sample on.
+        """Record of the trace so far, with a summary of the run up to now; of a ring, of its samples alone.
 
         ``complete`` is True for a run that has come to its end.
 
@@ -750,35 +762,88 @@ class Simulation:
         scenario : that the record is said to be of, where it was found on the way; default: what is simulated
         pictured : with scene and poses of bodies
         """
-        count = self._prepared.run.count
-        if (count[ki.PENDING] == 1 or count[ki.STARTED] == 0) and not self.finished:
-            # Samples up to the present time lie in the step that is kept back, or the last one wants what has been set
-            # at its time: end the step here, begin the next one, and take that back.
+        wall = self._wall
+        if self._window is None and self.finished:
+            record = self._record_now(scenario, pictured, wall)
+        else:
+            # Samples, tallies and events are to be of one time, and that may lie in the step that is kept back: end the
+            # step here, begin the next one, and take that back.
             before = self._kept()
             try:
-                self._settle_now(calling=False)
-                if self._loaded:
-                    self._kernel(self._prepared.system, self._prepared.workspace, self._prepared.run, 0)
-                times, states, outputs = self._trace.rows(self._prepared.run)
+                if self._window is not None:
+                    there, wall = self._window
+                    self._go_back(there)
+                else:
+                    self._end_here()
+                record = self._record_now(scenario, pictured, wall)
             finally:
                 self._go_back(before)
-        else:
-            times, states, outputs = self._trace.rows(self._prepared.run)
+        record.complete = self.finished
+        if self._failed():
+            mark_stopped(stopped(self._scenario, self._prepared), record)
+        return record
+
+    def _end_here(self) -> None:
+        """End a step at the present time, and record the sample there; to be taken back."""
+        self._settle_now(calling=False)
+        if not self._loaded:
+            return
         run = self._prepared.run
+        if run.count[ki.SAMPLE] == len(run.sample_time):
+            self._refill()
+            run = self._prepared.run
+        row, now = int(run.count[ki.SAMPLE]), float(run.clock[ki.TIME])
+        # Time stepping has recorded it.
+        late = run.stepping is None and abs(run.sample_time[row] - now) <= TICK_SLACK * max(1.0, abs(now))
+        if late:
+            # A step that ends a rounding before a sample leaves it to the next one. At a start, the sample at this time
+            # is written again, whatever is there.
+            run.count[ki.SAMPLE], run.count[ki.STARTED], run.sample[row] = row + 1, 0, np.nan
+        self._kernel(self._prepared.system, self._prepared.workspace, run, 0)
+        if late and np.isnan(run.sample[row]).any():
+            # There is no start from here.
+            run.count[ki.SAMPLE] = row
+
+    def _keep_window(self, until: float) -> None:
+        """Keep what there is at the end of the samples, before the pending step passes it on the way to a time."""
+        run, end = self._prepared.run, self._samples_end
+        passes = run.count[ki.PENDING] == 1 and run.clock[ki.TIME] + run.clock[ki.STEP] > end
+        if self._window is not None or not (passes and until > end):
+            return
+        before = self._kept()
+        try:
+            self._time = end
+            self._end_here()
+            window = self._kept(), self._wall
+        finally:
+            self._go_back(before)
+        self._window = window
+
+    def _hold(self, until: float) -> float:
+        """Time beyond which a step on the way to another time is kept back: buffer or samples end there [s]."""
+        last, end = float(self._prepared.run.sample_time[-1]), self._samples_end
+        return min(last, end) if self._window is None and until > end else last
+
+    def _record_now(self, scenario: Scenario | None, pictured: bool, wall: float) -> Record:
+        """Record of the arrays as they are, whose run has taken so much wall time [s]."""
+        run = self._prepared.run
+        times, states, outputs = self._trace.rows(run)
+        y = run.y
         if len(times) and self._relative:
-            states = states.copy()
+            states, y = states.copy(), y.copy()
             integrals = slice(run.layout.tracked, run.layout.size)
+            y[integrals] -= states[0, integrals]
             states[:, integrals] -= states[0, integrals]
         count = run.count.copy()
         count[ki.SAMPLE] = len(times)
-        whole = run._replace(sample_time=times, sample=states, output=outputs, count=count)
+        whole = run._replace(y=y, sample_time=times, sample=states, output=outputs, count=count)
         planned = self._planned
         if self._operator is not None and self._operator.path is not None:
             planned = replace(planned, path=self._operator.path)
         record = make_record(
             self._scenario if scenario is None else scenario,
             replace(self._prepared, run=whole, control=planned),
-            self._wall,
+            wall,
             pushed=sorted(self._pushed),
             happened=self._happened,
             base_as_planned=self._base_as_planned,
@@ -788,9 +853,6 @@ class Simulation:
         record.summary["warnings"] += self._said
         for attendant in self._attendants:
             attendant.add_to(record)
-        record.complete = self.finished
-        if self._failed():
-            mark_stopped(stopped(self._scenario, self._prepared), record)
         return record
 
     def _motor(self, joint: str) -> int:
@@ -842,6 +904,7 @@ class Simulation:
         """Integrate until the step that would pass a time is pending, or ends there."""
         until = asked = min(asked, self._end)
         while not self.finished and self._time < until:
+            self._keep_window(until)
             run = self._prepared.run
             # A tick that differs from the time asked for by roundings is not left for later.
             slack = TICK_SLACK * max(1.0, abs(asked))
@@ -866,7 +929,7 @@ class Simulation:
         if run.count[ki.PENDING] == 1:
             self._refill(run.clock[ki.TIME] + run.clock[ki.STEP])
             run = self._prepared.run
-        run.clock[ki.HOLD] = min(until, run.sample_time[-1])
+        run.clock[ki.HOLD] = min(until, self._hold(until))
         begun = clock.perf_counter()
         raised = self._attended(_PIECE, interruption.check)
         self._wall += clock.perf_counter() - begun
@@ -956,11 +1019,12 @@ class Simulation:
         """Integrate until a time as if the run ended there, or until it ends before."""
         reached = False
         while not (reached or self.finished):
+            self._keep_window(until)
             run = self._prepared.run
             if run.count[ki.PENDING] == 1:
                 self._refill(run.clock[ki.TIME] + run.clock[ki.STEP])
                 run = self._prepared.run
-            run.clock[ki.HOLD], run.clock[ki.END] = run.sample_time[-1], until
+            run.clock[ki.HOLD], run.clock[ki.END] = self._hold(until), until
             # What comes to its end here is half of something: signals that wait go on waiting.
             raised = self._attended(_PIECE, lambda: None)
             # Callbacks, and their snapshots, know nothing of this end.

@@ -275,6 +275,7 @@ class SnakePilot(SnakeControl):
         return {
             "state": copy_of(self.state),
             "trace": [array[: self._commanded].copy() for array in self.trace],
+            "rates": self.ws.work.u.copy(),
             "gripper": self.gripper.copy(),
             "lifter": self._lifter.state(),
             "sensors": [sensor.remembered() for sensor in self.sensors],
@@ -289,6 +290,7 @@ class SnakePilot(SnakeControl):
             mine[...] = array
         for mine, array in zip(self.trace, kept["trace"], strict=True):
             mine[: len(array)] = array
+        self.ws.work.u[...] = kept["rates"]
         self.gripper[...] = kept["gripper"]
         self._lifter.restore(kept["lifter"])
         for sensor, part in zip(self.sensors, kept["sensors"], strict=True):

@@ -133,3 +133,4 @@ class Snapshot:
     frozen: bool
     attendants: list[dict[str, Any]]
     due: tuple[Callable[[Any], None], ...]
+    window: tuple[float, tuple[Snapshot, float] | None]

@@ -105,17 +105,20 @@ def gravity_lever(robot: Robot) -> tuple[float, float]:
 
 
 def summarise(
-    record: Record, scenario: Scenario, prepared: Prepared, wall: float, begun: float = 0.0
+    record: Record, end: Record, scenario: Scenario, prepared: Prepared, wall: float, begun: float = 0.0
 ) -> dict[str, Any]:
-    """The content of ``summary.json`` for a run that has taken ``wall`` [s], and began at ``begun`` [s]."""
+    """The content of ``summary.json`` for a run that has taken ``wall`` [s], and began at ``begun`` [s].
+
+    ``end`` : one sample of all integrals, at the time up to which the tallies of ``prepared`` count
+    """
     run, robot, contacts = prepared.run, prepared.model.robot, prepared.contacts
     unilateral = prepared.system.unilateral
-    duration = float(record.time[-1] - record.time[0]) if len(record) else 0.0
+    duration = float(end.time[0] - (record.time[0] if len(record) else begun))
     # Of a ring, the effort is that of the whole run.
-    elapsed = float(record.time[-1]) - begun if len(record) else 0.0
+    elapsed = float(run.clock[ki.TIME]) - begun
 
     def final(name: str) -> float:
-        return float(record[name][-1]) if len(record) else 0.0
+        return float(end[name][0])
 
     turnover = energy_turnover(record)
     residual = float(np.abs(record["energy_residual"]).max(initial=0.0))
@@ -149,13 +152,13 @@ def summarise(
         **({} if unilateral is None else {f"{key}_J": final(name) for key, name in _LOSS_KEYS.items()}),
         **({} if run.stepping is None else {"scheme_loss_J": final("loss_scheme")}),
         **({"damper_loss_J": final("loss_damper")} if "loss_damper" in record else {}),
-        **_loads(record),
+        **_loads(end),
         "energy_turnover_J": turnover,
         "energy_residual_relative": residual / scale if scale > 0.0 else 0.0,
         "constraint_drift_max_m": float(run.extremes[:, ki.DRIFT_MAX].max(initial=0.0)),
         **_base(record, scenario, prepared),
         "contacts": [
-            _contact(record, k, contact, prepared, duration, contact.name in scenario.config.contacts.points)
+            _contact(record, end, k, contact, prepared, duration, contact.name in scenario.config.contacts.points)
             for k, contact in enumerate(contacts)
         ],
         "sinking": [
@@ -190,16 +193,15 @@ def _base(record: Record, scenario: Scenario, prepared: Prepared) -> dict[str, A
     return {"base": base_summary(record, scenario.metrics.settle_s, support.least, travel)}
 
 
-def _loads(record: Record) -> dict[str, Any]:
+def _loads(end: Record) -> dict[str, Any]:
     """Work of each external wrench [J], where there are some."""
-    if "work_loads" not in record:
+    if "work_loads" not in end:
         return {}
-    work = record["work_loads"][-1] if len(record) else np.zeros(len(record.labels["work_loads"]))
-    return {"loads_work_J": dict(zip(record.labels["work_loads"], work.tolist(), strict=True))}
+    return {"loads_work_J": dict(zip(end.labels["work_loads"], end["work_loads"][0].tolist(), strict=True))}
 
 
 def _contact(
-    record: Record, k: int, contact: Contact, prepared: Prepared, duration: float, declared: bool
+    record: Record, end: Record, k: int, contact: Contact, prepared: Prepared, duration: float, declared: bool
 ) -> dict[str, Any]:
     """What a contact has done; of a declared point under the unilateral law also how near it came."""
     force, run, unilateral = record["contact_normal_force"][:, k], prepared.run, prepared.system.unilateral
@@ -219,11 +221,11 @@ def _contact(
         "name": contact.name,
         "surface": contact.surface_name,
         "normal_force_min_N": lowest,
-        "normal_force_mean_N": float(record["contact_impulse"][-1, k] / duration) if duration > 0 else 0.0,
+        "normal_force_mean_N": float(end["contact_impulse"][0, k] / duration) if duration > 0 else 0.0,
         "normal_force_max_N": largest,
         "closed_fraction": 1.0,
         "pulling_fraction": min(pulling, 1.0),
-        "slip_distance_m": float(record["contact_slip_distance"][-1, k]) if len(record) else 0.0,
+        "slip_distance_m": float(end["contact_slip_distance"][0, k]),
         **real,
         **({"gap_min_m": float(record["contact_gap"][:, k].min())} if real and declared and len(record) else {}),
     }

@@ -320,7 +320,7 @@ def _leaving(record: Record, contacts: Sequence[Contact], names: Sequence[str], 
 def _unpressed(record: Record, prepared: Prepared, begun: float) -> list[str]:
     """Warn of contacts that stick although no force presses them; then the motion is not unique."""
     # The share refers to the whole run, even with a ring buffer, because samples do not show the pressing forces.
-    unilateral, time = prepared.system.unilateral, record.time[-1] - begun if len(record) else 0.0
+    unilateral, time = prepared.system.unilateral, prepared.run.clock[ki.TIME] - begun
     if unilateral is None or not time > 0.0:
         return []
     shares = unilateral.tally[:, ku.UNPRESSED] / time

@@ -251,6 +251,22 @@ def test_a_snapshot_has_the_same_future():
     np.testing.assert_array_equal(first.v, again.v)
 
 
+@pytest.mark.parametrize("restored", [False, True])
+def test_a_record_that_ends_between_two_ticks_is_the_same_later(restored):
+    """Joints follow lines there, whose rates a snapshot has."""
+    simulation = Simulation(dynamic(duration_s=0.2), duration=math.inf)
+    simulation.end_samples(0.1013)
+    simulation.advance(0.1013)
+    record, before = simulation.record(), simulation.snapshot()
+    simulation.advance(0.2)
+    if restored:
+        simulation.restore(before)
+    again = simulation.record()
+    assert again.time[-1] == 0.1013
+    for name in record:
+        np.testing.assert_array_equal(record[name], again[name], err_msg=name)
+
+
 @pytest.mark.parametrize("theta", [0.5, pytest.param(1.0, marks=pytest.mark.long)])
 @pytest.mark.parametrize("gain", [pytest.param(20.0, marks=pytest.mark.long), 100.0])
 def test_stiff_wheel_loops_roll_without_slipping(gain, theta):
