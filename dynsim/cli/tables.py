@@ -76,6 +76,7 @@ _ROWS: tuple[tuple[str, Callable[[Summary], Any], Callable[[Any], str]], ...] = 
     ("electrical energy [J]", _energy("electrical_energy_J"), _number),
     ("  from one supply [J]", _energy("electrical_energy_supply_J"), _number),
     ("  from a supply each [J]", _energy("electrical_energy_drawn_J"), _number),
+    ("battery energy [Wh]", lambda s: s.get("battery_energy_Wh"), lambda v: _number(v, digits=3)),
     ("mechanical work [J]", _energy("mechanical_work_J"), _number),
     ("Joule heat [J]", _energy("joule_heat_J"), _number),
     ("friction heat [J]", _energy("friction_heat_J"), _number),
