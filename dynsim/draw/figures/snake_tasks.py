@@ -196,7 +196,7 @@ def _height(axis: Axes, record: Record, name: str, body: int) -> None:
     height = 1e3 * record[POSITION][:, body, 2].astype(float)
     axis.plot(record.time, 1e3 * record["w_target"][:, 2], "--", color=TARGET, lw=1.0, label="target of the snake")
     axis.plot(record.time, 1e3 * record["w"][:, 2], color=style.BLUE, lw=1.0, label="controlled point")
-    rise = style.number(float(height[-1] - height[0]), 3)
+    rise = style.number(round(float(height[-1] - height[0]), 1) + 0.0)
     axis.plot(record.time, height, color="black", lw=1.4, label=f"{name}: rises by {rise} mm")
     axis.set_ylabel("height [mm]")
 
