@@ -76,6 +76,8 @@ _ROWS: tuple[tuple[str, Callable[[Summary], Any], Callable[[Any], str]], ...] = 
     ("electrical energy [J]", _energy("electrical_energy_J"), _number),
     ("  from one supply [J]", _energy("electrical_energy_supply_J"), _number),
     ("  from a supply each [J]", _energy("electrical_energy_drawn_J"), _number),
+    ("battery energy [Wh]", lambda s: s.get("battery_energy_Wh"), lambda v: _number(v, digits=3)),
+    ("worst joint, rms torque [N m]", lambda s: s.get("worst_joint"), lambda v: _worst(v)),
     ("mechanical work [J]", _energy("mechanical_work_J"), _number),
     ("Joule heat [J]", _energy("joule_heat_J"), _number),
     ("friction heat [J]", _energy("friction_heat_J"), _number),
@@ -132,7 +134,8 @@ def print_summary(console: Console, summary: Summary) -> None:
 def print_comparison(console: Console, summaries: Mapping[str, Summary]) -> None:
     """All variants side by side, one column each; several tables where the terminal is too narrow for one."""
     names = list(summaries)
-    cell = max([10, *map(len, names)]) + 2
+    # "wheel2R 3.17 of 1.68" is the widest cell, and most tables have none.
+    cell = max([20 if any(s.get("worst_joint") for s in summaries.values()) else 10, *map(len, names)]) + 2
     across = max(1, (console.width - _HEADING_WIDTH) // cell)
     for start in range(0, len(names), across):
         _print_columns(console, summaries, names[start : start + across])
@@ -331,6 +334,12 @@ _MOST_MOTORS = 10
 
 def _loaded(rms: float, nominal: float) -> str:
     return f"[bold red]{rms:.3g}[/]" if rms > nominal else f"{rms:.3g}"
+
+
+def _worst(motor: Summary) -> str:
+    """Name of a motor, rms torque, and nominal torque, or stall torque where that is not known."""
+    rating = motor.get("nominal_torque_N_m", motor.get("stall_torque_N_m", math.inf))
+    return f"{escaped_line(motor['joint'])} {_loaded(motor['torque_rms_N_m'], rating)} of {rating:g}"
 
 
 def _stop(stop: Summary) -> tuple[str, float]:

@@ -24,7 +24,7 @@ from dynsim.engine.gripper import STATES_TEXT, Grip
 from dynsim.engine.operator import Referenced
 from dynsim.engine.sensing import SampledSensor
 from dynsim.engine.snake_control import OBSTACLES, SnakeControl, copy_of
-from dynsim.engine.snake_record import add_task, hold_last, task_summary, task_warnings
+from dynsim.engine.snake_record import add_task, effort, hold_last, task_summary, task_warnings
 from dynsim.engine.snake_start import STEADY_TICKS, WheelLifter
 from dynsim.engine.stepped import State
 from dynsim.errors import SimulationStopped
@@ -351,7 +351,7 @@ class SnakePilot(SnakeControl):
         add_task(record, self, trace, w, np.array(points))
         if self.grip is not None:
             self._add_grip(record)
-        summary = {**record.summary, **task_summary(self, record)}
+        summary = {**record.summary, **task_summary(self, record), **effort(record.summary)}
         record.summary = {**summary, "warnings": [*summary["warnings"], *task_warnings(self, record, summary)]}
 
     def _add_grip(self, record: Record) -> None:

@@ -164,6 +164,16 @@ def task_summary(run: SnakeControl, record: Record) -> dict[str, Any]:
     }
 
 
+def effort(summary: dict[str, Any]) -> dict[str, Any]:
+    """What a battery gives for a dynamic run, and the servo whose rms torque is the largest part of its rating."""
+    rated = {k: m.get("nominal_torque_N_m", m.get("stall_torque_N_m")) for k, m in enumerate(summary["motors"])}
+    share = {k: summary["motors"][k]["torque_rms_N_m"] / rating for k, rating in rated.items() if rating}
+    return {
+        "battery_energy_Wh": summary["electrical_energy_supply_J"] / 3600.0,
+        **({"worst_joint": summary["motors"][max(share, key=lambda k: share[k])]} if share else {}),
+    }
+
+
 def task_warnings(run: SnakeControl, record: Record, summary: dict[str, Any]) -> list[str]:
     """What a user should know of the control, a line each."""
     warnings = []

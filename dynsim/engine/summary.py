@@ -20,7 +20,7 @@ from dynsim.engine.warnings import warnings_of
 from dynsim.integrators import run as ki
 from dynsim.integrators.stepping import tables as kt
 from dynsim.model.description import Array, Contact, Robot
-from dynsim.model.drives import Drive, TorqueSource
+from dynsim.model.drives import Drive, Servo, TorqueSource
 from dynsim.record import Record
 from dynsim.record.measures import (
     RESIDUAL_LIMIT,
@@ -307,7 +307,7 @@ def _time_stepping(run: ki.Run, springs: bool) -> dict[str, Any]:
 
 
 def motor_loads(record: Record, robot: Robot) -> list[dict[str, Any]]:
-    """Of each motor the root mean square and the largest current and torque at the shaft, and its ratings.
+    """Of each motor the root mean square and the largest current and torque at the shaft, ratings, a servo's friction.
 
     Over the whole run, by trapezoids between the samples; a rating that is not known is left out.
     """
@@ -338,11 +338,14 @@ def _ratings(motor: Drive, torque: str) -> dict[str, float]:
     """Ratings by key, infinite where they are not known."""
     if isinstance(motor, TorqueSource):
         return {torque: motor.nominal_torque}
-    return {
+    ratings = {
         "nominal_current_A": motor.nominal_current,
         "peak_current_A": motor.greatest_current,
         torque: motor.nominal_torque,
     }
+    if isinstance(motor, Servo):
+        ratings |= {"stall_torque_N_m": motor.stall_torque, "gear_friction_N_m": motor.coulomb_friction}
+    return ratings
 
 
 def _rms(time: Array, values: Array) -> Array:

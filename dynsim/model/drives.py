@@ -122,6 +122,11 @@ class Servo:
         """The lower of the limits of current and torque [A]."""
         return min(self.current_limit, self.torque_limit / self.torque_constant)
 
+    @property
+    def stall_torque(self) -> float:
+        """Of the motor at rest, at the limit of its voltage or current, without the friction of the gear [N m]."""
+        return self.torque_constant * min(self.voltage_limit / self.resistance, self.greatest_current)
+
 
 @dataclass(frozen=True)
 class TorqueSource:

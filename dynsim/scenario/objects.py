@@ -28,6 +28,8 @@ from dynsim.model.drives import Drive
 from dynsim.model.joints.ball import floating
 from dynsim.record.scene import HERE, Shape, quaternion
 
+# Of wood, so that no object is taken for a part of the robot.
+COLOUR = (0.91, 0.81, 0.65, 1.0)
 Edges = Annotated[list[Positive], Field(min_length=3, max_length=3)]
 
 
@@ -149,9 +151,11 @@ class Solid(StrictConfig):
     def solid(self) -> Shape:
         """What it looks like."""
         if self.size_m is not None:
-            return Shape("box", tuple(self.size_m))
+            return Shape("box", tuple(self.size_m), colour=COLOUR)
         radius = float(self.radius_m or 0.0)
-        return Shape("sphere", (radius,)) if self.length_m is None else Shape("cylinder", (radius, self.length_m))
+        if self.length_m is None:
+            return Shape("sphere", (radius,), colour=COLOUR)
+        return Shape("cylinder", (radius, self.length_m), colour=COLOUR)
 
     @property
     def spheres(self) -> tuple[Array, float]:

@@ -202,6 +202,31 @@ def test_a_snake_has_fingers_that_close(robots: dict[str, Record]) -> None:
         assert stems == count * [0.5 * ahead]
 
 
+def test_the_state_of_a_gripper_is_told_and_closes_its_fingers(robots: dict[str, Record]) -> None:
+    """By the state, where the record has one: what is told to open is closed until it is soft."""
+    snake = robots["snake"]
+    film = Film({"one": snake}, view="top", plot="", size=(640, 480))
+    robot, camera = film.painters["one"].robot, film.painters["one"].camera
+    seen = {}
+    for state in range(4):
+        record = Record(snake.time[:1], provenance=snake.provenance)
+        for name in (POSITION, ORIENTATION, "grounded"):
+            record.add(name, snake[name][:1], snake.units[name], labels=snake.labels[name])
+        record.add("gripper", np.zeros(1), "1")
+        record.add("gripper_state", np.array([state]), "1")
+        record.scene = snake.scene
+        painter = Painter(replace(robot, record=record), camera, (640, 480), (np.zeros(3), np.ones(3)), tint=MARK)
+        seen[state] = np.asarray(painter.frame(0.0)).astype(int)
+    # Words in the upper left corner, other ones for each state.
+    words = [image[:24, :200] for image in seen.values()]
+    assert all((words[a] != words[b]).any() for a in range(4) for b in range(a))
+    # Below them only the fingers differ: of the soft one.
+    rest = [image[40:] for image in seen.values()]
+    assert (rest[0] != rest[1]).any()
+    assert (rest[1] == rest[2]).all()
+    assert (rest[2] == rest[3]).all()
+
+
 def test_labels_lie_on_paper_beside_each_other_and_within_the_picture() -> None:
     """Each sign is seen: no two overlap, though all are wanted at one place, on an image that has their colour."""
     image = Image.new("RGB", (300, 200), "#D55E00")

@@ -5,17 +5,18 @@ import csv
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgba
 from PIL import Image
 
 import dynsim
 from dynsim.draw.figures import snake as figures
-from dynsim.draw.figures import snake_view, style, tanaka2019
+from dynsim.draw.figures import snake_tasks, snake_view, style, tanaka2019
 from dynsim.engine import simulate
 from dynsim.errors import RecordError
 from dynsim.record import Record
 from dynsim.scenario import load_scenario
 from dynsim.snake.geometry import snake_geometry
-from dynsim.snake.published import TABLE_III, table_iii, tables
+from dynsim.snake.published import TABLE_III, opening, table_iii, tables
 
 pytestmark = pytest.mark.long
 
@@ -250,3 +251,125 @@ def test_variants_that_the_paper_does_not_have_get_no_tables(record):
     assert tables("snake_joint_limits", {"a": record}) == {}
     assert tables("snake_positioning", {"a": record}) == {}
     assert tables("mine", {"cyclic": record}) == {}
+
+
+TASK = {"servos", "gripper", "object"}
+KINEMATIC = {"plant.level": "kinematic", "record.rate_hz": 50}
+
+
+def drawn(maker, record):
+    """A figure after its layout, with all its legends in it."""
+    with style.look():
+        figure = maker(record)
+        figure.draw_without_rendering()
+    for legend in filter(None, [*figure.legends, *(axis.get_legend() for axis in figure.axes)]):
+        box = legend.get_window_extent()
+        assert 0.0 <= box.x0 < box.x1 <= figure.bbox.x1
+        assert 0.0 <= box.y0 < box.y1 <= figure.bbox.y1
+    return figure
+
+
+def lines(axis):
+    return {line.get_label(): line for line in axis.lines}
+
+
+def test_servos_beside_their_limits(simulated):
+    record = simulated("snake_valve", "turns")
+    assert set(figures.figures(record)) >= TASK
+    figure = drawn(snake_tasks.servos, record)
+    assert len(figure.axes) == 2  # joints and wheels
+    for axis, (stall, friction) in zip(figure.axes, ((8.4, 0.8), (2.5, 0.0)), strict=True):
+        by_name = lines(axis)
+        np.testing.assert_allclose(by_name[f"± stall torque {stall:g} N m"].get_ydata(), stall)
+        assert any("friction of the gear" in text.get_text() for text in axis.get_legend().texts) == (friction > 0.0)
+        assert axis.get_ylim()[0] < -stall < stall < axis.get_ylim()[1]
+    worst = record.summary["worst_joint"]
+    (line,) = [line for name, line in lines(figure.axes[0]).items() if name.startswith("ψ2: rms")]
+    assert worst["joint"] == "psi2"
+    assert line.get_label() == f"ψ2: rms {worst['torque_rms_N_m']:.2f} N m"
+    np.testing.assert_array_equal(line.get_ydata(), record["torque"][:, record.labels["torque"].index("psi2")])
+
+
+def test_the_gripper_with_its_bounds_states_and_events(simulated):
+    record = simulated("snake_valve", "turns")
+    figure = drawn(snake_tasks.gripper, record)
+    distance, force, torque = figure.axes
+    np.testing.assert_array_equal(lines(distance)["distance"].get_ydata(), 1e3 * record["grasp_distance"])
+    np.testing.assert_allclose(lines(distance)["captures within 15 mm"].get_ydata(), 15.0)
+    # On the object: against the tie's force on its first body, the gripper. The valve's friction is 0.3 N m.
+    about_x = lines(torque)["about x"].get_ydata()
+    np.testing.assert_array_equal(about_x, -record["tie_force"][:, 3])
+    assert about_x[record.time.searchsorted(13.0)] == pytest.approx(0.3, abs=0.01)
+    np.testing.assert_allclose(lines(force)["± bound 20 N"].get_ydata(), 20.0)
+    np.testing.assert_allclose(lines(torque)["± bound 0.8 N m"].get_ydata(), 0.8)
+    shown = {name: float(lines(force)[f"_{name}"].get_xdata()[0]) for name in ("captures", "releases")}
+    assert shown == {"captures": 7.0, "releases": pytest.approx(18.5, abs=0.01)}
+    (legend,) = figure.legends
+    expected = ["hardening", "hardened", "softening", "captures", "releases"]
+    assert [text.get_text() for text in legend.texts] == expected
+    bands = {band.get_label(): band.get_datalim(force.transData).x1 for band in force.collections}
+    assert bands["_hardening"] == pytest.approx(8.0, abs=0.02)
+
+
+def test_the_valve_beside_the_head_that_turns_it(simulated):
+    record = simulated("snake_valve", "turns")
+    angle, load = drawn(snake_tasks.objects, record).axes
+    turned = np.rad2deg(record["q"][:, record.labels["q"].index("valve")])
+    (valve,) = [line for name, line in lines(angle).items() if name.startswith("valve: ")]
+    np.testing.assert_array_equal(valve.get_ydata(), turned)
+    target = lines(angle)["its target"]
+    assert target.get_xdata()[[0, -1]] == pytest.approx([7.0, 18.495], abs=0.01)
+    assert target.get_ydata()[[0, -1]] == pytest.approx([0.0, 90.0], abs=0.1)
+    friction = record["joint_friction"][:, record.labels["joint_friction"].index("valve")]
+    np.testing.assert_array_equal(lines(load)["friction"].get_ydata(), friction)
+
+
+@pytest.mark.parametrize(
+    ("name", "variant", "angle", "point"),
+    [
+        ("snake_valve", "turns", 90.0, "gripper"),
+        ("snake_valve", "turns", 90.0, "head"),
+        ("snake_door", "push", 60.0, "gripper"),
+    ],
+)
+def test_kinematic_objects_turn_with_the_gripper(name, variant, angle, point):
+    """Without a spring between them; whatever point of the head is controlled."""
+    record = simulate(load_scenario(name, variant, {**KINEMATIC, "plant.controlled_point": point}))
+    assert set(figures.figures(record)) & TASK == {"gripper", "object"}
+    (only,) = drawn(snake_tasks.objects, record).axes
+    own = only.lines[0]
+    gripper = lines(only)["gripper"]
+    rows = np.isin(own.get_xdata(), gripper.get_xdata())
+    assert gripper.get_ydata()[-1] == pytest.approx(angle, abs=0.01)
+    np.testing.assert_allclose(gripper.get_ydata(), own.get_ydata()[rows], rtol=0, atol=0.02)
+    (distance,) = drawn(snake_tasks.gripper, record).axes
+    assert "captures" not in lines(distance)
+    assert len([line for line in distance.lines if line.get_label() == "_captures"]) == 1
+
+
+def test_the_pipe_is_drawn_and_rises(simulated):
+    record = simulated("snake_pick_up", "lifts")
+    makers = figures.figures(record)
+    height, ground = drawn(makers["object"], record).axes
+    (pipe,) = [line for name, line in lines(height).items() if name.startswith("pipe: rises by")]
+    assert np.ptp(pipe.get_ydata()) == pytest.approx(160.0, abs=5.0)
+    weight = 0.2 * 9.81
+    rows = record.time.searchsorted([10.0, 25.0])
+    assert lines(ground)["pipe"].get_ydata()[rows] == pytest.approx([weight, 0.0], abs=0.01)
+    strip = drawn(makers["fig_13"], record)
+    assert "object" in [text.get_text() for text in strip.legends[0].texts]
+    wood = [patch for axis in strip.axes for patch in axis.patches if patch.get_facecolor() == to_rgba("#E9CFA6")]
+    assert len(wood) == 2 * len(strip.axes)  # run and branch
+
+
+@pytest.mark.usefixtures("unwritten")
+def test_figure_14_with_a_door(tmp_path):
+    records = {"pull_switching": simulate(load_scenario("snake_door", "pull_switching", KINEMATIC))}
+    written = figures.draw_comparison(records, tmp_path)
+    assert {"door.csv", "fig_14.png"} <= {path.name for path in written}
+    # The head turns with the door.
+    heading = np.rad2deg(records["pull_switching"]["w"][:, 5])
+    np.testing.assert_allclose(opening(records["pull_switching"]), np.abs(heading - heading[0]), rtol=0, atol=0.02)
+    figure = tanaka2019.door(records["pull_switching"])
+    assert "object" in [text.get_text() for text in figure.legends[0].texts]
+    plt.close(figure)

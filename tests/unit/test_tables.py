@@ -84,6 +84,20 @@ def test_zeros_print_as_zeros() -> None:
     assert numbers == ["arm", "0", "0", "3e-10", "0", "0", "0", "0.00", "0.00", "0"]
 
 
+def test_battery_and_worst_joint_have_rows() -> None:
+    worst = {"joint": "psi2", "torque_rms_N_m": 3.172, "nominal_torque_N_m": 1.68, "stall_torque_N_m": 8.4}
+    summary = {"scenario": "one", "variant": "", "battery_energy_Wh": 0.082754, "worst_joint": worst}
+    text = shown({"one": summary})
+    assert re.search(r"battery energy \[Wh\] +0\.0828\b", text)
+    assert re.search(r"worst joint, rms torque \[N m\] +psi2 3\.17 of 1\.68\b", text)
+    unrated = {**summary, "worst_joint": {key: worst[key] for key in worst if key != "nominal_torque_N_m"}}
+    some = {"one": summary, "other": unrated, "none": {**summary, "worst_joint": None}}
+    for width in (60, 80, 200):
+        assert {"psi2 3.17 of 1.68", "psi2 3.17 of 8.4"} <= set(
+            re.findall(r"psi2 [\d.]+ of [\d.]+", shown(some, width))
+        )
+
+
 def test_coordinates_that_are_rounding_of_zero_are_zero() -> None:
     output = io.StringIO()
     console = Terminal(file=output, emoji=False)

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from dynsim import load_scenario, simulate
+from dynsim.engine.snake_record import effort
 from dynsim.errors import ScenarioError
+from dynsim.model.drives import Servo
 
 ARM = """
 duration_s: 1
@@ -89,3 +93,36 @@ def test_rms_stands_beside_nominal_and_is_warned_of(arm):
 def test_a_peak_below_nominal_is_refused(arm):
     with pytest.raises(ScenarioError, match=r"peak_current_A = 5: is less than nominal_current_A = 6"):
         load_scenario(arm, overrides={"plant.link.motor.peak_current_A": 5})
+
+
+def test_battery_and_worst_joint_of_a_snake():
+    """A fifth of the stall torque is what ROBOTIS lets a servo hold for long: ψ2 under the raised head holds more."""
+    summary = simulate(load_scenario("snake_positioning_dynamic", "x", {"duration_s": 0.5})).summary
+    assert summary["battery_energy_Wh"] == pytest.approx(summary["electrical_energy_supply_J"] / 3600.0, rel=1e-15)
+    worst = summary["worst_joint"]
+    assert worst == max(summary["motors"], key=lambda motor: motor["torque_rms_N_m"] / motor["nominal_torque_N_m"])
+    assert worst["joint"] == "psi2"
+    expected = {"nominal_torque_N_m": 1.68, "stall_torque_N_m": 8.4, "gear_friction_N_m": 0.8}
+    assert {key: worst[key] for key in expected} == pytest.approx(expected)
+    (warned,) = [text for text in summary["warnings"] if "rms over the run" in text]
+    assert warned.startswith(f"psi2 {worst['torque_rms_N_m']:.3g} of 1.68 N m")
+
+
+def test_the_worst_joint_is_that_of_the_largest_part_of_its_rating():
+    """Nominal torque counts before stall torque; what is rated by neither does not."""
+    motors = [
+        {"joint": "strong", "torque_rms_N_m": 3.0, "stall_torque_N_m": 10.0},
+        {"joint": "weak", "torque_rms_N_m": 1.0, "stall_torque_N_m": 10.0, "nominal_torque_N_m": 2.0},
+        {"joint": "unknown", "torque_rms_N_m": 9.0},
+    ]
+    found = effort({"electrical_energy_supply_J": 7200.0, "motors": motors})
+    assert found == {"battery_energy_Wh": 2.0, "worst_joint": motors[1]}
+    assert "worst_joint" not in effort({"electrical_energy_supply_J": 0.0, "motors": motors[2:]})
+
+
+def test_stall_torque_is_at_the_lower_limit_of_voltage_and_current():
+    """K U / R = 2 · 12 / 3, or K I."""
+    servo = Servo("joint", torque_constant=2.0, resistance=3.0, k_p=1.0, voltage_limit=12.0)
+    assert servo.stall_torque == pytest.approx(8.0)
+    assert replace(servo, current_limit=3.0).stall_torque == pytest.approx(6.0)
+    assert replace(servo, torque_limit=5.0).stall_torque == pytest.approx(5.0)

@@ -239,6 +239,19 @@ def test_wheels_and_support_of_a_snake(snake: Record, opened: Opens) -> None:
         assert shown["gripper"] == snake["gripper"][row]
 
 
+def test_the_state_of_a_gripper_in_words(snake: Record, opened: Opens) -> None:
+    states = Record(snake.time, provenance=snake.provenance)
+    for name, signal in snake.signals.items():
+        states.add(name, signal.data, signal.unit, labels=signal.labels)
+    states.add("gripper_state", np.arange(len(snake)) * 4 // len(snake), "1")
+    states.scene = snake.scene
+    page = opened({"one": states})
+    for part, state in enumerate(("soft", "hardening", "hardened", "softening")):
+        (shown,) = page.seek(float(snake.time[(2 * part + 1) * len(snake) // 8]))["records"]
+        assert shown["gripper"] == part
+        assert f"gripper: {state}" in page.page.locator("#status").inner_text()
+
+
 def test_centre_of_pressure_of_a_mobile_base(mobile: Record, opened: Opens) -> None:
     page = opened({"one": mobile})
     (shown,) = page.seek(0.5)["records"]

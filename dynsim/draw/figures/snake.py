@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from dynsim.draw import film
-from dynsim.draw.figures import style, tanaka2019
+from dynsim.draw.figures import snake_tasks, style, tanaka2019
 from dynsim.draw.figures.snake_view import (
     BODY,
     GROUND,
@@ -69,6 +69,7 @@ def figures(record: Record) -> dict[str, Callable[[Record], Figure]]:
         "tracking": tracking,
         "joints": joints,
         "redundancy": redundancy,
+        **snake_tasks.makers(record),
         **tanaka2019.figures_of_run(record),
     }
 

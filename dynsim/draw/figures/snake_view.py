@@ -20,9 +20,11 @@ from dynsim.draw.geometry.shapes import corners_of, outline
 from dynsim.draw.geometry.wheels import wheel_groups
 from dynsim.errors import RecordError
 from dynsim.record import Record
+from dynsim.record.poses import POSITION
 from dynsim.snake.geometry import snake_geometry
 
 BODY, HEAD, GROUND, LIFT, TARGET, SUPPORT = "#444444", style.PULLING, style.BLUE, "#FFFFFF", style.GREEN, style.SKY
+OBJECT = "#E9CFA6"
 SYMBOLS = {"alpha": "α", "beta": "β", "gamma": "γ"}
 # Most modes whose numbers fit above the bars of a chart.
 NUMBERED = 30
@@ -34,6 +36,13 @@ SHARES = LinearSegmentedColormap.from_list("shares", [LIFT, GROUND])
 LEAST_HEIGHT = 0.3
 # Font size of the numbers at the vertical axes of postures [point].
 SMALL = 6.5
+
+
+def object_bodies(record: Record) -> dict[str, int]:
+    """Bodies of the objects beside the robot that a record has the poses of, by their names."""
+    names = record.provenance.get("scenario", {}).get("objects") or {}
+    bodies = () if record.scene is None or POSITION not in record else record.scene.bodies
+    return {body.name: k for k, body in enumerate(bodies) if body.name in names}
 
 
 class View:
@@ -52,6 +61,8 @@ class View:
         # Corners of the wheels of each pair.
         pairs = wheel_groups(record, scene).places
         self.wheels = [[corners_of(record, scene, body, row)[shape][0] for body, shape in pair] for pair in pairs]
+        solids = [corners_of(record, scene, body, row) for body in object_bodies(record).values()]
+        self.objects = [corners for shapes in solids for corners, _ in shapes]
         x, y, yaw = record["base_pose"][row]
         self.plane = SidePlane(np.array([x, y, 0.0]), np.array([np.cos(yaw), np.sin(yaw), 0.0]))
 
@@ -62,10 +73,12 @@ class View:
     def extent(self, above: bool) -> Array:
         """Everything that a view must show, (k, 2)."""
         wheels = [corners for pair in self.wheels for corners in pair]
-        return self.project(np.concatenate([self.points, *wheels]), above)
+        return self.project(np.concatenate([self.points, *wheels, *self.objects]), above)
 
     def draw(self, axes: Axes, above: bool) -> None:
-        """The body, the controlled point and the wheels; from above with the support and the centre of mass."""
+        """Objects, body, controlled point and wheels; from above with the support and the centre of mass."""
+        for corners in self.objects:
+            axes.add_patch(Polygon(outline(self.project(corners, above)), fc=OBJECT, ec=BODY, lw=0.5, zorder=1.5))
         if above:
             stands = [corners.mean(axis=0)[:2] for k in np.flatnonzero(self.grounded) for corners in self.wheels[k]]
             axes.add_patch(Polygon(outline(np.array(stands)), color=SUPPORT, alpha=0.25, lw=0, zorder=1))
@@ -124,7 +137,7 @@ def posture_grid(title: str, lines: Mapping[str, Sequence[tuple[View, str]]], on
     for axis in axes[-1]:
         axis.set_xlabel("x [m]")
     figure.supylabel("y [m]", fontsize=8)
-    figure.legend(handles=legend(), loc="outside lower center", ncols=6)
+    _explain(figure, [view for line in lines.values() for view, _ in line])
     return figure
 
 
@@ -135,7 +148,7 @@ def posture_strip(title: str, line: Sequence[tuple[View, str]]) -> Figure:
     side = limits([view.extent(above=False) for view in views], 0.08)
     tall, low = top[3] - top[2], side[3] - side[2]
     column = 9.0 / len(views)
-    height = column * (tall / (top[1] - top[0]) + low / (side[1] - side[0])) + 1.4
+    height = column * (tall / (top[1] - top[0]) + low / (side[1] - side[0])) + 2.1
     figure = style.new_figure(max(height, 2.9), title, width=9.0)
     axes = figure.subplots(2, len(views), squeeze=False, height_ratios=[tall, max(low, 0.35 * tall)])
     for (view, text), above, below in zip(line, *axes, strict=True):
@@ -154,7 +167,7 @@ def posture_strip(title: str, line: Sequence[tuple[View, str]]) -> Figure:
     for above, below in axes.T:
         above.set_xlabel("x [m]")
         below.set_xlabel("along heading [m]")
-    figure.legend(handles=legend(), loc="outside lower center", ncols=6)
+    _explain(figure, views)
     return figure
 
 
@@ -254,9 +267,9 @@ def greek(name: str) -> str:
     return name.replace("theta", "θ").replace("psi", "ψ")
 
 
-def legend() -> list[Any]:
-    """Handles for what a view shows."""
-    return [
+def _explain(figure: Figure, views: Sequence[View]) -> None:
+    """Below a figure: what its views show."""
+    handles: list[Any] = [
         Line2D([], [], color=HEAD, marker="o", ls="", ms=4, label="controlled point"),
         Line2D([], [], color=BODY, lw=1.8, label="body"),
         Patch(facecolor=GROUND, edgecolor=GROUND, label="wheel on the ground"),
@@ -264,3 +277,6 @@ def legend() -> list[Any]:
         Patch(facecolor=SUPPORT, alpha=0.25, label="support polygon"),
         Line2D([], [], color="black", marker="x", ls="", ms=4, label="centre of mass"),
     ]
+    if any(view.objects for view in views):
+        handles.append(Patch(facecolor=OBJECT, edgecolor=BODY, lw=0.5, label="object"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))

@@ -31,18 +31,22 @@ from dynsim.record import Record
 from dynsim.snake.geometry import snake_geometry
 from dynsim.snake.published import (
     COORDINATES,
+    DOORS,
     HEAD_ERROR,
     POLICIES,
     SOURCES,
     TABLE_III,
     displacement,
     mode_sequence,
+    opening,
     tables,
     used_limit,
 )
 from dynsim.system.files import write_text
 
 STOPPED = "joint at its limit"
+# Scenarios of Fig 13: the motion alone, and with a pipe.
+PICK_UPS = ("snake_operator", "snake_pick_up")
 
 Maker = Callable[[Mapping[str, Record]], Figure]
 
@@ -65,14 +69,14 @@ def figures(scenario: str, records: Mapping[str, Record]) -> dict[str, Maker]:
             makers["fig_8_and_16"] = motion
         if set(POLICIES) <= set(records):
             makers["policies"] = policies
-    if scenario == "snake_door_arc" and "pull_switching" in records:
+    if scenario in DOORS and "pull_switching" in records:
         makers["fig_14"] = lambda r: door(r["pull_switching"])
     return makers
 
 
 def figures_of_run(record: Record) -> dict[str, Callable[[Record], Figure]]:
     """Makers of the figures beside [T] that one run is enough for."""
-    return {"fig_13": picking_up} if record.summary["scenario"] == "snake_operator" and record["gripper"].any() else {}
+    return {"fig_13": picking_up} if record.summary["scenario"] in PICK_UPS and record["gripper"].any() else {}
 
 
 def write_tables(scenario: str, records: Mapping[str, Record], folder: Path) -> list[Path]:
@@ -299,7 +303,7 @@ def door(record: Record) -> Figure:
         view = _view_at(record, time)
         if caption == STOPPED:
             view = View(record, max(view.row - 1, 0))  # before the change that ends the stop
-        opened = abs(np.rad2deg(record["w"][view.row, 5] - record["w"][0, 5]))
+        opened = opening(record)[view.row]
         titled.append((view, f"({'abcdefghijklmnop'[k]}) {caption}\n{view.time:.1f} s, {opened:.1f}°"))
     lines = {" " * start: titled[start : start + 3] for start in range(0, len(titled), 3)}
     title = style.title(record, "the door and its angle, as in Fig 14 of [T]; green: arc of the knob")
@@ -307,7 +311,7 @@ def door(record: Record) -> Figure:
 
 
 def picking_up(record: Record) -> Figure:
-    """Fig 13: reaching, grasping, after picking up (there is no object in the simulation)."""
+    """Fig 13: reaching, grasping, after picking up; an object is in it where the scenario has one."""
     closed = np.flatnonzero(record["gripper"])
     height = record["w"][closed, 2]
     lifted = closed[np.argmax(height > height.max() - 1e-4)]  # the first time; later ones differ by rounding

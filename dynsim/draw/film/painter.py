@@ -20,10 +20,12 @@ from dynsim.draw.film.strokes import Box, arrow, dashes, font, labels, line, rin
 from dynsim.draw.geometry.camera import Camera
 from dynsim.draw.geometry.meshes import Meshes, simplified
 from dynsim.draw.geometry.robot import (
+    GRIPPER_STATES,
     DrawnContact,
     DrawnRobot,
     Penetration,
     contacts,
+    gripping,
     largest_force,
     paths,
     penetrations,
@@ -103,7 +105,8 @@ class Painter:
         self._wheels = wheel_groups(record, robot.scene)
         # The body that has a gripper.
         hand = robot.scene.hand
-        self._gripped = hand.body if hand is not None and "gripper" in record else WORLD
+        self._grip = gripping(record)
+        self._gripped = hand.body if hand is not None and self._grip is not None else WORLD
         self._solids = self._moving(shapes)
         self._contacts = contacts(robot)
         self._sunk = penetrations(record, robot.scene)
@@ -134,6 +137,7 @@ class Painter:
             forces = [self._paint_contact(draw, contact, position, turn, row, share) for contact in self._contacts]
             self._paint_hand(draw, position, turn)
             # Last, so that nothing lies over a sign.
+            self._tell_grip(draw, row)
             self.labels = labels(draw, [force for force in forces if force], self._font, image.size, PAPER)
         return image.reduce(FINER)
 
@@ -271,7 +275,8 @@ class Painter:
             return
         own = solids.corners
         if self._gripped != WORLD:
-            own = own + solids.aside[int(self.robot.record["gripper"][row] > 0)]
+            assert self._grip is not None
+            own = own + solids.aside[int(self._grip[row] > 0)]
         corners = position[solids.body] + rotated(turn[solids.body].T, own.T).T
         colour = solids.colour
         if self._wheels.down is not None:
@@ -385,6 +390,12 @@ class Painter:
         there = self.camera.project(at + (-long if pulls else long) / size * force)[:2]
         arrow(draw, *((there, here) if pulls else (here, there)), colour, width)
         return np.asarray(there)
+
+    def _tell_grip(self, draw: ImageDraw.ImageDraw, row: int) -> None:
+        """The state of a gripper in words, below the title, where the record knows it."""
+        if "gripper_state" in self.robot.record:
+            text = f"gripper: {GRIPPER_STATES[int(self.robot.record['gripper_state'][row])]}"
+            draw.text((10 * FINER, (24 if self.title else 8) * FINER), text, fill=HUB, font=self._font)
 
     def _paint_hand(self, draw: ImageDraw.ImageDraw, position: Array, turn: Array) -> None:
         hand = self.robot.scene.hand

@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 POSE_ERROR = 4e-5
 # Most frames; longer runs have fewer frames than POSE_ERROR needs.
 FRAMES = 20_000
+# States of a gripper by their numbers in records of runs with objects that it can hold.
+GRIPPER_STATES = ("soft", "hardening", "hardened", "softening")
 WORLD_AXES = np.eye(3)
 HERE_POINT: Vector3 = (0.0, 0.0, 0.0)
 
@@ -46,6 +48,11 @@ class DrawnRobot:
     scene: Scene
     rows: NDArray[np.intp]
     reach: float
+
+
+def gripping(record: Record) -> Array | None:
+    """State of the gripper, (T,): its number, without one 1 where it is closed; None without a gripper."""
+    return next((record[name] for name in ("gripper_state", "gripper") if name in record), None)
 
 
 def placed(record: Record) -> tuple[Scene | None, str]:

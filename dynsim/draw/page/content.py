@@ -13,11 +13,13 @@ from dynsim._version import __version__
 from dynsim.draw.geometry.camera import view_axes
 from dynsim.draw.geometry.meshes import Meshes, named, simplified
 from dynsim.draw.geometry.robot import (
+    GRIPPER_STATES,
     POSE_ERROR,
     DrawnRobot,
     azimuth,
     bounds,
     contacts,
+    gripping,
     paths,
     penetrations,
     robot_of,
@@ -116,9 +118,11 @@ def _record(name: str, robot: DrawnRobot, blocks: Blocks, meshes: Meshes, low: A
     }
     if (pressure := cop_of(record)) is not None:
         part["pressure"] = {"name": pressure[0], "at": blocks.add(pressure[1][rows], 1e-4)}
-    if "gripper" in record and scene.hand is not None:
-        part["gripper"] = blocks.add(record["gripper"][rows])
+    if (grip := gripping(record)) is not None and scene.hand is not None:
+        part["gripper"] = blocks.add(grip[rows])
         part["fingers"] = gripper(shapes, robot.reach)
+        if "gripper_state" in record:
+            part["states"] = list(GRIPPER_STATES)
     if scene.hand is not None:
         part["hand"] = {"body": scene.hand.body, "p": list(scene.hand.position), "name": scene.hand.name}
     part["signals"], part["axes"] = _signals(record, blocks)

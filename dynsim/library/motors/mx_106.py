@@ -2,7 +2,8 @@
 
 Data sheet (emanual.robotis.com, MX-106R): stall torque 8.4 N m at 12 V and 5.2 A, no-load speed 45 rpm, gear 225 : 1,
 153 g. With these K_m = U / ω_0 = 2.55 V s/rad and R = 3.64 Ω, so that this motor stalls at 3.3 A: the current of the
-data sheet is 1.58 times as much, and electrical energies come out too small by as much.
+data sheet is 1.58 times as much, and electrical energies come out too small by as much. Nominal torque: a fifth of the
+stall torque, as ROBOTIS estimates the continuous torque (robotis.us, Torque Ratings, 2020).
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ class Config(ServoParameters):
     voltage_V: Positive = 12.0
     stall_torque_N_m: Positive = 8.4
     no_load_speed_rad_per_s: Positive = 4.71
+    nominal_torque_N_m: Positive | None = 1.68
     k_p_V_per_rad: NonNegative = Field(
         default=58.6, description="41 N m/rad, with which the sag of T2 Snake-3 comes out as measured"
     )

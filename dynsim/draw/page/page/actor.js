@@ -1,7 +1,8 @@
 "use strict";
 // One robot in the scene. What it shows at an instant is a sample: from the tables of a record, or from a live frame.
 //   {time, poses: [x, y, z, w, x, y, z for each body], contacts: [{force, normal, tangent, mode}], wheels: [1 or 0],
-//    depths: [m] of data.sunk, pressure: [x, y] or null, gripper: 1, 0 or null}
+//    depths: [m] of data.sunk, pressure: [x, y] or null, gripper: number of its
+//    state, 0 where it is open, or null}
 
 class Actor {
   constructor(data, bytes, meshes, index) {

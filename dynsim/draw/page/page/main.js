@@ -290,6 +290,8 @@ class App {
     for (const [actor] of pairs) {
       const parts = actor.contacts.map(({ state }) => state.force === null || state.state === "open" ? `${state.name}: open`
         : `${state.name}: ${D.number(state.force, 3)} N, ${state.state}`);
+      // A live gripper is only known to be closed or open.
+      if (actor.data.states && !actor.live) parts.unshift(`gripper: ${actor.data.states[actor.shown.gripper]}`);
       actor.saturated = this.saturated(actor);
       actor.mark(actor.saturated);
       if (actor.saturated.length) parts.push(`voltage limit: ${actor.saturated.map((name) => this.plots.called(name)).join(", ")}`);

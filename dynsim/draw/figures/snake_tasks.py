@@ -1,0 +1,270 @@
+"""Figures of a snake at work: torques of its servos, how its gripper holds, and how objects move."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from dynsim.draw.figures import style
+from dynsim.draw.figures.snake_view import BODY, HEAD, TARGET, greek, object_bodies
+from dynsim.draw.figures.style import Array
+from dynsim.draw.geometry.robot import GRIPPER_STATES
+from dynsim.record import Record
+from dynsim.record.poses import ORIENTATION, POSITION
+from dynsim.record.quaternion import continuous, of_turn, product, rotated
+
+# Servos with lines in colours of their own, those of the largest rms torque; most objects in a figure.
+LOADED, OBJECTS = 4, 4
+FAINT = "#B0B0B0"
+# States of the gripper: colours of the bands behind curves.
+STATES = dict(zip(GRIPPER_STATES, ("#FFFFFF", "#FDEFD3", "#E1F3EC", "#FAE6F0"), strict=True))
+# Events of the gripper: how lines at them are drawn.
+EVENTS = {"captures": (0, (5, 2)), "slips": (0, (1, 1)), "loses": "-", "releases": (0, (5, 2, 1, 2))}
+# Least distance that is told from none [mm].
+LEAST = 0.1
+# Nearer to the axis of a hinge than this, the gripper tells its angle by its own turning [m].
+ON_AXIS = 0.01
+LEGEND: dict[str, Any] = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5)}
+
+
+def makers(record: Record) -> dict[str, Callable[[Record], Figure]]:
+    """Makers of these figures by file name, as far as the record has what they show."""
+    made: dict[str, Callable[[Record], Figure]] = {}
+    if any("stall_torque_N_m" in motor for motor in record.summary.get("motors", ())):
+        made["servos"] = servos
+    if "gripper_state" in record:
+        made["gripper"] = gripper
+    if object_bodies(record):
+        made["object"] = objects
+    return made
+
+
+def servos(record: Record) -> Figure:
+    """Shaft torques beside stall torque, nominal torque and gear friction; servos of one kind share a panel."""
+    kinds: dict[tuple[float, ...], list[dict[str, Any]]] = {}
+    for motor in record.summary["motors"]:
+        if "stall_torque_N_m" in motor:
+            keys = ("stall_torque_N_m", "nominal_torque_N_m", "gear_friction_N_m")
+            kinds.setdefault(tuple(motor.get(key, 0.0) for key in keys), []).append(motor)
+    heights = [1.0 if k == 0 else 0.6 for k in range(len(kinds))]
+    figure = style.new_figure(0.9 + 3.4 * sum(heights), style.title(record, "torques of the servos and their limits"))
+    axes = figure.subplots(len(kinds), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
+    for axis, ((stall, nominal, friction), motors) in zip(axes, kinds.items(), strict=True):
+        order = sorted(motors, key=lambda motor: -motor["torque_rms_N_m"])
+        colours = dict(zip((m["joint"] for m in order), style.VARIANT_COLOURS[:LOADED], strict=False))
+        for k, motor in enumerate(order):
+            name = motor["joint"]
+            values = record["torque"][:, record.labels["torque"].index(name)]
+            label = f"{greek(name)}: rms {motor['torque_rms_N_m']:.2f} N m" if name in colours else None
+            # The most loaded ones on top.
+            look = {"color": colours.get(name, FAINT), "lw": 1.1 if name in colours else 0.6, "zorder": 3.0 - 0.01 * k}
+            axis.plot(record.time, values, label=label, **look)
+        if len(order) > LOADED:
+            axis.plot([], [], color=FAINT, lw=0.6, label=f"{len(order) - LOADED} others")
+        _both(axis, stall, f"stall torque {stall:g} N m", color=HEAD, ls="--", lw=0.9)
+        if nominal:
+            _both(axis, nominal, f"nominal, rms: {nominal:g} N m", color="black", ls=":", lw=0.9)
+        if friction:
+            label = f"friction of the gear {friction:g} N m:\nholds this without current"
+            axis.axhspan(-friction, friction, color=style.SKY, alpha=0.25, lw=0, zorder=0, label=label)
+        axis.set(xlim=(record.time[0], record.time[-1]), ylim=(-1.1 * stall, 1.1 * stall), ylabel="torque [N m]")
+        _legend(axis)
+    axes[-1].set_xlabel("t [s]")
+    return figure
+
+
+def gripper(record: Record) -> Figure:
+    """Distance to the grasp frame, and forces and torques on what the gripper holds with their bounds."""
+    config = record.provenance["scenario"]["plant"].get("gripper", {})
+    forces = _held_forces(record)
+    rows = 1 if forces is None else 3
+    figure = style.new_figure(1.3 + 1.7 * rows, style.title(record, "the gripper"))
+    axes = figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
+    axes[0].plot(record.time, np.maximum(1e3 * record["grasp_distance"], LEAST), color=BODY, label="distance")
+    style.log_axis(axes[0])
+    axes[0].set_ylabel("to the nearest\ngrasp frame [mm]")
+    if (capture := config.get("capture_m")) is not None:
+        axes[0].axhline(1e3 * capture, color=HEAD, ls="--", lw=0.9, label=f"captures within {1e3 * capture:g} mm")
+    if forces is not None:
+        parts = (("force [N]", "N", "bound_N", ""), ("torque [N m]", "N m", "turning_bound_N_m", "about "))
+        for axis, values, (label, unit, key, about) in zip(axes[1:], np.split(forces, 2, axis=1), parts, strict=True):
+            for name, column in zip("xyz", values.T, strict=True):
+                axis.plot(record.time, column, color=style.AXIS_COLOURS[name], label=f"{about}{name}")
+            style.at_least(axis, 1e-3)
+            if (bound := config.get(key)) is not None:
+                _both(axis, bound, f"bound {bound:g} {unit}", color=HEAD, ls="--", lw=0.9)
+            axis.set_ylabel(label)
+    _finish(axes, record)
+    axes[-1].set_xlabel(
+        "t [s]" + ("" if forces is None else "      (of the gripper on what it holds; x: along the gripper)")
+    )
+    return figure
+
+
+def objects(record: Record) -> Figure:
+    """Angle or way of objects on joints beside the head's, and torque or force of the joint; height of free ones."""
+    bodies = object_bodies(record)
+    some = list(bodies)[:OBJECTS]
+    note = "" if len(some) == len(bodies) else f" ({len(some)} of {len(bodies)})"
+    panels = [panel for name in some for panel in _panels(record, name, bodies[name])]
+    subject = (f"the {some[0]}" if len(bodies) == 1 else "objects") + note
+    figure = style.new_figure(1.1 + 1.9 * len(panels), style.title(record, subject))
+    axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+    for axis, panel in zip(axes, panels, strict=True):
+        panel(axis)
+    _finish(axes, record)
+    axes[-1].set_xlabel("t [s]")
+    return figure
+
+
+def _panels(record: Record, name: str, body: int) -> list[Callable[[Axes], None]]:
+    """What is drawn of an object, a function for each row."""
+    assert record.scene is not None
+    kind = record.scene.bodies[body].joint.kind
+    if kind in ("revolute", "prismatic"):
+        loads = _joint_loads(record, name)
+        made: list[Callable[[Axes], None]] = [lambda axis: _moved(axis, record, name, body)]
+        return [*made, lambda axis: _loaded(axis, record, name, loads)] if loads else made
+    made = [lambda axis: _height(axis, record, name, body)]
+    ground = [
+        k for k, label in enumerate(record.labels.get("contact_normal_force", ())) if label.startswith(f"{name}.")
+    ]
+    return [*made, lambda axis: _standing(axis, record, name, ground)] if ground else made
+
+
+def _moved(axis: Axes, record: Record, name: str, body: int) -> None:
+    """Coordinate of an object on a hinge or on rails, and of the gripper about or along its axis in a hold."""
+    assert record.scene is not None
+    turns = record.scene.bodies[body].joint.kind == "revolute"
+    scale, unit = (180.0 / np.pi, "°") if turns else (1e3, "mm")
+    own = record["q"][:, record.labels["q"].index(name)]
+    last = f"{style.number(scale * own[-1], 3)}{'' if turns else ' '}{unit}"
+    axis.plot(record.time, scale * own, color="black", lw=2.4, label=f"{name}: {last}")
+    for start, end in _holds(record, name):
+        rows = slice(start, end)
+        drawn = (("w", "gripper", style.BLUE, "-"), ("w_target", "its target", TARGET, "--"))
+        for signal, label, colour, dashes in drawn:
+            along = own[start] + _followed(record, record[signal][rows], body)
+            axis.plot(record.time[rows], scale * along, color=colour, ls=dashes, lw=1.1, label=label)
+    style.at_least(axis, 1.0)
+    axis.set_ylabel(f"{'angle' if turns else 'way'} of {name} [{unit}]")
+
+
+def _followed(record: Record, w: Array, body: int) -> Array:
+    """How far poses of the controlled point have turned about, or gone along, the axis of a body's joint, (T,)."""
+    assert record.scene is not None
+    joint = record.scene.bodies[body].joint
+    axis = rotated(record[ORIENTATION][0, body].astype(float), np.array(joint.axis))
+    plant = record.provenance["scenario"]["plant"]
+    turn = product(product(of_turn([0, 0, 1], w[:, 5]), of_turn([0, 1, 0], w[:, 4])), of_turn([1, 0, 0], w[:, 3]))
+    ahead = 0.0 if plant.get("controlled_point") == "gripper" else plant.get("gripper_length_m", 0.0)
+    tip = w[:, :3] + ahead * rotated(turn, np.array([1.0, 0.0, 0.0])).T
+    if joint.kind == "prismatic":
+        return np.asarray((tip - tip[0]) @ axis)
+    arm = tip - record[POSITION][0, body]
+    arm = arm - np.outer(arm @ axis, axis)
+    if np.linalg.norm(arm[0]) < ON_AXIS:
+        q = continuous(product(turn, turn[:, :1] * np.array([1.0, -1.0, -1.0, -1.0])[:, None]))
+        return np.asarray(np.unwrap(2.0 * np.arctan2(axis @ q[1:], q[0])))
+    return np.asarray(np.unwrap(np.arctan2(np.cross(arm[0], arm) @ axis, arm @ arm[0])))
+
+
+def _joint_loads(record: Record, name: str) -> dict[str, Array]:
+    """Torques or forces that a hinge or rails exert on their object, by what exerts them."""
+    signals = (("friction", "joint_friction", name), ("spring", "tie_force", f"{name}.spring"))
+    return {
+        text: record[signal][:, record.labels[signal].index(label)]
+        for text, signal, label in signals
+        if signal in record and label in record.labels[signal]
+    }
+
+
+def _loaded(axis: Axes, record: Record, name: str, loads: dict[str, Array]) -> None:
+    hinge = record.provenance["scenario"]["objects"][name].get("hinge")
+    for (text, values), colour in zip(loads.items(), (style.ORANGE, style.PURPLE), strict=False):
+        axis.plot(record.time, values, color=colour, label=text)
+    style.at_least(axis, 1e-3)
+    axis.axhline(0.0, color=style.GREY, lw=0.6)
+    axis.set_ylabel(f"hinge on {name}\n[N m]" if hinge else f"rails on {name}\n[N]")
+
+
+def _height(axis: Axes, record: Record, name: str, body: int) -> None:
+    height = 1e3 * record[POSITION][:, body, 2].astype(float)
+    axis.plot(record.time, 1e3 * record["w_target"][:, 2], "--", color=TARGET, lw=1.0, label="target of the snake")
+    axis.plot(record.time, 1e3 * record["w"][:, 2], color=style.BLUE, lw=1.0, label="controlled point")
+    rise = style.number(round(float(height[-1] - height[0]), 1) + 0.0)
+    axis.plot(record.time, height, color="black", lw=1.4, label=f"{name}: rises by {rise} mm")
+    axis.set_ylabel("height [mm]")
+
+
+def _standing(axis: Axes, record: Record, name: str, columns: list[int]) -> None:
+    axis.plot(record.time, record["contact_normal_force"][:, columns].sum(axis=1), color=style.ORANGE, label=name)
+    axis.set_ylabel("surfaces carry [N]")
+    axis.set_ylim(bottom=0.0)
+
+
+def _held_forces(record: Record) -> Array | None:
+    """Forces x, y, z [N] and torques [N m] of the gripper on what it holds, (T, 6); None on the kinematic level."""
+    names = [name for name in record.labels.get("tie_force", ()) if name.startswith("gripper.")]
+    if not names:
+        return None
+    # It holds one object at a time. Ties tell the force on their first body, the gripper.
+    columns = [record.labels["tie_force"].index(name) for name in names]
+    return -record["tie_force"][:, columns].reshape(len(record), -1, 6).sum(axis=1)
+
+
+def _holds(record: Record, name: str) -> list[tuple[int, int]]:
+    """First row and the one after the last of each time in which the gripper holds an object."""
+    spans: list[tuple[int, int]] = []
+    for event in record.events:
+        if event.name != name or event.kind not in ("gripper captures", "gripper releases", "gripper loses"):
+            continue
+        row = int(np.searchsorted(record.time, event.time - 1e-9))
+        if event.kind == "gripper captures":
+            spans.append((row, len(record)))
+        else:
+            spans[-1] = (spans[-1][0], row)
+    return [span for span in spans if span[1] > span[0]]
+
+
+def _finish(axes: Array, record: Record) -> None:
+    """States of the gripper behind the curves, lines at its events, and legends."""
+    happened = {kind: [e.time for e in record.events if e.kind == f"gripper {kind}"] for kind in EVENTS}
+    for axis in axes:
+        axis.set_xlim(record.time[0], record.time[-1])
+        for state, (name, colour) in enumerate(STATES.items()):
+            if state > 0 and "gripper_state" in record and (where := record["gripper_state"] == state).any():
+                span: dict[str, Any] = {
+                    "transform": axis.get_xaxis_transform(),
+                    "color": colour,
+                    "lw": 0,
+                    "zorder": 0.2,
+                }
+                axis.fill_between(record.time, 0.0, 1.0, where=where, step="post", label=f"_{name}", **span)
+        for kind, times in happened.items():
+            for time in times:
+                axis.axvline(time, color="#555555", ls=EVENTS[kind], lw=0.8, label=f"_{kind}")
+        _legend(axis)
+    # Once for all panels, below.
+    named = {h.get_label(): h for h in (*axes[0].collections, *axes[0].lines) if str(h.get_label()).startswith("_")}
+    texts = [*STATES, *EVENTS]
+    shown = {text: named[f"_{text}"] for text in texts if f"_{text}" in named}
+    if shown:
+        axes[0].figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=len(shown))
+
+
+def _both(axis: Axes, value: float, label: str, **look: Any) -> None:
+    """Lines at plus and minus a value."""
+    axis.axhline(value, label=f"± {label}", **look)
+    axis.axhline(-value, **look)
+
+
+def _legend(axis: Axes) -> None:
+    """Beside the axes, lines drawn last first."""
+    handles, labels = axis.get_legend_handles_labels()
+    unique = dict(zip(labels, handles, strict=True))
+    axis.legend(unique.values(), unique.keys(), **LEGEND)
