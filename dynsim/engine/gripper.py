@@ -1,7 +1,7 @@
 """The gripper in a run: soft, hardening, hardened, softening; what it captures, how that slips, and why a run ends.
 
-It hardens when it is told to close. What is captured is held as it is then: springs begin without force, and what is
-added to them while the gripper hardens is not deflected yet.
+A command to close hardens the gripper. The captured object is held in its present position: the springs begin without
+force, and the stiffness that the hardening adds is not deflected yet.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from dynsim.record import Event
 SOFT, HARDENING, HARDENED, SOFTENING = range(4)
 STATES = ("soft", "hardening", "hardened", "softening")
 STATES_TEXT = ", ".join(f"{number} {name}" for number, name in enumerate(STATES))
-# Least share of its springs that a gripper has while it holds something: ties need some.
+# A gripper that holds an object has at least this share of its springs: a tie needs a stiffness.
 LEAST_SHARE = 0.01
-# Slips below this are none: ties that hold give way by their springs alone [m, rad].
+# Smaller slips are not recorded [m, rad].
 SLIPPED = np.array([1e-3, 2e-2])
 # A tie is at its bound when less than this share of it is missing.
 AT_BOUND = 1e-3
@@ -49,9 +49,9 @@ class Grip:
     Attributes
     ----------
     objects : names of the objects that have a grasp frame
-    period : of its control [s]
-    mode : one of :data:`STATES`; share : of the springs of a hardened one that it has
-    slipping : a slip of the present object was told; stuck_since : time since which that does not give way [s]
+    period : control period [s]
+    mode : one of :data:`STATES`; share : present share of the hardened springs
+    slipping : the slip of the present object is recorded; stuck_since : time since which this object is stuck [s]
     """
 
     model: Model
@@ -76,11 +76,11 @@ class Grip:
 
     @property
     def told(self) -> str:
-        """Its state in words, for a pilot."""
+        """Return the state in words, for the page of a pilot."""
         return STATES[self.mode] + (f" around {self.held.name}" if self.held is not None else "")
 
     def remembered(self) -> Grip:
-        """A copy of what the future depends on, and of what was recorded."""
+        """Return a copy of the state and of the recorded samples."""
         return replace(self, trace=list(self.trace))
 
     def restore(self, kept: Grip) -> None:
@@ -107,7 +107,7 @@ class Grip:
         ------
         SimulationStopped
             ``too_far``: it closes, and nothing is within capture; ``lost``: an object has slipped out; ``too_stiff``:
-            one on a hinge or rails does not give way.
+            an object on a hinge or rails does not move.
         """
         q = simulation.state.q
         if closed and self.mode in {SOFT, SOFTENING}:
@@ -131,7 +131,7 @@ class Grip:
             simulation.set_tie(tie_name(name, direction), holds=True)
 
     def _harden(self, time: float, simulation: Referenced) -> None:
-        """Let the springs grow or fade, and let go of what is held when they are gone."""
+        """Let the springs grow or fade, and release the object when they are gone."""
         before = self.share
         if self.mode == HARDENING:
             self.share = min(self.share + self.period / self.gripper.hardening, 1.0)
@@ -152,7 +152,7 @@ class Grip:
             self._tell(time, "gripper releases", name)
 
     def _look(self, time: float, q: Array, simulation: Referenced) -> None:
-        """Whether what is held slips, is lost, or does not give way."""
+        """Check whether the held object slips, is lost, or is stuck."""
         assert self.held is not None
         name, g = self.held.name, self.gripper
         R, p = self.placement(name, q)
@@ -161,7 +161,7 @@ class Grip:
         loads = np.array([abs(force[tie_name(name, direction)]) for direction in DIRECTIONS])
         bounds = np.repeat([g.bound, g.turning_bound], 3)
         bound = loads >= (1.0 - AT_BOUND) * bounds
-        # Springs give way by bound/stiffness in each direction; the rest is slip.
+        # Springs deflect by bound/stiffness in each direction; the rest is slip.
         springs = np.array([g.bound / g.stiffness, g.turning_bound / g.turning_stiffness])
         if not self.slipping and bound.any() and (np.array(moved) > springs + SLIPPED).any():
             self.slipping = True
@@ -181,7 +181,7 @@ class Grip:
             worst = DIRECTIONS[int((loads / bounds).argmax())]
             direction = f"along {worst}" if len(worst) == 1 else f"about {worst[1]}"
             raise SimulationStopped(
-                f"too_stiff: {name} does not give way from t = {self.stuck_since:g} s on, the gripper is at its bound "
+                f"too_stiff: {name} does not move from t = {self.stuck_since:g} s on, the gripper is at its bound "
                 f"{direction}; {slipped} (plant.gripper)",
                 time=time,
             )
@@ -202,7 +202,7 @@ class Grip:
 
 
 def nearest_of(placements: Mapping[str, tuple[Array, Array]]) -> tuple[str, float, float]:
-    """The object whose grasp frame is the nearest, its distance [m], and the angle between its axis and the gripper's.
+    """The object whose grasp frame is the nearest, its distance [m], and the angle between its axis and that of the gripper [rad].
 
     ``placements`` : rotation and origin of grasp frames in that of the gripper, by object
     """
@@ -223,7 +223,7 @@ def too_far(gripper: Gripper, time: float, name: str, distance: float, angle: fl
 
 
 def _attached(model: Model, frame: str) -> tuple[int, Array, Array]:
-    """Body of a frame, and its rotation and origin in the body's."""
+    """Return the body of a frame, and rotation and origin of the frame in this body."""
     robot = model.robot
     body, at = robot.attach(frame, np.zeros(3))
     return body, robot.attached_axes(frame), at

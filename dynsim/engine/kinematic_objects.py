@@ -1,7 +1,7 @@
 """Objects of a kinematic snake: they have no forces, stay where they are, and follow the gripper while it holds them.
 
-What is on a hinge turns with the gripper about its axis, what is on rails slides with it along them. An object that is
-let go stays where it is then.
+An object on a hinge turns with the gripper about its axis, an object on rails slides with it along them. A released
+object stays in its position.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ class CarriedObjects:
 
     Parameters
     ----------
-    gripper : of the snake; ahead : its tip ahead of the controlled point [m]
-    period : of the control [s]
+    gripper : its tip is ``ahead`` of the controlled point [m]
+    period : control period [s]
     """
 
     def __init__(self, scenario: Scenario, gripper: Gripper, ahead: float, period: float) -> None:
@@ -74,7 +74,7 @@ class CarriedObjects:
         return R, w[:3] + self._ahead * R[:, 0]
 
     def command(self, tick: int, closed: bool, w: Array) -> None:
-        """The gripper is told to be closed or open from a tick on, with the controlled point at w (6,).
+        """Close or open the gripper from a tick on, with the controlled point at w (6,).
 
         Raises
         ------
@@ -110,7 +110,7 @@ class CarriedObjects:
         return R.T @ B @ self.robot.attached_axes(grasp_frame(name)), R.T @ (other + B @ at - p)
 
     def _move_to(self, tick: int, w: Array) -> None:
-        """Bring what is held at a tick to where the gripper is then."""
+        """Move the held object with the gripper, to its position at a tick."""
         for hold in self.holds:
             if hold.start <= tick <= hold.end:
                 part = self._part[hold.name]
@@ -136,12 +136,12 @@ class CarriedObjects:
         return before + np.arctan2(axis @ np.cross(was, now), was @ now)
 
     def told(self, tick: int) -> str:
-        """State of the gripper at a tick in words, for a pilot."""
+        """Return the state of the gripper at a tick in words, for the page of a pilot."""
         hold = next((hold for hold in reversed(self.holds) if hold.start <= tick <= hold.end), None)
         return STATES[self._state(hold, tick)] + (f" around {hold.name}" if hold is not None else "")
 
     def positions(self, tick: int, w: Array) -> dict[str, float]:
-        """Coordinates of the objects by name, with the controlled point at w (6,) at the present tick."""
+        """Return the coordinates of the objects by name, with the controlled point at w (6,) at this tick."""
         self._move_to(tick, w)
         return dict(zip(self._labels, self.q.tolist(), strict=True))
 

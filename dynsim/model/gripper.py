@@ -1,7 +1,7 @@
-"""A soft gripper that hardens around what it holds, as the omni-gripper of [T] does.
+"""A soft gripper that hardens around an object, as the omni-gripper of [T] does.
 
-Soft, it holds nothing. Hardened, it holds an object by a spring, a damper and a bound in each of six directions, which
-are ties. Beyond a bound it gives way for good: the object stays where it has been pulled to.
+A soft gripper holds nothing. A hardened one holds an object by six ties, each with a spring, a damper and a bound.
+Beyond a bound the object slips, and stays in its new position.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
 
 @dataclass(frozen=True)
 class Gripper:
-    """Where a gripper is, when it captures, and how it holds.
+    """Position, capture range and stiffness of a gripper.
 
     Attributes
     ----------
     body : that carries it; tip : (3,) of the gripper in the frame of that body, whose x axis it points along [m]
     capture_distance, capture_angle : from the grasp frame of an object, within which it captures that [m, rad]
     hardening, softening : times that these take [s]
-    stiffness, damping, bound : of a hardened one, along each axis [N/m, N s/m, N]
+    stiffness, damping, bound : along each axis, when it is hardened [N/m, N s/m, N]
     turning_stiffness, turning_damping, turning_bound : about each axis [N m/rad, N m s/rad, N m]
     lost_distance, lost_angle : by which an object that it holds has slipped when it counts as lost [m, rad]
     """

@@ -1,4 +1,4 @@
-"""The ``objects:`` section of a scenario: bodies beside the robot, each a tree of its own, rooted in the world.
+"""The ``objects:`` section of a scenario: bodies in addition to the robot, each a separate tree rooted in the world.
 
     objects:
       box: {mass_kg: 0.3, size_m: [0.06, 0.06, 0.06], position_m: [0.4, 0.0, 0.03]}
@@ -41,12 +41,12 @@ class Hinge(StrictConfig):
 
     axis: Vector3 = Field([0.0, 0.0, 1.0], description="in the object's own axes")
     point_m: Vector3 = Field(
-        [0.0, 0.0, 0.0], description="of the axis, from the object's centre; origin of the body then"
+        [0.0, 0.0, 0.0], description="a point of the axis, from the object's centre; it is the origin of the body"
     )
     friction_N_m: NonNegative = Field(0.0, description="that holds it at rest; unilateral law")
     damping_N_m_s_per_rad: NonNegative = 0.0
     limits_deg: Pair | None = Field(None, description="lower and upper; default: none")
-    spring_N_m_per_rad: NonNegative = Field(0.0, description="of a closer; time stepping only")
+    spring_N_m_per_rad: NonNegative = Field(0.0, description="stiffness of a closer; time stepping only")
     rest_deg: float = Field(0.0, gt=-180.0, lt=180.0, description="angle at which the spring has no torque")
 
     @model_validator(mode="after")
@@ -88,7 +88,7 @@ class Slide(StrictConfig):
 
     @property
     def point_m(self) -> list[float]:
-        """Where the joint is: at the centre."""
+        """The joint is at the centre."""
         return [0.0, 0.0, 0.0]
 
     @model_validator(mode="after")
@@ -138,7 +138,7 @@ class Solid(StrictConfig):
 
     @property
     def inertia(self) -> Inertia:
-        """Of the solid about its centre: box I_x = m (b² + c²)/12, sphere I = 2 m r²/5, cylinder I_z = m r²/2."""
+        """Inertia about the centre: box I_x = m (b² + c²)/12, sphere I = 2 m r²/5, cylinder I_z = m r²/2."""
         if self.size_m is not None:
             squares = np.array(self.size_m) ** 2
             return Inertia(self.mass_kg, np.zeros(3), np.diag(self.mass_kg * (squares.sum() - squares) / 12.0))
@@ -159,7 +159,7 @@ class Solid(StrictConfig):
 
     @property
     def spheres(self) -> tuple[Array, float]:
-        """Centres (k, 3) and radius of what touches surfaces [m]: corners, the sphere, or both ends of a cylinder.
+        """Centres (k, 3) and radius of the spheres that touch surfaces [m]: corners, the sphere, or both ends of a cylinder.
 
         Ends of a cylinder are spheres within it: a pipe that lies touches as it should, one that stands stands on a
         sphere.
@@ -182,14 +182,16 @@ def _check_sizes(solid: Solid | SceneObject) -> None:
     needed = SIZES[solid.shape]
     for key in ("size_m", "radius_m", "length_m"):
         if (getattr(solid, key) is None) == (key in needed):
-            text = f"is needed for a {solid.shape}" if key in needed else f"is none of a {solid.shape}; remove it"
+            text = (
+                f"is needed for a {solid.shape}" if key in needed else f"does not apply to a {solid.shape}; remove it"
+            )
             raise error_at(key, text)
 
 
 class Part(Solid):
     """One of several solids of which an object is made."""
 
-    position_m: Vector3 = Field([0.0, 0.0, 0.0], description="of its centre, in the object's axes")
+    position_m: Vector3 = Field([0.0, 0.0, 0.0], description="position of its centre, in the object's axes")
     rpy_deg: Vector3 = Field([0.0, 0.0, 0.0], description="attitude in the object's axes, Rz(yaw) Ry(pitch) Rx(roll)")
 
 
@@ -272,12 +274,12 @@ class SceneObject(StrictConfig):
         if self.shape == "parts":
             for key in ("mass_kg", "size_m", "radius_m", "length_m"):
                 if getattr(self, key) is not None:
-                    raise error_at(key, "is none of an object of parts: each part has its own; remove it")
+                    raise error_at(key, "does not apply to an object of parts, each of which has its own; remove it")
             if self.parts is None:
                 raise error_at("parts", "is needed for shape: parts")
             return self
         if self.parts is not None:
-            raise error_at("parts", f"is none of a {self.shape}; remove it, or set shape: parts")
+            raise error_at("parts", f"does not apply to a {self.shape}; remove it, or set shape: parts")
         if self.mass_kg is None:
             raise error_at("mass_kg", f"is needed for a {self.shape}")
         _check_sizes(self)
@@ -285,12 +287,12 @@ class SceneObject(StrictConfig):
 
     @property
     def joint(self) -> Hinge | Slide | None:
-        """What it is fixed to the world by; None: it is free."""
+        """The joint between the object and the world; None: it is free."""
         return self.hinge if self.hinge is not None else self.slide
 
     @property
     def solids(self) -> dict[str, Part]:
-        """Its parts; of a single solid that one."""
+        """Its parts; a single solid is one part."""
         if self.parts is not None:
             return self.parts
         keys = ("mass_kg", "shape", "size_m", "radius_m", "length_m")
@@ -298,7 +300,7 @@ class SceneObject(StrictConfig):
 
     @property
     def inertia(self) -> Inertia:
-        """Of all parts about the origin of the object."""
+        """Inertia of all parts about the origin of the object."""
         parts = [(part, _turn(part.rpy_deg), np.array(part.position_m)) for part in self.solids.values()]
         return Inertia.merged([part.inertia.placed(R, p) for part, R, p in parts])
 
@@ -370,7 +372,7 @@ class SceneObject(StrictConfig):
 
 
 def _turn(rpy_deg: list[float]) -> Array:
-    # The reader of URDF waits until somebody turns something.
+    # Imported here: the reader of URDF takes long to load.
     if not any(rpy_deg):
         return np.eye(3)
     from dynsim.model.urdf.reader import rotation

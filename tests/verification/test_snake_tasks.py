@@ -127,7 +127,7 @@ def test_the_door_is_opened(variant: str, angle: float) -> None:
 def test_what_does_not_give_way_ends_with_reason_and_time(name: str) -> None:
     stop = stopped(name, "too_stiff")
     assert str(stop).startswith("too_stiff: ")
-    assert "does not give way from t = " in str(stop)
+    assert "does not move from t = " in str(stop)
     assert stop.record is not None
     assert ("slips", name.removeprefix("snake_")) in events(stop.record)
 
