@@ -202,7 +202,7 @@ class Grip:
 
 
 def nearest_of(placements: Mapping[str, tuple[Array, Array]]) -> tuple[str, float, float]:
-    """The object whose grasp frame is the nearest, its distance [m], and the angle between its axis and that of the gripper [rad].
+    """The object with the nearest grasp frame, its distance [m], and the angle between the two axes [rad].
 
     ``placements`` : rotation and origin of grasp frames in that of the gripper, by object
     """

@@ -159,7 +159,7 @@ class Solid(StrictConfig):
 
     @property
     def spheres(self) -> tuple[Array, float]:
-        """Centres (k, 3) and radius of the spheres that touch surfaces [m]: corners, the sphere, or both ends of a cylinder.
+        """Centres (k, 3) and radius of spheres that touch surfaces [m]: corners, the sphere, or ends of a cylinder.
 
         Ends of a cylinder are spheres within it: a pipe that lies touches as it should, one that stands stands on a
         sphere.
