@@ -253,8 +253,8 @@ class JointControl:
             return None
         end = self.end
         # References of a whole run may end a rounding before it, where the target is that of its last sample.
-        held = t > end + END_SLACK * max(1.0, abs(end))
-        return targets_on(self.path, np.where(held, end, t) if held.any() else t)
+        ended = t > end + END_SLACK * max(1.0, abs(end))
+        return targets_on(self.path, np.where(ended, end, t) if ended.any() else t)
 
 
 def targets_on(path: HandPath, t: NDArray[np.float64]) -> NDArray[np.float64]:

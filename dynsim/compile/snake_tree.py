@@ -61,9 +61,9 @@ class SnakeTree(Robot):
     raised: bool = field(kw_only=True)
     gripper: Gripper = field(kw_only=True)
 
-    def holding(self, held: str) -> list[Tie]:
+    def holding(self, name: str) -> list[Tie]:
         """Ties by which the gripper can hold the object of that name."""
-        return self.gripper.ties(held)
+        return self.gripper.ties(name)
 
     @property
     def lifting_joints(self) -> tuple[str, ...]:

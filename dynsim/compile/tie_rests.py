@@ -27,15 +27,21 @@ def set_rests(model: Model, unilateral: UnilateralArrays, at_start: Array, rests
     for k, (tie, row) in enumerate(zip(model.robot.ties, unilateral.tie, strict=True)):
         if not tie.holds:
             continue
-        if np.isnan(tie.rest) and tie.turns:
-            (A, _), (B, _) = _ends(model, unilateral, k, at_start)
-            row[ku.TIE_ATTITUDE : ku.TIE_ATTITUDE + 9] = (A.T @ B).ravel()
-            row[ku.TIE_REST] = 0.0
-        elif np.isnan(tie.rest):
-            row[ku.TIE_REST] = 0.0
-            row[ku.TIE_REST] = deflection(model, unilateral, k, at_start)
+        if np.isnan(tie.rest):
+            rest_here(model, unilateral, k, at_start)
         if rests is not None and not np.isnan(rests[k]):
             row[ku.TIE_REST] = rests[k]
+
+
+def rest_here(model: Model, unilateral: UnilateralArrays, k: int, q: Array) -> None:
+    """Write the rest of tie k into its table, so that it has no deflection at coordinates (nq,)."""
+    row = unilateral.tie[k]
+    row[ku.TIE_REST] = 0.0
+    if unilateral.tie_table[k, ku.TIE_TURNS] == 1:
+        (A, _), (B, _) = _ends(model, unilateral, k, q)
+        row[ku.TIE_ATTITUDE : ku.TIE_ATTITUDE + 9] = (A.T @ B).ravel()
+    else:
+        row[ku.TIE_REST] = deflection(model, unilateral, k, q)
 
 
 def may_have_slid(tie: Tie) -> bool:

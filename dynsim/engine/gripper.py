@@ -6,8 +6,9 @@ force, and the stiffness that the hardening adds is not deflected yet.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +19,10 @@ from dynsim.engine.operator import Referenced
 from dynsim.errors import SimulationStopped
 from dynsim.model.description import Array
 from dynsim.model.gripper import DIRECTIONS, Gripper, grasp_frame, tie_name
-from dynsim.record import Event
+from dynsim.record import Event, Record
 
+# Kinds of events, after this word.
+EVENT, EVENT_KINDS = "gripper ", ("captures", "slips", "loses", "releases")
 SOFT, HARDENING, HARDENED, SOFTENING = range(4)
 STATES = ("soft", "hardening", "hardened", "softening")
 STATES_TEXT = ", ".join(f"{number} {name}" for number, name in enumerate(STATES))
@@ -43,7 +46,7 @@ class Held:
 
 
 @dataclass
-class Grip:
+class GripperControl:
     """A gripper and the objects that it can hold.
 
     Attributes
@@ -75,15 +78,15 @@ class Grip:
         self._rate = {name: joints.index(name) for name in self.objects if name in joints}
 
     @property
-    def told(self) -> str:
+    def state_in_words(self) -> str:
         """Return the state in words, for the page of a pilot."""
         return STATES[self.mode] + (f" around {self.held.name}" if self.held is not None else "")
 
-    def remembered(self) -> Grip:
+    def remembered(self) -> GripperControl:
         """Return a copy of the state and of the recorded samples."""
         return replace(self, trace=list(self.trace))
 
-    def restore(self, kept: Grip) -> None:
+    def restore(self, kept: GripperControl) -> None:
         """Go back to what :meth:`remembered` gave."""
         for name in ("mode", "share", "held", "slipping", "stuck_since", "events"):
             setattr(self, name, getattr(kept, name))
@@ -184,10 +187,13 @@ class Grip:
                 f"too_stiff: {name} does not move from t = {self.stuck_since:g} s on, the gripper is at its bound "
                 f"{direction}; {slipped} (plant.gripper)",
                 time=time,
+                kind="too_stiff",
             )
         if lost:
             raise SimulationStopped(
-                f"lost: {slipped}; it holds {g.bound:g} N and {g.turning_bound:g} N m (plant.gripper)", time=time
+                f"lost: {slipped}; it holds {g.bound:g} N and {g.turning_bound:g} N m (plant.gripper)",
+                time=time,
+                kind="lost",
             )
 
     def _tell(self, time: float, kind: str, name: str, value: float | None = None) -> None:
@@ -199,6 +205,28 @@ class Grip:
             return tuple(np.zeros(len(ticks)) for _ in range(3))  # type: ignore[return-value]
         rows = np.array(self.trace)[np.minimum(ticks, len(self.trace) - 1)]
         return rows[:, 0].astype(np.int64), rows[:, 1], rows[:, 2]
+
+
+def gripper_summary(record: Record, objects: Iterable[str]) -> dict[str, Any]:
+    """What the gripper did and how far objects have moved, for ``summary.json``.
+
+    ``moved`` : last less first coordinate of an object on a hinge or rails [rad or m], displacement of a free one [m]
+    """
+    labels, q = list(record.labels["q"]), record["q"]
+    moved: dict[str, float | list[float]] = {}
+    for name in objects:
+        own = [name] if name in labels else [f"{name}.{axis}" for axis in "xyz"]
+        change = [float(q[-1, labels.index(label)] - q[0, labels.index(label)]) for label in own]
+        moved[name] = change[0] if len(change) == 1 else change
+    kinds = [(event.kind.removeprefix(EVENT), event.name) for event in record.events if event.kind.startswith(EVENT)]
+    by_kind = {kind: [name for other, name in kinds if other == kind] for kind in EVENT_KINDS}
+    summary: dict[str, Any] = {"moved": moved, **by_kind}
+    if "tie_force" in record:
+        ties = list(record.labels["tie_force"])
+        for key, axes in (("force_max_N", DIRECTIONS[:3]), ("torque_max_N_m", DIRECTIONS[3:])):
+            columns = [k for k, tie in enumerate(ties) if tie.startswith("gripper.") and tie.rpartition(".")[2] in axes]
+            summary[key] = float(np.abs(record["tie_force"][:, columns]).max(initial=0.0))
+    return summary
 
 
 def nearest_of(placements: Mapping[str, tuple[Array, Array]]) -> tuple[str, float, float]:
@@ -219,6 +247,7 @@ def too_far(gripper: Gripper, time: float, name: str, distance: float, angle: fl
         f"grasp frame of {name}; it captures within {1e3 * gripper.capture_distance:g} mm and "
         f"{np.degrees(gripper.capture_angle):g}° (plant.gripper)",
         time=time,
+        kind="too_far",
     )
 
 

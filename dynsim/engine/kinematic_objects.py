@@ -28,7 +28,7 @@ ON_AXIS = 0.01
 
 
 @dataclass
-class Hold:
+class HeldObject:
     """Object ``name`` in the gripper from one tick to another; R, p place it in the gripper's frame.
 
     ``start``, ``end`` : ticks; ``tip`` : pose of the gripper, rotation and position, and ``q`` coordinates at the start
@@ -64,7 +64,7 @@ class CarriedObjects:
         ends = np.cumsum(sizes).tolist()
         self._part = {name: slice(end - size, end) for name, size, end in zip(self.objects, sizes, ends, strict=True)}
         self.graspable = tuple(name for name, body in self.objects.items() if body.grasp is not None)
-        self.holds: list[Hold] = []
+        self.grasps: list[HeldObject] = []
         self.events: list[Event] = []
         self._closed = False
 
@@ -85,14 +85,14 @@ class CarriedObjects:
             self._closed = closed
             return
         self._closed, time = closed, tick * self._period
-        held = self.holds[-1] if self.holds and self.holds[-1].end > tick else None
+        present = self.grasps[-1] if self.grasps and self.grasps[-1].end > tick else None
         if not closed:
-            if held is not None:
-                held.end = tick + self.gripper.softening / self._period
-                self.events.append(Event(held.end * self._period, "gripper releases", held.name))
+            if present is not None:
+                present.end = tick + self.gripper.softening / self._period
+                self.events.append(Event(present.end * self._period, "gripper releases", present.name))
             return
-        if held is not None:  # it was still softening
-            held.end = np.inf
+        if present is not None:  # it was still softening
+            present.end = np.inf
             self.events.pop()
             return
         R, p = self.tip(w)
@@ -101,7 +101,7 @@ class CarriedObjects:
         name, distance, angle = nearest_of(placements)
         if (stop := too_far(self.gripper, time, name, distance, angle)) is not None:
             raise stop
-        self.holds.append(Hold(name, tick, np.inf, (R, p), self.q.copy()))
+        self.grasps.append(HeldObject(name, tick, np.inf, (R, p), self.q.copy()))
         self.events.append(Event(time, "gripper captures", name, distance))
 
     def _placement(self, name: str, R: Array, p: Array) -> tuple[Array, Array]:
@@ -111,46 +111,47 @@ class CarriedObjects:
 
     def _move_to(self, tick: int, w: Array) -> None:
         """Move the held object with the gripper, to its position at a tick."""
-        for hold in self.holds:
-            if hold.start <= tick <= hold.end:
-                part = self._part[hold.name]
-                self.q[part] = self._followed(hold, *self.tip(w))
+        for grasp in self.grasps:
+            if grasp.start <= tick <= grasp.end:
+                part = self._part[grasp.name]
+                self.q[part] = self._followed(grasp, *self.tip(w))
 
-    def _followed(self, hold: Hold, R: Array, p: Array) -> Array:
+    def _followed(self, grasp: HeldObject, R: Array, p: Array) -> Array:
         """Coordinates of a held object with the gripper at R, p."""
-        body, (R0, p0), joint = self.objects[hold.name], hold.tip, self.objects[hold.name].joint
-        index, at = self.robot.attach(grasp_frame(hold.name), np.zeros(3))
-        B, origin = self.model.body_pose(index, hold.q)
-        before = hold.q[self._part[hold.name]]
+        body, (R0, p0), joint = self.objects[grasp.name], grasp.tip, self.objects[grasp.name].joint
+        index, at = self.robot.attach(grasp_frame(grasp.name), np.zeros(3))
+        B, origin = self.model.body_pose(index, grasp.q)
+        before = grasp.q[self._part[grasp.name]]
         if joint is None:
             turn = R @ R0.T
             return np.array([*(p + turn @ (origin - p0)), *quaternion(turn @ B), *before[7:]])
         axis = B @ self.robot.links[index].axis
+        link = self.robot.links[index]
         if body.slide is not None:
-            return before + axis @ (p - p0)
+            return np.clip(before + axis @ (p - p0), link.lower, link.upper)
         # In the plane of the hinge: where the grasp frame was seen from the axis, and where it has gone with the tip.
         was = B @ at - axis * (axis @ B @ at)
         if np.linalg.norm(was) < ON_AXIS:
-            return before + axis @ rotation_vector(R @ R0.T)
+            return np.clip(before + axis @ rotation_vector(R @ R0.T), link.lower, link.upper)
         now = was + (p - p0) - axis * (axis @ (p - p0))
-        return before + np.arctan2(axis @ np.cross(was, now), was @ now)
+        return np.clip(before + np.arctan2(axis @ np.cross(was, now), was @ now), link.lower, link.upper)
 
-    def told(self, tick: int) -> str:
+    def state_in_words(self, tick: int) -> str:
         """Return the state of the gripper at a tick in words, for the page of a pilot."""
-        hold = next((hold for hold in reversed(self.holds) if hold.start <= tick <= hold.end), None)
-        return STATES[self._state(hold, tick)] + (f" around {hold.name}" if hold is not None else "")
+        present = next((grasp for grasp in reversed(self.grasps) if grasp.start <= tick <= grasp.end), None)
+        return STATES[self._state(present, tick)] + (f" around {present.name}" if present is not None else "")
 
     def positions(self, tick: int, w: Array) -> dict[str, float]:
         """Return the coordinates of the objects by name, with the controlled point at w (6,) at this tick."""
         self._move_to(tick, w)
         return dict(zip(self._labels, self.q.tolist(), strict=True))
 
-    def _state(self, hold: Hold | None, tick: float) -> int:
-        if hold is None:
+    def _state(self, grasp: HeldObject | None, tick: float) -> int:
+        if grasp is None:
             return SOFT
-        if (hold.end - tick) * self._period <= self.gripper.softening:
+        if (grasp.end - tick) * self._period <= self.gripper.softening:
             return SOFTENING
-        return HARDENED if (tick - hold.start) * self._period >= self.gripper.hardening else HARDENING
+        return HARDENED if (tick - grasp.start) * self._period >= self.gripper.hardening else HARDENING
 
     def add_to(self, record: Record, w: Array, ticks: NDArray[np.int64]) -> None:
         """Coordinates of objects as the signal ``q``, and what the gripper did, at poses (T, 6) and ticks (T,)."""
@@ -161,9 +162,9 @@ class CarriedObjects:
             rows.append(self.q.copy())
             if self.graspable:
                 distance[row] = nearest_of({k: self._placement(k, *self.tip(w[row])) for k in self.graspable})[1]
-        for hold in self.holds:
-            held = np.flatnonzero((ticks >= hold.start) & (ticks <= hold.end))
-            state[held] = [self._state(hold, tick) for tick in ticks[held].tolist()]
+        for grasp in self.grasps:
+            within = np.flatnonzero((ticks >= grasp.start) & (ticks <= grasp.end))
+            state[within] = [self._state(grasp, tick) for tick in ticks[within].tolist()]
         labels = self._labels
         record.add("q", np.array(rows), "rad or m", labels=labels, description="coordinates of objects")
         if self.graspable:

@@ -6,6 +6,7 @@ import numpy as np
 
 from dynsim._version import __version__
 from dynsim.compile.scene import snake_scene
+from dynsim.engine.gripper import gripper_summary
 from dynsim.engine.kinematic_run import SnakeRun
 from dynsim.engine.provenance import provenance
 from dynsim.engine.snake_record import add_task, hold_last, task_summary, task_warnings
@@ -64,6 +65,8 @@ def make_record(run: SnakeRun, scenario: Scenario, wall: float, pictured: bool =
         **task_summary(run, record),
     }
     warnings = [*task_warnings(run, record, summary), *_passed_limits(run, record)]
+    if run.objects is not None and run.objects.graspable:
+        summary["gripper"] = gripper_summary(record, run.objects.graspable)
     summary["warnings"] = [*warnings, *without_effect(scenario)]
     record.summary = summary
     return record

@@ -137,8 +137,8 @@ class Operator:
         return {name: getattr(self, name) for name in _STATE} | {"points": points, "hand": hand}
 
     def add_to(self, record: Record) -> None:
-        """A warning where the hand has not gone all of the way that it was told to; the rest is in the references."""
-        missed = sum(way for way, _ in self._missed.values())
+        """Add a warning if the hand has not moved as far as it was commanded; the remainder is in the references."""
+        missed = sum(distance for distance, _ in self._missed.values())
         if missed > MISSED * self._commanded:
             reason, (_, since) = max(self._missed.items(), key=lambda item: item[1][0])
             record.summary["warnings"].append(

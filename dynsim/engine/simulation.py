@@ -24,7 +24,7 @@ from dynsim.compile.control import END_SLACK
 from dynsim.compile.model import Model
 from dynsim.compile.references.teleop import VelocitySource
 from dynsim.compile.tables import check_couplings
-from dynsim.compile.tie_rests import deflection, may_have_slid, set_rests
+from dynsim.compile.tie_rests import deflection, may_have_slid, rest_here, set_rests
 from dynsim.dynamics import state as kst
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
@@ -586,8 +586,8 @@ class Simulation:
         """
         ties = {tie.name: k for k, tie in enumerate(self.robot.ties)}
         k = _index(ties, name, "tie")
-        given = {"stiffness": stiffness, "damping": damping}
-        values = {key: _finite(key, [value])[0] for key, value in given.items() if value is not None}
+        asked = {"stiffness": stiffness, "damping": damping}
+        values = {key: _finite(key, [value])[0] for key, value in asked.items() if value is not None}
         unilateral = self._prepared.system.unilateral
         assert unilateral is not None  # ties need that law
         before, c = unilateral.tie[k, [ku.TIE_STIFFNESS, ku.TIE_DAMPING]]
@@ -611,6 +611,10 @@ class Simulation:
         if holds is not None and holds != (table[ku.TIE_KIND] >= 0):
             table[ku.TIE_KIND] = (kc.ONE_WAY if tie.pushes else kc.BOX) if holds else -1
             row[ku.TIE_REST] = tie.rest
+            if holds and math.isnan(tie.rest):
+                # Not by the first step, whose geometry is that of its middle.
+                q = prepared.run.y[block(prepared.run.layout, "q")]
+                rest_here(prepared.model, prepared.system.unilateral, k, q)
         self._restart()
 
     def release(self, joint: str) -> None:

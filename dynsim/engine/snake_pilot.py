@@ -20,7 +20,7 @@ import numpy as np
 
 from dynsim.compile.model import Model
 from dynsim.compile.snake_tree import GROUND, HEAD, ROOT, SnakeTree
-from dynsim.engine.gripper import STATES_TEXT, Grip
+from dynsim.engine.gripper import STATES_TEXT, GripperControl, gripper_summary
 from dynsim.engine.operator import Referenced
 from dynsim.engine.sensing import SampledSensor
 from dynsim.engine.snake_control import OBSTACLES, SnakeControl, copy_of
@@ -120,7 +120,7 @@ class SnakePilot(SnakeControl):
         self._lies_since: float | None = None
         self.sensors = self._sensors(sensors or Sensors())
         objects = tuple(frame.name.rpartition(".")[0] for frame in robot.frames if frame.name.endswith(".grasp"))
-        self.grip = Grip(model, robot.gripper, objects, self.period) if objects else None
+        self.grip = GripperControl(model, robot.gripper, objects, self.period) if objects else None
         self._next_look = self._commanded = 0
         self._seen: Any = None
         self.read_commands(waiting=False)
@@ -188,7 +188,7 @@ class SnakePilot(SnakeControl):
         tilt = float(np.arccos(np.clip(R[2, 2], -1.0, 1.0)))
         if tilt > OVERTURNED:
             text = f"overturned: {ROOT}, which carries the head, is tilted by {np.degrees(tilt):.0f}° at t = {time:g} s"
-            raise SimulationStopped(text, time=time, state=self.postures())
+            raise SimulationStopped(text, time=time, state=self.postures(), kind="overturned")
         off = np.abs(self._volts_per_rad * (self.state.phi - q[self._joints]))
         overloaded = [name for name, most in zip(self.description.joint_names, off >= self._volts, strict=True) if most]
         below = float(self.state.w_target[2] - self.head_pose(q)[2])
@@ -204,6 +204,7 @@ class SnakePilot(SnakeControl):
                 "the limit of its voltage",
                 time=time,
                 state=self.postures(),
+                kind="too_heavy",
             )
 
     def _look(self) -> None:
@@ -365,6 +366,7 @@ class SnakePilot(SnakeControl):
         )
         for event in self.grip.events:
             record.add_event(event.time, event.kind, event.name, value=event.value)
+        record.summary = {**record.summary, "gripper": gripper_summary(record, self.grip.objects)}
 
     def _polyline(self, q: Array) -> Array:
         """Controlled point, joints and axles to the tail at coordinates (nq,), (points, 3) [m]."""

@@ -397,7 +397,7 @@ class Robot:
     feet: tuple[Foot, ...] = ()
     hand_frame: Array = field(default_factory=lambda: np.eye(3))
 
-    def holding(self, _: str) -> list[Tie]:
+    def holding(self, name: str) -> list[Tie]:
         """Ties by which a gripper of the robot can hold the object of that name: none."""
         return []
 

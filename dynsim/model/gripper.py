@@ -44,16 +44,16 @@ class Gripper:
     lost_distance: float = 0.015
     lost_angle: float = 0.5
 
-    def ties(self, held: str) -> list[Tie]:
+    def ties(self, object_name: str) -> list[Tie]:
         """Those by which it holds an object at its grasp frame; none of them holds at the start."""
         linear, turning = self.laws
         ties = []
         for k, name in enumerate(DIRECTIONS):
             stiffness, damping, bound = linear if k < 3 else turning
-            ends = self.body, grasp_frame(held), np.eye(3)[k % 3]
+            ends = self.body, grasp_frame(object_name), np.eye(3)[k % 3]
             ties.append(
                 Tie(
-                    tie_name(held, name),
+                    tie_name(object_name, name),
                     *ends,
                     stiffness,
                     damping,
@@ -75,11 +75,11 @@ class Gripper:
         )
 
 
-def grasp_frame(held: str) -> str:
+def grasp_frame(name: str) -> str:
     """Name of the frame of an object at which a gripper holds it."""
-    return f"{held}.grasp"
+    return f"{name}.grasp"
 
 
-def tie_name(held: str, direction: str) -> str:
+def tie_name(name: str, direction: str) -> str:
     """Name of the tie in one of the :data:`DIRECTIONS`."""
-    return f"gripper.{held}.{direction}"
+    return f"gripper.{name}.{direction}"

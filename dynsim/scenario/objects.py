@@ -70,9 +70,8 @@ class Hinge(StrictConfig):
 
     def spring(self, name: str, link: Link) -> Tie | None:
         """Its closer, between the link and the world."""
-        rest = math.radians(self.rest_deg)
-        law = self.spring_N_m_per_rad, 0.0
-        tie = Tie(f"{name}.spring", link.name, WORLD, link.axis, *law, turns=True, rest=rest, attitude=link.R_PJ.T)
+        angle, law = math.radians(self.rest_deg), (self.spring_N_m_per_rad, 0.0)
+        tie = Tie(f"{name}.spring", link.name, WORLD, link.axis, *law, turns=True, rest=angle, attitude=link.R_PJ.T)
         return tie if self.spring_N_m_per_rad > 0.0 else None
 
 

@@ -175,11 +175,11 @@ def push_posture(d: SnakeDescription, push: Push) -> np.ndarray | None:
     random, best = np.random.default_rng(0), None
     lower, upper = d.lower[:5], d.upper[:5]
     for _ in range(STARTS):
-        found = least_squares(
+        solution = least_squares(
             off, random.uniform(lower, upper), bounds=(lower, upper), xtol=1e-14, ftol=1e-14, gtol=1e-14
         )
-        if np.abs(found.fun).max() < 1e-9 and (best is None or found.x @ found.x < best @ best - 1e-9):
-            best = found.x
+        if np.abs(solution.fun).max() < 1e-9 and (best is None or solution.x @ solution.x < best @ best - 1e-9):
+            best = solution.x
     return None if best is None else posture(best)
 
 

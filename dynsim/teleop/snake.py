@@ -139,7 +139,7 @@ class SnakeSession:
     def _grip(self) -> dict[str, str]:
         """State of the gripper in words, where there are objects that it can hold."""
         objects = self._kinematic.objects
-        return {} if objects is None else {"grip": objects.told(self.ticks)}
+        return {} if objects is None else {"grip": objects.state_in_words(self.ticks)}
 
     def _touching(self) -> Mapping[str, Touch]:
         return {}
@@ -200,7 +200,7 @@ class DynamicSnakeSession(SnakeSession):
 
     def _grip(self) -> dict[str, str]:
         grip = self._pilot(self._simulation).grip
-        return {} if grip is None else {"grip": grip.told}
+        return {} if grip is None else {"grip": grip.state_in_words}
 
     def _touching(self) -> Mapping[str, Touch]:
         return self._simulation.touching

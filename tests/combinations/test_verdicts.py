@@ -27,7 +27,7 @@ PARTS = (
     r"^plant: ",
     r"; until then they could grow by a factor|; from t = 1 s on deviations have had the time to grow",
     r"^use .*, which is stable, or smaller gains",
-    r"^the torque of .* begins with|^the reference of .* begins|^the planned voltages count on",
+    r"^the .* of .* begins with|^the reference of .* begins|^the planned voltages count on",
     r"^the motion does not determine|^in the samples",
     r"^; (?:while|where) .*, other choices may move otherwise",
     r"^f_t = |^friction has put ",

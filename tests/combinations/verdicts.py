@@ -769,23 +769,23 @@ def _not_carried_out(match: Match, seen: Observed) -> str:
         return "there is no operator"
     rate, most = operator["rate_hz"], operator["hand_acceleration_m_s2"] / operator["rate_hz"]
     commands = [command for command in operator["commands"] if command["hand"] is not None]
-    velocity, moved, way = np.zeros(3), np.zeros(3), 0.0
+    velocity, moved, path = np.zeros(3), np.zeros(3), 0.0
     for tick in range(int(seen.time[-1] * rate + 1e-6) + 1):
         begun = [command["hand"] for command in commands if command["at_s"] * rate <= tick + 1e-6]
         change = np.array(begun[-1] if begun else [0.0, 0.0, 0.0]) - velocity
         velocity = velocity + change * min(1.0, most / max(float(np.linalg.norm(change)), 1e-300))
-        moved, way = moved + velocity / rate, way + float(np.linalg.norm(velocity)) / rate
+        moved, path = moved + velocity / rate, path + float(np.linalg.norm(velocity)) / rate
     missed, asked = float(match[1]), float(match[2])
     # Three digits are said, and a tick at the end may count.
-    near = DIGITS * way + max(float(np.linalg.norm(command["hand"])) for command in commands) / rate
-    if abs(asked - way) > near:
-        return f"it was commanded to go {way:.3g} m"
+    near = DIGITS * path + max(float(np.linalg.norm(command["hand"])) for command in commands) / rate
+    if abs(asked - path) > near:
+        return f"it was commanded to go {path:.3g} m"
     # By the triangle inequality the ways add up to no less than the distance, nor to more than both ways together.
     least = 0.0
     if "target_position" in seen.record:
         target = seen.record["target_position"]
         least = float(np.linalg.norm(moved - (target[-1] - target[0])))
-    return "" if least - near <= missed <= 2.0 * way + near else f"it ended {least:.3g} m from there"
+    return "" if least - near <= missed <= 2.0 * path + near else f"it ended {least:.3g} m from there"
 
 
 VERIFIERS: dict[str, Callable[[Match, Observed], str]] = {

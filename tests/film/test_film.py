@@ -221,10 +221,10 @@ def test_the_state_of_a_gripper_is_told_and_closes_its_fingers(robots: dict[str,
     words = [image[:24, :200] for image in seen.values()]
     assert all((words[a] != words[b]).any() for a in range(4) for b in range(a))
     # Below them only the fingers differ: of the soft one.
-    rest = [image[40:] for image in seen.values()]
-    assert (rest[0] != rest[1]).any()
-    assert (rest[1] == rest[2]).all()
-    assert (rest[2] == rest[3]).all()
+    others = [image[40:] for image in seen.values()]
+    assert (others[0] != others[1]).any()
+    assert (others[1] == others[2]).all()
+    assert (others[2] == others[3]).all()
 
 
 def test_labels_lie_on_paper_beside_each_other_and_within_the_picture() -> None:

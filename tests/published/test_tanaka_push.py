@@ -20,18 +20,18 @@ STRAIGHT = tuple(posture for posture in THERE if not POSTURES[posture].l_shape)
 
 def test_variants_are_the_postures_that_exist_in_three_directions():
     (path,) = (path for path in shipped_scenarios() if path.stem == SCENARIO)
-    assert set(variant_names(path)) == {f"{posture}_{way}" for posture in THERE for way in PUSHES}
+    assert set(variant_names(path)) == {f"{posture}_{direction}" for posture in THERE for direction in PUSHES}
 
 
 @pytest.mark.parametrize("posture", ["i", "ii", "iii", "vii"])
 def test_joints_of_the_scenario_are_those_that_the_search_finds(posture):
     """The base part does not change them; those of the L-shape are compared with those of the straight one."""
-    found = push_posture(build.robot(load_scenario(SCENARIO, f"{posture}_x")).description, POSTURES[posture])
+    computed = push_posture(build.robot(load_scenario(SCENARIO, f"{posture}_x")).description, POSTURES[posture])
     for same in THERE:
         if POSTURES[same][:2] == POSTURES[posture][:2]:
-            for way in PUSHES:
-                phi = build.robot(load_scenario(SCENARIO, f"{same}_{way}")).description.initial_joints
-                np.testing.assert_allclose(phi[:6], found[:6], atol=1e-6)
+            for direction in PUSHES:
+                phi = build.robot(load_scenario(SCENARIO, f"{same}_{direction}")).description.initial_joints
+                np.testing.assert_allclose(phi[:6], computed[:6], atol=1e-6)
                 bend = np.pi / 4.0 if POSTURES[same].l_shape else 0.0
                 np.testing.assert_allclose(phi[6:], [0.0, 0.0, bend, bend, 0.0, 0.0], atol=1e-6)
 
@@ -44,12 +44,12 @@ def test_no_posture_is_found_for_the_widest_offset(posture):
 @pytest.mark.parametrize("posture", THERE)
 def test_the_plate_is_where_the_scenario_says(posture):
     """0.2 m ahead of the head at t = 0, 1 mm beside it, 1 mm below it; and the target goes 120 mm into it."""
-    for way, gap in zip(PUSHES, (0.2, 1e-3, 1e-3), strict=True):
-        scenario = load_scenario(SCENARIO, f"{posture}_{way}", {"duration_s": 0.01})
+    for direction, gap in zip(PUSHES, (0.2, 1e-3, 1e-3), strict=True):
+        scenario = load_scenario(SCENARIO, f"{posture}_{direction}", {"duration_s": 0.01})
         record = simulate(scenario)
         assert record["contact_gap"][0, record.labels["contact_gap"].index(PLATE)] == pytest.approx(gap, abs=5e-5)
         (path,) = scenario.config.controller.paths
-        np.testing.assert_allclose(path.displacement[:3], (gap + 0.12) * np.array(PUSHES[way]), atol=1e-9)
+        np.testing.assert_allclose(path.displacement[:3], (gap + 0.12) * np.array(PUSHES[direction]), atol=1e-9)
         assert np.linalg.norm(path.displacement) / path.duration_s == pytest.approx(0.03, rel=1e-4)
 
 
@@ -60,7 +60,7 @@ def short():
 
 
 def test_a_push_is_taken_where_the_target_came_to(short):
-    """No deeper than it went: the table's depth is beyond it. The plate's spring gives way by f/k."""
+    """No deeper than it went: the table's depth is beyond it. The plate's spring gives direction by f/k."""
     result = pushed(short, "z")
     assert result.depth == pytest.approx(0.029, abs=2e-4)
     assert not result.stop_acted
@@ -101,7 +101,7 @@ def test_tables_have_paper_and_simulation_side_by_side(short, tmp_path):
 
 @pytest.fixture
 def force(simulated):
-    return lambda posture, way: pushed(simulated(SCENARIO, f"{posture}_{way}"), way).force
+    return lambda posture, direction: pushed(simulated(SCENARIO, f"{posture}_{direction}"), direction).force
 
 
 @pytest.mark.long
@@ -132,12 +132,12 @@ def test_an_l_shape_pushes_less_forward_and_as_much_down(force):
 @pytest.mark.parametrize("posture", THERE)
 def test_pushes_close_their_ledger_and_settle_their_servos(simulated, posture):
     """Wheels of (vii) that had slipped spun on at their voltage limit, on 103 J from the steps."""
-    for way in PUSHES:
-        record = simulated(SCENARIO, f"{posture}_{way}")
+    for direction in PUSHES:
+        record = simulated(SCENARIO, f"{posture}_{direction}")
         assert abs(record.summary["energy_residual_relative"]) <= 1e-12
         assert record.summary["time_stepping"]["limits_unsettled"] <= 1
         assert abs(record.summary["scheme_loss_J"]) <= 1e-2
-        assert not pushed(record, way).stop_acted
+        assert not pushed(record, direction).stop_acted
 
 
 @pytest.mark.long

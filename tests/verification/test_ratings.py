@@ -115,8 +115,8 @@ def test_the_worst_joint_is_that_of_the_largest_part_of_its_rating():
         {"joint": "weak", "torque_rms_N_m": 1.0, "stall_torque_N_m": 10.0, "nominal_torque_N_m": 2.0},
         {"joint": "unknown", "torque_rms_N_m": 9.0},
     ]
-    found = effort({"electrical_energy_supply_J": 7200.0, "motors": motors})
-    assert found == {"battery_energy_Wh": 2.0, "worst_joint": motors[1]}
+    summary = effort({"electrical_energy_supply_J": 7200.0, "motors": motors})
+    assert summary == {"battery_energy_Wh": 2.0, "worst_joint": motors[1]}
     assert "worst_joint" not in effort({"electrical_energy_supply_J": 0.0, "motors": motors[2:]})
 
 

@@ -100,6 +100,22 @@ def test_ties_end_and_begin_where_the_bodies_are() -> None:
     assert np.abs(record["energy_residual"]).max() < 1e-10
 
 
+@pytest.mark.parametrize("step", [1e-3, 5e-4])
+def test_a_tie_that_begins_on_a_moving_body_has_no_deflection_there(step: float) -> None:
+    """x = v/ω sin ω t of a spring that begins at x = 0, to second order of the step."""
+    simulation = Simulation(hanging(duration=2.0, integrator={"method": "time_stepping", "step_s": step}))
+    for tie in simulation.robot.ties:
+        simulation.set_tie(tie.name, holds=False)
+    simulation.set_wrench("box", [0.3, 0.0, MASS * G])
+    speed = float(simulation.advance(0.4).v[-6])
+    simulation.set_wrench("box", [0.0, 0.0, MASS * G])
+    begun = float(simulation.state.q[-7])
+    simulation.set_tie("x", holds=True, stiffness=30.0, damping=0.0)
+    rate, times = np.sqrt(30.0 / MASS), np.linspace(0.41, 0.9, 50)
+    moved = [float(simulation.advance(time).q[-7]) - begun for time in times]
+    np.testing.assert_allclose(moved, speed / rate * np.sin(rate * (times - 0.4)), atol=2.0 * speed * step**2 * rate)
+
+
 def test_a_snapshot_knows_ties_that_were_changed() -> None:
     simulation = Simulation(hanging(duration=1.0))
     simulation.advance(0.3)

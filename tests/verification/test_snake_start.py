@@ -17,8 +17,9 @@ def dynamic(**overrides):
 
 
 def plate(x):
-    """A plate that the head point touches at x [m]."""
+    """A plate that the head point touches at x [m]; the gripper ahead of it does not count."""
     return {
+        "contacts.candidates": "points",
         "surfaces": {"plate": {"type": "plane", "point_m": [float(x), 0.0, 0.0], "normal": [-1.0, 0.0, 0.0]}},
         "contacts.points": {
             "plate": {

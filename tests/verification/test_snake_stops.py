@@ -32,11 +32,11 @@ def test_by_default_they_are_at_the_limits_of_the_command():
 
 def test_each_kind_of_joint_has_its_own_and_the_limits_stay():
     robot = build.robot(dynamic(**{"plant.dynamics.stops_deg.pitch": 125.0}))
-    found = stops(robot)
-    assert {name for name, pair in found.items() if pair == (-125.0, 125.0)} == {
+    limits = stops(robot)
+    assert {name for name, pair in limits.items() if pair == (-125.0, 125.0)} == {
         "psi1", "psi2", *lifting_joints(robot.description),
     }  # fmt: skip
-    assert {pair for name, pair in found.items() if name.startswith("theta")} == {(-65.0, 65.0)}
+    assert {pair for name, pair in limits.items() if name.startswith("theta")} == {(-65.0, 65.0)}
     np.testing.assert_allclose(np.unique(np.rad2deg(robot.description.upper)), [65.0, 113.0])
 
 

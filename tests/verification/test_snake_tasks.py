@@ -56,6 +56,7 @@ def test_on_the_kinematic_level_objects_follow_the_gripper(
     before = record.time < 6.0
     assert np.ptp(moved[before]) == 0.0
     assert events(record)[0][0] == "captures"
+    assert record.summary["gripper"]["captures"] == [coordinate.partition(".")[0]]
 
 
 @pytest.mark.parametrize("name", ["snake_pick_up", "snake_valve", "snake_door"])
@@ -76,6 +77,11 @@ def test_the_pipe_is_picked_up() -> None:
     record, model = simulation.record(), simulation.model
     assert column(record, "pipe.z")[-1] - 0.03 > 0.14
     assert events(record) == [("captures", "pipe")]
+    gripped = record.summary["gripper"]
+    assert gripped["captures"] == ["pipe"]
+    assert gripped["loses"] == []
+    assert gripped["moved"]["pipe"][2] == pytest.approx(column(record, "pipe.z")[-1] - 0.03)
+    assert 1.7 < gripped["force_max_N"] < 2.2
     supplied = record["energy_electrical_supply"][-1]
     assert np.abs(record["energy_residual"]).max() < 1e-5 * supplied
     # Impulses of the ground, all upwards, and the change of momentum are those of the weight.
