@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.compile.model import Model
-from dynsim.compile.tie_rests import rotation_vector
 from dynsim.engine.operator import Referenced
 from dynsim.errors import SimulationStopped
 from dynsim.model.description import Array
@@ -121,11 +120,12 @@ class GripperControl:
             self.mode = SOFTENING
         self._harden(time, simulation)
         if self.held is not None:
-            self._look(time, q, simulation)
+            self._look(time, simulation)
         self.trace.append((self.mode, self.share, self.nearest(q)[1]))
 
     def _capture(self, time: float, q: Array, simulation: Referenced) -> None:
-        name, distance, angle = self.nearest(q)
+        placements = {name: self.placement(name, q) for name in self.objects}
+        name, distance, angle = nearest_of(placements, self.gripper)
         if (stop := too_far(self.gripper, time, name, distance, angle)) is not None:
             raise stop
         self.held, self.slipping, self.stuck_since = Held(name, *self.placement(name, q)), False, None
@@ -154,19 +154,20 @@ class GripperControl:
             self.held = None
             self._tell(time, "gripper releases", name)
 
-    def _look(self, time: float, q: Array, simulation: Referenced) -> None:
+    def _look(self, time: float, simulation: Referenced) -> None:
         """Check whether the held object slips, is lost, or is stuck."""
         assert self.held is not None
         name, g = self.held.name, self.gripper
-        R, p = self.placement(name, q)
-        moved = float(np.linalg.norm(p - self.held.p)), float(np.linalg.norm(rotation_vector(self.held.R.T @ R)))
-        force = simulation.tie_force
+        if self.mode == SOFTENING:  # what slips out now is let go
+            self.stuck_since = None
+            return
+        force, slip = simulation.tie_force, simulation.tie_slip
         loads = np.array([abs(force[tie_name(name, direction)]) for direction in DIRECTIONS])
         bounds = np.repeat([g.bound, g.turning_bound], 3)
         bound = loads >= (1.0 - AT_BOUND) * bounds
-        # Springs deflect by bound/stiffness in each direction; the rest is slip.
-        springs = np.array([g.bound / g.stiffness, g.turning_bound / g.turning_stiffness])
-        if not self.slipping and bound.any() and (np.array(moved) > springs + SLIPPED).any():
+        slips = np.array([slip[tie_name(name, direction)] for direction in DIRECTIONS])
+        moved = float(np.linalg.norm(slips[:3])), float(np.linalg.norm(slips[3:]))
+        if not self.slipping and (np.array(moved) > SLIPPED).any():
             self.slipping = True
             self._tell(time, "gripper slips", name, moved[0])
         still = name in self._rate and abs(float(simulation.state.v[self._rate[name]])) < AT_REST
@@ -229,13 +230,25 @@ def gripper_summary(record: Record, objects: Iterable[str]) -> dict[str, Any]:
     return summary
 
 
-def nearest_of(placements: Mapping[str, tuple[Array, Array]]) -> tuple[str, float, float]:
+def nearest_of(
+    placements: Mapping[str, tuple[Array, Array]], gripper: Gripper | None = None
+) -> tuple[str, float, float]:
     """The object with the nearest grasp frame, its distance [m], and the angle between the two axes [rad].
 
-    ``placements`` : rotation and origin of grasp frames in that of the gripper, by object
+    Parameters
+    ----------
+    placements : rotation and origin of grasp frames in that of the gripper, by object
+    gripper : objects within its capture come first
     """
-    distance, name = min((float(np.linalg.norm(p)), name) for name, (_, p) in placements.items())
-    return name, distance, float(np.arccos(np.clip(placements[name][0][0, 0], -1.0, 1.0)))
+
+    def seen(name: str) -> tuple[bool, float, float]:
+        R, p = placements[name]
+        distance, angle = float(np.linalg.norm(p)), float(np.arccos(np.clip(R[0, 0], -1.0, 1.0)))
+        beyond = gripper is not None and (distance > gripper.capture_distance or angle > gripper.capture_angle)
+        return beyond, distance, angle
+
+    name = min(placements, key=lambda name: (*seen(name), name))
+    return name, *seen(name)[1:]
 
 
 def too_far(gripper: Gripper, time: float, name: str, distance: float, angle: float) -> SimulationStopped | None:

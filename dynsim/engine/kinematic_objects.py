@@ -6,6 +6,7 @@ object stays in its position.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +17,7 @@ from dynsim.compile.scene import robot_scene
 from dynsim.compile.tie_rests import rotation_vector
 from dynsim.engine.gripper import HARDENED, HARDENING, SOFT, SOFTENING, STATES, STATES_TEXT, nearest_of, too_far
 from dynsim.engine.snake_record import attitude
-from dynsim.model.description import Array, Robot
+from dynsim.model.description import Array, Link, Robot
 from dynsim.model.gripper import Gripper, grasp_frame
 from dynsim.record import Event, Record
 from dynsim.record.scene import Scene, quaternion
@@ -31,7 +32,8 @@ ON_AXIS = 0.01
 class HeldObject:
     """Object ``name`` in the gripper from one tick to another; R, p place it in the gripper's frame.
 
-    ``start``, ``end`` : ticks; ``tip`` : pose of the gripper, rotation and position, and ``q`` coordinates at the start
+    ``start``, ``end`` : ticks; ``released`` : its coordinates from ``end`` on; ``tip``, ``q`` : pose of the gripper,
+    rotation and position, and all coordinates at the start
     """
 
     name: str
@@ -39,6 +41,7 @@ class HeldObject:
     end: float
     tip: tuple[Array, Array]
     q: Array
+    released: Array | None = None
 
 
 class CarriedObjects:
@@ -88,7 +91,8 @@ class CarriedObjects:
         present = self.grasps[-1] if self.grasps and self.grasps[-1].end > tick else None
         if not closed:
             if present is not None:
-                present.end = tick + self.gripper.softening / self._period
+                hardened = min((tick - present.start) * self._period / self.gripper.hardening, 1.0)
+                present.end = tick + math.ceil(hardened * self.gripper.softening / self._period - 1e-9)
                 self.events.append(Event(present.end * self._period, "gripper releases", present.name))
             return
         if present is not None:  # it was still softening
@@ -96,9 +100,8 @@ class CarriedObjects:
             self.events.pop()
             return
         R, p = self.tip(w)
-        self._move_to(tick, w)
         placements = {name: self._placement(name, R, p) for name in self.graspable}
-        name, distance, angle = nearest_of(placements)
+        name, distance, angle = nearest_of(placements, self.gripper)
         if (stop := too_far(self.gripper, time, name, distance, angle)) is not None:
             raise stop
         self.grasps.append(HeldObject(name, tick, np.inf, (R, p), self.q.copy()))
@@ -109,12 +112,24 @@ class CarriedObjects:
         B, other = self.model.body_pose(body, self.q)
         return R.T @ B @ self.robot.attached_axes(grasp_frame(name)), R.T @ (other + B @ at - p)
 
-    def _move_to(self, tick: int, w: Array) -> None:
-        """Move the held object with the gripper, to its position at a tick."""
+    def release(self, tick: int, w: Array) -> None:
+        """Let go of an object whose time has come, with the controlled point at w (6,)."""
         for grasp in self.grasps:
-            if grasp.start <= tick <= grasp.end:
+            if grasp.released is None and grasp.end <= tick:
                 part = self._part[grasp.name]
-                self.q[part] = self._followed(grasp, *self.tip(w))
+                grasp.released = self.q[part] = self._followed(grasp, *self.tip(w))
+
+    def due(self, tick: int) -> float:
+        """Return the number of periods until the next release."""
+        return min((grasp.end - tick for grasp in self.grasps if grasp.released is None), default=math.inf)
+
+    def _move_to(self, tick: int, w: Array) -> None:
+        """Move the held object with the gripper, to its position at a tick, and those that were released."""
+        for grasp in self.grasps:
+            if grasp.start <= tick <= grasp.end and not (tick == grasp.end and grasp.released is not None):
+                self.q[self._part[grasp.name]] = self._followed(grasp, *self.tip(w))
+            elif tick >= grasp.end and grasp.released is not None:
+                self.q[self._part[grasp.name]] = grasp.released
 
     def _followed(self, grasp: HeldObject, R: Array, p: Array) -> Array:
         """Coordinates of a held object with the gripper at R, p."""
@@ -132,9 +147,16 @@ class CarriedObjects:
         # In the plane of the hinge: where the grasp frame was seen from the axis, and where it has gone with the tip.
         was = B @ at - axis * (axis @ B @ at)
         if np.linalg.norm(was) < ON_AXIS:
-            return np.clip(before + axis @ rotation_vector(R @ R0.T), link.lower, link.upper)
+            return self._turned(grasp, before + axis @ rotation_vector(R @ R0.T), link)
         now = was + (p - p0) - axis * (axis @ (p - p0))
-        return np.clip(before + np.arctan2(axis @ np.cross(was, now), was @ now), link.lower, link.upper)
+        angle = float(np.arctan2(axis @ np.cross(was, now), was @ now))
+        return self._turned(grasp, before + angle, link)
+
+    def _turned(self, grasp: HeldObject, angle: Array, link: Link) -> Array:
+        """An angle without its jumps by whole turns since the last position, within the limits of the hinge."""
+        last = self.q[self._part[grasp.name]]
+        turns = np.round((last - angle) / (2.0 * np.pi))
+        return np.clip(angle + 2.0 * np.pi * turns, link.lower, link.upper)
 
     def state_in_words(self, tick: int) -> str:
         """Return the state of the gripper at a tick in words, for the page of a pilot."""
@@ -150,7 +172,7 @@ class CarriedObjects:
         if grasp is None:
             return SOFT
         if (grasp.end - tick) * self._period <= self.gripper.softening:
-            return SOFTENING
+            return SOFTENING if tick < grasp.end else SOFT
         return HARDENED if (tick - grasp.start) * self._period >= self.gripper.hardening else HARDENING
 
     def add_to(self, record: Record, w: Array, ticks: NDArray[np.int64]) -> None:

@@ -37,9 +37,10 @@ class SnakeRun(SnakeControl):
         if self.objects is not None:
             now, block = self.tick, self.block.gripper[self.tick - self.block_start :]
             w, _, _ = self.posture()
+            self.objects.release(now, w)
             self.objects.command(now, bool(block[0]), w)
             changes = np.flatnonzero(block != block[0])
-            periods = min([periods, *changes[:1].tolist()])
+            periods = int(min([periods, self.objects.due(now), *changes[:1].tolist()]))
         done, blocked = run_ticks(
             self.model,
             self.controller.law,

@@ -54,6 +54,11 @@ class Referenced(Protocol):
         """See :attr:`dynsim.engine.simulation.Simulation.tie_force`."""
         ...
 
+    @property
+    def tie_slip(self) -> dict[str, float]:
+        """See :attr:`dynsim.engine.simulation.Simulation.tie_slip`."""
+        ...
+
     def set_references(self, lines: Mapping[str, tuple[float, float]]) -> None:
         """See :meth:`dynsim.engine.simulation.Simulation.set_references`."""
 

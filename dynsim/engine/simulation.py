@@ -211,6 +211,11 @@ class Simulation:
         from dynsim.engine.snake_control import control_periods
         from dynsim.engine.snake_pilot import SnakePilot
 
+        if state is not None:
+            raise ModelError(
+                "a snake with a task-space controller cannot start from a State, which contains neither its target nor "
+                "its gripper; go back to a Simulation.snapshot()"
+            )
         periods = control_periods(self._scenario, control.task_space.schedule.period)
         pilot = SnakePilot(self.model, control.task_space, *periods, source, self._scenario.config.sensors)
         for sensor in pilot.sensors:
@@ -279,6 +284,13 @@ class Simulation:
             return {}
         forces = np.where(unilateral.tie_table[:, ku.TIE_HOLDS] == 1, unilateral.tie[:, ku.TIE_FORCE], 0.0)
         return dict(zip((tie.name for tie in self.robot.ties), forces.tolist(), strict=True))
+
+    @property
+    def tie_slip(self) -> dict[str, float]:
+        """Ways by which ties have slid beyond their bounds since they began, there and back [m or rad]."""
+        unilateral = self._prepared.system.unilateral
+        slips = [] if unilateral is None else unilateral.tie[:, ku.TIE_GIVEN].tolist()
+        return dict(zip((tie.name for tie in self.robot.ties), slips, strict=False))
 
     @property
     def operator(self) -> Operator | SnakePilot | None:
@@ -601,7 +613,8 @@ class Simulation:
         if table[ku.TIE_HOLDS] == 1 and after != before:
             y, layout, stored = prepared.run.y, prepared.run.layout, float(row[ku.TIE_STORED])
             left = stored * (before / after if after > before else after / before)
-            if after > before:
+            # A one-sided tie without contact has no force that could be kept.
+            if after > before and (stored > 0.0 or not tie.pushes):
                 x = deflection(prepared.model, prepared.system.unilateral, k, y[block(layout, "q")])
                 row[ku.TIE_REST] += x * (1.0 - before / after)
             row[ku.TIE_STORED] = left
@@ -610,6 +623,11 @@ class Simulation:
         row[ku.TIE_STIFFNESS], row[ku.TIE_DAMPING] = after, values.get("damping", float(c))
         if holds is not None and holds != (table[ku.TIE_KIND] >= 0):
             table[ku.TIE_KIND] = (kc.ONE_WAY if tie.pushes else kc.BOX) if holds else -1
+            if holds and table[ku.TIE_HOLDS] == 1:  # it has ended and begins anew, without a step between
+                y, layout = prepared.run.y, prepared.run.layout
+                y[layout.elastic + kst.STORED] -= row[ku.TIE_STORED]
+                y[layout.elastic + kst.DAMPED] += row[ku.TIE_STORED]
+                row[[ku.TIE_STORED, ku.TIE_GIVEN, ku.TIE_FORCE, ku.TIE_TURNED]] = 0.0
             row[ku.TIE_REST] = tie.rest
             if holds and math.isnan(tie.rest):
                 # Not by the first step, whose geometry is that of its middle.

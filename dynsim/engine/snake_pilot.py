@@ -364,7 +364,8 @@ class SnakePilot(SnakeControl):
         record.add(
             "grasp_distance", distance, "m", description="from the tip of the gripper to the nearest grasp frame"
         )
-        for event in self.grip.events:
+        begun, ended = record.time[0], record.time[-1]
+        for event in (event for event in self.grip.events if begun <= event.time <= ended):
             record.add_event(event.time, event.kind, event.name, value=event.value)
         record.summary = {**record.summary, "gripper": gripper_summary(record, self.grip.objects)}
 

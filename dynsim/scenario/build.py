@@ -128,7 +128,11 @@ def _with_objects(scenario: Scenario, built: Robot) -> Robot:
 def _tied(scenario: Scenario, built: Robot) -> Robot:
     """The robot and objects with the ties between them."""
     ties = {name: config.tie(name) for name, config in scenario.config.ties.items()}
+    taken = {tie.name for tie in built.ties}
     for name, tie in ties.items():
+        if name in taken:
+            text = f"ties.{name}: an object has a tie of that name, its spring or that of a gripper; choose another"
+            raise ModelError(text, keys=("ties", name))
         for key, body in (("body", tie.body), ("other", tie.other)):
             if key == "other" and body == WORLD:
                 continue
@@ -379,7 +383,10 @@ def contacts(scenario: Scenario, described: Robot | None = None) -> list[Contact
         result = [replace(contact, left_out=left_out) for contact, left_out in zip(result, still, strict=True)]
     if options.candidates != "points":
         law = _law(options, ContactPoint(body=""))
-        result += [replace(contact, **law) for contact in candidates(options.candidates, described, known, result)]
+        # Objects touch with what they are made of, not with their origins.
+        beside = {link.name for name, body in scenario.config.objects.items() for link in body.links(name)}
+        own = (entry for entry in candidates(options.candidates, described, known, result) if entry.body not in beside)
+        result += [replace(contact, **law) for contact in own]
     error = scenario.config.surface_error
     return result if error is None else [_rubbed(contact, error.friction_factor) for contact in result]
 

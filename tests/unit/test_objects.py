@@ -193,3 +193,21 @@ def test_a_pipe_joint_lies_on_its_three_ends():
 def test_wrong_objects_are_refused_with_the_key(change, key):
     with pytest.raises(ValueError, match=key):
         scene({"pipe": PIPE | change})
+
+
+@pytest.mark.parametrize("kind", ["joints", "links"])
+def test_candidates_of_the_robot_are_none_of_objects(kind):
+    """Their origins may be outside of them, or on a hinge."""
+    door = {"mass_kg": 1.0, "size_m": [0.02, 0.4, 0.4], "position_m": [1, 0, 0], "hinge": {"point_m": [0, 0.2, 0]}}
+    contacts = {"law": "unilateral", "friction": 0.3, "candidates": kind}
+    touching = build.contacts(scene({"pipe": PIPE, "door": door}, contacts=contacts))
+    assert {contact.name for contact in touching if contact.body in ("pipe", "door")} == {
+        "pipe.run1.floor", "pipe.run2.floor", "pipe.branch1.floor", "pipe.branch2.floor",
+    }  # fmt: skip
+
+
+def test_a_tie_with_the_name_of_a_spring_is_refused():
+    door = {"mass_kg": 1.0, "size_m": [0.02, 0.4, 0.4], "position_m": [1, 0, 0], "hinge": {"spring_N_m_per_rad": 1.0}}
+    tie = {"type": "torsion", "body": "door", "other": "world", "axis": [0, 0, 1], "stiffness_N_m_per_rad": 1.0}
+    with pytest.raises(ModelError, match=r"ties\.door\.spring: an object has a tie of that name"):
+        build.robot(scene({"door": door}, ties={"door.spring": tie}))

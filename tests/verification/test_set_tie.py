@@ -154,3 +154,23 @@ def test_a_gripper_has_six_ties_of_an_object() -> None:
     ties = Gripper("head", np.array([0.1, 0.0, 0.0])).ties("box")
     assert [tie.name for tie in ties] == [f"gripper.box.{name}" for name in ("x", "y", "z", "rx", "ry", "rz")]
     assert not any(tie.holds for tie in ties)
+
+
+def test_a_tie_that_ends_and_begins_without_a_step_between_has_a_new_rest() -> None:
+    simulation = Simulation(hanging(duration=2.0))
+    simulation.advance(1.0)
+    simulation.set_tie("z", holds=False)
+    simulation.set_tie("z", holds=True)
+    simulation.advance(2.0)
+    assert height(simulation) == pytest.approx(-2.0 * MASS * G / K, rel=1e-3)
+    assert np.abs(simulation.record()["energy_residual"]).max() < 1e-12
+
+
+def test_a_pushing_tie_in_the_air_keeps_its_contact() -> None:
+    scenario = hanging(duration=1.0)
+    ties = dict(scenario.config.ties)
+    ties["z"] = ties["z"].model_copy(update={"pushes": True, "bound_N": None, "rest_m": -0.03})
+    simulation = Simulation(Scenario("hanging", "", scenario.config.model_copy(update={"ties": ties})))
+    simulation.set_tie("z", stiffness=4.0 * K, damping=100.0)
+    simulation.advance(1.0)
+    assert height(simulation) == pytest.approx(-0.03 - MASS * G / (4.0 * K), abs=1e-5)
