@@ -46,7 +46,7 @@ from dynsim.engine.soundness import unstable_loop
 from dynsim.engine.stepped import GUARDS, Snapshot, State, Touch, event_name, own_guards, take_log
 from dynsim.engine.stopping import stopped
 from dynsim.engine.trace import Trace
-from dynsim.errors import ModelError, ScenarioError, brief, first_few
+from dynsim.errors import ModelError, ScenarioError, SimulationStopped, brief, first_few
 from dynsim.integrators import driver
 from dynsim.integrators import run as ki
 from dynsim.integrators.dense import state_within
@@ -151,6 +151,8 @@ class Simulation:
         self._relative = trace is not None or state is not None
         self._happened: list[Event] = []
         self._token = object()
+        # What a controller has ended the run by.
+        self._ended_by: SimulationStopped | None = None
         # Callbacks that are due at the present time, in the order of their calls; the callback that is called now.
         self._due: list[Callable[[Simulation], None]] = []
         self._calling: Callable[[Simulation], None] | None = None
@@ -349,9 +351,17 @@ class Simulation:
             raise ScenarioError("a callback cannot advance the simulation that calls it")
         if not isinstance(until, (int, float, np.number)) or not until >= self._time:
             raise ScenarioError(f"cannot advance to t = {brief(until)} s: the simulation is at {self._time:g} s")
+        try:
+            return self._advanced(min(float(until), self._end))
+        except SimulationStopped as stop:
+            if stop.record is None:  # of the controller, as a snake's, whose task has failed
+                self._ended_by = stop
+                raise_stopped(stop, self.record())
+            raise
+
+    def _advanced(self, until: float) -> State:
         # What a snapshot, or an error in a callback, has left over.
         self._call_due()
-        until = min(float(until), self._end)
         last = self._references_end
         # References of the whole run may end a rounding before it, where nothing is to be rewritten.
         if not self._frozen and until > last + END_SLACK * max(1.0, abs(last)):
@@ -759,6 +769,7 @@ class Simulation:
         if snapshot.owner is not self._token or next(sizes) != next(sizes):
             raise ScenarioError("the snapshot is of another simulation, or ticks or events were added since")
         self._go_back(snapshot)
+        self._ended_by = None
 
     def _go_back(self, snapshot: Snapshot) -> None:
         """Take everything from a snapshot that fits."""
@@ -803,6 +814,8 @@ class Simulation:
         record.complete = self.finished
         if self._failed():
             mark_stopped(stopped(self._scenario, self._prepared), record)
+        elif self._ended_by is not None:
+            mark_stopped(self._ended_by, record)
         return record
 
     def _end_here(self) -> None:

@@ -246,6 +246,59 @@ def test_a_grip_that_opens_slowly_releases_and_does_not_lose() -> None:
     assert events(record)[-1] == ("releases", "pipe")
 
 
+@pytest.mark.parametrize("level", ["kinematic", pytest.param("dynamic", marks=pytest.mark.long)])
+def test_a_pilot_who_closes_the_gripper_in_the_air_ends_the_session(level: str) -> None:
+    session = begin(load_scenario("snake_valve", "turns", {"plant.level": level}), longest=30.0)
+
+    def closes() -> None:
+        while session.time < 2.0:
+            session.tick(Command((0.0,) * 6, NO_REQUEST, session.time > 1.0))
+
+    with pytest.raises(SimulationStopped, match="too_far: the gripper closes at t = ") as caught:
+        closes()
+    assert caught.value.kind == "too_far"
+    record = session.record()
+    assert not events(record)
+
+
+def test_a_stop_of_the_controller_has_the_record_of_the_simulation() -> None:
+    commands = [{"at_s": 0.1, "gripper": "closed"}]
+    simulation = Simulation(load_scenario("snake_valve", "turns", {"controller.commands": commands, "duration_s": 1.0}))
+    with pytest.raises(SimulationStopped, match="too_far") as caught:
+        simulation.advance(1.0)
+    for record in (caught.value.record, simulation.record()):
+        assert record.time[-1] == pytest.approx(0.1)
+        assert "incomplete: too_far" in record.summary["warnings"][-1]
+
+
+def test_a_hanging_load_is_balanced_by_impulses_of_the_ground_and_sinks_by_its_weight() -> None:
+    """At rest: impulses against the weight of both, the gripper's force, and m g/k beside the unloaded gripper."""
+    settings = {"controller.state": "feedforward", "controller.paths": [], "controller.commands": [], "objects": {}}
+    scenario = load_scenario("snake_pick_up", "lifts", settings | {"duration_s": 0.05})
+    tip = simulate(scenario)["w"][0, :3]
+    ties: dict[str, Any] = {}
+    for name, axis in zip("xyz", np.eye(3).tolist(), strict=True):
+        ends = {"body": "head", "other": "load", "axis": axis}
+        linear = {"type": "linear", "point_m": [0.1805, 0, 0], "stiffness_N_per_m": 5e3, "damping_N_s_per_m": 20.0}
+        ties[f"f{name}"] = ends | linear | {"bound_N": 20.0}
+        ties[f"m{name}"] = ends | {"type": "torsion", "stiffness_N_m_per_rad": 5.0, "damping_N_m_s_per_rad": 0.05}
+    load = {"mass_kg": 0.3, "shape": "sphere", "radius_m": 0.02, "position_m": tip.tolist()}
+    simulation = Simulation(
+        load_scenario("snake_pick_up", "lifts", settings | {"duration_s": 8.0, "objects": {"load": load}, "ties": ties})
+    )
+    q = simulation.advance(8.0).q
+    record, model = simulation.record(), simulation.model
+    mass = sum(link.inertia.mass for link in model.robot.links)
+    later = int(np.searchsorted(record.time, 6.0))
+    impulse = record["contact_impulse"][-1].sum() - record["contact_impulse"][later].sum()
+    assert impulse == pytest.approx(mass * G * (record.time[-1] - record.time[later]), rel=1e-9)
+    force = np.array([simulation.tie_force[f"f{name}"] for name in "xyz"])
+    assert np.linalg.norm(force) == pytest.approx(0.3 * G, rel=1e-9)
+    R, p = model.body_pose(model.body_index("head"), q)
+    _, at = model.body_pose(model.body_index("load"), q)
+    assert np.linalg.norm(at - p - R @ [0.1805, 0.0, 0.0]) == pytest.approx(0.3 * G / 5e3, rel=0.02)
+
+
 def test_a_snake_does_not_start_from_a_state() -> None:
     scenario = load_scenario("snake_valve", "turns", {"duration_s": 0.1})
     simulation = Simulation(scenario)
