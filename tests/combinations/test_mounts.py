@@ -85,9 +85,13 @@ MOUNTS: dict[str, tuple[Callable[[Settings], None], dict[str, str]]] = {
     "turned_to_the_world": (to_the_world, {"ties": "torsion"}),
     "not_holding": (not_holding, {"ties": "linear"}),
 }
+# Those of the default tests.
+QUICK = {"closer", "to_the_world"}
 
 
-@pytest.mark.parametrize("name", sorted(MOUNTS))
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name in QUICK else pytest.mark.long) for name in sorted(MOUNTS)]
+)
 def test_a_plain_arm_with_it(name: str, tmp_path: Path) -> None:
     change, levels = MOUNTS[name]
     plain = PLAIN | {"motor": "servo", "give": "rigid"} | levels
@@ -96,7 +100,7 @@ def test_a_plain_arm_with_it(name: str, tmp_path: Path) -> None:
     assert not outcome.problems
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("number", range(6))
 @pytest.mark.parametrize("name", sorted(MOUNTS))
 def test_combined_scenes_with_it(name: str, number: int, tmp_path: Path) -> None:

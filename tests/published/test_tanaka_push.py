@@ -113,14 +113,14 @@ def test_forward_push_of_a_straight_robot_is_that_of_the_paper(force, posture):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("postures", [("i", "ii", "iii"), ("iv", "v", "vi")])
+@pytest.mark.parametrize("postures", [("i", "ii", "iii"), pytest.param(("iv", "v", "vi"), marks=pytest.mark.slow)])
 def test_a_lower_head_pushes_harder_forward_and_less_down(force, postures):
     """As published; an L-shape pushes less than a straight base part of the same height."""
     assert np.all(np.diff([force(posture, "x") for posture in postures]) > 0.0)
     assert np.all(np.diff([force(posture, "z") for posture in postures]) < 0.0)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_an_l_shape_pushes_less_forward_and_as_much_down(force):
     """[T]: "even when changing the posture of the base part, f_z is almost the same"."""
     for straight, bent in (("i", "iv"), ("ii", "v"), ("iii", "vi")):
@@ -129,7 +129,9 @@ def test_an_l_shape_pushes_less_forward_and_as_much_down(force):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("posture", THERE)
+@pytest.mark.parametrize(
+    "posture", [pytest.param(posture, marks=() if posture == "vii" else pytest.mark.slow) for posture in THERE]
+)
 def test_pushes_close_their_ledger_and_settle_their_servos(simulated, posture):
     """Wheels of (vii) that had slipped spun on at their voltage limit, on 103 J from the steps."""
     for direction in PUSHES:
