@@ -68,6 +68,10 @@ def momentum(seen: Observed) -> Finding:
             # Forces along axes of bodies act in the middle of the step, half a step's turn before its end.
             turn = 0.02 + 0.5 * seen.step * np.max([np.linalg.norm(spin[rows], axis=1) for spin in seen.motion.spin], 0)
             allowed = (seen.step * turn * size[rows] * reach + 1e-12)[:, None] + _products_jumped(seen, chosen, rows)
+            # Their points move by v h/2 until then, and with them the arms of moments (9294).
+            speeds = [seen.motion.velocity(i, seen.motion.origin[i])[rows] for i in range(len(seen.motion.origin))]
+            fastest = np.max([np.linalg.norm(v, axis=1) for v in speeds], 0)
+            allowed[:, :3] += (0.5 * seen.step**2 * fastest * size[rows])[:, None]
             # A step predicts the rates of its middle with the acceleration of the last one (8744, 9086).
             allowed += 0.5 * _products_jumped(seen, chosen, np.maximum(rows - 1, 0))
         elif seen.sample_time is not None:
