@@ -6,10 +6,9 @@ A run from its own start leaves this to its first step, ``begin_tie`` in
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
+from dynsim.compile.hand_posture import turn_error
 from dynsim.compile.model import Model
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.unilateral import UnilateralArrays
@@ -55,8 +54,7 @@ def deflection(model: Model, unilateral: UnilateralArrays, k: int, q: Array) -> 
     (A, at), (B, other) = _ends(model, unilateral, k, q)
     axis = row[ku.TIE_AXIS : ku.TIE_AXIS + 3]
     if unilateral.tie_table[k, ku.TIE_TURNS] == 1:
-        turned = A.T @ B @ row[ku.TIE_ATTITUDE : ku.TIE_ATTITUDE + 9].reshape(3, 3).T
-        x = -axis @ rotation_vector(turned)
+        x = -axis @ turn_error(row[ku.TIE_ATTITUDE : ku.TIE_ATTITUDE + 9].reshape(3, 3), A.T @ B)
     else:
         point, other_point = row[ku.TIE_POINT : ku.TIE_POINT + 3], row[ku.TIE_OTHER_POINT : ku.TIE_OTHER_POINT + 3]
         x = (A @ axis) @ (at + A @ point - other - B @ other_point)
@@ -67,11 +65,3 @@ def _ends(model: Model, unilateral: UnilateralArrays, k: int, q: Array) -> tuple
     """Rotation and origin of both bodies of tie k; the second may be the world."""
     a, b = unilateral.tie_table[k, [ku.TIE_A, ku.TIE_B]].tolist()
     return model.body_pose(a, q), (np.eye(3), np.zeros(3)) if b < 0 else model.body_pose(b, q)
-
-
-def rotation_vector(R: Array) -> Array:
-    """Axis times angle of a rotation, at most half a turn long, (3, 3) → (3,) [rad]."""
-    twice = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    sine = 0.5 * float(np.linalg.norm(twice))
-    angle = math.atan2(sine, 0.5 * (float(np.trace(R)) - 1.0))
-    return 0.5 * twice * (angle / sine if sine > 1e-9 else 1.0)

@@ -6,7 +6,7 @@ force, and the stiffness that the hardening adds is not deflected yet.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -15,16 +15,16 @@ from numpy.typing import NDArray
 
 from dynsim.compile.model import Model
 from dynsim.engine.operator import Referenced
+from dynsim.engine.stepped import State
 from dynsim.errors import SimulationStopped
 from dynsim.model.description import Array
 from dynsim.model.gripper import DIRECTIONS, Gripper, grasp_frame, tie_name
 from dynsim.record import Event, Record
+from dynsim.record.measures import GRIPPER_STATES
 
-# Kinds of events, after this word.
-EVENT, EVENT_KINDS = "gripper ", ("captures", "slips", "loses", "releases")
+# Kinds of events are this word and one of these.
+EVENT, EVENT_KINDS = "gripper", ("captures", "slips", "loses", "releases")
 SOFT, HARDENING, HARDENED, SOFTENING = range(4)
-STATES = ("soft", "hardening", "hardened", "softening")
-STATES_TEXT = ", ".join(f"{number} {name}" for number, name in enumerate(STATES))
 # A gripper that holds an object has at least this share of its springs: a tie needs a stiffness.
 LEAST_SHARE = 0.01
 # Smaller slips are not recorded [m, rad].
@@ -35,15 +35,6 @@ AT_BOUND = 1e-3
 AT_REST, STUCK_FOR = 1e-3, 1.0
 
 
-@dataclass(frozen=True)
-class Held:
-    """An object in the gripper: the placement of its grasp frame in that of the gripper at its capture."""
-
-    name: str
-    R: Array
-    p: Array
-
-
 @dataclass
 class GripperControl:
     """A gripper and the objects that it can hold.
@@ -52,8 +43,10 @@ class GripperControl:
     ----------
     objects : names of the objects that have a grasp frame
     period : control period [s]
-    mode : one of :data:`STATES`; share : present share of the hardened springs
+    mode : SOFT, HARDENING, HARDENED or SOFTENING; share : present share of the hardened springs
+    held : name of the object in it
     slipping : the slip of the present object is recorded; stuck_since : time since which this object is stuck [s]
+    trace : state and share after each period
     """
 
     model: Model
@@ -62,24 +55,22 @@ class GripperControl:
     period: float
     mode: int = SOFT
     share: float = 0.0
-    held: Held | None = None
+    held: str | None = None
     slipping: bool = False
     stuck_since: float | None = None
     events: tuple[Event, ...] = ()
-    trace: list[tuple[int, float, float]] = field(default_factory=list)
+    trace: list[tuple[int, float]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        robot = self.model.robot
         self._body = self.model.body_index(self.gripper.body)
-        self._grasps = {name: _attached(self.model, grasp_frame(name)) for name in self.objects}
         # Of objects on hinges or rails: their rates.
-        joints = [link.joint for link in robot.links]
+        joints = [link.joint for link in self.model.robot.links]
         self._rate = {name: joints.index(name) for name in self.objects if name in joints}
 
     @property
     def state_in_words(self) -> str:
-        """Return the state in words, for the page of a pilot."""
-        return STATES[self.mode] + (f" around {self.held.name}" if self.held is not None else "")
+        """The state, for the page of a pilot."""
+        return in_words(self.mode, self.held)
 
     def remembered(self) -> GripperControl:
         """Return a copy of the state and of the recorded samples."""
@@ -91,19 +82,13 @@ class GripperControl:
             setattr(self, name, getattr(kept, name))
         self.trace = list(kept.trace)
 
-    def placement(self, name: str, q: Array) -> tuple[Array, Array]:
-        """Rotation and origin of an object's grasp frame in that of the gripper, whose origin is its tip."""
+    def nearest(self, q: Array, gripper: Gripper | None = None) -> tuple[str, float, float]:
+        """See :func:`nearest_object`, at coordinates (nq,)."""
         R, p = self.model.body_pose(self._body, q)
-        body, A, at = self._grasps[name]
-        B, other = self.model.body_pose(body, q)
-        return R.T @ B @ A, R.T @ (other + B @ at - p) - self.gripper.tip
+        return nearest_object(self.model, self.objects, q, (R, p + R @ self.gripper.tip), gripper)
 
-    def nearest(self, q: Array) -> tuple[str, float, float]:
-        """The nearest object, its distance [m], and the angle between its axis and the gripper's [rad]."""
-        return nearest_of({name: self.placement(name, q) for name in self.objects})
-
-    def step(self, time: float, closed: bool, simulation: Referenced) -> None:
-        """One control period.
+    def step(self, time: float, closed: bool, state: State, simulation: Referenced) -> None:
+        """One control period, which begins with this state of the simulation.
 
         Raises
         ------
@@ -111,25 +96,22 @@ class GripperControl:
             ``too_far``: it closes, and nothing is within capture; ``lost``: an object has slipped out; ``too_stiff``:
             an object on a hinge or rails does not move.
         """
-        q = simulation.state.q
         if closed and self.mode in {SOFT, SOFTENING}:
             if self.held is None:
-                self._capture(time, q, simulation)
+                self._capture(time, state.q, simulation)
             self.mode = HARDENING
         elif not closed and self.mode in {HARDENING, HARDENED}:
             self.mode = SOFTENING
         self._harden(time, simulation)
         if self.held is not None:
-            self._look(time, simulation)
-        self.trace.append((self.mode, self.share, self.nearest(q)[1]))
+            self._look(self.held, time, state, simulation)
+        self.trace.append((self.mode, self.share))
 
     def _capture(self, time: float, q: Array, simulation: Referenced) -> None:
-        placements = {name: self.placement(name, q) for name in self.objects}
-        name, distance, angle = nearest_of(placements, self.gripper)
-        if (stop := too_far(self.gripper, time, name, distance, angle)) is not None:
-            raise stop
-        self.held, self.slipping, self.stuck_since = Held(name, *self.placement(name, q)), False, None
-        self._tell(time, "gripper captures", name, distance)
+        name, distance, angle = self.nearest(q, self.gripper)
+        refuse_capture(self.gripper, time, name, distance, angle)
+        self.held, self.slipping, self.stuck_since = name, False, None
+        self._tell(time, "captures", name, distance)
         for direction in DIRECTIONS:
             simulation.set_tie(tie_name(name, direction), holds=True)
 
@@ -144,33 +126,30 @@ class GripperControl:
             self.mode = SOFT if self.share <= 1e-9 else SOFTENING
         if self.held is None or self.share == before:
             return
-        name, share = self.held.name, max(self.share, LEAST_SHARE)
-        for k, direction in enumerate(DIRECTIONS):
-            stiffness, damping, _ = self.gripper.laws[k // 3]
-            simulation.set_tie(
-                tie_name(name, direction), stiffness=share * stiffness, damping=share * damping, holds=self.mode != SOFT
-            )
+        name, share = self.held, max(self.share, LEAST_SHARE)
+        for direction, law in self.gripper.laws.items():
+            spring = {"stiffness": share * law.stiffness, "damping": share * law.damping}
+            simulation.set_tie(tie_name(name, direction), holds=self.mode != SOFT, **spring)
         if self.mode == SOFT:
             self.held = None
-            self._tell(time, "gripper releases", name)
+            self._tell(time, "releases", name)
 
-    def _look(self, time: float, simulation: Referenced) -> None:
+    def _look(self, name: str, time: float, state: State, simulation: Referenced) -> None:
         """Check whether the held object slips, is lost, or is stuck."""
-        assert self.held is not None
-        name, g = self.held.name, self.gripper
+        g = self.gripper
         if self.mode == SOFTENING:  # what slips out now is let go
             self.stuck_since = None
             return
         force, slip = simulation.tie_force, simulation.tie_slip
         loads = np.array([abs(force[tie_name(name, direction)]) for direction in DIRECTIONS])
-        bounds = np.repeat([g.bound, g.turning_bound], 3)
+        bounds = np.array([law.bound for law in g.laws.values()])
         bound = loads >= (1.0 - AT_BOUND) * bounds
         slips = np.array([slip[tie_name(name, direction)] for direction in DIRECTIONS])
         moved = float(np.linalg.norm(slips[:3])), float(np.linalg.norm(slips[3:]))
         if not self.slipping and (np.array(moved) > SLIPPED).any():
             self.slipping = True
-            self._tell(time, "gripper slips", name, moved[0])
-        still = name in self._rate and abs(float(simulation.state.v[self._rate[name]])) < AT_REST
+            self._tell(time, "slips", name, moved[0])
+        still = name in self._rate and abs(float(state.v[self._rate[name]])) < AT_REST
         if not (still and bound.any()):
             self.stuck_since = None
         elif self.stuck_since is None:
@@ -180,7 +159,7 @@ class GripperControl:
             f"{name} has slipped by {1e3 * moved[0]:.3g} mm and {moved[1]:.3g} rad in the gripper at t = {time:g} s"
         )
         if lost:
-            self._tell(time, "gripper loses", name, moved[0])
+            self._tell(time, "loses", name, moved[0])
         if self.stuck_since is not None and (lost or time - self.stuck_since >= STUCK_FOR):
             worst = DIRECTIONS[int((loads / bounds).argmax())]
             direction = f"along {worst}" if len(worst) == 1 else f"about {worst[1]}"
@@ -192,20 +171,44 @@ class GripperControl:
             )
         if lost:
             raise SimulationStopped(
-                f"lost: {slipped}; it holds {g.bound:g} N and {g.turning_bound:g} N m (plant.gripper)",
+                f"lost: {slipped}; it holds {g.along.bound:g} N and {g.about.bound:g} N m (plant.gripper)",
                 time=time,
                 kind="lost",
             )
 
     def _tell(self, time: float, kind: str, name: str, value: float | None = None) -> None:
-        self.events = (*self.events, Event(time, kind, name, value))
+        self.events = (*self.events, gripper_event(time, kind, name, value))
 
-    def columns(self, ticks: NDArray[np.int64]) -> tuple[Array, Array, Array]:
-        """State, share of its springs, and distance of the nearest grasp frame [m] at ticks, (T,) each."""
-        if not self.trace:
-            return tuple(np.zeros(len(ticks)) for _ in range(3))  # type: ignore[return-value]
-        rows = np.array(self.trace)[np.minimum(ticks, len(self.trace) - 1)]
-        return rows[:, 0].astype(np.int64), rows[:, 1], rows[:, 2]
+    def add_to(self, record: Record) -> None:
+        """Signals and events of the gripper, and its part of the summary."""
+        ticks = np.floor(record.time / self.period + 1e-6).astype(int)
+        rows = np.array(self.trace or [(SOFT, 0.0)])
+        state, share = rows[np.minimum(ticks, len(rows) - 1)].T
+        record.add("gripper_share", share, "1", description="of the springs of the hardened gripper that it has")
+        distance = np.array([self.nearest(q)[1] for q in record["q"]])
+        add_gripper(record, state.astype(np.int64), distance, self.events)
+        record.summary = {**record.summary, "gripper": gripper_summary(record, self.objects)}
+
+
+def gripper_event(time: float, kind: str, name: str, value: float | None = None) -> Event:
+    """Event of one of the :data:`EVENT_KINDS`, of an object."""
+    return Event(time, f"{EVENT} {kind}", name, value)
+
+
+def in_words(state: int, name: str | None) -> str:
+    """State of a gripper and the object in it."""
+    return GRIPPER_STATES[state] + (f" around {name}" if name is not None else "")
+
+
+def add_gripper(record: Record, state: NDArray[np.int64], distance: Array, events: Iterable[Event]) -> None:
+    """Add the signals that both levels have: states and distances [m], (T,); and the events within the samples."""
+    text = ", ".join(f"{number} {name}" for number, name in enumerate(GRIPPER_STATES))
+    record.add("gripper_state", state, "1", description=text)
+    text = "from the tip of the gripper to the nearest grasp frame"
+    record.add("grasp_distance", distance, "m", description=text)
+    for event in events:
+        if record.time[0] <= event.time <= record.time[-1]:
+            record.add_event(event.time, event.kind, event.name, value=event.value)
 
 
 def gripper_summary(record: Record, objects: Iterable[str]) -> dict[str, Any]:
@@ -219,8 +222,7 @@ def gripper_summary(record: Record, objects: Iterable[str]) -> dict[str, Any]:
         own = [name] if name in labels else [f"{name}.{axis}" for axis in "xyz"]
         change = [float(q[-1, labels.index(label)] - q[0, labels.index(label)]) for label in own]
         moved[name] = change[0] if len(change) == 1 else change
-    kinds = [(event.kind.removeprefix(EVENT), event.name) for event in record.events if event.kind.startswith(EVENT)]
-    by_kind = {kind: [name for other, name in kinds if other == kind] for kind in EVENT_KINDS}
+    by_kind = {kind: [e.name for e in record.events if e.kind == f"{EVENT} {kind}"] for kind in EVENT_KINDS}
     summary: dict[str, Any] = {"moved": moved, **by_kind}
     if "tie_force" in record:
         ties = list(record.labels["tie_force"])
@@ -230,42 +232,41 @@ def gripper_summary(record: Record, objects: Iterable[str]) -> dict[str, Any]:
     return summary
 
 
-def nearest_of(
-    placements: Mapping[str, tuple[Array, Array]], gripper: Gripper | None = None
+def nearest_object(
+    model: Model, objects: Iterable[str], q: Array, tip: tuple[Array, Array], gripper: Gripper | None = None
 ) -> tuple[str, float, float]:
     """The object with the nearest grasp frame, its distance [m], and the angle between the two axes [rad].
 
     Parameters
     ----------
-    placements : rotation and origin of grasp frames in that of the gripper, by object
+    tip : rotation and position of the tip of the gripper
     gripper : objects within its capture come first
     """
+    seen = []
+    for name in objects:
+        body, at = model.robot.attach(grasp_frame(name), np.zeros(3))
+        B, origin = model.body_pose(body, q)
+        distance = float(np.linalg.norm(origin + B @ at - tip[1]))
+        axis = B @ model.robot.attached_axes(grasp_frame(name))[:, 0]
+        angle = float(np.arccos(np.clip(axis @ tip[0][:, 0], -1.0, 1.0)))
+        seen.append((gripper is not None and not captures(gripper, distance, angle), distance, angle, name))
+    _, distance, angle, name = min(seen)
+    return name, distance, angle
 
-    def seen(name: str) -> tuple[bool, float, float]:
-        R, p = placements[name]
-        distance, angle = float(np.linalg.norm(p)), float(np.arccos(np.clip(R[0, 0], -1.0, 1.0)))
-        beyond = gripper is not None and (distance > gripper.capture_distance or angle > gripper.capture_angle)
-        return beyond, distance, angle
 
-    name = min(placements, key=lambda name: (*seen(name), name))
-    return name, *seen(name)[1:]
+def captures(gripper: Gripper, distance: float, angle: float) -> bool:
+    """Whether a grasp frame is within capture [m, rad]."""
+    return distance <= gripper.capture_distance and angle <= gripper.capture_angle
 
 
-def too_far(gripper: Gripper, time: float, name: str, distance: float, angle: float) -> SimulationStopped | None:
-    """What ends a run in which the gripper closes so far from the nearest object [m, rad]; None if it captures that."""
-    if distance <= gripper.capture_distance and angle <= gripper.capture_angle:
-        return None
-    return SimulationStopped(
+def refuse_capture(gripper: Gripper, time: float, name: str, distance: float, angle: float) -> None:
+    """Raise SimulationStopped if the gripper closes too far from the nearest object [m, rad]."""
+    if captures(gripper, distance, angle):
+        return
+    raise SimulationStopped(
         f"too_far: the gripper closes at t = {time:g} s, {1e3 * distance:.3g} mm and {np.degrees(angle):.3g}° from the "
         f"grasp frame of {name}; it captures within {1e3 * gripper.capture_distance:g} mm and "
         f"{np.degrees(gripper.capture_angle):g}° (plant.gripper)",
         time=time,
         kind="too_far",
     )
-
-
-def _attached(model: Model, frame: str) -> tuple[int, Array, Array]:
-    """Return the body of a frame, and rotation and origin of the frame in this body."""
-    robot = model.robot
-    body, at = robot.attach(frame, np.zeros(3))
-    return body, robot.attached_axes(frame), at

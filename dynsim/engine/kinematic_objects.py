@@ -7,18 +7,28 @@ object stays in its position.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dynsim.compile.hand_posture import turn_error
 from dynsim.compile.model import Model
 from dynsim.compile.scene import robot_scene
-from dynsim.compile.tie_rests import rotation_vector
-from dynsim.engine.gripper import HARDENED, HARDENING, SOFT, SOFTENING, STATES, STATES_TEXT, nearest_of, too_far
+from dynsim.engine.gripper import (
+    HARDENED,
+    HARDENING,
+    SOFT,
+    SOFTENING,
+    add_gripper,
+    gripper_event,
+    in_words,
+    nearest_object,
+    refuse_capture,
+)
 from dynsim.engine.snake_record import attitude
 from dynsim.model.description import Array, Link, Robot
-from dynsim.model.gripper import Gripper, grasp_frame
+from dynsim.model.gripper import Gripper, grasp_frame, graspable
 from dynsim.record import Event, Record
 from dynsim.record.scene import Scene, quaternion
 from dynsim.scenario import Scenario
@@ -30,7 +40,7 @@ ON_AXIS = 0.01
 
 @dataclass
 class HeldObject:
-    """Object ``name`` in the gripper from one tick to another; R, p place it in the gripper's frame.
+    """Object ``name`` in the gripper from one tick to another.
 
     ``start``, ``end`` : ticks; ``released`` : its coordinates from ``end`` on; ``tip``, ``q`` : pose of the gripper,
     rotation and position, and all coordinates at the start
@@ -66,7 +76,7 @@ class CarriedObjects:
         sizes = [len(body.start()) for body in self.objects.values()]
         ends = np.cumsum(sizes).tolist()
         self._part = {name: slice(end - size, end) for name, size, end in zip(self.objects, sizes, ends, strict=True)}
-        self.graspable = tuple(name for name, body in self.objects.items() if body.grasp is not None)
+        self.graspable = graspable(self.robot)
         self.grasps: list[HeldObject] = []
         self.events: list[Event] = []
         self._closed = False
@@ -93,24 +103,17 @@ class CarriedObjects:
             if present is not None:
                 hardened = min((tick - present.start) * self._period / self.gripper.hardening, 1.0)
                 present.end = tick + math.ceil(hardened * self.gripper.softening / self._period - 1e-9)
-                self.events.append(Event(present.end * self._period, "gripper releases", present.name))
+                self.events.append(gripper_event(present.end * self._period, "releases", present.name))
             return
         if present is not None:  # it was still softening
             present.end = np.inf
             self.events.pop()
             return
-        R, p = self.tip(w)
-        placements = {name: self._placement(name, R, p) for name in self.graspable}
-        name, distance, angle = nearest_of(placements, self.gripper)
-        if (stop := too_far(self.gripper, time, name, distance, angle)) is not None:
-            raise stop
-        self.grasps.append(HeldObject(name, tick, np.inf, (R, p), self.q.copy()))
-        self.events.append(Event(time, "gripper captures", name, distance))
-
-    def _placement(self, name: str, R: Array, p: Array) -> tuple[Array, Array]:
-        body, at = self.robot.attach(grasp_frame(name), np.zeros(3))
-        B, other = self.model.body_pose(body, self.q)
-        return R.T @ B @ self.robot.attached_axes(grasp_frame(name)), R.T @ (other + B @ at - p)
+        tip = self.tip(w)
+        name, distance, angle = nearest_object(self.model, self.graspable, self.q, tip, self.gripper)
+        refuse_capture(self.gripper, time, name, distance, angle)
+        self.grasps.append(HeldObject(name, tick, np.inf, tip, self.q.copy()))
+        self.events.append(gripper_event(time, "captures", name, distance))
 
     def release(self, tick: int, w: Array) -> None:
         """Let go of an object whose time has come, with the controlled point at w (6,)."""
@@ -126,28 +129,28 @@ class CarriedObjects:
     def _move_to(self, tick: int, w: Array) -> None:
         """Move the held object with the gripper, to its position at a tick, and those that were released."""
         for grasp in self.grasps:
-            if grasp.start <= tick <= grasp.end and not (tick == grasp.end and grasp.released is not None):
-                self.q[self._part[grasp.name]] = self._followed(grasp, *self.tip(w))
-            elif tick >= grasp.end and grasp.released is not None:
+            if tick >= grasp.end and grasp.released is not None:
                 self.q[self._part[grasp.name]] = grasp.released
+            elif grasp.start <= tick <= grasp.end:
+                self.q[self._part[grasp.name]] = self._followed(grasp, *self.tip(w))
 
     def _followed(self, grasp: HeldObject, R: Array, p: Array) -> Array:
         """Coordinates of a held object with the gripper at R, p."""
-        body, (R0, p0), joint = self.objects[grasp.name], grasp.tip, self.objects[grasp.name].joint
+        body, (R0, p0) = self.objects[grasp.name], grasp.tip
         index, at = self.robot.attach(grasp_frame(grasp.name), np.zeros(3))
         B, origin = self.model.body_pose(index, grasp.q)
         before = grasp.q[self._part[grasp.name]]
-        if joint is None:
+        if body.joint is None:
             turn = R @ R0.T
             return np.array([*(p + turn @ (origin - p0)), *quaternion(turn @ B), *before[7:]])
-        axis = B @ self.robot.links[index].axis
         link = self.robot.links[index]
+        axis = B @ link.axis
         if body.slide is not None:
             return np.clip(before + axis @ (p - p0), link.lower, link.upper)
         # In the plane of the hinge: where the grasp frame was seen from the axis, and where it has gone with the tip.
         was = B @ at - axis * (axis @ B @ at)
         if np.linalg.norm(was) < ON_AXIS:
-            return self._turned(grasp, before + axis @ rotation_vector(R @ R0.T), link)
+            return self._turned(grasp, before + axis @ turn_error(R0, R), link)
         now = was + (p - p0) - axis * (axis @ (p - p0))
         angle = float(np.arctan2(axis @ np.cross(was, now), was @ now))
         return self._turned(grasp, before + angle, link)
@@ -161,12 +164,12 @@ class CarriedObjects:
     def state_in_words(self, tick: int) -> str:
         """Return the state of the gripper at a tick in words, for the page of a pilot."""
         present = next((grasp for grasp in reversed(self.grasps) if grasp.start <= tick <= grasp.end), None)
-        return STATES[self._state(present, tick)] + (f" around {present.name}" if present is not None else "")
+        return in_words(self._state(present, tick), None if present is None else present.name)
 
     def positions(self, tick: int, w: Array) -> dict[str, float]:
         """Return the coordinates of the objects by name, with the controlled point at w (6,) at this tick."""
         self._move_to(tick, w)
-        return dict(zip(self._labels, self.q.tolist(), strict=True))
+        return dict(zip(self.robot.position_names, self.q.tolist(), strict=True))
 
     def _state(self, grasp: HeldObject | None, tick: float) -> int:
         if grasp is None:
@@ -183,31 +186,19 @@ class CarriedObjects:
             self._move_to(tick, w[row])
             rows.append(self.q.copy())
             if self.graspable:
-                distance[row] = nearest_of({k: self._placement(k, *self.tip(w[row])) for k in self.graspable})[1]
+                distance[row] = nearest_object(self.model, self.graspable, self.q, self.tip(w[row]))[1]
         for grasp in self.grasps:
             within = np.flatnonzero((ticks >= grasp.start) & (ticks <= grasp.end))
             state[within] = [self._state(grasp, tick) for tick in ticks[within].tolist()]
-        labels = self._labels
+        labels = self.robot.position_names
         record.add("q", np.array(rows), "rad or m", labels=labels, description="coordinates of objects")
         if self.graspable:
-            record.add("gripper_state", state, "1", description=STATES_TEXT)
-            text = "from the tip of the gripper to the nearest grasp frame"
-            record.add("grasp_distance", distance, "m", description=text)
-        for event in self.events:
-            if event.time <= float(record.time[-1]):
-                record.add_event(event.time, event.kind, event.name, value=event.value)
-
-    @property
-    def _labels(self) -> tuple[str, ...]:
-        return tuple(name for link in self.robot.links for name in link.coordinates)
+            add_gripper(record, state, distance, self.events)
 
     def beside(self, scene: Scene) -> Scene:
         """The scene with the objects in it."""
         own = robot_scene(self.robot, (), {})
         assert own is not None
         shifted = len(scene.bodies)
-        bodies = [
-            body if body.parent < 0 else type(body)(body.name, body.parent + shifted, body.joint, body.shapes)
-            for body in own.bodies
-        ]
-        return type(scene)((*scene.bodies, *bodies), scene.surfaces, scene.points, scene.fixed, scene.supports)
+        bodies = (replace(body, parent=body.parent + shifted) if body.parent >= 0 else body for body in own.bodies)
+        return replace(scene, bodies=(*scene.bodies, *bodies))

@@ -10,9 +10,8 @@ Gravity and velocity forces are as slow as the motion itself. Where that part is
 steps, and the energy drifts: of one to six links that tumble for ten seconds by up to 18 rtol (DOPRI5) and 0.9 rtol
 (RADAU5). A share of the tolerance, 0.03 at rtol 1e-6 and 0.1 at 3e-8 and below, brings DOPRI5 to 0.7 and 5 rtol, in 1.0
 to 1.7 times its time at the tolerance itself. RADAU5 would need 3 to 4 times that at 1e-10, since its error estimate is
-of third order. Friction
-of contacts turns fast where slip is slow: there the implicit method is taken. Nothing is timed: the choice is the same
-on every machine.
+of third order. Friction of contacts turns fast if slip is slow: then the implicit method is taken. Nothing is timed:
+the choice is the same on every machine.
 """
 
 from __future__ import annotations

@@ -620,29 +620,26 @@ class Simulation:
         prepared, tie = self._prepared, self.robot.ties[k]
         assert prepared.system.unilateral is not None
         table, row = prepared.system.unilateral.tie_table[k], prepared.system.unilateral.tie[k]
+        y, layout = prepared.run.y, prepared.run.layout
+        q, stored = y[block(layout, "q")], float(row[ku.TIE_STORED])
         if table[ku.TIE_HOLDS] == 1 and after != before:
-            y, layout, stored = prepared.run.y, prepared.run.layout, float(row[ku.TIE_STORED])
-            left = stored * (before / after if after > before else after / before)
             # A one-sided tie without contact has no force that could be kept.
             if after > before and (stored > 0.0 or not tie.pushes):
-                x = deflection(prepared.model, prepared.system.unilateral, k, y[block(layout, "q")])
+                x = deflection(prepared.model, prepared.system.unilateral, k, q)
                 row[ku.TIE_REST] += x * (1.0 - before / after)
-            row[ku.TIE_STORED] = left
-            y[layout.elastic + kst.STORED] -= stored - left
-            y[layout.elastic + kst.DAMPED] += stored - left
+            row[ku.TIE_STORED] = stored * (before / after if after > before else after / before)
         row[ku.TIE_STIFFNESS], row[ku.TIE_DAMPING] = after, values.get("damping", float(c))
         if holds is not None and holds != (table[ku.TIE_KIND] >= 0):
             table[ku.TIE_KIND] = (kc.ONE_WAY if tie.pushes else kc.BOX) if holds else -1
             if holds and table[ku.TIE_HOLDS] == 1:  # it has ended and begins anew, without a step between
-                y, layout = prepared.run.y, prepared.run.layout
-                y[layout.elastic + kst.STORED] -= row[ku.TIE_STORED]
-                y[layout.elastic + kst.DAMPED] += row[ku.TIE_STORED]
                 row[[ku.TIE_STORED, ku.TIE_GIVEN, ku.TIE_FORCE, ku.TIE_TURNED]] = 0.0
             row[ku.TIE_REST] = tie.rest
             if holds and math.isnan(tie.rest):
                 # Not by the first step, whose geometry is that of its middle.
-                q = prepared.run.y[block(prepared.run.layout, "q")]
                 rest_here(prepared.model, prepared.system.unilateral, k, q)
+        lost = stored - row[ku.TIE_STORED]
+        y[layout.elastic + kst.STORED] -= lost
+        y[layout.elastic + kst.DAMPED] += lost
         self._restart()
 
     def release(self, joint: str) -> None:

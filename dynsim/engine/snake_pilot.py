@@ -20,7 +20,7 @@ import numpy as np
 
 from dynsim.compile.model import Model
 from dynsim.compile.snake_tree import GROUND, HEAD, ROOT, SnakeTree
-from dynsim.engine.gripper import STATES_TEXT, GripperControl, gripper_summary
+from dynsim.engine.gripper import GripperControl
 from dynsim.engine.operator import Referenced
 from dynsim.engine.sensing import SampledSensor
 from dynsim.engine.snake_control import OBSTACLES, SnakeControl, copy_of
@@ -31,6 +31,7 @@ from dynsim.errors import SimulationStopped
 from dynsim.jit.kernel import FixedSignature
 from dynsim.model.description import Array
 from dynsim.model.drives import Servo
+from dynsim.model.gripper import graspable
 from dynsim.record import Record
 from dynsim.scenario.sensors import Sensors
 from dynsim.snake import state as ss
@@ -119,7 +120,7 @@ class SnakePilot(SnakeControl):
         self._overload_ticks = max(1, round(OVERLOAD_LOOK / self.period))
         self._lies_since: float | None = None
         self.sensors = self._sensors(sensors or Sensors())
-        objects = tuple(frame.name.rpartition(".")[0] for frame in robot.frames if frame.name.endswith(".grasp"))
+        objects = graspable(robot)
         self.grip = GripperControl(model, robot.gripper, objects, self.period) if objects else None
         self._next_look = self._commanded = 0
         self._seen: Any = None
@@ -154,7 +155,7 @@ class SnakePilot(SnakeControl):
         self._look()
         self.begin_period()
         if self.grip is not None:
-            self.grip.step(self.time, bool(self.gripper[self.tick]), simulation)
+            self.grip.step(self.time, bool(self.gripper[self.tick]), self._seen, simulation)
         state, row = self.state, self.tick // self.stride if self.tick % self.stride == 0 else -1
         time, phi = self.time, state.phi.copy()
         mode = int(state.counts[ss.MODE])
@@ -351,23 +352,9 @@ class SnakePilot(SnakeControl):
         add("rho_dot_command", trace.u[:, columns:], "rad/s", labels=d.wheel_names, description=f"wheel {text}")
         add_task(record, self, trace, w, np.array(points))
         if self.grip is not None:
-            self._add_grip(record)
+            self.grip.add_to(record)
         summary = {**record.summary, **task_summary(self, record), **effort(record.summary)}
         record.summary = {**summary, "warnings": [*summary["warnings"], *task_warnings(self, record, summary)]}
-
-    def _add_grip(self, record: Record) -> None:
-        """What the gripper did."""
-        assert self.grip is not None
-        state, share, distance = self.grip.columns(np.floor(record.time / self.period + 1e-6).astype(int))
-        record.add("gripper_state", state, "1", description=STATES_TEXT)
-        record.add("gripper_share", share, "1", description="of the springs of the hardened gripper that it has")
-        record.add(
-            "grasp_distance", distance, "m", description="from the tip of the gripper to the nearest grasp frame"
-        )
-        begun, ended = record.time[0], record.time[-1]
-        for event in (event for event in self.grip.events if begun <= event.time <= ended):
-            record.add_event(event.time, event.kind, event.name, value=event.value)
-        record.summary = {**record.summary, "gripper": gripper_summary(record, self.grip.objects)}
 
     def _polyline(self, q: Array) -> Array:
         """Controlled point, joints and axles to the tail at coordinates (nq,), (points, 3) [m]."""

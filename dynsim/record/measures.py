@@ -23,6 +23,8 @@ SHORT = 5e-4
 # A share of a run's time below this is rounding error.
 ROUNDED = 1e-9
 
+# States of a gripper by the numbers of the signal ``gripper_state``.
+GRIPPER_STATES = ("soft", "hardening", "hardened", "softening")
 # Kind of the event of a mobile base that tips; found between samples, where the margin is zero.
 TIP_OVER = "tip_over"
 

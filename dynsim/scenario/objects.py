@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Annotated, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -25,6 +25,7 @@ from dynsim.config.base import NonNegative, Positive, StrictConfig, Vector3, err
 from dynsim.library.families import build, union
 from dynsim.model.description import WORLD, Array, Foot, Frame, Inertia, Link, Tie
 from dynsim.model.drives import Drive
+from dynsim.model.gripper import grasp_frame
 from dynsim.model.joints.ball import floating
 from dynsim.record.scene import HERE, Shape, quaternion
 
@@ -36,10 +37,30 @@ Edges = Annotated[list[Positive], Field(min_length=3, max_length=3)]
 Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
 
 
-class Hinge(StrictConfig):
-    """What an object turns on."""
+class Guide(StrictConfig):
+    """What lets an object move in one way; ``KIND`` is that of its joint."""
+
+    KIND: ClassVar[str]
 
     axis: Vector3 = Field([0.0, 0.0, 1.0], description="in the object's own axes")
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        unit_vector(self.axis, "axis")
+        return self
+
+    def _joint(self, link: Link, damping: float, friction: float, limits: list[float] | None) -> Link:
+        """The link on this joint, with limits [rad or m]."""
+        lower, upper = limits or (-math.inf, math.inf)
+        axis = unit_vector(self.axis, "axis")
+        return replace(link, kind=self.KIND, axis=axis, damping=damping, friction=friction, lower=lower, upper=upper)
+
+
+class Hinge(Guide):
+    """An axis about which an object turns."""
+
+    KIND = "revolute"
+
     point_m: Vector3 = Field(
         [0.0, 0.0, 0.0], description="a point of the axis, from the object's centre; it is the origin of the body"
     )
@@ -50,23 +71,14 @@ class Hinge(StrictConfig):
     rest_deg: float = Field(0.0, gt=-180.0, lt=180.0, description="angle at which the spring has no torque")
 
     @model_validator(mode="after")
-    def _check(self) -> Self:
-        unit_vector(self.axis, "axis")
+    def _check_limits(self) -> Self:
         _ordered(self.limits_deg, "limits_deg")
         return self
 
     def joint(self, link: Link) -> Link:
         """The link on this joint."""
-        lower, upper = np.deg2rad(self.limits_deg).tolist() if self.limits_deg else (-math.inf, math.inf)
-        return replace(
-            link,
-            kind="revolute",
-            axis=unit_vector(self.axis, "axis"),
-            damping=self.damping_N_m_s_per_rad,
-            friction=self.friction_N_m,
-            lower=lower,
-            upper=upper,
-        )
+        limits = None if self.limits_deg is None else np.deg2rad(self.limits_deg).tolist()
+        return self._joint(link, self.damping_N_m_s_per_rad, self.friction_N_m, limits)
 
     def spring(self, name: str, link: Link) -> Tie | None:
         """Its closer, between the link and the world."""
@@ -75,8 +87,10 @@ class Hinge(StrictConfig):
         return tie if self.spring_N_m_per_rad > 0.0 else None
 
 
-class Slide(StrictConfig):
+class Slide(Guide):
     """Rails on which an object moves along a straight line, as a drawer does."""
+
+    KIND = "prismatic"
 
     axis: Vector3 = Field([1.0, 0.0, 0.0], description="in the object's own axes")
     friction_N: NonNegative = Field(0.0, description="that holds it at rest; unilateral law")
@@ -91,23 +105,13 @@ class Slide(StrictConfig):
         return [0.0, 0.0, 0.0]
 
     @model_validator(mode="after")
-    def _check(self) -> Self:
-        unit_vector(self.axis, "axis")
+    def _check_limits(self) -> Self:
         _ordered(self.limits_m, "limits_m")
         return self
 
     def joint(self, link: Link) -> Link:
         """The link on this joint."""
-        lower, upper = self.limits_m if self.limits_m else (-math.inf, math.inf)
-        return replace(
-            link,
-            kind="prismatic",
-            axis=unit_vector(self.axis, "axis"),
-            damping=self.damping_N_s_per_m,
-            friction=self.friction_N,
-            lower=lower,
-            upper=upper,
-        )
+        return self._joint(link, self.damping_N_s_per_m, self.friction_N, self.limits_m)
 
     def spring(self, name: str, link: Link) -> Tie | None:
         """Its spring, between the link and the world."""
@@ -335,7 +339,7 @@ class SceneObject(StrictConfig):
         if self.grasp is None:
             return []
         R = frame_along(unit_vector(self.grasp.axis, "axis"))
-        return [Frame(f"{name}.grasp", name, R, np.array(self.grasp.position_m) - self._origin)]
+        return [Frame(grasp_frame(name), name, R, np.array(self.grasp.position_m) - self._origin)]
 
     def start(self) -> list[float]:
         """Its coordinates at the start."""

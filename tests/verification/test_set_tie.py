@@ -10,7 +10,7 @@ import pytest
 import dynsim
 from dynsim import Simulation
 from dynsim.errors import ModelError
-from dynsim.model.gripper import Gripper
+from dynsim.library.plants.snake import GripperConfig
 from dynsim.scenario import Scenario, ScenarioConfig
 
 G, MASS, K = 9.81, 0.3, 5e3
@@ -151,7 +151,7 @@ def test_a_tie_that_does_not_hold_at_the_start_has_no_force() -> None:
 
 
 def test_a_gripper_has_six_ties_of_an_object() -> None:
-    ties = Gripper("head", np.array([0.1, 0.0, 0.0])).ties("box")
+    ties = GripperConfig().gripper(0.1).ties("box")
     assert [tie.name for tie in ties] == [f"gripper.box.{name}" for name in ("x", "y", "z", "rx", "ry", "rz")]
     assert not any(tie.holds for tie in ties)
 

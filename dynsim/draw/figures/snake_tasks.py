@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from dynsim.draw.figures import style
 from dynsim.draw.figures.snake_view import BODY, HEAD, TARGET, greek, object_bodies
 from dynsim.draw.figures.style import Array
-from dynsim.draw.geometry.robot import GRIPPER_STATES
 from dynsim.record import Record
+from dynsim.record.measures import GRIPPER_STATES
 from dynsim.record.poses import ORIENTATION, POSITION
 from dynsim.record.quaternion import continuous, of_turn, product, rotated
 

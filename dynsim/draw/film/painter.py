@@ -20,7 +20,6 @@ from dynsim.draw.film.strokes import Box, arrow, dashes, font, labels, line, rin
 from dynsim.draw.geometry.camera import Camera
 from dynsim.draw.geometry.meshes import Meshes, simplified
 from dynsim.draw.geometry.robot import (
-    GRIPPER_STATES,
     DrawnContact,
     DrawnRobot,
     Penetration,
@@ -33,6 +32,7 @@ from dynsim.draw.geometry.robot import (
 from dynsim.draw.geometry.shapes import body_shapes, drawn_shape, drawn_surface, grid_faces, gripper, outline, solid
 from dynsim.draw.geometry.surfaces import round_patch, surface_grids
 from dynsim.draw.geometry.wheels import cop_of, supports, wheel_groups
+from dynsim.record.measures import GRIPPER_STATES
 from dynsim.record.poses import ORIENTATION, POSITION
 from dynsim.record.quaternion import rotated
 from dynsim.record.scene import HERE, WORLD, SceneSurface

@@ -20,8 +20,6 @@ Array = NDArray[np.float64]
 POSE_ERROR = 4e-5
 # Most frames; longer runs have fewer frames than POSE_ERROR needs.
 FRAMES = 20_000
-# States of a gripper by their numbers in records of runs with objects that it can hold.
-GRIPPER_STATES = ("soft", "hardening", "hardened", "softening")
 WORLD_AXES = np.eye(3)
 HERE_POINT: Vector3 = (0.0, 0.0, 0.0)
 

@@ -13,7 +13,6 @@ from dynsim._version import __version__
 from dynsim.draw.geometry.camera import view_axes
 from dynsim.draw.geometry.meshes import Meshes, named, simplified
 from dynsim.draw.geometry.robot import (
-    GRIPPER_STATES,
     POSE_ERROR,
     DrawnRobot,
     azimuth,
@@ -29,7 +28,7 @@ from dynsim.draw.geometry.shapes import body_shapes, drawn_shape, drawn_surface,
 from dynsim.draw.geometry.wheels import cop_of, supports, wheel_groups
 from dynsim.draw.page.blocks import Blocks, packed_mesh
 from dynsim.record import TIME, Record, Signal
-from dynsim.record.measures import hand_target
+from dynsim.record.measures import GRIPPER_STATES, hand_target
 from dynsim.record.poses import ORIENTATION, POSITION
 from dynsim.record.scene import Scene
 

@@ -19,7 +19,7 @@ from dynsim.config.base import NonNegative, Positive, StrictConfig
 from dynsim.errors import ModelError
 from dynsim.library import families
 from dynsim.model.drives import Drive
-from dynsim.model.gripper import Gripper
+from dynsim.model.gripper import Gripper, HoldingLaw
 from dynsim.snake.description import SnakeDescription
 from dynsim.snake.lifting import Lifts
 
@@ -92,21 +92,18 @@ class GripperConfig(StrictConfig):
 
     def gripper(self, length: float) -> Gripper:
         """The gripper, its tip that far ahead of the head point [m]."""
+        turning = self.turning_stiffness_N_m_per_rad, self.turning_damping_N_m_s_per_rad, self.turning_bound_N_m
         return Gripper(
-            "head",
-            np.array([length, 0.0, 0.0]),
-            self.capture_m,
-            float(np.deg2rad(self.capture_deg)),
-            self.hardening_s,
-            self.softening_s,
-            self.stiffness_N_per_m,
-            self.damping_N_s_per_m,
-            self.bound_N,
-            self.turning_stiffness_N_m_per_rad,
-            self.turning_damping_N_m_s_per_rad,
-            self.turning_bound_N_m,
-            self.lost_m,
-            float(np.deg2rad(self.lost_deg)),
+            body="head",
+            tip=np.array([length, 0.0, 0.0]),
+            capture_distance=self.capture_m,
+            capture_angle=float(np.deg2rad(self.capture_deg)),
+            hardening=self.hardening_s,
+            softening=self.softening_s,
+            along=HoldingLaw(self.stiffness_N_per_m, self.damping_N_s_per_m, self.bound_N),
+            about=HoldingLaw(*turning),
+            lost_distance=self.lost_m,
+            lost_angle=float(np.deg2rad(self.lost_deg)),
         )
 
 
