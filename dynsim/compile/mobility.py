@@ -1,4 +1,4 @@
-"""Contact points that no joint moves along the normal of their surface: in any posture, or in one of them.
+"""Joints that move no inertia, and contact points that no joint moves along the normal of their surface: in any posture, or in one of them.
 
 The force on such a point changes no motion, so no equation determines it. A point that is immobile in every posture is
 left out of the contact problem; in a single posture it carries nothing. Joints whose brakes are closed move nothing.
@@ -11,6 +11,7 @@ from collections.abc import Collection, Iterable, Sequence
 import numpy as np
 
 from dynsim.compile.model import Model
+from dynsim.config.problems import listed
 from dynsim.dynamics.contact.delassus import RANK_TOLERANCE
 from dynsim.dynamics.contact.mobility import IMMOBILE
 from dynsim.errors import ModelError
@@ -23,6 +24,11 @@ CONFIGURATIONS = 6
 SAME = 1e-9
 # Positions along the axis of a capsule at which its row is examined, in parts of its length.
 SHARES = (0.0, 0.3, 0.7, 1.0)
+# The inertia of a joint counts as zero below this part of Σ m l² + tr I of the bodies that it moves, and below this
+# part of their Σ m r² about the world's origin, which is rounding of the sweep.
+NOTHING, CANCELLED = 1e-12, 1e-14
+# The rounding of the sweep is at most this part of Σ m l² + tr I, or the inertia of a joint is not known.
+KNOWN = 1e-3
 
 
 def random_configurations(robot: Robot, braked: Collection[int] = (), at: Array | None = None) -> list[Array]:
@@ -133,3 +139,49 @@ def mobility_floors(
             typical = float(((contact.surface.normal(position) @ jacobian) ** 2 / inertia).sum())
             floors[k] = max(floors[k], RANK_TOLERANCE * typical)
     return floors
+
+
+def without_inertia(model: Model, q: Array) -> list[int]:
+    """Numbers of the joints that move no inertia at coordinates q (nq,); for several in a row only the last one."""
+    links = model.robot.links
+    felt = model.articulated_inertia(q)
+    mass = np.array([link.inertia.mass for link in links])
+    own = np.array([np.trace(link.inertia.tensor) for link in links])
+    positions = model.joint_positions(q, *((k, link.inertia.com) for k, link in enumerate(links)))
+    origins, centres = positions[: model.n], positions[model.n + 1 :]
+    numbers = {link.name: k for k, link in enumerate(links)}
+    parents = [-1 if link.parent is None else numbers[link.parent] for link in links]
+    behind = np.eye(model.n, dtype=bool)
+    for k in range(model.n - 1, -1, -1):
+        if parents[k] >= 0:
+            behind[parents[k]] |= behind[k]
+    slides = np.array([link.kind == "prismatic" for link in links])
+    lever = ((centres[None] - origins[:, None]) ** 2).sum(axis=2)
+    about_joint = np.where(slides, behind @ mass, (behind * (mass * lever + own)).sum(axis=1)) + model.armature
+    about_origin = behind @ (mass * (centres**2).sum(axis=1))
+    rounding = np.where(slides, 0.0, CANCELLED * about_origin)
+    # Of bodies that have run far away nothing is known.
+    known = rounding <= KNOWN * about_joint
+    none = (felt <= np.maximum(NOTHING * about_joint, rounding)) & (known | (about_joint == 0.0))
+    return [k for k in np.flatnonzero(none).tolist() if np.count_nonzero(none & behind[k]) == 1]
+
+
+def moving_nothing(model: Model, q: Array) -> str:
+    """A sentence about joints that move no inertia at coordinates q (nq,), or an empty string."""
+    if not np.isfinite(q).all():
+        return ""
+    none = without_inertia(model, q)
+    if not none:
+        return ""
+    joints = listed([model.robot.links[k].joint for k in none])
+    bodies = listed([model.robot.links[k].name for k in none])
+    return (
+        f"joint {joints} moves no inertia in this posture: the mass behind it ({bodies}) is zero or lies on its axis "
+        "without moments; give moments of inertia or a rotor inertia, change the posture, or lock the joint"
+    )
+
+
+def check_inertia(model: Model) -> None:
+    """Refuse a start in which a joint has nothing to accelerate: ModelError."""
+    if sentence := moving_nothing(model, model.robot.initial):
+        raise ModelError(f"plant: {sentence}", keys=("plant",))

@@ -14,7 +14,7 @@ import numpy as np
 from dynsim.compile.clearance import gaps
 from dynsim.compile.contact_law import DryFriction, JointStop, compile_unilateral, dry_frictions, joint_stops
 from dynsim.compile.control import JointControl
-from dynsim.compile.mobility import mobility_floors
+from dynsim.compile.mobility import check_inertia, mobility_floors
 from dynsim.compile.model import Model
 from dynsim.compile.shapes import compile_shapes
 from dynsim.compile.stepping import with_shapes
@@ -30,7 +30,6 @@ from dynsim.engine.compilation import kernels_logged
 from dynsim.engine.equilibrium import Balance, balanced, pressed, shifted
 from dynsim.engine.method import AUTO, PACE, Choice, choose
 from dynsim.engine.outcome import check_size
-from dynsim.engine.soundness import check_inertia
 from dynsim.engine.trace import even_times
 from dynsim.errors import ModelError, ScenarioError, SimulationStopped
 from dynsim.integrators import driver

@@ -21,11 +21,9 @@ import numpy as np
 
 from dynsim.compile.model import Model
 from dynsim.compile.shapes import gap_at
-from dynsim.config.problems import listed
 from dynsim.dynamics import tables as ka
 from dynsim.engine.force_indeterminacy import touching_rows
 from dynsim.engine.method import drive_slopes
-from dynsim.errors import ModelError
 from dynsim.model.description import Array, Contact
 from dynsim.record import Record
 from dynsim.scenario import Scenario, build
@@ -34,11 +32,6 @@ from dynsim.scenario.sensors import Encoders
 if TYPE_CHECKING:
     from dynsim.engine.prepare import Prepared
 
-# The inertia of a joint counts as zero below this part of Σ m l² + tr I of the bodies that it moves, and below this
-# part of their Σ m r² about the world's origin, which is rounding of the sweep.
-NOTHING, CANCELLED = 1e-12, 1e-14
-# The rounding of the sweep is at most this part of Σ m l² + tr I, or the inertia of a joint is not known.
-KNOWN = 1e-3
 # Joints up to which the loop is examined: its matrices have three rows each.
 LARGE = 100
 # Rows up to which a loop with the samples of late encoders is: as many as those of LARGE joints.
@@ -296,49 +289,3 @@ def unstable_stop(scenario: Scenario, prepared: Prepared, q: Array, v: Array, el
             growth = verdict[1].rate * elapsed / math.log(10.0)
             return f"{verdict[0]}; until then they could grow by a factor of 1e{growth:.0f}"
     return ""
-
-
-def without_inertia(model: Model, q: Array) -> list[int]:
-    """Numbers of the joints that move no inertia at coordinates q (nq,); for several in a row only the last one."""
-    links = model.robot.links
-    felt = model.articulated_inertia(q)
-    mass = np.array([link.inertia.mass for link in links])
-    own = np.array([np.trace(link.inertia.tensor) for link in links])
-    positions = model.joint_positions(q, *((k, link.inertia.com) for k, link in enumerate(links)))
-    origins, centres = positions[: model.n], positions[model.n + 1 :]
-    numbers = {link.name: k for k, link in enumerate(links)}
-    parents = [-1 if link.parent is None else numbers[link.parent] for link in links]
-    behind = np.eye(model.n, dtype=bool)
-    for k in range(model.n - 1, -1, -1):
-        if parents[k] >= 0:
-            behind[parents[k]] |= behind[k]
-    slides = np.array([link.kind == "prismatic" for link in links])
-    lever = ((centres[None] - origins[:, None]) ** 2).sum(axis=2)
-    about_joint = np.where(slides, behind @ mass, (behind * (mass * lever + own)).sum(axis=1)) + model.armature
-    about_origin = behind @ (mass * (centres**2).sum(axis=1))
-    rounding = np.where(slides, 0.0, CANCELLED * about_origin)
-    # Of bodies that have run far away nothing is known.
-    known = rounding <= KNOWN * about_joint
-    none = (felt <= np.maximum(NOTHING * about_joint, rounding)) & (known | (about_joint == 0.0))
-    return [k for k in np.flatnonzero(none).tolist() if np.count_nonzero(none & behind[k]) == 1]
-
-
-def moving_nothing(model: Model, q: Array) -> str:
-    """A sentence about joints that move no inertia at coordinates q (nq,), or an empty string."""
-    if not np.isfinite(q).all():
-        return ""
-    none = without_inertia(model, q)
-    if not none:
-        return ""
-    joints = listed([model.robot.links[k].joint for k in none])
-    bodies = listed([model.robot.links[k].name for k in none])
-    return (
-        f"joint {joints} moves no inertia in this posture: the mass behind it ({bodies}) is zero or lies on its axis "
-        "without moments; give moments of inertia or a rotor inertia, change the posture, or lock the joint"
-    )
-
-
-def check_inertia(model: Model) -> None:
-    """Refuse a start in which a joint has nothing to accelerate: ModelError."""
-    if sentence := moving_nothing(model, model.robot.initial):
-        raise ModelError(f"plant: {sentence}", keys=("plant",))

@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.compile.contact_law import START_TOLERANCE
+from dynsim.compile.mobility import moving_nothing
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.state import block
 from dynsim.engine.force_indeterminacy import paradox
 from dynsim.engine.prepare import Prepared
-from dynsim.engine.soundness import moving_nothing, unstable_stop
+from dynsim.engine.soundness import unstable_stop
 from dynsim.engine.stiff_friction import held_up
 from dynsim.errors import SimulationStopped
 from dynsim.integrators import project as kp

@@ -22,9 +22,8 @@ from typing import Any
 from dynsim.jit import numba_version  # noqa: F401
 
 # isort: split
-from llvmlite import ir
-from numba.core import cgutils, debuginfo, types
-from numba.core import ir as numba_ir
+from llvmlite import ir as llvm
+from numba.core import cgutils, debuginfo, ir, types
 from numba.core.boxing import box_namedtuple
 from numba.core.compiler_machinery import register_pass
 from numba.core.datamodel import models, registry
@@ -38,7 +37,7 @@ from numba.core.typing.collections import NamedTupleClassAttribute
 from numba.core.typing.templates import make_callable_template
 from numba.core.typing.typeof import typeof_impl
 
-_BYTE, _WORD = ir.IntType(8), ir.IntType(64)
+_BYTE, _WORD = llvm.IntType(8), llvm.IntType(64)
 _ADDRESS = _BYTE.as_pointer()
 
 
@@ -131,7 +130,7 @@ class _TablesModel(models.DataModel):  # type: ignore[misc]
         return _ADDRESS
 
     def get_data_type(self) -> Any:
-        return ir.ArrayType(_WORD, self.size // 8)
+        return llvm.ArrayType(_WORD, self.size // 8)
 
     def get_argument_type(self) -> Any:
         return _ADDRESS
@@ -143,7 +142,7 @@ class _TablesModel(models.DataModel):  # type: ignore[misc]
         return value
 
     def from_argument(self, builder: Any, value: Any) -> Any:
-        if isinstance(value, ir.Argument):
+        if isinstance(value, llvm.Argument):
             for attribute in ("noalias", "captures(none)"):
                 value.add_attribute(attribute)
         return value
@@ -165,7 +164,7 @@ class _TablesModel(models.DataModel):  # type: ignore[misc]
         """What numba counts references to; the address of a variable that has not been assigned yet is null."""
 
         def getter(value: Any, k: int) -> Any:
-            nothing = cgutils.alloca_once(builder, ir.ArrayType(_BYTE, self.size), zfill=True)
+            nothing = cgutils.alloca_once(builder, llvm.ArrayType(_BYTE, self.size), zfill=True)
             missing = cgutils.is_null(builder, value)
             return self.part(builder, builder.select(missing, builder.bitcast(nothing, _ADDRESS), value), k)
 
@@ -177,7 +176,7 @@ class _TablesModel(models.DataModel):  # type: ignore[misc]
     def room(self, builder: Any) -> Any:
         """A block in the frame of the function."""
         with debuginfo.suspend_emission(builder), builder.goto_entry_block():
-            block = builder.alloca(ir.ArrayType(_BYTE, self.size))
+            block = builder.alloca(llvm.ArrayType(_BYTE, self.size))
             block.align = self.alignment
             return builder.bitcast(block, _ADDRESS)
 
@@ -246,7 +245,7 @@ class _Lower(Lower):  # type: ignore[misc]
     @cached_property
     def _again(self) -> set[str]:
         """Names of those."""
-        assigned = (store.target.name for block in self.blocks.values() for store in block.find_insts(numba_ir.Assign))
+        assigned = (store.target.name for block in self.blocks.values() for store in block.find_insts(ir.Assign))
         return {
             name for name, times in Counter(assigned).items() if times > 1 and isinstance(self.typeof(name), Tables)
         }

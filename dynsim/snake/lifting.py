@@ -23,7 +23,7 @@ from dynsim.snake.base_part import BasePart, Fold, base_part
 Array = NDArray[np.float64]
 SAMPLES_PER_BLEND = 20
 """Fewer of them, and the path between two samples is no longer at the heights of the samples."""
-ROUNDING = 1e-9
+TIME_ROUNDING = 1e-9
 """By so much less a time may be than it must [s]."""
 
 
@@ -152,7 +152,7 @@ def _height(grounded: Array, time: Array, lifts: Lifts, name: str) -> Array:
 
 def refuse_short_lift(lifts: Lifts, name: str, up: float, down: float, blends: int) -> None:
     """CheckRefused where a pair is not lifted for as long as so many blends take; times in [s]."""
-    if down - up < blends * lifts.blend_s - ROUNDING:
+    if down - up < blends * lifts.blend_s - TIME_ROUNDING:
         raise CheckRefused(
             f"{name} is lifted for {down - up:.3f} s only, from t = {up:.3f} s on; up and down take "
             f"{blends * lifts.blend_s:g} s (lifts.blend_s)"

@@ -21,8 +21,8 @@ from dynsim.record.poses import poses_at
 from dynsim.record.scene import Scene
 from dynsim.scenario import Scenario
 from dynsim.snake import state as ss
-from dynsim.snake.description import COORDINATES, FIXING, SWITCHING, CommandBlock, Feedback
-from dynsim.teleop.session import NO_REQUEST, Array, Command, LiveFrame, PilotAxis, SpeedLimits, with_controller
+from dynsim.snake.description import COORDINATES, FIXING, NO_REQUEST, SWITCHING, CommandBlock, Feedback
+from dynsim.teleop.session import Array, Command, LiveFrame, PilotAxis, SpeedLimits, with_controller
 
 log = logging.getLogger(__name__)
 

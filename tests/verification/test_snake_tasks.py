@@ -12,8 +12,9 @@ from dynsim.engine.gripper import HARDENED, SOFT
 from dynsim.errors import ModelError, SimulationStopped
 from dynsim.record import Record
 from dynsim.scenario import scenario_from_resolved
+from dynsim.snake.description import NO_REQUEST
 from dynsim.teleop.begin import begin
-from dynsim.teleop.session import NO_REQUEST, Command
+from dynsim.teleop.session import Command
 
 G = 9.81
 

@@ -9,10 +9,11 @@ import pytest
 from scipy.linalg import expm
 
 from dynsim import Simulation, State, build_model, load_scenario, simulate
+from dynsim.compile.mobility import moving_nothing, without_inertia
 from dynsim.compile.model import Model
 from dynsim.engine import check
 from dynsim.engine.prepare import prepare
-from dynsim.engine.soundness import loop_growth, moving_nothing, without_inertia
+from dynsim.engine.soundness import loop_growth
 from dynsim.errors import ModelError, SimulationStopped
 from dynsim.model.description import Inertia, Link, Robot
 from dynsim.scenario.reading import scenario_from_resolved

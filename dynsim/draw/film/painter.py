@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from matplotlib.path import Path
+from matplotlib.path import Path as Outline
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from PIL import Image, ImageColor, ImageDraw
@@ -332,7 +332,7 @@ class Painter:
         if self._pressure is None or not np.isfinite(self._pressure[1][row]).all():
             return
         at = self._pressure[1][row]
-        inside = len(hull) > 2 and Path(hull).contains_point(at)
+        inside = len(hull) > 2 and Outline(hull).contains_point(at)
         x, y, _ = self.camera.project(np.array([*at, 0.0]))
         ring(draw, x, y, 5.0 * FINER, BLACK if inside else PULLING, 2 * FINER)
 

@@ -18,7 +18,7 @@ from dynsim.hardware.servo_map import ServoMap
 from dynsim.record import Record
 from dynsim.snake.base_part import base_part
 from dynsim.snake.lifting import (
-    ROUNDING,
+    TIME_ROUNDING,
     fold_to_heights,
     height_of,
     refuse_long_steps,
@@ -88,7 +88,7 @@ class LiftLookahead:
     def steady(self, time: float) -> bool:
         """Pairs may be lifted and put down at a time [s]: what was lifted last has had the time for both."""
         blend = self._lifts.blend_s
-        return time >= blend - ROUNDING and time - self._changed >= 2.0 * blend - ROUNDING
+        return time >= blend - TIME_ROUNDING and time - self._changed >= 2.0 * blend - TIME_ROUNDING
 
     def begin(self, sample: Sample, yaw: Array, grounded: Array) -> Sample:
         """The posture in which the simulation rests, with what lifting adds.
@@ -128,7 +128,7 @@ class LiftLookahead:
         if (grounded != self._grounded).any():
             self._change(since, grounded)
         self._hold(sample, yaw)
-        return self._whole(time - self._lifts.blend_s + ROUNDING)
+        return self._whole(time - self._lifts.blend_s + TIME_ROUNDING)
 
     def remaining(self) -> list[Sample]:
         """All that are still held back: there are no more. What is lifted stays so."""

@@ -32,11 +32,11 @@ class ServoRegisters:
     def __init__(self, model: ServoModel, id_: int, baud_code: int) -> None:
         self.model = model
         self._table = bytearray(TABLE_SIZE)
-        self._field_at = {field.address: name for name, field in model.fields.items()}
+        self._field_at = {item.address: name for name, item in model.fields.items()}
         # Each read of a state needs a dozen registers: their addresses are looked up once.
         self._places = {
-            name: (slice(field.address, field.address + field.size), field.size, field.signed)
-            for name, field in model.fields.items()
+            name: (slice(item.address, item.address + item.size), item.size, item.signed)
+            for name, item in model.fields.items()
         }
         self.reset()
         self["id"], self["baud"] = id_, baud_code
@@ -57,16 +57,16 @@ class ServoRegisters:
     def reset(self, keep: Collection[str] = ()) -> None:
         """All as delivered, but for the registers named in ``keep``."""
         kept = {name: self[name] for name in keep}
-        for name, field in self.model.fields.items():
-            self[name] = kept.get(name, field.default)
+        for name, item in self.model.fields.items():
+            self[name] = kept.get(name, item.default)
         self["model_number"] = self.model.number
         self.restart()
 
     def restart(self) -> None:
         """RAM as after power-on."""
-        for name, field in self.model.fields.items():
-            if not field.in_eeprom:
-                self[name] = field.default
+        for name, item in self.model.fields.items():
+            if not item.in_eeprom:
+                self[name] = item.default
         for pointers, data, count in INDIRECT_BLOCKS:
             for k in range(count):
                 self._table[pointers + 2 * k : pointers + 2 * k + 2] = (data + k).to_bytes(2, "little")
@@ -107,16 +107,16 @@ class ServoRegisters:
             name = self._field_at.get(start)
             if name is None:
                 return StatusError.ACCESS
-            field = self.model.fields[name]
-            whole = range(start, start + field.size)
-            if targets[position : position + field.size] != (whole if direct else [*whole]):
+            item = self.model.fields[name]
+            whole = range(start, start + item.size)
+            if targets[position : position + item.size] != (whole if direct else [*whole]):
                 return StatusError.DATA_LENGTH
-            value = field.decode(data[position : position + field.size])
-            error = self._objection(name, field, value)
+            value = item.decode(data[position : position + item.size])
+            error = self._objection(name, item, value)
             if error:
                 return error
             pending.append((name, value))
-            position += field.size
+            position += item.size
         for name, value in pending:
             self[name] = value
         return StatusError.NONE
@@ -124,7 +124,7 @@ class ServoRegisters:
     def _objection(self, name: str, field: Field, value: int) -> StatusError:
         if not field.writable:
             return StatusError.ACCESS
-        if field.in_eeprom and self["torque_enable"]:
+        if item.in_eeprom and self["torque_enable"]:
             return StatusError.ACCESS
         if field.low is not None and not field.low <= value <= (field.high or 0):
             return StatusError.DATA_RANGE

@@ -5,7 +5,8 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Sequence
 
-from dynsim.teleop.session import NO_REQUEST, Command, PilotAxis
+from dynsim.snake.description import NO_REQUEST
+from dynsim.teleop.session import Command, PilotAxis
 from dynsim.teleop.web.pilot import PilotCommand
 
 SILENCE = 0.25

@@ -16,8 +16,9 @@ from dynsim.draw.page import page
 from dynsim.errors import DynsimError, SimulationStopped
 from dynsim.record.quaternion import rotated
 from dynsim.record.scene import WORLD
+from dynsim.snake.description import NO_REQUEST
 from dynsim.system import interruption
-from dynsim.teleop.session import NO_REQUEST, Command, LiveFrame, Session
+from dynsim.teleop.session import Command, LiveFrame, Session
 from dynsim.teleop.web.deadman import DRIVING, Deadman
 from dynsim.teleop.web.server import FRAMES, Server
 
