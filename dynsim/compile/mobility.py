@@ -1,6 +1,6 @@
-"""Joints that move no inertia, and contact points that no joint moves along the normal of their surface: in any posture, or in one of them.
+"""Joints that move no inertia, and contact points that no joint moves along the normal of their surface.
 
-The force on such a point changes no motion, so no equation determines it. A point that is immobile in every posture is
+The force on an immobile point changes no motion, so no equation determines it. A point that is immobile in every posture is
 left out of the contact problem; in a single posture it carries nothing. Joints whose brakes are closed move nothing.
 """
 

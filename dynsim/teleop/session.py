@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from dynsim.engine.stepped import Touch
 from dynsim.record import Record
 from dynsim.scenario import Scenario, scenario_from_resolved
+from dynsim.snake.description import NO_REQUEST
 
 Array = NDArray[np.float64]
-NO_REQUEST = 0
 
 
 @dataclass(frozen=True)

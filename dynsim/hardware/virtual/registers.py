@@ -124,7 +124,7 @@ class ServoRegisters:
     def _objection(self, name: str, field: Field, value: int) -> StatusError:
         if not field.writable:
             return StatusError.ACCESS
-        if item.in_eeprom and self["torque_enable"]:
+        if field.in_eeprom and self["torque_enable"]:
             return StatusError.ACCESS
         if field.low is not None and not field.low <= value <= (field.high or 0):
             return StatusError.DATA_RANGE
