@@ -9,15 +9,15 @@ from pydantic import BaseModel
 
 
 def write_nulls(config: BaseModel, written: dict[str, Any], defaults: Any = None) -> None:
-    """Write ``null`` where a configuration has it and its field, or the plant, has another default.
+    """Write ``null`` where a configuration has it and its member, or the plant, has another default.
 
     ``written`` : the configuration as it was dumped without nulls; ``defaults`` : those of the plant, of the same form
     """
-    for key, field in type(config).model_fields.items():
+    for key, member in type(config).model_fields.items():
         value, of_plant = getattr(config, key), _entry(defaults, key)
         if value is not None:
             _write_within(value, written.get(key), of_plant)
-        elif not field.exclude and (field.default is not None or of_plant is not None):
+        elif not member.exclude and (member.default is not None or of_plant is not None):
             written[key] = None
 
 
