@@ -9,7 +9,7 @@ from typing import Annotated, Any, TextIO
 import typer
 
 from dynsim._version import __version__
-from dynsim.cli.display import console
+from dynsim.cli.tables import console
 from dynsim.config import completion
 
 app = typer.Typer(

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dynsim.cli.animate import animate
 from dynsim.cli.app import (
     FigureFormat,
     FiguresOption,
@@ -24,16 +23,14 @@ from dynsim.cli.app import (
     folder_option,
     parsed_overrides,
 )
-from dynsim.cli.display import console, errors, labelled, progress, record_files, say, say_written, told_in
-from dynsim.cli.drawing import Figures, Page, draw, draw_all, saved_before
+from dynsim.cli.drawing import Figures, Page, animate, draw, draw_all, open_page, saved_before, tell_of_view, view
 from dynsim.cli.export import export
-from dynsim.cli.hardware import hw
-from dynsim.cli.hw_drive import EXAMPLE, hw_drive
+from dynsim.cli.hardware import EXAMPLE, hw, hw_drive
 from dynsim.cli.plan import EXAMPLE as PLAN_EXAMPLE
 from dynsim.cli.plan import plan
 from dynsim.cli.sweep import sweep
+from dynsim.cli.tables import console, errors, labelled, progress, record_files, say, say_written, told_in
 from dynsim.cli.teleop import teleop
-from dynsim.cli.view import open_page, tell_of_view, view
 from dynsim.config import completion
 from dynsim.errors import DynsimError, RecordError, SimulationInterrupted, SimulationStopped
 from dynsim.system.terminal import escaped
@@ -58,7 +55,7 @@ def run(
 
     The method of integration follows from the system, integrator.method auto; the summary says which it is and why.
     """
-    from dynsim.engine.results import RUN_FILES, save_run
+    from dynsim.engine.recording import RUN_FILES, save_run
     from dynsim.scenario import load_scenario
     from dynsim.system.files import check_writable
 
@@ -104,7 +101,7 @@ def compare(
     quiet: QuietOption = False,
 ) -> None:
     """Simulate all variants of a scenario and compare them in a table and in figures."""
-    from dynsim.engine.results import COMPARISON_FILES, RUN_FILES, save_run
+    from dynsim.engine.recording import COMPARISON_FILES, RUN_FILES, save_run
     from dynsim.scenario import load_scenario, variant_names
     from dynsim.system.files import check_writable, discard
 

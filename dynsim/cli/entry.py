@@ -14,11 +14,10 @@ from typing import Any
 import typer
 
 from dynsim.cli.commands import app
-from dynsim.cli.display import errors
+from dynsim.cli.tables import errors
 from dynsim.errors import DynsimError, SimulationInterrupted
 from dynsim.system import interruption
-from dynsim.system.standard_streams import lenient_streams
-from dynsim.system.terminal import escaped
+from dynsim.system.terminal import escaped, lenient_streams
 
 
 def main(received: Sequence[int]) -> None:

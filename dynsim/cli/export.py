@@ -9,7 +9,7 @@ from typing import Annotated, cast
 import typer
 
 from dynsim.cli.app import SetOption, TrustOption, VariantOption, parsed_overrides
-from dynsim.cli.display import console
+from dynsim.cli.tables import console
 from dynsim.errors import RecordError, ScenarioError
 from dynsim.system.terminal import escaped
 

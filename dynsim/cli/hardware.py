@@ -4,18 +4,45 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Sequence
 from contextlib import nullcontext
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.console import Console
 from rich.table import Table
 
-from dynsim.cli.app import TrustOption
+from dynsim.cli.app import QuietOption, ScenarioArgument, SetOption, TrustOption, parsed_overrides
+from dynsim.cli.drawing import write_view
+from dynsim.cli.tables import errors
+from dynsim.cli.teleop import (
+    BaseSpeedOption,
+    HttpPortOption,
+    LongestOption,
+    OpenOption,
+    SpeedOption,
+    TurnOption,
+    UntilClosedOption,
+    VariantOption,
+    new_folder,
+    require_websockets,
+    tell_address,
+    tell_drive,
+)
 from dynsim.errors import DynsimError
+from dynsim.hardware.bus.protocol import Bus, Clock
+from dynsim.hardware.errors import ReplayInterrupted
+from dynsim.hardware.nudge import ANGLE, Nudge, nudge, swapped
+from dynsim.hardware.ports import VIRTUAL, bus_on
+from dynsim.hardware.replay.output import StopRequest, stop_on_signals
+from dynsim.hardware.replay.trajectory import MotionTask
+from dynsim.hardware.replay.verify import QUANTITIES, LimitRow, differences, way_to_start
+from dynsim.hardware.servo_map import MappedServo, ServoMap
+from dynsim.system import interruption
 from dynsim.system.files import file_name, json_text, write_json
-from dynsim.system.terminal import Terminal, plain
+from dynsim.system.terminal import Terminal, escaped, plain
 
 hw = typer.Typer(
     no_args_is_help=True,
@@ -173,7 +200,7 @@ def replay(
     Ctrl-C once: controlled stop. Twice: torque off.
     """
     require_client_library()
-    from dynsim.cli.dialog import confirm_replay
+    from dynsim.cli.hardware import confirm_replay
     from dynsim.hardware.errors import ServoMapError
     from dynsim.hardware.ports import VIRTUAL, bus_on
     from dynsim.hardware.replay.session import shown_by
@@ -222,9 +249,8 @@ def replayed(
     **options: Any,
 ) -> Any:
     """Run a replay that signals stop, with a progress bar unless ``quiet``; why that failed joins ``lost``."""
-    from dynsim.hardware.replay.display import displayed
+    from dynsim.hardware.replay.output import StopRequest, displayed, stop_on_signals
     from dynsim.hardware.replay.session import run_replay
-    from dynsim.hardware.replay.states import StopRequest, stop_on_signals
 
     stop = StopRequest()
     options |= {"policy": policy.value if policy else None, "stop": stop}
@@ -234,7 +260,7 @@ def replayed(
 
 def tell_dry_run(result: Any) -> None:
     """What a replay found that moved nothing."""
-    from dynsim.cli.dialog import print_limits
+    from dynsim.cli.hardware import print_limits
 
     print_limits(console, result.limits)
     console.print("dry run: servos verified and the bus timed, nothing was moved; --live moves")
@@ -339,11 +365,10 @@ def virtual(
 ) -> None:
     """Virtual servos behind a pseudo-terminal, for any Dynamixel tool. Ctrl-C ends it."""
     require_client_library()
-    from dynsim.hardware.replay.states import StopRequest, stop_on_signals
+    from dynsim.hardware.replay.output import StopRequest, stop_on_signals
     from dynsim.hardware.servo_map import load_servo_map
     from dynsim.hardware.virtual.faults import load_fault_script
-    from dynsim.hardware.virtual.line import line_for_map
-    from dynsim.hardware.virtual.pseudo_terminal import PseudoTerminal
+    from dynsim.hardware.virtual.line import PseudoTerminal, line_for_map
     from dynsim.hardware.virtual.simulated_plant import simulated_arm
 
     servo_map = load_servo_map(map_file)
@@ -411,11 +436,10 @@ def calibrate(
     With --nudge: find swapped senses instead, joint by joint.
     """
     require_client_library()
-    from dynsim.cli.dialog import find_senses, may_write
-    from dynsim.hardware.calibrate import read_zero_ticks, write_into_map
+    from dynsim.cli.hardware import find_senses, may_write
     from dynsim.hardware.errors import ServoMapError, VerificationFailed
     from dynsim.hardware.ports import bus_on
-    from dynsim.hardware.servo_map import SHIPPED, load_servo_map
+    from dynsim.hardware.servo_map import SHIPPED, load_servo_map, read_zero_ticks, write_into_map
 
     servo_map = load_servo_map(map_file)
     target = out or servo_map.path
@@ -445,3 +469,286 @@ def calibrate(
         table.add_row(servo.joint, str(servo.id), str(servo.zero_tick), str(ticks[servo.joint]))
     console.print(table)
     console.print(f"zero ticks of {len(ticks)} joints written to {target}")
+
+
+# Command ``dynsim hw drive``: a pilot drives a simulation in real time and servos follow it.
+
+
+EXAMPLE = "Example: dynsim hw drive elbow_comparison --variant two_elbows --map arm --port virtual"
+SERVOS = "servos"
+"""Folder of the measured run, in that of the drive."""
+
+
+def hw_drive(
+    scenario: ScenarioArgument,
+    map_file: MapFile,
+    port: ReplayPort,
+    variant: VariantOption = None,
+    overrides: SetOption = None,
+    rate: Rate = None,
+    policy: PolicyOption = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FOLDER", help="Default: results/SCENARIO/drive_N, a new one.")
+    ] = None,
+    speed: SpeedOption = 0.1,
+    turn: TurnOption = 0.5,
+    base_speed: BaseSpeedOption = 0.3,
+    longest: LongestOption = 600.0,
+    http_port: HttpPortOption = 0,
+    until_closed: UntilClosedOption = False,
+    open_: OpenOption = True,
+    live: Live = False,
+    yes: Yes = False,
+    configure: Configure = False,
+    faults: Faults = None,
+    quiet: QuietOption = False,
+) -> None:
+    """Drive a scenario from a browser as `dynsim teleop` does, with servos that follow the simulated joints.
+
+    Verify, arm and move to the start as a replay does; every posture is checked against the map before it is followed.
+    Ctrl-C once: controlled stop. Twice: torque off. The button of the page ends the drive regularly.
+    """
+    require_websockets()
+    require_client_library()
+    from dynsim.cli.hardware import confirm_replay
+    from dynsim.engine.recording import RUN_FILES
+    from dynsim.hardware.errors import ServoMapError
+    from dynsim.hardware.ports import VIRTUAL, bus_on
+    from dynsim.hardware.replay.drive import check_drive
+    from dynsim.hardware.replay.session import shown_by
+    from dynsim.hardware.servo_map import load_servo_map
+    from dynsim.hardware.virtual.faults import load_fault_script
+    from dynsim.scenario import load_scenario
+    from dynsim.system.files import check_writable
+    from dynsim.teleop.snake import SpeedLimits
+    from dynsim.teleop.web.follower import DriveRequest, SimulationProcess
+
+    if faults and port != VIRTUAL:
+        raise ServoMapError("--faults is for virtual servos: --port virtual")
+    loaded = load_scenario(scenario, variant, parsed_overrides(overrides))
+    servo_map = load_servo_map(map_file)
+    script = load_fault_script(faults, servo_map.ids) if faults else None
+    folder = out or new_folder(Path("results", loaded.name))
+    check_writable(folder, RUN_FILES)
+    limits = SpeedLimits(speed, turn, base_speed)
+    request = DriveRequest(loaded, servo_map, limits, longest, http_port, until_closed, folder)
+    moves = live or port == VIRTUAL
+    result: Any = None
+    with SimulationProcess(request) as process:
+        with console.status("loading the kernels; the first time they are compiled, which takes half a minute"):
+            ready = process.ready()
+        motion = check_drive(
+            ready.first,
+            servo_map,
+            process.feed,
+            step=ready.step,
+            longest=longest,
+            rate=rate,
+            scene=ready.still.scene,
+        )
+        if live and port != VIRTUAL:
+            confirm_replay(console, servo_map, motion, port, asked=not yes, at_most=True)
+        if moves:
+            tell_address(ready.address, "Ctrl-C stops the robot, a second one releases it", open_=open_)
+        posture = dict(zip(servo_map.joints, motion.start.tolist(), strict=True))
+        error: DynsimError | None = None
+        try:
+            with shown_by({"standard output": sys.stdout}, folder / SERVOS) as lost:
+                result = replayed(
+                    motion,
+                    servo_map,
+                    bus_on(port, servo_map, script=script, posture=posture, in_wall_time=True),
+                    folder / SERVOS,
+                    lost,
+                    quiet=quiet,
+                    live=moves,
+                    policy=policy,
+                    write_eeprom=configure,
+                    provenance={
+                        "port": port,
+                        "record": str(folder / "record.h5"),
+                        "simulated": ready.still.provenance,
+                    },
+                )
+        except DynsimError as stopped:
+            error, result = stopped, getattr(stopped, "result", None)
+        # What was driven is saved, whatever else the user asks for.
+        interruption.keep()
+        try:
+            done = process.finish("ended" if error is None else f"the servos have stopped: {error}")
+        except DynsimError as lost_drive:
+            if error is None:
+                raise
+            errors.print(f"[red]error:[/] {escaped(str(lost_drive))}")
+            raise error from None
+        interruption.heed()
+    if result is not None and not quiet:
+        print_timing(result)
+    if not moves and error is None:
+        tell_dry_run(result)
+        return
+    if done.saved:
+        _tell_files(loaded.variant or loaded.name, folder, result, quiet=quiet)
+        if not quiet:
+            tell_drive(done.report, done.driven, folder)
+    if error is None and not quiet:
+        tell_replay(result, "driven", folder / SERVOS, folder / "record.h5")
+    if error is not None:
+        if done.failure is not None:
+            errors.print(f"[red]error:[/] the simulation: {escaped(str(done.failure))}")
+        raise error
+    if done.failure is not None:
+        raise done.failure
+
+
+def _tell_files(name: str, folder: Path, result: Any, *, quiet: bool) -> None:
+    """The page with the measured robot beside the simulated one."""
+    from dynsim.record import Record
+
+    records = {name: Record.load(folder / "record.h5")}
+    if result is not None and len(result.record):
+        records["measured"] = result.record
+    write_view(records, folder, quiet)
+
+
+# Questions and tables of the commands that move a robot: before a replay, and about nudges of single servos.
+
+
+ANSWERS = ("y", "n", "again")
+CLEAR = "Is everybody clear of the robot, and the power cut within reach?"
+
+
+def confirm_replay(
+    console: Console, servo_map: ServoMap, motion: MotionTask, port: str, *, asked: bool, at_most: bool = False
+) -> None:
+    """Show the distance to the start and ask for consent.
+
+    A start beyond ``safety.start_distance`` needs an answer even where not ``asked``.
+
+    ``at_most``: the motion may end sooner.
+
+    Raises
+    ------
+    ReplayInterrupted
+        The user does not agree, or does not answer.
+    PortError, VerificationFailed
+        The posture cannot be read.
+    """
+    with bus_on(port, servo_map) as (bus, _):
+        approach = way_to_start(bus, servo_map, motion.start)
+    console.print(
+        f"{servo_map.robot}: {len(servo_map.servos)} servos will move for {motion.duration:.1f} s"
+        f"{' at most' if at_most else ''}, "
+        f"after {approach.duration:.1f} s to the start."
+    )
+    for distance in approach.distances[:1]:
+        console.print(f"furthest from its start: {distance}")
+    agreed = not asked or _agreed(console, CLEAR, "move?")
+    if agreed and approach.far:
+        still = "" if asked else " (asked with --yes too)"
+        bound = servo_map.safety.start_distance
+        console.print(f"further than safety.start_distance, {bound:g} rad, from their start{still}:")
+        for distance in approach.far:
+            console.print(f"  {distance}")
+        agreed = _agreed(console, "All joints go there in step: is the whole way free?", "move there?")
+    if not agreed:
+        raise ReplayInterrupted("not confirmed; nothing was moved")
+
+
+def print_limits(console: Console, rows: Sequence[LimitRow]) -> None:
+    """Limits that the servos have stored, beside the map's."""
+    table = Table("joint", "ID", *QUANTITIES, title="limits, stored in the servo | of the map")
+    for row in rows:
+        table.add_row(row.joint, str(row.id), *(" | ".join(cell) for cell in row.cells))
+    console.print(table)
+    for line in differences(rows):
+        console.print(line)
+
+
+def find_senses(
+    console: Console, servo_map: ServoMap, chosen: Sequence[MappedServo], port: str, *, live: bool, asked: bool
+) -> tuple[dict[str, int], list[str]]:
+    """Nudge joint after joint, and ask whether it moved as the map says.
+
+    A real port is a dry run without ``live``; where not ``asked``, motion is reported only.
+
+    Returns
+    -------
+    signs : dict
+        What the sign of every joint should be that turned against the map.
+    blocked : list
+        Joints that did not go where they were sent.
+
+    Raises
+    ------
+    ReplayInterrupted
+        The user does not agree, does not answer, or stopped a nudge.
+    VerificationFailed, ReplayAborted
+        A servo is not fit to move, or an abort rule ended a nudge; torque is off.
+    """
+    real = port != VIRTUAL
+    angle = f"{math.degrees(ANGLE):g}°"
+    if real and live and asked:
+        console.print(
+            f"{servo_map.robot}: {len(chosen)} joint(s) will turn {angle} and back, one by one; the others limp."
+        )
+        if not _agreed(console, CLEAR, "move?"):
+            raise ReplayInterrupted("not confirmed; nothing was moved")
+    agrees: dict[str, bool] = {}
+    blocked: list[str] = []
+    with bus_on(port, servo_map) as (bus, clock):
+        for servo in chosen:
+            moved = _nudge(bus, clock, servo_map, servo, live=live or not real)
+            if moved is None:
+                console.print(f"{servo}: fit to move")
+                continue
+            answer = _shown(console, moved, asked=asked)
+            while answer == "again":
+                moved = _nudge(bus, clock, servo_map, servo, live=True) or moved
+                answer = _shown(console, moved, asked=asked)
+            if not moved.followed:
+                blocked.append(servo.joint)
+            agrees[servo.joint] = answer == "y"
+    if real and not live:
+        console.print("dry run: nothing was moved; --live moves")
+    signs = swapped(servo_map, agrees)
+    for joint, sign in signs.items():
+        console.print(f"{joint}: turns against the map; its sign should be {sign}")
+    return signs, blocked
+
+
+def may_write(console: Console, joints: Sequence[str], target: object) -> bool:
+    """Ask whether the map is to be changed."""
+    return _agreed(console, f"The sign of {', '.join(joints)} is wrong in {target}.", "write it?")
+
+
+def _nudge(bus: Bus, clock: Clock, servo_map: ServoMap, servo: MappedServo, *, live: bool) -> Nudge | None:
+    stop = StopRequest()
+    with stop_on_signals(stop):
+        return nudge(servo_map, servo, bus, clock, live=live, stop=stop)
+
+
+def _shown(console: Console, moved: Nudge, *, asked: bool) -> str:
+    """Tell what a joint did; "y", "n" or "again"."""
+    console.print(
+        f"{moved.joint} (ID {moved.id}): {math.degrees(moved.moved):+.1f}° by the map, {moved.ticks:+d} ticks, and back"
+    )
+    if not asked or not moved.followed:
+        return "y"
+    sense = "positive" if moved.asked > 0 else "negative"
+    answer = ""
+    try:
+        while answer not in ANSWERS:
+            question = f"Did {moved.joint} turn in the {sense} sense first? [{'/'.join(ANSWERS)}]"
+            answer = typer.prompt(question).strip().lower()
+        return answer
+    except typer.Abort:
+        raise ReplayInterrupted(f"no answer about {moved.joint}; torque is off, nothing was written") from None
+
+
+def _agreed(console: Console, text: str, question: str) -> bool:
+    console.print(text)
+    try:
+        return typer.confirm(question)
+    except typer.Abort:
+        return False

@@ -17,7 +17,7 @@ from dynsim.cli.app import (
     VariantOption,
     parsed_overrides,
 )
-from dynsim.cli.display import plan_progress, say, say_written
+from dynsim.cli.tables import plan_progress, say, say_written
 from dynsim.errors import ScenarioError, UnreachableReference
 from dynsim.system.terminal import escaped
 
@@ -133,7 +133,7 @@ def plan(
         tell("writing", 0.98)
         save_plan(result, folder, figures=not no_figures, kind=format_.value)
     if not quiet:
-        from dynsim.cli.plan_table import print_plan
+        from dynsim.cli.tables import print_plan
 
         print_plan(result)
         say_written(folder)

@@ -20,12 +20,12 @@ from dynsim.cli.app import (
     folder_option,
     parsed_overrides,
 )
-from dynsim.cli.display import drawing, errors, say, sweep_progress
+from dynsim.cli.tables import drawing, errors, say, sweep_progress
 from dynsim.errors import ScenarioError, SimulationStopped
 from dynsim.system.terminal import escaped
 
 if TYPE_CHECKING:
-    from dynsim.studies.journal import SweepRow
+    from dynsim.studies.sweep import SweepRow
     from dynsim.studies.sweep_plan import Plan
 
 # Number of failed runs whose reasons are printed.
@@ -90,8 +90,7 @@ def sweep(
     if plot and no_figures:
         raise ScenarioError("--plot says what is drawn, --no-figures that nothing is: give one of them")
     from dynsim.scenario import read_scenario
-    from dynsim.studies.journal import OK
-    from dynsim.studies.sweep import TABLES, has_parquet, run_sweep
+    from dynsim.studies.sweep import OK, TABLES, has_parquet, run_sweep
     from dynsim.studies.sweep_plan import Axis, Law, Plan
 
     file = read_scenario(scenario)
@@ -170,8 +169,7 @@ def _draw(
 ) -> None:
     from dynsim.config.problems import suggest
     from dynsim.draw.figures.sweep import Sweep, draw
-    from dynsim.studies.journal import OK
-    from dynsim.studies.sweep import TABLES
+    from dynsim.studies.sweep import OK, TABLES
 
     known = dict.fromkeys(key for row in rows for key in row.numbers)
     for number in plotted:

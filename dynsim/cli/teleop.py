@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from dynsim.cli.app import QuietOption, ScenarioArgument, SetOption, VariantOption, folder_option, parsed_overrides
-from dynsim.cli.display import console, errors, say, say_written
-from dynsim.cli.view import open_address, write_view
+from dynsim.cli.drawing import open_address, write_view
+from dynsim.cli.tables import console, errors, say, say_written
 from dynsim.errors import DynsimError
 from dynsim.system import interruption
 from dynsim.system.terminal import escaped
@@ -54,11 +54,10 @@ def teleop(
     is saved with a scenario that repeats it: `dynsim run FOLDER/scenario.yaml` gives the same record, bit for bit.
     """
     require_websockets()
-    from dynsim.engine.results import RUN_FILES, save_drive
+    from dynsim.engine.recording import RUN_FILES, save_drive
     from dynsim.scenario import load_scenario
     from dynsim.system.files import check_writable
-    from dynsim.teleop.begin import begin
-    from dynsim.teleop.session import SpeedLimits
+    from dynsim.teleop.snake import SpeedLimits, begin
     from dynsim.teleop.web.live import LiveDrive
 
     loaded = load_scenario(scenario, variant, parsed_overrides(overrides))

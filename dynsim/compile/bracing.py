@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dynsim.dynamics import tables as ka
-from dynsim.dynamics.contact.braces import tables as kb
+from dynsim.dynamics.contact.braces import statics as kb
 from dynsim.dynamics.contact.braces.statics import brace_motion, brace_statics
 from dynsim.errors import ModelError, brief
 from dynsim.jit.kernel import integers, reals

@@ -1,7 +1,8 @@
 """Joints that move no inertia, and contact points that no joint moves along the normal of their surface.
 
-The force on an immobile point changes no motion, so no equation determines it. A point that is immobile in every posture
-is left out of the contact problem; in a single posture it carries nothing. Joints whose brakes are closed move nothing.
+The force on an immobile point changes no motion, so no equation determines it. A point that is immobile in every
+posture is left out of the contact problem; in a single posture it carries nothing. A joint whose brake is closed moves
+nothing.
 """
 
 from __future__ import annotations

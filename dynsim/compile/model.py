@@ -17,11 +17,11 @@ from dynsim.compile.tables import compile_model
 from dynsim.config.problems import listed
 from dynsim.dynamics import ledger
 from dynsim.dynamics import tables as ka
-from dynsim.dynamics.tree import articulated, joints, points, sweep
+from dynsim.dynamics.tree import articulated, joints, sweep
 from dynsim.errors import ModelError, brief
 from dynsim.model.description import Array, Contact, Robot
 from dynsim.model.surfaces import Surface
-from dynsim.record import notebook
+from dynsim.record import record
 
 _FLOAT64 = np.dtype(np.float64)
 
@@ -90,7 +90,7 @@ class Model:
             )
             for link in robot.links
         ]
-        return notebook.table(repr(self)[1:-1], [head, *rows])
+        return record.table(repr(self)[1:-1], [head, *rows])
 
     @classmethod
     def from_urdf(cls, path: str | os.PathLike[str], lock: Mapping[str, float] | None = None) -> Model:
@@ -104,9 +104,9 @@ class Model:
         Raises
         ------
         ModelError
-            The message names file, line, link or joint and what to do; see :func:`dynsim.model.urdf.build.read_urdf`.
+            The message names file, line, link or joint and what to do; see :func:`dynsim.model.urdf.reader.read_urdf`.
         """
-        from dynsim.model.urdf.build import read_urdf
+        from dynsim.model.urdf.reader import read_urdf
 
         if not isinstance(path, (str, os.PathLike)):
             raise ModelError(f"a URDF file is named by its path, not by {brief(path)}")
@@ -287,7 +287,7 @@ class Model:
         index, on_body = self._attached(body, point)
         self._sweep(q)
         out = np.zeros(3)
-        points.point_position(self._workspace, index, on_body, out)
+        joints.point_position(self._workspace, index, on_body, out)
         return out
 
     def point_jacobian(self, body: str | int, point: ArrayLike, q: ArrayLike) -> Array:
@@ -299,7 +299,7 @@ class Model:
         index, on_body = self._attached(body, point)
         position = self.point_position(index, on_body, q)
         jacobian = np.zeros((3, self.n))
-        points.point_jacobian(self.arrays, self._workspace, index, position, jacobian)
+        joints.point_jacobian(self.arrays, self._workspace, index, position, jacobian)
         return position, jacobian
 
     def body_pose(self, body: str | int, q: ArrayLike) -> tuple[Array, Array]:
@@ -317,7 +317,7 @@ class Model:
         attached = [self._attached(body, point) for body, point in (self.robot.hand, *further)]
         on_bodies = np.zeros((len(attached), 3))
         for row, (index, on_body) in zip(on_bodies, attached, strict=True):
-            points.point_position(self._workspace, index, on_body, row)
+            joints.point_position(self._workspace, index, on_body, row)
         return np.vstack([self._workspace.links[:, ka.P : ka.P + 3], on_bodies])
 
     def kinetic_energy(self, q: ArrayLike, v: ArrayLike) -> float:

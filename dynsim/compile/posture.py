@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dynsim.compile.bracing import MIN_N, BracePlanner, brace_rows
+from dynsim.compile.mobility import immobile_at
 from dynsim.compile.model import Model
-from dynsim.compile.shapes import gap_at
-from dynsim.errors import ModelError
-from dynsim.model.description import Array, Contact, Robot
+from dynsim.compile.shapes import gap_at, share_of_axis
+from dynsim.dynamics.contact.braces import statics as kb
+from dynsim.errors import ModelError, first_few
+from dynsim.model.description import Array, Contact, Load, Robot
+from dynsim.model.drives import Servo
 
 HAND = "hand"
 
@@ -122,3 +127,234 @@ def _furthest_beyond(robot: Robot, columns: Sequence[int], q: Array) -> tuple[in
             if side * (start - limit) <= 0.0 and side * (at - limit) > worst:
                 worst, furthest = side * (at - limit), (k, limit)
     return furthest
+
+
+# Motor torques that hold a posture at rest against weight, loads and braces, with the least heat.
+
+
+# Contacts with a gap below this are closed at the start [m].
+TOUCHING = 1e-6
+KEYS = ("initial", "equilibrium")
+# A contact, its link, the point on it [m], the normal in the world, and the gap [m].
+Touching = tuple[Contact, int, Array, Array, float]
+# Fraction of the static friction that an equilibrium uses if it can.
+RESERVED = 0.9
+
+
+@dataclass(frozen=True)
+class Rest:
+    """A posture at rest.
+
+    Attributes
+    ----------
+    torques : (n,) motor torques [N m or N], zero for joints without a motor that can give a torque at rest
+    normal_forces : normal force of each contact that touches, keyed by its name [N]; negative: the surface pulls
+    forces : forces of these contacts on the arm: index of the link, point in its frame [m], force in the world [N]
+    on_edge : True if only all of the static friction holds it
+    """
+
+    torques: Array
+    normal_forces: dict[str, float]
+    forces: list[tuple[int, Array, Array]]
+    on_edge: bool = False
+
+
+def holding_torques(
+    model: Model,
+    q: Array,
+    contacts: Sequence[Contact],
+    loads: Sequence[Load],
+    able: Sequence[str],
+    real: bool,
+    springs: Mapping[str, float] | None = None,
+) -> Rest:
+    """Return the torques of least heat that hold a posture.
+
+    Parameters
+    ----------
+    q : (nq,) the posture
+    contacts : all contacts; only contacts that touch carry
+    loads : external loads, evaluated at t = 0
+    able : joints whose motors can give a torque at rest
+    real : True for the unilateral law
+    springs : normal force of the spring of each contact that carries [N], NaN for a rigid contact. Compliant contacts
+        have these forces if that is possible, otherwise the nearest forces, with any torques; default: contacts that
+        touch, all rigid
+
+    Raises
+    ------
+    ModelError
+        If no torques hold the posture; the message names joints whose motors would have to give more than they can.
+        If the robot has coupled joints.
+    """
+    robot = model.robot
+    if robot.couplings:
+        raise ModelError("initial.equilibrium: not for robots with coupled joints, which share a motor", keys=KEYS)
+    touching = touching_contacts(model, contacts, q, real, springs)
+    # Frictionless first, then with a reserve, then with all friction that Coulomb allows; each with a minimum force
+    # first, so that contacts that press keep pressing.
+    attempts = [(0.0, 0.0, False)]
+    if real and touching:
+        ways = (False,) if springs is None else (True, False)
+        attempts = [
+            (share, least, follow_springs)
+            for share in (0.0, RESERVED, 1.0)
+            for follow_springs in ways
+            for least in (MIN_N, 0.0)
+        ]
+    pushes = [
+        _row(link, point, push, 0.0, 0.0, float(np.linalg.norm(push)))
+        for link, point, push in load_forces(model, q, loads)
+    ]
+    driven = replace(robot, motors=tuple(motor for motor in robot.motors if motor.joint in able))
+    for share, least, follow_springs in attempts:
+        rows = []
+        for contact, link, point, normal, _ in touching:
+            # The force of its spring is given, or a force near it is sought.
+            spring = np.nan if springs is None else springs[contact.name]
+            commanded = spring if follow_springs else np.nan
+            rows.append(_row(link, point, normal, share * contact.friction_at_rest, least, commanded))
+            if not (follow_springs or np.isnan(spring)):
+                rows[-1][1][[kb.NEAR, kb.COMPLIANCE]] = spring, 1.0 / contact.stiffness
+            if not real:
+                rows.append(_row(link, point, -normal, 0.0, 0.0))
+        planner = BracePlanner(driven, model.arrays, [link for link, _ in (*rows, *pushes)])
+        tables = np.array([table for _, table in (*rows, *pushes)]).reshape(1, -1, kb.BRACE_SIZE)
+        still, arrays = np.zeros((1, model.n)), planner.arrays
+        torques, normal_N, solved = planner.least_heat(q[None], still, still, tables)
+        if solved == 1:
+            pressed = normal_N[0, : len(rows)]
+            normal = pressed if real else pressed[::2] - pressed[1::2]
+            names = [contact.name for contact, *_ in touching]
+            forces = arrays.forces[: len(rows)] if real else arrays.forces[: len(rows)].reshape(-1, 2, 3).sum(axis=1)
+            places = [(link, point, force) for (_, link, point, *_), force in zip(touching, forces, strict=True)]
+            return Rest(torques[0], dict(zip(names, normal.tolist(), strict=True)), places, share == 1.0)
+    raise ModelError(_why(model, arrays.motors, arrays.free, [contact[0].name for contact in touching]), keys=KEYS)
+
+
+def touching_contacts(
+    model: Model, contacts: Sequence[Contact], q: Array, real: bool, named: Container[str] | None = None
+) -> list[Touching]:
+    """Return the contacts that touch and can carry, or only the named contacts, whatever their gaps."""
+    touching = [(contact, *_touching_point(model, contact, q)) for contact in contacts]
+    touching = [
+        entry
+        for entry in touching
+        if (abs(entry[-1]) <= TOUCHING or (real and entry[-1] < 0.0) if named is None else entry[0].name in named)
+    ]
+    # A point that no joint moves along its normal carries nothing, see dynsim.integrators.contacts.impacts.
+    return [
+        entry for entry in touching if not (entry[0].left_out or immobile_at(model, entry[1], entry[2], entry[3], q))
+    ]
+
+
+def _touching_point(model: Model, contact: Contact, q: Array) -> tuple[int, Array, Array, float]:
+    """Return the link, the point in its frame [m] where a contact touches, the normal in the world and the gap [m]."""
+    robot = model.robot
+    position, point = model.point_position(contact.body, contact.point, q), contact.point
+    if contact.tip is not None:
+        end = model.point_position(contact.body, contact.tip, q)
+        share = share_of_axis(contact, position, end)
+        position, point = position + share * (end - position), point + share * (contact.tip - point)
+    normal = np.asarray(contact.surface.normal(position), dtype=np.float64)
+    gap = contact.surface.gap(position) - contact.radius
+    link, on_link = robot.attach(contact.body, point)
+    if contact.radius > 0.0:
+        on_link = on_link - contact.radius * (model.body_pose(link, q)[0].T @ normal)
+    return link, on_link, normal, float(gap)
+
+
+def _row(
+    link: int, point: Array, normal: Array, friction: float, least: float, force: float = np.nan
+) -> tuple[int, Array]:
+    """Return a held brace for the kernels: its link and the row of its table."""
+    return link, brace_rows(point, normal[None], np.array([friction]), least, force, np.zeros((1, 3)))[0]
+
+
+def load_torques(model: Model, q: Array, loads: Sequence[Load]) -> Array:
+    """Return the torques that hold the loads at t = 0, −J_wᵀ W, (n,) [N m or N]."""
+    torques = np.zeros(model.n)
+    for link, point, force in load_forces(model, q, loads):
+        torques -= model.point_jacobian(link, point, q).T @ force
+    return torques
+
+
+def load_forces(model: Model, q: Array, loads: Sequence[Load]) -> list[tuple[int, Array, Array]]:
+    """Return the loads at t = 0 as pure forces: link, point in its frame [m], force in the world [N].
+
+    A torque M is the couple of M × d and −M × d at ±d/2, with d a unit vector across M.
+    """
+    forces = []
+    for load in loads:
+        wrench = load.components(np.zeros(1))[0]
+        link, point = model.robot.attach(load.body, load.point)
+        axes, _ = model.body_pose(link, q)
+        force, torque = (axes @ part if load.in_body else part for part in (wrench[:3], wrench[3:]))
+        pushes = [(point, force)]
+        if torque.any():
+            across = np.cross(torque, np.eye(3)[np.abs(torque).argmin()])
+            across /= np.linalg.norm(across)
+            lever, couple = 0.5 * axes.T @ across, np.cross(torque, across)
+            pushes += [(point + lever, couple), (point - lever, -couple)]
+        forces += [(link, at, push) for at, push in pushes if push.any()]
+    return forces
+
+
+def _why(model: Model, limits: Array, needed: Array, braces: Sequence[str]) -> str:
+    """Return a text that names the joints that cannot give the torques needed for weight and loads."""
+    robot = model.robot
+    motors = {motor.joint: motor for motor in robot.motors}
+    weak = []
+    for link, (low, high), torque in zip(robot.links, limits[:, [kb.LOWER, kb.UPPER]], needed, strict=True):
+        if low - 1e-9 <= torque <= high + 1e-9:
+            continue
+        motor, unit = motors.get(link.joint), link.units[3]
+        if low < high:
+            reason = f"its motor gives {high:.4g} {unit}"
+        elif motor is None:
+            reason = "has no motor"
+        elif isinstance(motor, Servo):
+            reason = "its servo follows rates, not positions"
+        else:
+            reason = "nothing makes its motor hold: no controller, or k_p = 0"
+        weak.append((abs(torque), f"{link.joint} {torque:.4g} {unit} ({reason})"))
+    text = "initial.equilibrium: nothing holds this posture at rest"
+    if weak:
+        largest = [entry for _, entry in sorted(weak, key=lambda entry: -entry[0])]
+        text += f": weight and loads ask for {first_few(largest)}"
+    carries = f"; {', '.join(braces)} cannot carry it" if braces else "; no contact touches"
+    return f"{text}{carries}. Change the posture, let a brace carry it, or take initial.equilibrium away"
+
+
+def static_margin(model: Model, q: Array, forces: Sequence[tuple[int, Array, Array]] = ()) -> float:
+    """Return the tip margin of a base at rest: 1 at the incentre, 0 tips, −1 lifted.
+
+    See :mod:`dynsim.dynamics.tree.support`.
+
+    Parameters
+    ----------
+    q : (nq,) coordinates
+    forces : external forces in addition to the weight: index of the link, point in its frame [m], force in the world
+        [N]; forces on objects next to the base do not count, and neither do the weights of these objects
+    """
+    robot, base = model.robot, model.robot.base
+    assert base is not None
+    axes, origin = model.body_pose(base.body, q)
+    force, moment, carried = np.zeros(3), np.zeros(3), robot.tree_of(base.body)
+    weights = [(i, link.inertia.com, link.inertia.mass * robot.gravity) for i, link in enumerate(robot.links)]
+    for link, point, push in (*weights, *forces):
+        if not carried[link]:
+            continue
+        force += push
+        moment += np.cross(model.point_position(link, point, q) - origin, push)
+    # Reaction of the ground, in the axes of the base.
+    pressed, (turn_x, turn_y) = -float(axes[:, 2] @ force), (-axes.T @ moment)[:2]
+    if pressed <= 0.0:
+        return -1.0
+    x, y = base.caster[:2]
+    caster = -turn_y / x
+    difference = 2.0 * (turn_x - caster * y) / base.track
+    loads = np.array([pressed - caster + difference, pressed - caster - difference, 2.0 * caster]) / 2.0
+    half = 0.5 * base.track
+    sides = np.array([np.hypot(x, y + half), np.hypot(x, y - half), base.track])
+    return float((loads / pressed * sides.sum() / sides).min())

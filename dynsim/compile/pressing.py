@@ -21,9 +21,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.compile.equilibrium import KEYS, Touching, holding_torques, touching_contacts
 from dynsim.compile.model import Model
-from dynsim.compile.posture import BEYOND
+from dynsim.compile.posture import BEYOND, KEYS, Touching, holding_torques, touching_contacts
 from dynsim.compile.shapes import gap_at
 from dynsim.dynamics.tree.joints import normalise, positions_along, rates_across
 from dynsim.errors import ModelError, first_few
@@ -50,7 +49,7 @@ def pressed_in(
     """Return the model in the nearest posture whose compliant contacts carry the forces that an equilibrium needs.
 
     Nearest to the initial posture. The model itself if no compliant contact touches. For the parameters see
-    :func:`dynsim.compile.equilibrium.holding_torques`.
+    :func:`dynsim.compile.posture.holding_torques`.
 
     Raises
     ------
@@ -115,7 +114,7 @@ def _search(
     ----------
     names : contacts that carry at first, with these forces [N]
     holding : function that returns forces of an equilibrium near the forces of springs, or None, see
-        :func:`dynsim.compile.equilibrium.holding_torques`
+        :func:`dynsim.compile.posture.holding_torques`
     """
     q, before = model.robot.initial, np.inf
     touching = touching_contacts(model, contacts, q, real, names)

@@ -7,7 +7,7 @@
 The root is the body behind the axle of wheel pair 1, at that axle. Going tailward a joint turns by Rz(θ) or Ry(ψ), so a
 joint of the head branch, which turns its head side, has the axis −e_z or −e_y. The angle of a joint is that of
 :mod:`dynsim.snake.kinematics`. Pitch joints on the axles of the base part, ψ4 … ψ8, lift wheel pairs
-(:mod:`dynsim.snake.base_part`).
+(:mod:`dynsim.snake.lifting`).
 
 All wheels are bodies, spheres where they touch: a driven one has a servo in velocity mode, the others turn freely.
 Their masses are in those of the links, which are the ones of the kinematic level; they add only their spin inertia.
@@ -28,9 +28,8 @@ from dynsim.model.description import Array, Foot, Inertia, Link, Robot, Tie
 from dynsim.model.drives import Drive, Servo
 from dynsim.model.gripper import Gripper
 from dynsim.model.joints.ball import floating
-from dynsim.snake.base_part import BasePart
 from dynsim.snake.description import SnakeDescription
-from dynsim.snake.lifting import Lifts
+from dynsim.snake.lifting import BasePart, Lifts
 
 GROUND = "ground"
 ROOT = "pair1"

@@ -1,7 +1,7 @@
 """Rests of ties of a run that goes on from a state: measured where its scenario starts, not where the state is.
 
 A run from its own start leaves this to its first step, ``begin_tie`` in
-:mod:`dynsim.integrators.stepping.compliance`, whose formulas these are.
+:mod:`dynsim.integrators.stepping.contacts`, whose formulas these are.
 """
 
 from __future__ import annotations

@@ -10,13 +10,11 @@ from typing import NamedTuple
 import numpy as np
 
 from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact.delassus import admissible_forces
 from dynsim.dynamics.contact.distance import ShapeArrays
 from dynsim.dynamics.contact.m_star import solve_m_star
-from dynsim.dynamics.contact.quadrics import contact_rows, sign_changed
-from dynsim.dynamics.contact.rows import set_modes
-from dynsim.dynamics.contact.shapes import shaped_rows
+from dynsim.dynamics.contact.rows import contact_rows, set_modes, shaped_rows, sign_changed
 from dynsim.dynamics.contact.shares import solve_rows
-from dynsim.dynamics.contact.splits import admissible_forces
 from dynsim.dynamics.contact.unilateral import UnilateralArrays, rub
 from dynsim.dynamics.drive.law import drive
 from dynsim.dynamics.ledger import dry_losses, ledger_rates

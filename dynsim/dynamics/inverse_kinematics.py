@@ -10,10 +10,9 @@ import numpy as np
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import distance as kd
 from dynsim.dynamics.contact.distance import ShapeArrays, distance
-from dynsim.dynamics.contact.quadrics import hessian_product, surface_distance
+from dynsim.dynamics.contact.rows import hessian_product, surface_distance
 from dynsim.dynamics.tables import ContactArrays, ModelArrays, Workspace
-from dynsim.dynamics.tree.joints import read_positions
-from dynsim.dynamics.tree.points import point_jacobian, point_position
+from dynsim.dynamics.tree.joints import point_jacobian, point_position, read_positions
 from dynsim.dynamics.tree.sweep import kinematics
 from dynsim.jit.kernel import internal_kernel, kernel
 

@@ -11,7 +11,7 @@ State y, all in one vector, blocks in this order:
     loss     (2,)   energy lost in impacts of contacts and of joint stops [J]; only under the unilateral law
     scheme   (1,)   energy lost by discretisation [J]; only in time stepping, see stepping.discretisation_energy
     elastic  (2,)   energy that contacts and ties have stored since the start, and what their dampers have taken [J];
-                    only where some give way, see dynsim.integrators.stepping.compliance
+                    only where some give way, see dynsim.integrators.stepping.contacts
 
 Error control covers the first three; the others are integrals on which the motion does not depend.
 """

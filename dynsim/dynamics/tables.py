@@ -18,7 +18,7 @@ import numpy as np
 REVOLUTE_X, REVOLUTE_Y, REVOLUTE_Z, REVOLUTE, PRISMATIC = 0, 1, 2, 3, 4
 # Rows of joints with several velocities, or with a motion of their own: dynsim.dynamics.tree.joints.
 BALL_X, BALL_Y, BALL_Z, ROLL, TURN, LEFT_WHEEL, RIGHT_WHEEL = 5, 6, 7, 8, 9, 10, 11
-# Friction of a contact under a negative (pulling) normal force, see dynsim.dynamics.contact.quadrics.
+# Friction of a contact under a negative (pulling) normal force, see dynsim.dynamics.contact.rows.
 FRICTION_SIGNED, FRICTION_DISSIPATIVE = 0, 1
 # Mode of a candidate: off its surface (no row), sliding (one row, friction in its direction), or held at its anchor
 # (three rows). Constant within a step.

@@ -23,7 +23,8 @@ from dynsim.system.memo import remembering
 logging.getLogger("dynsim").addHandler(logging.NullHandler())
 log = logging.getLogger(__name__)
 
-ENGINES = ("dynamics", "kinematic")
+# Modules of the engines, by name.
+ENGINES = {"dynamics": "dynsim.engine.simulation", "kinematic": "dynsim.engine.kinematic"}
 REFERENCES, SIMULATION = "references", "simulation"
 
 
@@ -155,4 +156,4 @@ def _module(scenario: Scenario) -> ModuleType:
     if scenario.engine not in ENGINES:
         known = ", ".join(ENGINES)
         raise ModelError(f"plant {scenario.plant.type!r} wants the engine {scenario.engine!r}; there are: {known}")
-    return importlib.import_module(f"dynsim.engine.{scenario.engine}")
+    return importlib.import_module(ENGINES[scenario.engine])

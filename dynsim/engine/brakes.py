@@ -13,7 +13,7 @@ from dynsim.dynamics.contact.rows import row_errors, set_modes
 from dynsim.dynamics.derivative import derivative
 from dynsim.dynamics.state import block
 from dynsim.engine.prepare import Prepared
-from dynsim.integrators.project import project_level
+from dynsim.integrators.run import project_level
 from dynsim.jit.kernel import integers
 from dynsim.scenario import Scenario, build
 

@@ -17,11 +17,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from dynsim.compile.contact_law import format_quantity
 from dynsim.compile.control import JointControl
-from dynsim.compile.equilibrium import holding_torques, load_torques, touching_contacts
 from dynsim.compile.model import Model
+from dynsim.compile.posture import holding_torques, load_torques, touching_contacts
 from dynsim.compile.pressing import pressed_in, spring_forces
+from dynsim.compile.tables import format_quantity
 from dynsim.dynamics.tables import ReferenceArrays
 from dynsim.errors import first_few
 from dynsim.model.description import Array, Contact, Load

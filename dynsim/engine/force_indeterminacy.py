@@ -1,6 +1,6 @@
 """Diagnosis of contact forces that are not unique: Painlevé's paradox, dependent rows; texts for warnings and stops.
 
-The check during a run is compiled (dynsim.dynamics.contact.uniqueness); here its finding is located in time and
+The check during a run is compiled (dynsim.dynamics.contact.delassus); here its finding is located in time and
 described, and the range of accelerations that dependent frictional rows allow is computed. docs/physics.md derives the
 criteria.
 """
@@ -17,13 +17,14 @@ from numpy.typing import NDArray
 from dynsim.compile.model import Model
 from dynsim.compile.shapes import share_of_axis
 from dynsim.dynamics import tables as ka
-from dynsim.dynamics.contact import uniqueness as kq
+from dynsim.dynamics.contact import delassus as kq
 from dynsim.dynamics.contact.delassus import RANK_TOLERANCE
-from dynsim.dynamics.contact.quadrics import SIGNS_LIMIT
+from dynsim.dynamics.contact.rows import SIGNS_LIMIT
 from dynsim.dynamics.derivative import System, derivative, new_workspace
 from dynsim.dynamics.tree.articulated import accelerate
 from dynsim.integrators import run as ki
 from dynsim.model.description import Contact
+from dynsim.record import Record
 
 Array = NDArray[np.float64]
 
@@ -433,3 +434,74 @@ def row_basis(rows: Array) -> Array:
     _, sizes, basis = np.linalg.svd(rows, full_matrices=False)
     # A row of zeros has rounding of its size.
     return basis[sizes > max(DEPENDENT * sizes.max(initial=0.0), 1e-9)]
+
+
+# Contacts that friction can wedge by itself: forces of one contact that push against no joint, inside its cone.
+
+
+# Samples in which a contact is examined, at equal distances among those in which it is closed.
+POSTURES = 20
+# A force that leaves its cone by less, relative or in N, lies on it except for rounding.
+ON_CONE = 1e-6
+
+
+@dataclass(frozen=True)
+class Wedge:
+    """A contact that can wedge itself, the least coefficient that does it, its own at rest, and the time [s]."""
+
+    contact: Contact
+    least: float
+    friction: float
+    time: float
+
+
+def wedges(model: Model, contacts: Sequence[Contact], record: Record) -> list[Wedge]:
+    """Contacts whose motion is not unique because they can wedge themselves, each where the least friction does it.
+
+    Springs decide the normal forces of compliant contacts. Friction that depends on direction (``grip``) is left out:
+    it has another cone, and does not oppose slip.
+    """
+    result, free, q = list[Wedge](), free_rates(model), record["q"]
+    for k, contact in enumerate(contacts):
+        friction = contact.friction_at_rest
+        if contact.stiffness > 0.0 or contact.grip_axis is not None or friction == 0.0:
+            continue
+        mode, own = record["contact_mode"][:, k], list[Wedge]()
+        closed = np.flatnonzero(mode != ka.OPEN)
+        for t in closed[np.unique(np.linspace(0, len(closed) - 1, min(POSTURES, len(closed))).astype(int))].tolist():
+            if not np.isfinite(q[t]).all():
+                continue
+            normal, jacobian = contact_point(model, contact, q[t])
+            least, moving = least_coefficient(jacobian @ free, normal)
+            if least > friction:
+                continue
+            if mode[t] == ka.SLIDING or not _holds(moving, normal, friction, record["contact_force"][t, k]):
+                own.append(Wedge(contact, least, friction, float(record.time[t])))
+        if own:
+            # The first of those that are equal except for rounding.
+            result.append(min(own, key=lambda wedge: float(f"{wedge.least:.4g}")))
+    return result
+
+
+def least_coefficient(jacobian: Array, normal: Array) -> tuple[float, Array]:
+    """μ* of a contact with ``jacobian`` (3, f), infinite for none, and the directions Q of its motion, (3, r).
+
+    A point that joints do not move along the normal carries nothing, and has none either.
+    """
+    moving = row_basis(jacobian.T).T
+    along = normal @ moving
+    own, other = float(np.linalg.norm(along)), float(np.linalg.norm(normal - moving @ along))
+    # Blocked directions are known up to DEPENDENT: what is less is a direction across the normal.
+    if own <= DEPENDENT or other <= DEPENDENT:
+        return np.inf, moving
+    return own / other, moving
+
+
+def _holds(moving: Array, normal: Array, friction: float, force: Array) -> bool:
+    """Whether the contact would stick without the force that blocks it too, ``force`` (3,) being all that it has."""
+    along = normal @ moving
+    # Of two directions one is along the surface; of one, which is not across the normal, none is.
+    slips = np.array([[-along[1]], [along[0]]]) / np.linalg.norm(along) if len(along) == 2 else np.zeros((1, 0))
+    needed = np.linalg.solve(np.column_stack([along, slips]), moving.T @ force)
+    slack = ON_CONE * (1.0 + float(np.linalg.norm(force)))
+    return bool(np.abs(needed[1:]).max(initial=0.0) <= friction * needed[0] + slack and needed[0] >= -slack)

@@ -3,26 +3,577 @@
 from __future__ import annotations
 
 import logging
+import math
 import time as clock
 from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
 
-from dynsim.compile.scene import snake_scene
+import numpy as np
+from numpy.typing import NDArray
+
+from dynsim._version import __version__
+from dynsim.compile.hand_posture import turn_error
+from dynsim.compile.model import Model
+from dynsim.compile.scene import robot_scene, snake_scene
 from dynsim.engine import Progress, Start
 from dynsim.engine.compilation import kernels_logged
-from dynsim.engine.kinematic_objects import CarriedObjects
-from dynsim.engine.kinematic_record import make_record
-from dynsim.engine.kinematic_run import SnakeRun
+from dynsim.engine.gripper import (
+    HARDENED,
+    HARDENING,
+    SOFT,
+    SOFTENING,
+    add_gripper,
+    gripper_event,
+    gripper_summary,
+    in_words,
+    nearest_object,
+    refuse_capture,
+)
 from dynsim.engine.outcome import check_size, interrupted, raise_stopped
-from dynsim.engine.snake_control import control_periods
+from dynsim.engine.recording import provenance
+from dynsim.engine.snake_control import OBSTACLES, SnakeControl, control_periods, copy_of
 from dynsim.errors import ModelError, SimulationStopped
+from dynsim.jit.kernel import reals
 from dynsim.library.families import member
-from dynsim.record import Record
-from dynsim.record.poses import pose_columns
+from dynsim.model.description import Array, Link, Robot
+from dynsim.model.gripper import Gripper, grasp_frame, graspable
+from dynsim.record import Event, Record
+from dynsim.record.measures import SHORT, percent
+from dynsim.record.poses import add_body_poses, pose_columns
+from dynsim.record.scene import Scene, quaternion
 from dynsim.scenario import Scenario, build
 from dynsim.scenario.effect import without_effect
-from dynsim.snake.description import CommandSource, SnakeDescription
-from dynsim.snake.state import new_trace
+from dynsim.scenario.schema import SceneObject
+from dynsim.snake import ticks as ss
+from dynsim.snake.description import COORDINATES, CommandSource, SnakeDescription, conditioning
+from dynsim.snake.kinematics import new_chain, posture_points
+from dynsim.snake.ticks import SnakeTrace, new_trace, record_row, run_ticks
 from dynsim.system import interruption
+
+# Signals, summary and warnings of the snake's task-space control, for both snake plants.
+
+
+OUT_OF_REACH = 1.0
+"""A target whose motion has waited for this time at the end of a run [s] is reported out of reach."""
+
+
+ASTRAY = 1e-3
+"""A head that is further than this from where its controller takes it to be [m] is reported."""
+
+
+def _wrapped(angle: NDArray[np.float64]) -> NDArray[np.float64]:
+    return angle - 2.0 * np.pi * np.floor((angle + np.pi) / (2.0 * np.pi))
+
+
+def attitude(w: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rotation matrices R = Rz(gamma) Ry(beta) Rx(alpha) of poses w, shape (T, 6) -> (T, 3, 3)."""
+    (sa, sb, sg), (ca, cb, cg) = np.sin(w[:, 3:]).T, np.cos(w[:, 3:]).T
+    return np.array(
+        [
+            [cg * cb, cg * sb * sa - sg * ca, cg * sb * ca + sg * sa],
+            [sg * cb, sg * sb * sa + cg * ca, sg * sb * ca - cg * sa],
+            [-sb, cb * sa, cb * ca],
+        ]
+    ).transpose(2, 0, 1)
+
+
+def attitude_distance(w: NDArray[np.float64], w_target: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Angle of the rotation between two attitudes [rad], shape (T,)."""
+    # From the Frobenius norm: the arc cosine of a trace loses half the digits near zero.
+    norm = np.linalg.norm(attitude(w) - attitude(w_target), axis=(1, 2))
+    return 2.0 * np.arcsin(np.clip(norm / np.sqrt(8.0), 0.0, 1.0))
+
+
+def hold_last(trace: SnakeTrace) -> None:
+    """Complete the last row, at whose time no control period begins, with the values held until then."""
+    if len(trace.u) > 1:
+        for array in (trace.u, trace.slip, trace.at_limit):
+            array[-1] = array[-2]
+
+
+def add_task(
+    record: Record, run: SnakeControl, trace: SnakeTrace, w: NDArray[np.float64], points: NDArray[np.float64]
+) -> None:
+    """Signals of the controlled point, the modes, the redundancy, the support, and the posture as a polyline.
+
+    Parameters
+    ----------
+    trace : a row for each sample of the record
+    w : (T, 6) pose of the controlled point
+    points : (T, points, 3) [m]
+    """
+    # Angles of w on the branch of the target, so that no curve jumps by 2 pi.
+    w = w.copy()
+    w[:, 3:] = trace.w_target[:, 3:] + _wrapped(w[:, 3:] - trace.w_target[:, 3:])
+    position_error = np.linalg.norm(w[:, :3] - trace.w_target[:, :3], axis=1)
+    attitude_error = attitude_distance(w, trace.w_target)
+    grounded = run.controller.law.grounded[trace.mode]
+    ticks, period = run.tick, run.controller.schedule.period
+    gripper = run.gripper[np.minimum(np.rint(record.time / period).astype(int), max(ticks - 1, 0))]
+    names = run.description.joint_names
+    pairs = tuple(f"pair{i + 1}" for i in range(run.description.pairs))
+    add = record.add
+    add("w", w, "m, rad", labels=COORDINATES, description="pose of the controlled point")
+    add("w_target", trace.w_target, "m, rad", labels=COORDINATES, description="its target")
+    add("w_estimate", trace.w_hat, "m, rad", labels=COORDINATES, description="what the controller takes it for")
+    add("position_error", position_error, "m", description="distance of the controlled point from its target")
+    add("attitude_error", attitude_error, "rad", description="angle between its attitude and the target's")
+    add("base_pose", trace.base, "m, rad", labels=("x", "y", "yaw"), description="base part, at wheel pair 1")
+    add("mode", np.array(run.controller.modes.numbers)[trace.mode], "1", description="mode number")
+    add("grounded", grounded, "1", labels=pairs, description="1 where the wheel pair is on the ground")
+    add("gripper", gripper, "1", description="1 closed (hardened), 0 open (soft)")
+    add("cost", trace.cost, "1", description="V of the redundancy")
+    add("sigma_min", trace.sigma, "1", description="smallest singular value of B~ of the mode, unweighted")
+    add("support_margin", trace.margin, "m", description="centre of mass inside the support polygon by this much")
+    add("support_area", trace.area, "m^2", description="of the support polygon")
+    add("centre_of_mass", trace.centre, "m", labels=("x", "y", "z"))
+    add("slip", trace.slip, "m/s", description="largest violation of a wheel row within the period")
+    add("at_limit", trace.at_limit, "1", labels=names, description="1 joint out of the allocation, 2 clamped")
+    labels = tuple(f"point{i}" for i in range(points.shape[1]))
+    add("posture", points, "m", labels=labels, description="polyline: controlled point, joints, axles to the tail")
+
+
+def _waiting_for(counts: NDArray[np.int64], period: float) -> dict[str, float]:
+    """Why the target waited, and how long [s]; reasons that did not occur are left out."""
+    known = counts[ss.WAITED_FOR + 1 : ss.PATH_SLOWED]
+    ticks = [*known, counts[ss.WAITED] - known.sum()]
+    return {name: float(count * period) for name, count in zip(OBSTACLES, ticks, strict=True) if count}
+
+
+def _out_of_reach(counts: NDArray[np.int64], period: float, duration: float) -> dict[str, Any] | None:
+    """Since when a target has waited that waits at the end of the run, and for what; None where it does not."""
+    still = float(counts[ss.STILL] * period)
+    if still < OUT_OF_REACH:
+        return None
+    return {"since_s": duration - still, "reason": OBSTACLES[counts[ss.STILL_FOR] - 1]}
+
+
+def task_summary(run: SnakeControl, record: Record) -> dict[str, Any]:
+    """What the control has done, for ``summary.json``."""
+    description, law, period = run.description, run.controller.law, run.controller.schedule.period
+    counts = run.state.counts
+    phi, w, at_limit = record["phi"], record["w"], record["at_limit"]
+    beyond = np.maximum(phi - description.upper, description.lower - phi)
+    duration = float(record.time[-1])
+    return {
+        "final_position_error_m": float(record["position_error"][-1]),
+        "final_attitude_error_rad": float(record["attitude_error"][-1]),
+        "position_error_max_m": float(record["position_error"].max()),
+        "attitude_error_max_rad": float(record["attitude_error"].max()),
+        "displacement": (w[-1] - w[0]).tolist(),
+        "target_displacement": (record["w_target"][-1] - record["w_target"][0]).tolist(),
+        "final_phi_rad": phi[-1].tolist(),
+        "final_base_pose": record["base_pose"][-1].tolist(),
+        "joint_limit_violation_max_rad": float(max(beyond.max(), 0.0)),
+        "joints_taken_out": [description.joint_names[j] for j in np.flatnonzero((at_limit == 1).any(axis=0))],
+        "waiting_s": float(counts[ss.WAITED] * period),
+        "waiting_for_s": _waiting_for(counts, period),
+        "path_slowed_s": float(counts[ss.PATH_SLOWED] * period),
+        "path_late_s": float(run.state.progress[ss.LATE] * period),
+        "out_of_reach": _out_of_reach(counts, period, duration),
+        "slowed_s": float(counts[ss.SLOWED] * period),
+        "null_space_reduced_s": float(counts[ss.NULL_REDUCED] * period),
+        "clamped_joint_ticks": int(counts[ss.CLAMPED]),
+        "joint_rate_max_rad_s": float(np.abs(record["phi_dot"]).max()),
+        "wheel_rate_max_rad_s": float(np.abs(record["rho_dot"]).max(initial=0.0)),
+        "slip_max_m_s": float(record["slip"].max()),
+        "cost_initial": float(record["cost"][0]),
+        "cost_final": float(record["cost"][-1]),
+        "mode_switches": run.switcher.switches,
+        "modes_refused": sum(not refusal.taken for refusal in run.switcher.refusals),
+        "refusals": [
+            {
+                "time_s": refusal.tick * period,
+                "mode": run.controller.modes.numbers[refusal.row],
+                # JSON has no infinity: None where the predicted state is no longer finite
+                "support_margin_m": refusal.margin if np.isfinite(refusal.margin) else None,
+                "taken": refusal.taken,
+            }
+            for refusal in run.switcher.refusals
+        ],
+        "sigma_min_min": float(record["sigma_min"].min()),
+        "support_margin_min_m": float(record["support_margin"].min()),
+        "support_area_initial_m2": float(record["support_area"][0]),
+        "support_area_final_m2": float(record["support_area"][-1]),
+        "tipping": bool((record["support_margin"] <= 0.0).any()),
+        "model": {
+            str(number): conditioning(run.model, law, row, record["base_pose"][0], phi[0])._asdict()
+            for row, number in enumerate(run.controller.modes.numbers)
+        },
+    }
+
+
+def effort(summary: dict[str, Any]) -> dict[str, Any]:
+    """What a battery gives for a dynamic run, and the servo whose rms torque is the largest part of its rating."""
+    rated = {k: m.get("nominal_torque_N_m", m.get("stall_torque_N_m")) for k, m in enumerate(summary["motors"])}
+    share = {k: summary["motors"][k]["torque_rms_N_m"] / rating for k, rating in rated.items() if rating}
+    return {
+        "battery_energy_Wh": summary["electrical_energy_supply_J"] / 3600.0,
+        **({"worst_joint": summary["motors"][max(share, key=lambda k: share[k])]} if share else {}),
+    }
+
+
+def task_warnings(run: SnakeControl, record: Record, summary: dict[str, Any]) -> list[str]:
+    """What a user should know of the control, a line each."""
+    warnings = []
+    if summary["waiting_s"] >= SHORT * summary["duration_s"] > 0.0:
+        share = percent(min(summary["waiting_s"] / summary["duration_s"], 1.0))
+        why = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in summary["waiting_for_s"].items())
+        warnings.append(f"the target waited for {summary['waiting_s']:.2f} s ({share} of the run): {why}")
+    if (gone := summary["out_of_reach"]) is not None:
+        target = ", ".join(f"{value:.3f}" for value in record["w_target"][-1])
+        warnings.append(
+            f"the path is out of reach from t = {gone['since_s']:.2f} s on ({gone['reason']}): the target waited there "
+            f"to the end of the run, at ({', '.join(COORDINATES)}) = ({target})"
+        )
+    if summary["path_slowed_s"] > 0.0:
+        warnings.append(
+            f"the path is too fast for the joints: the target was slower than commanded for "
+            f"{summary['path_slowed_s']:.2f} s and came {summary['path_late_s']:.2f} s late "
+            "(controller.rate_limit_rad_s)"
+        )
+    if summary["slowed_s"] > 0.0:
+        warnings.append(
+            f"feedback and shape points were slowed down for {summary['slowed_s']:.2f} s: they asked for more than the "
+            "limits of joints and rates allow"
+        )
+    if summary["null_space_reduced_s"] > 0.0:
+        warnings.append(
+            f"the null-space motion was reduced for {summary['null_space_reduced_s']:.2f} s to keep the rate limit: "
+            "the cost falls slower there (controller.null_gain)"
+        )
+    if summary["clamped_joint_ticks"]:
+        off = np.linalg.norm(record["w_estimate"][:, :3] - record["w_target"][:, :3], axis=1).max()
+        warnings.append(
+            f"joints were clamped at their limits in {summary['clamped_joint_ticks']} joint-ticks: by the joint angles "
+            f"that the controller knows, the head is off its target by up to {1e3 * off:.3g} mm"
+        )
+    astray = np.linalg.norm(record["w"][:, :3] - record["w_estimate"][:, :3], axis=1).max()
+    if astray > ASTRAY and run.controller.schedule.state_source not in {ss.MEASURED, ss.GIVEN}:
+        warnings.append(
+            f"the head is up to {1e3 * astray:.3g} mm from where the controller takes it to be: servos sag under their "
+            "loads and wheels slip (controller.state: measured sees both)"
+        )
+    if summary["tipping"]:
+        share = percent(float((record["support_margin"] <= 0.0).mean()))
+        warnings.append(f"the robot tips: its centre of mass is outside the support polygon for {share} of the run")
+    least, margin = run.controller.least_margin, record["support_margin"]
+    if least > 0.0 and not summary["tipping"] and margin.min() <= least:
+        worst = int(margin.argmin())
+        warnings.append(
+            f"the support margin falls to {1e3 * margin[worst]:.1f} mm at t = {record.time[worst]:.2f} s, below "
+            f"switching.least_margin_m ({1e3 * least:g} mm): it is tested when a mode is chosen, not within it"
+        )
+    return warnings + _refusal_warnings(summary["refusals"], run.controller.least_margin)
+
+
+def _refusal_warnings(refusals: list[dict[str, Any]], least_margin: float) -> list[str]:
+    """One line for every mode that was refused, and one for every mode that was taken although it tips."""
+    texts = []
+    for mode, taken in dict.fromkeys((refusal["mode"], refusal["taken"]) for refusal in refusals):
+        same = [refusal for refusal in refusals if (refusal["mode"], refusal["taken"]) == (mode, taken)]
+        margin = same[0]["support_margin_m"]
+        needed = f"a support margin of more than {1e3 * least_margin:g} mm is needed, it has"
+        why = "its prediction diverges" if margin is None else f"{needed} {1e3 * margin:.1f} mm"
+        outcome = "taken, as no other stands better," if taken else "refused"
+        times = f" ({len(same)} times in all)" if len(same) > 1 else ""
+        texts.append(f"mode {mode} was {outcome} at t = {same[0]['time_s']:.3f} s{times}: {why}")
+    return texts
+
+
+# Objects of a kinematic snake: they have no forces, stay where they are, and follow the gripper while it holds them.
+
+
+# A grasp frame that is nearer to the axis of its hinge tells no angle: the turning of the gripper does [m].
+ON_AXIS = 0.01
+
+
+@dataclass
+class HeldObject:
+    """Object ``name`` in the gripper from one tick to another.
+
+    ``start``, ``end`` : ticks; ``released`` : its coordinates from ``end`` on; ``tip``, ``q`` : pose of the gripper,
+    rotation and position, and all coordinates at the start
+    """
+
+    name: str
+    start: int
+    end: float
+    tip: tuple[Array, Array]
+    q: Array
+    released: Array | None = None
+
+
+class CarriedObjects:
+    """The objects of a run, and when the gripper held which.
+
+    Parameters
+    ----------
+    gripper : its tip is ``ahead`` of the controlled point [m]
+    period : control period [s]
+    """
+
+    def __init__(self, scenario: Scenario, gripper: Gripper, ahead: float, period: float) -> None:
+        self.objects: dict[str, SceneObject] = scenario.config.objects
+        self.gripper, self._ahead, self._period = gripper, ahead, period
+        links = [link for name, body in self.objects.items() for link in body.links(name)]
+        frames = [frame for name, body in self.objects.items() for frame in body.frames(name)]
+        start = np.concatenate([body.start() for body in self.objects.values()])
+        first = next(iter(self.objects))
+        self.robot = Robot("objects", tuple(links), (), (first, np.zeros(3)), q0=start, frames=tuple(frames))
+        self.model, self.q = Model(self.robot), start.copy()
+        # Where the coordinates of each object are.
+        sizes = [len(body.start()) for body in self.objects.values()]
+        ends = np.cumsum(sizes).tolist()
+        self._part = {name: slice(end - size, end) for name, size, end in zip(self.objects, sizes, ends, strict=True)}
+        self.graspable = graspable(self.robot)
+        self.grasps: list[HeldObject] = []
+        self.events: list[Event] = []
+        self._closed = False
+
+    def tip(self, w: Array) -> tuple[Array, Array]:
+        """Rotation and position of the gripper's tip at a pose (6,) of the controlled point."""
+        R = attitude(w[None])[0]
+        return R, w[:3] + self._ahead * R[:, 0]
+
+    def command(self, tick: int, closed: bool, w: Array) -> None:
+        """Close or open the gripper from a tick on, with the controlled point at w (6,).
+
+        Raises
+        ------
+        SimulationStopped
+            It closes, and nothing is within capture.
+        """
+        if closed == self._closed or not self.graspable:
+            self._closed = closed
+            return
+        self._closed, time = closed, tick * self._period
+        present = self.grasps[-1] if self.grasps and self.grasps[-1].end > tick else None
+        if not closed:
+            if present is not None:
+                hardened = min((tick - present.start) * self._period / self.gripper.hardening, 1.0)
+                present.end = tick + math.ceil(hardened * self.gripper.softening / self._period - 1e-9)
+                self.events.append(gripper_event(present.end * self._period, "releases", present.name))
+            return
+        if present is not None:  # it was still softening
+            present.end = np.inf
+            self.events.pop()
+            return
+        tip = self.tip(w)
+        name, distance, angle = nearest_object(self.model, self.graspable, self.q, tip, self.gripper)
+        refuse_capture(self.gripper, time, name, distance, angle)
+        self.grasps.append(HeldObject(name, tick, np.inf, tip, self.q.copy()))
+        self.events.append(gripper_event(time, "captures", name, distance))
+
+    def release(self, tick: int, w: Array) -> None:
+        """Let go of an object whose time has come, with the controlled point at w (6,)."""
+        for grasp in self.grasps:
+            if grasp.released is None and grasp.end <= tick:
+                part = self._part[grasp.name]
+                grasp.released = self.q[part] = self._followed(grasp, *self.tip(w))
+
+    def due(self, tick: int) -> float:
+        """Return the number of periods until the next release."""
+        return min((grasp.end - tick for grasp in self.grasps if grasp.released is None), default=math.inf)
+
+    def _move_to(self, tick: int, w: Array) -> None:
+        """Move the held object with the gripper, to its position at a tick, and those that were released."""
+        for grasp in self.grasps:
+            if tick >= grasp.end and grasp.released is not None:
+                self.q[self._part[grasp.name]] = grasp.released
+            elif grasp.start <= tick <= grasp.end:
+                self.q[self._part[grasp.name]] = self._followed(grasp, *self.tip(w))
+
+    def _followed(self, grasp: HeldObject, R: Array, p: Array) -> Array:
+        """Coordinates of a held object with the gripper at R, p."""
+        body, (R0, p0) = self.objects[grasp.name], grasp.tip
+        index, at = self.robot.attach(grasp_frame(grasp.name), np.zeros(3))
+        B, origin = self.model.body_pose(index, grasp.q)
+        before = grasp.q[self._part[grasp.name]]
+        if body.joint is None:
+            turn = R @ R0.T
+            return np.array([*(p + turn @ (origin - p0)), *quaternion(turn @ B), *before[7:]])
+        link = self.robot.links[index]
+        axis = B @ link.axis
+        if body.slide is not None:
+            return np.clip(before + axis @ (p - p0), link.lower, link.upper)
+        # In the plane of the hinge: where the grasp frame was seen from the axis, and where it has gone with the tip.
+        was = B @ at - axis * (axis @ B @ at)
+        if np.linalg.norm(was) < ON_AXIS:
+            return self._turned(grasp, before + axis @ turn_error(R0, R), link)
+        now = was + (p - p0) - axis * (axis @ (p - p0))
+        angle = float(np.arctan2(axis @ np.cross(was, now), was @ now))
+        return self._turned(grasp, before + angle, link)
+
+    def _turned(self, grasp: HeldObject, angle: Array, link: Link) -> Array:
+        """An angle without its jumps by whole turns since the last position, within the limits of the hinge."""
+        last = self.q[self._part[grasp.name]]
+        turns = np.round((last - angle) / (2.0 * np.pi))
+        return np.clip(angle + 2.0 * np.pi * turns, link.lower, link.upper)
+
+    def state_in_words(self, tick: int) -> str:
+        """Return the state of the gripper at a tick in words, for the page of a pilot."""
+        present = next((grasp for grasp in reversed(self.grasps) if grasp.start <= tick <= grasp.end), None)
+        return in_words(self._state(present, tick), None if present is None else present.name)
+
+    def positions(self, tick: int, w: Array) -> dict[str, float]:
+        """Return the coordinates of the objects by name, with the controlled point at w (6,) at this tick."""
+        self._move_to(tick, w)
+        return dict(zip(self.robot.position_names, self.q.tolist(), strict=True))
+
+    def _state(self, grasp: HeldObject | None, tick: float) -> int:
+        if grasp is None:
+            return SOFT
+        if (grasp.end - tick) * self._period <= self.gripper.softening:
+            return SOFTENING if tick < grasp.end else SOFT
+        return HARDENED if (tick - grasp.start) * self._period >= self.gripper.hardening else HARDENING
+
+    def add_to(self, record: Record, w: Array, ticks: NDArray[np.int64]) -> None:
+        """Coordinates of objects as the signal ``q``, and what the gripper did, at poses (T, 6) and ticks (T,)."""
+        self.q, rows = self.robot.initial.copy(), []
+        state, distance = np.zeros(len(ticks), dtype=np.int64), np.zeros(len(ticks))
+        for row, tick in enumerate(ticks.tolist()):
+            self._move_to(tick, w[row])
+            rows.append(self.q.copy())
+            if self.graspable:
+                distance[row] = nearest_object(self.model, self.graspable, self.q, self.tip(w[row]))[1]
+        for grasp in self.grasps:
+            within = np.flatnonzero((ticks >= grasp.start) & (ticks <= grasp.end))
+            state[within] = [self._state(grasp, tick) for tick in ticks[within].tolist()]
+        labels = self.robot.position_names
+        record.add("q", np.array(rows), "rad or m", labels=labels, description="coordinates of objects")
+        if self.graspable:
+            add_gripper(record, state, distance, self.events)
+
+    def beside(self, scene: Scene) -> Scene:
+        """The scene with the objects in it."""
+        own = robot_scene(self.robot, (), {})
+        assert own is not None
+        shifted = len(scene.bodies)
+        bodies = (replace(body, parent=body.parent + shifted) if body.parent >= 0 else body for body in own.bodies)
+        return replace(scene, bodies=(*scene.bodies, *bodies))
+
+
+# Run of the kinematic snake: control periods in compiled code, mode switches between them in Python.
+
+
+CHUNK = 500  # ticks between two checks for signals and updates of the bar: about 25 ms, at worst ten times as long
+
+
+class SnakeRun(SnakeControl):
+    """The control of a snake whose joints follow their rates exactly, and whose base moves as its wheels roll."""
+
+    objects: CarriedObjects | None = None
+
+    def load_kernels(self) -> None:
+        """Compile or load the kernels: that is no simulation time."""
+        law, schedule, trial = self.controller.law, self.controller.schedule, copy_of(self.state)
+        trace = new_trace(self.model, 1)
+        run_ticks(self.model, law, schedule, trial, self.block.velocity, 0, 1, 1, 1, self.ws, trace)
+        record_row(self.model, law, trial, self.ws, 0, trace)
+
+    def advance(self) -> None:
+        """Run the control periods up to the next one in which something may change: one, of a source that knows one.
+
+        Raises
+        ------
+        SimulationStopped
+            The state is no longer finite, or the source failed.
+        """
+        self.begin_period()
+        periods = min(self.periods(), CHUNK)
+        if self.objects is not None:
+            now, block = self.tick, self.block.gripper[self.tick - self.block_start :]
+            w, _, _ = self.posture()
+            self.objects.release(now, w)
+            self.objects.command(now, bool(block[0]), w)
+            changes = np.flatnonzero(block != block[0])
+            periods = int(min([periods, self.objects.due(now), *changes[:1].tolist()]))
+        done, blocked = run_ticks(
+            self.model,
+            self.controller.law,
+            self.controller.schedule,
+            self.state,
+            self.block.velocity,
+            periods,
+            int(not self.recovering),
+            int(self.controller.when_blocked),
+            self.stride,
+            self.ws,
+            self.trace,
+        )
+        if done < 0:
+            raise self.diverged()
+        self.end_period(blocked)
+
+
+# The record of a run of the kinematic snake: signals, summary, warnings.
+
+
+def make_record(run: SnakeRun, scenario: Scenario, wall: float, pictured: bool = True) -> Record:
+    """Signals, units, summary and provenance of a run, finished or not.
+
+    Parameters
+    ----------
+    run : after its last tick; the state at the end becomes the last sample.
+    wall : time that the ticks took [s].
+    pictured : with the scene and the poses of its bodies.
+    """
+    description, state, law = run.description, run.state, run.controller.law
+    model, period, ticks = run.model, run.controller.schedule.period, run.tick
+    rows = -(-ticks // run.stride) + 1
+    trace = SnakeTrace(*(array[:rows] for array in run.trace))
+    record_row(model, law, state, run.ws, rows - 1, trace)
+    hold_last(trace)
+    trace.w_hat[-1] = state.w_hat
+    time = np.append(np.arange(rows - 1) * run.stride, ticks) * period
+    points = np.zeros((rows, 1 + model.head_joints + 2 * model.base_joints, 3))
+    posture_points(model, reals(trace.base), reals(trace.phi), run.ws.work.frame, new_chain(model), np.zeros(6), points)
+    names, wheels, joints = description.joint_names, description.wheel_names, len(description.joint_names)
+    record = Record(time, provenance=provenance(scenario))
+    add = record.add
+    add("phi", trace.phi, "rad", labels=names, description="joint angles, head to tail")
+    add("rho", trace.rho, "rad", labels=wheels, description="angles of the active wheels")
+    add("phi_dot", trace.u[:, :joints], "rad/s", labels=names, description="joint rates held from this time on")
+    add("rho_dot", trace.u[:, joints:], "rad/s", labels=wheels, description="wheel rates held from this time on")
+    add_task(record, run, trace, trace.w, points)
+    if run.objects is not None:
+        run.objects.add_to(record, trace.w, np.rint(time / period).astype(np.int64))
+    if pictured:
+        scene = snake_scene(description)
+        record.scene = scene if run.objects is None else run.objects.beside(scene)
+        add_body_poses(record)
+    summary = {
+        "scenario": scenario.name,
+        "variant": scenario.variant,
+        "dynsim_version": __version__,
+        "duration_s": float(record.time[-1]),
+        "integration_wall_s": wall,
+        "real_time_factor": float(record.time[-1]) / wall if wall > 0.0 else 0.0,
+        "steps": int(state.counts[ss.TICKS]),
+        **task_summary(run, record),
+    }
+    warnings = [*task_warnings(run, record, summary), *_passed_limits(run, record)]
+    if run.objects is not None and run.objects.graspable:
+        summary["gripper"] = gripper_summary(record, run.objects.graspable)
+    summary["warnings"] = [*warnings, *without_effect(scenario)]
+    record.summary = summary
+    return record
+
+
+def _passed_limits(run: SnakeRun, record: Record) -> list[str]:
+    """Warn of the joint that passes its limit furthest: this level has no stops, as the dynamic one has."""
+    d = run.description
+    beyond = np.maximum(record["phi"] - d.upper, d.lower - record["phi"]).max(axis=0)
+    worst = int(beyond.argmax())
+    if beyond[worst] <= 1e-9:  # rounding
+        return []
+    return [
+        f"{d.joint_names[worst]} passes its limit by {beyond[worst]:.3f} rad; a real one would stop "
+        "(controller.limit_policy: allocate)"
+    ]
+
 
 log = logging.getLogger(__name__)
 

@@ -25,11 +25,11 @@ from dynsim.dynamics.derivative import derivative
 from dynsim.dynamics.drive.law import asked_of
 from dynsim.dynamics.state import block
 from dynsim.dynamics.tree import loads as kl
-from dynsim.engine.attended import copied
 from dynsim.engine.prepare import Prepared
+from dynsim.engine.stopping import copied
 from dynsim.errors import ScenarioError, brief
 from dynsim.integrators import run as ki
-from dynsim.integrators.output import fill_output
+from dynsim.integrators.run import fill_output
 
 Array = NDArray[np.float64]
 # Steps of the differences [rad, m, rad/s, A, …]: from least rounding error to below the speeds that smooth friction.

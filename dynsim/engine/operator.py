@@ -7,26 +7,191 @@ hand at p_d + h v (damped Gauss–Newton, :func:`dynsim.dynamics.inverse_kinemat
     q_d(t) = q_d + (q_d⁺ − q_d) (t − t_k)/h
 
 v and the velocities of the base change from tick to tick by no more than their acceleration limits times h, also where
-joint limits restrict the hand (:mod:`dynsim.engine.hand_governor`). Wheels get the rates (V ∓ ω T/2)/r, at which they
+joint limits restrict the hand (:mod:`dynsim.engine.operator`). Wheels get the rates (V ∓ ω T/2)/r, at which they
 roll without slip.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.compile.model import Model
+from dynsim.compile.reaching import path_arrays
+from dynsim.compile.references.plane_curve import wheel_angles
 from dynsim.compile.references.teleop import BASE, HAND, VELOCITIES, TeleopOptions, VelocitySource
-from dynsim.compile.rolling import wheel_angles
-from dynsim.engine.hand_governor import HandGovernor
+from dynsim.dynamics import inverse_kinematics as kik
+from dynsim.dynamics.tables import workspace
 from dynsim.engine.stepped import State, Touch
+from dynsim.jit.kernel import reals
 from dynsim.model.base_pose import base_pose, base_row
+from dynsim.model.description import Robot
 from dynsim.record import Record
+from dynsim.scenario.schema import Encoders
+
+# Reference governor of the hand: limits its commanded velocity so that the joints can always stop in time.
+
+
+HALVINGS = 6
+"""Bisections of λ; each computes one stopping path."""
+ROUNDING = 1e-9
+"""Tolerance of joint rates and accelerations, relative to their limits."""
+_GOVERNOR_STATE = ("target", "velocity", "joints", "rates", "hindrance", "_path")
+
+
+@dataclass(frozen=True)
+class StoppingPath:
+    """Hand velocities [m/s], hand targets [m] and joint positions of each tick, (T, 3), (T, 3) and (T, c)."""
+
+    velocity: Array
+    targets: Array
+    joints: Array
+
+    def remainder(self) -> StoppingPath:
+        """What is left of it after a tick."""
+        return StoppingPath(self.velocity[1:], self.targets[1:], self.joints[1:])
+
+
+class HandGovernor:
+    """Takes a hand along velocities, as far as it can stop in time.
+
+    Attributes
+    ----------
+    target : (3,) of the hand [m]; velocity : (3,) [m/s]; joints : (c,) that have it there [rad or m]
+    rates : (c,) of the joints in the last tick [rad/s or m/s]
+    hindrance : why the hand is slower than it was asked to be; empty where it is not
+    """
+
+    def __init__(self, model: Model, options: TeleopOptions, q: Array, axes: Array) -> None:
+        self._options, self._model, self._axes = options, model, axes
+        self._arrays = path_arrays(model, options.joints, options.braces)
+        self._workspace = workspace(model.n, 0, 0)
+        self._q = reals(q)
+        links = {link.joint: link for link in model.robot.links}
+        self._low = np.array([links[joint].lower for joint in options.joints])
+        self._high = np.array([links[joint].upper for joint in options.joints])
+        self.target = np.array(model.point_position(*model.robot.hand, q), dtype=np.float64)
+        self.velocity = np.zeros(3)
+        self.joints = self._q[self._arrays.place].copy()
+        self.rates, self.hindrance = np.zeros(len(self.joints)), ""
+        self._path = StoppingPath(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, len(self.joints))))
+
+    def begin(self, q: Array, v: Array) -> None:
+        """Begin with the rates that the joints have at coordinates q, (nq,), with rates v, (n,), instead of at rest."""
+        columns = [self._model.joint_names.index(joint) for joint in self._options.joints]
+        self.rates = v[columns].copy()
+        jacobian = self._model.point_jacobian(*self._model.robot.hand, q)[:, columns]
+        self.velocity = self._axes.T @ jacobian @ self.rates
+
+    def state(self) -> dict[str, Any]:
+        """What the future depends on: values that are replaced, and never written to."""
+        return {name: getattr(self, name) for name in _GOVERNOR_STATE}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go back to a state of this governor."""
+        for name, value in state.items():
+            setattr(self, name, value)
+
+    def go(self, wish: Array) -> None:
+        """A tick towards a velocity (3,) [m/s] that differs from the last by no more than a h."""
+        self.hindrance = ""
+        if not (wish.any() or self.velocity.any()):
+            self.rates = np.zeros_like(self.rates)
+            return
+        slower = self._path.velocity[0] if len(self._path.velocity) else np.zeros(3)
+        path, why = self._path_to_rest(wish)
+        if path is None:
+            self.hindrance = why
+            path = self._bisected(slower, wish)
+        self._take(self._path if path is None else path)
+
+    def _bisected(self, slower: Array, wish: Array) -> StoppingPath | None:
+        """The way from the fastest admissible velocity between those two; None where it is the slower one."""
+        low, high, best = 0.0, 1.0, None
+        at_rest, least = not self.velocity.any(), self._options.hand_acceleration / self._options.rate
+        for _ in range(HALVINGS):
+            part = 0.5 * (low + high)
+            velocity = slower + part * (wish - slower)
+            path, _ = self._path_to_rest(velocity)
+            creeps = at_rest or float(np.linalg.norm(velocity)) < least
+            if path is None or (creeps and not self._gets_easier(velocity)):
+                high = part
+            else:
+                low, best = part, path
+        return best
+
+    def _gets_easier(self, velocity: Array) -> bool:
+        """Joints are slower in the second tick than in the first, as on the way out of a singular posture.
+
+        A hand creeps only then. To an edge it would creep by jerks, and so near that it would creep back, too.
+        """
+        joints, _ = self._followed(np.array([velocity, velocity]))
+        if joints is None:
+            return False
+        first, second = np.abs(np.diff(np.vstack([self.joints, joints]), axis=0)).max(axis=1)
+        return bool(second < first)
+
+    def _take(self, path: StoppingPath) -> None:
+        """The first tick of a way, or rest where none is left."""
+        if not len(path.velocity):
+            self.velocity, self.rates = np.zeros(3), np.zeros_like(self.rates)
+            return
+        self.rates = (path.joints[0] - self.joints) * self._options.rate
+        self.velocity, self.target, self.joints = path.velocity[0].copy(), path.targets[0].copy(), path.joints[0].copy()
+        self._path = path.remainder()
+
+    def _path_to_rest(self, velocity: Array) -> tuple[StoppingPath | None, str]:
+        """The way to rest that begins with a velocity, or None and what is against it."""
+        options = self._options
+        speed, lost = float(np.linalg.norm(velocity)), options.hand_acceleration / options.rate
+        if speed == 0.0:
+            return StoppingPath(np.zeros((1, 3)), self.target[None].copy(), self.joints[None].copy()), ""
+        parts = np.maximum(1.0 - lost / speed * np.arange(max(1, math.ceil(speed / lost - ROUNDING))), 0.0)
+        velocities = parts[:, None] * velocity
+        joints, targets = self._followed(velocities)
+        if joints is None:
+            return None, "out of reach"
+        rates = np.diff(np.vstack([self.joints, joints]), axis=0) * options.rate
+        changes = np.diff(np.vstack([self.rates, rates, np.zeros_like(self.rates)]), axis=0) * options.rate
+        why = (
+            self._first((joints < self._low) | (joints > self._high), "is at its limit")
+            or self._first(np.abs(rates) > options.rate_limit * (1.0 + ROUNDING), "would be too fast")
+            or self._first(np.abs(changes) > options.acceleration_limit * (1.0 + ROUNDING), "would speed up too fast")
+        )
+        return (None, why) if why else (StoppingPath(velocities, targets, joints), "")
+
+    def _first(self, broken: NDArray[np.bool_], reason: str) -> str:
+        """The joint that is the first to break a limit."""
+        ticks, joints = np.nonzero(broken)
+        return f"{self._options.joints[joints[0]]} {reason}" if len(ticks) else ""
+
+    def _followed(self, velocities: Array) -> tuple[Array | None, Array]:
+        """Joints (T, c) with the hand where velocities (T, 3) take it, None out of reach; and the targets (T, 3)."""
+        options = self._options
+        targets = self.target + np.cumsum(velocities @ self._axes.T, axis=0) / options.rate
+        q, joints, count = self._q.copy(), np.zeros((len(targets), len(self.joints))), len(targets)
+        q[self._arrays.place] = self.joints
+        ended, _ = kik.follow_path(
+            self._model.arrays,
+            self._workspace,
+            self._arrays,
+            targets,
+            np.zeros((count, 0)),
+            0,
+            0,
+            count,
+            options.tolerance,
+            q,
+            joints,
+        )
+        return (joints if ended == count else None), targets
+
 
 Array = NDArray[np.float64]
 # A state at a tick may be a rounding before it [ticks].
@@ -215,3 +380,140 @@ def _eased(velocity: Array, wanted: Array, allowed: float) -> Array:
     size = float(np.linalg.norm(change))
     # What is reached is exact: a robot that is to rest rests.
     return wanted.copy() if size <= allowed else velocity + allowed / size * change
+
+
+# Sensors of a sampled controller: sampling, noise, resolution, delay and hold.
+
+
+# A sample that arrives this little after a tick is available at that tick [s].
+
+
+class Stateful(Protocol):
+    """A simulation whose state can be read."""
+
+    @property
+    def state(self) -> State:
+        """See :attr:`dynsim.engine.simulation.Simulation.state`."""
+        ...
+
+
+class SampledSensor:
+    """Called when a sample is due; :meth:`value` is the last one that has arrived.
+
+    A sample of x is x + σ ξ with ξ standard normal, rounded to the resolution ρ where there is one: ρ round(x/ρ).
+
+    Parameters
+    ----------
+    read : the true value of a state, (k,)
+    period : of the samples [s]
+    delay : from a sample to its arrival [s]
+    noise, resolution : (k,) standard deviations σ, and ρ, 0 for none
+    seed : of the noise
+    """
+
+    def __init__(
+        self,
+        read: Callable[[State], Array],
+        *,
+        period: float,
+        delay: float,
+        noise: Array,
+        resolution: Array,
+        seed: list[int],
+    ) -> None:
+        self.period = period
+        self._read, self._delay, self._noise, self._resolution = read, delay, noise, resolution
+        self._random = np.random.default_rng(seed)
+        self._samples: deque[tuple[float, Array]] = deque()
+        self._before: Array | None = None
+
+    def __call__(self, simulation: Stateful) -> None:
+        """Take a sample."""
+        state = simulation.state
+        x = self._read(state) + self._noise * self._random.standard_normal(len(self._noise))
+        rounded = self._resolution > 0.0
+        x[rounded] = self._resolution[rounded] * np.rint(x[rounded] / self._resolution[rounded])
+        # The first is known from the start.
+        delay = self._delay if self._samples else 0.0
+        self._samples.append((state.time + delay, x))
+
+    def value(self, time: float) -> Array:
+        """The last sample that has arrived at a time [s], (k,)."""
+        while len(self._samples) > 1 and self._samples[1][0] <= time + ROUNDING:
+            self._before = self._samples.popleft()[1]
+        return self._samples[0][1]
+
+    def rate(self, time: float) -> Array:
+        """By what the last two samples that have arrived differ, over the period, (k,); zero before there are two."""
+        value = self.value(time)
+        return np.zeros_like(value) if self._before is None else (value - self._before) / self.period
+
+    def remembered(self) -> dict[str, Any]:
+        """What the future depends on."""
+        samples = list(self._samples)
+        return {"samples": samples, "before": self._before, "random": self._random.bit_generator.state}
+
+    def restore(self, kept: dict[str, Any]) -> None:
+        """Go back to what :meth:`remembered` gave."""
+        self._samples, self._before = deque(kept["samples"]), kept["before"]
+        self._random.bit_generator.state = kept["random"]
+
+
+class EncodedCommands:
+    """A sampled controller that sees its joints through encoders: at its ticks it takes all commands by what they tell.
+
+    q̂ is the last sample that has arrived and v̂ the difference to the one before it over their period, as servo drives
+    make it: resolution ρ and period T of the encoders give steps of ρ/T in v̂.
+
+    Parameters
+    ----------
+    take : takes the commands at measured positions and rates of the motors' joints, (na,) [rad or m, rad/s or m/s]
+    period : of the controller [s]
+    """
+
+    def __init__(
+        self, encoders: Encoders, seed: int, robot: Robot, period: float, take: Callable[[Array, Array], None]
+    ) -> None:
+        self.period, self._take = period, take
+        places = dict(zip(robot.joint_names, robot.position_index, strict=True))
+        at = np.array([places[motor.joint] for motor in robot.motors], dtype=np.int64)
+        turns = {link.joint: link.units[0] == "rad" for link in robot.links}
+        revolute = np.array([turns[motor.joint] for motor in robot.motors], dtype=np.bool_)
+        self._joints, self._unit = (
+            tuple(motor.joint for motor in robot.motors),
+            " or ".join(unit for unit, there in (("rad", revolute.any()), ("m", not revolute.all())) if there),
+        )
+        self.sensor = SampledSensor(
+            lambda state: state.q[at],
+            period=period if encoders.rate_hz is None else 1.0 / encoders.rate_hz,
+            delay=encoders.delay_s,
+            noise=np.where(revolute, np.radians(encoders.noise_deg), encoders.noise_m),
+            resolution=np.where(revolute, np.radians(encoders.resolution_deg), encoders.resolution_m),
+            seed=[seed],
+        )
+        self._measured: list[tuple[float, Array]] = []
+
+    def __call__(self, simulation: Stateful) -> None:
+        """A tick of the controller."""
+        time = simulation.state.time
+        measured = self.sensor.value(time)
+        self._measured.append((time, measured))
+        self._take(measured, self.sensor.rate(time))
+
+    def remembered(self) -> dict[str, Any]:
+        """What the future depends on, and what was told."""
+        return {"sensor": self.sensor.remembered(), "measured": list(self._measured)}
+
+    def restore(self, kept: dict[str, Any]) -> None:
+        """Go back to what :meth:`remembered` gave."""
+        self.sensor.restore(kept["sensor"])
+        self._measured = list(kept["measured"])
+
+    def add_to(self, record: Record) -> None:
+        """What the controller was told, held from tick to tick."""
+        times = np.array([time for time, _ in self._measured]) - ROUNDING
+        rows = np.searchsorted(times, record.time, side="right") - 1
+        # A run may have stopped before its first tick.
+        readings = np.reshape([positions for _, positions in self._measured], (len(times), len(self._joints)))
+        text = "joints as the controller's encoders tell them"
+        record.add("q_measured", readings[rows], self._unit, labels=self._joints, description=text)

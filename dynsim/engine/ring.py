@@ -86,7 +86,7 @@ def _extremes(run: ki.Run, force: Array, gaps: Array) -> Array:
     extremes = run.extremes.copy()
     extremes[:, ki.FORCE_MIN], extremes[:, ki.FORCE_MAX] = force.min(axis=0), force.max(axis=0)
     extremes[:, ki.DRIFT_MAX] = np.abs(gaps).max(axis=0)
-    # As dynsim.integrators.watch has it: linear between two samples.
+    # As dynsim.integrators.run has it: linear between two samples.
     low, high = np.minimum(force[1:], force[:-1]), np.maximum(force[1:], force[:-1])
     part = np.where(high <= 0.0, 1.0, low / np.where(low < high, low - high, -1.0))
     extremes[:, ki.PULLING] = np.diff(run.sample_time) @ np.where(low < 0.0, part, 0.0)

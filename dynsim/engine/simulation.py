@@ -14,50 +14,54 @@ import math
 import time as clock
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dynsim.compile.contact_law import joint_stops
-from dynsim.compile.control import END_SLACK
+from dynsim.compile.clearance import by_surface, sinking
+from dynsim.compile.control import END_SLACK, JointControl
 from dynsim.compile.model import Model
+from dynsim.compile.posture import holding_torques, load_forces, static_margin
 from dynsim.compile.references.teleop import VelocitySource
-from dynsim.compile.tables import check_couplings
+from dynsim.compile.shapes import gap_at
+from dynsim.compile.tables import check_couplings, joint_stops
 from dynsim.compile.tie_rests import deflection, may_have_slid, rest_here, set_rests
 from dynsim.dynamics import state as kst
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
-from dynsim.dynamics.contact.cone import problem as kc
+from dynsim.dynamics.contact.cone import steps as kc
 from dynsim.dynamics.contact.unilateral import UnilateralArrays
 from dynsim.dynamics.drive.law import take_measured_commands
 from dynsim.dynamics.state import block
 from dynsim.dynamics.tree import loads as kl
 from dynsim.dynamics.tree.joints import normalise
-from dynsim.engine import attended
+from dynsim.engine import SIMULATION, Progress, Start, stopping
 from dynsim.engine.brakes import Brakes, projection_loss
 from dynsim.engine.linearization import Linearization, linearized
-from dynsim.engine.operator import Operator
-from dynsim.engine.outcome import mark_stopped, raise_stopped
-from dynsim.engine.prepare import prepare, sample_times
+from dynsim.engine.operator import EncodedCommands, Operator
+from dynsim.engine.outcome import interrupted, mark_stopped, raise_stopped
+from dynsim.engine.prepare import Prepared, at_start, prepare, sample_times
 from dynsim.engine.recording import make_record
-from dynsim.engine.sensing import EncodedCommands
 from dynsim.engine.soundness import unstable_loop
 from dynsim.engine.stepped import GUARDS, Snapshot, State, Touch, event_name, own_guards, take_log
-from dynsim.engine.stopping import stopped
+from dynsim.engine.stopping import last_state, stopped
 from dynsim.engine.trace import Trace
 from dynsim.errors import ModelError, ScenarioError, SimulationStopped, brief, first_few
 from dynsim.integrators import driver
 from dynsim.integrators import run as ki
-from dynsim.integrators.dense import state_within
+from dynsim.integrators.run import state_within
+from dynsim.model.description import Contact, Robot
 from dynsim.model.drives import Drive
 from dynsim.record import Event, Record
 from dynsim.record.measures import TIP_OVER
-from dynsim.scenario import Scenario, require_scenario
+from dynsim.scenario import Scenario, build, require_scenario
 from dynsim.scenario.build import START_TOLERANCE, check_start
 from dynsim.scenario.combinations import LINEARIZATION, WATCHED_EVENTS
+from dynsim.scenario.effect import without_effect
 from dynsim.system import interruption
-from dynsim.system.memo import Memo, remembering
+from dynsim.system.memo import Memo, recall, remembering
 
 if TYPE_CHECKING:
     from dynsim.engine.snake_pilot import SnakePilot
@@ -67,7 +71,7 @@ log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
-# Most steps in one call of compiled code, which ends sooner on request, see dynsim.engine.attended.
+# Most steps in one call of compiled code, which ends sooner on request, see dynsim.engine.stopping.
 _PIECE = 1 << 62
 # Limits on ticks of callers: their number (kinds are bits of an integer), and their period [s].
 MOST_TICKS, SHORTEST_PERIOD = 60, 1e-9
@@ -156,7 +160,7 @@ class Simulation:
         # Callbacks that are due at the present time, in the order of their calls; the callback that is called now.
         self._due: list[Callable[[Simulation], None]] = []
         self._calling: Callable[[Simulation], None] | None = None
-        self._loaded, self._watch = False, attended.WallWatch(scenario.integrator.wall_limit_s)
+        self._loaded, self._watch = False, stopping.WallWatch(scenario.integrator.wall_limit_s)
         self._kernel = driver.direct(self._prepared.run)
         self._guards: list[tuple[str, str, Callable[[Simulation], None] | None]] = []
         self._calls: list[Callable[[Simulation], None]] = []
@@ -974,9 +978,9 @@ class Simulation:
     def _attended(self, limit: int, look: Callable[[], None]) -> BaseException | None:
         """One compiled piece; what ``look`` has raised meanwhile, or a signal."""
         if not self._loaded:
-            attended.load(self._prepared)
+            stopping.load(self._prepared)
             self._loaded = True
-        self._prepared, raised = attended.advance(self._prepared, limit, self._watch, look, self._kernel)
+        self._prepared, raised = stopping.advance(self._prepared, limit, self._watch, look, self._kernel)
         return raised
 
     def _take_due(self, raised: BaseException | None) -> None:
@@ -1142,3 +1146,219 @@ def _finite(quantity: str, values: ArrayLike) -> Array:
     if not np.isfinite(array).all():
         raise ModelError(f"{quantity} {array.tolist()} must be finite")
     return array
+
+
+# Start of a dynamics run: initial posture, gaps and tip margin, and the checks before the first step.
+
+
+# A joint that the solution of the posture moves by less than this counts as unmoved [rad or m].
+MOVED = 1e-12
+
+
+def check(scenario: Scenario, started: Callable[[Start], None]) -> Start:
+    """See :func:`dynsim.engine.check`."""
+    start = start_of(scenario)
+    started(start)
+    prepared = prepare(scenario)
+    control, model = prepared.control, prepared.model
+    if prepared.balance is not None:
+        # Compliant contacts are pressed in, which moves joints.
+        points, gaps = _touching(model, prepared.contacts)
+        hand = model.point_position(*model.robot.hand, model.robot.initial)
+        said = [*start.warnings, *prepared.balance.warnings]
+        start = replace(start, hand=hand, contacts=points, gaps=gaps, warnings=said)
+    if (unstable := unstable_loop(scenario, prepared)) is not None:
+        start = replace(start, warnings=[*start.warnings, unstable[0]])
+    if control.path is not None and control.teleop is None:
+        begin = control.path.position(np.zeros(1))[0]
+        start = replace(start, off_path=float(np.linalg.norm(begin - start.hand)))
+    _begin(scenario, prepared)
+    return start
+
+
+def commanded_by_python(scenario: Scenario, control: JointControl) -> bool:
+    """Return whether Python code gives commands at ticks: an operator, the controller of a snake, or encoders."""
+    sensors = scenario.config.sensors
+    encoded = sensors is not None and sensors.encoders is not None
+    return encoded or control.teleop is not None or control.task_space is not None
+
+
+def _begin(scenario: Scenario, prepared: Prepared) -> None:
+    """Choose contact modes and find forces at t = 0, as a run does before its first step.
+
+    Not if Python code gives the first commands.
+
+    Raises
+    ------
+    SimulationStopped
+        If forces do not exist, or cannot last.
+    """
+    if not prepared.contacts or commanded_by_python(scenario, prepared.control):
+        return
+    stopping.load(prepared)
+    work = partial(driver.advance, prepared.system, prepared.workspace, prepared.run, 0)
+    _, raised = stopping.attend(work, lambda: None, interruption.check)
+    if raised is not None:
+        raise raised
+    if prepared.run.count[ki.STATUS] not in (ki.RUNNING, ki.FINISHED):
+        raise stopped(scenario, prepared)
+
+
+def start_of(scenario: Scenario) -> Start:
+    """Posture, gaps and margin at t = 0, whether they are allowed or not."""
+    described, contacts, piloted = at_start(scenario)
+    model = recall("model", lambda: Model(described), described)
+    robot = model.robot
+    q, (points, gaps) = robot.initial, _touching(model, contacts)
+    declared = scenario.config.contacts.points
+    movable = declared.keys() - {contact.name for contact in contacts if contact.left_out}
+    if piloted is not None:  # a snake, whose joints `initial` does not place
+        movable = set()
+    aloft = [name for name, gap in gaps.items() if name in movable and abs(gap) > build.START_TOLERANCE]
+    solved = {}
+    if scenario.config.initial is not None and scenario.config.initial.on_surface:
+        before = build.unposed(scenario).initial
+        for link, k in zip(robot.links, robot.position_index, strict=True):
+            if len(link.row.neutral) == 1 and abs(q[k] - before[k]) > MOVED:
+                angle = link.units[0] == "rad"
+                ends = np.array([q[k], before[k]])
+                to, was = (np.degrees(ends) if angle else ends).tolist()
+                solved[link.joint] = (to, was, "deg" if angle else "m")
+    hand = model.point_position(*robot.hand, q)
+    key = build.on_surface_key(scenario, aloft) if aloft else ""
+    warnings = [
+        *without_effect(scenario, bool(robot.motors)),
+        *_below(scenario, robot),
+        *build.left_out_warnings(scenario, contacts),
+    ]
+    return Start(hand, points, gaps, key, solved, *_margins(scenario, model, contacts), warnings)
+
+
+def _touching(model: Model, contacts: Sequence[Contact]) -> tuple[dict[str, Array], dict[str, float]]:
+    """Positions (3,) of contact points at the start, and their gaps [m]."""
+    points, gaps, q = dict[str, Array](), dict[str, float](), model.robot.initial
+    for contact in contacts:
+        try:
+            gaps[contact.name] = gap_at(model, contact, q)
+        except ModelError:  # an unknown body, of which the check of contacts gives the line
+            continue
+        points[contact.name] = model.point_position(contact.body, contact.point, q)
+    return points, gaps
+
+
+def _below(scenario: Scenario, robot: Robot) -> list[str]:
+    """A sentence for each surface that bodies begin below."""
+    sunk = by_surface(sinking(robot, build.surfaces(scenario), robot.initial[None]))
+    return [
+        f"{', '.join(s.body for s in below)}: below {surface} at the start, by up to "
+        f"{1e3 * max(s.depth for s in below):.3g} mm; surfaces hold only the points of contacts"
+        for surface, below in sunk.items()
+    ]
+
+
+def _margins(scenario: Scenario, model: Model, contacts: Sequence[Contact]) -> tuple[float | None, float | None]:
+    """Tip margin of a mobile base at rest, alone and with its braces; None where there is none."""
+    robot, q = model.robot, model.robot.initial
+    if robot.base is None:
+        return None, None
+    loads = build.loads(scenario, robot)
+    forces = load_forces(model, q, loads)
+    alone, able = static_margin(model, q, forces), [motor.joint for motor in robot.motors]
+    try:
+        balance = holding_torques(model, q, contacts, loads, able, scenario.config.contacts.law == "unilateral")
+    except ModelError:
+        return alone, None
+    return alone, static_margin(model, q, [*forces, *balance.forces]) if balance.forces else None
+
+
+# Engine of the multibody plants: integrates the coupled system and makes the record of the run.
+
+
+# More steps than any run takes.
+_ALL = 1 << 62
+# Ticks between two checks for Ctrl-C, at which the progress bar is updated.
+TICKS = 10
+
+
+def simulate(scenario: Scenario, progress: Progress | None = None, *, pictured: bool = True) -> Record:
+    """See :func:`dynsim.engine.simulate`."""
+    if scenario.controller is not None and scenario.controller.type == "task_space":
+        # Not prepared twice: that raises the head of a snake.
+        return _stepped(scenario, progress, pictured)
+    prepared = prepare(scenario, progress)
+    if commanded_by_python(scenario, prepared.control):
+        return _stepped(scenario, progress, pictured)
+    size = prepared.model.n, len(prepared.contacts), len(prepared.stops)
+    # Loading or compiling the kernels is no integration time.
+    recall("kernels", partial(stopping.load, prepared), prepared.choice.method, *size)
+    if (unstable := unstable_loop(scenario, prepared)) is not None:
+        log.warning("%s: %s", scenario.title, unstable[0])
+    watch, run = stopping.WallWatch(scenario.integrator.wall_limit_s), prepared.run
+
+    def look() -> None:
+        if progress is not None:
+            progress(float(run.clock[ki.TIME]), SIMULATION)
+        interruption.check()
+
+    own = own_guards(prepared)
+    happened: list[Event] = []
+    stop: SimulationStopped | None = None
+    started = clock.perf_counter()
+    try:
+        look()
+        log.info("%s: integrating %g s by %s", scenario.title, scenario.duration_s, prepared.choice.method)
+        while run.count[ki.STATUS] == ki.RUNNING:
+            prepared, raised = stopping.advance(prepared, _ALL, watch, look)
+            run = prepared.run
+            happened += [Event(time, *(event_name(prepared, e) or own[e])) for time, e in take_log(run)]
+            if raised is not None:
+                raise raised
+            look()
+        interruption.keep()
+    except KeyboardInterrupt:
+        interruption.keep()
+        interruption.answered()
+        stop = interrupted(scenario, float(run.clock[ki.TIME]), last_state(prepared, run.y))
+    wall = clock.perf_counter() - started
+    log.info("%s: integrated %g s in %d steps, %.3f s", scenario.title, run.clock[ki.TIME], run.count[ki.STEPS], wall)
+    record = make_record(scenario, prepared, wall, happened=happened, pictured=pictured)
+    if stop is None and run.count[ki.STATUS] != ki.FINISHED:
+        stop = stopped(scenario, prepared)
+    if stop is not None:
+        raise_stopped(stop, record)
+    return record
+
+
+def _stepped(scenario: Scenario, progress: Progress | None, pictured: bool) -> Record:
+    """A run with ticks of an operator, a snake's script or encoders: by the public stepper, bit for bit its record."""
+    from dynsim.engine.simulation import Simulation
+
+    # Without an end, as a session: a step that ends at a tick and one at the end of a run need not be the same.
+    simulation = Simulation(scenario, duration=math.inf)
+    simulation.end_samples(scenario.duration_s)
+    prepared, operator, k = simulation._prepared, simulation.operator, 0
+    # It has times of its own; a record that is too large is refused before it begins.
+    sample_times(scenario, prepared.run.layout, prepared.run.columns, len(prepared.model.robot.links))
+    rate = operator.rate if operator is not None else 1.0 / (prepared.control.sample_time or 1.0)
+    stop: SimulationStopped | None = None
+    try:
+        while simulation.time < scenario.duration_s:
+            k += TICKS
+            # A signal within a callback would leave references half written.
+            interruption.keep()
+            simulation.advance(min(k / rate, scenario.duration_s))
+            if progress is not None:
+                progress(simulation.time, SIMULATION)
+            interruption.heed()
+            interruption.check()
+    except SimulationStopped as ended:
+        stop = ended
+    except KeyboardInterrupt:
+        interruption.answered()
+        stop = interrupted(scenario, simulation.time, {})
+    interruption.keep()
+    record = simulation.record(scenario, pictured=pictured)
+    if stop is not None:
+        raise_stopped(stop, record)
+    record.complete = True
+    return record

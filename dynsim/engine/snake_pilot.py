@@ -21,11 +21,9 @@ import numpy as np
 from dynsim.compile.model import Model
 from dynsim.compile.snake_tree import GROUND, HEAD, ROOT, SnakeTree
 from dynsim.engine.gripper import GripperControl
-from dynsim.engine.operator import Referenced
-from dynsim.engine.sensing import SampledSensor
-from dynsim.engine.snake_control import OBSTACLES, SnakeControl, copy_of
-from dynsim.engine.snake_record import add_task, effort, hold_last, task_summary, task_warnings
-from dynsim.engine.snake_start import STEADY_TICKS, WheelLifter
+from dynsim.engine.kinematic import add_task, effort, hold_last, task_summary, task_warnings
+from dynsim.engine.operator import Referenced, SampledSensor
+from dynsim.engine.snake_control import OBSTACLES, STEADY_TICKS, SnakeControl, WheelLifter, copy_of
 from dynsim.engine.stepped import State
 from dynsim.errors import SimulationStopped
 from dynsim.jit.kernel import FixedSignature
@@ -33,11 +31,10 @@ from dynsim.model.description import Array
 from dynsim.model.drives import Servo
 from dynsim.model.gripper import graspable
 from dynsim.record import Record
-from dynsim.scenario.sensors import Sensors
-from dynsim.snake import state as ss
+from dynsim.scenario.schema import Sensors
+from dynsim.snake import ticks as ss
 from dynsim.snake.description import CommandSource, TaskSpaceController
-from dynsim.snake.state import FEEDFORWARD, GIVEN, MEASURED, Schedule, SnakeTrace
-from dynsim.snake.ticks import command_tick, record_row
+from dynsim.snake.ticks import FEEDFORWARD, GIVEN, MEASURED, Schedule, SnakeTrace, command_tick, record_row
 
 _ROOT_COORDINATES = 7
 # How often somebody looks whether the head lies on the ground, and how long it does until the run ends [s].

@@ -23,11 +23,11 @@ from dynsim.compile.model import Model
 from dynsim.compile.shapes import gap_at
 from dynsim.dynamics import tables as ka
 from dynsim.engine.force_indeterminacy import touching_rows
-from dynsim.engine.method import drive_slopes
+from dynsim.engine.prepare import drive_slopes
 from dynsim.model.description import Array, Contact
 from dynsim.record import Record
 from dynsim.scenario import Scenario, build
-from dynsim.scenario.sensors import Encoders
+from dynsim.scenario.schema import Encoders
 
 if TYPE_CHECKING:
     from dynsim.engine.prepare import Prepared

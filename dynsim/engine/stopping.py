@@ -2,24 +2,348 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+import threading
+import time as clock
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.compile.contact_law import START_TOLERANCE
 from dynsim.compile.mobility import moving_nothing
+from dynsim.compile.tables import START_TOLERANCE
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
+from dynsim.dynamics.derivative import derivative
 from dynsim.dynamics.state import block
-from dynsim.engine.force_indeterminacy import paradox
-from dynsim.engine.prepare import Prepared
+from dynsim.engine.compilation import kernels_logged
+from dynsim.engine.force_indeterminacy import contact_point, paradox
+from dynsim.engine.prepare import Prepared, right_hand_side
 from dynsim.engine.soundness import unstable_stop
-from dynsim.engine.stiff_friction import held_up
 from dynsim.errors import SimulationStopped
-from dynsim.integrators import project as kp
+from dynsim.integrators import driver
 from dynsim.integrators import run as ki
+from dynsim.integrators import run as kp
+from dynsim.integrators.stepping import tables as kt
 from dynsim.scenario import Scenario
+from dynsim.system import interruption
+
+# Loading and running of compiled code in a thread; the calling thread handles signals and the wall-time limit.
+
+
+log = logging.getLogger(__name__)
+
+# Interval of the checks, and how long to wait for compiled code that was asked to return [s].
+LOOK_S, PATIENCE_S = 0.1, 0.5
+# A run whose present step takes longer than this is stuck [s]. The longest step observed took 80 s: of 24 contacts
+# whose forces no method of the solver finds.
+STUCK_S = 600.0
+# Most steps of time stepping in the caller's own thread: contacts may close within them.
+MOST_SHORT = 50
+# Time of one iteration of the contact solver, divided by the cube of the number of rows [s].
+ROUND = 2e-9
+
+
+def attend(
+    work: Callable[[], None], ask: Callable[[], None], look: Callable[[], None]
+) -> tuple[bool, BaseException | None]:
+    """Do ``work`` in a thread of its own; meanwhile handle signals and call ``look``.
+
+    Parameters
+    ----------
+    work : that releases the interpreter's lock
+    ask : asks the work to end soon
+    look : called every LOOK_S; what it raises, as what signals raise here, asks the work to end
+
+    Returns
+    -------
+    ended : False when the work was left alone: it may go on for a while, and write to its arrays
+    raised : by ``look``, or by a signal
+
+    Raises
+    ------
+    Exception
+        That of the work.
+    """
+    done, failure = threading.Event(), list[BaseException]()
+
+    def run() -> None:
+        try:
+            work()
+        except BaseException as raised:
+            failure.append(raised)
+        done.set()
+
+    ended, request = False, None
+    try:
+        try:
+            threading.Thread(target=run, name="compiled code", daemon=True).start()
+            while not (ended := done.wait(LOOK_S)):
+                look()
+        except BaseException as raised:
+            request = raised
+            ask()
+            ended = done.wait(PATIENCE_S)
+    finally:
+        # Also after a second signal.
+        if not ended:
+            interruption.leave()
+    if ended and failure:
+        raise failure[0]
+    return ended, request
+
+
+class OutOfTime(Exception):
+    """Whoever listens has seen a run for too long; ``status`` is what it has come to."""
+
+    def __init__(self, status: int) -> None:
+        super().__init__(status)
+        self.status = status
+
+
+class WallWatch:
+    """Looks at the clock: for the wall limit of a run, and for one step that does not end.
+
+    Parameters
+    ----------
+    limit : wall time that the integration may take [s]; None: any
+    """
+
+    def __init__(self, limit: float | None) -> None:
+        self._limit, self._spent = limit, 0.0
+        self._looked = clock.monotonic()
+        self._seen, self._still = -1, 0.0
+
+    @property
+    def over(self) -> bool:
+        """The limit is."""
+        return self._limit is not None and self._spent > self._limit
+
+    def begin(self) -> None:
+        """A piece begins; what was between pieces counts as nothing."""
+        self._looked, self._seen, self._still = clock.monotonic(), -1, 0.0
+
+    def spend(self) -> float:
+        """Count the time since the last look, and return it [s]."""
+        now = clock.monotonic()
+        passed, self._looked = now - self._looked, now
+        self._spent += passed
+        return passed
+
+    def look(self, run: ki.Run) -> None:
+        """Raise :class:`OutOfTime` where there is a reason."""
+        passed = self.spend()
+        if self.over:
+            raise OutOfTime(ki.OUT_OF_TIME)
+        seen = int(run.count.sum()) + (0 if run.newton is None else int(run.newton.count.sum()))
+        # A process that was stopped for a while has not looked either.
+        self._still = self._still + min(passed, 10.0 * LOOK_S) if seen == self._seen else 0.0
+        self._seen = seen
+        if self._still > STUCK_S:
+            raise OutOfTime(ki.STUCK)
+
+
+def load(prepared: Prepared) -> None:
+    """Load the kernels of a run, or compile them, and log that.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        The compiler goes on alone.
+    """
+    with kernels_logged(log, prepared.kind):
+        compiled = partial(driver.advance, prepared.system, prepared.workspace, prepared.run, -1)
+        _, raised = attend(compiled, lambda: None, interruption.check)
+    if raised is not None:
+        raise raised
+
+
+def _short_steps(prepared: Prepared) -> int:
+    """How many steps are over before anybody would have looked, whatever happens within them.
+
+    They are taken in the caller's own thread: to hand a short run to another one costs some hundredths of its time.
+    None under the unilateral law, where one step may take a minute; but steps of one length, whose contact problems
+    are given up after so many rounds: as many as take no longer than code that was asked to return, with the rows of
+    the last step. So many rounds are hardly ever needed, and a thread for each tick of a controller would double the
+    time of a snake.
+    """
+    if prepared.system.unilateral is not None:
+        rows = max(int(prepared.workspace.counts[ka.ROWS]), 1)
+        few = min(int(PATIENCE_S / (kt.MOST_ROUNDS * ROUND * rows**3)), MOST_SHORT)
+        return few if prepared.run.stepping is not None else 0
+    n, p = len(prepared.workspace.joints), prepared.workspace.small.shape[1]
+    seconds = right_hand_side(n, p, dense=prepared.system.dense is not None)
+    # Of RADAU5 with a Jacobian and its factors.
+    step = (2 * n + 60) * seconds + 3e-9 * n**3 if prepared.run.newton is not None else 6.0 * seconds
+    return int(LOOK_S / step)
+
+
+def advance(
+    prepared: Prepared,
+    limit: int,
+    watch: WallWatch,
+    look: Callable[[], None],
+    kernel: Callable[..., None] | None = None,
+) -> tuple[Prepared, BaseException | None]:
+    """One piece of up to ``limit`` steps, see :func:`dynsim.integrators.driver.advance`.
+
+    STATUS may be OUT_OF_TIME or STUCK besides what the kernels make of it.
+
+    Parameters
+    ----------
+    kernel : what takes the steps, of :func:`dynsim.integrators.driver.direct`; default: that of the driver
+
+    Returns
+    -------
+    prepared : the same, or a copy where the piece was left alone; that one cannot go on
+    raised : what ``look`` has raised, or a signal
+    """
+    run, few, kernel = prepared.run, min(_short_steps(prepared), limit), kernel or driver.advance
+    ended, raised = True, None
+
+    def ask() -> None:
+        run.count[ki.ASKED] = 1
+
+    def both() -> None:
+        look()
+        watch.look(run)
+
+    watch.begin()
+    due = few == 0
+    if not due:
+        kernel(prepared.system, prepared.workspace, run, few)
+        # Not where it has come to what its caller is to look at. (A pending step at the begin is to be accepted.)
+        count = run.count
+        due = count[ki.STATUS] == ki.RUNNING and count[ki.PENDING] == count[ki.TICKED] == count[ki.LOGGED] == 0
+    if due and limit > few:
+        remainder = partial(kernel, prepared.system, prepared.workspace, run, limit - few)
+        ended, raised = attend(remainder, ask, both)
+    watch.spend()
+    if not ended:
+        prepared = copied(prepared)
+    count = prepared.run.count
+    count[ki.ASKED] = 0
+    if not ended or count[ki.STATUS] == ki.RUNNING:
+        if isinstance(raised, OutOfTime):
+            count[ki.STATUS] = raised.status
+        elif not ended:
+            count[ki.STATUS] = ki.STUCK
+        elif watch.over:
+            count[ki.STATUS] = ki.OUT_OF_TIME
+    return prepared, None if isinstance(raised, OutOfTime) else raised
+
+
+def copied(value: Any) -> Any:
+    """Tables and arrays of their own, in which nothing moves any more."""
+    if isinstance(value, Prepared):
+        return replace(value, run=copied(value.run), workspace=copied(value.workspace), system=copied(value.system))
+    if isinstance(value, np.ndarray):
+        return value.copy()
+    if isinstance(value, tuple):
+        parts = map(copied, value)
+        return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
+    return value
+
+
+# How fast friction changes with slip: why explicit steps are short.
+
+
+Array = NDArray[np.float64]
+
+# Steps of an explicit method at the limit of stability, in time constants: 3.3 by DOPRI5 [Hairer and Wanner], shorter
+# after a rejected step, longer before one.
+LEAST, MOST = 1.0, 5.0
+
+
+def held_up(prepared: Prepared) -> str:
+    """A clause about the contact whose friction changes so fast that explicit steps have to be this short, or ""."""
+    run = prepared.run
+    step = float(run.clock[ki.STEP])
+    if run.method != ki.DOPRI5 or not prepared.contacts or not np.isfinite(run.y).all():
+        return ""
+    changing = fastest(prepared)
+    if changing is None or not LEAST < step / changing.within < MOST:
+        return ""
+    return (
+        f"steps are as short as {step:.1e} s because {changing.contact} slips at {changing.speed:.3g} m/s and its "
+        f"friction changes within {changing.within:.3g} s; integrator.method: radau5 follows that with longer steps"
+    )
+
+
+@dataclass(frozen=True)
+class Changing:
+    """The contact whose friction changes fastest by itself, its slip [m/s], and τ of all together [s]."""
+
+    contact: str
+    speed: float
+    within: float
+
+
+def fastest(prepared: Prepared) -> Changing | None:
+    """The fastest change of friction at the state of the run; None if none changes."""
+    system, run, ws, model = prepared.system, prepared.run, prepared.workspace, prepared.model
+    unilateral = system.unilateral
+    q = run.y[block(run.layout, "q")]
+    derivative(system, float(run.clock[ki.TIME]), run.y, ws, np.zeros_like(run.y))
+    rows, forces = [model.coupling_rows], [model.coupling_rows]
+    if unilateral is not None:
+        identity = np.eye(model.n)
+        still = [identity[table[ku.STOP_JOINT]][None] for table in unilateral.stop_table if table[ku.STOP_CLOSED] == 1]
+        still += [identity[table[ku.DRY_JOINT]][None] for table in unilateral.dry_table if table[ku.DRY_HOLDS] == 1]
+        rows, forces = [*rows, *still], [*forces, *still]
+    slides: list[tuple[int, Array, Array]] = []
+    for k, contact in enumerate(prepared.contacts):
+        mode = int(ws.active[k, ka.MODE])
+        if unilateral is not None and mode == ka.OPEN:
+            continue
+        normal, point = contact_point(model, contact, q)
+        if unilateral is not None and mode == ka.STICKING:
+            rows.append(point)
+            forces.append(point)
+            continue
+        along, tangents, damping = _friction(prepared, k, normal)
+        rows.append((normal @ point)[None])
+        forces.append(((normal - along) @ point)[None])
+        slides.append((k, tangents @ point, damping))
+    if not slides:
+        return None
+    R, F = np.vstack(rows), np.vstack(forces)
+    inverse = np.linalg.inv(model.mass_matrix(q) + np.diag(model.armature))
+    left = inverse - inverse @ F.T @ np.linalg.pinv(R @ inverse @ F.T, rcond=1e-9) @ R @ inverse
+    E, DE = np.vstack([row for _, row, _ in slides]), np.vstack([damping @ row for _, row, damping in slides])
+    A = E @ left @ DE.T
+    if not np.isfinite(A).all() or not A.any():
+        return None
+    own = [float(np.trace(row @ left @ row.T @ damping)) for _, row, damping in slides]
+    k = slides[int(np.argmax(own))][0]
+    speed = float(np.linalg.norm(_slip(prepared, k)))
+    return Changing(prepared.contacts[k].name, speed, 1.0 / float(np.abs(np.linalg.eigvals(A)).max()))
+
+
+def _slip(prepared: Prepared, k: int) -> Array:
+    return np.asarray(prepared.workspace.contacts[k, ka.SLIP_VELOCITY : ka.SLIP_VELOCITY + 3])
+
+
+def _friction(prepared: Prepared, k: int, normal: Array) -> tuple[Array, Array, Array]:
+    """Friction of contact k that slips: minus its force per normal force, (3,); the rows of E on the surface; and D."""
+    ws, unilateral, contact = prepared.workspace, prepared.system.unilateral, prepared.contacts[k]
+    slip = _slip(prepared, k)
+    pressed = float(ws.contacts[k, ka.NORMAL_FORCE])
+    if unilateral is not None:
+        along = ws.contacts[k, ka.TANGENT : ka.TANGENT + 3]
+        mu = float(ws.rows[ws.active[k, ka.FIRST_ROW], ka.ROW_MU])
+        speed = max(float(np.linalg.norm(slip)), float(unilateral.number[ku.SLOW]))
+        return mu * along, np.cross(normal, along)[None], np.array([[mu * pressed / speed]])
+    smooth = float(np.hypot(np.linalg.norm(slip), contact.slip_smoothing))
+    size = contact.friction * (pressed if contact.pulling_friction == "signed" else abs(pressed))
+    tangents = np.linalg.svd(normal[None])[2][1:]
+    across = tangents @ slip / smooth
+    damping = size / smooth * (np.eye(2) - np.outer(across, across))
+    return contact.friction * np.sign(size * pressed) * slip / smooth, tangents, damping
+
 
 # Names of the values of STATUS.
 KINDS = {

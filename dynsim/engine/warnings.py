@@ -9,18 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.compile.clearance import Sinking, by_surface
-from dynsim.compile.contact_law import START_TOLERANCE, JointStop, format_quantity
 from dynsim.compile.control import JointControl
+from dynsim.compile.tables import START_TOLERANCE, JointStop, format_quantity
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
-from dynsim.engine.force_indeterminacy import motion_spread, sharing
+from dynsim.engine.force_indeterminacy import motion_spread, sharing, wedges
 from dynsim.engine.prepare import Prepared
 from dynsim.engine.soundness import unstable_later, unstable_loop
-from dynsim.engine.wedging import wedges
 from dynsim.errors import first_few
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts import events as ke
-from dynsim.integrators.project import RATE_TOLERANCE
+from dynsim.integrators.run import RATE_TOLERANCE
 from dynsim.integrators.stepping import tables as kt
 from dynsim.model.description import Contact, Robot
 from dynsim.model.drives import Drive, Motor, Servo, TorqueSource

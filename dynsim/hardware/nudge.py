@@ -14,19 +14,16 @@ from typing import Any, cast
 
 import numpy as np
 
-from dynsim.hardware.bus.clock import Clock
 from dynsim.hardware.bus.control_table import RAD_PER_TICK
-from dynsim.hardware.bus.protocol import Bus
-from dynsim.hardware.calibrate import refuse_torque
+from dynsim.hardware.bus.protocol import Bus, Clock
 from dynsim.hardware.errors import ReplayAborted, ReplayInterrupted, VerificationFailed
 from dynsim.hardware.replay.check import CheckedMotion, plan_cycle
 from dynsim.hardware.replay.machine import Replay
-from dynsim.hardware.replay.motion import QUINTIC_PEAK, quintic
+from dynsim.hardware.replay.output import ReplayState, StopRequest
 from dynsim.hardware.replay.rules import Cause
-from dynsim.hardware.replay.states import ReplayState, StopRequest
-from dynsim.hardware.replay.trajectory import Path
+from dynsim.hardware.replay.trajectory import QUINTIC_PEAK, Path, quintic
 from dynsim.hardware.replay.verify import read_ticks
-from dynsim.hardware.servo_map import MappedServo, ServoMap
+from dynsim.hardware.servo_map import MappedServo, ServoMap, refuse_torque
 
 ANGLE = math.radians(3.0)
 SPEED = 0.1

@@ -8,13 +8,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from dynsim.hardware.bus.clock import Clock, VirtualClock, WallClock
 from dynsim.hardware.bus.dynamixel_bus import DynamixelBus, latency_timer, open_serial_port
+from dynsim.hardware.bus.protocol import Clock, VirtualClock, WallClock
 from dynsim.hardware.errors import VerificationFailed
 from dynsim.hardware.servo_map import ServoMap
 from dynsim.hardware.virtual.faults import FaultScript
-from dynsim.hardware.virtual.line import line_for_map
-from dynsim.hardware.virtual.port import VirtualPort
+from dynsim.hardware.virtual.line import VirtualPort, line_for_map
 
 VIRTUAL = "virtual"
 PSEUDO_TERMINAL_LATENCY = 0.05

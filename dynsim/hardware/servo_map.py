@@ -9,33 +9,208 @@ Joint angle [rad] and servo position [ticks] are related by
 
 from __future__ import annotations
 
+import io
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from tempfile import TemporaryDirectory
+from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, model_validator
+import numpy as np
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
+    ValidationError,
+    model_validator,
+)
+from pydantic_core import core_schema
+from ruamel.yaml import YAML
 
 from dynsim.config.base import Positive, StrictConfig, error_at
-from dynsim.config.problems import Origin, dotted, suggest
-from dynsim.errors import brief
+from dynsim.config.problems import Origin, dotted, explain, suggest, unknown_keys
+from dynsim.errors import RecordError, brief
 from dynsim.hardware.bus.control_table import (
+    BAUD_RATES,
     MAX_ID,
     MODELS,
+    MX_106,
     RAD_PER_TICK,
     RAD_S_PER_UNIT,
+    STATE_BLOCK,
     TICKS_PER_TURN,
     VOLT_PER_UNIT,
     OperatingMode,
     ServoModel,
 )
-from dynsim.hardware.errors import ServoMapError
-from dynsim.hardware.safety import BusSettings, Safety, objections_to_times
-from dynsim.hardware.strict_yaml import Objection, Within, read_located, rounded_up
+from dynsim.hardware.bus.protocol import Bus, NoAnswer, RequestRefused
+from dynsim.hardware.errors import ServoMapError, VerificationFailed
 from dynsim.snake.lifting import Lifts
-from dynsim.system.files import file_name
-from dynsim.system.inputs import is_file
+from dynsim.system.files import file_name, write_text
+from dynsim.system.inputs import is_file, parse_yaml, read_text
+
+# YAML files for hardware (servo maps, fault scripts, gates) as pydantic models; errors name file, line and key.
+
+
+Objection = tuple[str, str]
+"""Dotted key of a file, and the reason why its value is refused."""
+
+
+@dataclass(frozen=True)
+class Within:
+    """Annotation of a number from ``low`` to ``high``; its error gives the reason and a valid value."""
+
+    low: float
+    high: float
+    unit: str
+    why: str
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
+        return core_schema.no_info_after_validator_function(self._checked, handler(source))
+
+    def __get_pydantic_json_schema__(self, schema: core_schema.CoreSchema, handler: GetJsonSchemaHandler) -> Any:
+        json_schema = {key: value for key, value in handler(schema).items() if key != "exclusiveMinimum"}
+        return json_schema | {"minimum": self.low, "maximum": self.high}
+
+    def _checked(self, value: float) -> float:
+        if not self.low <= value <= self.high:
+            bounds = f"{self.low:g} to {self.high:g}{self.unit and ' ' + self.unit}"
+            raise ValueError(f"{self.why}; use {bounds}")
+        return value
+
+
+_Schema = TypeVar("_Schema", bound=BaseModel)
+
+
+def rounded_up(value: float) -> float:
+    """A short number to offer instead of one that was refused, not below ``value``: to 1e-4."""
+    return math.ceil(value * 1e4) / 1e4
+
+
+def read_yaml(path: Path, schema: type[_Schema], context: dict[str, Any] | None = None) -> _Schema:
+    """Read YAML into a pydantic model, whose validators are given ``context``; see :func:`read_located`."""
+    return read_located(path, schema, context)[0]
+
+
+def read_located(path: Path, schema: type[_Schema], context: dict[str, Any] | None = None) -> tuple[_Schema, Origin]:
+    """The same, with where its keys are in the file.
+
+    Raises
+    ------
+    ServoMapError
+        Missing file, bad YAML or bad entry; the message holds file, line and key.
+    """
+    data = parse_yaml(read_text(path, ServoMapError), ServoMapError, str(path))
+    if not isinstance(data, dict):
+        raise ServoMapError(f"{path}: expected a mapping with the keys {', '.join(schema.model_fields)}")
+    origin = Origin(path, (data,))
+    try:
+        return schema.model_validate(data, context=context), origin
+    except ValidationError as error:
+        raise ServoMapError(explain(error, data, origin, unknown_keys(error, data, origin, schema))) from None
+
+
+# Sections of a servo map that concern all servos: serial line, supply, and abort limits.
+
+
+LONGEST_REACTION = 0.5
+"""Longest time from the first cycle that shows a fault to its declaration by a rule [s]."""
+STOP_CYCLES = 3
+"""Least number of cycles of a stop along the path."""
+ROUNDED = 1e-9
+"""Relative rounding error by which a number of cycles may exceed a time."""
+
+FaultPolicy = Literal["hold", "decelerate", "off"]
+
+# The servos know 4.5 Mbit/s, the client library does not.
+_BAUD_CHOICES = [rate for rate in BAUD_RATES if rate <= 4_000_000]
+
+
+class BusSettings(StrictConfig):
+    """The serial line."""
+
+    baud: int = Field(3_000_000, json_schema_extra={"enum": [*_BAUD_CHOICES]}, description="bit rate [bit/s]")
+    rate: Positive = Field(200.0, description="goal and state cycles per second [Hz]")
+    latency: Annotated[
+        Positive, Within(1e-4, 2.54, "s", "no adapter answers at once, and no watchdog waits longer")
+    ] = Field(2e-3, description="what adapter and operating system may add to an answer [s]")
+    return_delay: float = Field(0.0, ge=0, le=508e-6, description="longest return delay a servo may have stored [s]")
+
+    @model_validator(mode="after")
+    def _baud_is_one_of_the_servos(self) -> BusSettings:
+        if self.baud not in _BAUD_CHOICES:
+            raise error_at("baud", f"is not one of {', '.join(map(str, _BAUD_CHOICES))}")
+        return self
+
+
+class Supply(StrictConfig):
+    """Voltage range in which the robot may move."""
+
+    lowest: Positive = Field(10.0, description="[V]")
+    highest: Positive = Field(14.8, description="[V]")
+
+
+class Safety(StrictConfig):
+    """When to abort, and how to stop."""
+
+    policy: FaultPolicy = Field(
+        "decelerate",
+        description="on a fault: freeze where the robot is; slow down along the path and hold; release the torque",
+    )
+    stop_time: float = Field(0.3, gt=0, le=3.0, description="time in which `decelerate` comes to rest [s]")
+    run_up: Annotated[Positive, Within(0.01, 1e5, "rad/s²", "takes minutes, or is a knock")] = Field(
+        2.0, description="acceleration of the stretch added where a record begins or ends in motion [rad/s²]"
+    )
+    approach_velocity: Annotated[Positive, Within(1e-3, 1.0, "rad/s", "nobody has checked the way to the start")] = (
+        Field(0.3, description="top speed of the move to the start posture [rad/s]")
+    )
+    start_distance: Annotated[
+        Positive, Within(1e-3, 2 * math.pi, "rad", "no joint would ever, or always, be asked about")
+    ] = Field(0.5, description="a joint further than this from the start posture is asked about once more [rad]")
+    watchdog: float = Field(
+        0.2, ge=0.02, le=2.54, description="servos stop by themselves when the bus is silent for this long [s]"
+    )
+    missed_cycles: int = Field(
+        3, ge=1, le=100, description="consecutive cycles of one servo without a status that abort"
+    )
+    late_cycles: int = Field(5, ge=1, le=1000, description="consecutive late cycles that abort")
+    following_cycles: int = Field(5, ge=1, le=100, description="consecutive cycles beyond following_error that abort")
+    torque_cycles: int = Field(10, ge=1, le=100, description="consecutive cycles beyond limits.torque that abort")
+    temperature_max: Positive = Field(65.0, description="of a servo, beyond which the replay aborts [°C]")
+    supply: Supply = Field(Supply(), description="beyond which the replay aborts, or does not start")
+    at_end: Literal["off", "hold"] = Field(
+        "off", description="torque after a run that went well; a robot that falls when limp holds"
+    )
+
+
+def objections_to_times(bus: BusSettings, safety: Safety) -> Iterable[Objection]:
+    """Rules that would fire too late to matter at the rate of the map, and stops shorter than cycles."""
+    if bus.latency >= safety.watchdog:
+        yield "bus.latency", "is not below safety.watchdog: one lost answer would trip the watchdogs"
+    for key in ("missed_cycles", "late_cycles", "following_cycles", "torque_cycles"):
+        reaction = getattr(safety, key) / bus.rate
+        if reaction > LONGEST_REACTION * (1 + ROUNDED):
+            most = int(LONGEST_REACTION * bus.rate * (1 + ROUNDED))
+            fix = f"use {most} or less" if most else "use a higher bus.rate"
+            yield f"safety.{key}", f"takes {reaction:.3g} s at {bus.rate:g} Hz, reactions {LONGEST_REACTION:g} s; {fix}"
+    if safety.missed_cycles / bus.rate >= safety.watchdog:
+        yield (
+            "safety.missed_cycles",
+            f"takes {safety.missed_cycles / bus.rate:.3g} s at {bus.rate:g} Hz: the watchdogs would trip first, after "
+            f"{safety.watchdog:g} s; use fewer, or a longer safety.watchdog",
+        )
+    if safety.stop_time < STOP_CYCLES / bus.rate:
+        yield (
+            "safety.stop_time",
+            f"is less than {STOP_CYCLES} cycles of {bus.rate:g} Hz; use {rounded_up(STOP_CYCLES / bus.rate):g} or more",
+        )
+
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _CHECKOUT = _PACKAGE.parent / "scenarios" / "hardware"
@@ -426,3 +601,83 @@ def json_schema() -> dict[str, Any]:
     limit is below the upper one. Loading checks these.
     """
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **_MapFile.model_json_schema()}
+
+
+# Calibration of a servo map: zero ticks read in a zero posture set by hand; zero ticks or signs written to the map.
+
+
+Key = Literal["zero_tick", "sign"]
+READS = 20
+STILL = 3
+"""Largest spread over the reads of a servo at rest [ticks]."""
+
+
+def read_zero_ticks(bus: Bus, servos: Iterable[MappedServo]) -> dict[str, int]:
+    """Median servo position of each joint, torque being off.
+
+    Raises
+    ------
+    VerificationFailed
+        Torque is on, a servo does not answer, or moves.
+    """
+    chosen = list(servos)
+    refuse_torque(bus, chosen)
+    ticks: dict[str, list[int]] = {servo.joint: [] for servo in chosen}
+    for _ in range(READS):
+        replies = bus.sync_read([servo.id for servo in chosen], *STATE_BLOCK).replies
+        for servo in chosen:
+            if servo.id in replies:
+                ticks[servo.joint].append(int.from_bytes(replies[servo.id].data[6:10], "little", signed=True))
+    for servo in chosen:
+        seen = ticks[servo.joint]
+        if len(seen) < READS // 2:
+            raise VerificationFailed(f"{servo}: {len(seen)} of {READS} reads answered")
+        if max(seen) - min(seen) > STILL:
+            raise VerificationFailed(f"{servo.joint} moves (ticks {min(seen)} to {max(seen)}); hold it still")
+    return {joint: int(np.median(seen)) for joint, seen in ticks.items()}
+
+
+def refuse_torque(bus: Bus, servos: Iterable[MappedServo]) -> None:
+    """Raises VerificationFailed where a servo has its torque on, or does not answer."""
+    for servo in servos:
+        try:
+            torque = bus.read(servo.id, MX_106.fields["torque_enable"])
+        except (NoAnswer, RequestRefused) as error:
+            raise VerificationFailed(f"{servo.joint}: {error}; check power, cable, ID and baud rate") from error
+        if torque:
+            raise VerificationFailed(f"{servo}: torque is on; `dynsim hw stop` releases it")
+
+
+def write_into_map(servo_map: ServoMap, key: Key, values: Mapping[str, int], path: Path) -> None:
+    """Write the map with new zero ticks or senses, by joint, to ``path``; all else, comments too, stays as it is.
+
+    Raises
+    ------
+    ServoMapError
+        With the new value a joint's limits would leave the single turn position mode knows, or the file cannot be
+        written.
+    """
+    yaml = YAML(typ="rt")
+    yaml.preserve_quotes = True
+    yaml.width = 200
+    data = yaml.load(servo_map.path.read_text(encoding="utf-8"))
+    for joint, value in values.items():
+        data["servos"][joint][key] = value
+    text = io.StringIO()
+    yaml.dump(data, text)
+    with TemporaryDirectory() as folder:
+        draft = Path(folder, servo_map.path.name)
+        draft.write_text(text.getvalue(), encoding="utf-8")
+        for servo in load_servo_map(draft).servos:
+            ends = (
+                sorted(servo.to_ticks(angle) for angle in servo.position_limits) if servo.in_position_mode else [0, 0]
+            )
+            if servo.joint in values and (ends[0] < 0 or ends[1] > 4095):
+                raise ServoMapError(
+                    f"{servo.joint}: with sign {servo.sign} and zero at tick {servo.zero_tick} its limits reach ticks "
+                    f"{ends[0]} to {ends[1]}, position mode ends at 0 and 4095; turn the horn or narrow the limits"
+                )
+    try:
+        write_text(path, text.getvalue())
+    except RecordError as error:
+        raise ServoMapError(str(error)) from error

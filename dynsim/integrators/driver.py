@@ -30,17 +30,13 @@ from dynsim.dynamics.tree.joints import normalise, read_positions
 from dynsim.dynamics.tree.support import watch_support
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts.events import consistent, solve_modes, switch_contacts, take_directions, watch_modes
-from dynsim.integrators.dense import rewrite_sample, sample_step, write_waiting
 from dynsim.integrators.dopri5 import step_dopri5
 from dynsim.integrators.events import arm_events, cut_step, fire_events, take_ticks
-from dynsim.integrators.project import settle
-from dynsim.integrators.radau5.ends import end_accepted, end_workspace
-from dynsim.integrators.radau5.step import after_step, step_radau5
+from dynsim.integrators.radau5.step import after_step, end_accepted, end_workspace, step_radau5
 from dynsim.integrators.radau5.tables import forget
-from dynsim.integrators.run import Run
+from dynsim.integrators.run import Run, forces_unique, rewrite_sample, sample_step, settle, watch, write_waiting
 from dynsim.integrators.stepping.step import advance_moreau
 from dynsim.integrators.steps import choose_step, finished, finite, first_step, next_step, rejected, stalled
-from dynsim.integrators.watch import forces_unique, watch
 from dynsim.jit.kernel import FixedSignature, free_kernel, inline_kernel, internal_kernel, noinline_kernel
 
 

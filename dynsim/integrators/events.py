@@ -18,7 +18,7 @@ from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.unilateral import UnilateralArrays
 from dynsim.dynamics.derivative import System
 from dynsim.dynamics.tables import Workspace
-from dynsim.dynamics.tree.points import point_position
+from dynsim.dynamics.tree.joints import point_position
 from dynsim.dynamics.tree.support import tip_margin
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts import events as ke

@@ -4,34 +4,407 @@ The changes avoid these costs of numba's pipeline:
 
 - It keeps every callee twice, as a library of its own and as a copy in its caller, see :class:`_OwnCallees`.
 - It compiles a function again for each set of options of its callers, see :func:`register_part`.
-- It takes named tuples apart at every call, see dynsim.jit.struct_types.
+- It takes named tuples apart at every call, see dynsim.jit.compiler.
 - It repeats the same look-ups, see :func:`_quick_look_ups`.
 
-The changes act in dynsim's own compilations only; the parts of numba that they replace are in dynsim.jit.numba_version.
+The changes act in dynsim's own compilations only; the parts of numba that they replace are in dynsim.jit.compiler.
 """
 
 from __future__ import annotations
 
 import gc
+import hashlib
+import inspect
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import pkgutil
+from abc import ABC
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import cache, cached_property, partial
 from typing import Any, TypeVar
 
-from dynsim.jit.numba_version import check_sources
-
-# isort: split
 import numba
+from llvmlite import ir as llvm
 from llvmlite.binding import Linkage, parse_assembly
 from numba import _dynfunc
-from numba.core import config, ir, typed_passes, types, untyped_passes
+from numba.core import cgutils, config, debuginfo, ir, typed_passes, types, untyped_passes
+from numba.core.boxing import box_namedtuple
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
-from numba.core.compiler_machinery import PassManager
+from numba.core.compiler_machinery import PassManager, register_pass
+from numba.core.datamodel import models, registry
+from numba.core.imputils import impl_ret_borrowed, lower_builtin, lower_getattr_generic
+from numba.core.lowering import Lower
+from numba.core.pythonapi import NativeValue, box, unbox
+from numba.core.registry import cpu_target
+from numba.core.targetconfig import ConfigStack
+from numba.core.typed_passes import NativeLowering
 from numba.core.types.functions import BaseFunction
-from numba.core.typing.templates import infer, infer_global, make_overload_template
+from numba.core.typing.collections import NamedTupleClassAttribute
+from numba.core.typing.templates import infer, infer_global, make_callable_template, make_overload_template
+from numba.core.typing.typeof import typeof_impl
 
-from dynsim.jit.struct_types import Lowering, constructors
+# Parts of numba that dynsim replaces in its own compilations, and the numba versions this was written for.
+
+
+SUPPORTED = "0.68.1"
+
+# 32 digits of the SHA-256 of the source of what is replaced or copied, by its name in numba.
+REPLACED = {
+    "numba.core.codegen:CPUCodeLibrary._optimize_functions": "9439219fa946f1ad5d202cb5dcbd2d51",
+    "numba.core.codegen:CPUCodeLibrary._optimize_final_module": "e405bd473752613ba43e3becff2b625a",
+    "numba.core.codegen:CPUCodeLibrary.finalize": "4b4c34b83488a72fea5f3d836a8a9f72",
+    "numba.core.codegen:CPUCodeLibrary.serialize_using_object_code": "a895c26d01bad670463c4b4f1013b3c1",
+    "numba.core.codegen:CPUCodeLibrary._unserialize": "c83d278d993487f35768b1aca22ca2c6",
+    "numba.core.compiler:CompilerBase.compile_extra": "09b90ed8a19dfc12d292b5df3b3e5dd0",
+    "numba.core.compiler:CompileResult._reduce": "5f86eacfa5202c202b3dc200f1a7a9b6",
+    "numba.core.compiler:CompileResult._rebuild": "44fa9dc2255883ab49195d18c3cca8c0",
+    "numba.core.compiler:DefaultPassBuilder.define_nopython_pipeline": "d643d727077eeb492cbb19c9faa7eda2",
+    "numba.core.compiler:DefaultPassBuilder.define_untyped_pipeline": "0cb11451d06eef493a9959a4fced3d1d",
+    "numba.core.compiler:DefaultPassBuilder.define_typed_pipeline": "bd5ccc7ef772a33a2075ae4f7bb3aa1f",
+    "numba.core.compiler:DefaultPassBuilder.define_nopython_lowering_pipeline": "9e7ddc0e96eaaecfc024833eb6757cdb",
+    "numba.core.dispatcher:_DispatcherBase.get_call_template": "f15b62d0e9c0f6052c48a2a69ef378ac",
+    "numba.core.dispatcher:_DispatcherBase.get_overload": "7dd56f622edd2016377021a5835d5a82",
+    "numba.core.dispatcher:Dispatcher.compile": "0ab4aee15e79bb1d17c7d87c3b6e61f3",
+    "numba.core.lowering:Lower._lower_call_normal": "ff84f88a6d07d7c41697a4c4531d3f79",
+    "numba.core.lowering:Lower.loadvar": "dc1f6093a6145137a369222b01703410",
+    "numba.core.lowering:Lower.storevar": "16d897dd729a5836fc2d7d91fc47e618",
+    "numba.core.typed_passes:BaseNativeLowering.run_pass": "0b482df4865451f4163c61506423e5fc",
+    "numba.core.typed_passes:NativeLowering.lowering_class": "15e5a08796b58a082ddcf71ae8a4dbb4",
+    "numba.core.boxing:unbox_tuple": "864513414bf1549589075c22099fff91",
+    "numba.core.boxing:box_namedtuple": "6c9d9587027b3477903860a7ec0af7ff",
+    "numba.core.typing.typeof:_typeof_tuple": "b66c93fcf165d5a450fcc093dba93d86",
+    "numba.core.typing.collections:NamedTupleClassAttribute.resolve___call__": "877d70abc4a3303bc08288da318da09c",
+    "numba.core.typing.context:BaseContext._get_attribute_templates": "c6739afafca9833a74a3d917e014ed38",
+    "numba.core.types.functions:BaseFunction.get_call_type": "6559c167bfc0ad36ab4af049ed2f2b9d",
+    "numba.core.ir:Inst._rec_list_vars": "054700e9100b6299de3cb0d97f294acd",
+    "numba.core.typing.templates:_OverloadFunctionTemplate._get_impl": "4e27d07b214ca16d6e8ed88f70d886b6",
+    "numba.core.typing.templates:_OverloadFunctionTemplate._build_impl": "12c12b30a1b799381c90cef5c9cd446c",
+    "numba.cpython.tupleobj:namedtuple_constructor": "3a45bad5e04389db8701e8ddb996d058",
+    "numba.cpython.tupleobj:namedtuple_getattr": "54ffd696e4e9fd33cb7da5ee75c54324",
+}
+
+
+def source_hash(name: str) -> str:
+    """32 digits of the SHA-256 of the source of a function, or getter, of numba; empty where there is none."""
+    try:
+        function = pkgutil.resolve_name(name)
+        source = inspect.getsource(getattr(function, "fget", function))
+    except (ImportError, AttributeError, OSError, TypeError):
+        return ""
+    return hashlib.sha256(source.encode()).hexdigest()[:32]
+
+
+@cache
+def check_sources() -> None:
+    """Raises ImportError where what is replaced is not what this was written for."""
+    for name, digest in REPLACED.items():
+        if source_hash(name) != digest:
+            raise _refused(f"; {name}, which it replaces when it compiles, differs")
+
+
+def _refused(why: str = "") -> ImportError:
+    return ImportError(
+        f'numba {numba.__version__} is installed, dynsim needs numba {SUPPORTED}{why}: pip install "numba=={SUPPORTED}"'
+    )
+
+
+if numba.__version__.split(".")[:2] != SUPPORTED.split(".")[:2]:
+    raise _refused()
+
+if __name__ == "__main__":
+    for name in REPLACED:
+        print(f'    "{name}": "{source_hash(name)}",')
+
+
+# Struct types: named tuples in compiled code as memory blocks that are passed by address.
+
+
+# isort: split
+
+_BYTE, _WORD = llvm.IntType(8), llvm.IntType(64)
+_ADDRESS = _BYTE.as_pointer()
+
+
+class Tables(types.NamedTuple):  # type: ignore[misc]
+    """Type of a named tuple that is passed by its address.
+
+    Its name says which, not what is in it: numba's name of a run is ten thousand letters long, and part of the name of
+    each function that is given one.
+    """
+
+    def __init__(self, kinds: Iterable[Any], cls: type) -> None:
+        self.types = tuple(kinds)
+        self.count = len(self.types)
+        self.fields = tuple(cls._fields)  # type: ignore[attr-defined]
+        self.instance_class = cls
+        digest = hashlib.sha256(repr([str(kind) for kind in self.types]).encode()).hexdigest()[:15]
+        self._hash = int(digest, 16)  # the same in every process: types are kept on disk with the kernels
+        types.Type.__init__(self, f"{cls.__name__}.{digest}")
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    def __eq__(self, other: object) -> bool:
+        return self is other or (isinstance(other, Tables) and self.key == other.key)
+
+
+class _OfDynsim(ABC):  # noqa: B024
+    """The classes of named tuples in dynsim's own modules, for ``typeof``: all others are numba's."""
+
+    @classmethod
+    def __subclasshook__(cls, kind: type) -> bool:
+        return issubclass(kind, tuple) and hasattr(kind, "_asdict") and kind.__module__.startswith("dynsim.")
+
+
+@typeof_impl.register(_OfDynsim)
+def _typeof(value: Any, context: Any) -> Tables | None:
+    kinds = [typeof_impl(part, context) for part in value]
+    return None if None in kinds else Tables(kinds, type(value))
+
+
+def constructors(function: Callable[..., Any], typing: Any) -> None:
+    """Let kernels call the classes of dynsim's named tuples that a function names; other compiled code sees numba's."""
+    for name in function.__code__.co_names:
+        cls = function.__globals__.get(name)
+        if isinstance(cls, type) and issubclass(cls, _OfDynsim):
+            kind = types.NamedTupleClass(cls)
+            if kind not in typing._attributes:
+                typing.insert_attributes(type("Constructor", (_Constructor,), {"key": kind})(typing))
+
+
+class _TablesClass(types.NamedTupleClass):  # type: ignore[misc]
+    """To lowering, a class whose instances are :class:`Tables`."""
+
+    def get_impl_key(self, sig: Any) -> Any:
+        return _TablesClass
+
+
+class _Constructor(NamedTupleClassAttribute):  # type: ignore[misc]
+    def resolve___call__(self, kind: Any) -> Any:
+        if ConfigStack().top().nrt:  # not a kernel: they do not count references
+            return super().resolve___call__(kind)
+        cls = kind.instance_class
+
+        def typer(*args: Any, **kws: Any) -> Tables:
+            return Tables(map(types.unliteral, typer.pysig.bind(*args, **kws).args), cls)
+
+        typer.pysig = inspect.signature(cls)  # type: ignore[attr-defined]
+        return types.Function(make_callable_template(_TablesClass, typer))
+
+
+@registry.register_default(Tables)
+class _TablesModel(models.DataModel):  # type: ignore[misc]
+    """The value is the address of the block; as data it is the block itself, in whole words."""
+
+    def __init__(self, dmm: Any, fe_type: Tables) -> None:
+        super().__init__(dmm, fe_type)
+        self.parts = [dmm.lookup(kind) for kind in fe_type]
+        target, end, self.starts, self.alignment = cpu_target.target_context.target_data, 0, [], 8
+        for part in self.parts:
+            kind = part.get_data_type()
+            inner = isinstance(part, _TablesModel)
+            alignment = part.alignment if inner else kind.get_abi_alignment(target)
+            end = -(-end // alignment) * alignment
+            self.starts.append(end)
+            end += part.size if inner else kind.get_abi_size(target)
+            self.alignment = max(self.alignment, alignment)
+        self.size = -(-end // self.alignment) * self.alignment
+
+    def get_value_type(self) -> Any:
+        return _ADDRESS
+
+    def get_data_type(self) -> Any:
+        return llvm.ArrayType(_WORD, self.size // 8)
+
+    def get_argument_type(self) -> Any:
+        return _ADDRESS
+
+    def get_return_type(self) -> Any:
+        return self.get_data_type()
+
+    def as_argument(self, builder: Any, value: Any) -> Any:
+        return value
+
+    def from_argument(self, builder: Any, value: Any) -> Any:
+        if isinstance(value, llvm.Argument):
+            for attribute in ("noalias", "captures(none)"):
+                value.add_attribute(attribute)
+        return value
+
+    def as_data(self, builder: Any, value: Any) -> Any:
+        return builder.load(builder.bitcast(value, self.get_data_type().as_pointer()))
+
+    def from_data(self, builder: Any, value: Any) -> Any:
+        block = self.room(builder)
+        builder.store(value, builder.bitcast(block, value.type.as_pointer()))
+        return block
+
+    as_return, from_return = as_data, from_data
+
+    def load_from_data_pointer(self, builder: Any, ptr: Any, align: int | None = None) -> Any:
+        return builder.bitcast(ptr, _ADDRESS)
+
+    def traverse(self, builder: Any) -> list[tuple[Any, Any]]:
+        """What numba counts references to; the address of a variable that has not been assigned yet is null."""
+
+        def getter(value: Any, k: int) -> Any:
+            nothing = cgutils.alloca_once(builder, llvm.ArrayType(_BYTE, self.size), zfill=True)
+            missing = cgutils.is_null(builder, value)
+            return self.part(builder, builder.select(missing, builder.bitcast(nothing, _ADDRESS), value), k)
+
+        return [(kind, partial(getter, k=k)) for k, kind in enumerate(self.fe_type)]
+
+    def inner_models(self) -> list[Any]:
+        return self.parts
+
+    def room(self, builder: Any) -> Any:
+        """A block in the frame of the function."""
+        with debuginfo.suspend_emission(builder), builder.goto_entry_block():
+            block = builder.alloca(llvm.ArrayType(_BYTE, self.size))
+            block.align = self.alignment
+            return builder.bitcast(block, _ADDRESS)
+
+    def copied(self, builder: Any, value: Any) -> Any:
+        """The block once more; nothing of nothing."""
+        block = self.room(builder)
+        with builder.if_then(cgutils.is_not_null(builder, value)):
+            cgutils.raw_memcpy(builder, block, value, _WORD(self.size), 1)
+        return builder.select(cgutils.is_null(builder, value), value, block)
+
+    def start(self, builder: Any, value: Any, k: int) -> Any:
+        """Address of part k."""
+        return builder.gep(value, [_WORD(self.starts[k])], inbounds=True) if self.starts[k] else value
+
+    def part(self, builder: Any, value: Any, k: int) -> Any:
+        """Part k of the tuple: of a tuple in it the address."""
+        model, start = self.parts[k], self.start(builder, value, k)
+        if isinstance(model, _TablesModel):
+            return start
+        kind = model.get_data_type()
+        start = builder.bitcast(start, kind.as_pointer())
+        if kind == model.get_value_type():
+            return builder.load(start)  # in one, and LLVM's to take apart
+        return model.load_from_data_pointer(builder, start)
+
+    def put(self, builder: Any, block: Any, k: int, value: Any) -> None:
+        """Part k of a block that is being made."""
+        model, start = self.parts[k], self.start(builder, block, k)
+        if isinstance(model, _TablesModel):
+            cgutils.raw_memcpy(builder, start, value, _WORD(model.size), 1)
+        else:
+            data = model.as_data(builder, value)
+            builder.store(data, builder.bitcast(start, data.type.as_pointer()))
+
+
+def parts_of(context: Any, builder: Any, kind: Any, value: Any) -> list[Any]:
+    """The parts of a named tuple in compiled code."""
+    model = context.data_model_manager[kind]
+    return [model.part(builder, value, k) for k in range(len(kind))]
+
+
+def made(context: Any, builder: Any, kind: Tables, values: Sequence[Any]) -> Any:
+    """A named tuple of these parts, in the frame of the function."""
+    model = context.data_model_manager[kind]
+    block = model.room(builder)
+    for k, value in enumerate(values):
+        model.put(builder, block, k, value)
+    return block
+
+
+@lower_builtin(_TablesClass, types.VarArg(types.Any))
+def _constructed(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    kind = sig.return_type
+    values = [context.cast(builder, *conversion) for conversion in zip(args, sig.args, kind, strict=True)]
+    return impl_ret_borrowed(context, builder, kind, made(context, builder, kind, values))
+
+
+class _Lower(Lower):  # type: ignore[misc]
+    """numba's, with constructors of :class:`Tables`, and copies of those that are assigned in several places."""
+
+    def _lower_call_normal(self, fnty: Any, expr: Any, signature: Any) -> Any:
+        if isinstance(fnty, types.NamedTupleClass) and isinstance(signature.return_type, Tables):
+            fnty = _TablesClass(fnty.instance_class)
+        return super()._lower_call_normal(fnty, expr, signature)
+
+    @cached_property
+    def _again(self) -> set[str]:
+        """Names of those."""
+        assigned = (store.target.name for block in self.blocks.values() for store in block.find_insts(ir.Assign))
+        return {
+            name for name, times in Counter(assigned).items() if times > 1 and isinstance(self.typeof(name), Tables)
+        }
+
+    def loadvar(self, name: str) -> Any:
+        """The tuple outlives the next assignment."""
+        return self._copied(super().loadvar(name), name)
+
+    def storevar(self, value: Any, name: str, argidx: int | None = None) -> None:
+        """The variable outlives the next tuple that is made where this one was."""
+        super().storevar(self._copied(value, name), name, argidx)
+
+    def _copied(self, value: Any, name: str) -> Any:
+        if name not in self._again:
+            return value
+        return self.context.data_model_manager[self.typeof(name)].copied(self.builder, value)
+
+
+@register_pass(mutates_CFG=True, analysis_only=False)
+class Lowering(NativeLowering):  # type: ignore[misc]
+    """numba's, by :class:`_Lower`."""
+
+    _name = "dynsim_lowering"
+
+    @property
+    def lowering_class(self) -> type[Lower]:
+        return _Lower
+
+
+@lower_builtin("static_getitem", Tables, types.IntegerLiteral)
+def _numbered(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    kind, (value, number) = sig.args[0], args
+    return _borrowed(context, builder, kind, value, number % len(kind))
+
+
+@lower_getattr_generic(Tables)
+def _field(context: Any, builder: Any, typ: Any, value: Any, attr: str) -> Any:
+    return _borrowed(context, builder, typ, value, typ.fields.index(attr))
+
+
+def _borrowed(context: Any, builder: Any, kind: Any, value: Any, k: int) -> Any:
+    """Part k, whose references numba counts where it counts any."""
+    part = context.data_model_manager[kind].part(builder, value, k)
+    return impl_ret_borrowed(context, builder, kind[k], part)
+
+
+@unbox(Tables)
+def _unboxed(typ: Any, obj: Any, c: Any) -> Any:
+    """numba's ``unbox_tuple``, part by part into a block. The number of parts is that of the class."""
+    model, cleanups = c.context.data_model_manager[typ], []
+    block, is_error = model.room(c.builder), cgutils.alloca_once_value(c.builder, cgutils.false_bit)
+    for k, kind in enumerate(typ):
+        native = c.unbox(kind, c.pyapi.tuple_getitem(obj, k))
+        model.put(c.builder, block, k, native.value)
+        with c.builder.if_then(native.is_error, likely=False):
+            c.builder.store(cgutils.true_bit, is_error)
+        if native.cleanup is not None:
+            cleanups.append(native.cleanup)
+
+    def cleanup() -> None:
+        for clean in reversed(cleanups):
+            clean()
+
+    return NativeValue(block, cleanup=cleanup if cleanups else None, is_error=c.builder.load(is_error))
+
+
+@box(Tables)
+def _boxed(typ: Any, value: Any, c: Any) -> Any:
+    return box_namedtuple(typ, cgutils.pack_struct(c.builder, parts_of(c.context, c.builder, typ, value)), c)
+
+
+# isort: split
+
 
 _NO_ENTRY: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 

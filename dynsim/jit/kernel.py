@@ -234,7 +234,7 @@ def kernel(function: F) -> F:
 def free_kernel(function: F) -> F:
     """As :func:`kernel`, without the interpreter's lock while it runs: others can listen meanwhile.
 
-    For what takes long, and only Python calls: see dynsim.engine.attended.
+    For what takes long, and only Python calls: see dynsim.engine.stopping.
     """
     return _compile(function, nogil=True)
 

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, field_validator, model_validator
+
+from dynsim.config.base import NonNegative, Positive, StrictConfig, Vector3, error_at
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.drive import law as law
 
 Array = NDArray[np.float64]
 SMOOTHING = 1e-2
@@ -69,7 +76,7 @@ class Motor:
 
 @dataclass(frozen=True)
 class Servo:
-    """A position servo on a revolute joint, everything at its output shaft; its law: dynsim.dynamics.drive.servo.
+    """A position servo on a revolute joint, everything at its output shaft; its law: dynsim.dynamics.drive.law.
 
     Attributes
     ----------
@@ -140,3 +147,229 @@ class TorqueSource:
 
 
 Drive = Motor | Servo | TorqueSource
+
+
+# Keys common to all motors of a scenario, and those of a geared brushed DC motor ([WM] eqs 16–25).
+
+
+def limit(value: float | None) -> float:
+    """The value of an optional limit: infinite for none."""
+    return np.inf if value is None else value
+
+
+class DriveParameters(StrictConfig):
+    """A motor of any kind: what it weighs, and what it stands for ever."""
+
+    mass_kg: NonNegative = Field(
+        default=0.0, description="of motor and gear, a point mass on the link before the joint"
+    )
+    mass_point_m: Vector3 | None = Field(
+        default=None, description="where, in that link's frame; default: at the motor's joint"
+    )
+
+    nominal_torque_N_m: Positive | None = Field(
+        default=None, description="that motor and gear stand for ever, at the joint; N at a prismatic joint"
+    )
+
+    @model_validator(mode="after")
+    def _check_mass(self) -> Self:
+        if self.mass_point_m is not None and self.mass_kg == 0.0:
+            raise error_at("mass_point_m", "has no effect without mass_kg")
+        return self
+
+    @property
+    def mass_point(self) -> NDArray[np.float64] | None:
+        """Where its mass is, (3,) [m]; None: at the joint."""
+        return None if self.mass_point_m is None else np.array(self.mass_point_m)
+
+    @property
+    def nominal_torque(self) -> float:
+        """[N m or N], infinite where it is not known."""
+        return limit(self.nominal_torque_N_m)
+
+
+class MotorParameters(DriveParameters):
+    """L di/dt = u − R i − K k v; joint torque K k i − I_m k² v̇ − d_m k² v."""
+
+    torque_constant_N_m_per_A: Positive
+    resistance_ohm: Positive
+    inductance_H: Positive
+    rotor_inertia_kg_m2: NonNegative
+    gear_ratio: Positive = Field(description="motor turns per joint turn; at a prismatic joint rad of the motor per m")
+    gear_damping_N_m_s_per_rad: NonNegative = Field(default=0.0, description="on the motor side")
+    coulomb_friction_N_m: NonNegative = Field(
+        default=0.0, description="of the gear, at the joint: holds at rest; N at a prismatic joint; unilateral law"
+    )
+    voltage_limit_V: Positive | None = None
+    nominal_current_A: Positive | None = Field(
+        default=None, description="that it stands for ever: a run that needs more warns"
+    )
+    peak_current_A: Positive | None = Field(default=None, description="limit of its driver")
+
+    @model_validator(mode="after")
+    def _check_currents(self) -> Self:
+        if limit(self.peak_current_A) < (self.nominal_current_A or 0.0):
+            raise error_at("peak_current_A", f"is less than nominal_current_A = {self.nominal_current_A:g}")
+        return self
+
+    @field_validator("inductance_H", mode="before")
+    @classmethod
+    def _not_zero(cls, value: Any) -> Any:
+        """L = 0 is a circuit many know from textbooks: say what to take instead."""
+        if value == 0:
+            raise ValueError("must be positive; for none take 1e-6 with integrator.method: auto or radau5")
+        return value
+
+    def motor(self, joint: str) -> Motor:
+        """The motor on the joint of that name."""
+        return Motor(
+            joint=joint,
+            torque_constant=self.torque_constant_N_m_per_A,
+            resistance=self.resistance_ohm,
+            inductance=self.inductance_H,
+            rotor_inertia=self.rotor_inertia_kg_m2,
+            gear_ratio=self.gear_ratio,
+            gear_damping=self.gear_damping_N_m_s_per_rad,
+            dry_friction=self.coulomb_friction_N_m,
+            voltage_limit=limit(self.voltage_limit_V),
+            mass=self.mass_kg,
+            mass_point=self.mass_point,
+            current_limit=limit(self.peak_current_A),
+            nominal_current=limit(self.nominal_current_A),
+            nominal_torque=self.nominal_torque,
+        )
+
+
+# Data-sheet parameters of a servo in position or velocity mode, all at the output shaft.
+
+
+# Gains that each mode uses; the first must be positive.
+GAINS = {"position": ("k_p_V_per_rad", "k_d_V_s_per_rad"), "velocity": ("k_v_V_s_per_rad",)}
+
+
+class ServoParameters(DriveParameters):
+    """Everything at the output shaft: K_m = U / ω_0 and R = U K_m / τ_stall at ``voltage_V``, which limits the voltage.
+
+    The gains are the servo's own; those of the controller are for DC motors.
+    """
+
+    voltage_V: Positive = Field(description="supply, at which stall torque and no-load speed hold")
+    stall_torque_N_m: Positive
+    no_load_speed_rad_per_s: Positive
+    mode: Literal["position", "velocity"] = Field(
+        default="position", description="what of the reference the servo follows"
+    )
+    k_p_V_per_rad: NonNegative = Field(default=0.0, description="position mode")
+    k_d_V_s_per_rad: NonNegative = Field(default=0.0, description="position mode")
+    k_v_V_s_per_rad: NonNegative = Field(default=0.0, description="velocity mode")
+    rotor_inertia_kg_m2: NonNegative = Field(default=0.0, description="of rotor and gear, at the output shaft")
+    gear_damping_N_m_s_per_rad: NonNegative = Field(default=0.0, description="at the output shaft")
+    coulomb_friction_N_m: NonNegative = Field(default=0.0, description="of the gear, at the output shaft")
+    coulomb_speed_rad_per_s: Positive | None = Field(
+        default=None,
+        description="below it the Coulomb friction fades; default: 0.01, under the unilateral law it holds at rest",
+    )
+    current_limit_A: Positive | None = None
+    torque_limit_N_m: Positive | None = Field(default=None, description="of the current, without the gear's friction")
+    nominal_current_A: Positive | None = Field(
+        default=None, description="that it stands for ever: a run that needs more warns"
+    )
+
+    @model_validator(mode="after")
+    def _check_currents(self) -> Self:
+        if limit(self.current_limit_A) < (self.nominal_current_A or 0.0):
+            raise error_at("nominal_current_A", f"is more than current_limit_A = {self.current_limit_A:g}")
+        return self
+
+    @model_validator(mode="before")
+    @classmethod
+    def _gains_of_the_mode(cls, data: Any) -> Any:
+        """Set the default gains of the other mode to 0: the user did not write them, and they have no effect."""
+        if not isinstance(data, Mapping):
+            return data
+        mode = data.get("mode", cls.model_fields["mode"].default)
+        others = [key for name, keys in GAINS.items() if name != mode for key in keys]
+        return {**{key: 0.0 for key in others if cls.model_fields[key].default}, **data} if mode in GAINS else data
+
+    @model_validator(mode="after")
+    def _check_gains(self) -> Self:
+        own = GAINS[self.mode][0]
+        if getattr(self, own) == 0.0:
+            raise error_at(own, f"must be positive in mode {self.mode}")
+        for name, keys in GAINS.items():
+            for key in keys:
+                if name != self.mode and getattr(self, key) != 0.0:
+                    raise error_at(key, f"has no effect in mode {self.mode}")
+        return self
+
+    def servo(self, joint: str) -> Servo:
+        """The servo on the joint of that name."""
+        torque_constant = self.voltage_V / self.no_load_speed_rad_per_s
+        return Servo(
+            joint=joint,
+            torque_constant=torque_constant,
+            resistance=self.voltage_V * torque_constant / self.stall_torque_N_m,
+            k_p=self.k_p_V_per_rad,
+            k_d=self.k_d_V_s_per_rad,
+            k_v=self.k_v_V_s_per_rad,
+            velocity_mode=self.mode == "velocity",
+            armature=self.rotor_inertia_kg_m2,
+            reflected_damping=self.gear_damping_N_m_s_per_rad,
+            coulomb_friction=self.coulomb_friction_N_m,
+            coulomb_speed=self.coulomb_speed_rad_per_s,
+            voltage_limit=self.voltage_V,
+            current_limit=limit(self.current_limit_A),
+            torque_limit=limit(self.torque_limit_N_m),
+            mass=self.mass_kg,
+            mass_point=self.mass_point,
+            nominal_current=limit(self.nominal_current_A),
+            nominal_torque=self.nominal_torque,
+        )
+
+
+# Servos outside the compiled kernels: the kernels' parameter row, and the servo law for arrays of servos.
+
+
+def servo_row(m: Servo) -> Array:
+    """Row of ``DriveArrays.motor`` of a servo, (MOTOR_SIZE,)."""
+    row = np.zeros(ka.MOTOR_SIZE)
+    row[ka.K_M], row[ka.RESISTANCE] = m.torque_constant, m.resistance
+    row[ka.J_M], row[ka.D_M] = m.armature, m.reflected_damping
+    row[ka.K_P], row[ka.K_D], row[ka.K_V] = m.k_p, m.k_d, m.k_v
+    row[ka.U_MAX] = m.voltage_limit
+    row[ka.I_MAX] = m.greatest_current
+    speed = SMOOTHING if m.coulomb_speed is None else m.coulomb_speed
+    row[ka.COULOMB], row[ka.COULOMB_SPEED], row[ka.FREE_DRAG] = m.coulomb_friction, speed, m.free_drag
+    return row
+
+
+class ServoBank:
+    """N servos, each on a shaft of its own."""
+
+    def __init__(self, servos: list[Servo]) -> None:
+        self._table = np.array([servo_row(servo) for servo in servos]).reshape(-1, ka.MOTOR_SIZE)
+        self._mode = np.array(
+            [ka.VELOCITY_MODE if servo.velocity_mode else ka.POSITION_MODE for servo in servos], dtype=np.int64
+        )
+        self._position, self._velocity = np.zeros(len(servos)), np.zeros(len(servos))
+
+    def command(
+        self, enabled: NDArray[np.bool_], in_position_mode: NDArray[np.bool_], position: Array, velocity: Array
+    ) -> None:
+        """Modes and set points [rad, rad/s] from now on, all (N,); what is not ``enabled`` is off."""
+        modes = np.where(in_position_mode, ka.POSITION_MODE, ka.VELOCITY_MODE)
+        self._mode, self._position, self._velocity = np.where(enabled, modes, ka.OFF), position, velocity
+
+    def supply(self, voltage: float) -> None:
+        """Limit all voltages to that of a supply [V]."""
+        self._table[:, ka.U_MAX] = max(voltage, 0.0)
+
+    def torque(self, q: Array, v: Array) -> Array:
+        """Torques at the output shafts at positions [rad] and rates [rad/s], (N,) → (N,) [N m]."""
+        torques = np.empty(len(self._mode))
+        for a, (mode, q_ref, v_ref, at, rate) in enumerate(
+            zip(self._mode, self._position, self._velocity, q, v, strict=True)
+        ):
+            asked = law.servo_command(self._table, a, mode, q_ref, v_ref, at, rate)
+            torques[a] = law.servo_torque(self._table, a, mode, asked, rate)
+        return torques

@@ -59,7 +59,7 @@ class Quadric:
 
     def gap(self, position: Array) -> float:
         """Signed distance [m] of a point along the normal; exact for plane, sphere and cylinder."""
-        from dynsim.dynamics.contact.quadrics import surface_distance
+        from dynsim.dynamics.contact.rows import surface_distance
 
         gradient = self.Q @ position + self.b
         slope = float(np.linalg.norm(gradient))

@@ -20,7 +20,7 @@ from dynsim.planner.search import Planned, Search, Tally
 from dynsim.planner.verify import Corner, Tolerances, Verdict, Verifier
 from dynsim.record import Record
 from dynsim.scenario import Scenario, require_scenario
-from dynsim.scenario.loads import Payload
+from dynsim.scenario.schema import Payload
 
 # Two rounds agree if their heats differ by less than this share.
 AGREE = 0.01
@@ -333,7 +333,7 @@ def plan_braces(
     """Which points of an arm to brace, on which surfaces, in what posture along the hand's path, with what forces.
 
     Minimises the mean heat of the motors, Σ R i², over the path ``controller.hand.path`` of the scenario, see
-    :mod:`dynsim.planner.local`, for each number of braces; verified with friction and surfaces that are not as planned.
+    :mod:`dynsim.planner.arm`, for each number of braces; verified with friction and surfaces that are not as planned.
 
     Parameters
     ----------

@@ -9,9 +9,9 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from dynsim.compile.clearance import axis_ends, gaps
-from dynsim.compile.references.feed_forward import pressing
-from dynsim.compile.splines import clamped_cubic, quintic_rates
-from dynsim.dynamics.contact.braces import tables as kb
+from dynsim.compile.references.inverse_kinematics import pressing
+from dynsim.compile.references.plane_curve import clamped_cubic, quintic_rates
+from dynsim.dynamics.contact.braces import statics as kb
 from dynsim.errors import ModelError
 from dynsim.jit.kernel import reals
 from dynsim.model.description import Array, Contact
@@ -56,8 +56,8 @@ def references(task: Task, braces: tuple[Candidate, ...], knots: Array, Q: Array
     """Dense references through postures at knots, (K, n); in words why there are none.
 
     A spline through the knots, every instant put back onto path and surfaces. The heat is that of
-    :func:`dynsim.compile.references.feed_forward.pressing` along them, accelerations and losses included, with all of
-    the friction that a creeping brace feels. ``factor`` : so many times as many instants
+    :func:`dynsim.compile.references.inverse_kinematics.pressing` along them, accelerations and losses included, with
+    all of the friction that a creeping brace feels. ``factor`` : so many times as many instants
     """
     span = task.span
     count = factor * max(INSTANTS, int(np.ceil(span / SPACING)), 2 * (len(knots) - 1))

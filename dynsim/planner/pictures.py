@@ -24,11 +24,11 @@ GRID, BEYOND = 160, 0.15
 def draw_plan(plan: BracePlan, folder: Path, kind: str) -> None:
     """Figures into ``figures/``, and ``view.html``."""
     draw_plan_figures(picture(plan), folder / "figures", kind)
-    from dynsim.draw.page import html
+    from dynsim.draw.page import content
 
     shown = _records(plan)
     if shown:
-        html.write(shown, folder / "view.html")
+        content.write(shown, folder / "view.html")
 
 
 def _records(plan: BracePlan) -> dict[str, Record]:

@@ -17,9 +17,8 @@ from dynsim.jit.kernel import integers, reals
 from dynsim.library import families
 from dynsim.model.description import Array
 from dynsim.model.surfaces import Quadric
-from dynsim.planner.arm import MovingArm, axis_points, moving_arm
+from dynsim.planner.arm import MovingArm, Problem, axis_points, moving_arm, workspace
 from dynsim.planner.compiled import Course, Points
-from dynsim.planner.local import Problem, workspace
 from dynsim.scenario import Scenario, build
 
 # Weight of the bend of the postures along the path [W/rad²]: for uniqueness; no part of the cost that is reported.

@@ -17,8 +17,8 @@ import numpy as np
 
 from dynsim.jit.kernel import reals
 from dynsim.model.description import Array
+from dynsim.planner.arm import Local, solve
 from dynsim.planner.dense import Dense, references, touching_links
-from dynsim.planner.local import Local, solve
 from dynsim.planner.problem import COARSE_SLIP_SCALE, FINAL_SLIP_SCALE, FINE_SLIP_SCALE, Candidate, Task
 
 # Sets of each size that go on from the cheap problem, and from the one with slip.

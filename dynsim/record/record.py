@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import bisect
 import difflib
+import html
 import importlib
 import math
 import os
-from collections.abc import Iterator, KeysView, Mapping
+from collections.abc import Iterable, Iterator, KeysView, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dynsim.errors import MissingEntry, RecordError, brief
-from dynsim.record import export, notebook, reader, writer
+from dynsim.record import export, reader
 from dynsim.record.content import TIME, Content, Event, Signal, check_name, check_signal, check_time
 from dynsim.record.scene import Scene
 from dynsim.system.files import replacing
@@ -26,6 +27,20 @@ from dynsim.system.files import replacing
 if TYPE_CHECKING:
     import pandas
     import xarray
+
+# HTML tables by which notebooks display objects.
+
+
+def table(title: str, rows: Iterable[tuple[object, ...]], more: str = "") -> str:
+    """HTML of a table with its title; the first cell of a row names it. ``more`` follows as it is."""
+    lines = "".join(
+        f'<tr><th style="text-align:left">{html.escape(str(first))}</th>'
+        + "".join(f'<td style="text-align:left">{html.escape(str(cell))}</td>' for cell in cells)
+        + "</tr>"
+        for first, *cells in rows
+    )
+    return f"<div><b>{html.escape(title)}</b><table>{lines}</table>{more}</div>"
+
 
 # Number of signals that the repr names.
 _SHOWN = 6
@@ -156,7 +171,7 @@ class Record:
             for name, signal in self.signals.items()
         ]
         hint = "" if self.scene is None else "<p><code>record.view()</code> shows it in 3D.</p>"
-        return notebook.table(repr(self)[1:-1], rows, hint)
+        return table(repr(self)[1:-1], rows, hint)
 
     def view(self, *others: Record, ghost: bool = False, height: int = 640) -> Any:
         """A page that shows the run in 3D, with plots over time; notebooks show it inline.
@@ -245,7 +260,7 @@ class Record:
 
     def to_hdf5(self) -> memoryview:
         """The bytes of the file that :meth:`save` writes."""
-        return writer.encode(self._content())
+        return reader.encode(self._content())
 
     def _content(self) -> Content:
         return Content(

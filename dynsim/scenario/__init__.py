@@ -1,11 +1,11 @@
 """Scenarios: reading from YAML (``reading``), validation (``schema``), and building of their objects (``build``)."""
 
 from dynsim.scenario.build import build_model, require_scenario
-from dynsim.scenario.editors import json_schema
 from dynsim.scenario.reading import (
     ScenarioFile,
     SetOptions,
     find_scenario,
+    json_schema,
     load_scenario,
     parse_override,
     read_scenario,

@@ -23,8 +23,7 @@ from dynsim.library import families
 from dynsim.model.description import WORLD, Array, Contact, Foot, Inertia, Load, Robot
 from dynsim.model.surfaces import SURFACES, Surface
 from dynsim.scenario.candidates import candidates
-from dynsim.scenario.loads import Payload
-from dynsim.scenario.schema import ContactPoint, Contacts, Scenario
+from dynsim.scenario.schema import ContactPoint, Contacts, Payload, Scenario
 from dynsim.system.memo import recall
 
 if TYPE_CHECKING:

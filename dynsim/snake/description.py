@@ -13,7 +13,7 @@ from dynsim.errors import ModelError
 from dynsim.jit.kernel import integers, reals
 from dynsim.snake.controller import ControlLaw
 from dynsim.snake.kinematics import SnakeModel, active_rows, constraint_matrices, new_chain, pose_of_point, walk_chain
-from dynsim.snake.state import Schedule
+from dynsim.snake.ticks import Schedule
 
 Policy = Literal["fixed", "cyclic", "predictive"]
 

@@ -13,8 +13,8 @@ import numpy as np
 
 from dynsim.record import Record
 from dynsim.snake.description import COORDINATES, SnakeDescription
-from dynsim.snake.geometry import snake_geometry
 from dynsim.snake.kinematics import pose_of_point
+from dynsim.snake.lifting import snake_geometry
 
 Table = list[list[str]]  # headings first
 

@@ -11,8 +11,8 @@ from dynsim.engine import SIMULATION, Progress, simulate
 from dynsim.errors import ScenarioError, SimulationInterrupted, SimulationStopped, brief
 from dynsim.record import Record
 from dynsim.scenario import Scenario, load_scenario, variant_names
-from dynsim.studies.columns import csv_table, flat, is_scalar, is_text
 from dynsim.studies.processes import WorkerInterrupted, WorkerLost, run_in_processes
+from dynsim.studies.sweep import csv_table, flat, is_scalar, is_text
 from dynsim.system.files import json_text, replace_together
 
 

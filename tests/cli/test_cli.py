@@ -465,7 +465,7 @@ def test_a_damaged_kernel_cache_is_a_warning_in_one_line(tmp_path: Path):
     cache = tmp_path / "dynsim" / cache_folder().name
     cache.mkdir(parents=True, mode=0o700)
     # One that takes little to compile.
-    damaged = [file for file in files if file.name.startswith("dynsim.dynamics.tree.points.point_position-")]
+    damaged = [file for file in files if file.name.startswith("dynsim.dynamics.tree.joints.point_position-")]
     assert damaged
     for file in files:
         (cache / file.name).write_bytes(file.read_bytes()[: -1 if file in damaged else None])

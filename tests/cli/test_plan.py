@@ -13,7 +13,7 @@ from support.planner_scenes import scene
 from typer.testing import CliRunner
 
 from dynsim.cli.app import app
-from dynsim.cli.plan_table import _notes
+from dynsim.cli.tables import _notes
 from dynsim.errors import ModelError, ScenarioError, UnreachableReference
 from dynsim.planner.answer import Size
 from dynsim.planner.verify import Corner, Verdict

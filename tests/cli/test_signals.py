@@ -322,7 +322,7 @@ def test_a_signal_while_figures_are_drawn_is_no_error_of_theirs(tmp_path: Path):
 # A signal whose KeyboardInterrupt Python drops, because it comes while a callback of the garbage collector runs.
 LOST = """
 import os, signal, weakref
-import dynsim.engine.attended as attended
+import dynsim.engine.stopping as attended
 from dynsim.cli import main
 
 class Thing: ...

@@ -48,7 +48,7 @@ def test_a_command_runs_nothing_of_the_working_directory(folder: Path, arguments
 SPAWN = """
 import sys
 from multiprocessing import get_context
-from dynsim.teleop.web.servos import safe_path
+from dynsim.teleop.web.follower import safe_path
 
 if __name__ == "__main__":
     with safe_path():

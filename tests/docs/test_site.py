@@ -14,8 +14,7 @@ from urllib.parse import unquote, urlsplit
 import pytest
 
 import dynsim
-from dynsim.hardware.safety import Safety
-from dynsim.hardware.servo_map import ServoEntry, _MapFile
+from dynsim.hardware.servo_map import Safety, ServoEntry, _MapFile
 from dynsim.scenario import ScenarioConfig
 from dynsim.system.shipped import shipped_scenarios
 

@@ -18,13 +18,11 @@ from support.meshed_robot import meshed_robot
 import dynsim
 from dynsim import cli
 from dynsim.cli import commands
-from dynsim.cli.display import record_files
+from dynsim.cli.tables import record_files
 from dynsim.draw.figures.style import BLUE, DEEP, PULLING
 from dynsim.draw.film import Film, write
-from dynsim.draw.film.painter import FINER, FRICTION, Painter
-from dynsim.draw.film.strip import Strip, largest
-from dynsim.draw.film.strokes import font, labels
-from dynsim.draw.geometry.camera import view_axes
+from dynsim.draw.film.film import Strip, largest
+from dynsim.draw.film.painter import FINER, FRICTION, Painter, font, labels, view_axes
 from dynsim.draw.geometry.meshes import Meshes
 from dynsim.draw.geometry.robot import bounds
 from dynsim.draw.geometry.shapes import body_shapes, from_z, solid

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dynsim.model.description import Inertia, Link, Robot
-from dynsim.model.urdf.build import read_urdf
+from dynsim.model.urdf.reader import read_urdf
 from fuzz import campaign
 from fuzz.broken import WAYS
 from fuzz.case import SHIPPED

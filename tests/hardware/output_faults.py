@@ -19,9 +19,8 @@ import pytest
 from rich.console import Console
 
 import dynsim
-from dynsim.hardware.replay import display, session
-from dynsim.hardware.replay.loop import Loop
-from dynsim.hardware.replay.machine import Replay
+from dynsim.hardware.replay import output, session
+from dynsim.hardware.replay.machine import Loop, Replay
 from dynsim.hardware.replay.output import Background, Journal
 
 PACKAGE = str(Path(dynsim.__file__).parent)
@@ -128,7 +127,7 @@ def watched(outputs: Outputs) -> Iterator[Console]:
         patch.setattr(h5py, "File", _watched(outputs, "h5py.File", h5py.File))
         patch.setattr(threading.Thread, "start", _watched(outputs, "Thread.start", threading.Thread.start))
         patch.setattr(session, "INTERVAL", 0.001)
-        patch.setattr(display, "DRAWING_INTERVAL", 0.001)
+        patch.setattr(output, "DRAWING_INTERVAL", 0.001)
         _take_turns(outputs, patch)
         yield Console(file=Stream(outputs, io.StringIO()), force_terminal=True, width=100)  # type: ignore[arg-type]
 

@@ -18,7 +18,7 @@ from dynsim.hardware.bus.control_table import MX_106
 from dynsim.hardware.errors import ComparisonGateFailed, ServoMapError
 from dynsim.hardware.replay.compare import Gate, check_gate, compare_records, draw_comparison, load_gate
 from dynsim.hardware.virtual.line import ADAPTER_LATENCY
-from dynsim.hardware.virtual.servo_plant import MotorLaw
+from dynsim.hardware.virtual.simulated_plant import MotorLaw
 from dynsim.record import Record
 from dynsim.record.joint_motion import export_record
 

@@ -16,15 +16,13 @@ import pytest
 from support.fault_table import CASES, Case
 
 from dynsim.errors import CheckRefused, DynsimError
-from dynsim.hardware.bus.clock import Clock
+from dynsim.hardware.bus.protocol import Clock
 from dynsim.hardware.errors import OutputsFailed, PortError, ReplayAborted
 from dynsim.hardware.replay.check import MotionLimits
-from dynsim.hardware.replay.display import displayed
-from dynsim.hardware.replay.drive import SILENCE, DrivenMotion, check_drive, lead
-from dynsim.hardware.replay.incremental_path import IncrementalPath, Sample
+from dynsim.hardware.replay.drive import SILENCE, DrivenMotion, IncrementalPath, Sample, check_drive, lead
+from dynsim.hardware.replay.output import ReplayProgress, ReplayState, StopRequest, displayed
 from dynsim.hardware.replay.rules import Cause
 from dynsim.hardware.replay.session import run_replay, shown_by
-from dynsim.hardware.replay.states import ReplayProgress, ReplayState, StopRequest
 from dynsim.hardware.replay.trajectory import Path as RobotPath
 from dynsim.hardware.servo_map import load_servo_map
 

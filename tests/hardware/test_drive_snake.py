@@ -10,18 +10,15 @@ import pytest
 
 from dynsim import load_scenario
 from dynsim.errors import CheckRefused
-from dynsim.hardware.bus.clock import Clock
+from dynsim.hardware.bus.protocol import Clock
 from dynsim.hardware.replay.check import check_motion
-from dynsim.hardware.replay.drive import check_drive
-from dynsim.hardware.replay.incremental_path import IncrementalPath, Sample
+from dynsim.hardware.replay.drive import IncrementalPath, Sample, check_drive
 from dynsim.hardware.replay.rules import Cause
 from dynsim.hardware.servo_map import ServoMap
 from dynsim.record import Record
 from dynsim.snake.description import FIXING, SWITCHING
-from dynsim.teleop.begin import begin
-from dynsim.teleop.session import Command
-from dynsim.teleop.web.follower import NOT_LIFTED, NOT_YET, REGULAR, Columns, ServoFollower
-from dynsim.teleop.web.servos import PipeFeed
+from dynsim.teleop.snake import Command, begin
+from dynsim.teleop.web.follower import NOT_LIFTED, NOT_YET, REGULAR, Columns, PipeFeed, ServoFollower
 
 from .conftest import Rig, Run, check_goals_within_limits
 from .test_lifting import BLEND, CLEARANCE, JOINTS, Oracle, settled, snake_map, with_lifts

@@ -12,9 +12,9 @@ import pytest
 
 from dynsim.hardware.bus.packet import Instruction, Packet
 from dynsim.hardware.errors import ReplayAborted
+from dynsim.hardware.replay.output import ReplayState, ServoEnd, StopRequest, of_the_whole
 from dynsim.hardware.replay.rules import Cause
 from dynsim.hardware.replay.session import run_replay
-from dynsim.hardware.replay.states import ReplayState, ServoEnd, StopRequest, of_the_whole
 from dynsim.hardware.servo_map import load_servo_map
 
 from .conftest import Rig, Run

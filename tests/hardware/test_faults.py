@@ -12,9 +12,9 @@ from support.fault_table import CASES, POLICIES, Case, broken_promises
 from dynsim.hardware.bus.control_table import RAD_PER_TICK
 from dynsim.hardware.bus.packet import Instruction
 from dynsim.hardware.replay.check import velocity_limit
-from dynsim.hardware.replay.motion import CyclePlan
+from dynsim.hardware.replay.output import ReplayState
 from dynsim.hardware.replay.rules import Cause
-from dynsim.hardware.replay.states import ReplayState
+from dynsim.hardware.replay.trajectory import CyclePlan
 from dynsim.hardware.servo_map import ServoMap
 from dynsim.hardware.virtual.servos import PHYSICS_STEP
 
@@ -259,7 +259,7 @@ def test_overload_integrator_shuts_a_jammed_joint_down() -> None:
     from dynsim.hardware.bus.packet import StatusError
     from dynsim.hardware.virtual.faults import FaultScript
     from dynsim.hardware.virtual.line import VirtualLine
-    from dynsim.hardware.virtual.registers import ServoRegisters
+    from dynsim.hardware.virtual.servos import ServoRegisters
 
     script = FaultScript.model_validate({"faults": [{"kind": "stuck", "id": 1, "at": 0.0}]})
     line = VirtualLine({1: ServoRegisters(MX_106, 1, 3)}, positions=[np.pi], script=script)

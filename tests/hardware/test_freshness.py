@@ -7,16 +7,14 @@ import random
 import numpy as np
 import pytest
 
-from dynsim.hardware.bus.clock import VirtualClock
 from dynsim.hardware.bus.control_table import MX_106, RAD_PER_TICK, STATE_BLOCK
 from dynsim.hardware.bus.dynamixel_bus import MARKS, DynamixelBus
 from dynsim.hardware.bus.packet import Instruction
-from dynsim.hardware.bus.protocol import NoAnswer
+from dynsim.hardware.bus.protocol import NoAnswer, VirtualClock
+from dynsim.hardware.replay.output import ReplayState
 from dynsim.hardware.replay.rules import Cause
-from dynsim.hardware.replay.states import ReplayState
 from dynsim.hardware.virtual.faults import FaultScript
-from dynsim.hardware.virtual.line import line_for_map
-from dynsim.hardware.virtual.port import VirtualPort
+from dynsim.hardware.virtual.line import VirtualPort, line_for_map
 
 pytestmark = pytest.mark.long
 

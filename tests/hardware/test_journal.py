@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from dynsim.hardware.bus.clock import VirtualClock
-from dynsim.hardware.replay.output import Journal, Recorder, RunLog
-from dynsim.hardware.replay.states import StopRequest
+from dynsim.hardware.bus.protocol import VirtualClock
+from dynsim.hardware.replay.output import Journal, Recorder, RunLog, StopRequest
 
 
 @pytest.fixture

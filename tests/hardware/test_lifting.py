@@ -38,8 +38,7 @@ from dynsim.hardware.replay.machine import Replay
 from dynsim.hardware.replay.trajectory import path_of_record
 from dynsim.hardware.servo_map import SHIPPED, load_servo_map
 from dynsim.record import Record
-from dynsim.snake.base_part import Fold, base_part
-from dynsim.snake.lifting import Lifts, lifted
+from dynsim.snake.lifting import Fold, Lifts, base_part, lifted
 
 pytestmark = pytest.mark.long
 

@@ -16,7 +16,7 @@ from dynsim.draw.figures import style
 from dynsim.draw.page import viewable
 from dynsim.hardware.replay.check import check_motion
 from dynsim.hardware.replay.measured import describe
-from dynsim.hardware.replay.states import ReplayState
+from dynsim.hardware.replay.output import ReplayState
 from dynsim.hardware.servo_map import SHIPPED, load_servo_map
 from dynsim.record import Record
 from dynsim.record.scene import HERE, WORLD, Body, Joint, Point, Scene

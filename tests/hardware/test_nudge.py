@@ -12,13 +12,12 @@ import numpy as np
 import pytest
 
 from dynsim import cli
-from dynsim.cli import dialog
+from dynsim.cli import hardware
 from dynsim.hardware.bus.control_table import RAD_PER_TICK
-from dynsim.hardware.calibrate import write_into_map
 from dynsim.hardware.errors import ReplayAborted, ReplayInterrupted, ServoMapError, VerificationFailed
 from dynsim.hardware.nudge import ANGLE, PAUSE, SPEED, nudge, swapped
-from dynsim.hardware.replay.states import StopRequest
-from dynsim.hardware.servo_map import load_servo_map
+from dynsim.hardware.replay.output import StopRequest
+from dynsim.hardware.servo_map import load_servo_map, write_into_map
 from dynsim.system.terminal import Terminal
 
 from .conftest import Run
@@ -186,7 +185,7 @@ def on_the_rig(rig, monkeypatch) -> Run:
     def bus_on(port, servo_map):
         yield run.replay.bus, run.clock
 
-    monkeypatch.setattr(dialog, "bus_on", bus_on)
+    monkeypatch.setattr(hardware, "bus_on", bus_on)
     return run
 
 
@@ -228,7 +227,7 @@ def test_a_replay_asks_with_the_way_to_its_start_and_again_where_it_is_far(
     monkeypatch.setattr(sys, "stdin", io.StringIO(answers))
     motion = rig.motion()
     with nullcontext() if agreed else pytest.raises(ReplayInterrupted, match="nothing was moved"):
-        dialog.confirm_replay(Terminal(soft_wrap=True), rig.map, motion, "/dev/ttyRobot", asked=asked)
+        hardware.confirm_replay(Terminal(soft_wrap=True), rig.map, motion, "/dev/ttyRobot", asked=asked)
     out = capsys.readouterr().out
     now, start = (0.9 if far else 0.1), motion.path.position[0][0]
     assert f"furthest from its start: shoulder {abs(now - start):.2f}" in out
@@ -240,4 +239,4 @@ def test_a_replay_asks_with_the_way_to_its_start_and_again_where_it_is_far(
 def test_who_does_not_answer_is_named_before_anything_is_asked(on_the_rig, rig) -> None:
     on_the_rig.line.servos.dead.add(2)
     with pytest.raises(VerificationFailed, match=r"no answer from elbow \(ID 2\)"):
-        dialog.confirm_replay(Terminal(), rig.map, rig.motion(), "/dev/ttyRobot", asked=True)
+        hardware.confirm_replay(Terminal(), rig.map, rig.motion(), "/dev/ttyRobot", asked=True)

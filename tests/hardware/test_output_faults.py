@@ -13,9 +13,8 @@ import pytest
 
 from dynsim.errors import DynsimError
 from dynsim.hardware.errors import OutputsFailed, PortError, ReplayAborted
-from dynsim.hardware.replay.display import displayed
+from dynsim.hardware.replay.output import ReplayState, StopRequest, displayed
 from dynsim.hardware.replay.session import run_replay, shown_by
-from dynsim.hardware.replay.states import ReplayState, StopRequest
 
 from .conftest import TORQUE_ADDRESS, Rig, Run, swing
 from .output_faults import AFTER, BEFORE, Call, Outputs, watched

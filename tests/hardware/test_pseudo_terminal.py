@@ -21,9 +21,8 @@ from dynsim.hardware.bus.control_table import MX_106
 from dynsim.hardware.bus.dynamixel_bus import DynamixelBus, open_serial_port
 from dynsim.hardware.bus.protocol import NoAnswer
 from dynsim.hardware.errors import PortError
-from dynsim.hardware.replay.states import ReplayState
-from dynsim.hardware.virtual.line import line_for_map
-from dynsim.hardware.virtual.pseudo_terminal import PseudoTerminal
+from dynsim.hardware.replay.output import ReplayState
+from dynsim.hardware.virtual.line import PseudoTerminal, line_for_map
 from dynsim.record import Record
 
 from .conftest import MAP, Rig, swing

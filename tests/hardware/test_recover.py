@@ -17,11 +17,10 @@ import pytest
 from dynsim.errors import RecordError
 from dynsim.hardware.errors import OutputsFailed, PortError, ReplayAborted
 from dynsim.hardware.replay import measured, output, session
-from dynsim.hardware.replay.loop import Loop
+from dynsim.hardware.replay.machine import Loop
 from dynsim.hardware.replay.measured import recover
-from dynsim.hardware.replay.output import PART, GrowingFile, move_away, row_type
+from dynsim.hardware.replay.output import PART, GrowingFile, ReplayResult, move_away, row_type
 from dynsim.hardware.replay.session import run_replay
-from dynsim.hardware.replay.states import ReplayResult
 from dynsim.record import Record
 
 from .conftest import Rig

@@ -29,7 +29,7 @@ from dynsim.hardware.bus.dynamixel_bus import WRITE_TIMEOUT, DynamixelBus, open_
 from dynsim.hardware.bus.packet import STATUS, Decoder, Packet, encode
 from dynsim.hardware.bus.protocol import NoAnswer
 from dynsim.hardware.errors import PortError
-from dynsim.hardware.virtual.port import VirtualPort
+from dynsim.hardware.virtual.line import VirtualPort
 
 F = MX_106.fields
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dynsim.hardware.bus.control_table import MX_28, MX_106
-from dynsim.hardware.virtual.servo_plant import FREE_DAMPING, VELOCITY_TIME_CONSTANT, Drive, MotorLaw
+from dynsim.hardware.virtual.simulated_plant import FREE_DAMPING, VELOCITY_TIME_CONSTANT, Drive, MotorLaw
 
 
 @pytest.mark.parametrize("voltage", [12.0, 9.5, 0.0, -1.0])

@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 from jsonschema import Draft202012Validator
 from ruamel.yaml import YAML
 
-from dynsim.hardware.calibrate import read_zero_ticks, write_into_map
 from dynsim.hardware.errors import ServoMapError, VerificationFailed
-from dynsim.hardware.servo_map import json_schema, load_servo_map
+from dynsim.hardware.servo_map import json_schema, load_servo_map, read_zero_ticks, write_into_map
 
 SHIPPED = Path(__file__).parents[2] / "scenarios" / "hardware"
 

@@ -20,9 +20,16 @@ from dynsim.hardware.bus.control_table import MX_28, MX_106, RAD_PER_TICK
 from dynsim.hardware.errors import ServoMapError
 from dynsim.hardware.servo_map import load_servo_map
 from dynsim.hardware.virtual.line import VirtualLine, line_for_map
-from dynsim.hardware.virtual.servo_plant import Drive, InertialLoad, MotorLaw
 from dynsim.hardware.virtual.servos import PHYSICS_STEP
-from dynsim.hardware.virtual.simulated_plant import START_CHANGE, SimulatedArm, _bare, simulated_arm
+from dynsim.hardware.virtual.simulated_plant import (
+    START_CHANGE,
+    Drive,
+    InertialLoad,
+    MotorLaw,
+    SimulatedArm,
+    _bare,
+    simulated_arm,
+)
 from dynsim.model.drives import Servo
 from dynsim.record import Record
 

@@ -11,8 +11,8 @@ import pytest
 
 from dynsim.errors import SimulationStopped
 from dynsim.hardware.bus.packet import Instruction, Packet
+from dynsim.hardware.replay.output import ReplayProgress, ReplayState, StopRequest, stop_on_signals
 from dynsim.hardware.replay.rules import Cause
-from dynsim.hardware.replay.states import ReplayProgress, ReplayState, StopRequest, stop_on_signals
 
 ON_THE_WAY = [
     ReplayState.CONNECT,

@@ -15,12 +15,11 @@ import serial
 
 from dynsim import cli
 from dynsim.hardware.bus import scan
-from dynsim.hardware.bus.clock import VirtualClock
 from dynsim.hardware.bus.dynamixel_bus import SerialPort
+from dynsim.hardware.bus.protocol import VirtualClock
 from dynsim.hardware.bus.scan import STOP_BAUD_RATES, stop_all
 from dynsim.hardware.errors import PortError
-from dynsim.hardware.virtual.line import VirtualLine, line_for_map
-from dynsim.hardware.virtual.port import VirtualPort
+from dynsim.hardware.virtual.line import VirtualLine, VirtualPort, line_for_map
 
 DISCONNECTED = "device reports readiness to read but returned no data (device disconnected or multiple access on port?)"
 

@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 from support.processes import wait_for
 
-from dynsim.hardware.replay.output import PART
-from dynsim.hardware.replay.states import ReplayState
+from dynsim.hardware.replay.output import PART, ReplayState
 from dynsim.record import Record
 
 from .test_pseudo_terminal import Servos, command, virtual_servos

@@ -11,8 +11,8 @@ import pytest
 
 from dynsim.hardware.bus.control_table import OperatingMode
 from dynsim.hardware.bus.dynamixel_bus import READ_WAIT, SerialPort
+from dynsim.hardware.replay.output import ReplayState
 from dynsim.hardware.replay.rules import Cause
-from dynsim.hardware.replay.states import ReplayState
 
 
 @pytest.mark.parametrize(

@@ -16,13 +16,11 @@ from dynamixel_sdk import (
     Protocol2PacketHandler,
 )
 
-from dynsim.hardware.bus.clock import VirtualClock
 from dynsim.hardware.bus.control_table import BAUD_RATES, MODELS, MX_28, MX_106, ServoModel
 from dynsim.hardware.bus.packet import Packet, StatusError, crc16, encode, encode_fast
-from dynsim.hardware.virtual.line import VirtualLine
-from dynsim.hardware.virtual.port import VirtualPort
-from dynsim.hardware.virtual.registers import ServoRegisters
-from dynsim.hardware.virtual.servos import BOOT_TIME
+from dynsim.hardware.bus.protocol import VirtualClock
+from dynsim.hardware.virtual.line import VirtualLine, VirtualPort
+from dynsim.hardware.virtual.servos import BOOT_TIME, ServoRegisters
 
 F = MX_106.fields
 BAUD, BAUD_CODE = 1_000_000, 3

@@ -6,16 +6,14 @@ import numpy as np
 import pytest
 from dynamixel_sdk import Protocol2PacketHandler
 
-from dynsim.hardware.bus.clock import VirtualClock
 from dynsim.hardware.bus.control_table import MX_28, MX_106, RAD_PER_TICK, OperatingMode, describe_hardware_error
 from dynsim.hardware.bus.dynamixel_bus import DynamixelBus
 from dynsim.hardware.bus.packet import StatusError
+from dynsim.hardware.bus.protocol import VirtualClock
 from dynsim.hardware.virtual.faults import FaultScript
-from dynsim.hardware.virtual.line import VirtualLine
-from dynsim.hardware.virtual.port import VirtualPort
-from dynsim.hardware.virtual.registers import ServoRegisters
-from dynsim.hardware.virtual.servo_plant import MotorLaw
-from dynsim.hardware.virtual.servos import BOOT_TIME, PHYSICS_STEP
+from dynsim.hardware.virtual.line import VirtualLine, VirtualPort
+from dynsim.hardware.virtual.servos import BOOT_TIME, PHYSICS_STEP, ServoRegisters
+from dynsim.hardware.virtual.simulated_plant import MotorLaw
 
 F = MX_106.fields
 BAUD_CODE = 3

@@ -16,8 +16,7 @@ from dynsim.hardware.servo_map import load_servo_map
 from dynsim.record.poses import ORIENTATION, POSITION, poses_at
 from dynsim.scenario import scenario_from_resolved
 from dynsim.snake.description import FIXING, SWITCHING
-from dynsim.teleop.begin import begin
-from dynsim.teleop.session import Command
+from dynsim.teleop.snake import Command, begin
 
 pytestmark = pytest.mark.long
 

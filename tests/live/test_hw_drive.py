@@ -18,7 +18,7 @@ from websockets.exceptions import ConnectionClosed
 
 from dynsim import Record, load_scenario, simulate
 from dynsim.hardware.replay.check import check_motion
-from dynsim.hardware.replay.states import ReplayState
+from dynsim.hardware.replay.output import ReplayState
 from dynsim.hardware.servo_map import SHIPPED, load_servo_map
 from dynsim.teleop.web.live import NOT_READY
 

@@ -8,10 +8,9 @@ import json
 import pytest
 
 from dynsim.snake.description import SWITCHING
-from dynsim.teleop.session import PilotAxis
-from dynsim.teleop.web.deadman import DRIVING, NOBODY, RELEASED, SILENCE, SILENT, Deadman
+from dynsim.teleop.snake import PilotAxis
 from dynsim.teleop.web.live import RealTimeClock
-from dynsim.teleop.web.pilot import PilotCommand, Refused, parse
+from dynsim.teleop.web.pilot import DRIVING, NOBODY, RELEASED, SILENCE, SILENT, Deadman, PilotCommand, Refused, parse
 
 AXES = (PilotAxis("x", "hand", "m/s", 0.1), PilotAxis("turn", "base", "rad/s", 0.5))
 

@@ -20,8 +20,7 @@ from support.urdf_in_pinocchio import assert_pinocchio_reads_the_same
 from dynsim.compile.model import Model
 from dynsim.engine import simulate
 from dynsim.errors import ModelError
-from dynsim.model.urdf.build import read_urdf
-from dynsim.model.urdf.reader import read_tree
+from dynsim.model.urdf.reader import read_tree, read_urdf
 from dynsim.scenario import build_model, load_scenario
 
 # Masses of 1 to 100 kg at distances of up to 2 m: sums of some hundred products, each rounded to 1e-16.

@@ -19,7 +19,10 @@ from dynsim.compile.tables import compile_contacts, compile_drives, compile_load
 from dynsim.dynamics import tables as ka  # noqa: E402
 from dynsim.dynamics.derivative import System  # noqa: E402
 from dynsim.dynamics.state import OUT_FORCE, OUT_SLIP, OUT_VECTOR, state_layout  # noqa: E402
-from dynsim.engine.dynamics import Prepared, prepare  # noqa: E402
+from dynsim.engine.simulation import (  # noqa: E402
+    Prepared,
+    prepare,
+)
 from dynsim.integrators import run as ki  # noqa: E402
 from dynsim.integrators.driver import advance  # noqa: E402
 from dynsim.jit.kernel import integers, reals  # noqa: E402

@@ -10,8 +10,14 @@ import pytest
 mujoco = pytest.importorskip("mujoco", minversion="4.0")
 
 from dynsim.dynamics import tables as ka  # noqa: E402
-from dynsim.dynamics.drive.servo import servo_command, servo_torque  # noqa: E402
-from dynsim.engine.dynamics import Prepared, prepare  # noqa: E402
+from dynsim.dynamics.drive.law import (  # noqa: E402
+    servo_command,
+    servo_torque,
+)
+from dynsim.engine.simulation import (  # noqa: E402
+    Prepared,
+    prepare,
+)
 from dynsim.scenario import load_scenario  # noqa: E402
 from dynsim.studies.bench.snake import BETA, SCENARIO, Z, build_snake, positions, run_dynsim, run_mujoco  # noqa: E402
 

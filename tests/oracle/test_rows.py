@@ -18,7 +18,7 @@ from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact.rows import force_vectors, set_modes
 from dynsim.jit.kernel import integers
 from dynsim.model.description import Contact, Coupling, Robot
-from dynsim.model.urdf.build import read_urdf
+from dynsim.model.urdf.reader import read_urdf
 
 seeds = st.integers(0, 2**32 - 1)
 

@@ -17,7 +17,7 @@ from dynsim.engine import check
 from dynsim.engine.prepare import prepare
 from dynsim.errors import ModelError
 from dynsim.scenario.reading import scenario_from_resolved, to_yaml
-from dynsim.teleop.begin import begin
+from dynsim.teleop.snake import begin
 
 MOTORS: dict[str, dict[str, Any]] = {
     "dc": {

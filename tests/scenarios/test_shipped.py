@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import dynsim
-from dynsim.compile.contact_law import SETTLE_SPEED
+from dynsim.compile.tables import SETTLE_SPEED
 from dynsim.dynamics.tables import SLIDING, STICKING
 from dynsim.engine import check
 from dynsim.scenario import shipped_scenarios, variant_names

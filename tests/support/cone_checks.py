@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dynsim.dynamics.contact.cone.problem import BOTH_WAYS, BOX, CONE
+from dynsim.dynamics.contact.cone.steps import BOTH_WAYS, BOX, CONE
 
 
 def violation(W, b, kind, mu, f):

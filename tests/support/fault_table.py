@@ -27,19 +27,17 @@ from typing import Any, get_args
 import numpy as np
 
 from dynsim._version import __version__
-from dynsim.hardware.bus.clock import VirtualClock
 from dynsim.hardware.bus.dynamixel_bus import DynamixelBus
 from dynsim.hardware.bus.packet import Instruction, Packet
+from dynsim.hardware.bus.protocol import VirtualClock
 from dynsim.hardware.replay.check import CheckedMotion, check_motion
 from dynsim.hardware.replay.machine import Replay
+from dynsim.hardware.replay.output import SILENT, ReplayProgress, ReplayResult, ReplayState, StopRequest
 from dynsim.hardware.replay.rules import Cause
-from dynsim.hardware.replay.states import SILENT, ReplayProgress, ReplayResult, ReplayState, StopRequest
 from dynsim.hardware.replay.trajectory import path_of_record
-from dynsim.hardware.safety import FaultPolicy
-from dynsim.hardware.servo_map import ServoMap, load_servo_map
+from dynsim.hardware.servo_map import FaultPolicy, ServoMap, load_servo_map
 from dynsim.hardware.virtual.faults import FaultScript
-from dynsim.hardware.virtual.line import VirtualLine, line_for_map
-from dynsim.hardware.virtual.port import VirtualPort
+from dynsim.hardware.virtual.line import VirtualLine, VirtualPort, line_for_map
 from dynsim.record import Record
 from dynsim.system.files import write_json
 

@@ -25,7 +25,7 @@ from dynsim.draw.figures.style import look, new_figure, save, variant_styles
 from dynsim.engine import simulate
 from dynsim.errors import DynsimError
 from dynsim.scenario import load_scenario, variant_names
-from dynsim.studies.columns import csv_table
+from dynsim.studies.sweep import csv_table
 from dynsim.system.files import write_json, write_text
 
 Array = NDArray[np.float64]

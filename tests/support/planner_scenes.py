@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from dynsim.compile.bracing import Brace
-from dynsim.engine.dynamics import prepare
+from dynsim.engine.simulation import prepare
 from dynsim.planner.answer import plan_braces
 from dynsim.planner.dense import references
 from dynsim.planner.problem import Options, task

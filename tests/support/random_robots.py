@@ -9,14 +9,23 @@ from typing import Any
 
 import numpy as np
 
-from dynsim.compile.contact_law import JointStop, compile_unilateral, dry_frictions, joint_stops
 from dynsim.compile.model import Model
 from dynsim.compile.shapes import compile_shapes
-from dynsim.compile.stepping import with_shapes
-from dynsim.compile.tables import compile_contacts, compile_couplings, compile_drives, compile_loads, compile_model
+from dynsim.compile.tables import (
+    JointStop,
+    compile_contacts,
+    compile_couplings,
+    compile_drives,
+    compile_loads,
+    compile_model,
+    compile_unilateral,
+    dry_frictions,
+    joint_stops,
+    with_shapes,
+)
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.derivative import System, derivative, new_workspace
-from dynsim.dynamics.simd.system import has_forms
+from dynsim.dynamics.simd.forms import has_forms
 from dynsim.dynamics.state import ELASTIC_SIZE, LOSSES, block, output_layout, state_layout
 from dynsim.engine.prepare import guards
 from dynsim.integrators.driver import advance

@@ -11,9 +11,19 @@ import numpy as np
 import pinocchio
 
 from dynsim.model.description import Link
-from dynsim.model.urdf.build import ROWS, _links, _places
-from dynsim.model.urdf.reader import SEVERAL, UrdfTree, read_tree
-from dynsim.model.urdf.xml import _ATTRIBUTES, _CHILDREN, Element, UrdfFile, _words
+from dynsim.model.urdf.reader import (
+    _ATTRIBUTES,
+    _CHILDREN,
+    ROWS,
+    SEVERAL,
+    Element,
+    UrdfFile,
+    UrdfTree,
+    _links,
+    _places,
+    _words,
+    read_tree,
+)
 
 # Two readers of the same decimals differ by roundings: of the sines of angles, and of sums over merged bodies.
 AGREEMENT = 1e-9

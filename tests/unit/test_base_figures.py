@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 import dynsim
 from dynsim.draw import figures
-from dynsim.draw.figures import arm, base, motors, posture, skeleton, style, top_view
+from dynsim.draw.figures import arm, base, energy, posture, style
 from dynsim.record import Event, Record, measures
 from dynsim.record.joint_motion import export_record, joint_motion
 from dynsim.record.measures import percent
@@ -103,17 +103,17 @@ def test_values_that_are_not_finite_are_drawn_around(tipped: Record, tmp_path: P
 
 
 def test_supports_of_the_record_are_where_the_pose_has_them(turning: Record) -> None:
-    body, _ = skeleton.skeleton(turning)
+    body, _ = posture.skeleton(turning)
     assert body is not None
     assert [point.name for point in body.scene.supports] == list(turning.labels["wheel_load"])
     for row in (0, len(turning) - 1):
         expected = [in_world(turning, *at)[row] for at in ((0, TRACK / 2), (0, -TRACK / 2), (CASTER, 0))]
-        np.testing.assert_allclose(top_view.support_corners(body, row), expected, atol=1e-7)
+        np.testing.assert_allclose(base.support_corners(body, row), expected, atol=1e-7)
     assert [turning.scene.bodies[k].name for k in turning.scene.base] == ["base", "base.left.wheel", "base.right.wheel"]
 
 
 def test_the_top_view_has_equal_axes_tracks_and_triangles(turning: Record) -> None:
-    figure = drawn(top_view.top_view(turning))
+    figure = drawn(base.top_view(turning))
     world = figure.axes[0]
     assert all(axes.get_aspect() == 1.0 for axes in figure.axes[:2])
     lines = {str(line.get_label()): line for line in world.get_lines()}
@@ -131,7 +131,7 @@ def test_the_top_view_has_equal_axes_tracks_and_triangles(turning: Record) -> No
 
 def test_the_pressure_path_is_cut_at_the_sides_of_the_triangle() -> None:
     corners = np.array([[0.0, 1.0], [0.0, -1.0], [1.0, 0.0]])
-    at, outside = top_view.pressure_pieces(np.array([[-1.0, 0.0], [0.5, 0.0], [0.5, 1.0], [0.2, 0.1]]), corners)
+    at, outside = base.pressure_pieces(np.array([[-1.0, 0.0], [0.5, 0.0], [0.5, 1.0], [0.2, 0.1]]), corners)
     # It comes in at x = 0, goes out at (0.5, 0.5), beyond which it crosses no side, and comes in where y = 1 - x.
     inside = 2.0 + 0.5 / 1.2
     np.testing.assert_allclose(at[~np.isin(at, [0, 1, 2, 3])][[0, 1, -1]], [1.0 / 1.5, 1.5, inside], rtol=1e-12)
@@ -143,7 +143,7 @@ def test_the_pressure_path_is_cut_at_the_sides_of_the_triangle() -> None:
 
 def test_outside_of_the_triangle_is_where_the_margin_is_negative(tipped: Record) -> None:
     corners = np.array([[0.0, TRACK / 2], [0.0, -TRACK / 2], [CASTER, 0.0]])
-    at, outside = top_view.pressure_pieces(top_view.pressure_in_base(tipped), corners)
+    at, outside = base.pressure_pieces(base.pressure_in_base(tipped), corners)
     # A piece between two samples on the same side of the margin, and cut by none, is on that side too.
     whole = np.flatnonzero((at[:-1] % 1 == 0) & (np.diff(at) == 1))
     rows = at[whole].astype(int)
@@ -152,7 +152,7 @@ def test_outside_of_the_triangle_is_where_the_margin_is_negative(tipped: Record)
     np.testing.assert_array_equal(outside[whole][same], negative[rows][same])
     assert outside.any()
     assert not outside.all()
-    assert "outside the triangle" in texts(drawn(top_view.top_view(tipped)))
+    assert "outside the triangle" in texts(drawn(base.top_view(tipped)))
 
 
 def test_tipping_is_marked_in_every_panel_that_shows_its_time(tipped: Record, turning: Record) -> None:
@@ -210,7 +210,7 @@ def test_motors_of_wheels_have_names(turning: Record) -> None:
     assert turning.scene.wheel_names == {"base.left": "left wheel", "base.right": "right wheel"}
     record = copy.deepcopy(turning)
     record["current"][:, :2] = 100.0 + record["current"][:, :2]
-    named = texts(drawn(motors.motors(record)))
+    named = texts(drawn(energy.motors(record)))
     assert "left wheel" in named
     assert "right wheel" in named
     assert "base.left" not in named
@@ -279,7 +279,7 @@ def test_tracking_shows_the_errors_of_the_record(turning: Record) -> None:
 
 
 def test_postures_show_the_base_and_its_wheels(turning: Record) -> None:
-    body, _ = skeleton.skeleton(turning)
+    body, _ = posture.skeleton(turning)
     assert body is not None
     at_start, at_end = ([corners for corners, _ in body.solids(row)] for row in (0, len(turning) - 1))
     assert len(at_start) == 4  # plate, ball of the caster, two wheels

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from dynsim.dynamics.tables import Workspace, workspace
+from dynsim.jit.compiler import Tables
 from dynsim.jit.kernel import internal_kernel, kernel
-from dynsim.jit.struct_types import Tables
 
 
 class Inner(NamedTuple):

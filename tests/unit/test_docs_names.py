@@ -11,14 +11,14 @@ from pathlib import Path
 import pytest
 
 import dynsim
-from dynsim.engine.results import VIEW
+from dynsim.engine.recording import VIEW
 from dynsim.library.families import FAMILIES
 from dynsim.record import FORMAT
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "dynsim"
 PAGES = ("architecture.md", "extending.md")
-# The error handler of codecs that dynsim.system.standard_streams registers under this name.
+# The error handler of codecs that dynsim.system.terminal registers under this name.
 NO_MODULES = {"dynsim.plain"}
 # Files that the reader of an example creates.
 MADE = {"dynsim/library/surfaces/ellipsoid.py", "dynsim/model/joints/screw.py"}

@@ -16,19 +16,9 @@ from matplotlib.transforms import Bbox
 
 import dynsim
 from dynsim.draw import figures
-from dynsim.draw.figures import (
-    arm,
-    contacts,
-    energy,
-    events,
-    hand,
-    motors,
-    posture,
-    skeleton,
-    style,
-)
+from dynsim.draw.figures import arm, contacts, energy, posture, style
 from dynsim.draw.geometry import robot
-from dynsim.engine import summary as metrics
+from dynsim.engine import recording as metrics
 from dynsim.errors import RecordError
 from dynsim.record import Event, Record, measures
 from dynsim.scenario import load_scenario
@@ -137,7 +127,7 @@ def test_run_without_target(braced: Record) -> None:
     record = without(braced, "target_position")
     available = {name for name, draw in arm.FIGURES.items() if draw(record) is not None}
     assert available == FIGURES - {"tracking_error"}
-    assert "target" not in texts(drawn(hand.path(record)))
+    assert "target" not in texts(drawn(energy.path(record)))
 
 
 def test_record_without_samples_has_no_figures(braced: Record, tmp_path: Path) -> None:
@@ -235,10 +225,10 @@ def test_ledger_stack_adds_up_to_the_electrical_energy(braced: Record) -> None:
 
 
 def test_hand_path_panels_have_one_scale_and_all_points(braced: Record) -> None:
-    figure = drawn(hand.path(braced))
+    figure = drawn(energy.path(braced))
     spans = [np.ptp(axes.get_xlim()) for axes in figure.axes] + [np.ptp(axes.get_ylim()) for axes in figure.axes]
     np.testing.assert_allclose(spans, spans[0], rtol=1e-12)
-    for axes, (i, j) in zip(figure.axes, hand.PLANES, strict=True):
+    for axes, (i, j) in zip(figure.axes, energy.PLANES, strict=True):
         for name in ("hand_position", "target_position"):
             inside = axes.viewLim.contains
             assert all(inside(*point) for point in braced[name][:, (i, j)])
@@ -252,7 +242,7 @@ def test_labels_of_hand_path_ticks_stand_apart(braced: Record) -> None:
     for name in ("hand_position", "target_position"):
         record.add(name, circle, "m", labels=("x", "y", "z"))
     with style.look():
-        figure = drawn(hand.path(record))
+        figure = drawn(energy.path(record))
         figure.draw_without_rendering()
     for axes in figure.axes:
         low, high = axes.get_xlim()
@@ -267,20 +257,20 @@ def test_target_that_is_held_is_a_mark(braced: Record) -> None:
     held = without(braced, "target_position")
     held.add("target_position", np.tile(braced["target_position"][0], (len(braced), 1)), "m", labels=("x", "y", "z"))
     for record, named in ((held, {"target"}), (braced, {"target", "start of the target"})):
-        for figure in (drawn(hand.path(record)), drawn(hand.path_comparison({"a": record}))):
+        for figure in (drawn(energy.path(record)), drawn(energy.path_comparison({"a": record}))):
             assert {name for name in texts(figure).splitlines() if "target" in name} == named
             target = next(line for line in figure.axes[0].get_lines() if line.get_label() == "target")
             assert target.get_marker() == ("x" if record is held else "None")
 
 
 def test_tracking_error_states_the_rms_of_the_summary(braced: Record) -> None:
-    assert f"rms {1e3 * braced.summary['hand_error_rms_m']:.3g} mm" in texts(drawn(hand.error(braced)))
+    assert f"rms {1e3 * braced.summary['hand_error_rms_m']:.3g} mm" in texts(drawn(energy.error(braced)))
 
 
 def test_every_variant_has_its_colour_everywhere(braced: Record, free: Record) -> None:
     records = {"two_elbows": braced, "no_elbow": free}
     styles = style.variant_styles(list(records))
-    for figure in (hand.error_comparison(records), energy.energy_comparison(records)):
+    for figure in (energy.error_comparison(records), energy.energy_comparison(records)):
         colours = [line.get_color() for line in drawn(figure).axes[0].get_lines()[:2]]
         assert colours == [styles[name]["color"] for name in records]
     assert style.PULLING not in style.VARIANT_COLOURS
@@ -292,7 +282,7 @@ def test_many_motors_are_an_envelope_and_the_largest(braced: Record) -> None:
     values = np.outer(np.ones(samples), np.arange(count, dtype=float))
     for name, unit in (("current", "A"), ("voltage", "V")):
         record.add(name, values, unit, labels=tuple(f"joint_{k}" for k in range(count)))
-    shown = texts(drawn(motors.motors(record))).splitlines()
+    shown = texts(drawn(energy.motors(record))).splitlines()
     assert shown == ["all 40 motors", *(f"joint_{k}" for k in range(34, 40))]
 
 
@@ -318,7 +308,7 @@ def test_transient_of_the_whole_run_has_no_panel(settle: float) -> None:
 
 def test_long_record(braced: Record, tmp_path: Path) -> None:
     record = stretched(braced, 60_000)
-    for draw in (hand.error, energy.ledger, contacts.forces, motors.motors):
+    for draw in (energy.error, energy.ledger, contacts.forces, energy.motors):
         assert style.save(drawn(draw(record)), tmp_path / "long.png").stat().st_size > 2000
 
 
@@ -361,7 +351,7 @@ def test_contacts_with_a_radius_are_marked_on_their_surface() -> None:
     radii = {f"contacts.points.elbow_{k}.radius_m": 0.02 for k in (4, 7)}
     overrides = {"duration_s": 0.05, "surfaces.floor.point_m": [0.0, 0.0, -0.02], **radii}
     record = dynsim.simulate(load_scenario("pressing", "plain", overrides))
-    body, _ = skeleton.skeleton(record)
+    body, _ = posture.skeleton(record)
     assert body is not None
     touching = {point.name: (position, force) for point, _, position, force in body.contacts()}
     position, force = touching["elbow_7"]
@@ -370,12 +360,12 @@ def test_contacts_with_a_radius_are_marked_on_their_surface() -> None:
 
 
 def test_labels_of_contacts_do_not_overprint_each_other(braced: Record) -> None:
-    body, _ = skeleton.skeleton(braced)
-    plane = skeleton.SidePlane(np.zeros(3), np.array([1.0, 0.0, 0.0]))
-    assert [label.level for label in skeleton.contact_labels(body, plane, 1000.0)] == [0, 0]
-    close = skeleton.contact_labels(body, plane, 10.0)
+    body, _ = posture.skeleton(braced)
+    plane = posture.SidePlane(np.zeros(3), np.array([1.0, 0.0, 0.0]))
+    assert [label.level for label in posture.contact_labels(body, plane, 1000.0)] == [0, 0]
+    close = posture.contact_labels(body, plane, 10.0)
     assert [label.level for label in close] == [0, 1]
-    low, _ = skeleton.with_labels((np.zeros(2), np.ones(2)), close, 10.0)
+    low, _ = posture.with_labels((np.zeros(2), np.ones(2)), close, 10.0)
     assert low[1] < close[1].place[1] + (close[1].offset[1] - close[1].half[1]) / 10.0
 
 
@@ -434,12 +424,12 @@ def test_tracking_error_has_a_settled_axis(braced: Record) -> None:
         0.0,
         0.0,
     ]
-    figure = drawn(hand.error(record))
+    figure = drawn(energy.error(record))
     assert len(figure.axes) == 4
     error = 1e3 * np.abs(record["hand_position"] - wanted).max()
     for start, whole in (figure.axes[:2], figure.axes[2:]):
         assert whole.get_ylim()[1] < 0.1 * error < error < start.get_ylim()[1]
-    compared = drawn(hand.error_comparison({"one": record, "other": record}))
+    compared = drawn(energy.error_comparison({"one": record, "other": record}))
     assert compared.axes[1].get_yscale() == "log"
     assert compared.axes[1].get_ylim()[1] < 0.1 * error
 
@@ -448,7 +438,7 @@ def test_side_plane_of_an_arm_along_minus_y() -> None:
     record = Record([0.0])
     record.add("hand_position", [[0.0, -2.0, 0.1]], "m", labels=("x", "y", "z"))
     segments = np.array([[[0.0, 0.0, 0.0], [0.0, -1.0, 0.3]], [[0.0, -1.0, 0.3], [0.0, -2.0, 0.1]]])
-    plane = skeleton.side_plane(record, [segments])
+    plane = posture.side_plane(record, [segments])
     np.testing.assert_allclose(plane.project(np.array([0.0, -2.0, 0.1])), [2.0, 0.1], atol=1e-12)
 
 
@@ -466,7 +456,7 @@ def test_a_free_body_hangs_on_nothing(tmp_path: Path):
         "plant: {type: urdf_arm, file: free.urdf, hand: {body: arm, point_m: [0.2, 0, 0]},"
         " initial_pose: {root: {position_m: [1, 2, 3]}}}\n"
     )
-    body, _ = skeleton.skeleton(dynsim.simulate(load_scenario(tmp_path / "free.yaml")))
+    body, _ = posture.skeleton(dynsim.simulate(load_scenario(tmp_path / "free.yaml")))
     assert body is not None
     drawn = [segment for segment in body.segments(0) if np.ptp(segment, axis=0).any()]
     np.testing.assert_allclose(drawn, [[[1, 2, 3], [1.5, 2, 3]], [[1.5, 2, 3], [1.7, 2, 3]]], atol=1e-15)
@@ -501,7 +491,7 @@ def test_real_contact_figure_names_modes_and_marks_events(real: Record) -> None:
     assert {"lift_off", "landing"} <= kinds
     explained = figure.axes[-1].get_xlabel()
     for kind in kinds:
-        sign, text = events.MARKS[kind][1:]
+        sign, text = contacts.MARKS[kind][1:]
         assert f"{sign} {text}" in explained
     # The panel of the whole run; that of the transient shows what is in it.
     marks = [line for line in figure.axes[-1].get_lines() if line.get_label() == "_event"]
@@ -517,7 +507,7 @@ def test_real_contact_figure_names_modes_and_marks_events(real: Record) -> None:
 
 
 def test_every_time_figure_marks_the_events_of_contacts(real: Record, braced: Record) -> None:
-    for draw in (hand.error, energy.energy, energy.ledger, motors.motors):
+    for draw in (energy.error, energy.energy, energy.ledger, energy.motors):
         figure = drawn(draw(real))
         for axes in figure.axes:
             if axes.get_title(loc="left") == "with Joule heat":
@@ -535,7 +525,7 @@ def test_comparisons_mark_the_events_of_every_run_in_its_colour(real: Record, br
     other.events = real.events[:1]
     records = {"glued": braced, "real": real, "other": other}
     colours = {name: look["color"] for name, look in style.variant_styles(list(records)).items()}
-    for draw, panels in ((hand.error_comparison, (0, 1)), (energy.energy_comparison, (0, 2))):
+    for draw, panels in ((energy.error_comparison, (0, 1)), (energy.energy_comparison, (0, 2))):
         figure = drawn(draw(records))
         for axes in (figure.axes[k] for k in panels):
             marks = [line for line in axes.get_lines() if line.get_label() == "_event"]
@@ -557,7 +547,7 @@ def test_comparisons_mark_the_events_of_every_run_in_its_colour(real: Record, br
 def test_the_marks_are_explained_beside_nothing_else(real: Record) -> None:
     """All kinds, three digits each: the lines lie within the figure, and not on the names of the bars beside them."""
     crowded = copy.copy(real)
-    crowded.events = [Event(0.001 * k, kind, "elbow_7") for k in range(100) for kind in events.MARKS]
+    crowded.events = [Event(0.001 * k, kind, "elbow_7") for k in range(100) for kind in contacts.MARKS]
     for draw in (energy.energy_comparison, contacts.forces_comparison):
         figure = drawn(draw({"one": crowded, "other": crowded}))
         whole = figure.bbox
@@ -583,14 +573,14 @@ def test_shares_near_none_and_all_are_told_from_them() -> None:
 def test_many_events_are_marks_without_lines(pendulum: Record) -> None:
     record = copy.copy(pendulum)
     record.events = []
-    for k in range(events.LINES + 1):
+    for k in range(contacts.LINES + 1):
         record.add_event(0.01 * k, "bounce", "tip")
     axes = style.new_figure(2.0, "").subplots()
     axes.set_xlim(0.0, 1.0)
-    events.mark(axes, events.marked(record))
+    contacts.mark(axes, contacts.marked(record))
     assert len(axes.get_lines()) == 1
-    assert events.marked(record, ["other"]) == []
-    events.mark(axes, events.marked(record)[:3])
+    assert contacts.marked(record, ["other"]) == []
+    contacts.mark(axes, contacts.marked(record)[:3])
     assert len(axes.get_lines()) == 5
     assert axes.get_xlim() == (0.0, 1.0)
 
@@ -607,7 +597,7 @@ def test_contacts_that_never_touch_are_not_drawn(real: Record) -> None:
     assert len(record.summary["contacts"]) > 5
     figure = drawn(contacts.forces(record))
     assert {axes.get_ylabel().split("\n")[0] for axes in figure.axes} - {""} == {"joint_4", "joint_7"}
-    body, _ = skeleton.skeleton(record)
+    body, _ = posture.skeleton(record)
     assert body is not None
     assert [point.name for point, *_ in body.contacts()] == ["joint_4", "joint_7"]
     mixed = drawn(contacts.forces_comparison({"points": real, "joints": record}))
@@ -636,13 +626,13 @@ def test_drawn_energy_is_a_curve_where_it_differs_from_net(braced: Record, more:
 
 
 def test_ten_motors_are_an_envelope_and_six(braced: Record) -> None:
-    shown = texts(drawn(motors.motors(braced))).splitlines()
+    shown = texts(drawn(energy.motors(braced))).splitlines()
     assert shown[0] == "all 10 motors"
-    assert len(shown) == 1 + motors.LARGEST
+    assert len(shown) == 1 + energy.LARGEST
 
 
 def test_what_lies_below_a_surface_is_marked(braced: Record) -> None:
-    body, _ = skeleton.skeleton(braced)
+    body, _ = posture.skeleton(braced)
     assert body is not None
     assert robot.penetrations(braced, body.scene, np.array([0])) == []
     sunk = copy.copy(braced)
@@ -650,7 +640,7 @@ def test_what_lies_below_a_surface_is_marked(braced: Record) -> None:
     moved = braced["body_position"].copy()
     moved[:, 4:, 2] -= 0.25
     sunk.signals["body_position"] = dataclasses.replace(braced.signals["body_position"], data=moved)
-    body, _ = skeleton.skeleton(sunk)
+    body, _ = posture.skeleton(sunk)
     assert body is not None
     marked = robot.penetrations(sunk, body.scene, np.array([len(sunk) - 1]))
     # Of a horizontal floor at zero the depth is the height of the lowest point.
@@ -664,7 +654,7 @@ def test_what_lies_below_a_surface_is_marked(braced: Record) -> None:
 @pytest.mark.parametrize(("angle", "read"), [(-1e-9, "0"), (-0.4, "0"), (-30.2, "-30"), (180.0, "180")])
 def test_the_azimuth_of_the_side_plane_has_no_minus_zero(angle: float, read: str) -> None:
     turn = np.radians(angle)
-    plane = skeleton.SidePlane(np.zeros(3), np.array([np.cos(turn), np.sin(turn), 0.0]))
+    plane = posture.SidePlane(np.zeros(3), np.array([np.cos(turn), np.sin(turn), 0.0]))
     assert f"azimuth {read}°" in plane.label
 
 

@@ -21,9 +21,9 @@ def test_a_run_logs_what_takes_long_and_its_warnings(caplog: pytest.LogCaptureFi
     record = dynsim.simulate(load_scenario("elbow_comparison", overrides=SHORT))
     assert {entry.name for entry in caplog.records} == {
         "dynsim.engine",
-        "dynsim.engine.attended",
+        "dynsim.engine.stopping",
         "dynsim.engine.prepare",
-        "dynsim.engine.dynamics",
+        "dynsim.engine.simulation",
     }
     messages = [entry.getMessage() for entry in caplog.records if entry.levelno == logging.INFO]
     title = "elbow_comparison (two_elbows): "

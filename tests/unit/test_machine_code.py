@@ -30,7 +30,7 @@ HASH_OF_RUN = """
 import hashlib, sys
 import numpy as np
 import dynsim
-from dynsim.engine.dynamics import prepare
+from dynsim.engine.simulation import prepare
 from dynsim.dynamics.derivative import derivative
 
 scenario = dynsim.load_scenario("elbow_comparison", overrides={"duration_s": 0.3})

@@ -11,7 +11,7 @@ import pytest
 import dynsim
 from dynsim.scenario import read_scenario
 from dynsim.studies.batch import BatchWork
-from dynsim.studies.columns import numbers
+from dynsim.studies.sweep import numbers
 from dynsim.studies.sweep_plan import Axis, Plan
 from dynsim.system.memo import KEPT, Memo, recall, remembering
 

@@ -11,8 +11,7 @@ import pytest
 from dynsim import Scenario, load_scenario, simulate
 from dynsim.dynamics.derivative import derivative
 from dynsim.dynamics.state import block
-from dynsim.engine.method import fastest_rate
-from dynsim.engine.prepare import prepare
+from dynsim.engine.prepare import fastest_rate, prepare
 from dynsim.scenario import scenario_from_resolved
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from dynsim import load_scenario
 from dynsim.dynamics import tables as ka
-from dynsim.engine.dynamics import prepare
+from dynsim.engine.simulation import prepare
 from dynsim.errors import DynsimError
 
 SERVO = {

@@ -12,8 +12,8 @@ import pytest
 from numba.core import ir
 from numba.core.types.functions import BaseFunction
 
+from dynsim.jit import compiler
 from dynsim.jit import kernel as jit
-from dynsim.jit import numba_version
 
 pytestmark = pytest.mark.skipif(numba.config.DISABLE_JIT, reason="what the compiler does")
 
@@ -23,7 +23,7 @@ from collections import namedtuple
 
 if "imported" in sys.argv or "compiled" in sys.argv:
     import dynsim.jit.kernel as jit
-    import dynsim.dynamics.simd.tables
+    import dynsim.dynamics.simd.forms
 
 if "compiled" in sys.argv:
     from typing import NamedTuple
@@ -229,9 +229,9 @@ def test_kernels_are_not_compiled_by_another_numba(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: str
 ) -> None:
     name = NAME if change == "another source" else f"{NAME}_all"
-    monkeypatch.setitem(numba_version.REPLACED, name, "0" * 32)
+    monkeypatch.setitem(compiler.REPLACED, name, "0" * 32)
     monkeypatch.setattr(jit, "cache_folder", lambda: tmp_path)
-    numba_version.check_sources.cache_clear()
+    compiler.check_sources.cache_clear()
 
     @jit.kernel
     def double(x):  # type: ignore[no-untyped-def]
@@ -242,7 +242,7 @@ def test_kernels_are_not_compiled_by_another_numba(
     ):
         double(3)
     monkeypatch.undo()
-    numba_version.check_sources()
+    compiler.check_sources()
 
 
 def test_another_minor_version_of_numba_is_refused_before_its_internals_are_imported() -> None:

@@ -12,7 +12,7 @@ import dynsim
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.engine import check, warnings
-from dynsim.engine import summary as metrics
+from dynsim.engine import recording as metrics
 from dynsim.engine.prepare import Prepared, prepare
 from dynsim.engine.stopping import _reason
 from dynsim.errors import ModelError

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dynsim.engine.results import save_drive, save_run
+from dynsim.engine.recording import save_drive, save_run
 from dynsim.errors import RecordError
 from dynsim.record import Record
 from dynsim.scenario import load_scenario
@@ -244,11 +244,11 @@ def test_a_drive_that_has_no_room_leaves_its_script(tmp_path: Path, simulated, m
     def full(*_: object) -> None:
         raise RecordError("record.h5: No space left on device")
 
-    monkeypatch.setattr("dynsim.engine.results.replace_together", full)
+    monkeypatch.setattr("dynsim.engine.recording.replace_together", full)
     with pytest.raises(RecordError, match=r"No space left.*the script is kept.*dynsim run .*scenario\.yaml"):
         save_drive(record, tmp_path)
     assert [file.name for file in tmp_path.iterdir()] == ["scenario.yaml"]
     assert load_scenario(tmp_path / "scenario.yaml").name == record.provenance["scenario"]["name"]
-    monkeypatch.setattr("dynsim.engine.results.write_text", full)
+    monkeypatch.setattr("dynsim.engine.recording.write_text", full)
     with pytest.raises(RecordError, match=r"^record\.h5: No space left on device$"):
         save_drive(record, tmp_path)

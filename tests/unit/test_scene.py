@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dynsim.compile.protocols import BuildContext
-from dynsim.draw.geometry.surfaces import round_patch, surface_grids
+from dynsim.draw.geometry.shapes import round_patch, surface_grids
 from dynsim.errors import RecordError
 from dynsim.library.surfaces import cylinder, plane, sphere
 from dynsim.model.description import Quadric

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from dynsim.engine.mode_switching import ModeSwitcher
+from dynsim.engine.snake_control import ModeSwitcher
 from dynsim.errors import ModelError
 from dynsim.library.controllers.snake_commands import Circle, DoorArc, Ramp, Script, ScriptedSource, SnakeCommand
 from dynsim.library.controllers.task_space import TABLE_II

@@ -15,7 +15,7 @@ from dynsim.engine import simulate
 from dynsim.errors import RecordError
 from dynsim.record import Record
 from dynsim.scenario import load_scenario
-from dynsim.snake.geometry import snake_geometry
+from dynsim.snake.lifting import snake_geometry
 from dynsim.snake.published import TABLE_III, opening, table_iii, tables
 
 pytestmark = pytest.mark.long

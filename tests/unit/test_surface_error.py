@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import dynsim
-from dynsim.compile.splines import clamped_cubic
+from dynsim.compile.references.plane_curve import clamped_cubic
 from dynsim.errors import ModelError, ScenarioError
 from dynsim.model.surfaces import Box, HeightField, Quadric
 from dynsim.scenario import build

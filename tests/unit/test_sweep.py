@@ -34,10 +34,8 @@ from dynsim.record.sensitivity import sensitivities, spread
 from dynsim.scenario import SetOptions, read_scenario
 from dynsim.studies import batch, processes
 from dynsim.studies import sweep as module
-from dynsim.studies.columns import numbers
-from dynsim.studies.journal import JOURNAL, LOST, SweepRow
 from dynsim.studies.processes import WorkerInterrupted, WorkerLost, WorkerSilent, run_in_processes
-from dynsim.studies.sweep import run_sweep
+from dynsim.studies.sweep import JOURNAL, LOST, SweepRow, numbers, run_sweep
 from dynsim.studies.sweep_plan import Axis, Law, Plan
 
 PENDULUM = read_scenario("single_pendulum")

@@ -15,8 +15,7 @@ import pytest
 from dynsim.errors import DynsimError, RecordError
 from dynsim.scenario import read_scenario
 from dynsim.studies import sweep as sweep_module
-from dynsim.studies.journal import JOURNAL, PLAN, SweepJournal, SweepRow
-from dynsim.studies.sweep import run_sweep
+from dynsim.studies.sweep import JOURNAL, PLAN, SweepJournal, SweepRow, run_sweep
 from dynsim.studies.sweep_plan import Axis, Plan
 from dynsim.system.files import held_folder
 

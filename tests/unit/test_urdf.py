@@ -16,7 +16,7 @@ from dynsim.errors import ModelError
 from dynsim.model.description import Inertia, Link, Robot
 from dynsim.model.joints.ball import ball, floating
 from dynsim.model.joints.planar import planar, rolling
-from dynsim.model.urdf.build import read_urdf
+from dynsim.model.urdf.reader import read_urdf
 from dynsim.model.urdf.writer import write_urdf
 
 ARM = Path(__file__).parents[2] / "scenarios" / "robots" / "six_axis_arm.urdf"

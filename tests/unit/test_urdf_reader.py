@@ -17,8 +17,7 @@ from support.urdf_in_pinocchio import assert_pinocchio_reads_the_same, plain_tex
 from dynsim.compile.model import Model
 from dynsim.errors import DynsimError, ModelError
 from dynsim.model.urdf import reader as urdf_reader
-from dynsim.model.urdf.build import read_urdf
-from dynsim.model.urdf.xml import UrdfFile
+from dynsim.model.urdf.reader import UrdfFile, read_urdf
 
 # Line 1 is the XML declaration; link "arm" is in line 3, its mass in line 6, joint "hinge" in line 10.
 GOOD = """<?xml version="1.0"?>
@@ -240,7 +239,7 @@ def test_the_longest_chain_that_is_taken_is_read(tmp_path: Path) -> None:
     links = [f'<link name="l{i}">{INERTIAL}</link>' for i in range(urdf_reader.LINKS_MAX)]
     joints = [LOOP.format(f"j{i}", f"l{i}", f"l{i + 1}") for i in reversed(range(urdf_reader.LINKS_MAX - 1))]
     (tmp_path / "chain.urdf").write_text(f'<robot name="r">{"".join(links + joints)}</robot>')
-    code = "import sys; from pathlib import Path; from dynsim.model.urdf.build import read_urdf; "
+    code = "import sys; from pathlib import Path; from dynsim.model.urdf.reader import read_urdf; "
     code += "print(len(read_urdf(Path(sys.argv[1])).links))"
     done = subprocess.run(
         [sys.executable, "-c", code, str(tmp_path / "chain.urdf")], capture_output=True, text=True, check=False

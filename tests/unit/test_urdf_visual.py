@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dynsim.compile.scene import robot_scene
-from dynsim.model.urdf.build import read_urdf
+from dynsim.model.urdf.reader import read_urdf
 from dynsim.record.quaternion import rotated
 from dynsim.record.scene import Scene, Shape
 

@@ -16,7 +16,7 @@ from dynsim.compile.model import Model
 from dynsim.draw import figures
 from dynsim.draw.figures import snake as snake_figures
 from dynsim.draw.figures import style
-from dynsim.engine import provenance
+from dynsim.engine import recording
 from dynsim.errors import CheckRefused, DynsimError, MissingEntry, ModelError, RecordError, ScenarioError
 from dynsim.hardware.errors import ServoMapError
 from dynsim.hardware.replay.check import check_motion
@@ -324,8 +324,8 @@ def test_times_that_are_none_are_refused(sample: int, value: float) -> None:
 def test_provenance_does_without_the_metadata_of_a_library_and_finds_the_commit_of_a_submodule(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(provenance, "LIBRARIES", ("numpy", "no_such_library"))
-    made_by = provenance.provenance(load_scenario("single_pendulum"))
+    monkeypatch.setattr(recording, "LIBRARIES", ("numpy", "no_such_library"))
+    made_by = recording.provenance(load_scenario("single_pendulum"))
     assert made_by["libraries"] == {"numpy": np.__version__, "no_such_library": "unknown"}
     package = tmp_path / "outer" / "inner" / "dynsim" / "engine"
     git = tmp_path / "outer" / ".git" / "modules" / "inner"
@@ -333,13 +333,13 @@ def test_provenance_does_without_the_metadata_of_a_library_and_finds_the_commit_
     git.mkdir(parents=True)
     (tmp_path / "outer" / "inner" / ".git").write_text("gitdir: ../.git/modules/inner\n")
     (git / "HEAD").write_text("0123abcd\n")
-    monkeypatch.setattr(provenance, "__file__", str(package / "provenance.py"))
-    provenance.commit.cache_clear()
-    assert provenance.commit() == "0123abcd"
+    monkeypatch.setattr(recording, "__file__", str(package / "provenance.py"))
+    recording.commit.cache_clear()
+    assert recording.commit() == "0123abcd"
     (git / "HEAD").write_bytes(b"\xff\xfe")
-    provenance.commit.cache_clear()
-    assert provenance.commit() == ""
-    provenance.commit.cache_clear()
+    recording.commit.cache_clear()
+    assert recording.commit() == ""
+    recording.commit.cache_clear()
 
 
 def test_an_initial_angle_without_digits_is_refused():

@@ -10,7 +10,7 @@ from support.random_robots import assemble, random_inertia, random_robot, random
 
 from dynsim.compile.model import Model
 from dynsim.dynamics import tables as ka
-from dynsim.dynamics.tree.angles import sine_cosine
+from dynsim.dynamics.tree.joints import sine_cosine
 from dynsim.jit.kernel import kernel
 from dynsim.model.description import Inertia, Link, Robot
 from dynsim.model.drives import Motor

@@ -15,7 +15,7 @@ import dynsim
 from dynsim.compile.bracing import Brace, BracePlanner, BraceStatics, PreparedBraces, brace_rows
 from dynsim.compile.model import Model
 from dynsim.dynamics.contact.braces import statics
-from dynsim.dynamics.contact.braces import tables as kb
+from dynsim.dynamics.contact.braces import statics as kb
 from dynsim.errors import ModelError
 
 seeds = st.integers(0, 2**32 - 1)

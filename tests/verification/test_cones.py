@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import lsq_linear
 from support.cone_checks import violation
 
-from dynsim.dynamics.contact.cone.problem import (
+from dynsim.dynamics.contact.cone.steps import (
     BOTH_WAYS,
     BOX,
     CONE,
@@ -13,9 +13,9 @@ from dynsim.dynamics.contact.cone.problem import (
     NO_SOLUTION,
     ONE_WAY,
     TANGENT,
+    solve_block,
     solve_cones,
 )
-from dynsim.dynamics.contact.cone.steps import solve_block
 
 BLOCK = [CONE, TANGENT, TANGENT]
 

@@ -16,7 +16,7 @@ from dynsim.dynamics.state import CONSTRAINT
 from dynsim.engine import simulate
 from dynsim.errors import ModelError
 from dynsim.model.description import Coupling
-from dynsim.model.urdf.build import read_urdf
+from dynsim.model.urdf.reader import read_urdf
 from dynsim.scenario import build_model, load_scenario
 
 BODY = '<inertial><mass value="{}"/><origin xyz="0 0 0.1"/>' + (

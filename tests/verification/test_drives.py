@@ -11,11 +11,18 @@ from support.random_robots import CompiledSystem, assemble
 
 from dynsim import load_scenario, simulate
 from dynsim.dynamics import tables as ka
-from dynsim.dynamics.drive.dc import dc_balance, dc_command, dc_torque, within_current
-from dynsim.dynamics.drive.law import drive_block, take_commands
-from dynsim.dynamics.drive.limit import clipped
-from dynsim.dynamics.drive.servo import servo_command, servo_torque
-from dynsim.dynamics.drive.torque import open_torque
+from dynsim.dynamics.drive.law import (
+    clipped,
+    dc_balance,
+    dc_command,
+    dc_torque,
+    drive_block,
+    open_torque,
+    servo_command,
+    servo_torque,
+    take_commands,
+    within_current,
+)
 from dynsim.dynamics.state import GEAR
 from dynsim.model.description import Inertia, Link, Robot, vector
 from dynsim.model.drives import Drive, Motor, Servo, TorqueSource

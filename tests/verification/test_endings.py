@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import dynsim
-from dynsim.engine import attended, kinematic
+from dynsim.engine import kinematic, stopping
 from dynsim.engine.prepare import prepare
 from dynsim.errors import ScenarioError, SimulationInterrupted, SimulationStopped
 from dynsim.integrators import driver, events, steps
@@ -398,7 +398,7 @@ def test_ctrl_c_ends_a_run_whose_step_does_not(monkeypatch: pytest.MonkeyPatch, 
 
 
 def test_a_step_that_does_not_end_is_stuck(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(attended, "STUCK_S", 0.3)
+    monkeypatch.setattr(stopping, "STUCK_S", 0.3)
     stands = Stands(monkeypatch)
     try:
         with pytest.raises(SimulationStopped, match=r"one step of .* does not end") as raised:
@@ -411,7 +411,7 @@ def test_a_step_that_does_not_end_is_stuck(monkeypatch: pytest.MonkeyPatch):
 
 def test_steps_that_take_long_are_not_stuck(monkeypatch: pytest.MonkeyPatch):
     """Each step of a run takes more than half of STUCK_S: the run continues, because it advances."""
-    monkeypatch.setattr(attended, "STUCK_S", 0.4)
+    monkeypatch.setattr(stopping, "STUCK_S", 0.4)
     advance = driver.advance
 
     def slowly(system: Any, ws: Any, run: Any, limit: int) -> None:
@@ -474,8 +474,8 @@ def test_ticks_of_a_snake_are_run_without_a_thread_each(monkeypatch: pytest.Monk
         handed_over.append(1)
         return attend_to(work, *others)
 
-    attend_to = attended.attend
-    monkeypatch.setattr(attended, "attend", attend)
+    attend_to = stopping.attend
+    monkeypatch.setattr(stopping, "attend", attend)
     dynsim.simulate(dynsim.load_scenario("snake_positioning_dynamic", "x", {"duration_s": 0.1}))
     assert handed_over == [1]  # the loading of kernels
 
@@ -485,7 +485,7 @@ def test_what_the_work_raises_is_raised():
         raise ValueError("of the work")
 
     with pytest.raises(ValueError, match="of the work"):
-        attended.attend(work, lambda: None, lambda: None)
+        stopping.attend(work, lambda: None, lambda: None)
 
 
 def test_work_of_one_thread_is_not_mistaken_for_that_of_another_task():
@@ -495,8 +495,8 @@ def test_work_of_one_thread_is_not_mistaken_for_that_of_another_task():
     def look() -> None:
         raise KeyboardInterrupt
 
-    ended, raised = attended.attend(lambda: release.wait(30.0), lambda: None, look)
+    ended, raised = stopping.attend(lambda: release.wait(30.0), lambda: None, look)
     assert (ended, type(raised)) == (False, KeyboardInterrupt)
-    assert attended.attend(lambda: done.append(1), lambda: None, lambda: None) == (True, None)
+    assert stopping.attend(lambda: done.append(1), lambda: None, lambda: None) == (True, None)
     assert done == [1]
     release.set()

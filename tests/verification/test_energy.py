@@ -5,7 +5,7 @@ import pytest
 from support.validation import FREE, free_scenario
 
 import dynsim
-from dynsim.engine import summary as metrics
+from dynsim.engine import recording as metrics
 from dynsim.scenario import build, scenario_from_resolved
 
 MOTOR = {

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from support.cone_checks import violation
 
-from dynsim.dynamics.contact.cone.problem import CONE, CONE_ROOM, approach_or_draw_near, solve_cones
+from dynsim.dynamics.contact.cone.steps import CONE, CONE_ROOM, approach_or_draw_near, solve_cones
 from dynsim.integrators.stepping import contacts
 from dynsim.integrators.stepping import tables as kt
 from dynsim.jit.kernel import kernel

@@ -16,7 +16,7 @@ from support.random_robots import assemble, random_contacts, random_robot
 from dynsim.compile.model import Model
 from dynsim.dynamics import derivative as system
 from dynsim.dynamics import ledger
-from dynsim.dynamics.tree import articulated, points, sweep
+from dynsim.dynamics.tree import articulated, joints, sweep
 from dynsim.integrators import driver, steps
 from dynsim.jit.kernel import FixedSignature, reals
 
@@ -88,8 +88,8 @@ def test_every_public_kernel_has_one_compiled_signature():
         sweep.newton_euler,
         sweep.mass_matrix,
         articulated.forward_dynamics,
-        points.point_position,
-        points.point_jacobian,
+        joints.point_position,
+        joints.point_jacobian,
         ledger.kinetic_energy,
         ledger.potential_energy,
     ):

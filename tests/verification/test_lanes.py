@@ -17,10 +17,9 @@ from support.lanes import Divergent, Lanes, Notes, Place, select
 
 from dynsim.dynamics import derivative as system
 from dynsim.dynamics import tables as ka
-from dynsim.dynamics.contact.delassus import solve_dependent
-from dynsim.dynamics.contact.shapes import shaped_rows
+from dynsim.dynamics.contact.delassus import admissible_forces, solve_dependent
+from dynsim.dynamics.contact.rows import shaped_rows
 from dynsim.dynamics.contact.shares import solve_near_shares
-from dynsim.dynamics.contact.splits import admissible_forces
 from dynsim.dynamics.contact.unilateral import slide_direction
 
 N = 4

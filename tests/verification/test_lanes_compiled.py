@@ -29,8 +29,7 @@ from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact.rows import set_modes
 from dynsim.dynamics.contact.unilateral import FROZEN, REFERENCE
 from dynsim.dynamics.derivative import System, derivative
-from dynsim.dynamics.simd.system import StageLanes, evaluate_four, has_forms, stage_lanes
-from dynsim.dynamics.simd.tables import WIDTH
+from dynsim.dynamics.simd.forms import WIDTH, StageLanes, evaluate_four, has_forms, stage_lanes
 from dynsim.jit.kernel import integers, kernel, reals
 
 pytestmark = pytest.mark.long

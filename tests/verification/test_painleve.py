@@ -11,9 +11,9 @@ from support.random_robots import CompiledSystem, assemble, random_contacts, ran
 
 import dynsim
 from dynsim.dynamics import tables as ka
-from dynsim.dynamics.contact.uniqueness import ROOM, UNIQUE, force_verdict
+from dynsim.dynamics.contact.delassus import ROOM, UNIQUE, force_verdict
 from dynsim.dynamics.derivative import new_workspace
-from dynsim.engine import dynamics, recording
+from dynsim.engine import recording, simulation
 from dynsim.engine.force_indeterminacy import acceleration_range, contact_matrices, motion_spread, paradox
 from dynsim.errors import SimulationStopped
 from dynsim.integrators import driver
@@ -381,7 +381,7 @@ def test_a_summary_says_that_three_braces_on_two_joints_leave_the_yaw_open(tmp_p
 def test_a_reversed_diagonal_beside_a_positive_determinant_is_a_warning():
     """The forces are unique, and the summary says what they rest on."""
     scenario = dynsim.load_scenario("elbow_comparison", overrides={"duration_s": 0.02})
-    prepared = dynamics.prepare(scenario)
+    prepared = simulation.prepare(scenario)
     driver.advance(prepared.system, prepared.workspace, prepared.run, 10**6)
     for since, expected in ((np.inf, []), (0.013, ["elbow_4: from t = 0.013 s on"])):
         prepared.run.extremes[0, ki.LOCAL_SINCE] = since  # as the watch does, see the random cases above

@@ -13,14 +13,14 @@ from support.planner_scenes import scene, scene_scenario
 
 import dynsim
 from dynsim.compile.bracing import Brace
-from dynsim.compile.splines import clamped_cubic, quintic_rates
+from dynsim.compile.references.plane_curve import clamped_cubic, quintic_rates
 from dynsim.errors import ModelError, ScenarioError
 from dynsim.jit.kernel import integers, reals
 from dynsim.model.surfaces import Box, HeightField, Quadric, shape_arrays
 from dynsim.planner.answer import BracePlan, Size
+from dynsim.planner.arm import Problem, solve, workspace
 from dynsim.planner.compiled import Arm, Course, Points
 from dynsim.planner.dense import references
-from dynsim.planner.local import Problem, solve, workspace
 from dynsim.planner.problem import FINAL_SLIP_SCALE, Options, task
 from dynsim.planner.search import Search, Tally
 from dynsim.planner.verify import Corner, Tolerances, Verdict, Verifier

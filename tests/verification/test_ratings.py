@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dynsim import load_scenario, simulate
-from dynsim.engine.snake_record import effort
+from dynsim.engine.kinematic import effort
 from dynsim.errors import ScenarioError
 from dynsim.model.drives import Servo
 

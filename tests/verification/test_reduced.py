@@ -7,7 +7,7 @@ import pytest
 from support.lanes import copies
 from support.random_robots import CompiledSystem, assemble, random_positions, random_robot, random_robot_of
 
-from dynsim.integrators.radau5.linear_systems import factor_both, solve_both
+from dynsim.integrators.radau5.step import factor_both, solve_both
 from dynsim.integrators.radau5.tables import ALPHA_RADAU, BETA_RADAU, GAMMA_RADAU
 from dynsim.jit.kernel import kernel
 

@@ -7,7 +7,7 @@ from support.rotors import rotor_energies, rotor_model
 import dynsim
 from dynsim.dynamics.derivative import derivative
 from dynsim.dynamics.state import ELECTRICAL, block
-from dynsim.engine.dynamics import prepare
+from dynsim.engine.simulation import prepare
 from dynsim.errors import ScenarioError
 from dynsim.scenario import build_model, load_scenario
 

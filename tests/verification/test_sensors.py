@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dynsim import Simulation, check, load_scenario, simulate
-from dynsim.engine import attended
+from dynsim.engine import stopping
 from dynsim.errors import ModelError, ScenarioError, SimulationStopped
 from dynsim.integrators import run as ki
 from dynsim.record import Record
@@ -194,7 +194,7 @@ def test_a_run_that_stops_before_its_first_tick_says_why(run, monkeypatch):
         prepared.run.count[ki.STATUS] = ki.NOT_FINITE
         return prepared, None
 
-    monkeypatch.setattr(attended, "advance", stop_at_once)
+    monkeypatch.setattr(stopping, "advance", stop_at_once)
     with pytest.raises(SimulationStopped) as stop:
         run({})
     assert len(stop.value.record) == 0

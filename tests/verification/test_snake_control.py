@@ -10,7 +10,7 @@ from dynsim.errors import ModelError
 from dynsim.jit.kernel import reals
 from dynsim.library.controllers import task_space
 from dynsim.library.plants import snake
-from dynsim.snake import state as ss
+from dynsim.snake import ticks as ss
 from dynsim.snake.controller import control_input, new_work, sigma_min
 from dynsim.snake.description import conditioning
 from dynsim.snake.kinematics import constraint_matrices, new_chain, pose_of_point, walk_chain

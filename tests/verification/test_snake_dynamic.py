@@ -11,13 +11,12 @@ from dynsim.compile.shapes import gap_at
 from dynsim.compile.snake_tree import configuration, lifted_moments
 from dynsim.engine import simulate
 from dynsim.engine.simulation import Simulation
+from dynsim.engine.snake_control import WheelLifter
 from dynsim.engine.snake_pilot import base_pose, roll_pitch_yaw
-from dynsim.engine.snake_start import WheelLifter
 from dynsim.errors import DynsimError, ModelError, SimulationStopped
 from dynsim.scenario import build, load_scenario, scenario_from_resolved
 from dynsim.snake.kinematics import pose_of_point
-from dynsim.teleop.begin import begin
-from dynsim.teleop.session import Command
+from dynsim.teleop.snake import Command, begin
 
 WEIGHT = 10.0 * 9.81
 MODE_1 = np.array([1.0, 1, 0, 1, 1, 0, 1])

@@ -11,7 +11,7 @@ import pytest
 from numba import config
 
 from dynsim.engine import kinematic, simulate
-from dynsim.engine.snake_record import attitude, attitude_distance
+from dynsim.engine.kinematic import attitude, attitude_distance
 from dynsim.errors import ModelError, ScenarioError
 from dynsim.scenario import Scenario, ScenarioConfig, load_scenario
 from dynsim.snake import controller as control

@@ -13,8 +13,7 @@ from dynsim.errors import ModelError, SimulationStopped
 from dynsim.record import Record
 from dynsim.scenario import scenario_from_resolved
 from dynsim.snake.description import NO_REQUEST
-from dynsim.teleop.begin import begin
-from dynsim.teleop.session import Command
+from dynsim.teleop.snake import Command, begin
 
 G = 9.81
 

@@ -12,9 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import linprog, minimize, minimize_scalar
 
-from dynsim.dynamics.contact.cone.program import cone_program, solve_cone_program
-from dynsim.dynamics.contact.cone.socp import best_split, split_room
-from dynsim.dynamics.contact.splits import ONE_WAY, null_space
+from dynsim.dynamics.contact.cone.program import best_split, cone_program, solve_cone_program, split_room
+from dynsim.dynamics.contact.delassus import ONE_WAY, null_space
 from dynsim.jit.kernel import integers, reals
 
 seeds = st.integers(0, 2**32 - 1)

@@ -14,7 +14,7 @@ from support.random_robots import ADAPTIVE, CompiledSystem, assemble, random_con
 
 import dynsim
 from dynsim.dynamics.derivative import new_workspace
-from dynsim.dynamics.simd.tables import aligned
+from dynsim.dynamics.simd.forms import aligned
 from dynsim.dynamics.state import OutputLayout, StateLayout, block
 from dynsim.engine.force_indeterminacy import acceleration_range
 from dynsim.integrators.run import FINISHED, METHODS, PROJECTIONS, STATUS, STEPS, Run

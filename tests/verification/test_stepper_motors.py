@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import dynsim
-from dynsim.engine.summary import energy_residual
+from dynsim.engine.recording import energy_residual
 from dynsim.errors import ModelError
 from dynsim.model.drives import Servo
 

@@ -8,13 +8,12 @@ from support.random_robots import CompiledSystem, assemble
 from support.stepping_systems import plane, stepped
 
 from dynsim.dynamics import tables as ka
-from dynsim.dynamics.drive.servo import servo_block, servo_block_on, servo_circuit, servo_circuit_on, servo_segment
+from dynsim.dynamics.drive.law import servo_block, servo_block_on, servo_circuit, servo_circuit_on, servo_segment
 from dynsim.dynamics.state import ELECTRICAL, SLIP
 from dynsim.integrators.stepping.tables import UNSETTLED
 from dynsim.jit.kernel import integers, reals
 from dynsim.model.description import Contact, Inertia, Link, Robot
-from dynsim.model.drives import Motor, Servo, TorqueSource
-from dynsim.model.servo import servo_row
+from dynsim.model.drives import Motor, Servo, TorqueSource, servo_row
 
 X, Y, Z = np.eye(3)
 RADIUS = 0.05

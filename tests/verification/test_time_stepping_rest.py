@@ -7,8 +7,8 @@ import pytest
 from support.random_robots import CompiledSystem, assemble
 from support.stepping_systems import plane, stepped
 
-from dynsim.dynamics.contact.cone.least_norm import select_least_norm
-from dynsim.dynamics.contact.cone.problem import BOX, CONE, CONE_ROOM, ONE_WAY, TANGENT
+from dynsim.dynamics.contact.cone.program import select_least_norm
+from dynsim.dynamics.contact.cone.steps import BOX, CONE, CONE_ROOM, ONE_WAY, TANGENT
 from dynsim.dynamics.state import FRICTION, IMPACT_LOSS, OUT_FORCE
 from dynsim.integrators.run import LOGGED
 from dynsim.jit.kernel import integers, kernel

@@ -9,7 +9,7 @@ import pytest
 from support.random_robots import CompiledSystem, assemble
 
 from dynsim import load_scenario, simulate
-from dynsim.compile.contact_law import SETTLE_SPEED
+from dynsim.compile.tables import SETTLE_SPEED
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.state import FRICTION, OUT_FORCE, OUT_GAP, OUT_MODE

@@ -12,7 +12,7 @@ from dynsim.dynamics import tables as ka
 from dynsim.dynamics.state import OUT_FORCE, OUT_GAP, OUT_MODE, OUT_VECTOR
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts import events as ke
-from dynsim.integrators.project import GAP_TOLERANCE
+from dynsim.integrators.run import GAP_TOLERANCE
 from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot, vector
 
 G = 9.81

@@ -14,7 +14,7 @@ import pytest
 
 from dynsim import Record, load_scenario, simulate
 from dynsim.dynamics.tables import SLIDING, STICKING
-from dynsim.engine.wedging import least_coefficient
+from dynsim.engine.force_indeterminacy import least_coefficient
 
 # n_z/n_y, g along z, and a load along x that is more than friction of 2.1 holds without a wedge: 2.1 · 10/0.894 = 23.5.
 LEAST, WEIGHT, LOAD = 2.0, 10.0, 30.0

@@ -21,12 +21,10 @@ from support.meshed_robot import CORNERS, FACES, dae, meshed_robot, obj, stl, st
 
 import dynsim
 from dynsim import cli
-from dynsim.draw.geometry.mesh_files import Mesh, read_mesh
-from dynsim.draw.geometry.meshes import Meshes, simplified, welded
+from dynsim.draw.geometry.meshes import Mesh, Meshes, read_mesh, simplified, welded
 from dynsim.draw.page import content, page, viewable, write
-from dynsim.draw.page.blocks import Blocks
-from dynsim.draw.page.blocks import packed_mesh as packed
-from dynsim.draw.page.html import three
+from dynsim.draw.page.content import Blocks, three
+from dynsim.draw.page.content import packed_mesh as packed
 from dynsim.errors import RecordError
 from dynsim.record import Record
 from dynsim.record.poses import ORIENTATION, POSITION, add_body_poses

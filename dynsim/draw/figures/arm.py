@@ -7,25 +7,25 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from dynsim.draw.figures import base, contacts, energy, hand, motors, posture, style, top_view
+from dynsim.draw.figures import base, contacts, energy, posture, style
 from dynsim.record import Record
 
 # File name → figure, None where the record has no data for it.
 FIGURES: dict[str, Callable[[Record], Figure | None]] = {
-    "hand_path": hand.path,
-    "tracking_error": hand.error,
+    "hand_path": energy.path,
+    "tracking_error": energy.error,
     "energy": energy.energy,
     "energy_ledger": energy.ledger,
     "contact_forces": contacts.forces,
-    "motors": motors.motors,
+    "motors": energy.motors,
     "posture": posture.posture,
-    "base": top_view.top_view,
+    "base": base.top_view,
     "overturning": base.overturning,
     "base_tracking": base.tracking,
 }
 COMPARISONS: dict[str, Callable[[Mapping[str, Record]], Figure | None]] = {
-    "compare_hand_path": hand.path_comparison,
-    "compare_tracking_error": hand.error_comparison,
+    "compare_hand_path": energy.path_comparison,
+    "compare_tracking_error": energy.error_comparison,
     "compare_energy": energy.energy_comparison,
     "compare_contact_forces": contacts.forces_comparison,
     "compare_posture": posture.posture_comparison,

@@ -10,10 +10,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullLocator
 
-from dynsim.draw.figures import events, style
+from dynsim.draw.figures import contacts, style
 from dynsim.draw.figures.style import Array
+from dynsim.draw.geometry.shapes import box_about
 from dynsim.record import Record
-from dynsim.record.measures import RESIDUAL_LIMIT, energy_turnover
+from dynsim.record.measures import RESIDUAL_LIMIT, energy_turnover, hand_error, hand_target
 
 # Terms of the ledger in the order in which they are stacked.
 TERMS = {
@@ -66,7 +67,7 @@ def energy(record: Record) -> Figure | None:
     bottom.axhline(0.0, color=style.GREY, linewidth=0.6)
     bottom.set_ylabel("mechanical work [J]")
     bottom.set_xlabel("time [s]")
-    events.mark_all([(top,), (bottom,)], record)
+    contacts.mark_all([(top,), (bottom,)], record)
     for axes in (top, bottom):
         style.legend_above(axes, columns=2)
     return figure
@@ -77,7 +78,7 @@ def energy_comparison(records: Mapping[str, Record]) -> Figure | None:
     shown = {name: record for name, record in records.items() if has_motors(record)}
     if not shown:
         return None
-    height = 5.0 + 2.0 * events.height_of_variants(shown)
+    height = 5.0 + 2.0 * contacts.height_of_variants(shown)
     figure = style.new_figure(
         height, style.comparison_title(list(shown.values()), "electrical energy and mechanical work")
     )
@@ -101,7 +102,7 @@ def energy_comparison(records: Mapping[str, Record]) -> Figure | None:
     work.set_ylabel("mechanical work [J]")
     work.set_xlabel("time [s]")
     colours = {name: str(look["color"]) for name, look in styles.items()}
-    events.explain(work, events.mark_variants([(over_time,), (work,)], shown, colours))
+    contacts.explain(work, contacts.mark_variants([(over_time,), (work,)], shown, colours))
     _totals(total, list(shown), finals, [str(styles[name]["color"]) for name in shown], logarithmic)
     style.legend_below(figure, [over_time], 5)
     return figure
@@ -142,7 +143,7 @@ def ledger(record: Record) -> Figure | None:
         _residual(panels[1], record, turnover)
         main.tick_params(labelbottom=False)
     panels[-1].set_xlabel("time [s]")
-    events.mark_all([(axes,) for axes in panels], record)
+    contacts.mark_all([(axes,) for axes in panels], record)
     if not near:
         panels[-1].set_xlabel(f"{panels[-1].get_xlabel()}\n{_residual_note(record, turnover)}")
     style.legend_below(figure, [whole], 3)
@@ -232,3 +233,243 @@ def _joules(values: Array, largest: float = 0.0) -> str:
     """The last value; 0 if it is rounding beside the largest of its ledger."""
     last = float(values[-1])
     return f"{style.number(0.0 if abs(last) < NOTHING * largest else last)} J"
+
+
+# Figures of motor currents and voltages over time.
+
+
+# Most motors with lines of their own: those with the largest currents; of more motors the envelope is drawn too.
+LARGEST = 6
+
+
+def motors(record: Record) -> Figure | None:
+    """Motor currents and terminal voltages; None without motors."""
+    if "current" not in record or record["current"].shape[1] == 0:
+        return None
+    signals = (("current", "current [A]"), ("voltage", "voltage [V]"))
+    count = record["current"].shape[1]
+    # By the current after the start, where all motors are busy; the same motors in both panels.
+    settled = record.time >= style.settle_time(record)
+    late = settled if settled.any() else slice(None)
+    effort = np.sqrt((record["current"][late] ** 2).mean(axis=0))
+    shown = np.arange(count) if count <= LARGEST else np.sort(np.argsort(effort)[::-1][:LARGEST])
+    figure = style.new_figure(4.4, style.title(record, "motor currents and voltages"))
+    rows = style.time_rows(
+        figure, [[(record.time, record[name])] for name, _ in signals], style.settle_time(record), compress=True
+    )
+    looks = style.variant_styles(shown.tolist())
+    for (name, label), panels in zip(signals, rows, strict=True):
+        for axes in panels:
+            _draw(axes, record, name, shown, looks)
+        panels[0].set_ylabel(label)
+    contacts.mark_all(rows, record)
+    named = f"{LARGEST} largest by\nrms current" if count > LARGEST else None
+    figure.legend(*rows[0][-1].get_legend_handles_labels(), loc="outside right center", title=named, title_fontsize=7.5)
+    return figure
+
+
+def _draw(axes: Axes, record: Record, name: str, shown: np.ndarray, looks: Mapping[int, Mapping[str, Any]]) -> None:
+    values, labels = record[name], record.labels[name]
+    called = {} if record.scene is None else record.scene.wheel_names
+    if len(shown) < values.shape[1]:
+        low, high = values.min(axis=1), values.max(axis=1)
+        axes.fill_between(record.time, low, high, color="#CFCFCF", linewidth=0, label=f"all {len(labels)} motors")
+    for k in shown:
+        style.line(axes, record.time, values[:, k], label=called.get(labels[k], labels[k]), **looks[k])
+    axes.axhline(0.0, color=style.GREY, linewidth=0.6)
+
+
+# Figures of the hand and its target: paths in three planes, and tracking error over time ([WM] Figs 4–6).
+
+
+PLANES = ((0, 1), (0, 2), (1, 2))
+MILLI = 1e3
+# A target whose motion stays within this is fixed [m].
+HELD = 1e-6
+# Legends: position of the hand by its path, and by the goals of the joints.
+TARGET, GOALS = "target", "goals"
+# Mark of the start of a hand, the same for all variants.
+START: dict[str, Any] = {
+    "linestyle": "none",
+    "marker": "o",
+    "markerfacecolor": "white",
+    "markeredgecolor": style.BLACK,
+    "markersize": 4,
+    "zorder": 4,
+}
+
+
+def path(record: Record) -> Figure | None:
+    """Hand path and target in xy, xz and yz at one scale; None without a hand."""
+    return _paths({"hand": record}, style.title(record, "hand path"))
+
+
+def path_comparison(records: Mapping[str, Record]) -> Figure | None:
+    """Hand paths of all variants in xy, xz and yz."""
+    return _paths(records, style.comparison_title(list(records.values()), "hand paths"))
+
+
+def _paths(records: Mapping[str, Record], title: str) -> Figure | None:
+    shown = {name: record for name, record in records.items() if "hand_position" in record}
+    if not shown:
+        return None
+    # Three square panels and the legend, without room above and below.
+    figure = style.new_figure(2.62 + style.LEGEND_ROW * -(-(3 + len(shown)) // 4) / 72.0, title)
+    panels = _planes(figure, list(shown.values()))
+    styles = style.variant_styles(list(records))
+    for axes, plane in zip(panels, PLANES, strict=True):
+        _draw_target(axes, next(iter(shown.values())), plane)
+        for name, record in shown.items():
+            position = style.sparse(record["hand_position"][:, plane])
+            axes.plot(*position.T, label=name, **styles[name])
+            axes.plot(*position[0], **START)
+    _legend_below(figure, panels[0])
+    return figure
+
+
+def error(record: Record) -> Figure | None:
+    """Tracking error over time, components and norm; None without a target."""
+    target = hand_target(record)
+    if target is None:
+        return None
+    deviation = MILLI * (record["hand_position"] - target)
+    norm = np.linalg.norm(deviation, axis=1)
+    figure = style.new_figure(4.1, style.title(record, "tracking error"))
+    series = [[(record.time, deviation)], [(record.time, norm)]]
+    rows = style.time_rows(figure, series, style.settle_time(record))
+    looks = style.variant_styles("xyz")
+    for axes in rows[0]:
+        for k, name in enumerate("xyz"):
+            style.line(axes, record.time, deviation[:, k], label=name, **looks[name])
+    for axes in rows[1]:
+        style.line(axes, record.time, norm, label=_error_label("|e|", record), color=style.BLACK)
+        axes.set_ylim(bottom=0.0)
+    rows[0][0].set_ylabel(f"hand − {target_name(record)} [mm]")
+    rows[1][0].set_ylabel(f"distance from {target_name(record)} [mm]")
+    for panels in zip(*rows, strict=True):
+        _mark_settle(panels, record)
+    contacts.mark_all(rows, record)
+    style.legend_above(rows[0][-1], columns=4)
+    style.legend_above(rows[1][-1])
+    return figure
+
+
+def error_comparison(records: Mapping[str, Record]) -> Figure | None:
+    """Tracking errors of all variants: distance from the target, logarithmic, and the vertical part."""
+    shown = {name: record for name, record in records.items() if hand_target(record) is not None}
+    if not shown:
+        return None
+    height = 4.4 + 2.0 * contacts.height_of_variants(shown)
+    figure = style.new_figure(height, style.comparison_title(list(shown.values()), "tracking error"))
+    deviations = {name: MILLI * (record["hand_position"] - hand_target(record)) for name, record in shown.items()}
+    norms = {name: np.linalg.norm(deviation, axis=1) for name, deviation in deviations.items()}
+    styles = style.variant_styles(list(records))
+    settle = max(map(style.settle_time, shown.values()))
+    series = [[(r.time, norms[name]) for name, r in shown.items()]]
+    series += [[(r.time, deviations[name][:, 2]) for name, r in shown.items()]]
+    rows = style.time_rows(figure, series, settle)
+    for distance, vertical in zip(*rows, strict=True):
+        for name, record in shown.items():
+            style.line(distance, record.time, norms[name], label=_error_label(name, record), **styles[name])
+            style.line(vertical, record.time, deviations[name][:, 2], **styles[name])
+        _mark_settle((distance, vertical), next(iter(shown.values())))
+    if any((norm > 0.0).any() for norm in norms.values()):
+        late = np.concatenate([norms[name][record.time >= settle] for name, record in shown.items()])
+        _log_rows(rows[0], late[late > 0.0])
+    rows[0][0].set_ylabel("distance from target [mm]")
+    rows[1][0].set_ylabel("vertical error [mm]")
+    colours = {name: str(look["color"]) for name, look in styles.items()}
+    contacts.explain(rows[1][-1], contacts.mark_variants(rows, shown, colours))
+    style.legend_below(figure, rows[0][-1:], 2)
+    return figure
+
+
+def _log_rows(panels: Sequence[Axes], settled: Array) -> None:
+    """Logarithmic axes; that of the whole run, where the beginning has a panel of its own, for what has settled."""
+    for axes in panels:
+        axes.autoscale(axis="y")
+        style.log_axis(axes)
+    if len(panels) > 1 and settled.size:
+        panels[-1].set_ylim(float(settled.min()) / 1.3, 1.3 * float(settled.max()))
+        style.log_axis(panels[-1])
+
+
+def _planes(figure: Figure, records: list[Record]) -> list[Axes]:
+    """Three square panels of one scale, large enough for hands and targets."""
+    points = [record["hand_position"] for record in records]
+    points += [target for record in records if (target := hand_target(record)) is not None]
+    low, high = box_about(points)
+    span = float((high - low).max())
+    half = 0.56 * span if span > 0.0 else 0.05
+    middle = 0.5 * (low + high)
+    panels = list(figure.subplots(1, 3))
+    for axes, (i, j) in zip(panels, PLANES, strict=True):
+        axes.set_aspect("equal", anchor="N")  # room that is left is above the legend
+        axes.set_xlim(middle[i] - half, middle[i] + half)
+        axes.set_ylim(middle[j] - half, middle[j] + half)
+        axes.set_xlabel(f"{'xyz'[i]} [m]")
+        axes.set_ylabel(f"{'xyz'[j]} [m]")
+        # Fewer beside each other, where "−0.050" is wide, than above each other.
+        axes.locator_params(axis="x", nbins=4)
+        axes.locator_params(axis="y", nbins=5)
+    return panels
+
+
+def _draw_target(axes: Axes, record: Record, plane: tuple[int, int]) -> None:
+    wanted = hand_target(record)
+    if wanted is None:
+        return
+    target = wanted[:, plane]
+    known = wanted[np.isfinite(wanted).all(axis=1)]
+    if len(known) and float(np.ptp(known, axis=0).max()) <= HELD:
+        # Larger than the start of the hand, which may lie on it.
+        axes.plot(*target[0], "x", label=target_name(record), color=style.BLACK, markersize=8, zorder=3)
+        return
+    axes.plot(*edge_on(target).T, label=target_name(record), color=style.BLACK, linestyle=(0, (4, 2)), zorder=3, lw=0.9)
+    axes.plot(*target[0], "x", color=style.BLACK, markersize=5, zorder=4)
+
+
+def target_name(record: Record) -> str:
+    """What a legend calls :func:`dynsim.record.measures.hand_target`."""
+    return TARGET if "target_position" in record else GOALS
+
+
+def edge_on(points: Array) -> Array:
+    """A curve in the plane of the drawing, (T, 2); one seen edge-on as the segment that it covers.
+
+    Running to and fro over itself it would fill the gaps of its own dashes.
+    """
+    points = style.sparse(points)
+    if len(points) < 3 or not np.isfinite(points).all():
+        return points
+    centred = points - points.mean(axis=0)
+    sizes, directions = np.linalg.svd(centred, full_matrices=False)[1:]
+    if sizes[-1] > 1e-6 * sizes[0]:
+        return points
+    along = centred @ directions[0]
+    return points[[int(along.argmin()), int(along.argmax())]]
+
+
+def _legend_below(figure: Figure, axes: Axes) -> None:
+    followed = {line.get_label() for line in axes.get_lines() if line.get_linestyle() != "None"}
+    axes.plot([], [], label="start of the hand", **START)
+    for target in (TARGET, GOALS):
+        # One that is held is a mark itself.
+        if target in followed:
+            axes.plot([], [], "x", color=style.BLACK, markersize=5, label=f"start of the {target}")
+    style.legend_below(figure, [axes], 4)
+
+
+def _error_label(name: str, record: Record) -> str:
+    settle = style.settle_time(record)
+    rms = hand_error(record, settle)["hand_error_rms_m"]
+    return name if rms is None or not np.isfinite(rms) else f"{name}: rms {MILLI * rms:.3g} mm from {settle:g} s on"
+
+
+def _mark_settle(panels: Sequence[Axes], record: Record) -> None:
+    """A line in every panel; the legend of the first names it, as a label beside it would lie on the curves."""
+    settle = style.settle_time(record)
+    if max(0.0, record.time[0]) < settle < min(float(record.time[-1]), panels[0].get_xlim()[1]):
+        for axes in panels:
+            label = f"settled from {settle:g} s on" if axes is panels[0] else None
+            axes.axvline(settle, color=style.GREY, linestyle=":", linewidth=1.0, label=label)

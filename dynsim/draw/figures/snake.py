@@ -40,7 +40,7 @@ from dynsim.draw.figures.snake_view import (
     turns,
 )
 from dynsim.record import Record
-from dynsim.snake.geometry import snake_geometry
+from dynsim.snake.lifting import snake_geometry
 from dynsim.snake.published import used_limit
 
 # Numbers of postures: of an animation, in a row, and over each other in one picture.

@@ -14,14 +14,13 @@ from matplotlib.patches import Patch, Polygon
 from numpy.typing import NDArray
 
 from dynsim.draw.figures import style
-from dynsim.draw.figures.skeleton import SidePlane
+from dynsim.draw.figures.posture import SidePlane
 from dynsim.draw.figures.style import Array
-from dynsim.draw.geometry.shapes import corners_of, outline
-from dynsim.draw.geometry.wheels import wheel_groups
+from dynsim.draw.geometry.shapes import corners_of, outline, wheel_groups
 from dynsim.errors import RecordError
 from dynsim.record import Record
 from dynsim.record.poses import POSITION
-from dynsim.snake.geometry import snake_geometry
+from dynsim.snake.lifting import snake_geometry
 
 BODY, HEAD, GROUND, LIFT, TARGET, SUPPORT = "#444444", style.PULLING, style.BLUE, "#FFFFFF", style.GREEN, style.SKY
 OBJECT = "#E9CFA6"

@@ -28,7 +28,7 @@ from dynsim.draw.figures.snake_view import (
 )
 from dynsim.draw.figures.style import VARIANT_COLOURS
 from dynsim.record import Record
-from dynsim.snake.geometry import snake_geometry
+from dynsim.snake.lifting import snake_geometry
 from dynsim.snake.published import (
     COORDINATES,
     DOORS,

@@ -6,18 +6,20 @@ of their centres, which suffices for faces that are small compared with their di
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal
 
+import matplotlib
 import numpy as np
 from matplotlib.path import Path as Outline
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
-from PIL import Image, ImageColor, ImageDraw
+from PIL import Image, ImageColor, ImageDraw, ImageFont
 
 from dynsim.draw.figures.style import BLACK, BLUE, DEEP, GREEN, GREY, ORANGE, PULLING, SKY
-from dynsim.draw.film.strokes import Box, arrow, dashes, font, labels, line, ring
-from dynsim.draw.geometry.camera import Camera
 from dynsim.draw.geometry.meshes import Meshes, simplified
 from dynsim.draw.geometry.robot import (
     DrawnContact,
@@ -29,13 +31,167 @@ from dynsim.draw.geometry.robot import (
     paths,
     penetrations,
 )
-from dynsim.draw.geometry.shapes import body_shapes, drawn_shape, drawn_surface, grid_faces, gripper, outline, solid
-from dynsim.draw.geometry.surfaces import round_patch, surface_grids
-from dynsim.draw.geometry.wheels import cop_of, supports, wheel_groups
+from dynsim.draw.geometry.shapes import (
+    body_shapes,
+    cop_of,
+    drawn_shape,
+    drawn_surface,
+    grid_faces,
+    gripper,
+    outline,
+    round_patch,
+    solid,
+    supports,
+    surface_grids,
+    wheel_groups,
+)
 from dynsim.record.measures import GRIPPER_STATES
 from dynsim.record.poses import ORIENTATION, POSITION
 from dynsim.record.quaternion import rotated
 from dynsim.record.scene import HERE, WORLD, SceneSurface
+
+# Lines, dashes, arrows, rings and labels drawn on an image, in pixels; the font of films.
+
+
+Box = tuple[float, float, float, float]
+
+
+@cache
+def font(size: int) -> ImageFont.FreeTypeFont:
+    """The font that matplotlib brings, so that films look the same everywhere."""
+    return ImageFont.truetype(Path(matplotlib.get_data_path(), "fonts", "ttf", "DejaVuSans.ttf"), size)
+
+
+def line(draw: ImageDraw.ImageDraw, points: Array, colour: tuple[int, ...], width: int) -> None:
+    """A path through points, (n, 2) [pixel]."""
+    if len(points) > 1:
+        draw.line(points.ravel().tolist(), fill=colour, width=width, joint="curve")
+
+
+def dashes(draw: ImageDraw.ImageDraw, points: Array, length: float, colour: str, width: int) -> None:
+    """A path as dashes that are as long as their gaps [pixel]."""
+    if len(points) < 2:
+        return
+    distance = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    for start in np.arange(0.0, distance[-1], 2.0 * length):
+        ends = np.linspace(start, min(start + length, distance[-1]), 5)
+        dash = np.stack([np.interp(ends, distance, points[:, k]) for k in (0, 1)], axis=1)
+        draw.line(dash.ravel().tolist(), fill=colour, width=width)
+
+
+def arrow(draw: ImageDraw.ImageDraw, tail: Array, head: Array, colour: str, width: int) -> None:
+    """From tail to head [pixel], its head filled."""
+    along = head - tail
+    size = float(np.linalg.norm(along))
+    if size < 1e-6:
+        return
+    along = along / size
+    across = np.array([-along[1], along[0]])
+    long = min(3.4 * width, size)
+    neck = head - long * along
+    draw.line([*tail.tolist(), *neck.tolist()], fill=colour, width=width)
+    corners: Sequence[Array] = (head, neck + 0.45 * long * across, neck - 0.45 * long * across)
+    draw.polygon([tuple(corner.tolist()) for corner in corners], fill=colour)
+
+
+def ring(draw: ImageDraw.ImageDraw, x: float, y: float, radius: float, colour: str, width: int) -> None:
+    """A circle about a dot [pixel]."""
+    draw.circle((x, y), radius, outline=colour, width=width)
+    draw.circle((x, y), 2, fill=colour)
+
+
+def labels(
+    draw: ImageDraw.ImageDraw,
+    texts: Sequence[tuple[str, Array, str]],
+    face: ImageFont.FreeTypeFont,
+    size: tuple[int, int],
+    paper: str,
+) -> list[Box]:
+    """Texts above their places, on paper of their own: over what is there, within the picture, beside each other.
+
+    Parameters
+    ----------
+    texts : text, middle of its lower edge (2,), colour
+    size : of the picture
+
+    Returns
+    -------
+    list
+        Where they are: left, top, right, bottom.
+    """
+    edge = 0.2 * face.size
+    boxes: list[Box] = []
+    for text, anchor, colour in texts:
+        width, height = draw.textlength(text, font=face) + 2.0 * edge, 1.1 * face.size
+        x = min(max(float(anchor[0]) - 0.5 * width, 0.0), size[0] - width)
+        y = min(max(float(anchor[1]) - height, 0.0), size[1] - height)
+        for _ in texts:
+            # Above what it would hide.
+            hidden = [box for box in boxes if x < box[2] and box[0] < x + width and y < box[3] and box[1] < y + height]
+            if not hidden:
+                break
+            y = min(box[1] for box in hidden) - height
+        boxes.append((x, y, x + width, y + height))
+        draw.rounded_rectangle(boxes[-1], radius=edge, fill=paper)
+        draw.text((x + 0.5 * width, y + 0.5 * height), text, fill=colour, font=face, anchor="mm")
+    return boxes
+
+
+# The camera of a film: a parallel projection, so that the scale does not depend on the distance; named views.
+
+
+View = Literal["side", "top", "iso"]
+# Directions from the robot to the camera, in axes whose x is the robot's longest horizontal extent.
+FROM: dict[str, tuple[float, float, float]] = {
+    "side": (0.0, -1.0, 0.0),
+    "top": (0.0, 0.0, 1.0),
+    "iso": (-0.5, -1.0, 0.55),
+}
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A parallel projection: p = scale · (right, −up) · (r − centre) + middle.
+
+    Attributes
+    ----------
+    axes : (3, 3) unit vectors in the world: right, up and towards the viewer
+    centre : (3,) the point r that is shown in the middle [m]
+    scale : [pixel/m]
+    middle : (2,) of the picture [pixel]; y is down
+    """
+
+    axes: Array
+    centre: Array
+    scale: float
+    middle: Array
+
+    @classmethod
+    def fitted(cls, axes: Array, low: Array, high: Array, area: tuple[float, float, float, float]) -> Camera:
+        """See a box along the axes of a view from ``low`` to ``high`` in an area (left, top, right, bottom) [pixel]."""
+        left, top, right, bottom = area
+        size = np.maximum(high - low, 1e-9)
+        scale = float(min((right - left) / size[0], (bottom - top) / size[1]))
+        middle = np.array([0.5 * (left + right), 0.5 * (top + bottom)])
+        return cls(axes, 0.5 * (low + high) @ axes, scale, middle)
+
+    def project(self, points: Array) -> Array:
+        """(…, 3) world [m] → (…, 3): x and y [pixel], and how near to the viewer [m]."""
+        seen = (points - self.centre) @ self.axes.T
+        seen[..., :2] = self.middle + seen[..., :2] * np.array([self.scale, -self.scale])
+        return np.asarray(seen)
+
+
+def view_axes(view: View, azimuth: float) -> Array:
+    """Unit vectors to the right, up and towards the viewer, (3, 3)."""
+    c, s = np.cos(azimuth), np.sin(azimuth)
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    back = np.array(FROM[view])
+    back = turn @ (back / np.linalg.norm(back))
+    right = turn[:, 0] if view == "top" else np.cross([0.0, 0.0, 1.0], back)
+    right = right / np.linalg.norm(right)
+    return np.stack([right, np.cross(back, right), back])
+
 
 Array = NDArray[np.float64]
 FINER = 2

@@ -1,12 +1,10 @@
 """Viewer pages: one HTML file with scene, data and program, for any browser, without a network.
 
-    Record(s) → head and blocks (:mod:`dynsim.draw.page.content`) → text (:mod:`dynsim.draw.page.html`)
+    Record(s) → head and blocks (:mod:`dynsim.draw.page.content`) → text (:mod:`dynsim.draw.page.content`)
 
 It depends on records alone: simulated and measured ones are shown in the same way.
 """
 
-from dynsim.draw.page.content import viewable
-from dynsim.draw.page.html import page, write
-from dynsim.draw.page.inline import Inline
+from dynsim.draw.page.content import Inline, page, viewable, write
 
 __all__ = ["Inline", "page", "viewable", "write"]

@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+import base64
+import gzip
+import html
+import json
 import math
-from collections.abc import Mapping
+import os
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from dynsim._version import __version__
-from dynsim.draw.geometry.camera import view_axes
-from dynsim.draw.geometry.meshes import Meshes, named, simplified
+from dynsim.draw.film.painter import view_axes
+from dynsim.draw.geometry.meshes import Mesh, Meshes, named, simplified
 from dynsim.draw.geometry.robot import (
     POSE_ERROR,
     DrawnRobot,
@@ -24,13 +33,95 @@ from dynsim.draw.geometry.robot import (
     robot_of,
     robots,
 )
-from dynsim.draw.geometry.shapes import body_shapes, drawn_shape, drawn_surface, gripper, thinnest
-from dynsim.draw.geometry.wheels import cop_of, supports, wheel_groups
-from dynsim.draw.page.blocks import Blocks, packed_mesh
+from dynsim.draw.geometry.shapes import (
+    body_shapes,
+    cop_of,
+    drawn_shape,
+    drawn_surface,
+    gripper,
+    supports,
+    thinnest,
+    wheel_groups,
+)
+from dynsim.errors import RecordError
 from dynsim.record import TIME, Record, Signal
 from dynsim.record.measures import GRIPPER_STATES, hand_target
 from dynsim.record.poses import ORIENTATION, POSITION
 from dynsim.record.scene import Scene
+from dynsim.system.files import replacing
+
+# Compression of time series for pages: quantised, differenced, and split into byte planes.
+
+
+# Largest code of a finite value by number of bits; 32 bits are used where half a step of 16 exceeds the allowed error.
+_CODES = {16: 2**16 - 2, 32: 2**32 - 2}
+_TYPES: dict[int, np.dtype[Any]] = {16: np.dtype("<u2"), 32: np.dtype("<u4")}
+
+
+class Blocks:
+    """Collects blocks; the description of a block goes into the head of the page."""
+
+    def __init__(self) -> None:
+        self._parts: list[bytes] = []
+        self._size = 0
+
+    def add(self, columns: ArrayLike, error: float = np.inf) -> dict[str, Any]:
+        """Add columns, (T,) or (T, …), each to half a step of its range in 16 bits, or 32 where ``error`` is less."""
+        data = np.asarray(columns, dtype=np.float64)
+        data = data.reshape(len(data), -1) if len(data) else data.reshape(0, 1)
+        known = np.isfinite(data)
+        low = np.where(known, data, np.inf).min(axis=0, initial=np.inf)
+        high = np.where(known, data, -np.inf).max(axis=0, initial=-np.inf)
+        some = np.isfinite(low)
+        low, span = np.where(some, low, 0.0), np.where(some, high - low, 0.0)
+        bits = 16 if 0.5 * span.max(initial=0.0) / _CODES[16] <= error else 32
+        scale = span / _CODES[bits]
+        with np.errstate(all="ignore"):
+            codes = np.rint((np.where(known, data, low) - low) / np.where(scale > 0.0, scale, 1.0))
+        kind = _TYPES[bits]
+        codes = np.where(known, codes, float(_CODES[bits] + 1)).astype(kind)
+        steps = np.diff(codes.T, axis=1, prepend=np.zeros((codes.shape[1], 1), dtype=kind))
+        planes = np.ascontiguousarray(steps).view(np.uint8).reshape(-1, bits // 8).T
+        content = np.ascontiguousarray(planes).tobytes()
+        self._parts.append(content)
+        start, self._size = self._size, self._size + len(content)
+        header = {"at": start, "rows": len(data), "columns": int(codes.shape[1]), "bits": bits}
+        return header | {"offset": low.tolist(), "scale": scale.tolist()}
+
+    def raw(self, data: NDArray[Any]) -> dict[str, Any]:
+        """Add an array of whole numbers ≥ 0 as it is (a mesh), little endian: in 16 bits, or 32 if one needs them."""
+        bits = 16 if data.max(initial=0) < 2**16 else 32
+        content = data.astype(_TYPES[bits]).tobytes()
+        self._parts.append(content)
+        start, self._size = self._size, self._size + len(content)
+        return {"at": start, "count": int(data.size), "bits": bits}
+
+    def packed(self, head: dict[str, Any]) -> str:
+        """Head and blocks: the length of the head in 4 bytes, its JSON, the blocks; compressed, in base64."""
+        text = json.dumps(head, allow_nan=False, separators=(",", ":"), ensure_ascii=True).encode("ascii")
+        content = len(text).to_bytes(4, "little") + text + b"".join(self._parts)
+        # No time in it: the same record gives the same page.
+        return base64.b64encode(gzip.compress(content, 6, mtime=0)).decode("ascii")
+
+
+def packed_mesh(mesh: Mesh, blocks: Blocks) -> dict[str, Any]:
+    """A mesh as the page reads it: corners in 16 bits within their box, triangles, and the colours of these."""
+    corners, triangles, colours = mesh
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    step = np.where(high > low, (high - low) / 65535.0, 1.0)
+    paint: dict[str, Any] = {}
+    if colours is not None:
+        # −1 for none: numbers that are none are equal to nothing.
+        palette, number = np.unique(np.round(np.nan_to_num(colours, nan=-1.0), 3), axis=0, return_inverse=True)
+        paint["palette"] = [None if row[0] < 0.0 else row.tolist() for row in palette]
+        paint["paint"] = blocks.raw(number.reshape(-1))
+    return paint | {
+        "vertices": blocks.raw(np.rint((corners - low) / step)),
+        "triangles": blocks.raw(triangles),
+        "low": low.tolist(),
+        "step": step.tolist(),
+    }
+
 
 Array = NDArray[np.float64]
 # Most samples of a signal in plots; of longer signals the least and the largest value of each bin are kept.
@@ -43,7 +134,7 @@ _SHOWN = {POSITION, ORIENTATION, "posture"}
 
 
 def packed(records: Mapping[str, Record], *, ghost: bool = False) -> str:
-    """Head and blocks of a page, in base64; see :func:`dynsim.draw.page.html.page`.
+    """Head and blocks of a page, in base64; see :func:`dynsim.draw.page.content.page`.
 
     Raises
     ------
@@ -247,3 +338,110 @@ def _thinned(time: Array, values: NDArray[Any]) -> tuple[Array, Array]:
     kept = np.take_along_axis(bins, order, axis=1).reshape(-1, values.shape[1])
     at = time[:whole].reshape(-1, size)[:, [0, size // 2]].ravel()
     return np.append(at, time[-1]), np.concatenate([kept, values[-1:]])
+
+
+# The HTML text of a viewer page: its scripts and styles, three.js from its package, and the data; writing of pages.
+
+
+SCRIPTS = ("decode", "solids", "marks", "actor", "stage", "plots", "controls", "main")
+"""Files of the page's program, in the order in which they are loaded."""
+_THREE = ("jupyter_threejs_sage", "static/r130/three.min.js")
+
+
+def page(records: Mapping[str, Record], *, ghost: bool = False, scripts: Sequence[str] = (), connect: str = "") -> str:
+    """The page of one record, or of several beside each other.
+
+    Parameters
+    ----------
+    records : by the names that the page shows
+    ghost : several are laid over each other, the first one solid
+    scripts : texts of further programs, which run after the page's own and find it as ``dynsim``
+    connect : the one address that a page of a live drive may connect to; a page of records has none
+
+    Raises
+    ------
+    RecordError
+        There is nothing to be seen: no record with samples and a scene; or three.js is not installed.
+    """
+    data = packed(records, ghost=ghost)
+    titles = (record.title.partition(" / ")[0] for record in records.values())
+    title = next(filter(None, titles), "record")
+    allowed = f"; connect-src {html.escape(connect)}" if connect else ""
+    return _filled({"title": html.escape(title), "data": data, "connect": allowed}, scripts)
+
+
+def write(records: Mapping[str, Record], path: str | os.PathLike[str], *, ghost: bool = False) -> Path:
+    """Write the page of :func:`page` to a file: complete or not at all.
+
+    Raises
+    ------
+    RecordError
+        As :func:`page`, or the file cannot be written.
+    """
+    content = page(records, ghost=ghost).encode("utf-8", errors="replace")
+    with replacing(Path(path)) as stream:
+        stream.write(content)
+    return Path(path)
+
+
+def _filled(values: Mapping[str, str], scripts: Sequence[str]) -> str:
+    own = resources.files("dynsim.draw.page").joinpath("page")
+    style = own.joinpath("style.css").read_text(encoding="utf-8")
+    program = "\n".join(own.joinpath(f"{name}.js").read_text(encoding="utf-8") for name in SCRIPTS)
+    program = "\n".join([program, *scripts])
+    parts = {"style": style, "three": _inline(three()), "program": _inline(program), **values}
+    text = own.joinpath("page.html").read_text(encoding="utf-8")
+    return re.sub(r"<!--\{(\w+)\}-->", lambda match: parts[match[1]], text)
+
+
+def three() -> str:
+    """The text of three.js, with its licence in its first lines.
+
+    Raises
+    ------
+    RecordError
+        The package is not installed.
+    """
+    package, file = _THREE
+    try:
+        return resources.files(package).joinpath(file).read_text(encoding="utf-8")
+    except (ModuleNotFoundError, FileNotFoundError) as error:
+        raise RecordError("to view records in 3D: pip install jupyter-threejs-sage") from error
+
+
+def _inline(program: str) -> str:
+    """As it may stand within a script element."""
+    return re.sub(r"</(script)", r"<\\/\1", program, flags=re.IGNORECASE).replace("<!--", r"<\!--")
+
+
+# A viewer page shown inside a notebook.
+
+
+@dataclass(frozen=True)
+class Inline:
+    """A page that a notebook shows in a frame of its own, ``height`` pixels high; :meth:`save` writes it to a file."""
+
+    page: str
+    height: int = 640
+
+    def _repr_html_(self) -> str:
+        # Scripts run, but not with the rights of the notebook.
+        return (
+            f'<iframe sandbox="allow-scripts allow-downloads" srcdoc="{html.escape(self.page)}" '
+            f'style="width:100%;height:{int(self.height)}px;border:0" title="dynsim"></iframe>'
+        )
+
+    def __repr__(self) -> str:
+        return f"<page of {len(self.page) / 1e6:.2f} MB; save(FILE) writes it>"
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write the page to a file.
+
+        Raises
+        ------
+        RecordError
+            The file cannot be written.
+        """
+        with replacing(Path(path)) as stream:
+            stream.write(self.page.encode("utf-8", errors="replace"))
+        return Path(path)

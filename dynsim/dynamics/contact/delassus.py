@@ -10,6 +10,18 @@ from __future__ import annotations
 import math
 
 from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact import unilateral as ku
+from dynsim.dynamics.contact.cone.program import best_split, split_room_in
+from dynsim.dynamics.contact.rows import SIGNS_LIMIT
+from dynsim.dynamics.contact.unilateral import (
+    UnilateralArrays,
+    holding_bound,
+    note_dry_forces,
+    note_stop_forces,
+    rows_of_couplings,
+)
+from dynsim.dynamics.tables import ContactArrays, ModelArrays, Workspace
+from dynsim.dynamics.tree.articulated import change_accelerations
 from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
 # A pivot below this fraction of the largest entry counts as a dependent row: far above rounding (1e-16 times a few
@@ -302,3 +314,521 @@ def solve_definite(gram, x, size):
         for b in range(a + 1, size):
             x[a] -= gram[a, b] * x[b]
         x[a] /= gram[a, a]
+
+
+# Split of forces among dependent rows of sticking points, held joints and stops, within their bounds if possible.
+
+
+# A unit direction of splits whose part along a normal row is smaller leaves that normal force as it is.
+NORMAL_PART = 1e-6
+# A direction with a smaller square in the leading rows has its other parts alone: of couplings behind closed brakes.
+NO_LEADING = 1e-20
+# Instead of a bound: of stops, which push one way.
+ONE_WAY = -1.0
+
+
+@internal_kernel
+def margin(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace, k):
+    """μ_s f_n − |f_t| of candidate k, which sticks [N]."""
+    r, rows = ws.active[k, ka.FIRST_ROW], ws.rows
+    a, b = rows[r + 1, ka.FORCE], rows[r + 2, ka.FORCE]
+    return unilateral.number[ku.HOLDING] * contacts.law[k, ka.STATIC] * rows[r, ka.FORCE] - math.sqrt(a * a + b * b)
+
+
+@internal_kernel
+def dry_margin(unilateral: UnilateralArrays, ws: Workspace, k):
+    """Margin of dry friction that holds a joint: its bound minus its force [N m or N]."""
+    return holding_bound(unilateral, k) - abs(ws.rows[unilateral.dry_table[k, ku.DRY_ROW], ka.FORCE])
+
+
+@internal_kernel
+def admissible_forces(model: ModelArrays, contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: Workspace):
+    """Replace the forces of dependent rows that stick where they are beyond their bounds; note those of joints.
+
+    The forces change in the null space of the rows: accelerations only change as far as rows are not quite dependent.
+    """
+    if unilateral is None:  # known to the compiler
+        return
+    # Small, because it is merged into the right-hand side.
+    if unilateral.number[ku.REDUNDANT] == 1.0 or unilateral.stop.shape[0] + unilateral.dry.shape[0] > 0:
+        look_at_forces(model, contacts, unilateral, ws)
+
+
+@noinline_kernel
+def look_at_forces(model: ModelArrays, contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace):
+    """:func:`admissible_forces` where there are dependent rows, stops or dry friction."""
+    unilateral.number[ku.SPLIT] = 0.0
+    if unilateral.number[ku.REDUNDANT] == 1.0 and beyond_bounds(contacts, unilateral, ws):
+        split_forces(model, contacts, unilateral, ws)
+    note_stop_forces(unilateral, ws)
+    note_dry_forces(unilateral, ws)
+
+
+@internal_kernel
+def beyond_bounds(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace):
+    """True if a sticking point or a held joint has more force than its friction can have, or a closed stop pulls."""
+    for k in range(ws.contacts.shape[0]):
+        if ws.active[k, ka.MODE] == ka.STICKING and margin(contacts, unilateral, ws, k) < 0.0:
+            return True
+    for k in range(unilateral.dry_table.shape[0]):
+        if unilateral.dry_table[k, ku.DRY_HOLDS] == 1 and dry_margin(unilateral, ws, k) < 0.0:
+            return True
+    for k in range(unilateral.stop_table.shape[0]):
+        closed, r = unilateral.stop_table[k, ku.STOP_CLOSED] == 1, unilateral.stop_table[k, ku.STOP_ROW]
+        if closed and ws.rows[r, ka.FORCE] < 0.0:
+            return True
+    return False
+
+
+@noinline_kernel
+def split_forces(model: ModelArrays, contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace):
+    """The best split of the forces of all that sticks, into FORCE of its rows; its worst margin into BEST_MARGIN.
+
+    Pivots of J M⁻¹ Jᵀ are squares: rows that count as dependent at a pivot of 1e-10 may differ by 1e-5, and a change of
+    split by as much of the forces. Accelerations take this change, so that they agree with the forces.
+    """
+    room, index, mu, rows = unilateral.room, unilateral.index, unilateral.vector[0], ws.rows
+    first, row = index[0], index[1]
+    points, count, p, ties = find_splits(unilateral, ws)
+    for j in range(points):
+        mu[j] = unilateral.number[ku.HOLDING] * contacts.law[ws.active[row[first[j]], ka.OWNER], ka.STATIC]
+    j = points
+    for k in range(unilateral.dry_table.shape[0]):
+        if unilateral.dry_table[k, ku.DRY_HOLDS] == 1:
+            mu[j] = holding_bound(unilateral, k)
+            j += 1
+    for _ in range(count - j):
+        mu[j] = ONE_WAY
+        j += 1
+    force, out = unilateral.vector[1], unilateral.vector[2]
+    for i in range(p):
+        force[i] = rows[row[i], ka.FORCE]
+    width = int(unilateral.number[ku.WIDTH])
+    unilateral.number[ku.SPLIT] = 1.0
+    programs = split_room_in(unilateral.split_room, index[3], width, count)
+    worst = best_split(
+        force[:p], room[ku.NULL_SPACE], width, first, mu, points, count - points, out[:p], programs, True
+    )
+    unilateral.number[ku.BEST_MARGIN] = worst
+    column = ws.column
+    for m in range(column.shape[0]):
+        column[m, 0] = 0.0
+    for i in range(p + ties):
+        change = out[i] - force[i] if i < p else change_of_coupling(room[ku.NULL_SPACE], width, i, force, out, p)
+        rows[row[i], ka.FORCE] = out[i] if i < p else rows[row[i], ka.FORCE] + change
+        for m in range(column.shape[0]):
+            column[m, 0] += change * column[m, 2 + 2 * row[i]]
+    change_accelerations(model, ws)
+
+
+@internal_kernel
+def change_of_coupling(N, width, i, force, out, p):
+    """Change of the force of row i, a coupling, when forces of the leading p rows change from ``force`` to ``out``."""
+    total = 0.0
+    for c in range(width):
+        part = 0.0
+        for j in range(p):
+            part += N[j, c] * (out[j] - force[j])
+        total += N[i, c] * part
+    return total
+
+
+@internal_kernel
+def find_splits(unilateral: UnilateralArrays, ws: Workspace):
+    """Directions in which the forces of all that sticks may change, into NULL_SPACE, right after ``derivative``.
+
+    index[0] is the first row of each sticking point, then of each held joint, then of each closed stop, and index[1]
+    the rows in the table, with those of couplings behind them: their forces change with the others, within no bound.
+
+    Returns
+    -------
+    points, count, p, ties : sticking points; points, held joints and stops; their rows; rows of couplings
+    """
+    room, first, row = unilateral.room, unilateral.index[0], unilateral.index[1]
+    count, p = 0, 0
+    for k in range(ws.contacts.shape[0]):
+        if ws.active[k, ka.MODE] == ka.STICKING:
+            first[count] = p
+            for s in range(3):
+                row[p] = ws.active[k, ka.FIRST_ROW] + s
+                p += 1
+            count += 1
+    points = count
+    for k in range(unilateral.dry_table.shape[0]):
+        if unilateral.dry_table[k, ku.DRY_HOLDS] == 1:
+            first[count], row[p] = p, unilateral.dry_table[k, ku.DRY_ROW]
+            p += 1
+            count += 1
+    for k in range(unilateral.stop_table.shape[0]):
+        if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
+            first[count], row[p] = p, unilateral.stop_table[k, ku.STOP_ROW]
+            p += 1
+            count += 1
+    ties = rows_of_couplings(unilateral, ws)
+    for r in range(ties):
+        row[p + r] = r
+    size = p + ties
+    for i in range(size):
+        for j in range(size):
+            room[ku.SPLIT_MATRIX, i, j] = ws.small[0, row[i], row[j]]
+    unilateral.number[ku.WIDTH] = null_space(room[ku.SPLIT_MATRIX], size, room[ku.NULL_SPACE], unilateral.index[2], p)
+    unilateral.number[ku.SPLIT_ROWS] = p
+    return points, count, p, ties
+
+
+@internal_kernel
+def first_split_row(ws: Workspace, k):
+    """First row of candidate k, which sticks, in the splits found last."""
+    row = 0
+    for j in range(k):
+        row += ka.MOST_ROWS if ws.active[j, ka.MODE] == ka.STICKING else 0
+    return row
+
+
+@internal_kernel
+def normal_is_open(unilateral: UnilateralArrays, ws: Workspace, k):
+    """True if the splits found last leave the normal force of candidate k, which sticks, undetermined."""
+    return row_shares(unilateral, first_split_row(ws, k))
+
+
+@internal_kernel
+def point_shares(unilateral: UnilateralArrays, ws: Workspace, k):
+    """True if the splits found last leave a force of candidate k, which sticks, undetermined."""
+    row = first_split_row(ws, k)
+    return row_shares(unilateral, row) or row_shares(unilateral, row + 1) or row_shares(unilateral, row + 2)
+
+
+@internal_kernel
+def joint_shares(unilateral: UnilateralArrays, ws: Workspace, k):
+    """True if the splits found last leave the dry friction that holds joint k undetermined."""
+    row = ka.MOST_ROWS * ws.counts[ka.STUCK]
+    for j in range(k):
+        row += unilateral.dry_table[j, ku.DRY_HOLDS]
+    return row_shares(unilateral, row)
+
+
+@internal_kernel
+def row_shares(unilateral: UnilateralArrays, row):
+    """True if the splits found last leave the force of one of their rows undetermined."""
+    largest = 0.0
+    for c in range(int(unilateral.number[ku.WIDTH])):
+        largest = max(largest, abs(unilateral.room[ku.NULL_SPACE, row, c]))
+    return largest > NORMAL_PART
+
+
+@internal_kernel
+def stops_that_share(unilateral: UnilateralArrays):
+    """Number of closed stops whose forces the splits found last leave undetermined."""
+    sharing, closed = 0, 0
+    for k in range(unilateral.stop_table.shape[0]):
+        closed += unilateral.stop_table[k, ku.STOP_CLOSED]
+    size = int(unilateral.number[ku.SPLIT_ROWS])
+    for i in range(size - closed, size):
+        sharing += 1 if row_shares(unilateral, i) else 0
+    return sharing
+
+
+@internal_kernel
+def null_space(W, p, N, order, leading):
+    """Basis of the null space of W, (p, p), symmetric and positive semidefinite, into N, (p, width).
+
+    It is orthonormal in its ``leading`` rows.
+
+    Cholesky with pivoting, Π W Πᵀ = [L1; L2] [L1; L2]ᵀ; the columns (−L1⁻ᵀ L2ᵀ; 1), orthonormalised. W is overwritten.
+
+    Returns
+    -------
+    width : p minus the rank, less what changes nothing in the leading rows
+    """
+    largest, rank = 0.0, 0
+    for i in range(p):
+        order[i] = i
+        largest = max(largest, W[i, i])
+    while rank < p:
+        best = rank
+        for i in range(rank + 1, p):
+            if W[order[i], order[i]] > W[order[best], order[best]]:
+                best = i
+        if not W[order[best], order[best]] > RANK_TOLERANCE * largest:
+            break
+        order[rank], order[best] = order[best], order[rank]
+        a = order[rank]
+        pivot = math.sqrt(W[a, a])
+        W[a, a] = pivot
+        for i in range(rank + 1, p):
+            W[order[i], a] /= pivot
+        for i in range(rank + 1, p):
+            for j in range(rank + 1, p):
+                W[order[i], order[j]] -= W[order[i], a] * W[order[j], a]
+        rank += 1
+    width = 0
+    for free in order[rank:p]:
+        for i in range(p):
+            N[i, width] = 0.0
+        N[free, width] = 1.0
+        for k in range(rank - 1, -1, -1):
+            total = -W[free, order[k]]
+            for i in range(k + 1, rank):
+                total -= W[order[i], order[k]] * N[order[i], width]
+            N[order[k], width] = total / W[order[k], order[k]]
+        # Twice is enough (Kahan, Parlett).
+        for _ in range(2):
+            for b in range(width):
+                part = 0.0
+                for i in range(leading):
+                    part += N[i, b] * N[i, width]
+                for i in range(p):
+                    N[i, width] -= part * N[i, b]
+        size = 0.0
+        for i in range(leading):
+            size += N[i, width] * N[i, width]
+        if size > NO_LEADING:
+            for i in range(p):
+                N[i, width] /= math.sqrt(size)
+            width += 1
+    return width
+
+
+# Test whether the contacts determine their forces: determinant and diagonal of J M⁻¹ F.
+
+
+UNIQUE, REVERSED, SEVERAL = 0, 1, 2
+
+# Blocks of the scratch ``room``, (ROOM, p, p); of SIGNS and FORCES only the first row is used.
+FRICTIONLESS, FRICTION, BASIS, MATRIX, PRODUCT, SIGNS, FORCES = 0, 1, 2, 3, 4, 5, 6
+ROOM = 7
+# A determinant above this fraction of the bound by its terms is clearly positive.
+CLEAR = 1e-3
+# A normal mobility below this fraction of that along the force is the square of rounding.
+IMMOBILE = 1e-24
+# Rounding: below these fractions a diagonal entry or a force has no sign, and two solutions are the same one.
+DIAGONAL_TOLERANCE = 1e-12
+FORCE_TOLERANCE = 1e-9
+
+
+@internal_kernel
+def clearly_unique(ws: Workspace):
+    """True for no row, and for one or two without dissipative friction whose determinant is positive by far.
+
+    Small, because it is merged into the step: passing the tables to the rest of the watch costs as much as a sweep.
+    """
+    small, p = ws.small, ws.counts[ka.ROWS]
+    if p == 0 or p > 2:
+        return p == 0
+    for k in range(p):
+        if ws.active[k, ka.LAW] == ka.FRICTION_DISSIPATIVE or not small[0, k, k] > 0.0:
+            return False
+    if p == 1:
+        return True
+    straight, crossed = small[0, 0, 0] * small[0, 1, 1], small[0, 0, 1] * small[0, 1, 0]
+    return straight - crossed > CLEAR * (straight + abs(crossed))
+
+
+@internal_kernel
+def dominant(ws: Workspace, room):
+    """True without friction, and when every A(σ) is strictly diagonally dominant, so that none of them is singular."""
+    small, p = ws.small, ws.counts[ka.ROWS]
+    frictional = False
+    for k in range(p):
+        frictional = frictional or ws.rows[k, ka.ROW_MU] > 0.0
+    if not frictional:
+        return True
+    for k in range(p):
+        if not small[0, k, k] > 0.0:
+            return False
+    split_matrix(ws, room)
+    for k in range(p):
+        others = 0.0
+        for m in range(p):
+            others += abs(room[FRICTION, k, m])
+            if m != k:
+                others += abs(room[FRICTIONLESS, k, m])
+        if not room[FRICTIONLESS, k, k] > others:
+            return False
+    return True
+
+
+@internal_kernel
+def last_link(ws: Workspace, k):
+    """The last link that row k touches."""
+    return max(ws.active[k, ka.BODY_A], ws.active[k, ka.BODY_B])
+
+
+@internal_kernel
+def split_matrix(ws: Workspace, room):
+    """A0 and B into ``room``, from the eliminated rows and the matrix that the derivative has left in ``ws``.
+
+    A row's column is zero beyond its own links, and links come after their parents.
+    """
+    active, column, links, state = ws.active, ws.column, ws.links, ws.rows
+    p = ws.counts[ka.ROWS]
+    for k in range(p):
+        for m in range(k + 1):
+            total = 0.0
+            for i in range(min(last_link(ws, k), last_link(ws, m)) + 1):
+                total += column[i, 1 + 2 * k] * column[i, 1 + 2 * m] * links[i, ka.INVERSE_D]
+            room[FRICTIONLESS, k, m] = total
+            room[FRICTIONLESS, m, k] = total
+    for k in range(p):
+        for m in range(p):
+            sign = state[m, ka.SIGN] if active[m, ka.LAW] == ka.FRICTION_DISSIPATIVE else 1.0
+            room[FRICTION, k, m] = sign * (room[FRICTIONLESS, k, m] - ws.small[0, k, m])
+
+
+@internal_kernel
+def force_verdict(ws: Workspace, room, since, t):
+    """UNIQUE, or why the constraint forces at the state of ``ws`` are not determined, right after ``derivative``.
+
+    REVERSED: the determinant of J M⁻¹ F with the present signs, per that without friction, is not positive, or every
+    diagonal entry is negative. SEVERAL: other signs of dissipative contacts agree with their forces too.
+
+    Parameters
+    ----------
+    room : (ROOM, p, p) scratch, or more
+    since : (c,) first time at which the contact's diagonal entry was negative [s], written here; inf: never
+    """
+    if dominant(ws, room):
+        return UNIQUE
+    split_matrix(ws, room)
+    drop_immobile(ws, room)
+    p = ws.counts[ka.ROWS]
+    rank = frictionless_basis(room, p)
+    negative, free = 0, 0
+    for k in range(p):
+        own = room[FRICTIONLESS, k, k]
+        if own > 0.0 and ws.small[0, k, k] < -DIAGONAL_TOLERANCE * own:
+            negative += 1
+            # Only a frictional row can have it: that of a sliding point.
+            owner = ws.active[k, ka.OWNER]
+            since[owner] = min(since[owner], t)
+        if ws.rows[k, ka.ROW_MU] > 0.0 and ws.active[k, ka.LAW] == ka.FRICTION_DISSIPATIVE:
+            free += 1
+    reverse, doubtful, several = negative == p, negative == p, False
+    for choice in range(1 << free if free <= SIGNS_LIMIT else free + 1):
+        index = 0
+        for k in range(p):
+            sign = 1.0
+            if ws.active[k, ka.LAW] == ka.FRICTION_DISSIPATIVE:
+                sign = ws.rows[k, ka.SIGN]
+                if ws.rows[k, ka.ROW_MU] > 0.0:
+                    turned = (choice >> index) & 1 == 1 if free <= SIGNS_LIMIT else choice == index + 1
+                    sign = -sign if turned else sign
+                    index += 1
+            room[SIGNS, 0, k] = sign
+        determinant = solve_choice(ws, room, rank)
+        if determinant <= 0.0:
+            doubtful = True
+            reverse = reverse or choice == 0
+        if choice > 0 and determinant != 0.0 and rank == p and another_solution(ws, room):
+            several = True
+    if doubtful and several:
+        return SEVERAL
+    return REVERSED if reverse else UNIQUE
+
+
+@internal_kernel
+def drop_immobile(ws: Workspace, room):
+    """Zero the rows of points that no joint moves along their normals: what is left there is rounding, of any sign."""
+    p = ws.counts[ka.ROWS]
+    for k in range(p):
+        along = 0.0
+        for i in range(last_link(ws, k) + 1):
+            along += ws.column[i, 2 + 2 * k] * ws.column[i, 2 + 2 * k] * ws.links[i, ka.INVERSE_D]
+        if room[FRICTIONLESS, k, k] <= max(IMMOBILE * along, ws.rows[k, ka.ROW_FLOOR]):
+            for m in range(p):
+                room[FRICTIONLESS, k, m], room[FRICTIONLESS, m, k], room[FRICTION, k, m] = 0.0, 0.0, 0.0
+
+
+@internal_kernel
+def frictionless_basis(room, p):
+    """A0 = L Lᵀ by Cholesky with pivoting: L, (p, rank), into ``room[BASIS]``; returns the rank."""
+    largest = 0.0
+    for k in range(p):
+        room[FORCES, 0, k] = room[FRICTIONLESS, k, k]
+        largest = max(largest, room[FRICTIONLESS, k, k])
+    for rank in range(p):
+        best = 0
+        for k in range(1, p):
+            if room[FORCES, 0, k] > room[FORCES, 0, best]:
+                best = k
+        if room[FORCES, 0, best] <= RANK_TOLERANCE * largest:
+            return rank
+        inverse = 1.0 / math.sqrt(room[FORCES, 0, best])
+        for k in range(p):
+            total = room[FRICTIONLESS, k, best]
+            for s in range(rank):
+                total -= room[BASIS, k, s] * room[BASIS, best, s]
+            room[BASIS, k, rank] = total * inverse
+        for k in range(p):
+            room[FORCES, 0, k] -= room[BASIS, k, rank] * room[BASIS, k, rank]
+    return p
+
+
+@internal_kernel
+def solve_choice(ws: Workspace, room, rank):
+    """Sign of the determinant of A(σ) for the signs in ``room``; the forces into ``room[FORCES, 0]`` at full rank.
+
+    Dependent rows: of Lᵀ A(σ) L, the forces that supports of equal stiffness have, which lie in the range of A0.
+    """
+    p = ws.counts[ka.ROWS]
+    target = MATRIX if rank == p else PRODUCT
+    for k in range(p):
+        room[FORCES, 0, k] = ws.rows[k, ka.RHS]
+        for m in range(p):
+            room[target, k, m] = room[FRICTIONLESS, k, m] - room[FRICTION, k, m] * room[SIGNS, 0, m]
+    if rank < p:
+        for r in range(rank):
+            for s in range(rank):
+                total = 0.0
+                for k in range(p):
+                    for m in range(p):
+                        total += room[BASIS, k, r] * room[PRODUCT, k, m] * room[BASIS, m, s]
+                room[MATRIX, r, s] = total
+    return eliminate_square(room, rank)
+
+
+@internal_kernel
+def eliminate_square(room, size):
+    """Solve the leading ``size`` rows of ``room[MATRIX]`` x = ``room[FORCES, 0]``; returns the determinant's sign."""
+    matrix, x, sign = room[MATRIX], room[FORCES, 0], 1.0
+    for k in range(size):
+        best = k
+        for i in range(k + 1, size):
+            if abs(matrix[i, k]) > abs(matrix[best, k]):
+                best = i
+        pivot = matrix[best, k]
+        if not abs(pivot) > 0.0:
+            return 0.0
+        if best != k:
+            sign = -sign
+            x[k], x[best] = x[best], x[k]
+            for j in range(k, size):
+                matrix[k, j], matrix[best, j] = matrix[best, j], matrix[k, j]
+        sign = sign if pivot > 0.0 else -sign
+        for i in range(k + 1, size):
+            factor = matrix[i, k] / pivot
+            for j in range(k + 1, size):
+                matrix[i, j] -= factor * matrix[k, j]
+            x[i] -= factor * x[k]
+    for i in range(size - 1, -1, -1):
+        for j in range(i + 1, size):
+            x[i] -= matrix[i, j] * x[j]
+        x[i] /= matrix[i, i]
+    return sign
+
+
+@internal_kernel
+def another_solution(ws: Workspace, room):
+    """True when the forces in ``room`` have the signs that they were solved for and differ from those of ``ws``."""
+    largest, difference, p = 0.0, 0.0, ws.counts[ka.ROWS]
+    for k in range(p):
+        force = room[FORCES, 0, k]
+        largest = max(largest, abs(force), abs(ws.rows[k, ka.FORCE]))
+        difference = max(difference, abs(force - ws.rows[k, ka.FORCE]))
+    if not difference > FORCE_TOLERANCE * largest:
+        return False
+    for k in range(p):
+        free = ws.active[k, ka.LAW] == ka.FRICTION_DISSIPATIVE
+        if free and room[FORCES, 0, k] * room[SIGNS, 0, k] < -FORCE_TOLERANCE * largest:
+            return False
+    return True

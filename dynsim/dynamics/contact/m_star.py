@@ -5,7 +5,7 @@ from __future__ import annotations
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact.shares import solve_rows
 from dynsim.dynamics.contact.unilateral import UnilateralArrays
-from dynsim.dynamics.drive.dc import dc_balance
+from dynsim.dynamics.drive.law import dc_balance
 from dynsim.dynamics.tables import DriveArrays, ModelArrays, Workspace
 from dynsim.dynamics.tree.sweep import mass_matrix, newton_euler
 from dynsim.jit.kernel import internal_kernel

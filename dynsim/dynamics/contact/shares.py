@@ -15,8 +15,7 @@ from __future__ import annotations
 
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
-from dynsim.dynamics.contact.delassus import solve_dependent, solve_small
-from dynsim.dynamics.contact.splits import find_splits
+from dynsim.dynamics.contact.delassus import find_splits, solve_dependent, solve_small
 from dynsim.dynamics.contact.unilateral import UnilateralArrays
 from dynsim.dynamics.tables import Workspace
 from dynsim.jit.kernel import internal_kernel, noinline_kernel

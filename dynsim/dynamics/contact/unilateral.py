@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dynsim.dynamics import tables as ka
-from dynsim.dynamics.contact.cone import problem as kc
+from dynsim.dynamics.contact.cone import steps as kc
 from dynsim.dynamics.tables import ContactArrays, Workspace
 from dynsim.jit.kernel import internal_kernel
 
@@ -151,7 +151,7 @@ class UnilateralArrays(NamedTuple):
     stop: np.ndarray  # (s, STOP_SIZE)
     dry_table: np.ndarray  # (d, DRY_TABLE_SIZE) int
     dry: np.ndarray  # (d, DRY_SIZE)
-    tie_table: np.ndarray  # (e, TIE_TABLE_SIZE) int, of time stepping alone: see dynsim.integrators.stepping.compliance
+    tie_table: np.ndarray  # (e, TIE_TABLE_SIZE) int, of time stepping alone: see dynsim.integrators.stepping.contacts
     tie: np.ndarray  # (e, TIE_SIZE)
     index: np.ndarray  # (INDICES, p or c + 2) int
     vector: np.ndarray  # (VECTORS, p)
@@ -168,7 +168,7 @@ def share_count(couplings: int, contacts: int, stops: int, joints: int) -> int:
 
 
 def kept_size(shares: int, contacts: int, stops: int, joints: int) -> int:
-    """Length of ``kept``, see :mod:`dynsim.integrators.contacts.attempts`."""
+    """Length of ``kept``, see :mod:`dynsim.integrators.contacts.impacts`."""
     candidate, stop, joint = SLIDE_SIZE + MODE_SIZE + TALLY_SIZE, STOP_TABLE_SIZE + STOP_SIZE, DRY_TABLE_SIZE + DRY_SIZE
     return contacts * candidate + stops * stop + joints * joint + NUMBERS + shares
 

@@ -7,22 +7,160 @@ function below that looks at the kind, and one in ``dynsim.compile.tables.compil
 from __future__ import annotations
 
 from dynsim.dynamics import tables as ka
-from dynsim.dynamics.drive.dc import at_current_limit, dc_balance, dc_block, dc_command, dc_torque, within_current
-from dynsim.dynamics.drive.limit import clipped
-from dynsim.dynamics.drive.servo import (
-    servo_block,
-    servo_block_on,
-    servo_circuit,
-    servo_circuit_on,
-    servo_command,
-    servo_drag,
-    servo_segment,
-    servo_torque,
-)
-from dynsim.dynamics.drive.torque import open_torque
 from dynsim.dynamics.state import StateLayout
 from dynsim.dynamics.tables import DriveArrays, ReferenceArrays, Workspace
 from dynsim.jit.kernel import inline_kernel, internal_kernel, kernel, noinline_kernel
+
+# Clamping of a value to ±limit, for every kind of drive.
+
+
+def clipped(x, limit):
+    """Value x clamped to ±limit, by its real part; NaN stays NaN."""
+    if x.real > limit:
+        return limit
+    if x.real < -limit:
+        return -limit
+    return x
+
+
+# A DC motor with its circuit, and the voltage PD on its terminals ([WM] eqs 16–26, 56).
+
+
+def dc_command(motor, a, q_ref, v_ref, q, v):
+    """u = k_p (q_d − q) + k_d (v_d − v) [V], before its limit ([WM] eq 56)."""
+    return motor[a, ka.K_P] * (q_ref - q) + motor[a, ka.K_D] * (v_ref - v)
+
+
+def within_current(u, v, k_m, drop):
+    """The voltage u, clipped so that it drives no more current than the limit [V]; may exceed the voltage limit.
+
+    drop : R I of the limit [V]
+    """
+    back = k_m * v
+    return back + clipped(u - back, drop)
+
+
+def dc_torque(motor, a, i):
+    """K_m i [N m] ([WM] eq 19); the losses of rotor and gear belong to the joint."""
+    return motor[a, ka.K_M] * i
+
+
+def dc_balance(motor, a, u, v, i):
+    """L di/dt = u − R i − K_m v [V] ([WM] eqs 24, 26)."""
+    return u - motor[a, ka.RESISTANCE] * i - motor[a, ka.K_M] * v
+
+
+def dc_block(motor, a, follows):
+    """∂τ/∂(q, v, i) and ∂(di/dt)/∂(q, v, i); ``follows`` is 1 where the voltage follows the state, else 0."""
+    inductance = motor[a, ka.INDUCTANCE]
+    return (
+        0.0,
+        0.0,
+        motor[a, ka.K_M],
+        -follows * motor[a, ka.K_P] / inductance,
+        -(follows * motor[a, ka.K_D] + motor[a, ka.K_M]) / inductance,
+        -motor[a, ka.RESISTANCE] / inductance,
+    )
+
+
+def at_current_limit(motor, a, u, v):
+    """Whether the voltage that is left by :func:`within_current` is that of the limit."""
+    drop = motor[a, ka.RESISTANCE] * motor[a, ka.I_MAX]
+    return abs(u - motor[a, ka.K_M] * v) >= drop * (1.0 - 1e-12)
+
+
+# A position servo: voltage loop, motor without inductance, limits of voltage and current, friction of the gear.
+
+
+def servo_command(motor, a, mode, q_ref, v_ref, q, v):
+    """The voltage that the loop asks for [V], before its limit."""
+    if mode == ka.VELOCITY_MODE:
+        return motor[a, ka.K_V] * (v_ref - v) + motor[a, ka.K_M] * v
+    return motor[a, ka.K_P] * (q_ref - q) + motor[a, ka.K_D] * (v_ref - v)
+
+
+def servo_segment(motor, a, mode, command, v):
+    """Which limit holds at a command and a rate: 0 none, ±1 that of the voltage, ±2 that of the current."""
+    if mode == ka.OFF:
+        return 0
+    u = clipped(command, motor[a, ka.U_MAX])
+    wanted = (u - motor[a, ka.K_M] * v) / motor[a, ka.RESISTANCE]
+    if wanted.real > motor[a, ka.I_MAX]:
+        return 2
+    if wanted.real < -motor[a, ka.I_MAX]:
+        return -2
+    if command.real > motor[a, ka.U_MAX]:
+        return 1
+    return -1 if command.real < -motor[a, ka.U_MAX] else 0
+
+
+def servo_circuit_on(motor, a, mode, segment, command, v):
+    """:func:`servo_circuit` with this limit holding, as :func:`servo_segment` tells it, whatever the state says."""
+    if mode == ka.OFF:
+        return motor[a, ka.K_M] * v, 0.0 * v
+    if segment == 2 or segment == -2:
+        i = motor[a, ka.I_MAX] if segment > 0 else -motor[a, ka.I_MAX]
+        return motor[a, ka.RESISTANCE] * i + motor[a, ka.K_M] * v, i
+    u = command if segment == 0 else motor[a, ka.U_MAX] if segment > 0 else -motor[a, ka.U_MAX]
+    return u, (u - motor[a, ka.K_M] * v) / motor[a, ka.RESISTANCE]
+
+
+def servo_circuit(motor, a, mode, command, v):
+    """Terminal voltage u [V] and current i [A] of a command, both within their limits."""
+    if mode == ka.OFF:
+        return motor[a, ka.K_M] * v, 0.0 * v
+    u = clipped(command, motor[a, ka.U_MAX])
+    wanted = (u - motor[a, ka.K_M] * v) / motor[a, ka.RESISTANCE]
+    i = clipped(wanted, motor[a, ka.I_MAX])
+    if i != wanted:
+        u = motor[a, ka.RESISTANCE] * i + motor[a, ka.K_M] * v
+    return u, i
+
+
+def servo_drag(motor, a, mode, v):
+    """Friction of the gear against v [N m]: Coulomb's, smoothed below v_s; while off a viscous one comes with it."""
+    drag = motor[a, ka.COULOMB] * v / (v * v + motor[a, ka.COULOMB_SPEED] ** 2) ** 0.5
+    if mode == ka.OFF:
+        drag += motor[a, ka.FREE_DRAG] * v
+    return drag
+
+
+def servo_torque(motor, a, mode, command, v):
+    """K_m i − drag [N m] of a command."""
+    _, i = servo_circuit(motor, a, mode, command, v)
+    return motor[a, ka.K_M] * i - servo_drag(motor, a, mode, v)
+
+
+def servo_block_on(motor, a, mode, segment, sampled, v):
+    """∂τ/∂(q, v) with this limit holding; a command that is ``sampled`` does not follow the state."""
+    smoothing = motor[a, ka.COULOMB_SPEED] ** 2
+    by_q, by_v = 0.0, -motor[a, ka.COULOMB] * smoothing / (v * v + smoothing) ** 1.5
+    if mode == ka.OFF:
+        return by_q, by_v - motor[a, ka.FREE_DRAG]
+    if -2 < segment < 2:
+        slope = motor[a, ka.K_M] / motor[a, ka.RESISTANCE]
+        by_v -= slope * motor[a, ka.K_M]
+        if not sampled and segment == 0:
+            if mode == ka.VELOCITY_MODE:
+                by_v += slope * (motor[a, ka.K_M] - motor[a, ka.K_V])
+            else:
+                by_q -= slope * motor[a, ka.K_P]
+                by_v -= slope * motor[a, ka.K_D]
+    return by_q, by_v
+
+
+def servo_block(motor, a, mode, sampled, command, v):
+    """∂τ/∂(q, v) at a command; one that is ``sampled`` does not follow the state."""
+    return servo_block_on(motor, a, mode, servo_segment(motor, a, mode, command, v), sampled, v)
+
+
+# An ideal torque source: the reference is the torque itself, within its limit.
+
+
+def open_torque(motor, a, command):
+    """τ [N m]: the command within the limit."""
+    return clipped(command, motor[a, ka.I_MAX])
+
 
 for _law in (at_current_limit, clipped, dc_balance, dc_block, dc_command, dc_torque, open_torque):
     internal_kernel(_law)

@@ -7,23 +7,169 @@ from their own source.
 from __future__ import annotations
 
 import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba.core import cgutils, types
+from numba.extending import intrinsic
+from numba.np.arrayobj import make_array, populate_array
 
 from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact import delassus as kq
 from dynsim.dynamics.contact import unilateral as ku
-from dynsim.dynamics.contact import uniqueness as kq
-from dynsim.dynamics.contact.delassus import solve_dependent, solve_small
-from dynsim.dynamics.contact.quadrics import sign_changed, surface_distance
+from dynsim.dynamics.contact.delassus import (
+    admissible_forces,
+    clearly_unique,
+    look_at_forces,
+    solve_dependent,
+    solve_small,
+)
+from dynsim.dynamics.contact.rows import sign_changed, surface_distance
 from dynsim.dynamics.contact.shares import solve_near_shares, solve_nearest
-from dynsim.dynamics.contact.splits import admissible_forces, look_at_forces
 from dynsim.dynamics.contact.unilateral import slide_direction, sliding_friction
-from dynsim.dynamics.contact.uniqueness import clearly_unique
-from dynsim.dynamics.drive.law import evaluate_reference, fed_forward
-from dynsim.dynamics.drive.limit import clipped
-from dynsim.dynamics.drive.servo import servo_circuit
-from dynsim.dynamics.simd.tables import lane, lane_count, with_lane
+from dynsim.dynamics.derivative import System, derivative
+from dynsim.dynamics.drive.law import clipped, evaluate_reference, fed_forward, servo_circuit
+from dynsim.dynamics.tables import Workspace
 from dynsim.dynamics.tree.loads import add_loads
-from dynsim.jit.compiler import form_of
-from dynsim.jit.simd import every, lanes_of, select
+from dynsim.jit.compiler import Tables, form_of, made, parts_of
+from dynsim.jit.kernel import internal_kernel, noinline_kernel
+from dynsim.jit.simd import INT32, Lanes, every, lanes_of, select
+
+# Tables for SIMD: float tables whose last axis is the lanes, as tables of Lanes, and single lanes of them.
+
+
+# Number of lanes: four doubles are one register of AVX2.
+WIDTH = 4
+# Tables of a workspace that have lanes, as one more axis, the last; rows and modes are the same for all.
+WITH_LANES = ("links", "joints", "trig", "motors", "contacts", "rows", "column", "small")
+
+
+def aligned(*shape: int) -> np.ndarray:
+    """Zeros of this shape that begin at a cache line, as whole vectors load fastest."""
+    size = math.prod(shape)
+    room = np.zeros(size + 8)
+    start = (-room.__array_interface__["data"][0] % 64) // 8
+    return room[start : start + size].reshape(shape)
+
+
+def lane_workspace(ws: Workspace) -> Workspace:
+    """A workspace whose lanes are all what ``ws`` is; ``trig`` unpadded, as sines are computed a lane at a time."""
+    unpadded = ws._replace(trig=ws.trig[:, : len(ws.joints)])
+    tables = {name: getattr(unpadded, name)[..., None] for name in WITH_LANES}
+    lanes = {name: aligned(*table.shape[:-1], WIDTH) for name, table in tables.items()}
+    for name, table in lanes.items():
+        table[...] = tables[name]
+    return ws._replace(active=ws.active.copy(), counts=ws.counts.copy(), **lanes)
+
+
+@intrinsic
+def lane_count(typingctx: Any, value: Any) -> Any:
+    """How many lanes a value or table has."""
+    count = lanes_of(value)
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return context.get_constant(types.intp, count)
+
+    return types.intp(value), codegen
+
+
+@intrinsic
+def lane(typingctx: Any, value: Any, k: Any) -> Any:
+    """Lane k of a value; of tables a view; tuples part by part. What has no lanes is itself."""
+    result = _lane_type(value)
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        index = context.cast(builder, args[1], sig.args[1], types.intp)
+        return _lane(context, builder, args[0], value, index)
+
+    return result(value, types.unliteral(k)), codegen
+
+
+def _lane_type(kind: Any) -> Any:
+    if isinstance(kind, Lanes):
+        return types.float64
+    if isinstance(kind, types.Array) and isinstance(kind.dtype, Lanes):
+        return types.Array(types.float64, kind.ndim, "A", aligned=False)
+    if isinstance(kind, Tables):
+        return Tables([_lane_type(part) for part in kind], kind.instance_class)
+    return kind
+
+
+def _lane(context: Any, builder: Any, value: Any, kind: Any, index: Any) -> Any:
+    result = _lane_type(kind)
+    if result == kind:
+        return value
+    if isinstance(kind, Lanes):
+        return builder.extract_element(value, builder.trunc(index, INT32))
+    if isinstance(kind, Tables):
+        parts = parts_of(context, builder, kind, value)
+        lanes = [_lane(context, builder, x, part, index) for x, part in zip(parts, kind, strict=True)]
+        return made(context, builder, result, lanes)
+    source, view = make_array(kind)(context, builder, value), make_array(result)(context, builder)
+    start = builder.gep(builder.bitcast(source.data, view.data.type), [index])
+    return _viewed(context, builder, view, start, source.shape, source.strides, 8)
+
+
+@intrinsic
+def with_lane(typingctx: Any, value: Any, k: Any, x: Any) -> Any:
+    """The value with the number x as its lane k."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        index = builder.trunc(context.cast(builder, args[1], sig.args[1], types.intp), INT32)
+        return builder.insert_element(args[0], context.cast(builder, args[2], sig.args[2], types.float64), index)
+
+    return value(value, types.unliteral(k), types.unliteral(x)), codegen
+
+
+@intrinsic
+def as_lanes(typingctx: Any, array: Any) -> Any:
+    """A C-contiguous array of doubles, its last axis the lanes, as an array of lanes."""
+    result = _of_lanes(array)
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return _as_lanes(context, builder, args[0], array, result)
+
+    return result(array), codegen
+
+
+def _of_lanes(array: Any) -> Any:
+    return types.Array(Lanes(WIDTH), array.ndim - 1, "C", aligned=False)
+
+
+def _as_lanes(context: Any, builder: Any, value: Any, kind: Any, result: Any) -> Any:
+    source, view = make_array(kind)(context, builder, value), make_array(result)(context, builder)
+    shape = cgutils.unpack_tuple(builder, source.shape)[:-1]
+    strides = cgutils.unpack_tuple(builder, source.strides)[:-1]
+    start = builder.bitcast(source.data, view.data.type)
+    return _viewed(context, builder, view, start, shape, strides, 8 * result.dtype.lanes)
+
+
+def _viewed(context: Any, builder: Any, view: Any, data: Any, shape: Any, strides: Any, itemsize: int) -> Any:
+    populate_array(
+        view,
+        data=data,
+        shape=shape,
+        strides=strides,
+        itemsize=context.get_constant(types.intp, itemsize),
+        meminfo=None,
+    )
+    return view._getvalue()
+
+
+@intrinsic
+def tables_as_lanes(typingctx: Any, ws: Any) -> Any:
+    """:func:`as_lanes` of all tables of a workspace that have lanes."""
+    parts = [_of_lanes(part) if name in WITH_LANES else part for name, part in zip(ws.fields, ws, strict=True)]
+    result = Tables(parts, ws.instance_class)
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        values = [
+            value if seen == kind else _as_lanes(context, builder, value, kind, seen)
+            for value, kind, seen in zip(parts_of(context, builder, ws, args[0]), ws, result, strict=True)
+        ]
+        return made(context, builder, result, values)
+
+    return result(ws), codegen
 
 
 def any_lanes(*kinds):
@@ -184,3 +330,59 @@ def add_loads_lanes(model, loads, t, ws, power, start):
     """The same of external wrenches."""
     for k in range(lane_count(t)):
         add_loads(model, loads, lane(t, k), lane(ws, k), lane(power, k), start)
+
+
+# The right-hand side on SIMD lanes: ``derivative`` of four states at four times, and its tables.
+
+
+# Parts of a system whose kernels have no forms for lanes.
+_WITHOUT_FORMS = ("dense", "shapes")
+
+
+def has_forms(system: System) -> bool:
+    """True of points on quadrics, by the articulated solve: only their right-hand sides compile for lanes."""
+    return all(getattr(system, name) is None for name in _WITHOUT_FORMS)
+
+
+class StageLanes(NamedTuple):
+    """Room for right-hand sides that are evaluated four at a time."""
+
+    ws: Workspace
+    t: np.ndarray  # (4,)
+    y: np.ndarray  # (m, 4)
+    f: np.ndarray  # (m, 4)
+    delta: np.ndarray  # (4,)
+    output: np.ndarray  # (columns.size, 4), see dynsim.dynamics.state.OutputLayout
+
+
+def stage_lanes(ws: Workspace, m: int, columns: int) -> StageLanes:
+    """Allocate :class:`StageLanes` beside a workspace, whose rows are taken whenever the Jacobian is made anew."""
+    return StageLanes(lane_workspace(ws), aligned(4), aligned(m, 4), aligned(m, 4), aligned(4), aligned(columns, 4))
+
+
+@noinline_kernel
+def evaluate_four(lanes: StageLanes, system: System):
+    """``derivative`` of all lanes, one program for all of its callers."""
+    derivative(system, as_lanes(lanes.t)[()], as_lanes(lanes.y), tables_as_lanes(lanes.ws), as_lanes(lanes.f))
+
+
+@internal_kernel
+def take_rows(ws: Workspace, lanes: Workspace):
+    """Rows, modes and anchors of a workspace for all lanes of another one."""
+    for r in range(ws.active.shape[0]):
+        for s in range(ws.active.shape[1]):
+            lanes.active[r, s] = ws.active[r, s]
+        for s in range(ws.rows.shape[1]):
+            for k in range(4):
+                lanes.rows[r, s, k] = ws.rows[r, s]
+    for c in range(ws.contacts.shape[0]):
+        for s in range(ws.contacts.shape[1]):
+            for k in range(4):
+                lanes.contacts[c, s, k] = ws.contacts[c, s]
+    for s in range(ws.counts.shape[0]):
+        lanes.counts[s] = ws.counts[s]
+    # As solves leave it that have other rows: joints that none of them feels are zero.
+    for i in range(ws.column.shape[0]):
+        for s in range(ws.column.shape[1]):
+            for k in range(4):
+                lanes.column[i, s, k] = 0.0

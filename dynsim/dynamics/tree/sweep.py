@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.tables import ModelArrays, Workspace
-from dynsim.dynamics.tree.angles import sine_cosine
-from dynsim.dynamics.tree.joints import sweep_row
+from dynsim.dynamics.tree.joints import sine_cosine, sweep_row
 from dynsim.dynamics.tree.spatial import (
     compose,
     cross,

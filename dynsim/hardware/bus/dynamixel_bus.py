@@ -33,9 +33,8 @@ from dynamixel_sdk import COMM_SUCCESS, PortHandler, Protocol2PacketHandler
 
 from dynsim.hardware.bus.control_table import BROADCAST_ID, Field
 from dynsim.hardware.bus.packet import ALERT, HEADER, STATUS, Decoder, Packet, StatusError
-from dynsim.hardware.bus.protocol import BlockRead, NoAnswer, RequestRefused, ServoReply
+from dynsim.hardware.bus.protocol import BlockRead, NoAnswer, RequestRefused, ServoReply, TerminalError, require_posix
 from dynsim.hardware.errors import PortError
-from dynsim.hardware.posix import TerminalError, require_posix
 
 WRITE_TIMEOUT = 0.25
 """Longest wait for a port that takes no byte [s]."""

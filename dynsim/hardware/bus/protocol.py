@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 from dynsim.hardware.bus.control_table import Field
+from dynsim.hardware.errors import PortError
 
 
 class ServoReply(NamedTuple):
@@ -122,3 +124,72 @@ class Bus(Protocol):
         ...
 
     def close(self) -> None: ...
+
+
+# Clocks of a replay: their interface, wall time for serial ports, virtual time for servos in memory.
+
+
+class Clock(Protocol):
+    """Monotonic time."""
+
+    def now(self) -> float:
+        """Seconds since an arbitrary origin [s]."""
+        ...
+
+    def sleep_until(self, deadline: float) -> None:
+        """Return at ``deadline`` [s], at once if it has passed."""
+        ...
+
+
+class WallClock:
+    """The computer's monotonic clock, from an ``origin`` of it on [s]."""
+
+    def __init__(self, origin: float = 0.0) -> None:
+        self._origin = origin
+
+    def now(self) -> float:
+        return time.monotonic() - self._origin
+
+    def sleep_until(self, deadline: float) -> None:
+        remaining = deadline - self.now()
+        if remaining > 0:
+            time.sleep(remaining)
+
+
+class VirtualClock:
+    """Time that passes only when somebody waits: a replay on it is deterministic and as fast as the computer allows."""
+
+    def __init__(self) -> None:
+        self._now = 0.0
+
+    def now(self) -> float:
+        return self._now
+
+    def sleep_until(self, deadline: float) -> None:
+        self._now = max(self._now, deadline)
+
+
+# POSIX modules for serial ports and pseudo-terminals; None where the system lacks them, as on Windows.
+
+
+try:
+    import fcntl
+    import termios
+    import tty
+except ImportError:
+    fcntl = termios = tty = None  # type: ignore[assignment]
+
+TerminalError: type[Exception] = OSError if termios is None else termios.error
+"""Exception that a serial port raises beside OSError."""
+
+
+def require_posix(user: str) -> None:
+    """Refuse an operation that needs POSIX, named ``user`` in the message.
+
+    Raises
+    ------
+    PortError
+        This system is another one.
+    """
+    if termios is None:
+        raise PortError(f"{user}: needs a POSIX system such as Linux or macOS, which this is not")

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 from dynsim.hardware.bus.control_table import MODEL_BY_NUMBER, MX_106
 from dynsim.hardware.bus.dynamixel_bus import DynamixelBus, open_serial_port
-from dynsim.hardware.bus.protocol import NoAnswer, RequestRefused
+from dynsim.hardware.bus.protocol import NoAnswer, RequestRefused, TerminalError
 from dynsim.hardware.errors import PortError
-from dynsim.hardware.posix import TerminalError
 
 SCAN_BAUD_RATES = (57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000)
 STOP_BAUD_RATES = (3_000_000, 1_000_000, 57_600, 115_200, 2_000_000, 4_000_000)

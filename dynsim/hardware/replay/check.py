@@ -17,13 +17,18 @@ from numpy.typing import NDArray
 from dynsim.errors import CheckRefused
 from dynsim.hardware.bus.control_table import HEALTH_BLOCK, STATE_BLOCK, TICKS_PER_TURN
 from dynsim.hardware.replay.measured import unmeasured
-from dynsim.hardware.replay.motion import Array, CyclePlan, GoalCourse, MotionTask, Needs, PlannedCourse
 from dynsim.hardware.replay.trajectory import (
     COMMON,
     JERK_WINDOW,
     LONG,
     SHAKING_WINDOW,
+    Array,
+    CyclePlan,
+    GoalCourse,
+    MotionTask,
+    Needs,
     Path,
+    PlannedCourse,
     column_of,
     long_steps,
     path_of_record,

@@ -16,8 +16,8 @@ from dynsim.config.base import Positive, StrictConfig
 from dynsim.errors import RecordError, brief
 from dynsim.hardware.bus.control_table import RAD_PER_TICK
 from dynsim.hardware.errors import ComparisonGateFailed
-from dynsim.hardware.replay.states import ReplayState
-from dynsim.hardware.strict_yaml import read_yaml
+from dynsim.hardware.replay.output import ReplayState
+from dynsim.hardware.servo_map import read_yaml
 from dynsim.record import Record
 from dynsim.snake.lifting import Lifts, lifted
 
@@ -379,7 +379,8 @@ def draw_comparison(comparison: Comparison, path: Path, joints: Sequence[str] = 
     RecordError
         A joint is not among those compared, or the file cannot be written.
     """
-    from dynsim.draw.figures.errors import Followed, draw_errors
+    from dynsim.draw.figures.measured import Compared as Followed
+    from dynsim.draw.figures.measured import draw_errors
 
     names = [joint.joint for joint in comparison.joints]
     wheels = [wheel.wheel for wheel in comparison.wheels]

@@ -8,30 +8,600 @@ are sent.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+import struct
+from collections.abc import Callable, Collection, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dynsim.errors import SimulationStopped
-from dynsim.hardware.bus.clock import Clock
-from dynsim.hardware.bus.control_table import RAD_S2_PER_UNIT, RAD_S_PER_UNIT, WATCHDOG_SECONDS_PER_UNIT
-from dynsim.hardware.bus.protocol import Bus, NoAnswer, RequestRefused, too_busy
+from dynsim.hardware.bus.control_table import (
+    HEALTH_BLOCK,
+    MX_106,
+    RAD_PER_TICK,
+    RAD_S2_PER_UNIT,
+    RAD_S_PER_UNIT,
+    STATE_BLOCK,
+    WATCHDOG_SECONDS_PER_UNIT,
+    describe_hardware_error,
+)
+from dynsim.hardware.bus.protocol import Bus, Clock, NoAnswer, RequestRefused, too_busy
 from dynsim.hardware.errors import PortError
 from dynsim.hardware.replay.check import velocity_limit
-from dynsim.hardware.replay.ending import AT_REST, Ending, read_health
-from dynsim.hardware.replay.loop import FIELDS, Loop
 from dynsim.hardware.replay.measured import describe, measured_record, timing_of
-from dynsim.hardware.replay.motion import QUINTIC_PEAK, Approach, MotionTask, PlannedCourse
-from dynsim.hardware.replay.output import REGISTERS, REGISTERS_AFTER_FAULT, Journal, Layout, Recorder, RunLog
-from dynsim.hardware.replay.rules import Cause, Fault, watchdog_units
-from dynsim.hardware.replay.states import UNARMED, ReplayProgress, ReplayResult, ReplayState, Stopped, StopRequest
+from dynsim.hardware.replay.output import (
+    HOLDING,
+    LIMP,
+    MOVING,
+    NOT_ARMED,
+    REGISTERS,
+    REGISTERS_AFTER_FAULT,
+    TRIPPED,
+    UNARMED,
+    Journal,
+    Layout,
+    Recorder,
+    ReplayProgress,
+    ReplayResult,
+    ReplayState,
+    RunLog,
+    ServoEnd,
+    Stopped,
+    StopRequest,
+    of_the_whole,
+)
+from dynsim.hardware.replay.rules import AbortRules, Cause, Cycle, Fault, decode_health, watchdog_units
+from dynsim.hardware.replay.trajectory import QUINTIC_PEAK, Approach, GoalCourse, MotionTask, PlannedCourse
 from dynsim.hardware.replay.verify import Registers, all_registers, configure, difference_lines, verify
-from dynsim.hardware.safety import FaultPolicy
-from dynsim.hardware.servo_map import MappedServo, ServoMap
+from dynsim.hardware.servo_map import FaultPolicy, MappedServo, ServoMap
 from dynsim.system.files import write_json
+
+# The control loop of a replay: at each deadline it writes goals, reads states, records and checks them.
+
+
+Array = NDArray[np.float64]
+
+FIELDS = MX_106.fields
+"""Registers that all models share have the same address in all of them."""
+STATE = struct.Struct("<hii")
+"""Effort, velocity and position in a block of :data:`~dynsim.hardware.bus.control_table.STATE_BLOCK`."""
+
+
+GoalRegisters = dict[str, dict[int, int]]
+"""By the name of the register and the ID of the servo."""
+
+
+def goal_registers(
+    servos: Iterable[MappedServo], position: Iterable[float], velocity: Iterable[float]
+) -> GoalRegisters:
+    """Of servos in position mode the ticks of their angles [rad], of the others units of their rates [rad/s]."""
+    goals: GoalRegisters = {"goal_position": {}, "goal_velocity": {}}
+    for servo, angle, rate in zip(servos, position, velocity, strict=True):
+        if servo.in_position_mode:
+            goals["goal_position"][servo.id] = servo.to_ticks(float(angle))
+        else:
+            goals["goal_velocity"][servo.id] = servo.to_velocity_units(float(rate))
+    return goals
+
+
+class Loop:
+    """Goals out, measurements in, cycle by cycle.
+
+    Attributes
+    ----------
+    map : ServoMap
+    bus : Bus
+    stop : StopRequest
+    rules : AbortRules
+    period : float
+        [s].
+    goal, goal_rate : array, shape (N,)
+        Commanded last [rad], [rad/s].
+    measured : array, shape (N,)
+        Where every joint was seen last [rad].
+    origin, tick :
+        Clock time [s] of the first deadline, and the number of the last one.
+    course : GoalCourse or None
+        What is followed, or was last.
+    path_started : float or None
+        Clock time [s] of path time 0, once the replay of the path began.
+    policy_goals : list
+        (clock time, ID, register value) of every goal sent after a fault.
+    """
+
+    def __init__(
+        self,
+        motion: MotionTask,
+        servo_map: ServoMap,
+        bus: Bus,
+        clock: Clock,
+        stop: StopRequest,
+        recorder: Recorder,
+        journal: Journal,
+    ) -> None:
+        self.map = servo_map
+        self.bus = bus
+        self.stop = stop
+        self.rules = AbortRules(servo_map, motion.plan)
+        self.period = 1.0 / motion.plan.rate
+        count = len(servo_map.servos)
+        self.goal, self.goal_rate = np.zeros(count), np.zeros(count)
+        self.measured = np.zeros(count)
+        self.origin = clock.now()
+        self.tick = 0
+        self.course: GoalCourse | None = None
+        self.path_started: float | None = None
+        self.policy_goals: list[tuple[float, int, int]] = []
+        self._clock = clock
+        self._recorder = recorder
+        self._journal = journal
+        self._in_position_mode = np.array([servo.in_position_mode for servo in servo_map.servos])
+        # What may be sent: lowest and highest tick and the longest step from goal to goal, or the highest speed.
+        self._tick_bounds = [
+            (*servo.tick_limits, velocity_limit(servo) * servo.gear * 2 * self.period / RAD_PER_TICK + 2)
+            for servo in servo_map.servos
+        ]
+        self._unit_bounds = [abs(servo.to_velocity_units(velocity_limit(servo))) for servo in servo_map.servos]
+        self._health_every = motion.plan.health_every
+        self._cycles = 0
+        self._sent: dict[int, int] = {}
+        self._heard_at = math.inf
+
+    def take_over(self, index: int, register: int, angle: float) -> None:
+        """A servo was armed where it is: at the goal ``register``, at a joint angle [rad]."""
+        self._sent[self.map.servos[index].id] = register
+        self.goal[index] = self.measured[index] = angle
+
+    def all_taken_over(self) -> None:
+        """All are armed; from now on silence makes their watchdogs trip."""
+        self._heard_at = self._clock.now()
+
+    def stall(self) -> Fault | None:
+        """The fault of having been silent for longer than the servos' watchdogs allow, until now."""
+        silence = self._clock.now() - self._heard_at
+        return self.rules.stall(silence) if self.rules.stalled(silence) else None
+
+    def now(self) -> float:
+        """[s]."""
+        return self._clock.now()
+
+    def pause(self, duration: float) -> None:
+        """Let a time pass [s]."""
+        self._clock.sleep_until(self._clock.now() + duration)
+
+    def begin(self) -> None:
+        """Deadlines count from now."""
+        self.origin, self.tick = self._clock.now(), 0
+
+    def deadline_of(self, tick: int) -> float:
+        return self.origin + tick * self.period
+
+    def wait_for_deadline(self) -> tuple[float, int]:
+        """Sleep until the next cycle is due; its lateness [s] and the number of cycles skipped."""
+        self.tick += 1
+        behind = math.floor((self._clock.now() - self.deadline_of(self.tick)) / self.period)
+        skipped = max(0, behind)
+        self.tick += skipped
+        self._clock.sleep_until(self.deadline_of(self.tick))
+        return self._clock.now() - self.deadline_of(self.tick) + skipped * self.period, skipped
+
+    def follow(self, course: GoalCourse) -> None:
+        """Go along a course to its end.
+
+        From goal to goal one period of it passes, also where cycles in between were skipped: made up for at once they
+        would be one great step.
+        """
+        self.course = course
+        while not course.over:
+            lateness, skipped = self.wait_for_deadline()
+            self.stop.check()
+            position, velocity = course.advance(self.period)
+            self._cycle(position, velocity, lateness, skipped)
+
+    def stay(self, position: Array) -> Cycle:
+        """One cycle at rest."""
+        lateness, skipped = self.wait_for_deadline()
+        self.stop.check()
+        return self._cycle(position, np.zeros_like(position), lateness, skipped)
+
+    def look(self) -> None:
+        """One cycle that only reads."""
+        lateness, skipped = self.wait_for_deadline()
+        self.stop.check()
+        self.exchange(lateness, skipped, write=False)
+
+    def _cycle(self, position: Array, velocity: Array, lateness: float, skipped: int) -> Cycle:
+        stall = self.stall()
+        if stall:
+            # Servos that stopped by themselves must not be sent to where they would be by now.
+            raise Stopped(stall)
+        self.goal, self.goal_rate = position, velocity
+        cycle = self.exchange(lateness, skipped, write=True)
+        faults = self.rules.examine(cycle)
+        if faults:
+            raise Stopped(*faults)
+        return cycle
+
+    def exchange(self, lateness: float, skipped: int, *, write: bool) -> Cycle:
+        """Write all goals, read all states (and one servo's health in turn), record."""
+        began = self._clock.now()
+        if write:
+            self._send(self.goal, self.goal_rate)
+        block = self.bus.sync_read(self.map.ids, *STATE_BLOCK)
+        exchange = self._clock.now() - began
+        servos = self.map.servos
+        count = len(servos)
+        position, velocity, torque = np.full((3, count), np.nan)
+        alert = np.zeros(count, dtype=bool)
+        for index, servo in enumerate(servos):
+            reply = block.replies.get(servo.id)
+            if reply is None:
+                continue
+            effort, units, ticks = STATE.unpack(reply.data)
+            torque[index] = servo.to_torque(effort)
+            velocity[index] = servo.to_velocity(units)
+            position[index] = servo.to_angle(ticks)
+            alert[index] = reply.alert
+        cycle = Cycle(
+            time=began,
+            goal_position=self.goal.copy(),
+            goal_velocity=self.goal_rate.copy(),
+            position=position,
+            velocity=velocity,
+            torque=torque,
+            alert=alert,
+            lateness=lateness,
+            skipped=skipped,
+            exchange=exchange,
+            stray=block.stray_bytes,
+            outdated=tuple(block.outdated),
+        )
+        self.measured = np.where(cycle.missed, self.measured, cycle.position)
+        self._cycles += 1
+        if self._cycles % self._health_every == 0:
+            servo = servos[self._cycles // self._health_every % count]
+            # Like a sync read of one: a servo that is silent costs one time-out and no retry.
+            answer = self.bus.sync_read((servo.id,), *HEALTH_BLOCK).replies.get(servo.id)
+            if answer is not None:
+                cycle.health[servo.id] = decode_health(servo, answer.data)
+        now = self._clock.now()
+        if self._heard_at < math.inf:
+            cycle.silence, self._heard_at = max(began - self._heard_at, now - began), now
+        origin = math.nan if self.path_started is None else self.path_started
+        path_time = self.course.time if self.course and self.path_started is not None else math.nan
+        self._journal.guard("record", self._recorder.add, cycle, self._journal.state, path_time, origin)
+        self._report(cycle)
+        return cycle
+
+    def _report(self, cycle: Cycle) -> None:
+        error = self.rules.following_error(cycle)[self._in_position_mode]
+        worst = float(np.nanmax(np.abs(error))) if np.isfinite(error).any() else 0.0
+        self._journal.report(worst, self.course.fraction if self.course else 0.0)
+
+    def _send(self, position: Array, velocity: Array) -> None:
+        """The only place goals of a motion leave through. Refuses what no checked motion can ask for."""
+        servos = self.map.servos
+        goals = goal_registers(servos, position, velocity)
+        for servo, (low, high, step), fastest in zip(servos, self._tick_bounds, self._unit_bounds, strict=True):
+            if servo.in_position_mode:
+                goal = goals["goal_position"][servo.id]
+                allowed = low <= goal <= high and abs(goal - self._sent[servo.id]) <= step
+            else:
+                goal = goals["goal_velocity"][servo.id]
+                allowed = abs(goal) <= fastest
+            if not allowed:
+                raise Stopped(Fault(Cause.GOAL_GUARD, f"{servo.joint}: goal {goal} was not sent", (servo.id,)))
+        self.write_goals(goals)
+
+    def write_goals(self, goals: GoalRegisters) -> None:
+        """Goal registers by name and ID, as they are."""
+        for name, values in goals.items():
+            if not values:
+                continue
+            self.bus.sync_write(FIELDS[name], values)
+            self._sent.update(values)
+            if self._journal.state == ReplayState.FAULT:
+                now = self._clock.now()
+                self.policy_goals += [(now, id_, value) for id_, value in values.items()]
+
+
+# End of a replay: stops the robot and leaves torque on, or switches torque off, then reads the state of the servos.
+
+
+REST_TIME = 1.0
+"""Longest wait for the servos to stand still, and for silent ones to come back (a restart takes 0.3 s) [s]."""
+REST_CYCLES = 10
+AT_REST = 0.1
+"""Joints and wheels slower than this are at rest [rad/s]; a few units of the velocity register."""
+READS = 3
+"""Reads after which a servo that has not answered counts as silent."""
+
+
+class Ending:
+    """Brings the robot to one of the end states.
+
+    Parameters
+    ----------
+    loop : Loop
+    journal : Journal
+    result : ReplayResult
+        Gets further faults, what every servo does in the end, and the IDs that did not confirm torque off.
+    policy : "hold", "decelerate" or "off"
+    """
+
+    def __init__(self, loop: Loop, journal: Journal, result: ReplayResult, policy: FaultPolicy) -> None:
+        self._loop = loop
+        self._journal = journal
+        self._result = result
+        self._policy = policy
+        self._servos = loop.map.servos
+        self._troubled: set[int] = set()
+        self._held = self._released = False
+        self._at_rest = False
+
+    def regular(self) -> None:
+        """What the map says about the end of a motion. Raises PortError."""
+        if self._loop.map.safety.at_end == "hold":
+            self._leave_holding()
+        else:
+            self._release()
+
+    def after_fault(self, struck: ReplayState, *, found_holding: bool) -> None:
+        """Carry out the fault policy for the faults of the result; raises nothing.
+
+        Parameters
+        ----------
+        struck : ReplayState
+            In which the fault happened.
+        found_holding : bool
+            Torque was on before the robot was armed.
+        """
+        self._at_rest = struck == ReplayState.SETTLE
+        interrupted = self._result.faults[0].cause == Cause.INTERRUPTED
+        if self._loop.stop.for_release:
+            self._try(self._release)
+        elif struck in UNARMED:
+            return
+        elif struck == ReplayState.DISARM:
+            self._try(self.regular)
+        elif struck == ReplayState.ARM:
+            # Nothing has moved yet: back to how the robot was found, unless somebody else took its torque meanwhile.
+            taken = any(fault.cause == Cause.TORQUE_LOST for fault in self._result.faults)
+            self._try(self._leave_holding if found_holding and not taken else self._release)
+        elif self._policy == "off" and not interrupted:
+            self._try(self._release)
+        else:
+            # A dead port needs no policy, but the attempt costs nothing and finds out whether it is really dead.
+            if not self._try(self._hold if self._policy == "hold" and not interrupted else self._decelerate):
+                self._try(self._hold)
+            self._try(self._come_to_rest)
+            self._try(self._release if self._policy == "off" else self._leave_holding)
+
+    def release_at_last(self) -> bool:
+        """Torque off if the user has asked for it since the policy was carried out; raises nothing."""
+        if self._released or not self._loop.stop.for_release:
+            return False
+        self._try(self._release)
+        self.read_back(armed=True)
+        return True
+
+    def read_back(self, *, armed: bool) -> None:
+        """Ask every servo what it does, and derive from it what the robot does; raises nothing."""
+        self._result.servos = tuple(ServoEnd(servo.joint, servo.id) for servo in self._servos)
+        self._try(self._ask)
+        self._result.end_state = of_the_whole(self._result.servos) if armed else NOT_ARMED
+
+    def _ask(self) -> None:
+        self._result.servos = read_back(self._loop.bus, self._servos)
+
+    # -- what goes wrong on the way -----------------------------------------------------------------------------------
+
+    def _try(self, step: Callable[[], None]) -> bool:
+        """Whether a step went through; why not becomes a fault of the result."""
+        try:
+            step()
+        except PortError as error:
+            if all(fault.cause != Cause.PORT for fault in self._result.faults):
+                self._declare(Fault(Cause.PORT, f"{error}; armed servos stop by their bus watchdog"))
+        except Exception as error:
+            self._declare(Fault(Cause.PROGRAM, repr(error)))
+        except BaseException as error:
+            # Somebody wants out, and gets out when the robot has been seen to.
+            self._loop.stop()
+            self._declare(Fault(Cause.PROGRAM, repr(error)))
+        else:
+            return True
+        return False
+
+    def _declare(self, fault: Fault) -> None:
+        self._result.declare(replace(fault, time=self._loop.now()))
+        self._journal.say(f"{fault.cause}: {fault.text}")
+
+    def _watch(self, lateness: float, skipped: int) -> Cycle:
+        """Read; the rules go on, and who gets into trouble stops where it is."""
+        loop = self._loop
+        cycle = loop.exchange(lateness, skipped, write=False)
+        # The goals that follow do not depend on when they are sent.
+        for fault in loop.rules.examine(cycle):
+            if fault.cause != Cause.DEADLINE:
+                self._declare(fault)
+                self._stop_where_they_are(fault)
+        return cycle
+
+    def _stop_where_they_are(self, fault: Fault) -> None:
+        if self._held:
+            return
+        if fault.cause == Cause.STALL:
+            self._hold()
+        else:
+            self._hold_measured(self._known_as(fault.ids))
+
+    def _known_as(self, ids: Collection[int]) -> list[int]:
+        """Numbers of servos in the map, of which none was in trouble before."""
+        indices = [index for index, servo in enumerate(self._servos) if servo.id in ids and index not in self._troubled]
+        self._troubled.update(indices)
+        return indices
+
+    # -- ways of stopping ---------------------------------------------------------------------------------------------
+
+    def _hold(self) -> None:
+        """Goals of all servos := where they are."""
+        self._held = True
+        if any(fault.cause == Cause.STALL for fault in self._result.faults):
+            # What was read last is from before.
+            self._loop.exchange(0.0, 0, write=False)
+        self._hold_measured(range(len(self._servos)))
+
+    def _hold_measured(self, indices: Iterable[int]) -> None:
+        """Goals of the given servos := where they are."""
+        loop = self._loop
+        goals: GoalRegisters = {"goal_position": {}, "goal_velocity": {}}
+        for index in indices:
+            servo = self._servos[index]
+            loop.goal_rate[index] = 0.0
+            if not servo.in_position_mode:
+                goals["goal_velocity"][servo.id] = 0
+                continue
+            ticks = servo.to_ticks(float(loop.measured[index]))
+            low, high = servo.tick_limits
+            if low <= ticks <= high:
+                goals["goal_position"][servo.id] = ticks
+                loop.goal[index] = loop.measured[index]
+            # A reading outside of the joint's limits is not to be trusted: that servo keeps its last goal.
+        loop.write_goals(goals)
+
+    def _decelerate(self) -> None:
+        """Slow down along the path to rest, so that all joints keep step; servos in trouble stop where they are."""
+        loop, faults = self._loop, self._result.faults
+        if any(fault.cause == Cause.STALL for fault in faults):
+            # They have stopped by themselves, and take no goals.
+            return self._hold()
+        self._hold_measured(self._known_as([id_ for fault in faults for id_ in fault.ids]))
+        course = loop.course
+        if course is None:
+            return None
+        start, end = course.time, course.end
+        speed = 0.0 if self._at_rest else course.speed
+        stop_time = course.braking_time(loop.map.safety.stop_time)
+        elapsed, goals = 0.0, 0
+        while elapsed < stop_time and not loop.stop.for_release and not self._held:
+            lateness, skipped = loop.wait_for_deadline()
+            stall = loop.stall()
+            if stall:
+                self._declare(stall)
+                return self._hold()
+            goals += 1
+            elapsed = min(stop_time, goals * loop.period)
+            course.time = min(end, start + speed * (elapsed - elapsed**2 / (2 * stop_time)))
+            position, rate = course.at(course.time)
+            velocity = rate * speed * (1 - elapsed / stop_time)
+            self._send(position, velocity)
+            self._watch(lateness, skipped)
+        return None
+
+    def _send(self, position: Array, velocity: Array) -> None:
+        """Goals [rad], [rad/s] of the servos that are not in trouble."""
+        loop = self._loop
+        well = [index for index in range(len(self._servos)) if index not in self._troubled]
+        loop.goal[well], loop.goal_rate[well] = position[well], velocity[well]
+        loop.write_goals(goal_registers([self._servos[index] for index in well], position[well], velocity[well]))
+
+    def _come_to_rest(self) -> None:
+        """Wait until everybody answers and stands still, for REST_TIME at most."""
+        quiet = 0
+        for _ in range(math.ceil(REST_TIME / self._loop.period)):
+            if self._loop.stop.for_release:
+                return
+            cycle = self._watch(*self._loop.wait_for_deadline())
+            # A servo that is silent is not at rest: it may be restarting.
+            quiet = quiet + 1 if np.all(np.abs(cycle.velocity) < AT_REST) else 0
+            if quiet == REST_CYCLES:
+                return
+
+    def _leave_holding(self) -> None:
+        """Watchdogs off, so that the robot keeps holding when this program has gone. Raises PortError."""
+        loop = self._loop
+        health = read_health(loop.bus, self._servos)
+        unconfirmed = []
+        for index, servo in enumerate(self._servos):
+            if loop.stop.for_release:
+                return self._release()
+            try:
+                loop.bus.write(servo.id, FIELDS["bus_watchdog"], 0)
+            except (NoAnswer, RequestRefused) as error:
+                unconfirmed.append(f"{servo.joint}: {error}")
+            registers = health.get(servo.id)
+            if registers and registers["bus_watchdog"] == -1:
+                # It stopped by itself, and took no goal until now.
+                loop.measured[index] = servo.to_angle(registers["present_position"])
+                self._hold_measured([index])
+        if unconfirmed:
+            self._journal.say(
+                f"watchdogs not confirmed to be off, they may stop these servos: {'; '.join(unconfirmed)}"
+            )
+        return self._journal.say("servos that are on stay ON; `dynsim hw stop` releases them")
+
+    def _release(self) -> None:
+        """Torque off by broadcast, until all confirm or REST_TIME is over; then watchdogs off. Raises PortError."""
+        loop, until = self._loop, self._loop.now() + REST_TIME
+        self._released = True
+        while True:
+            loop.bus.torque_off_all()
+            health = read_health(loop.bus, self._servos)
+            still_on = [id_ for id_ in loop.map.ids if id_ not in health or health[id_]["torque_enable"]]
+            self._result.torque_still_on = tuple(still_on)
+            if not still_on or loop.now() >= until:
+                break
+            loop.pause(REST_TIME / 10)
+        # Of those that are off: a watchdog that trips later would leave goals read-only for whoever comes next.
+        for id_ in loop.map.ids:
+            if id_ not in still_on and health[id_]["bus_watchdog"]:
+                with suppress(NoAnswer, RequestRefused):
+                    loop.bus.write(id_, FIELDS["bus_watchdog"], 0)
+        confirmed = f"; NOT confirmed by ID {', '.join(map(str, still_on))}" if still_on else ""
+        self._journal.say(f"torque off{confirmed}")
+
+
+def read_health(bus: Bus, servos: Sequence[MappedServo]) -> dict[int, dict[str, int]]:
+    """Registers 64 to 146 of every servo that answers, by ID and name.
+
+    Raises
+    ------
+    PortError
+    """
+    health: dict[int, dict[str, int]] = {}
+    for _ in range(READS):
+        silent = [servo for servo in servos if servo.id not in health]
+        if not silent:
+            break
+        replies = bus.sync_read([servo.id for servo in silent], *HEALTH_BLOCK).replies
+        health |= {servo.id: decode_health(servo, replies[servo.id].data) for servo in silent if servo.id in replies}
+    return health
+
+
+def read_back(bus: Bus, servos: Sequence[MappedServo]) -> tuple[ServoEnd, ...]:
+    """What every servo is doing now. Raises PortError."""
+    health = read_health(bus, servos)
+    return tuple(
+        _end(servo, health[servo.id]) if servo.id in health else ServoEnd(servo.joint, servo.id) for servo in servos
+    )
+
+
+def _end(servo: MappedServo, registers: dict[str, int]) -> ServoEnd:
+    torque, error = bool(registers["torque_enable"]), registers["hardware_error"]
+    position, velocity = servo.to_angle(registers["present_position"]), servo.to_velocity(registers["present_velocity"])
+    if not torque:
+        doing = f"limp: {describe_hardware_error(error)}" if error else LIMP
+    elif registers["bus_watchdog"] == -1:
+        doing = TRIPPED
+    else:
+        doing = HOLDING if abs(velocity) < AT_REST else MOVING
+    return ServoEnd(servo.joint, servo.id, torque, error, position, velocity, doing)
+
 
 APPROACH_ACCELERATION = 10.0
 """Profile acceleration written to the servos for the move to the start [rad/s²]."""

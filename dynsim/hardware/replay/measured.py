@@ -15,8 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.errors import RecordError
-from dynsim.hardware.replay.output import MEASURED, PART, PART_FORMAT, SUMMARY, Layout, Rows, is_held, row_type
-from dynsim.hardware.replay.states import ReplayState, TimingStatistics
+from dynsim.hardware.replay.output import (
+    MEASURED,
+    PART,
+    PART_FORMAT,
+    SUMMARY,
+    Layout,
+    ReplayState,
+    Rows,
+    TimingStatistics,
+    is_held,
+    row_type,
+)
 from dynsim.hardware.replay.trajectory import GROUNDED, wheel_offsets
 from dynsim.hardware.servo_map import ServoMap
 from dynsim.record import TIME, Record

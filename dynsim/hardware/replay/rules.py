@@ -20,9 +20,8 @@ from dynsim.hardware.bus.control_table import (
     WATCHDOG_SECONDS_PER_UNIT,
     describe_hardware_error,
 )
-from dynsim.hardware.replay.motion import CyclePlan
-from dynsim.hardware.safety import Safety
-from dynsim.hardware.servo_map import MappedServo, ServoMap
+from dynsim.hardware.replay.trajectory import CyclePlan
+from dynsim.hardware.servo_map import MappedServo, Safety, ServoMap
 
 
 class Cause(StrEnum):

@@ -11,12 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from dynsim.errors import DynsimError
-from dynsim.hardware.bus.clock import Clock
-from dynsim.hardware.bus.protocol import Bus
+from dynsim.hardware.bus.protocol import Bus, Clock
 from dynsim.hardware.errors import OutputsFailed, PortError, ReplayAborted, ReplayInterrupted, VerificationFailed
 from dynsim.hardware.replay.machine import RECORD, Replay
 from dynsim.hardware.replay.measured import write_measured
-from dynsim.hardware.replay.motion import MotionTask
 from dynsim.hardware.replay.output import (
     INTERVAL,
     LOG,
@@ -24,12 +22,13 @@ from dynsim.hardware.replay.output import (
     PART,
     SUMMARY,
     Background,
+    ReplayResult,
     RowStream,
     RunLog,
     move_away,
 )
 from dynsim.hardware.replay.rules import Cause
-from dynsim.hardware.replay.states import ReplayResult
+from dynsim.hardware.replay.trajectory import MotionTask
 from dynsim.hardware.servo_map import ServoMap
 from dynsim.system.files import write_json
 

@@ -26,9 +26,8 @@ from dynsim.hardware.bus.control_table import (
 )
 from dynsim.hardware.bus.protocol import Bus, NoAnswer, RequestRefused, too_busy
 from dynsim.hardware.errors import VerificationFailed
-from dynsim.hardware.replay.motion import QUINTIC_PEAK, MotionTask, Needs
-from dynsim.hardware.safety import Safety
-from dynsim.hardware.servo_map import MappedServo, ServoMap
+from dynsim.hardware.replay.trajectory import QUINTIC_PEAK, MotionTask, Needs
+from dynsim.hardware.servo_map import MappedServo, Safety, ServoMap
 
 EEPROM_BLOCK = (0, 64)
 TRIAL_READS = 10

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from pydantic import Field, ValidationInfo, model_validator
 
 from dynsim.config.base import StrictConfig, error_at
-from dynsim.hardware.strict_yaml import read_yaml
+from dynsim.hardware.servo_map import read_yaml
 
 Probability = Annotated[float, Field(ge=0, le=1)]
 

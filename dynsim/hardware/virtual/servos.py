@@ -3,26 +3,191 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.hardware.bus.control_table import (
+    BAUD_RATES,
+    BROADCAST_ID,
+    EEPROM_END,
+    INDIRECT_BLOCKS,
     MAX_ID,
     RAD_PER_TICK,
     RAD_S2_PER_UNIT,
     RAD_S_PER_UNIT,
+    TABLE_SIZE,
     TICKS_PER_TURN,
     VOLT_PER_UNIT,
     WATCHDOG_SECONDS_PER_UNIT,
+    Field,
     OperatingMode,
+    ServoModel,
 )
-from dynsim.hardware.bus.packet import StatusError
+from dynsim.hardware.bus.packet import ALERT, STATUS, Instruction, Packet, StatusError, encode, encode_fast
 from dynsim.hardware.virtual.faults import AngleFault, Fault, FaultScript, TemperatureRamp, VoltageSag
-from dynsim.hardware.virtual.registers import ServoRegisters
-from dynsim.hardware.virtual.servo_plant import Drive, InertialLoad, ServoPlant
+from dynsim.hardware.virtual.simulated_plant import Drive, InertialLoad, ServoPlant
+
+# Registers of one virtual servo, with the access rules of the real one.
+
+
+GOAL_FIELDS = ("goal_pwm", "goal_current", "goal_velocity", "goal_position")
+MODES = {
+    True: (0, 1, 3, 4, 5, 16),  # with current sensor
+    False: (1, 3, 4, 16),
+}
+
+
+class ServoRegisters:
+    """Control table of one servo.
+
+    Attributes
+    ----------
+    model : ServoModel
+    """
+
+    def __init__(self, model: ServoModel, id_: int, baud_code: int) -> None:
+        self.model = model
+        self._table = bytearray(TABLE_SIZE)
+        self._field_at = {item.address: name for name, item in model.fields.items()}
+        # Each read of a state needs a dozen registers: their addresses are looked up once.
+        self._places = {
+            name: (slice(item.address, item.address + item.size), item.size, item.signed)
+            for name, item in model.fields.items()
+        }
+        self.reset()
+        self["id"], self["baud"] = id_, baud_code
+
+    def __getitem__(self, name: str) -> int:
+        span, _, signed = self._places[name]
+        return int.from_bytes(self._table[span], "little", signed=signed)
+
+    def __setitem__(self, name: str, value: int) -> None:
+        span, size, signed = self._places[name]
+        self._table[span] = value.to_bytes(size, "little", signed=signed)
+
+    @property
+    def baud(self) -> int:
+        """[bit/s]."""
+        return BAUD_RATES[self["baud"]]
+
+    def reset(self, keep: Collection[str] = ()) -> None:
+        """All as delivered, but for the registers named in ``keep``."""
+        kept = {name: self[name] for name in keep}
+        for name, item in self.model.fields.items():
+            self[name] = kept.get(name, item.default)
+        self["model_number"] = self.model.number
+        self.restart()
+
+    def restart(self) -> None:
+        """RAM as after power-on."""
+        for name, item in self.model.fields.items():
+            if not item.in_eeprom:
+                self[name] = item.default
+        for pointers, data, count in INDIRECT_BLOCKS:
+            for k in range(count):
+                self._table[pointers + 2 * k : pointers + 2 * k + 2] = (data + k).to_bytes(2, "little")
+                self._table[data + k] = 0
+        if "goal_current" in self.model.fields:
+            self["goal_current"] = self["current_limit"]
+        self["goal_pwm"] = self["pwm_limit"]
+
+    def read(self, address: int, length: int) -> bytes | None:
+        """Bytes, indirect ones resolved; None outside of the table."""
+        if length < 1 or address + length > TABLE_SIZE:
+            return None
+        if address + length <= INDIRECT_BLOCKS[0][1]:
+            return bytes(self._table[address : address + length])
+        return bytes(self._table[self._resolve(a)] for a in range(address, address + length))
+
+    def write(self, address: int, data: bytes) -> StatusError:
+        """Write consecutive items, all or none."""
+        if not data or address + len(data) > TABLE_SIZE:
+            return StatusError.ACCESS
+        end = address + len(data)
+        direct = end <= INDIRECT_BLOCKS[0][0]
+        targets = range(address, end) if direct else [self._resolve(a) for a in range(address, end)]
+        pending: list[tuple[str, int]] = []
+        position = 0
+        while position < len(targets):
+            start = targets[position]
+            if not direct and self._is_pointer(start):
+                if self["torque_enable"]:
+                    return StatusError.ACCESS
+                self._table[start] = data[position]
+                position += 1
+                continue
+            if not direct and start == address + position and self._is_indirect_data(start):
+                self._table[start] = data[position]
+                position += 1
+                continue
+            name = self._field_at.get(start)
+            if name is None:
+                return StatusError.ACCESS
+            item = self.model.fields[name]
+            whole = range(start, start + item.size)
+            if targets[position : position + item.size] != (whole if direct else [*whole]):
+                return StatusError.DATA_LENGTH
+            value = item.decode(data[position : position + item.size])
+            error = self._objection(name, item, value)
+            if error:
+                return error
+            pending.append((name, value))
+            position += item.size
+        for name, value in pending:
+            self[name] = value
+        return StatusError.NONE
+
+    def _objection(self, name: str, field: Field, value: int) -> StatusError:
+        if not field.writable:
+            return StatusError.ACCESS
+        if field.in_eeprom and self["torque_enable"]:
+            return StatusError.ACCESS
+        if field.low is not None and not field.low <= value <= (field.high or 0):
+            return StatusError.DATA_RANGE
+        if name == "operating_mode" and value not in MODES[self.model.measures_current]:
+            return StatusError.DATA_RANGE
+        if name in GOAL_FIELDS:
+            if self["bus_watchdog"] == -1:
+                return StatusError.DATA_RANGE
+            low, high = self._goal_range(name)
+            if not low <= value <= high:
+                return StatusError.DATA_LIMIT
+        if name == "torque_enable" and value and self["hardware_error"] & self["shutdown"]:
+            return StatusError.RESULT_FAIL
+        return StatusError.NONE
+
+    def _goal_range(self, name: str) -> tuple[int, int]:
+        if name == "goal_position":
+            if self["operating_mode"] == OperatingMode.POSITION:
+                return self["min_position"], self["max_position"]
+            # Multi-turn modes know no position limits.
+            return -1_048_575, 1_048_575
+        limit = self[
+            {"goal_pwm": "pwm_limit", "goal_current": "current_limit", "goal_velocity": "velocity_limit"}[name]
+        ]
+        return -limit, limit
+
+    def _resolve(self, address: int) -> int:
+        for pointers, data, count in INDIRECT_BLOCKS:
+            if data <= address < data + count:
+                at = pointers + 2 * (address - data)
+                target = int.from_bytes(self._table[at : at + 2], "little")
+                # A pointer to another indirect byte would be followed only once by the real servo.
+                return target if target < TABLE_SIZE else address
+        return address
+
+    @staticmethod
+    def _is_pointer(address: int) -> bool:
+        return any(pointers <= address < pointers + 2 * count for pointers, _, count in INDIRECT_BLOCKS)
+
+    @staticmethod
+    def _is_indirect_data(address: int) -> bool:
+        return any(data <= address < data + count for _, data, count in INDIRECT_BLOCKS)
+
 
 PROTOCOL = 2
 """Protocol of the line. A servo set to another one never answers."""
@@ -403,3 +568,202 @@ class VirtualServos:
         registers["present_voltage"] = max(0, round(self._drive.voltage / VOLT_PER_UNIT))
         registers["present_temperature"] = min(255, max(0, round(float(self.temperature[index]))))
         registers["realtime_tick"] = int(self.time * 1e3) % 32768
+
+
+# Firmware of a virtual servo: instructions of Protocol 2.0 and their answers.
+
+
+CLEAR_TURNS = b"\x01\x44\x58\x4c\x22"
+RESET_ALL = 0xFF
+KEPT_BY_RESET: dict[int, tuple[str, ...]] = {RESET_ALL: (), 0x01: ("id",), 0x02: ("id", "baud")}
+"""Registers that a factory reset does not change, by its parameter."""
+
+SHADOWED = (Instruction.WRITE, Instruction.REG_WRITE)
+"""Instructions that a servo carries out without an answer when they are sent to its secondary ID, in RAM."""
+
+
+class Answer(NamedTuple):
+    """A frame that one or several servos send at one time.
+
+    Attributes
+    ----------
+    servos : tuple of int
+        The servos that send, by the IDs they had at first; more than one when they share an ID.
+    frame : bytes
+    chained : bool
+        It follows on the answer before without a pause.
+    """
+
+    servos: tuple[int, ...]
+    frame: bytes
+    chained: bool = False
+
+
+def together(frames: Sequence[tuple[int, bytes]]) -> Answer:
+    """Servos that answer at once, each with its frame: all drive the line, and a zero bit wins (unverified)."""
+    if len(frames) == 1:
+        servo, frame = frames[0]
+        return Answer((servo,), frame)
+    line = bytearray(max((frame for _, frame in frames), key=len))
+    for _, frame in frames:
+        for k, byte in enumerate(frame):
+            line[k] &= byte
+    return Answer(tuple(servo for servo, _ in frames), bytes(line))
+
+
+class Firmware:
+    """Carries out instructions on servos. These are named by the ID they had at first."""
+
+    def __init__(self, servos: VirtualServos) -> None:
+        self._servos = servos
+        self._registered: dict[int, tuple[int, bytes]] = {}
+
+    def answers(self, packet: Packet, hearing: Hearing) -> Iterator[Answer]:
+        """Carry out an instruction; what comes back, in the order of the line."""
+        p = packet.parameters
+        match packet.instruction:
+            case Instruction.SYNC_READ | Instruction.FAST_SYNC_READ if len(p) >= 5:
+                address, length = int.from_bytes(p[0:2], "little"), int.from_bytes(p[2:4], "little")
+                entries = [(id_, address, length) for id_ in p[4:]]
+                read = self._fast_read if packet.instruction == Instruction.FAST_SYNC_READ else self._read_many
+                yield from read(entries, hearing)
+            case Instruction.BULK_READ | Instruction.FAST_BULK_READ:
+                entries = [
+                    (p[k], int.from_bytes(p[k + 1 : k + 3], "little"), int.from_bytes(p[k + 3 : k + 5], "little"))
+                    for k in range(0, len(p) - 4, 5)
+                ]
+                read = self._fast_read if packet.instruction == Instruction.FAST_BULK_READ else self._read_many
+                yield from read(entries, hearing)
+            case Instruction.SYNC_WRITE if len(p) >= 4:
+                address, length = int.from_bytes(p[0:2], "little"), int.from_bytes(p[2:4], "little")
+                for k in range(4, len(p) - length, length + 1):
+                    # Nobody answers a sync write: a refused goal goes unnoticed, as on real servos.
+                    self._write_silently(p[k], address, p[k + 1 : k + 1 + length], hearing)
+            case Instruction.BULK_WRITE:
+                k = 0
+                while k + 5 <= len(p):
+                    address = int.from_bytes(p[k + 1 : k + 3], "little")
+                    length = int.from_bytes(p[k + 3 : k + 5], "little")
+                    self._write_silently(p[k], address, p[k + 5 : k + 5 + length], hearing)
+                    k += 5 + length
+            case _:
+                yield from self._answers_of_each(packet, hearing)
+
+    def _write_silently(self, id_: int, address: int, data: bytes, hearing: Hearing) -> None:
+        for servo in self._awake(hearing, id_):
+            self._servos.write(servo, address, data)
+        if hearing.by_shadow and address >= EEPROM_END:
+            for servo in self._shadows(hearing, id_):
+                self._servos.write(servo, address, data)
+
+    def _answers_of_each(self, packet: Packet, hearing: Hearing) -> Iterator[Answer]:
+        broadcast = packet.id == BROADCAST_ID
+        for servo in self._shadows(hearing, packet.id):
+            if packet.instruction in SHADOWED and int.from_bytes(packet.parameters[0:2], "little") >= EEPROM_END:
+                self._reply(servo, packet.id, packet)
+        # A list: the instruction may give a servo another ID.
+        for id_ in sorted(hearing.by_id) if broadcast else [packet.id]:
+            frames = []
+            for servo in self._awake(hearing, id_):
+                reply = self._reply(servo, id_, packet)
+                if reply and (not broadcast or packet.instruction == Instruction.PING):
+                    frames.append((servo, encode(reply)))
+            if frames:
+                yield together(frames)
+
+    def _reply(self, servo: int, id_: int, packet: Packet) -> Packet | None:
+        registers, p = self._servos.registers[servo], packet.parameters
+        answers_all = registers["status_return_level"] == 2
+        match packet.instruction:
+            case Instruction.PING:
+                data = (registers.read(0, 2) or b"") + bytes([registers["firmware"]])
+                return self._status(servo, id_, StatusError.NONE, data)
+            case Instruction.READ if len(p) == 4:
+                return self._read(servo, id_, int.from_bytes(p[0:2], "little"), int.from_bytes(p[2:4], "little"))
+            case Instruction.WRITE if len(p) >= 3:
+                error = self._servos.write(servo, int.from_bytes(p[0:2], "little"), p[2:])
+            case Instruction.REG_WRITE if len(p) >= 3:
+                error = self._register(servo, int.from_bytes(p[0:2], "little"), p[2:])
+            case Instruction.ACTION:
+                error = self._act(servo)
+            case Instruction.REBOOT | Instruction.FACTORY_RESET:
+                # The answer goes out before, as the servo was.
+                answer = self._status(servo, id_, StatusError.NONE)
+                if packet.instruction == Instruction.REBOOT:
+                    self._servos.reboot(servo)
+                elif p[:1] == bytes([RESET_ALL]) and packet.id == BROADCAST_ID:
+                    return None  # it would give all of them one ID
+                elif p and p[0] in KEPT_BY_RESET:
+                    self._servos.reset(servo, KEPT_BY_RESET[p[0]])
+                else:
+                    answer = self._status(servo, id_, StatusError.DATA_RANGE)
+                return answer if answers_all else None
+            case Instruction.CLEAR if p == CLEAR_TURNS:
+                error = self._clear_turns(servo)
+            case _:
+                error = StatusError.INSTRUCTION
+        return self._status(servo, id_, error) if answers_all else None
+
+    def _read_many(self, entries: Sequence[tuple[int, int, int]], hearing: Hearing) -> Iterator[Answer]:
+        for id_, address, length in entries:
+            replies = [(servo, self._read(servo, id_, address, length)) for servo in self._awake(hearing, id_)]
+            if frames := [(servo, encode(reply)) for servo, reply in replies if reply]:
+                yield together(frames)
+
+    def _fast_read(self, entries: Sequence[tuple[int, int, int]], hearing: Hearing) -> Iterator[Answer]:
+        """One packet, of which every servo sends its part; behind one that is silent nobody speaks (unverified)."""
+        speakers, replies = [], []
+        for id_, address, length in entries:
+            servo = next(iter(self._awake(hearing, id_)), None)
+            reply = None if servo is None else self._read(servo, id_, address, length)
+            if servo is None or reply is None:
+                break
+            if len(reply.parameters) != length:
+                reply = Packet(id_, STATUS, bytes(length), reply.error)
+            speakers.append(servo)
+            replies.append(reply)
+        parts = encode_fast(replies, [length for _, _, length in entries])
+        for index, (servo, part) in enumerate(zip(speakers, parts, strict=True)):
+            yield Answer((servo,), part, chained=index > 0)
+
+    def _read(self, servo: int, id_: int, address: int, length: int) -> Packet | None:
+        if self._servos.registers[servo]["status_return_level"] == 0:
+            return None
+        data = self._servos.read(servo, address, length)
+        if data is None:
+            return self._status(servo, id_, StatusError.ACCESS)
+        return self._status(servo, id_, StatusError.NONE, data)
+
+    def _status(self, servo: int, id_: int, error: StatusError, data: bytes = b"") -> Packet:
+        alert = ALERT if self._servos.registers[servo]["hardware_error"] else 0
+        return Packet(id_, STATUS, data, error | alert)
+
+    def _awake(self, hearing: Hearing, id_: int) -> list[int]:
+        """Servos that have an ID and are not dead, off or starting."""
+        return list(filter(self._servos.listens, hearing.by_id.get(id_, ())))
+
+    def _shadows(self, hearing: Hearing, id_: int) -> list[int]:
+        """Servos of which it is the secondary ID."""
+        return list(filter(self._servos.listens, hearing.by_shadow.get(id_, ())))
+
+    def _register(self, servo: int, address: int, data: bytes) -> StatusError:
+        """Keep a write until :meth:`_act`."""
+        self._registered[servo] = (address, data)
+        self._servos.registers[servo]["registered_instruction"] = 1
+        return StatusError.NONE
+
+    def _act(self, servo: int) -> StatusError:
+        """Carry out the registered write; a restart has forgotten it."""
+        registers = self._servos.registers[servo]
+        if not registers["registered_instruction"]:
+            return StatusError.RESULT_FAIL
+        registers["registered_instruction"] = 0
+        return self._servos.write(servo, *self._registered.pop(servo))
+
+    def _clear_turns(self, servo: int) -> StatusError:
+        """Count turns from here; only at rest."""
+        index = self._servos.ids.index(servo)
+        if abs(self._servos.plant.velocity[index]) > self._servos.registers[servo]["moving_threshold"] * RAD_S_PER_UNIT:
+            return StatusError.RESULT_FAIL
+        self._servos.forget_turns(index)
+        return StatusError.NONE

@@ -10,26 +10,27 @@ import math
 from dynsim.dynamics import state as kst
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
-from dynsim.dynamics.contact.cone import problem as kc
-from dynsim.dynamics.contact.cone.problem import approach, approach_or_draw_near, solve_cones
+from dynsim.dynamics.contact.cone import steps as kc
+from dynsim.dynamics.contact.cone.steps import approach, approach_or_draw_near, solve_cones
+from dynsim.dynamics.contact.delassus import find_splits, normal_is_open
 from dynsim.dynamics.contact.mobility import moves_along_normal
 from dynsim.dynamics.contact.rows import row_errors, set_modes
 from dynsim.dynamics.contact.unilateral import (
     UnilateralArrays,
     dry_rows_held,
     holding_bound,
+    rows_of_couplings,
     sliding_friction,
     stop_gap,
     stop_rate,
 )
 from dynsim.dynamics.derivative import System, derivative
-from dynsim.dynamics.tables import Workspace
+from dynsim.dynamics.tables import ContactArrays, Workspace
 from dynsim.dynamics.tree.articulated import accelerate
-from dynsim.integrators import project as kp
 from dynsim.integrators import run as ki
-from dynsim.integrators.project import project_level
-from dynsim.integrators.run import Run
-from dynsim.jit.kernel import internal_kernel
+from dynsim.integrators import run as kp
+from dynsim.integrators.run import Run, project_level
+from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
 # An approach faster than this many times the projection tolerance of rates is an impact.
 STRIKE = 3.0
@@ -414,3 +415,149 @@ def impact(system: System, ws: Workspace, run: Run):
             unilateral.stop[k, ku.STOP_LOSS] += rows[r, ka.FORCE]
             y[layout.loss + kst.JOINT_STOP_LOSS] += rows[r, ka.FORCE]
             r += 1
+
+
+# Snapshot of all that a choice of contact modes writes, so that a choice can be tried and taken back.
+
+
+@noinline_kernel
+def keep(unilateral: UnilateralArrays, ws: Workspace, run: Run):
+    """Keep modes, their tables and the state, between two steps, when ``y_new`` is free."""
+    kept, mode = unilateral.kept, unilateral.mode
+    for k in range(mode.shape[0]):
+        mode[k, ku.WANTED] = ws.active[k, ka.MODE]
+    at = write(kept, 0, mode)
+    at = write(kept, at, unilateral.dry_table)
+    at = write(kept, at, unilateral.stop_table)
+    at = write(kept, at, unilateral.slide)
+    at = write(kept, at, unilateral.tally)
+    at = write(kept, at, unilateral.dry)
+    at = write(kept, at, unilateral.stop)
+    at = write_numbers(kept, at, unilateral.number)
+    write_numbers(kept, at, unilateral.shares)
+    for i in range(run.y.shape[0]):
+        run.y_new[i] = run.y[i]
+
+
+@noinline_kernel
+def take_back(system: System, ws: Workspace, run: Run):
+    """Modes, their tables and the state as :func:`keep` has seen them, and the right-hand side there."""
+    unilateral = system.unilateral
+    kept, mode = unilateral.kept, unilateral.mode
+    at = read(kept, 0, mode)
+    at = read(kept, at, unilateral.dry_table)
+    at = read(kept, at, unilateral.stop_table)
+    at = read(kept, at, unilateral.slide)
+    at = read(kept, at, unilateral.tally)
+    at = read(kept, at, unilateral.dry)
+    at = read(kept, at, unilateral.stop)
+    at = read_numbers(kept, at, unilateral.number)
+    read_numbers(kept, at, unilateral.shares)
+    for i in range(run.y.shape[0]):
+        run.y[i] = run.y_new[i]
+    # First with the present rows, for the positions of points, which the earlier rows start from.
+    evaluate(system, ws, run)
+    set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
+    evaluate(system, ws, run)
+    run.count[ki.STATUS] = ki.RUNNING
+
+
+@internal_kernel
+def write(kept, at, table):
+    """Write a table into ``kept`` from ``at`` on; returns where the next begins."""
+    for i in range(table.shape[0]):
+        for j in range(table.shape[1]):
+            kept[at] = table[i, j]
+            at += 1
+    return at
+
+
+@internal_kernel
+def read(kept, at, table):
+    """Read a table, of numbers or of integers, from ``kept``; returns where the next begins."""
+    for i in range(table.shape[0]):
+        for j in range(table.shape[1]):
+            table[i, j] = kept[at]
+            at += 1
+    return at
+
+
+@internal_kernel
+def write_numbers(kept, at, numbers):
+    """Write numbers into ``kept`` from ``at`` on; returns where the next begin."""
+    for i in range(numbers.shape[0]):
+        kept[at + i] = numbers[i]
+    return at + numbers.shape[0]
+
+
+@internal_kernel
+def read_numbers(kept, at, numbers):
+    """Read numbers from ``kept``; returns where the next begin."""
+    for i in range(numbers.shape[0]):
+        numbers[i] = kept[at + i]
+    return at + numbers.shape[0]
+
+
+# Acceleration of a sticking point without its own force: whether anything presses it against its surface.
+
+
+# Starts of the contact problem of all others; a point for which none finds a solution counts as pressed.
+STARTS = 8
+# Fraction of the largest right-hand side below which an acceleration counts as zero.
+NO_ACCELERATION = 1e-8
+
+
+@noinline_kernel
+def approach_without_force(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace, k):
+    """Acceleration of sticking candidate k towards its surface without its own force, right after ``derivative``.
+
+    The contact problem has all other forces: sticking points may slip in it, held joints move and stops open; sliding
+    points keep their direction. Positive, by NO_ACCELERATION, if nothing moves the point, so that the guard of a point
+    that leaves falls through zero [m/s²].
+    """
+    index, vector, active, W = unilateral.index, unilateral.vector, ws.active, ws.small[0]
+    size = ws.counts[ka.COUPLED]
+    begin_problem(unilateral, rows_of_couplings(unilateral, ws), size)
+    for j in range(ws.contacts.shape[0]):
+        mode, r = active[j, ka.MODE], active[j, ka.FIRST_ROW]
+        if j == k or mode == ka.OPEN:
+            continue
+        vector[ku.CONE_FRICTION, size] = unilateral.number[ku.HOLDING] * contacts.law[j, ka.STATIC]
+        for s in range(3 if mode == ka.STICKING else 1):
+            index[ku.KINDS, size] = kc.ONE_WAY if mode == ka.SLIDING else kc.CONE if s == 0 else kc.TANGENT
+            index[ku.TABLE_ROW, size] = r + s
+            size += 1
+    largest, first = largest_right_side(ws), active[k, ka.FIRST_ROW]
+    for i in range(size):
+        a = index[ku.TABLE_ROW, i]
+        vector[ku.OFFSET, i], vector[ku.SOLUTION, i] = -ws.rows[a, ka.RHS], 0.0
+        # Columns of sliding points have their friction in W already.
+        for j in range(size):
+            unilateral.room[ku.PROBLEM, i, j] = W[a, index[ku.TABLE_ROW, j]]
+    if size > 0 and not solve_problem(unilateral, unilateral.room[ku.PROBLEM], size, largest, STARTS):
+        return 1.0
+    away = -ws.rows[first, ka.RHS]
+    for i in range(size):
+        away += W[first, index[ku.TABLE_ROW, i]] * vector[ku.SOLUTION, i]
+    return NO_ACCELERATION * largest - away
+
+
+@internal_kernel
+def watch_unpressed(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace, h):
+    """Add an accepted step to the time of each point that sticks although nothing presses it.
+
+    Only if the split of least norm lies in all cones: equally stiff supports have this split, and hold the point.
+    Otherwise the guard of the normal force lets the point leave.
+    """
+    if unilateral.number[ku.REDUNDANT] == 1.0 and unilateral.number[ku.SPLIT] == 0.0 and ws.counts[ka.STUCK] > 0:
+        add_unpressed(contacts, unilateral, ws, h)
+
+
+@noinline_kernel
+def add_unpressed(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace, h):
+    """:func:`watch_unpressed` where rows depend on each other."""
+    find_splits(unilateral, ws)
+    for k in range(ws.contacts.shape[0]):
+        is_open = ws.active[k, ka.MODE] == ka.STICKING and normal_is_open(unilateral, ws, k)
+        if is_open and approach_without_force(contacts, unilateral, ws, k) < 0.0:
+            unilateral.tally[k, ku.UNPRESSED] += h

@@ -18,10 +18,10 @@ import math
 from dynsim.dynamics import state as kst
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
-from dynsim.dynamics.contact.cone import problem as kc
+from dynsim.dynamics.contact.cone import steps as kc
+from dynsim.dynamics.contact.delassus import dry_margin, find_splits, margin, point_shares
 from dynsim.dynamics.contact.rows import set_modes
 from dynsim.dynamics.contact.shares import even_out, share_slot, some_slide
-from dynsim.dynamics.contact.splits import dry_margin, find_splits, margin, point_shares
 from dynsim.dynamics.contact.unilateral import (
     UnilateralArrays,
     dry_bound,
@@ -52,8 +52,7 @@ from dynsim.integrators.contacts.impacts import (
     strike_limit,
 )
 from dynsim.integrators.contacts.resting import leave_least, release_dependent_joints
-from dynsim.integrators.project import RATE_TOLERANCE, project_level
-from dynsim.integrators.run import Run
+from dynsim.integrators.run import RATE_TOLERANCE, Run, project_level
 from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
 # An acceleration along the surface below this fraction of the largest right-hand side counts as zero.

@@ -12,17 +12,15 @@ import math
 from dynsim.dynamics import state as kst
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
-from dynsim.dynamics.contact.cone import problem as kc
-from dynsim.dynamics.contact.cone.socp import best_split, split_room_in
-from dynsim.dynamics.contact.delassus import RANK_TOLERANCE, solve_small
+from dynsim.dynamics.contact.cone import steps as kc
+from dynsim.dynamics.contact.cone.program import best_split, split_room_in
+from dynsim.dynamics.contact.delassus import ONE_WAY, RANK_TOLERANCE, change_of_coupling, null_space, solve_small
 from dynsim.dynamics.contact.rows import set_modes
-from dynsim.dynamics.contact.splits import ONE_WAY, change_of_coupling, null_space
 from dynsim.dynamics.contact.unilateral import UnilateralArrays, dry_bound, dry_rests, dry_rows_held
 from dynsim.dynamics.derivative import System
 from dynsim.dynamics.tables import Workspace
 from dynsim.integrators.contacts.impacts import FORCE_TOLERANCE, evaluate
-from dynsim.integrators.project import project_level
-from dynsim.integrators.run import Run
+from dynsim.integrators.run import Run, project_level
 from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
 # Largest share of its friction that a joint at rest may have: all but a rounding, to distinguish it from a sliding one.
@@ -42,7 +40,7 @@ def release_dependent_joints(system: System, ws: Workspace, size):
 
     Such a row depends on the normal rows, and how they share a force changes the friction of sliding points: no split
     of the right-hand side equals the solution. At rest Coulomb's law admits any force within the bound. Rows that
-    depend only on rows of sticking points and other joints remain, see :mod:`dynsim.dynamics.contact.splits`, except
+    depend only on rows of sticking points and other joints remain, see :mod:`dynsim.dynamics.contact.delassus`, except
     rows that depend on them only nearly: holding such a joint would take forces beyond all bounds, and the order of
     pivots would decide whether it is held. ``size`` is the size of the solved problem.
 

@@ -19,22 +19,23 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 from numba.core import types
 
 from dynsim.dynamics import state as kst
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
+from dynsim.dynamics.contact.delassus import clearly_unique
 from dynsim.dynamics.contact.unilateral import UnilateralArrays
 from dynsim.dynamics.derivative import System, derivative
 from dynsim.dynamics.drive.law import drive_block
-from dynsim.dynamics.simd.system import StageLanes, evaluate_four, take_rows
+from dynsim.dynamics.simd.forms import StageLanes, as_lanes, evaluate_four, lane, tables_as_lanes, take_rows
 from dynsim.dynamics.tables import Workspace
-from dynsim.dynamics.tree.joints import displace
+from dynsim.dynamics.tree.joints import displace, positions_along, rates_across
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts.impacts import slip_speed
+from dynsim.integrators.events import note_inside
 from dynsim.integrators.radau5 import tables as kn
-from dynsim.integrators.radau5.ends import evaluate_end
-from dynsim.integrators.radau5.linear_systems import factor_both, solve_both
 from dynsim.integrators.radau5.tables import (
     A_RADAU,
     ALPHA_RADAU,
@@ -46,10 +47,412 @@ from dynsim.integrators.radau5.tables import (
     T_RADAU,
     NewtonArrays,
 )
-from dynsim.integrators.run import Run
+from dynsim.integrators.run import (
+    Run,
+    fill_output,
+    forces_unique,
+    off_surface,
+    settle,
+    watch,
+    write_sample,
+    write_samples,
+    write_waiting,
+)
 from dynsim.integrators.steps import energy_norm, error_norm
 from dynsim.jit.compiler import form_of
 from dynsim.jit.kernel import internal_kernel, noinline_kernel
+from dynsim.jit.simd import four, turned
+
+# Linear systems of RADAU5's Newton method, reduced to the rates: one real and one complex, solved together.
+
+
+@internal_kernel
+def factor_both(system: System, r: NewtonArrays, h):
+    """Inverses of both reduced matrices, from ``r.along`` and ``r.linear``, for steps of length h."""
+    r.inverse[0] = reduced_inverse(system, r, GAMMA_RADAU / h)
+    r.inverse[1] = reduced_inverse(system, r, complex(ALPHA_RADAU / h, BETA_RADAU / h))
+
+
+@internal_kernel
+def solve_both(system: System, ws: Workspace, y, r: NewtonArrays, h):
+    """``r.one`` and ``r.two``, (s,) real and complex, from right sides to solutions, by :func:`factor_both`."""
+    r.one[:] = solve_newton(system, y, r, GAMMA_RADAU / h, r.inverse[0].real, r.one)
+    r.two[:] = solve_newton(system, y, r, complex(ALPHA_RADAU / h, BETA_RADAU / h), r.inverse[1], r.two)
+
+
+def reduced_inverse(system: System, r: NewtonArrays, g):
+    """The inverse of the reduced matrix for g, real or complex; as Python only."""
+    along, block, table = r.along, r.linear, system.drives.table
+    n = along.shape[1]
+    first = 2 * n  # of the rows of circuits
+    matrix = g * np.eye(n) - along[n:first].T - along[:n].T / g
+    for row, (j, k) in zip(block, table[:, [ka.DRIVEN, ka.CIRCUIT]], strict=True):
+        if k >= 0:
+            matrix[:, j] -= along[first + k] * (row[ka.RATE_Q] / g + row[ka.RATE_V]) / (g - row[ka.RATE_I])
+    return np.linalg.inv(matrix)
+
+
+def solve_newton(system: System, y, r: NewtonArrays, g, inverse, x):
+    """(g I − J)⁻¹ x by the inverse of the reduced matrix, x (s,) real or complex; as Python only."""
+    along, table, layout = r.along, system.drives.table, system.layout
+    n, q, v = along.shape[1], layout.q, layout.v
+    first = 2 * n - layout.current  # of the rows of circuits
+    angle, solved = x[q : q + n].copy(), x.copy()
+    if layout.extra > 0:
+        rates_across(system.model, y, q, x, angle)
+    angle /= g
+    u = x[v : v + n] + angle @ along[:n]
+    circuits = [
+        (row, j, layout.current + k)
+        for row, (j, k) in zip(r.linear, table[:, [ka.DRIVEN, ka.CIRCUIT]], strict=True)
+        if k >= 0
+    ]
+    for row, j, e in circuits:
+        u = u + along[first + e] * (x[e] + row[ka.RATE_Q] * angle[j]) / (g - row[ka.RATE_I])
+    u = inverse @ u
+    for row, j, e in circuits:
+        pull = row[ka.RATE_Q] * (angle[j] + u[j] / g) + row[ka.RATE_V] * u[j]
+        solved[e] = (x[e] + pull) / (g - row[ka.RATE_I])
+    solved[v : v + n] = u
+    if layout.extra > 0:
+        positions_along(system.model, y, q, u, solved)
+        solved[q : q + n + layout.extra] /= g
+    else:
+        solved[q : q + n] = angle + u / g
+    return solved
+
+
+def _compiled(*_: Any) -> bool:
+    return True
+
+
+@internal_kernel
+def pair(real, z):
+    """What x ∘ (p, m) multiplies by: a real number and a complex one."""
+    return four(real, z.real, z.real, real), four(0.0, -z.imag, z.imag, 0.0)
+
+
+@form_of(factor_both, _compiled)
+def invert_on_lanes(system, r, h):
+    """The inverses of both, by Gauss–Jordan elimination; pivots large in both."""
+    along, block, table = r.along, r.linear, system.drives.table
+    p, m = as_lanes(r.direct), as_lanes(r.crossed)
+    over, circuit = as_lanes(r.over), as_lanes(r.circuit)
+    n, real, z = p.shape[0], GAMMA_RADAU / h, complex(ALPHA_RADAU / h, BETA_RADAU / h)
+    first = 2 * n
+    gp, gm = pair(real, z)
+    op, om = pair(1.0 / real, 1.0 / z)
+    over[0], over[1] = op, om
+    for i in range(n):
+        for j in range(n):
+            p[i, j] = -along[j, i] * op - along[n + j, i]
+            m[i, j] = -along[j, i] * om
+        p[i, i] += gp
+        m[i, i] += gm
+    for a in range(table.shape[0]):
+        j, k = table[a, ka.DRIVEN], table[a, ka.CIRCUIT]
+        if k >= 0:
+            rate = block[a, ka.RATE_I]
+            cp, cm = pair(1.0 / (real - rate), 1.0 / (z - rate))
+            circuit[a, 0], circuit[a, 1] = cp, cm
+            sp, sm = block[a, ka.RATE_Q] * op + block[a, ka.RATE_V], block[a, ka.RATE_Q] * om
+            sp, sm = sp * cp - sm * cm, sp * cm + sm * cp
+            for i in range(n):
+                p[i, j] -= along[first + k, i] * sp
+                m[i, j] -= along[first + k, i] * sm
+    for k in range(n):
+        best, largest = k, 0.0
+        for i in range(k, n):
+            size = (r.direct[i, k, 1] ** 2 + r.crossed[i, k, 2] ** 2) * r.direct[i, k, 0] ** 2
+            if size > largest:
+                best, largest = i, size
+        r.pivot[k] = best
+        if best != k:
+            for j in range(n):
+                p[k, j], p[best, j] = p[best, j], p[k, j]
+                m[k, j], m[best, j] = m[best, j], m[k, j]
+        dp, dm = pair(1.0 / r.direct[k, k, 0], 1.0 / complex(r.direct[k, k, 1], r.crossed[k, k, 2]))
+        p[k, k], m[k, k] = 1.0, 0.0
+        for j in range(n):
+            c, d = p[k, j], m[k, j]
+            p[k, j], m[k, j] = c * dp - d * dm, c * dm + d * dp
+        for i in range(n):
+            if i != k:
+                e, f = p[i, k], m[i, k]
+                p[i, k], m[i, k] = 0.0, 0.0
+                for j in range(n):
+                    c, d = p[k, j], m[k, j]
+                    p[i, j], m[i, j] = p[i, j] - (e * c - f * d), m[i, j] - (e * d + f * c)
+    for k in range(n - 1, -1, -1):
+        best = r.pivot[k]
+        if best != k:
+            for i in range(n):
+                p[i, k], p[i, best] = p[i, best], p[i, k]
+                m[i, k], m[i, best] = m[i, best], m[i, k]
+
+
+@form_of(solve_both, _compiled)
+def multiply_on_lanes(system, ws, y, r, h):
+    """By the inverses of :func:`invert_on_lanes`."""
+    along, block, table, layout = r.along, r.linear, system.drives.table, system.layout
+    n, q, v, current = along.shape[1], layout.q, layout.v, layout.current
+    p, m, x, room = as_lanes(r.direct), as_lanes(r.crossed), as_lanes(r.x), as_lanes(r.room)
+    over, circuit = as_lanes(r.over), as_lanes(r.circuit)
+    op, om = over[0], over[1]
+    u, angle, across, first = room[0], room[1], room[2], 2 * n
+    for j in range(x.shape[0]):
+        x[j] = four(r.one[j], r.two[j].real, r.two[j].imag, 0.0)
+    if layout.extra > 0:
+        rates_across(system.model, y, q, x, angle)
+    for i in range(n):
+        e = angle[i] if layout.extra > 0 else x[q + i]
+        angle[i] = e * op + turned(e) * om
+        u[i] = x[v + i]
+    for j in range(n):
+        e = angle[j]
+        for i in range(n):
+            u[i] += along[j, i] * e
+    for a in range(table.shape[0]):
+        j, k = table[a, ka.DRIVEN], table[a, ka.CIRCUIT]
+        if k >= 0:
+            free = x[current + k] + block[a, ka.RATE_Q] * angle[j]
+            free = free * circuit[a, 0] + turned(free) * circuit[a, 1]
+            for i in range(n):
+                u[i] += along[first + k, i] * free
+    for i in range(n):
+        across[i] = turned(u[i])
+    for i in range(n):
+        total, other = x[v + i] * 0.0, x[v + i] * 0.0
+        for j in range(n):
+            total += p[i, j] * u[j]
+            other += m[i, j] * across[j]
+        x[v + i] = total + other
+    for a in range(table.shape[0]):
+        j, k = table[a, ka.DRIVEN], table[a, ka.CIRCUIT]
+        if k >= 0:
+            rate = x[v + j]
+            moved = angle[j] + rate * op + turned(rate) * om
+            free = x[current + k] + block[a, ka.RATE_Q] * moved + block[a, ka.RATE_V] * rate
+            x[current + k] = free * circuit[a, 0] + turned(free) * circuit[a, 1]
+    if layout.extra == 0:
+        for i in range(n):
+            rate = x[v + i]
+            x[q + i] = angle[i] + rate * op + turned(rate) * om
+    else:
+        for i in range(n):
+            u[i] = x[v + i]
+        positions_along(system.model, y, q, u, x)
+        for j in range(q, q + n + layout.extra):
+            e = x[j]
+            x[j] = e * op + turned(e) * om
+    for j in range(x.shape[0]):
+        e = x[j]
+        r.one[j], r.two[j] = lane(e, 0), complex(lane(e, 1), lane(e, 2))
+
+
+# End of a RADAU5 step: derivative, constraint and uniqueness checks, and samples on lanes.
+
+
+def samples_on_lanes(newton: Any, system: Any, ws: Any, run: Any, *_: Any) -> bool:
+    """Where there are lanes, by types."""
+    return bool(newton != types.none and newton[newton.fields.index("lanes")] != types.none)
+
+
+@internal_kernel
+def may_wait(unilateral: UnilateralArrays | None, run: Run):
+    """True where nothing but steps happens between two samples: modes, commands and loads go on as they are."""
+    if unilateral is None:  # known to the compiler
+        return run.event.shape[0] + run.tick.shape[0] + run.breaks.shape[0] == 0
+    return False
+
+
+@internal_kernel
+def has_stops(unilateral: UnilateralArrays | None):
+    """True where joints have stops or dry friction, whose forces are kept for one state alone."""
+    if unilateral is None:  # known to the compiler
+        return False
+    return unilateral.stop.shape[0] + unilateral.dry.shape[0] > 0
+
+
+@form_of(write_samples, samples_on_lanes)
+def write_samples_on_lanes(newton, system, ws, run, more):
+    """Four at a time; those that cannot wait by fewer, and one is done sooner alone."""
+    newton.count[kn.WAITING] += more
+    wait = may_wait(system.unilateral, run)
+    # What the ground carries is computed for one state alone too.
+    alone = has_stops(system.unilateral) or run.support.index.shape[0] > 0
+    while newton.count[kn.WAITING] >= 4 or (newton.count[kn.WAITING] > 0 and not wait):
+        if alone or newton.count[kn.WAITING] == 1:
+            newton.count[kn.WAITING] -= 1
+            write_sample(system, ws, run)
+        else:
+            write_together(newton, system, ws, run, 0)
+
+
+@form_of(write_waiting, samples_on_lanes)
+def write_waiting_on_lanes(newton, system, ws, run):
+    """Write even a single sample from lanes: its value must not depend on when a caller looks.
+
+    The first lane keeps the end of a step that is pending.
+    """
+    if newton.count[kn.WAITING] > 0:
+        write_together(newton, system, ws, run, 1)
+
+
+@internal_kernel
+def write_together(newton: NewtonArrays, system: System, ws: Workspace, run: Run, begin):
+    """Record the waiting samples, up to four, from lane ``begin`` on."""
+    count = load_samples(newton, run, begin)
+    fill_lanes(newton.lanes, run, begin + count)
+    evaluate_four(newton.lanes, system)
+    take_samples(newton, system, ws, run, begin, count)
+
+
+@internal_kernel
+def load_samples(newton: NewtonArrays, run: Run, begin):
+    """Samples that wait into the lanes from ``begin`` on; returns how many."""
+    lanes, first, count = newton.lanes, run.count[ki.SAMPLE], min(newton.count[kn.WAITING], 4 - begin)
+    for k in range(count):
+        lanes.t[begin + k] = run.sample_time[first + k]
+        for j in range(run.y.shape[0]):
+            lanes.y[j, begin + k] = run.sample[first + k, j]
+    return count
+
+
+@internal_kernel
+def fill_lanes(lanes: StageLanes, run: Run, begin):
+    """The first lane into those from ``begin`` on, for which there is nothing else."""
+    for k in range(begin, 4):
+        lanes.t[k] = lanes.t[0]
+        for j in range(run.y.shape[0]):
+            lanes.y[j, k] = lanes.y[j, 0]
+
+
+@internal_kernel
+def take_samples(newton: NewtonArrays, system: System, ws: Workspace, run: Run, begin, count):
+    """Record so many samples from the lanes, from ``begin`` on; what has left its surfaces is projected, alone."""
+    if count == 0:
+        return
+    lanes = newton.lanes
+    tables = tables_as_lanes(lanes.ws)
+    fill_output(system, tables, run, as_lanes(lanes.output))
+    run.count[ki.EVALUATIONS] += count
+    newton.count[kn.WAITING] -= count
+    for k in range(begin, begin + count):
+        if off_surface(lane(tables, k)):
+            write_sample(system, ws, run)
+        else:
+            row = run.output[run.count[ki.SAMPLE]]
+            for j in range(lanes.output.shape[0]):
+                row[j] = lanes.output[j, k]
+            run.count[ki.SAMPLE] += 1
+
+
+@internal_kernel
+def evaluate_end(newton: NewtonArrays, system: System, ws: Workspace, run: Run):
+    """Derivatives at the three stages into ``f``, and the last one, which is at y_new, into stage[6] too."""
+    evaluate_two(newton, system, ws, run)
+    evaluate_end_alone(newton, system, ws, run)
+
+
+@internal_kernel
+def evaluate_two(newton: NewtonArrays, system: System, ws: Workspace, run: Run):
+    """Derivatives at the first two stages, into ``f``."""
+    for s in range(2):
+        for j in range(newton.kept.shape[1]):
+            run.stage[7, j] = run.y[j] + newton.z[s, j]
+        derivative(system, run.clock[ki.TIME] + kn.NODE_RADAU[s] * run.clock[ki.STEP], run.stage[7], ws, newton.f[s])
+        if run.event.shape[0] > 0:
+            note_inside(system, ws, run, s, kn.NODE_RADAU[s])
+    run.count[ki.EVALUATIONS] += 2
+
+
+@internal_kernel
+def evaluate_end_alone(newton: NewtonArrays, system: System, ws: Workspace, run: Run):
+    """Derivative at y_new into the third row of ``f``, then into stage[6].
+
+    Not the other way round: entries that no derivative writes are zero in ``f``, and scratch in stage[6].
+    """
+    derivative(system, run.clock[ki.TIME] + run.clock[ki.STEP], run.y_new, ws, newton.f[2])
+    for j in range(run.y.shape[0]):
+        run.stage[6, j] = newton.f[2, j]
+    run.count[ki.EVALUATIONS] += 1
+
+
+@internal_kernel
+def end_workspace(newton: NewtonArrays | None, system: System, ws: Workspace, run: Run):
+    """The workspace of the end of the step just taken."""
+    return ws
+
+
+@internal_kernel
+def end_accepted(newton: NewtonArrays | None, system: System, ws: Workspace, run: Run):
+    """Project y_new where it is off the constraints, and watch the forces; False, and STATUS, when that cannot be."""
+    return end_settled(system, ws, run, off_surface(ws)) and end_watched(system, ws, run)
+
+
+@internal_kernel
+def end_settled(system: System, ws: Workspace, run: Run, off):
+    """True when y_new is on the constraints; where it was ``off`` them ``ws`` is of what it has become."""
+    if not off or settle(system, run.clock[ki.TIME] + run.clock[ki.STEP], run.y_new, ws, run.stage[6], run):
+        return True
+    run.count[ki.STATUS] = ki.NOT_PROJECTED
+    return False
+
+
+@internal_kernel
+def end_watched(system: System, ws: Workspace, run: Run):
+    """True when forces at y_new are unique; ``ws`` right after ``derivative`` there."""
+    h = run.clock[ki.STEP]
+    if not (clearly_unique(ws) or forces_unique(system, ws, run, run.clock[ki.TIME] + h)):
+        return False
+    watch(ws, run, h)
+    return True
+
+
+def _on_lanes(newton: Any, system: Any, ws: Any, run: Any, *_: Any) -> bool:
+    """Where samples are taken on lanes and nothing else asks what the forces at the end are."""
+    return samples_on_lanes(newton, system, ws, run) and bool(system[system.fields.index("unilateral")] == types.none)
+
+
+@form_of(evaluate_end, _on_lanes)
+def evaluate_end_on_lanes(newton, system, ws, run):
+    """Evaluate y_new on the first lane, the two inner stages on the next, and a waiting sample on the last."""
+    lanes, t, h = newton.lanes, run.clock[ki.TIME], run.clock[ki.STEP]
+    lanes.t[0], lanes.t[1], lanes.t[2] = t + h, t + kn.NODE_RADAU[0] * h, t + kn.NODE_RADAU[1] * h
+    for j in range(run.y.shape[0]):
+        lanes.y[j, 0] = run.y_new[j]
+        lanes.y[j, 1], lanes.y[j, 2] = run.y[j] + newton.z[0, j], run.y[j] + newton.z[1, j]
+    count = load_samples(newton, run, 3)
+    fill_lanes(lanes, run, 3 + count)
+    dependent, contradictory = lanes.ws.counts[ka.DEPENDENT], lanes.ws.counts[ka.CONTRADICTORY]
+    evaluate_four(lanes, system)
+    ws.counts[ka.DEPENDENT] += lanes.ws.counts[ka.DEPENDENT] - dependent
+    ws.counts[ka.CONTRADICTORY] += lanes.ws.counts[ka.CONTRADICTORY] - contradictory
+    run.count[ki.EVALUATIONS] += 3
+    for j in range(run.y.shape[0]):
+        newton.f[0, j], newton.f[1, j], newton.f[2, j] = lanes.f[j, 1], lanes.f[j, 2], lanes.f[j, 0]
+        run.stage[6, j] = newton.f[2, j]
+    take_samples(newton, system, ws, run, 3, count)
+    if run.event.shape[0] > 0:
+        for s in range(2):
+            note_inside(system, lane(tables_as_lanes(lanes.ws), 1 + s), run, s, kn.NODE_RADAU[s])
+
+
+@form_of(end_accepted, _on_lanes)
+def end_accepted_on_lanes(newton, system, ws, run):
+    """By what the first lane has left, unless the end must be projected."""
+    end = lane(tables_as_lanes(newton.lanes.ws), 0)
+    if not off_surface(end):
+        return end_watched(system, end, run)
+    return end_settled(system, ws, run, True) and end_watched(system, ws, run)
+
+
+@form_of(end_workspace, _on_lanes)
+def end_workspace_on_lanes(newton, system, ws, run):
+    """The first lane."""
+    return lane(tables_as_lanes(newton.lanes.ws), 0)
+
 
 # Newton's method: most iterations, and the contraction below which the Jacobian stays.
 MOST_ITERATIONS, GOOD_CONTRACTION = 8, 0.05

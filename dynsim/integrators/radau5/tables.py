@@ -8,8 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dynsim.dynamics import tables as ka
-from dynsim.dynamics.simd.system import StageLanes
-from dynsim.dynamics.simd.tables import aligned
+from dynsim.dynamics.simd.forms import StageLanes, aligned
 from dynsim.jit.kernel import internal_kernel
 
 # Radau IIA of order 5, coefficients of Hairer and Wanner (Solving Ordinary Differential Equations II, IV.8): T⁻¹ A⁻¹ T
@@ -72,7 +71,7 @@ class NewtonArrays(NamedTuple):
     weight: np.ndarray  # (s,) 1 / tolerance
     one: np.ndarray  # (s,) right side and solution of the real system
     two: np.ndarray  # (s,) complex
-    direct: np.ndarray  # (n, n, 4) inverses of both matrices, see dynsim.integrators.radau5.linear_systems
+    direct: np.ndarray  # (n, n, 4) inverses of both matrices, see dynsim.integrators.radau5.step
     crossed: np.ndarray  # (n, n, 4)
     over: np.ndarray  # (2, 4) 1/g
     circuit: np.ndarray  # (na, 2, 4) and 1/(g − ∂(di/dt)/∂i)

@@ -7,22 +7,22 @@ from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.unilateral import UnilateralArrays, note_stop_forces
 from dynsim.dynamics.derivative import System
-from dynsim.dynamics.drive.law import drive, take_commands
-from dynsim.dynamics.ledger import drive_powers
+from dynsim.dynamics.drive.law import drive, drive_on_segments, segment_of, take_commands
+from dynsim.dynamics.ledger import drive_powers, kinetic_energy, potential_energy
 from dynsim.dynamics.tables import ModelArrays, Workspace
-from dynsim.dynamics.tree.angles import sine_cosine
 from dynsim.dynamics.tree.articulated import accelerate, add_row_forces, factor, row_system
-from dynsim.dynamics.tree.joints import normalise
+from dynsim.dynamics.tree.joints import normalise, sine_cosine
 from dynsim.dynamics.tree.loads import add_loads
+from dynsim.dynamics.tree.spatial import dot, point_velocity, six, times_inertia
+from dynsim.dynamics.tree.sweep import body_inertia, forward_sweep, inertial_wrench
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts import events as ke
-from dynsim.integrators.dense import sampled_now
 from dynsim.integrators.events import take_ticks
-from dynsim.integrators.output import fill_drives, fill_energies, steady_torque, write_output
-from dynsim.integrators.run import Run
+from dynsim.integrators.run import Run, fill_drives, fill_energies, sampled_now, steady_torque, watch, write_output
 from dynsim.integrators.stepping import tables as kt
-from dynsim.integrators.stepping.compliance import book_soft_contact, book_ties
 from dynsim.integrators.stepping.contacts import (
+    book_soft_contact,
+    book_ties,
     list_contacts,
     note_contacts,
     rates_jumped,
@@ -33,12 +33,168 @@ from dynsim.integrators.stepping.contacts import (
     strikes,
     tangent_rows,
 )
-from dynsim.integrators.stepping.discretisation_energy import begin_energy, drive_work, midpoint_work, stored_energy
-from dynsim.integrators.stepping.drives import MOST_TRIES, drive_at_theta, eliminate_currents, limits_agree
 from dynsim.integrators.stepping.tables import SteppingArrays, constraint_rates, geometry, moved, place_joints
 from dynsim.integrators.steps import choose_step, finished, finite, stalled
-from dynsim.integrators.watch import watch
 from dynsim.jit.kernel import free_kernel, internal_kernel
+
+# The drives within a step of time stepping: implicit by linear blocks, with limits decided at x_θ.
+
+
+# Most repetitions of a step for the segments of its drives; after ALL_AT_ONCE of them one drive changes at a time, as
+# changes of several at once may undo each other.
+MOST_TRIES, ALL_AT_ONCE = 16, 4
+
+
+@internal_kernel
+def eliminate_currents(system: System, ws: Workspace, run: Run):
+    """What is left of drives and damping: torques into APPLIED, the implicit share into the ARMATURE of ``s.body``.
+
+    The joints must be at (q + h θ v, v), and what is applied without drives in APPLIED. With Δ = v' − v, i' − i is
+    a + c Δ, and the torque of x_θ is τ + ∂τ/∂i θ a + (∂τ/∂q h θ² + ∂τ/∂v θ + ∂τ/∂i θ c) Δ.
+    """
+    s, h, body, joints, motors = run.stepping, run.clock[ki.STEP], system.model.body, ws.joints, ws.motors
+    theta, drives = s.theta, system.drives
+    drive_on_segments(
+        drives, system.reference, run.clock[ki.TIME] + theta * h, run.y, system.layout, s.segment, ws, s.linear
+    )
+    for i in range(joints.shape[0]):
+        damping = body[i, ka.DAMPING] + body[i, ka.GEAR_DAMPING]
+        s.body[i, ka.ARMATURE] = body[i, ka.ARMATURE] + h * theta * damping
+    for a in range(motors.shape[0]):
+        j, linear, free, per = drives.table[a, ka.DRIVEN], s.linear[a], 0.0, 0.0
+        if drives.table[a, ka.CIRCUIT] >= 0:
+            scale = h / (1.0 - h * theta * linear[ka.RATE_I])
+            free = scale * motors[a, ka.DIDT]
+            per = scale * (linear[ka.RATE_Q] * h * theta * theta + linear[ka.RATE_V] * theta)
+        s.eliminated[a, kt.FREE], s.eliminated[a, kt.PER], s.eliminated[a, kt.DIDT_THEN] = free, per, motors[a, ka.DIDT]
+        joints[j, ka.APPLIED] += linear[ka.TORQUE_I] * theta * free
+        slope = (
+            linear[ka.TORQUE_Q] * h * theta * theta + linear[ka.TORQUE_V] * theta + linear[ka.TORQUE_I] * theta * per
+        )
+        s.body[j, ka.ARMATURE] -= h * slope
+
+
+@internal_kernel
+def drive_at_theta(system: System, ws: Workspace, run: Run):
+    """The drives at x_θ of the step into y_new, by their own laws: torques in APPLIED, which has nothing else."""
+    s, h, y, y_new, layout = run.stepping, run.clock[ki.STEP], run.y, run.y_new, system.layout
+    between, theta = run.stage[2], s.theta
+    for j in range(y.shape[0]):
+        between[j] = y[j] + theta * (y_new[j] - y[j])
+    place_joints(system, ws, y)
+    for i in range(ws.joints.shape[0]):
+        v = between[layout.v + i]
+        ws.joints[i, ka.Q] += h * theta * v
+        ws.joints[i, ka.QD], ws.joints[i, ka.APPLIED] = v, 0.0
+    drive(system.drives, system.reference, run.clock[ki.TIME] + theta * h, between, layout, ws)
+
+
+@internal_kernel
+def limits_agree(system: System, ws: Workspace, run: Run, tries):
+    """True when the drives at x_θ, after :func:`drive_at_theta`, lie on their segments; else puts them there.
+
+    From one limit to the opposite one a drive goes by the unlimited segment, which lies between: a light wheel passes
+    it within a step under either limit, and each would ask for the other. Between the current limits of a motor with
+    inductance lie those of its voltage instead.
+    """
+    s, agree = run.stepping, True
+    t = run.clock[ki.TIME] + s.theta * run.clock[ki.STEP]
+    for a in range(ws.motors.shape[0]):
+        segment = segment_of(system.drives, system.reference, t, ws, a)
+        direct = system.drives.table[a, ka.DRIVE_KIND] == ka.DC_MOTOR and abs(segment) == 2
+        if segment == -s.segment[a] and not direct:
+            segment = 0
+        if segment != s.segment[a] and (agree or tries < ALL_AT_ONCE):
+            s.segment[a], agree = segment, False
+    return agree
+
+
+# Energy error of time-stepping discretisation, a term of the ledger: ``loss_scheme``.
+
+
+@internal_kernel
+def stored_energy(system: System, ws: Workspace, y, out):
+    """Energy of bodies and rotors, and of coils, at y [J], into out, (2,). Sweeps there."""
+    layout, motor = system.layout, system.drives.motor
+    place_joints(system, ws, y)
+    for i in range(ws.joints.shape[0]):
+        ws.joints[i, ka.QD] = y[layout.v + i]
+    forward_sweep(system.model, ws, 1.0, 0.0, 1.0)
+    out[kt.MECHANICAL] = kinetic_energy(system.model, ws) + potential_energy(system.model, ws)
+    out[kt.MAGNETIC] = 0.0
+    for a in range(ws.motors.shape[0]):
+        k = system.drives.table[a, ka.CIRCUIT]
+        if k >= 0:
+            out[kt.MAGNETIC] += 0.5 * motor[a, ka.INDUCTANCE] * y[layout.current + k] * y[layout.current + k]
+
+
+@internal_kernel
+def begin_energy(system: System, ws: Workspace, run: Run):
+    """Energy at the start of a step: that at the end of the last one, unless the state is another one by now."""
+    energy, same = run.stepping.energy, True
+    for j in range(system.layout.tracked):
+        same = same and run.y[j] == run.y_new[j]
+    # NaN before the first step.
+    if same and energy[kt.STOP, kt.MECHANICAL] == energy[kt.STOP, kt.MECHANICAL]:
+        energy[kt.START, kt.MECHANICAL], energy[kt.START, kt.MAGNETIC] = (
+            energy[kt.STOP, kt.MECHANICAL],
+            energy[kt.STOP, kt.MAGNETIC],
+        )
+    else:
+        stored_energy(system, ws, run.y, energy[kt.START])
+
+
+@internal_kernel
+def midpoint_work(model: ModelArrays, ws: Workspace, v, vdot, h):
+    """v̄·M Δ + h v̄·(c + g) at the midpoint, whose sweep is still there [J]; leaves the links' velocities of v̄ in V.
+
+    v, vdot : (n,) rates at the start, mean acceleration; v̄ = v + h vdot / 2, Δ = h vdot
+    """
+    tree, body, links = model.tree, model.body, ws.links
+    inertia, bias = 0.0, 0.0
+    for i in range(tree.shape[0]):
+        m, c, I = body_inertia(model, ws, i)
+        wrench = inertial_wrench(ws, i, m, c, I)
+        j, rate, change = tree[i, ka.PARENT], v[i] + 0.5 * h * vdot[i], h * vdot[i]
+        for s in range(6):
+            links[i, ka.V + s] = links[i, ka.S + s] * rate + (links[j, ka.V + s] if j >= 0 else 0.0)
+            links[i, ka.A + s] = links[i, ka.S + s] * change + (links[j, ka.A + s] if j >= 0 else 0.0)
+        V, A = six(links, i, ka.V), six(links, i, ka.A)
+        bias += dot(wrench, V)
+        at_c, change_at_c, L = point_velocity(V, c), point_velocity(A, c), times_inertia(I, A)
+        inertia += (
+            V[0] * L[0]
+            + V[1] * L[1]
+            + V[2] * L[2]
+            + m * (at_c[0] * change_at_c[0] + at_c[1] * change_at_c[1] + at_c[2] * change_at_c[2])
+            + body[i, ka.ARMATURE] * rate * change
+        )
+    return inertia + h * bias
+
+
+@internal_kernel
+def drive_work(system: System, ws: Workspace, run: Run):
+    """What linear drives and the place of their power make [J], after ``drive`` at x_θ: its torques are in APPLIED."""
+    s, h, y, y_new, layout = run.stepping, run.clock[ki.STEP], run.y, run.y_new, system.layout
+    joints, motors, motor, body, theta = ws.joints, ws.motors, system.drives.motor, system.model.body, s.theta
+    v, vdot, applied = s.before[kt.V_START], s.before[kt.ACCELERATION], s.before[kt.APPLIED_THEN]
+    total = 0.0
+    for i in range(joints.shape[0]):
+        change = h * vdot[i]
+        used = h * applied[i] - (s.body[i, ka.ARMATURE] - body[i, ka.ARMATURE]) * change
+        law = joints[i, ka.APPLIED] - (body[i, ka.DAMPING] + body[i, ka.GEAR_DAMPING]) * joints[i, ka.QD]
+        total += (v[i] + 0.5 * change) * used - h * joints[i, ka.QD] * law
+    for a in range(motors.shape[0]):
+        k, j = system.drives.table[a, ka.CIRCUIT], system.drives.table[a, ka.DRIVEN]
+        if k >= 0:
+            start, linear = y[layout.current + k], s.linear[a]
+            more = y_new[layout.current + k] - start
+            by_v = (linear[ka.RATE_Q] * h * theta + linear[ka.RATE_V]) * theta
+            rate = s.eliminated[a, kt.DIDT_THEN] + by_v * h * vdot[j] + linear[ka.RATE_I] * theta * more
+            total += (
+                h * motor[a, ka.INDUCTANCE] * ((start + 0.5 * more) * rate - motors[a, ka.CURRENT] * motors[a, ka.DIDT])
+            )
+    return total
 
 
 @internal_kernel

@@ -23,9 +23,8 @@ from typing import NamedTuple
 import numpy as np
 
 from dynsim.dynamics import tables as ka
-from dynsim.dynamics.contact.cone import problem as kc
-from dynsim.dynamics.contact.quadrics import contact_rows
-from dynsim.dynamics.contact.shapes import shaped_rows
+from dynsim.dynamics.contact.cone import steps as kc
+from dynsim.dynamics.contact.rows import contact_rows, shaped_rows
 from dynsim.dynamics.tables import ContactArrays, ModelArrays, Workspace, row_limit
 from dynsim.dynamics.tree.joints import displace, normalise, read_positions
 from dynsim.dynamics.tree.spatial import cross, dot, dot_vector, put_vector, rotate, rotation, six, vector

@@ -14,11 +14,9 @@ from dynsim.compile.bracing import MIN_N
 from dynsim.compile.control import PLANNED, BasePath, HandPath, JointControl, targets_on
 from dynsim.compile.model import Model
 from dynsim.compile.protocols import BuildContext
-from dynsim.compile.references.feed_forward import planned_voltages
-from dynsim.compile.references.inverse_kinematics import follow
+from dynsim.compile.references.inverse_kinematics import follow, planned_voltages
+from dynsim.compile.references.plane_curve import clamped_cubic, quintic_coefficients, rolled, wheel_angles
 from dynsim.compile.references.teleop import TeleopOptions
-from dynsim.compile.rolling import rolled, wheel_angles
-from dynsim.compile.splines import clamped_cubic, quintic_coefficients
 from dynsim.config.base import NonNegative, Positive, StrictConfig, Vector3, check_waypoints, error_at
 from dynsim.config.problems import suggest
 from dynsim.errors import ModelError

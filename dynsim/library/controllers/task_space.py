@@ -21,13 +21,13 @@ from dynsim.jit.kernel import integers, reals
 from dynsim.library.controllers.snake_commands import STATES as MODE_STATES
 from dynsim.library.controllers.snake_commands import Script, ScriptedSource, TimedScript
 from dynsim.snake import controller
-from dynsim.snake import state as ss
 from dynsim.snake import support as stability
+from dynsim.snake import ticks as ss
 from dynsim.snake.controller import ControlLaw, control_input, new_work
 from dynsim.snake.description import ModeTable, Policy, SnakeDescription, TaskSpaceController, conditioning
 from dynsim.snake.kinematics import SnakeModel, pose_of_point
-from dynsim.snake.state import Schedule
 from dynsim.snake.support import Cost
+from dynsim.snake.ticks import Schedule
 
 ENGINE = "kinematic"
 

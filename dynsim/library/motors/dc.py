@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from dynsim.compile.protocols import BuildContext
-from dynsim.model.drives import Motor
-from dynsim.model.motor_parameters import MotorParameters
+from dynsim.model.drives import Motor, MotorParameters
 
 
 class Config(MotorParameters):

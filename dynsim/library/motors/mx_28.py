@@ -13,8 +13,7 @@ from pydantic import Field
 
 from dynsim.compile.protocols import BuildContext
 from dynsim.config.base import NonNegative, Positive
-from dynsim.model.drives import Servo
-from dynsim.model.servo_parameters import ServoParameters
+from dynsim.model.drives import Servo, ServoParameters
 
 
 class Config(ServoParameters):

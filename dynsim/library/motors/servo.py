@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from dynsim.compile.protocols import BuildContext
-from dynsim.model.drives import Servo
-from dynsim.model.servo_parameters import ServoParameters
+from dynsim.model.drives import Servo, ServoParameters
 
 
 class Config(ServoParameters):

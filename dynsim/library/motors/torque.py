@@ -8,8 +8,7 @@ from pydantic import Field
 
 from dynsim.compile.protocols import BuildContext
 from dynsim.config.base import Positive
-from dynsim.model.drives import TorqueSource
-from dynsim.model.motor_parameters import DriveParameters, limit
+from dynsim.model.drives import DriveParameters, TorqueSource, limit
 
 
 class Config(DriveParameters):

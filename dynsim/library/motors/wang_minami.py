@@ -6,8 +6,7 @@ from typing import Literal
 
 from dynsim.compile.protocols import BuildContext
 from dynsim.config.base import NonNegative, Positive
-from dynsim.model.drives import Motor
-from dynsim.model.motor_parameters import MotorParameters
+from dynsim.model.drives import Motor, MotorParameters
 
 
 class Config(MotorParameters):

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dynsim.compile.control import HandPath
 from dynsim.compile.protocols import BuildContext
-from dynsim.compile.splines import minimum_jerk
+from dynsim.compile.references.plane_curve import minimum_jerk
 from dynsim.config.base import NonNegative, Positive, StrictConfig, Vector3
 
 

@@ -107,10 +107,10 @@ def build(config: Config, context: BuildContext) -> Robot:
     Raises
     ------
     ModelError
-        A file that is refused (see :func:`dynsim.model.urdf.build.read_urdf`), or a hand on a body that it
+        A file that is refused (see :func:`dynsim.model.urdf.reader.read_urdf`), or a hand on a body that it
         does not have.
     """
-    from dynsim.model.urdf.build import read_urdf
+    from dynsim.model.urdf.reader import read_urdf
 
     lock = {**{name: float(np.deg2rad(angle)) for name, angle in config.lock_deg.items()}, **config.lock_m}
     robot = read_urdf(Path(config.file), lock)

@@ -2,22 +2,384 @@
 
 Elements that the URDF specification makes optional have its defaults (a link without ``<inertial>`` has no mass, a
 joint without ``<axis>`` turns about x). Others that are missing, misspelt, repeated or not numbers are refused. Visuals
-are read leniently (:mod:`dynsim.model.urdf.visual`).
+are read leniently (:mod:`dynsim.model.urdf.reader`).
 """
 
 from __future__ import annotations
 
+import difflib
+import heapq
 import math
-from dataclasses import dataclass, replace
+import re
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Protocol
+from xml.parsers import expat
 
 import numpy as np
 
 from dynsim.errors import ModelError
-from dynsim.model.description import Array, Inertia
-from dynsim.model.urdf.visual import materials, visual_shapes
-from dynsim.model.urdf.xml import MOMENTS, Element, UrdfFile, cut, quoted, suggestion
-from dynsim.record.scene import Shape
+from dynsim.model.description import Array, Coupling, Frame, Inertia, Link, Robot
+from dynsim.model.joints.ball import floating
+from dynsim.model.joints.planar import planar
+from dynsim.record.quaternion import of_turn, product
+from dynsim.record.scene import Shape, ShapeKind, quaternion
+from dynsim.system.inputs import read_bytes
+
+# XML of a URDF file: elements with line numbers, and attributes read as numbers; unknown ones are reported.
+
+
+# The largest robots in use have some 100 links and 1 MB of text.
+BYTES_MAX, ELEMENTS_MAX, DEPTH_MAX = 16_000_000, 100_000, 100
+ATTRIBUTES_MAX, NAME_LENGTH_MAX, _NUMBER_LENGTH_MAX = 100, 200, 400
+# Largest magnitude of a number: no robot needs larger ones, and their products could overflow.
+_MAGNITUDE_MAX = 1e15
+
+# Elements of physics; their values are attributes, so text in them is an error.
+_WITHOUT_TEXT = {"mass", "inertia", "origin", "axis", "limit", "dynamics", "mimic"}
+
+_NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
+MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+# Child elements that physics depends on, by parent, and their attributes. Other elements and, on limits and losses,
+# other attributes are extensions of single programs; they are ignored unless they look like one of these misspelt.
+_CHILDREN = {
+    "robot": ("link", "joint"),
+    "link": ("inertial",),
+    "inertial": ("origin", "mass", "inertia"),
+    "joint": ("origin", "parent", "child", "axis", "limit", "dynamics", "mimic"),
+}
+_ATTRIBUTES = {
+    "origin": ("xyz", "rpy"),
+    "mass": ("value",),
+    "inertia": MOMENTS,
+    "parent": ("link",),
+    "child": ("link",),
+    "axis": ("xyz",),
+    "limit": ("lower", "upper", "effort", "velocity"),
+    "dynamics": ("damping", "friction"),
+    "mimic": ("joint", "multiplier", "offset"),
+}
+_EXTENDED = ("limit", "dynamics")
+_EXAMPLE = {1: '"0.25"', 3: '"0 0 0.25"'}
+
+
+@dataclass
+class Element:
+    """A tag with its attributes, the line it begins in, and what it holds."""
+
+    tag: str
+    attributes: dict[str, str]
+    line: int
+    children: list[Element] = field(default_factory=list)
+
+    def child(self, tag: str) -> Element | None:
+        """The first child of that kind."""
+        return next((child for child in self.children if child.tag == tag), None)
+
+
+class Placed(Protocol):
+    """Something of the file with a line."""
+
+    @property
+    def line(self) -> int: ...
+
+
+class UrdfFile:
+    """One file, read by elements; all errors name it."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def error(self, line: int, text: str) -> ModelError:
+        """An error about a line of the file."""
+        return ModelError(f"{self.path}:{line}: {text}")
+
+    def root(self) -> Element:
+        """The outermost element, with all that it holds.
+
+        Raises
+        ------
+        ModelError
+            The file cannot be read, is no XML, or passes a limit.
+        """
+        return self._parse(self._read())
+
+    def _read(self) -> bytes:
+        data = read_bytes(self.path, ModelError, BYTES_MAX)
+        if not data.strip():
+            raise ModelError(f"{self.path}: is empty; a URDF file has <robot> with links and joints")
+        return data
+
+    def _parse(self, data: bytes) -> Element:
+        """The elements of XML text in any encoding that expat knows; with their lines."""
+        parser = expat.ParserCreate()
+        open_elements: list[Element] = []
+        roots: list[Element] = []
+        count = 0
+
+        def begin(tag: str, attributes: dict[str, str]) -> None:
+            nonlocal count
+            count += 1
+            line = parser.CurrentLineNumber
+            if tag.startswith("xacro:"):
+                raise self.error(line, f"<{cut(tag)}>: {self._expand}")
+            if count > ELEMENTS_MAX:
+                raise self.error(line, f"more than {ELEMENTS_MAX} elements; simplify the model")
+            if len(open_elements) >= DEPTH_MAX:
+                raise self.error(line, f"elements are nested more than {DEPTH_MAX} deep; URDF needs fewer than ten")
+            if len(attributes) > ATTRIBUTES_MAX:
+                raise self.error(line, f"<{cut(tag)}> has more than {ATTRIBUTES_MAX} attributes; simplify the model")
+            around = [element.tag for element in open_elements]
+            parents = {"link": ["robot"], "inertial": ["robot", "link"]}.get(tag, around)
+            in_robot = around[:1] == ["robot"] and "gazebo" not in around
+            if in_robot and around != parents and not (tag == "inertial" and around[:2] == parents):
+                raise self.error(
+                    line,
+                    f"<{tag}> in <{cut(around[-1])}> would be ignored; it belongs in <{parents[-1]}>, move it there",
+                )
+            element = Element(tag, attributes, line)
+            (open_elements[-1].children if open_elements else roots).append(element)
+            open_elements.append(element)
+
+        def end(_: str) -> None:
+            open_elements.pop()
+
+        def text(content: str) -> None:
+            element = open_elements[-1]
+            # Without attributes it is refused for what it lacks.
+            if content.strip() and element.tag in _WITHOUT_TEXT and element.attributes:
+                tag = element.tag
+                raise self.error(
+                    parser.CurrentLineNumber,
+                    f"<{tag}> holds the text {quoted(content.strip())}; URDF has values in attributes only",
+                )
+
+        def document_type(*_: object) -> None:
+            raise self.error(
+                parser.CurrentLineNumber, "has a DOCTYPE; entities and DTDs are not read: remove it, write them out"
+            )
+
+        parser.StartElementHandler, parser.EndElementHandler, parser.CharacterDataHandler = begin, end, text
+        parser.StartDoctypeDeclHandler = document_type
+        try:
+            parser.Parse(data, True)
+        except expat.ExpatError as error:
+            raise self.error(error.lineno, f"not XML: {expat.ErrorString(error.code)}") from None
+        except (LookupError, ValueError) as error:
+            raise ModelError(f"{self.path}: its encoding is not known ({error}); save it as UTF-8") from None
+        return roots[0]
+
+    @property
+    def _expand(self) -> str:
+        return (
+            f"this is a xacro file; run `xacro {self.path} > {self.path.name.split('.')[0]}_expanded.urdf` (of ROS) "
+            "and give that file"
+        )
+
+    def name(self, element: Element, others: Mapping[str, Placed]) -> str:
+        """The name of a link or joint: there, printable, and the only one of its kind."""
+        name = element.attributes.get("name", "")
+        if not name:
+            raise self.error(element.line, f"<{element.tag}> has no name; give it one")
+        self._check_expanded(element, "name", f"<{element.tag}>")
+        if not name.isprintable():
+            raise self.error(
+                element.line, f"{element.tag} {quoted(name)}: the name has control characters; remove them"
+            )
+        if len(name) > NAME_LENGTH_MAX:
+            raise self.error(element.line, f"{element.tag} {quoted(name)}: a name has at most {NAME_LENGTH_MAX} signs")
+        if name in others:
+            raise self.error(
+                element.line,
+                f"{element.tag} {quoted(name)} is there twice (also in line {others[name].line}); rename one of them",
+            )
+        return name
+
+    def check_children(self, element: Element, who: str) -> None:
+        """Refuse what is there twice, belongs elsewhere or looks misspelt: other readers pass over it in silence."""
+        known, seen = _CHILDREN[element.tag], set()
+        for child in element.children:
+            if child.tag in known:
+                if child.tag in seen and element.tag != "robot":
+                    raise self.error(child.line, f"{who} has more than one <{child.tag}>; remove one")
+                seen.add(child.tag)
+                self._check_attributes(child, who)
+                continue
+            meant = _near(child.tag, known)
+            if meant:
+                raise self.error(child.line, f"{who}: unknown element <{cut(child.tag)}>; did you mean <{meant}>?")
+            if child.tag in ("link", "joint", "inertial", "mass", "inertia"):
+                raise self.error(child.line, f"{who}: <{child.tag}> does not belong in <{element.tag}>")
+
+    def _check_attributes(self, element: Element, who: str) -> None:
+        known = _ATTRIBUTES.get(element.tag, ())
+        for key in element.attributes if known else ():
+            meant = _near(key, known)
+            if key not in known and (meant or element.tag not in _EXTENDED):
+                hint = f"did you mean {meant}?" if meant else f"known: {', '.join(known)}"
+                raise self.error(element.line, f"{who}: unknown attribute {cut(key)} of <{element.tag}>; {hint}")
+
+    def required(self, element: Element, tag: str, who: str, fix: str) -> Element:
+        """The child of that kind; without it ``fix`` says what to do."""
+        child = element.child(tag)
+        if child is None:
+            where = f"{who}: <{element.tag}>" if element.tag == "inertial" else who
+            raise self.error(element.line, f"{where} has no <{tag}>; {fix}")
+        return child
+
+    def text(self, element: Element, key: str, who: str) -> str:
+        """An attribute that must be there and not empty."""
+        if not element.attributes.get(key):
+            raise self.error(element.line, f"{who}: <{element.tag}> has no {key}; add it")
+        self._check_expanded(element, key, who)
+        return element.attributes[key]
+
+    def number(self, element: Element, key: str, who: str, default: float | None = None) -> float:
+        """The one number of an attribute."""
+        return float(self.numbers(element, key, 1, who, None if default is None else (default,))[0])
+
+    def numbers(
+        self, element: Element, key: str, count: int, who: str, default: tuple[float, ...] | None = None
+    ) -> Array:
+        """The numbers of an attribute: plain ASCII decimals, as many as there must be, finite."""
+        text = element.attributes.get(key)
+        if text is None:
+            if default is not None:
+                return np.array(default)
+            raise self.error(element.line, f"{who}: <{element.tag}> has no {key}; add it, like {key}={_EXAMPLE[count]}")
+        self._check_expanded(element, key, who)
+        words = _words(text)
+        stated = f"{who}: <{element.tag} {key}={quoted(text)}>"
+        if len(words) != count:
+            raise self.error(
+                element.line, f"{stated} has {len(words)} entries, {count} are needed, like {_EXAMPLE[count]}"
+            )
+        values = []
+        for word in words:
+            if len(word) > _NUMBER_LENGTH_MAX or not _NUMBER.fullmatch(word):
+                raise self.error(
+                    element.line,
+                    f"{stated} is not a finite number; write it in the digits 0–9 with a point, like {_EXAMPLE[count]}",
+                )
+            value = float(word)
+            vanished = value == 0.0 and re.search("[1-9]", re.split("[eE]", word)[0])
+            # Limits may be as large as numbers go: that stands for none.
+            largest = math.inf if element.tag == "limit" else _MAGNITUDE_MAX
+            if vanished or not math.isfinite(value) or abs(value) > largest:
+                raise self.error(element.line, f"{stated} is out of the range of numbers; check its exponent")
+            values.append(value)
+        return np.array(values)
+
+    def _check_expanded(self, element: Element, key: str, who: str) -> None:
+        if "${" in element.attributes[key] or "$(" in element.attributes[key]:
+            raise self.error(
+                element.line, f"{who}: <{element.tag} {key}={quoted(element.attributes[key])}>: {self._expand}"
+            )
+
+
+def suggestion(word: str, known: object) -> str:
+    """``; did you mean 'x'?``, or nothing when no known word is near."""
+    near = difflib.get_close_matches(word[:100], [str(k) for k in known], n=1, cutoff=0.6)  # type: ignore[attr-defined]
+    return f"; did you mean {near[0]!r}?" if near else ""
+
+
+def _near(word: str, known: tuple[str, ...]) -> str:
+    """The known word that ``word`` looks like misspelt, empty if none. Programs have extensions of similar names."""
+    if word in known:
+        return ""
+    near = difflib.get_close_matches(word[:40].casefold(), known, n=1, cutoff=0.8)
+    return near[0] if near else ""
+
+
+def _words(text: str) -> list[str]:
+    """What stands between white space, of XML's kinds only."""
+    return [word for word in re.split(r"[ \t\r\n]+", text) if word]
+
+
+def quoted(text: str) -> str:
+    """A text of the file, quoted and cut to what fits in a message."""
+    return repr(cut(text))
+
+
+def cut(text: str) -> str:
+    """A text of the file, no longer than fits in a message."""
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+# Visual shapes and named colours of URDF links (``<visual>``), read leniently.
+
+
+Colour = tuple[float, float, float, float]
+# As in dynsim.model.urdf.reader: no length, scale or angle is larger.
+_LARGEST = 1e15
+
+
+def materials(robot: Element) -> dict[str, Colour]:
+    """Colours that the file defines by name, outside of its links."""
+    colours = {
+        child.attributes.get("name", ""): _colour(child, {}) for child in robot.children if child.tag == "material"
+    }
+    return {name: colour for name, colour in colours.items() if colour is not None}
+
+
+def visual_shapes(link: Element, named_colours: Mapping[str, Colour]) -> tuple[Shape, ...]:
+    """Shapes of a link in its frame; ``named_colours`` are colours by name."""
+    shapes = [_shape(child, named_colours) for child in link.children if child.tag == "visual"]
+    return tuple(shape for shape in shapes if shape is not None)
+
+
+def _shape(visual: Element, named_colours: Mapping[str, Colour]) -> Shape | None:
+    geometry = visual.child("geometry")
+    if geometry is None or len(geometry.children) != 1:
+        return None
+    solid = geometry.children[0]
+    material = visual.child("material")
+    colour = None if material is None else _colour(material, named_colours)
+    origin = visual.child("origin")
+    xyz = (0.0, 0.0, 0.0) if origin is None else _numbers(origin, "xyz", 3, "0 0 0")
+    rpy = (0.0, 0.0, 0.0) if origin is None else _numbers(origin, "rpy", 3, "0 0 0")
+    kind: ShapeKind
+    file = ""
+    match solid.tag:
+        case "box":
+            kind, size = "box", _numbers(solid, "size", 3)
+        case "sphere":
+            kind, size = "sphere", _numbers(solid, "radius", 1)
+        case "cylinder" | "capsule":
+            kind = "cylinder" if solid.tag == "cylinder" else "capsule"
+            size = _numbers(solid, "radius", 1) + _numbers(solid, "length", 1)
+            size = size if len(size) == 2 else ()
+        case "mesh":
+            kind, size, file = "mesh", _numbers(solid, "scale", 3, "1 1 1"), solid.attributes.get("filename", "")
+            size = size if file else ()
+        case _:
+            return None
+    if not (size and xyz and rpy) or (kind != "mesh" and min(size) <= 0.0):
+        return None
+    roll, pitch, yaw = rpy
+    turn = product(of_turn((0, 0, 1), yaw), product(of_turn((0, 1, 0), pitch), of_turn((1, 0, 0), roll)))
+    return Shape(kind, size, file=file, colour=colour).placed(np.array(xyz), turn)
+
+
+def _colour(material: Element, named_colours: Mapping[str, Colour]) -> Colour | None:
+    stated = material.child("color")
+    numbers = () if stated is None else _numbers(stated, "rgba", 4)
+    if not numbers or not all(0.0 <= number <= 1.0 for number in numbers):
+        return named_colours.get(material.attributes.get("name", ""))
+    red, green, blue, opacity = numbers
+    return red, green, blue, opacity
+
+
+def _numbers(element: Element, key: str, count: int, default: str = "") -> tuple[float, ...]:
+    """So many numbers of an attribute; empty where there are others."""
+    try:
+        numbers = tuple(map(float, element.attributes.get(key, default).split()))
+    except ValueError:
+        return ()
+    return numbers if len(numbers) == count and all(abs(number) < _LARGEST for number in numbers) else ()
+
 
 # The largest robots in use have some 100 links.
 LINKS_MAX = 2000
@@ -314,3 +676,269 @@ def rotation(roll: float, pitch: float, yaw: float) -> Array:
             [-sp, cp * sr, cp * cr],
         ]
     )
+
+
+# URDF import: bodies, joints, limits, viscous losses, couplings, frames and shapes of a robot.
+
+
+HAND = "hand"
+# Functions that make the rows of joints with several of them.
+ROWS = {"floating": floating, "planar": planar}
+
+
+@dataclass(frozen=True)
+class _Place:
+    """The moving body that carries a link (None: the world), the link's frame there, and its distance from the root."""
+
+    body: str | None
+    R: Array
+    p: Array
+    moving: int
+    joints: int
+
+
+def read_urdf(path: Path, lock: Mapping[str, float] | None = None) -> Robot:
+    """Read the bodies and joints of a URDF file.
+
+    Joints keep their names and the order of the file (a parent still comes first); each body is named after the link
+    at its moving joint, and every other link is a frame of the body that carries it. Floating and planar joints become
+    their rows (:mod:`dynsim.model.joints`). The hand is the link named
+    ``hand``, else the tip of the chain with the most moving joints: the last link fixed to its last body, or that
+    body's origin when nothing is fixed to it. The root link is the world. A mimic joint is a coupling to its leader; a
+    locked leader locks it too.
+
+    Parameters
+    ----------
+    path : file
+    lock : positions [rad or m] of joints that are to be fixed, by name
+
+    Raises
+    ------
+    ModelError
+        No such file, not URDF, a number that is none, a mass without inertia and the like; a mimic joint whose leader
+        there is not; no joint of a name in ``lock``, or one without a single position. The message names file, line,
+        link or joint, value and what to do.
+
+    Warns
+    -----
+    UserWarning
+        A link with a shape has no mass; moments of inertia of a link are not those of a body; a joint is locked beyond
+        its limits.
+    """
+    tree = read_tree(path)
+    locked = _locked(tree, {**_locked_followers(tree, lock or {}), **(lock or {})})
+    places = _places(locked)
+    links = _links(locked, places)
+    if not links:
+        raise ModelError(f"{path}: no moving joint")
+    _warn(locked, places, links)
+    frames = [Frame(name, pose.body, pose.R, pose.p) for name, pose in places.items() if pose.body != name]
+    rows = tuple(row for link in links for row in (ROWS[link.kind](link) if link.kind in ROWS else (link,)))
+    for joint in locked.joints.values():
+        for name in (joint.name, joint.mimics or joint.name):
+            if joint.mimics is not None and locked.joints[name].kind in SEVERAL:
+                raise tree.error(
+                    joint.line, f"joint {joint.name!r} mimics {joint.mimics!r}, and {name!r} has several positions"
+                )
+    couplings = tuple(
+        Coupling(joint.name, joint.mimics, joint.multiplier, joint.offset)
+        for joint in locked.joints.values()
+        if joint.mimics is not None and joint.kind in MOVING
+    )
+    hand = _hand(tree, places)
+    return Robot(
+        name=tree.name,
+        links=rows,
+        motors=(),
+        hand=(str(hand.body), hand.p),
+        hand_frame=hand.R,
+        frames=tuple(frames),
+        couplings=couplings,
+        fixed_shapes=_shapes(locked, places).get(None, ()),
+        fixed_inertia=_fixed(locked, places),
+    )
+
+
+def _fixed(tree: UrdfTree, places: Mapping[str, _Place]) -> Inertia:
+    """Mass properties of all that is fixed to the root, in its frame."""
+    parts = [
+        inertia.placed(pose.R, pose.p)
+        for name, pose in places.items()
+        if pose.body is None and (inertia := tree.links[name].inertia) is not None
+    ]
+    return Inertia.merged(parts) if parts else Inertia(0.0)
+
+
+def _locked_followers(tree: UrdfTree, lock: Mapping[str, float]) -> dict[str, float]:
+    """Positions of the mimic joints whose leader is locked or fixed, directly or through others [rad or m]."""
+    positions: dict[str, float] = {}
+    for follower in tree.joints.values():
+        chain, joint = [], follower
+        while joint.mimics is not None and joint.name not in lock and joint.kind != "fixed":
+            if joint.mimics not in tree.joints:
+                raise tree.error(
+                    joint.line,
+                    f"joint {joint.name!r} mimics joint {joint.mimics!r}, which is not in the file"
+                    f"{suggestion(joint.mimics, tree.joints)}",
+                )
+            if joint in chain:
+                raise tree.error(joint.line, f"joint {joint.name!r} mimics itself, by way of {joint.mimics!r}")
+            chain.append(joint)
+            joint = tree.joints[joint.mimics]
+        if chain and (joint.name in lock or joint.kind == "fixed"):
+            q = lock.get(joint.name, 0.0)
+            for link in reversed(chain):
+                q = link.multiplier * q + link.offset
+            positions[follower.name] = q
+    return positions
+
+
+def _locked(tree: UrdfTree, lock: Mapping[str, float]) -> UrdfTree:
+    """The tree with joints fixed at positions: T_PC = T_PJ · Rot(a, q), or T_PJ · Trans(a q) for a prismatic one."""
+    joints = dict(tree.joints)
+    for name, value in lock.items():
+        if name not in joints:
+            raise ModelError(
+                f"{tree.path}: lock: no joint {name!r}{suggestion(name, joints)}; joints: {', '.join(joints)}"
+            )
+        joint = joints[name]
+        if joint.kind not in MOVING:
+            fix = "; make it fixed in the file" if joint.kind in SEVERAL else ""
+            raise tree.error(
+                joint.line, f"lock: joint {name!r} is {joint.kind}, which has no position to lock it at{fix}"
+            )
+        if not math.isfinite(value):
+            raise ModelError(f"{tree.path}: lock: {name} = {value} is not a finite number")
+        if not joint.lower - 1e-9 <= value <= joint.upper + 1e-9:
+            warnings.warn(
+                f"{tree.path}: joint {name} is locked at {value:g}, its limits are {joint.lower:g} and {joint.upper:g}",
+                stacklevel=3,
+            )
+        if joint.kind == "prismatic":
+            joints[name] = replace(joint, kind="fixed", p=joint.p + joint.R @ joint.axis * value)
+        else:
+            joints[name] = replace(joint, kind="fixed", R=joint.R @ _turn(joint.axis, value))
+    return replace(tree, joints=joints)
+
+
+def _turn(axis: Array, angle: float) -> Array:
+    """Rotation about a unit axis, R = 1 + sin q [a]× + (1 − cos q) [a]×² (Rodrigues)."""
+    x, y, z = axis
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross
+
+
+def _places(tree: UrdfTree) -> dict[str, _Place]:
+    """Where every link is; a parent comes before its children, of those that could come next the first of the file."""
+    below: dict[str, list[tuple[int, UrdfJoint]]] = {name: [] for name in tree.links}
+    for order, joint in enumerate(tree.joints.values()):
+        below[joint.parent].append((order, joint))
+    places = {tree.root: _Place(None, np.eye(3), np.zeros(3), 0, 0)}
+    # Fixed joints first: what is behind them belongs to a body that is there, and may carry joints early in the file.
+    pending: list[tuple[bool, int, str]] = []
+    joints = tree.joints
+
+    def open_up(link: str) -> None:
+        for order, joint in below[link]:
+            heapq.heappush(pending, (joint.kind != "fixed", order, joint.name))
+
+    open_up(tree.root)
+    while pending:
+        moves, _, name = heapq.heappop(pending)
+        joint, parent = joints[name], places[joints[name].parent]
+        if moves:
+            places[joint.child] = _Place(joint.child, np.eye(3), np.zeros(3), parent.moving + 1, parent.joints + 1)
+        else:
+            R, p = parent.R @ joint.R, parent.p + parent.R @ joint.p
+            places[joint.child] = _Place(parent.body, R, p, parent.moving, parent.joints + 1)
+        open_up(joint.child)
+    return places
+
+
+def _links(tree: UrdfTree, places: Mapping[str, _Place]) -> tuple[Link, ...]:
+    """The moving bodies, with all that is fixed to them; a floating or planar joint is still one, of this kind."""
+    parts: dict[str | None, list[Inertia]] = {}
+    for name, pose in places.items():
+        inertia = tree.links[name].inertia
+        if inertia is not None and pose.body is not None:
+            own = name == pose.body
+            parts.setdefault(pose.body, []).append(inertia if own else inertia.placed(pose.R, pose.p))
+    joint_to = {joint.child: joint for joint in tree.joints.values()}
+    shapes = _shapes(tree, places)
+    links = []
+    for name, pose in places.items():
+        if pose.body != name:
+            continue
+        joint = joint_to[name]
+        parent = places[joint.parent]
+        links.append(
+            Link(
+                name=name,
+                joint=joint.name,
+                parent=parent.body,
+                kind=MOVING.get(joint.kind, joint.kind),
+                axis=joint.axis,
+                inertia=Inertia.merged(parts.get(name, [Inertia(0.0)])),
+                R_PJ=parent.R @ joint.R,
+                p_PJ=parent.p + parent.R @ joint.p,
+                damping=joint.damping,
+                friction=joint.friction,
+                lower=joint.lower,
+                upper=joint.upper,
+                velocity_limit=joint.velocity_limit,
+                effort_limit=joint.effort_limit,
+                shapes=shapes.get(name, ()),
+            )
+        )
+    return tuple(links)
+
+
+def _shapes(tree: UrdfTree, places: Mapping[str, _Place]) -> dict[str | None, tuple[Shape, ...]]:
+    """What each moving body, and the world (None), looks like, with all that is fixed to it."""
+    drawn: dict[str | None, tuple[Shape, ...]] = {}
+    for name, pose in places.items():
+        turn = quaternion(pose.R)
+        shapes = tuple(shape.placed(pose.p, turn) for shape in tree.links[name].shapes)
+        drawn[pose.body] = (*drawn.get(pose.body, ()), *shapes)
+    return drawn
+
+
+def _hand(tree: UrdfTree, places: Mapping[str, _Place]) -> _Place:
+    """The controlled point: the link ``hand`` if it moves, else the tip of the deepest chain, the first of equals."""
+    tip = max(tree.links, key=lambda name: (places[name].moving, places[name].joints))
+    if HAND in places and places[HAND].moving > 0:
+        tip = HAND
+    return places[tip]
+
+
+def _warn(tree: UrdfTree, places: Mapping[str, _Place], links: tuple[Link, ...]) -> None:
+    """Refuse bodies that cannot be; warn of masses that are missing."""
+    for link in links:
+        link.inertia.check(
+            f"{tree.path}:{tree.links[link.name].line}: link {link.name!r}, with all that is fixed to it"
+        )
+    loaded: set[str | None] = set()
+    for link in reversed(links):
+        if link.name in loaded or link.inertia.mass > 0.0 or link.inertia.tensor.any():
+            loaded |= {link.name, link.parent}
+    empty = [link.joint for link in links if link.name not in loaded and (link.parent in loaded or not link.parent)]
+    if empty:
+        warnings.warn(f"{tree.path}: nothing beyond these joints has a mass ({', '.join(empty)})", stacklevel=3)
+    moving = [tree.links[name] for name, pose in places.items() if pose.body is not None]
+    bare = [link.name for link in moving if link.inertia is None and link.shaped]
+    if bare:
+        warnings.warn(
+            f"{tree.path}: links with a shape but without <inertial> have no mass ({', '.join(bare)})", stacklevel=3
+        )
+    odd = []
+    for part in moving:
+        try:
+            (part.inertia or Inertia(0.0)).check(part.name)
+        except ModelError:
+            odd.append(part.name)
+    if odd:
+        warnings.warn(
+            f"{tree.path}: moments of inertia that no body can have, taken as they stand because the bodies that these "
+            f"links are fixed to can have the sum ({', '.join(odd)})",
+            stacklevel=3,
+        )

@@ -10,8 +10,7 @@ import numpy as np
 
 from dynsim.errors import ModelError
 from dynsim.model.description import WORLD, Frame, Link, Robot
-from dynsim.model.urdf.build import HAND, ROWS
-from dynsim.model.urdf.reader import MOVING, UNLIMITED
+from dynsim.model.urdf.reader import HAND, MOVING, ROWS, UNLIMITED
 from dynsim.record.urdf_text import add_shapes, connect, numbers, xml_text
 
 

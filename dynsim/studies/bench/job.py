@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.engine.dynamics import Prepared, prepare
+from dynsim.engine.simulation import Prepared, prepare
 from dynsim.engine.stepped import take_log
 from dynsim.integrators import run as ki
 from dynsim.integrators.driver import advance

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.engine.dynamics import prepare
 from dynsim.engine.recording import make_record
+from dynsim.engine.simulation import prepare
 from dynsim.integrators import run as ki
 from dynsim.record.measures import energy_turnover
 from dynsim.scenario import load_scenario, shipped_scenarios

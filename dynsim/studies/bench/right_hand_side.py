@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.derivative import System, derivative
 from dynsim.dynamics.state import block
-from dynsim.engine.dynamics import Prepared, prepare
+from dynsim.engine.simulation import Prepared, prepare
 from dynsim.jit.kernel import kernel
 from dynsim.scenario import load_scenario
 from dynsim.studies.bench import mujoco_peer, pinocchio_peer

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from dynsim._version import __version__
-from dynsim.engine.provenance import commit
+from dynsim.engine.recording import commit
 from dynsim.studies.bench import job, precision, right_hand_side, snake, sweeps
 from dynsim.studies.bench.programs import SCENARIO, STEP
 

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.dynamics import tables as ka
-from dynsim.engine.dynamics import Prepared
-from dynsim.engine.simulation import Simulation
+from dynsim.engine.simulation import Prepared, Simulation
 from dynsim.engine.snake_pilot import roll_pitch_yaw
 from dynsim.integrators import run as ki
 from dynsim.model.description import Robot

@@ -18,8 +18,8 @@ from dynsim.record.quaternion import rotated
 from dynsim.record.scene import WORLD
 from dynsim.snake.description import NO_REQUEST
 from dynsim.system import interruption
-from dynsim.teleop.session import Command, LiveFrame, Session
-from dynsim.teleop.web.deadman import DRIVING, Deadman
+from dynsim.teleop.snake import Command, LiveFrame, Session
+from dynsim.teleop.web.pilot import DRIVING, Deadman
 from dynsim.teleop.web.server import FRAMES, Server
 
 WAIT = 1e-3

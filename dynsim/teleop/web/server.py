@@ -24,8 +24,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from dynsim.errors import DynsimError
-from dynsim.teleop.web.deadman import Deadman
-from dynsim.teleop.web.pilot import MOST_BYTES, PilotCommand, Refused, parse
+from dynsim.teleop.web.pilot import MOST_BYTES, Deadman, PilotCommand, Refused, parse
 
 HERE = "127.0.0.1"
 FRAMES = 60.0

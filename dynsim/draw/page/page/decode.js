@@ -1,5 +1,5 @@
 "use strict";
-// The data of the page: from base64 and gzip to a head and tables of numbers; see dynsim/draw/page/blocks.py.
+// The data of the page: from base64 and gzip to a head and tables of numbers; see dynsim/draw/page/content.py.
 const D = {};
 
 D.unpack = async function (text) {

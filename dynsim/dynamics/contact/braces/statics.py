@@ -7,22 +7,88 @@ cone program. Each brace has f = (f_n, f_1, f_2) along its normal n and two tang
 velocities of its point along them. A sliding brace has f_t = −μ f_n d, d the direction of slip; a commanded f_n is
 given. So the unknowns of a brace are f if it is held, f_n if it slides or has no friction, without f_n if commanded.
 If braces have a target force, the program minimises the deviation from it instead of the heat, see ``NEAR`` of
-:mod:`dynsim.dynamics.contact.braces.tables`.
+:mod:`dynsim.dynamics.contact.braces.statics`.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
+
+import numpy as np
 
 from dynsim.dynamics import tables as ka
-from dynsim.dynamics.contact.braces import tables as kb
-from dynsim.dynamics.contact.braces.tables import BraceArrays
-from dynsim.dynamics.contact.cone.program import ConeProgram, solve_cone_program
+from dynsim.dynamics.contact.cone.program import ConeProgram, cone_program, solve_cone_program
 from dynsim.dynamics.tables import ModelArrays, Workspace
-from dynsim.dynamics.tree.joints import read_positions
-from dynsim.dynamics.tree.points import point_jacobian, point_position
+from dynsim.dynamics.tree.joints import point_jacobian, point_position, read_positions
 from dynsim.dynamics.tree.sweep import kinematics, newton_euler
-from dynsim.jit.kernel import internal_kernel, kernel
+from dynsim.jit.kernel import integers, internal_kernel, kernel, reals
+
+# Tables of the cone program for the forces of braces: braces and motors in, forces out, workspace.
+
+
+# BraceArrays.table
+POINT = 0  # 3: in the body's frame [m]
+AXES = 3  # 9: unit normal and two tangents in W, one after the other
+SLIP = 12  # 2: unit direction of sliding along the tangents, zero for a brace that is held
+FRICTION = 14
+LEAST = 15  # min_N
+COMMANDED = 16  # [N], NaN for none
+# Target of the normal force of a brace [N], and its weight (compliance) [m/N]; zero for braces without a target.
+# If any brace has a target, forces minimise Σ compliance (f_n − near)² instead of the heat.
+NEAR, COMPLIANCE = 17, 18
+BRACE_SIZE = 19
+# BraceArrays.motors: a torque source has K_m = 1 and no resistance, a joint without a motor K_m = 1 and no current
+HEAT = 0  # w = R / K_m² [W/(N m)²]
+LOWER = 1  # torque limits at the present joint rate [N m], infinite for none; both zero without a motor
+UPPER = 2
+CONSTANT, RESISTANCE, VOLTAGE_LIMIT, CURRENT_LIMIT = 3, 4, 5, 6  # K_m [N m/A], R [Ω], U [V], I [A]
+MOTOR_SIZE = 7
+# BraceArrays.results: normal and tangential forces, then the ends of the interval of the normal force
+FORCES, LOW, HIGH = 0, 3, 4
+RESULT_SIZE = 5
+
+
+class BraceArrays(NamedTuple):
+    """Braces, motors, results and workspace."""
+
+    link: np.ndarray  # (c,) int
+    table: np.ndarray  # (c, BRACE_SIZE)
+    motors: np.ndarray  # (n, MOTOR_SIZE)
+    first: np.ndarray  # (c + 1,) int: the first unknown of each brace, and their number
+    free: np.ndarray  # (n,) torques without the unknown forces [N m]
+    torques: np.ndarray  # (n,) [N m]
+    results: np.ndarray  # (c, RESULT_SIZE) [N]
+    forces: np.ndarray  # (c, 3) on the arm in W [N]
+    certificate: np.ndarray  # (n,) see brace_statics
+    B: np.ndarray  # (3 c, n) a row for each unknown
+    inside: np.ndarray  # (3 c,) scratch
+    position: np.ndarray  # (3,) scratch
+    jacobian: np.ndarray  # (3, n) scratch
+    program: ConeProgram
+
+
+def brace_arrays(link: np.ndarray, motors: np.ndarray) -> BraceArrays:
+    """Allocate a :class:`BraceArrays` for braces on these links and for these motors."""
+    c, n = len(link), len(motors)
+    forces = ka.MOST_ROWS * c
+    return BraceArrays(
+        link=link,
+        table=reals(np.zeros((c, BRACE_SIZE))),
+        motors=motors,
+        first=integers(np.zeros(c + 1)),
+        free=reals(np.zeros(n)),
+        torques=reals(np.zeros(n)),
+        results=reals(np.zeros((c, RESULT_SIZE))),
+        forces=reals(np.zeros((c, 3))),
+        certificate=reals(np.zeros(n)),
+        B=reals(np.zeros((forces, n))),
+        inside=reals(np.zeros(forces)),
+        position=reals(np.zeros(3)),
+        jacobian=reals(np.zeros((3, n))),
+        program=cone_program(forces + 1, n, 2 * c + 2 * n + 1, 4 * c + 2 * n + 1),
+    )
+
 
 # Tolerance of the largest margin to the constraints, in units of the force scale [1]: below −SLACK there is no
 # solution, within ±SLACK the solution has no interior.
@@ -76,7 +142,7 @@ def brace_statics(
     """
     for t in range(q.shape[0]):
         for k in range(braces.link.shape[0]):
-            for e in range(kb.BRACE_SIZE):
+            for e in range(BRACE_SIZE):
                 braces.table[k, e] = tables[t, k, e]
         set_motion(model, ws, q[t], v[t], vdot[t])
         torque_limits(braces, ws)
@@ -85,7 +151,7 @@ def brace_statics(
         for j in range(torques.shape[1]):
             torques[t, j] = braces.torques[j]
         for k in range(normal.shape[1]):
-            normal[t, k] = braces.results[k, kb.FORCES]
+            normal[t, k] = braces.results[k, FORCES]
     return q.shape[0]
 
 
@@ -105,13 +171,13 @@ def torque_limits(braces: BraceArrays, ws: Workspace):
     """
     motors = braces.motors
     for j in range(motors.shape[0]):
-        constant, resistance, current = motors[j, kb.CONSTANT], motors[j, kb.RESISTANCE], motors[j, kb.CURRENT_LIMIT]
+        constant, resistance, current = motors[j, CONSTANT], motors[j, RESISTANCE], motors[j, CURRENT_LIMIT]
         low, high = -current, current
         if resistance > 0.0:
             induced = constant * ws.joints[j, ka.QD]
-            low = min(max(low, (-motors[j, kb.VOLTAGE_LIMIT] - induced) / resistance), current)
-            high = max(min(high, (motors[j, kb.VOLTAGE_LIMIT] - induced) / resistance), -current)
-        motors[j, kb.LOWER], motors[j, kb.UPPER] = constant * low, constant * high
+            low = min(max(low, (-motors[j, VOLTAGE_LIMIT] - induced) / resistance), current)
+            high = max(min(high, (motors[j, VOLTAGE_LIMIT] - induced) / resistance), -current)
+        motors[j, LOWER], motors[j, UPPER] = constant * low, constant * high
 
 
 @internal_kernel
@@ -123,8 +189,8 @@ def least_heat_forces(model: ModelArrays, ws: Workspace, braces: BraceArrays, in
     unknowns = first[c]
     passive, limited = 0, False
     for j in range(n):
-        passive += motors[j, kb.LOWER] == motors[j, kb.UPPER]
-        limited |= not (math.isinf(motors[j, kb.LOWER]) and math.isinf(motors[j, kb.UPPER]))
+        passive += motors[j, LOWER] == motors[j, UPPER]
+        limited |= not (math.isinf(motors[j, LOWER]) and math.isinf(motors[j, UPPER]))
     best = False
     if passive == 0:
         # The optimum without limits is also the optimum within limits if it keeps them, which it does in most cases.
@@ -153,17 +219,17 @@ def least_heat_forces(model: ModelArrays, ws: Workspace, braces: BraceArrays, in
             keep(braces, scale)
         for k in range(c):
             for end in range(2):
-                if table[k, kb.COMMANDED] == table[k, kb.COMMANDED]:
-                    results[k, kb.LOW + end] = table[k, kb.COMMANDED]
+                if table[k, COMMANDED] == table[k, COMMANDED]:
+                    results[k, LOW + end] = table[k, COMMANDED]
                 elif inside <= SLACK:
-                    results[k, kb.LOW + end] = results[k, kb.FORCES]
+                    results[k, LOW + end] = results[k, FORCES]
                 elif intervals:
-                    results[k, kb.LOW + end] = extreme_force(braces, unknowns, equations, cones, k, end, scale)
+                    results[k, LOW + end] = extreme_force(braces, unknowns, equations, cones, k, end, scale)
         return True
     for k in range(c):
-        commanded = table[k, kb.COMMANDED] == table[k, kb.COMMANDED]
-        results[k, kb.LOW] = table[k, kb.COMMANDED] if commanded else table[k, kb.LEAST]
-        results[k, kb.HIGH] = table[k, kb.COMMANDED] if commanded else math.inf
+        commanded = table[k, COMMANDED] == table[k, COMMANDED]
+        results[k, LOW] = table[k, COMMANDED] if commanded else table[k, LEAST]
+        results[k, HIGH] = table[k, COMMANDED] if commanded else math.inf
     return True
 
 
@@ -183,19 +249,19 @@ def keep(braces: BraceArrays, scale):
 def brace_forces(braces: BraceArrays, k, scale):
     """Compute the force of brace k from the unknowns, along its axes and in the world."""
     table, results, x, at = braces.table, braces.results, braces.program.x, braces.first[k]
-    normal = table[k, kb.COMMANDED]
+    normal = table[k, COMMANDED]
     if normal != normal:
         normal, at = scale * x[at], at + 1
-    results[k, kb.FORCES] = normal
+    results[k, FORCES] = normal
     for e in range(2):
         directed = at == braces.first[k + 1]
-        results[k, kb.FORCES + 1 + e] = (
-            -table[k, kb.FRICTION] * normal * table[k, kb.SLIP + e] if directed else scale * x[at + e]
+        results[k, FORCES + 1 + e] = (
+            -table[k, FRICTION] * normal * table[k, SLIP + e] if directed else scale * x[at + e]
         )
     for i in range(3):
         braces.forces[k, i] = 0.0
         for e in range(ka.MOST_ROWS):
-            braces.forces[k, i] += results[k, kb.FORCES + e] * table[k, kb.AXES + 3 * e + i]
+            braces.forces[k, i] += results[k, FORCES + e] * table[k, AXES + 3 * e + i]
 
 
 @internal_kernel
@@ -203,7 +269,7 @@ def ample(braces: BraceArrays, scale):
     """Return whether all torques keep their limits with room to spare."""
     for j in range(braces.free.shape[0]):
         torque, room = braces.torques[j], AMPLE * scale
-        if torque - braces.motors[j, kb.LOWER] < room or braces.motors[j, kb.UPPER] - torque < room:
+        if torque - braces.motors[j, LOWER] < room or braces.motors[j, UPPER] - torque < room:
             return False
     return True
 
@@ -215,8 +281,8 @@ def middle_forces(braces: BraceArrays, scale):
     for k in range(braces.link.shape[0]):
         for i in range(first[k], first[k + 1]):
             x[i] = 0.0
-        if table[k, kb.COMMANDED] != table[k, kb.COMMANDED]:
-            x[first[k]] = 1.0 + 2.0 * table[k, kb.LEAST] / scale
+        if table[k, COMMANDED] != table[k, COMMANDED]:
+            x[first[k]] = 1.0 + 2.0 * table[k, LEAST] / scale
 
 
 @internal_kernel
@@ -251,9 +317,9 @@ def brace_rows(model: ModelArrays, ws: Workspace, braces: BraceArrays):
     for k in range(braces.link.shape[0]):
         point_position(ws, braces.link[k], table[k], braces.position)
         point_jacobian(model, ws, braces.link[k], braces.position, jacobian)
-        scale = max(scale, table[k, kb.LEAST])
-        commanded, mu, at = table[k, kb.COMMANDED] == table[k, kb.COMMANDED], table[k, kb.FRICTION], first[k]
-        directed = mu == 0.0 or table[k, kb.SLIP] != 0.0 or table[k, kb.SLIP + 1] != 0.0
+        scale = max(scale, table[k, LEAST])
+        commanded, mu, at = table[k, COMMANDED] == table[k, COMMANDED], table[k, FRICTION], first[k]
+        directed = mu == 0.0 or table[k, SLIP] != 0.0 or table[k, SLIP + 1] != 0.0
         tangents = at + (0 if commanded else 1)
         first[k + 1] = tangents + (0 if directed else 2)
         for j in range(n):
@@ -261,11 +327,11 @@ def brace_rows(model: ModelArrays, ws: Workspace, braces: BraceArrays):
             first_tangent, second_tangent = along(table, jacobian, k, j, 1), along(table, jacobian, k, j, 2)
             lever = max(lever, abs(rate), abs(first_tangent), abs(second_tangent))
             if directed:
-                rate -= mu * (table[k, kb.SLIP] * first_tangent + table[k, kb.SLIP + 1] * second_tangent)
+                rate -= mu * (table[k, SLIP] * first_tangent + table[k, SLIP + 1] * second_tangent)
             else:
                 B[tangents, j], B[tangents + 1, j] = first_tangent, second_tangent
             if commanded:
-                braces.free[j] -= table[k, kb.COMMANDED] * rate
+                braces.free[j] -= table[k, COMMANDED] * rate
             else:
                 B[at, j] = rate
     return max(scale, torque / lever) if lever > 0.0 else scale
@@ -274,7 +340,7 @@ def brace_rows(model: ModelArrays, ws: Workspace, braces: BraceArrays):
 @internal_kernel
 def along(table, jacobian, k, j, e):
     """Return the velocity of the point of brace k along its axis e per unit of rate j."""
-    at = kb.AXES + 3 * e
+    at = AXES + 3 * e
     return table[k, at] * jacobian[0, j] + table[k, at + 1] * jacobian[1, j] + table[k, at + 2] * jacobian[2, j]
 
 
@@ -295,23 +361,23 @@ def constraints(braces: BraceArrays, scale, limits, relaxed):
             G[i, k] = 0.0
         h[i] = 0.0
     for j in range(c):
-        k, mu, commanded = braces.first[j], table[j, kb.FRICTION], table[j, kb.COMMANDED] == table[j, kb.COMMANDED]
+        k, mu, commanded = braces.first[j], table[j, FRICTION], table[j, COMMANDED] == table[j, COMMANDED]
         tangents = k + (0 if commanded else 1)
         if not commanded:
-            G[rows, k], h[rows], first[cones] = 1.0, -table[j, kb.LEAST] / scale, rows
+            G[rows, k], h[rows], first[cones] = 1.0, -table[j, LEAST] / scale, rows
             G[rows, unknowns] = -1.0
             rows, cones = rows + 1, cones + 1
         if tangents < braces.first[j + 1]:
             first[cones] = rows
             if commanded:
-                h[rows] = mu * table[j, kb.COMMANDED] / scale
+                h[rows] = mu * table[j, COMMANDED] / scale
             else:
                 G[rows, k] = mu
             G[rows + 1, tangents], G[rows + 2, tangents + 1], G[rows, unknowns] = 1.0, 1.0, -1.0
             rows, cones = rows + 3, cones + 1
     # Torques in units of the force scale.
     for j in range(n if limits else 0):
-        low, high = motors[j, kb.LOWER], motors[j, kb.UPPER]
+        low, high = motors[j, LOWER], motors[j, UPPER]
         if low == high and not relaxed:
             for k in range(unknowns):
                 A[equations, k] = B[k, j]
@@ -365,7 +431,7 @@ def contradiction(braces: BraceArrays, equations, cones, relaxed):
     # Torques are the last of the equations and of the cones: loop backwards.
     e, i = equations - 1, program.first[cones] - 1
     for j in range(braces.free.shape[0] - 1, -1, -1):
-        low, high = motors[j, kb.LOWER], motors[j, kb.UPPER]
+        low, high = motors[j, LOWER], motors[j, UPPER]
         braces.certificate[j] = 0.0
         if low == high and not relaxed:
             braces.certificate[j] = -program.y[e]
@@ -384,7 +450,7 @@ def extreme_force(braces: BraceArrays, unknowns, equations, cones, j, end, scale
     """Return the smallest (end 0) or largest (end 1) possible normal force of brace j [N]; x must start inside."""
     program, k, x = braces.program, braces.first[j], braces.program.x
     if end == 0 and equations == 0 and holds_with_least(braces, j):
-        return braces.table[j, kb.LEAST]
+        return braces.table[j, LEAST]
     rows, first = program.first[cones], program.first
     clear_objective(program, unknowns)
     sign = 1.0 if end == 0 else -1.0
@@ -400,14 +466,14 @@ def extreme_force(braces: BraceArrays, unknowns, equations, cones, j, end, scale
 @internal_kernel
 def holds_with_least(braces: BraceArrays, j):
     """Return whether the forces found stay possible when the force of brace j is shortened to its minimum."""
-    results, k, least = braces.results, braces.first[j], braces.table[j, kb.LEAST]
-    shorter = results[j, kb.FORCES] - least
-    share = shorter / results[j, kb.FORCES] if shorter > 0.0 else 0.0
+    results, k, least = braces.results, braces.first[j], braces.table[j, LEAST]
+    shorter = results[j, FORCES] - least
+    share = shorter / results[j, FORCES] if shorter > 0.0 else 0.0
     for i in range(braces.free.shape[0]):
         torque = braces.torques[i] + shorter * braces.B[k, i]
         for e in range(k + 1, braces.first[j + 1]):
-            torque += share * results[j, kb.FORCES + e - k] * braces.B[e, i]
-        if not braces.motors[i, kb.LOWER] <= torque <= braces.motors[i, kb.UPPER]:
+            torque += share * results[j, FORCES + e - k] * braces.B[e, i]
+        if not braces.motors[i, LOWER] <= torque <= braces.motors[i, UPPER]:
             return False
     return True
 
@@ -419,20 +485,20 @@ def least_heat(braces: BraceArrays, unknowns, equations, cones, scale):
     clear_objective(program, unknowns)
     largest = 0.0
     for j in range(braces.link.shape[0]):
-        compliance, k = braces.table[j, kb.COMPLIANCE], braces.first[j]
+        compliance, k = braces.table[j, COMPLIANCE], braces.first[j]
         if compliance > 0.0:
-            program.H[k, k], program.g[k] = compliance, -compliance * braces.table[j, kb.NEAR] / scale
+            program.H[k, k], program.g[k] = compliance, -compliance * braces.table[j, NEAR] / scale
             largest = max(largest, compliance)
     near = largest > 0.0
     for k in range(0 if near else unknowns):
         for m in range(k + 1):
             total = 0.0
             for j in range(n):
-                total += B[k, j] * motors[j, kb.HEAT] * B[m, j]
+                total += B[k, j] * motors[j, HEAT] * B[m, j]
             program.H[k, m], program.H[m, k] = total, total
             largest = max(largest, abs(total))
         for j in range(n):
-            program.g[k] -= B[k, j] * motors[j, kb.HEAT] * braces.free[j] / scale
+            program.g[k] -= B[k, j] * motors[j, HEAT] * braces.free[j] / scale
     unit = 1.0 / largest if largest > 0.0 else 1.0
     for k in range(unknowns):
         for m in range(unknowns):

@@ -17,6 +17,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact.cone import steps as kc
+from dynsim.dynamics.contact.cone.steps import block_size
 from dynsim.jit.kernel import integers, internal_kernel, kernel, reals
 
 ITERATIONS = 60
@@ -434,3 +437,337 @@ def way_out(u, du, a, end):
         return apex
     below = math.sqrt(inner) - product
     return min(constant / below, apex) if below > 0.0 else apex
+
+
+# Split of forces among redundant sticking contacts by cone programs: least norm in the cones, or largest margin.
+
+
+# Weight of |z|² in the objective with the margin: makes the best split unique where the margin alone does not.
+LEAST_WEIGHT = 1e-13
+# Bound on the margin, in units of the largest given force: pressing two walls apart has no largest margin.
+MARGIN_MAX = 10.0
+# Tolerance in units of the largest force: for tangential forces without friction, and for cones that meet in a point.
+FORCE_TOLERANCE = 1e-9
+
+
+def split_room(r: int, count: int) -> ConeProgram:
+    """The room of :func:`best_split` for null spaces of up to r columns and ``count`` contacts."""
+    return cone_program(*split_sizes(r, count))
+
+
+def split_size(r: int, count: int) -> int:
+    """Numbers in that room, see :func:`split_room_in`."""
+    return program_size(*split_sizes(r, count))
+
+
+def split_sizes(r: int, count: int) -> tuple[int, int, int, int]:
+    """Unknowns, equations, cones and rows of the larger of its programs."""
+    return r + 1, 2 * count, count + 1, ka.MOST_ROWS * count + 1
+
+
+@internal_kernel
+def split_room_in(flat, first, r, count):
+    """:func:`split_room` in given arrays, (split_size(r, count),) and (count + 2,) int."""
+    return laid_out(flat, first, r + 1, 2 * count, count + 1, ka.MOST_ROWS * count + 1)
+
+
+@kernel
+def best_split(f0, N, r, contact_first, mu, contacts, joints, out, room: ConeProgram, least):
+    """Forces f = f0 + N z of redundant sticking contacts: in all cones if any split is, and then the least, if wanted.
+
+    The best margin is max_z min_j (μ_j f_n,j − |f_t,j|). Is it negative, no split holds all contacts. A contact without
+    friction can hold no tangential force: where its own can vanish it is kept at zero, and its margin is f_n,j.
+
+    Parameters
+    ----------
+    f0 : (p or more,) forces of all rows [N]
+    N : (p or more, r or more) directions in which they can be split otherwise; r of them
+    contact_first : (contacts + joints or more,) int, normal row of each sticking contact, whose tangential rows follow,
+        then the ``joints``: the row of each joint that dry friction holds, and of each closed joint stop
+    mu : (contacts + joints or more,) static friction; of joints the bound of their force, whose margin is μ_j − |f_j|;
+        negative for a stop, whose margin is its force f_j
+    out : (p or more,) the force of least norm in all cones; if no force is in all cones, the force of the best margin
+    room : see :func:`split_room`
+    least : False: the split of the best margin in any case
+
+    Returns
+    -------
+    float
+        The best margin [N], at most ten times the largest force in f0.
+    """
+    p, count = f0.shape[0], contacts + joints
+    scale = 0.0
+    for i in range(p):
+        out[i] = f0[i]
+        scale = max(scale, abs(f0[i]))
+    if scale == 0.0 or count == 0:
+        return 0.0
+    x, equations = room.x, 0
+    worst = math.inf
+    for j in range(count):
+        i = contact_first[j]
+        if j >= contacts:
+            worst = min(worst, (mu[j] - abs(f0[i]) if mu[j] >= 0.0 else f0[i]) / scale)
+            continue
+        if mu[j] > 0.0:
+            worst = min(worst, (mu[j] * f0[i] - math.hypot(f0[i + 1], f0[i + 2])) / scale)
+            continue
+        worst = min(worst, f0[i] / scale)
+        for e in range(1, ka.MOST_ROWS):
+            for k in range(r):
+                room.A[equations, k] = N[i + e, k]
+            room.A[equations, r] = 0.0
+            room.b[equations] = -f0[i + e] / scale
+            equations += 1
+    if r == 0:
+        for e in range(equations):
+            if abs(room.b[e]) > FORCE_TOLERANCE:
+                worst = min(worst, -abs(room.b[e]))
+        return worst * scale
+
+    # The margin t is the last unknown.
+    rows = cone_rows(f0, N, r, contact_first, mu, contacts, joints, scale, room)
+    for k in range(r + 1):
+        for m in range(r + 1):
+            room.H[k, m] = 0.0
+        room.H[k, k] = LEAST_WEIGHT
+        room.g[k], x[k] = 0.0, 0.0
+    room.H[r, r], room.g[r] = 0.0, -1.0
+    x[r] = min(worst, 0.0) - 1.0
+    room.first[count + 1] = rows + 1
+    for k in range(r):
+        room.G[rows, k] = 0.0
+    room.G[rows, r], room.h[rows] = -1.0, MARGIN_MAX
+    solve_cone_program(room, r + 1, equations, count + 1)
+    margin = x[r]
+    error = 0.0
+    for e in range(equations):
+        off = -room.b[e]
+        for k in range(r):
+            off += room.A[e, k] * x[k]
+        error = max(error, abs(off))
+    if error > FORCE_TOLERANCE:
+        margin = min(margin, -error)
+
+    if least and margin > FORCE_TOLERANCE:
+        # There is room inside the cones: the least force, from the point found.
+        for k in range(r):
+            room.g[k] = 0.0
+            for i in range(p):
+                room.g[k] += N[i, k] * f0[i] / scale
+            for m in range(r):
+                room.H[k, m] = 0.0
+                for i in range(p):
+                    room.H[k, m] += N[i, k] * N[i, m]
+        solve_cone_program(room, r, equations, count)
+    for i in range(p):
+        for k in range(r):
+            out[i] += scale * N[i, k] * x[k]
+    return margin * scale
+
+
+@internal_kernel
+def cone_rows(f0, N, r, contact_first, mu, contacts, joints, scale, room: ConeProgram):
+    """The cones in z and the margin t; returns how many rows.
+
+    (μ f_n − t, f_t) of contacts, (μ − t, f) of joints, f − t of stops.
+    """
+    row = 0
+    for j in range(contacts):
+        i, room.first[j] = contact_first[j], row
+        slope = mu[j] if mu[j] > 0.0 else 1.0
+        for k in range(r):
+            room.G[row, k] = slope * N[i, k]
+        room.G[row, r], room.h[row] = -1.0, slope * f0[i] / scale
+        row += 1
+        if mu[j] > 0.0:
+            for e in range(1, ka.MOST_ROWS):
+                for k in range(r):
+                    room.G[row, k] = N[i + e, k]
+                room.G[row, r], room.h[row] = 0.0, f0[i + e] / scale
+                row += 1
+    for j in range(contacts, contacts + joints):
+        i, room.first[j] = contact_first[j], row
+        if mu[j] < 0.0:
+            for k in range(r):
+                room.G[row, k] = N[i, k]
+            room.G[row, r], room.h[row] = -1.0, f0[i] / scale
+            row += 1
+            continue
+        for k in range(r):
+            room.G[row, k], room.G[row + 1, k] = 0.0, N[i, k]
+        room.G[row, r], room.h[row] = -1.0, mu[j] / scale
+        room.G[row + 1, r], room.h[row + 1] = 0.0, f0[i] / scale
+        row += 2
+    room.first[contacts + joints] = row
+    return row
+
+
+# Selection of indeterminate contact forces: towards least norm, as far as the friction cones allow.
+
+
+# Blocks of the scratch ``room``: G, its factor, columns S (coefficients on the rows of their block), then vectors.
+MATRIX, FACTOR, COLUMNS, NOW, GOAL, RIGHT, PIVOT, ROW, SIZE = 0, 1, 2, 3, 4, 5, 6, 7, 8
+# A row that separates faster than this has no force; slip slower than this has no direction, nor has a force that
+# changes the rate of its own row by less [m/s].
+STILL = 1e-9
+# G is singular if a pivot is below SINGULAR times the mean of its diagonal. The projection adds SHIFT times that mean
+# to the diagonal; each refinement multiplies the error by about SHIFT.
+SINGULAR, SHIFT, REFINEMENTS = 1e-10, 1e-6, 4
+# Bisections of the way to a cone; share of the largest force that may lie outside it.
+HALVINGS, ROUNDING = 50, 1e-12
+
+
+@internal_kernel
+def select_least_norm(W, w, kind, mu, p, f, room):
+    """Move the forces f, (p,), with the motion w = W f + b towards their least norm. Uses ``room``, (CONE_ROOM, p, p).
+
+    Leaves f as it is where it is unique.
+    """
+    n = changeable(W, w, kind, mu, p, f, room)
+    if n < 2:
+        return
+    G, L, S, row, size = room[MATRIX], room[FACTOR], room[COLUMNS], room[ROW, 0], room[SIZE, 0]
+    now, goal, right = room[NOW, 0], room[GOAL, 0], room[RIGHT, 0]
+    trace = 0.0
+    for i in range(n):
+        a, now[i] = int(row[i]), 0.0
+        for k in range(int(size[i])):
+            now[i] += S[i, k] * f[a + k]
+        for j in range(i + 1):
+            b, total = int(row[j]), 0.0
+            for k in range(int(size[i])):
+                for m in range(int(size[j])):
+                    total += S[i, k] * W[a + k, b + m] * S[j, m]
+            G[i, j], G[j, i] = total, total
+        trace += G[i, i]
+    if not trace > 0.0 or factored(G, L, room[PIVOT, 0], n, 0.0, SINGULAR * trace / n):
+        return
+    shift = SHIFT * trace / n
+    factored(G, L, room[PIVOT, 0], n, shift, 0.0)
+    # x = (G + ε)⁻¹ G x₀, refined: the error outside the range of G stays zero, that inside falls by ε each time.
+    for i in range(n):
+        goal[i] = 0.0
+    for _ in range(1 + REFINEMENTS):
+        for i in range(n):
+            right[i] = 0.0
+            for j in range(n):
+                right[i] += G[i, j] * (now[j] - goal[j])
+        substitute(L, room[PIVOT, 0], right, n)
+        for i in range(n):
+            goal[i] += right[i]
+    strongest = 0.0
+    for k in range(p):
+        strongest = max(strongest, abs(f[k]))
+    share = 1.0
+    if not inside(mu, n, room, 1.0, ROUNDING * strongest):
+        low, high = 0.0, 1.0
+        for _ in range(HALVINGS):
+            share = 0.5 * (low + high)
+            if inside(mu, n, room, share, ROUNDING * strongest):
+                low = share
+            else:
+                high = share
+        share = low
+    step = room[PIVOT, 0]
+    for r in range(p):
+        step[r] = 0.0
+    for i in range(n):
+        a = int(row[i])
+        for k in range(int(size[i])):
+            step[a + k] += share * (goal[i] - now[i]) * S[i, k]
+    change = 0.0
+    for r in range(p):
+        total = 0.0
+        for k in range(p):
+            total += W[r, k] * step[k]
+        change = max(change, abs(total))
+    part = 1.0 if change <= STILL else STILL / change
+    for r in range(p):
+        f[r] += part * step[r]
+
+
+@internal_kernel
+def changeable(W, w, kind, mu, p, f, room):
+    """The columns S of the rows whose forces may change: coefficients, first row and size; returns their number."""
+    S, row, size = room[COLUMNS], room[ROW, 0], room[SIZE, 0]
+    n, k = 0, 0
+    while k < p:
+        if kind[k] == kc.CONE and w[k] <= STILL:
+            slip = math.sqrt(w[k + 1] * w[k + 1] + w[k + 2] * w[k + 2])
+            if mu[k] > 0.0 and slip > STILL:
+                x, y = sliding_share(W, w, mu, f, k, slip)
+                scale = 1.0 / math.sqrt(1.0 + x * x + y * y)
+                row[n], size[n], S[n, 0], S[n, 1], S[n, 2] = k, 3.0, scale, scale * x, scale * y
+                n += 1
+            else:
+                for m in range(3 if mu[k] > 0.0 else 1):
+                    row[n], size[n], S[n, 0] = k + m, 1.0, 1.0
+                    n += 1
+        elif kind[k] == kc.ONE_WAY and w[k] <= STILL:
+            row[n], size[n], S[n, 0] = k, 1.0, 1.0
+            n += 1
+        k += block_size(kind, k)
+    return n
+
+
+@internal_kernel
+def sliding_share(W, w, mu, f, k, slip):
+    """Friction per normal force, (x, y), of the point with first row k that slides at ``slip``: within its cone."""
+    if f[k] * W[k, k] <= STILL:
+        return -mu[k] * w[k + 1] / slip, -mu[k] * w[k + 2] / slip
+    x, y = f[k + 1] / f[k], f[k + 2] / f[k]
+    size = math.sqrt(x * x + y * y)
+    part = mu[k] / size if size > mu[k] else 1.0
+    return part * x, part * y
+
+
+@internal_kernel
+def factored(G, L, pivot, n, shift, least):
+    """G + ``shift`` = L D Lᵀ, (n, n), D into ``pivot``; False where a pivot is not above ``least``."""
+    for j in range(n):
+        d = G[j, j] + shift
+        for k in range(j):
+            d -= L[j, k] * L[j, k] * pivot[k]
+        pivot[j] = d
+        if not d > least:
+            return False
+        for i in range(j + 1, n):
+            total = G[i, j]
+            for k in range(j):
+                total -= L[i, k] * L[j, k] * pivot[k]
+            L[i, j] = total / d
+    return True
+
+
+@internal_kernel
+def substitute(L, pivot, x, n):
+    """x ← (L D Lᵀ)⁻¹ x."""
+    for i in range(n):
+        for k in range(i):
+            x[i] -= L[i, k] * x[k]
+    for i in range(n - 1, -1, -1):
+        x[i] /= pivot[i]
+        for k in range(i + 1, n):
+            x[i] -= L[k, i] * x[k]
+
+
+@internal_kernel
+def inside(mu, n, room, share, slack):
+    """True when the forces ``share`` of the way from NOW to GOAL lie in their cones."""
+    now, goal, row, size = room[NOW, 0], room[GOAL, 0], room[ROW, 0], room[SIZE, 0]
+    i = 0
+    while i < n:
+        normal = now[i] + share * (goal[i] - now[i])
+        if normal < -slack:
+            return False
+        # Three columns of one row each, in a row: a point that sticks.
+        sticks = size[i] == 1.0 and i + 2 < n and row[i + 1] == row[i] + 1.0 and mu[int(row[i])] > 0.0
+        if sticks:
+            x = now[i + 1] + share * (goal[i + 1] - now[i + 1])
+            y = now[i + 2] + share * (goal[i + 2] - now[i + 2])
+            if math.sqrt(x * x + y * y) > mu[int(row[i])] * normal + slack:
+                return False
+            i += 2
+        i += 1
+    return True
