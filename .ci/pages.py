@@ -5,12 +5,13 @@ between ``<!-- table: NAME -->`` and ``<!-- end -->``, NAME being that of a func
 files in results/, which say which version made them; results/README.md has the commands. ``--check`` changes nothing
 and ends with 1 where a page is stale (tests/unit/test_pages.py).
 
-Times are those of the last ``dynsim bench`` and ``PYTHONPATH=tests python -m support.start_up``; other numbers are the
-same on every machine, to the digits shown.
+Times are those of the last ``PYTHONPATH=tests python -m studies.bench`` and ``… -m support.start_up``; other numbers
+are the same on every machine, to the digits shown.
 """
 
 from __future__ import annotations
 
+import ast
 import csv
 import io
 import json
@@ -25,7 +26,11 @@ from typing import Any
 from dynsim.cli.tables import print_comparison
 from dynsim.scenario.combinations import LAWS, METHODS, RESTRICTIONS
 from dynsim.snake.published import TABLE_III
-from dynsim.studies.bench.programs import (
+from dynsim.system.terminal import Terminal
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT / "tests"))
+from studies.bench.programs import (  # noqa: E402
     ABA,
     CONSTRAINT_DYNAMICS,
     DYNSIM_CONTACTS,
@@ -38,11 +43,7 @@ from dynsim.studies.bench.programs import (
     MUJOCO_IMPLICIT,
     SAME_TASK,
 )  # fmt: skip
-from dynsim.studies.bench.snake import BETA, Z
-from dynsim.system.terminal import Terminal
-
-ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "tests"))
+from studies.bench.snake import BETA, Z  # noqa: E402
 from support.fault_table import markdown  # noqa: E402
 
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
@@ -940,6 +941,23 @@ def sag_error(quantity: str) -> float:
     return math.sqrt(sum(x * x for x in off) / len(off))
 
 
+def modules() -> str:
+    """Return a table of the files of the package with the first lines of their docstrings."""
+    package = ROOT / "dynsim"
+    rows = ["| file | contents |", "|---|---|"]
+    folders = [package, *sorted(path.parent for path in package.rglob("__init__.py") if path.parent != package)]
+    for folder in folders:
+        for path in sorted(folder.glob("*.py"), key=lambda path: (path.name != "__init__.py", path.name)):
+            text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+            first = " ".join(text.split("\n\n")[0].split()).replace("|", r"\|").removesuffix(".")
+            name = path.relative_to(package)
+            if path.name == "__init__.py":
+                rows.append(f"| **dynsim/{'' if folder == package else f'{name.parent}/'}** | {first} |")
+            elif not path.name.startswith("_"):
+                rows.append(f"| `{name}` | {first} |")
+    return "\n".join(rows) + "\n"
+
+
 TABLES: dict[str, Callable[[], str]] = {
     table.__name__: table
     for table in (
@@ -947,7 +965,7 @@ TABLES: dict[str, Callable[[], str]] = {
         snake_table_iii, snake_table_iv, snake_table_v, time_stepping, endings, right_hand_side, ratios, job, precision,
         sweeps, snake_bench, combinations, comparison, faults, planned_arm, planned_gains, planned_scenes,
         snake_positioning, snake_limits,
-        snake_ways, snake_circles, snake_order, snake_areas, snake_on_servos, snake_tasks,
+        snake_ways, snake_circles, snake_order, snake_areas, snake_on_servos, snake_tasks, modules,
     )
 }  # fmt: skip
 

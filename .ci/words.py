@@ -29,7 +29,7 @@ FIRST_PAGES = {
     "docs/troubleshooting.md",
 }
 # Limits on places per 1000 words, by group of texts; texts of other groups are compared with words.txt.
-PUBLIC, PRIVATE, REST = "public", "private", "rest"
+PUBLIC, PRIVATE, OTHER = "public", "private", "other"
 LIMITS = {PUBLIC: 1.5, PRIVATE: 5.0}
 # A folder of few words may have this many places whatever its density.
 ALLOWANCE = 1
@@ -39,8 +39,8 @@ GROUP_OF = {
     "public docstring": PUBLIC,
     "private docstring": PRIVATE,
     "comment": PRIVATE,
-    "test name": REST,
-    "page": REST,
+    "test name": OTHER,
+    "page": OTHER,
 }
 
 VERB = (
@@ -233,7 +233,7 @@ class Count:
             if name in FIRST_PAGES:
                 group = PUBLIC
             elif not name.startswith("dynsim/"):
-                group = REST
+                group = OTHER
             key = (name if path.suffix == ".md" else name.rpartition("/")[0], group)
             self.words[key] += len(re.findall(r"[A-Za-z]{2,}", text.prose))
             for pattern, expression in COMPILED.items():
@@ -263,7 +263,7 @@ def too_many(count: Count, known: dict[str, int]) -> list[str]:
     lines = []
     for (name, group), words in sorted(count.words.items()):
         number = len(count.places[name, group])
-        if group == REST:
+        if group == OTHER:
             if number > known.get(name, 0):
                 lines.append(f"{name}: {number} places; before: {known.get(name, 0)}")
         elif number > max(ALLOWANCE, LIMITS[group] * words / 1000.0):
@@ -282,8 +282,8 @@ def main() -> int:
     if options.list:
         for path in files_of([path.resolve() for path in options.list]):
             count.add(path)
-        for place in sorted(place for places in count.places.values() for place in places):
-            print(f"{place.path}:{place.line}: {place.kind}: {place.pattern}: …{place.excerpt}…")
+        for item in sorted(item for places in count.places.values() for item in places):
+            print(f"{item.path}:{item.line}: {item.kind}: {item.pattern}: …{item.excerpt}…")
         total, words = sum(map(len, count.places.values())), sum(count.words.values())
         print(f"{total} places in {words} words, {1000.0 * total / max(words, 1):.1f} per 1000")
         return 0
@@ -291,9 +291,11 @@ def main() -> int:
     for path in files_of([ROOT / name for name in folders]):
         if "site" not in path.relative_to(ROOT).parts[1:2] or path.suffix == ".py":
             count.add(path)
-    rest = {name: len(count.places[name, group]) for name, group in count.words if group == REST}
+    others = {name: len(count.places[name, group]) for name, group in count.words if group == OTHER}
     if options.update:
-        KNOWN.write_text("".join(f"{name} {rest[name]}\n" for name in sorted(rest) if rest[name]), encoding="utf-8")
+        KNOWN.write_text(
+            "".join(f"{name} {others[name]}\n" for name in sorted(others) if others[name]), encoding="utf-8"
+        )
     lines = too_many(count, recorded())
     print("\n".join(lines) if lines else "words: within the limits")
     if lines:
@@ -303,7 +305,7 @@ def main() -> int:
     for (name, group), words in count.words.items():
         by_group[group] += len(count.places[name, group])
         words_of[group] += words
-    for group in (PUBLIC, PRIVATE, REST):
+    for group in (PUBLIC, PRIVATE, OTHER):
         density = 1000.0 * by_group[group] / max(words_of[group], 1)
         print(f"  {group:8} {by_group[group]:5} places in {words_of[group]:6} words, {density:.1f} per 1000")
     return int(bool(lines))

@@ -1,4 +1,4 @@
-"""Commands run, compare, check, list, plot, bench and schema; large imports are deferred until a command is called."""
+"""Commands run, compare, check, list, plot and schema; large imports are deferred until a command is called."""
 
 from __future__ import annotations
 
@@ -244,24 +244,6 @@ app.command(epilog=PLAN_EXAMPLE)(plan)
 app.command(epilog="Example: dynsim teleop snake_operator --speed 0.2")(teleop)
 app.command(epilog="Example: dynsim view results/elbow_comparison/*/record.h5 --ghost")(view)
 app.command(epilog="Example: dynsim animate results/elbow_comparison/two_elbows --out film.gif --view side")(animate)
-
-
-@app.command(epilog="Example: dynsim bench --quick --json bench.json")
-def bench(
-    quick: Annotated[bool, typer.Option("--quick", help="Fewer sizes and repetitions.")] = False,
-    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures as JSON.")] = None,
-) -> None:
-    """Time right-hand sides and the whole job beside Pinocchio and MuJoCo (where installed)."""
-    from dynsim.studies.bench.run import run_bench
-    from dynsim.studies.bench.table import format_table
-    from dynsim.system.files import write_json
-
-    with console.status("measuring") as status:
-        result = run_bench(quick, status.update)
-    for table in format_table(result):
-        console.print(table)
-    if json_file is not None:
-        write_json(json_file, result)
 
 
 @app.command(epilog="Example: dynsim schema > scenario.schema.json")

@@ -1,1 +1,1 @@
-"""Studies of several runs: variants, batches and sweeps, in processes or on a cluster; benchmarks."""
+"""Studies of several runs: variants, batches and sweeps, in processes or on a cluster."""

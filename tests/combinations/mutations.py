@@ -78,7 +78,7 @@ FAULTS = (
     ),
     Fault(
         "equilibrium",
-        (("compile/equilibrium.py", "RESERVED = 0.9", "RESERVED = 1.0"),),
+        (("compile/posture.py", "RESERVED = 0.9", "RESERVED = 1.0"),),
     ),
     Fault(
         "passed_stop",
@@ -92,13 +92,13 @@ FAULTS = (
     ),
     Fault(
         "snake_start",
-        (("engine/snake_start.py", "        alone = _alone(scenario)\n", "        alone = scenario\n"),),
+        (("engine/snake_control.py", "        alone = _alone(scenario)\n", "        alone = scenario\n"),),
     ),
     Fault(
         "voltage",
         (
             (
-                "integrators/dense.py",
+                "integrators/run.py",
                 "    if not sampled_now(run):\n        return\n",
                 "    if run.count[ki.SAMPLE] >= 0:\n        return\n",
             ),

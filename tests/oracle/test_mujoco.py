@@ -14,6 +14,9 @@ from hypothesis import strategies as st
 
 mujoco = pytest.importorskip("mujoco", minversion="4.0")
 
+from studies.bench.job import CASES, prepare_case  # noqa: E402
+from studies.bench.mujoco_peer import build_mujoco, roll_out, setpoints, state_of  # noqa: E402
+
 from dynsim.compile.model import Model  # noqa: E402
 from dynsim.compile.tables import compile_contacts, compile_drives, compile_loads  # noqa: E402
 from dynsim.dynamics import tables as ka  # noqa: E402
@@ -28,8 +31,6 @@ from dynsim.integrators.driver import advance  # noqa: E402
 from dynsim.jit.kernel import integers, reals  # noqa: E402
 from dynsim.model.description import Inertia, Link, Robot  # noqa: E402
 from dynsim.scenario import load_scenario  # noqa: E402
-from dynsim.studies.bench.job import CASES, prepare_case  # noqa: E402
-from dynsim.studies.bench.mujoco_peer import build_mujoco, roll_out, setpoints, state_of  # noqa: E402
 
 TIGHT = {"integrator.rtol": 1e-11, "integrator.atol": 1e-13}
 

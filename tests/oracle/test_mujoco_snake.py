@@ -1,4 +1,4 @@
-"""The dynamic snake in the MuJoCo model of `dynsim bench`: mass matrix, servo torques and one manoeuvre."""
+"""The dynamic snake in the MuJoCo model of the benchmark: mass matrix, servo torques and one manoeuvre."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 mujoco = pytest.importorskip("mujoco", minversion="4.0")
+
+from studies.bench.snake import BETA, SCENARIO, Z, build_snake, positions, run_dynsim, run_mujoco  # noqa: E402
 
 from dynsim.dynamics import tables as ka  # noqa: E402
 from dynsim.dynamics.drive.law import (  # noqa: E402
@@ -19,7 +21,6 @@ from dynsim.engine.simulation import (  # noqa: E402
     prepare,
 )
 from dynsim.scenario import load_scenario  # noqa: E402
-from dynsim.studies.bench.snake import BETA, SCENARIO, Z, build_snake, positions, run_dynsim, run_mujoco  # noqa: E402
 
 
 @pytest.fixture(scope="module")

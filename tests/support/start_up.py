@@ -15,8 +15,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from dynsim.studies.bench.programs import SCENARIO
-from dynsim.studies.bench.run import machine, versions
+from studies.bench.programs import SCENARIO
+from studies.bench.run import machine, versions
+
 from dynsim.system.files import write_json
 
 FILE = Path("results/reference/start_up.json")

@@ -1,4 +1,4 @@
-"""``dynsim bench`` in short: errors of all programs, dashes where a peer is missing. No times are asserted."""
+"""The benchmark in short: errors of all programs, dashes where a peer is missing. No times are asserted."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import sys
 
 import pytest
 from rich.console import Console
+from studies.bench import job, precision, programs, right_hand_side, run, snake
+from studies.bench.table import format_table
 
 from dynsim.scenario import variant_names
-from dynsim.studies.bench import job, precision, programs, right_hand_side, run, snake
-from dynsim.studies.bench.table import format_table
 
 pytestmark = pytest.mark.long
 

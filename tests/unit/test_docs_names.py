@@ -160,28 +160,10 @@ def test_examples_make_what_is_not_there() -> None:
     assert [path for path in MADE if file_named(path) is not None] == []
 
 
-def house() -> dict[str, str]:
-    """The rooms, file by file: room or file → what is said of it."""
-    block = page("dev/rooms.md").split("```text\n")[1].split("```")[0]
-    lines: dict[str, str] = {}
-    for line in block.splitlines():
-        if line.startswith(" "):
-            last = next(reversed(lines))
-            lines[last] += f" {line.strip()}"
-        else:
-            room, said = line.split(maxsplit=1)
-            lines[room] = said
-    return lines
+def test_every_file_of_the_package_has_a_docstring() -> None:
+    assert [path for path in PACKAGE.rglob("*.py") if path.name != "_version.py" and not docstring(path)] == []
 
 
-def test_the_house_has_every_room_and_every_file_that_it_names() -> None:
-    rooms = {
-        f"{path.relative_to(PACKAGE)}/"
-        for path in PACKAGE.rglob("*")
-        if path.is_dir() and any(path.glob("*.py")) and path.name != "shipped_scenarios"
-    }
-    files = {path.name for path in PACKAGE.glob("*.py") if not path.name.startswith("_")}
-    assert set(house()) == rooms | files
-    for room, said in house().items():
-        for name in re.findall(r"\w+\.py", said):
-            assert (PACKAGE / room / name).is_file(), f"{room}: {name}"
+def docstring(path: Path) -> str:
+    """Docstring of a file."""
+    return ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""

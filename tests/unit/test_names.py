@@ -18,7 +18,7 @@ ALLOWED_IN_TESTS = {"held"}
 # Participles, which do not name an action or a result of a function.
 PARTICIPLES = {"folded", "shown", "sunk"}
 # Of the public interface: how long the last frame of a film stays.
-PUBLIC = {("cli/animate.py", "hold"), ("draw/film/film.py", "hold")}
+PUBLIC = {("cli/drawing.py", "hold"), ("draw/film/film.py", "hold")}
 
 
 def bad_names(source: str) -> Iterator[tuple[str, int]]:

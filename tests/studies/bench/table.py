@@ -8,8 +8,8 @@ from typing import Any
 from rich import box
 from rich.table import Table
 
-from dynsim.studies.bench import job, precision, snake
-from dynsim.studies.bench.programs import JOBS, RIGHT_HAND_SIDES
+from studies.bench import job, precision, snake
+from studies.bench.programs import JOBS, RIGHT_HAND_SIDES
 
 Row = Mapping[str, Any]
 

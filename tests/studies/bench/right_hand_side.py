@@ -17,8 +17,8 @@ from dynsim.dynamics.state import block
 from dynsim.engine.simulation import Prepared, prepare
 from dynsim.jit.kernel import kernel
 from dynsim.scenario import load_scenario
-from dynsim.studies.bench import mujoco_peer, pinocchio_peer
-from dynsim.studies.bench.programs import (
+from studies.bench import mujoco_peer, pinocchio_peer
+from studies.bench.programs import (
     ABA,
     CONSTRAINT_DYNAMICS,
     DYNSIM_CONTACTS,

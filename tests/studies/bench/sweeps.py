@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from dynsim.scenario import read_scenario
-from dynsim.studies.bench.programs import SCENARIO
 from dynsim.studies.processes import cores
 from dynsim.studies.sweep import run_sweep
 from dynsim.studies.sweep_plan import Law, Plan
+from studies.bench.programs import SCENARIO
 
 RUNS = (250, 500, 1000)
 

@@ -13,8 +13,8 @@ from typing import Any
 
 from dynsim._version import __version__
 from dynsim.engine.recording import commit
-from dynsim.studies.bench import job, precision, right_hand_side, snake, sweeps
-from dynsim.studies.bench.programs import SCENARIO, STEP
+from studies.bench import job, precision, right_hand_side, snake, sweeps
+from studies.bench.programs import SCENARIO, STEP
 
 SIZES = (10, 30, 100, 300, 1000)
 

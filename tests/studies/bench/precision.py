@@ -13,7 +13,7 @@ from dynsim.engine.simulation import prepare
 from dynsim.integrators import run as ki
 from dynsim.record.measures import energy_turnover
 from dynsim.scenario import load_scenario, shipped_scenarios
-from dynsim.studies.bench.job import integrate
+from studies.bench.job import integrate
 
 METHODS = ("dopri5", "radau5")
 RTOLS = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9)

@@ -17,8 +17,8 @@ from dynsim.engine.stepped import take_log
 from dynsim.integrators import run as ki
 from dynsim.integrators.driver import advance
 from dynsim.scenario import build, load_scenario, variant_names
-from dynsim.studies.bench import mujoco_peer
-from dynsim.studies.bench.programs import DYNSIM_RADAU5, MUJOCO_EULER, MUJOCO_IMPLICIT, SCENARIO, STEP
+from studies.bench import mujoco_peer
+from studies.bench.programs import DYNSIM_RADAU5, MUJOCO_EULER, MUJOCO_IMPLICIT, SCENARIO, STEP
 
 Array = NDArray[np.float64]
 
@@ -34,7 +34,7 @@ class Case:
     variant : str
         Of elbow_comparison.
     mujoco_contacts : str
-        ``contacts`` of :func:`dynsim.studies.bench.mujoco_peer.build_mujoco`.
+        ``contacts`` of :func:`studies.bench.mujoco_peer.build_mujoco`.
     same_physics : bool
         Whether the programs solve the same equations; where not, MuJoCo's rows are marked.
     """

@@ -22,7 +22,7 @@ from dynsim.record import Record
 from dynsim.scenario import Scenario, load_scenario
 from dynsim.snake.description import COORDINATES
 from dynsim.snake.published import TABLE_III, displacement
-from dynsim.studies.bench.mujoco_peer import STIFFEST, roll_out, state_of
+from studies.bench.mujoco_peer import STIFFEST, roll_out, state_of
 
 Array = NDArray[np.float64]
 
