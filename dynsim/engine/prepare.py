@@ -47,6 +47,7 @@ from dynsim.integrators import driver
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts import events as ke
 from dynsim.integrators.events import TIP_MARGIN
+from dynsim.integrators.methods import METHODS, by_number
 from dynsim.integrators.run import RATE_TOLERANCE
 from dynsim.integrators.stepping.tables import stepping_arrays
 from dynsim.model.description import Array, Contact, Load, Robot
@@ -305,7 +306,7 @@ def prepare(
     )
     _check_work(scenario, n, c + joint_rows, choice.method)
     _check_stiffness(choice.method, scenario.duration_s, robot)
-    method = ki.METHODS[choice.method]
+    method = METHODS[choice.method].number
     step = options.step_s or (1e-3 if method == ki.TIME_STEPPING else 0.0)
     balance, initial = None, scenario.config.initial
     if initial is not None and initial.equilibrium:
@@ -496,7 +497,8 @@ def _longest_step(method: int, *, watched: bool) -> float:
     them. Knots of references are as far apart as this. An implicit method stops at their bends, but a force may pass
     its bound between two of them, which changes the motion.
     """
-    return PACE if method == ki.DOPRI5 or (watched and method == ki.RADAU5) else np.inf
+    table = by_number(method)
+    return PACE if table.explicit or (watched and table.adaptive) else np.inf
 
 
 def _breaks(loads: Sequence[Load], control: JointControl, method: int, options: Integrator) -> np.ndarray:
@@ -505,7 +507,7 @@ def _breaks(loads: Sequence[Load], control: JointControl, method: int, options: 
     For an implicit method also the times at which references bend: their knots are closer than its steps are long.
     """
     times = [load.knots for load in loads if len(load.coefficients) and (not load.hold or _varies(load))]
-    if method == ki.RADAU5:
+    if by_number(method).adaptive and not by_number(method).explicit:
         tolerances = options.rtol, options.absolute_tolerance
         times.append(recall("bends", lambda: control.bends(*tolerances), control, *tolerances))
     return np.unique(np.concatenate(times)) if times else np.zeros(0)
@@ -531,12 +533,11 @@ def sample_times(scenario: Scenario, layout: StateLayout, columns: OutputLayout,
 def _check_stiffness(method: str, duration: float, robot: Robot) -> None:
     """Raise an error for an explicit method if the poles R/L of the circuits alone require too many steps."""
     circuits = [motor for motor in robot.motors if isinstance(motor, Motor)]
-    if method != "dopri5" or not circuits:
+    if not METHODS[method].explicit or not circuits:
         return
     motor = max(circuits, key=lambda motor: motor.resistance / motor.inductance)
     pole = motor.resistance / motor.inductance
-    # DOPRI5 is stable up to |h pole| of 3.3.
-    steps = duration * pole / 3.3
+    steps = duration * pole / METHODS[method].stability
     if steps > STEPS_LIMIT:
         raise ScenarioError(
             f"{motor.joint}: R/L = {pole:.2g} 1/s holds integrator.method {method} to about {steps:.1g} steps for "
@@ -568,7 +569,10 @@ def _check_work(scenario: Scenario, n: int, p: int, method: str) -> None:
     # some hundredths of a second, with three iterations, and occasionally a Jacobian by differences and its factors.
     step = options.step_s if options.step_s and method == "time_stepping" else 1e-3
     explicit, implicit = 4.0 * seconds / step, ((2 * n + 14) * seconds + 3e-9 * n**3) / 1e-2
-    rate = {"radau5": implicit, AUTO: min(explicit, implicit)}.get(method, explicit)
+    if method == AUTO:
+        rate = min(explicit, implicit)
+    else:
+        rate = explicit if METHODS[method].explicit or not METHODS[method].adaptive else implicit
     wall = scenario.duration_s * rate
     if wall > CLEARLY * options.wall_limit_s:
         raise ScenarioError(

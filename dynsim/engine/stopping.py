@@ -27,6 +27,7 @@ from dynsim.errors import SimulationStopped
 from dynsim.integrators import driver
 from dynsim.integrators import run as ki
 from dynsim.integrators import run as kp
+from dynsim.integrators.methods import by_number
 from dynsim.integrators.stepping import tables as kt
 from dynsim.scenario import Scenario
 from dynsim.system import interruption
@@ -262,7 +263,7 @@ def held_up(prepared: Prepared) -> str:
     """A clause about the contact whose friction changes so fast that explicit steps have to be this short, or ""."""
     run = prepared.run
     step = float(run.clock[ki.STEP])
-    if run.method != ki.DOPRI5 or not prepared.contacts or not np.isfinite(run.y).all():
+    if not by_number(run.method).explicit or not prepared.contacts or not np.isfinite(run.y).all():
         return ""
     changing = fastest(prepared)
     if changing is None or not LEAST < step / changing.within < MOST:

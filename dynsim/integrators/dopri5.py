@@ -42,6 +42,21 @@ def combine(y, h, row, stages, k, y_new):
 
 
 @inline_kernel
+def explicit_error(system: System, ws: Workspace, run: Run, row):
+    """Error norm of an explicit step with error coefficients ``row`` (7,); the estimate is left in stage[7]."""
+    h, y, k = run.clock[ki.STEP], run.y, run.stage
+    for j in range(y.shape[0]):
+        k[7, j] = 0.0
+    combine(k[7], h, row, 7, k, k[7])
+    error = error_norm(system, ws, run, k[7], 1.0)
+    if system.layout.circuits < ws.motors.shape[0]:
+        # Currents of circuits are states: their errors show those of the power.
+        for j in (system.layout.ledger + kst.ELECTRICAL, system.layout.ledger + kst.JOULE):
+            error = max(error, energy_norm(run, j, k[7, j]))
+    return error
+
+
+@inline_kernel
 def step_dopri5(system: System, ws: Workspace, run: Run):
     """One step of Dormand and Prince's method; returns the error norm.
 
@@ -55,12 +70,4 @@ def step_dopri5(system: System, ws: Workspace, run: Run):
         if run.event.shape[0] > 0 and 2 <= s <= 3:
             note_inside(system, ws, run, s - 2, NODE_DOPRI5[s])
     run.count[ki.EVALUATIONS] += 6
-    for j in range(y.shape[0]):
-        k[7, j] = 0.0
-    combine(k[7], h, ERROR_DOPRI5, 7, k, k[7])
-    error = error_norm(system, ws, run, k[7], 1.0)
-    if system.layout.circuits < ws.motors.shape[0]:
-        # Currents of circuits are states: their errors show those of the power.
-        for j in (system.layout.ledger + kst.ELECTRICAL, system.layout.ledger + kst.JOULE):
-            error = max(error, energy_norm(run, j, k[7, j]))
-    return error
+    return explicit_error(system, ws, run, ERROR_DOPRI5)

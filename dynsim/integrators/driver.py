@@ -32,10 +32,10 @@ from dynsim.integrators import run as ki
 from dynsim.integrators.contacts.events import consistent, solve_modes, switch_contacts, take_directions, watch_modes
 from dynsim.integrators.dopri5 import step_dopri5
 from dynsim.integrators.events import arm_events, cut_step, fire_events, take_ticks
+from dynsim.integrators.methods import compiled
 from dynsim.integrators.radau5.step import after_step, end_accepted, end_workspace, step_radau5
 from dynsim.integrators.radau5.tables import forget
 from dynsim.integrators.run import Run, forces_unique, rewrite_sample, sample_step, settle, watch, write_waiting
-from dynsim.integrators.stepping.step import advance_moreau
 from dynsim.integrators.steps import choose_step, finished, finite, first_step, next_step, rejected, stalled
 from dynsim.jit.kernel import FixedSignature, free_kernel, inline_kernel, internal_kernel, noinline_kernel
 
@@ -250,14 +250,11 @@ def advance(system: System, ws: Workspace, run: Run, limit: int) -> None:
     beyond HOLD: it is kept, PENDING, and accepted by the next call unless the caller drops it; and when another thread
     has set ASKED.
 
-    Three compiled functions behind one name, so that each is only compiled when it is used.
+    One compiled function per method, so that each is only compiled when it is used.
     """
-    _METHODS[run.method](system, ws, run, limit)
+    compiled(run.method)(system, ws, run, limit)
 
 
 def direct(run: Run) -> Callable[[System, Workspace, Run, int], None]:
     """:func:`advance` for a run in many short pieces, whose tables keep the types that they have in the first."""
-    return FixedSignature(_METHODS[run.method])
-
-
-_METHODS = {ki.DOPRI5: advance_dopri5, ki.RADAU5: advance_radau5, ki.TIME_STEPPING: advance_moreau}
+    return FixedSignature(compiled(run.method))

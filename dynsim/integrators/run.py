@@ -23,14 +23,16 @@ from dynsim.dynamics.tree import support as ks
 from dynsim.dynamics.tree.articulated import accelerate
 from dynsim.dynamics.tree.joints import displace, normalise, point_position
 from dynsim.dynamics.tree.support import SupportArrays, ground_reaction, no_support
+from dynsim.integrators import methods
 from dynsim.integrators.radau5 import tables as kn
 from dynsim.integrators.radau5.tables import NODE_RADAU, NewtonArrays, newton_arrays
 from dynsim.integrators.stepping import tables as kt
 from dynsim.integrators.stepping.tables import SteppingArrays
 from dynsim.jit.kernel import inline_kernel, integers, internal_kernel, kernel, reals
 
-DOPRI5, RADAU5, TIME_STEPPING = 0, 1, 2
-METHODS = {"dopri5": DOPRI5, "radau5": RADAU5, "time_stepping": TIME_STEPPING}
+# Run.method
+DOPRI5, RADAU5, TIME_STEPPING = methods.DOPRI5.number, methods.RADAU5.number, methods.TIME_STEPPING.number
+LINEAR, HERMITE = methods.LINEAR, methods.HERMITE
 
 RUNNING, FINISHED, NOT_FINITE, STEP_TOO_SMALL, NOT_PROJECTED, NO_FORCES = 0, 1, 2, 3, 4, 5
 FORCES_REVERSED, SEVERAL_FORCES, STOPPED = 6, 7, 8
@@ -93,11 +95,13 @@ class Run(NamedTuple):
     """The moving part of one simulation; m is the length of the state."""
 
     method: int
+    dense_kind: int  # see dynsim.integrators.methods
     layout: StateLayout
     y: np.ndarray  # (m,) state at TIME
     y_new: np.ndarray  # (m,)
     stage: np.ndarray  # (8, m) stage derivatives; stage[0] belongs to y
     dense: np.ndarray  # (4, m) y(θ) = y + θ (d0 + (1−θ)(d1 + θ (d2 + (1−θ) d3)))
+    quartic: np.ndarray  # (7,) coefficients of d3 / h, by stage
     clock: np.ndarray  # (CLOCK_SIZE,)
     count: np.ndarray  # (COUNT_SIZE,) int
     extremes: np.ndarray  # (c, EXTREMES_SIZE)
@@ -166,9 +170,9 @@ def new_run(
     Raises
     ------
     ValueError
-        For time stepping without the block ``scheme`` of the state.
+        For an unknown method, and for time stepping without the block ``scheme`` of the state.
     """
-    m, p = len(y), row_limit(c, couplings)
+    m, p, table = len(y), row_limit(c, couplings), methods.by_number(method)
     if method == TIME_STEPPING and layout.size == layout.scheme:
         raise ValueError("the state has no room for the scheme's energy, see dynsim.dynamics.state")
     clock = np.zeros(CLOCK_SIZE)
@@ -186,11 +190,13 @@ def new_run(
         newton = newton._replace(lanes=stage_lanes(workspace(n, na, c, couplings), m, columns.size))
     return Run(
         method=method,
+        dense_kind=table.dense,
         layout=layout,
         y=reals(y),
         y_new=np.zeros(m),
         stage=np.zeros((8, m)),
         dense=np.zeros((4, m)),
+        quartic=reals(table.quartic),
         clock=clock,
         count=count,
         extremes=extremes,
@@ -441,25 +447,21 @@ def collocated(newton: NewtonArrays | None, j, whole):
 @internal_kernel
 def fill_dense(run: Run):
     """Coefficients of the dense output over the step from y to y_new, see ``Run.dense``."""
-    h, y, y_new, k, d = run.clock[STEP], run.y, run.y_new, run.stage, run.dense
+    h, y, y_new, k, d, b = run.clock[STEP], run.y, run.y_new, run.stage, run.dense, run.quartic
     for j in range(y.shape[0]):
         d[0, j] = y_new[j] - y[j]
         d[3, j] = 0.0
-        if run.method == TIME_STEPPING:
+        if run.dense_kind == LINEAR:
             d[1, j], d[2, j] = 0.0, 0.0
-        elif run.method == RADAU5:
-            d[1, j], d[2, j] = collocated(run.newton, j, d[0, j])
-        else:
+        elif run.dense_kind == HERMITE:
             d[1, j] = h * k[0, j] - d[0, j]
             d[2, j] = d[0, j] - h * k[6, j] - d[1, j]
-            d[3, j] = h * (
-                -12715105075.0 / 11282082432.0 * k[0, j]
-                + 87487479700.0 / 32700410799.0 * k[2, j]
-                - 10690763975.0 / 1880347072.0 * k[3, j]
-                + 701980252875.0 / 199316789632.0 * k[4, j]
-                - 1453857185.0 / 822651844.0 * k[5, j]
-                + 69997945.0 / 29380423.0 * k[6, j]
-            )
+            bend = b[0] * k[0, j]
+            for s in range(1, 7):
+                bend += b[s] * k[s, j]
+            d[3, j] = h * bend
+        else:
+            d[1, j], d[2, j] = collocated(run.newton, j, d[0, j])
 
 
 @internal_kernel

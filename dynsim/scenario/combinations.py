@@ -13,12 +13,14 @@ from typing import Any
 from dynsim.config.base import error_at
 from dynsim.config.problems import dotted, listed
 from dynsim.errors import ModelError
+from dynsim.integrators import methods
 from dynsim.model.description import Robot
 from dynsim.model.drives import Motor
 
 LAWS = ("bilateral", "unilateral")
-METHODS = ("auto", "dopri5", "radau5", "time_stepping")
-EVENT_DRIVEN, TIME_STEPPING = METHODS[:3], METHODS[3:]
+METHODS = ("auto", *methods.METHODS)
+TIME_STEPPING = tuple(method.name for method in methods.METHODS.values() if not method.adaptive)
+EVENT_DRIVEN = tuple(name for name in METHODS if name not in TIME_STEPPING)
 
 # Keys of contacts and of their points that only one law reads.
 BILATERAL_KEYS = ("slip_smoothing_m_s", "pulling_friction")

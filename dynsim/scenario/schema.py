@@ -24,7 +24,7 @@ from dynsim.model.joints.ball import floating
 from dynsim.record import record
 from dynsim.record.csv_rows import read_rows
 from dynsim.record.scene import HERE, Shape, quaternion
-from dynsim.scenario.combinations import BILATERAL_KEYS, THETA, UNILATERAL_KEYS, check_keys
+from dynsim.scenario.combinations import BILATERAL_KEYS, METHODS, THETA, UNILATERAL_KEYS, check_keys
 from dynsim.scenario.effect import idle_keys, is_set
 
 # The ``sensors:`` section of a scenario: rate, delay, resolution and noise of a sampled controller's inputs.
@@ -843,7 +843,7 @@ class SurfaceError(StrictConfig):
 class Integrator(StrictConfig):
     """Time integration."""
 
-    method: Literal["auto", "dopri5", "radau5", "time_stepping"] = Field(
+    method: Literal[METHODS] = Field(  # type: ignore[valid-type]
         default="auto",
         description="auto: one of the adaptive ones, by the system; adaptive 5(4), adaptive implicit (where motors "
         "hold the steps of the other), or fixed step with contacts that open and close",

@@ -29,8 +29,9 @@ from dynsim.dynamics.simd.forms import has_forms
 from dynsim.dynamics.state import ELASTIC_SIZE, LOSSES, block, output_layout, state_layout
 from dynsim.engine.prepare import guards
 from dynsim.integrators.driver import advance
+from dynsim.integrators.methods import METHODS
 from dynsim.integrators.radau5.tables import CLOSE
-from dynsim.integrators.run import FINISHED, METHODS, STATUS, TIME_STEPPING, Run, new_run
+from dynsim.integrators.run import FINISHED, STATUS, TIME_STEPPING, Run, new_run
 from dynsim.integrators.stepping.tables import stepping_arrays
 from dynsim.jit.kernel import integers, reals
 from dynsim.model.description import Contact, Inertia, Link, Load, Quadric, Robot
@@ -41,7 +42,7 @@ from dynsim.model.joints.wheels import wheeled
 
 SURFACES = ("plane", "sphere", "cylinder")
 # Methods that integrate the right-hand side, whose contacts hold both ways: time stepping has tests of its own.
-ADAPTIVE = tuple(name for name, method in METHODS.items() if method != TIME_STEPPING)
+ADAPTIVE = tuple(name for name, method in METHODS.items() if method.adaptive)
 SEVERAL_ROWS = {
     "ball": ball,
     "floating": floating,
@@ -254,10 +255,10 @@ class CompiledSystem:
         couplings = len(self.robot.couplings) + len(self.stops)
         dry, ties = (0, 0) if system.unilateral is None else (len(system.unilateral.dry), len(self.robot.ties))
         couplings += dry + ties
-        if METHODS[method] == TIME_STEPPING:
+        if METHODS[method].number == TIME_STEPPING:
             stepping = stepping_arrays(system.model, system.contacts, na, couplings, theta)
         run = new_run(
-            METHODS[method],
+            METHODS[method].number,
             y,
             self.system.layout,
             output_layout(n, na, c, 0, len(self.stops), dry, ties),
@@ -292,7 +293,7 @@ class CompiledSystem:
 
     def simulate(self, y: np.ndarray, times: np.ndarray, method: str = "dopri5", **options: Any) -> Run:
         """Integrate to the last of ``times``, which must be reached; ``options`` are those of :meth:`new_run`."""
-        b = self.with_shapes() if METHODS[method] == TIME_STEPPING else self
+        b = self.with_shapes() if METHODS[method].number == TIME_STEPPING else self
         return b.finish(b.new_run(y, times, method, **options))
 
     def finish(self, run: Run) -> Run:

@@ -9,6 +9,7 @@ import pytest
 from support.random_robots import ADAPTIVE, CompiledSystem, assemble
 
 from dynsim.dynamics.state import CONSTRAINT, ELECTRICAL, FRICTION, GEAR, JOINT, JOULE, OUT_GAP
+from dynsim.integrators.methods import METHODS, by_number
 from dynsim.integrators.radau5.step import (
     SHORT,
     energy_error,
@@ -24,7 +25,6 @@ from dynsim.integrators.run import (
     DRIFT_MAX,
     EVALUATIONS,
     FINISHED,
-    METHODS,
     PROJECTIONS,
     REJECTED,
     STATUS,
@@ -85,12 +85,22 @@ def slopes(values: np.ndarray) -> np.ndarray:
     return np.log2(values[:-1] / values[1:])
 
 
+# Steps [s] in the range where errors are asymptotic and above rounding; for samples also the order of dense output.
+STEPS_OF_ORDER = {
+    "dopri5": [8e-4, 4e-4, 2e-4],
+    "radau5": [2e-3, 1e-3, 5e-4],
+    "bogacki_shampine": [4e-4, 2e-4, 1e-4],
+}
+STEPS_OF_SAMPLES = {
+    "dopri5": (4, [8e-4, 4e-4]),
+    "radau5": (3, [4e-3, 2e-3]),
+    "bogacki_shampine": (3, [4e-4, 2e-4]),
+}
+
+
 @pytest.mark.parametrize(
     ("method", "order", "steps"),
-    [
-        ("dopri5", 5, [8e-4, 4e-4, 2e-4]),
-        ("radau5", 5, [2e-3, 1e-3, 5e-4]),
-    ],
+    [(method.name, method.order, STEPS_OF_ORDER[method.name]) for method in METHODS.values() if method.adaptive],
 )
 @pytest.mark.parametrize("braced", [False, True])
 def test_order_by_halving_the_step(method, order, steps, braced):
@@ -116,10 +126,10 @@ def test_radau5_is_of_its_stage_order_at_least_when_the_inductance_vanishes():
 
 @pytest.mark.parametrize(
     ("method", "order", "steps"),
-    [("dopri5", 4, [8e-4, 4e-4]), ("radau5", 3, [4e-3, 2e-3])],
+    [(name, *STEPS_OF_SAMPLES[name]) for name, method in METHODS.items() if method.adaptive],
 )
 def test_order_of_the_dense_output(method, order, steps):
-    """Between the steps: local order 4 of dopri5, 3 of radau5 (errors of order + 1 locally)."""
+    """Between the steps: local order 4 of dopri5, 3 of radau5 and bogacki_shampine (errors of order + 1 locally)."""
     b, y = arm()
     # Fractions of the largest step that are no grid points of either.
     times = steps[0] * (np.arange(40, 100) + 0.37)
@@ -127,8 +137,10 @@ def test_order_of_the_dense_output(method, order, steps):
     assert orders.min() >= order - 0.5, orders
 
 
-def test_every_method_is_in_these_tests():
-    assert {*METHODS} - {*ADAPTIVE} == {"time_stepping"}  # order, ledger and pieces: test_time_stepping
+def test_methods_have_different_numbers_and_unknown_numbers_are_errors():
+    assert len({method.number for method in METHODS.values()}) == len(METHODS)
+    with pytest.raises(ValueError, match="99"):
+        by_number(99)
 
 
 @pytest.mark.parametrize("method", ADAPTIVE)
