@@ -134,44 +134,6 @@ def of_elbows(scenario: str, key: str) -> list[float]:
     return [validation()["runs"][f"{scenario} {name}"][key] for name in VARIANTS]
 
 
-def held(scenario: str, show: Callable[[dict[str, Any]], str]) -> list[str]:
-    """Of the first elbow that a variant declares, or of both, in each variant."""
-    cells = []
-    for name in VARIANTS:
-        touching = contact()[scenario][name]["contacts"]
-        cells.append(
-            " / ".join(show(touching[elbow]) if elbow in touching else NONE for elbow in ("elbow_4", "elbow_7"))
-        )
-    return [NONE if cell == "– / –" else cell for cell in cells]
-
-
-def elbows_in_short() -> str:
-    glued, real = contact()["elbow_comparison"], contact()["elbow_comparison_floor"]
-    mean = held("elbow_comparison", lambda c: number(c["normal_force_mean_N"], 3))
-    times = {row["variant"]: row for row in bench()["variants"]}
-    return lines(
-        ["", *HEADS],
-        [
-            ["electrical energy in 10 s [J]", *(number(glued[v]["electrical_energy_J"]) for v in VARIANTS)],
-            ["hand error, rms [mm]", *(fixed(1e3 * glued[v]["hand_error_rms_m"], 1) for v in VARIANTS)],
-            ["mean normal force, elbow 4 / elbow 7 [N]", *mean],
-            ["on a real floor: electrical energy [J]", *(number(real[v]["electrical_energy_J"]) for v in VARIANTS)],
-            ["… hand error, rms [mm]", *(fixed(1e3 * real[v]["hand_error_rms_m"], 1) for v in VARIANTS)],
-            [
-                "… mean normal force, elbow 4 / elbow 7 [N]",
-                *held("elbow_comparison_floor", lambda c: fixed(c["normal_force_mean_N"], 2)),
-            ],
-            [
-                "… elbow sticks [% of time]",
-                *held("elbow_comparison_floor", lambda c: fixed(100 * c["sticking_fraction"], 0)),
-            ],
-            ["deepest joint below the floor [mm]", *(_depth(v, "joint_depth_max_m") for v in VARIANTS)],
-            ["energy ledger residual", *(small(glued[v]["energy_residual_relative"]) for v in VARIANTS)],
-            ["integration, processor time [ms]", *(number(1e3 * times[v]["cpu_minimum_s"], 2) for v in VARIANTS)],
-        ],
-    )
-
-
 def _depth(variant: str, key: str) -> str:
     depth = 1e3 * validation()["elbows"][variant][key]
     return fixed(depth, 1) if 0.05 <= depth < 9.95 else fixed(depth, 0)
@@ -542,21 +504,13 @@ def between_snakes(k: int, coordinate: int) -> float:
 
 
 def comparison() -> str:
-    """What `dynsim compare elbow_comparison` prints, less some rows."""
+    """Return some rows of the table that `dynsim compare elbow_comparison` prints."""
     output = io.StringIO()
-    summaries = validation()["elbow_summaries"]
-    print_comparison(Terminal(file=output, width=120, emoji=False), summaries)
-    kept = (
-        "electrical energy", "  from", "hand error", "deepest", "ledger", "elbow_4: force", "pulling", "two_elbows",
-        "───",
-    )  # fmt: skip
+    print_comparison(Terminal(file=output, width=120, emoji=False), validation()["elbow_summaries"])
+    kept = ("electrical energy", "hand error", "deepest", "ledger", "two_elbows", "───")
     text = [line[1:].rstrip() for line in output.getvalue().split("warning: ")[0].splitlines()]
-    rows = [row for row in text if any(label in row for label in kept) and "times the least" not in row]
-    # Of two elbows the first one's share of pulling.
-    shown = rows[: next(k for k, row in enumerate(rows) if "pulling" in row) + 1]
-    warned = {name: summary["warnings"] for name, summary in summaries.items()}
-    notes = [f"warning: {name}: {warned[name][0]}" for name in ("two_elbows", "elbow_4")]
-    return "```\n" + "\n".join([*shown, "", *notes]) + "\n```\n"
+    rows = [row for row in text if any(label in row for label in kept)]
+    return "```\n" + "\n".join(rows) + "\n```\n"
 
 
 def combinations() -> str:
@@ -961,7 +915,7 @@ def modules() -> str:
 TABLES: dict[str, Callable[[], str]] = {
     table.__name__: table
     for table in (
-        elbows_in_short, elbows, glued_and_real, overturning_holds, overturning_drives, assumptions, ledger,
+        elbows, glued_and_real, overturning_holds, overturning_drives, assumptions, ledger,
         snake_table_iii, snake_table_iv, snake_table_v, time_stepping, endings, right_hand_side, ratios, job, precision,
         sweeps, snake_bench, combinations, comparison, faults, planned_arm, planned_gains, planned_scenes,
         snake_positioning, snake_limits,

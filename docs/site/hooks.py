@@ -32,6 +32,7 @@ _INDEX = re.compile(
     r"|(?<![\w-])(?P<letter>[^\W\d_][\u0300-\u036f]*)_(?P<index>[^\W_]{1,8})(?![\w*_])",
     flags=re.MULTILINE | re.DOTALL,
 )
+_OUTSIDE = re.compile(rf"\]\((?:\.\./)+({'|'.join(map(re.escape, OUTSIDE))})(?=[)#])")
 _PICTURE = re.compile(r"\]\((?:\.\./)*(results/[\w/.-]+\.(?:png|gif))\)")
 
 
@@ -60,6 +61,7 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
     markdown = _INDEX.sub(lambda match: match["kept"] or f"{match['letter']}<sub>{match['index']}</sub>", markdown)
     up = "../" * page.file.src_uri.count("/")
     markdown = _PICTURE.sub(lambda match: f"]({up}{match[1]})", markdown)
+    markdown = _OUTSIDE.sub(lambda match: f"]({up}{OUTSIDE[match[1]]}", markdown)
     if page.file.src_uri in OUTSIDE.values():
         markdown = re.sub(r"\]\((?:\.\./)?docs/", f"]({up}", markdown)
         for source, target in OUTSIDE.items():

@@ -1,4 +1,4 @@
-"""Code blocks of README, tutorials and how-to pages run, page by page, in an empty folder.
+"""Code blocks of README, the first pages and how-to pages run, page by page, in an empty folder.
 
 A block of ``yaml`` with a title is a file; each line of ``bash`` is a command of dynsim, which must end well; lines
 of a ``text`` block after it must be in what it printed; blocks of ``python`` share their names. ``sh`` is not run;
@@ -22,7 +22,7 @@ import dynsim
 ROOT = Path(__file__).parents[2]
 HOW_TO = sorted(f"docs/how-to/{page.name}" for page in (ROOT / "docs" / "how-to").glob("*.md"))
 PAGES = [
-    "README.md", "docs/tutorials/first-arm.md", "docs/quickstart.md", *HOW_TO, "docs/cite.md",
+    "README.md", "docs/getting-started.md", "docs/python.md", *HOW_TO, "docs/cite.md",
 ]  # fmt: skip
 BLOCK = re.compile(r"^```(\w+)(?: title=\"([^\"]+)\")?\n(.*?)^```$", flags=re.MULTILINE | re.DOTALL)
 PACKAGE = str(Path(dynsim.__file__).parents[1])

@@ -24,7 +24,7 @@ pytest.importorskip("mkdocstrings")
 
 ROOT = Path(__file__).parents[2]
 OPENED = (
-    "index", "gallery", "tutorials/first-arm", "quickstart", "how-to/export", "reference/scenario-keys",
+    "index", "gallery", "getting-started", "python", "how-to/export", "reference/scenario-keys",
     "reference/servo-map-keys", "reference/python", "physics", "validation", "notebooks/sweep",
 )  # fmt: skip
 

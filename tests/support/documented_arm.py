@@ -1,4 +1,4 @@
-"""The braced arm of docs/quickstart.md and the tutorials: its plant, for scenarios of tests."""
+"""The plant of the braced arm of docs/getting-started.md, for scenarios of tests."""
 
 PLANT = """plant:
   type: serial_arm

@@ -1,4 +1,4 @@
-"""The scripts of docs/extending.md and docs/quickstart.md run, and do what the text says."""
+"""The scripts of docs/extending.md and docs/python.md run, and do what the text says."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ def test_stepping() -> None:
     assert names["again"].finished
 
 
-def test_stepping_of_the_quick_start() -> None:
-    names = script("quickstart.md", "From Python")
+def test_stepping_of_the_python_page() -> None:
+    names = script("python.md", "Step through a simulation")
     # The step that would pass 1.5 s is not in the record yet; the step size is below two samples.
     assert 1.49 <= names["record"].time[-1] <= 1.5
     assert not names["simulation"].finished
