@@ -156,7 +156,7 @@ def errors(model: ModelArrays, ws: Workspace, path: PathArrays, target, q):
 @internal_kernel
 def gap_and_normal(shapes: ShapeArrays | None, braces: ContactArrays, b, x, y, z):
     """Distance of brace b at a point of W from its surface [m], and the normal there (3 numbers)."""
-    if shapes is not None:  # noqa: SIM102 (known to the compiler)
+    if shapes is not None:  # noqa: SIM102 (resolved at compile time)
         if shapes.kind[b, kd.SURFACE] != kd.AS_POINT:
             gap = distance(shapes, b, x, y, z)
             return gap[0] - shapes.data[b, kd.RADIUS], gap[1], gap[2], gap[3]

@@ -93,7 +93,7 @@ def ledger_rates(model: ModelArrays, drives: DriveArrays, ws: Workspace, out, la
 @internal_kernel
 def dry_losses(unilateral: UnilateralArrays | None, ws: Workspace, out, start):
     """What dry friction of joints that slide takes, onto the losses of gears and joints in the ledger [W]."""
-    if unilateral is None:  # known to the compiler
+    if unilateral is None:  # resolved at compile time
         return
     for k in range(unilateral.dry.shape[0]):
         if unilateral.dry_table[k, ku.DRY_HOLDS] == 0:

@@ -347,7 +347,7 @@ def admissible_forces(model: ModelArrays, contacts: ContactArrays, unilateral: U
 
     The forces change in the null space of the rows: accelerations only change as far as rows are not quite dependent.
     """
-    if unilateral is None:  # known to the compiler
+    if unilateral is None:  # resolved at compile time
         return
     # Small, because it is merged into the right-hand side.
     if unilateral.number[ku.REDUNDANT] == 1.0 or unilateral.stop.shape[0] + unilateral.dry.shape[0] > 0:

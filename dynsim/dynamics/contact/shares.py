@@ -24,7 +24,7 @@ from dynsim.jit.kernel import internal_kernel, noinline_kernel
 @internal_kernel
 def solve_rows(unilateral: UnilateralArrays | None, ws: Workspace, p):
     """Forces of the p active rows into FORCE; returns whether they depend on each other, as :func:`solve_small`."""
-    if unilateral is None:  # known to the compiler
+    if unilateral is None:  # resolved at compile time
         return solve_small(ws.small, ws.rows, ws.active, p)
     if unilateral.number[ku.SHARED] == 1.0:
         return solve_near_shares(unilateral, ws, p)

@@ -269,7 +269,7 @@ def dry_rests(unilateral: UnilateralArrays, k):
 @internal_kernel
 def rub(unilateral: UnilateralArrays | None, ws: Workspace):
     """Add the dry friction of the joints without a row to the applied forces; it is constant within a step."""
-    if unilateral is None:  # known to the compiler
+    if unilateral is None:  # resolved at compile time
         return
     for k in range(unilateral.dry.shape[0]):
         if unilateral.dry_table[k, DRY_HOLDS] == 0:

@@ -286,7 +286,7 @@ def slide_direction_lanes(unilateral, contacts, k, slip, n):
 @form_of(admissible_forces, any_lanes)
 def admissible_forces_lanes(model, contacts, unilateral, ws):
     """One by one, where there is something to look at."""
-    if unilateral is None:  # known to the compiler
+    if unilateral is None:  # resolved at compile time
         return
     if unilateral.number[ku.REDUNDANT] == 1.0 or unilateral.stop.shape[0] + unilateral.dry.shape[0] > 0:
         for k in range(lane_count(ws)):
