@@ -11,9 +11,12 @@ def solve_banded(band, lower, upper, right):
 
     Parameters
     ----------
-    band : (n, 2 lower + upper + 1), entry (i, j) of A at [i, lower + j − i], its last columns zero; overwritten
-    lower, upper : diagonals below and above the main one
-    right : (n, m), b; overwritten with x
+    band : (n, 2 lower + upper + 1) ndarray
+        Entry (i, j) of A at [i, lower + j − i]; the last columns are zero. Overwritten.
+    lower, upper : int
+        Numbers of diagonals below and above the main diagonal.
+    right : (n, m) ndarray
+        Right side b; overwritten with x.
     """
     n, m = right.shape
     for k in range(n):

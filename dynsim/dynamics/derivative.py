@@ -36,7 +36,7 @@ from dynsim.jit.kernel import integers, internal_kernel, kernel, reals
 
 
 class System(NamedTuple):
-    """All constant data of a simulation."""
+    """Constant data of a simulation."""
 
     layout: StateLayout
     model: ModelArrays
@@ -44,18 +44,18 @@ class System(NamedTuple):
     reference: ReferenceArrays
     contacts: ContactArrays
     loads: LoadArrays
-    dense: np.ndarray | None  # room for M* and b, see constraint.m_star; None for the articulated solve alone
+    dense: np.ndarray | None  # scratch for M* and b, see dynsim.dynamics.contact.m_star; None: articulated solve only
     couplings: CouplingArrays = CouplingArrays(
         integers(np.zeros((0, ka.COUPLING_JOINT_SIZE))), reals(np.zeros((0, ka.COUPLING_SIZE)))
     )
-    unilateral: UnilateralArrays | None = None  # candidates are glued to their surfaces, and joints have no stops
-    shapes: ShapeArrays | None = None  # of candidates that are not points on quadrics; None: all are
+    unilateral: UnilateralArrays | None = None  # None: candidates stick to their surfaces, and joints have no stops
+    shapes: ShapeArrays | None = None  # candidates other than points on quadrics; None: no such candidates
 
 
 def new_workspace(system: System) -> Workspace:
-    """The workspace of a system: couplings hold, candidates slide, under the unilateral law they are open.
+    """Allocate the workspace of a system with closed couplings and sliding candidates; unilateral law: open candidates.
 
-    Candidates that are left out are open under both laws.
+    Candidates marked LEFT_OUT are open under both laws.
     """
     contacts, couplings, unilateral = system.contacts, system.couplings, system.unilateral
     c, joint_rows = contacts.link.shape[0], couplings.joint.shape[0]
@@ -70,7 +70,7 @@ def new_workspace(system: System) -> Workspace:
 
 @internal_kernel
 def constrained_acceleration(model: ModelArrays, unilateral: UnilateralArrays | None, ws: Workspace):
-    """vdot and row forces of the applied forces, by the articulated solve, into ``ws.joints`` and ``ws.rows``."""
+    """Compute vdot and row forces of the applied forces by the articulated solve, in ``ws.joints`` and ``ws.rows``."""
     factor(model, ws)
     p, passes = ws.counts[ka.ROWS], 0
     while p > 0:
@@ -92,12 +92,12 @@ def m_star_acceleration(
     ws: Workspace,
     dependent,
 ):
-    """The same unknowns by the dense M*, where ``dense`` has room for it.
+    """Compute the same unknowns from the dense M*, if ``dense`` is allocated.
 
-    The articulated solve has run before, because projection uses its factors; the rows that it saw depend on others
-    are not counted twice: ``dependent`` is their number before it.
+    The articulated solve runs first, because projection uses its factors. Dependent rows are not counted twice:
+    ``dependent`` is their number before that solve.
     """
-    if dense is None:  # known to the compiler, which then leaves M* out of the default program
+    if dense is None:  # resolved at compile time; the default program then excludes M*
         return
     ws.counts[ka.DEPENDENT] = dependent
     passes = 1
@@ -109,11 +109,11 @@ def m_star_acceleration(
 
 @kernel
 def derivative(system: System, t, y, ws: Workspace, dy):
-    """dy/dt of the whole coupled system at time t; y, dy: see dynsim.dynamics.state."""
+    """Compute dy/dt of the whole coupled system at time t; for y and dy see dynsim.dynamics.state."""
     model, drives, contacts, layout = system.model, system.drives, system.contacts, system.layout
     joints, motors = ws.joints, ws.motors
     n, na = joints.shape[0], motors.shape[0]
-    # Most robots have a position for each rate; the others read and write their positions by kind of joint.
+    # Most robots have one position per rate; the others read and write their positions by kind of joint.
     plain = layout.extra == 0
     if not plain:
         read_positions(model, y, layout.q, ws)
@@ -121,7 +121,7 @@ def derivative(system: System, t, y, ws: Workspace, dy):
         if plain:
             joints[i, ka.Q] = y[layout.q + i]
         joints[i, ka.QD] = y[layout.v + i]
-        # The sweep multiplies it by zero, which would keep a NaN of a state without solution for ever.
+        # The sweep multiplies it by zero, which would propagate a NaN of a state without solution indefinitely.
         joints[i, ka.QDD] = 0.0
         joints[i, ka.APPLIED] = -(model.body[i, ka.DAMPING] + model.body[i, ka.GEAR_DAMPING]) * joints[i, ka.QD]
     drive(drives, system.reference, t, y, layout, ws)

@@ -17,19 +17,19 @@ from dynsim.dynamics.tree.sweep import kinematics
 from dynsim.jit.kernel import internal_kernel, kernel
 
 ITERATIONS = 200
-STEP_MAX = 0.3  # [rad or m] per iteration, against jumps to another branch of solutions
+STEP_MAX = 0.3  # [rad or m] per iteration; prevents jumps to another branch of solutions
 
 
 class PathArrays(NamedTuple):
     """Point, joints and braces that follow a path, and scratch. r = 3 + braces, c moving joints, n joints."""
 
-    link: int  # that carries the point
-    point: np.ndarray  # (3,) in its frame [m]
+    link: int  # link that carries the point
+    point: np.ndarray  # (3,) point in the frame of the link [m]
     braces: ContactArrays
-    shapes: ShapeArrays | None  # of the braces; None: all are points on quadrics
+    shapes: ShapeArrays | None  # shapes of the braces; None: all are points on quadrics
     column: np.ndarray  # (c,) int, rows of the joints
-    place: np.ndarray  # (c,) int, their coordinates
-    lower: np.ndarray  # (c,) limits that hold on the way [rad or m], infinite for none
+    place: np.ndarray  # (c,) int, coordinates of the joints
+    lower: np.ndarray  # (c,) joint limits along the path [rad or m], infinite if there is no limit
     upper: np.ndarray  # (c,)
     jacobian: np.ndarray  # (3, n)
     rates: np.ndarray  # (r, c)
@@ -43,22 +43,30 @@ class PathArrays(NamedTuple):
 def follow_path(
     model: ModelArrays, ws: Workspace, path: PathArrays, targets, base, carried, begin, end, tolerance, q, result
 ):
-    """Positions of the joints for the targets from ``begin`` up to ``end``, into ``result``.
+    """Compute joint positions for the targets from ``begin`` up to ``end``, and write them to ``result``.
 
-    Damped Gauss–Newton from the solution before, dq = Jᵀ (J Jᵀ + λ 1)⁻¹ e, λ falling with the error e. A joint at a
-    limit that Jᵀ e would push beyond it is left out of a step, and what a step takes beyond a limit is cut off.
+    Damped Gauss–Newton from the previous solution, dq = Jᵀ (J Jᵀ + λ 1)⁻¹ e, where λ falls with the error e. A joint at
+    a limit that Jᵀ e would push beyond it is excluded from a step, and a step is clipped at the limits.
 
     Parameters
     ----------
-    targets : (T, 3) of the point [m]
-    base, carried : (T, 4) coordinates of a mobile base, and where in q they begin; (T, 0): none
-    tolerance : distance that counts as reached [m]
-    q : (nq,) of the solution before; overwritten with the last one
-    result : (T, c) [rad or m]; those before ``begin`` are there already
+    targets : (T, 3) ndarray
+        Targets of the point [m].
+    base, carried : (T, 4) ndarray, int
+        Coordinates of a mobile base, and their first index in q; (T, 0) without a base.
+    tolerance : float
+        Distance that counts as reached [m].
+    q : (nq,) ndarray
+        Previous solution; overwritten with the last one.
+    result : (T, c) ndarray
+        Joint positions [rad or m]; entries before ``begin`` must be filled already.
 
     Returns
     -------
-    k, best : the target that is not reached, or ``end``, and the distance that is left [m]
+    k : int
+        Index of the first target that is not reached, or ``end``.
+    best : float
+        Remaining distance [m].
     """
     moving, rows = path.column.shape[0], path.error.shape[0]
     limited = is_limited(path)
@@ -66,8 +74,8 @@ def follow_path(
         for e in range(base.shape[1]):
             q[carried + e] = base[k, e]
         if k >= 3 and moving <= rows:
-            # The parabola through the last three solutions leaves one iteration to do. Not for redundant joints: what
-            # the hand does not determine would run away along it.
+            # The parabola through the last three solutions leaves one iteration to do. Not for redundant joints: the
+            # motion that the hand does not determine would run away.
             for j in range(moving):
                 q[path.place[j]] = 3.0 * result[k - 1, j] - 3.0 * result[k - 2, j] + result[k - 3, j]
         if limited:
@@ -76,7 +84,7 @@ def follow_path(
         for _ in range(ITERATIONS):
             left = errors(model, ws, path, targets[k], q)
             best = min(best, left)
-            # Two orders below the tolerance: the references shall be smooth, not just close.
+            # Two orders below the tolerance: the references must be smooth, not just close.
             if left < 1e-4 * tolerance:
                 break
             if limited:
@@ -93,7 +101,7 @@ def follow_path(
 
 @internal_kernel
 def is_limited(path: PathArrays):
-    """Whether any joint has a limit."""
+    """True if any joint has a limit."""
     for j in range(path.column.shape[0]):  # noqa: SIM110 (kernels have no generators)
         if path.lower[j] > -math.inf or path.upper[j] < math.inf:
             return True
@@ -102,7 +110,7 @@ def is_limited(path: PathArrays):
 
 @internal_kernel
 def leave_out(path: PathArrays, q):
-    """Joints at limits that a step downhill would take beyond them have no rates, so that it does not move them."""
+    """Zero the rates of joints at limits that a step downhill would move beyond them."""
     for j in range(path.column.shape[0]):
         pull = 0.0
         for e in range(path.error.shape[0]):
@@ -115,7 +123,7 @@ def leave_out(path: PathArrays, q):
 
 @internal_kernel
 def cut_off(path: PathArrays, q):
-    """Joints beyond a limit are put on it."""
+    """Put joints beyond a limit on it."""
     for j in range(path.column.shape[0]):
         at = q[path.place[j]]
         if at > path.upper[j]:
@@ -126,7 +134,7 @@ def cut_off(path: PathArrays, q):
 
 @internal_kernel
 def errors(model: ModelArrays, ws: Workspace, path: PathArrays, target, q):
-    """What is missing to the target and the surfaces, and how the joints change it; returns its length [m]."""
+    """Compute the errors to the target and the surfaces and their derivatives; return the length of the error [m]."""
     read_positions(model, q, 0, ws)
     for j in range(ws.joints.shape[0]):
         ws.joints[j, ka.QD] = 0.0
@@ -155,8 +163,8 @@ def errors(model: ModelArrays, ws: Workspace, path: PathArrays, target, q):
 
 @internal_kernel
 def gap_and_normal(shapes: ShapeArrays | None, braces: ContactArrays, b, x, y, z):
-    """Distance of brace b at a point of W from its surface [m], and the normal there (3 numbers)."""
-    if shapes is not None:  # noqa: SIM102 (known to the compiler)
+    """Return the distance of brace b, at a point in W, from its surface [m], and the normal there (3 numbers)."""
+    if shapes is not None:  # noqa: SIM102 (resolved at compile time)
         if shapes.kind[b, kd.SURFACE] != kd.AS_POINT:
             gap = distance(shapes, b, x, y, z)
             return gap[0] - shapes.data[b, kd.RADIUS], gap[1], gap[2], gap[3]
@@ -174,7 +182,7 @@ def gap_and_normal(shapes: ShapeArrays | None, braces: ContactArrays, b, x, y, z
 
 @internal_kernel
 def step(path: PathArrays, damping, q):
-    """Take the damped step: (J Jᵀ + λ 1) y = e by Cholesky, dq = Jᵀ y, no entry longer than ``STEP_MAX``."""
+    """Take the damped step: (J Jᵀ + λ 1) y = e by Cholesky, dq = Jᵀ y, each entry limited to ``STEP_MAX``."""
     rates, system, y, change = path.rates, path.system, path.error, path.change
     rows, moving = rates.shape
     for a in range(rows):

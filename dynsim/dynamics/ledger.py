@@ -17,7 +17,7 @@ from dynsim.jit.kernel import internal_kernel, kernel
 
 @internal_kernel
 def drive_powers(drives: DriveArrays, ws: Workspace):
-    """Electrical, drawn, Joule and mechanical power of all drives, and that of their drag [W]; see `ledger_rates`."""
+    """Return electrical, drawn, Joule, mechanical and drag power of all drives [W]; see :func:`ledger_rates`."""
     joints, motors, motor = ws.joints, ws.motors, drives.motor
     electrical, drawn, joule, mechanical, drag = 0.0, 0.0, 0.0, 0.0, 0.0
     for a in range(motors.shape[0]):
@@ -40,12 +40,12 @@ def drive_powers(drives: DriveArrays, ws: Workspace):
 
 @internal_kernel
 def ledger_rates(model: ModelArrays, drives: DriveArrays, ws: Workspace, out, layout):
-    """Rates of all integrals, into the blocks ledger and contact of ``out`` [W; N, m/s], and the normal forces.
+    """Write the rates of all integrals to the blocks ledger and contact of ``out`` [W; N, m/s], and the normal forces.
 
-    Electrical Σ u i; drawn Σ max(u i, 0), a supply for each motor; supply max(Σ u i, 0), one for all; Joule Σ R i²;
-    gear Σ D_m v² and the drag of servos; joint Σ D v²; friction −Σ f_n (d − n)·v of what slides, d the force direction;
-    constraint Σ f J v of all rows (zero on the constraint); mechanical Σ tau v with tau = K_m i − J_m vdot − D_m v −
-    drag ([WM] eq 25).
+    Electrical Σ u i; drawn Σ max(u i, 0), one supply per motor; supply max(Σ u i, 0), one supply for all; Joule Σ R i²;
+    gear Σ D_m v² and the drag of servos; joint Σ D v²; friction −Σ f_n (d − n)·v of sliding contacts, with the force
+    direction d; constraint Σ f J v of all rows (zero on the constraint); mechanical Σ tau v with
+    tau = K_m i − J_m vdot − D_m v − drag ([WM] eq 25).
     """
     joints, state = ws.joints, ws.contacts
     electrical, drawn, joule, mechanical, drag = drive_powers(drives, ws)
@@ -59,12 +59,12 @@ def ledger_rates(model: ModelArrays, drives: DriveArrays, ws: Workspace, out, la
     rows = ws.rows
     for k in range(state.shape[0]):
         m, mode, slip = ws.active[k, ka.FIRST_ROW], ws.active[k, ka.MODE], 0.0
-        # Zero of a candidate that is off its surface: no solve writes to its row.
+        # Zero for a candidate off its surface: no solve writes to its row.
         f, rate = rows[m, ka.FORCE], state[k, ka.GAP_RATE]
         state[k, ka.NORMAL_FORCE] = f
         if mode == ka.SLIDING:
             x, y, z = state[k, ka.SLIP_VELOCITY], state[k, ka.SLIP_VELOCITY + 1], state[k, ka.SLIP_VELOCITY + 2]
-            # The slip velocity has no part along n, so d·v_t is the friction alone.
+            # The slip velocity has no component along n, so d·v_t is only friction.
             friction -= f * (
                 rows[m, ka.DIRECTION + 3] * x + rows[m, ka.DIRECTION + 4] * y + rows[m, ka.DIRECTION + 5] * z
             )
@@ -92,8 +92,8 @@ def ledger_rates(model: ModelArrays, drives: DriveArrays, ws: Workspace, out, la
 
 @internal_kernel
 def dry_losses(unilateral: UnilateralArrays | None, ws: Workspace, out, start):
-    """What dry friction of joints that slide takes, onto the losses of gears and joints in the ledger [W]."""
-    if unilateral is None:  # known to the compiler
+    """Add the dissipation by dry friction of sliding joints to the losses of gears and joints in the ledger [W]."""
+    if unilateral is None:  # resolved at compile time
         return
     for k in range(unilateral.dry.shape[0]):
         if unilateral.dry_table[k, ku.DRY_HOLDS] == 0:
@@ -105,7 +105,7 @@ def dry_losses(unilateral: UnilateralArrays | None, ws: Workspace, out, start):
 
 @kernel
 def kinetic_energy(model: ModelArrays, ws: Workspace):
-    """½ Σ V·I V + ½ Σ J_m v² [J], from the poses and axes of the last sweep; overwrites V."""
+    """Return ½ Σ V·I V + ½ Σ J_m v² [J], from the poses and axes of the last sweep; overwrites V."""
     tree, links, joints = model.tree, ws.links, ws.joints
     total = 0.0
     for i in range(tree.shape[0]):
@@ -126,7 +126,7 @@ def kinetic_energy(model: ModelArrays, ws: Workspace):
 
 @kernel
 def potential_energy(model: ModelArrays, ws: Workspace):
-    """−Σ m g·c [J], zero at the world origin, after ``forward_sweep``."""
+    """Return −Σ m g·c [J], zero at the world origin, after ``forward_sweep``."""
     total = 0.0
     for i in range(ws.links.shape[0]):
         m, c, _ = body_inertia(model, ws, i)
@@ -136,7 +136,7 @@ def potential_energy(model: ModelArrays, ws: Workspace):
 
 @internal_kernel
 def magnetic_energy(drives: DriveArrays, ws: Workspace):
-    """½ Σ L i² [J]."""
+    """Return ½ Σ L i² [J]."""
     total = 0.0
     for a in range(ws.motors.shape[0]):
         total += 0.5 * drives.motor[a, ka.INDUCTANCE] * ws.motors[a, ka.CURRENT] * ws.motors[a, ka.CURRENT]

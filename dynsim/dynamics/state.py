@@ -9,9 +9,9 @@ State y, all in one vector, blocks in this order:
     contact  (2 c,) impulse of the normal force [N s] and slip [m] of each contact point
     load     (l,)   work of each external wrench [J]
     loss     (2,)   energy lost in impacts of contacts and of joint stops [J]; only under the unilateral law
-    scheme   (1,)   energy lost by discretisation [J]; only in time stepping, see stepping.discretisation_energy
-    elastic  (2,)   energy that contacts and ties have stored since the start, and what their dampers have taken [J];
-                    only where some give way, see dynsim.integrators.stepping.contacts
+    scheme   (1,)   energy lost by discretisation [J]; only in time stepping, see dynsim.integrators.stepping.step
+    elastic  (2,)   energy stored by contacts and ties since the start, and dissipated by their dampers [J];
+                    only with compliant contacts or ties, see dynsim.integrators.stepping.contacts
 
 Error control covers the first three; the others are integrals on which the motion does not depend.
 """
@@ -31,13 +31,13 @@ CONTACT_SIZE = 2
 # Losses of impacts [J].
 IMPACT_LOSS, JOINT_STOP_LOSS = 0, 1
 LOSSES = 2
-# Of what gives way [J].
+# Compliant contacts and ties [J].
 STORED, DAMPED = 0, 1
 ELASTIC_SIZE = 2
 
 
 class StateLayout(NamedTuple):
-    """First index of each block of the state, and what else kernels need to know of it."""
+    """First index of each block of the state, and other sizes that kernels need."""
 
     q: int
     v: int
@@ -49,7 +49,7 @@ class StateLayout(NamedTuple):
     scheme: int
     elastic: int
     size: int
-    tracked: int  # how many entries, from the first on, error control looks at: all that derivatives depend on
+    tracked: int  # number of leading entries under error control: all entries that derivatives depend on
     extra: int  # nq − n
     circuits: int  # currents among the states
 
@@ -57,7 +57,10 @@ class StateLayout(NamedTuple):
 def state_layout(
     nq: int, n: int, circuits: int, contacts: int, loads: int = 0, losses: int = 0, scheme: int = 0, elastic: int = 0
 ) -> StateLayout:
-    """The layout for nq positions, n rates, so many circuits, contact points, wrenches, and last blocks so long."""
+    """Return the layout for nq positions, n rates and the numbers of circuits, contact points and wrenches.
+
+    ``losses``, ``scheme`` and ``elastic`` are the sizes of the last blocks.
+    """
     starts = np.cumsum([0, nq, n, circuits, LEDGER_SIZE, CONTACT_SIZE * contacts, loads, losses, scheme, elastic])
     q, v, current, ledger, contact, load, loss, scheme_start, elastic_start, size = (int(start) for start in starts)
     return StateLayout(
@@ -78,9 +81,9 @@ def state_layout(
 
 
 class OutputLayout(NamedTuple):
-    """First column of each recorded output that is no state; ``contact`` has OUTPUTS_PER_CONTACT for each point.
+    """First column of each recorded output that is not a state; ``contact`` has OUTPUTS_PER_CONTACT for each point.
 
-    ``support`` is there for robots with a mobile base, see dynsim.dynamics.tree.support.
+    ``support`` exists for robots with a mobile base, see dynsim.dynamics.tree.support.
     """
 
     vdot: int
@@ -98,7 +101,7 @@ class OutputLayout(NamedTuple):
 
 
 def block(layout: StateLayout | OutputLayout, name: str) -> slice:
-    """Where a block lies, by its name: up to where the next one begins."""
+    """Return the slice of the block ``name``: up to the start of the next block."""
     names = layout._fields
     return slice(getattr(layout, name), getattr(layout, names[names.index(name) + 1]))
 
@@ -113,8 +116,10 @@ OUTPUTS_PER_CONTACT = 9
 def output_layout(
     n: int, motors: int, contacts: int, support: int = 0, stops: int = 0, dry: int = 0, ties: int = 0
 ) -> OutputLayout:
-    """The columns for n joints, so many motors, contact points, joint stops, joints that rub, ties, and so many of a
-    base's support."""
+    """Return the columns for n joints and the numbers of motors, contact points, joint stops, dry frictions and ties.
+
+    ``support`` is the number of columns for the support of a mobile base.
+    """
     parts = [n, motors, motors, motors, 3, ENERGIES, OUTPUTS_PER_CONTACT * contacts, support, stops, dry, ties]
     starts = np.cumsum([0, *parts])
     return OutputLayout(*(int(start) for start in starts))

@@ -4,8 +4,8 @@ n links (one rate each), na drives (motors), c contact points, p constraint rows
 body that it carries; parents come before their children. Spatial vectors are (angular, linear) in W at the world
 origin, so inertias and wrenches of different bodies simply add.
 
-A table is one array whose columns are named by the constants below. Arrays are few because each costs time in every
-compiled call, and because the columns of one link are then next to each other in memory.
+A table is one array whose columns are named by the constants below. Arrays are few because each one costs time in every
+compiled call, and because the columns of one link are then adjacent in memory.
 """
 
 from __future__ import annotations
@@ -16,22 +16,22 @@ import numpy as np
 
 # Joint kinds. The three axis-aligned revolute joints are special cases of REVOLUTE, for speed.
 REVOLUTE_X, REVOLUTE_Y, REVOLUTE_Z, REVOLUTE, PRISMATIC = 0, 1, 2, 3, 4
-# Rows of joints with several velocities, or with a motion of their own: dynsim.dynamics.tree.joints.
+# Rows of joints with several velocities, or with a special motion: dynsim.dynamics.tree.joints.
 BALL_X, BALL_Y, BALL_Z, ROLL, TURN, LEFT_WHEEL, RIGHT_WHEEL = 5, 6, 7, 8, 9, 10, 11
 # Friction of a contact under a negative (pulling) normal force, see dynsim.dynamics.contact.rows.
 FRICTION_SIGNED, FRICTION_DISSIPATIVE = 0, 1
 # Mode of a candidate: off its surface (no row), sliding (one row, friction in its direction), or held at its anchor
 # (three rows). Constant within a step.
 OPEN, SLIDING, STICKING = 0, 1, 2
-MOST_ROWS = 3  # of one candidate
+MOST_ROWS = 3  # rows of a candidate
 
 # ModelArrays.tree, int
 PARENT = 0  # index of the parent link, -1 for the world
 KIND = 1  # joint kind
-TURNED = 2  # 0 when R_PJ is the identity, so that one product can be skipped
+TURNED = 2  # 0 if R_PJ is the identity, so that one product can be skipped
 BRANCHES = 3  # number of children other than link i + 1
-POSITION_INDEX = 4  # where the row's coordinates begin in the block of positions
-BASE = 5  # index of the link that the row's joint is mounted on: that of its first row's parent, -1 for the world
+POSITION_INDEX = 4  # start of the row's coordinates in the block of positions
+BASE = 5  # link on which the row's joint is mounted: the parent of the joint's first row, -1 for the world
 TREE_SIZE = 6
 # ModelArrays.body
 R_PJ = 0  # 9: rotation of the joint frame at q = 0 in the parent's frame, row-major
@@ -40,23 +40,23 @@ AXIS = 12  # 3: joint axis in the body's frame, unit length
 MASS = 15  # [kg]
 COM = 16  # 3: centre of mass in B [m]
 INERTIA = 19  # 6: about the centre of mass, in B, xx xy xz yy yz zz [kg m^2]
-ARMATURE = 25  # reflected motor inertia J_m, or BRAKED where a brake is closed [kg m^2 or kg]
+ARMATURE = 25  # reflected motor inertia J_m, or BRAKED if a brake is closed [kg m^2 or kg]
 DAMPING = 26  # viscous joint loss D [N m s/rad or N s/m]
 GEAR_DAMPING = 27  # viscous gear loss D_m, reflected [N m s/rad or N s/m]
-PARAMETER = 28  # what else a kind of joint needs, such as the lead of a screw
+PARAMETER = 28  # extra parameter of some kinds of joint, such as the lead of a screw
 BODY_SIZE = 29
-# So heavy that loads do not change the joint's position even by rounding, and a contact point that braked joints alone
-# carry stays where it is.
+# So heavy that loads do not change the joint's position even by rounding, and a contact point carried by braked joints
+# only does not move.
 BRAKED = 1e30
 # Drive kinds, see dynsim.dynamics.drive.
 DC_MOTOR, POSITION_SERVO, OPEN_TORQUE = 0, 1, 2
 # DriveArrays.table, int
 DRIVEN = 0  # index of the link whose joint the drive moves
 DRIVE_KIND = 1
-CIRCUIT = 2  # index of its current among those of the state, -1 for none
-SAMPLED = 3  # CONTINUOUS: the command follows the state; else it is held, taken AT_TICKS or GIVEN by the caller
+CIRCUIT = 2  # index of its current in the currents of the state, -1 for none
+SAMPLED = 3  # CONTINUOUS: the command follows the state; otherwise it is held: taken AT_TICKS or GIVEN by the caller
 SERVO_MODE = 4  # POSITION_MODE, VELOCITY_MODE or OFF; may be written between steps
-CURRENT_LIMITED = 5  # 1: of a DC motor whose driver limits the current to I_MAX
+CURRENT_LIMITED = 5  # 1: DC motor whose driver limits the current to I_MAX
 DRIVE_SIZE = 6
 CONTINUOUS, AT_TICKS, GIVEN = 0, 1, 2
 # DriveArrays.motor
@@ -68,21 +68,21 @@ D_M = 4  # d_m k^2 [N m s/rad]
 K_P = 5  # [V/rad]
 K_D = 6  # [V s/rad]
 U_MAX = 7  # voltage limit [V], inf for none
-I_MAX = 8  # current limit of a servo or DC motor [A], torque limit of an open torque [N m]; inf for none
+I_MAX = 8  # current limit of a servo or DC motor [A], limit of an open torque [N m]; inf for none
 K_V = 9  # gain of a servo's velocity loop [V s/rad]
 COULOMB = 10  # gear friction of a servo at speed [N m]
-COULOMB_SPEED = 11  # below which it fades [rad/s]
+COULOMB_SPEED = 11  # speed below which it fades [rad/s]
 FREE_DRAG = 12  # viscous drag of a servo's gear while it is off [N m s/rad]
 MOTOR_SIZE = 16  # whole cache lines
 # DriveArrays.input
 COMMAND = 0  # command of a sampled drive between ticks [V; N m for an open torque]
-LINE_START = 1  # a rewritten reference: its value [rad; N m for an open torque]
+LINE_START = 1  # rewritten reference: its value [rad; N m for an open torque]
 LINE_RATE = 2  # [rad/s; N m/s]
 LINE_SINCE = 3  # time at which it has that value [s]
 INPUT_SIZE = 4
 # Modes of a servo
 POSITION_MODE, VELOCITY_MODE, OFF = 0, 1, 2
-# ReferenceArrays.spline, instead of a row of coefficients: held, and the line of DriveArrays.input
+# ReferenceArrays.spline, instead of a row of coefficients: held, or the line of DriveArrays.input
 HELD_POSITION, REWRITTEN = -1, -2
 # Linear block of a drive, see dynsim.dynamics.drive.law.drive_block
 TORQUE_Q, TORQUE_V, TORQUE_I, RATE_Q, RATE_V, RATE_I = 0, 1, 2, 3, 4, 5
@@ -91,31 +91,31 @@ BLOCK_SIZE = 6
 LINK = 0
 FRICTION_LAW = 1
 CURVED = 2  # 0 for a plane: Q = 0, and then b is its unit normal
-LEFT_OUT = 3  # 1: no joint moves it along the normal in any posture; it has no active row, ever
+LEFT_OUT = 3  # 1: no joint moves it along the normal in any posture; it never has an active row
 CONTACT_LINK_SIZE = 4
 # ContactArrays.point
 POINT = 0  # 3: in the body's frame [m]
 QUADRIC = 3  # 10: C(r) = r.Q r/2 + b.r + c: Q xx xy xz yy yz zz, b, c
 POINT_SIZE = 13
-# ContactArrays.law: of friction and impacts; the bilateral law reads MU and V_S alone
+# ContactArrays.law: friction and impacts; the bilateral law reads MU and V_S only
 MU = 0  # kinetic coefficient μ
 V_S = 1  # smoothing speed of the slip direction [m/s]
 STATIC = 2  # static coefficient μ_s ≥ μ
-STRIBECK = 3  # speed v_s [m/s] of μ + (μ_s − μ) exp(−(s/v_s)²); 0: μ from the first slip on
+STRIBECK = 3  # speed v_s [m/s] of μ + (μ_s − μ) exp(−(s/v_s)²); 0: μ as soon as it slips
 VISCOUS = 4  # [s/m]: adds c s to the coefficient
 RESTITUTION = 5
-GRIP = 6  # of time stepping: friction along GRIP_AXIS per that across; 1: isotropic
+GRIP = 6  # time stepping: ratio of friction along GRIP_AXIS to friction across; 1: isotropic
 GRIP_AXIS = 7  # 3: in the body's frame; zero for isotropic friction
-CONTACT_STIFFNESS = 10  # of time stepping: of surface and body along the normal [N/m]; 0: rigid
+CONTACT_STIFFNESS = 10  # time stepping: stiffness of surface and body along the normal [N/m]; 0: rigid
 CONTACT_DAMPING = 11  # [N s/m]
-FLOOR = 12  # of the bilateral law: with a mobility along the normal up to this it has no force [1/kg]
+FLOOR = 12  # bilateral law: no force if the mobility along the normal is at most this [1/kg]
 CONTACT_LAW_SIZE = 13
 # CouplingArrays.joint, int
 FOLLOWER = 0  # link whose joint follows
 LEADER = 1
 COUPLING_JOINT_SIZE = 2
 # CouplingArrays.law
-RATIO = 0  # [1, or m/rad and the like]
+RATIO = 0  # [1, m/rad or similar]
 OFFSET = 1  # [rad or m]
 COUPLING_SIZE = 2
 
@@ -128,7 +128,7 @@ A = 24  # 6: spatial acceleration minus gravity
 F = 30  # 6: wrench through the joint; scratch of the solves
 U_OVER_D = 36  # 6: IA S / D, D = S.IA S + J_m
 INVERSE_D = 42  # 1 / D
-IA = 43  # 21: articulated inertia handed down by branches: angular block 6, coupling 9 row-major, linear block 6
+IA = 43  # 21: articulated inertia passed down by branches: angular block 6, coupling 9 row-major, linear block 6
 LINK_SIZE = 64
 # Workspace.joints
 Q = 0  # [rad or m]
@@ -136,7 +136,7 @@ QD = 1  # v [rad/s or m/s]
 QDD = 2  # vdot
 BIAS = 3  # h + g, or the result of newton_euler
 APPLIED = 4  # applied generalised force
-EXTRA = 5  # second coordinate of a row that has two
+EXTRA = 5  # second coordinate of a row with two
 JOINT_SIZE = 6
 # Workspace.motors
 CURRENT = 0  # [A]
@@ -145,9 +145,9 @@ Q_REF = 2  # [rad; N m for an open torque]
 V_REF = 3  # [rad/s]
 DIDT = 4  # [A/s]
 DRAG = 5  # gear friction that is not part of GEAR_DAMPING, against v [N m]
-DRY_DRAG = 6  # that of a gear whose friction holds at rest, a row's: positive against v > 0 [N m or N]
+DRY_DRAG = 6  # drag of a gear with dry friction: positive against v > 0 [N m or N]
 MOTOR_STATE_SIZE = 7
-# Workspace.contacts: what is known of each candidate, whether it has rows or not
+# Workspace.contacts: geometry and forces of each candidate, with or without rows
 NORMAL = 0  # 3: surface normal in W
 TANGENT = 3  # 3: smoothed slip direction in W
 POSITION = 6  # 3: in W [m]
@@ -156,47 +156,47 @@ GAP = 12  # signed distance from the surface [m]
 GAP_RATE = 13  # [m/s]
 NORMAL_FORCE = 14  # f_n [N], zero without rows
 FORCE_VECTOR = 15  # 3: normal and friction force in W [N]
-ANCHOR = 18  # 3: where a sticking point is held, in W [m]
+ANCHOR = 18  # 3: point at which a sticking point is held, in W [m]
 FIRST_TANGENT = 21  # 3: directions of a sticking point's tangential rows in W
 SECOND_TANGENT = 24  # 3
 CONTACT_STATE_SIZE = 27
 # Workspace.rows: one scalar constraint each, and its force
-ROW = 0  # 6: the constraint's motion is ROW . (V_A - V_B); of a joint row the coefficients of its two joints
-DIRECTION = 6  # 6: wrench of a unit force on A, its negative on B; of a joint row as ROW
+ROW = 0  # 6: the constraint's motion is ROW . (V_A - V_B); for a joint row the coefficients of its two joints
+DIRECTION = 6  # 6: wrench of a unit force on A, its negative on B; for a joint row as ROW
 TARGET = 12  # J vdot must equal this [m/s^2]
 RHS = 13  # right-hand side of the small system
 FORCE = 14  # [N]
 SIGN = 15  # sign of the force that DIRECTION was built for
 ROW_MU = 16  # friction that DIRECTION carries
-ROW_GAP = 17  # what projection takes away from the positions [m or rad], see dynsim.dynamics.contact.rows
-ROW_RATE = 18  # and from the rates [m/s or rad/s]
-ROW_OFFSET = 19  # of a joint row: what its two joints, times its coefficients, must add up to [rad or m]
-ROW_FLOOR = 20  # with a mobility up to this the row has no force
+ROW_GAP = 17  # error of positions that projection removes [m or rad], see dynsim.dynamics.contact.rows
+ROW_RATE = 18  # error of rates that projection removes [m/s or rad/s]
+ROW_OFFSET = 19  # joint row: required sum of its two joints times its coefficients [rad or m]
+ROW_FLOOR = 20  # the row has no force if its mobility is at most this
 ROW_STATE_SIZE = 21
-# Workspace.active, int: of each row
+# Workspace.active, int: for each row
 ROW_KIND = 0
-OWNER = 1  # candidate, tie, coupling or, counted on behind the couplings, joint stop, then dry friction of a joint
+OWNER = 1  # candidate, tie, coupling or, numbered after the couplings, joint stop, then dry friction of a joint
 BODY_A = 2  # link, or the following joint of a joint row
 BODY_B = 3  # link at the other end, -1 for the world; the leading joint of a joint row
-LAW = 4  # FRICTION_SIGNED unless the sign of the force decides about DIRECTION
-ORDER = 5  # scratch of the solve: columns as they were exchanged
-# and, in the same array, of each candidate
+LAW = 4  # FRICTION_SIGNED unless DIRECTION depends on the sign of the force
+ORDER = 5  # scratch of the solve: order of exchanged columns
+# and, in the same array, for each candidate
 MODE = 6  # OPEN, SLIDING or STICKING
 FIRST_ROW = 7
 ACTIVE_SIZE = 8
-# Kinds of rows: of a point that slides on its surface or is held there, between two bodies, between two joints.
+# Kinds of rows: point that slides on its surface, point that sticks to it, row between two bodies, or two joints.
 SLIDING_ROW, STICKING_ROW, BODY_ROW, JOINT_ROW = 0, 1, 2, 3
 # Workspace.counts, int
 ROWS = 0  # active rows p
 DEPENDENT = 1  # right-hand sides whose constraint forces were not unique
 CONTRADICTORY = 2  # right-hand sides for which no signs of the forces agreed with friction
-COUPLED = 3  # joint rows, the first of the active ones
-STUCK = 4  # candidates that stick
+COUPLED = 3  # number of joint rows, the first active rows
+STUCK = 4  # number of sticking candidates
 COUNTS_SIZE = 5
 
 
 class ModelArrays(NamedTuple):
-    """The tree of bodies."""
+    """Tables of the tree of bodies."""
 
     tree: np.ndarray  # (n, TREE_SIZE) int
     body: np.ndarray  # (n, BODY_SIZE)
@@ -204,7 +204,7 @@ class ModelArrays(NamedTuple):
 
 
 class DriveArrays(NamedTuple):
-    """What drives the joints, each of one kind, with the law of its command. ``input`` may be written between steps."""
+    """Drives of the joints by kind, with the law of each command. ``input`` may be written between steps."""
 
     table: np.ndarray  # (na, DRIVE_SIZE) int
     motor: np.ndarray  # (na, MOTOR_SIZE)
@@ -212,7 +212,7 @@ class DriveArrays(NamedTuple):
 
 
 class ReferenceArrays(NamedTuple):
-    """Joint references q_d(t): held angles, and quintic splines on one uniform grid for the moving ones."""
+    """Joint references q_d(t): held angles, and quintic splines on one uniform grid for moving joints."""
 
     spline: np.ndarray  # (na,) int: row of coefficients, HELD_POSITION or REWRITTEN
     held: np.ndarray  # (na,) constant angle of a held joint
@@ -220,7 +220,7 @@ class ReferenceArrays(NamedTuple):
     coefficients: np.ndarray  # (segments, splines, 6) ascending powers of t - t_knot
     voltage: np.ndarray = np.zeros(
         (0, 0, 6)
-    )  # (segments, na, 6) added to the commands of DC motors [V]; no segments: nothing is
+    )  # (segments, na, 6) added to the commands of DC motors [V]; no segments: no addition
 
 
 class ContactArrays(NamedTuple):
@@ -239,27 +239,27 @@ class CouplingArrays(NamedTuple):
 
 
 class Workspace(NamedTuple):
-    """Everything a right-hand side computes on its way; allocated once. p is the most rows that there can be."""
+    """Intermediate results of a right-hand side; allocated once. p is the largest possible number of rows."""
 
     links: np.ndarray  # (n, LINK_SIZE)
     joints: np.ndarray  # (n, JOINT_SIZE)
-    trig: np.ndarray  # (3, n or more) sine, cosine and q; padded to whole vectors of four, which have no slow remainder
+    trig: np.ndarray  # (3, n or more) sine, cosine and q; padded to whole vectors of four to avoid a slow remainder
     motors: np.ndarray  # (na, MOTOR_STATE_SIZE)
     contacts: np.ndarray  # (c, CONTACT_STATE_SIZE)
-    rows: np.ndarray  # (p, ROW_STATE_SIZE) the active ones first: couplings, then contacts
+    rows: np.ndarray  # (p, ROW_STATE_SIZE) the active rows first: couplings, then contacts
     active: np.ndarray  # (p, ACTIVE_SIZE) int
-    column: np.ndarray  # (n, 1 + 2p) eliminated right-hand sides: applied force, then per row itself and its direction
+    column: np.ndarray  # (n, 1 + 2p) eliminated right-hand sides: applied force, then each row and its direction
     small: np.ndarray  # (4, p, p) the system J M^-1 F of the active rows and the scratch of its solve
     counts: np.ndarray  # (COUNTS_SIZE,) int
 
 
 def row_limit(c: int, couplings: int) -> int:
-    """The most rows that c candidates and so many couplings can have."""
+    """Return the largest number of rows that c candidates and ``couplings`` couplings can have."""
     return MOST_ROWS * c + couplings
 
 
 def workspace(n: int, na: int, c: int, couplings: int = 0) -> Workspace:
-    """Allocate a :class:`Workspace` for n links, na motors, c candidates and so many couplings; no row is active."""
+    """Allocate a :class:`Workspace` for n links, na motors, c candidates and ``couplings`` couplings; no row active."""
     p = row_limit(c, couplings)
     return Workspace(
         links=np.zeros((n, LINK_SIZE)),

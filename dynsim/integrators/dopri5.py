@@ -13,7 +13,7 @@ from dynsim.integrators.run import Run
 from dynsim.integrators.steps import energy_norm, error_norm
 from dynsim.jit.kernel import inline_kernel, internal_kernel
 
-# Stage rows a_ij, with the solution as the last row, whose derivative is the next step's first stage.
+# Stage rows a_ij; the last row is the solution, whose derivative is the first stage of the next step.
 A_DOPRI5 = np.array(
     [
         [0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
@@ -31,7 +31,7 @@ ERROR_DOPRI5 = np.array([71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 33920
 
 @internal_kernel
 def combine(y, h, row, stages, k, y_new):
-    """y_new = y + h Σ row_s k_s over the first ``stages`` stages."""
+    """Write y_new = y + h Σ row_s k_s over the first ``stages`` stages."""
     for j in range(y.shape[0]):
         y_new[j] = y[j]
     for s in range(stages):
@@ -43,14 +43,14 @@ def combine(y, h, row, stages, k, y_new):
 
 @inline_kernel
 def explicit_error(system: System, ws: Workspace, run: Run, row):
-    """Error norm of an explicit step with error coefficients ``row`` (7,); the estimate is left in stage[7]."""
+    """Return the error norm of an explicit step with error coefficients ``row`` (7,); the estimate is left in stage[7]."""
     h, y, k = run.clock[ki.STEP], run.y, run.stage
     for j in range(y.shape[0]):
         k[7, j] = 0.0
     combine(k[7], h, row, 7, k, k[7])
     error = error_norm(system, ws, run, k[7], 1.0)
     if system.layout.circuits < ws.motors.shape[0]:
-        # Currents of circuits are states: their errors show those of the power.
+        # Currents of circuits are states: their errors also show the errors of the power.
         for j in (system.layout.ledger + kst.ELECTRICAL, system.layout.ledger + kst.JOULE):
             error = max(error, energy_norm(run, j, k[7, j]))
     return error
@@ -58,15 +58,15 @@ def explicit_error(system: System, ws: Workspace, run: Run, row):
 
 @inline_kernel
 def step_dopri5(system: System, ws: Workspace, run: Run):
-    """One step of Dormand and Prince's method; returns the error norm.
+    """Take one step of Dormand and Prince's method and return the error norm.
 
-    The last stage is the derivative at y_new; it is left in stage[6], the error estimate in stage[7].
+    The last stage, the derivative at y_new, is left in stage[6], the error estimate in stage[7].
     """
     t, h, y, y_new, k = run.clock[ki.TIME], run.clock[ki.STEP], run.y, run.y_new, run.stage
     for s in range(1, 7):
         combine(y, h, A_DOPRI5[s], s, k, y_new)
         derivative(system, t + NODE_DOPRI5[s] * h, y_new, ws, k[s])
-        # The stages at 0.3 and 0.8 of the step.
+        # Stages at 0.3 and 0.8 of the step.
         if run.event.shape[0] > 0 and 2 <= s <= 3:
             note_inside(system, ws, run, s - 2, NODE_DOPRI5[s])
     run.count[ki.EVALUATIONS] += 6

@@ -3,17 +3,17 @@
 Methods, all with dense output (so that records do not force steps):
 
 - ``DOPRI5``: Dormand–Prince 5(4), adaptive, six evaluations a step; dense output of order 4 (Hairer, Nørsett, Wanner:
-  Solving Ordinary Differential Equations I, II.5–II.6). For systems that are not stiff;
+  Solving Ordinary Differential Equations I, II.5–II.6). For non-stiff systems;
 - ``RADAU5``: implicit, order 5 with three stages (stage order 3), error estimate of order 3, adaptive; accuracy limits
   its steps, not the fast eigenvalues of motors (−450 ± 1900i 1/s in the published arm), see ``radau5``; dense output of
   order 3;
 - ``TIME_STEPPING``: contacts open and close within fixed steps, see ``stepping``; samples are linear within a step.
 
-After each accepted step of the adaptive methods q and v are projected onto the active rows if they are off them by more
+After each accepted step of the adaptive methods, q and v are projected onto the active rows if they are off by more
 than ``GAP_TOLERANCE`` or ``RATE_TOLERANCE``, see ``project``.
 
-A sample at a tick has the values that are in force from the tick on: it is recorded at the end of the step before, and
-again once the commands have been taken.
+A sample at a tick has the values in force from the tick on: it is recorded at the end of the preceding step, and again
+after the commands are taken.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from dynsim.jit.kernel import FixedSignature, free_kernel, inline_kernel, intern
 
 @internal_kernel
 def start(system: System, ws: Workspace, run: Run):
-    """First derivative, on the contacts, and a first step size where none is given. Sets STATUS when there is none."""
+    """Evaluate the first derivative, on the contacts, and a first step size if none is set. Sets STATUS on failure."""
     if not start_contacts(system.unilateral, system, ws, run):
         run.count[ki.STATUS] = ki.NOT_PROJECTED if run.count[ki.STATUS] == ki.RUNNING else run.count[ki.STATUS]
     elif not finite(run.stage[0]):
@@ -57,8 +57,8 @@ def start(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def start_contacts(unilateral: UnilateralArrays | None, system: System, ws: Workspace, run: Run):
-    """Derivative at the start of a step, on the constraints; under the unilateral law with modes that agree with it."""
-    if unilateral is None:  # known to the compiler, as it is below: system.unilateral would not be
+    """Evaluate the derivative at the start of a step, on the constraints; unilateral law: with agreeing modes."""
+    if unilateral is None:  # resolved at compile time, as below; system.unilateral would not be
         return settle(system, run.clock[ki.TIME], run.y, ws, run.stage[0], run)
     due, first = run.count[ki.MODES_DUE] > 0, run.count[ki.MODES_DUE] == ki.AT_START
     if due:
@@ -76,19 +76,19 @@ def start_contacts(unilateral: UnilateralArrays | None, system: System, ws: Work
 
 @internal_kernel
 def hold_here(unilateral: UnilateralArrays, ws: Workspace):
-    """Let dry friction hold joints where they are: an impact comes before the modes that say which ones it holds."""
+    """Let dry friction hold joints in position: an impact precedes the modes that select the joints it holds."""
     for k in range(unilateral.dry_table.shape[0]):
         unilateral.dry[k, ku.DRY_AT] = ws.joints[unilateral.dry_table[k, ku.DRY_JOINT], ka.Q]
 
 
 @inline_kernel
 def accept(system: System, ws: Workspace, run: Run):
-    """Project y_new, record, and make it the new y. Sets STATUS when contacts cannot be met or forces not be known."""
+    """Project y_new, record it, make it the new y. Sets STATUS if contacts cannot be met or forces are not unique."""
     t, h = run.clock[ki.TIME], run.clock[ki.STEP]
     if not end_accepted(run.newton, system, ws, run):
         return
     watch_modes(system.model, system.contacts, system.unilateral, ws, h, run.gaps)
-    # The event of tipping has asked for the ground's reaction at the end of this step.
+    # The tipping event needs the ground reaction at the end of this step.
     if run.event.shape[0] > 0:
         watch_support(run.support)
     if system.layout.extra > 0:
@@ -104,7 +104,7 @@ def accept(system: System, ws: Workspace, run: Run):
 
 @inline_kernel
 def take_step(system: System, ws: Workspace, run: Run, error):
-    """What becomes of a step that has been taken: True when it is accepted by error control, events and HOLD."""
+    """True if error control, events and HOLD accept the step just taken."""
     clock, count = run.clock, run.count
     if run.event.shape[0] > 0 and cut_step(system, end_workspace(run.newton, system, ws, run), run):
         return False
@@ -117,7 +117,7 @@ def take_step(system: System, ws: Workspace, run: Run, error):
 
 @internal_kernel
 def propose(run: Run):
-    """The step to try next; while a root is searched it is given."""
+    """Set the step size to try next, unless a root is being searched, which sets it."""
     if run.count[ki.SEARCHING] == 0:
         run.clock[ki.PROPOSED] = run.clock[ki.STEP]
         choose_step(run)
@@ -125,23 +125,23 @@ def propose(run: Run):
 
 @internal_kernel
 def go_on(run: Run, order, beta):
-    """The step size after an accepted step."""
+    """Set the step size after an accepted step."""
     clock, count = run.clock, run.count
     if count[ki.FIRED] == 1:
         clock[ki.STEP] = clock[ki.PROPOSED]
     else:
         next_step(run, clock[ki.ERROR], order, beta)
-        # A step that was cut short says nothing against the one proposed before.
+        # A step that was cut short does not disprove the step size proposed before.
         if count[ki.TRIMMED] == 1:
             clock[ki.STEP] = max(clock[ki.STEP], clock[ki.PROPOSED])
 
 
 @internal_kernel
 def evaluate_for_commands(unilateral: UnilateralArrays | None, system: System, ws: Workspace, run: Run):
-    """The state that commands are computed from, into ``ws``; on the rows, if contact modes are those of this state.
+    """Evaluate the state from which commands are computed, into ``ws``; on the rows if contact modes fit this state.
 
-    At the start, and after a jump of rates, rows are still those of before: held joints may have no place yet, and
-    projection onto them would move the robot.
+    At the start, and after a jump of rates, the rows are still the earlier ones: held joints may have no position yet,
+    and projection onto them would move the robot.
     """
     if unilateral is not None and run.count[ki.MODES_DUE] > 0:
         derivative(system, run.clock[ki.TIME], run.y, ws, run.stage[0])
@@ -152,7 +152,7 @@ def evaluate_for_commands(unilateral: UnilateralArrays | None, system: System, w
 
 @internal_kernel
 def ready(system: System, ws: Workspace, run: Run):
-    """Start or restart where that is due, and do what is due at this time; False when the caller is to look."""
+    """Start or restart and process ticks if due; False if control must return to the caller."""
     count = run.count
     due = take_ticks(run)
     if due & ki.TAKE_COMMANDS:
@@ -170,7 +170,7 @@ def ready(system: System, ws: Workspace, run: Run):
 
 @inline_kernel
 def waiting(system: System, ws: Workspace, run: Run):
-    """True when a step can be taken; False when the caller is to look first."""
+    """True if a step can be taken; False if control must return to the caller first."""
     # Most runs have nothing to do between two steps.
     idle = run.count[ki.STARTED] == 1 and run.tick.shape[0] + run.breaks.shape[0] == 0
     return idle or ready(system, ws, run)
@@ -178,7 +178,7 @@ def waiting(system: System, ws: Workspace, run: Run):
 
 @inline_kernel
 def conclude(system: System, ws: Workspace, run: Run, error, order):
-    """Accept or refuse the step just taken, or that was kept back; True when the caller is to look."""
+    """Accept or reject the step just taken or pending; True if control must return to the caller."""
     count = run.count
     if count[ki.PENDING] == 0:
         if rejected(ws, run, error, order):
@@ -196,7 +196,7 @@ def conclude(system: System, ws: Workspace, run: Run, error, order):
 
 @free_kernel
 def advance_dopri5(system: System, ws: Workspace, run: Run, limit):
-    """:func:`advance` of DOPRI5."""
+    """Run :func:`advance` with DOPRI5."""
     taken, error = 0, 0.0
     if limit < 0:
         return
@@ -213,15 +213,21 @@ def advance_dopri5(system: System, ws: Workspace, run: Run, limit):
 
 @noinline_kernel
 def conclude_apart(system: System, ws: Workspace, run: Run, error, order):
-    """:func:`conclude`, compiled apart: what a step of RADAU5 calls takes long, and functions as small as this compile
-    in less than half the time of one that has them all."""
+    """Call :func:`conclude`, compiled separately.
+
+    The callees of a RADAU5 step compile slowly, and functions as small as this one compile in less than half the time
+    of one function that contains them all.
+    """
     return conclude(system, ws, run, error, order)
 
 
 @free_kernel
 def advance_radau5(system: System, ws: Workspace, run: Run, limit):
-    """:func:`advance` of RADAU5. Samples wait on, with three others at most, where only ``limit`` has ended it: which
-    ones are computed together must not depend on how fast the machine is."""
+    """Run :func:`advance` with RADAU5.
+
+    Samples keep waiting, with at most three others, if only ``limit`` has ended the call: which samples are computed
+    together must not depend on the speed of the machine.
+    """
     taken, error = 0, 0.0
     if limit < 0:
         return
@@ -244,17 +250,16 @@ def advance_radau5(system: System, ws: Workspace, run: Run, limit):
 
 
 def advance(system: System, ws: Workspace, run: Run, limit: int) -> None:
-    """Take up to ``limit`` steps towards END; run.count[STATUS] says how it ended. Fewer than 0: only be loaded.
+    """Take up to ``limit`` steps towards END and set run.count[STATUS]; a negative limit only loads the function.
 
-    Returns before that when an event or a tick wants the caller to look (LOGGED, TICKED), when the next step would end
-    beyond HOLD: it is kept, PENDING, and accepted by the next call unless the caller drops it; and when another thread
-    has set ASKED.
+    Returns earlier if an event or a tick needs the caller (LOGGED, TICKED), if the next step would end beyond HOLD (it
+    is kept, PENDING, and accepted by the next call unless the caller drops it), and if another thread has set ASKED.
 
-    One compiled function per method, so that each is only compiled when it is used.
+    One compiled function per method, so that each is compiled only when it is used.
     """
     compiled(run.method)(system, ws, run, limit)
 
 
 def direct(run: Run) -> Callable[[System, Workspace, Run, int], None]:
-    """:func:`advance` for a run in many short pieces, whose tables keep the types that they have in the first."""
+    """Return :func:`advance` for a run in many short pieces whose tables keep the types of the first piece."""
     return FixedSignature(compiled(run.method))

@@ -1,12 +1,13 @@
 """Event location: a step ends where a guard function crosses zero; ticks end steps at given times.
 
-The event table has the guard of each event, its value at the last accepted step and on which side of zero that was.
-After a step that error control has accepted the guards are evaluated from the workspace of the right-hand side. If one
-has passed zero the step is repeated, shorter, until it ends within ``event_tolerance`` beyond the root. So it is a root
-of the method's own solution, not of the dense output, whose order is lower.
+The event table has the guard of each event, its value at the last accepted step and its side of zero there. After a
+step that error control has accepted, the guards are evaluated from the workspace of the right-hand side. If one has
+crossed zero, the step is repeated, shorter, until it ends within ``event_tolerance`` beyond the root. The root thus
+belongs to the method's own solution, not to the dense output, whose order is lower.
 
-A guard may also pass zero twice within a step. Those of this file are noted at two inner stages, where the derivative
-is evaluated anyway: the cubic through these values and those at the ends shows it, and the step is taken until there.
+A guard may also cross zero twice within a step. Guards of this file are recorded at two inner stages, where the
+derivative is evaluated anyway: the cubic through these values and those at the ends shows the crossings, and the step
+is cut there.
 """
 
 from __future__ import annotations
@@ -26,25 +27,25 @@ from dynsim.integrators.contacts.events import contact_guard, lowest, note_gaps,
 from dynsim.integrators.run import Run
 from dynsim.jit.kernel import internal_kernel
 
-# Kinds of guards. A new one is a number here, a branch in ``guard`` and a name in GUARDS of dynsim.engine.stepped.
-# Those of the unilateral law, from NORMAL_GUARD on, are in dynsim.integrators.contacts.events.
+# Kinds of guards. To add one: a number here, a branch in ``guard`` and a name in GUARDS of dynsim.engine.stepped.
+# Guards of the unilateral law, from NORMAL_GUARD on, are in dynsim.integrators.contacts.events.
 JOINT_POSITION, JOINT_RATE, MOTOR_CURRENT, MOTOR_VOLTAGE, CONTACT_FORCE, CONTACT_GAP = 0, 1, 2, 3, 4, 5
 HAND_X, HAND_Y, HAND_Z = 6, 7, 8
 TIP_MARGIN = 9
 
 # Most trial steps for a root; regula falsi with halving (Illinois) needs about eight. After FALSI_LIMIT trials the
-# bracket is bisected, for guards that jump (forces do where their split changes); after SEARCH_LIMIT one more is taken.
+# bracket is bisected, for guards that jump (forces do when their split changes); after SEARCH_LIMIT one more follows.
 SEARCH_LIMIT, FALSI_LIMIT = 60, 16
-# A step also ends at a turn that stays short of zero by this part of the way back, since the cubic is not exact. The
-# next step shows more, as its ends are next to the turn.
+# A step also ends at a turning point that stays short of zero by this part of the way back, since the cubic is not
+# exact. The next step shows more, because its ends are next to the turning point.
 SHORT_OF_ZERO = 0.1
-# A guard that turns back by less than this part of its level, or of its unit, is at rest but for rounding.
+# A guard that turns back by less than this part of its level, or of its unit, is constant up to rounding.
 ROUNDING = 1e-12
 
 
 @internal_kernel
 def guard(system: System, t, ws: Workspace, run: Run, e):
-    """Value of event e, zero where it happens, right after ``derivative`` at time t."""
+    """Return the value of the guard of event e, zero at the event, right after ``derivative`` at time t."""
     kind, k, value = run.event_table[e, ki.EVENT_KIND], run.event_table[e, ki.EVENT_INDEX], 0.0
     if kind == JOINT_POSITION:
         value = ws.joints[k, ka.Q]
@@ -70,9 +71,9 @@ def guard(system: System, t, ws: Workspace, run: Run, e):
 
 @internal_kernel
 def note_inside(system: System, ws: Workspace, run: Run, inner, x):
-    """Note the guards at part x of the step that is being taken, right after ``derivative`` there, for `turns_within`.
+    """Record the guards at fraction x of the step being taken, right after ``derivative`` there, for `turns_within`.
 
-    Of the unilateral law only forces of closed contacts: :func:`too_long` looks at gaps and slip. Others are NaN.
+    Of the unilateral law, only forces of closed contacts: :func:`too_long` checks gaps and slip. Other guards are NaN.
     """
     run.clock[ki.INNER + inner] = x
     for e in range(run.event.shape[0]):
@@ -85,8 +86,8 @@ def note_inside(system: System, ws: Workspace, run: Run, inner, x):
 
 @internal_kernel
 def presses(unilateral: UnilateralArrays | None, ws: Workspace, run: Run, e):
-    """True if event e is that a closed contact loses its force, which the motion determines."""
-    if unilateral is None:  # known to the compiler
+    """True if event e is that a closed contact loses its force, and the motion determines this force."""
+    if unilateral is None:  # resolved at compile time
         return False
     if run.event_table[e, ki.EVENT_KIND] != ke.NORMAL_GUARD or unilateral.number[ku.SPLIT] == 1.0:
         return False
@@ -95,7 +96,7 @@ def presses(unilateral: UnilateralArrays | None, ws: Workspace, run: Run, e):
 
 @internal_kernel
 def rounding(run: Run, e):
-    """Value of the guard of event e that may be rounding."""
+    """Return the guard value of event e that may be rounding."""
     return ROUNDING * max(1.0, abs(run.event[e, ki.EVENT_LEVEL]))
 
 
@@ -103,8 +104,8 @@ def rounding(run: Run, e):
 def turns_within(run: Run):
     """Return the fraction of the step just taken at which a guard turns beyond zero and comes back, or 1.
 
-    By the cubic through its values at both ends and at two stages. The event's direction does not matter, since one of
-    two passages has it.
+    Uses the cubic through its values at both ends and at two stages. The direction of the event does not matter, since
+    one of two crossings has it.
     """
     fraction, event, a, b = 1.0, run.event, run.clock[ki.INNER], run.clock[ki.INNER + 1]
     for e in range(event.shape[0]):
@@ -130,9 +131,9 @@ def turns_within(run: Run):
 
 @internal_kernel
 def arm_events(system: System, ws: Workspace, run: Run):
-    """Values and sides of all guards at the start of a step, right after ``derivative`` there.
+    """Set values and sides of all guards at the start of a step, right after ``derivative`` there.
 
-    An event that has just happened keeps the side it has gone to, whatever the rounding of its guard.
+    An event that has just occurred keeps its new side, whatever the rounding of its guard.
     """
     for e in range(run.event.shape[0]):
         value = guard(system, run.clock[ki.TIME], ws, run, e)
@@ -144,22 +145,22 @@ def arm_events(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def happened(run: Run, e, value):
-    """True when the guard of event e has passed zero in its direction once it has this value."""
+    """True if the guard of event e, at this value, has crossed zero in its direction."""
     side, direction = run.event[e, ki.SIDE], run.event_table[e, ki.DIRECTION]
     return side != 0.0 and value * side <= 0.0 and (direction == 0 or direction * side < 0.0)
 
 
 @internal_kernel
 def event_tolerance(t):
-    """Bracket of a root that is narrow enough [s]: some roundings of the time."""
+    """Return the bracket width at which a root counts as located [s]: a few roundings of the time."""
     return 1e-13 + 1e-15 * abs(t)
 
 
 @internal_kernel
 def cut_step(system: System, ws: Workspace, run: Run):
-    """True when the step just taken must be repeated because an event lies within it: STEP is then the next trial.
+    """True if the step just taken must be repeated because an event lies within it; STEP is then the next trial.
 
-    False leaves FIRED at 1 when the step ends at an event.
+    If False, FIRED is 1 if the step ends at an event.
     """
     clock, count, event = run.clock, run.count, run.event
     h, hit = clock[ki.STEP], False
@@ -190,13 +191,13 @@ def cut_step(system: System, ws: Workspace, run: Run):
     count[ki.SEARCHING] += 1
     low, high = clock[ki.LOW], clock[ki.HIGH]
     if high - low <= event_tolerance(clock[ki.TIME]) or count[ki.SEARCHING] > SEARCH_LIMIT:
-        # A repeated step of RADAU5 is not bit-identical, since its Newton method depends on how the last one has
-        # contracted: at HIGH it may miss a guard that had passed zero there, sometimes or every time.
+        # A repeated step of RADAU5 is not bit-identical, since its Newton method depends on the contraction of the last
+        # one: at HIGH it may miss a guard that had crossed zero there, sometimes or every time.
         if h == high and (hit or count[ki.SEARCHING] > SEARCH_LIMIT):
             if not hit:
                 keep_passed(run)
             count[ki.SEARCHING] = 0
-            # Contacts and turns that were passed over before the event come first.
+            # Contacts and turning points that were passed over before the event come first.
             if passes_over(system, ws, run):
                 return True
             count[ki.FIRED] = 1
@@ -207,7 +208,7 @@ def cut_step(system: System, ws: Workspace, run: Run):
     for e in range(event.shape[0]):
         a, b = event[e, ki.AT_LOW], event[e, ki.AT_HIGH]
         if happened(run, e, b) and not happened(run, e, a):
-            # From the root that has just been found a secant leads back to it, where rounding decides.
+            # A secant from the root just located leads back to it, where rounding decides.
             known = low == 0.0 and run.event_table[e, ki.EVENT_KIND] < ke.NORMAL_GUARD and abs(a) <= rounding(run, e)
             trial = min(trial, low + (high - low) * (0.5 if known else a / (a - b)))
     if not low < trial < high or count[ki.SEARCHING] > FALSI_LIMIT:
@@ -218,7 +219,7 @@ def cut_step(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def keep_passed(run: Run):
-    """Keep the values at HIGH of events that had passed zero there: the functions that act on events read them."""
+    """Save the values at HIGH of events that had crossed zero there, for the functions that act on events."""
     for e in range(run.event.shape[0]):
         if happened(run, e, run.event[e, ki.AT_HIGH]):
             run.event[e, ki.VALUE] = run.event[e, ki.AT_HIGH]
@@ -226,7 +227,7 @@ def keep_passed(run: Run):
 
 @internal_kernel
 def passes_over(system: System, ws: Workspace, run: Run):
-    """True when the step has passed over a contact, a turn of slip or a level: STEP is then the one to take instead."""
+    """True if the step has passed over a contact, a reversal of slip or a level; STEP is then the step to take."""
     part = too_long(system.model, system.contacts, system.unilateral, ws, run.clock[ki.STEP], run.gaps)
     part = min(part, turns_within(run))
     # A false alarm must not shorten steps indefinitely, or to zero.
@@ -241,7 +242,7 @@ def passes_over(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def fire_events(run: Run):
-    """Log the events that the accepted step ends at, and act on them; True when the run must return to its caller."""
+    """Log and handle the events at the end of the accepted step; True if control must return to the caller."""
     count, event, look = run.count, run.event, False
     for e in range(event.shape[0]):
         if count[ki.FIRED] == 1 and happened(run, e, event[e, ki.VALUE]):
@@ -263,9 +264,9 @@ def fire_events(run: Run):
 
 @internal_kernel
 def next_tick(run: Run, until):
-    """The earliest tick or break, or ``until`` when that comes first [s].
+    """Return the earliest tick or break, or ``until`` if that is earlier [s].
 
-    A step to a break ends some roundings before it, so that its last stage lies on the near side of a jump.
+    A step to a break ends a few roundings before it, so that its last stage is on the near side of a jump.
     """
     for k in range(run.tick.shape[0]):
         until = min(until, run.tick[k, ki.TICK_NEXT])
@@ -277,9 +278,9 @@ def next_tick(run: Run, until):
 
 @internal_kernel
 def take_ticks(run: Run):
-    """Return the kinds of the due ticks, as a sum of their bits; advance them, and move TIME exactly to them.
+    """Return the kinds of the due ticks, as a sum of their bits; advance them, and set TIME exactly to them.
 
-    At a break the method restarts.
+    The method restarts at a break.
     """
     due, clock, tick, k = 0, run.clock, run.tick, run.count[ki.NEXT_BREAK]
     while k < run.breaks.shape[0] and run.breaks[k] - clock[ki.TIME] <= 1e-12 * max(1.0, abs(clock[ki.TIME])):
@@ -291,7 +292,7 @@ def take_ticks(run: Run):
         if tick[k, ki.TICK_NEXT] - clock[ki.TIME] <= 1e-12 * max(1.0, abs(clock[ki.TIME])):
             clock[ki.TIME] = tick[k, ki.TICK_NEXT]
             run.tick_table[k, ki.TICK_COUNT] += 1
-            # Not a sum of periods, whose roundings would add up.
+            # Not a sum of periods, whose rounding errors would add up.
             tick[k, ki.TICK_NEXT] = tick[k, ki.TICK_PHASE] + run.tick_table[k, ki.TICK_COUNT] * tick[k, ki.TICK_PERIOD]
             due |= run.tick_table[k, ki.TICK_KIND]
     return due

@@ -36,33 +36,33 @@ LINEAR, HERMITE = methods.LINEAR, methods.HERMITE
 
 RUNNING, FINISHED, NOT_FINITE, STEP_TOO_SMALL, NOT_PROJECTED, NO_FORCES = 0, 1, 2, 3, 4, 5
 FORCES_REVERSED, SEVERAL_FORCES, STOPPED = 6, 7, 8
-# Under the unilateral law: no forces agree with Coulomb's law; modes change without end.
+# Under the unilateral law: no forces agree with Coulomb's law; modes change endlessly.
 NO_CONTACT_FORCES, CHATTER = 9, 10
-# MOST_TRIALS steps made hardly any progress. Set by the caller: the wall time limit is over; a step does not end.
+# MOST_TRIALS steps made almost no progress. Set by the caller: wall-clock limit reached; a step does not end.
 NO_PROGRESS, OUT_OF_TIME, STUCK = 11, 12, 13
 
 # Run.clock
 TIME, STEP, LAST_ERROR, END, RTOL, ATOL, STEP_MAX = 0, 1, 2, 3, 4, 5, 6
-NOT_UNIQUE = 7  # end of the step at which the contact forces were not unique, which was not accepted [s]
-# A step that would end beyond HOLD is left pending, not accepted; the step size proposed before a cut; error norm of
-# the step taken; the bracket of the root that is searched, from TIME on [s].
+NOT_UNIQUE = 7  # end of the rejected step at which the contact forces were not unique [s]
+# A step that would end beyond HOLD is left pending, not accepted; step size proposed before a cut; error norm of the
+# step taken; bracket of the root that is searched, measured from TIME [s].
 HOLD, PROPOSED, ERROR, LOW, HIGH = 8, 9, 10, 11, 12
-# Time at which trials were last counted from zero, and the least that MOST_TRIALS of them have to come on by [s].
+# Time at which trials were last counted from zero, and the required progress of MOST_TRIALS trials [s].
 COUNTED_SINCE, LEAST_PROGRESS = 13, 14
-INNER = 15  # 2: the parts of the step at which guards are noted within it
+INNER = 15  # 2: fractions of the step at which guards are recorded within it
 CLOCK_SIZE = 17
 # Run.count, int
 STEPS, REJECTED, EVALUATIONS, PROJECTIONS, SAMPLE, STATUS, STARTED = 0, 1, 2, 3, 4, 5, 6
-# A step waits to be accepted; trials of a root; which end of the bracket moved last; the step ends at an event; it ends
-# at a tick; events in the log; bits of the ticks that the caller is to look at.
+# A step is pending; trials of a root; which end of the bracket moved last; the step ends at an event; it ends at a
+# tick; events in the log; bits of the ticks that need the caller.
 PENDING, SEARCHING, TURNED_BACK, FIRED, TRIMMED, LOGGED, TICKED = 7, 8, 9, 10, 11, 12, 13
-NEXT_BREAK = 14  # index of the first of Run.breaks that is not past
-MODES_DUE = 15  # contact modes are to be chosen at the next start, which is that of the run, or follows a jump of rates
+NEXT_BREAK = 14  # index of the first break of Run.breaks that is not past
+MODES_DUE = 15  # contact modes must be chosen at the next start: start of the run, or after a jump of rates
 GRAZING = 16  # how often the step was shortened because it passed over something
 TRIALS = 17  # steps tried, accepted or not, since COUNTED_SINCE
-ASKED = 18  # written by another thread: the piece is to end at the next step
+ASKED = 18  # written by another thread: return at the next step
 COUNT_SIZE = 19
-# Steps that are looked at together, and the part of a run's duration that they have to come on by.
+# Trials of one progress check, and its required progress as a fraction of the duration of the run.
 MOST_TRIALS, PROGRESS = 10_000, 1e-6
 AT_START, AFTER_JUMP = 1, 2
 # Run.event, and Run.event_table, int
@@ -71,7 +71,7 @@ INNER_VALUE = 6  # 2: at INNER
 EVENT_SIZE = 8
 EVENT_KIND, EVENT_INDEX, DIRECTION, ON_EVENT = 0, 1, 2, 3
 EVENT_TABLE_SIZE = 4
-# What an event does besides being logged: nothing, the caller looks, the run ends.
+# Action of an event in addition to its log entry: none, return to the caller, end the run.
 LOG, RETURN, STOP = 0, 1, 2
 # Run.tick, and Run.tick_table, int. Kinds are bits.
 TICK_PERIOD, TICK_NEXT, TICK_PHASE = 0, 1, 2
@@ -81,18 +81,18 @@ TICK_TABLE_SIZE = 2
 TAKE_COMMANDS, CALLER = 1, 2
 LOG_LENGTH = 1024
 GAPS_SIZE = 10
-# Entries of Run.log_event from these numbers on are of contacts, of joint stops, and of joints with dry friction, see
-# contact_events.
+# Entries of Run.log_event from these numbers on belong to contacts, to joint stops, and to joints with dry friction,
+# see dynsim.integrators.contacts.events.
 CONTACT_LOG, STOP_LOG, DRY_LOG = 1 << 20, 1 << 40, 1 << 50
 # Run.extremes, per contact
 FORCE_MIN, FORCE_MAX, DRIFT_MAX = 0, 1, 2
 PULLING, LAST_FORCE = 3, 4  # time with a negative normal force [s]; normal force at the last accepted step [N]
-LOCAL_SINCE = 5  # first time at which the contact's entry on the diagonal of J M⁻¹ F was negative [s], else inf
+LOCAL_SINCE = 5  # first time at which the contact's entry on the diagonal of J M⁻¹ F was negative [s], otherwise inf
 EXTREMES_SIZE = 6
 
 
 class Run(NamedTuple):
-    """The moving part of one simulation; m is the length of the state."""
+    """State and working arrays of one integration; m is the length of the state."""
 
     method: int
     dense_kind: int  # see dynsim.integrators.methods
@@ -105,7 +105,7 @@ class Run(NamedTuple):
     clock: np.ndarray  # (CLOCK_SIZE,)
     count: np.ndarray  # (COUNT_SIZE,) int
     extremes: np.ndarray  # (c, EXTREMES_SIZE)
-    room: np.ndarray  # (ROOM, p, p) scratch for the most rows p, see dynsim.dynamics.contact.delassus
+    room: np.ndarray  # (ROOM, p, p) scratch; p is the largest number of rows, see dynsim.dynamics.contact.delassus
     hand_link: int
     hand_point: np.ndarray  # (3,) in the body's frame
     sample_time: np.ndarray  # (T,)
@@ -115,22 +115,22 @@ class Run(NamedTuple):
     tick: np.ndarray  # (k, TICK_SIZE)
     tick_table: np.ndarray  # (k, TICK_TABLE_SIZE) int
     breaks: np.ndarray  # (b,) increasing times at which derivatives jump or bend: steps end there [s]
-    log_time: np.ndarray  # (LOG_LENGTH,) of events [s]
-    log_event: np.ndarray  # (LOG_LENGTH,) int: which
-    hand: np.ndarray  # (3,) room
+    log_time: np.ndarray  # (LOG_LENGTH,) event times [s]
+    log_event: np.ndarray  # (LOG_LENGTH,) int: event codes
+    hand: np.ndarray  # (3,) scratch
     gaps: np.ndarray  # (c, GAPS_SIZE) gaps, their rates, normals, positions and slip at the start of the step
     support: SupportArrays
     columns: OutputLayout
     output: np.ndarray  # (T, columns.size)
-    stepping: SteppingArrays | None  # of time stepping alone
-    newton: NewtonArrays | None  # of radau5 alone
+    stepping: SteppingArrays | None  # time stepping only
+    newton: NewtonArrays | None  # RADAU5 only
 
     def states(self, name: str) -> np.ndarray:
-        """A block of the sampled states by its name, see :func:`dynsim.dynamics.state.block`."""
+        """Return the block ``name`` of the sampled states, see :func:`dynsim.dynamics.state.block`."""
         return self.sample[: self.count[SAMPLE], block(self.layout, name)]
 
     def outputs(self, name: str) -> np.ndarray:
-        """Columns of the samples' outputs by their name; those of contacts are (T, c, OUTPUTS_PER_CONTACT)."""
+        """Return the output columns ``name`` of the samples; for contacts (T, c, OUTPUTS_PER_CONTACT)."""
         columns = self.output[: self.count[SAMPLE], block(self.columns, name)]
         if name == "contact":
             return columns.reshape(len(columns), columns.shape[1] // kst.OUTPUTS_PER_CONTACT, kst.OUTPUTS_PER_CONTACT)
@@ -162,19 +162,47 @@ def new_run(
     stepping: SteppingArrays | None = None,
     lanes: bool = False,
 ) -> Run:
-    """Allocate a :class:`Run` from t = 0 at state y, (layout.size,).
+    """Allocate a :class:`Run` that starts at t = 0.
 
-    ``least_progress``: of MOST_TRIALS steps [s]; default: PROGRESS of the run until ``end``.
-    ``lanes``: RADAU5 evaluates right-hand sides together, see dynsim.dynamics.simd.forms.has_forms.
+    Parameters
+    ----------
+    method : int
+        DOPRI5, RADAU5 or TIME_STEPPING.
+    y : (layout.size,) ndarray
+        Initial state.
+    layout, columns : StateLayout, OutputLayout
+        Layouts of the state and of the outputs of a sample.
+    n, na, c, couplings : int
+        Numbers of joints, motors, contact candidates and couplings.
+    sample_time : (T,) ndarray
+        Sample times [s].
+    hand : tuple
+        Body of the hand and its point in the body's frame (3,) [m].
+    end, step, step_max : float
+        End time, first step and largest step [s].
+    rtol, atol : float
+        Tolerances of the error control.
+    events, ticks : tuple of ndarray, optional
+        Tables of floats and of integers, see ``Run.event`` and ``Run.tick``.
+    breaks : (b,) ndarray, optional
+        Times at which derivatives jump or bend [s].
+    least_progress : float, optional
+        Required progress of MOST_TRIALS steps [s]; default: PROGRESS of the time until ``end``.
+    support : SupportArrays, optional
+        Ground support of a mobile base.
+    stepping : SteppingArrays, optional
+        Arrays of time stepping.
+    lanes : bool, optional
+        RADAU5 evaluates right-hand sides together, see dynsim.dynamics.simd.forms.has_forms.
 
     Raises
     ------
     ValueError
-        For an unknown method, and for time stepping without the block ``scheme`` of the state.
+        If the method is unknown, or the state lacks the block ``scheme`` that time stepping requires.
     """
     m, p, table = len(y), row_limit(c, couplings), methods.by_number(method)
     if method == TIME_STEPPING and layout.size == layout.scheme:
-        raise ValueError("the state has no room for the scheme's energy, see dynsim.dynamics.state")
+        raise ValueError("time stepping requires the block 'scheme' of the state, see dynsim.dynamics.state")
     clock = np.zeros(CLOCK_SIZE)
     clock[[STEP, LAST_ERROR, END, RTOL, ATOL, STEP_MAX]] = step, 1e-4, end, rtol, atol, step_max
     clock[HOLD] = np.inf
@@ -222,12 +250,12 @@ def new_run(
     )
 
 
-# Statistics of accepted steps: extremes of contact forces and gaps, time of pulling; uniqueness of the forces.
+# Statistics of accepted steps: extremes of contact forces and gaps, pulling times; uniqueness of the forces.
 
 
 @internal_kernel
 def watch(ws: Workspace, run: Run, h):
-    """Extremes of normal forces and gaps at accepted steps; time of pulling, the force linear within the last step."""
+    """Update extremes of normal forces and gaps and pulling times (force linear in the step) after an accepted step."""
     state, extremes = ws.contacts, run.extremes
     for k in range(state.shape[0]):
         low = min(extremes[k, LAST_FORCE], state[k, ka.NORMAL_FORCE])
@@ -243,7 +271,7 @@ def watch(ws: Workspace, run: Run, h):
 
 @internal_kernel
 def forces_unique(system: System, ws: Workspace, run: Run, t):
-    """True when the contacts determine their forces at time t, right after ``derivative``; else sets STATUS."""
+    """True if the contacts determine their forces at time t, right after ``derivative``; otherwise sets STATUS."""
     verdict = force_verdict(ws, run.room, run.extremes[:, LOCAL_SINCE], t)
     if verdict == kq.UNIQUE:
         return True
@@ -252,19 +280,19 @@ def forces_unique(system: System, ws: Workspace, run: Run, t):
     return False
 
 
-# Recorded outputs of a sample that are not states: accelerations, drives, hand, energies, contacts, support.
+# Recorded outputs of a sample other than states: accelerations, drives, hand, energies, contacts, support.
 
 
 @internal_kernel
 def write_output(system: System, ws: Workspace, run: Run, row):
-    """All recorded outputs that are not states, after ``derivative``, into the columns of OutputLayout."""
+    """Write all recorded outputs other than states to the columns of OutputLayout, after ``derivative``."""
     fill_output(system, ws, run, run.output[row])
     write_support(system, ws, run, row)
 
 
 @internal_kernel
 def fill_output(system: System, ws: Workspace, run: Run, out):
-    """The same without the ground reactions of a mobile base, into out (columns.size,); also for lanes."""
+    """Write these outputs without the ground reactions of a mobile base to out, (columns.size,); also for lanes."""
     joints, state, columns = ws.joints, ws.contacts, run.columns
     force_vectors(ws)
     for i in range(joints.shape[0]):
@@ -286,7 +314,7 @@ def fill_output(system: System, ws: Workspace, run: Run, out):
 
 @internal_kernel
 def fill_energies(system: System, ws: Workspace, run: Run, out):
-    """Kinetic, potential and magnetic energy of the last sweep and its currents."""
+    """Write kinetic, potential and magnetic energy of the last sweep and its currents."""
     energy = run.columns.energy
     out[energy] = kinetic_energy(system.model, ws)
     out[energy + 1] = potential_energy(system.model, ws)
@@ -295,7 +323,7 @@ def fill_energies(system: System, ws: Workspace, run: Run, out):
 
 @internal_kernel
 def fill_drives(system: System, ws: Workspace, run: Run, out):
-    """Currents, voltages and shaft torques of the motors, at the accelerations that are in ``out``."""
+    """Write currents, voltages and shaft torques of the motors, at the accelerations in ``out``."""
     joints, motors, motor, columns = ws.joints, ws.motors, system.drives.motor, run.columns
     for a in range(motors.shape[0]):
         i = system.drives.table[a, ka.DRIVEN]
@@ -307,18 +335,18 @@ def fill_drives(system: System, ws: Workspace, run: Run, out):
 
 @internal_kernel
 def steady_torque(motor, motors, a, v):
-    """Shaft torque of motor a at a constant rate v [N m or N]."""
+    """Return the shaft torque of motor a at a constant rate v [N m or N]."""
     return motor[a, ka.K_M] * motors[a, ka.CURRENT] - motor[a, ka.D_M] * v - motors[a, ka.DRAG] - motors[a, ka.DRY_DRAG]
 
 
 @internal_kernel
 def with_rotor(stepping: SteppingArrays | None, steady, inertial, a):
-    """Shaft torque of motor a at a constant rate, ``steady``, less what its rotor takes, ``inertial``.
+    """Return the shaft torque of motor a at a constant rate, ``steady``, minus the torque of its rotor, ``inertial``.
 
-    Recorded torques are without impulses. In the steps of an impact, whose accelerations have one in them, the torque
-    stays as it was in the last step without; at the start of a run it is ``steady``.
+    Recorded torques exclude impulses. In the steps of an impact, whose accelerations contain an impulse, the torque
+    stays as in the last step without one; at the start of a run it is ``steady``.
     """
-    if stepping is None:  # known to the compiler
+    if stepping is None:  # resolved at compile time
         return steady - inertial
     if stepping.grid[kt.HELD_STEPS] == 0.0:
         return steady - inertial
@@ -327,8 +355,8 @@ def with_rotor(stepping: SteppingArrays | None, steady, inertial, a):
 
 @internal_kernel
 def row_forces(unilateral: UnilateralArrays | None, stop, dry, tie):
-    """Forces of joint stops, (s,), of dry frictions, (d,), and of ties, (e,), or more."""
-    if unilateral is None:  # known to the compiler
+    """Write forces of joint stops, (s,), of dry friction, (d,), and of ties, (e,); the arrays may be longer."""
+    if unilateral is None:  # resolved at compile time
         return
     for k in range(unilateral.stop.shape[0]):
         stop[k] = unilateral.stop[k, ku.STOP_FORCE]
@@ -340,7 +368,7 @@ def row_forces(unilateral: UnilateralArrays | None, stop, dry, tie):
 
 @internal_kernel
 def write_support(system: System, ws: Workspace, run: Run, row):
-    """What the ground carries of a mobile base, into the columns ``support``."""
+    """Write the ground reaction of a mobile base to the columns ``support``."""
     if run.support.index.shape[0] == 0:
         return
     ground_reaction(system.model, system.loads, run.sample_time[row], ws, run.support)
@@ -351,7 +379,7 @@ def write_support(system: System, ws: Workspace, run: Run, row):
 # Projection of positions and rates onto the active constraint rows.
 
 
-# A tenth of the specified drift (1e-9 m), and a rate that adds less than that in a step [m, m/s; rad, rad/s].
+# A tenth of the specified drift (1e-9 m), and a rate that adds less than this in one step [m, m/s; rad, rad/s].
 GAP_TOLERANCE = 1e-10
 RATE_TOLERANCE = 1e-8
 PROJECTION_LIMIT = 6
@@ -359,11 +387,11 @@ PROJECTION_LIMIT = 6
 
 @internal_kernel
 def off_surface(ws: Workspace):
-    """True when the state has left an active row by more than the projection tolerances."""
+    """True if the state is off an active row by more than the projection tolerances."""
     state, rows, active = ws.contacts, ws.rows, ws.active
     row_errors(ws)
     for r in range(ws.counts[ka.ROWS]):
-        # Rounding limits the rate to a fraction of the speed.
+        # Rounding limits the accuracy of the rate to a fraction of the speed.
         if active[r, ka.ROW_KIND] == ka.JOINT_ROW:
             speed = abs(rows[r, ka.ROW + 1] * ws.joints[active[r, ka.BODY_B], ka.QD])
         else:
@@ -377,10 +405,10 @@ def off_surface(ws: Workspace):
 
 @internal_kernel
 def project(system: System, ws: Workspace, y):
-    """One Newton step of q and v onto the active rows, weighted by the mass matrix, right after :func:`off_surface`.
+    """Take one Newton step of q and v onto the active rows, weighted by the mass matrix, after :func:`off_surface`.
 
     dq = −M⁻¹ Jᵀ λ with J M⁻¹ Jᵀ λ = gap, and the same for v with J v: the nearest point in the kinetic metric. The
-    factors of M + J_m and the eliminated rows are those that the derivative has left in the workspace.
+    factors of M + J_m and the eliminated rows are still in the workspace from the derivative.
     """
     project_level(system, ws, y, 0)
     project_level(system, ws, y, 1)
@@ -388,7 +416,7 @@ def project(system: System, ws: Workspace, y):
 
 @internal_kernel
 def project_level(system: System, ws: Workspace, y, level):
-    """Positions (level 0) or rates (1) of :func:`project`; returns ½ λᵀ J v, the kinetic energy that rates lose [J]."""
+    """Project positions (level 0) or rates (1), see `project`; return ½ λᵀ J v, the energy that rates lose [J]."""
     state, active, column, small = ws.rows, ws.active, ws.column, ws.small
     n, p = ws.joints.shape[0], ws.counts[ka.ROWS]
     start = system.layout.q if level == 0 else system.layout.v
@@ -417,7 +445,7 @@ def project_level(system: System, ws: Workspace, y, level):
 
 @internal_kernel
 def settle(system: System, t, y, ws: Workspace, dy, run: Run):
-    """Derivative at y, projecting y first where needed. Returns False when the rows cannot be met."""
+    """Evaluate the derivative at y, projecting y first if needed. Returns False if the rows cannot be met."""
     derivative(system, t, y, ws, dy)
     run.count[EVALUATIONS] += 1
     for _ in range(PROJECTION_LIMIT):
@@ -435,8 +463,8 @@ def settle(system: System, t, y, ws: Workspace, dy, run: Run):
 
 @internal_kernel
 def collocated(newton: NewtonArrays | None, j, whole):
-    """Quadratic and cubic coefficient of entry j, of the cubic through y, the stages and y_new = y + ``whole``."""
-    if newton is None:  # known to the compiler
+    """Return the quadratic and cubic coefficients of entry j of the cubic through y, stages and y + ``whole``."""
+    if newton is None:  # resolved at compile time
         return 0.0, 0.0
     c0, c1 = NODE_RADAU[0], NODE_RADAU[1]
     first = (newton.z[0, j] / c0 - whole) / (1.0 - c0)
@@ -446,7 +474,7 @@ def collocated(newton: NewtonArrays | None, j, whole):
 
 @internal_kernel
 def fill_dense(run: Run):
-    """Coefficients of the dense output over the step from y to y_new, see ``Run.dense``."""
+    """Compute the coefficients of the dense output over the step from y to y_new, see ``Run.dense``."""
     h, y, y_new, k, d, b = run.clock[STEP], run.y, run.y_new, run.stage, run.dense, run.quartic
     for j in range(y.shape[0]):
         d[0, j] = y_new[j] - y[j]
@@ -466,7 +494,7 @@ def fill_dense(run: Run):
 
 @internal_kernel
 def interpolate(run: Run, t, out):
-    """State at time t by ``Run.dense`` into out: (m,); of the rounding beyond the step's end nothing is made."""
+    """Write the state at time t from ``Run.dense`` to out, (m,); times beyond the end by rounding are clamped."""
     d, x = run.dense, min((t - run.clock[TIME]) / run.clock[STEP], 1.0)
     z = 1.0 - x
     for j in range(out.shape[0]):
@@ -475,7 +503,7 @@ def interpolate(run: Run, t, out):
 
 @kernel
 def state_within(run: Run, t, out):
-    """State at a time within the step that is pending, by the dense output, into out: (m,)."""
+    """Write the state at a time within the pending step, from the dense output, to out, (m,)."""
     fill_dense(run)
     interpolate(run, t, out)
 
@@ -484,12 +512,12 @@ def state_within(run: Run, t, out):
 def sample_step(system: System, ws: Workspace, run: Run):
     """Record every sample time within the step from TIME to TIME + STEP, from the dense output.
 
-    Samples are projected like steps are, so that recorded gaps hold the promised tolerance too.
+    Samples are projected as steps are, so that recorded gaps meet the same tolerance.
     """
     t, h = run.clock[TIME], run.clock[STEP]
     first = run.count[SAMPLE] + waiting_samples(run.newton)
     last = first
-    # A sample at END must not be lost to the rounding of t + h.
+    # Rounding of t + h must not lose a sample at END.
     until = run.clock[END] if t + h >= run.clock[END] - 1e-12 * max(1.0, run.clock[END]) else t + h
     if last >= run.sample_time.shape[0] or run.sample_time[last] > until:
         return
@@ -504,7 +532,7 @@ def sample_step(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def write_sample(system: System, ws: Workspace, run: Run):
-    """Project the next sample and record it, whose state is there."""
+    """Project and record the next sample, whose state is already there."""
     s = run.count[SAMPLE]
     settle(system, run.sample_time[s], run.sample[s], ws, run.stage[7], run)
     write_output(system, ws, run, s)
@@ -513,16 +541,16 @@ def write_sample(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def sampled_now(run: Run):
-    """True where the last sample that was recorded is at TIME, apart from rounding."""
+    """True if the last recorded sample is at TIME, apart from rounding."""
     s, t = run.count[SAMPLE] - 1, run.clock[TIME]
     return s >= 0 and abs(run.sample_time[s] - t) <= 1e-12 * max(1.0, abs(t))
 
 
 @internal_kernel
 def rewrite_sample(system: System, ws: Workspace, run: Run):
-    """Record a sample at TIME again, after commands, loads or modes have jumped: it has their values from now on.
+    """Record the sample at TIME again, with the values from now on, after commands, loads or modes have jumped.
 
-    Right after a start: ``ws`` is of the present state, and remains so.
+    Call right after a start: ``ws`` belongs to the present state, and still does afterwards.
     """
     if not sampled_now(run):
         return
@@ -535,19 +563,19 @@ def rewrite_sample(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def write_samples(newton: NewtonArrays | None, system: System, ws: Workspace, run: Run, more):
-    """Record so many ``more`` samples, whose states are there; on lanes up to three of them wait for the next ones."""
+    """Record ``more`` samples whose states are there; on lanes, up to three of them wait for the next ones."""
     for _ in range(more):
         write_sample(system, ws, run)
 
 
 @internal_kernel
 def write_waiting(newton: NewtonArrays | None, system: System, ws: Workspace, run: Run):
-    """Record the samples that wait for others: something else than a step comes next."""
+    """Record the samples that wait for others, because something other than a step comes next."""
 
 
 @internal_kernel
 def waiting_samples(newton: NewtonArrays | None):
-    """Samples whose states are there and that are not recorded yet."""
-    if newton is None:  # known to the compiler
+    """Return the number of samples whose states are there but not recorded yet."""
+    if newton is None:  # resolved at compile time
         return 0
     return newton.count[kn.WAITING]

@@ -1,13 +1,13 @@
-"""Compiler pipeline of the kernels, numba's with changes that save compilation time; variants for SIMD lanes.
+"""Compiler pipeline of the kernels: numba's pipeline with changes that save compilation time; variants for SIMD lanes.
 
 The changes avoid these costs of numba's pipeline:
 
-- It keeps every callee twice, as a library of its own and as a copy in its caller, see :class:`_OwnCallees`.
+- It stores every callee twice, as a separate library and as a copy in its caller, see :class:`_OwnCallees`.
 - It compiles a function again for each set of options of its callers, see :func:`register_part`.
-- It takes named tuples apart at every call, see dynsim.jit.compiler.
+- It unpacks named tuples at every call, see :class:`Tables`.
 - It repeats the same look-ups, see :func:`_quick_look_ups`.
 
-The changes act in dynsim's own compilations only; the parts of numba that they replace are in dynsim.jit.compiler.
+The changes are active in dynsim's compilations only; :data:`REPLACED` lists the parts of numba that they replace.
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ from numba.core.typing.collections import NamedTupleClassAttribute
 from numba.core.typing.templates import infer, infer_global, make_callable_template, make_overload_template
 from numba.core.typing.typeof import typeof_impl
 
-# Parts of numba that dynsim replaces in its own compilations, and the numba versions this was written for.
+# Parts of numba that dynsim replaces in its compilations, and the numba version for which this was written.
 
 
 SUPPORTED = "0.68.1"
 
-# 32 digits of the SHA-256 of the source of what is replaced or copied, by its name in numba.
+# First 32 digits of the SHA-256 of the source of each part that is replaced or copied, by its name in numba.
 REPLACED = {
     "numba.core.codegen:CPUCodeLibrary._optimize_functions": "9439219fa946f1ad5d202cb5dcbd2d51",
     "numba.core.codegen:CPUCodeLibrary._optimize_final_module": "e405bd473752613ba43e3becff2b625a",
@@ -87,7 +87,7 @@ REPLACED = {
 
 
 def source_hash(name: str) -> str:
-    """32 digits of the SHA-256 of the source of a function, or getter, of numba; empty where there is none."""
+    """Return the first 32 digits of the SHA-256 of the source of a function or getter of numba; empty if not found."""
     try:
         function = pkgutil.resolve_name(name)
         source = inspect.getsource(getattr(function, "fget", function))
@@ -98,10 +98,16 @@ def source_hash(name: str) -> str:
 
 @cache
 def check_sources() -> None:
-    """Raises ImportError where what is replaced is not what this was written for."""
+    """Check the parts of numba that are replaced.
+
+    Raises
+    ------
+    ImportError
+        If a part differs from the version for which this was written.
+    """
     for name, digest in REPLACED.items():
         if source_hash(name) != digest:
-            raise _refused(f"; {name}, which it replaces when it compiles, differs")
+            raise _refused(f"; {name}, which dynsim replaces, differs")
 
 
 def _refused(why: str = "") -> ImportError:
@@ -130,8 +136,8 @@ _ADDRESS = _BYTE.as_pointer()
 class Tables(types.NamedTuple):  # type: ignore[misc]
     """Type of a named tuple that is passed by its address.
 
-    Its name says which, not what is in it: numba's name of a run is ten thousand letters long, and part of the name of
-    each function that is given one.
+    Its name is short and does not list the fields: numba's name of a run has ten thousand letters, and is part of the
+    name of each function that takes one.
     """
 
     def __init__(self, kinds: Iterable[Any], cls: type) -> None:
@@ -140,7 +146,7 @@ class Tables(types.NamedTuple):  # type: ignore[misc]
         self.fields = tuple(cls._fields)  # type: ignore[attr-defined]
         self.instance_class = cls
         digest = hashlib.sha256(repr([str(kind) for kind in self.types]).encode()).hexdigest()[:15]
-        self._hash = int(digest, 16)  # the same in every process: types are kept on disk with the kernels
+        self._hash = int(digest, 16)  # the same in every process: types are stored on disk with the kernels
         types.Type.__init__(self, f"{cls.__name__}.{digest}")
 
     def __hash__(self) -> int:
@@ -151,7 +157,7 @@ class Tables(types.NamedTuple):  # type: ignore[misc]
 
 
 class _OfDynsim(ABC):  # noqa: B024
-    """The classes of named tuples in dynsim's own modules, for ``typeof``: all others are numba's."""
+    """Named-tuple classes of dynsim's modules, for ``typeof``; numba handles all other classes."""
 
     @classmethod
     def __subclasshook__(cls, kind: type) -> bool:
@@ -165,7 +171,7 @@ def _typeof(value: Any, context: Any) -> Tables | None:
 
 
 def constructors(function: Callable[..., Any], typing: Any) -> None:
-    """Let kernels call the classes of dynsim's named tuples that a function names; other compiled code sees numba's."""
+    """Let kernels call the named-tuple classes of dynsim that a function names; other code uses numba's ones."""
     for name in function.__code__.co_names:
         cls = function.__globals__.get(name)
         if isinstance(cls, type) and issubclass(cls, _OfDynsim):
@@ -175,7 +181,7 @@ def constructors(function: Callable[..., Any], typing: Any) -> None:
 
 
 class _TablesClass(types.NamedTupleClass):  # type: ignore[misc]
-    """To lowering, a class whose instances are :class:`Tables`."""
+    """Class whose instances are :class:`Tables`, for lowering."""
 
     def get_impl_key(self, sig: Any) -> Any:
         return _TablesClass
@@ -183,7 +189,7 @@ class _TablesClass(types.NamedTupleClass):  # type: ignore[misc]
 
 class _Constructor(NamedTupleClassAttribute):  # type: ignore[misc]
     def resolve___call__(self, kind: Any) -> Any:
-        if ConfigStack().top().nrt:  # not a kernel: they do not count references
+        if ConfigStack().top().nrt:  # not a kernel: kernels do not count references
             return super().resolve___call__(kind)
         cls = kind.instance_class
 
@@ -196,7 +202,7 @@ class _Constructor(NamedTupleClassAttribute):  # type: ignore[misc]
 
 @registry.register_default(Tables)
 class _TablesModel(models.DataModel):  # type: ignore[misc]
-    """The value is the address of the block; as data it is the block itself, in whole words."""
+    """Data model: the value is the address of the block; as data it is the block itself, in whole words."""
 
     def __init__(self, dmm: Any, fe_type: Tables) -> None:
         super().__init__(dmm, fe_type)
@@ -247,7 +253,7 @@ class _TablesModel(models.DataModel):  # type: ignore[misc]
         return builder.bitcast(ptr, _ADDRESS)
 
     def traverse(self, builder: Any) -> list[tuple[Any, Any]]:
-        """What numba counts references to; the address of a variable that has not been assigned yet is null."""
+        """Return the parts whose references numba counts; a variable not yet assigned has the null address."""
 
         def getter(value: Any, k: int) -> Any:
             nothing = cgutils.alloca_once(builder, llvm.ArrayType(_BYTE, self.size), zfill=True)
@@ -260,36 +266,36 @@ class _TablesModel(models.DataModel):  # type: ignore[misc]
         return self.parts
 
     def room(self, builder: Any) -> Any:
-        """A block in the frame of the function."""
+        """Allocate a block in the frame of the function."""
         with debuginfo.suspend_emission(builder), builder.goto_entry_block():
             block = builder.alloca(llvm.ArrayType(_BYTE, self.size))
             block.align = self.alignment
             return builder.bitcast(block, _ADDRESS)
 
     def copied(self, builder: Any, value: Any) -> Any:
-        """The block once more; nothing of nothing."""
+        """Return a copy of the block; null for null."""
         block = self.room(builder)
         with builder.if_then(cgutils.is_not_null(builder, value)):
             cgutils.raw_memcpy(builder, block, value, _WORD(self.size), 1)
         return builder.select(cgutils.is_null(builder, value), value, block)
 
     def start(self, builder: Any, value: Any, k: int) -> Any:
-        """Address of part k."""
+        """Return the address of part k."""
         return builder.gep(value, [_WORD(self.starts[k])], inbounds=True) if self.starts[k] else value
 
     def part(self, builder: Any, value: Any, k: int) -> Any:
-        """Part k of the tuple: of a tuple in it the address."""
+        """Return part k of the tuple; for a nested tuple its address."""
         model, start = self.parts[k], self.start(builder, value, k)
         if isinstance(model, _TablesModel):
             return start
         kind = model.get_data_type()
         start = builder.bitcast(start, kind.as_pointer())
         if kind == model.get_value_type():
-            return builder.load(start)  # in one, and LLVM's to take apart
+            return builder.load(start)  # in one load, which LLVM may split
         return model.load_from_data_pointer(builder, start)
 
     def put(self, builder: Any, block: Any, k: int, value: Any) -> None:
-        """Part k of a block that is being made."""
+        """Set part k of a block that is being built."""
         model, start = self.parts[k], self.start(builder, block, k)
         if isinstance(model, _TablesModel):
             cgutils.raw_memcpy(builder, start, value, _WORD(model.size), 1)
@@ -299,13 +305,13 @@ class _TablesModel(models.DataModel):  # type: ignore[misc]
 
 
 def parts_of(context: Any, builder: Any, kind: Any, value: Any) -> list[Any]:
-    """The parts of a named tuple in compiled code."""
+    """Return the parts of a named tuple in compiled code."""
     model = context.data_model_manager[kind]
     return [model.part(builder, value, k) for k in range(len(kind))]
 
 
 def made(context: Any, builder: Any, kind: Tables, values: Sequence[Any]) -> Any:
-    """A named tuple of these parts, in the frame of the function."""
+    """Build a named tuple of these parts in the frame of the function."""
     model = context.data_model_manager[kind]
     block = model.room(builder)
     for k, value in enumerate(values):
@@ -321,7 +327,7 @@ def _constructed(context: Any, builder: Any, sig: Any, args: Any) -> Any:
 
 
 class _Lower(Lower):  # type: ignore[misc]
-    """numba's, with constructors of :class:`Tables`, and copies of those that are assigned in several places."""
+    """Lowering of numba, with constructors of :class:`Tables`, and copies of tables assigned in several places."""
 
     def _lower_call_normal(self, fnty: Any, expr: Any, signature: Any) -> Any:
         if isinstance(fnty, types.NamedTupleClass) and isinstance(signature.return_type, Tables):
@@ -330,18 +336,18 @@ class _Lower(Lower):  # type: ignore[misc]
 
     @cached_property
     def _again(self) -> set[str]:
-        """Names of those."""
+        """Names of variables of type :class:`Tables` that are assigned more than once."""
         assigned = (store.target.name for block in self.blocks.values() for store in block.find_insts(ir.Assign))
         return {
             name for name, times in Counter(assigned).items() if times > 1 and isinstance(self.typeof(name), Tables)
         }
 
     def loadvar(self, name: str) -> Any:
-        """The tuple outlives the next assignment."""
+        """Copy the tuple, which must survive the next assignment."""
         return self._copied(super().loadvar(name), name)
 
     def storevar(self, value: Any, name: str, argidx: int | None = None) -> None:
-        """The variable outlives the next tuple that is made where this one was."""
+        """Copy the variable, which must survive the next tuple built in the same block."""
         super().storevar(self._copied(value, name), name, argidx)
 
     def _copied(self, value: Any, name: str) -> Any:
@@ -352,7 +358,7 @@ class _Lower(Lower):  # type: ignore[misc]
 
 @register_pass(mutates_CFG=True, analysis_only=False)
 class Lowering(NativeLowering):  # type: ignore[misc]
-    """numba's, by :class:`_Lower`."""
+    """Lowering pass that uses :class:`_Lower`."""
 
     _name = "dynsim_lowering"
 
@@ -373,14 +379,14 @@ def _field(context: Any, builder: Any, typ: Any, value: Any, attr: str) -> Any:
 
 
 def _borrowed(context: Any, builder: Any, kind: Any, value: Any, k: int) -> Any:
-    """Part k, whose references numba counts where it counts any."""
+    """Return part k; numba counts its references if it counts any."""
     part = context.data_model_manager[kind].part(builder, value, k)
     return impl_ret_borrowed(context, builder, kind[k], part)
 
 
 @unbox(Tables)
 def _unboxed(typ: Any, obj: Any, c: Any) -> Any:
-    """numba's ``unbox_tuple``, part by part into a block. The number of parts is that of the class."""
+    """Unbox a tuple into a block part by part, as numba's ``unbox_tuple``; the class sets the number of parts."""
     model, cleanups = c.context.data_model_manager[typ], []
     block, is_error = model.room(c.builder), cgutils.alloca_once_value(c.builder, cgutils.false_bit)
     for k, kind in enumerate(typ):
@@ -412,23 +418,23 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def packs_formulas() -> bool:
-    """Whether LLVM packs the scalar formulas of 3-vectors and wrenches into vector instructions.
+    """Return whether LLVM packs the scalar formulas of 3-vectors and wrenches into vector instructions.
 
-    A right-hand side takes 8 % less time then. numba leaves it off; who sets NUMBA_SLP_VECTORIZE has the last word.
+    A right-hand side then takes 8 % less time. numba leaves it off; the variable NUMBA_SLP_VECTORIZE has priority.
     """
     return bool(config.SLP_VECTORIZE) or "NUMBA_SLP_VECTORIZE" not in os.environ
 
 
 class _OwnCallees(JITCodeLibrary):
-    """Machine code that calls only what it brings along.
+    """Machine code that calls only functions that it contains.
 
-    numba links a copy of every callee into its caller, optimised again there, and leaves all copies under one name:
-    which of them runs is then a matter of what the process has loaded before, and so are the last bits of a result.
-    Made internal, the copies of a library are its own, in the process that compiles and in all that load it.
+    numba links a copy of every callee into its caller, optimises it again there, and gives all copies the same name:
+    which of them runs then depends on the code loaded earlier in the process, and so do the last bits of a result. As
+    internal functions the copies are private to a library, in the compiling process and in all that load it.
     """
 
     def _optimize_functions(self, ll_module: Any) -> None:
-        """Nothing yet: all of it is optimised in the end."""
+        """Do nothing yet: all functions are optimised at the end."""
         ll_module.data_layout = self._codegen._data_layout
 
     def finalize(self) -> None:
@@ -439,14 +445,14 @@ class _OwnCallees(JITCodeLibrary):
         for function in self._final_module.functions:
             if function.linkage == Linkage.linkonce_odr and not function.is_declaration:
                 function.linkage = Linkage.internal
-        # numba runs a cheaper set of passes before, for the sake of reference counting, which kernels do without.
+        # numba first runs cheaper passes for reference counting, which kernels do not use.
         passes, builder = self._codegen._module_pass_manager(slp_vectorize=packs_formulas())
         passes.run(self._final_module, builder)
 
     def serialize_using_object_code(self) -> tuple[str, str, tuple[bytes, bytes]]:
-        """For the cache: machine code, and the names by which it is found; not the code to merge into further kernels.
+        """Return machine code and its symbol names for the cache, without the code for inlining into other kernels.
 
-        Parts are for that, see :func:`as_part`; to read it back would take longer than a run of some seconds.
+        Parts serve that purpose, see :func:`as_part`; reading it back would take longer than a run of some seconds.
         """
         self._ensure_finalized()
         module, inside = self._final_module, (Linkage.internal, Linkage.private)
@@ -461,8 +467,10 @@ class _OwnCallees(JITCodeLibrary):
 
 
 class _LeanCompiler(Compiler):
-    """numba's compiler without the passes for what kernels do not have: closures, array expressions, ``with``, loops
-    over types."""
+    """Compiler of numba without passes for features that kernels do not use.
+
+    These are closures, array expressions, ``with`` and loops over types.
+    """
 
     def define_pipelines(self) -> list[PassManager]:
         passes = PassManager("kernel")
@@ -493,13 +501,13 @@ _PASSES = (
 
 
 class KernelCompiler(_LeanCompiler):
-    """numba's compiler, into :class:`_OwnCallees`."""
+    """Compiler of kernels, into :class:`_OwnCallees`."""
 
     def compile_extra(self, func: Callable[..., Any]) -> Any:
         check_sources()
         self.state.library = _OwnCallees(self.state.targetctx.codegen(), func.__qualname__)
         self.state.library.enable_object_caching()
-        # What is compiled is still in use: collecting garbage meanwhile finds none, and takes an eighth of the time.
+        # All objects are still in use: garbage collection would free nothing and take an eighth of the time.
         collecting = gc.isenabled()
         gc.disable()
         try:
@@ -512,9 +520,9 @@ class KernelCompiler(_LeanCompiler):
 
 @contextmanager
 def _quick_look_ups() -> Iterator[None]:
-    """Two look-ups of numba that take a quarter of the time, mended while a kernel is compiled.
+    """Speed up two look-ups of numba, which take a quarter of the time, while a kernel is compiled.
 
-    What is compiled is the same. Others compile before or after, as numba holds its lock of the compiler meanwhile.
+    The result is the same. Other threads compile before or after, because numba holds its compiler lock meanwhile.
     """
     replaced = (BaseFunction, "get_call_type", _remembered()), (ir.Inst, "_rec_list_vars", _variables)
     originals = [getattr(owner, name) for owner, name, _ in replaced]
@@ -528,9 +536,10 @@ def _quick_look_ups() -> Iterator[None]:
 
 
 def _remembered() -> Callable[..., Any]:
-    """``get_call_type`` that remembers the signatures of operators: numba tries some forty rules for each ``+``.
+    """Return ``get_call_type`` with a cache of operator signatures: numba tries some forty rules for each ``+``.
 
-    Only those found among numba's own: what is compiled on demand (``max``) depends on the options of its caller.
+    Only signatures found among numba's own are cached: functions compiled on demand (``max``) depend on the options of
+    their caller.
     """
     look_up, signatures = BaseFunction.get_call_type, {}
 
@@ -549,7 +558,7 @@ def _remembered() -> Callable[..., Any]:
 
 
 def _variables(self: Any, value: Any) -> list[ir.Var]:
-    """The variables in a value, in order; numba asks for those of a whole function some forty times."""
+    """Return the variables in a value, in order; numba requests those of a whole function some forty times."""
     if isinstance(value, ir.Var):
         return [value]
     if isinstance(value, ir.Inst):
@@ -565,15 +574,15 @@ def _variables(self: Any, value: Any) -> list[ir.Var]:
     ]
 
 
-# What instructions hold besides variables.
+# Types in instructions other than variables.
 _PLAIN = {str, int, float, type(None), ir.Loc, ir.Const, ir.Global, ir.FreeVar, ir.Arg, type(ir.UNDEFINED), type(len)}
 
 
 class _ToLink(JITCodeLibrary):
-    """Code that is only linked into other libraries and optimised there; it never becomes machine code of its own."""
+    """Code that is only linked into other libraries and optimised there; it never becomes machine code itself."""
 
     def finalize(self) -> None:
-        """Nothing is linked in yet: the kernel links each part once."""
+        """Link nothing yet: the kernel links each part once."""
         for library in self._linking_libraries:
             self._reload_init.update(library._reload_init)
         self._finalize_dynamic_globals()
@@ -581,7 +590,7 @@ class _ToLink(JITCodeLibrary):
 
 
 def _with_callees(libraries: Iterable[Any], seen: set[Any] | None = None) -> Iterator[Any]:
-    """Libraries, and those that parts among them call, each once."""
+    """Yield the libraries, and those called by parts among them, each once."""
     seen = set() if seen is None else seen
     for library in libraries:
         if library not in seen:
@@ -592,17 +601,17 @@ def _with_callees(libraries: Iterable[Any], seen: set[Any] | None = None) -> Ite
 
 
 class _ToCall(_ToLink):
-    """The same for code that must not be merged into its callers."""
+    """Code as in :class:`_ToLink` that must not be inlined into its callers."""
 
     def add_llvm_module(self, ll_module: Any) -> None:
-        for function in ll_module.functions:  # its own; what it calls is linked in later, and may be merged into it
+        for function in ll_module.functions:  # only its functions; callees are linked later and may be inlined
             if not function.is_declaration:
                 function.add_function_attribute("noinline")
         super().add_llvm_module(ll_module)
 
 
 class PartCompiler(_LeanCompiler):
-    """numba's compiler, into :class:`_ToLink`."""
+    """Compiler of parts, into :class:`_ToLink`."""
 
     library = _ToLink
 
@@ -610,7 +619,7 @@ class PartCompiler(_LeanCompiler):
         self.state.library = self.library(self.state.targetctx.codegen(), func.__qualname__)
         self.state.flags.no_compile = True
         result = super().compile_extra(func)
-        # Nothing to call: numba only asks for an object of the kind.
+        # There is nothing to call: numba only needs an object of this kind.
         entry = _dynfunc.make_function(
             result.fndesc.lookup_module(), func.__name__, "", 0, result.environment, (result.library,)
         )
@@ -619,21 +628,21 @@ class PartCompiler(_LeanCompiler):
 
 
 class NoInlineCompiler(PartCompiler):
-    """numba's compiler, into :class:`_ToCall`."""
+    """Compiler of parts, into :class:`_ToCall`."""
 
     library = _ToCall
 
 
 def as_part(function: Callable[..., Any], options: Mapping[str, Any]) -> Any:
-    """numba's dispatcher of what is linked into its callers; LLVM decides whether it is merged into them."""
+    """Return numba's dispatcher of a function that is linked into its callers; LLVM decides whether to inline it."""
     return numba.njit(pipeline_class=PartCompiler, **{"forceinline": False, **options, **_NO_ENTRY})(function)
 
 
 def register_part(function: F, compiler: type[Compiler], options: Mapping[str, Any]) -> F:
-    """The function itself; kernels that call it link it in, compiled once for the types of its arguments.
+    """Register a function as a part and return it; kernels that call it link it in, compiled once per argument types.
 
-    numba's own ``register_jitable`` compiles it once more for each set of options of its callers, and takes from them
-    what is not said here (``forceinline``).
+    numba's ``register_jitable`` would compile it again for each set of options of its callers, and inherit from them
+    the options that are not set here (``forceinline``).
     """
 
     def implementation(*kinds: Any, **__: Any) -> Any:
@@ -648,12 +657,12 @@ def register_part(function: F, compiler: type[Compiler], options: Mapping[str, A
     return function
 
 
-# Parts with another form, and for which types of arguments it stands in.
+# Parts with a variant, and the condition on argument types under which it is used.
 _FORMS: dict[Callable[..., Any], tuple[Callable[..., Any], Callable[..., bool]]] = {}
 
 
 def form_of(function: Callable[..., Any], when: Callable[..., bool]) -> Callable[[F], F]:
-    """The decorated function stands in for a registered part where ``when(*types of its arguments)`` is true."""
+    """Use the decorated function instead of a registered part if ``when(*types of its arguments)`` is true."""
 
     def put(form: F) -> F:
         _FORMS[function] = form, when
@@ -663,7 +672,7 @@ def form_of(function: Callable[..., Any], when: Callable[..., bool]) -> Callable
 
 
 def _implementation(template: Any, args: Any, kws: Any) -> Any:
-    """``_get_impl`` of a template, whatever the options of the caller."""
+    """Return ``_get_impl`` of a template, regardless of the options of the caller."""
     key = template.context, tuple(args), tuple(kws.items())
     if key not in template._impl_cache:
         template._build_impl(key, args, kws)

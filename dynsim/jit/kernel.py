@@ -1,7 +1,7 @@
 """Decorators of compiled functions (``@kernel`` and its kinds), and the cache of their machine code on disk.
 
-The compiler pipeline is in dynsim.jit.compiler. The cache replaces numba's, which checks only the file of the function
-itself, so that after an edit of a callee in another file old machine code is run, and which does not detect damaged
+The compiler pipeline is in dynsim.jit.compiler. The cache replaces numba's cache, which checks only the file of the
+function itself (after an edit of a callee in another file it would run old machine code) and does not detect damaged
 files, see :class:`_KernelCache`.
 """
 
@@ -35,18 +35,18 @@ from dynsim.jit.compiler import KernelCompiler, NoInlineCompiler, PartCompiler, 
 
 _OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}, "_nrt": False}
 
-# The packages whose functions are compiled into each other: an edit in one makes all compiled code stale.
+# Packages whose functions are compiled into each other: an edit in one makes all compiled code stale.
 _PACKAGES = tuple(Path(__file__).parents[1] / name for name in ("jit", "dynamics", "integrators", "snake"))
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 
 class _KernelCache(_Cache):
-    """Machine code on disk, a file for each function and signature: SHA-256 of the rest, then numba's own pickle.
+    """Machine code on disk, one file per function and signature: SHA-256 of the rest, then numba's own pickle.
 
     A file that is damaged or cannot be written costs a compilation, never the run: LLVM aborts the process on broken
-    machine code, so nothing is handed to it before its digest is right. Unlike numba's own cache it loads none of the
-    rules by which code is compiled (0.4 s): machine code needs none, and the compiler loads them when it is asked to.
+    machine code, so it is loaded only if its digest is right. Unlike numba's cache it does not load the compiler's
+    typing and lowering rules (0.4 s): machine code does not need them, and the compiler loads them when it runs.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -65,16 +65,16 @@ class _KernelCache(_Cache):
                 tell()
             return None
         except OSError as error:
-            _warn(f"{path}: cannot be read ({error.strerror}); compiling it anew")
+            _warn(f"{path}: cannot be read ({error.strerror}); recompiling")
             return None
         digest, payload = content[:_DIGEST_SIZE], content[_DIGEST_SIZE:]
         if hashlib.sha256(payload).digest() != digest:
-            _warn(f"{path}: damaged machine code; compiling it anew")
+            _warn(f"{path}: damaged machine code; recompiling")
             return None
         return CompileResult._rebuild(target_context, *pickle.loads(payload))
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        if data.library.has_dynamic_globals:  # addresses of this process, which NUMBA_OPT=0 leaves in
+        if data.library.has_dynamic_globals:  # addresses of this process, present if NUMBA_OPT=0
             return
         path = self._path(sig, data.codegen)
         payload = serialize.dumps(data._reduce())
@@ -91,11 +91,13 @@ class _KernelCache(_Cache):
                     os.unlink(file.name)
                     raise
         except OSError as error:
-            _warn(f"{path}: cannot be kept ({error.strerror}); the next run compiles it again")
+            _warn(f"{path}: cannot be saved ({error.strerror}); the next run compiles it again")
 
     def _path(self, sig: Any, codegen: Any) -> Path:
-        """Named by what may differ for the same sources: processor, signature, what the user asks of numba, and a
-        function of another package."""
+        """Return a path that depends on processor, signature and numba settings.
+
+        For a function of another package it also depends on the source.
+        """
         source = Path(self._function.__code__.co_filename)
         content = b"" if _names_the_folder(source) else source.read_bytes()
         asked = config.OPT, config.LOOP_VECTORIZE, packs_formulas(), config.BOUNDSCHECK, config.DEBUGINFO_DEFAULT
@@ -111,7 +113,7 @@ class _KernelCache(_Cache):
 
 
 def _names_the_folder(source: Path) -> bool:
-    """Whether the source is in the name of :func:`cache_folder` already."""
+    """Return whether the name of :func:`cache_folder` depends on this source already."""
     return any(source.is_relative_to(package) for package in _PACKAGES)
 
 
@@ -125,12 +127,12 @@ def _warn(text: str) -> None:
 
 @lru_cache(maxsize=1)
 def cache_folder() -> Path:
-    """Folder of the compiled kernels, named by what would make its content stale; only this user can write to it.
+    """Return the folder of the compiled kernels; its name changes when its content becomes stale.
 
-    In NUMBA_CACHE_DIR, else XDG_CACHE_HOME, else LOCALAPPDATA (of Windows), else ~/.cache; where that cannot be, in the
-    temporary directory; where strangers can write there too, a folder for this process alone. A new one removes those
-    beside it that no process has asked for in :data:`UNUSED_S`: younger ones may belong to a dynsim in another
-    environment.
+    Only this user can write to it. It is in NUMBA_CACHE_DIR, XDG_CACHE_HOME, LOCALAPPDATA (Windows) or ~/.cache,
+    whichever is set first; if that fails, in the temporary directory; if other users can write there, a private folder
+    of this process. A new folder removes its neighbours that no process has used for :data:`UNUSED_S`; younger ones may
+    belong to a dynsim in another environment.
     """
     digest = hashlib.sha256(f"{sys.version} {numba.__version__} {llvmlite.__version__} {np.__version__}".encode())
     for source in (file for package in _PACKAGES for file in sorted(package.rglob("*.py"))):
@@ -139,7 +141,7 @@ def cache_folder() -> Path:
     roots = [os.environ.get(variable) for variable in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME", "LOCALAPPDATA")]
     home = os.path.expanduser(next((root for root in roots if root), "~/.cache"))
     temporary = Path(tempfile.gettempdir(), f"cache-{_USER}")
-    # A user without a home keeps the tilde.
+    # For a user without a home the tilde remains.
     for root in (temporary,) if home.startswith("~") else (Path(home), temporary):
         try:
             folder = (root / name).resolve()
@@ -152,24 +154,24 @@ def cache_folder() -> Path:
         if new:
             _remove_unused(folder)
         return folder
-    _warn("every process compiles its kernels anew; name a folder of your own in XDG_CACHE_HOME")
+    _warn("kernels are recompiled in every process; set XDG_CACHE_HOME to a folder that only you can write to")
     folder = Path(_of_this_process().name, name)
     folder.mkdir(parents=True)
     return folder
 
 
-# None on Windows, whose files have no numbers of owners.
+# None on Windows, whose files have no owner numbers.
 _USER = os.getuid() if hasattr(os, "getuid") else None
 
-# Kernels that nobody has asked for in so long are removed [s]: 30 days.
+# Kernels that no process has used for this time are removed [s]: 30 days.
 UNUSED_S = 30 * 86400.0
 
 
 def _make_private(folder: Path) -> None:
-    """Make the folder where it is not; raises OSError where others than this user and root can change what is in it.
+    """Create the folder if needed; raise OSError if users other than this one and root can change its content.
 
-    Loading machine code runs it. Who can write to a folder above can put another one in its place, unless it is sticky.
-    Where users have no number a folder is taken as it is: the mode of a file does not tell who can write to it.
+    Loading machine code executes it. A user who can write to a parent folder can replace the folder, unless the parent
+    is sticky. On systems without user numbers the folder is accepted: file modes do not show who can write to it.
     """
     trusted = 0, _USER
     for part in (*reversed(folder.parents), folder):
@@ -178,7 +180,7 @@ def _make_private(folder: Path) -> None:
         if _USER is None:
             continue
         status = part.lstat()
-        # By a group of the user's own number, or root's, nobody else.
+        # Writable by the user's own group or root's, but nobody outside them.
         writable = status.st_mode & (stat.S_IWOTH if status.st_gid in trusted else stat.S_IWOTH | stat.S_IWGRP)
         sticky = part != folder and status.st_mode & stat.S_ISVTX
         if not stat.S_ISDIR(status.st_mode) or status.st_uid not in trusted or (writable and not sticky):
@@ -188,7 +190,7 @@ def _make_private(folder: Path) -> None:
 
 
 def _remove_unused(folder: Path) -> None:
-    """Remove the folders of kernels beside this one that have been unused for :data:`UNUSED_S`."""
+    """Remove the neighbouring folders of kernels that have been unused for :data:`UNUSED_S`."""
     with suppress(OSError):
         for other in folder.parent.iterdir():
             if re.fullmatch("[0-9a-f]{16}", other.name) and time.time() - other.lstat().st_mtime > UNUSED_S:
@@ -197,13 +199,13 @@ def _remove_unused(folder: Path) -> None:
 
 @lru_cache(maxsize=1)
 def _of_this_process() -> tempfile.TemporaryDirectory[str]:
-    """Removed when the process ends."""
+    """Return a temporary folder that is removed when the process ends."""
     return tempfile.TemporaryDirectory(prefix="dynsim-")
 
 
 @contextmanager
 def told_of_compilation(tell: Callable[[], None]) -> Iterator[None]:
-    """Call ``tell`` once when a kernel is not on disk, before it is compiled in this process: that takes long."""
+    """Call ``tell`` once before a kernel that is not on disk is compiled in this process, which takes long."""
 
     def once() -> None:
         _listeners.remove(once)
@@ -221,34 +223,35 @@ _listeners: list[Callable[[], None]] = []
 
 
 def kernel(function: F) -> F:
-    """Compile ``function`` on first call and keep the machine code on disk.
+    """Compile ``function`` on first call and store the machine code on disk.
 
-    Of fast-math only contraction (a·b + c in one rounding) is allowed: reordering would let the compiler assume that
-    there are no NaNs, and NaN must stay NaN so that divergence is seen. ``error_model="numpy"``: a division by zero
-    gives inf or NaN and does not branch. Kernels allocate nothing, so numba's reference counting of arrays is switched
-    off (``_nrt``): its atomic operations cost a tenth of a right-hand side.
+    Fast-math is limited to contraction (a·b + c in one rounding): reordering would let the compiler assume that there
+    are no NaNs, and NaN must stay NaN so that divergence is detected. ``error_model="numpy"``: a division by zero gives
+    inf or NaN and does not branch. Kernels allocate nothing, so numba's reference counting of arrays is switched off
+    (``_nrt``): its atomic operations cost a tenth of a right-hand side.
     """
     return _compile(function)
 
 
 def free_kernel(function: F) -> F:
-    """As :func:`kernel`, without the interpreter's lock while it runs: others can listen meanwhile.
+    """Compile as :func:`kernel`, and release the interpreter lock while it runs, so that other threads can run.
 
-    For what takes long, and only Python calls: see dynsim.engine.stopping.
+    For long-running functions that only Python calls: see dynsim.engine.stopping.
     """
     return _compile(function, nogil=True)
 
 
 def inline_kernel(function: F) -> F:
-    """As :func:`kernel`, for callers of the right-hand side: merged into their caller before compilation.
+    """Compile as :func:`kernel`, for callers of the right-hand side: inlined into their caller before compilation.
 
-    A compiled function carries the code of all it calls, so each extra level would compile the right-hand side again.
+    A compiled function includes the code of all its callees, so each extra level would compile the right-hand side
+    again.
     """
     return _compile(function, inline="always")
 
 
 def internal_kernel(function: F) -> F:
-    """For what only kernels call: compiled as part of them. From Python it is the plain function that it was.
+    """Compile a function as part of the kernels that call it; in Python it remains the plain function.
 
     Unpacking the tables of a model from Python objects would take longer to compile than most of these functions.
     """
@@ -256,26 +259,26 @@ def internal_kernel(function: F) -> F:
 
 
 def noinline_kernel(function: F) -> F:
-    """As :func:`internal_kernel`, for what is rarely called from the right-hand side: a call, never merged.
+    """Compile as :func:`internal_kernel`, for functions rarely called from the right-hand side: never inlined.
 
-    Merged, it would take registers from what runs every time.
+    Inlined, it would occupy registers of the code that runs every time.
     """
     return register_part(function, NoInlineCompiler, _OPTIONS)
 
 
 def exact_kernel(function: F) -> F:
-    """As :func:`internal_kernel`, with every product rounded: for what is merged into several places.
+    """Compile as :func:`internal_kernel`, with every product rounded, for functions inlined in several places.
 
-    Which products of a sum are contracted depends on the place, and so would the last bits of what it computes.
+    Which products of a sum are contracted depends on the place, and so would the last bits of the result.
     """
     return register_part(function, PartCompiler, {**_OPTIONS, "fastmath": False, "forceinline": True})
 
 
 class FixedSignature:
-    """A kernel that is called again and again with arguments of the same types, those of the first call.
+    """Kernel that is called repeatedly with arguments of the same types as in the first call.
 
-    Numba looks at the types of all arguments in each call; in some hundred tables that takes as long as what many a
-    kernel does. Nobody looks here: an array of another type would be misread.
+    Numba checks the types of all arguments in each call; for a hundred tables that takes as long as many a kernel. Here
+    nothing is checked: an array of another type would be misread.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -292,17 +295,17 @@ def _compile(function: F, **options: Any) -> F:
     compiled = numba.njit(pipeline_class=KernelCompiler, no_cfunc_wrapper=True, **_OPTIONS, **options)(function)
     if not config.DISABLE_JIT:
         compiled._cache = _KernelCache(function)
-        if not options:  # other kernels bring it along: they need no entry of its own
+        if not options:  # other kernels include it: they need no separate entry
             part = as_part(function, _OPTIONS)
             compiled.get_call_template, compiled.get_overload = part.get_call_template, part.get_overload
     return compiled
 
 
 def reals(values: Any) -> np.ndarray:
-    """The canonical float array of every kernel argument: float64, C order, writable, a copy."""
+    """Return the canonical float array of every kernel argument: float64, C order, writable, a copy."""
     return np.array(values, dtype=np.float64, order="C")
 
 
 def integers(values: Any) -> np.ndarray:
-    """The canonical integer array of every kernel argument: int64, C order, writable, a copy."""
+    """Return the canonical integer array of every kernel argument: int64, C order, writable, a copy."""
     return np.array(values, dtype=np.int64, order="C")

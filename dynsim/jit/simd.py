@@ -1,8 +1,8 @@
-"""A compiler type of N doubles (SIMD) with its operations: one source of a kernel serves numbers and vectors.
+"""Compiler type of N doubles (SIMD) with its operations: one source of a kernel serves numbers and vectors.
 
-Arithmetic, roots and ``min``/``max`` go lane by lane in vector instructions. A comparison gives a :class:`Mask`, which
-has no truth value: a branch on it does not compile, as lanes could not take different branches. Kernels that branch on
-data have variants for lanes, made with :func:`select` and :func:`every`, see dynsim.dynamics.simd.forms.
+Arithmetic, roots and ``min``/``max`` work lane by lane in vector instructions. A comparison gives a :class:`Mask`. It
+has no truth value: a branch on it does not compile, because lanes could not take different branches. Kernels that
+branch on data have variants for lanes, made with :func:`select` and :func:`every`, see dynsim.dynamics.simd.forms.
 
 LLVM maps ``<N x double>`` to the registers of the processor: eight lanes are one register of AVX-512, two of AVX2 or
 four of SSE2.
@@ -34,11 +34,11 @@ class Lanes(types.Type):
         super().__init__(name=f"Lanes({count})")
 
     def unify(self, typingctx: Any, other: Any) -> Any:
-        """A variable that is a number at first, and lanes later, is lanes."""
+        """Return lanes for a variable that is first a number and later lanes."""
         return self if isinstance(other, (types.Float, types.Integer)) else None
 
     def can_convert_from(self, typingctx: Any, other: Any) -> Any:
-        """A number stands for lanes that are all the same."""
+        """Allow a number to be converted to equal lanes."""
         return Conversion.unsafe if isinstance(other, (types.Float, types.Integer)) else None
 
 
@@ -67,7 +67,7 @@ def _vector(count: int) -> ir.VectorType:
 
 
 def spread(context: Any, builder: Any, value: Any, kind: Any, count: int) -> Any:
-    """A value as lanes: itself, or a number in all of them."""
+    """Return a value as lanes: itself, or a number in all of them."""
     if isinstance(kind, Lanes):
         return value
     vector = _vector(count)
@@ -83,7 +83,7 @@ def _cast(context: Any, builder: Any, kind: Any, to: Lanes, value: Any) -> Any:
 
 
 def lanes_of(*kinds: Any) -> int:
-    """How many lanes the first of these types has that has any; tuples and arrays have those of their parts."""
+    """Return the lane count of the first of these types that has lanes; tuples and arrays have those of their parts."""
     for kind in kinds:
         lanes = getattr(kind, "lanes", 0)
         if not lanes and isinstance(kind, types.Array):
@@ -96,7 +96,7 @@ def lanes_of(*kinds: Any) -> int:
 
 
 def _operation(function: Any, result: Callable[[int], types.Type], emit: Callable[..., Any]) -> None:
-    """``function`` of lanes, and of lanes and numbers; ``emit(builder, count, *vectors)``."""
+    """Define ``function`` for lanes, and for lanes and numbers; ``emit(builder, count, *vectors)``."""
 
     class Template(AbstractTemplate):
         key = function
@@ -172,14 +172,14 @@ for _function, _name in ((math.sqrt, "sqrt"), (np.rint, "rint"), (np.floor, "flo
     _operation(_function, Lanes, _llvm(_name))
 _operation(operator.neg, Lanes, lambda builder, count, a: builder.fsub(ir.Constant(_vector(count), [-0.0] * count), a))
 _operation(operator.pow, Lanes, lambda builder, count, a, b: _call(builder, count, "pow", a, b))
-# As numba does it for numbers, which says what becomes of NaN.
+# As numba does for numbers, which defines the treatment of NaN.
 _operation(min, Lanes, lambda builder, count, a, b: builder.select(builder.fcmp_ordered("<", b, a), b, a))
 _operation(max, Lanes, lambda builder, count, a, b: builder.select(builder.fcmp_ordered(">", b, a), b, a))
 
 
 @intrinsic
 def select(typingctx: Any, mask: Any, a: Any, b: Any) -> Any:
-    """Lanes of a where the mask is true, of b elsewhere; numbers are all lanes."""
+    """Return lanes of a where the mask is true, of b elsewhere; numbers fill all lanes."""
     result = Lanes(mask.lanes)
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -195,7 +195,7 @@ def select(typingctx: Any, mask: Any, a: Any, b: Any) -> Any:
 
 @intrinsic
 def every(typingctx: Any, mask: Any) -> Any:
-    """Whether the mask is true of all lanes."""
+    """Return whether the mask is true for all lanes."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         bits = builder.bitcast(args[0], ir.IntType(mask.lanes))
@@ -206,7 +206,7 @@ def every(typingctx: Any, mask: Any) -> Any:
 
 @intrinsic
 def four(typingctx: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
-    """Four numbers as lanes."""
+    """Return four numbers as lanes."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         value = ir.Constant(_vector(4), ir.Undefined)
@@ -220,7 +220,7 @@ def four(typingctx: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
 
 @intrinsic
 def turned(typingctx: Any, value: Any) -> Any:
-    """Four lanes with the two in the middle exchanged."""
+    """Return four lanes with the middle two exchanged."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         order = ir.Constant(ir.VectorType(INT32, 4), [0, 2, 1, 3])

@@ -1,1 +1,1 @@
-"""Files, YAML input, signals, standard streams, terminal, shipped scenarios; and memoisation."""
+"""Files, YAML input, signals, standard streams, terminal, shipped scenarios, and memoisation."""

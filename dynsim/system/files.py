@@ -1,7 +1,8 @@
 """Atomic writing of files, marking of incomplete sets of files, and locks of folders.
 
-A file is written beside its target under a name that no other process has, and renamed when it is complete. So devices,
-pipes and sockets are refused. While files that belong together are exchanged, a file ``INCOMPLETE`` marks their folder.
+A file is written next to its target under a name that no other process uses, and renamed when it is complete. Devices,
+pipes and sockets are therefore refused. While files that belong together are exchanged, a file ``INCOMPLETE`` marks
+their folder.
 """
 
 from __future__ import annotations
@@ -30,27 +31,26 @@ _MARK = (
 )
 _TEMPORARY = re.compile(r"\.dynsim-[0-9a-f]{16}\.tmp")
 _LEFT_BEHIND = 60.0
-"""An unlocked temporary file older than this [s] was left by a process that died; younger ones may not be locked
-yet."""
+"""Age [s] from which an unlocked temporary file was left by a dead process; younger files may not be locked yet."""
 _STREAM = re.compile(r"/dev/(stdin|stdout|stderr|fd/.*)|/proc/.*")
 """Names of open descriptors of a process: they may be files, but cannot be replaced."""
 _NAME_LENGTH = 120
-"""Of a file name made from a text [characters]; file systems end at 255 bytes."""
+"""Longest file name made from a text [characters]; file systems allow 255 bytes."""
 
 
 def check_writable(folder: Path, names: Iterable[str] = ()) -> None:
-    """Find out before a long simulation whether its files, by name, can be written to a folder; creates nothing.
+    """Check before a long simulation whether the files ``names`` can be written to a folder; creates nothing.
 
     Raises
     ------
     RecordError
-        A file is in the way, or there is no permission.
+        If a file is in the way or a permission is missing.
     """
     try:
         existing = folder.absolute()
         while not existing.exists():
             if existing.is_symlink():
-                raise RecordError(f"cannot write to {folder}: {existing} is a link to nothing")
+                raise RecordError(f"cannot write to {folder}: {existing} is a broken link")
             existing = existing.parent
         mark = folder / INCOMPLETE
         blocked = [name for name in names if (folder / name).exists() and not (folder / name).is_file()]
@@ -68,12 +68,12 @@ def check_writable(folder: Path, names: Iterable[str] = ()) -> None:
 
 @contextmanager
 def held_folder(folder: Path) -> Iterator[None]:
-    """Make a folder, if need be; within, no other process holds it. File systems without locks, and Windows, let it.
+    """Create a folder if needed, and lock it within the block, if file system and operating system support locks.
 
     Raises
     ------
     RecordError
-        Another process holds it, or it cannot be made.
+        If another process has locked it or it cannot be created.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -88,7 +88,7 @@ def held_folder(folder: Path) -> Iterator[None]:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise RecordError(
-                f"{folder}: another process is at work there; wait until it ends, or give another --out"
+                f"{folder}: another process is using this folder; wait until it ends, or choose another --out"
             ) from error
         except OSError:  # a file system without locks
             pass
@@ -98,7 +98,7 @@ def held_folder(folder: Path) -> Iterator[None]:
 
 
 def discard(folder: Path, patterns: Iterable[str]) -> None:
-    """Delete the files of a folder that match, if there are any; what cannot be deleted stays."""
+    """Delete all files of a folder that match; files that cannot be deleted stay."""
     for pattern in patterns:
         for path in folder.glob(pattern):
             with suppress(OSError):
@@ -106,26 +106,29 @@ def discard(folder: Path, patterns: Iterable[str]) -> None:
 
 
 def file_name(text: object) -> str:
-    """A name for a file or folder made of a text from anywhere: one that cannot lead to another folder."""
+    """Make a safe name for a file or folder from any text: it cannot lead to another folder."""
     name = "".join(c if c.isprintable() and c not in '/\\:*?"<>|' else "_" for c in str(text))
     return name.strip(". ")[:_NAME_LENGTH] or "unnamed"
 
 
 @contextmanager
 def replacing(path: Path, *, durable: bool = False) -> Iterator[BinaryIO]:
-    """A stream whose content becomes the file ``path`` when the block ends well.
+    """Provide a stream whose content replaces the file ``path`` if the block ends without an exception.
 
-    A link at ``path`` is kept and the file it names replaced. A new file gets the mode that the umask asks for, a
-    replaced one keeps its own.
+    If ``path`` is a link, the link is kept and its target is replaced. A new file gets the mode set by the umask, a
+    replaced file keeps its mode.
 
     Parameters
     ----------
-    durable : wait until the content is on the disk, so that a power cut, too, leaves the old file or the new one
+    path : Path
+        File to write.
+    durable : bool, optional
+        Wait until the content is on the disk, so that even after a power cut the old or the new file is there.
 
     Raises
     ------
     RecordError
-        ``path`` is no file, or cannot be written (no space, no permission); an older file there is left as it was.
+        If ``path`` is not a regular file or cannot be written (no space, no permission); an older file is unchanged.
     """
     with _Draft(path) as draft:
         yield draft.stream
@@ -134,19 +137,19 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[BinaryIO]:
 
 
 def replace_together(folder: Path, contents: Mapping[str, bytes | memoryview]) -> None:
-    """Write files, by name, that belong together: all of them or none.
+    """Write files that belong together, given as name: content; all of them or none.
 
-    All are complete on disk before the first is renamed, and while they are renamed the folder holds a file
-    ``INCOMPLETE`` that names them: :func:`check_complete` refuses them if the process dies in between.
+    All are complete on disk before the first is renamed. While they are renamed, a file ``INCOMPLETE`` in the folder
+    lists them: :func:`check_complete` refuses them if the process dies meanwhile.
 
     Raises
     ------
     RecordError
-        A file cannot be written; older ones are left as they were, unless the message says that they are marked.
+        If a file cannot be written; older files are unchanged, unless the message says that they are marked.
     """
     places = {os.path.realpath(folder / name) for name in contents}
     if len(places) < len(contents):
-        raise RecordError(f"cannot write to {folder}: two of {', '.join(contents)} are links to one file")
+        raise RecordError(f"cannot write to {folder}: two of {', '.join(contents)} are links to the same file")
     with ExitStack() as open_drafts:
         drafts = [open_drafts.enter_context(_Draft(folder / name)) for name in contents]
         for draft, content in zip(drafts, contents.values(), strict=True):
@@ -161,12 +164,12 @@ def replace_together(folder: Path, contents: Mapping[str, bytes | memoryview]) -
 
 
 def check_complete(path: Path) -> None:
-    """Refuse a file that may be of another run than those beside it, see :func:`replace_together`.
+    """Refuse a file that may belong to a different run than the others of its folder, see :func:`replace_together`.
 
     Raises
     ------
     RecordError
-        The folder is marked, and the mark names the file.
+        If the folder is marked and the mark names the file.
     """
     mark = path.parent / INCOMPLETE
     try:
@@ -177,8 +180,8 @@ def check_complete(path: Path) -> None:
         names = None
     if names is None or path.name in names:
         raise RecordError(
-            f"{path}: may be of another run than the files beside it: {mark} says that a run died, or is at work, "
-            "while it exchanged them; run it again, or delete that mark to take the files as they are"
+            f"{path}: may belong to a different run than the other files there: {mark} shows that a run died, or is "
+            "busy, while exchanging them; run it again, or delete that mark to use the files as they are"
         )
 
 
@@ -188,7 +191,7 @@ def write_text(path: Path, text: str) -> Path:
     Raises
     ------
     RecordError
-        The file cannot be written; an older one is left as it was.
+        If the file cannot be written; an older file is unchanged.
     """
     with replacing(path) as stream:
         stream.write(text.encode("utf-8"))
@@ -201,12 +204,12 @@ def write_json(path: Path, data: Any) -> Path:
 
 
 def json_text(data: Any) -> str:
-    """JSON as dynsim writes it."""
+    """Return JSON in the format of dynsim's files."""
     return json.dumps(data, indent=2, ensure_ascii=False) + "\n"
 
 
 class _Draft:
-    """Content on its way to ``path``, in a temporary file beside it; errors within its ``with`` name the path."""
+    """Content for ``path`` in a temporary file next to it; errors within its ``with`` name the path."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -214,12 +217,12 @@ class _Draft:
     def __enter__(self) -> _Draft:
         with self.one_line_errors():
             existing = self._existing()
-            # The name is nobody else's: made anew or not at all, and a link that lies there is not followed.
+            # Only this process uses the name: the file must not exist, and a link of that name is not followed.
             self._temporary = self._target.with_name(f".dynsim-{os.urandom(8).hex()}.tmp")
             try:
                 self.stream: BinaryIO = self._temporary.open("x+b")
                 self._take_over(existing)
-            except FileExistsError:  # somebody else's
+            except FileExistsError:  # not our file
                 raise
             except BaseException:
                 self._discard()
@@ -235,7 +238,7 @@ class _Draft:
 
     @contextmanager
     def one_line_errors(self) -> Iterator[None]:
-        """OSError as RecordError."""
+        """Convert OSError to RecordError."""
         try:
             yield
         except (OSError, UnicodeEncodeError) as error:
@@ -249,7 +252,7 @@ class _Draft:
             self._temporary.unlink()
 
     def _existing(self) -> os.stat_result | None:
-        """Find out what is at the path, and which file is to be replaced."""
+        """Check the existing file at the path, and determine which file to replace."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
         try:
             existing: os.stat_result | None = os.stat(self.path)
@@ -262,31 +265,31 @@ class _Draft:
             raise OSError(0, "is a device, pipe or socket; write to a file and copy it there")
         self._target = Path(os.path.realpath(self.path))
         if existing is not None and not os.access(self._target, os.W_OK):
-            raise PermissionError(0, "the file may not be written")
+            raise PermissionError(0, "the file is write-protected")
         _remove_left_behind(self._target.parent)
         return existing
 
     def _take_over(self, existing: os.stat_result | None) -> None:
-        """Hold the temporary file, and give it owner and mode of the one that it replaces."""
+        """Lock the temporary file, and give it owner and mode of the file that it replaces."""
         descriptor = self.stream.fileno()
         lock(descriptor, wait=False)
         if existing is not None and hasattr(os, "fchmod"):
-            with suppress(OSError):  # only root may give files away; then they are ours, as after any replacement
+            with suppress(OSError):  # only root may change the owner; otherwise the file remains ours
                 if (existing.st_uid, existing.st_gid) != (os.geteuid(), os.getegid()):
                     os.fchown(descriptor, existing.st_uid, existing.st_gid)
             with suppress(OSError):  # a file system without modes
                 os.fchmod(descriptor, stat.S_IMODE(existing.st_mode))
 
     def complete(self, durable: bool) -> None:
-        """All content is there: hand it to the system, and let the disk have it."""
+        """Flush the complete content to the system, and to the disk if ``durable``."""
         self.stream.flush()
         if durable:
             os.fsync(self.stream.fileno())
 
     def publish(self) -> None:
-        """Let the content be what the path holds."""
+        """Replace the file at the path by the content."""
         if not hasattr(os, "fchmod"):
-            self.stream.close()  # Windows renames no open file
+            self.stream.close()  # Windows cannot rename an open file
         os.replace(self._temporary, self._target)
 
 
@@ -295,7 +298,7 @@ def _reason(error: Exception) -> str:
 
 
 def lock(descriptor: int, *, wait: bool) -> bool:
-    """Hold a file until it is closed; False if somebody else does."""
+    """Lock a file until it is closed; False if another process has locked it."""
     if fcntl is None:
         return True
     try:
@@ -308,7 +311,7 @@ def lock(descriptor: int, *, wait: bool) -> bool:
 
 
 def _remove_left_behind(folder: Path) -> None:
-    """Remove temporary files of runs that died."""
+    """Remove temporary files of processes that died."""
     if fcntl is None:
         return
     with suppress(OSError), os.scandir(folder) as entries:
@@ -328,10 +331,10 @@ def _remove_left_behind(folder: Path) -> None:
 
 @contextmanager
 def _marked(folder: Path, names: Mapping[str, object]) -> Iterator[list[Path]]:
-    """Mark the folder as incomplete with respect to the files named; yields a list for those that are exchanged.
+    """Mark the folder as incomplete with respect to the files ``names``; yield a list for files that are exchanged.
 
-    The mark goes when the block ends well, or before it has exchanged anything. One process at a time; others wait.
-    Mark and renames are not waited for: file systems with a journal keep their order, and an empty mark names all.
+    The mark is removed if the block succeeds, or fails before it has exchanged a file. One process at a time; others
+    wait. Mark and renames are not synced: journaling file systems keep their order, and an empty mark covers all files.
     """
     mark = folder / INCOMPLETE
     published: list[Path] = []
@@ -356,21 +359,21 @@ def _marked(folder: Path, names: Mapping[str, object]) -> Iterator[list[Path]]:
         try:
             _remove_mark(mark, stream, before - set(names))
         except OSError as error:
-            raise RecordError(f"{mark}: cannot be removed ({_reason(error)}); the files beside it are whole") from error
+            raise RecordError(f"{mark}: cannot be removed ({_reason(error)}); the other files are complete") from error
 
 
 def _remove_mark(mark: Path, stream: BinaryIO, left: set[str]) -> None:
-    """Remove the mark, unless there are files that others left when they died."""
+    """Remove the mark, unless it still lists files of other processes that died."""
     if left:
         _rewrite_mark(stream, left)
         return
     if fcntl is None:
-        stream.close()  # Windows removes no open file
+        stream.close()  # Windows cannot remove an open file
     mark.unlink()
 
 
 def _open_mark(mark: Path) -> tuple[BinaryIO, set[str]]:
-    """The mark, held by this process, and the names it had."""
+    """Open the mark, locked by this process; return it and the names in it."""
     flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
     while True:
         stream = os.fdopen(os.open(mark, flags | getattr(os, "O_NONBLOCK", 0), 0o666), "r+b", buffering=0)
@@ -378,14 +381,14 @@ def _open_mark(mark: Path) -> tuple[BinaryIO, set[str]]:
             lock(stream.fileno(), wait=True)
             status = os.fstat(stream.fileno())
             if not stat.S_ISREG(status.st_mode):
-                raise OSError(0, "is in the way; it is no file")
+                raise OSError(0, "is in the way: not a regular file; remove it")
             with suppress(FileNotFoundError):
                 if os.path.samestat(status, os.lstat(mark)):
                     text = stream.read().decode("utf-8", errors="replace")
                     if text and not text.startswith(_MARK):
-                        raise OSError(0, "is in the way: no mark of dynsim; move it")
+                        raise OSError(0, "is in the way: not a mark of dynsim; move it")
                     return stream, _marked_names(text) or set()
-            # Another process has removed it meanwhile: it was done.
+            # Another process has removed it meanwhile, because it was done.
             stream.close()
         except BaseException:
             stream.close()
@@ -399,5 +402,5 @@ def _rewrite_mark(stream: BinaryIO, names: set[str]) -> None:
 
 
 def _marked_names(text: str) -> set[str] | None:
-    """Files that a mark names; None when it does not say, which means all."""
+    """Return the files that a mark names; None if it names none, which means all files."""
     return set(text.splitlines()[1:]) or None

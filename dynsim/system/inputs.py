@@ -1,8 +1,9 @@
 """Reading of files that users name: regular files of bounded size, as text or YAML, without blocking.
 
 YAML is built from the parser's events, so that every error is a dynsim error with its line, the expansion of aliases is
-bounded, and a file of some 100 000 numbers loads in a second (ruamel's compiled parser; its Python one takes ten times
-as long). Plain values are those of YAML 1.2's core schema: null, booleans, integers, floats and text; a date is text.
+bounded, and a file of some 100 000 numbers loads in a second (ruamel's compiled parser; its Python parser takes ten
+times as long). Plain values follow the core schema of YAML 1.2: null, booleans, integers, floats and text; a date is
+text.
 """
 
 from __future__ import annotations
@@ -16,14 +17,14 @@ from typing import Any, NoReturn
 
 from dynsim.errors import DynsimError
 
-# Bounds on a YAML file: bytes, values after aliases are written out, mappings and lists within each other.
+# Limits of a YAML file: bytes, values after expansion of aliases, nested mappings and lists.
 SIZE_LIMIT = 16_000_000
 NODE_LIMIT = 1_000_000
 DEPTH_LIMIT = 50
-# Most digits of an integer: about as many as a float can represent.
+# Limit of the digits of an integer: about as many as a float can represent.
 DIGITS_LIMIT = 308
 
-# Makes an error from its message: a class of errors, or a partial one.
+# Makes an error from its message: a class of errors, or a partial of one.
 ErrorClass = Callable[[str], DynsimError]
 
 _NULLS = frozenset(("", "~", "null", "Null", "NULL"))
@@ -32,25 +33,25 @@ _INTEGER = re.compile(r"[-+]?(?:0b[01]+|0o[0-7]+|0x[0-9a-fA-F]+|[0-9]+)")
 _FLOAT = re.compile(
     r"[-+]?(?:(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?|\.inf|\.Inf|\.INF)|\.nan|\.NaN|\.NAN"
 )
-# Not allowed in a text of YAML, escaped or not: control characters except tab and line ends, and lone surrogates.
+# Not allowed in YAML text, escaped or not: control characters except tab and line ends, and lone surrogates.
 _FORBIDDEN = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f\x80-\x84\x86-\x9f\ud800-\udfff\ufffe\uffff]")
 _CORE = "tag:yaml.org,2002:"
 _TEXT_TAGS = (None, "!", _CORE + "str")
-# Events that begin a value, and the method that reads it; names of those that cannot begin a key.
+# Events that begin a value, with the method that reads it; names of events that cannot begin a key.
 _VALUES = {"ScalarEvent": "_scalar", "MappingStartEvent": "_mapping", "SequenceStartEvent": "_list", "AliasEvent": ""}
 _NO_KEYS = {"MappingStartEvent": "a mapping", "SequenceStartEvent": "a list", "AliasEvent": "an alias"}
-# Stands for the value of an anchor whose end has not come yet.
+# Value of an anchor whose end has not been reached.
 _INCOMPLETE = object()
 
 
 def is_file(path: str | os.PathLike[str], error: ErrorClass) -> bool:
-    """True for a regular file, False when there is nothing of that name.
+    """True for a regular file, False if nothing exists there.
 
     Raises
     ------
     DynsimError
-        Of the class ``error``: a folder, pipe, socket or device (they may block or never end), or a name that cannot
-        be looked up.
+        Of the class ``error``, for a folder, pipe, socket or device (they may block or never end), or a name that
+        cannot be looked up.
     """
     try:
         mode = os.stat(path).st_mode
@@ -59,7 +60,7 @@ def is_file(path: str | os.PathLike[str], error: ErrorClass) -> bool:
     except OSError as reason:
         raise error(f"{path}: cannot be read ({reason.strerror})") from reason
     except ValueError as reason:
-        raise error(f"{os.fspath(path)!r}: cannot be the name of a file ({reason})") from reason
+        raise error(f"{os.fspath(path)!r}: is not a valid file name ({reason})") from reason
     if stat.S_ISREG(mode):
         return True
     kind = "folder" if stat.S_ISDIR(mode) else "pipe" if stat.S_ISFIFO(mode) else "device or socket"
@@ -67,18 +68,18 @@ def is_file(path: str | os.PathLike[str], error: ErrorClass) -> bool:
 
 
 def check_file(path: str | os.PathLike[str], error: ErrorClass) -> None:
-    """As :func:`is_file`, and raise ``error`` when there is no such file."""
+    """Raise ``error`` if there is no such file; otherwise as :func:`is_file`."""
     if not is_file(path, error):
         raise error(f"{path}: no such file")
 
 
 def read_bytes(path: Path, error: ErrorClass, limit: int = SIZE_LIMIT) -> bytes:
-    """The content of a file of at most ``limit`` bytes.
+    """Return the content of a file of at most ``limit`` bytes.
 
     Raises
     ------
     DynsimError
-        Of the class ``error``: no regular file, too large or not readable.
+        Of the class ``error``, if it is not a regular file, too large or not readable.
     """
     check_file(path, error)
     try:
@@ -87,17 +88,17 @@ def read_bytes(path: Path, error: ErrorClass, limit: int = SIZE_LIMIT) -> bytes:
     except OSError as reason:
         raise error(f"{path}: cannot be read ({reason.strerror})") from reason
     if len(content) > limit:
-        raise error(f"{path}: is larger than {limit / 1e6:g} MB, more than is read")
+        raise error(f"{path}: is larger than {limit / 1e6:g} MB, the size limit")
     return content
 
 
 def read_text(path: Path, error: ErrorClass, limit: int = SIZE_LIMIT) -> str:
-    """The text of a UTF-8 file of at most ``limit`` bytes, without a byte order mark.
+    """Return the text of a UTF-8 file of at most ``limit`` bytes, without a byte order mark.
 
     Raises
     ------
     DynsimError
-        Of the class ``error``: no regular file, too large, not readable or not UTF-8.
+        Of the class ``error``, if it is not a regular file, too large, not readable or not UTF-8.
     """
     content = read_bytes(path, error, limit)
     try:
@@ -109,7 +110,7 @@ def read_text(path: Path, error: ErrorClass, limit: int = SIZE_LIMIT) -> str:
 
 
 class YamlMapping(dict[str, Any]):
-    """A mapping of a YAML text; ``lines`` has the line of every key."""
+    """Mapping of a YAML text; ``lines`` has the line of every key."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -117,7 +118,7 @@ class YamlMapping(dict[str, Any]):
 
 
 class YamlList(list[Any]):
-    """A list of a YAML text; ``lines`` has the line of every entry."""
+    """List of a YAML text; ``lines`` has the line of every entry."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -125,26 +126,31 @@ class YamlList(list[Any]):
 
 
 def parse_yaml(text: str, error: ErrorClass, source: str, *, line_numbers: bool = True) -> Any:
-    """The one document of a YAML text as plain values in :class:`YamlMapping` and :class:`YamlList`; None without one.
+    """Return the only document of a YAML text as plain values in YamlMapping and YamlList; None if it is empty.
 
     Keys are text as written: ``1`` and ``"1"`` are the same key. Aliases are copies, ``<<`` merges.
 
     Parameters
     ----------
-    text, error : the text; the class of errors to raise
-    source : what the text is, for messages
-    line_numbers : whether messages give lines (not for a text of one line)
+    text : str
+        Text to parse.
+    error : ErrorClass
+        Class of errors to raise.
+    source : str
+        Origin of the text, for messages.
+    line_numbers : bool, optional
+        Whether messages include lines (not useful for a text of one line).
 
     Raises
     ------
     DynsimError
-        Of the class ``error``, with source and line, whatever is wrong with the text.
+        Of the class ``error``, with source and line, for any error in the text.
     """
     return _Reader(text, error, source, line_numbers).document()
 
 
 class _Reader:
-    """Puts the values of a document together from its events."""
+    """Builder of the values of a document from its events."""
 
     def __init__(self, text: str, error: ErrorClass, source: str, line_numbers: bool) -> None:
         self._error, self._source, self._line_numbers = error, source, line_numbers
@@ -163,7 +169,7 @@ class _Reader:
                 root = self._value(event, 0)
             documents += kind == "DocumentStartEvent"
             if documents > 1:
-                self._fail(_line(event), "a second document begins; there must be one")
+                self._fail(_line(event), "a second document begins; only one is allowed")
         return root
 
     def _parsed(self, text: str) -> Iterator[Any]:
@@ -172,7 +178,7 @@ class _Reader:
         try:
             yield from YAML(typ="safe").parse(text)
         except Exception as reason:
-            # Any text may come: whatever the parser stumbles over, the text is at fault.
+            # The parser may fail in any way on arbitrary text: it is always an error of the text.
             mark = getattr(reason, "problem_mark", None) or getattr(reason, "context_mark", None)
             problem = getattr(reason, "problem", None) or getattr(reason, "context", None) or str(reason)
             hint = " ".join(problem.split())
@@ -186,13 +192,13 @@ class _Reader:
         raise self._error(f"{location}: {problem}")
 
     def _value(self, event: Any, depth: int) -> Any:
-        """The value that begins with an event, within so many mappings and lists."""
+        """Return the value that begins with an event, nested in ``depth`` mappings and lists."""
         kind, line, anchor = type(event).__name__, _line(event), event.anchor
         if kind == "AliasEvent":
             if anchor not in self._anchors:
-                self._fail(line, f"alias *{anchor}: there is no anchor &{anchor} before it")
+                self._fail(line, f"alias *{anchor}: no anchor &{anchor} before it")
             if self._anchors[anchor] is _INCOMPLETE:
-                self._fail(line, f"alias *{anchor} is within &{anchor} itself: it would never end")
+                self._fail(line, f"alias *{anchor} is inside &{anchor} itself, an endless recursion")
             return self._copy(self._anchors[anchor], line, depth)
         if kind != "ScalarEvent":
             self._check_depth(line, depth)
@@ -223,14 +229,14 @@ class _Reader:
         if _INTEGER.fullmatch(text):
             base = 0 if text.lstrip("+-")[:2] in ("0b", "0o", "0x") else 10
             if len(text) > DIGITS_LIMIT or abs(number := int(text, base)) >= 10**DIGITS_LIMIT:
-                self._fail(line, f"a number of {len(text)} digits; no quantity has more than {DIGITS_LIMIT}")
+                self._fail(line, f"a number with {len(text)} digits; the limit is {DIGITS_LIMIT}")
             return number
         if _FLOAT.fullmatch(text):
             return float(text if text[-1] in "0123456789." else text.lower().replace(".", ""))
         return text
 
     def _tagged(self, text: str, tag: str, line: int) -> Any:
-        """A scalar whose type the file gives (``!!float 1``)."""
+        """Return a scalar whose type is set in the file (``!!float 1``)."""
         kinds: dict[str, Any] = {"null": type(None), "bool": bool, "int": int, "float": float}
         kind = kinds.get(tag.removeprefix(_CORE)) if tag.startswith(_CORE) else None
         if kind is None:
@@ -239,12 +245,12 @@ class _Reader:
         if kind is float and type(value) is int:
             value = float(value)
         if type(value) is not kind:
-            self._fail(line, f"{text[:40]!r} is no !!{tag.removeprefix(_CORE)}")
+            self._fail(line, f"{text[:40]!r} is not a valid !!{tag.removeprefix(_CORE)}")
         return value
 
     def _fail_tag(self, tag: str, line: int) -> NoReturn:
         shown = tag.replace(_CORE, "!!")[:60]
-        self._fail(line, f"tag {shown!r} is not known; write plain mappings, lists, numbers and texts")
+        self._fail(line, f"unknown tag {shown!r}; use plain mappings, lists, numbers and texts")
 
     def _list(self, event: Any, line: int, depth: int) -> YamlList:
         self._check_tag(event, "seq")
@@ -263,11 +269,11 @@ class _Reader:
             if key.implicit[0] and _tag(key) is None and name == "<<":
                 mappings = value if isinstance(value, YamlList) else [value]
                 if not all(isinstance(mapping, YamlMapping) for mapping in mappings):
-                    self._fail(_line(start), "<< takes a mapping, or a list of mappings")
+                    self._fail(_line(start), "<< requires a mapping, or a list of mappings")
                 merged.extend(mappings)
             else:
                 own[name], own.lines[name] = value, _line(key)
-        # Its own keys win, then those that were merged first.
+        # The mapping's own keys win, then the keys merged first.
         whole = YamlMapping()
         for mapping in (*reversed(merged), own):
             whole.update(mapping)
@@ -276,7 +282,7 @@ class _Reader:
 
     def _key(self, event: Any, mapping: YamlMapping) -> str:
         if kind := _NO_KEYS.get(type(event).__name__):
-            self._fail(_line(event), f"{kind} is no key; keys are texts")
+            self._fail(_line(event), f"{kind} cannot be a key; keys are texts")
         if (tag := _tag(event)) not in _TEXT_TAGS:
             self._fail_tag(str(tag), _line(event))
         name = self._allowed(event)
@@ -287,7 +293,7 @@ class _Reader:
         return name
 
     def _copy(self, value: Any, line: int, depth: int) -> Any:
-        """A copy of a value, at an alias, that shares no mapping or list with it."""
+        """Return a copy of a value, at an alias, that shares no mapping or list with it."""
         self._count(line)
         if isinstance(value, YamlMapping | YamlList):
             self._check_depth(line, depth)
@@ -309,12 +315,12 @@ class _Reader:
 
     def _check_depth(self, line: int, depth: int) -> None:
         if depth >= DEPTH_LIMIT:
-            self._fail(line, f"more than {DEPTH_LIMIT} mappings and lists within each other")
+            self._fail(line, f"more than {DEPTH_LIMIT} nested mappings and lists")
 
     def _count(self, line: int) -> None:
         self._nodes += 1
         if self._nodes > NODE_LIMIT:
-            self._fail(line, f"more than {NODE_LIMIT:,} values (aliases written out)".replace(",", " "))
+            self._fail(line, f"more than {NODE_LIMIT:,} values (with aliases expanded)".replace(",", " "))
 
 
 def _line(event: Any) -> int:

@@ -1,9 +1,9 @@
 """Interrupt signals: handled at once, or postponed while a result is computed or saved.
 
 Python raises KeyboardInterrupt at any point of a program. Within a callback of the garbage collector it is lost, within
-one of the compiler it crashes the process, and between the last step and the saved record the record would be lost. So
-a signal is also stored, long work checks for it (:func:`check`), and within a callback of the compiler, and between
-:func:`keep` and :func:`heed`, it is postponed.
+a callback of the compiler it crashes the process, and between the last step and the saved record the record would be
+lost. A signal is therefore also stored, long work checks for it (:func:`check`), and within a callback of the compiler,
+and between :func:`keep` and :func:`heed`, it is postponed.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from types import FrameType
 
 STOP_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
-# Callbacks of llvmlite by which LLVM reads and writes its cache of compiled code; an exception in them is not handled.
+# Callbacks of llvmlite by which LLVM reads and writes its cache of compiled code; exceptions in them are not handled.
 _OF_THE_COMPILER = ("_raw_object_cache_notify", "_raw_object_cache_getbuffer")
 
 _pending = False
@@ -34,9 +34,9 @@ def _compiler_waits(frame: FrameType | None) -> bool:
 
 @contextmanager
 def handled() -> Iterator[list[int]]:
-    """Within: the ``STOP_SIGNALS`` raise KeyboardInterrupt, see above; gives the signals that came.
+    """Let the ``STOP_SIGNALS`` raise KeyboardInterrupt within the block, see above; yield the list of received signals.
 
-    One that is ignored (``nohup``) or that somebody else handles stays so.
+    A signal that is ignored (``nohup``) or has another handler is left alone.
     """
     global _pending, _kept
     received: list[int] = []
@@ -61,45 +61,45 @@ def handled() -> Iterator[list[int]]:
 
 
 def exit_code(received: Sequence[int]) -> int:
-    """Of a process that a signal ended: 128 and the number of the first; that of Ctrl-C where none was received."""
+    """Return the exit code of a process ended by signals: 128 plus the first signal; by default SIGINT (Ctrl-C)."""
     return 128 + (received[0] if received else signal.SIGINT)
 
 
 def keep() -> None:
-    """From here on signals wait: a result is being made or saved."""
+    """Postpone signals from here on, because a result is being computed or saved."""
     global _kept
     _kept = True
 
 
 def heed() -> None:
-    """Signals are handled again; one that came in between is raised by the next :func:`check`."""
+    """Handle signals again; the next :func:`check` raises for a signal received in between."""
     global _kept
     _kept = False
 
 
 def check() -> None:
-    """Raise KeyboardInterrupt for a signal that waits, or whose own was lost."""
+    """Raise KeyboardInterrupt for a signal that was postponed or whose exception was lost."""
     if _pending:
         raise KeyboardInterrupt
 
 
 def answered() -> None:
-    """The last signal has been handled: :func:`check` need not raise for it any more."""
+    """Mark the last signal as handled: :func:`check` no longer raises for it."""
     global _pending
     _pending = False
 
 
 def is_kept() -> bool:
-    """Whether signals wait, because a result is being made or saved."""
+    """Return whether signals are postponed, because a result is being computed or saved."""
     return _kept
 
 
 def leave() -> None:
-    """Note that a thread of this process goes on which nobody can end, nor waits for: it ends with the process."""
+    """Record that a thread of this process cannot be ended and is not waited for: it ends with the process."""
     global _left
     _left = True
 
 
 def is_left() -> bool:
-    """Whether there is such a thread."""
+    """Return whether there is such a thread."""
     return _left

@@ -14,29 +14,29 @@ from pydantic import BaseModel
 
 T = TypeVar("T")
 
-# Number of results of each kind that are kept: few, as successive runs of a sweep share most inputs.
+# Number of results kept for each kind: few, because successive runs of a sweep share most inputs.
 KEPT = 4
 
 
 class Memo:
-    """Results of pure functions, each found by the inputs from which it was computed.
+    """Results of pure functions, indexed by the inputs from which they were computed.
 
-    Numbers, texts and arrays are the same where their bits are (−0.0 is not 0.0, 1 is not 1.0), and so are tuples,
-    lists, dicts and configurations of such; anything else only where it is the same object, which must not be changed.
-    Whoever takes a result must not change it either. A function that raises is called again next time.
+    Numbers, texts and arrays are equal if their bits are equal (−0.0 is not 0.0, 1 is not 1.0), and so are tuples,
+    lists, dicts and configurations of them; any other object equals only itself and must not be changed. Callers must
+    not change a result either. A function that raises is called again next time.
     """
 
     def __init__(self) -> None:
         self._kept: dict[str, OrderedDict[Hashable, tuple[Any, Any]]] = {}
 
     def recall(self, kind: str, make: Callable[[], T], *inputs: Any) -> T:
-        """See :func:`recall`."""
+        """Return the result for these inputs, see the function :func:`recall`."""
         kept, key = self._kept.setdefault(kind, OrderedDict()), _bits(inputs)
         if key in kept:
             kept.move_to_end(key)
             return cast(T, kept[key][1])
         result = make()
-        # With the inputs, so that no other object gets the identity of one that is gone.
+        # Keep the inputs too, so that no other object can reuse the identity of a deleted one.
         kept[key] = inputs, result
         if len(kept) > KEPT:
             kept.popitem(last=False)
@@ -48,7 +48,7 @@ _current: ContextVar[Memo | None] = ContextVar("memo", default=None)
 
 @contextmanager
 def remembering(memo: Memo | None = None) -> Iterator[None]:
-    """Within: :func:`recall` goes by this memo; by default by the one around, or a new one where there is none."""
+    """Use a memo for :func:`recall` within the block; default: the enclosing block's memo, or a new one."""
     token = _current.set(memo or _current.get() or Memo())
     try:
         yield
@@ -57,12 +57,16 @@ def remembering(memo: Memo | None = None) -> Iterator[None]:
 
 
 def recall(kind: str, make: Callable[[], T], *inputs: Any) -> T:
-    """What ``make`` gives, or gave within the same :func:`remembering` for the same inputs.
+    """Return the result of ``make``, or of an earlier call within the same :func:`remembering` for equal inputs.
 
     Parameters
     ----------
-    kind : of the result; each keeps the last :data:`KEPT`
-    inputs : all that the result depends on
+    kind : str
+        Kind of result; the last :data:`KEPT` results of each kind are kept.
+    make : callable
+        Computes the result.
+    inputs : Any
+        Everything that the result depends on.
     """
     memo = _current.get()
     return make() if memo is None else memo.recall(kind, make, *inputs)
@@ -83,6 +87,6 @@ def _bits(value: Any) -> Hashable:
     if value is None or kind in (int, bool, str, bytes):
         return kind, value
     if isinstance(value, BaseModel):
-        # Some say an error of what is set to its default, and none of what is left out.
+        # Some configurations refuse a key that is set to its default but accept it if omitted.
         return kind, frozenset(value.model_fields_set), _bits(value.__dict__), _bits(value.__pydantic_private__)
     return kind, id(value)

@@ -9,12 +9,12 @@ SHIPPED = _CHECKOUT if _CHECKOUT.is_dir() else Path(__file__).resolve().parents[
 
 
 def shipped_scenarios() -> list[Path]:
-    """Scenario files that come with dynsim."""
+    """Return the scenario files that come with dynsim."""
     return sorted(SHIPPED.glob("*.yaml"))
 
 
 def shipped_scenario(path: Path) -> Path | None:
-    """The shipped file that a name without a folder (or in ``scenarios``) means, None when there is none."""
+    """Return the shipped file for a name without a folder (or in ``scenarios``), or None."""
     if path.parent not in (Path(), Path("scenarios")):
         return None
     files = {file.name: file for file in shipped_scenarios()}

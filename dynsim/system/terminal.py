@@ -25,7 +25,7 @@ _UNFIT = {"Cc", "Cf", "Cs", "Zl", "Zp"}
 
 
 def plain(text: object) -> str:
-    r"""A text with every character that a terminal might obey written out: ESC as ``\x1b``. Lines stay lines."""
+    r"""Return a text in which control characters are written out (ESC as ``\x1b``); line breaks are kept."""
     written = str(text)
     if written.isprintable():
         return written
@@ -36,29 +36,29 @@ def plain(text: object) -> str:
 
 
 def escaped(text: object) -> str:
-    """A text for a place where rich reads markup: as :func:`plain`, and ``[red]`` stays ``[red]``."""
+    """Return a text for use where rich reads markup: as :func:`plain`, and ``[red]`` is printed literally."""
     return escape(plain(text))
 
 
 def escaped_line(text: object) -> str:
-    r"""As :func:`escaped`, of a name or a sentence: a line break stays in the line, as ``\n``."""
+    r"""Return :func:`escaped` of a name or a sentence, with line breaks written as ``\n``."""
     return escape(plain(text).replace("\n", "\\n"))
 
 
 class Terminal(Console):
-    """A console that prints control characters in escaped form, also in texts of other libraries.
+    """Console that prints control characters in escaped form, also in texts of other libraries.
 
-    Markup is interpreted if the console is set up to: texts that are inserted into markup need :func:`escaped`.
+    Markup is interpreted if the console is set up to: texts inserted into markup need :func:`escaped`.
     """
 
     @property
     def unbounded(self) -> bool:
-        """A file or a pipe, of which nobody has said how wide it is."""
+        """Whether the output is a file or a pipe of unknown width."""
         return not self.is_terminal and self._width is None
 
     @property
     def size(self) -> ConsoleDimensions:
-        """That of the terminal or of COLUMNS; without either lines end where they end."""
+        """Size of the terminal, or from COLUMNS; without either, lines are not wrapped."""
         return ConsoleDimensions(UNBOUNDED, super().size.height) if self.unbounded else super().size
 
     @size.setter
@@ -66,11 +66,11 @@ class Terminal(Console):
         self._width, self._height = new_size
 
     def render_str(self, text: str, **options: Any) -> Text:
-        """Cells, titles and prints all come by here."""
+        """Render text without control characters; cells, titles and prints all pass through here."""
         return super().render_str(plain(text), **options)
 
 
-# Standard output and error whose failures do not end a run: closed pipes, full disks, ASCII terminals.
+# Standard output and error whose failures (closed pipes, full disks, ASCII terminals) do not end a run.
 
 
 # Characters that dynsim prints → their replacements in encodings that lack them; others become "?".
@@ -91,7 +91,7 @@ codecs.register_error("dynsim.plain", _plain)
 
 
 class LenientStream:
-    """A text stream that discards its output from its first failure on, which ``failure`` keeps."""
+    """Text stream that discards its output after its first failure, stored in ``failure``."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -114,7 +114,7 @@ class LenientStream:
 
     def _give_up(self, error: OSError) -> None:
         self.failure = error
-        # What is still in its buffer would fail once more when Python ends.
+        # The content of its buffer would fail again when Python ends.
         with suppress(OSError, ValueError):
             nowhere = os.open(os.devnull, os.O_WRONLY)
             os.dup2(nowhere, self._stream.fileno())
@@ -125,21 +125,21 @@ class LenientStream:
 
 
 def hold_descriptors() -> None:
-    """Let the descriptors of closed standard streams lead nowhere.
+    """Redirect the descriptors of closed standard streams to the null device.
 
-    The next files opened would get them: what a library prints would go to a record, or to the servos.
+    Otherwise the next files opened would get them, and the output of a library would go to a record, or to the servos.
     """
     for descriptor in (0, 1, 2):
         try:
             os.fstat(descriptor)
         except OSError:
-            # The system gives the lowest that is free.
+            # The system assigns the lowest free descriptor.
             os.open(os.devnull, os.O_RDWR)
 
 
 @contextmanager
 def lenient_streams() -> Iterator[LenientStream | None]:
-    """Within the block standard output and error are lenient; gives standard output, None where it is closed."""
+    """Make standard output and error lenient within the block; yield standard output, or None if it is closed."""
     hold_descriptors()
     before = sys.stdout, sys.stderr
     with _encodable(sys.stdout), _encodable(sys.stderr):
@@ -157,7 +157,7 @@ def lenient_streams() -> Iterator[LenientStream | None]:
 
 @contextmanager
 def _encodable(stream: Any) -> Iterator[None]:
-    """Signs that the stream's encoding lacks are written in plain letters."""
+    """Write characters that the stream's encoding lacks as plain letters."""
     if not hasattr(stream, "reconfigure"):
         yield
         return
@@ -166,6 +166,6 @@ def _encodable(stream: Any) -> Iterator[None]:
     try:
         yield
     finally:
-        # Fails only where a stream cannot be flushed.
+        # Fails only if a stream cannot be flushed.
         with suppress(OSError, ValueError):
             stream.reconfigure(errors=before)

@@ -1,8 +1,8 @@
-"""Solver of small dense (Delassus) systems for the forces of constraint rows, which may be linearly dependent.
+"""Small dense (Delassus) systems of constraint forces: solver for dependent rows, split of the load, uniqueness test.
 
-One row format for every constraint: up to two links, ROW (the constrained motion is ROW · V), TARGET (what J vdot must
-be) and DIRECTION (the wrench of a unit force). Under sliding friction row and direction differ, so the p×p matrix is
-not symmetric then.
+One row format serves every constraint: up to two links, ROW (the constrained motion is ROW · V), TARGET (the required
+J vdot) and DIRECTION (the wrench of a unit force). Under sliding friction row and direction differ, so the p×p matrix
+is not symmetric.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from dynsim.dynamics.tree.articulated import change_accelerations
 from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
 # A pivot below this fraction of the largest entry counts as a dependent row: far above rounding (1e-16 times a few
-# dozen operations), far below what independent elbows give (> 1e-6).
+# dozen operations), far below the pivots of independent elbows (> 1e-6).
 RANK_TOLERANCE = 1e-10
 
 
@@ -38,9 +38,12 @@ def solve_small(small, state, active, p):
 
     Parameters
     ----------
-    small : (4, p or more, p or more)
+    small : (4, p or more, p or more) ndarray
         Matrix, not symmetric under friction, and scratch.
-    state, active : (p or more, ROW_STATE_SIZE), (p or more, ACTIVE_SIZE) int
+    state : (p or more, ROW_STATE_SIZE) ndarray
+        Table of rows.
+    active : (p or more, ACTIVE_SIZE) ndarray of int
+        Table of active rows.
     """
     if p == 1 and abs(small[0, 0, 0]) > state[0, ka.ROW_FLOOR]:
         state[0, ka.FORCE] = state[0, ka.RHS] / small[0, 0, 0]
@@ -51,7 +54,7 @@ def solve_small(small, state, active, p):
     if p == 2:
         a, b, c, d = small[0, 0, 0], small[0, 0, 1], small[0, 1, 0], small[0, 1, 1]
         determinant = a * d - b * c
-        # Well conditioned: Cramer's rule loses no more than the elimination.
+        # Well conditioned: Cramer's rule is as accurate as elimination.
         floors = state[0, ka.ROW_FLOOR] * state[1, ka.ROW_FLOOR]
         if abs(determinant) > 1e-3 * (abs(a * d) + abs(b * c)) + floors:
             x, y = state[0, ka.RHS] / determinant, state[1, ka.RHS] / determinant
@@ -62,7 +65,7 @@ def solve_small(small, state, active, p):
 
 @noinline_kernel
 def eliminate(small, state, active, p):
-    """:func:`solve_small` for any number of rows, without the closed forms."""
+    """Do the work of :func:`solve_small` for any number of rows, without closed forms."""
     largest = largest_entry(small, state, p)
     for i in range(p):
         state[i, ka.FORCE] = state[i, ka.RHS]
@@ -73,7 +76,7 @@ def eliminate(small, state, active, p):
         for i in range(k + 1, p):
             if abs(small[1, i, k]) > abs(small[1, best, k]):
                 best = i
-        # Written so that NaN falls through to the plain elimination and is seen by the integrator.
+        # Written so that NaN falls through to plain elimination, where the integrator detects it.
         if abs(small[1, best, k]) <= RANK_TOLERANCE * largest:
             return least_norm(small, state, active, p, largest)
         if best != k:
@@ -97,20 +100,20 @@ def eliminate(small, state, active, p):
 
 @noinline_kernel
 def solve_dependent(small, state, active, p):
-    """:func:`solve_small` of rows that are known to depend on each other.
+    """Solve as :func:`solve_small` for rows that are known to depend on each other.
 
-    Pivots of columns in their order may not show it: the last one is the inverse of an entry of the inverse, large for
-    a row with almost no part in the dependence. Forces would be as large as rounding allows.
+    Pivots of columns in their order may not show it: the last pivot is the inverse of an entry of the inverse, large
+    for a row with almost no part in the dependence. Forces would be as large as rounding allows.
     """
     return least_norm(small, state, active, p, largest_entry(small, state, p))
 
 
 @internal_kernel
 def largest_entry(small, state, p):
-    """Return the size that pivots are compared with."""
+    """Return the size to which pivots are compared."""
     largest = 0.0
     for i in range(p):
-        # A row without mobility is dependent even if no other row has more.
+        # A row without mobility is dependent even if no other row has a larger mobility.
         largest = max(largest, state[i, ka.ROW_FLOOR] / RANK_TOLERANCE)
         for j in range(p):
             largest = max(largest, abs(small[0, i, j]))
@@ -168,7 +171,7 @@ def least_norm(small, state, active, p, largest):
     for k in range(r):
         state[k, ka.FORCE] -= part[k]
     multiply_transposed(wide, state, r, d)
-    # Back to the order of the rows.
+    # Restore the order of the rows.
     for k in range(p):
         part[k] = state[k, ka.FORCE]
     for k in range(p):
@@ -178,9 +181,9 @@ def least_norm(small, state, active, p, largest):
 
 @internal_kernel
 def eliminate_to_rank(small, state, active, p, largest):
-    """Rank of ``small[1]`` by its elimination; multipliers stay below the diagonal.
+    """Return the rank of ``small[1]`` by elimination; multipliers stay below the diagonal.
 
-    ``largest``: size of the largest entry of ``small[0]``, see :func:`largest_entry`.
+    ``largest`` is the size of the largest entry of ``small[0]``, see :func:`largest_entry`.
 
     A column without a pivot goes to the end and is finished: elimination would not add larger terms to it.
     """
@@ -226,7 +229,7 @@ def eliminate_to_rank(small, state, active, p, largest):
 
 @internal_kernel
 def largest_in_column(matrix, column, start, p):
-    """Row of the largest entry of a column from row ``start`` on."""
+    """Return the row of the largest entry of a column from row ``start`` on."""
     best = start
     for i in range(start + 1, p):
         if abs(matrix[i, column]) > abs(matrix[best, column]):
@@ -236,7 +239,7 @@ def largest_in_column(matrix, column, start, p):
 
 @internal_kernel
 def swap_columns(matrix, active, p, j, k):
-    """Exchange two columns, and their places in ORDER."""
+    """Exchange two columns and their entries in ORDER."""
     if j != k:
         for i in range(p):
             matrix[i, j], matrix[i, k] = matrix[i, k], matrix[i, j]
@@ -245,7 +248,7 @@ def swap_columns(matrix, active, p, j, k):
 
 @internal_kernel
 def multiply_transposed(wide, state, r, d):
-    """wideᵀ x of the first r forces x into the d forces behind them; wide: (r, d)."""
+    """Write wideᵀ x of the first r forces x to the d forces after them; wide: (r, d)."""
     for a in range(d):
         state[r + a, ka.FORCE] = 0.0
     for k in range(r):
@@ -256,12 +259,13 @@ def multiply_transposed(wide, state, r, d):
 
 @internal_kernel
 def apply_normal(small, state, p, r):
-    """X (1 + Xᵀ X)⁻¹ t = (1 + X Xᵀ)⁻¹ X t by the smaller of the two; X: ``small[2]``, (r, p − r), t: FORCE from r on.
+    """Compute X (1 + Xᵀ X)⁻¹ t = (1 + X Xᵀ)⁻¹ X t by the smaller system.
 
-    The result, (r,), goes into the last row of ``small[3]``; the last row of ``small[2]``, free of X, is scratch.
+    X is ``small[2]``, (r, p − r), t is FORCE from r on. The result, (r,), goes to the last row of ``small[3]``; the
+    last row of ``small[2]``, free of X, is scratch.
     """
     X, gram, x, t, d = small[2], small[3], small[3, p - 1], small[2, p - 1], p - r
-    if d == 1:  # as two braces that stick on a planar arm have it
+    if d == 1:  # for example two braces that stick on a planar arm
         total = 1.0
         for k in range(r):
             total += X[k, 0] * X[k, 0]
@@ -297,7 +301,7 @@ def apply_normal(small, state, p, r):
 
 @internal_kernel
 def solve_definite(gram, x, size):
-    """Solve gram y = x in place by Cholesky, Rᵀ R of the upper triangle; by outer products, loops run along rows."""
+    """Solve gram y = x in place by Cholesky, Rᵀ R of the upper triangle; outer products let loops run along rows."""
     for a in range(size):
         inverse = 1.0 / math.sqrt(gram[a, a])
         for b in range(a, size):
@@ -319,17 +323,17 @@ def solve_definite(gram, x, size):
 # Split of forces among dependent rows of sticking points, held joints and stops, within their bounds if possible.
 
 
-# A unit direction of splits whose part along a normal row is smaller leaves that normal force as it is.
+# A unit split direction whose component along a normal row is smaller does not change that normal force.
 NORMAL_PART = 1e-6
-# A direction with a smaller square in the leading rows has its other parts alone: of couplings behind closed brakes.
+# A direction with a smaller square in the leading rows changes other rows only: couplings behind closed brakes.
 NO_LEADING = 1e-20
-# Instead of a bound: of stops, which push one way.
+# Value in place of a bound, for stops, which push one way.
 ONE_WAY = -1.0
 
 
 @internal_kernel
 def margin(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace, k):
-    """μ_s f_n − |f_t| of candidate k, which sticks [N]."""
+    """Return μ_s f_n − |f_t| of sticking candidate k [N]."""
     r, rows = ws.active[k, ka.FIRST_ROW], ws.rows
     a, b = rows[r + 1, ka.FORCE], rows[r + 2, ka.FORCE]
     return unilateral.number[ku.HOLDING] * contacts.law[k, ka.STATIC] * rows[r, ka.FORCE] - math.sqrt(a * a + b * b)
@@ -337,26 +341,26 @@ def margin(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace,
 
 @internal_kernel
 def dry_margin(unilateral: UnilateralArrays, ws: Workspace, k):
-    """Margin of dry friction that holds a joint: its bound minus its force [N m or N]."""
+    """Return the margin of dry friction that holds a joint: its bound minus its force [N m or N]."""
     return holding_bound(unilateral, k) - abs(ws.rows[unilateral.dry_table[k, ku.DRY_ROW], ka.FORCE])
 
 
 @internal_kernel
 def admissible_forces(model: ModelArrays, contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: Workspace):
-    """Replace the forces of dependent rows that stick where they are beyond their bounds; note those of joints.
+    """Replace forces of dependent sticking rows that exceed their bounds, and record forces of joints.
 
-    The forces change in the null space of the rows: accelerations only change as far as rows are not quite dependent.
+    The forces change in the null space of the rows: accelerations change only if rows are not fully dependent.
     """
-    if unilateral is None:  # known to the compiler
+    if unilateral is None:  # resolved at compile time
         return
-    # Small, because it is merged into the right-hand side.
+    # Small, because it is inlined into the right-hand side.
     if unilateral.number[ku.REDUNDANT] == 1.0 or unilateral.stop.shape[0] + unilateral.dry.shape[0] > 0:
         look_at_forces(model, contacts, unilateral, ws)
 
 
 @noinline_kernel
 def look_at_forces(model: ModelArrays, contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace):
-    """:func:`admissible_forces` where there are dependent rows, stops or dry friction."""
+    """Do the work of :func:`admissible_forces` if there are dependent rows, stops or dry friction."""
     unilateral.number[ku.SPLIT] = 0.0
     if unilateral.number[ku.REDUNDANT] == 1.0 and beyond_bounds(contacts, unilateral, ws):
         split_forces(model, contacts, unilateral, ws)
@@ -366,7 +370,7 @@ def look_at_forces(model: ModelArrays, contacts: ContactArrays, unilateral: Unil
 
 @internal_kernel
 def beyond_bounds(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace):
-    """True if a sticking point or a held joint has more force than its friction can have, or a closed stop pulls."""
+    """True if a sticking point or held joint needs more force than its friction allows, or a closed stop pulls."""
     for k in range(ws.contacts.shape[0]):
         if ws.active[k, ka.MODE] == ka.STICKING and margin(contacts, unilateral, ws, k) < 0.0:
             return True
@@ -382,10 +386,10 @@ def beyond_bounds(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Wor
 
 @noinline_kernel
 def split_forces(model: ModelArrays, contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace):
-    """The best split of the forces of all that sticks, into FORCE of its rows; its worst margin into BEST_MARGIN.
+    """Compute the best split of all sticking forces, in FORCE of the rows; its worst margin goes to BEST_MARGIN.
 
-    Pivots of J M⁻¹ Jᵀ are squares: rows that count as dependent at a pivot of 1e-10 may differ by 1e-5, and a change of
-    split by as much of the forces. Accelerations take this change, so that they agree with the forces.
+    Pivots of J M⁻¹ Jᵀ are squares: rows that count as dependent at a pivot of 1e-10 may differ by 1e-5, and then a
+    change of split changes accelerations by this fraction. They are updated to agree with the forces.
     """
     room, index, mu, rows = unilateral.room, unilateral.index, unilateral.vector[0], ws.rows
     first, row = index[0], index[1]
@@ -423,7 +427,7 @@ def split_forces(model: ModelArrays, contacts: ContactArrays, unilateral: Unilat
 
 @internal_kernel
 def change_of_coupling(N, width, i, force, out, p):
-    """Change of the force of row i, a coupling, when forces of the leading p rows change from ``force`` to ``out``."""
+    """Return the change of coupling force i when forces of the leading p rows change from ``force`` to ``out``."""
     total = 0.0
     for c in range(width):
         part = 0.0
@@ -435,14 +439,21 @@ def change_of_coupling(N, width, i, force, out, p):
 
 @internal_kernel
 def find_splits(unilateral: UnilateralArrays, ws: Workspace):
-    """Directions in which the forces of all that sticks may change, into NULL_SPACE, right after ``derivative``.
+    """Write the directions in which sticking forces may change to NULL_SPACE, right after ``derivative``.
 
-    index[0] is the first row of each sticking point, then of each held joint, then of each closed stop, and index[1]
-    the rows in the table, with those of couplings behind them: their forces change with the others, within no bound.
+    index[0] is the first row of each sticking point, then of each held joint, then of each closed stop; index[1] has
+    the rows in the table, followed by the coupling rows: their forces change with the others, without bounds.
 
     Returns
     -------
-    points, count, p, ties : sticking points; points, held joints and stops; their rows; rows of couplings
+    points : int
+        Number of sticking points.
+    count : int
+        Number of sticking points, held joints and closed stops.
+    p : int
+        Number of their rows.
+    ties : int
+        Number of coupling rows.
     """
     room, first, row = unilateral.room, unilateral.index[0], unilateral.index[1]
     count, p = 0, 0
@@ -478,7 +489,7 @@ def find_splits(unilateral: UnilateralArrays, ws: Workspace):
 
 @internal_kernel
 def first_split_row(ws: Workspace, k):
-    """First row of candidate k, which sticks, in the splits found last."""
+    """Return the first row of sticking candidate k in the last splits."""
     row = 0
     for j in range(k):
         row += ka.MOST_ROWS if ws.active[j, ka.MODE] == ka.STICKING else 0
@@ -487,20 +498,20 @@ def first_split_row(ws: Workspace, k):
 
 @internal_kernel
 def normal_is_open(unilateral: UnilateralArrays, ws: Workspace, k):
-    """True if the splits found last leave the normal force of candidate k, which sticks, undetermined."""
+    """True if the last splits leave the normal force of sticking candidate k undetermined."""
     return row_shares(unilateral, first_split_row(ws, k))
 
 
 @internal_kernel
 def point_shares(unilateral: UnilateralArrays, ws: Workspace, k):
-    """True if the splits found last leave a force of candidate k, which sticks, undetermined."""
+    """True if the last splits leave a force of sticking candidate k undetermined."""
     row = first_split_row(ws, k)
     return row_shares(unilateral, row) or row_shares(unilateral, row + 1) or row_shares(unilateral, row + 2)
 
 
 @internal_kernel
 def joint_shares(unilateral: UnilateralArrays, ws: Workspace, k):
-    """True if the splits found last leave the dry friction that holds joint k undetermined."""
+    """True if the last splits leave the dry friction that holds joint k undetermined."""
     row = ka.MOST_ROWS * ws.counts[ka.STUCK]
     for j in range(k):
         row += unilateral.dry_table[j, ku.DRY_HOLDS]
@@ -509,7 +520,7 @@ def joint_shares(unilateral: UnilateralArrays, ws: Workspace, k):
 
 @internal_kernel
 def row_shares(unilateral: UnilateralArrays, row):
-    """True if the splits found last leave the force of one of their rows undetermined."""
+    """True if the last splits leave the force of one of their rows undetermined."""
     largest = 0.0
     for c in range(int(unilateral.number[ku.WIDTH])):
         largest = max(largest, abs(unilateral.room[ku.NULL_SPACE, row, c]))
@@ -518,7 +529,7 @@ def row_shares(unilateral: UnilateralArrays, row):
 
 @internal_kernel
 def stops_that_share(unilateral: UnilateralArrays):
-    """Number of closed stops whose forces the splits found last leave undetermined."""
+    """Return the number of closed stops whose forces the last splits leave undetermined."""
     sharing, closed = 0, 0
     for k in range(unilateral.stop_table.shape[0]):
         closed += unilateral.stop_table[k, ku.STOP_CLOSED]
@@ -530,7 +541,7 @@ def stops_that_share(unilateral: UnilateralArrays):
 
 @internal_kernel
 def null_space(W, p, N, order, leading):
-    """Basis of the null space of W, (p, p), symmetric and positive semidefinite, into N, (p, width).
+    """Write a basis of the null space of W, (p, p), symmetric and positive semidefinite, to N, (p, width).
 
     It is orthonormal in its ``leading`` rows.
 
@@ -538,7 +549,8 @@ def null_space(W, p, N, order, leading):
 
     Returns
     -------
-    width : p minus the rank, less what changes nothing in the leading rows
+    width : int
+        p minus the rank, minus the directions that change nothing in the leading rows.
     """
     largest, rank = 0.0, 0
     for i in range(p):
@@ -571,7 +583,7 @@ def null_space(W, p, N, order, leading):
             for i in range(k + 1, rank):
                 total -= W[order[i], order[k]] * N[order[i], width]
             N[order[k], width] = total / W[order[k], order[k]]
-        # Twice is enough (Kahan, Parlett).
+        # Orthogonalising twice is enough (Kahan, Parlett).
         for _ in range(2):
             for b in range(width):
                 part = 0.0
@@ -597,20 +609,20 @@ UNIQUE, REVERSED, SEVERAL = 0, 1, 2
 # Blocks of the scratch ``room``, (ROOM, p, p); of SIGNS and FORCES only the first row is used.
 FRICTIONLESS, FRICTION, BASIS, MATRIX, PRODUCT, SIGNS, FORCES = 0, 1, 2, 3, 4, 5, 6
 ROOM = 7
-# A determinant above this fraction of the bound by its terms is clearly positive.
+# A determinant above this fraction of the bound from its terms is clearly positive.
 CLEAR = 1e-3
-# A normal mobility below this fraction of that along the force is the square of rounding.
+# A normal mobility below this fraction of the mobility along the force is the square of rounding.
 IMMOBILE = 1e-24
-# Rounding: below these fractions a diagonal entry or a force has no sign, and two solutions are the same one.
+# Rounding: below these fractions a diagonal entry or a force has no sign, and two solutions are equal.
 DIAGONAL_TOLERANCE = 1e-12
 FORCE_TOLERANCE = 1e-9
 
 
 @internal_kernel
 def clearly_unique(ws: Workspace):
-    """True for no row, and for one or two without dissipative friction whose determinant is positive by far.
+    """True without rows, or for one or two rows without dissipative friction whose determinant is clearly positive.
 
-    Small, because it is merged into the step: passing the tables to the rest of the watch costs as much as a sweep.
+    Small, because it is inlined into the step: passing the tables to the full check costs as much as a sweep.
     """
     small, p = ws.small, ws.counts[ka.ROWS]
     if p == 0 or p > 2:
@@ -626,7 +638,7 @@ def clearly_unique(ws: Workspace):
 
 @internal_kernel
 def dominant(ws: Workspace, room):
-    """True without friction, and when every A(σ) is strictly diagonally dominant, so that none of them is singular."""
+    """True without friction, or if every A(σ) is strictly diagonally dominant, so that none is singular."""
     small, p = ws.small, ws.counts[ka.ROWS]
     frictional = False
     for k in range(p):
@@ -650,15 +662,15 @@ def dominant(ws: Workspace, room):
 
 @internal_kernel
 def last_link(ws: Workspace, k):
-    """The last link that row k touches."""
+    """Return the last link that row k involves."""
     return max(ws.active[k, ka.BODY_A], ws.active[k, ka.BODY_B])
 
 
 @internal_kernel
 def split_matrix(ws: Workspace, room):
-    """A0 and B into ``room``, from the eliminated rows and the matrix that the derivative has left in ``ws``.
+    """Write A0 and B to ``room``, from the eliminated rows and the matrix that the derivative left in ``ws``.
 
-    A row's column is zero beyond its own links, and links come after their parents.
+    The column of a row is zero beyond its own links, and links come after their parents.
     """
     active, column, links, state = ws.active, ws.column, ws.links, ws.rows
     p = ws.counts[ka.ROWS]
@@ -677,15 +689,17 @@ def split_matrix(ws: Workspace, room):
 
 @internal_kernel
 def force_verdict(ws: Workspace, room, since, t):
-    """UNIQUE, or why the constraint forces at the state of ``ws`` are not determined, right after ``derivative``.
+    """Return UNIQUE, or why the constraint forces at the state of ``ws`` are not unique, right after ``derivative``.
 
-    REVERSED: the determinant of J M⁻¹ F with the present signs, per that without friction, is not positive, or every
-    diagonal entry is negative. SEVERAL: other signs of dissipative contacts agree with their forces too.
+    REVERSED: the determinant of J M⁻¹ F with the present signs, relative to the frictionless one, is not positive, or
+    every diagonal entry is negative. SEVERAL: other signs of dissipative contacts also agree with their forces.
 
     Parameters
     ----------
-    room : (ROOM, p, p) scratch, or more
-    since : (c,) first time at which the contact's diagonal entry was negative [s], written here; inf: never
+    room : (ROOM or more, p or more, p or more) ndarray
+        Scratch.
+    since : (c,) ndarray
+        First time at which the contact's diagonal entry was negative [s], updated here; inf: never.
     """
     if dominant(ws, room):
         return UNIQUE
@@ -698,7 +712,7 @@ def force_verdict(ws: Workspace, room, since, t):
         own = room[FRICTIONLESS, k, k]
         if own > 0.0 and ws.small[0, k, k] < -DIAGONAL_TOLERANCE * own:
             negative += 1
-            # Only a frictional row can have it: that of a sliding point.
+            # Only the frictional row of a sliding point can have a negative entry.
             owner = ws.active[k, ka.OWNER]
             since[owner] = min(since[owner], t)
         if ws.rows[k, ka.ROW_MU] > 0.0 and ws.active[k, ka.LAW] == ka.FRICTION_DISSIPATIVE:
@@ -728,7 +742,7 @@ def force_verdict(ws: Workspace, room, since, t):
 
 @internal_kernel
 def drop_immobile(ws: Workspace, room):
-    """Zero the rows of points that no joint moves along their normals: what is left there is rounding, of any sign."""
+    """Zero the rows of points that no joint moves along their normals: their entries are rounding, of any sign."""
     p = ws.counts[ka.ROWS]
     for k in range(p):
         along = 0.0
@@ -741,7 +755,7 @@ def drop_immobile(ws: Workspace, room):
 
 @internal_kernel
 def frictionless_basis(room, p):
-    """A0 = L Lᵀ by Cholesky with pivoting: L, (p, rank), into ``room[BASIS]``; returns the rank."""
+    """Factor A0 = L Lᵀ by Cholesky with pivoting; L, (p, rank), goes to ``room[BASIS]``; return the rank."""
     largest = 0.0
     for k in range(p):
         room[FORCES, 0, k] = room[FRICTIONLESS, k, k]
@@ -766,9 +780,9 @@ def frictionless_basis(room, p):
 
 @internal_kernel
 def solve_choice(ws: Workspace, room, rank):
-    """Sign of the determinant of A(σ) for the signs in ``room``; the forces into ``room[FORCES, 0]`` at full rank.
+    """Return the sign of the determinant of A(σ) for the signs in ``room``; forces go to ``room[FORCES, 0]``.
 
-    Dependent rows: of Lᵀ A(σ) L, the forces that supports of equal stiffness have, which lie in the range of A0.
+    For dependent rows, Lᵀ A(σ) L is used: supports of equal stiffness have these forces, in the range of A0.
     """
     p = ws.counts[ka.ROWS]
     target = MATRIX if rank == p else PRODUCT
@@ -789,7 +803,7 @@ def solve_choice(ws: Workspace, room, rank):
 
 @internal_kernel
 def eliminate_square(room, size):
-    """Solve the leading ``size`` rows of ``room[MATRIX]`` x = ``room[FORCES, 0]``; returns the determinant's sign."""
+    """Solve the leading ``size`` rows of ``room[MATRIX]`` x = ``room[FORCES, 0]``; return the determinant's sign."""
     matrix, x, sign = room[MATRIX], room[FORCES, 0], 1.0
     for k in range(size):
         best = k
@@ -819,7 +833,7 @@ def eliminate_square(room, size):
 
 @internal_kernel
 def another_solution(ws: Workspace, room):
-    """True when the forces in ``room`` have the signs that they were solved for and differ from those of ``ws``."""
+    """True if the forces in ``room`` have the signs that they were solved for and differ from the forces of ``ws``."""
     largest, difference, p = 0.0, 0.0, ws.counts[ka.ROWS]
     for k in range(p):
         force = room[FORCES, 0, k]

@@ -1,8 +1,8 @@
 """Signed distances φ from surfaces, with unit normal n = ∇φ and curvature H = ∂²φ, and the nearest point of an axis.
 
-Plane, sphere, cylinder: exact everywhere. Box: with edges rounded by a radius, exact outside and down to that radius
-inside; n is continuous, H jumps where a flat face meets its round edge (φ is C¹). Height field z = h(x, y), a bicubic
-C² spline: exact along the normal through the foot point, n and H are continuous.
+Plane, sphere, cylinder: exact everywhere. Box: edges rounded by a radius, exact outside and down to that radius inside;
+n is continuous, H jumps where a flat face meets its round edge (φ is C¹). Height field z = h(x, y), a bicubic C²
+spline: exact along the normal through the foot point; n and H are continuous.
 """
 
 from __future__ import annotations
@@ -16,31 +16,31 @@ from dynsim.jit.kernel import internal_kernel, kernel
 
 # ShapeArrays.kind, int
 SURFACE = 0  # one of the kinds below
-MOVES = 1  # 1: the axis touches at its point nearest to the surface, 0: at its beginning
-FIELD = 2  # of a height field: where its coefficients begin in ShapeArrays.fields
-COUNT = 3  # 2: its numbers of grid lines along x and y
+MOVES = 1  # 1: the axis touches at its point nearest to the surface, 0: at its start
+FIELD = 2  # height field: start of its coefficients in ShapeArrays.fields
+COUNT = 3  # 2: numbers of grid lines along x and y
 SHAPE_KIND_SIZE = 5
 # Surfaces; AS_POINT: a point on the quadric of ContactArrays
 AS_POINT, PLANE, SPHERE, CYLINDER, BOX, HEIGHT_FIELD = 0, 1, 2, 3, 4, 5
 # ShapeArrays.data
 RADIUS = 0  # ρ [m]
-D = 1  # 3: axis from its beginning to its end, in the body's frame [m]
-POSITION = 4  # 3: a point of a plane or an axis, a centre, the first point of a grid (without height) [m]
+D = 1  # 3: axis from its start to its end, in the body's frame [m]
+POSITION = 4  # 3: point of a plane or an axis, centre, or first point of a grid (without height) [m]
 AXES = 7  # 9: normal of a plane, axis of a cylinder; axes of a box in W, one after the other
-SIZE = 16  # 3: radius, negative where inside is free; half edges of a box without its rounding; spacing of a grid [m]
+SIZE = 16  # 3: radius, negative if the inside is free; half edges of a box without rounding; spacing of a grid [m]
 EDGE = 19  # radius of the edges of a box [m]
 SHAPE_SIZE = 20
 
-# Steps to the foot point on a height field; from a few spacings away three to five are enough.
+# Steps to the foot point on a height field; from a few grid spacings away three to five are enough.
 FOOT_STEPS = 40
-# A step of that many spacings is the last one: convergence is quadratic.
+# A step below this number of spacings is the last one: convergence is quadratic.
 FOOT_TOLERANCE = 1e-9
-# Bisections of an axis over a box, of which most are Newton's steps.
+# Steps along an axis over a box: Newton steps, mostly, or bisections.
 AXIS_STEPS = 60
 
 
 class ShapeArrays(NamedTuple):
-    """Candidates by their shapes and their surfaces."""
+    """Candidates with their shapes and surfaces."""
 
     kind: np.ndarray  # (c, SHAPE_KIND_SIZE) int
     data: np.ndarray  # (c, SHAPE_SIZE)
@@ -49,7 +49,7 @@ class ShapeArrays(NamedTuple):
 
 @internal_kernel
 def distance(shapes: ShapeArrays, k, x, y, z):
-    """φ [m], n (3 numbers) and H (xx xy xz yy yz zz) [1/m] at a point of W, for the surface of candidate k."""
+    """Return φ [m], n (3 numbers) and H (xx xy xz yy yz zz) [1/m] at a point of W, for the surface of candidate k."""
     kind, data = shapes.kind[k, SURFACE], shapes.data
     if kind == HEIGHT_FIELD:
         return field_distance(shapes, k, x, y, z)
@@ -59,7 +59,7 @@ def distance(shapes: ShapeArrays, k, x, y, z):
         return nx * x + ny * y + nz * z, nx, ny, nz, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     if kind == BOX:
         return box_distance(shapes, k, x, y, z)
-    # Sphere and cylinder: H = (1 − n nᵀ)/r, without what lies along the axis of a cylinder.
+    # Sphere and cylinder: H = (1 − n nᵀ)/r, without the part along the axis of a cylinder.
     if kind == CYLINDER:
         along = nx * x + ny * y + nz * z
         x, y, z = x - along * nx, y - along * ny, z - along * nz
@@ -85,10 +85,11 @@ def distance(shapes: ShapeArrays, k, x, y, z):
 
 @internal_kernel
 def box_distance(shapes: ShapeArrays, k, x, y, z):
-    """As :func:`distance` for a box whose centre is the origin.
+    """Do :func:`distance` for a box centred at the origin.
 
-    With p in its axes, b its half edges without the rounding r, and o = max(|p| − b, 0): φ = |o| − r outside the core
-    b, n and H those of a plane, a cylinder or a sphere by how many components o has. Within the core: the nearest face.
+    With p in its axes, half edges b without the rounding r, and o = max(|p| − b, 0): outside the core b, φ = |o| − r,
+    and n and H belong to a plane, a cylinder or a sphere if o has one, two or three components. Within the core: the
+    nearest face.
     """
     data = shapes.data
     px = data[k, AXES] * x + data[k, AXES + 1] * y + data[k, AXES + 2] * z
@@ -103,11 +104,11 @@ def box_distance(shapes: ShapeArrays, k, x, y, z):
         ox, oy, oz = max(ox, 0.0), max(oy, 0.0), max(oz, 0.0)
         r = math.sqrt(ox * ox + oy * oy + oz * oz)
         far = r
-    # Axes along which φ is bent: those with a component, when there are several.
+    # Axes along which φ is curved: axes with a component of o, if there are several.
     fx, fy, fz = 1.0 if ox > 0.0 else 0.0, 1.0 if oy > 0.0 else 0.0, 1.0 if oz > 0.0 else 0.0
     h = 1.0 / r if fx + fy + fz > 1.0 else 0.0
     ox, oy, oz = math.copysign(ox, px) / r, math.copysign(oy, py) / r, math.copysign(oz, pz) / r
-    # In the axes of the box H = h (diag(f) − o oᵀ); to W with the axes as rows.
+    # In the axes of the box H = h (diag(f) − o oᵀ); transform to W with the axes as rows.
     x0, x1, x2 = data[k, AXES], data[k, AXES + 1], data[k, AXES + 2]
     y0, y1, y2 = data[k, AXES + 3], data[k, AXES + 4], data[k, AXES + 5]
     z0, z1, z2 = data[k, AXES + 6], data[k, AXES + 7], data[k, AXES + 8]
@@ -128,14 +129,14 @@ def box_distance(shapes: ShapeArrays, k, x, y, z):
 
 @internal_kernel
 def field_distance(shapes: ShapeArrays, k, x, y, z):
-    """As :func:`distance` for a height field, by the foot point c = (u, v, h(u, v)) at which the point lies along n.
+    """Do :func:`distance` for a height field, by the foot point c = (u, v, h(u, v)) at which the point lies along n.
 
     Newton's method on ½ |r − c|², from the point of the field straight below; with e = z − h, X = ∂c/∂(u, v), G = XᵀX
-    its second derivative is G − e ∂²h. Halved steps where the distance grows. Then φ = n·(r − c) and
+    its second derivative is G − e ∂²h. Steps are halved if the distance grows. Then φ = n·(r − c) and
 
         H = X G⁻¹ B (G + φ B)⁻¹ Xᵀ,   B = −∂²h / √(1 + |∇h|²):
 
-    a step of r moves c by X (G + φ B)⁻¹ Xᵀ dr, and n by X G⁻¹ B times that. Valid within the radius of curvature.
+    a step dr moves c by X (G + φ B)⁻¹ Xᵀ dr, and n by X G⁻¹ B times that. Valid within the radius of curvature.
     """
     data = shapes.data
     size = min(data[k, SIZE], data[k, SIZE + 1])
@@ -155,7 +156,7 @@ def field_distance(shapes: ShapeArrays, k, x, y, z):
             guu, guv, gvv = 1.0 + p * p, p * q, 1.0 + q * q
             muu, muv, mvv = guu - e * a, guv - e * b, gvv - e * c
             det = muu * mvv - muv * muv
-            if not (muu > 0.0 and det > 1e-3 * guu * gvv):  # not a minimum nearby: Gauss and Newton's step
+            if not (muu > 0.0 and det > 1e-3 * guu * gvv):  # no minimum nearby: use a Gauss–Newton step
                 muu, muv, mvv = guu, guv, gvv
                 det = muu * mvv - muv * muv
             step_u, step_v = (mvv * gu - muv * gv) / det, (muu * gv - muv * gu) / det
@@ -182,7 +183,7 @@ def field_distance(shapes: ShapeArrays, k, x, y, z):
 
 @internal_kernel
 def field_height(shapes: ShapeArrays, k, x, y):
-    """h and its derivatives x, y, xx, xy, yy at a point of the field; beyond its grid it goes on straight."""
+    """Return h and its derivatives x, y, xx, xy, yy at a point of the field; linear extrapolation beyond its grid."""
     fields, data, kind = shapes.fields, shapes.data, shapes.kind
     nx, ny = kind[k, COUNT], kind[k, COUNT + 1]
     i, x0, x1, x2, x3, dx0, dx1, dx2, dx3, ex0, ex1, ex2, ex3 = spline_weights(
@@ -208,12 +209,12 @@ def field_height(shapes: ShapeArrays, k, x, y):
 
 @internal_kernel
 def spline_weights(x, per, count):
-    """Cell of x in units of the grid, and the weights of its four uniform cubic B-splines with two derivatives.
+    """Return the cell of x in grid units, and weights of its four uniform cubic B-splines with two derivatives.
 
-    ``per``: 1 / spacing. Beyond the first and last of ``count`` grid points the weights go on straight.
+    ``per`` is 1 / spacing. Beyond the first and last of ``count`` grid points the weights are extrapolated linearly.
     """
     clamped = min(max(x, 0.0), count - 1.0)
-    # NaN as an integer is anything.
+    # NaN converts to an arbitrary integer.
     i = max(min(int(clamped), count - 2), 0)
     t, beyond = clamped - i, x - clamped
     s = 1.0 - t
@@ -240,10 +241,10 @@ def spline_weights(x, per, count):
 
 @internal_kernel
 def nearest(shapes: ShapeArrays, k, x, y, z, dx, dy, dz):
-    """u in [0, 1] at which x + u d is nearest to the surface of candidate k: sphere, cylinder or box from outside.
+    """Return u in [0, 1] at which x + u d is nearest to the surface of candidate k: sphere, cylinder, box from outside.
 
-    In closed form for the first two. Of a box φ is convex, so n·d grows with u: Newton's method kept within brackets.
-    In the middle of where the distance does not change.
+    Closed form for sphere and cylinder. For a box, φ is convex, so n·d grows with u: Newton's method within brackets.
+    If the distance is constant over an interval, returns its middle.
     """
     kind, data = shapes.kind[k, SURFACE], shapes.data
     if kind == BOX:
@@ -262,7 +263,7 @@ def nearest(shapes: ShapeArrays, k, x, y, z, dx, dy, dz):
 
 @internal_kernel
 def nearest_to_box(shapes: ShapeArrays, k, x, y, z, dx, dy, dz):
-    """:func:`nearest` of a box."""
+    """Do :func:`nearest` for a box."""
     low, high, u = 0.0, 1.0, 0.5
     length = math.sqrt(dx * dx + dy * dy + dz * dz)
     for step in range(AXIS_STEPS):
@@ -285,7 +286,7 @@ def nearest_to_box(shapes: ShapeArrays, k, x, y, z, dx, dy, dz):
                 high = u
             bend = dx * (hxx * dx + 2.0 * (hxy * dy + hxz * dz)) + dy * (hyy * dy + 2.0 * hyz * dz) + dz * hzz * dz
             trial = u - slope / bend if bend > 0.0 else low
-            # Newton's step in the limit of rounding moves nothing; along a flat face there is none.
+            # At the limit of rounding Newton's step moves nothing; along a flat face there is no step.
             if bend > 0.0 and trial == u:
                 return u
             u = trial if low < trial < high else 0.5 * (low + high)
@@ -296,7 +297,7 @@ def nearest_to_box(shapes: ShapeArrays, k, x, y, z, dx, dy, dz):
 
 @kernel
 def surface_distances(shapes: ShapeArrays, points, gaps, normals):
-    """φ [m] and n of the surface of candidate 0 at points, (T, 3), into ``gaps``, (T,), and ``normals``, (T, 3)."""
+    """Write φ [m] and n of the surface of candidate 0 at points, (T, 3), to ``gaps``, (T,), and ``normals``, (T, 3)."""
     for t in range(points.shape[0]):
         gap = distance(shapes, 0, points[t, 0], points[t, 1], points[t, 2])
         gaps[t], normals[t, 0], normals[t, 1], normals[t, 2] = gap[0], gap[1], gap[2], gap[3]
@@ -304,6 +305,6 @@ def surface_distances(shapes: ShapeArrays, points, gaps, normals):
 
 @kernel
 def nearest_points(shapes: ShapeArrays, starts, along, u):
-    """:func:`nearest` of candidate 0 for axes from ``starts`` along ``along``, (T, 3), into ``u``, (T,)."""
+    """Apply :func:`nearest` for candidate 0 to axes from ``starts`` along ``along``, (T, 3); results in ``u``, (T,)."""
     for t in range(starts.shape[0]):
         u[t] = nearest(shapes, 0, starts[t, 0], starts[t, 1], starts[t, 2], along[t, 0], along[t, 1], along[t, 2])

@@ -15,11 +15,14 @@ from dynsim.jit.kernel import internal_kernel
 def solve_m_star(K, model: ModelArrays, drives: DriveArrays, unilateral: UnilateralArrays | None, ws: Workspace):
     """Fill M* and b and solve for vdot, contact forces and di/dt.
 
-    K : (n + p + k, n + p + k + 1) or more, room for M* with b as its last column; k motors have a circuit.
-
     [M + J_m, −Fᵀ, 0; J, 0, 0; 0, 0, L] [vdot; f; di/dt] = [applied; target; u − R i − K_m v]. F (force directions)
     differs from J (rows) under friction: the paper's −J_tᵀ f_t with f_t = μ f_n has moved to the left side. Call after
     ``contact_rows``: the mass matrix overwrites velocities and wrenches of the sweep.
+
+    Parameters
+    ----------
+    K : (n + p + k or more, n + p + k + 1 or more) ndarray
+        Scratch for M* with b as its last column; k motors have a circuit.
     """
     n, p, na = model.tree.shape[0], ws.counts[ka.ROWS], drives.table.shape[0]
     size = K.shape[0]
@@ -52,8 +55,8 @@ def solve_m_star(K, model: ModelArrays, drives: DriveArrays, unilateral: Unilate
             v = joints[drives.table[a, ka.DRIVEN], ka.QD]
             K[row, size] = dc_balance(drives.motor, a, motors[a, ka.VOLTAGE], v, motors[a, ka.CURRENT])
             K[row, row] = drives.motor[a, ka.INDUCTANCE]
-    # Gaussian elimination. The positive definite mass block needs no pivoting; what it leaves of the constraint block
-    # is J (M + J_m)⁻¹ F, not symmetric and perhaps of deficient rank.
+    # Gaussian elimination. The positive definite mass block needs no pivoting; it leaves J (M + J_m)⁻¹ F of the
+    # constraint block, not symmetric and possibly rank-deficient.
     for k in range(n):
         inverse = 1.0 / K[k, k]
         for i in range(k + 1, n + p):

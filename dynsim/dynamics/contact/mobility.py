@@ -9,18 +9,18 @@ from dynsim.dynamics.tables import ContactArrays, ModelArrays, Workspace
 from dynsim.dynamics.tree.spatial import ZERO_VECTOR, dot, dot_vector, six, vector, wrench_at
 from dynsim.jit.kernel import noinline_kernel
 
-# Rate of a point along its normal by the rate of a joint, as a fraction of the terms that cancel in it, below which it
-# is rounding. Rounding is 1e-16 times some dozen operations; at the limit the forces have three digits left.
+# Limit of rounding for the rate of a point along its normal per rate of a joint, as a fraction of the terms that cancel
+# in it. Rounding is 1e-16 times some dozen operations; at the limit the forces have three digits left.
 IMMOBILE = 1e-12
-# A rate of more than this is not rounding for any robot [m/rad or m/m].
+# A larger rate is not rounding for any robot [m/rad or m/m].
 CLEARLY = 1e-9
-# A point is not brought onto its surface by a joint that would have to move further than this [rad or m].
+# A joint that would have to move further than this does not bring a point onto its surface [rad or m].
 WAY = 0.1
 
 
 @noinline_kernel
 def moves_along_normal(model: ModelArrays, contacts: ContactArrays, ws: Workspace, k, gap):
-    """True if some joint moves candidate k along its normal, and far enough to close ``gap`` [m], after a sweep.
+    """True if a joint moves candidate k along its normal far enough to close ``gap`` [m]; call after a sweep.
 
     The rate by joint i is S_i · (p × n, n). Its terms are products of the distances of joint and point from the origin:
     the largest of these, times the angular part of S, and its linear part are the scale of rounding.

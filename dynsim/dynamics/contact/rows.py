@@ -1,8 +1,9 @@
-"""Table of active constraint rows (couplings, dry friction, stops, contacts, ties), their forces and errors.
+"""Constraint rows (couplings, dry friction, stops, contacts, ties): table, forces, errors, and geometry of contacts.
 
 A row is one scalar constraint J vdot = target with one force. It has a kind, an owner (the candidate, coupling, stop,
 joint or tie) and up to two bodies. The table is rebuilt only when a mode changes. Order: couplings, joints held by dry
-friction, closed joint stops, closed candidates, ties; behind these active rows, one without force per open candidate.
+friction, closed joint stops, closed candidates, ties; after these active rows, one row without force for each open
+candidate.
 """
 
 from __future__ import annotations
@@ -40,14 +41,13 @@ from dynsim.jit.kernel import exact_kernel, internal_kernel, noinline_kernel
 def set_modes(
     contacts: ContactArrays, couplings: CouplingArrays, unilateral: UnilateralArrays | None, ws: Workspace, modes
 ):
-    """Give every candidate its mode, (c,) of OPEN, SLIDING or STICKING, and rebuild the table of rows.
+    """Set the mode of every candidate, (c,) of OPEN, SLIDING or STICKING, and rebuild the table of rows.
 
-    Behind the couplings come the joints with dry friction, the joint stops that are closed, then the candidates, and
-    ties between bodies.
+    The couplings are followed by joints held by dry friction, closed joint stops, candidates, and ties between bodies.
 
-    Call it right after ``derivative`` at the state where modes change, and ``derivative`` once more afterwards: a
-    candidate that begins to stick is held where the last evaluation has seen it. Its slip should have come to rest:
-    what is left of it the next projection takes away, unseen by the ledger.
+    Call right after ``derivative`` at the state at which modes change, and call ``derivative`` again afterwards: a
+    candidate that begins to stick is held at its position in the last evaluation. Its slip should be zero: the next
+    projection removes any remaining slip, without an entry in the ledger.
     """
     active, rows = ws.active, ws.rows
     p, sticking = couplings.joint.shape[0], 0
@@ -84,7 +84,7 @@ def set_modes(
             active[k, ka.FIRST_ROW] = p
             new_row(ws, p, ka.SLIDING_ROW, k, contacts.link[k, ka.LINK])
             p += 1
-    # Solves write the joints that a row feels, and read all the others as zero.
+    # Solves write the joints that a row involves, and read all other entries as zero.
     for i in range(ws.column.shape[0]):
         for s in range(ws.column.shape[1]):
             ws.column[i, s] = 0.0
@@ -92,7 +92,7 @@ def set_modes(
 
 @internal_kernel
 def dry_rows(unilateral: UnilateralArrays, ws: Workspace, p):
-    """A joint row, of one joint, for every joint that dry friction holds; returns the number of rows then."""
+    """Write a joint row with one joint for every joint held by dry friction; return the new number of rows."""
     table, owner = unilateral.dry_table, p + unilateral.stop_table.shape[0]
     for k in range(table.shape[0]):
         if table[k, ku.DRY_HOLDS] == 0:
@@ -108,7 +108,7 @@ def dry_rows(unilateral: UnilateralArrays, ws: Workspace, p):
 
 @internal_kernel
 def tie_rows(unilateral: UnilateralArrays, ws: Workspace, p):
-    """A row between two bodies for every tie that holds; returns the number of rows then."""
+    """Write a row between two bodies for every active tie; return the new number of rows."""
     table = unilateral.tie_table
     for k in range(table.shape[0]):
         if table[k, ku.TIE_HOLDS] == 1:
@@ -120,7 +120,7 @@ def tie_rows(unilateral: UnilateralArrays, ws: Workspace, p):
 
 @internal_kernel
 def stop_rows(unilateral: UnilateralArrays, couplings, ws: Workspace, p):
-    """A joint row, of one joint, for every stop that is closed; returns the number of rows then."""
+    """Write a joint row with one joint for every closed stop; return the new number of rows."""
     table, stop = unilateral.stop_table, unilateral.stop
     for k in range(table.shape[0]):
         stop[k, ku.STOP_FORCE] = 0.0
@@ -140,7 +140,7 @@ def stop_rows(unilateral: UnilateralArrays, couplings, ws: Workspace, p):
 
 @internal_kernel
 def new_row(ws: Workspace, r, kind, owner, link):
-    """Row r of one body, without friction."""
+    """Initialise row r of one body, without friction."""
     active = ws.active
     active[r, ka.ROW_KIND], active[r, ka.OWNER], active[r, ka.LAW] = kind, owner, ka.FRICTION_SIGNED
     active[r, ka.BODY_A], active[r, ka.BODY_B] = link, -1
@@ -151,7 +151,7 @@ def new_row(ws: Workspace, r, kind, owner, link):
 
 @internal_kernel
 def drop_anchor(ws: Workspace, k):
-    """Hold candidate k at the foot of its present position on the surface, along n and two tangents there."""
+    """Hold candidate k at the projection of its present position onto the surface, along n and two tangents there."""
     state = ws.contacts
     for s in range(3):
         state[k, ka.ANCHOR + s] = state[k, ka.POSITION + s] - state[k, ka.GAP] * state[k, ka.NORMAL + s]
@@ -160,10 +160,10 @@ def drop_anchor(ws: Workspace, k):
 
 @internal_kernel
 def tangents(ws: Workspace, k):
-    """Two directions along the surface at the present normal of candidate k, for the rows of a point that sticks."""
+    """Compute two tangents at the present normal of candidate k, for the rows of a sticking point."""
     state = ws.contacts
     n = vector(state, k, ka.NORMAL)
-    # n × the axis that is furthest from n.
+    # n × the coordinate axis furthest from n.
     ax, ay, az = abs(n[0]), abs(n[1]), abs(n[2])
     if ax <= ay and ax <= az:
         t = 0.0, n[2], -n[1]
@@ -178,22 +178,22 @@ def tangents(ws: Workspace, k):
 
 @internal_kernel
 def point_row(rows, r, at, d):
-    """Motion of a body's point at ``at`` along d, as row r."""
+    """Write the motion of a body's point at ``at`` along d as row r."""
     put_six(rows, r, ka.ROW, wrench_at(at, d, ZERO_VECTOR))
 
 
 @noinline_kernel
 def sticking_rows(model: ModelArrays, ws: Workspace, k, i):
-    """Rows of candidate k, on link i, that sticks; the first one is there already.
+    """Write the rows of sticking candidate k on link i; the first one is there already.
 
-    The first row is the surface's own, as if it slid, so that the gap stays that of the surface. The others are
-    t · (r − anchor) = 0 with the tangents t of the anchor: constant, so that t · r̈ = 0 is exact on any surface,
-    whatever is left of the velocity. At rest the three together are r̈ = 0.
+    The first row is the row of the surface, as if the point slid, so that the gap remains the surface's gap. The others
+    are t · (r − anchor) = 0 with the tangents t of the anchor: constant, so that t · r̈ = 0 is exact on any surface for
+    any remaining velocity. At rest the three together are r̈ = 0.
     """
     state, rows, links, active = ws.contacts, ws.rows, ws.links, ws.active
     first = active[k, ka.FIRST_ROW]
     at = vector(state, k, ka.POSITION)
-    # Velocity of the point, and its acceleration at vdot = 0 (A carries −g from its root).
+    # Velocity of the point, and its acceleration at vdot = 0 (A includes −g from the root).
     V = six(links, i, ka.V)
     v, a = point_velocity(V, at), point_acceleration(six(links, i, ka.A), V, at)
     a = a[0] + model.gravity[0], a[1] + model.gravity[1], a[2] + model.gravity[2]
@@ -212,7 +212,7 @@ def sticking_rows(model: ModelArrays, ws: Workspace, k, i):
 
 @internal_kernel
 def force_vectors(ws: Workspace):
-    """Whole force of every candidate in W, friction included, into ``ws.contacts``, after ``derivative``."""
+    """Write the whole force of every candidate in W, with friction, to ``ws.contacts``, after ``derivative``."""
     state, rows, active = ws.contacts, ws.rows, ws.active
     for k in range(state.shape[0]):
         first = active[k, ka.FIRST_ROW]
@@ -226,9 +226,9 @@ def force_vectors(ws: Workspace):
 
 @internal_kernel
 def row_errors(ws: Workspace):
-    """How far positions and rates are off each active row, into ROW_GAP and ROW_RATE, after ``derivative``.
+    """Write the errors of positions and rates along each active row to ROW_GAP and ROW_RATE, after ``derivative``.
 
-    Of a coupling q_follower − ratio q_leader − offset; those of tangential rows of sticking points are there already.
+    For a coupling: q_follower − ratio q_leader − offset. Tangential rows of sticking points have their errors already.
     """
     rows, active, joints = ws.rows, ws.active, ws.joints
     for r in range(ws.counts[ka.ROWS]):
@@ -245,7 +245,7 @@ def row_errors(ws: Workspace):
 
 @internal_kernel
 def joint_rate(ws: Workspace, r):
-    """Rate of the joint row r."""
+    """Return the rate of joint row r."""
     rows, active, joints = ws.rows, ws.active, ws.joints
     return (
         rows[r, ka.ROW] * joints[active[r, ka.BODY_A], ka.QD]
@@ -256,9 +256,9 @@ def joint_rate(ws: Workspace, r):
 # Contact points on quadrics: geometry, slip direction, constraint rows, and the friction of the bilateral law.
 
 
-# Most solves, beyond two per contact, in search of signs of dissipative contacts that agree with their forces.
+# Most solves, in addition to two per contact, in search of signs of dissipative contacts that agree with their forces.
 SIGN_PASSES = 64
-# With more contacts than this not every choice of signs is tried.
+# With more contacts than this, not every choice of signs is tried.
 SIGNS_LIMIT = 8
 # A normal force below this fraction of the largest one is rounding.
 NO_FORCE = 1e-12
@@ -266,9 +266,9 @@ NO_FORCE = 1e-12
 
 @internal_kernel
 def surface_distance(value, slope, curvature):
-    """Signed distance along the normal from the level-set value: root of C − |∇C| s + κ s²/2 with κ = nᵀQn.
+    """Return the signed distance along the normal from the level-set value.
 
-    Exact for the plane, the sphere and the cylinder.
+    It is the root of C − |∇C| s + κ s²/2 with κ = nᵀQn: exact for the plane, the sphere and the cylinder.
     """
     inner = 1.0 - 2.0 * curvature * value / (slope * slope)
     if inner <= 0.0:
@@ -278,7 +278,7 @@ def surface_distance(value, slope, curvature):
 
 @internal_kernel
 def hessian_product(point, k, u):
-    """u·Q u of the surface of contact k; point: (c, POINT_SIZE)."""
+    """Return u·Q u of the surface of contact k; point: (c, POINT_SIZE)."""
     return (
         u[0] * (point[k, ka.QUADRIC] * u[0] + 2.0 * (point[k, ka.QUADRIC + 1] * u[1] + point[k, ka.QUADRIC + 2] * u[2]))
         + u[1] * (point[k, ka.QUADRIC + 3] * u[1] + 2.0 * point[k, ka.QUADRIC + 4] * u[2])
@@ -288,15 +288,15 @@ def hessian_product(point, k, u):
 
 @internal_kernel
 def contact_rows(model: ModelArrays, contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: Workspace):
-    """Position, gap, slip, constraint row and force direction of every candidate, after ``forward_sweep``.
+    """Compute position, gap, slip, constraint row and force direction of every candidate, after ``forward_sweep``.
 
-    A candidate that is off its surface has a row too, behind the active ones: geometry without branches.
+    A candidate off its surface also has a row, after the active rows: this geometry has no branches.
 
     C(r) = r·Q r/2 + b·r + c, n = ∇C/|∇C| ([WM] eqs 3, 6, 8); a gap > 0 is off the surface. Row:
     n·r̈ = −ṙᵀ(∂²C/∂r²)ṙ / |∇C| ([WM] eqs 15, 30). Force per unit f_n: n − σ μ t with the smoothed slip direction
-    t = v_t / √(|v_t|² + v_s²) ([WM] eqs 9, 14 and f_t = μ f_n); v_s is dynsim's assumption, the paper says nothing
-    of zero slip. σ is 1 in the paper's law; for the dissipative law it is the sign of f_n, kept between calls. Under
-    the unilateral law t and μ are those of :func:`~dynsim.dynamics.contact.unilateral.slide_direction`.
+    t = v_t / √(|v_t|² + v_s²) ([WM] eqs 9, 14 and f_t = μ f_n); v_s is dynsim's assumption, the paper does not cover
+    zero slip. σ is 1 in the paper's law; for the dissipative law it is the sign of f_n, kept between calls. Under the
+    unilateral law t and μ come from :func:`~dynsim.dynamics.contact.unilateral.slide_direction`.
     """
     links, state, rows, point, gravity = ws.links, ws.contacts, ws.rows, contacts.point, model.gravity
     for k in range(contacts.link.shape[0]):
@@ -304,7 +304,7 @@ def contact_rows(model: ModelArrays, contacts: ContactArrays, unilateral: Unilat
         mu = signed_friction(ws, m)
         R = rotation(links, i, ka.R)
         at = transform(vector(links, i, ka.P), R, vector(point, k, ka.POINT))
-        # ∇C and C; a plane's ∇C is its unit normal, which spares every right-hand side two roots and three divisions.
+        # ∇C and C; ∇C of a plane is its unit normal, which saves every right-hand side two roots and three divisions.
         n = vector(point, k, ka.QUADRIC + 6)
         gap = dot_vector(n, at) + point[k, ka.QUADRIC + 9]
         inverse, curved = 1.0, contacts.link[k, ka.CURVED] != 0
@@ -315,7 +315,7 @@ def contact_rows(model: ModelArrays, contacts: ContactArrays, unilateral: Unilat
             inverse = 1.0 / slope
             n = times_number(n, inverse)
             gap = surface_distance(gap + 0.5 * dot_vector(bent, at), slope, hessian_product(point, k, n))
-        # Velocity of the point, and its acceleration at vdot = 0 (A carries −g from its root).
+        # Velocity of the point, and its acceleration at vdot = 0 (A includes −g from the root).
         V = six(links, i, ka.V)
         v, a = point_velocity(V, at), point_acceleration(six(links, i, ka.A), V, at)
         a = a[0] + gravity[0], a[1] + gravity[1], a[2] + gravity[2]
@@ -335,7 +335,7 @@ def contact_rows(model: ModelArrays, contacts: ContactArrays, unilateral: Unilat
         put_vector(state, k, ka.POSITION, at)
         put_vector(state, k, ka.NORMAL, n)
         put_vector(state, k, ka.SLIP_VELOCITY, slip)
-        # From here on nothing is read back: stores to one table keep the compiler from trusting the other.
+        # Only stores follow: a store to one table makes the compiler reload values of the other.
         put_vector(state, k, ka.TANGENT, t)
         point_row(rows, m, at, n)
         unit_force(rows, m, mu, at, n, t)
@@ -348,27 +348,27 @@ def contact_rows(model: ModelArrays, contacts: ContactArrays, unilateral: Unilat
 
 @internal_kernel
 def signed_friction(ws: Workspace, m):
-    """σ μ of row m."""
+    """Return σ μ of row m."""
     mu = ws.rows[m, ka.ROW_MU]
     return mu * ws.rows[m, ka.SIGN] if ws.active[m, ka.LAW] == ka.FRICTION_DISSIPATIVE else mu
 
 
 @exact_kernel
 def unit_force(rows, m, mu, at, n, t):
-    """Wrench of a unit normal force with its friction, n − σ μ t through the contact point, as DIRECTION of row m.
+    """Write the wrench of a unit normal force with friction, n − σ μ t at the contact point, to DIRECTION of row m.
 
-    The same bits where it is first made and where a sign has turned, so that a right-hand side does not depend on the
-    signs of the one before.
+    The result is bit-identical at first computation and after a change of sign, so that a right-hand side does not
+    depend on the signs of the preceding one.
     """
     x, y, z = n[0] - mu * t[0], n[1] - mu * t[1], n[2] - mu * t[2]
-    # Written out: a function of its own would have its products contracted.
+    # Written out: in a separate function the compiler would contract the products.
     wrench = at[1] * z - at[2] * y, at[2] * x - at[0] * z, at[0] * y - at[1] * x, x, y, z
     put_six(rows, m, ka.DIRECTION, wrench)
 
 
 @internal_kernel
 def turn_direction(ws: Workspace, m):
-    """DIRECTION of row m for its present SIGN."""
+    """Recompute DIRECTION of row m for its present SIGN."""
     state, k = ws.contacts, ws.active[m, ka.OWNER]
     at, n, t = vector(state, k, ka.POSITION), vector(state, k, ka.NORMAL), vector(state, k, ka.TANGENT)
     unit_force(ws.rows, m, signed_friction(ws, m), at, n, t)
@@ -376,13 +376,13 @@ def turn_direction(ws: Workspace, m):
 
 @internal_kernel
 def sign_changed(ws: Workspace, passes):
-    """True when dissipative contacts' solved forces contradict their assumed signs; turns those directions around.
+    """True if solved forces of dissipative contacts contradict their assumed signs; reverses those directions.
 
-    All at once in the first passes, then only the first of them (least-index pivoting, which cannot cycle while all
-    choices have determinants of one sign), at last every choice in turn. Without a consistent choice (Painlevé) the
-    forces become NaN, the count of CONTRADICTORY goes up and the search ends. Forces that vanish to rounding have no
-    sign and take +. So the result does not depend on the signs that the search began with, unless several choices are
-    consistent (dynsim.dynamics.contact.delassus watches for that).
+    All of them in the first passes, then only the first one (least-index pivoting, which cannot cycle while all choices
+    have determinants of one sign), finally every choice in turn. Without a consistent choice (Painlevé) the forces
+    become NaN, the count of CONTRADICTORY increases and the search ends. Forces that vanish to rounding have no sign
+    and count as +. The result thus does not depend on the initial signs of the search, unless several choices are
+    consistent (dynsim.dynamics.contact.delassus checks this).
     """
     rows, active, p = ws.rows, ws.active, ws.counts[ka.ROWS]
     limit = 2 * p + SIGN_PASSES
@@ -419,8 +419,8 @@ def sign_changed(ws: Workspace, passes):
 # Contact geometry of spheres and capsules, and of surfaces given by a signed distance.
 
 
-# sin² of the angle between an axis and the direction of constant distance. Below it u̇ = 0: the axis is parallel to
-# that of a cylinder, say, and no point of it is nearest.
+# sin² of the angle between an axis and the direction of constant distance. Below it u̇ = 0: the axis is parallel to the
+# axis of a cylinder, for example, and has no nearest point.
 ALONG = 1e-8
 
 
@@ -428,11 +428,11 @@ ALONG = 1e-8
 def shaped_rows(
     shapes, unilateral: UnilateralArrays | None, model: ModelArrays, contacts: ContactArrays, ws: Workspace
 ):
-    """Overwrite what ``contact_rows`` has made of the candidates that are no points on quadrics; None: there are none.
+    """Overwrite the results of ``contact_rows`` for candidates other than points on quadrics; None: no such candidates.
 
-    Position (the point of contact c), gap, slip, row, target and direction as there, and the rows of those that stick.
+    Position (the point of contact c), gap, slip, row, target and direction, and the rows of sticking candidates.
     """
-    if shapes is None:  # known to the compiler, which then leaves shapes out of the default program
+    if shapes is None:  # resolved at compile time; the default program then excludes shapes
         return
     for k in range(contacts.link.shape[0]):
         if shapes.kind[k, kd.SURFACE] != kd.AS_POINT:
@@ -448,14 +448,14 @@ def shaped_row(
     ws: Workspace,
     k,
 ):
-    """Geometry and rows of one candidate.
+    """Compute geometry and rows of one candidate.
 
-    Friction acts at c, along the velocity of the body's point there. Where it sticks it rolls: its tangential rows are
-    t · v_c = 0 for the point of the body that is at c now, which another one follows. With v_c = v_O + ω × c
+    Friction acts at c, along the velocity of the body's point there. A sticking candidate rolls: its tangential rows
+    are t · v_c = 0 for the body point that is at c now, and is replaced by another one. With v_c = v_O + ω × c
 
         t · (v̇_O + ω̇ × c + ω × ċ) = 0,   ċ = ṡ − ρ H ṡ,   ṡ = v + u̇ d,
 
-    so that against a point that is held, ω × v_c becomes ω × ċ. There is no place to which it must return.
+    so that in comparison with a held point, ω × v_c becomes ω × ċ. There is no anchor to which it must return.
     """
     links, state, rows, point, data = ws.links, ws.contacts, ws.rows, contacts.point, shapes.data
     i, m, radius = contacts.link[k, ka.LINK], ws.active[k, ka.FIRST_ROW], shapes.data[k, kd.RADIUS]
@@ -468,7 +468,7 @@ def shaped_row(
         s = along(s, d, u)
     far, nx, ny, nz, hxx, hxy, hxz, hyy, hyz, hzz = distance(shapes, k, s[0], s[1], s[2])
     n, H = (nx, ny, nz), (hxx, hxy, hxz, hyy, hyz, hzz)
-    # Velocity of the body's point at s, and its acceleration at vdot = 0 (A carries −g from its root).
+    # Velocity of the body's point at s, and its acceleration at vdot = 0 (A includes −g from the root).
     V = six(links, i, ka.V)
     w, v, a = (V[0], V[1], V[2]), point_velocity(V, s), point_acceleration(six(links, i, ka.A), V, s)
     a = a[0] + model.gravity[0], a[1] + model.gravity[1], a[2] + model.gravity[2]
@@ -505,7 +505,7 @@ def shaped_row(
         return
     rolls = radius > 0.0 or shapes.kind[k, kd.MOVES] != 0
     if rolls:
-        # It rolls on from where it has begun to stick: any two tangents of the place where it is span the same rows.
+        # It rolls away from its anchor: any two tangents at its present point span the same rows.
         tangents(ws, k)
     sticking_rows(model, ws, k, i)
     if rolls:

@@ -1,13 +1,13 @@
-"""Forces of dependent rows while contacts slide: the least change from those at the last change of modes.
+"""Forces of dependent rows while contacts slide: the least change from the forces at the last change of modes.
 
 If rows depend on each other, the equations of motion determine only some sums of their forces. Without sliding contacts
-every split of these sums gives the same motion. A sliding contact has a friction force in proportion to its own normal
-force, so each split gives a different motion. The choice of modes has found forces s that agree with Coulomb's law, and
+every split of these sums gives the same motion. The friction of a sliding contact is proportional to its normal force,
+so each split gives a different motion. The choice of modes has solved for forces s that agree with Coulomb's law, and
 the right-hand side continues from them:
 
     f = s + Δ,   W Δ = b − W s, Δ of least norm.
 
-So forces are continuous at changes of modes. The split of least norm itself may pull at a contact that slides in the
+Forces are thus continuous at changes of modes. The split of least norm itself may pull at a contact that slides in the
 chosen modes.
 """
 
@@ -23,8 +23,8 @@ from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
 @internal_kernel
 def solve_rows(unilateral: UnilateralArrays | None, ws: Workspace, p):
-    """Forces of the p active rows into FORCE; returns whether they depend on each other, as :func:`solve_small`."""
-    if unilateral is None:  # known to the compiler
+    """Solve for the forces of the p active rows; return whether they are dependent, as :func:`solve_small`."""
+    if unilateral is None:  # resolved at compile time
         return solve_small(ws.small, ws.rows, ws.active, p)
     if unilateral.number[ku.SHARED] == 1.0:
         return solve_near_shares(unilateral, ws, p)
@@ -35,13 +35,13 @@ def solve_rows(unilateral: UnilateralArrays | None, ws: Workspace, p):
 
 @internal_kernel
 def solve_near_shares(unilateral: UnilateralArrays, ws: Workspace, p):
-    """The forces that are nearest to the shares; SIMD lanes use a variant of this kernel."""
+    """Solve for the forces nearest to the shares; SIMD lanes use a variant of this kernel."""
     return solve_nearest(unilateral, ws, p)
 
 
 @noinline_kernel
 def solve_nearest(unilateral: UnilateralArrays, ws: Workspace, p):
-    """:func:`solve_near_shares` for one state; the right-hand side is unchanged."""
+    """Do the work of :func:`solve_near_shares` for one state; the right-hand side is unchanged."""
     rows, W, share, right = ws.rows, ws.small[0], unilateral.vector[0], unilateral.vector[1]
     for r in range(p):
         slot = share_slot(unilateral, ws, r)
@@ -58,7 +58,7 @@ def solve_nearest(unilateral: UnilateralArrays, ws: Workspace, p):
 
 @internal_kernel
 def share_slot(unilateral: UnilateralArrays, ws: Workspace, r):
-    """Index of row r in ``shares``: couplings, stops, joints with dry friction, candidates; −1 for ties."""
+    """Return the index of row r in ``shares``: couplings, stops, joints with dry friction, candidates; −1 for ties."""
     kind, k = ws.active[r, ka.ROW_KIND], ws.active[r, ka.OWNER]
     if kind == ka.JOINT_ROW:
         return k
@@ -70,7 +70,7 @@ def share_slot(unilateral: UnilateralArrays, ws: Workspace, r):
 
 @internal_kernel
 def keep_shares(unilateral: UnilateralArrays, ws: Workspace, modes):
-    """Keep the present forces as shares, right before ``set_modes`` of ``modes``, (c,).
+    """Save the present forces as shares, right before ``set_modes`` of ``modes``, (c,).
 
     Independent rows stay independent when some of them are removed.
     """
@@ -94,9 +94,9 @@ def some_slide(modes):
 
 @noinline_kernel
 def even_out(unilateral: UnilateralArrays, ws: Workspace):
-    """Remove the part without effect on the motion from the shares of sticking points, right after ``derivative``.
+    """Remove the part that does not affect the motion from the shares of sticking points, right after ``derivative``.
 
-    So their split remains the split of least norm, even if other points slide.
+    Their split thus remains the split of least norm, even if other points slide.
     """
     shares, N, row = unilateral.shares, unilateral.room[ku.NULL_SPACE], unilateral.index[1]
     _, count, p, ties = find_splits(unilateral, ws)

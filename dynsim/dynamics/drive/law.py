@@ -1,7 +1,9 @@
 """Drive laws of all motors by kind: references, commands, torques, and linear blocks of implicit methods.
 
-A drive kind is a constant in dynsim.dynamics.tables, a file of plain functions in this package, a branch in each
-function below that looks at the kind, and one in ``dynsim.compile.tables.compile_drives``.
+The laws of a kind are plain scalar functions of (table of parameters, row, reference, state), compiled unchanged.
+Virtual servos call them without numba; tests call them with complex numbers (complex-step derivatives). Their
+comparisons therefore use real parts. A drive kind is a constant in dynsim.dynamics.tables, a group of such functions, a
+branch in each function below that depends on the kind, and one in ``dynsim.compile.tables.compile_drives``.
 """
 
 from __future__ import annotations
@@ -11,11 +13,11 @@ from dynsim.dynamics.state import StateLayout
 from dynsim.dynamics.tables import DriveArrays, ReferenceArrays, Workspace
 from dynsim.jit.kernel import inline_kernel, internal_kernel, kernel, noinline_kernel
 
-# Clamping of a value to ±limit, for every kind of drive.
+# Clipping of a value to ±limit, for every kind of drive.
 
 
 def clipped(x, limit):
-    """Value x clamped to ±limit, by its real part; NaN stays NaN."""
+    """Return x clipped to ±limit, by its real part; NaN is kept."""
     if x.real > limit:
         return limit
     if x.real < -limit:
@@ -23,35 +25,35 @@ def clipped(x, limit):
     return x
 
 
-# A DC motor with its circuit, and the voltage PD on its terminals ([WM] eqs 16–26, 56).
+# DC motor with its circuit, and the voltage PD on its terminals ([WM] eqs 16–26, 56).
 
 
 def dc_command(motor, a, q_ref, v_ref, q, v):
-    """u = k_p (q_d − q) + k_d (v_d − v) [V], before its limit ([WM] eq 56)."""
+    """Return u = k_p (q_d − q) + k_d (v_d − v) [V], before its limit ([WM] eq 56)."""
     return motor[a, ka.K_P] * (q_ref - q) + motor[a, ka.K_D] * (v_ref - v)
 
 
 def within_current(u, v, k_m, drop):
-    """The voltage u, clipped so that it drives no more current than the limit [V]; may exceed the voltage limit.
+    """Return the voltage u [V], clipped so that the current stays within its limit; may exceed the voltage limit.
 
-    drop : R I of the limit [V]
+    ``drop`` is R I of the current limit [V].
     """
     back = k_m * v
     return back + clipped(u - back, drop)
 
 
 def dc_torque(motor, a, i):
-    """K_m i [N m] ([WM] eq 19); the losses of rotor and gear belong to the joint."""
+    """Return K_m i [N m] ([WM] eq 19); the losses of rotor and gear belong to the joint."""
     return motor[a, ka.K_M] * i
 
 
 def dc_balance(motor, a, u, v, i):
-    """L di/dt = u − R i − K_m v [V] ([WM] eqs 24, 26)."""
+    """Return L di/dt = u − R i − K_m v [V] ([WM] eqs 24, 26)."""
     return u - motor[a, ka.RESISTANCE] * i - motor[a, ka.K_M] * v
 
 
 def dc_block(motor, a, follows):
-    """∂τ/∂(q, v, i) and ∂(di/dt)/∂(q, v, i); ``follows`` is 1 where the voltage follows the state, else 0."""
+    """Return ∂τ/∂(q, v, i) and ∂(di/dt)/∂(q, v, i); ``follows`` is 1 if the voltage follows the state, otherwise 0."""
     inductance = motor[a, ka.INDUCTANCE]
     return (
         0.0,
@@ -64,23 +66,23 @@ def dc_block(motor, a, follows):
 
 
 def at_current_limit(motor, a, u, v):
-    """Whether the voltage that is left by :func:`within_current` is that of the limit."""
+    """Return whether the voltage from :func:`within_current` is at the current limit."""
     drop = motor[a, ka.RESISTANCE] * motor[a, ka.I_MAX]
     return abs(u - motor[a, ka.K_M] * v) >= drop * (1.0 - 1e-12)
 
 
-# A position servo: voltage loop, motor without inductance, limits of voltage and current, friction of the gear.
+# Position servo: voltage loop, motor without inductance, limits of voltage and current, friction of the gear.
 
 
 def servo_command(motor, a, mode, q_ref, v_ref, q, v):
-    """The voltage that the loop asks for [V], before its limit."""
+    """Return the voltage that the loop commands [V], before its limit."""
     if mode == ka.VELOCITY_MODE:
         return motor[a, ka.K_V] * (v_ref - v) + motor[a, ka.K_M] * v
     return motor[a, ka.K_P] * (q_ref - q) + motor[a, ka.K_D] * (v_ref - v)
 
 
 def servo_segment(motor, a, mode, command, v):
-    """Which limit holds at a command and a rate: 0 none, ±1 that of the voltage, ±2 that of the current."""
+    """Return the active limit at a command and a rate: 0 none, ±1 voltage, ±2 current."""
     if mode == ka.OFF:
         return 0
     u = clipped(command, motor[a, ka.U_MAX])
@@ -95,7 +97,7 @@ def servo_segment(motor, a, mode, command, v):
 
 
 def servo_circuit_on(motor, a, mode, segment, command, v):
-    """:func:`servo_circuit` with this limit holding, as :func:`servo_segment` tells it, whatever the state says."""
+    """Return :func:`servo_circuit` at the limit ``segment``, see :func:`servo_segment`, regardless of the state."""
     if mode == ka.OFF:
         return motor[a, ka.K_M] * v, 0.0 * v
     if segment == 2 or segment == -2:
@@ -106,7 +108,7 @@ def servo_circuit_on(motor, a, mode, segment, command, v):
 
 
 def servo_circuit(motor, a, mode, command, v):
-    """Terminal voltage u [V] and current i [A] of a command, both within their limits."""
+    """Return terminal voltage u [V] and current i [A] of a command, both within their limits."""
     if mode == ka.OFF:
         return motor[a, ka.K_M] * v, 0.0 * v
     u = clipped(command, motor[a, ka.U_MAX])
@@ -118,7 +120,7 @@ def servo_circuit(motor, a, mode, command, v):
 
 
 def servo_drag(motor, a, mode, v):
-    """Friction of the gear against v [N m]: Coulomb's, smoothed below v_s; while off a viscous one comes with it."""
+    """Return the gear friction against v [N m]: Coulomb, smoothed below v_s; while off also viscous."""
     drag = motor[a, ka.COULOMB] * v / (v * v + motor[a, ka.COULOMB_SPEED] ** 2) ** 0.5
     if mode == ka.OFF:
         drag += motor[a, ka.FREE_DRAG] * v
@@ -126,13 +128,13 @@ def servo_drag(motor, a, mode, v):
 
 
 def servo_torque(motor, a, mode, command, v):
-    """K_m i − drag [N m] of a command."""
+    """Return K_m i − drag [N m] of a command."""
     _, i = servo_circuit(motor, a, mode, command, v)
     return motor[a, ka.K_M] * i - servo_drag(motor, a, mode, v)
 
 
 def servo_block_on(motor, a, mode, segment, sampled, v):
-    """∂τ/∂(q, v) with this limit holding; a command that is ``sampled`` does not follow the state."""
+    """Return ∂τ/∂(q, v) at this limit; a ``sampled`` command does not follow the state."""
     smoothing = motor[a, ka.COULOMB_SPEED] ** 2
     by_q, by_v = 0.0, -motor[a, ka.COULOMB] * smoothing / (v * v + smoothing) ** 1.5
     if mode == ka.OFF:
@@ -150,15 +152,15 @@ def servo_block_on(motor, a, mode, segment, sampled, v):
 
 
 def servo_block(motor, a, mode, sampled, command, v):
-    """∂τ/∂(q, v) at a command; one that is ``sampled`` does not follow the state."""
+    """Return ∂τ/∂(q, v) at a command; a ``sampled`` command does not follow the state."""
     return servo_block_on(motor, a, mode, servo_segment(motor, a, mode, command, v), sampled, v)
 
 
-# An ideal torque source: the reference is the torque itself, within its limit.
+# Ideal torque source: the reference is the torque itself, within its limit.
 
 
 def open_torque(motor, a, command):
-    """τ [N m]: the command within the limit."""
+    """Return τ [N m]: the command clipped to the limit."""
     return clipped(command, motor[a, ka.I_MAX])
 
 
@@ -168,13 +170,13 @@ for _law in (servo_segment, servo_circuit_on, servo_circuit, servo_block_on, ser
     internal_kernel(_law)
 for _law in (servo_command, servo_drag, servo_torque):
     internal_kernel(_law)
-# Few motors have it: merged, its product K_m v would be that of the balance too, whose last bits depend on that.
+# Not inlined: few motors use it, and its product K_m v would be shared with the balance, whose last bits would change.
 noinline_kernel(within_current)
 
 
 @internal_kernel
 def evaluate_reference(drives: DriveArrays, reference: ReferenceArrays, t, ws: Workspace):
-    """References q_d and rates v_d of all drives at time t, into ``ws.motors`` [rad, rad/s; N m of an open torque]."""
+    """Write references q_d and rates v_d of all drives at time t to ``ws.motors`` [rad, rad/s; N m: open torque]."""
     motors, c, line = ws.motors, reference.coefficients, drives.input
     spacing = reference.grid[1]
     x = t - reference.grid[0]
@@ -197,7 +199,7 @@ def evaluate_reference(drives: DriveArrays, reference: ReferenceArrays, t, ws: W
 
 @internal_kernel
 def command(drives: DriveArrays, ws: Workspace, a):
-    """What drive a is told to do, by its law at the present state, before limits [V; N m for an open torque]."""
+    """Return the command of drive a, by its law at the present state, before limits [V; N m for an open torque]."""
     motor, i, kind = drives.motor, drives.table[a, ka.DRIVEN], drives.table[a, ka.DRIVE_KIND]
     q_ref, v_ref = ws.motors[a, ka.Q_REF], ws.motors[a, ka.V_REF]
     if kind == ka.DC_MOTOR:
@@ -211,7 +213,7 @@ def command(drives: DriveArrays, ws: Workspace, a):
 
 @internal_kernel
 def fed_forward(voltage, grid, t, a, asked):
-    """The command of a drive with its planned voltage, where there are any: after the plan's end its last value."""
+    """Add the planned voltage of a drive, if any, to its command; the last value applies after the end of the plan."""
     if voltage.shape[0] == 0:
         return asked
     x = min(t - grid[0], voltage.shape[0] * grid[1])
@@ -223,10 +225,10 @@ def fed_forward(voltage, grid, t, a, asked):
     return asked + total
 
 
-# A call for each motor would take a fourteenth of an explicit step.
+# Inlined: a call for each motor would take a fourteenth of an explicit step.
 @inline_kernel
 def drive_dc(drives: DriveArrays, asked, i, ws: Workspace, a):
-    """The DC motor a at a command [V] and a current [A]."""
+    """Evaluate DC motor a at a command [V] and a current [A]."""
     motors, motor, j = ws.motors, drives.motor, drives.table[a, ka.DRIVEN]
     u = clipped(drives.input[a, ka.COMMAND] if drives.table[a, ka.SAMPLED] else asked, motor[a, ka.U_MAX])
     if drives.table[a, ka.CURRENT_LIMITED] != 0:
@@ -238,14 +240,14 @@ def drive_dc(drives: DriveArrays, asked, i, ws: Workspace, a):
 
 @internal_kernel
 def drive(drives: DriveArrays, reference: ReferenceArrays, t, y, layout: StateLayout, ws: Workspace):
-    """Currents, voltages and rates of current of all drives into ``ws.motors``; their torques onto ``ws.joints``.
+    """Write currents, voltages and current rates of all drives to ``ws.motors``; add their torques to ``ws.joints``.
 
-    Positions and rates of the joints must be in ``ws.joints``, and the other applied forces.
+    ``ws.joints`` must have the positions and rates of the joints and the other applied forces.
     """
     table, motor, motors, joints = drives.table, drives.motor, ws.motors, ws.joints
     na = motors.shape[0]
     evaluate_reference(drives, reference, t, ws)
-    if layout.circuits == na:  # every drive has a circuit, its own: the loop that most robots take
+    if layout.circuits == na:  # every drive has its circuit: the loop for most robots
         for a in range(na):
             j = table[a, ka.DRIVEN]
             asked = dc_command(motor, a, motors[a, ka.Q_REF], motors[a, ka.V_REF], joints[j, ka.Q], joints[j, ka.QD])
@@ -271,7 +273,7 @@ def drive(drives: DriveArrays, reference: ReferenceArrays, t, y, layout: StateLa
 
 @internal_kernel
 def take_commands(drives: DriveArrays, reference: ReferenceArrays, t, ws: Workspace):
-    """At a tick: the commands of all sampled drives at the state in ``ws.joints``, held from now on."""
+    """Take the commands of all sampled drives at a tick, at the state in ``ws.joints``; they are held from now on."""
     evaluate_reference(drives, reference, t, ws)
     for a in range(ws.motors.shape[0]):
         if drives.table[a, ka.SAMPLED] == ka.AT_TICKS:
@@ -281,15 +283,15 @@ def take_commands(drives: DriveArrays, reference: ReferenceArrays, t, ws: Worksp
 
 @kernel
 def take_measured_commands(drives: DriveArrays, reference: ReferenceArrays, t, ws: Workspace):
-    """:func:`take_commands` for a caller that has put into ``ws.joints`` what sensors tell of the joints."""
+    """Call :func:`take_commands` after the caller has put the measured joint states into ``ws.joints``."""
     take_commands(drives, reference, t, ws)
 
 
 @internal_kernel
 def drive_block(drives: DriveArrays, ws: Workspace, a, block):
-    """∂τ/∂(q, v, i) and ∂(di/dt)/∂(q, v, i) of drive a, into the row ``block``, (BLOCK_SIZE,).
+    """Write ∂τ/∂(q, v, i) and ∂(di/dt)/∂(q, v, i) of drive a to the row ``block``, (BLOCK_SIZE,).
 
-    After ``derivative``: references, voltages and states are those in the workspace.
+    Call after ``derivative``: references, voltages and states come from the workspace.
     """
     motors, motor, kind, mode = ws.motors, drives.motor, drives.table[a, ka.DRIVE_KIND], drives.table[a, ka.SERVO_MODE]
     sampled = drives.table[a, ka.SAMPLED] != 0
@@ -309,7 +311,7 @@ def drive_block(drives: DriveArrays, ws: Workspace, a, block):
 
 @internal_kernel
 def fill_dc_block(motor, a, follows, block):
-    """:func:`dc_block` into the row ``block``."""
+    """Write :func:`dc_block` to the row ``block``."""
     slopes = dc_block(motor, a, follows)
     block[ka.TORQUE_Q], block[ka.TORQUE_V], block[ka.TORQUE_I] = slopes[0], slopes[1], slopes[2]
     block[ka.RATE_Q], block[ka.RATE_V], block[ka.RATE_I] = slopes[3], slopes[4], slopes[5]
@@ -317,7 +319,7 @@ def fill_dc_block(motor, a, follows, block):
 
 @internal_kernel
 def asked_of(drives: DriveArrays, reference: ReferenceArrays, t, ws: Workspace, a):
-    """What drive a is asked for at the present state and time t, before limits, after ``evaluate_reference``."""
+    """Return the command of drive a at the present state and time t, before limits, after ``evaluate_reference``."""
     if drives.table[a, ka.SAMPLED] != 0:
         return drives.input[a, ka.COMMAND]
     asked = command(drives, ws, a)
@@ -328,7 +330,7 @@ def asked_of(drives: DriveArrays, reference: ReferenceArrays, t, ws: Workspace, 
 
 @internal_kernel
 def segment_of(drives: DriveArrays, reference: ReferenceArrays, t, ws: Workspace, a):
-    """Which limit holds drive a at the present state: 0 none, ±1 the voltage's, ±2 the current's; as above."""
+    """Return the active limit of drive a at the present state: 0 none, ±1 voltage, ±2 current."""
     motor, asked = drives.motor, asked_of(drives, reference, t, ws, a)
     if drives.table[a, ka.DRIVE_KIND] == ka.POSITION_SERVO:
         v = ws.joints[drives.table[a, ka.DRIVEN], ka.QD]
@@ -346,9 +348,12 @@ def segment_of(drives: DriveArrays, reference: ReferenceArrays, t, ws: Workspace
 def drive_on_segments(
     drives: DriveArrays, reference: ReferenceArrays, t, y, layout: StateLayout, segment, ws: Workspace, linear
 ):
-    """:func:`drive` and :func:`drive_block` with given limits holding, (na,), whatever the state says of them.
+    """Do :func:`drive` and :func:`drive_block` with given active limits ``segment``, (na,), regardless of the state.
 
-    linear : (na, BLOCK_SIZE), the blocks
+    Parameters
+    ----------
+    linear : (na, BLOCK_SIZE) ndarray
+        Receives the linear blocks.
     """
     table, motor, motors, joints = drives.table, drives.motor, ws.motors, ws.joints
     evaluate_reference(drives, reference, t, ws)

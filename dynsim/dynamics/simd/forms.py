@@ -1,7 +1,7 @@
-"""Variants for SIMD lanes of kernels that branch on data: with selects, or the kernel itself lane by lane.
+"""The right-hand side on SIMD lanes: tables with lanes, variants of kernels, and ``derivative`` of four states at once.
 
-The compiler takes them in place of the kernels for arguments with lanes only. All other kernels are compiled for lanes
-from their own source.
+The compiler uses a variant instead of its kernel for arguments with lanes only: for kernels that branch on data, with
+selects or lane by lane. All other kernels are compiled for lanes from their own source.
 """
 
 from __future__ import annotations
@@ -40,12 +40,12 @@ from dynsim.jit.simd import INT32, Lanes, every, lanes_of, select
 
 # Number of lanes: four doubles are one register of AVX2.
 WIDTH = 4
-# Tables of a workspace that have lanes, as one more axis, the last; rows and modes are the same for all.
+# Tables of a workspace with lanes, as an additional last axis; rows and modes are the same for all lanes.
 WITH_LANES = ("links", "joints", "trig", "motors", "contacts", "rows", "column", "small")
 
 
 def aligned(*shape: int) -> np.ndarray:
-    """Zeros of this shape that begin at a cache line, as whole vectors load fastest."""
+    """Return zeros of this shape that begin at a cache line, from which whole vectors load fastest."""
     size = math.prod(shape)
     room = np.zeros(size + 8)
     start = (-room.__array_interface__["data"][0] % 64) // 8
@@ -53,7 +53,7 @@ def aligned(*shape: int) -> np.ndarray:
 
 
 def lane_workspace(ws: Workspace) -> Workspace:
-    """A workspace whose lanes are all what ``ws`` is; ``trig`` unpadded, as sines are computed a lane at a time."""
+    """Return a workspace whose lanes all equal ``ws``; ``trig`` is unpadded, as sines are computed lane by lane."""
     unpadded = ws._replace(trig=ws.trig[:, : len(ws.joints)])
     tables = {name: getattr(unpadded, name)[..., None] for name in WITH_LANES}
     lanes = {name: aligned(*table.shape[:-1], WIDTH) for name, table in tables.items()}
@@ -64,7 +64,7 @@ def lane_workspace(ws: Workspace) -> Workspace:
 
 @intrinsic
 def lane_count(typingctx: Any, value: Any) -> Any:
-    """How many lanes a value or table has."""
+    """Return the number of lanes of a value or table."""
     count = lanes_of(value)
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -75,7 +75,7 @@ def lane_count(typingctx: Any, value: Any) -> Any:
 
 @intrinsic
 def lane(typingctx: Any, value: Any, k: Any) -> Any:
-    """Lane k of a value; of tables a view; tuples part by part. What has no lanes is itself."""
+    """Return lane k of a value; a view for tables; part by part for tuples. A value without lanes is returned as is."""
     result = _lane_type(value)
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -112,7 +112,7 @@ def _lane(context: Any, builder: Any, value: Any, kind: Any, index: Any) -> Any:
 
 @intrinsic
 def with_lane(typingctx: Any, value: Any, k: Any, x: Any) -> Any:
-    """The value with the number x as its lane k."""
+    """Return the value with its lane k replaced by the number x."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         index = builder.trunc(context.cast(builder, args[1], sig.args[1], types.intp), INT32)
@@ -123,7 +123,7 @@ def with_lane(typingctx: Any, value: Any, k: Any, x: Any) -> Any:
 
 @intrinsic
 def as_lanes(typingctx: Any, array: Any) -> Any:
-    """A C-contiguous array of doubles, its last axis the lanes, as an array of lanes."""
+    """Return a C-contiguous array of doubles, whose last axis is the lanes, as an array of lanes."""
     result = _of_lanes(array)
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -158,7 +158,7 @@ def _viewed(context: Any, builder: Any, view: Any, data: Any, shape: Any, stride
 
 @intrinsic
 def tables_as_lanes(typingctx: Any, ws: Any) -> Any:
-    """:func:`as_lanes` of all tables of a workspace that have lanes."""
+    """Apply :func:`as_lanes` to all tables of a workspace that have lanes."""
     parts = [_of_lanes(part) if name in WITH_LANES else part for name, part in zip(ws.fields, ws, strict=True)]
     result = Tables(parts, ws.instance_class)
 
@@ -178,19 +178,19 @@ def any_lanes(*kinds):
 
 
 def times(*kinds):
-    """True if there are several times: t is the third argument."""
+    """True if t, the third argument, has lanes."""
     return lanes_of(kinds[2]) > 0
 
 
 @form_of(clipped, any_lanes)
 def clipped_lanes(x, limit):
-    """A lane within its limits; NaN stays NaN."""
+    """Clip each lane to ±limit; NaN is kept."""
     return select(x > limit, limit, select(x < -limit, -limit, x))
 
 
 @form_of(servo_circuit, any_lanes)
 def servo_circuit_lanes(motor, a, mode, command, v):
-    """Voltage and current; lanes at the limit of current have another voltage."""
+    """Return voltage and current; lanes at the current limit have a different voltage."""
     if mode == ka.OFF:
         return motor[a, ka.K_M] * v, 0.0 * v
     u = clipped(command, motor[a, ka.U_MAX])
@@ -201,14 +201,14 @@ def servo_circuit_lanes(motor, a, mode, command, v):
 
 @form_of(surface_distance, any_lanes)
 def surface_distance_lanes(value, slope, curvature):
-    """Lanes without a root along the normal take the distance of first order."""
+    """Return the distance; lanes without a root along the normal use the first-order distance."""
     inner = 1.0 - 2.0 * curvature * value / (slope * slope)
     return select(inner <= 0.0, value / slope, 2.0 * value / (slope * (1.0 + math.sqrt(inner))))
 
 
 @form_of(solve_small, any_lanes)
 def solve_small_lanes(small, state, active, p):
-    """Use the closed forms if they hold for all lanes, else the kernel for each lane; return the sum of its results."""
+    """Use the closed forms if they hold for all lanes, otherwise the kernel lane by lane; return the sum of results."""
     if p == 1 and every(abs(small[0, 0, 0]) > state[0, ka.ROW_FLOOR]):
         state[0, ka.FORCE] = state[0, ka.RHS] / small[0, 0, 0]
         return 0
@@ -228,7 +228,7 @@ def solve_small_lanes(small, state, active, p):
 
 @form_of(solve_dependent, any_lanes)
 def solve_dependent_lanes(small, state, active, p):
-    """One by one."""
+    """Solve lane by lane."""
     dependent = 0
     for k in range(lane_count(small)):
         dependent += solve_dependent(lane(small, k), lane(state, k), active, p)
@@ -237,7 +237,7 @@ def solve_dependent_lanes(small, state, active, p):
 
 @form_of(solve_near_shares, any_lanes)
 def solve_near_shares_lanes(unilateral, ws, p):
-    """One by one."""
+    """Solve lane by lane."""
     dependent = 0
     for k in range(lane_count(ws)):
         dependent += solve_nearest(unilateral, lane(ws, k), p)
@@ -261,7 +261,7 @@ def all_clearly_unique(ws):
 
 @form_of(slide_direction, any_lanes)
 def slide_direction_lanes(unilateral, contacts, k, slip, n):
-    """Each lane's own direction; ``unilateral.slide`` keeps the speed of the last state that was evaluated alone."""
+    """Return the direction of each lane; ``unilateral.slide`` keeps the speed of the last single-state evaluation."""
     slide, (x, y, z) = unilateral.slide, slip
     a, b, c = slide[k, ku.REFERENCE], slide[k, ku.REFERENCE + 1], slide[k, ku.REFERENCE + 2]
     along = x * a + y * b + z * c
@@ -285,8 +285,8 @@ def slide_direction_lanes(unilateral, contacts, k, slip, n):
 
 @form_of(admissible_forces, any_lanes)
 def admissible_forces_lanes(model, contacts, unilateral, ws):
-    """One by one, where there is something to look at."""
-    if unilateral is None:  # known to the compiler
+    """Check lane by lane, if there is anything to check."""
+    if unilateral is None:  # resolved at compile time
         return
     if unilateral.number[ku.REDUNDANT] == 1.0 or unilateral.stop.shape[0] + unilateral.dry.shape[0] > 0:
         for k in range(lane_count(ws)):
@@ -295,7 +295,7 @@ def admissible_forces_lanes(model, contacts, unilateral, ws):
 
 @form_of(sign_changed, any_lanes)
 def sign_changed_lanes(ws, passes):
-    """True if any lane's signs have changed. The other lanes keep theirs: once they agree, they remain in agreement."""
+    """True if the signs of any lane have changed. Lanes whose signs agree keep them, and still agree afterwards."""
     one_way = False
     for k in range(ws.counts[ka.ROWS]):
         if ws.active[k, ka.LAW] == ka.FRICTION_DISSIPATIVE:
@@ -310,14 +310,14 @@ def sign_changed_lanes(ws, passes):
 
 @form_of(evaluate_reference, times)
 def evaluate_reference_lanes(drives, reference, t, ws):
-    """At several times, which may lie in different segments."""
+    """Evaluate at several times, which may be in different segments."""
     for k in range(lane_count(t)):
         evaluate_reference(drives, reference, lane(t, k), lane(ws, k))
 
 
 @form_of(fed_forward, times)
 def fed_forward_lanes(voltage, grid, t, a, asked):
-    """The same of planned voltages."""
+    """Add planned voltages at several times."""
     if voltage.shape[0] == 0:
         return asked
     for k in range(lane_count(t)):
@@ -327,25 +327,25 @@ def fed_forward_lanes(voltage, grid, t, a, asked):
 
 @form_of(add_loads, times)
 def add_loads_lanes(model, loads, t, ws, power, start):
-    """The same of external wrenches."""
+    """Add external wrenches at several times."""
     for k in range(lane_count(t)):
         add_loads(model, loads, lane(t, k), lane(ws, k), lane(power, k), start)
 
 
-# The right-hand side on SIMD lanes: ``derivative`` of four states at four times, and its tables.
+# Evaluation: ``derivative`` of four states at four times, and its tables.
 
 
-# Parts of a system whose kernels have no forms for lanes.
+# Parts of a system whose kernels have no variants for lanes.
 _WITHOUT_FORMS = ("dense", "shapes")
 
 
 def has_forms(system: System) -> bool:
-    """True of points on quadrics, by the articulated solve: only their right-hand sides compile for lanes."""
+    """True for points on quadrics with the articulated solve: only these right-hand sides compile for lanes."""
     return all(getattr(system, name) is None for name in _WITHOUT_FORMS)
 
 
 class StageLanes(NamedTuple):
-    """Room for right-hand sides that are evaluated four at a time."""
+    """Arrays of right-hand sides that are evaluated four at a time."""
 
     ws: Workspace
     t: np.ndarray  # (4,)
@@ -356,19 +356,19 @@ class StageLanes(NamedTuple):
 
 
 def stage_lanes(ws: Workspace, m: int, columns: int) -> StageLanes:
-    """Allocate :class:`StageLanes` beside a workspace, whose rows are taken whenever the Jacobian is made anew."""
+    """Allocate :class:`StageLanes` for a workspace, whose rows are copied whenever the Jacobian is recomputed."""
     return StageLanes(lane_workspace(ws), aligned(4), aligned(m, 4), aligned(m, 4), aligned(4), aligned(columns, 4))
 
 
 @noinline_kernel
 def evaluate_four(lanes: StageLanes, system: System):
-    """``derivative`` of all lanes, one program for all of its callers."""
+    """Call ``derivative`` for all lanes; one compiled program for all callers."""
     derivative(system, as_lanes(lanes.t)[()], as_lanes(lanes.y), tables_as_lanes(lanes.ws), as_lanes(lanes.f))
 
 
 @internal_kernel
 def take_rows(ws: Workspace, lanes: Workspace):
-    """Rows, modes and anchors of a workspace for all lanes of another one."""
+    """Copy rows, modes and anchors of a workspace to all lanes of another one."""
     for r in range(ws.active.shape[0]):
         for s in range(ws.active.shape[1]):
             lanes.active[r, s] = ws.active[r, s]
@@ -381,7 +381,7 @@ def take_rows(ws: Workspace, lanes: Workspace):
                 lanes.contacts[c, s, k] = ws.contacts[c, s]
     for s in range(ws.counts.shape[0]):
         lanes.counts[s] = ws.counts[s]
-    # As solves leave it that have other rows: joints that none of them feels are zero.
+    # As after solves with other rows: entries of joints that no row involves are zero.
     for i in range(ws.column.shape[0]):
         for s in range(ws.column.shape[1]):
             for k in range(4):

@@ -1,8 +1,8 @@
 """The articulated solver: O(n) elimination for accelerations and the matrix of constraint rows; M is never formed.
 
 Eliminating the joints from the tips to the root factors M + J_m; D_i is the pivot of joint i. For a right-hand side b
-let column(b) be the eliminated b; then a·(M + J_m)⁻¹ b = Σ_i column(a)_i column(b)_i / D_i. So the p×p matrix of the
-constraints needs only dot products of columns, and one forward sweep gives vdot.
+let column(b) be the eliminated b; then a·(M + J_m)⁻¹ b = Σ_i column(a)_i column(b)_i / D_i. The p×p matrix of the
+constraints thus needs only dot products of columns, and one forward sweep gives vdot.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from dynsim.jit.kernel import inline_kernel, internal_kernel, kernel, noinline_k
 
 @internal_kernel
 def factor(model: ModelArrays, ws: Workspace):
-    """Tips to root, after ``forward_sweep``: articulated inertias, and what the applied forces leave at each joint.
+    """Compute articulated inertias and eliminated applied forces, tips to root, after ``forward_sweep``.
 
     I^A_i = I_i + Σ_children (I^A − U Uᵀ/D), U = I^A S, D = S·U + J_m (Featherstone, world frame, one origin).
-    F^A_i = F_i + Σ_children (F^A + U w/D), w = applied − S·F^A, into ``ws.column[:, 0]``. The inertial wrenches F are
-    those of the sweep: velocity products and weight come in here, so the bias forces need no pass of their own.
+    F^A_i = F_i + Σ_children (F^A + U w/D), w = applied − S·F^A, into ``ws.column[:, 0]``. The inertial wrenches F come
+    from the sweep: velocity products and weight enter here, so the bias forces need no separate pass.
     """
     tree, body, links, joints, column = model.tree, model.body, ws.links, ws.joints, ws.column
     n = tree.shape[0]
@@ -47,8 +47,8 @@ def factor(model: ModelArrays, ws: Workspace):
                 links[i, ka.IA + k] = 0.0
             for k in range(6):
                 links[i, ka.F + k] = 0.0
-    # What link i + 1 hands down, kept in registers while the chain is serial; only links with further children
-    # collect in memory.
+    # Contribution of link i + 1, kept in registers while the chain is serial; only links with further children
+    # accumulate in memory.
     I, F = ZERO_INERTIA, ZERO_SIX
     for i in range(n - 1, -1, -1):
         m, c, I_c = body_inertia(model, ws, i)
@@ -79,11 +79,11 @@ def factor(model: ModelArrays, ws: Workspace):
 
 @internal_kernel
 def row_system(model: ModelArrays, ws: Workspace):
-    """The p×p system J M⁻¹ F f = target − J M⁻¹ applied, into ``ws.small[0]`` and the RHS column, after :func:`factor`.
+    """Write the p×p system J M⁻¹ F f = target − J M⁻¹ applied to ``ws.small[0]`` and the RHS column, after `factor`.
 
-    Row k and its force direction leave the columns ``ws.column[:, 1 + 2 k]`` and ``ws.column[:, 2 + 2 k]``. Only joints
-    between its links and the world feel a row; the rest of a column is zero from the start. Entry (k, m) is
-    Σ column_k column_m / D over the joints that both rows feel.
+    Row k and its force direction leave the columns ``ws.column[:, 1 + 2 k]`` and ``ws.column[:, 2 + 2 k]``. A row
+    involves only joints between its links and the world; the rest of a column is zero from the start. Entry (k, m) is
+    Σ column_k column_m / D over the joints that both rows involve.
     """
     tree, links, small, state = model.tree, ws.links, ws.small, ws.rows
     for k in range(ws.counts[ka.ROWS]):
@@ -95,7 +95,7 @@ def row_system(model: ModelArrays, ws: Workspace):
                 if k == ws.active[ws.active[k, ka.OWNER], ka.FIRST_ROW]:
                     sticking_columns(model, ws, k)
                 continue
-        # What elimination has left of the row and of its force direction.
+        # Row and force direction after the elimination so far.
         row, direction = six(state, k, ka.ROW), six(state, k, ka.DIRECTION)
         for m in range(k):
             small[0, k, m] = 0.0
@@ -114,8 +114,10 @@ def row_system(model: ModelArrays, ws: Workspace):
 
 @internal_kernel
 def enter_column(ws: Workspace, i, k, r, w, own, total):
-    """Put row and direction of row k at joint i into its columns and into the system; its own entry and right-hand side
-    so far."""
+    """Write row and direction of row k at joint i to its columns and to the system.
+
+    Returns its own entry and right-hand side so far.
+    """
     column, small = ws.column, ws.small
     column[i, 1 + 2 * k] = r
     column[i, 2 + 2 * k] = w
@@ -129,10 +131,10 @@ def enter_column(ws: Workspace, i, k, r, w, own, total):
 
 @noinline_kernel
 def sticking_columns(model: ModelArrays, ws: Workspace, k):
-    """:func:`row_system` for the three rows of a point that sticks, k and the next two: their own directions.
+    """Do :func:`row_system` for the three rows of a sticking point, k and the next two, with their own directions.
 
-    One walk for all of them. What they have in common with the rows before is the same on both sides of the diagonal
-    unless the other one slides.
+    One pass for all of them. Their products with earlier rows are symmetric about the diagonal unless the other row
+    slides.
     """
     tree, links, column, small, state = model.tree, ws.links, ws.column, ws.small[0], ws.rows
     b, c = k + 1, k + 2
@@ -179,15 +181,15 @@ def sticking_columns(model: ModelArrays, ws: Workspace, k):
 
 @noinline_kernel
 def two_ended_row(model: ModelArrays, ws: Workspace, k):
-    """Column, own entry and right-hand side of a row with two ends, as :func:`row_system` does them for one end.
+    """Compute column, own entry and right-hand side of a row with two ends, as :func:`row_system` does for one end.
 
-    Two accumulators climb from the two ends, the one with the larger index first, so that both meet in the first common
-    ancestor and go on as one. A joint row has no wrench: its coefficients enter at its two joints.
+    Two accumulators climb from the two ends, the larger index first, so that both meet in the first common ancestor
+    and continue as one. A joint row has no wrench: its coefficients enter at its two joints.
     """
     tree, links, small, state = model.tree, ws.links, ws.small, ws.rows
     first, last = ws.active[k, ka.BODY_A], ws.active[k, ka.BODY_B]
     jointed = ws.active[k, ka.ROW_KIND] == ka.JOINT_ROW
-    # Of the sides A and B: what elimination has left of row and direction.
+    # Sides A and B: row and direction after the elimination so far.
     row_a, direction_a = ZERO_SIX, ZERO_SIX
     if not jointed:
         row_a, direction_a = six(state, k, ka.ROW), six(state, k, ka.DIRECTION)
@@ -237,9 +239,9 @@ def add_row_forces(model: ModelArrays, ws: Workspace):
 
 @inline_kernel
 def sweep_accelerations(model: ModelArrays, ws: Workspace, onto):
-    """Forward sweep: vdot = (M + J_m)⁻¹ b from the eliminated b in ``ws.column[:, 0]``. Uses F as scratch.
+    """Compute vdot = (M + J_m)⁻¹ b from the eliminated b in ``ws.column[:, 0]``, in a forward sweep. F is scratch.
 
-    vdot_i = column_i / D − (U/D)·a_p, a_i = a_p + S vdot_i. It is added to what vdot was if ``onto`` is True.
+    vdot_i = column_i / D − (U/D)·a_p, a_i = a_p + S vdot_i. If ``onto`` is True, it is added to the present vdot.
     """
     tree, links, joints, column = model.tree, ws.links, ws.joints, ws.column
     # The acceleration of link i − 1 stays in registers; it is read back only where the tree branches.
@@ -269,7 +271,7 @@ def change_accelerations(model: ModelArrays, ws: Workspace):
 
 @kernel
 def forward_dynamics(model: ModelArrays, ws: Workspace):
-    """vdot = (M + J_m)⁻¹ (applied − h − g) without contacts: sweep, factor, accelerate. In and out: ``ws.joints``."""
+    """Compute vdot = (M + J_m)⁻¹ (applied − h − g) without contacts, in ``ws.joints``: sweep, factor, accelerate."""
     forward_sweep(model, ws, 1.0, 0.0, 1.0)
     factor(model, ws)
     accelerate(model, ws)

@@ -1,24 +1,24 @@
-"""Rows of joints with several rates (ball, rolling base, wheeled base): axes, poses, coordinates, and q̇ = N(q) v.
+"""Joints with several rates (ball, rolling base, wheeled base), sines and cosines, and positions of body-fixed points.
 
 Every joint is a sequence of one-velocity rows. A row is a link of the tree with a motion axis S and one velocity; all
 rows of a joint but the last are massless. The axes of a joint with several rows are fixed in the body that it carries,
 so with V_J = Σ S_k v_k and V the velocity of that body, d/dt(S_k) = V × S_k, and the bias of the joint is
-V × V_J = V_P × V_J: each row has the bias V_P × S_k v_k, V_P the velocity of what the *joint* is mounted on (``BASE``),
-not of the row before. The sweeps need nothing else.
+V × V_J = V_P × V_J: each row has the bias V_P × S_k v_k, where V_P is the velocity of the body on which the *joint* is
+mounted (``BASE``), not of the preceding row. The sweeps need nothing else.
 
-Positions are not the integrals of such velocities: q̇ = N(q) v, and there may be more of them than velocities. The
-first row takes its pose from the coordinates of the whole joint; the others copy it.
+Positions are not integrals of such velocities: q̇ = N(q) v, and there may be more positions than velocities. The first
+row computes its pose from the coordinates of the whole joint; the others copy it.
 
 =====================  ===============================  ==================================================
 joint                  coordinates                      rows
 =====================  ===============================  ==================================================
 ball                   quaternion w, x, y, z            angular velocity about the body's x, y, z
 rolling base           x, y, heading in the ground      unit speed along the heading; unit rate of turning
-wheeled base           angles of its left and right     rates of the wheels: each moves the axle's middle by r/2 ahead
-                       wheel; x, y in the ground        and turns it by r/T, the left one to the right
+wheeled base           angles of its left and right     rates of the wheels: each moves the centre of the axle by r/2
+                       wheel; x, y in the ground        forwards and turns it by r/T, the left wheel to the right
 =====================  ===============================  ==================================================
 
-The heading of a wheeled base is (r/T)(right − left): r/T is the parameter of its first row, r/2 that of its second.
+The heading of a wheeled base is (r/T)(right − left): r/T is the parameter of its first row, r/2 of its second.
 
 A free body is three prismatic rows and a ball; a planar joint two prismatic rows and a revolute one.
 """
@@ -66,9 +66,9 @@ COS10, COS12, COS14 = -2.75573143513906633035e-07, 2.08757232129817482790e-09, -
 
 @internal_kernel
 def sine_cosine_of(q):
-    """Sine and cosine of one q; within one unit in the last place of libm's.
+    """Return sine and cosine of one q; within one unit in the last place of libm.
 
-    Free of calls, which would push all values of a sweep out of their registers, and of branches:
+    Contains no calls, which would push all values of a sweep out of their registers, and no branches:
     r = q − k π/2 with π/2 in three parts, then the polynomials of FreeBSD's msun (k_sin.c, k_cos.c) on |r| ≤ π/4.
     Infinite q gives NaN.
     """
@@ -86,7 +86,7 @@ def sine_cosine_of(q):
 
 @internal_kernel
 def sine_cosine(joints, trig):
-    """Sine and cosine of every q, into trig: (3, ≥ n), in vectors of several q."""
+    """Write sine and cosine of every q to trig, (3, ≥ n), in vectors of several q."""
     for i in range(joints.shape[0]):
         trig[2, i] = joints[i, ka.Q]
     for i in range(trig.shape[1]):
@@ -95,13 +95,14 @@ def sine_cosine(joints, trig):
 
 @internal_kernel
 def row_motion(model: ModelArrays, ws: Workspace, i, B, p):
-    """Pose and motion axis of row i of a joint with several rows.
+    """Return pose and motion axis of row i of a joint with several rows.
 
     Parameters
     ----------
-    model : tables of the joints' placements, axes and parameters
-    B, p : rotation and origin of the joint's frame at q = 0 in the world; of a later row the pose that its predecessor
-        has left
+    model : ModelArrays
+        Placements, axes and parameters of the joints.
+    B, p : tuple
+        Rotation and origin of the joint frame at q = 0 in the world; for later rows, the pose of the preceding row.
 
     Returns
     -------
@@ -109,7 +110,7 @@ def row_motion(model: ModelArrays, ws: Workspace, i, B, p):
         Rotation and origin of the body, axis as a motion at the world origin.
     """
     kind, joints, trig = model.tree[i, ka.KIND], ws.joints, ws.trig
-    # Of a unit rate: the angular velocity s, and the velocity l of the body's origin.
+    # At unit rate: angular velocity s, and velocity l of the body's origin.
     s, l = ZERO_VECTOR, ZERO_VECTOR
     if kind == ka.BALL_X:
         B = compose(B, turned(joints[i, ka.Q], joints[i, ka.EXTRA], joints[i + 1, ka.Q], joints[i + 2, ka.Q]))
@@ -148,7 +149,7 @@ def row_motion(model: ModelArrays, ws: Workspace, i, B, p):
 
 @internal_kernel
 def turned(w, x, y, z):
-    """Rotation of a quaternion of any length: between two normalisations it drifts."""
+    """Return the rotation of a quaternion of any length, because it drifts between normalisations."""
     s = 2.0 / (w * w + x * x + y * y + z * z)
     return (
         1.0 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y),
@@ -159,13 +160,13 @@ def turned(w, x, y, z):
 
 @internal_kernel
 def row_rates(model: ModelArrays, ws: Workspace, i, v, vdot, gx, gy, gz):
-    """V and A of link i from its axis S, for every kind of joint: V = V_p + S v, A = A_p + V_b × S v + S vdot.
+    """Return V and A of link i from its axis S, for every kind of joint: V = V_p + S v, A = A_p + V_b × S v + S vdot.
 
-    p is the parent, b what the joint is mounted on. ``forward_sweep`` writes this out for joints of one row.
+    p is the parent, b the body on which the joint is mounted. ``forward_sweep`` inlines this for joints of one row.
     """
     links, j, m = ws.links, model.tree[i, ka.PARENT], model.tree[i, ka.BASE]
     bias = cross_motion(six(links, m, ka.V), six(links, i, ka.S)) if m >= 0 else ZERO_SIX
-    # The world's acceleration is −g.
+    # The acceleration of the world is −g.
     root = (0.0, 0.0, 0.0, -gx, -gy, -gz)
     for s in range(6):
         links[i, ka.V + s] = links[i, ka.S + s] * v + (links[j, ka.V + s] if j >= 0 else 0.0)
@@ -174,9 +175,9 @@ def row_rates(model: ModelArrays, ws: Workspace, i, v, vdot, gx, gy, gz):
 
 @noinline_kernel
 def sweep_row(model: ModelArrays, ws: Workspace, i, v, vdot, gx, gy, gz):
-    """R, p, S, V and A of row i into ``ws.links``: what ``forward_sweep`` does for a link (dynsim.dynamics.tree.sweep).
+    """Write R, p, S, V and A of row i to ``ws.links``, as ``forward_sweep`` does for a link.
 
-    v, vdot : rate and acceleration of the row with the sweep's factors; g : gravity likewise
+    ``v``, ``vdot`` and gravity g include the factors of the sweep.
     """
     body, links, j = model.body, ws.links, model.tree[i, ka.PARENT]
     B, p = rotation(body, i, ka.R_PJ), vector(body, i, ka.P_PJ)
@@ -192,7 +193,7 @@ def sweep_row(model: ModelArrays, ws: Workspace, i, v, vdot, gx, gy, gz):
 
 @kernel
 def read_positions(model: ModelArrays, y, start, ws: Workspace):
-    """Coordinates of all joints from y[start:] into the workspace."""
+    """Copy the coordinates of all joints from y[start:] to the workspace."""
     tree, joints = model.tree, ws.joints
     for i in range(tree.shape[0]):
         k = start + tree[i, ka.POSITION_INDEX]
@@ -205,22 +206,22 @@ def read_positions(model: ModelArrays, y, start, ws: Workspace):
 
 @internal_kernel
 def quaternion_rate(w, x, y, z, a, b, c):
-    """q̇ = ½ q ∘ (0, ω) of q = (w, x, y, z), from the angular velocity ω = (a, b, c) in the body."""
+    """Return q̇ = ½ q ∘ (0, ω) of q = (w, x, y, z), from the angular velocity ω = (a, b, c) in the body."""
     a, b, c = 0.5 * a, 0.5 * b, 0.5 * c
     return -(x * a + y * b + z * c), w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a
 
 
 @internal_kernel
 def quaternion_turn(w, x, y, z, dw, dx, dy, dz):
-    """vec(q̄ ∘ δq) of q = (w, x, y, z): half the turn, in the body, that changes a unit quaternion q by δq."""
+    """Return vec(q̄ ∘ δq) of q = (w, x, y, z): half the rotation in the body that changes a unit quaternion q by δq."""
     return w * dx - x * dw - y * dz + z * dy, w * dy - y * dw - z * dx + x * dz, w * dz - z * dw - x * dy + y * dx
 
 
 @noinline_kernel
 def position_rates(model: ModelArrays, ws: Workspace, dy, start):
-    """q̇ = N(q) v into dy[start:]. Ball: ½ q ∘ (0, ω) with ω in the body; rolling: V (cos ψ, sin ψ), ω.
+    """Write q̇ = N(q) v to dy[start:]. Ball: ½ q ∘ (0, ω) with ω in the body; rolling: V (cos ψ, sin ψ), ω.
 
-    Wheels: their own rates, and V = (r/2)(left + right) along the heading as of a rolling base.
+    Wheels: their own rates, and V = (r/2)(left + right) along the heading as for a rolling base.
     """
     tree, joints = model.tree, ws.joints
     for i in range(tree.shape[0]):
@@ -259,7 +260,7 @@ def displace(model: ModelArrays, ws: Workspace, y, start):
             y[k + 1] += joints[i, ka.QDD] * ws.trig[0, i + 1]
         elif kind == ka.LEFT_WHEEL:
             left, right = joints[i, ka.QDD], joints[i + 1, ka.QDD]
-            # Along the heading halfway: what is left of the displacement's square is then no first-order error.
+            # Heading at half the displacement: the error is then of third order, not second.
             heading = model.body[i, ka.PARAMETER] * (y[k + 1] - y[k] + 0.5 * (right - left))
             shift = model.body[i + 1, ka.PARAMETER] * (left + right)
             y[k] += left
@@ -285,10 +286,10 @@ def normalise(model: ModelArrays, y, start):
 
 @internal_kernel
 def position_error(model: ModelArrays, y, y_new, error, start, rtol, atol):
-    """Sum of squares of the errors of the positions, each per its tolerance, and their number: for the step control.
+    """Return the sum of squares of the position errors relative to their tolerances, and their number.
 
     The error of a quaternion counts as the three angles 2 vec(q̄ ∘ δq) of the rotation that undoes it, against
-    atol + rtol [rad]: what a revolute joint one radian from zero is held to.
+    atol + rtol [rad]: the same as for a revolute joint one radian from zero.
     """
     tree, total, count = model.tree, 0.0, 0
     for i in range(tree.shape[0]):
@@ -311,7 +312,7 @@ def position_error(model: ModelArrays, y, y_new, error, start, rtol, atol):
 
 @internal_kernel
 def positions_along(model: ModelArrays, y, start, u, out):
-    """out[start:] ← out[start:] + N(q) u, positions of y[start:], rates u (n,); both may be complex."""
+    """Add N(q) u to out[start:], with positions y[start:] and rates u (n,); both may be complex."""
     tree = model.tree
     for i in range(tree.shape[0]):
         k, kind = start + tree[i, ka.POSITION_INDEX], tree[i, ka.KIND]
@@ -336,7 +337,7 @@ def positions_along(model: ModelArrays, y, start, u, out):
 
 @internal_kernel
 def rates_across(model: ModelArrays, y, start, d, out):
-    """Rates out (n,) whose positions change as d[start:] does, as far as rates can: N⁺ d; both may be complex."""
+    """Write N⁺ d to out, (n,): rates whose positions change as d[start:], as closely as possible; may be complex."""
     tree = model.tree
     for i in range(tree.shape[0]):
         k, kind = start + tree[i, ka.POSITION_INDEX], tree[i, ka.KIND]
@@ -356,7 +357,7 @@ def rates_across(model: ModelArrays, y, start, d, out):
 
 @kernel
 def point_position(ws: Workspace, link, point, out):
-    """p_WB + R_WB point: world position of a body-fixed point, after ``forward_sweep``. out: (3,) [m]."""
+    """Write p_WB + R_WB point to out, (3,) [m]: world position of a body-fixed point, after ``forward_sweep``."""
     if link < 0:
         out[0], out[1], out[2] = point[0], point[1], point[2]
         return
@@ -365,7 +366,7 @@ def point_position(ws: Workspace, link, point, out):
 
 @kernel
 def point_jacobian(model: ModelArrays, ws: Workspace, link, position, out):
-    """Jacobian of the world velocity of the point at ``position`` on ``link``; out: (3, n) [m/rad or 1].
+    """Write the Jacobian of the world velocity of the point at ``position`` on ``link`` to out, (3, n) [m/rad or 1].
 
     Column j is S_lin + S_ang × position for every joint j between the world and the link, zero elsewhere.
     """

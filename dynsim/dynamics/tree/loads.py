@@ -14,9 +14,9 @@ from dynsim.jit.kernel import internal_kernel, noinline_kernel
 # LoadArrays.table, int
 LINK, IN_BODY, HOLDS, DATA, SEGMENTS = 0, 1, 2, 3, 4
 TABLE_SIZE = 5
-# Of LoadArrays.data, from table[l, DATA] on: point in the body's frame [m], wrench that is added to that of the
-# segments: force [N] and moment [N m]. Then the segments: first time [s], then ascending powers of t − that time, four
-# for each component of force and moment. At last the time at which the last segment ends.
+# LoadArrays.data, from table[l, DATA] on: point in the body's frame [m], wrench that is added to the segments' wrench:
+# force [N] and moment [N m]. Then the segments: first time [s], then ascending powers of t − that time, four for each
+# component of force and moment. Finally the end time of the last segment.
 POINT, WRENCH, FIRST_SEGMENT = 0, 3, 9
 SEGMENT_SIZE = 25
 
@@ -24,22 +24,22 @@ SEGMENT_SIZE = 25
 class LoadArrays(NamedTuple):
     """External wrenches."""
 
-    table: np.ndarray  # (l, TABLE_SIZE) int: link, axes of the wrench, held beyond its times, place in data, segments
+    table: np.ndarray  # (l, TABLE_SIZE) int: link, axes of the wrench, held beyond its times, start in data, segments
     data: np.ndarray  # (…,) see POINT, WRENCH, FIRST_SEGMENT
 
 
 @internal_kernel
 def segment_start(loads: LoadArrays, k, t):
-    """Place in ``loads.data`` of the segment of load k that t lies in, and the time to evaluate it at; −1 for none.
+    """Return the start in ``loads.data`` of the segment of load k at t, and the time of evaluation; −1 for none.
 
-    Depends on time alone, so it is the same for all states that are evaluated together.
+    Depends on time only, so it is the same for all states that are evaluated together.
     """
     count = loads.table[k, SEGMENTS]
     first = loads.table[k, DATA] + FIRST_SEGMENT
     if count == 0:
         return -1, t
     end = loads.data[first + count * SEGMENT_SIZE]
-    # From the right at both ends: the steps end there (Run.breaks).
+    # Both ends belong to the right: the steps end there (Run.breaks).
     if t < loads.data[first] or t >= end:
         if loads.table[k, HOLDS] == 0:
             return -1, t
@@ -56,7 +56,7 @@ def segment_start(loads: LoadArrays, k, t):
 
 @internal_kernel
 def load_wrench(loads: LoadArrays, k, t, ws: Workspace):
-    """Moment about the world origin and force of load k at time t in W [N m, N], after ``forward_sweep``."""
+    """Return moment about the world origin and force of load k at time t in W [N m, N], after ``forward_sweep``."""
     links, table, data = ws.links, loads.table, loads.data
     i, start = table[k, LINK], table[k, DATA]
     force, moment = segment_vector(data, start + WRENCH), segment_vector(data, start + WRENCH + 3)
@@ -81,13 +81,13 @@ def load_wrench(loads: LoadArrays, k, t, ws: Workspace):
 
 @internal_kernel
 def segment_vector(data, c):
-    """Three numbers of the data from place c on."""
+    """Return three numbers of the data from index c on."""
     return data[c], data[c + 1], data[c + 2]
 
 
 @internal_kernel
 def cubic(data, c, x):
-    """Polynomial of degree three in x with its ascending coefficients from place c on."""
+    """Evaluate the cubic polynomial in x with ascending coefficients from index c on."""
     return data[c] + x * (data[c + 1] + x * (data[c + 2] + x * data[c + 3]))
 
 

@@ -1,8 +1,8 @@
 """Spatial algebra on tuples of numbers or of vectors (SIMD): 3-vectors, rotations, six-vectors, articulated inertias.
 
 Motions are (angular, linear) and wrenches (moment, force), both about the world origin in the axes of W (Featherstone,
-Rigid Body Dynamics Algorithms, 2008). A rotation is nine numbers, row by row. Tuples live in registers; ``six`` and its
-kin read them from row i of a table, from column c on, and ``put_six`` and its kin write them there.
+Rigid Body Dynamics Algorithms, 2008). A rotation is nine numbers, row by row. Tuples live in registers; ``six`` and
+similar functions read them from row i of a table, from column c on, and ``put_six`` etc. write them there.
 """
 
 from __future__ import annotations
@@ -346,7 +346,7 @@ def times(a, s):
 
 @internal_kernel
 def minus_outer(a, d, u):
-    """a − d uᵀ, symmetric: what a joint hands down of an articulated inertia, with d = u / D."""
+    """Return a − d uᵀ, symmetric: the articulated inertia passed down by a joint, with d = u / D."""
     return (
         a[0] - d[0] * u[0], a[1] - d[0] * u[1], a[2] - d[0] * u[2],
         a[3] - d[1] * u[1], a[4] - d[1] * u[2], a[5] - d[2] * u[2],

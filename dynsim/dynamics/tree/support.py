@@ -5,8 +5,8 @@ c = (c_x, c_y), in the plane z = 0 of its frame, whose z is the normal of the gr
 force along z and the moments about x and y, so they are determined; the constraints against side slip and of rolling
 give the forces along y and x. The base is assumed to stay on the ground: N < 0 is a pull.
 
-It carries its own tree of bodies. What objects beside it need comes from their hinges and contacts; what joins them to
-the tree acts on the base from outside, as contacts do.
+It carries its own tree of bodies. Separate objects are supported by their hinges and contacts; connections between
+them and the tree act on the base from outside, as contacts do.
 """
 
 from __future__ import annotations
@@ -36,21 +36,21 @@ from dynsim.dynamics.tree.spatial import (
 from dynsim.dynamics.tree.sweep import body_inertia, inertial_wrench
 from dynsim.jit.kernel import integers, internal_kernel, noinline_kernel, reals
 
-# SupportArrays.index, int: the body, and the rows of the wheels' rates
+# SupportArrays.index, int: body, and rows of the wheel rates
 BODY, LEFT, RIGHT = 0, 1, 2
 INDEX_SIZE = 3
 # SupportArrays.base
 TRACK, CASTER_X, CASTER_Y, SPIN_INERTIA, FRICTION = 0, 1, 2, 3, 4
-# Perimeter of the support triangle by the length of the side opposite to l, r and c: the largest margins there.
+# Perimeter of the support triangle divided by the side opposite to l, r and c: the largest margins there.
 SHARE = 5
 BASE_SIZE = 8
-# SupportArrays.state: what is recorded of it
-LOADS = 0  # 3: of left wheel, right wheel, caster [N]
+# SupportArrays.state: recorded values
+LOADS = 0  # 3: left wheel, right wheel, caster [N]
 PRESSURE = 3  # 2: centre of pressure in W [m], NaN for no load
 MARGIN = 5
 TRACTION = 6  # 2: |F| / (μ N) of left and right wheel, NaN for N <= 0
 OUTPUTS = 8
-# and what it follows from: the forces of the wheels along x, the sum of those along y [N]
+# and their causes: forces of the wheels along x, total force along y [N]
 LONGITUDINAL, LATERAL = 8, 10
 STATE_SIZE = 11
 # SupportArrays.least: loads as in state, then the margin
@@ -59,35 +59,35 @@ LEAST_SIZE = 4
 
 
 class SupportArrays(NamedTuple):
-    """The mobile base of a robot; tables of size zero: it has none."""
+    """Ground support of a mobile base; tables of size zero for a robot without one."""
 
     index: np.ndarray  # (INDEX_SIZE,) int
-    carried: np.ndarray  # (n,) int: 1 for the rows of its own tree, 0 for those of objects beside it
+    carried: np.ndarray  # (n,) int: 1 for the rows of its tree, 0 for separate objects
     base: np.ndarray  # (BASE_SIZE,)
     state: np.ndarray  # (STATE_SIZE,) written by ground_reaction
-    least: np.ndarray  # (LEAST_SIZE,) of the loads and of the margin at accepted steps, see watch_support
+    least: np.ndarray  # (LEAST_SIZE,) smallest loads and margin at accepted steps, see watch_support
 
 
 def no_support() -> SupportArrays:
-    """That of a robot without a mobile base."""
+    """Return the tables of a robot without a mobile base."""
     return SupportArrays(*(integers(np.zeros(0)) for _ in range(2)), *(reals(np.zeros(0)) for _ in range(3)))
 
 
 @noinline_kernel
 def ground_reaction(model: ModelArrays, loads: LoadArrays, t, ws: Workspace, support: SupportArrays):
-    """Loads, centre of pressure, tip margin and traction demand at time t into ``support.state``.
+    """Write loads, centre of pressure, tip margin and traction demand at time t to ``support.state``.
 
-    To be called right after ``derivative``; overwrites V with what it is and A with the accelerations minus gravity.
+    Call right after ``derivative``; overwrites V, with the same values, and A with the accelerations minus gravity.
 
     Balance of momentum of all bodies of its tree about the world origin: W = Σ (İV − weight) + İ_a − Σ W_contact −
     Σ W_load. The inertia I_a of the wheels about their axle y is not in the tensors of the bodies but on the rows of
     the wheels; its momentum I_a (φ̇_L + φ̇_R) y changes by I_a ((φ̈_L + φ̈_R) y + (φ̇_L + φ̇_R) ω × y). Momentum of rotors
-    and gears is left out, as it is of all joints. Moved to the base's frame, M_x = (N_L − N_R) T/2 + N_C c_y,
-    M_y = −N_C c_x, F_z = ΣN; M_z = (F_R − F_L) T/2 and F_x = F_L + F_R give the forces along x that roll the wheels.
+    and gears is omitted, as for all joints. Moved to the base's frame, M_x = (N_L − N_R) T/2 + N_C c_y, M_y = −N_C c_x,
+    F_z = ΣN; M_z = (F_R − F_L) T/2 and F_x = F_L + F_R give the forces along x that roll the wheels.
 
-    The margin is min_i d_i/ρ, d_i the distance of the centre of pressure Σ N_i p_i / ΣN from side i (negative beyond
-    it), ρ the inradius. N_i/ΣN are its barycentric coordinates, so d_i/ρ = (N_i/ΣN) (perimeter / side i): 1 at the
-    incentre. ΣN <= 0 counts as −1. Loaded wheels share the lateral force, by load.
+    The margin is min_i d_i/ρ with the distance d_i of the centre of pressure Σ N_i p_i / ΣN from side i (negative
+    beyond it) and the inradius ρ. N_i/ΣN are its barycentric coordinates, so d_i/ρ = (N_i/ΣN) (perimeter / side i): 1
+    at the incentre. ΣN <= 0 counts as −1. Loaded wheels share the lateral force in proportion to their loads.
     """
     links, joints, gravity = ws.links, ws.joints, model.gravity
     index, base, state, carried = support.index, support.base, support.state, support.carried
@@ -98,7 +98,7 @@ def ground_reaction(model: ModelArrays, loads: LoadArrays, t, ws: Workspace, sup
             mass, centre, inertia = body_inertia(model, ws, i)
             W = plus(W, inertial_wrench(ws, i, mass, centre, inertia))
     for k in range(ws.counts[ka.ROWS]):
-        # Forces between two joints are none from outside, nor are those between two of its bodies.
+        # Forces between two joints, or between two bodies of the tree, are internal.
         if ws.active[k, ka.ROW_KIND] != ka.JOINT_ROW:
             first, other = ws.active[k, ka.BODY_A], ws.active[k, ka.BODY_B]
             within = carried[other] if other >= 0 else 0
@@ -155,7 +155,7 @@ def ground_reaction(model: ModelArrays, loads: LoadArrays, t, ws: Workspace, sup
 
 @internal_kernel
 def tip_margin(model: ModelArrays, loads: LoadArrays, t, ws: Workspace, support: SupportArrays):
-    """The tip margin by :func:`ground_reaction`; a robot without a mobile base does not tip."""
+    """Return the tip margin from :func:`ground_reaction`; infinite without a mobile base."""
     if support.index.shape[0] == 0:
         return math.inf
     ground_reaction(model, loads, t, ws, support)
@@ -164,7 +164,7 @@ def tip_margin(model: ModelArrays, loads: LoadArrays, t, ws: Workspace, support:
 
 @internal_kernel
 def watch_support(support: SupportArrays):
-    """Least loads and margin so far, after :func:`ground_reaction` at the end of an accepted step."""
+    """Update the smallest loads and margin, after :func:`ground_reaction` at the end of an accepted step."""
     if support.index.shape[0] == 0:
         return
     state, least = support.state, support.least

@@ -33,10 +33,10 @@ from dynsim.jit.kernel import internal_kernel, kernel
 
 @internal_kernel
 def forward_sweep(model: ModelArrays, ws: Workspace, velocity, acceleration, gravity):
-    """Root to tips: pose, axis, velocity and acceleration of every link ([WM] eqs 36–41).
+    """Compute pose, axis, velocity and acceleration of every link, root to tips ([WM] eqs 36–41).
 
     X_WB = X_WP X_PJ X_J(q). A revolute axis a through p is S = (a, p × a), a prismatic one S = (0, a).
-    V = V_p + S v and A = A_p + V_p × S v + S vdot with A_world = −gravity, so that every inertial wrench holds the
+    V = V_p + S v and A = A_p + V_p × S v + S vdot with A_world = −gravity, so that every inertial wrench includes the
     weight.
 
     Parameters
@@ -100,13 +100,13 @@ def forward_sweep(model: ModelArrays, ws: Workspace, velocity, acceleration, gra
             put_six(links, i, ka.V, J)
             put_six(links, i, ka.A, (S[0] * ai, S[1] * ai, S[2] * ai, S[3] * ai - gx, S[4] * ai - gy, S[5] * ai - gz))
         if k > ka.PRISMATIC:
-            # Apart from the rest, which keeps its values in registers.
+            # In a separate function, so that the other values stay in registers.
             sweep_row(model, ws, i, vi, ai, gx, gy, gz)
 
 
 @internal_kernel
 def body_inertia(model: ModelArrays, ws: Workspace, i):
-    """Mass, centre of mass c in W, and inertia I_c about it in the axes of W (xx xy xz yy yz zz), after a sweep."""
+    """Return mass, centre of mass c in W, and inertia I_c about it in W axes (xx xy xz yy yz zz), after a sweep."""
     body, R = model.body, rotation(ws.links, i, ka.R)
     I_b = six(body, i, ka.INERTIA)
     t0, t1, t2 = times_inertia(I_b, (R[0], R[1], R[2]))
@@ -125,7 +125,7 @@ def body_inertia(model: ModelArrays, ws: Workspace, i):
 
 @internal_kernel
 def inertial_wrench(ws: Workspace, i, m, c, I):
-    """Wrench about the world origin that moves body i as the sweep says: (I_c α + ω × I_c ω + c × m a_c, m a_c)."""
+    """Return the wrench about the world origin for the motion of body i: (I_c α + ω × I_c ω + c × m a_c, m a_c)."""
     w, A = vector(ws.links, i, ka.V), six(ws.links, i, ka.A)
     a = point_acceleration(A, six(ws.links, i, ka.V), c)
     fx, fy, fz = m * a[0], m * a[1], m * a[2]
@@ -142,15 +142,15 @@ def inertial_wrench(ws: Workspace, i, m, c, I):
 
 @kernel
 def kinematics(model: ModelArrays, ws: Workspace):
-    """Poses, axes and velocities of all links from q and v in ``ws.joints``: :func:`forward_sweep` at vdot = 0."""
+    """Compute poses, axes and velocities of all links from q and v in ``ws.joints``, with vdot = 0."""
     forward_sweep(model, ws, 1.0, 0.0, 1.0)
 
 
 @kernel
 def newton_euler(model: ModelArrays, ws: Workspace, velocity, acceleration, gravity):
-    """Generalised forces tau = M vdot + h + g, into the BIAS column of ``ws.joints`` [N m or N] ([WM] eqs 42–44, 52).
+    """Write tau = M vdot + h + g to the BIAS column of ``ws.joints`` [N m or N] ([WM] eqs 42–44, 52).
 
-    Forward sweep, then tips to root: F_i += Σ_children F, tau_i = S·F_i. The factors are those of
+    Forward sweep, then tips to root: F_i += Σ_children F, tau_i = S·F_i. For the factors see
     :func:`forward_sweep`. Reflected motor inertia and joint losses are not in tau.
     """
     forward_sweep(model, ws, velocity, acceleration, gravity)
@@ -170,10 +170,9 @@ def newton_euler(model: ModelArrays, ws: Workspace, velocity, acceleration, grav
 
 @kernel
 def mass_matrix(model: ModelArrays, ws: Workspace, M):
-    """M(q), column by column as p(q, 0, e_i, 0) ([WM] eq 55). M: (n, n) output.
+    """Write M(q) to M, (n or more, n or more), column by column as p(q, 0, e_i, 0) ([WM] eq 55).
 
-    Overwrites V, A, F, vdot and bias of the workspace. M may have more rows and columns than n.
-    Reflected motor inertia is not added.
+    Overwrites V, A, F, vdot and bias of the workspace. Reflected motor inertia is not added.
     """
     n, joints = model.tree.shape[0], ws.joints
     for i in range(n):

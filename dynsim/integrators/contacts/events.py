@@ -67,17 +67,17 @@ from dynsim.integrators.contacts.resting import hold_free_joints, leave_least, s
 from dynsim.integrators.run import GAP_TOLERANCE, RATE_TOLERANCE, Run, project_level
 from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
-# Release of joints that dry friction holds although other rows have begun to turn them.
+# Release of joints held by dry friction when other rows begin to turn them.
 
 
-# Share of the tolerances of projection that errors which it cannot remove may reach, and the share below which a sum of
-# errors need not be looked at.
+# Fraction of the projection tolerances that errors which projection cannot remove may reach, and the fraction below
+# which the sum of the errors is not examined.
 MOST_LEFT, LITTLE_LEFT = 0.5, 0.25
 
 
 @internal_kernel
 def note_left(unilateral: UnilateralArrays, ws: Workspace):
-    """Note the error that projection leaves right after a choice of modes; it does not grow if nothing moves."""
+    """Record the error that projection leaves right after a choice of modes; it does not grow if nothing moves."""
     left = 0.0
     if unilateral.number[ku.REDUNDANT] == 1.0:
         left, _ = contradiction(unilateral, ws)
@@ -86,13 +86,13 @@ def note_left(unilateral: UnilateralArrays, ws: Workspace):
 
 @internal_kernel
 def most_left(unilateral: UnilateralArrays):
-    """Share of the tolerances at which a joint is released: growing errors may use half of the remaining tolerance."""
+    """Return the fraction of the tolerances at which a joint is released: half of the remaining tolerance."""
     return unilateral.number[ku.LEFT] + MOST_LEFT * (1.0 - unilateral.number[ku.LEFT])
 
 
 @internal_kernel
 def left_margin(unilateral: UnilateralArrays, ws: Workspace, k):
-    """1 where rows agree; below 0 if a joint is to be let go. The guard of the first held joint looks for all."""
+    """Return 1 if the rows agree, below 0 if a joint must be released; the guard of the first held joint checks all."""
     for j in range(k):
         if unilateral.dry_table[j, ku.DRY_HOLDS] == 1:
             return 1.0
@@ -102,19 +102,22 @@ def left_margin(unilateral: UnilateralArrays, ws: Workspace, k):
 
 @noinline_kernel
 def contradiction(unilateral: UnilateralArrays, ws: Workspace):
-    """What projection leaves of gaps and rates along rows of which held joints are a part, right after ``derivative``.
+    """Compute the residual of projection along rows that involve held joints, right after ``derivative``.
 
     Nothing else in the workspace changes.
 
     Returns
     -------
-    left, joint : its norm as a share of the tolerance, the larger of both levels; the joint to release, or −1
+    left : float
+        Norm of the residual as a fraction of the tolerance; the larger of gaps and rates.
+    joint : int
+        Joint to release, or −1.
     """
     rows, p, off, most, gives = ws.rows, ws.counts[ka.ROWS], 0.0, 0.0, -1
     row_errors(ws)
     for r in range(p):
         off += (rows[r, ka.ROW_GAP] / GAP_TOLERANCE) ** 2 + (rows[r, ka.ROW_RATE] / RATE_TOLERANCE) ** 2
-    # The remainder of least squares is no larger than the errors themselves.
+    # The least-squares residual is at most as large as the errors themselves.
     if off <= LITTLE_LEFT * LITTLE_LEFT:
         return most, gives
     force, right, errors = unilateral.vector[0], unilateral.vector[1], unilateral.vector[2]
@@ -137,10 +140,10 @@ def contradiction(unilateral: UnilateralArrays, ws: Workspace):
 
 @internal_kernel
 def first_to_yield(unilateral: UnilateralArrays, errors, norm):
-    """Return the held joint that slips first as forces against these errors grow; −1 if none has a part in them.
+    """Return the held joint that slips first as forces against these errors grow; −1 if none is involved.
 
-    The errors are along the one combination w of rows with wᵀ J = 0, so that their forces may change along w without
-    another motion. Forces against the errors grow until one of them is at the bound that opposes its error.
+    The errors lie along the only combination w of rows with wᵀ J = 0, so forces can change along w without changing the
+    motion. They grow against the errors until one of them reaches the bound that opposes its error.
     """
     table, least, joint, forces = unilateral.dry_table, math.inf, -1, unilateral.vector[0]
     for k in range(table.shape[0]):
@@ -154,16 +157,16 @@ def first_to_yield(unilateral: UnilateralArrays, errors, norm):
 
 @noinline_kernel
 def let_joint_go(system: System, ws: Workspace, run: Run):
-    """Let a held joint that contradicts other rows move as these rows turn it; True if there was one.
+    """Release a held joint that contradicts other rows, so that these rows can turn it; True if there was one.
 
-    Right after :func:`evaluate`; all modes are to be chosen then. If the rate of the joint is only rounding it will be
-    held again, where it is then.
+    Call right after :func:`evaluate`, then choose all modes. If the rate of the joint is only rounding, it is held
+    again in its new position.
     """
     unilateral, mode, y, layout = system.unilateral, system.unilateral.mode, run.y, system.layout
     if unilateral.number[ku.REDUNDANT] == 0.0:
         return False
     left, k = contradiction(unilateral, ws)
-    # Half of the growth is enough: rounding changes the value by which an event has been located.
+    # Half of the growth suffices: rounding changes the value at which the event was located.
     if k < 0 or left < 0.5 * (unilateral.number[ku.LEFT] + most_left(unilateral)):
         return False
     unilateral.dry_table[k, ku.DRY_HOLDS] = 0
@@ -177,7 +180,7 @@ def let_joint_go(system: System, ws: Workspace, run: Run):
     return True
 
 
-# Kinds of guards, behind those of dynsim.integrators.events.
+# Kinds of guards; numbers continue the list in dynsim.integrators.events.
 NORMAL_GUARD, SLIP_GUARD, STOP_GUARD, DRY_GUARD = 10, 11, 12, 13
 # Log entries of a candidate, of a stop, and (slip only) of a joint with dry friction.
 LANDING, LIFT_OFF, SLIP_START, SLIP_STOP, BOUNCE, CHATTERS, STOP_HIT, STOP_LEFT = 0, 1, 2, 3, 4, 5, 6, 7
@@ -187,19 +190,20 @@ LOG_KINDS = 8
 # rate of that slip.
 GAP_THEN, RATE_THEN, NORMAL_THEN, POSITION_THEN, SLIP_THEN, SLIP_RATE_THEN = 0, 1, 2, 5, 8, 9
 
-# A candidate that starts, or comes to rest, this close to its surface touches it [m].
+# A candidate that starts or comes to rest this close to its surface touches it [m].
 TOUCH = 1e-9
-# More events of a candidate or stop than MOST_EVENTS in WINDOW [s] are chatter; the speed below which impacts settle
-# grows tenfold then, up to MOST_SETTLE [m/s or rad/s].
+# More than MOST_EVENTS events of one candidate or stop in WINDOW [s] are chatter; the speed below which impacts settle
+# then grows tenfold, up to MOST_SETTLE [m/s or rad/s].
 WINDOW, MOST_EVENTS, MOST_SETTLE = 1.0, 200, 1e-2
-# More changes at one instant, which lasts INSTANT [s], or more chatter of one candidate or stop than this end the run.
+# More changes at one instant (of length INSTANT [s]), or more chatter of one candidate or stop, end the run.
 MOST_CHANGES, MOST_CHATTER = 60, 100
 INSTANT = 1e-11
 # A frozen direction of slip is updated when friction has turned from it by the angle with this tangent.
 TURNED = 0.5
-# At the end of the best split sticking is still a solution. So friction at rest is reduced for the choice of modes, by
-# FIRST_REDUCTION and ten times more up to MOST_REDUCTION, until the chosen modes agree with their forces: far above
-# rounding and the tolerances of the choice, far below the uncertainty of friction coefficients.
+# At the limit of the best split, sticking is still a solution. For the choice of modes, friction at rest is therefore
+# reduced by FIRST_REDUCTION, then by ten times as much at each trial up to MOST_REDUCTION, until the chosen modes agree
+# with their forces: far above rounding and the tolerances of the choice, far below the uncertainty of friction
+# coefficients.
 FIRST_REDUCTION, MOST_REDUCTION = 1e-5, 2e-3
 # Fraction of the largest force below which the normal force of a sticking point at its limit counts as zero.
 NO_FORCE = 1e-8
@@ -207,8 +211,8 @@ NO_FORCE = 1e-8
 
 @internal_kernel
 def contact_guard(contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: Workspace, kind, k):
-    """Value of a guard of the unilateral law, right after ``derivative``."""
-    if unilateral is None:  # known to the compiler
+    """Return the value of a guard of the unilateral law, right after ``derivative``."""
+    if unilateral is None:  # resolved at compile time
         return 1.0
     best, split = unilateral.number[ku.BEST_MARGIN], unilateral.number[ku.SPLIT] == 1.0
     if kind == STOP_GUARD:
@@ -225,7 +229,7 @@ def contact_guard(contacts: ContactArrays, unilateral: UnilateralArrays | None, 
     mode = ws.active[k, ka.MODE]
     if kind == NORMAL_GUARD:
         if mode == ka.STICKING and unilateral.number[ku.SPLIT] == 1.0 and normal_is_open(unilateral, ws, k):
-            # The least possible normal force only touches zero.
+            # The least possible normal force touches zero without crossing it.
             return approach_without_force(contacts, unilateral, ws, k)
         return (
             ws.contacts[k, ka.GAP] + unilateral.slide[k, ku.LANDS_AT]
@@ -235,8 +239,8 @@ def contact_guard(contacts: ContactArrays, unilateral: UnilateralArrays | None, 
     if mode == ka.SLIDING and contacts.law[k, ka.STATIC] > 0.0:
         return unilateral.slide[k, ku.SPEED] + unilateral.slide[k, ku.HEADWAY] + BACKWARD
     if mode == ka.STICKING:
-        # Dependent rows whose split of least norm is outside the cones: the forces are the least inside, on some cone,
-        # and do not show the margin left. If none fit, the split of best margin shows which contacts are at the limit.
+        # Dependent rows whose split of least norm is outside the cones: the forces are the smallest inside, lie on a
+        # cone, and do not show the remaining margin. If no split fits, the best one shows the contacts at the limit.
         if split and best > 0.0:
             return best
         return margin(contacts, unilateral, ws, k)
@@ -245,13 +249,13 @@ def contact_guard(contacts: ContactArrays, unilateral: UnilateralArrays | None, 
 
 @internal_kernel
 def rest_margin(unilateral: UnilateralArrays, ws: Workspace, k):
-    """1 where dry-friction joint k, which is held, does not accelerate; below 0 if its row cannot hold it any more.
+    """Return 1 if held dry-friction joint k does not accelerate, below 0 if its row can no longer hold it.
 
-    Rows may depend on each other in one posture only, such as a joint and a point at the crest of a surface. When they
-    leave it they contradict each other, at first by less than the rank of their system shows, and the solution of least
-    squares leaves accelerations along them. With modes chosen again the joint slides. It counts as accelerated by the
-    limit of that choice, or by twice the acceleration left then if the choice has held it nevertheless. Below this
-    limit, rates and gaps along the rows show the contradiction in time.
+    Rows may depend on each other in one posture only, such as the rows of a joint and of a point at the crest of a
+    surface. Next to this posture they contradict each other, at first by less than the rank of their system shows, and
+    the least-squares solution leaves accelerations along them. The joint slides when modes are chosen again. It counts
+    as accelerated above the limit of that choice, or above twice the acceleration left then if the choice held it
+    anyway. Below this limit, rates and gaps along the rows show the contradiction in time.
     """
     if unilateral.number[ku.REDUNDANT] == 0.0:
         return 1.0
@@ -261,29 +265,29 @@ def rest_margin(unilateral: UnilateralArrays, ws: Workspace, k):
 
 @internal_kernel
 def force_margin(unilateral: UnilateralArrays, ws: Workspace, k):
-    """Margin of the force of dry-friction joint k, which is held, or of the best split of dependent rows [N m or N]."""
+    """Return the force margin of held dry-friction joint k, or of the best split of dependent rows [N m or N]."""
     best = unilateral.number[ku.BEST_MARGIN]
     return best if unilateral.number[ku.SPLIT] == 1.0 and best > 0.0 else dry_margin(unilateral, ws, k)
 
 
 @internal_kernel
 def moves_held(unilateral: UnilateralArrays, ws: Workspace, k):
-    """True if the event of dry-friction joint k, which is held, is that it accelerates, not that its force is full."""
+    """True if the event of held dry-friction joint k is that it accelerates, not that its force is at the bound."""
     return dry_bound(unilateral, k) * rest_margin(unilateral, ws, k) < force_margin(unilateral, ws, k)
 
 
 @internal_kernel
 def too_long(model: ModelArrays, contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: Workspace, h, gaps):
-    """Return the fraction of a step to take instead, if it has passed over something, or 1.
+    """Return the fraction of the step to take instead if it has passed over an event, or 1.
 
     An open candidate may dip below its surface, or a joint beyond its open stop, and be out again at the end: the
-    minimum of the cubic through gaps and their rates at both ends, ``gaps``, (c, GAPS_SIZE), at the start. In the same
-    way the slip of a point, or the rate of a joint with dry friction, may have turned round twice. A candidate may have
-    gone through a body: it is out at the other side, having moved at least both gaps together. Or a point with a frozen
-    direction of slip has become fast across it, where friction would be along its slip.
+    minimum of the cubic through gaps and gap rates at both ends shows this; ``gaps``, (c, GAPS_SIZE), has the values at
+    the start. In the same way the slip of a point, or the rate of a joint with dry friction, may have reversed twice.
+    A candidate may have gone through a body: it is then on the other side and has moved at least the sum of both gaps.
+    A point with a frozen slip direction may have become fast across it, where friction would act along its slip.
     """
     fraction = 1.0
-    if unilateral is None:  # known to the compiler
+    if unilateral is None:  # resolved at compile time
         return fraction
     dry = unilateral.dry
     for k in range(dry.shape[0]):
@@ -291,7 +295,7 @@ def too_long(model: ModelArrays, contacts: ContactArrays, unilateral: Unilateral
             joint, side = unilateral.dry_table[k, ku.DRY_JOINT], dry[k, ku.DRY_SIDE]
             then, now = h * side * dry[k, ku.DRY_ACCELERATION_THEN], h * side * ws.joints[joint, ka.QDD]
             before, after = side * dry[k, ku.DRY_RATE_THEN], side * ws.joints[joint, ka.QD]
-            # A joint slower than CREEP hardly moves, and searching for its turns makes some contacts chatter.
+            # A joint slower than CREEP hardly moves, and a search for its reversals makes some contacts chatter.
             slack = dry[k, ku.DRY_HEADWAY] + unilateral.number[ku.CREEP]
             fraction = min(fraction, dip(before, then, after, now, slack))
     for k in range(gaps.shape[0]):
@@ -306,7 +310,7 @@ def too_long(model: ModelArrays, contacts: ContactArrays, unilateral: Unilateral
                 fraction = min(fraction, max(1.5 * slow / speed, 0.01))
         if slips_along(contacts, ws, k):
             then, now = h * gaps[k, SLIP_RATE_THEN], h * slip_rate(model, contacts, unilateral, ws, k)
-            # Slower slip hardly has a direction, and searching for its turns makes some contacts chatter.
+            # Slower slip hardly has a direction, and a search for its reversals makes some contacts chatter.
             slack = unilateral.slide[k, ku.HEADWAY] + slow
             fraction = min(fraction, dip(gaps[k, SLIP_THEN], then, unilateral.slide[k, ku.SPEED], now, slack))
         if passes_through(ws, gaps, k):
@@ -325,15 +329,15 @@ def too_long(model: ModelArrays, contacts: ContactArrays, unilateral: Unilateral
 
 @internal_kernel
 def slips_along(contacts: ContactArrays, ws: Workspace, k):
-    """True if candidate k slides with friction, whose direction the slip along REFERENCE decides."""
+    """True if candidate k slides with friction; the sign of its slip along REFERENCE decides the direction."""
     return ws.active[k, ka.MODE] == ka.SLIDING and contacts.law[k, ka.STATIC] > 0.0
 
 
 @internal_kernel
 def slip_rate(model: ModelArrays, contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace, k):
-    """Acceleration along REFERENCE of the point of the body where candidate k touches [m/s²]."""
+    """Return the acceleration along REFERENCE of the body point where candidate k touches [m/s²]."""
     i, at = contacts.link[k, ka.LINK], vector(ws.contacts, k, ka.POSITION)
-    # A is that at vdot = 0 and carries -g from its root.
+    # A is the acceleration at vdot = 0 and includes −g from the root.
     V, A, j = six(ws.links, i, ka.V), six(ws.links, i, ka.A), i
     while j >= 0:
         A = plus_scaled(A, six(ws.links, j, ka.S), ws.joints[j, ka.QDD])
@@ -346,7 +350,10 @@ def slip_rate(model: ModelArrays, contacts: ContactArrays, unilateral: Unilatera
 
 @internal_kernel
 def dip(g0, d0, g1, d1, depth):
-    """Fraction of a step where the cubic through gaps g with changes d per step is least, if below −depth; or 1."""
+    """Return the fraction of a step at which the cubic through gaps g with changes d per step dips below −depth; or 1.
+
+    It is the position of the minimum.
+    """
     if d0 >= 0.0 or d1 <= 0.0:
         return 1.0
     # Hermite: g0 + d0 x + a x² + b x³.
@@ -357,10 +364,10 @@ def dip(g0, d0, g1, d1, depth):
 
 @internal_kernel
 def lowest(d0, a, b):
-    """Where d0 x + a x² + b x³ has a minimum between 0 and 1, or 1."""
+    """Return where d0 x + a x² + b x³ has a minimum between 0 and 1, or 1."""
     root, x = a * a - 3.0 * b * d0, 1.0
     if root > 0.0:
-        # The form of the root that has no cancellation.
+        # This form of the root has no cancellation.
         if d0 < 0.0 and a + math.sqrt(root) != 0.0:
             x = -d0 / (a + math.sqrt(root))
         elif d0 >= 0.0 and a < 0.0 and b > 0.0:
@@ -372,8 +379,8 @@ def lowest(d0, a, b):
 def passes_through(ws: Workspace, gaps, k):
     """True when open candidate k may have gone through a body within the step.
 
-    A distance changes by no more than the path of the point is long, so the path must be at least both gaps together;
-    a path that bends by half a turn is π/2 times as long as its chord.
+    A distance changes by at most the length of the point's path, so the path must be at least as long as both gaps
+    together; a path that bends by half a turn is π/2 times as long as its chord.
     """
     state = ws.contacts[k]
     g0, g1 = gaps[k, GAP_THEN], state[ka.GAP]
@@ -389,8 +396,8 @@ def passes_through(ws: Workspace, gaps, k):
 
 @internal_kernel
 def note_gaps(model: ModelArrays, contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: Workspace, gaps):
-    """Note gaps, slip, rates of joints, normals and positions at the start of a step, for :func:`too_long`."""
-    if unilateral is None:  # known to the compiler
+    """Record gaps, slip, rates of joints, normals and positions at the start of a step, for :func:`too_long`."""
+    if unilateral is None:  # resolved at compile time
         return
     for k in range(unilateral.dry.shape[0]):
         joint = unilateral.dry_table[k, ku.DRY_JOINT]
@@ -415,7 +422,7 @@ def note_gaps(model: ModelArrays, contacts: ContactArrays, unilateral: Unilatera
 def watch_modes(
     model: ModelArrays, contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: Workspace, h, gaps
 ):
-    """Note times in each mode, depths, gaps and slip directions at the end of an accepted step, before its samples."""
+    """Update times per mode, depths, gaps and slip directions at the end of an accepted step, before its samples."""
     if unilateral is None:
         return
     watch_unpressed(contacts, unilateral, ws, h)
@@ -443,9 +450,9 @@ def watch_modes(
 
 @internal_kernel
 def take_directions(unilateral: UnilateralArrays | None, ws: Workspace, run: Run):
-    """Freeze directions of points that have become slow, free them if fast again; after the samples of a step.
+    """Freeze slip directions of points that have become slow, release them if fast again; after the samples of a step.
 
-    Friction is the same before and after: a direction is frozen along the slip, and freed where it is along the slip.
+    Friction does not jump: a direction is frozen along the slip, and released when it is along the slip.
     """
     if unilateral is None:
         return
@@ -460,7 +467,7 @@ def take_directions(unilateral: UnilateralArrays | None, ws: Workspace, run: Run
             for s in range(3):
                 slide[k, ku.REFERENCE + s] = slide[k, ku.NEXT + s]
         elif speed * speed > along * along + (TURNED * slow) ** 2:
-            # Take the direction of friction, see slide_direction. Slip across it relaxes: the method restarts.
+            # Start from the direction of friction, see slide_direction. Slip across it relaxes: the method restarts.
             for s in range(3):
                 slide[k, ku.REFERENCE + s] = (slow - along) * slide[k, ku.REFERENCE + s] + speed * slide[k, ku.NEXT + s]
             run.count[ki.STARTED] = 0
@@ -471,7 +478,7 @@ def take_directions(unilateral: UnilateralArrays | None, ws: Workspace, run: Run
 
 @internal_kernel
 def stay_tangential(slide, ws: Workspace, k):
-    """Keep a frozen direction along the surface, whose normal turns as the point moves on.
+    """Keep a frozen direction tangential to the surface, whose normal turns as the point moves.
 
     A point without friction may never have slipped; its direction is then zero, or rounding along the normal, which is
     removed.
@@ -490,9 +497,9 @@ def stay_tangential(slide, ws: Workspace, k):
 
 @internal_kernel
 def at_limit(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace, k):
-    """True if candidate k, whose guard of slip has fallen through zero, begins to slip or leaves.
+    """True if candidate k, whose slip guard has fallen through zero, begins to slip or leaves.
 
-    The guards of dependent rows fall together, with the best worst margin. Candidates with a larger margin hold.
+    The guards of dependent rows fall together, with the largest worst margin. Candidates with a larger margin hold.
     """
     if unilateral.number[ku.SPLIT] == 0.0:
         return True
@@ -501,7 +508,7 @@ def at_limit(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspac
 
 @internal_kernel
 def split_slack(ws: Workspace):
-    """Difference below which margins of a split are the same [N or N m]."""
+    """Return the difference below which margins of a split count as equal [N or N m]."""
     largest = 0.0
     for r in range(ws.counts[ka.ROWS]):
         largest = max(largest, abs(ws.rows[r, ka.FORCE]))
@@ -531,7 +538,7 @@ def consistent(system: System, ws: Workspace):
 
 @noinline_kernel
 def solve_modes(system: System, ws: Workspace, run: Run, first):
-    """Choose all modes again, and log the changes, unless ``first``: none of them is an event then."""
+    """Choose all modes again and log the changes; if ``first``, nothing is logged."""
     before = ws.counts[ka.DEPENDENT]
     resolve(system, ws, run, TOUCH)
     note_left(system.unilateral, ws)
@@ -546,11 +553,11 @@ def solve_modes(system: System, ws: Workspace, run: Run, first):
 
 @internal_kernel
 def split_ends(system: System, ws: Workspace, run: Run):
-    """True if the best split of several points and joints that stick together has reached its end.
+    """True if the best split of several points and joints that stick together has reached its limit.
 
-    The set that then starts to slip, and its forces, are not continuous: a single point or joint would only be a part
-    of that set. A single sticking point starts by itself, in the direction of its friction, if it shares its force with
-    no joint or stop.
+    The set that then starts to slip, and its forces, are discontinuous: a single point or joint would be only part of
+    that set. A single sticking point that shares its force with no joint or stop starts alone, in the direction of its
+    friction.
     """
     unilateral, strongest = system.unilateral, 0.0
     if unilateral.number[ku.SPLIT] == 0.0:
@@ -564,12 +571,12 @@ def split_ends(system: System, ws: Workspace, run: Run):
         kind, k = run.event_table[e, ki.EVENT_KIND], run.event_table[e, ki.EVENT_INDEX]
         if kind < NORMAL_GUARD or run.event[e, ki.VALUE] > 0.0:
             continue
-        # One that shares its force with none begins to slip by itself, although others share theirs.
+        # A joint that shares its force with no other row begins to slip alone, even if other rows share theirs.
         if kind == DRY_GUARD and unilateral.dry_table[k, ku.DRY_HOLDS] == 1 and joint_shares(unilateral, ws, k):
             return True
         if kind == STOP_GUARD and unilateral.stop_table[k, ku.STOP_CLOSED] == 1 and stops > 0:
             return True
-        # A point at the apex of its cone leaves; modes of a point whose friction drops are chosen at full friction.
+        # A point at the apex of its cone leaves; if its friction drops, modes are chosen at full friction.
         if kind == SLIP_GUARD and ws.active[k, ka.MODE] == ka.STICKING and not drops(system, k):
             pressed = ws.rows[ws.active[k, ka.FIRST_ROW], ka.FORCE] > NO_FORCE * strongest
             if pressed and point_shares(unilateral, ws, k) and at_limit(system.contacts, unilateral, ws, k):
@@ -579,9 +586,9 @@ def split_ends(system: System, ws: Workspace, run: Run):
 
 @noinline_kernel
 def solve_reduced(system: System, ws: Workspace, run: Run):
-    """Choose all modes with a little less friction at rest, and log the changes; False if no choice agrees.
+    """Choose all modes with slightly reduced friction at rest and log the changes.
 
-    Everything is then restored.
+    Returns False and restores everything if no choice agrees.
     """
     number, clock = system.unilateral.number, run.clock
     before, not_unique, reduction = ws.counts[ka.DEPENDENT], clock[ki.NOT_UNIQUE], FIRST_REDUCTION
@@ -590,7 +597,7 @@ def solve_reduced(system: System, ws: Workspace, run: Run):
     while not agrees and reduction <= MOST_REDUCTION:
         number[ku.HOLDING] = 1.0 - reduction
         resolve(system, ws, run, TOUCH)
-        # At full friction modes would agree in which too much sticks.
+        # At full friction, modes in which too much sticks would agree.
         agrees = run.count[ki.STATUS] == ki.RUNNING and consistent(system, ws)
         if not agrees:
             take_back(system, ws, run)
@@ -609,7 +616,7 @@ def solve_reduced(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def rearm(run: Run):
-    """All guards of the unilateral law are on their positive side."""
+    """Set all guards of the unilateral law to their positive side."""
     for e in range(run.event.shape[0]):
         if run.event_table[e, ki.EVENT_KIND] >= NORMAL_GUARD:
             run.event[e, ki.SIDE], run.event[e, ki.VALUE] = 1.0, 1.0
@@ -627,7 +634,7 @@ def count_changes(system: System, run: Run):
 
 @internal_kernel
 def log(run: Run, code):
-    """Write an event to the log; an event that does not fit is missing only from the log."""
+    """Write an event to the log; if the log is full, only the entry is lost."""
     count = run.count
     if count[ki.LOGGED] < run.log_time.shape[0]:
         run.log_time[count[ki.LOGGED]], run.log_event[count[ki.LOGGED]] = run.clock[ki.TIME], code
@@ -636,7 +643,7 @@ def log(run: Run, code):
 
 @internal_kernel
 def tell(system: System, run: Run, k, kind):
-    """Log an event of candidate k, count it, and watch for chatter."""
+    """Log and count an event of candidate k, and check for chatter."""
     tally = system.unilateral.tally
     log(run, ki.CONTACT_LOG + LOG_KINDS * k + kind)
     if kind == LANDING:
@@ -652,7 +659,7 @@ def tell(system: System, run: Run, k, kind):
 
 @internal_kernel
 def tell_stop(system: System, run: Run, k, kind):
-    """Log that a joint hits or leaves stop k, count hits, and watch for chatter."""
+    """Log that a joint hits or leaves stop k, count hits, and check for chatter."""
     stop = system.unilateral.stop
     log(run, ki.STOP_LOG + LOG_KINDS * k + kind)
     if kind == STOP_HIT:
@@ -662,9 +669,9 @@ def tell_stop(system: System, run: Run, k, kind):
 
 @internal_kernel
 def watch_chatter(run: Run, table, k, settle, first):
-    """Count an event of row k, with SETTLE in column ``settle``; if it is one too many, impacts settle from faster.
+    """Count an event of row k, with SETTLE in column ``settle``; on chatter, impacts settle from a higher speed.
 
-    Codes of the log begin at ``first``.
+    Log codes begin at ``first``.
     """
     start, count, chattered = settle + 1, settle + 2, settle + 3
     if run.clock[ki.TIME] - table[k, start] > WINDOW:
@@ -691,7 +698,7 @@ def log_changes(system: System, ws: Workspace, run: Run):
             if now != ka.OPEN:
                 tell(system, run, k, LANDING)
             elif unilateral.mode[k, ku.STRUCK] == 1:
-                # It flies off from where it has landed, below its surface: there it is not to land again at once.
+                # It leaves from where it landed, below its surface: it must not land there again at once.
                 unilateral.slide[k, ku.LANDS_AT] = ku.AT_ROOT + max(0.0, -ws.contacts[k, ka.GAP])
                 tell(system, run, k, BOUNCE)
         elif now == ka.OPEN:
@@ -712,7 +719,7 @@ def log_changes(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def tell_joints(unilateral: UnilateralArrays, run: Run):
-    """Log which joints dry friction has begun, or ceased, to hold since they were last noted in DRY_TOLD."""
+    """Log joints that dry friction has begun or ceased to hold since their state in DRY_TOLD."""
     for k in range(unilateral.dry_table.shape[0]):
         tell_joint(unilateral, run, k, 1 if dry_rests(unilateral, k) else 0)
 
@@ -728,7 +735,7 @@ def tell_joint(unilateral: UnilateralArrays, run: Run, k, holds):
 
 @internal_kernel
 def break_loose(unilateral: UnilateralArrays, ws: Workspace, k):
-    """Let joint k, which dry friction does not hold any more, slide against it; False if its slip has ended."""
+    """Let joint k, which dry friction no longer holds, slide against it; False if its slip has ended."""
     table, split = unilateral.dry_table, unilateral.number[ku.SPLIT] == 1.0
     if table[k, ku.DRY_HOLDS] == 0:
         return False
@@ -801,7 +808,7 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
                 tell(system, run, k, LIFT_OFF)
                 continue
             if drops(system, k):
-                # Forces jump, and with them the direction of slip.
+                # Forces jump, and the slip direction with them.
                 mode[k, ku.GIVES_WAY], by_hand = 1, False
                 continue
             begin_slip(system, ws, k, ws.rows[r + 1, ka.FORCE], ws.rows[r + 2, ka.FORCE])
@@ -819,7 +826,7 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
         tell_joints(unilateral, run)
         rearm(run)
         count_changes(system, run)
-    # As one leaves, points that start to slip hardly accelerate yet: with full friction they would seem to be at rest.
+    # When one leaves, points that start to slip hardly accelerate yet: with full friction they would seem at rest.
     elif not leaves or not solve_reduced(system, ws, run):
         solve_modes(system, ws, run, False)
     run.count[ki.STARTED] = 0

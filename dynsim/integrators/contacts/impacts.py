@@ -1,6 +1,6 @@
 """Impacts: touching contacts are projected onto their surfaces, and impulses stop or reverse their approach.
 
-Moreau's law with Newton's restitution and Coulomb's cone on impulses, for all contacts and stops that touch, at once.
+Moreau's law with Newton's restitution and Coulomb's cone on impulses, for all touching contacts and stops at once.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ from dynsim.jit.kernel import internal_kernel, noinline_kernel
 STRIKE = 3.0
 # Successive impacts at one instant after which restitution is zero.
 MOST_BOUNCES = 30.0
-# Starts of an impact problem with restitution, which has no solution if restitution contradicts friction.
+# Newton starts for an impact problem with restitution, which has no solution if restitution contradicts friction.
 BOUNCE_STARTS = 40
 # A point that begins to touch is brought this close to its surface [m].
 FOOT_TOLERANCE = 1e-13
-# Projections that leave more than this part of a gap converge linearly: the point leads to a singular posture.
+# Projections that leave more than this fraction of a gap converge linearly: the point approaches a singular posture.
 SLOWLY = 0.1
 # Solution of the cones: residual relative to the largest entry, and fraction of the largest force that counts as zero.
 CONE_TOLERANCE, FORCE_TOLERANCE = 1e-9, 1e-9
-# If all rates or accelerations are smaller, the goal of residuals is relative to this instead: behind closed brakes a
+# If all rates or accelerations are smaller, the goal of residuals is relative to this instead: with closed brakes a
 # point has motions of 1e-30, and no force on it improves on zero force [m/s, m/s²].
 IMMOBILE = 1e-3
 # The search for another solution of an impact starts with forces that give this fraction of the largest rate.
@@ -53,7 +53,7 @@ OTHER_START = 1e-6
 
 @internal_kernel
 def slip_speed(ws: Workspace, k):
-    """|v_t| of candidate k [m/s]."""
+    """Return |v_t| of candidate k [m/s]."""
     state = ws.contacts
     x, y, z = state[k, ka.SLIP_VELOCITY], state[k, ka.SLIP_VELOCITY + 1], state[k, ka.SLIP_VELOCITY + 2]
     return math.sqrt(x * x + y * y + z * z)
@@ -61,7 +61,7 @@ def slip_speed(ws: Workspace, k):
 
 @internal_kernel
 def evaluate(system: System, ws: Workspace, run: Run):
-    """Evaluate the right-hand side at the present state, with the present modes, and the errors of its rows."""
+    """Evaluate the right-hand side at the present state with the present modes, and the errors of its rows."""
     derivative(system, run.clock[ki.TIME], run.y, ws, run.stage[0])
     run.count[ki.EVALUATIONS] += 1
     row_errors(ws)
@@ -69,7 +69,7 @@ def evaluate(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def largest_right_side(ws: Workspace):
-    """Largest right-hand side of all rows [m/s² or rad/s²]."""
+    """Return the largest right-hand side of all rows [m/s² or rad/s²]."""
     largest = 0.0
     for r in range(ws.counts[ka.ROWS]):
         largest = max(largest, abs(ws.rows[r, ka.RHS]))
@@ -78,20 +78,20 @@ def largest_right_side(ws: Workspace):
 
 @internal_kernel
 def strike_limit(ws: Workspace, k):
-    """Rate along the normal below which candidate k does not strike [m/s]."""
+    """Return the rate along the normal below which candidate k does not strike [m/s]."""
     return STRIKE * kp.RATE_TOLERANCE * (1.0 + slip_speed(ws, k))
 
 
 @internal_kernel
 def find_touching(system: System, ws: Workspace, touch):
-    """Note candidates and stops that touch and do not leave; True if any of them approaches.
+    """Mark candidates and stops that touch and do not leave; True if any of them approaches.
 
-    A point that no joint moves along its normal in this posture does not touch: its force would be arbitrary. Neither
-    does a point that a projection could bring onto its surface only by another posture. If the posture changes, it
-    lands as soon as it is deeper than it is now.
+    A point that no joint can move along its normal in this posture does not touch: its force would be arbitrary.
+    Neither does a point that a projection could bring onto its surface only by changing the posture. If the posture
+    changes, the point lands as soon as it is deeper than now.
 
-    As a point leaves that nothing presses, open points that rest at their surfaces stay open, and land if they move
-    deeper: closed, one of them could hold the others in its place, pressed by nothing either, and leave at once.
+    When an unpressed point leaves, open points that rest at their surfaces stay open, and land if they move deeper:
+    if closed, one of them could hold the others in place although nothing presses it either, and leave at once.
     """
     unilateral = system.unilateral
     state, mode, table = ws.contacts, unilateral.mode, unilateral.stop_table
@@ -111,7 +111,7 @@ def find_touching(system: System, ws: Workspace, touch):
         mode[k, ku.TOUCHING] = 1 if near else 0
         if near and state[k, ka.GAP_RATE] < -limit:
             mode[k, ku.STRUCK] = 1
-        # A point that lands, however slowly, is stopped too: nothing else would stop it if it stayed open.
+        # A point that lands is stopped however slow it is: nothing else would stop it if it stayed open.
         strikes = strikes or (near and state[k, ka.GAP_RATE] < (-limit if closed else 0.0))
     for k in range(table.shape[0]):
         rate = stop_rate(unilateral, ws, k)
@@ -125,7 +125,7 @@ def find_touching(system: System, ws: Workspace, touch):
 
 @internal_kernel
 def keep_touching(unilateral: UnilateralArrays, ws: Workspace):
-    """Release points and joints that leave faster than they settle, after an impact or the closing of a brake."""
+    """Release points and joints that leave faster than they settle, after an impact or when a brake has closed."""
     state, mode, table = ws.contacts, unilateral.mode, unilateral.stop_table
     for k in range(mode.shape[0]):
         if state[k, ka.GAP_RATE] > unilateral.tally[k, ku.SETTLE]:
@@ -137,14 +137,15 @@ def keep_touching(unilateral: UnilateralArrays, ws: Workspace):
 
 @internal_kernel
 def come_down(system: System, ws: Workspace, run: Run):
-    """Bring points and joints that touch onto their surfaces and stops, to rounding, before they are held in place.
+    """Bring touching points and joints onto their surfaces and stops, to rounding, before they are held in position.
 
-    A point lands a little below its surface. If rows depend on each other, like the rows of a point on a body with one
-    degree of freedom, there might be no state at which its normal row and the tangential ones of a foot found above it
-    all vanish. A point about to bounce is not held: lifted at each bounce, it would bounce indefinitely.
+    A point lands slightly below its surface. If rows depend on each other, like the rows of a point on a body with one
+    degree of freedom, there might be no state at which its normal row and the tangential rows of a point of contact
+    above the surface all vanish. A point about to bounce is not held: lifted at each bounce, it would bounce
+    indefinitely.
 
-    Joints that dry friction holds stay where they are, unless that contradicts a stop or a point with which they come
-    down: then friction lets them move, by no more than the gaps to close, and holds them where they are afterwards.
+    Joints that dry friction holds do not move, unless that contradicts a stop or point that comes down with them: then
+    friction lets them move, by at most the gaps to close, and holds them in their new positions.
     """
     unilateral = system.unilateral
     mode, table = unilateral.mode, unilateral.dry_table
@@ -170,14 +171,14 @@ def come_down(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def project_down(system: System, ws: Workspace, run: Run):
-    """Project positions onto the active rows, if possible to rounding; False when the rows cannot be met."""
+    """Project positions onto the active rows, to rounding if possible; False if the rows cannot be met."""
     before = worst = math.inf
     for trial in range(1 + kp.PROJECTION_LIMIT):
         evaluate(system, ws, run)
         worst = 0.0
         for r in range(ws.counts[ka.ROWS]):
             worst = max(worst, abs(ws.rows[r, ka.ROW_GAP]))
-        # If a point is nearly immobile along its normal, steps only halve the distance to where it is quite immobile.
+        # If a point is nearly immobile along its normal, steps only halve the distance to where it is fully immobile.
         if worst <= FOOT_TOLERANCE or SLOWLY * before < worst <= kp.GAP_TOLERANCE or trial == kp.PROJECTION_LIMIT:
             break
         before = worst
@@ -187,7 +188,7 @@ def project_down(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def kind_of_joint_row(unilateral: UnilateralArrays, couplings, r):
-    """Kind of row r of the contact problem, of a coupling, of dry friction or, behind them, of a joint stop."""
+    """Return the kind of row r of the contact problem: coupling, dry friction or, after these, joint stop."""
     if r < couplings:
         return kc.BOTH_WAYS
     return kc.BOX if r < couplings + dry_rows_held(unilateral) else kc.ONE_WAY
@@ -195,7 +196,7 @@ def kind_of_joint_row(unilateral: UnilateralArrays, couplings, r):
 
 @internal_kernel
 def begin_problem(unilateral: UnilateralArrays, couplings, count):
-    """Write ``count`` joint rows, the first ``couplings`` of them for couplings, as the first of a contact problem."""
+    """Write ``count`` joint rows, the first ``couplings`` of them couplings, as the first of a contact problem."""
     index, vector = unilateral.index, unilateral.vector
     for r in range(count):
         index[ku.KINDS, r], index[ku.TABLE_ROW, r] = kind_of_joint_row(unilateral, couplings, r), r
@@ -207,7 +208,7 @@ def begin_problem(unilateral: UnilateralArrays, couplings, count):
 
 @internal_kernel
 def gather(system: System, ws: Workspace, run: Run):
-    """Write rows along normal and tangents of everything that touches, and their system, into the workspace.
+    """Write normal and tangential rows of everything that touches, and their system, into the workspace.
 
     Writes kinds and table rows of the rows into ``unilateral.index``; returns the number of rows.
     """
@@ -230,12 +231,14 @@ def gather(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def solve_problem(unilateral: UnilateralArrays, W, size, largest, starts):
-    """Solve the contact problem of ``unilateral.vector`` and W, (size, size), into SOLUTION; False when that fails.
+    """Solve the contact problem of ``unilateral.vector`` and W, (size, size), into SOLUTION; False on failure.
 
     Parameters
     ----------
-    largest : largest of the rates or accelerations to bring to zero
-    starts : starts of Newton's method before a problem that may have no solution is given up; 0: as many as it takes
+    largest : float
+        Largest of the rates or accelerations to bring to zero.
+    starts : int
+        Starts of Newton's method before a problem that may have no solution is given up; 0: unlimited.
     """
     vector, room, kind = unilateral.vector, unilateral.room[ku.SCRATCH :], unilateral.index[ku.KINDS]
     b, mu, f, good = vector[ku.OFFSET], vector[ku.CONE_FRICTION], vector[ku.SOLUTION], 1e-2 * CONE_TOLERANCE
@@ -249,7 +252,7 @@ def solve_problem(unilateral: UnilateralArrays, W, size, largest, starts):
 
 @internal_kernel
 def friction_at_rest(system: System, k):
-    """Coefficient of the cone of candidate k, which is at rest along its surface."""
+    """Return the coefficient of the friction cone of candidate k, which is at rest along its surface."""
     if system.unilateral.mode[k, ku.GIVES_WAY] == 1:
         return system.contacts.law[k, ka.MU]
     return system.unilateral.number[ku.HOLDING] * system.contacts.law[k, ka.STATIC]
@@ -257,7 +260,7 @@ def friction_at_rest(system: System, k):
 
 @internal_kernel
 def friction_of_impact(system: System, ws: Workspace, k):
-    """Coefficient of friction of candidate k in an impact: at the slip before it, or static if at rest."""
+    """Return the coefficient of friction of candidate k in an impact: at the slip before it, or static if at rest."""
     slip, before = slip_speed(ws, k), system.unilateral.mode[k, ku.BEFORE]
     if before == ka.STICKING or (before == ka.OPEN and slip <= system.unilateral.number[ku.SLOW]):
         return friction_at_rest(system, k)
@@ -268,19 +271,19 @@ def friction_of_impact(system: System, ws: Workspace, k):
 def impulses(system: System, ws: Workspace, p, largest, share):
     """Solve for the impulses of :func:`impact` with ``share`` of the restitutions; write row losses into FORCE [J].
 
-    False when there is no solution, or one that would create energy.
+    Returns False if there is no solution, or only one that would create energy.
     """
     unilateral, rows = system.unilateral, ws.rows
     vector, mode = unilateral.vector, unilateral.mode
     for r in range(p):
         vector[ku.OFFSET, r], vector[ku.SOLUTION, r] = rows[r, ka.ROW_RATE], 0.0
-        # Friction of joints is too weak to take an impulse.
+        # Dry friction of joints is bounded and takes no impulse.
         vector[ku.CONE_FRICTION, r] = 0.0
     for k in range(mode.shape[0]):
         if mode[k, ku.TOUCHING] == 1:
             r = ws.active[k, ka.FIRST_ROW]
             vector[ku.CONE_FRICTION, r] = friction_of_impact(system, ws, k)
-            # A closed point had no speed to reverse: a brake or another impact has just given it this one.
+            # A closed point had no speed to reverse: a brake or another impact has just caused this speed.
             falls = mode[k, ku.STRUCK] == 1 and mode[k, ku.BEFORE] == ka.OPEN
             if falls and -rows[r, ka.ROW_RATE] > unilateral.tally[k, ku.SETTLE]:
                 vector[ku.OFFSET, r] *= 1.0 + share * system.contacts.law[k, ka.RESTITUTION]
@@ -301,10 +304,10 @@ def impulses(system: System, ws: Workspace, p, largest, share):
 
 @internal_kernel
 def forget_rounding(system: System, ws: Workspace):
-    """Set rates of rows that were closed before the impact to zero in OFFSET where they are within the tolerance.
+    """Zero the rates in OFFSET of rows that were closed before the impact if they are within the tolerance.
 
     An impact may have several solutions, for instance with a wedged point that leaves or stays. From zero forces, the
-    sign of such a rate would decide between them, and that is rounding.
+    sign of such a rate would decide between them, and that sign is rounding.
     """
     unilateral, offset = system.unilateral, system.unilateral.vector[ku.OFFSET]
     mode, table = unilateral.mode, unilateral.stop_table
@@ -330,7 +333,7 @@ def stays_or_leaves(unilateral: UnilateralArrays, k):
 
 @internal_kernel
 def rate_after(ws: Workspace, b, f, p, r):
-    """Rate of row r after impulses f."""
+    """Return the rate of row r after impulses f."""
     rate = b[r]
     for s in range(p):
         rate += ws.small[0, r, s] * f[s]
@@ -339,7 +342,7 @@ def rate_after(ws: Workspace, b, f, p, r):
 
 @internal_kernel
 def look_for_other(system: System, ws: Workspace, run: Run, p, largest):
-    """Note points that were closed and leave in the impact if another solution keeps them; SOLUTION stays as it is.
+    """Count points that were closed and leave in the impact if another solution keeps them; SOLUTION is unchanged.
 
     One start near the forces of the wedge finds most of these solutions, not all.
     """
@@ -384,8 +387,8 @@ def impact(system: System, ws: Workspace, run: Run):
     for r in range(p):
         largest = max(largest, abs(rows[r, ka.ROW_RATE]))
     # Newton's restitution may contradict friction: a wedged point cannot leave, and some impacts would gain energy.
-    # Those impacts are without restitution, which always has a solution, and a loss. The same applies to points that
-    # throw each other back and forth at one instant: impacts that accumulate end in contact.
+    # Such impacts are solved without restitution: this problem always has a solution, and a loss. The same applies to
+    # points that throw each other back and forth at one instant: impacts that accumulate end in contact.
     bouncing = unilateral.number[ku.CHANGES] <= MOST_BOUNCES and impulses(system, ws, p, largest, 1.0)
     if not bouncing and not impulses(system, ws, p, largest, 0.0):
         run.count[ki.STATUS], run.clock[ki.NOT_UNIQUE] = ki.NO_CONTACT_FORCES, run.clock[ki.TIME]
@@ -408,7 +411,7 @@ def impact(system: System, ws: Workspace, run: Run):
             y[layout.contact + kst.CONTACT_SIZE * k + kst.IMPULSE] += f[r]
     r = system.couplings.joint.shape[0] + dry_rows_held(unilateral)
     for s in range(r):
-        # Loss of a brake that closes, which stops its joint as a coupling does.
+        # Loss of a closing brake, which stops its joint as a coupling does.
         y[layout.loss + kst.IMPACT_LOSS] += rows[s, ka.FORCE]
     for k in range(unilateral.stop_table.shape[0]):
         if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
@@ -417,12 +420,12 @@ def impact(system: System, ws: Workspace, run: Run):
             r += 1
 
 
-# Snapshot of all that a choice of contact modes writes, so that a choice can be tried and taken back.
+# Snapshot of everything that a choice of contact modes writes, so that the choice can be tried and undone.
 
 
 @noinline_kernel
 def keep(unilateral: UnilateralArrays, ws: Workspace, run: Run):
-    """Keep modes, their tables and the state, between two steps, when ``y_new`` is free."""
+    """Save modes, their tables and the state between two steps, when ``y_new`` is free."""
     kept, mode = unilateral.kept, unilateral.mode
     for k in range(mode.shape[0]):
         mode[k, ku.WANTED] = ws.active[k, ka.MODE]
@@ -441,7 +444,7 @@ def keep(unilateral: UnilateralArrays, ws: Workspace, run: Run):
 
 @noinline_kernel
 def take_back(system: System, ws: Workspace, run: Run):
-    """Modes, their tables and the state as :func:`keep` has seen them, and the right-hand side there."""
+    """Restore modes, tables and state as saved by :func:`keep`, and evaluate the right-hand side there."""
     unilateral = system.unilateral
     kept, mode = unilateral.kept, unilateral.mode
     at = read(kept, 0, mode)
@@ -455,7 +458,7 @@ def take_back(system: System, ws: Workspace, run: Run):
     read_numbers(kept, at, unilateral.shares)
     for i in range(run.y.shape[0]):
         run.y[i] = run.y_new[i]
-    # First with the present rows, for the positions of points, which the earlier rows start from.
+    # First with the present rows, for the positions of points, from which the earlier rows start.
     evaluate(system, ws, run)
     set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
     evaluate(system, ws, run)
@@ -464,7 +467,7 @@ def take_back(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def write(kept, at, table):
-    """Write a table into ``kept`` from ``at`` on; returns where the next begins."""
+    """Write a table into ``kept`` from index ``at``; return the next index."""
     for i in range(table.shape[0]):
         for j in range(table.shape[1]):
             kept[at] = table[i, j]
@@ -474,7 +477,7 @@ def write(kept, at, table):
 
 @internal_kernel
 def read(kept, at, table):
-    """Read a table, of numbers or of integers, from ``kept``; returns where the next begins."""
+    """Read a table of floats or integers from ``kept``; return the next index."""
     for i in range(table.shape[0]):
         for j in range(table.shape[1]):
             table[i, j] = kept[at]
@@ -484,7 +487,7 @@ def read(kept, at, table):
 
 @internal_kernel
 def write_numbers(kept, at, numbers):
-    """Write numbers into ``kept`` from ``at`` on; returns where the next begin."""
+    """Write numbers into ``kept`` from index ``at``; return the next index."""
     for i in range(numbers.shape[0]):
         kept[at + i] = numbers[i]
     return at + numbers.shape[0]
@@ -492,16 +495,16 @@ def write_numbers(kept, at, numbers):
 
 @internal_kernel
 def read_numbers(kept, at, numbers):
-    """Read numbers from ``kept``; returns where the next begin."""
+    """Read numbers from ``kept``; return the next index."""
     for i in range(numbers.shape[0]):
         numbers[i] = kept[at + i]
     return at + numbers.shape[0]
 
 
-# Acceleration of a sticking point without its own force: whether anything presses it against its surface.
+# Acceleration of a sticking point without its own force: shows whether anything presses it against its surface.
 
 
-# Starts of the contact problem of all others; a point for which none finds a solution counts as pressed.
+# Newton starts for the contact problem of the other points; if all fail, the point counts as pressed.
 STARTS = 8
 # Fraction of the largest right-hand side below which an acceleration counts as zero.
 NO_ACCELERATION = 1e-8
@@ -509,11 +512,11 @@ NO_ACCELERATION = 1e-8
 
 @noinline_kernel
 def approach_without_force(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace, k):
-    """Acceleration of sticking candidate k towards its surface without its own force, right after ``derivative``.
+    """Return the acceleration of sticking candidate k towards its surface without its own force.
 
-    The contact problem has all other forces: sticking points may slip in it, held joints move and stops open; sliding
-    points keep their direction. Positive, by NO_ACCELERATION, if nothing moves the point, so that the guard of a point
-    that leaves falls through zero [m/s²].
+    Call right after ``derivative``. The contact problem has all other forces: in it, sticking points may slip, held
+    joints may move and stops may open; sliding points keep their direction. The result [m/s²] is positive, by
+    NO_ACCELERATION, if nothing moves the point, so that the guard of a point that leaves falls through zero.
     """
     index, vector, active, W = unilateral.index, unilateral.vector, ws.active, ws.small[0]
     size = ws.counts[ka.COUPLED]
@@ -531,7 +534,7 @@ def approach_without_force(contacts: ContactArrays, unilateral: UnilateralArrays
     for i in range(size):
         a = index[ku.TABLE_ROW, i]
         vector[ku.OFFSET, i], vector[ku.SOLUTION, i] = -ws.rows[a, ka.RHS], 0.0
-        # Columns of sliding points have their friction in W already.
+        # Columns of sliding points already include their friction in W.
         for j in range(size):
             unilateral.room[ku.PROBLEM, i, j] = W[a, index[ku.TABLE_ROW, j]]
     if size > 0 and not solve_problem(unilateral, unilateral.room[ku.PROBLEM], size, largest, STARTS):
@@ -546,8 +549,8 @@ def approach_without_force(contacts: ContactArrays, unilateral: UnilateralArrays
 def watch_unpressed(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace, h):
     """Add an accepted step to the time of each point that sticks although nothing presses it.
 
-    Only if the split of least norm lies in all cones: equally stiff supports have this split, and hold the point.
-    Otherwise the guard of the normal force lets the point leave.
+    This applies only if the split of least norm lies in all cones: equally stiff supports have this split, and hold the
+    point. Otherwise the guard of the normal force lets the point leave.
     """
     if unilateral.number[ku.REDUNDANT] == 1.0 and unilateral.number[ku.SPLIT] == 0.0 and ws.counts[ka.STUCK] > 0:
         add_unpressed(contacts, unilateral, ws, h)
@@ -555,7 +558,7 @@ def watch_unpressed(contacts: ContactArrays, unilateral: UnilateralArrays, ws: W
 
 @noinline_kernel
 def add_unpressed(contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace, h):
-    """:func:`watch_unpressed` where rows depend on each other."""
+    """Do the work of :func:`watch_unpressed` for rows that depend on each other."""
     find_splits(unilateral, ws)
     for k in range(ws.contacts.shape[0]):
         is_open = ws.active[k, ka.MODE] == ka.STICKING and normal_is_open(unilateral, ws, k)

@@ -6,7 +6,7 @@ First impulses stop approaching points and joints (:mod:`dynsim.integrators.cont
     0 ≤ f_n ⟂ n·r̈ ≥ 0,   |f_t| ≤ μ_s f_n, and f_t = −μ_s f_n a_t/|a_t| where a_t ≠ 0
 
 is solved for the points at rest along their surfaces; points that slide already have the force f_n (n − μ t) with the
-one unknown f_n. The solution tells which points lift off, which stick, and which begin to slip in which direction.
+single unknown f_n. The solution shows which points lift off, which stick, and which begin to slip in which direction.
 
 Long because: the steps of the choice share the rows, the system and the scratch of one gathered problem.
 """
@@ -57,35 +57,35 @@ from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
 # An acceleration along the surface below this fraction of the largest right-hand side counts as zero.
 SLIP_TOLERANCE = 1e-8
-# Forces that contradict their modes by less than this, absolute [N] and of the largest, are rounding.
+# Forces that contradict their modes by less than this, absolute [N] and relative to the largest, are rounding.
 FORCE_SLACK = 1e-9
-# A point or joint that slips against its direction at less than this has not stopped yet, and one that slips along it
-# faster continues [m/s or rad/s]: if it begins to slip with almost no acceleration, its speed is rounding.
+# A point or joint that slips against its direction more slowly than this has not stopped yet, and one that slips along
+# it faster continues [m/s or rad/s]: if slip begins with almost no acceleration, its speed is rounding.
 BACKWARD = 2e-11
-# A joint with a smaller share than this in the accelerations that contradicting rows leave has no part in them.
+# A joint with a smaller share of the accelerations that contradicting rows leave is not involved.
 LEAST_SHARE = 1e-3
 # If no forces agree with slip slower than this, or than twice SLOW [m/s], the slip is stopped, as unbounded friction
-# would stop it: an impact of 5e-11 J per kilogram at 1e-5 m/s. Without it points that land within a step of coming to
+# would stop it: an impact of 5e-11 J per kilogram at 1e-5 m/s. Otherwise points that land within a step of coming to
 # rest would end a run.
 NEARLY_AT_REST = 1e-5
-# Margins of a split that differ by less, as a fraction of its largest force, are the same, and forces with no more of a
-# margin are a corner of the admissible ones: the accuracy of the program that finds the best split.
+# Margins of a split that differ by less than this fraction of its largest force are equal, and forces with no larger
+# margin are a corner of the admissible forces: the accuracy of the program that finds the best split.
 SPLIT_SLACK = 1e-7
-# A friction force this close to the cone, as a fraction, counts as on it.
+# A friction force within this fraction of the cone counts as on it.
 ON_CONE = 1e-7
-# Halvings of the interval of a direction of slip: to rounding.
+# Bisections of the interval of a slip direction: to rounding.
 MOST_HALVINGS = 60
-# Which joints with dry friction a choice of modes holds: all slow joints; the same, unless their rates contradict other
-# closed rows; only joints at rest.
+# Which joints with dry friction a choice of modes holds: all slow joints; all slow joints unless their rates contradict
+# other closed rows; only joints at rest.
 HOLD_SLOW, HOLD_COMPATIBLE, HOLD_RESTING = 0, 1, 2
 # Holding heavy joints may change the rates of light joints by a multiple of the rate lost; if joints geared to the held
-# ones lose more than this multiple, the held joints were not at rest.
+# joints lose more than this multiple, the held joints were not at rest.
 MOST_CHANGE = 100.0
 
 
 @internal_kernel
 def resolve(system: System, ws: Workspace, run: Run, touch):
-    """Stop striking points and joints, and choose modes for all that touch: closed, or at most ``touch`` [m] off.
+    """Stop striking points and joints, and choose modes for everything closed or at most ``touch`` [m] off.
 
     ``unilateral.mode`` records the modes BEFORE, and the candidates that STRUCK. Sets STATUS if there is no solution.
     """
@@ -118,11 +118,11 @@ def choose(system: System, ws: Workspace, run: Run):
     for k in range(dry.shape[0]):
         dry[k, ku.DRY_OVERLOADED] = 0
     choose_joints(system, ws, run)
-    # What settles after an impact may move light joints the other way; their friction is then against the new way.
+    # Settling after an impact may reverse light joints; their friction then opposes the new direction.
     if run.count[ki.STATUS] == ki.RUNNING and some_turned_round(system, ws):
         touch_again(system.unilateral)
         choose_joints(system, ws, run)
-    # Each time there is at least one more of them.
+    # Each pass finds at least one more.
     while run.count[ki.STATUS] == ki.RUNNING and note_overloaded(system, ws):
         touch_again(system.unilateral)
         choose_joints(system, ws, run)
@@ -132,11 +132,11 @@ def choose(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def note_overloaded(system: System, ws: Workspace):
-    """Note points and joints that the chosen modes hold with more force than their friction; True if there are more.
+    """Mark points and joints that the chosen modes hold with more force than their friction; True if there are more.
 
-    A point or joint that other rows leave little mobility, or that takes a heavy body with it, is hardly accelerated
-    where its friction is exceeded: by less than the solution shows, see ``slips``. Its force shows that it slips. Held,
-    it would break loose at once, and be held again, without end.
+    A point or joint that other rows leave little mobility, or that moves a heavy body, hardly accelerates when its
+    friction is exceeded: by less than the solution shows, see ``slips``. Its force shows that it slips. If held, it
+    would break loose at once, and be held again, endlessly.
     """
     unilateral, more = system.unilateral, False
     mode, dry, number = unilateral.mode, unilateral.dry_table, unilateral.number
@@ -148,7 +148,7 @@ def note_overloaded(system: System, ws: Workspace):
     for k in range(mode.shape[0]):
         if ws.active[k, ka.MODE] == ka.STICKING and mode[k, ku.OVERLOADED] == 0:
             left = margin(system.contacts, unilateral, ws, k)
-            # One that has given way is held by kinetic friction; forces that are shared may be split otherwise.
+            # A point past its static friction is held by kinetic friction; shared forces may be split differently.
             alone = number[ku.REDUNDANT] == 0.0 or not point_shares(unilateral, ws, k)
             if mode[k, ku.GIVES_WAY] == 1 and alone:
                 law = system.contacts.law
@@ -164,7 +164,7 @@ def note_overloaded(system: System, ws: Workspace):
 
 @internal_kernel
 def force_slack(ws: Workspace):
-    """Size below which forces that contradict their modes are rounding [N or N m]."""
+    """Return the size below which forces that contradict their modes are rounding [N or N m]."""
     strongest = 0.0
     for k in range(ws.contacts.shape[0]):
         strongest = max(strongest, abs(ws.contacts[k, ka.NORMAL_FORCE]))
@@ -173,7 +173,7 @@ def force_slack(ws: Workspace):
 
 @internal_kernel
 def some_turned_round(system: System, ws: Workspace):
-    """True if a joint or point slides, not slowly, against the direction that its friction was chosen for."""
+    """True if a joint or point slides, not slowly, against the direction for which its friction was chosen."""
     unilateral, turned = system.unilateral, False
     slow = 2.0 * unilateral.number[ku.SLOW]
     for k in range(unilateral.dry_table.shape[0]):
@@ -188,10 +188,10 @@ def some_turned_round(system: System, ws: Workspace):
 
 @noinline_kernel
 def choose_joints(system: System, ws: Workspace, run: Run):
-    """Choose modes, and if there are no forces, again without the points and stops that leave.
+    """Choose modes and, if there are no forces, choose again without the points and stops that leave.
 
-    An impact may leave rates that are too slow to count as leaving. They are taken to be zero, by a convention and not
-    by the law: if that has no solution, these points and stops have no force.
+    An impact may leave rates that are too slow to count as leaving. By convention, not by the law, they are taken to be
+    zero: if that has no solution, these points and stops have no force.
     """
     not_unique = run.clock[ki.NOT_UNIQUE]
     choose_rule(system, ws, run)
@@ -203,7 +203,7 @@ def choose_joints(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def release_leaving(system: System, ws: Workspace):
-    """Release points and stops that leave more slowly than impacts settle, but not by rounding; True if any do."""
+    """Release points and stops that leave faster than rounding but slower than impacts settle; True if any do."""
     unilateral, any_leaves = system.unilateral, False
     mode, table = unilateral.mode, unilateral.stop_table
     for k in range(mode.shape[0]):
@@ -217,7 +217,7 @@ def release_leaving(system: System, ws: Workspace):
 
 @internal_kernel
 def choose_rule(system: System, ws: Workspace, run: Run):
-    """:func:`choose_modes` with the first rule to hold joints with dry friction that is not rejected."""
+    """Call :func:`choose_modes` with each rule to hold joints with dry friction until one is not rejected."""
     if search_modes(system, ws, run, HOLD_COMPATIBLE):
         return
     # A joint that moves, however slowly, because a contact or stop moves it, is not at rest.
@@ -231,12 +231,12 @@ def choose_rule(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def search_modes(system: System, ws: Workspace, run: Run, rule):
-    """:func:`choose_modes` from no forces, or near the forces before the event if that would end in a corner.
+    """Call :func:`choose_modes` from zero forces, or near the forces before the event if that would end in a corner.
 
-    If joints at rest share forces with sliding points, the solutions are a polygon or a body with more corners, and
-    each moves differently. Newton's method ends in one of the corners, where a joint is at its bound and a point on its
-    cone, and neither moves: the next change of forces ends that, and modes would be chosen again without end. The
-    forces before the event belong to the polygon or lie next to it, and solutions near them move as before.
+    If joints at rest share forces with sliding points, the solutions form a polygon or polyhedron, and each of them
+    moves differently. Newton's method ends in a corner, where a joint is at its bound and a point on its cone, and
+    neither moves: the next change of forces ends that, and modes would be chosen again endlessly. The forces before the
+    event belong to this set or are next to it, and solutions near them move as before.
     """
     number, search, chosen, not_unique = system.unilateral.number, ku.FROM_ZERO, False, run.clock[ki.NOT_UNIQUE]
     while search <= ku.LAST:
@@ -252,9 +252,9 @@ def search_modes(system: System, ws: Workspace, run: Run, rule):
 
 @noinline_kernel
 def note_forces(system: System, ws: Workspace):
-    """Note the present forces of all that touches or rubs in ``shares``, right after :func:`evaluate`.
+    """Record the present forces of everything that touches or rubs in ``shares``, right after :func:`evaluate`.
 
-    A choice of modes may start near them, and overwrites them by its choice.
+    A choice of modes may start near them, and then overwrites them.
     """
     unilateral, rows, state = system.unilateral, ws.rows, ws.contacts
     shares, first = unilateral.shares, system.couplings.joint.shape[0] + unilateral.stop_table.shape[0]
@@ -277,7 +277,7 @@ def note_forces(system: System, ws: Workspace):
 
 @internal_kernel
 def sliding_parts(system: System, ws: Workspace, k):
-    """Friction along both tangents of candidate k, which slides, per unit of its normal force."""
+    """Return the friction along both tangents of sliding candidate k per unit of its normal force."""
     state = ws.contacts
     slip, n = vector(state, k, ka.SLIP_VELOCITY), vector(state, k, ka.NORMAL)
     tx, ty, tz, mu = slide_direction(system.unilateral, system.contacts, k, slip, n)
@@ -300,7 +300,7 @@ def touch_again(unilateral: UnilateralArrays):
 
 @noinline_kernel
 def choose_modes(system: System, ws: Workspace, run: Run, rule):
-    """:func:`choose` with one rule to hold joints with dry friction; False, without changed rates, if that is rejected.
+    """Choose modes with one rule to hold joints with dry friction; False, with rates unchanged, if it is rejected.
 
     HOLD_COMPATIBLE is rejected if the slow rates of the held joints contradict other closed rows, or could only be
     zero if other joints stopped too.
@@ -322,7 +322,7 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
         if run.count[ki.STATUS] != ki.FORCES_REVERSED:
             run.count[ki.STATUS] = ki.NO_CONTACT_FORCES
         run.clock[ki.NOT_UNIQUE] = run.clock[ki.TIME]
-        # Leave the rows that contradict the law in the workspace, for a search for the cause.
+        # Leave the rows that contradict the law in the workspace, for diagnosis.
         set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
         evaluate(system, ws, run)
         return True
@@ -334,9 +334,9 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
     for i in range(size):
         slot = share_slot(unilateral, ws, unilateral.index[ku.TABLE_ROW, i])
         unilateral.shares[slot] = unilateral.vector[ku.SOLUTION, i]
-    # Remove residual rates after an impact that was allowed to settle, and of points that were solved for as if at
-    # rest: a point that begins to slip could otherwise move against its given direction, stop, and begin again. A point
-    # that moves along it keeps its rate: it would never get under way if events of other points came too often.
+    # Remove residual rates after an impact that was allowed to settle, and of points that were solved as if at rest: a
+    # point that begins to slip could otherwise move against its direction, stop, and begin again. A point that moves
+    # along it keeps its rate: otherwise it would never start to move if events of other points were too frequent.
     for k in range(mode.shape[0]):
         starts = mode[k, ku.WANTED] == ka.SLIDING and unilateral.slide[k, ku.FROZEN] == 1.0
         rests = starts and slip_speed(ws, k) <= least and slip_along(unilateral, ws, k) <= -RATE_TOLERANCE
@@ -358,7 +358,7 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
     for k in range(mode.shape[0]):
         rubs = mode[k, ku.WANTED] == ka.SLIDING and system.contacts.law[k, ka.STATIC] > 0.0
         if rubs and unilateral.slide[k, ku.FROZEN] == 0.0 and slip_speed(ws, k) < unilateral.number[ku.SLOW]:
-            # Rows of other contacts have stopped it too, and its friction keeps the direction that it had.
+            # Rows of other contacts have stopped it too, and its friction keeps its direction.
             unilateral.slide[k, ku.FROZEN], mode[k, ku.BEGINS] = 1.0, 1
         if mode[k, ku.WANTED] == ka.SLIDING and mode[k, ku.BEGINS] == 1:
             aim(unilateral, ws, k)
@@ -382,11 +382,11 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
         holds = redundant and unilateral.dry_table[k, ku.DRY_HOLDS] == 1
         unilateral.dry[k, ku.DRY_LEFT] = acceleration_left(unilateral, ws, k) if holds else 0.0
     for k in range(unilateral.stop_table.shape[0]):
-        # A joint that leaves from a little beyond its stop has not hit it again.
+        # A joint that leaves from slightly beyond its stop has not hit it again.
         unilateral.stop[k, ku.HIT_AT] = ku.DEPTH + max(0.0, -stop_gap(unilateral, ws, k))
     for k in range(mode.shape[0]):
         if mode[k, ku.WANTED] == ka.OPEN:
-            # A point that leaves may be moved below its surface as others come down; this is not another landing.
+            # A point that leaves may move below its surface as other points come down; this is not another landing.
             deepest = ku.AT_ROOT + max(0.0, -ws.contacts[k, ka.GAP])
             unilateral.slide[k, ku.LANDS_AT] = max(unilateral.slide[k, ku.LANDS_AT], deepest)
         starts = mode[k, ku.WANTED] == ka.SLIDING and unilateral.slide[k, ku.FROZEN] == 1.0
@@ -396,13 +396,16 @@ def choose_modes(system: System, ws: Workspace, run: Run, rule):
 
 @noinline_kernel
 def solve_accelerations(system: System, ws: Workspace, run: Run, p, largest, least, slides_on):
-    """Solve for forces that agree with the law; a point that slips slower than ``least`` [m/s] is at rest.
+    """Solve for forces that agree with the law; a point that slips slower than ``least`` [m/s] counts as at rest.
 
-    With ``slides_on`` it is not if it slides already, see :func:`keeps_sliding`.
+    With ``slides_on``, a point that already slides does not count as at rest, see :func:`keeps_sliding`.
 
     Returns
     -------
-    solved, size : whether there are such forces, and the size of their problem
+    solved : bool
+        Whether there are such forces.
+    size : int
+        Size of their problem.
     """
     unilateral, mode, size = system.unilateral, system.unilateral.mode, 0
     for k in range(mode.shape[0]):
@@ -410,7 +413,7 @@ def solve_accelerations(system: System, ws: Workspace, run: Run, p, largest, lea
             slides = (slides_on and keeps_sliding(unilateral, ws, k)) or begins_sliding(system, ws, k, least)
             mode[k, ku.WANTED] = ka.SLIDING if slides else ka.STICKING
             mode[k, ku.GIVES_WAY] = 1 if mode[k, ku.GIVES_WAY] == 1 and drops(system, k) else 0
-    # If static friction falls to a smaller kinetic one, the forces of the other contacts change.
+    # If static friction drops to a smaller kinetic value, the forces of the other contacts change.
     for _ in range(1 + mode.shape[0]):
         size = reduce_rows(system, ws, run, p)
         if run.count[ki.STATUS] == ki.FORCES_REVERSED:
@@ -439,7 +442,7 @@ def holds_moving_joint(unilateral: UnilateralArrays, ws: Workspace):
 
 @internal_kernel
 def release_moving_joints(unilateral: UnilateralArrays, ws: Workspace):
-    """Let joints slide that are not quite at rest."""
+    """Let joints that are not quite at rest slide."""
     for k in range(unilateral.dry_table.shape[0]):
         if not joint_rests(unilateral, ws, k):
             unilateral.dry_table[k, ku.DRY_HOLDS] = 0
@@ -459,7 +462,7 @@ def rates_contradict(unilateral: UnilateralArrays, ws: Workspace):
 
 @internal_kernel
 def stops_others(unilateral: UnilateralArrays, ws: Workspace):
-    """True if holding slow joints takes far more from the rates than they have, right after :func:`project_level`."""
+    """True if holding slow joints changes rates by far more than theirs, right after :func:`project_level`."""
     slowly, change = 0.0, 0.0
     for k in range(unilateral.dry_table.shape[0]):
         if unilateral.dry_table[k, ku.DRY_HOLDS] == 1:
@@ -471,13 +474,13 @@ def stops_others(unilateral: UnilateralArrays, ws: Workspace):
 
 @internal_kernel
 def hold_slow_joints(unilateral: UnilateralArrays, ws: Workspace, rule):
-    """Hold the joints that do not move where they are, by dry friction; the others keep sliding as they move.
+    """Hold joints that do not move in position, by dry friction; the others keep sliding as they move.
 
-    A joint that slides, however slowly, in its direction keeps its rate, as a point does: nothing strikes it, and other
+    A joint that slides in its direction, however slowly, keeps its rate, as a point does: nothing strikes it, and other
     joints would have to stop with it.
 
-    A joint whose brake is closed rests without friction: the brake carries all of its load. A row of friction would
-    reach its bound and break loose, and the joint would not move.
+    A joint with a closed brake rests without friction: the brake carries all of its load. A friction row would reach
+    its bound and break loose although the joint would not move.
     """
     table, dry = unilateral.dry_table, unilateral.dry
     for k in range(table.shape[0]):
@@ -492,18 +495,18 @@ def hold_slow_joints(unilateral: UnilateralArrays, ws: Workspace, rule):
 
 @internal_kernel
 def note_headway(unilateral: UnilateralArrays, ws: Workspace, k):
-    """Note the speed against its side with which dry-friction joint k begins to slide."""
+    """Record the speed against its side with which dry-friction joint k begins to slide."""
     rate = ws.joints[unilateral.dry_table[k, ku.DRY_JOINT], ka.QD]
     unilateral.dry[k, ku.DRY_HEADWAY] = max(0.0, -unilateral.dry[k, ku.DRY_SIDE] * rate)
 
 
 @internal_kernel
 def acceleration_left(unilateral: UnilateralArrays, ws: Workspace, k):
-    """Acceleration of dry-friction joint k, which is held, if its row alone gave way, right after :func:`evaluate`.
+    """Return the acceleration of held dry-friction joint k if its row alone were released, after :func:`evaluate`.
 
-    Rows J v̇ = b that contradict each other along one combination w, wᵀ J = 0, are left with the accelerations
-    r = w (w·b) / |w|² by least squares: the joint has only a share, which may be small where a point has most. With the
-    joint sliding, as in a choice of modes, all other rows hold, and it takes the whole: w·b / w_k = |r|² / r_k.
+    For rows J v̇ = b that contradict each other along one combination w, wᵀ J = 0, least squares leave the
+    accelerations r = w (w·b) / |w|²: the joint has only a share, which may be small if a point has most of it. If the
+    joint slides, as in a choice of modes, all other rows hold, and it takes the whole: w·b / w_k = |r|² / r_k.
     """
     rows, p, squares, largest = ws.rows, ws.counts[ka.ROWS], 0.0, 0.0
     for r in range(p):
@@ -518,7 +521,7 @@ def acceleration_left(unilateral: UnilateralArrays, ws: Workspace, k):
 
 @internal_kernel
 def let_joints_slide(system: System, size, largest):
-    """Write which joints dry friction still holds into DRY_NEXT, and the directions of the others into DRY_SIDE."""
+    """Write the joints that dry friction still holds into DRY_NEXT, and the directions of the others into DRY_SIDE."""
     unilateral, i = system.unilateral, system.couplings.joint.shape[0]
     table, f = unilateral.dry_table, unilateral.vector[ku.SOLUTION]
     for k in range(table.shape[0]):
@@ -533,7 +536,7 @@ def let_joints_slide(system: System, size, largest):
 
 @internal_kernel
 def slip_along(unilateral: UnilateralArrays, ws: Workspace, k):
-    """Slip of candidate k along its given direction [m/s]."""
+    """Return the slip of candidate k along its given direction [m/s]."""
     along = 0.0
     for s in range(3):
         along += unilateral.slide[k, ku.REFERENCE + s] * ws.contacts[k, ka.SLIP_VELOCITY + s]
@@ -542,10 +545,10 @@ def slip_along(unilateral: UnilateralArrays, ws: Workspace, k):
 
 @internal_kernel
 def keeps_sliding(unilateral: UnilateralArrays, ws: Workspace, k):
-    """True for a candidate that slides, however slowly, in its direction, with the friction of the right-hand side.
+    """True if candidate k slides in its direction, however slowly, with the friction of the right-hand side.
 
-    It keeps its slip, and with it its friction: at rest it could be given another, and the forces of the modes would
-    not be those of the choice.
+    It keeps its slip, and thus its friction: at rest its friction could change, and the forces of the modes would not
+    be the forces of the choice.
     """
     if unilateral.mode[k, ku.BEFORE] != ka.SLIDING:
         return False
@@ -556,9 +559,9 @@ def keeps_sliding(unilateral: UnilateralArrays, ws: Workspace, k):
 
 @internal_kernel
 def begins_sliding(system: System, ws: Workspace, k, least):
-    """True for a candidate that slides faster than ``least`` [m/s], or without friction; sets its direction."""
+    """True if candidate k slides faster than ``least`` [m/s], or without friction; sets its direction."""
     unilateral = system.unilateral
-    # An impact may have turned its slip.
+    # An impact may have turned the slip.
     if slip_on(unilateral, ws, k, least):
         return True
     if system.contacts.law[k, ka.STATIC] == 0.0:
@@ -569,7 +572,7 @@ def begins_sliding(system: System, ws: Workspace, k, least):
 
 @internal_kernel
 def slip_on(unilateral: UnilateralArrays, ws: Workspace, k, least):
-    """Let candidate k slide along its slip, v_t/|v_t|, if that is faster than ``least`` [m/s]; True if it is."""
+    """Let candidate k slide along its slip, v_t/|v_t|, if this is faster than ``least`` [m/s]; True if it is."""
     slide, speed = unilateral.slide, slip_speed(ws, k)
     if speed > least:
         slide[k, ku.FROZEN] = 0.0
@@ -582,7 +585,7 @@ def slip_on(unilateral: UnilateralArrays, ws: Workspace, k, least):
 def reduce_rows(system: System, ws: Workspace, run: Run, p):
     """Write the problem of accelerations into ``unilateral``, with only normal rows of sliding points; return its size.
 
-    Column of such a row: W (n − μ t). A row that its own force would accelerate against itself sets STATUS (Painlevé).
+    Column of such a row: W (n − μ t). Sets STATUS if a row's own force would accelerate it against itself (Painlevé).
     """
     unilateral, W = system.unilateral, ws.small[0]
     index, vector, mode = unilateral.index, unilateral.vector, unilateral.mode
@@ -625,7 +628,7 @@ def reduce_rows(system: System, ws: Workspace, run: Run, p):
 
 @internal_kernel
 def acceleration(unilateral: UnilateralArrays, i, size):
-    """Acceleration along row i of the reduced problem."""
+    """Return the acceleration along row i of the reduced problem."""
     total = unilateral.vector[ku.OFFSET, i]
     for j in range(size):
         total += unilateral.room[ku.PROBLEM, i, j] * unilateral.vector[ku.SOLUTION, j]
@@ -634,7 +637,7 @@ def acceleration(unilateral: UnilateralArrays, i, size):
 
 @internal_kernel
 def slips(system: System, k, i, size, largest):
-    """True when candidate k, at row i of the reduced problem, is on its cone and accelerated along its surface."""
+    """True if candidate k, at row i of the reduced problem, is on its cone and accelerates along its surface."""
     unilateral = system.unilateral
     f = unilateral.vector[ku.SOLUTION]
     friction = math.sqrt(f[i + 1] * f[i + 1] + f[i + 2] * f[i + 2])
@@ -648,7 +651,7 @@ def slips(system: System, k, i, size, largest):
 
 @internal_kernel
 def begin_slip(system: System, ws: Workspace, k, fx, fy):
-    """Candidate k begins to slip against (fx, fy) along its two tangents: its friction force, or its acceleration."""
+    """Start slip of candidate k against (fx, fy) along its two tangents: its friction force or its acceleration."""
     slide, state = system.unilateral.slide, ws.contacts
     size = math.sqrt(fx * fx + fy * fy)
     slide[k, ku.FROZEN] = 1.0
@@ -662,11 +665,11 @@ def begin_slip(system: System, ws: Workspace, k, fx, fy):
 
 @internal_kernel
 def aim(unilateral: UnilateralArrays, ws: Workspace, k):
-    """Turn the reference of candidate k so that its friction is along d, its present REFERENCE, at the slip v it has.
+    """Turn the reference of candidate k so that its friction at its slip v is along d, its present REFERENCE.
 
-    A point that was solved for as at rest begins to slip along d, but may have some slip across d left, which turns its
-    friction, see ``slide_direction``. That would not be the friction of the choice: a joint that is driven the other
-    way by it would stop at once and begin again, without end. With v = a d + b and b across d, the reference is
+    A point that was solved as at rest begins to slip along d, but may still have some slip across d, which turns its
+    friction, see ``slide_direction``. That friction would differ from the choice: a joint that it drives the other way
+    would stop at once and begin again, endlessly. With v = a d + b and b across d, the reference is
     r = (u d − b)/√(u² + b²), and v + (s − v·r) r, with s = SLOW, is along d if (a + u) u = s √(u² + b²).
     """
     slide, state = unilateral.slide, ws.contacts
@@ -691,7 +694,7 @@ def aim(unilateral: UnilateralArrays, ws: Workspace, k):
 
 @internal_kernel
 def drops(system: System, k):
-    """True for a candidate whose friction falls from a static coefficient to a smaller kinetic one when it slips."""
+    """True if the friction of candidate k drops from a static to a smaller kinetic coefficient when it slips."""
     law = system.contacts.law
     return law[k, ka.STRIBECK] == 0.0 and law[k, ka.STATIC] > law[k, ka.MU]
 
@@ -740,7 +743,7 @@ def take_solution(system: System, ws: Workspace, size, largest):
         while index[ku.TABLE_ROW, i] != ws.active[k, ka.FIRST_ROW]:
             i += 1
         if not f[i] > FORCE_TOLERANCE * strongest:
-            # It touches without a force, maybe a little below its surface: it lands only if it moves deeper.
+            # It touches without force, possibly slightly below its surface: it lands only if it moves deeper.
             mode[k, ku.WANTED], unilateral.slide[k, ku.LANDS_AT] = ka.OPEN, ku.DEPTH
         elif mode[k, ku.WANTED] == ka.STICKING and slips(system, k, i, size, largest):
             fx, fy = f[i + 1], f[i + 2]

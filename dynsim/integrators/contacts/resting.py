@@ -1,8 +1,8 @@
 """Joints at rest that dry friction holds by a constant force instead of a row, because other rows hold them too.
 
 The equations of motion do not determine how such a joint and the others share the load. The choice of modes gives one
-solution; the joint takes its force from the solution with the same motion and the largest worst margin. If another
-joint were at its bound, the next change of forces would end the share, and modes would be chosen again without end.
+solution; the joint gets its force from the solution with the same motion and the largest worst margin. If another
+joint were at its bound, the next change of forces would end the share, and modes would be chosen again endlessly.
 """
 
 from __future__ import annotations
@@ -23,30 +23,36 @@ from dynsim.integrators.contacts.impacts import FORCE_TOLERANCE, evaluate
 from dynsim.integrators.run import Run, project_level
 from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
-# Largest share of its friction that a joint at rest may have: all but a rounding, to distinguish it from a sliding one.
+# Largest share of its friction that a joint at rest may have: 1 but for rounding, to distinguish it from sliding.
 NEARLY_ALL = 1.0 - 1e-15
 # Share of a joint's mobility that other rows leave: below NEARLY_DEPENDENT no friction could hold the joint by a row;
-# below ROUNDING, or below what rounding makes of it, its row depends on the other rows.
+# below ROUNDING, or below its rounding error, its row depends on the other rows.
 NEARLY_DEPENDENT, ROUNDING = 1e-6, 1e-12
-# Relative error of mobilities: some roundings, because they are sums over joints.
+# Relative rounding error of mobilities, which are sums over joints.
 ROUNDINGS = 1e-15
-# In DRY_NEXT: rests without a row from now on.
+# Value of DRY_NEXT: the joint rests without a row from now on.
 RELEASED = 2
 
 
 @internal_kernel
 def release_dependent_joints(system: System, ws: Workspace, size):
-    """Give joints at rest that sliding contacts or stops hold the constant force of the solution instead of a row.
+    """Hold joints at rest, if sliding contacts or stops hold them too, by the force of the solution instead of a row.
 
     Such a row depends on the normal rows, and how they share a force changes the friction of sliding points: no split
     of the right-hand side equals the solution. At rest Coulomb's law admits any force within the bound. Rows that
-    depend only on rows of sticking points and other joints remain, see :mod:`dynsim.dynamics.contact.delassus`, except
-    rows that depend on them only nearly: holding such a joint would take forces beyond all bounds, and the order of
-    pivots would decide whether it is held. ``size`` is the size of the solved problem.
+    depend only on rows of sticking points and other joints remain, see :mod:`dynsim.dynamics.contact.delassus`, unless
+    they depend on them only nearly: holding such a joint would take unbounded forces, and the order of pivots would
+    decide whether it is held.
+
+    Parameters
+    ----------
+    size : int
+        Size of the solved problem.
 
     Returns
     -------
-    margin : the worst margin of the solution taken, as a share of its largest force; infinite if no joint was released
+    margin : float
+        Worst margin of the solution taken, as a share of its largest force; infinite if no joint was released.
     """
     unilateral, W = system.unilateral, ws.small[0]
     table, mode, bare, whole = unilateral.dry_table, unilateral.mode, 0, 0
@@ -93,11 +99,11 @@ def release_dependent_joints(system: System, ws: Workspace, size):
 
 @noinline_kernel
 def take_widest_split(system: System, ws: Workspace, size):
-    """Replace the solution by the one with the same motion whose worst margin is largest.
+    """Replace the solution by the one with the same motion and the largest worst margin.
 
-    It has ``size`` rows. Forces may change where they act on nothing but each other: of joints at rest, closed stops
-    and sticking points within their bounds, of sliding points along their whole force. Friction that slides, or begins
-    to, stays as it is for its normal force. Returns that margin as a share of the largest force.
+    It has ``size`` rows. Forces that act only on each other may change: of joints at rest, closed stops and sticking
+    points within their bounds, of sliding points along their whole force. Friction that slides, or begins to, keeps its
+    ratio to the normal force. Returns the margin as a share of the largest force.
     """
     unilateral, table = system.unilateral, system.unilateral.dry_table
     vector, kinds, N = unilateral.vector, unilateral.index[ku.KINDS], unilateral.room[ku.NULL_SPACE]
@@ -154,7 +160,7 @@ def take_widest_split(system: System, ws: Workspace, size):
 
 @internal_kernel
 def mobility_along_forces(unilateral: UnilateralArrays, ws: Workspace, i, j):
-    """Mobility between rows i and j of the solved problem along their whole forces, friction of slip included."""
+    """Return the mobility between rows i and j of the solved problem along whole forces, with sliding friction."""
     vector, total = unilateral.vector, 0.0
     a, b = unilateral.index[ku.TABLE_ROW, i], unilateral.index[ku.TABLE_ROW, j]
     for s in range(3):
@@ -178,8 +184,8 @@ def sticks(unilateral: UnilateralArrays, ws: Workspace, i):
 
 @internal_kernel
 def rest_without_row(unilateral: UnilateralArrays, k):
-    """Keep dry-friction joint k at rest with the constant force that it has in the solution."""
-    # Rows of joints come first, so that they are the same in the reduced problem.
+    """Keep dry-friction joint k at rest with its constant force in the solution."""
+    # Rows of joints come first, so their numbers are the same in the reduced problem.
     share = -unilateral.vector[ku.SOLUTION, unilateral.dry_table[k, ku.DRY_ROW]] / dry_bound(unilateral, k)
     unilateral.dry_table[k, ku.DRY_NEXT] = 0
     unilateral.dry[k, ku.DRY_SIDE] = min(max(share, -NEARLY_ALL), NEARLY_ALL)
@@ -187,11 +193,10 @@ def rest_without_row(unilateral: UnilateralArrays, k):
 
 @noinline_kernel
 def hold_free_joints(system: System, ws: Workspace, run: Run, begins):
-    """Give rows to the joints that rest with a constant force and that contacts and stops no longer hold.
+    """Give rows to joints that rest with a constant force and that contacts and stops no longer hold.
 
-    Called after single modes have changed, at the end of an accepted step. If slip ``begins`` somewhere, a joint whose
-    force is all of its friction moves with the contact or stop that held it: with a row it would stick, and break loose
-    at once.
+    Call after single modes have changed, at the end of an accepted step. If slip ``begins`` somewhere, a joint at its
+    friction bound moves with the contact or stop that held it: with a row it would stick and break loose at once.
     """
     unilateral, y = system.unilateral, run.y
     table, dry, mode = unilateral.dry_table, unilateral.dry, unilateral.mode
@@ -257,7 +262,7 @@ def extended(factor, W, row, count, r):
 
 @internal_kernel
 def mobility_left(factor, W, row, count, r):
-    """Return the mobility W along row r that the rows of a factor leave; write row ``count`` of the factor, for r."""
+    """Return the mobility W along row r that the rows of a factor leave; write row ``count`` of the factor."""
     square = W[r, r]
     for i in range(count):
         total = W[r, row[i]]
@@ -270,10 +275,10 @@ def mobility_left(factor, W, row, count, r):
 
 @internal_kernel
 def rounding_left(factor, W, row, count, r):
-    """Return how far rounding may change what :func:`mobility_left`, called right before, has returned.
+    """Return how far rounding may change the result of the preceding call of :func:`mobility_left`.
 
-    That is w·W w of the combination w = (−x, 1) of the rows and row r, with x the forces along the rows that hold what
-    a unit force along row r moves. An error δ √(W_ii W_jj) of each entry changes it by δ (Σ |w_i| √W_ii)²: much where
+    That result is w·W w of the combination w = (−x, 1) of the rows and row r; forces x along the rows cancel the effect
+    of a unit force along row r on them. An error δ √(W_ii W_jj) of each entry changes it by δ (Σ |w_i| √W_ii)²: much if
     the rows nearly depend on each other, because x is large then. The part of the factor above its diagonal is scratch.
     """
     size = math.sqrt(W[r, r])
@@ -288,7 +293,7 @@ def rounding_left(factor, W, row, count, r):
 
 @internal_kernel
 def mobility(ws: Workspace, r, s):
-    """Change of the rate along row r by a unit impulse along row s."""
+    """Return the change of the rate along row r by a unit impulse along row s."""
     total = 0.0
     for i in range(ws.joints.shape[0]):
         total += ws.column[i, 1 + 2 * r] * ws.column[i, 1 + 2 * s] * ws.links[i, ka.INVERSE_D]
@@ -297,9 +302,9 @@ def mobility(ws: Workspace, r, s):
 
 @internal_kernel
 def leave_least(ws: Workspace, small, column, errors):
-    """Write what projection leaves of a column of the rows, their gaps or rates, right after ``derivative``.
+    """Write the residual that projection leaves in a column of the rows (gaps or rates), right after ``derivative``.
 
-    RHS and FORCE of the rows, and ``small``, are scratch.
+    RHS and FORCE of the rows, and ``small``, serve as scratch.
     """
     rows, p = ws.rows, ws.counts[ka.ROWS]
     for r in range(p):

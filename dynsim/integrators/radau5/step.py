@@ -2,7 +2,7 @@
 
 Stages Z_i = h Σ a_ij f(t + c_j h, y + Z_j), and y_new = y + Z_3 (Hairer, Wanner: Solving Ordinary Differential
 Equations II, IV.8). With W = T⁻¹ Z the linear systems of Newton's method decouple into a real and a complex one of the
-size of the state, g I − J with g = γ/h or (α + iβ)/h, and each of these reduces to one of the size of the rates. Of
+size of the state, g I − J with g = γ/h or (α + iβ)/h, and each of these reduces to one of the size of the rates. In
 
     q̇ = N v,    v̇ = f(q, v, i),    di/dt = a q + b v + c i + …
 
@@ -10,7 +10,7 @@ the first and the last rows are eliminated, u_q = (r_q + N u_v)/g and u_i = (r_i
 
     (g − ∂f/∂v − ∂f/∂θ/g − ∂f/∂i (a/g + b)/(g − c)) u_v = r_v + ∂f/∂θ N⁺ r_q/g + ∂f/∂i (r_i + a r_q/g)/(g − c),
 
-θ being displacements along the rates. The Jacobian neglects the change of N with q: where bodies rotate in space
+where θ are displacements along the rates. The Jacobian neglects the change of N with q: if bodies rotate in space,
 Newton's method converges more slowly, to the same solution. Jacobian and factors are kept as long as it converges.
 """
 
@@ -63,28 +63,28 @@ from dynsim.jit.compiler import form_of
 from dynsim.jit.kernel import internal_kernel, noinline_kernel
 from dynsim.jit.simd import four, turned
 
-# Linear systems of RADAU5's Newton method, reduced to the rates: one real and one complex, solved together.
+# Linear systems of RADAU5's Newton method, reduced to the rates: a real and a complex system, solved together.
 
 
 @internal_kernel
 def factor_both(system: System, r: NewtonArrays, h):
-    """Inverses of both reduced matrices, from ``r.along`` and ``r.linear``, for steps of length h."""
+    """Invert both reduced matrices, from ``r.along`` and ``r.linear``, for steps of length h."""
     r.inverse[0] = reduced_inverse(system, r, GAMMA_RADAU / h)
     r.inverse[1] = reduced_inverse(system, r, complex(ALPHA_RADAU / h, BETA_RADAU / h))
 
 
 @internal_kernel
 def solve_both(system: System, ws: Workspace, y, r: NewtonArrays, h):
-    """``r.one`` and ``r.two``, (s,) real and complex, from right sides to solutions, by :func:`factor_both`."""
+    """Replace right sides ``r.one`` and ``r.two``, (s,) real and complex, by solutions; after :func:`factor_both`."""
     r.one[:] = solve_newton(system, y, r, GAMMA_RADAU / h, r.inverse[0].real, r.one)
     r.two[:] = solve_newton(system, y, r, complex(ALPHA_RADAU / h, BETA_RADAU / h), r.inverse[1], r.two)
 
 
 def reduced_inverse(system: System, r: NewtonArrays, g):
-    """The inverse of the reduced matrix for g, real or complex; as Python only."""
+    """Return the inverse of the reduced matrix for g, real or complex; never compiled."""
     along, block, table = r.along, r.linear, system.drives.table
     n = along.shape[1]
-    first = 2 * n  # of the rows of circuits
+    first = 2 * n  # first row of the circuits
     matrix = g * np.eye(n) - along[n:first].T - along[:n].T / g
     for row, (j, k) in zip(block, table[:, [ka.DRIVEN, ka.CIRCUIT]], strict=True):
         if k >= 0:
@@ -93,10 +93,10 @@ def reduced_inverse(system: System, r: NewtonArrays, g):
 
 
 def solve_newton(system: System, y, r: NewtonArrays, g, inverse, x):
-    """(g I − J)⁻¹ x by the inverse of the reduced matrix, x (s,) real or complex; as Python only."""
+    """Return (g I − J)⁻¹ x from the inverse of the reduced matrix, x (s,) real or complex; never compiled."""
     along, table, layout = r.along, system.drives.table, system.layout
     n, q, v = along.shape[1], layout.q, layout.v
-    first = 2 * n - layout.current  # of the rows of circuits
+    first = 2 * n - layout.current  # first row of the circuits
     angle, solved = x[q : q + n].copy(), x.copy()
     if layout.extra > 0:
         rates_across(system.model, y, q, x, angle)
@@ -128,13 +128,13 @@ def _compiled(*_: Any) -> bool:
 
 @internal_kernel
 def pair(real, z):
-    """What x ∘ (p, m) multiplies by: a real number and a complex one."""
+    """Return the factors by which x ∘ (p, m) multiplies by a real and a complex number."""
     return four(real, z.real, z.real, real), four(0.0, -z.imag, z.imag, 0.0)
 
 
 @form_of(factor_both, _compiled)
 def invert_on_lanes(system, r, h):
-    """The inverses of both, by Gauss–Jordan elimination; pivots large in both."""
+    """Invert both by Gauss–Jordan elimination, with pivots that are large in both."""
     along, block, table = r.along, r.linear, system.drives.table
     p, m = as_lanes(r.direct), as_lanes(r.crossed)
     over, circuit = as_lanes(r.over), as_lanes(r.circuit)
@@ -193,7 +193,7 @@ def invert_on_lanes(system, r, h):
 
 @form_of(solve_both, _compiled)
 def multiply_on_lanes(system, ws, y, r, h):
-    """By the inverses of :func:`invert_on_lanes`."""
+    """Multiply by the inverses of :func:`invert_on_lanes`."""
     along, block, table, layout = r.along, r.linear, system.drives.table, system.layout
     n, q, v, current = along.shape[1], layout.q, layout.v, layout.current
     p, m, x, room = as_lanes(r.direct), as_lanes(r.crossed), as_lanes(r.x), as_lanes(r.room)
@@ -254,32 +254,32 @@ def multiply_on_lanes(system, ws, y, r, h):
 
 
 def samples_on_lanes(newton: Any, system: Any, ws: Any, run: Any, *_: Any) -> bool:
-    """Where there are lanes, by types."""
+    """True, from the types, if there are lanes."""
     return bool(newton != types.none and newton[newton.fields.index("lanes")] != types.none)
 
 
 @internal_kernel
 def may_wait(unilateral: UnilateralArrays | None, run: Run):
-    """True where nothing but steps happens between two samples: modes, commands and loads go on as they are."""
-    if unilateral is None:  # known to the compiler
+    """True if only steps happen between two samples, so that modes, commands and loads do not change."""
+    if unilateral is None:  # resolved at compile time
         return run.event.shape[0] + run.tick.shape[0] + run.breaks.shape[0] == 0
     return False
 
 
 @internal_kernel
 def has_stops(unilateral: UnilateralArrays | None):
-    """True where joints have stops or dry friction, whose forces are kept for one state alone."""
-    if unilateral is None:  # known to the compiler
+    """True if joints have stops or dry friction, whose forces are stored for a single state only."""
+    if unilateral is None:  # resolved at compile time
         return False
     return unilateral.stop.shape[0] + unilateral.dry.shape[0] > 0
 
 
 @form_of(write_samples, samples_on_lanes)
 def write_samples_on_lanes(newton, system, ws, run, more):
-    """Four at a time; those that cannot wait by fewer, and one is done sooner alone."""
+    """Record four samples at a time, fewer if they cannot wait; a single sample is cheaper without lanes."""
     newton.count[kn.WAITING] += more
     wait = may_wait(system.unilateral, run)
-    # What the ground carries is computed for one state alone too.
+    # The ground reaction is also computed for a single state only.
     alone = has_stops(system.unilateral) or run.support.index.shape[0] > 0
     while newton.count[kn.WAITING] >= 4 or (newton.count[kn.WAITING] > 0 and not wait):
         if alone or newton.count[kn.WAITING] == 1:
@@ -291,9 +291,9 @@ def write_samples_on_lanes(newton, system, ws, run, more):
 
 @form_of(write_waiting, samples_on_lanes)
 def write_waiting_on_lanes(newton, system, ws, run):
-    """Write even a single sample from lanes: its value must not depend on when a caller looks.
+    """Write even a single sample from lanes: its value must not depend on when control returns to a caller.
 
-    The first lane keeps the end of a step that is pending.
+    The first lane keeps the end of a pending step.
     """
     if newton.count[kn.WAITING] > 0:
         write_together(newton, system, ws, run, 1)
@@ -301,7 +301,7 @@ def write_waiting_on_lanes(newton, system, ws, run):
 
 @internal_kernel
 def write_together(newton: NewtonArrays, system: System, ws: Workspace, run: Run, begin):
-    """Record the waiting samples, up to four, from lane ``begin`` on."""
+    """Record the waiting samples, up to four, starting at lane ``begin``."""
     count = load_samples(newton, run, begin)
     fill_lanes(newton.lanes, run, begin + count)
     evaluate_four(newton.lanes, system)
@@ -310,7 +310,7 @@ def write_together(newton: NewtonArrays, system: System, ws: Workspace, run: Run
 
 @internal_kernel
 def load_samples(newton: NewtonArrays, run: Run, begin):
-    """Samples that wait into the lanes from ``begin`` on; returns how many."""
+    """Load waiting samples into the lanes from ``begin`` on; return their number."""
     lanes, first, count = newton.lanes, run.count[ki.SAMPLE], min(newton.count[kn.WAITING], 4 - begin)
     for k in range(count):
         lanes.t[begin + k] = run.sample_time[first + k]
@@ -321,7 +321,7 @@ def load_samples(newton: NewtonArrays, run: Run, begin):
 
 @internal_kernel
 def fill_lanes(lanes: StageLanes, run: Run, begin):
-    """The first lane into those from ``begin`` on, for which there is nothing else."""
+    """Copy the first lane into the unused lanes from ``begin`` on."""
     for k in range(begin, 4):
         lanes.t[k] = lanes.t[0]
         for j in range(run.y.shape[0]):
@@ -330,7 +330,7 @@ def fill_lanes(lanes: StageLanes, run: Run, begin):
 
 @internal_kernel
 def take_samples(newton: NewtonArrays, system: System, ws: Workspace, run: Run, begin, count):
-    """Record so many samples from the lanes, from ``begin`` on; what has left its surfaces is projected, alone."""
+    """Record ``count`` samples from the lanes from ``begin`` on; a sample off its surfaces is projected separately."""
     if count == 0:
         return
     lanes = newton.lanes
@@ -350,14 +350,14 @@ def take_samples(newton: NewtonArrays, system: System, ws: Workspace, run: Run, 
 
 @internal_kernel
 def evaluate_end(newton: NewtonArrays, system: System, ws: Workspace, run: Run):
-    """Derivatives at the three stages into ``f``, and the last one, which is at y_new, into stage[6] too."""
+    """Evaluate the derivatives at the three stages into ``f``, and the last one, at y_new, into stage[6] too."""
     evaluate_two(newton, system, ws, run)
     evaluate_end_alone(newton, system, ws, run)
 
 
 @internal_kernel
 def evaluate_two(newton: NewtonArrays, system: System, ws: Workspace, run: Run):
-    """Derivatives at the first two stages, into ``f``."""
+    """Evaluate the derivatives at the first two stages into ``f``."""
     for s in range(2):
         for j in range(newton.kept.shape[1]):
             run.stage[7, j] = run.y[j] + newton.z[s, j]
@@ -369,9 +369,9 @@ def evaluate_two(newton: NewtonArrays, system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def evaluate_end_alone(newton: NewtonArrays, system: System, ws: Workspace, run: Run):
-    """Derivative at y_new into the third row of ``f``, then into stage[6].
+    """Evaluate the derivative at y_new into the third row of ``f``, then copy it into stage[6].
 
-    Not the other way round: entries that no derivative writes are zero in ``f``, and scratch in stage[6].
+    Not the other way round: entries that no derivative writes are zero in ``f`` but scratch in stage[6].
     """
     derivative(system, run.clock[ki.TIME] + run.clock[ki.STEP], run.y_new, ws, newton.f[2])
     for j in range(run.y.shape[0]):
@@ -381,19 +381,19 @@ def evaluate_end_alone(newton: NewtonArrays, system: System, ws: Workspace, run:
 
 @internal_kernel
 def end_workspace(newton: NewtonArrays | None, system: System, ws: Workspace, run: Run):
-    """The workspace of the end of the step just taken."""
+    """Return the workspace of the end of the step just taken."""
     return ws
 
 
 @internal_kernel
 def end_accepted(newton: NewtonArrays | None, system: System, ws: Workspace, run: Run):
-    """Project y_new where it is off the constraints, and watch the forces; False, and STATUS, when that cannot be."""
+    """Project y_new if it is off the constraints, and watch the forces; False, and STATUS, on failure."""
     return end_settled(system, ws, run, off_surface(ws)) and end_watched(system, ws, run)
 
 
 @internal_kernel
 def end_settled(system: System, ws: Workspace, run: Run, off):
-    """True when y_new is on the constraints; where it was ``off`` them ``ws`` is of what it has become."""
+    """True if y_new is on the constraints; if it was ``off`` them, it is projected and ``ws`` is evaluated there."""
     if not off or settle(system, run.clock[ki.TIME] + run.clock[ki.STEP], run.y_new, ws, run.stage[6], run):
         return True
     run.count[ki.STATUS] = ki.NOT_PROJECTED
@@ -402,7 +402,7 @@ def end_settled(system: System, ws: Workspace, run: Run, off):
 
 @internal_kernel
 def end_watched(system: System, ws: Workspace, run: Run):
-    """True when forces at y_new are unique; ``ws`` right after ``derivative`` there."""
+    """True if the forces at y_new are unique; ``ws`` right after ``derivative`` there."""
     h = run.clock[ki.STEP]
     if not (clearly_unique(ws) or forces_unique(system, ws, run, run.clock[ki.TIME] + h)):
         return False
@@ -411,7 +411,7 @@ def end_watched(system: System, ws: Workspace, run: Run):
 
 
 def _on_lanes(newton: Any, system: Any, ws: Any, run: Any, *_: Any) -> bool:
-    """Where samples are taken on lanes and nothing else asks what the forces at the end are."""
+    """True if samples are taken on lanes and the law is bilateral, so that only samples use the forces at the end."""
     return samples_on_lanes(newton, system, ws, run) and bool(system[system.fields.index("unilateral")] == types.none)
 
 
@@ -441,7 +441,7 @@ def evaluate_end_on_lanes(newton, system, ws, run):
 
 @form_of(end_accepted, _on_lanes)
 def end_accepted_on_lanes(newton, system, ws, run):
-    """By what the first lane has left, unless the end must be projected."""
+    """Check the end in the first lane, unless it must be projected."""
     end = lane(tables_as_lanes(newton.lanes.ws), 0)
     if not off_surface(end):
         return end_watched(system, end, run)
@@ -450,26 +450,26 @@ def end_accepted_on_lanes(newton, system, ws, run):
 
 @form_of(end_workspace, _on_lanes)
 def end_workspace_on_lanes(newton, system, ws, run):
-    """The first lane."""
+    """Return the first lane."""
     return lane(tables_as_lanes(newton.lanes.ws), 0)
 
 
 # Newton's method: most iterations, and the contraction below which the Jacobian stays.
 MOST_ITERATIONS, GOOD_CONTRACTION = 8, 0.05
 # In steps shorter than this [s], errors of rates and currents near zero count by their effect until the end of the
-# step. This slack is smaller if rtol is smaller than SLACK_RTOL, because then all steps are short.
+# step. This slack is smaller if rtol is below SLACK_RTOL, because then all steps are short.
 SHORT, SLACK_RTOL = 0.005, 1e-6
-# Change of rates for differences, as a part of the slowest slip: its square is rounding of slip at 1e-7 m/s.
+# Change of rates for differences, as a fraction of the slowest slip: its square is rounding of slip at 1e-7 m/s.
 SMALL = 1e-4
-# What a step whose Newton's method diverges is said to be in error by: half of it is tried next.
+# Error norm assigned to a step whose Newton iteration diverges: half of the step is tried next.
 NO_STAGES = 10.5
 
 
 @noinline_kernel
 def differentiate(system: System, ws: Workspace, run: Run):
-    """Finite differences of v̇ along the rates' displacements, the rates and the currents, at (TIME, y).
+    """Compute finite differences of v̇ along the rates' displacements, the rates and the currents, at (TIME, y).
 
-    The stiff electrical rows are not taken from here but are the drives' own; v̇ is linear in the currents.
+    The stiff electrical rows come from the drives instead; v̇ is linear in the currents.
     """
     t, y, x, base, r = run.clock[ki.TIME], run.y, run.stage[6], run.stage[7], run.newton
     # The workspace may still hold a sample or a rejected step.
@@ -481,7 +481,7 @@ def differentiate(system: System, ws: Workspace, run: Run):
     run.count[ki.EVALUATIONS] += r.along.shape[0] + 1
     r.count[kn.JACOBIANS] += 1
     r.count[kn.STALE], r.count[kn.MADE_AT], r.clock[kn.FACTORED] = 0, run.count[ki.STEPS], 0.0
-    # Nothing is known of how Newton's method contracts with it.
+    # The contraction of Newton's method with the new Jacobian is not known yet.
     r.clock[kn.CONTRACTION] = 0.0
 
 
@@ -491,10 +491,10 @@ def largest_change(unilateral: UnilateralArrays | None, ws: Workspace):
 
     A change δ along a slip v and across it turns its friction, and differences have a relative error of δ/2v
     in directions in which friction does not change: with 1/τ of friction that turns within τ, Newton's method diverges
-    beyond steps of some 2v/δ τ. A point that slides slowly takes SMALL of its slip, far above rounding.
+    beyond steps of some 2v/δ τ. For a point that slides slowly the change is SMALL of its slip, far above rounding.
     """
     change = math.inf
-    if unilateral is None:  # known to the compiler
+    if unilateral is None:  # resolved at compile time
         return change
     for k in range(ws.contacts.shape[0]):
         if ws.active[k, ka.MODE] == ka.SLIDING:
@@ -504,9 +504,9 @@ def largest_change(unilateral: UnilateralArrays | None, ws: Workspace):
 
 @internal_kernel
 def displaced(system: System, ws: Workspace, y, s, x, change):
-    """x = y but for number s of the rates' displacements, the rates, by ``change`` at most, and the currents.
+    """Write x = y with entry s changed, counting the rates' displacements, the rates, then the currents.
 
-    Returns by how much it differs.
+    ``change`` limits changes of rates. Returns the change.
     """
     n, layout = ws.joints.shape[0], system.layout
     for j in range(y.shape[0]):
@@ -525,7 +525,7 @@ def displaced(system: System, ws: Workspace, y, s, x, change):
 
 @internal_kernel
 def columns(lanes: StageLanes | None, system: System, ws: Workspace, t, y, x, base, r: NewtonArrays):
-    """Finite differences of v̇ into ``r.along``, right after ``derivative`` at y, which is ``base``; x (m,) is room."""
+    """Write finite differences of v̇ into ``r.along``; ``base`` is the derivative at y, x (m,) is scratch."""
     v = system.layout.v
     for s in range(r.along.shape[0]):
         delta = displaced(system, ws, y, s, x, r.clock[kn.CHANGE])
@@ -537,7 +537,7 @@ def columns(lanes: StageLanes | None, system: System, ws: Workspace, t, y, x, ba
 
 @internal_kernel
 def evaluate_stages(lanes: StageLanes | None, system: System, ws: Workspace, t, h, y, x, r: NewtonArrays):
-    """Derivatives at the stages, into ``r.f``; x (m,) is room."""
+    """Evaluate the derivatives at the stages into ``r.f``; x (m,) is scratch."""
     for s in range(3):
         for j in range(r.kept.shape[1]):
             x[j] = y[j] + r.z[s, j]
@@ -550,7 +550,7 @@ def _given(lanes: Any, *_: Any) -> bool:
 
 @form_of(columns, _given)
 def columns_on_lanes(lanes, system, ws, t, y, x, base, r):
-    """Four columns at a time; if their number is not a multiple of four, the last one is repeated."""
+    """Compute four columns at a time; if their number is not a multiple of four, the last one is repeated."""
     v, last = system.layout.v, r.along.shape[0] - 1
     take_rows(ws, lanes.ws)
     for first in range(0, last + 1, 4):
@@ -567,7 +567,7 @@ def columns_on_lanes(lanes, system, ws, t, y, x, base, r):
 
 @form_of(evaluate_stages, _given)
 def stages_on_lanes(lanes, system, ws, t, h, y, x, r):
-    """Three lanes, and the last of them again."""
+    """Evaluate three lanes, and the last of them again."""
     for j in range(r.kept.shape[1]):
         z0, z1, z2 = y[j] + r.z[0, j], y[j] + r.z[1, j], y[j] + r.z[2, j]
         lanes.y[j, 0], lanes.y[j, 1], lanes.y[j, 2], lanes.y[j, 3] = z0, z1, z2, z2
@@ -580,7 +580,7 @@ def stages_on_lanes(lanes, system, ws, t, h, y, x, r):
 
 @internal_kernel
 def keep_stages(run: Run):
-    """The stages of the step accepted last, as a polynomial for the first guess of the next ones, and its error."""
+    """Save the stages of the last accepted step as a polynomial for the first guess of the next ones, and its error."""
     r, c0, c1 = run.newton, NODE_RADAU[0], NODE_RADAU[1]
     if r.count[kn.SEEN] == run.count[ki.STEPS]:
         return
@@ -595,17 +595,17 @@ def keep_stages(run: Run):
 
 @internal_kernel
 def missed(x):
-    """P(x) = ∫ Π (s − c_i) ds from 0 to x; c_3 = 1 is a double root."""
+    """Return P(x) = ∫ Π (s − c_i) ds from 0 to x; c_3 = 1 is a double root."""
     return x * (x - 1.0) * (x - 1.0) * (0.25 * x - 0.1)
 
 
 @internal_kernel
 def guess_stages(run: Run, h):
-    """First guess of the stages: where the last ones lead to, and what these and the new ones miss.
+    """Guess the stages by extrapolating the last ones, corrected for the errors of both steps.
 
     Stages are of order 3. With P(x) = ∫ Π (s − c_i) ds from 0 to x, and D = h⁴ y⁗/6, the collocation polynomial of the
-    last step is y − D P(x), x = 1 + c ρ in the next one, ρ times as long, whose stages are y − ρ⁴ D P(c). The error
-    estimate of the last step was −D/(10 γ): so its stages lead to the next ones but for h⁵.
+    last step is y − D P(x), with x = 1 + c ρ in the next step, ρ times as long, whose stages are y − ρ⁴ D P(c). The
+    error estimate of the last step was −D/(10 γ), so its stages give the next ones up to h⁵.
     """
     r, c0, c1 = run.newton, NODE_RADAU[0], NODE_RADAU[1]
     ahead = h / r.clock[kn.KEPT] if r.count[kn.EXTRAPOLATES] == 1 else 0.0
@@ -626,7 +626,7 @@ def guess_stages(run: Run, h):
 
 @noinline_kernel
 def solve_stages(system: System, ws: Workspace, run: Run, h):
-    """Newton's method for the stages of a step of length h; True when it has converged."""
+    """Solve for the stages of a step of length h by Newton's method; True if it has converged."""
     t, y, x, r = run.clock[ki.TIME], run.y, run.y_new, run.newton
     tracked, before, contraction = r.kept.shape[1], 0.0, 0.0
     g, c = GAMMA_RADAU / h, complex(ALPHA_RADAU / h, BETA_RADAU / h)
@@ -668,7 +668,7 @@ def solve_stages(system: System, ws: Workspace, run: Run, h):
             r.w[2, j] += r.two[j].imag
             for s in range(3):
                 r.z[s, j] = T_RADAU[s, 0] * r.w[0, j] + T_RADAU[s, 1] * r.w[1, j] + T_RADAU[s, 2] * r.w[2, j]
-        # The ledger adds up the derivatives of the last iterate but one: steps without a guess take one more.
+        # The ledger adds up the derivatives of the last iterate but one: steps without a guess do one more iteration.
         if lever * change <= r.clock[kn.CLOSE] and k >= least:
             r.clock[kn.LEVER] = lever
             return True
@@ -677,12 +677,12 @@ def solve_stages(system: System, ws: Workspace, run: Run, h):
 
 @internal_kernel
 def slack(system: System, h, rtol):
-    """How many atol rates and currents may be off by in a step of length h.
+    """Return the factor on atol for rates and currents in a step of length h.
 
     An error e of a rate moves a joint by h e within the step. Circuits that ring after a start do so for milliseconds
-    in steps of 0.1 ms: a rate that is wrong by 50 atol there moves its joint no further than one that is wrong by atol
-    in a step of 5 ms, and motors damp it. Without motors the error would stay. The effect of impacts on it would stay
-    for a while, and steps after impacts are even shorter: below an rtol of 1e-6 the slack is smaller, and almost zero
+    in steps of 0.1 ms: there, an error of 50 atol in a rate moves its joint no further than an error of atol in a step
+    of 5 ms, and motors damp it. Without motors the error would stay. The effect of impacts on it would stay for a
+    while, and steps after impacts are even shorter: below an rtol of 1e-6 the slack is smaller, and almost none remains
     at 1e-8.
     """
     if system.layout.circuits == 0:
@@ -692,7 +692,7 @@ def slack(system: System, h, rtol):
 
 @internal_kernel
 def estimate(system: System, ws: Workspace, run: Run, h, slope):
-    """Norm of the error (γ/h − J)⁻¹ (f + Σ e_s Z_s / h), of order 3, into stage[7]; f is ``slope``."""
+    """Compute the norm of the error (γ/h − J)⁻¹ (f + Σ e_s Z_s / h), of order 3, in stage[7]; f is ``slope``."""
     r, error = run.newton, run.stage[7]
     for j in range(r.one.shape[0]):
         r.one[j] = slope[j] + (ERROR_RADAU[0] * r.z[0, j] + ERROR_RADAU[1] * r.z[1, j] + ERROR_RADAU[2] * r.z[2, j]) / h
@@ -707,7 +707,7 @@ def estimate(system: System, ws: Workspace, run: Run, h, slope):
 
 @internal_kernel
 def energy_error(system: System, run: Run, h):
-    """Norm of the error of electrical energy and Joule heat, by the formula of :func:`estimate` without a Jacobian."""
+    """Return the error norm of electrical energy and Joule heat, by the formula of `estimate` without Jacobian."""
     r, largest = run.newton, 0.0
     for j in (system.layout.ledger + kst.ELECTRICAL, system.layout.ledger + kst.JOULE):
         error = h * run.stage[0, j]
@@ -719,7 +719,7 @@ def energy_error(system: System, run: Run, h):
 
 @noinline_kernel
 def step_radau5(system: System, ws: Workspace, run: Run):
-    """One RADAU5 step; returns the error norm. stage[6] is the derivative at y_new."""
+    """Take one RADAU5 step and return the error norm. stage[6] is the derivative at y_new."""
     t, h, y, y_new, r = run.clock[ki.TIME], run.clock[ki.STEP], run.y, run.y_new, run.newton
     tracked = r.kept.shape[1]
     keep_stages(run)
@@ -774,7 +774,7 @@ def add_up(run: Run, h):
 
 @internal_kernel
 def after_step(run: Run, h):
-    """Whether the Jacobian stays, and the factors, after a step of length h was accepted."""
+    """Decide whether Jacobian and factors are kept after an accepted step of length h."""
     r, clock = run.newton, run.clock
     if r.clock[kn.CONTRACTION] > GOOD_CONTRACTION:
         r.count[kn.STALE] = 1

@@ -1,4 +1,4 @@
-"""Coefficients of RADAU5, and the data that it keeps from step to step: Jacobian, factors, stages, counters."""
+"""Coefficients of RADAU5, and the data that it keeps between steps: Jacobian, factors, stages, counters."""
 
 from __future__ import annotations
 
@@ -40,34 +40,34 @@ T_INVERSE_RADAU = np.array(
 )
 ERROR_RADAU = np.array([-(13 + 7 * _ROOT) / 3, (-13 + 7 * _ROOT) / 3, -1 / 3])
 
-# NewtonArrays.clock: step that the factors are of, that the stages are of, that the extrapolation is of [s];
-# contraction of Newton's method, and what it says of the error of the last iterate; the error
-# that the last one may have, per tolerance; largest change of rates for a Jacobian's differences [rad/s or m/s].
+# NewtonArrays.clock: step of the factors, step of the stages, step of the extrapolation [s]; contraction of Newton's
+# method, and its bound on the error of the last iterate; admissible error of the last iterate, relative to the
+# tolerance; largest change of rates for the differences of a Jacobian [rad/s or m/s].
 FACTORED, TRIED, KEPT, CONTRACTION, LEVER, CLOSE, CHANGE = 0, 1, 2, 3, 4, 5, 6
 NEWTON_CLOCK_SIZE = 7
-# Without circuits nothing may damp what is left of it, and it adds up over the steps.
+# Without circuits nothing may damp the remaining error, and it adds up over the steps.
 CLOSE_ENOUGH, CLOSE_UNDAMPED = 0.03, 0.003
-# NewtonArrays.count, int: the Jacobian must be made anew; accepted steps when it was made, and when the stages were
-# kept for extrapolation; there are such; Jacobians, factorisations, Newton iterations, steps in which they diverged;
-# samples whose states are there and that are not recorded yet; columns of Jacobians, by which whoever listens sees that
-# a large one comes on.
+# NewtonArrays.count, int: the Jacobian must be recomputed; accepted steps when it was computed, and when the stages
+# were saved for extrapolation; stages are saved; Jacobians, factorisations, Newton iterations, steps in which they
+# diverged; samples whose states are there and that are not recorded yet; columns of Jacobians, which show an observer
+# that a large Jacobian progresses.
 STALE, MADE_AT, SEEN, EXTRAPOLATES, JACOBIANS, FACTORS, ITERATIONS, DIVERGED, WAITING = 0, 1, 2, 3, 4, 5, 6, 7, 8
 COLUMNS = 9
 NEWTON_COUNT_SIZE = 10
 
 
 class NewtonArrays(NamedTuple):
-    """Room of RADAU5: n rates, na motors, k circuits, s entries of the state with a tolerance, m in all."""
+    """Working arrays of RADAU5: n rates, na motors, k circuits, s entries of the state with a tolerance, m in all."""
 
     along: np.ndarray  # (2 n + k, n) ∂v̇/∂(θ, v, i), θ being displacements along the rates
     linear: np.ndarray  # (na, BLOCK_SIZE) linear blocks of the drives
-    inverse: np.ndarray  # (2, n, n) complex: of the real and the complex Newton matrix, as Python
+    inverse: np.ndarray  # (2, n, n) complex: inverses of the real and complex Newton matrix, not compiled
     pivot: np.ndarray  # (n,) int
     z: np.ndarray  # (3, m) stages of the step tried, from y on
     w: np.ndarray  # (3, s) the same, T⁻¹ z
     f: np.ndarray  # (3, m) derivatives at the stages
-    kept: np.ndarray  # (4, s) coefficients of the accepted stages' polynomial, and the error estimate of their step
-    error: np.ndarray  # (s,) that of the step tried
+    kept: np.ndarray  # (4, s) coefficients of the polynomial of the accepted stages, and error estimate of their step
+    error: np.ndarray  # (s,) error estimate of the step tried
     weight: np.ndarray  # (s,) 1 / tolerance
     one: np.ndarray  # (s,) right side and solution of the real system
     two: np.ndarray  # (s,) complex
@@ -114,7 +114,7 @@ def newton_arrays(n: int, na: int, circuits: int, tracked: int, m: int) -> Newto
 
 @internal_kernel
 def forget(newton: NewtonArrays | None, steps):
-    """What was known of the right-hand side, when ``steps`` were accepted, is so no longer: it has jumped."""
-    if newton is None:  # known to the compiler
+    """Discard data about the right-hand side as of ``steps`` accepted steps, because it has jumped."""
+    if newton is None:  # resolved at compile time
         return
     newton.count[STALE], newton.count[SEEN], newton.count[EXTRAPOLATES] = 1, steps, 0

@@ -1,6 +1,6 @@
-"""The contact law of time stepping: Coulomb's cone on the rates at the end of a step, with the rows of that end.
+"""The contact law of time stepping: Coulomb's cone on the rates at the end of a step, with the rows at that end.
 
-The rows J of a step are those of its midpoint. On a surface of curvature κ, J(q_m) v' = 0 would take the energy
+The rows J of a step belong to its midpoint. On a surface of curvature κ, J(q_m) v' = 0 would take the energy
 ½ m (h κ v²)² in each step from a body that only follows the surface. The rows at the end are extrapolated without
 another sweep: with the same rates v the rows of this step give r = J_k v, those of the last step s = J_{k−1} v, so that
 J(q') v' = J_k v' + c h/(h + h_last) up to O(h²), with c = r − s. The law is on
@@ -10,7 +10,7 @@ J(q') v' = J_k v' + c h/(h + h_last) up to O(h²), with c = r − s. The law is 
 W = J M⁻¹ Jᵀ stays symmetric, and each step solves one contact problem. For a contact that slides and cannot stop within
 the step friction is along the mean slip: w_t = u_t + u_t'. A contact that lands has no earlier rows: a = 0, or e u_n by
 Newton's restitution, unless that and friction would create energy together. Its penetration is removed slowly, and only
-as far as the energy lost in the landing allows; a joint that has passed its stop at a hit is moved back likewise.
+to the extent that the energy lost in the landing allows; a joint that has passed its stop is moved back likewise.
 
 The law on mean rates, J (v + v') = 0, would be simpler but multiplies disturbances by −1: rates alternate undamped.
 """
@@ -58,20 +58,20 @@ from dynsim.jit.kernel import internal_kernel
 # Compliant rows in time stepping: springs and dampers of contacts, and ties between bodies.
 
 
-# A force is at its bound when less than this share of it is missing.
+# A force is at its bound if less than this share of it is missing.
 AT_BOUND = 1e-12
-# Time in which unresolved springs return to their rest, in steps.
+# Time in which unresolved springs return to rest, in steps.
 COMPLIANT_RETURN_STEPS = 2.0
-# ε of the tangents of a contact that gives way, in mobilities of theirs: a spring 1/(h² ε) that no step resolves, some
-# 1e9 N/m where it holds a kilogram.
+# ε of the tangents of a compliant contact, as a multiple of their mobility: a spring 1/(h² ε) that no step resolves,
+# some 1e9 N/m if it holds a kilogram.
 TANGENTIAL = 1e-4
-# How often the first step of a run is solved again with tangential impulses of its own as those of the last step.
+# How often the first step of a run is solved again with its tangential impulses taken as impulses of the last step.
 MOST_LOADED = 30
 
 
 @internal_kernel
 def give_way(k, c, w, x, u, h, theta):
-    """φ, compliance ε and what is added to the end rate, a, of a row with mobility w that is at x with rate u."""
+    """Return φ, compliance ε and addition a to the end rate of a row with mobility w that is at x with rate u."""
     resolved = 1.0 / max(1.0, h * h * k * w)
     phi = 1.0 - (1.0 - theta) * resolved
     K = phi * h * k + c + (1.0 - resolved) * COMPLIANT_RETURN_STEPS * h * k
@@ -80,10 +80,10 @@ def give_way(k, c, w, x, u, h, theta):
 
 @internal_kernel
 def soften_contact(law, s: SteppingArrays, ws: Workspace, k, h):
-    """Let the rows of candidate k, which is listed, give way, if they do; into W, ``s.b`` and ``s.turn``.
+    """Add compliance to the rows of listed candidate k, if it has any, in W, ``s.b`` and ``s.turn``.
 
-    Tangents against the impulses of the last step, ``s.f``: u' + a + ε (p − p_last) = 0 where it sticks. Rigid, nearly
-    straight chains of wheels would wedge themselves in: lateral forces of hundreds of newtons from rates of 1e-8 m/s.
+    Tangents are relative to the impulses of the last step, ``s.f``: u' + a + ε (p − p_last) = 0 if the contact sticks.
+    If rigid, nearly straight chains of wheels would jam: lateral forces of hundreds of newtons from rates of 1e-8 m/s.
     """
     stiffness, damping = law[k, ka.CONTACT_STIFFNESS], law[k, ka.CONTACT_DAMPING]
     if stiffness == 0.0:
@@ -102,10 +102,10 @@ def soften_contact(law, s: SteppingArrays, ws: Workspace, k, h):
 
 @internal_kernel
 def load_tangents(law, s: SteppingArrays, ws: Workspace):
-    """Take tangential impulses of compliant contacts as those of the last step; True if the law changes by that.
+    """Take tangential impulses of compliant contacts as those of the last step; True if this changes the law.
 
-    A start has no last step. With p_last = 0 all of its static friction would first have to deflect the tangents, which
-    lets a body that rests accelerate by ε p/h. What the tangents carry at a start they have carried before.
+    At a start there is no last step. With p_last = 0 all static friction would first have to deflect the tangents, so
+    that a body at rest would accelerate by ε p/h. The loads of the tangents at a start are assumed to be old.
     """
     changes = False
     for k in range(ws.contacts.shape[0]):
@@ -113,7 +113,7 @@ def load_tangents(law, s: SteppingArrays, ws: Workspace):
             continue
         for m in range(1, ka.MOST_ROWS):
             i = ws.active[k, ka.FIRST_ROW] + m
-            # W has ε already.
+            # W includes ε already.
             more = TANGENTIAL / (1.0 + TANGENTIAL) * ws.small[0, i, i] * (s.f[i] - s.impulse[3 * k + m])
             s.b[i] -= more
             s.impulse[3 * k + m] = s.f[i]
@@ -123,15 +123,15 @@ def load_tangents(law, s: SteppingArrays, ws: Workspace):
 
 @internal_kernel
 def spring_energy(stiffness, x):
-    """½ k x² of what is pressed in by −x [J]."""
+    """Return ½ k x² of a one-sided spring compressed by −x [J]."""
     return 0.5 * stiffness * min(x, 0.0) ** 2
 
 
 @internal_kernel
 def book_soft_contact(law, layout, s: SteppingArrays, ws: Workspace, k, work, y_new, h):
-    """What the normal force of candidate k, whose work is ``work``, has stored and lost; the rest is the scheme's.
+    """Book the energy stored and lost by the normal force of candidate k, whose work is ``work``.
 
-    Where there is no force the surface comes back by itself, and its damper takes all.
+    The remainder belongs to the scheme. Without force the surface recovers by itself, and its damper takes all energy.
     """
     now, last, stiffness = s.memory[kt.NOW, k], s.memory[kt.LAST, k], law[k, ka.CONTACT_STIFFNESS]
     lost = last[kt.STORED]
@@ -147,7 +147,7 @@ def book_soft_contact(law, layout, s: SteppingArrays, ws: Workspace, k, work, y_
 
 @internal_kernel
 def book_spring(layout, stored, lost, work, y_new):
-    """More energy in a spring, and what its damper takes, of the work −``work`` that both are given [J]."""
+    """Book energy ``stored`` in a spring and ``lost`` in its damper, which together receive −``work`` [J]."""
     y_new[layout.elastic + kst.STORED] += stored
     y_new[layout.elastic + kst.DAMPED] += lost
     y_new[layout.scheme] -= work + stored + lost
@@ -156,7 +156,7 @@ def book_spring(layout, stored, lost, work, y_new):
 
 @internal_kernel
 def list_ties(unilateral: UnilateralArrays, ws: Workspace):
-    """Begin and end ties as their kinds say; True when one has changed. A rest that is NaN is where the bodies are."""
+    """Start and end ties according to their kinds; True if one has changed. A rest of NaN becomes the present pose."""
     table, tie, changed = unilateral.tie_table, unilateral.tie, False
     for k in range(table.shape[0]):
         holds = 1 if table[k, ku.TIE_KIND] >= 0 else 0
@@ -174,7 +174,7 @@ def list_ties(unilateral: UnilateralArrays, ws: Workspace):
 
 @internal_kernel
 def begin_tie(unilateral: UnilateralArrays, ws: Workspace, k):
-    """The rest of tie k where it is NaN: as its bodies are now."""
+    """Set the rest of tie k, if it is NaN, to the present pose of its bodies."""
     table, tie = unilateral.tie_table, unilateral.tie
     if tie[k, ku.TIE_REST] == tie[k, ku.TIE_REST]:
         return
@@ -187,7 +187,7 @@ def begin_tie(unilateral: UnilateralArrays, ws: Workspace, k):
 
 @internal_kernel
 def axes_of(ws: Workspace, b):
-    """Rotation of body b, or of the world, −1."""
+    """Return the rotation of body b, or of the world, −1."""
     if b < 0:
         return 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0
     return rotation(ws.links, b, ka.R)
@@ -195,7 +195,7 @@ def axes_of(ws: Workspace, b):
 
 @internal_kernel
 def origin_of(ws: Workspace, b):
-    """Origin of body b, or of the world, −1."""
+    """Return the origin of body b, or of the world, −1."""
     if b < 0:
         return ZERO_VECTOR
     return vector(ws.links, b, ka.P)
@@ -203,7 +203,7 @@ def origin_of(ws: Workspace, b):
 
 @internal_kernel
 def relative_attitude(ws: Workspace, a, b):
-    """Rotation of body b in the axes of body a."""
+    """Return the rotation of body b in the axes of body a."""
     A, B = rotation(ws.links, a, ka.R), axes_of(ws, b)
     x, y, z = rotate_back(A, first_axis(B)), rotate_back(A, second_axis(B)), rotate_back(A, third_axis(B))
     return x[0], y[0], z[0], x[1], y[1], z[1], x[2], y[2], z[2]
@@ -211,7 +211,7 @@ def relative_attitude(ws: Workspace, a, b):
 
 @internal_kernel
 def tie_deflection(unilateral: UnilateralArrays, ws: Workspace, k):
-    """How far A of tie k is before B along the axis, or turned about it, of the rotation vector [m or rad]."""
+    """Return how far A of tie k is ahead of B along the axis, or is turned about it by rotation vector [m or rad]."""
     table, tie = unilateral.tie_table, unilateral.tie
     a, b, axis = table[k, ku.TIE_A], table[k, ku.TIE_B], vector(tie, k, ku.TIE_AXIS)
     if table[k, ku.TIE_TURNS] == 1:
@@ -224,7 +224,7 @@ def tie_deflection(unilateral: UnilateralArrays, ws: Workspace, k):
 
 @internal_kernel
 def tie_turn(unilateral: UnilateralArrays, ws: Workspace, k):
-    """Rotation vector of B against A since tie k began, in the axes of A, at most half a turn long [rad]."""
+    """Return the rotation vector of B relative to A since tie k began, in axes of A, at most half a turn long [rad]."""
     table, R = unilateral.tie_table, rotation(unilateral.tie, k, ku.TIE_ATTITUDE)
     E = compose(
         relative_attitude(ws, table[k, ku.TIE_A], table[k, ku.TIE_B]),
@@ -238,11 +238,11 @@ def tie_turn(unilateral: UnilateralArrays, ws: Workspace, k):
 
 @internal_kernel
 def turning_axis(axis, turn):
-    """Direction along which angular velocity changes the part along an axis of a rotation vector, which is ``turn``.
+    """Return the direction along which angular velocity changes the ``axis`` component of rotation vector ``turn``.
 
     With the rotation vector φ it is a + ½ φ × a + c φ × (φ × a), c = 1/φ² − (1 + cos φ)/(2 φ sin φ): the axis itself
-    if the bodies turn about it alone. A torque along the axis would not be the gradient of ½ k x² otherwise, and turns
-    to and fro would make energy.
+    if the bodies turn about it only. Otherwise a torque along the axis would not be the gradient of ½ k x², and
+    turning back and forth would create energy.
     """
     square = dot_vector(turn, turn)
     size = math.sqrt(square)
@@ -261,7 +261,7 @@ def turning_axis(axis, turn):
 
 @internal_kernel
 def place_ties(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace):
-    """Rows of the ties that hold, at the geometry of the sweep: the motion of A against B at the point of B."""
+    """Write rows of active ties at the geometry of the sweep: the motion of A relative to B at the point of B."""
     table, tie, rows = unilateral.tie_table, unilateral.tie, ws.rows
     for k in range(table.shape[0]):
         if table[k, ku.TIE_HOLDS] == 0:
@@ -273,7 +273,7 @@ def place_ties(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace):
             put_vector(rows, r, ka.ROW, rotate(A, turning_axis(axis, turn)))
             put_vector(rows, r, ka.ROW + 3, ZERO_VECTOR)
             x = -dot_vector(axis, turn)
-            # Rotation vectors are at most half a turn long and go on at the other side; the rest goes with them.
+            # Rotation vectors are at most half a turn long and jump to the opposite side; the rest angle jumps too.
             if abs(x - tie[k, ku.TIE_TURNED]) > math.pi:
                 tie[k, ku.TIE_REST] += math.copysign(2.0 * math.pi, x - tie[k, ku.TIE_TURNED])
             tie[k, ku.TIE_TURNED] = x
@@ -289,7 +289,7 @@ def place_ties(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace):
 
 @internal_kernel
 def soften_ties(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, h):
-    """Let the rows of ties give way, within their bounds; starts from their last impulses."""
+    """Add compliance to the rows of ties, within their bounds; start from their last impulses."""
     table, tie, W = unilateral.tie_table, unilateral.tie, ws.small[0]
     for k in range(table.shape[0]):
         if table[k, ku.TIE_HOLDS] == 0:
@@ -307,7 +307,7 @@ def soften_ties(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, 
 
 @internal_kernel
 def book_ties(unilateral: UnilateralArrays, layout, s: SteppingArrays, ws: Workspace, y_new, h):
-    """What ties have stored and lost, and where their rests are, should the step be accepted."""
+    """Book the energy stored and lost by ties, and compute their rests for the case that the step is accepted."""
     table, tie = unilateral.tie_table, unilateral.tie
     for k in range(table.shape[0]):
         row, stored = tie[k], tie[k, ku.TIE_STORED]
@@ -336,38 +336,40 @@ def book_ties(unilateral: UnilateralArrays, layout, s: SteppingArrays, ws: Works
 
 @internal_kernel
 def accept_ties(unilateral: UnilateralArrays):
-    """The step has been accepted: rests and energies are those of its end."""
+    """Accept the rests and energies of ties at the end of the step."""
     for k in range(unilateral.tie.shape[0]):
         tie = unilateral.tie[k]
         tie[ku.TIE_GIVEN] += abs(tie[ku.TIE_REST_NOW] - tie[ku.TIE_REST])
         tie[ku.TIE_REST], tie[ku.TIE_STORED] = tie[ku.TIE_REST_NOW], tie[ku.TIE_STORED_NOW]
 
 
-# Share of the energy that passes through the rows of a step, below which a gain is rounding: restitution of 1 has none.
+# Share of the energy that passes through the rows of a step, below which a gain is rounding: restitution of 1 has no
+# gain.
 NO_GAIN = 1e-6
-# cos of the largest angle by which a row turns in a step; beyond it the contact is at a kink, an edge, another place.
+# cos of the largest angle by which a row turns in a step; beyond it the contact is at a kink, an edge or another point.
 SAME_ROW = 0.95
-# A place of contact that has moved by more than this times the way of the body there is another one; by less than the
-# second, which the body may have gone as it turned back, it is the same [m].
+# A contact point that has moved by more than this multiple of the body's path is another point; if it has moved by less
+# than the second value, which the body may have covered while reversing, it is the same [m].
 SAME_PLACE, SHORT_WAY = 4.0, 1e-4
-# What is no further from the end of an axis, as a part of its length, is the end.
+# Distance from the end of an axis, as a fraction of its length, up to which a point counts as the end.
 AT_END = 1e-9
-# What is no further from its surface touches when a run begins, or its rates have jumped [m].
+# Gap up to which a point touches when a run begins or its rates have jumped [m].
 TOUCHES = 1e-9
-# A gap is closed, and depth taken back, within this time, and no shorter one than so many steps [s]; not faster than
-# this [m/s]. Shorter times bounce.
+# Gaps are closed, and depths removed, within this time and at least this number of steps [s]; no faster than this
+# speed [m/s]. Shorter times bounce.
 RETURN_TIME, RETURN_STEPS, RETURN_SPEED = 0.02, 10.0, 0.02
-# Impulses that do not solve their problem are no larger than this times the largest rate, each over its mobility.
+# Limit of impulses that do not solve their problem, each times its mobility, as a multiple of the largest rate.
 MOST_UNSOLVED = 1e3
-# Gaps by which the scheme itself sways, in units of h |a_n|, are none: feedback on them would feed energy.
+# Gaps due to oscillation of the scheme itself, in units of h |a_n|, count as zero: feedback on them would add energy.
 SWAY = 2.0
 
 
 @internal_kernel
 def recall(system, s: SteppingArrays, ws: Workspace, y):
-    """Where the rates of y are not those of the last step's end: begin anew, with what touches at y.
+    """Restart with the contacts touching at y if the rates of y are not the rates at the end of the last step.
 
-    Its rows at y, half a step before the midpoint, stand for those of the last step: h/(h + 0) of what turns. Sweeps.
+    Their rows at y, half a step before the midpoint, replace the rows of the last step, with h/(h + 0) of the change of
+    turning rows. Sweeps.
     """
     layout = system.layout
     if s.grid[kt.LENGTH_LAST] > 0.0 and not rates_jumped(s, y, layout.v):
@@ -409,7 +411,7 @@ def rates_jumped(s: SteppingArrays, y, first):
 
 @internal_kernel
 def note_place(system, state, k, note):
-    """Directions and place of candidate k, by which the next step knows its rows again."""
+    """Record directions and location of candidate k, by which the next step recognises its rows."""
     for m in range(3):
         note[kt.NORMAL_THEN + m], note[kt.TANGENT_THEN + m] = state[ka.NORMAL + m], state[ka.FIRST_TANGENT + m]
     note[kt.CENTRE], note[kt.CENTRE + 1], note[kt.CENTRE + 2] = centre(system.shapes, state, k)
@@ -417,7 +419,7 @@ def note_place(system, state, k, note):
 
 @internal_kernel
 def remember(unilateral: UnilateralArrays, s: SteppingArrays, y, first, h):
-    """The step has been accepted, and its rates are those of y."""
+    """Save the data of the accepted step, whose end rates are the rates of y."""
     accept_ties(unilateral)
     for i in range(s.before.shape[1]):
         s.before[kt.V_LAST, i] = y[first + i]
@@ -431,9 +433,9 @@ def remember(unilateral: UnilateralArrays, s: SteppingArrays, y, first, h):
 
 @internal_kernel
 def list_contacts(system, s: SteppingArrays, ws: Workspace, h):
-    """Rows for the candidates that touch; the table of rows is rebuilt, and True returned, when these change.
+    """Mark the candidates that touch; if they change, rebuild the table of rows and return True.
 
-    What was closed stays on the list while its place goes on: over convex surfaces the midpoint is above them.
+    A closed contact stays listed while its contact point is the same: over convex surfaces the midpoint is above them.
     """
     stops, ties = close_stops(system.model, system.unilateral, ws), list_ties(system.unilateral, ws)
     changed = stops or ties
@@ -443,7 +445,7 @@ def list_contacts(system, s: SteppingArrays, ws: Workspace, h):
         s.turn[k, kt.KNOWN] = 1.0 if known else 0.0
         listed = ws.contacts[k, ka.GAP] <= kt.MARGIN or (known and last[kt.CLOSED] == 1.0)
         listed = listed and not at_axis_end(system, ws, k)
-        # Its depth is no reason: it is taken back slowly.
+        # Depth does not matter: it is removed slowly.
         listed = listed and moves_along_normal(system.model, system.contacts, ws, k, 0.0)
         mode = ka.STICKING if listed else ka.OPEN
         changed = changed or mode != s.modes[k]
@@ -455,12 +457,12 @@ def list_contacts(system, s: SteppingArrays, ws: Workspace, h):
 
 @internal_kernel
 def at_axis_end(system, ws: Workspace, k):
-    """True if candidate k is the nearest point of an axis and an end of it, which has a candidate of its own.
+    """True if candidate k is the nearest point of an axis and an end of it, which has a separate candidate.
 
-    Its radius is smaller, but a step lets points in by more than that: both would carry.
+    Its radius is smaller, but a step lets points penetrate by more than that: both would carry load.
     """
     shapes = system.shapes
-    if shapes is None:  # known to the compiler
+    if shapes is None:  # resolved at compile time
         return False
     if shapes.kind[k, kd.MOVES] == 0:
         return False
@@ -476,7 +478,7 @@ def at_axis_end(system, ws: Workspace, k):
 
 @internal_kernel
 def goes_on(system, last, ws: Workspace, k, h):
-    """True when the normal of candidate k has turned a little, and its place has gone about as far as its body."""
+    """True if the normal of candidate k has turned little and its contact point has moved about as far as its body."""
     state, turned = ws.contacts[k], 0.0
     for m in range(3):
         turned += state[ka.NORMAL + m] * last[kt.NORMAL_THEN + m]
@@ -487,8 +489,8 @@ def goes_on(system, last, ws: Workspace, k, h):
 
 @internal_kernel
 def place_goes_on(shapes, last, state, V, k, h):
-    """True unless the place of candidate k has jumped, as that of a capsule may from one of its ends to the other."""
-    if shapes is None:  # known to the compiler
+    """True unless the contact point of candidate k has jumped, e.g. from one end of a capsule to the other."""
+    if shapes is None:  # resolved at compile time
         return True
     if shapes.kind[k, kd.MOVES] == 0:
         return True
@@ -500,7 +502,7 @@ def place_goes_on(shapes, last, state, V, k, h):
 
 @internal_kernel
 def centre(shapes, state, k):
-    """Centre of the sphere with which candidate k touches [m]."""
+    """Return the centre of the sphere with which candidate k touches [m]."""
     radius = 0.0
     if shapes is not None:
         radius = shapes.data[k, kd.RADIUS]
@@ -513,9 +515,9 @@ def centre(shapes, state, k):
 
 @internal_kernel
 def close_stops(model: ModelArrays, unilateral: UnilateralArrays, ws: Workspace):
-    """Close the joint stops whose gap is not open, open the others; True when one has changed.
+    """Close joint stops whose gap is not open, open the others; True if one has changed.
 
-    A closed brake has all of the load of its joint, and a stop none.
+    A closed brake carries all of the load of its joint, and a stop none.
     """
     table, changed = unilateral.stop_table, False
     for k in range(table.shape[0]):
@@ -528,14 +530,14 @@ def close_stops(model: ModelArrays, unilateral: UnilateralArrays, ws: Workspace)
 
 @internal_kernel
 def tangent_rows(system, s: SteppingArrays, ws: Workspace):
-    """Rows of the listed candidates and the kinds of the contact problem; TARGET is the acceleration zero.
+    """Write rows of the listed candidates and kinds of the contact problem; TARGET is the acceleration zero.
 
-    The second tangent is scaled by GRIP, friction along the axis being that times friction across: the ellipse of
-    admissible forces is a disc then, and slip opposes friction as the ellipse's normal does.
+    The second tangent is scaled by GRIP, the ratio of friction along the axis to friction across: the ellipse of
+    admissible forces becomes a disc, and slip opposes friction as the normal of the ellipse does.
     """
     state, rows, active = ws.contacts, ws.rows, ws.active
     for r in range(ws.counts[ka.COUPLED]):
-        # Behind the couplings come dry frictions, then joint stops.
+        # Couplings are followed by dry frictions, then by joint stops.
         s.kind[r] = kc.BOTH_WAYS if r < system.couplings.joint.shape[0] else kc.ONE_WAY
         s.mu[r], rows[r, ka.TARGET] = 0.0, 0.0
     for k in range(system.unilateral.dry.shape[0]):
@@ -558,16 +560,16 @@ def tangent_rows(system, s: SteppingArrays, ws: Workspace):
 
 @internal_kernel
 def slip_of_rates(law, k, x, y):
-    """Slip of candidate k from the rates x, y of its tangents [m/s]."""
+    """Return the slip of candidate k from the rates x, y of its tangents [m/s]."""
     x = x / law[k, ka.GRIP] if law[k, ka.GRIP] > 0.0 else 0.0
     return math.sqrt(x * x + y * y)
 
 
 @internal_kernel
 def friction_of(law, s: SteppingArrays, k, r):
-    """Coefficient of friction of candidate k, first row r: at the slip with which the step begins.
+    """Return the friction coefficient of candidate k, first row r, at the slip with which the step begins.
 
-    A point that sticks has tangential rates too where its rows turn: whether it has slid decides.
+    A sticking point also has tangential rates if its rows turn: whether it has slid decides.
     """
     last, speed = s.memory[kt.LAST, k], slip_of_rates(law, k, s.rate[0, r + 1], s.rate[0, r + 2])
     if speed <= kt.BAD or (last[kt.CLOSED] == 1.0 and last[kt.SLID] == 0.0):
@@ -577,7 +579,7 @@ def friction_of(law, s: SteppingArrays, k, r):
 
 @internal_kernel
 def turn_rows(law, s: SteppingArrays, ws: Workspace, k, h):
-    """What the law adds to the end rates of listed candidate k, into ``s.turn``; its friction is in ``s.mu``."""
+    """Write the additions of the law to the end rates of listed candidate k to ``s.turn``; friction is in ``s.mu``."""
     turn, last, state, r = s.turn[k], s.memory[kt.LAST, k], ws.contacts[k], ws.active[k, ka.FIRST_ROW]
     share = h / (h + s.grid[kt.LENGTH_LAST]) if turn[kt.KNOWN] == 1.0 else 0.0
     along = 0.0
@@ -600,7 +602,7 @@ def turn_rows(law, s: SteppingArrays, ws: Workspace, k, h):
         turn[kt.ADDED] -= turn[kt.PUSH]
     if last[kt.SLID] == 1.0:
         slip = math.sqrt(s.rate[0, r + 1] ** 2 + s.rate[0, r + 2] ** 2)
-        # Of a start nothing is known.
+        # At a start no impulse is known.
         impulse = s.mu[r] * last[kt.NORMAL_IMPULSE]
         if impulse > 0.0:
             impulse *= h / s.grid[kt.LENGTH_LAST]
@@ -611,9 +613,16 @@ def turn_rows(law, s: SteppingArrays, ws: Workspace, k, h):
 
 @internal_kernel
 def return_rate(gap, turned, budget, h):
-    """Rate at which a closed contact is brought back onto its surface: positive out of it, negative down to it [m/s].
+    """Return the rate at which a closed contact is brought back onto its surface; positive out of it [m/s].
 
-    gap : at the midpoint [m]; turned : of its normal rate [m/s]; budget : what it may take [J]
+    Parameters
+    ----------
+    gap : float
+        Gap at the midpoint [m].
+    turned : float
+        Part of its normal rate due to rows that turn [m/s].
+    budget : float
+        Energy that it may take [J].
     """
     gap -= 0.25 * h * turned
     off = max(0.0, abs(gap) - SWAY * h * abs(turned))
@@ -625,9 +634,9 @@ def return_rate(gap, turned, budget, h):
 
 @internal_kernel
 def stop_return(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, k, h):
-    """Rate at which closed joint stop k moves its joint back, as far as its hits have taken energy [rad/s or m/s].
+    """Return the rate at which closed joint stop k moves its joint back, limited by the losses of its hits.
 
-    The impulse of the last step, ``s.f`` of its row, says how much energy this rate needs.
+    Unit: rad/s or m/s. The impulse of the last step, ``s.f`` of its row, shows how much energy this rate needs.
     """
     loss, rate, row = unilateral.stop[k, ku.STOP_LOSS], 0.0, unilateral.stop_table[k, ku.STOP_ROW]
     if loss > 0.0:
@@ -640,29 +649,29 @@ def stop_return(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, 
 
 @internal_kernel
 def largest_mobility(W, r):
-    """Larger eigenvalue of the block of W of the two tangents behind row r."""
+    """Return the larger eigenvalue of the block of W of the two tangents that follow row r."""
     a, b, c = W[r + 1, r + 1], W[r + 1, r + 2], W[r + 2, r + 2]
     return 0.5 * (a + c) + math.sqrt(0.25 * (a - c) ** 2 + b * b)
 
 
 @internal_kernel
 def solve_contacts(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, h):
-    """Impulses of all rows, by the last ones as a start, and their mean forces into ``ws.rows``; then ``s.memory``.
+    """Solve for the impulses of all rows, starting from the last ones, and write their mean forces to ``ws.rows``.
 
-    Where the slip of a contact that was to slide on ends, or turns back, the law is that of the end after all: at most
-    once for each contact. A problem without solution is solved without what the law adds to the rates, and an impact
-    that would create energy is solved without restitution: at most once each.
+    Also updates ``s.impulse``. If the slip of a contact that was to slide on ends or reverses, the law of the end
+    applies after all: at most once for each contact. A problem without solution is solved without the additions of the
+    law to the rates, and an impact that would create energy is solved without restitution: at most once each.
     """
     p, coupled, rows = ws.counts[ka.ROWS], ws.counts[ka.COUPLED], ws.rows
     start = 3 * ws.contacts.shape[0]
     scale_impulses(s, h)
     for r in range(p):
-        # RHS = − J M⁻¹ (applied − bias), TARGET being zero.
+        # RHS = − J M⁻¹ (applied − bias), because TARGET is zero.
         s.b[r] = s.rate[0, r] - h * rows[r, ka.RHS]
         s.right[r] = s.b[r]
         s.f[r] = s.impulse[start + r] if r < coupled else 0.0
     for k in range(unilateral.dry.shape[0]):
-        # A closed brake has all of the load of its joint.
+        # A closed brake carries all of the load of its joint.
         bound = 0.0 if unilateral.dry_table[k, ku.DRY_BRAKE] == ku.CLOSED else dry_bound(unilateral, k)
         s.mu[unilateral.dry_table[k, ku.DRY_ROW]] = h * bound
     for k in range(unilateral.stop_table.shape[0]):
@@ -714,7 +723,7 @@ def solve_contacts(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Wor
 
 @internal_kernel
 def scale_impulses(s: SteppingArrays, h):
-    """Turn the impulses of the last step into those that the same forces have in a step of length h."""
+    """Scale the impulses of the last step to the impulses of the same forces in a step of length h."""
     before = s.grid[kt.IMPULSE_STEP]
     if before > 0.0 and before != h:
         for j in range(s.impulse.shape[0]):
@@ -724,9 +733,17 @@ def scale_impulses(s: SteppingArrays, h):
 
 @internal_kernel
 def solve_problem(s: SteppingArrays, W, p, rigid):
-    """Impulses f and law rates w of the problem W f + ``s.right``; where f is not unique, that of least norm.
+    """Solve W f + ``s.right`` for impulses f and law rates w; if f is not unique, select f of least norm.
 
-    rigid : False where all contacts give way, which makes W regular, and f unique. Returns the residual.
+    Parameters
+    ----------
+    rigid : bool
+        False if all contacts are compliant, which makes W regular and f unique.
+
+    Returns
+    -------
+    residual : float
+        Residual of the contact problem [m/s].
     """
     residual = approach(W, s.right, s.kind, s.mu, p, s.f, s.room, kt.GOOD, 1)
     s.statistics[kt.SOLVES] += 1.0
@@ -743,10 +760,10 @@ def solve_problem(s: SteppingArrays, W, p, rigid):
 
 @internal_kernel
 def drop_turns(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, p):
-    """Set what the law adds to the rates of rigid contacts and stops to zero, and all impulses; False if it was zero.
+    """Zero the additions of the law to rates of rigid contacts and stops, and all impulses; False if they were zero.
 
-    Where W is of deficient rank the additions need not be a motion of the system, and then there may be no solution.
-    The rates without impulses are a motion, and with them alone there is one. Compliant contacts keep their springs.
+    If W is rank-deficient, the additions need not be a motion of the system, and then there may be no solution. The
+    rates without impulses are a motion, so with these only a solution exists. Compliant contacts keep their springs.
     """
     dropped = False
     for k in range(unilateral.stop_table.shape[0]):
@@ -763,7 +780,7 @@ def drop_turns(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspa
             turn[kt.PUSH], turn[kt.MEAN] = 0.0, 0.0
     if dropped:
         s.statistics[kt.DROPPED] += 1.0
-        # The last ones may be huge.
+        # The last impulses may be huge.
         for r in range(p):
             s.f[r] = 0.0
     return dropped
@@ -779,9 +796,9 @@ def bounces(law, s: SteppingArrays, ws: Workspace, k):
 
 @internal_kernel
 def gains_energy(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace):
-    """True if contacts and stops together would give energy, p·(u + u')/2 > 0.
+    """True if contacts and stops together would add energy, p·(u + u')/2 > 0.
 
-    u' is without what extrapolated rows and returns to the surface add: of closed rows the law rate w itself.
+    u' is without the additions of extrapolated rows and returns to the surface: for closed rows the law rate w itself.
     """
     gain, passed = 0.0, 0.0
     for k in range(unilateral.stop_table.shape[0]):
@@ -804,7 +821,7 @@ def gains_energy(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Works
 
 @internal_kernel
 def drop_restitution(law, s: SteppingArrays, ws: Workspace):
-    """Let what lands stay, as event-driven methods do where Newton's restitution contradicts friction."""
+    """Remove restitution from landings, as event-driven methods do if Newton's restitution contradicts friction."""
     for k in range(ws.contacts.shape[0]):
         if bounces(law, s, ws, k):
             s.turn[k, kt.ADDED] = s.turn[k, kt.TURNED]
@@ -812,9 +829,9 @@ def drop_restitution(law, s: SteppingArrays, ws: Workspace):
 
 @internal_kernel
 def hold_energy(s: SteppingArrays, W, p):
-    """Scale impulses that solve nothing by the factor from 0 to 1 for which ½ fᵀ W f + f·b, what they add, is least.
+    """Scale impulses that do not solve their problem by the factor in [0, 1] that minimises ½ fᵀ W f + f·b.
 
-    A scaled f stays in its cones and takes energy, whatever f is.
+    This is the energy that they add. A scaled f stays in its cones and takes energy, whatever f is.
     """
     linear, square, strongest, fastest = 0.0, 0.0, 0.0, 0.0
     for k in range(p):
@@ -831,7 +848,7 @@ def hold_energy(s: SteppingArrays, W, p):
 
 @internal_kernel
 def slip_ends(s: SteppingArrays, ws: Workspace):
-    """Give contacts that were to slide on, and have not, the law of the end; True when there are such."""
+    """Apply the law of the end to contacts that were to slide on and have not; True if there are any."""
     ends = False
     for k in range(ws.contacts.shape[0]):
         if ws.active[k, ka.MODE] != ka.STICKING or s.turn[k, kt.MEAN] == 0.0:
@@ -850,7 +867,7 @@ def slip_ends(s: SteppingArrays, ws: Workspace):
 def strikes(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, elsewhere):
     """True if a rigid contact or a joint stop has struck in this step.
 
-    ``elsewhere``: also a closed contact that has come to another place of its body.
+    With ``elsewhere``, closed contacts whose contact point has moved to another part of the body also count.
     """
     for k in range(unilateral.stop_table.shape[0]):
         closes = unilateral.stop_table[k, ku.STOP_CLOSED] > unilateral.stop_table[k, ku.STOP_BEFORE]
@@ -866,15 +883,15 @@ def strikes(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace,
 
 @internal_kernel
 def is_stopped(s: SteppingArrays, r):
-    """True if row r came near at the start of the step, and its force has stopped or reversed that."""
+    """True if row r approached at the start of the step, and its force has stopped or reversed that."""
     return s.rate[0, r] < -kt.BAD and s.f[r] > 0.0
 
 
 @internal_kernel
 def note_contacts(system, s: SteppingArrays, ws: Workspace):
-    """What the step has made of each candidate, into ``s.memory`` and ``s.motion``; its end rates are in ``s.rate``.
+    """Write the state of each candidate after the step to ``s.memory`` and ``s.motion``; end rates are in ``s.rate``.
 
-    Closed is what presses, or does not leave: a force that has become zero alone is no event.
+    A contact that presses or does not leave is closed: a force that merely becomes zero is not an event.
     """
     for k in range(ws.contacts.shape[0]):
         now, last, state = s.memory[kt.NOW, k], s.memory[kt.LAST, k], ws.contacts[k]

@@ -37,20 +37,20 @@ from dynsim.integrators.stepping.tables import SteppingArrays, constraint_rates,
 from dynsim.integrators.steps import choose_step, finished, finite, stalled
 from dynsim.jit.kernel import free_kernel, internal_kernel
 
-# The drives within a step of time stepping: implicit by linear blocks, with limits decided at x_θ.
+# Drives within a time-stepping step: implicit linear blocks, with limits decided at x_θ.
 
 
-# Most repetitions of a step for the segments of its drives; after ALL_AT_ONCE of them one drive changes at a time, as
-# changes of several at once may undo each other.
+# Most repetitions of a step to find the segments of its drives; after ALL_AT_ONCE of them one drive changes at a time,
+# because simultaneous changes may undo each other.
 MOST_TRIES, ALL_AT_ONCE = 16, 4
 
 
 @internal_kernel
 def eliminate_currents(system: System, ws: Workspace, run: Run):
-    """What is left of drives and damping: torques into APPLIED, the implicit share into the ARMATURE of ``s.body``.
+    """Write torques of drives and damping to APPLIED, and their implicit part to the ARMATURE of ``s.body``.
 
-    The joints must be at (q + h θ v, v), and what is applied without drives in APPLIED. With Δ = v' − v, i' − i is
-    a + c Δ, and the torque of x_θ is τ + ∂τ/∂i θ a + (∂τ/∂q h θ² + ∂τ/∂v θ + ∂τ/∂i θ c) Δ.
+    The joints must be at (q + h θ v, v), and APPLIED must have all other torques. With Δ = v' − v, i' − i
+    is a + c Δ, and the torque at x_θ is τ + ∂τ/∂i θ a + (∂τ/∂q h θ² + ∂τ/∂v θ + ∂τ/∂i θ c) Δ.
     """
     s, h, body, joints, motors = run.stepping, run.clock[ki.STEP], system.model.body, ws.joints, ws.motors
     theta, drives = s.theta, system.drives
@@ -76,7 +76,7 @@ def eliminate_currents(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def drive_at_theta(system: System, ws: Workspace, run: Run):
-    """The drives at x_θ of the step into y_new, by their own laws: torques in APPLIED, which has nothing else."""
+    """Evaluate the drives at x_θ of the step into y_new by their own laws; APPLIED then has only their torques."""
     s, h, y, y_new, layout = run.stepping, run.clock[ki.STEP], run.y, run.y_new, system.layout
     between, theta = run.stage[2], s.theta
     for j in range(y.shape[0]):
@@ -91,11 +91,11 @@ def drive_at_theta(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def limits_agree(system: System, ws: Workspace, run: Run, tries):
-    """True when the drives at x_θ, after :func:`drive_at_theta`, lie on their segments; else puts them there.
+    """True if the drives at x_θ, after :func:`drive_at_theta`, are on their segments; otherwise moves them there.
 
-    From one limit to the opposite one a drive goes by the unlimited segment, which lies between: a light wheel passes
-    it within a step under either limit, and each would ask for the other. Between the current limits of a motor with
-    inductance lie those of its voltage instead.
+    From one limit to the opposite limit a drive passes through the unlimited segment between them: a light wheel
+    crosses it within a step under either limit, and each limit would call for the other. Between the current limits of
+    a motor with inductance are the limits of its voltage instead.
     """
     s, agree = run.stepping, True
     t = run.clock[ki.TIME] + s.theta * run.clock[ki.STEP]
@@ -114,7 +114,7 @@ def limits_agree(system: System, ws: Workspace, run: Run, tries):
 
 @internal_kernel
 def stored_energy(system: System, ws: Workspace, y, out):
-    """Energy of bodies and rotors, and of coils, at y [J], into out, (2,). Sweeps there."""
+    """Write the energy of bodies and rotors, and of coils, at y [J] to out, (2,). Sweeps there."""
     layout, motor = system.layout, system.drives.motor
     place_joints(system, ws, y)
     for i in range(ws.joints.shape[0]):
@@ -130,7 +130,7 @@ def stored_energy(system: System, ws: Workspace, y, out):
 
 @internal_kernel
 def begin_energy(system: System, ws: Workspace, run: Run):
-    """Energy at the start of a step: that at the end of the last one, unless the state is another one by now."""
+    """Set the energy at the start of a step: the energy at the end of the last one, unless the state has changed."""
     energy, same = run.stepping.energy, True
     for j in range(system.layout.tracked):
         same = same and run.y[j] == run.y_new[j]
@@ -146,9 +146,14 @@ def begin_energy(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def midpoint_work(model: ModelArrays, ws: Workspace, v, vdot, h):
-    """v̄·M Δ + h v̄·(c + g) at the midpoint, whose sweep is still there [J]; leaves the links' velocities of v̄ in V.
+    """Return v̄·M Δ + h v̄·(c + g) at the midpoint [J], whose sweep is still in ``ws``.
 
-    v, vdot : (n,) rates at the start, mean acceleration; v̄ = v + h vdot / 2, Δ = h vdot
+    Leaves the links' velocities of v̄ in V.
+
+    Parameters
+    ----------
+    v, vdot : (n,) ndarray
+        Rates at the start and mean acceleration; v̄ = v + h vdot / 2, Δ = h vdot.
     """
     tree, body, links = model.tree, model.body, ws.links
     inertia, bias = 0.0, 0.0
@@ -174,7 +179,7 @@ def midpoint_work(model: ModelArrays, ws: Workspace, v, vdot, h):
 
 @internal_kernel
 def drive_work(system: System, ws: Workspace, run: Run):
-    """What linear drives and the place of their power make [J], after ``drive`` at x_θ: its torques are in APPLIED."""
+    """Return the energy made by linear drives and by where their power acts [J]; ``drive`` at x_θ is in APPLIED."""
     s, h, y, y_new, layout = run.stepping, run.clock[ki.STEP], run.y, run.y_new, system.layout
     joints, motors, motor, body, theta = ws.joints, ws.motors, system.drives.motor, system.model.body, s.theta
     v, vdot, applied = s.before[kt.V_START], s.before[kt.ACCELERATION], s.before[kt.APPLIED_THEN]
@@ -199,13 +204,13 @@ def drive_work(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def step_moreau(system: System, ws: Workspace, run: Run):
-    """One step from y to y_new; mean accelerations and forces stay in the workspace."""
+    """Take one step from y to y_new; mean accelerations and forces stay in the workspace."""
     s, y, layout = run.stepping, run.y, system.layout
     v0, v_bias, last = s.before[kt.V_START], s.before[kt.V_BIAS], s.before[kt.ACCELERATION]
     model = ModelArrays(system.model.tree, s.body, system.model.gravity)
     begin_energy(system, ws, run)
     recall(system, s, ws, y)
-    # The mean acceleration of an impact says nothing about the next step; that of the last step without one does.
+    # The mean acceleration of an impact does not predict the next step; the last step without an impact does.
     known = s.before[kt.SMOOTH] if s.grid[kt.IMPACT_LAST] == 1.0 else last
     for i in range(ws.joints.shape[0]):
         v0[i] = y[layout.v + i]
@@ -214,7 +219,7 @@ def step_moreau(system: System, ws: Workspace, run: Run):
         take_drives(system, ws, run)
         place_midpoint(system, model, ws, run)
         if tries == 1 and list_contacts(system, s, ws, run.clock[ki.STEP]):
-            # The last acceleration tells nothing of the next one.
+            # The last acceleration does not predict the next one.
             for i in range(ws.joints.shape[0]):
                 v_bias[i], ws.joints[i, ka.QD] = v0[i], v0[i]
             geometry(system, model, ws)
@@ -230,10 +235,10 @@ def step_moreau(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def take_drives(system: System, ws: Workspace, run: Run):
-    """The drives at (q + h θ v, v), as they go into the step; its torques without loads stay in ``s.before``."""
+    """Evaluate the drives at (q + h θ v, v) for the step; torques without loads stay in ``s.before``."""
     s, y, layout, joints, body = run.stepping, run.y, system.layout, ws.joints, system.model.body
     place_joints(system, ws, y)
-    if layout.extra > 0:  # rolling bases move along their heading, whatever was swept last
+    if layout.extra > 0:  # rolling bases move along their heading; the last sweep may have been elsewhere
         sine_cosine(joints, ws.trig)
     for i in range(joints.shape[0]):
         v = s.before[kt.V_START, i]
@@ -247,7 +252,7 @@ def take_drives(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def place_midpoint(system: System, model: ModelArrays, ws: Workspace, run: Run):
-    """Geometry at q + h v/2, and velocity products of the rates that the last acceleration leads to."""
+    """Compute geometry at q + h v/2, and velocity products of the rates that the last acceleration predicts."""
     moved(system, ws, run.y, 0.5 * run.clock[ki.STEP], run.y_new)
     place_joints(system, ws, run.y_new)
     for i in range(ws.joints.shape[0]):
@@ -257,7 +262,7 @@ def place_midpoint(system: System, model: ModelArrays, ws: Workspace, run: Run):
 
 @internal_kernel
 def solve_step(system: System, model: ModelArrays, ws: Workspace, run: Run):
-    """Impulses and accelerations at the midpoint, and the state that they lead to, into y_new."""
+    """Solve for impulses and accelerations at the midpoint, and write the resulting state to y_new."""
     s, t, h, y, y_new, layout = run.stepping, run.clock[ki.TIME], run.clock[ki.STEP], run.y, run.y_new, system.layout
     joints, v0, last = ws.joints, s.before[kt.V_START], s.before[kt.ACCELERATION]
     if system.loads.table.shape[0] > 0:
@@ -290,14 +295,14 @@ def solve_step(system: System, model: ModelArrays, ws: Workspace, run: Run):
 
 @internal_kernel
 def book(system: System, ws: Workspace, run: Run):
-    """The ledger of the step into y_new, after :func:`drive_at_theta`: power at x_θ, and what contacts have done."""
+    """Book the ledger of the step into y_new, after :func:`drive_at_theta`: power at x_θ, and work of contacts."""
     s, t, h, y_new, layout = run.stepping, run.clock[ki.TIME], run.clock[ki.STEP], run.y_new, system.layout
     joints, body, start = ws.joints, system.model.body, system.layout.ledger
-    # Of the sweep at the midpoint, before others overwrite it.
+    # From the sweep at the midpoint, before it is overwritten.
     stored = -midpoint_work(system.model, ws, s.before[kt.V_START], s.before[kt.ACCELERATION], h)
     stored += drive_work(system, ws, run)
     if system.loads.table.shape[0] > 0:
-        # Once more, for their powers at the mean velocities that are in the links now.
+        # Again, for their powers at the mean velocities that the links have now.
         add_loads(system.model, system.loads, t + s.theta * h, ws, run.stage[1], layout.load)
     gear, joint = 0.0, 0.0
     for i in range(joints.shape[0]):
@@ -331,13 +336,13 @@ def book(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def work_of_row(s: SteppingArrays, ws: Workspace, r, h):
-    """Work of the force of row r on its motion, p (u + u')/2 [J]."""
+    """Return the work of the force of row r on its motion, p (u + u')/2 [J]."""
     return 0.5 * h * ws.rows[r, ka.FORCE] * (s.rate[0, r] + s.rate[1, r])
 
 
 @internal_kernel
 def book_stops(unilateral: UnilateralArrays, system: System, s: SteppingArrays, ws: Workspace, y_new, h):
-    """What joint stops take is a loss, not an error of the constraints."""
+    """Book the work of joint stops as a loss, not as an error of the constraints."""
     for k in range(unilateral.stop.shape[0]):
         if unilateral.stop_table[k, ku.STOP_CLOSED] == 0:
             continue
@@ -348,14 +353,14 @@ def book_stops(unilateral: UnilateralArrays, system: System, s: SteppingArrays, 
 
 @internal_kernel
 def book_dry(unilateral: UnilateralArrays, system: System, s: SteppingArrays, ws: Workspace, y_new, h):
-    """Dry friction: what it takes is a loss of gear and joint in the ratio of their bounds; forces into the tables."""
+    """Book dry friction as a loss of gear and joint in the ratio of their bounds; write its forces to the tables."""
     ledger = system.layout.ledger
     for k in range(unilateral.dry.shape[0]):
         dry, r, a = unilateral.dry[k], unilateral.dry_table[k, ku.DRY_ROW], unilateral.dry_table[k, ku.DRY_DRIVE]
         dry[ku.DRY_FORCE], work = ws.rows[r, ka.FORCE], work_of_row(s, ws, r, h)
         share = dry[ku.OF_GEAR] / (dry[ku.OF_GEAR] + dry[ku.OF_JOINT])
-        # In a step in which the motion turns round, its force may be along the mean motion: an error of the step, as
-        # that of contacts.
+        # If the motion reverses within a step, its force may be along the mean motion: an error of the step, as for
+        # contacts.
         lost = min(work, 0.0)
         y_new[system.layout.scheme] -= work - lost
         y_new[ledger + kst.GEAR] -= share * lost
@@ -368,10 +373,10 @@ def book_dry(unilateral: UnilateralArrays, system: System, s: SteppingArrays, ws
 
 @internal_kernel
 def book_contacts(system: System, s: SteppingArrays, ws: Workspace, y_new, h):
-    """What contacts take: all of what strikes as impact loss, tangents of what slides, or comes to stick, as friction.
+    """Book the work of contacts: all of landings as impact loss, tangents that slide or begin to stick as friction.
 
-    In a landing friction may give what the normal impulse takes: only their sum is a loss. What is left of held rows is
-    the scheme's; what pushes out of the surface comes from the impact losses.
+    In a landing, friction may return energy that the normal impulse takes: only their sum is a loss. The rest of the
+    work of closed rows belongs to the scheme; pushing out of the surface is paid from the impact losses.
     """
     layout, first = system.layout, system.layout.contact
     for k in range(ws.contacts.shape[0]):
@@ -390,8 +395,8 @@ def book_contacts(system: System, s: SteppingArrays, ws: Workspace, y_new, h):
                 if now[kt.SLID] == 0.0 and last[kt.SLID] == 0.0:
                     friction = 0.0
             slips = friction != 0.0 or now[kt.SLID] == 1.0
-            # The mean force of a step in which slip ends or turns round may be along its mean motion. Friction gives no
-            # energy: that is an error of the step.
+            # If slip ends or reverses within a step, the mean force may be along its mean motion. Friction returns no
+            # energy: this is an error of the step.
             friction = min(friction, 0.0)
             if last[kt.CLOSED] == 0.0 and not soft:
                 struck, friction = normal + tangential, 0.0
@@ -415,7 +420,7 @@ def book_contacts(system: System, s: SteppingArrays, ws: Workspace, y_new, h):
 
 @internal_kernel
 def count_step(unilateral: UnilateralArrays, law, s: SteppingArrays, ws: Workspace, h):
-    """Times, depths and losses of candidates and joint stops in the step that is accepted."""
+    """Count times, depths and losses of candidates and joint stops in the accepted step."""
     for k in range(unilateral.stop.shape[0]):
         if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
             unilateral.stop[k, ku.CLOSED_TIME] += h
@@ -432,10 +437,10 @@ def count_step(unilateral: UnilateralArrays, law, s: SteppingArrays, ws: Workspa
 
 @internal_kernel
 def keep_torques(system: System, ws: Workspace, run: Run):
-    """Shaft torques of the accepted step, at x_θ, unless it has an impact: before its samples, and ``remember``.
+    """Record shaft torques of the accepted step, at x_θ, unless it has an impact; before its samples and ``remember``.
 
-    The mean acceleration of an impact is Δv/h, which has no limit as steps become shorter. So is that of the next step,
-    which makes up for rows of what has landed that turned within the step of the landing.
+    The mean acceleration of an impact is Δv/h, which diverges as steps become shorter. The same is true of the next
+    step, which corrects for landed rows that turned within the step of the landing.
     """
     s, motor, y, y_new, layout = run.stepping, system.drives.motor, run.y, run.y_new, system.layout
     impact = strikes(system.contacts.law, system.unilateral, s, ws, False)
@@ -458,9 +463,9 @@ def keep_torques(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def tell_changes(unilateral: UnilateralArrays, s: SteppingArrays, run: Run):
-    """Log and count what the accepted step has changed, at its end; True when the caller is to empty the ke.log.
+    """Log and count the changes of the accepted step, at its end; True if the caller must empty the log.
 
-    What a contact begins with is no event.
+    The initial state of a contact is not an event.
     """
     tally, table, stop = unilateral.tally, unilateral.stop_table, unilateral.stop
     for k in range(s.told.shape[0]):
@@ -495,7 +500,7 @@ def tell_changes(unilateral: UnilateralArrays, s: SteppingArrays, run: Run):
 
 @internal_kernel
 def keep_directions(s: SteppingArrays, ws: Workspace):
-    """Copy the wrenches of unit forces of all active rows: those with which the step was solved."""
+    """Copy the wrenches of unit forces of all active rows, with which the step was solved."""
     for r in range(ws.counts[ka.ROWS]):
         for j in range(6):
             s.direction[r, j] = ws.rows[r, ka.DIRECTION + j]
@@ -503,9 +508,9 @@ def keep_directions(s: SteppingArrays, ws: Workspace):
 
 @internal_kernel
 def put_directions_back(s: SteppingArrays, ws: Workspace):
-    """Undo what ``geometry`` has made of the directions: the forces of the step belong to its rows alone.
+    """Undo changes of the directions by ``geometry``: the forces of the step belong to its own rows only.
 
-    ``geometry`` leaves the rows of sticking contacts with tangents of its own, without the factor of the grip.
+    ``geometry`` gives the rows of sticking contacts different tangents, without the factor of the grip.
     """
     for r in range(ws.counts[ka.ROWS]):
         for j in range(6):
@@ -514,10 +519,10 @@ def put_directions_back(s: SteppingArrays, ws: Workspace):
 
 @internal_kernel
 def sample_moreau(system: System, ws: Workspace, run: Run):
-    """Record every sample time within the step, the state linear in between.
+    """Record every sample time within the step, with the state linear in between.
 
-    Forces are the means of the step, as vectors too: along the normal and the tangents at its midpoint, by which the
-    sum of all forces is the change of momentum.
+    Forces are means over the step, also as vectors: along the normal and the tangents at its midpoint, so that the sum
+    of all forces is the change of momentum.
     """
     t, h, last = run.clock[ki.TIME], run.clock[ki.STEP], run.count[ki.SAMPLE]
     s = run.stepping
@@ -537,14 +542,14 @@ def sample_moreau(system: System, ws: Workspace, run: Run):
         geometry(system, system.model, ws)
         put_directions_back(s, ws)
         write_output(system, ws, run, last)
-        # What lies between the ends of a step is linear, energy is not.
+        # Between the ends of a step the state is linear, but energy is not.
         between = -(1.0 - x) * (s.energy[kt.START, kt.MECHANICAL] + s.energy[kt.START, kt.MAGNETIC])
         between -= x * (s.energy[kt.STOP, kt.MECHANICAL] + s.energy[kt.STOP, kt.MAGNETIC])
         for k in range(kst.ENERGIES):
             between += run.output[last, run.columns.energy + k]
         row[system.layout.scheme] -= between
         for k in range(ws.contacts.shape[0]):
-            # The rows are those of sticking even where it slides.
+            # The rows are sticking rows even if the contact slides.
             run.output[last, run.columns.contact + k * kst.OUTPUTS_PER_CONTACT + kst.OUT_MODE] = s.motion[k]
         last += 1
     run.count[ki.SAMPLE] = last
@@ -552,7 +557,7 @@ def sample_moreau(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def commands_due(system: System, ws: Workspace, run: Run):
-    """Take sampled commands where they are due; True when the caller is to look."""
+    """Take sampled commands if due; True if control must return to the caller."""
     due = take_ticks(run)
     if due & ki.TAKE_COMMANDS:
         place_joints(system, ws, run.y)
@@ -571,8 +576,11 @@ def commands_due(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def rewrite_sample(system: System, ws: Workspace, run: Run):
-    """Currents, voltages and torques of a sample at TIME, recorded at the end of the last step, by the commands from
-    now on; where a brake has closed since, its state too. Accelerations and forces are still the means of that step."""
+    """Update drives in a sample at TIME, recorded at the end of the last step, for the commands from now on.
+
+    If a brake has closed since, the state of the sample is updated too. Accelerations and forces are still the means of
+    that step.
+    """
     if not sampled_now(run):
         return
     last, columns = run.count[ki.SAMPLE] - 1, run.columns
@@ -586,7 +594,7 @@ def rewrite_sample(system: System, ws: Workspace, run: Run):
         return
     for j in range(row.shape[0]):
         row[j] = run.y[j]
-    # The next step begins with a sweep of its own.
+    # The next step begins with a separate sweep.
     geometry(system, system.model, ws)
     fill_energies(system, ws, run, out)
     for k in range(ws.contacts.shape[0]):
@@ -597,8 +605,10 @@ def rewrite_sample(system: System, ws: Workspace, run: Run):
 
 @internal_kernel
 def advance_time(s: SteppingArrays, clock):
-    """TIME at the end of the accepted step: the start of the steps of one length and so many of them, not a sum of
-    roundings. A step that was trimmed, and a tick, begin anew."""
+    """Set TIME to the end of the accepted step: start of the equal steps plus their number times the step size.
+
+    This avoids summing roundings. The count restarts after a trimmed step and at a tick.
+    """
     grid, whole = s.grid, clock[ki.PROPOSED]
     if grid[kt.GRID_START] + grid[kt.GRID_STEPS] * whole != clock[ki.TIME]:
         grid[kt.GRID_START], grid[kt.GRID_STEPS] = clock[ki.TIME], 0.0
@@ -612,7 +622,7 @@ def advance_time(s: SteppingArrays, clock):
 
 @free_kernel
 def advance_moreau(system: System, ws: Workspace, run: Run, limit):
-    """``advance`` of time stepping."""
+    """Run ``advance`` with time stepping."""
     clock, count, taken = run.clock, run.count, 0
     if limit < 0:
         return

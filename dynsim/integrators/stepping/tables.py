@@ -9,10 +9,10 @@ Drives are implicit by their linear blocks: i' is eliminated, which adds the eff
 damping to the diagonal of M (``stepping.drives``). The impulses p solve one contact problem over all candidates that
 touch at q_m; its law is on the rates at the end, with the rows of the end (``stepping.contacts``).
 
-θ = 1 damps and is of first order; θ = 1/2 is of second order between events, and keeps the energy of linear systems,
-contacts aside, to rounding. A landing leaves a penetration of up to h times its speed, which is taken back.
+θ = 1 damps and is of first order; θ = 1/2 is of second order between events and, contacts aside, conserves the energy
+of linear systems to rounding. A landing leaves a penetration of up to h times its speed, which is removed afterwards.
 
-The ledger has the discrete works: power at x_θ, friction −p_t·(u + u')/2, and p_n (u_n + u_n')/2 of rows that hold.
+The ledger has the discrete works: power at x_θ, friction −p_t·(u + u')/2, and p_n (u_n + u_n')/2 of closed rows.
 """
 
 from __future__ import annotations
@@ -31,47 +31,47 @@ from dynsim.dynamics.tree.spatial import cross, dot, dot_vector, put_vector, rot
 from dynsim.dynamics.tree.sweep import forward_sweep
 from dynsim.jit.kernel import integers, internal_kernel, reals
 
-# Residuals of contact problems [m/s]: the aim of a search, one that ends it, and one above which a solve counts as
-# capped. Below the last a point that touches does not leave, and a point that sticks does not slip.
+# Residuals of contact problems [m/s]: goal of a search, acceptable residual, and residual above which a solve counts as
+# capped. Below the last value a point that touches does not leave, and a point that sticks does not slip.
 GOOD, FAIR, BAD = 1e-11, 1e-10, 1e-8
-# Starts of the last search, and in all searches together.
+# Starts of the last search, and starts in all searches together.
 LAST_ROUNDS = 12
 MOST_ROUNDS = 1 + kc.NEAR_STEPS + LAST_ROUNDS
-# A gap that counts as closed: far above rounding [m].
+# Gap that counts as closed: far above rounding [m].
 MARGIN = 1e-10
-# SteppingArrays.memory: of the last accepted step, and of the one that is tried; its columns, of a candidate
+# SteppingArrays.memory: the last accepted step, and the step being tried; columns for each candidate
 LAST, NOW = 0, 1
 LISTED = 0  # 1: it had rows
 CLOSED = 1  # 1: it pressed, or touched without leaving
 SLID = 2  # 1: it slid
 NORMAL_IMPULSE = 3  # [N s]
-END_RATE = 4  # 3: rates of its rows at the end of that step
+END_RATE = 4  # 3: end rates of its rows in that step
 NORMAL_THEN, TANGENT_THEN = 7, 10  # 3 each: directions of its first two rows
-CENTRE = 13  # 3: of the sphere that touches [m]
-BUDGET = 16  # energy that its landing has taken, and that pushing it out of its surface may give back [J]
+CENTRE = 13  # 3: centre of the touching sphere [m]
+BUDGET = 16  # energy dissipated by its landing, which pushing it out of its surface may return [J]
 STORED = 17  # energy in its spring [J]
 MEMORY_SIZE = 18
-# SteppingArrays.turn, of a candidate with rows
-ADDED = 0  # 3: what the law adds to the end rates of its rows [m/s]
-TURNED = 3  # 3: the share of that which is due to rows that turn
+# SteppingArrays.turn, for a candidate with rows
+ADDED = 0  # 3: additions of the law to the end rates of its rows [m/s]
+TURNED = 3  # 3: part of these additions due to rows that turn
 PUSH = 6  # rate at which it is pushed out of its surface; negative: let into it [m/s]
 MEAN = 7  # 1: it slides on, along the mean of its rates
-KNOWN = 8  # 1: its rows are those of the last step, turned
-STRUCK = 9  # what the step books as its impact loss [J]
-PRESSED_IN, IMPLICIT = 10, 11  # of what gives way: gap at the start [m], and φ of its law
+KNOWN = 8  # 1: its rows continue the rows of the last step
+STRUCK = 9  # impact loss booked by the step [J]
+PRESSED_IN, IMPLICIT = 10, 11  # compliant contacts: gap at the start [m], and φ of the law
 TURN_SIZE = 12
 # SteppingArrays.statistics: largest residual [m/s], solves above BAD, largest penetration [m]; solves, and solves with
-# more than one start; most of what steps have taken of the energy, or made (negative), at any time [J];
-# steps whose limits of drives contradict each other; energy that would be another one if all came half a step later
-# [J]; solves without what the law adds to the rates, because with it there was no solution.
+# more than one start; largest scheme energy at any time, taken (positive) or made (negative) [J]; steps in which limits
+# of drives contradict each other; change of energy if everything came half a step later [J]; solves without the
+# additions of the law to the rates, because with them there was no solution.
 WORST, CAPPED, PENETRATION, SOLVES, LONG_SOLVES, TAKEN, UNSETTLED, HALF_STEP, DROPPED = 0, 1, 2, 3, 4, 5, 6, 7, 8
-# Most energy that steps have taken until any time, and most that they have made since [J].
+# Largest energy taken by steps up to any time, and largest energy made since then [J].
 MOST_TAKEN, MADE = 9, 10
-STIFFEST = 11  # largest stiffness times mobility of a row that gives way [1/s²]
+STIFFEST = 11  # largest stiffness times mobility of a compliant row [1/s²]
 STATISTICS_SIZE = 12
-# SteppingArrays.before: rates at the start; rates of the velocity products; acceleration of the last step, and then of
-# this one; what is applied at the start, without loads; rates at the end of the last accepted step; acceleration of the
-# last step without an impact.
+# SteppingArrays.before: rates at the start; rates of the velocity products; acceleration of the last step, replaced by
+# the acceleration of this one; applied torques at the start, without loads; rates at the end of the last accepted step;
+# acceleration of the last step without an impact.
 V_START, V_BIAS, ACCELERATION, APPLIED_THEN, V_LAST, SMOOTH = 0, 1, 2, 3, 4, 5
 BEFORE_SIZE = 6
 # SteppingArrays.eliminated
@@ -79,37 +79,37 @@ FREE, PER, DIDT_THEN = 0, 1, 2
 # SteppingArrays.energy
 START, STOP = 0, 1
 MECHANICAL, MAGNETIC = 0, 1
-# SteppingArrays.grid: time from which steps of one length are counted [s], how many have been since; length of the last
-# accepted step [s], the power of drives and loads in it, and in the step that is tried [W]; for how many steps motors
-# keep their torques because of an impact, the last one included; 1: the last accepted step had an impact; length of the
-# step that ``impulse`` belongs to, zero before the first one [s].
+# SteppingArrays.grid: time from which steps of equal length are counted [s], number of such steps since; length of the
+# last accepted step [s], power of drives and loads in it, and in the step being tried [W]; number of steps for which
+# motors keep their torques because of an impact, including the last step; 1: the last accepted step had an impact;
+# length of the step that ``impulse`` belongs to, zero before the first one [s].
 GRID_START, GRID_STEPS, LENGTH_LAST, POWER_LAST, POWER_NOW, HELD_STEPS, IMPACT_LAST, IMPULSE_STEP = range(8)
 GRID_SIZE = 8
 
 
 class SteppingArrays(NamedTuple):
-    """What time stepping reads and writes beside ``Run``; p is the most rows that there can be."""
+    """Working arrays of time stepping in addition to ``Run``; p is the largest possible number of rows."""
 
     theta: float
-    body: np.ndarray  # (n, BODY_SIZE) as that of the model, its ARMATURE with what is implicit
+    body: np.ndarray  # (n, BODY_SIZE) body of the model with the implicit terms added to ARMATURE
     linear: np.ndarray  # (na, BLOCK_SIZE)
-    segment: np.ndarray  # (na,) int: which limit holds each drive, see dynsim.dynamics.drive.law.segment_of
-    torque: np.ndarray  # (na,) on the shafts, in the last accepted step without an impact [N m or N]; NaN: none yet
-    eliminated: np.ndarray  # (na, 3) i' − i at v' = v, what v' − v adds to it; di/dt at the start
-    before: np.ndarray  # (BEFORE_SIZE, n) see V_START and what follows it
+    segment: np.ndarray  # (na,) int: active limit of each drive, see dynsim.dynamics.drive.law.segment_of
+    torque: np.ndarray  # (na,) shaft torque in the last accepted step without an impact [N m or N]; NaN: none yet
+    eliminated: np.ndarray  # (na, 3) i' − i at v' = v; its change with v' − v; di/dt at the start
+    before: np.ndarray  # (BEFORE_SIZE, n) see V_START and following
     energy: np.ndarray  # (2, 2) at START and STOP of the step: MECHANICAL and MAGNETIC [J]
     rate: np.ndarray  # (2, p) row rates at the start and the end
-    direction: np.ndarray  # (p, 6) wrenches of unit forces of the rows, kept while a sample is swept
-    impulse: np.ndarray  # (p,) of the rows of candidate k at 3 k, then couplings: the next start
+    direction: np.ndarray  # (p, 6) wrenches of unit forces of the rows, saved while a sample is swept
+    impulse: np.ndarray  # (p,) next start: rows of candidate k at 3 k, then couplings
     f: np.ndarray  # (p,)
     b: np.ndarray  # (p,) row rates at the end without impulses
-    w: np.ndarray  # (p,) what the law is on
+    w: np.ndarray  # (p,) rates in the contact law
     right: np.ndarray  # (p,) of the contact problem
     mu: np.ndarray  # (p,)
     kind: np.ndarray  # (p,) int
     modes: np.ndarray  # (c,) int: OPEN, or STICKING for three rows
     motion: np.ndarray  # (c,) int: OPEN, SLIDING or STICKING at the end of the step
-    told: np.ndarray  # (c,) int: that of the last accepted step; −1 before the first
+    told: np.ndarray  # (c,) int: motion in the last accepted step; −1 before the first
     memory: np.ndarray  # (2, c, MEMORY_SIZE) LAST and NOW
     turn: np.ndarray  # (c, TURN_SIZE)
     room: np.ndarray  # (CONE_ROOM, p, p)
@@ -124,7 +124,7 @@ def stepping_arrays(
     joint_rows: int,
     theta: float,
 ) -> SteppingArrays:
-    """Allocate :class:`SteppingArrays`."""
+    """Allocate :class:`SteppingArrays` for ``joint_rows`` rows of joints and the rows of all candidates."""
     n, c = model.body.shape[0], contacts.link.shape[0]
     p = row_limit(c, joint_rows)
     return SteppingArrays(
@@ -158,7 +158,7 @@ def stepping_arrays(
 
 @internal_kernel
 def moved(system, ws: Workspace, y, scale, out):
-    """Positions of y moved by ``scale`` times the ka.QDD column, into out; its other entries as in y."""
+    """Write positions of y moved by ``scale`` times the ka.QDD column to out; other entries as in y."""
     layout = system.layout
     for j in range(y.shape[0]):
         out[j] = y[j]
@@ -174,7 +174,7 @@ def moved(system, ws: Workspace, y, scale, out):
 
 @internal_kernel
 def place_joints(system, ws: Workspace, y):
-    """Positions of y into ``ws.joints``."""
+    """Copy the positions of y into ``ws.joints``."""
     layout = system.layout
     if layout.extra > 0:
         read_positions(system.model, y, layout.q, ws)
@@ -185,9 +185,10 @@ def place_joints(system, ws: Workspace, y):
 
 @internal_kernel
 def geometry(system, model: ModelArrays, ws: Workspace):
-    """Poses, gaps and rows at the positions and rates in ``ws.joints``; tangents along and across the grip axis.
+    """Compute poses, gaps and rows at the positions and rates in ``ws.joints``.
 
-    Without one they are functions of the normal: isotropic friction does not turn with the body.
+    Tangents are along and across the grip axis. Without an axis they depend on the normal only: isotropic friction does
+    not turn with the body.
     """
     forward_sweep(model, ws, 1.0, 0.0, 1.0)
     contact_rows(model, system.contacts, system.unilateral, ws)
@@ -199,7 +200,7 @@ def geometry(system, model: ModelArrays, ws: Workspace):
         across = dot_vector(t, n)
         t = t[0] - across * n[0], t[1] - across * n[1], t[2] - across * n[2]
         length = math.sqrt(dot_vector(t, t))
-        if not length > 1e-6:  # there is no axis, or it is along the normal: any direction does
+        if not length > 1e-6:  # no axis, or along the normal: any direction will do
             t = (0.0, n[2], -n[1]) if abs(n[0]) < 0.7 else (-n[2], 0.0, n[0])
             length = math.sqrt(dot_vector(t, t))
         t = t[0] / length, t[1] / length, t[2] / length
@@ -209,7 +210,7 @@ def geometry(system, model: ModelArrays, ws: Workspace):
 
 @internal_kernel
 def constraint_rates(model: ModelArrays, ws: Workspace, y, first, out):
-    """J v of all rows, v from ``first`` on in y. A row's rate climbs from its link to the world."""
+    """Write J v of all rows to out; v starts at ``first`` in y. The rate of a row sums from its link to the world."""
     rows, active = ws.rows, ws.active
     for r in range(ws.counts[ka.ROWS]):
         a, b = active[r, ka.BODY_A], active[r, ka.BODY_B]

@@ -4,10 +4,9 @@
 
 subject to lower ≤ tau ≤ upper (both zero for a joint without a motor), |f_t| ≤ μ f_n and f_n ≥ min_N: a second-order
 cone program. Each brace has f = (f_n, f_1, f_2) along its normal n and two tangents; the rows of B map rates to the
-velocities of its point along them. A sliding brace has f_t = −μ f_n d, d the direction of slip; a commanded f_n is
-given. So the unknowns of a brace are f if it is held, f_n if it slides or has no friction, without f_n if commanded.
-If braces have a target force, the program minimises the deviation from it instead of the heat, see ``NEAR`` of
-:mod:`dynsim.dynamics.contact.braces.statics`.
+velocities of its point along them. A sliding brace has f_t = −μ f_n d with the direction of slip d; a commanded f_n is
+given. The unknowns of a brace are thus f if it is held, f_n if it slides or has no friction, without f_n if commanded.
+If braces have a target force, the program minimises the deviation from it instead of the heat, see ``NEAR``.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from dynsim.dynamics.tree.joints import point_jacobian, point_position, read_pos
 from dynsim.dynamics.tree.sweep import kinematics, newton_euler
 from dynsim.jit.kernel import integers, internal_kernel, kernel, reals
 
-# Tables of the cone program for the forces of braces: braces and motors in, forces out, workspace.
+# Tables of the program: braces and motors in, forces out, workspace.
 
 
 # BraceArrays.table
@@ -53,15 +52,15 @@ class BraceArrays(NamedTuple):
     """Braces, motors, results and workspace."""
 
     link: np.ndarray  # (c,) int
-    table: np.ndarray  # (c, BRACE_SIZE)
+    table: np.ndarray  # (c, BRACE_SIZE) braces
     motors: np.ndarray  # (n, MOTOR_SIZE)
-    first: np.ndarray  # (c + 1,) int: the first unknown of each brace, and their number
+    first: np.ndarray  # (c + 1,) int: first unknown of each brace, and number of unknowns
     free: np.ndarray  # (n,) torques without the unknown forces [N m]
     torques: np.ndarray  # (n,) [N m]
     results: np.ndarray  # (c, RESULT_SIZE) [N]
     forces: np.ndarray  # (c, 3) on the arm in W [N]
     certificate: np.ndarray  # (n,) see brace_statics
-    B: np.ndarray  # (3 c, n) a row for each unknown
+    B: np.ndarray  # (3 c, n) one row for each unknown
     inside: np.ndarray  # (3 c,) scratch
     position: np.ndarray  # (3,) scratch
     jacobian: np.ndarray  # (3, n) scratch
@@ -69,7 +68,7 @@ class BraceArrays(NamedTuple):
 
 
 def brace_arrays(link: np.ndarray, motors: np.ndarray) -> BraceArrays:
-    """Allocate a :class:`BraceArrays` for braces on these links and for these motors."""
+    """Allocate :class:`BraceArrays` for braces on the links ``link``, (c,), and for the motors, (n, MOTOR_SIZE)."""
     c, n = len(link), len(motors)
     forces = ka.MOST_ROWS * c
     return BraceArrays(
@@ -90,12 +89,12 @@ def brace_arrays(link: np.ndarray, motors: np.ndarray) -> BraceArrays:
     )
 
 
-# Tolerance of the largest margin to the constraints, in units of the force scale [1]: below −SLACK there is no
+# Tolerance of the largest margin to the constraints, as a fraction of the force scale [1]: below −SLACK there is no
 # solution, within ±SLACK the solution has no interior.
 SLACK = 1e-9
-# If all torques are within their limits by this share of the force scale, no program maximises the margin.
+# If all torques keep this distance from their limits, as a fraction of the force scale, the margin is not maximised.
 AMPLE = 1e-6
-# An interval is open if forces of this multiple of their scale are still possible.
+# An interval is open if forces of this multiple of the force scale are still possible.
 FAR = 1e4
 # Weight of the forces in the objective, in addition to the heat: keeps forces finite that do not load any motor.
 LEAST_WEIGHT = 1e-14
@@ -107,8 +106,10 @@ def brace_motion(model: ModelArrays, ws: Workspace, braces: BraceArrays, q, v, p
 
     Parameters
     ----------
-    q, v : (T, nq), (T, n)
-    positions, velocities : (T, c, 3) [m, m/s], overwritten; the points are given by ``braces.table``
+    q, v : (T, nq) ndarray, (T, n) ndarray
+        Coordinates and rates.
+    positions, velocities : (T, c, 3) ndarray
+        Results [m, m/s], overwritten; the points are in ``braces.table``.
     """
     jacobian, n = braces.jacobian, braces.free.shape[0]
     for t in range(q.shape[0]):
@@ -128,7 +129,7 @@ def brace_motion(model: ModelArrays, ws: Workspace, braces: BraceArrays, q, v, p
 def brace_statics(
     model: ModelArrays, ws: Workspace, braces: BraceArrays, q, v, vdot, tables, torques, normal, intervals
 ):
-    """Compute forces of least heat along a motion; the last forces, and intervals if wanted, go to ``braces``.
+    """Compute forces of least heat along a motion; the last forces, and intervals if requested, go to ``braces``.
 
     Returns the number of instants with a solution: it stops at the first instant at which no forces fulfil all
     constraints. Then ``certificate`` is a vector ω (n,) of joint rates that proves it: for all torques within their
@@ -136,9 +137,12 @@ def brace_statics(
 
     Parameters
     ----------
-    q, v, vdot : (T, nq), (T, n), (T, n)
-    tables : (T, c, BRACE_SIZE), the braces at each instant
-    torques, normal : (T, n) motor torques [N m] and (T, c) normal forces [N], overwritten
+    q, v, vdot : (T, nq) ndarray, (T, n) ndarray, (T, n) ndarray
+        Coordinates, rates and accelerations.
+    tables : (T, c, BRACE_SIZE) ndarray
+        Braces at each instant.
+    torques, normal : (T, n) ndarray, (T, c) ndarray
+        Motor torques [N m] and normal forces [N], overwritten.
     """
     for t in range(q.shape[0]):
         for k in range(braces.link.shape[0]):
@@ -182,7 +186,7 @@ def torque_limits(braces: BraceArrays, ws: Workspace):
 
 @internal_kernel
 def least_heat_forces(model: ModelArrays, ws: Workspace, braces: BraceArrays, intervals):
-    """Write torques, forces and intervals of one instant to ``braces``; False and a certificate without a solution."""
+    """Write torques, forces and intervals of one instant to ``braces``; without a solution, a certificate and False."""
     results, table, motors = braces.results, braces.table, braces.motors
     c, n, first, x = braces.link.shape[0], braces.free.shape[0], braces.first, braces.program.x
     scale = brace_rows(model, ws, braces)
@@ -193,14 +197,14 @@ def least_heat_forces(model: ModelArrays, ws: Workspace, braces: BraceArrays, in
         limited |= not (math.isinf(motors[j, LOWER]) and math.isinf(motors[j, UPPER]))
     best = False
     if passive == 0:
-        # The optimum without limits is also the optimum within limits if it keeps them, which it does in most cases.
+        # The optimum without limits is also the optimum with limits if it keeps them, as in most cases.
         equations, cones = constraints(braces, scale, False, False)
         middle_forces(braces, scale)
         least_heat(braces, unknowns, equations, cones, scale)
         keep(braces, scale)
         best = not limited or ample(braces, scale)
     if limited and (intervals or not best):
-        # Equations that contradict each other have no margin: first allow the torques of passive joints to be off.
+        # Contradictory equations have no margin: first allow the torques of passive joints to be off.
         if passive > 0:
             equations, cones = constraints(braces, scale, True, True)
             if largest_margin(braces, equations, cones, scale) < -SLACK:
@@ -266,7 +270,7 @@ def brace_forces(braces: BraceArrays, k, scale):
 
 @internal_kernel
 def ample(braces: BraceArrays, scale):
-    """Return whether all torques keep their limits with room to spare."""
+    """Return whether all torques keep ample distance from their limits."""
     for j in range(braces.free.shape[0]):
         torque, room = braces.torques[j], AMPLE * scale
         if torque - braces.motors[j, LOWER] < room or braces.motors[j, UPPER] - torque < room:
@@ -276,7 +280,7 @@ def ample(braces: BraceArrays, scale):
 
 @internal_kernel
 def middle_forces(braces: BraceArrays, scale):
-    """Set the initial forces, along the normals: inside the cones of all braces."""
+    """Set the initial forces, along the normals, inside the cones of all braces."""
     table, x, first = braces.table, braces.program.x, braces.first
     for k in range(braces.link.shape[0]):
         for i in range(first[k], first[k + 1]):
@@ -287,7 +291,7 @@ def middle_forces(braces: BraceArrays, scale):
 
 @internal_kernel
 def largest_margin(braces: BraceArrays, equations, cones, scale):
-    """Find a point x inside all constraints; returns the worst margin there, the largest possible, at most 1."""
+    """Find a point x inside all constraints; return the worst margin there, the largest possible, at most 1."""
     program, unknowns = braces.program, braces.first[braces.link.shape[0]]
     x, rows = program.x, program.first[cones]
     clear_objective(program, unknowns + 1)
@@ -303,7 +307,7 @@ def largest_margin(braces: BraceArrays, equations, cones, scale):
 
 @internal_kernel
 def brace_rows(model: ModelArrays, ws: Workspace, braces: BraceArrays):
-    """Compute the torques without the unknown forces, and the rows B of these forces; returns a force scale [N]."""
+    """Compute the torques without the unknown forces, and the rows B of these forces; return a force scale [N]."""
     newton_euler(model, ws, 1.0, 1.0, 1.0)
     table, B, jacobian, first, n = braces.table, braces.B, braces.jacobian, braces.first, braces.free.shape[0]
     torque, lever, scale = 0.0, 0.0, 1e-3
@@ -346,9 +350,9 @@ def along(table, jacobian, k, j, e):
 
 @internal_kernel
 def constraints(braces: BraceArrays, scale, limits, relaxed):
-    """Set up equations and cones in the forces divided by ``scale``; returns their numbers.
+    """Set up equations and cones in the forces divided by ``scale``; return their numbers.
 
-    ``limits`` : include the torque limits; ``relaxed`` : passive joints are in cones, not in equations
+    ``limits`` includes the torque limits; with ``relaxed``, passive joints are in cones instead of equations.
     """
     program, table, B, motors = braces.program, braces.table, braces.B, braces.motors
     A, b, G, h, first = program.A, program.b, program.G, program.h, program.first
@@ -399,7 +403,7 @@ def constraints(braces: BraceArrays, scale, limits, relaxed):
 
 @internal_kernel
 def clear_objective(program: ConeProgram, unknowns):
-    """Set the objective to only the unknowns, with a small weight."""
+    """Reset the objective to a small weight on the unknowns."""
     for k in range(unknowns):
         program.g[k] = 0.0
         for m in range(unknowns):
@@ -408,7 +412,7 @@ def clear_objective(program: ConeProgram, unknowns):
 
 @internal_kernel
 def worst_margin(program: ConeProgram, unknowns, cones):
-    """Return the smallest distance of x to the boundary of a cone, negative outside."""
+    """Return the smallest distance of x to the boundary of a cone; negative outside."""
     worst = math.inf
     for c in range(cones):
         head, square = 0.0, 0.0
@@ -426,9 +430,9 @@ def worst_margin(program: ConeProgram, unknowns, cones):
 
 @internal_kernel
 def contradiction(braces: BraceArrays, equations, cones, relaxed):
-    """Write multipliers of the torques as joint rates, from the multipliers of a best margin that is negative."""
+    """Write multipliers of the torques, as joint rates, from the multipliers of a negative best margin."""
     program, motors = braces.program, braces.motors
-    # Torques are the last of the equations and of the cones: loop backwards.
+    # Torques are the last equations and the last cones: loop backwards.
     e, i = equations - 1, program.first[cones] - 1
     for j in range(braces.free.shape[0] - 1, -1, -1):
         low, high = motors[j, LOWER], motors[j, UPPER]
@@ -465,7 +469,7 @@ def extreme_force(braces: BraceArrays, unknowns, equations, cones, j, end, scale
 
 @internal_kernel
 def holds_with_least(braces: BraceArrays, j):
-    """Return whether the forces found stay possible when the force of brace j is shortened to its minimum."""
+    """Return whether the forces remain possible when the force of brace j is reduced to its minimum."""
     results, k, least = braces.results, braces.first[j], braces.table[j, LEAST]
     shorter = results[j, FORCES] - least
     share = shorter / results[j, FORCES] if shorter > 0.0 else 0.0
@@ -480,7 +484,7 @@ def holds_with_least(braces: BraceArrays, j):
 
 @internal_kernel
 def least_heat(braces: BraceArrays, unknowns, equations, cones, scale):
-    """Find the forces of least heat, in units of ``scale``: H = B w Bᵀ, g = −B w free; or forces nearest to targets."""
+    """Find the forces of least heat in units of ``scale`` (H = B w Bᵀ, g = −B w free), or forces nearest to targets."""
     program, B, motors, n = braces.program, braces.B, braces.motors, braces.free.shape[0]
     clear_objective(program, unknowns)
     largest = 0.0

@@ -1,4 +1,4 @@
-"""Solver of small dense second-order-cone programs (interior point).
+"""Small dense second-order-cone programs: interior-point solver, and selection of indeterminate contact forces.
 
     minimise ½ xᵀ H x + gᵀ x   subject to   A x = b,   s = G x + h ∈ K
 
@@ -23,25 +23,25 @@ from dynsim.dynamics.contact.cone.steps import block_size
 from dynsim.jit.kernel import integers, internal_kernel, kernel, reals
 
 ITERATIONS = 60
-# Tolerance of the optimality conditions, for a program scaled to numbers near 1: the rounding of some dozen operations.
+# Tolerance of the optimality conditions for a program scaled to numbers near 1: rounding of some dozen operations.
 TOLERANCE = 1e-13
-# Complementarity gap at which the iteration ends: smaller ones are lost in double precision.
+# Complementarity gap at which the iteration ends: smaller gaps are lost in double precision.
 GAP_MIN = 1e-16
 # Below CLOSE, the iteration ends after PATIENCE steps that do not halve the residual.
 CLOSE, PATIENCE = 1e-9, 2
-# Regularises the Newton system along undetermined directions; the optimum is the same.
+# Regularisation of the Newton system along undetermined directions; the optimum is unchanged.
 REGULAR = 1e-13
-# Smallest pivot of an unknown, relative to its diagonal entry before elimination: a smaller one has lost all digits.
+# Smallest pivot of an unknown, relative to its diagonal entry before elimination: smaller pivots have no digits left.
 PIVOT_MIN = 1e-14
-# An equation is dependent if its pivot is below this part of the sizes of its terms; −HUGE replaces that pivot.
+# An equation is dependent if its pivot is below this fraction of the sizes of its terms; −HUGE replaces that pivot.
 RANK_TOLERANCE, HUGE = 1e-10, 1e100
-# Part of the way to the boundary of the cones that a step leaves. With a hundredth of it, steps end off the central
-# path, on the edge of a cone, and the next steps creep along that edge.
+# Fraction of the distance to the boundary of the cones that a step leaves. With a hundredth of it, steps end off the
+# central path, at the edge of a cone, and the next steps creep along that edge.
 ASIDE = 2e-2
 
 
 class ConeProgram(NamedTuple):
-    """Data, solution and scratch of a program; leading parts are used by smaller ones. S is the sum of cone sizes."""
+    """Data, solution and scratch of a program; smaller programs use leading parts. S is the sum of cone sizes."""
 
     H: np.ndarray  # (n, n)
     g: np.ndarray  # (n,)
@@ -49,16 +49,16 @@ class ConeProgram(NamedTuple):
     b: np.ndarray  # (m,)
     G: np.ndarray  # (S, n)
     h: np.ndarray  # (S,)
-    first: np.ndarray  # (cones + 1,) int: where each cone begins in s, and the end
+    first: np.ndarray  # (cones + 1,) int: start of each cone in s, and the end
     x: np.ndarray  # (n,) start and solution
     y: np.ndarray  # (m,)
     s: np.ndarray  # (S,)
     z: np.ndarray  # (S,)
-    kkt: np.ndarray  # (n + m, n + m) scratch, as all below
+    kkt: np.ndarray  # (n + m, n + m) scratch, like all arrays below
     step: np.ndarray  # (n + m,)
     scaled: np.ndarray  # (S, n)
-    scaling: np.ndarray  # (S,) w of each cone, unit hyperbolic norm
-    size: np.ndarray  # (cones,) its factor
+    scaling: np.ndarray  # (S,) w of each cone, with unit hyperbolic norm
+    size: np.ndarray  # (cones,) factor of the scaling
     work: np.ndarray  # (7, S)
     kept: np.ndarray  # (n + m + 2 S,) the best x, y, s and z so far
 
@@ -73,15 +73,20 @@ def cone_program(n: int, m: int, cones: int, rows: int) -> ConeProgram:
 
 
 def program_size(n: int, m: int, cones: int, rows: int) -> int:
-    """Numbers that :func:`laid_out` needs for a program."""
+    """Return the number of floats that :func:`laid_out` needs for a program."""
     return n * n + n + m * n + m + 3 * rows + n + m + (n + m) ** 2 + n + m + 2 * rows * n + 10 * rows + cones + n + m
 
 
 @internal_kernel
 def laid_out(flat, first, n, m, cones, rows):
-    """A :class:`ConeProgram` in one array: a table with many arrays would be handed through every function.
+    """Return a :class:`ConeProgram` in one array: a table of many arrays would be passed through every function.
 
-    flat : (program_size(...),); first : (cones + 1,) int
+    Parameters
+    ----------
+    flat : (program_size(...),) ndarray
+        Storage of all arrays.
+    first : (cones + 1,) ndarray of int
+        Starts of the cones.
     """
     a = n * n
     b = a + n
@@ -125,8 +130,8 @@ def laid_out(flat, first, n, m, cones, rows):
 def solve_cone_program(program: ConeProgram, n, m, cones):
     """Solve the leading n unknowns, m equations and ``cones`` cones from ``program.x``, where all s must be inside.
 
-    Solution and multipliers are left in x, y, s and z. Returns the largest residual of the optimality conditions, s · z
-    included; for numbers near 1 it is the relative error of the optimum.
+    Solution and multipliers are left in x, y, s and z. Returns the largest residual of the optimality conditions,
+    including s · z; for numbers near 1 it is the relative error of the optimum.
     """
     x, y, s, z, first = program.x, program.y, program.s, program.z, program.first
     work, step = program.work, program.step
@@ -139,7 +144,7 @@ def solve_cone_program(program: ConeProgram, n, m, cones):
         for i in range(rows):
             gap += s[i] * z[i]
         gap = gap / cones if cones > 0 else 1.0
-        # Close to the boundary of the cones rounding ends the progress, or NaN.
+        # Close to the boundary of the cones, rounding (or NaN) ends the progress.
         since += 1
         if error < least:
             if error < 0.5 * least:
@@ -151,7 +156,7 @@ def solve_cone_program(program: ConeProgram, n, m, cones):
         scale_cones(program, cones)
         factor_kkt(program, n, m, rows, cones)
 
-        # Predictor: all the way to complementarity.
+        # Predictor: a full step to complementarity.
         for c in range(cones):
             jordan(work, LAMBDA, LAMBDA, TARGET, first[c], first[c + 1], -1.0, 0.0)
         newton_step(program, n, m, cones)
@@ -209,7 +214,7 @@ def start(program: ConeProgram, n, m, cones):
 
 @internal_kernel
 def slope(program: ConeProgram, n, m, k):
-    """(H x + g + Aᵀ y)_k."""
+    """Return (H x + g + Aᵀ y)_k."""
     total = program.g[k]
     for j in range(n):
         total += program.H[k, j] * program.x[j]
@@ -220,7 +225,7 @@ def slope(program: ConeProgram, n, m, k):
 
 @internal_kernel
 def equation(program: ConeProgram, n, e):
-    """(A x − b)_e."""
+    """Return (A x − b)_e."""
     total = -program.b[e]
     for k in range(n):
         total += program.A[e, k] * program.x[k]
@@ -229,7 +234,7 @@ def equation(program: ConeProgram, n, e):
 
 @internal_kernel
 def conditions(program: ConeProgram, n, m, cones):
-    """Return the largest residual of the optimality conditions, s · z included; those of slacks go into ``work``."""
+    """Return the largest residual of the optimality conditions, including s · z; residuals of slacks go to ``work``."""
     x, s, z, rows = program.x, program.s, program.z, program.first[cones]
     worst, gap = 0.0, 0.0
     for k in range(n):
@@ -247,12 +252,12 @@ def conditions(program: ConeProgram, n, m, cones):
         program.work[RESIDUAL, i] = left
         worst = max(worst, abs(left))
         gap += s[i] * z[i]
-    return worst if gap <= worst else gap  # NaN stays
+    return worst if gap <= worst else gap  # NaN is kept
 
 
 @internal_kernel
 def scale_cones(program: ConeProgram, cones):
-    """Nesterov–Todd scaling W of every cone, W z = W⁻¹ s = λ: its vector w, its factor, and λ."""
+    """Compute the Nesterov–Todd scaling W of every cone, W z = W⁻¹ s = λ: its vector w, its factor, and λ."""
     s, z, first, w, work = program.s, program.z, program.first, program.scaling, program.work
     for c in range(cones):
         a, end = first[c], first[c + 1]
@@ -271,7 +276,7 @@ def scale_cones(program: ConeProgram, cones):
 
 @internal_kernel
 def hyperbolic(u, a, end):
-    """√(u_0² − |u_1|²) of the cone's part of u."""
+    """Return √(u_0² − |u_1|²) of the cone's part of u."""
     square = 0.0
     for i in range(a + 1, end):
         square += u[i] * u[i]
@@ -281,7 +286,7 @@ def hyperbolic(u, a, end):
 
 @internal_kernel
 def unscale(program: ConeProgram, c, u):
-    """W⁻¹ u of cone c in place."""
+    """Apply W⁻¹ of cone c to u in place."""
     w, a, end = program.scaling, program.first[c], program.first[c + 1]
     factor, along, head = 1.0 / program.size[c], 0.0, u[a]
     for i in range(a + 1, end):
@@ -294,10 +299,10 @@ def unscale(program: ConeProgram, c, u):
 
 @internal_kernel
 def factor_kkt(program: ConeProgram, n, m, rows, cones):
-    """L D Lᵀ of [H + Gᵀ W⁻² G + Aᵀ A, Aᵀ; A, 0], kept regular; D on the diagonal, L below it.
+    """Factor [H + Gᵀ W⁻² G + Aᵀ A, Aᵀ; A, 0] = L D Lᵀ, regularised; D on the diagonal, L below it.
 
     Aᵀ A, which the right-hand side compensates, gives pivots to unknowns that only the equations determine.
-    An equation that depends on those before it gets a pivot that stops its multiplier.
+    An equation that depends on the preceding ones gets a pivot that suppresses its multiplier.
     """
     kkt, scaled = program.kkt, program.scaled
     column = program.work[TARGET]
@@ -326,7 +331,7 @@ def factor_kkt(program: ConeProgram, n, m, rows, cones):
         for j in range(k):
             for i in range(j):
                 kkt[k, j] -= kkt[k, i] * kkt[j, i]
-        # Until here the entries are L D.
+        # So far the entries are L D.
         removed = 0.0
         least = PIVOT_MIN * kkt[k, k]
         for j in range(k):
@@ -342,7 +347,7 @@ def factor_kkt(program: ConeProgram, n, m, rows, cones):
 
 @internal_kernel
 def newton_step(program: ConeProgram, n, m, cones):
-    """Step of all unknowns for λ ∘ (W dz + W⁻¹ ds) = TARGET, which is overwritten."""
+    """Compute the step of all unknowns for λ ∘ (W dz + W⁻¹ ds) = TARGET, which is overwritten."""
     work, kkt, step, first = program.work, program.kkt, program.step, program.first
     z, rows = program.z, first[cones]
     target, ds, dz = work[TARGET], work[DS], work[DZ]
@@ -387,7 +392,7 @@ def newton_step(program: ConeProgram, n, m, cones):
 
 @internal_kernel
 def jordan(work, u, v, out, a, end, factor, keep):
-    """Row ``out`` becomes keep times itself plus factor (u · v, u_0 v_1 + v_0 u_1), in the cone from a to end."""
+    """Set row ``out`` to keep times itself plus factor (u · v, u_0 v_1 + v_0 u_1), in the cone from a to end."""
     product = 0.0
     for i in range(a, end):
         product += work[u, i] * work[v, i]
@@ -399,7 +404,7 @@ def jordan(work, u, v, out, a, end, factor, keep):
 
 @internal_kernel
 def divide(work, u, out, a, end):
-    """Row ``out`` becomes the r with u ∘ r = out, in the cone from a to end."""
+    """Replace row ``out`` by the r with u ∘ r = out, in the cone from a to end."""
     along = 0.0
     for i in range(a + 1, end):
         along += work[u, i] * work[out, i]
@@ -412,7 +417,7 @@ def divide(work, u, out, a, end):
 
 @internal_kernel
 def longest_step(program: ConeProgram, cones):
-    """The longest step, at most 1, that keeps s and z in their cones."""
+    """Return the longest step, at most 1, that keeps s and z in their cones."""
     first, reach = program.first, 1.0
     for c in range(cones):
         reach = min(reach, way_out(program.s, program.work[DS], first[c], first[c + 1]))
@@ -422,8 +427,8 @@ def longest_step(program: ConeProgram, cones):
 
 @internal_kernel
 def way_out(u, du, a, end):
-    """Where u + α du leaves the cone, the smallest α > 0; infinite if nowhere."""
-    # No further than to the height of the apex: on a way through the apex itself rounding hides the double root below.
+    """Return the smallest α > 0 at which u + α du leaves the cone; infinite if it never does."""
+    # At most to the height of the apex: on a line through the apex itself, rounding hides the double root below.
     apex = -u[a] / du[a] if du[a] < 0.0 else math.inf
     if end == a + 1:
         return apex
@@ -442,58 +447,65 @@ def way_out(u, du, a, end):
 # Split of forces among redundant sticking contacts by cone programs: least norm in the cones, or largest margin.
 
 
-# Weight of |z|² in the objective with the margin: makes the best split unique where the margin alone does not.
+# Weight of |z|² in the objective of the margin: makes the best split unique if the margin alone does not.
 LEAST_WEIGHT = 1e-13
-# Bound on the margin, in units of the largest given force: pressing two walls apart has no largest margin.
+# Bound on the margin, in units of the largest given force: two walls pressed apart have no largest margin.
 MARGIN_MAX = 10.0
 # Tolerance in units of the largest force: for tangential forces without friction, and for cones that meet in a point.
 FORCE_TOLERANCE = 1e-9
 
 
 def split_room(r: int, count: int) -> ConeProgram:
-    """The room of :func:`best_split` for null spaces of up to r columns and ``count`` contacts."""
+    """Allocate scratch for :func:`best_split`, for null spaces of up to r columns and ``count`` contacts."""
     return cone_program(*split_sizes(r, count))
 
 
 def split_size(r: int, count: int) -> int:
-    """Numbers in that room, see :func:`split_room_in`."""
+    """Return the number of floats in that scratch, see :func:`split_room_in`."""
     return program_size(*split_sizes(r, count))
 
 
 def split_sizes(r: int, count: int) -> tuple[int, int, int, int]:
-    """Unknowns, equations, cones and rows of the larger of its programs."""
+    """Return unknowns, equations, cones and rows of the larger of its programs."""
     return r + 1, 2 * count, count + 1, ka.MOST_ROWS * count + 1
 
 
 @internal_kernel
 def split_room_in(flat, first, r, count):
-    """:func:`split_room` in given arrays, (split_size(r, count),) and (count + 2,) int."""
+    """Return :func:`split_room` in given arrays, (split_size(r, count),) and (count + 2,) int."""
     return laid_out(flat, first, r + 1, 2 * count, count + 1, ka.MOST_ROWS * count + 1)
 
 
 @kernel
 def best_split(f0, N, r, contact_first, mu, contacts, joints, out, room: ConeProgram, least):
-    """Forces f = f0 + N z of redundant sticking contacts: in all cones if any split is, and then the least, if wanted.
+    """Split forces f = f0 + N z of redundant sticking contacts: inside all cones if possible, then with least norm.
 
-    The best margin is max_z min_j (μ_j f_n,j − |f_t,j|). Is it negative, no split holds all contacts. A contact without
-    friction can hold no tangential force: where its own can vanish it is kept at zero, and its margin is f_n,j.
+    The best margin is max_z min_j (μ_j f_n,j − |f_t,j|). If it is negative, no split holds all contacts. A contact
+    without friction cannot carry a tangential force: its force is set to zero if possible, and its margin is f_n,j.
 
     Parameters
     ----------
-    f0 : (p or more,) forces of all rows [N]
-    N : (p or more, r or more) directions in which they can be split otherwise; r of them
-    contact_first : (contacts + joints or more,) int, normal row of each sticking contact, whose tangential rows follow,
-        then the ``joints``: the row of each joint that dry friction holds, and of each closed joint stop
-    mu : (contacts + joints or more,) static friction; of joints the bound of their force, whose margin is μ_j − |f_j|;
-        negative for a stop, whose margin is its force f_j
-    out : (p or more,) the force of least norm in all cones; if no force is in all cones, the force of the best margin
-    room : see :func:`split_room`
-    least : False: the split of the best margin in any case
+    f0 : (p or more,) ndarray
+        Forces of all rows [N].
+    N : (p or more, r or more) ndarray
+        Directions in which they can be split differently; r columns are used.
+    contact_first : (contacts + joints or more,) ndarray of int
+        Normal row of each sticking contact, followed by its tangential rows, then for the ``joints`` the row of each
+        joint held by dry friction and of each closed joint stop.
+    mu : (contacts + joints or more,) ndarray
+        Static friction; for joints the bound of their force, whose margin is μ_j − |f_j|; negative for a stop, whose
+        margin is its force f_j.
+    out : (p or more,) ndarray
+        Force of least norm in all cones; if no force is in all cones, the force of the best margin.
+    room : ConeProgram
+        Scratch, see :func:`split_room`.
+    least : bool
+        False: always the split of the best margin.
 
     Returns
     -------
     float
-        The best margin [N], at most ten times the largest force in f0.
+        Best margin [N], at most ten times the largest force in f0.
     """
     p, count = f0.shape[0], contacts + joints
     scale = 0.0
@@ -550,7 +562,7 @@ def best_split(f0, N, r, contact_first, mu, contacts, joints, out, room: ConePro
         margin = min(margin, -error)
 
     if least and margin > FORCE_TOLERANCE:
-        # There is room inside the cones: the least force, from the point found.
+        # The cones have an interior: find the least force, from the point found.
         for k in range(r):
             room.g[k] = 0.0
             for i in range(p):
@@ -568,9 +580,9 @@ def best_split(f0, N, r, contact_first, mu, contacts, joints, out, room: ConePro
 
 @internal_kernel
 def cone_rows(f0, N, r, contact_first, mu, contacts, joints, scale, room: ConeProgram):
-    """The cones in z and the margin t; returns how many rows.
+    """Write the cones in z and the margin t; return the number of rows.
 
-    (μ f_n − t, f_t) of contacts, (μ − t, f) of joints, f − t of stops.
+    (μ f_n − t, f_t) for contacts, (μ − t, f) for joints, f − t for stops.
     """
     row = 0
     for j in range(contacts):
@@ -603,18 +615,18 @@ def cone_rows(f0, N, r, contact_first, mu, contacts, joints, scale, room: ConePr
     return row
 
 
-# Selection of indeterminate contact forces: towards least norm, as far as the friction cones allow.
+# Selection of indeterminate contact forces: towards least norm, within the friction cones.
 
 
 # Blocks of the scratch ``room``: G, its factor, columns S (coefficients on the rows of their block), then vectors.
 MATRIX, FACTOR, COLUMNS, NOW, GOAL, RIGHT, PIVOT, ROW, SIZE = 0, 1, 2, 3, 4, 5, 6, 7, 8
-# A row that separates faster than this has no force; slip slower than this has no direction, nor has a force that
-# changes the rate of its own row by less [m/s].
+# A row that separates faster than this has no force; slip slower than this has no direction, and neither has a force
+# that changes the rate of its row by less [m/s].
 STILL = 1e-9
 # G is singular if a pivot is below SINGULAR times the mean of its diagonal. The projection adds SHIFT times that mean
 # to the diagonal; each refinement multiplies the error by about SHIFT.
 SINGULAR, SHIFT, REFINEMENTS = 1e-10, 1e-6, 4
-# Bisections of the way to a cone; share of the largest force that may lie outside it.
+# Bisections of the step to a cone; share of the largest force that may be outside it.
 HALVINGS, ROUNDING = 50, 1e-12
 
 
@@ -622,7 +634,7 @@ HALVINGS, ROUNDING = 50, 1e-12
 def select_least_norm(W, w, kind, mu, p, f, room):
     """Move the forces f, (p,), with the motion w = W f + b towards their least norm. Uses ``room``, (CONE_ROOM, p, p).
 
-    Leaves f as it is where it is unique.
+    Leaves f unchanged if it is unique.
     """
     n = changeable(W, w, kind, mu, p, f, room)
     if n < 2:
@@ -645,7 +657,7 @@ def select_least_norm(W, w, kind, mu, p, f, room):
         return
     shift = SHIFT * trace / n
     factored(G, L, room[PIVOT, 0], n, shift, 0.0)
-    # x = (G + ε)⁻¹ G x₀, refined: the error outside the range of G stays zero, that inside falls by ε each time.
+    # x = (G + ε)⁻¹ G x₀, refined: the error outside the range of G stays zero, inside it falls by ε each time.
     for i in range(n):
         goal[i] = 0.0
     for _ in range(1 + REFINEMENTS):
@@ -689,7 +701,7 @@ def select_least_norm(W, w, kind, mu, p, f, room):
 
 @internal_kernel
 def changeable(W, w, kind, mu, p, f, room):
-    """The columns S of the rows whose forces may change: coefficients, first row and size; returns their number."""
+    """Write the columns S of rows whose forces may change, with first row and size; return their number."""
     S, row, size = room[COLUMNS], room[ROW, 0], room[SIZE, 0]
     n, k = 0, 0
     while k < p:
@@ -713,7 +725,7 @@ def changeable(W, w, kind, mu, p, f, room):
 
 @internal_kernel
 def sliding_share(W, w, mu, f, k, slip):
-    """Friction per normal force, (x, y), of the point with first row k that slides at ``slip``: within its cone."""
+    """Return the friction per normal force, (x, y), of the point with first row k that slides at ``slip``."""
     if f[k] * W[k, k] <= STILL:
         return -mu[k] * w[k + 1] / slip, -mu[k] * w[k + 2] / slip
     x, y = f[k + 1] / f[k], f[k + 2] / f[k]
@@ -724,7 +736,7 @@ def sliding_share(W, w, mu, f, k, slip):
 
 @internal_kernel
 def factored(G, L, pivot, n, shift, least):
-    """G + ``shift`` = L D Lᵀ, (n, n), D into ``pivot``; False where a pivot is not above ``least``."""
+    """Factor G + ``shift`` = L D Lᵀ, (n, n), with D in ``pivot``; False if a pivot is not above ``least``."""
     for j in range(n):
         d = G[j, j] + shift
         for k in range(j):
@@ -742,7 +754,7 @@ def factored(G, L, pivot, n, shift, least):
 
 @internal_kernel
 def substitute(L, pivot, x, n):
-    """x ← (L D Lᵀ)⁻¹ x."""
+    """Overwrite x with (L D Lᵀ)⁻¹ x."""
     for i in range(n):
         for k in range(i):
             x[i] -= L[i, k] * x[k]
@@ -754,14 +766,14 @@ def substitute(L, pivot, x, n):
 
 @internal_kernel
 def inside(mu, n, room, share, slack):
-    """True when the forces ``share`` of the way from NOW to GOAL lie in their cones."""
+    """True if the forces at the fraction ``share`` from NOW to GOAL are in their cones."""
     now, goal, row, size = room[NOW, 0], room[GOAL, 0], room[ROW, 0], room[SIZE, 0]
     i = 0
     while i < n:
         normal = now[i] + share * (goal[i] - now[i])
         if normal < -slack:
             return False
-        # Three columns of one row each, in a row: a point that sticks.
+        # Three consecutive columns of one row each: a sticking point.
         sticks = size[i] == 1.0 and i + 2 < n and row[i + 1] == row[i] + 1.0 and mu[int(row[i])] > 0.0
         if sticks:
             x = now[i + 1] + share * (goal[i + 1] - now[i + 1])

@@ -1,6 +1,7 @@
-"""Steps of the contact-problem solver: residual, Newton step, block Gauss–Seidel sweep; layout of its scratch.
+"""Contact problem with bilateral and unilateral rows, Coulomb cones and dry joint friction, unsmoothed: its solver.
 
-The problem and its residual are those of dynsim.dynamics.contact.cone.steps; ``room`` is its scratch array.
+First the steps (residual, Newton step, block Gauss–Seidel sweep) and the layout of the scratch array ``room``, then the
+solver itself.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ MOTION, MOBILITY, RIGHT, STATUS, FIRST, SECOND, BETA = 2, 3, 4, 5, 6, 7, 8
 BEST, SWEPT, START, GOAL = 9, 10, 11, 12
 SHIFTED_RIGHT, KEPT, LAST, ANCHOR, PROOF, NO_FRICTION, KNOWN = 13, 14, 15, 16, 17, 18, 19
 CONE_ROOM = 20
-# STATUS of a block at its first row: no force, u = 0, slides, at the bound FIRST.
+# STATUS of a block, at its first row: no force, u = 0, sliding, at the bound FIRST.
 OFF, HOLDS, SLIDES, CLAMPED = 0.0, 1.0, 2.0, 3.0
 # The proximal term is PROXIMAL_FACTOR times the relative residual, at least LEAST_PROXIMAL, which is above rounding.
 PROXIMAL_FACTOR, LEAST_PROXIMAL = 1e3, 1e-11
@@ -26,13 +27,13 @@ ROOT_STEPS = 60
 
 @internal_kernel
 def block_size(kind, k):
-    """Rows of the block that begins at row k."""
+    """Return the number of rows of the block that begins at row k."""
     return 3 if kind[k] == CONE else 1
 
 
 @internal_kernel
 def mobilities(W, kind, p, room):
-    """Own mobility of each block into ``room[MOBILITY, 0]``: the mean of its diagonal entries."""
+    """Write the mobility of each block, the mean of its diagonal entries, to ``room[MOBILITY, 0]``."""
     mobility = room[MOBILITY, 0]
     largest = 0.0
     for k in range(p):
@@ -43,7 +44,7 @@ def mobilities(W, kind, p, room):
         total = 0.0
         for i in range(size):
             total += abs(W[k + i, k + i])
-        # An immobile row has some mobility, so that what is divided by it stays finite.
+        # An immobile row gets some mobility, so that quotients stay finite.
         total = max(total / size, 1e-14 * largest, 1e-300)
         for i in range(size):
             mobility[k + i] = total
@@ -52,7 +53,7 @@ def mobilities(W, kind, p, room):
 
 @internal_kernel
 def motion(W, b, p, f, u):
-    """u = W f + b."""
+    """Compute u = W f + b."""
     for k in range(p):
         total = b[k]
         for m in range(p):
@@ -62,7 +63,7 @@ def motion(W, b, p, f, u):
 
 @internal_kernel
 def measure(W, b, kind, mu, p, f, room):
-    """u = W f + b into ``room[MOTION, 0]``; returns the residual, and the sum of the errors' squares / mobility."""
+    """Compute u = W f + b in ``room[MOTION, 0]``; return the residual and Σ error² / mobility."""
     u, mobility = room[MOTION, 0], room[MOBILITY, 0]
     motion(W, b, p, f, u)
     residual, merit, k = 0.0, 0.0, 0
@@ -72,7 +73,7 @@ def measure(W, b, kind, mu, p, f, room):
         if kind[k] == BOX:
             error = abs(w * (f[k] - bounded(f[k] - u[k] / w, mu[k])))
         merit += error * error / w
-        # Written so that NaN stays.
+        # Written so that NaN is kept.
         residual = residual if error <= residual else error
         if kind[k] == CONE:
             x, y, radius = w * f[k + 1] - u[k + 1], w * f[k + 2] - u[k + 2], mu[k] * w * max(f[k], 0.0)
@@ -88,22 +89,22 @@ def measure(W, b, kind, mu, p, f, room):
 
 @internal_kernel
 def bounded(x, bound):
-    """x within ±bound."""
+    """Return x clipped to ±bound."""
     return min(max(x, -bound), bound)
 
 
 @internal_kernel
 def newton_step(W, b, kind, mu, p, f, room, relative, most):
-    """One step of f by Newton's method, from u of f in ``room[MOTION, 0]``.
+    """Take one Newton step of f, from u of f in ``room[MOTION, 0]``.
 
-    Blocks that are off (z_n = w f_n − u_n ≤ 0) get f = 0 and have no unknown, nor have BOX rows with |z| ≥ w μ, whose
-    bound goes to the right-hand side of all rows. The others have u_n' = 0, and with
-    z_t = w f_t − u_t inside the disc of radius μ z_n u_t' = 0. Outside, along d = z_t / |z_t| and e across it,
+    Blocks that are off (z_n = w f_n − u_n ≤ 0) get f = 0 and have no unknown. BOX rows with |z| ≥ w μ have no unknown
+    either; their bound goes to the right-hand side of all rows. The others have u_n' = 0, and u_t' = 0 if
+    z_t = w f_t − u_t is inside the disc of radius μ z_n. Outside, along d = z_t / |z_t| and e across it,
 
         d·f_t' = μ f_n',    (1 − β) w e·f_t' + β e·u_t' = 0,    β = μ z_n / |z_t|,
 
     so that such a block has the unknowns f_n and e·f_t. Rows n, e of the motion and columns n + μ d, e of the force
-    make the matrix. To each row comes a proximal term, w times a fraction of up to ``most`` that falls with the
+    make the matrix. Each row gets a proximal term, w times a fraction of up to ``most`` that falls with the
     ``relative`` residual.
     """
     mobility, A, x = room[MOBILITY, 0], room[MATRIX], room[RIGHT, 0]
@@ -115,7 +116,7 @@ def newton_step(W, b, kind, mu, p, f, room, relative, most):
         known[k] = b[k]
     m = 0
     while m < p:
-        # STATUS is written at the first row of a block only: at tangents there is what another problem left.
+        # STATUS is written at the first row of a block only: tangents have values left by another problem.
         if status[m] == CLAMPED:
             for k in range(p):
                 known[k] += W[k, m] * first[m]
@@ -166,7 +167,7 @@ def newton_step(W, b, kind, mu, p, f, room, relative, most):
 
 @internal_kernel
 def find_statuses(kind, mu, p, f, room):
-    """STATUS of each block, of those that slide FIRST, SECOND = d and BETA, of those at a bound FIRST."""
+    """Set STATUS of each block; for sliding blocks FIRST, SECOND = d and BETA; at a bound FIRST."""
     u, mobility = room[MOTION, 0], room[MOBILITY, 0]
     status, first, second, beta = room[STATUS, 0], room[FIRST, 0], room[SECOND, 0], room[BETA, 0]
     k = 0
@@ -189,7 +190,7 @@ def find_statuses(kind, mu, p, f, room):
 
 @internal_kernel
 def fill_row(W, kind, mu, p, i, j, alpha, gamma, room, r):
-    """Row r of Newton's matrix: the motion alpha u_i + gamma u_j over the unknowns."""
+    """Write row r of Newton's matrix: the motion alpha u_i + gamma u_j in terms of the unknowns."""
     A, status, first, second, beta = room[MATRIX], room[STATUS, 0], room[FIRST, 0], room[SECOND, 0], room[BETA, 0]
     c, m = 0, 0
     while m < p:
@@ -225,7 +226,7 @@ def eliminate(A, x, size):
         for i in range(k + 1, size):
             factor = A[i, k] * inverse
             if factor != 0.0:
-                # Slices, whose indices begin at zero: only such loops take several numbers at once.
+                # Slices that begin at index zero: only such loops are vectorised.
                 row, pivot = A[i, k + 1 : size], A[k, k + 1 : size]
                 for j in range(row.shape[0]):
                     row[j] -= factor * pivot[j]
@@ -239,7 +240,7 @@ def eliminate(A, x, size):
 
 @internal_kernel
 def sweep(W, b, kind, mu, p, f, room):
-    """One sweep of block Gauss–Seidel: each block solved exactly with the others' forces as they are."""
+    """Do one sweep of block Gauss–Seidel: each block solved exactly with the other forces fixed."""
     mobility = room[MOBILITY, 0]
     k = 0
     while k < p:
@@ -267,11 +268,11 @@ def sweep(W, b, kind, mu, p, f, room):
 
 @internal_kernel
 def solve_block(W, k, n, x, y, mu, f, least):
-    """Forces of the block at row k alone, whose motion without them is (n, x, y).
+    """Return the forces of the block at row k alone, whose motion without them is (n, x, y).
 
-    Off when n ≥ 0. Else u_n = 0 makes f_n = −(n + w·f_t) / W_nn, and what is left is (S + α) f_t = g with the Schur
-    complement S of W_nn, g = w n / W_nn − (x, y). It sticks when α = 0 lies in the cone; else α is the root of
-    |f_t| − μ f_n, which is positive at 0 and negative far out.
+    Off if n ≥ 0. Otherwise u_n = 0 makes f_n = −(n + w·f_t) / W_nn, which leaves (S + α) f_t = g with the Schur
+    complement S of W_nn, g = w n / W_nn − (x, y). It sticks if α = 0 is in the cone; otherwise α is the root of
+    |f_t| − μ f_n, which is positive at 0 and negative for large α.
     """
     f[k], f[k + 1], f[k + 2] = 0.0, 0.0, 0.0
     normal = W[k, k]
@@ -318,7 +319,7 @@ def solve_block(W, k, n, x, y, mu, f, least):
 
 @internal_kernel
 def slid(a, c, d, gx, gy, wx, wy, n, mu, alpha):
-    """(f_n, f_t, |f_t| − μ f_n) of ((a, c), (c, d)) + α."""
+    """Return (f_n, f_t, |f_t| − μ f_n) of ((a, c), (c, d)) + α."""
     determinant = (a + alpha) * (d + alpha) - c * c
     fx = ((d + alpha) * gx - c * gy) / determinant
     fy = ((a + alpha) * gy - c * gx) / determinant
@@ -326,7 +327,7 @@ def slid(a, c, d, gx, gy, wx, wy, n, mu, alpha):
     return fn, fx, fy, math.sqrt(fx * fx + fy * fy) - mu * fn
 
 
-# Solver of the contact problem: bilateral and unilateral rows, Coulomb cones and dry joint friction, unsmoothed.
+# Solver of the contact problem.
 
 
 __all__ = [
@@ -343,41 +344,47 @@ __all__ = [
     "solve_cones",
 ]
 
-# What ``solve_cones`` returns instead of a residual when it has proved that there is no solution.
+# Return value of ``solve_cones`` instead of a residual if there is provably no solution.
 NO_SOLUTION = -1.0
 
-# Newton's steps from one start; of these the first go all the way, the others only as far as they come nearer.
+# Newton steps from one start; the first are full steps, the others are shortened until they reduce the merit.
 NEWTON_STEPS, FULL_STEPS, HALVINGS = 20, 6, 8
-# Starts in all, sweeps that come before a start times its number, and where that number starts anew.
+# Total number of starts; sweeps per start (times its number); and number of starts after which this count restarts.
 ROUNDS, SWEEPS, SWEPT_ROUNDS = 200, 10, 40
-# Starts before a proof is tried, and of each problem of the proof.
+# Starts before a proof is tried, and for each problem of the proof.
 FEW_ROUNDS = 8
-# Proximal-point method: number of steps, first and least ε.
+# Proximal-point method: number of steps, first and smallest ε.
 NEAR_STEPS, FIRST_EPSILON, LEAST_EPSILON = 60, 1e-3, 1e-9
-# A proof holds for all forces up to this times |b| / mobility; its problem is regularised by the second number.
+# A proof covers all forces up to this times |b| / mobility; its problem is regularised by the second number.
 PROVED_FORCE, PROOF_SHIFT, PROOF_STEPS = 1e6, 1e-6, 4
 
 
 @kernel
 def solve_cones(W, b, kind, mu, p, f, room, tolerance):
-    """Forces f of a contact problem, from f as a start; returns its residual, or NO_SOLUTION.
+    """Solve a contact problem for the forces f; return its residual, or NO_SOLUTION.
 
     The residual is the largest error of a block in the units of u, by the natural map with the block's own mobility w
-    (the mean of its diagonal entries): |u| of BOTH_WAYS, |min(w f, u)| of ONE_WAY and of normals, and
-    |w f_t − P(w f_t − u_t)| of tangents, P the projection on the disc of radius μ w f_n; the same of BOX rows, with
-    that on ±μ w. It is zero exactly at solutions, and nothing in it is regularised. One above ``tolerance`` means that
-    no better f was found.
+    (the mean of its diagonal entries): |u| for BOTH_WAYS, |min(w f, u)| for ONE_WAY and normals, and
+    |w f_t − P(w f_t − u_t)| for tangents, with the projection P on the disc of radius μ w f_n; the same for BOX rows,
+    with the projection on ±μ w. It is zero exactly at solutions; nothing in it is regularised. A residual above
+    ``tolerance`` means that no better f was found.
 
     Parameters
     ----------
-    W, b : (p, p), (p,) or more; need not be symmetric in ONE_WAY columns, and may be of deficient rank
-    kind : (p,) int, BOTH_WAYS, ONE_WAY, CONE, TANGENT or BOX
-    mu : (p,) friction coefficients at the CONE rows, bounds of the forces at BOX rows, which may be infinite
-    f : (p,) start, overwritten by the solution or the best that was found
-    room : (CONE_ROOM, p, p) or more, scratch
-    tolerance : residual that is good enough [units of u]
+    W, b : (p or more, p or more) ndarray, (p or more,) ndarray
+        Need not be symmetric in ONE_WAY columns, and may be rank-deficient.
+    kind : (p,) ndarray of int
+        BOTH_WAYS, ONE_WAY, CONE, TANGENT or BOX.
+    mu : (p,) ndarray
+        Friction coefficients at CONE rows, bounds of the forces at BOX rows, possibly infinite.
+    f : (p,) ndarray
+        Start, overwritten by the solution or the best forces found.
+    room : (CONE_ROOM, p or more, p or more) ndarray
+        Scratch.
+    tolerance : float
+        Sufficient residual [units of u].
     """
-    if p == 0:  # of a system that nothing can touch, there is no room either
+    if p == 0:  # without possible contacts there is no scratch either
         return 0.0
     residual = approach_or_draw_near(W, b, kind, mu, p, f, room, tolerance, FEW_ROUNDS)
     if residual <= tolerance:
@@ -389,7 +396,7 @@ def solve_cones(W, b, kind, mu, p, f, room, tolerance):
 
 @internal_kernel
 def approach_or_draw_near(W, b, kind, mu, p, f, room, tolerance, rounds):
-    """:func:`solve_cones` without a proof: one start, then :func:`draw_near`, then up to ``rounds`` starts."""
+    """Do :func:`solve_cones` without a proof: one start, then :func:`draw_near`, then up to ``rounds`` starts."""
     residual = approach(W, b, kind, mu, p, f, room, tolerance, 1)
     if not residual <= tolerance:
         residual = draw_near(W, b, kind, mu, p, f, room, tolerance)
@@ -400,7 +407,7 @@ def approach_or_draw_near(W, b, kind, mu, p, f, room, tolerance, rounds):
 
 @internal_kernel
 def approach(W, b, kind, mu, p, f, room, tolerance, rounds):
-    """:func:`solve_cones` by Newton's method from so many starts: the first is f, then swept and scattered ones."""
+    """Do :func:`solve_cones` by Newton's method from up to ``rounds`` starts: f, then swept and scattered ones."""
     best, swept, mobility = room[BEST, 0], room[SWEPT, 0], room[MOBILITY, 0]
     mobilities(W, kind, p, room)
     residual, merit = measure(W, b, kind, mu, p, f, room)
@@ -425,7 +432,7 @@ def approach(W, b, kind, mu, p, f, room, tolerance, rounds):
                 for k in range(p):
                     swept[k] = f[k]
             residual, merit = measure(W, b, kind, mu, p, f, room)
-        # What is too weak for some problems is too strong for others.
+        # A value too small for some problems is too large for others.
         most = 1e-6 if attempt % 6 < 2 else 1e-3 if attempt % 6 < 4 else 1e-9
         for step in range(NEWTON_STEPS + 1):
             # Written so that NaN is never the best.
@@ -446,7 +453,7 @@ def approach(W, b, kind, mu, p, f, room, tolerance, rounds):
 
 @internal_kernel
 def damped_step(W, b, kind, mu, p, f, room, relative, most, before, damped):
-    """One Newton step, which if ``damped`` is halved until the merit falls; returns residual and merit there."""
+    """Take one Newton step, halved until the merit falls if ``damped``; return residual and merit there."""
     start, goal = room[START, 0], room[GOAL, 0]
     for k in range(p):
         start[k] = f[k]
@@ -475,14 +482,14 @@ def damped_step(W, b, kind, mu, p, f, room, relative, most, before, damped):
 
 @internal_kernel
 def scatter(mobility, p, f, size, attempt):
-    """A start of so large forces times mobility, without pattern, and the same in every run."""
+    """Set a start with forces of order ``size`` / mobility, patternless but the same in every run."""
     for k in range(p):
         f[k] = size / mobility[k] * math.sin(12.9898 * (k + 1) * attempt)
 
 
 @internal_kernel
 def shift(W, b, p, room, epsilon):
-    """W + ε w and b − ε w a of the anchor a into ``room[SHIFTED]``, ``room[SHIFTED_RIGHT, 0]``."""
+    """Write W + ε w and b − ε w a, with the anchor a, to ``room[SHIFTED]`` and ``room[SHIFTED_RIGHT, 0]``."""
     shifted, right, mobility, anchor = room[SHIFTED], room[SHIFTED_RIGHT, 0], room[MOBILITY, 0], room[ANCHOR, 0]
     for k in range(p):
         for m in range(p):
@@ -493,11 +500,11 @@ def shift(W, b, p, room, epsilon):
 
 @internal_kernel
 def draw_near(W, b, kind, mu, p, f, room, tolerance):
-    """Solve (W + ε w) f' + b − ε w f = 0, cones as before, again and again (proximal point); returns the residual.
+    """Solve (W + ε w) f' + b − ε w f = 0, with the same cones, repeatedly (proximal point); return the residual.
 
-    A fixed point solves the problem itself, whatever ε is; if forces are not unique, they stay near the start f. As
-    W + ε w is regular, each of these problems takes few Newton steps. ε falls after a solved
-    problem and grows after an unsolved one. Leaves the best f.
+    A fixed point solves the problem itself for any ε; if forces are not unique, they stay near the start f. As W + ε w
+    is regular, each of these problems takes few Newton steps. ε falls after a solved problem and grows after an
+    unsolved one. Leaves the best f.
     """
     shifted, right = room[SHIFTED], room[SHIFTED_RIGHT, 0]
     kept, anchor = room[KEPT, 0], room[ANCHOR, 0]
@@ -511,7 +518,7 @@ def draw_near(W, b, kind, mu, p, f, room, tolerance):
     for _ in range(NEAR_STEPS):
         shift(W, b, p, room, epsilon)
         left = approach(shifted, right, kind, mu, p, f, room, inner, 1)
-        # ``approach`` has left those of the shifted problem.
+        # ``approach`` has left the mobilities of the shifted problem.
         mobilities(W, kind, p, room)
         residual, _ = measure(W, b, kind, mu, p, f, room)
         if residual < least:
@@ -534,12 +541,12 @@ def draw_near(W, b, kind, mu, p, f, room, tolerance):
 
 @internal_kernel
 def impossible(W, b, kind, mu, p, room):
-    """True when it is proved that no forces up to PROVED_FORCE |b| / w solve the problem.
+    """True if it is proved that no forces up to PROVED_FORCE |b| / w solve the problem.
 
     The proof is a combination d of motions, of any sign for BOTH_WAYS rows, not negative for ONE_WAY rows and normals,
-    zero for tangents and BOX rows. A solution has d·u ≥ 0; but d·u = (Wᵀd)·f + d·b, which is negative when d·b is, and
-    no force that is allowed makes (Wᵀd)·f positive: bodies that close in on each other from all sides. Such a d is what
-    is left of motion, −ε w f, when the problem without friction is solved with ε w added to W.
+    zero for tangents and BOX rows. A solution has d·u ≥ 0; but d·u = (Wᵀd)·f + d·b, which is negative if d·b is and no
+    admissible force makes (Wᵀd)·f positive: bodies that close in on each other from all sides. Such a d is the
+    remaining motion, −ε w f, of the problem without friction solved with ε w added to W.
     """
     proof, none, scale = room[PROOF, 0], room[NO_FRICTION, 0], 0.0
     right, mobility = room[SHIFTED_RIGHT, 0], room[MOBILITY, 0]
@@ -547,7 +554,7 @@ def impossible(W, b, kind, mu, p, room):
         proof[k], none[k], room[ANCHOR, 0, k], scale = 0.0, 0.0, 0.0, max(scale, abs(b[k]))
     mobilities(W, kind, p, room)
     shift(W, b, p, room, PROOF_SHIFT)
-    # What is left of what is left: each time a millionth of what forces can move.
+    # Repeat for the remaining motion: each time a millionth of the motion that forces can cause remains.
     for _ in range(PROOF_STEPS):
         approach(room[SHIFTED], right, kind, none, p, proof, room, 1e-9 * scale, FEW_ROUNDS)
         mobilities(W, kind, p, room)
