@@ -24,7 +24,7 @@ from dynsim.hardware.replay.output import (
     ReplayState,
     Rows,
     TimingStatistics,
-    is_held,
+    is_locked,
     row_type,
 )
 from dynsim.hardware.replay.trajectory import GROUNDED, wheel_offsets
@@ -232,7 +232,7 @@ def recover(folder: Path, out: Path | None = None) -> Record:
     """
     part = folder / PART
     try:
-        if part.is_file() and is_held(part):
+        if part.is_file() and is_locked(part):
             raise RecordError(f"{part}: the replay is still running; wait until it has ended")
         record = whole = _load_if_valid(folder / MEASURED)
         if not part.is_file() and not (whole and whole.complete):
