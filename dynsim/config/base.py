@@ -16,9 +16,9 @@ NonNegative = Annotated[float, Field(ge=0)]
 
 
 def _forbid_conversion(schema: Any) -> None:
-    """Make the numbers of a pydantic core schema take numbers only.
+    """Make all numbers of a pydantic core schema strict.
 
-    Otherwise ``true`` would be read as 1 and the text "1_9.2" as 19.2. Keys are texts and are not changed.
+    Otherwise ``true`` would be read as 1 and the string "1_9.2" as 19.2. Keys are strings and stay as they are.
     """
     if isinstance(schema, dict):
         if schema.get("type") in ("float", "int"):
@@ -32,7 +32,7 @@ def _forbid_conversion(schema: Any) -> None:
 
 
 class StrictModel(BaseModel):
-    """A mapping of a file: unknown keys are errors, and numbers are neither texts nor true."""
+    """Base class of mappings in files: unknown keys are errors; strings and Booleans are not accepted as numbers."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -44,35 +44,50 @@ class StrictModel(BaseModel):
 
 
 class StrictConfig(StrictModel):
-    """A mapping of a scenario file: numbers must be finite too."""
+    """Base class of mappings in scenario files: numbers must also be finite."""
 
     model_config = ConfigDict(allow_inf_nan=False, validate_default=True, defer_build=True)
 
 
 class BodyPoint(StrictConfig):
-    """A point fixed on a body."""
+    """Point fixed on a body."""
 
-    body: str = Field(description="name of the body, or of a frame fixed on one")
-    point_m: Vector3 = Field(default=[0.0, 0.0, 0.0], description="in that body's or frame's axes, from its origin")
+    body: str = Field(description="name of the body, or of a frame fixed to a body")
+    point_m: Vector3 = Field(default=[0.0, 0.0, 0.0], description="coordinates in the axes of the body or frame")
 
 
 def error_at(key: str, message: str) -> PydanticCustomError:
-    """An error for a validator of a whole mapping to raise about one dotted ``key`` within it."""
+    """Return the error that a validator of a whole mapping raises for one dotted ``key`` of the mapping."""
     return PydanticCustomError("value_error", "{message}", {"message": message, "key": key})
 
 
 def check_waypoints(times: Sequence[float], values: Sequence[Any], key: str) -> None:
-    """ValueError unless the times of waypoints increase and there are as many as values, which ``key`` names."""
+    """Check the times of waypoints.
+
+    Parameters
+    ----------
+    times : sequence of float
+        Times of the waypoints [s].
+    values : sequence
+        Values of the waypoints.
+    key : str
+        Key of the values, for the error message.
+
+    Raises
+    ------
+    ValueError
+        If the numbers of times and values differ, or the times do not increase.
+    """
     if len(times) != len(values):
-        raise ValueError(f"{len(times)} times_s and {len(values)} {key}: there must be as many")
+        raise ValueError(f"{len(times)} times_s and {len(values)} {key}: the numbers must be equal")
     if np.any(np.diff(times) <= 0.0):
         raise ValueError("times_s must increase")
 
 
 def unit_vector(values: list[float], name: str) -> NDArray[np.float64]:
-    """``values`` scaled to length one; ValueError when it has none."""
+    """Return ``values`` scaled to length one; raises ValueError if their length is zero."""
     array = np.array(values, dtype=np.float64)
     length = float(np.linalg.norm(array))
     if length < 1e-12:
-        raise ValueError(f"{name} has no direction (length zero)")
+        raise ValueError(f"{name} must not be the zero vector")
     return array / length

@@ -1,4 +1,4 @@
-"""Shell completion of scenario and variant names; imports no large packages, as it runs at every Tab key."""
+"""Shell completion of scenario and variant names; imports no large packages because it runs at every press of Tab."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dynsim.system.shipped import shipped_scenario, shipped_scenarios
 
 
 def scenarios(incomplete: str) -> list[str]:
-    """Names of shipped scenarios and paths of YAML files that begin with the given text."""
+    """Return names of shipped scenarios and paths of YAML files that start with ``incomplete``."""
     from glob import escape
 
     folder, separator, _ = incomplete.rpartition("/")
@@ -21,8 +21,8 @@ def scenarios(incomplete: str) -> list[str]:
 
 
 def variants(ctx: typer.Context, incomplete: str) -> list[str]:
-    """Variants of the scenario on the command line."""
-    # Imported here: the command line loads this module.
+    """Return the variants of the scenario on the command line whose names start with ``incomplete``."""
+    # Imported here because the command line loads this module.
     from dynsim.system.inputs import YamlMapping, is_file, parse_yaml, read_text
 
     # While the option has no value yet, the arguments before it are not parsed.

@@ -1,6 +1,6 @@
 """One-line error messages from pydantic's validation errors: file, line, key, value and fix.
 
-Scenarios and servo maps share it, so that errors of both have the same form.
+Scenarios and servo maps share this module, so their errors have the same form.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from pydantic import BaseModel, ValidationError
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
 
-# Most unknown keys, most other problems in a message, and most characters of a value or key.
+# Limits of a message: number of unknown keys, number of other problems, characters of a value or key.
 UNKNOWN_SHOWN = 20
 OTHERS_SHOWN = 4
 SHOWN_LIMIT = 80
-# Keys whose values select one of several configurations for a mapping.
+# Keys whose value selects the configuration class of a mapping.
 TAGS = ("type", "kind")
 # A list index in a dotted key.
 INDEX = re.compile("[0-9]{1,9}")
@@ -33,16 +33,18 @@ INDEX = re.compile("[0-9]{1,9}")
 
 @dataclass(frozen=True)
 class Origin:
-    """Origin of the values of a scenario, from which messages name the line of a key.
+    """Origin of the values of a scenario; messages use it to show the line of a key.
 
     Attributes
     ----------
     file : Path or str
-        The file, or what else is to be called the source.
+        The file, or another name of the source.
     mappings : tuple
-        What was merged, as read: the variant's difference, then the rest of the file.
+        Merged mappings as read from the file: the changes of the variant first, then the rest of the file.
     overrides : tuple of str
-        Dotted keys that were set on top, and ``overriding``, how that was done.
+        Dotted keys that were overridden.
+    overriding : str
+        Means by which they were overridden, for example a command-line option.
     """
 
     file: Path | str
@@ -51,18 +53,18 @@ class Origin:
     overriding: str = "overrides"
 
     def sets(self, keys: Sequence[int | str]) -> bool:
-        """True when an override set the value at ``keys``, something in it or something that it is in."""
+        """Return True if an override set the value at ``keys``, a value inside it, or a mapping that contains it."""
         own = ".".join(map(str, keys))
         return any(own == key or own.startswith(key + ".") or key.startswith(own + ".") for key in self.overrides)
 
     def line(self, keys: Sequence[int | str]) -> int:
-        """Line of the last of ``keys`` that the file has; 0 when it has none of them."""
-        # The mapping that has most of the keys; of equals the first, because the variant lies over the rest.
+        """Return the line of the last of ``keys`` that is in the file; 0 if the file contains none of the keys."""
+        # The mapping that matches the most keys wins; on a tie the first, because the variant overrides the rest.
         lines = [_line(mapping, keys) for mapping in self.mappings]
         return max(lines, key=lambda depth_and_line: depth_and_line[0], default=(0, 0))[1]
 
     def location(self, keys: Sequence[int | str]) -> str:
-        """``file:line`` of a key, or how it was overridden."""
+        """Return ``file:line`` of a key, or the means by which it was overridden."""
         if self.sets(keys):
             return self.overriding
         return f"{self.file}:{line}" if (line := self.line(keys)) else str(self.file)
@@ -71,7 +73,21 @@ class Origin:
 def unknown_keys(
     error: ValidationError, data: Any, origin: Origin, schema: type[BaseModel], also: Sequence[str] = ()
 ) -> list[str]:
-    """Every unknown key: place, key, and the known one that it is like; at the top, those ``also`` are known."""
+    """Return one message for each unknown key: location, key, and a similar known key.
+
+    Parameters
+    ----------
+    error : ValidationError
+        Error of pydantic.
+    data : Any
+        Data that were validated.
+    origin : Origin
+        Origin of the data.
+    schema : type of BaseModel
+        Schema that the data violate.
+    also : sequence of str
+        Further keys that are known at the top level.
+    """
     texts: list[str] = []
     for problem in error.errors(include_url=False, include_input=False):
         if problem["type"] != "extra_forbidden" or len(texts) > UNKNOWN_SHOWN:
@@ -80,28 +96,28 @@ def unknown_keys(
         known = _fields(schema, problem["loc"][:-1]) + (list(also) if len(keys) == 1 else [])
         suggestion = suggest(str(keys[-1]), known)
         if not suggestion and known:
-            suggestion = f"; known here: {', '.join(known)}"
+            suggestion = f"; known keys: {', '.join(known)}"
         texts.append(f"{origin.location(keys)}: {dotted(keys)}: unknown key{suggestion}")
     return texts
 
 
 def explain(error: ValidationError, data: Any, origin: Origin, unknown: Sequence[str]) -> str:
-    """One line with file:line, key, value and fix of each problem: unknown keys first, then others."""
+    """Return one line with file:line, key, value and fix of each problem; unknown keys come first."""
     texts = list(dict.fromkeys(unknown))
     shown = texts[:UNKNOWN_SHOWN] + (["and more"] if len(texts) > UNKNOWN_SHOWN else [])
     problems = error.errors(include_url=False, include_input=False)
     others: dict[str, str] = {}
-    # Of a list of fixed length: one problem for every entry that it lacks.
-    alike = Counter((problem["type"], problem["loc"][:-1]) for problem in problems)
+    # pydantic reports one problem for each missing entry of a list of fixed length.
+    siblings = Counter((problem["type"], problem["loc"][:-1]) for problem in problems)
     for problem in problems:
         if problem["type"] == "extra_forbidden":
             continue
-        keys, value, text = _problem(problem, data, alike[problem["type"], problem["loc"][:-1]])
+        keys, value, text = _problem(problem, data, siblings[problem["type"], problem["loc"][:-1]])
         key = dotted(keys)
         # A misspelt key also makes the right one missing.
         misspelt = problem["type"] == "missing" and any(f"did you mean {str(keys[-1])!r}?" in other for other in texts)
         if not misspelt:
-            # A value that may be of several types has a problem with each of them: the first is told.
+            # pydantic reports one problem for each type of a union: show only the first.
             others.setdefault(key, f"{origin.location(keys)}: {key and f'{key}{value}: '}{text}")
     shown += itertools.islice(others.values(), OTHERS_SHOWN)
     if (more := len(others) - OTHERS_SHOWN) > 0:
@@ -109,15 +125,18 @@ def explain(error: ValidationError, data: Any, origin: Origin, unknown: Sequence
     return "; ".join(shown)
 
 
-def _problem(problem: ErrorDetails, data: Any, alike: int) -> tuple[list[int | str], str, str]:
-    """Keys of a value, " = value" where it is short, and what is wrong; ``alike`` problems are in one list."""
+def _problem(problem: ErrorDetails, data: Any, siblings: int) -> tuple[list[int | str], str, str]:
+    """Return the keys of a value, " = value" (empty for mappings and lists), and the problem.
+
+    ``siblings`` is the number of problems of the same type in the same list.
+    """
     context, kind, message = problem.get("ctx", {}), problem["type"], problem["msg"].removeprefix("Value error, ")
     loc = (*problem["loc"], *context.get("key", "").split("."))
     keys, value, exists = _locate(data, tuple(part for part in loc if part != ""))
     if kind in ("union_tag_invalid", "union_tag_not_found"):
         return _wrong_tag(keys, value, context)
     if kind == "missing" and isinstance(problem["loc"][-1], int) and isinstance(value, list):
-        text = f"has {len(value)} entries, {len(value) + alike} are needed"
+        text = f"has {len(value)} entries; it must have {len(value) + siblings}"
     elif kind == "missing":
         text = "is missing; add it"
     elif kind in ("model_type", "dict_type", "model_attributes_type"):
@@ -140,21 +159,21 @@ def _problem(problem: ErrorDetails, data: Any, alike: int) -> tuple[list[int | s
 
 
 def _wrong_tag(keys: list[int | str], value: Any, context: Mapping[str, Any]) -> tuple[list[int | str], str, str]:
-    """Of a mapping whose ``type`` (or ``kind``) says which one it is: it names none, is misspelt, or is not there."""
+    """Return keys, value and problem of a mapping whose ``type`` (or ``kind``) is unknown, misspelt or missing."""
     tag = context["discriminator"].strip("'")
     known = context.get("expected_tags", "").replace("'", "")
     entries = value if isinstance(value, Mapping) else {}
     if named := entries.get(tag):
-        text = f"unknown {tag} {value_text(named)}{suggest(str(named), known.split(', '))}; known: {known}"
+        text = f"unknown {tag} {value_text(named)}{suggest(str(named), known.split(', '))}; choices: {known}"
         return [*keys, tag], "", text
     near = difflib.get_close_matches(tag, [key for key in entries if isinstance(key, str)], n=1)
     if near:
         return [*keys, near[0]], "", f"unknown key; did you mean {tag!r}?"
-    return [*keys, tag], "", "is missing; it says which one" + (f": {known}" if known else "")
+    return [*keys, tag], "", "is missing; add it" + (f" (choices: {known})" if known else "")
 
 
 def key_text(key: object) -> str:
-    """A key for a message: in one line and not too long."""
+    """Return a key for a message, on one line and of limited length."""
     text = str(key)
     text = text if len(text) <= SHOWN_LIMIT else text[:SHOWN_LIMIT] + "…"
     return text if text.isprintable() else repr(text)[1:-1]
@@ -165,7 +184,7 @@ def dotted(keys: Sequence[int | str]) -> str:
 
 
 def value_text(value: object) -> str:
-    """A value for a message: in one line and not too long."""
+    """Return a value for a message, on one line and of limited length."""
     if isinstance(value, str):
         return repr(value if len(value) <= SHOWN_LIMIT else value[:SHOWN_LIMIT] + "…")
     text = repr(value)
@@ -174,18 +193,18 @@ def value_text(value: object) -> str:
 
 def suggest(word: str, known: Any) -> str:
     if len(word) > SHOWN_LIMIT:
-        return ""  # the comparison takes the square of the length
+        return ""  # the time of the comparison grows with the square of the length
     near = difflib.get_close_matches(word, [str(k) for k in itertools.islice(known, 1000)], n=1, cutoff=0.6)
     return f"; did you mean {near[0]!r}?" if near else ""
 
 
 def _locate(data: Any, loc: tuple[int | str, ...]) -> tuple[list[int | str], Any, bool]:
-    """Keys of a pydantic location without its union tags; the value there, and whether there is one."""
+    """Return the keys of a pydantic location without its union tags, the value there, and whether it exists."""
     keys: list[int | str] = []
     node, exists = data, True
     for part in loc:
         if isinstance(node, list) and isinstance(part, str) and INDEX.fullmatch(part):
-            part = int(part)  # of a dotted key
+            part = int(part)  # a list index in a dotted key
         in_mapping = isinstance(node, Mapping) and part in node
         in_list = isinstance(node, list) and isinstance(part, int) and part < len(node)
         if exists and (in_mapping or in_list):
@@ -202,7 +221,7 @@ def _locate(data: Any, loc: tuple[int | str, ...]) -> tuple[list[int | str], Any
 
 
 def _line(mapping: Any, keys: Sequence[int | str]) -> tuple[int, int]:
-    """How many of ``keys`` lead into a mapping of a YAML file, and the line of the last of them; (0, 0) for none."""
+    """Return how many of ``keys`` exist in a mapping of a YAML file, and the line of the last; (0, 0) if none does."""
     depth = line = 0
     node = mapping
     for key in keys:
@@ -215,7 +234,7 @@ def _line(mapping: Any, keys: Sequence[int | str]) -> tuple[int, int]:
 
 
 def _fields(schema: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
-    """Keys that data of a schema may have at a pydantic location."""
+    """Return the keys that a schema allows at a pydantic location."""
     classes = [schema]
     for part in loc:
         fields = [c.model_fields[part] for c in classes if isinstance(part, str) and part in c.model_fields]
@@ -228,7 +247,7 @@ def _fields(schema: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
 
 
 def _models(annotation: Any) -> list[type[BaseModel]]:
-    """Configurations within an annotation; a choice by ``type`` (``families.MemberField``) has them in ``models``."""
+    """Return the configuration classes in an annotation; ``families.MemberField`` lists them in ``models``."""
     if isinstance(annotation, type) and not isinstance(annotation, types.GenericAlias):
         return [annotation] if issubclass(annotation, BaseModel) else []
     if callable(choices := getattr(annotation, "models", None)):
@@ -242,5 +261,5 @@ def _literals(model: type[BaseModel]) -> tuple[Any, ...]:
 
 
 def listed(names: Sequence[str]) -> str:
-    """Names for a line of text: all of a few, the first and the last of many."""
+    """Return up to four names joined by commas; of more names only the first, the last and their number."""
     return ", ".join(names) if len(names) <= 4 else f"{names[0]} … {names[-1]} ({len(names)})"

@@ -8,28 +8,28 @@ from dynsim.errors import DynsimError
 
 
 class ServoMapError(DynsimError):
-    """A servo map, fault script or gate file that cannot be read or is not valid (file, line, key, fix)."""
+    """Unreadable or invalid servo map, fault script or gate file; the message has file, line, key and fix."""
 
 
 class PortError(DynsimError):
-    """The port cannot be opened, is held by another process, or died."""
+    """The port cannot be opened, is in use by another process, or failed."""
 
     exit_code: ClassVar[int] = 3
 
 
 class VerificationFailed(DynsimError):
-    """The servos on the bus are not the ones of the map, or are not fit to move."""
+    """The servos on the bus do not match the servo map or are not ready to move."""
 
     exit_code: ClassVar[int] = 3
 
 
 class ReplayAborted(DynsimError):
-    """An abort rule fired; the fault policy was carried out and the reason is in the log.
+    """An abort rule fired; the fault policy was applied and the log contains the reason.
 
     Attributes
     ----------
     result : ReplayResult
-        End state, measured record and timing of the run until then.
+        End state, measured record and timing of the run up to the abort.
     """
 
     exit_code: ClassVar[int] = 4
@@ -40,18 +40,18 @@ class ReplayAborted(DynsimError):
 
 
 class ReplayInterrupted(ReplayAborted):
-    """The user (or a signal) stopped the replay."""
+    """The user or a signal stopped the replay."""
 
     exit_code: ClassVar[int] = 130
 
 
 class OutputsFailed(DynsimError):
-    """The motion went well, but the log, the record or what else tells of it could not be written."""
+    """The motion succeeded, but the log, the record or another output could not be written."""
 
     exit_code: ClassVar[int] = 1
 
 
 class ComparisonGateFailed(DynsimError):
-    """The measured run is further from the simulated one than the gate file allows."""
+    """The measured run differs from the simulated run by more than the gate file allows."""
 
     exit_code: ClassVar[int] = 5

@@ -1,7 +1,8 @@
-"""Check of the sense of rotation: turns each joint by a small angle and back, and compares with the servo map.
+"""Check of the direction of rotation: turn each joint by a small angle and back, and compare with the servo map.
 
-A nudge is a replay of one servo, with all checks and abort rules of a replay: the servo is verified, armed where it
-stands, moved by 3° and back at 0.1 rad/s at most, and its torque is switched off. All other servos have torque off.
+A nudge is a replay of one servo, with all checks and abort rules of a replay: the servo is verified, armed at its
+present position, moved by 3° and back at no more than 0.1 rad/s, and its torque is switched off. The torque of all
+other servos is off.
 """
 
 from __future__ import annotations
@@ -27,29 +28,29 @@ from dynsim.hardware.servo_map import MappedServo, ServoMap, refuse_torque
 
 ANGLE = math.radians(3.0)
 SPEED = 0.1
-"""Top speed of a nudge [rad/s]."""
+"""Maximum speed of a nudge [rad/s]."""
 PAUSE = 0.5
-"""Pause at the far end [s], for a person to see the motion."""
+"""Pause at the far end [s], so that a person can see the motion."""
 KNOTS = 31
-"""Knots of each leg: the interpolant is within 1e-7 rad of the quintic."""
-YIELDS = 0.75
-"""Following error that ends a nudge, in parts of its angle, so that a blocked joint is not loaded further."""
+"""Number of knots per leg; the interpolant is within 1e-7 rad of the quintic."""
+ERROR_LIMIT = 0.75
+"""Following error that ends a nudge, as a fraction of its angle; it limits the load on a blocked joint."""
 MOVED = 0.5
-"""Least motion from which the sense of rotation is determined, in parts of the angle."""
+"""Minimum motion from which the direction of rotation is determined, as a fraction of the angle."""
 
 
 @dataclass(frozen=True)
 class Nudge:
-    """What one joint did.
+    """Result of the nudge of one joint.
 
     Attributes
     ----------
     joint : str
     id : int
     asked, moved : float
-        Way out of the goals and of the servo, in the map's sense [rad].
+        Commanded and measured displacement at the far end, positive as in the servo map [rad].
     ticks : int
-        Way out in the servo's own count.
+        Measured displacement in servo ticks.
     """
 
     joint: str
@@ -60,12 +61,12 @@ class Nudge:
 
     @property
     def followed(self) -> bool:
-        """The servo went where it was sent."""
+        """True if the servo moved in the commanded direction by at least ``MOVED`` of the commanded angle."""
         return self.moved / self.asked >= MOVED
 
 
 class _OneServo:
-    """A bus on which a broadcast ping finds one servo: the others are none of this replay's business."""
+    """Bus on which a broadcast ping returns one servo only; the replay ignores all other servos."""
 
     def __init__(self, bus: Bus, id_: int) -> None:
         self._bus = bus
@@ -81,23 +82,41 @@ class _OneServo:
 def nudge(
     servo_map: ServoMap, servo: MappedServo, bus: Bus, clock: Clock, *, live: bool, stop: StopRequest | None = None
 ) -> Nudge | None:
-    """Turn one joint 3° and back; None where ``live`` is false: the servo is verified then, and nothing moves.
+    """Turn one joint by 3° and back.
 
-    It goes in the positive sense of the map, or in the negative one where the positive limit is too near.
+    The joint turns in the positive direction of the map, or in the negative direction if the upper limit is too close.
+
+    Parameters
+    ----------
+    servo_map : ServoMap
+        Map with the servo.
+    servo : MappedServo
+        Servo to move.
+    bus, clock : Bus, Clock
+        Bus and clock of the replay.
+    live : bool
+        If False, verify the servo without moving it.
+    stop : StopRequest, optional
+        Request of the user to stop.
+
+    Returns
+    -------
+    Nudge or None
+        Measured motion; None if ``live`` is False.
 
     Raises
     ------
     VerificationFailed
-        A servo of the map has its torque on (what holds the robot must not be released by the way), this one is not fit
-        to move, or has no room.
+        If a servo of the map has its torque on (it may be holding the robot, and a nudge ends with torque off), or
+        this servo is not ready to move or is too close to its limits.
     ReplayInterrupted, ReplayAborted
-        The user or an abort rule ended the nudge; torque is off.
+        If the user or an abort rule ended the nudge; torque is off.
     """
     refuse_torque(bus, servo_map.servos)
     tick = read_ticks(bus, [servo])[servo.id]
     start = servo.to_angle(tick)
-    distance = _way(servo, start)
-    single = _alone(servo_map, servo)
+    distance = _signed_distance(servo, start)
+    single = _single_servo_map(servo_map, servo)
     motion = CheckedMotion(path=_out_and_back(start, distance), plan=plan_cycle(single, single.bus.rate))
     replay = Replay(motion, single, cast(Bus, _OneServo(bus, servo.id)), clock, live=live, stop=stop)
     result = replay.run()
@@ -106,7 +125,7 @@ def nudge(
             raise VerificationFailed(result.fault.text)
         kind = ReplayInterrupted if result.fault.cause == Cause.INTERRUPTED else ReplayAborted
         text = f"{servo.joint}: {result.fault.cause} in {result.fault_state.name}: {result.fault.text}"
-        raise kind(f"{text}; robot left {result.end_state}", result=result)
+        raise kind(f"{text}; end state: {result.end_state}", result=result)
     if not live:
         return None
     angles = result.record[servo.kind.follows.position][:, 0][result.record["state"] == ReplayState.REPLAY]
@@ -115,17 +134,25 @@ def nudge(
 
 
 def swapped(servo_map: ServoMap, agrees: Mapping[str, bool]) -> dict[str, int]:
-    """The sign that the map should have for every joint that moved against the sense of the map."""
+    """Return the corrected sign of every joint that moved against the direction in the map.
+
+    Parameters
+    ----------
+    servo_map : ServoMap
+        Map whose signs were checked.
+    agrees : mapping of str to bool
+        Whether each joint moved as in the map; joints that are missing count as correct.
+    """
     return {servo.joint: -servo.sign for servo in servo_map.servos if not agrees.get(servo.joint, True)}
 
 
-def _way(servo: MappedServo, start: float) -> float:
+def _signed_distance(servo: MappedServo, start: float) -> float:
     low, high = servo.position_limits
     if start + ANGLE <= high:
         return ANGLE
     if start - ANGLE >= low:
         return -ANGLE
-    raise VerificationFailed(f"{servo.joint} has no room for {math.degrees(ANGLE):g}° between its limits")
+    raise VerificationFailed(f"{servo.joint} is less than {math.degrees(ANGLE):g}° from both limits; move it by hand")
 
 
 def _out_and_back(start: float, distance: float) -> Path:
@@ -138,11 +165,11 @@ def _out_and_back(start: float, distance: float) -> Path:
     return Path(time, position, rates[:-1], rates[1:])
 
 
-def _alone(servo_map: ServoMap, servo: MappedServo) -> ServoMap:
-    """The map of one servo that yields to what is in its way, and is limp afterwards."""
+def _single_servo_map(servo_map: ServoMap, servo: MappedServo) -> ServoMap:
+    """Return a map of one servo that stops at an obstacle and ends with its torque off."""
     watched, alone = copy.copy(servo), copy.copy(servo_map)
     if servo.in_position_mode:
-        bound = min(YIELDS * ANGLE, servo.kind.following_error)
+        bound = min(ERROR_LIMIT * ANGLE, servo.kind.following_error)
         watched.kind = servo.kind.model_copy(update={"following_error": bound})
     alone.servos = (watched,)
     alone.safety = servo_map.safety.model_copy(

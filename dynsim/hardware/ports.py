@@ -1,4 +1,4 @@
-"""Opening of a bus by the name of its port, real or virtual."""
+"""Open a bus by the name of its real or virtual port."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from dynsim.hardware.virtual.line import VirtualPort, line_for_map
 
 VIRTUAL = "virtual"
 PSEUDO_TERMINAL_LATENCY = 0.05
-"""Latency allowed to virtual servos behind a pseudo-terminal, as a busy computer may suspend their process [s]."""
+"""Latency allowed for virtual servos on a pseudo-terminal, because a busy computer may suspend their process [s]."""
 
 
 @contextmanager
@@ -30,16 +30,34 @@ def bus_on(
     posture: Mapping[str, float] | None = None,
     in_wall_time: bool = False,
 ) -> Iterator[tuple[DynamixelBus, Clock]]:
-    """The bus behind a port name, "virtual" being servos in memory on a virtual clock, or ``in_wall_time``.
+    """Open the bus of a port and close it when the block ends.
 
-    ``script`` and ``plant`` are for virtual servos, and so is ``posture``, in which they stand at first [rad by joint].
+    Parameters
+    ----------
+    port : str
+        Serial device, or "virtual" for virtual servos in this process.
+    servo_map : ServoMap
+        Servos and settings of the bus.
+    script : FaultScript, optional
+        Faults of the virtual servos.
+    plant : optional
+        Plant that the virtual servos drive.
+    posture : mapping of str to float, optional
+        Initial joint angles of the virtual servos [rad].
+    in_wall_time : bool, optional
+        If True, virtual servos run in wall time; default: on a virtual clock.
+
+    Yields
+    ------
+    bus : DynamixelBus
+    clock : Clock
 
     Raises
     ------
     PortError
-        The port cannot be opened.
+        If the port cannot be opened.
     VerificationFailed
-        The adapter's latency timer is too long for the loop.
+        If the latency timer of the adapter is too long for the control loop.
     """
     clock: Clock
     if port == VIRTUAL:
@@ -51,7 +69,7 @@ def bus_on(
         timer = latency_timer(port)
         if timer is not None and timer > 1:
             raise VerificationFailed(
-                f"{port}: the adapter's latency timer is {timer} ms, the loop needs 1 ms: "
+                f"{port}: the latency timer of the adapter is {timer} ms (limit 1 ms); set it with "
                 f"echo 1 | sudo tee /sys/bus/usb-serial/devices/{Path(port).resolve().name}/latency_timer"
             )
         handler = open_serial_port(port, servo_map.bus.baud)

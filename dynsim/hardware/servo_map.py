@@ -1,10 +1,11 @@
-"""The servo map: its schema, its checks and its files; servos, the columns of a record they follow, and limits.
+"""Servo maps: schema, checks and files, conversions between joints and servos, safety settings, and calibration.
 
 Joint angle [rad] and servo position [ticks] are related by
 
     tick = zero_tick + sign · gear · angle / (2π/4096)
 
-``gear`` being servo turns per joint turn. Angles are radians inside; a key whose unit is not SI carries it in its name.
+where ``gear`` is servo turns per joint turn. Angles are radians internally; a key with a unit other than SI has the
+unit in its name.
 """
 
 from __future__ import annotations
@@ -55,16 +56,16 @@ from dynsim.snake.lifting import Lifts
 from dynsim.system.files import file_name, write_text
 from dynsim.system.inputs import is_file, parse_yaml, read_text
 
-# YAML files for hardware (servo maps, fault scripts, gates) as pydantic models; errors name file, line and key.
+# Read YAML files for hardware (servo maps, fault scripts, gates) into pydantic models; errors have file, line and key.
 
 
 Objection = tuple[str, str]
-"""Dotted key of a file, and the reason why its value is refused."""
+"""Dotted key of a file, and the reason why its value is rejected."""
 
 
 @dataclass(frozen=True)
 class Within:
-    """Annotation of a number from ``low`` to ``high``; its error gives the reason and a valid value."""
+    """Annotation of a number from ``low`` to ``high``; the error has the reason ``why`` and the valid range."""
 
     low: float
     high: float
@@ -89,22 +90,31 @@ _Schema = TypeVar("_Schema", bound=BaseModel)
 
 
 def rounded_up(value: float) -> float:
-    """A short number to offer instead of one that was refused, not below ``value``: to 1e-4."""
+    """Round up to a multiple of 1e-4, for the valid value in an error message."""
     return math.ceil(value * 1e4) / 1e4
 
 
 def read_yaml(path: Path, schema: type[_Schema], context: dict[str, Any] | None = None) -> _Schema:
-    """Read YAML into a pydantic model, whose validators are given ``context``; see :func:`read_located`."""
+    """Read YAML into a pydantic model; see :func:`read_located`."""
     return read_located(path, schema, context)[0]
 
 
 def read_located(path: Path, schema: type[_Schema], context: dict[str, Any] | None = None) -> tuple[_Schema, Origin]:
-    """The same, with where its keys are in the file.
+    """Read YAML into a pydantic model, and return it with the location of its keys in the file.
+
+    Parameters
+    ----------
+    path : Path
+        YAML file.
+    schema : type of BaseModel
+        Model of the file.
+    context : dict, optional
+        Context that is passed to the validators.
 
     Raises
     ------
     ServoMapError
-        Missing file, bad YAML or bad entry; the message holds file, line and key.
+        If the file is missing, is not YAML or has an invalid entry; the message has file, line and key.
     """
     data = parse_yaml(read_text(path, ServoMapError), ServoMapError, str(path))
     if not isinstance(data, dict):
@@ -116,19 +126,19 @@ def read_located(path: Path, schema: type[_Schema], context: dict[str, Any] | No
         raise ServoMapError(explain(error, data, origin, unknown_keys(error, data, origin, schema))) from None
 
 
-# Sections of a servo map that concern all servos: serial line, supply, and abort limits.
+# Sections of a servo map that apply to all servos: serial line, supply, and abort limits.
 
 
 LONGEST_REACTION = 0.5
-"""Longest time from the first cycle that shows a fault to its declaration by a rule [s]."""
+"""Maximum time from the first cycle with a fault to the abort [s]."""
 STOP_CYCLES = 3
-"""Least number of cycles of a stop along the path."""
+"""Minimum number of cycles of a stop along the path."""
 ROUNDED = 1e-9
-"""Relative rounding error by which a number of cycles may exceed a time."""
+"""Relative rounding error allowed when a number of cycles is compared with a time."""
 
 FaultPolicy = Literal["hold", "decelerate", "off"]
 
-# The servos know 4.5 Mbit/s, the client library does not.
+# The servos support 4.5 Mbit/s, the client library does not.
 _BAUD_CHOICES = [rate for rate in BAUD_RATES if rate <= 4_000_000]
 
 
@@ -138,22 +148,22 @@ class BusSettings(StrictConfig):
     baud: int = Field(3_000_000, json_schema_extra={"enum": [*_BAUD_CHOICES]}, description="bit rate [bit/s]")
     rate: Positive = Field(200.0, description="goal and state cycles per second [Hz]")
     latency: Annotated[
-        Positive, Within(1e-4, 2.54, "s", "no adapter answers at once, and no watchdog waits longer")
-    ] = Field(2e-3, description="what adapter and operating system may add to an answer [s]")
-    return_delay: float = Field(0.0, ge=0, le=508e-6, description="longest return delay a servo may have stored [s]")
+        Positive, Within(1e-4, 2.54, "s", "must be long enough for an adapter and at most the longest watchdog")
+    ] = Field(2e-3, description="maximum delay of an answer by adapter and operating system [s]")
+    return_delay: float = Field(0.0, ge=0, le=508e-6, description="maximum return delay time stored in the servos [s]")
 
     @model_validator(mode="after")
     def _baud_is_one_of_the_servos(self) -> BusSettings:
         if self.baud not in _BAUD_CHOICES:
-            raise error_at("baud", f"is not one of {', '.join(map(str, _BAUD_CHOICES))}")
+            raise error_at("baud", f"must be one of {', '.join(map(str, _BAUD_CHOICES))}")
         return self
 
 
 class Supply(StrictConfig):
-    """Voltage range in which the robot may move."""
+    """Range of the supply voltage in which the robot may move."""
 
-    lowest: Positive = Field(10.0, description="[V]")
-    highest: Positive = Field(14.8, description="[V]")
+    lowest: Positive = Field(10.0, description="minimum voltage [V]")
+    highest: Positive = Field(14.8, description="maximum voltage [V]")
 
 
 class Safety(StrictConfig):
@@ -161,111 +171,112 @@ class Safety(StrictConfig):
 
     policy: FaultPolicy = Field(
         "decelerate",
-        description="on a fault: freeze where the robot is; slow down along the path and hold; release the torque",
+        description="reaction to a fault: `hold` the present position, `decelerate` along the path and hold, or switch "
+        "torque `off`",
     )
-    stop_time: float = Field(0.3, gt=0, le=3.0, description="time in which `decelerate` comes to rest [s]")
-    run_up: Annotated[Positive, Within(0.01, 1e5, "rad/s²", "takes minutes, or is a knock")] = Field(
-        2.0, description="acceleration of the stretch added where a record begins or ends in motion [rad/s²]"
-    )
-    approach_velocity: Annotated[Positive, Within(1e-3, 1.0, "rad/s", "nobody has checked the way to the start")] = (
-        Field(0.3, description="top speed of the move to the start posture [rad/s]")
-    )
+    stop_time: float = Field(0.3, gt=0, le=3.0, description="duration of a stop by `decelerate` [s]")
+    run_up: Annotated[
+        Positive, Within(0.01, 1e5, "rad/s²", "must allow a run-up that is neither endless nor a jerk")
+    ] = Field(2.0, description="acceleration of the run-up or run-out if a record starts or ends in motion [rad/s²]")
+    approach_velocity: Annotated[
+        Positive, Within(1e-3, 1.0, "rad/s", "must be slow, because the move to the start is not checked")
+    ] = Field(0.3, description="maximum speed of the move to the start posture [rad/s]")
     start_distance: Annotated[
-        Positive, Within(1e-3, 2 * math.pi, "rad", "no joint would ever, or always, be asked about")
-    ] = Field(0.5, description="a joint further than this from the start posture is asked about once more [rad]")
-    watchdog: float = Field(
-        0.2, ge=0.02, le=2.54, description="servos stop by themselves when the bus is silent for this long [s]"
-    )
+        Positive, Within(1e-3, 2 * math.pi, "rad", "must ask about some joints, but not about all")
+    ] = Field(0.5, description="a joint farther than this from the start posture needs a second confirmation [rad]")
+    watchdog: float = Field(0.2, ge=0.02, le=2.54, description="servos stop if the bus is silent for this long [s]")
     missed_cycles: int = Field(
-        3, ge=1, le=100, description="consecutive cycles of one servo without a status that abort"
+        3, ge=1, le=100, description="consecutive cycles without status from a servo before an abort"
     )
-    late_cycles: int = Field(5, ge=1, le=1000, description="consecutive late cycles that abort")
-    following_cycles: int = Field(5, ge=1, le=100, description="consecutive cycles beyond following_error that abort")
-    torque_cycles: int = Field(10, ge=1, le=100, description="consecutive cycles beyond limits.torque that abort")
-    temperature_max: Positive = Field(65.0, description="of a servo, beyond which the replay aborts [°C]")
-    supply: Supply = Field(Supply(), description="beyond which the replay aborts, or does not start")
+    late_cycles: int = Field(5, ge=1, le=1000, description="consecutive late cycles before an abort")
+    following_cycles: int = Field(
+        5, ge=1, le=100, description="consecutive cycles beyond following_error before an abort"
+    )
+    torque_cycles: int = Field(10, ge=1, le=100, description="consecutive cycles beyond limits.torque before an abort")
+    temperature_max: Positive = Field(65.0, description="servo temperature above which the replay aborts [°C]")
+    supply: Supply = Field(Supply(), description="voltage range outside which the replay aborts or does not start")
     at_end: Literal["off", "hold"] = Field(
-        "off", description="torque after a run that went well; a robot that falls when limp holds"
+        "off", description="torque after a successful run; use `hold` for a robot that falls without torque"
     )
 
 
 def objections_to_times(bus: BusSettings, safety: Safety) -> Iterable[Objection]:
-    """Rules that would fire too late to matter at the rate of the map, and stops shorter than cycles."""
+    """Yield abort rules that fire too late at the rate of the map, and stops shorter than the cycles they need."""
     if bus.latency >= safety.watchdog:
-        yield "bus.latency", "is not below safety.watchdog: one lost answer would trip the watchdogs"
+        yield "bus.latency", "must be below safety.watchdog, or one lost answer would trip the watchdogs"
     for key in ("missed_cycles", "late_cycles", "following_cycles", "torque_cycles"):
         reaction = getattr(safety, key) / bus.rate
         if reaction > LONGEST_REACTION * (1 + ROUNDED):
             most = int(LONGEST_REACTION * bus.rate * (1 + ROUNDED))
             fix = f"use {most} or less" if most else "use a higher bus.rate"
-            yield f"safety.{key}", f"takes {reaction:.3g} s at {bus.rate:g} Hz, reactions {LONGEST_REACTION:g} s; {fix}"
+            yield f"safety.{key}", f"takes {reaction:.3g} s at {bus.rate:g} Hz (limit {LONGEST_REACTION:g} s); {fix}"
     if safety.missed_cycles / bus.rate >= safety.watchdog:
         yield (
             "safety.missed_cycles",
-            f"takes {safety.missed_cycles / bus.rate:.3g} s at {bus.rate:g} Hz: the watchdogs would trip first, after "
-            f"{safety.watchdog:g} s; use fewer, or a longer safety.watchdog",
+            f"takes {safety.missed_cycles / bus.rate:.3g} s at {bus.rate:g} Hz, but the watchdogs trip after "
+            f"{safety.watchdog:g} s; use fewer cycles or a longer safety.watchdog",
         )
     if safety.stop_time < STOP_CYCLES / bus.rate:
         yield (
             "safety.stop_time",
-            f"is less than {STOP_CYCLES} cycles of {bus.rate:g} Hz; use {rounded_up(STOP_CYCLES / bus.rate):g} or more",
+            f"is below {STOP_CYCLES} cycles at {bus.rate:g} Hz; use {rounded_up(STOP_CYCLES / bus.rate):g} or more",
         )
 
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _CHECKOUT = _PACKAGE.parent / "scenarios" / "hardware"
 SHIPPED = _CHECKOUT if _CHECKOUT.is_dir() else _PACKAGE / "shipped_scenarios" / "hardware"
-"""Folder of the servo maps that come with dynsim."""
+"""Folder of the servo maps that are shipped with dynsim."""
 
 
 HIGHEST_SUPPLY, RATED_SUPPLY = 14.8, 12.0
-"""Highest recommended supply of the MX series, and supply of its data sheet [V]; speed and torque grow with it."""
-FURTHEST_OFF = 1.0
-"""Largest limit on the following error of a position servo; a larger one would have no effect [rad]."""
+"""Maximum recommended supply of the MX series, and supply in its data sheet [V]; speed and torque grow with it."""
+MAX_FOLLOWING_ERROR = 1.0
+"""Largest limit on the following error of a position servo; a larger limit would have no effect [rad]."""
 ROOM = 20.0
-"""Room temperature, which a servo that has not moved yet has [°C]."""
+"""Room temperature, assumed for a servo that has not moved yet [°C]."""
 
-_NO_LIMIT = "bounds nothing that a servo can do, or lets nothing pass"
+_NO_LIMIT = "would have no effect, or reject every motion"
 
 
 class Follows(StrictConfig):
-    """Signals of the record a servo follows."""
+    """Signals of the record that a servo follows."""
 
-    position: str = Field(description="signal with the joint's angle [rad]")
-    velocity: str = Field(description="signal with its rate [rad/s]")
+    position: str = Field(description="signal with the joint angle [rad]")
+    velocity: str = Field(description="signal with the joint rate [rad/s]")
     torque: str | None = Field(
-        None, description="signal with its torque [N m], which the offline check compares with limits.torque"
+        None, description="signal with the joint torque [N m], which the offline check compares with limits.torque"
     )
     rates: Literal["continuous", "held"] = Field(
         "continuous",
-        description="the rate changes smoothly between samples, or is held until the next one (a sampled controller)",
+        description="joint rate between samples: changes smoothly, or is held (sampled controller)",
     )
 
 
 class Limits(StrictConfig):
-    """What a joint may do.
+    """Limits of a joint.
 
-    The default of the acceleration lets the start of the published arm's record pass, which jumps to 2.6 rad/s within
-    5 ms; a joint that turns a load wants less. That of the jerk refuses a zigzag of 2 mrad every 5 ms.
+    The default acceleration accepts the start of the record of the published arm, which jumps to 2.6 rad/s within 5 ms;
+    use less for a joint that turns a load. The default jerk rejects a zigzag of 2 mrad every 5 ms.
     """
 
     position_deg: tuple[float, float] | None = Field(
-        None, description="lowest and highest joint angle [°]; required in position mode, not for wheels"
+        None, description="minimum and maximum joint angle [°]; required in position mode, not for wheels"
     )
-    velocity: Positive = Field(description="highest joint speed [rad/s]")
+    velocity: Positive = Field(description="maximum joint speed [rad/s]")
     torque: Positive = Field(description="joint torque at which the replay aborts [N m]")
     acceleration: Annotated[Positive, Within(0.01, 1e5, "rad/s²", _NO_LIMIT)] = Field(
-        2000.0, description="highest acceleration of the path, between samples too [rad/s²]"
+        2000.0, description="maximum acceleration of the path, including between samples [rad/s²]"
     )
     jerk: Annotated[Positive, Within(0.01, 1e7, "rad/s³", _NO_LIMIT)] = Field(
-        60_000.0, description="highest change of acceleration, averaged in magnitude over 0.1 s [rad/s³]"
+        60_000.0, description="maximum mean magnitude of the jerk over 0.1 s [rad/s³]"
     )
     shaking: Annotated[Positive, Within(0.01, 100.0, "rad/s", _NO_LIMIT)] = Field(
-        3.0, description="highest velocity that is gained and lost again within 0.3 s, or lost and gained [rad/s]"
+        3.0, description="maximum change of velocity that is reversed within 0.3 s [rad/s]"
     )
 
 
-# For editors; what loading says about it is in _position_limits_fit_the_mode.
+# For editors; when a map is loaded, Kind._objections checks the same.
 _POSITION_NEEDS_LIMITS: dict[str, Any] = {
     "if": {"properties": {"mode": {"const": "position"}}},
     "then": {
@@ -275,17 +286,20 @@ _POSITION_NEEDS_LIMITS: dict[str, Any] = {
 
 
 class Kind(StrictConfig):
-    """Everything servos of one sort have in common."""
+    """Settings shared by several servos."""
 
     model: Literal["MX-106", "MX-28", "XL430-W250", "XM430-W210", "XM430-W350", "XH540-W150", "XH540-W270"] = Field(
-        description="of the servo"
+        description="model of the servo"
     )
-    mode: Literal["position", "velocity"] = Field(description="of the servo: position for joints, velocity for wheels")
-    firmware_min: int = Field(41, description="oldest firmware accepted")
-    follows: Follows = Field(description="signals of the record")
-    limits: Limits = Field(description="what the joint may do")
+    mode: Literal["position", "velocity"] = Field(
+        description="operating mode: position for joints, velocity for wheels"
+    )
+    firmware_min: int = Field(41, description="oldest firmware version accepted")
+    follows: Follows = Field(description="signals of the record that the servo follows")
+    limits: Limits = Field(description="limits of the joint")
     following_error: Positive = Field(
-        description="largest difference of measured and commanded: [rad] in position mode, [rad/s] in velocity mode"
+        description="maximum difference between measured and commanded value: [rad] in position mode, [rad/s] in "
+        "velocity mode"
     )
     gear: Positive = Field(1.0, description="servo turns per joint turn")
 
@@ -298,85 +312,86 @@ class Kind(StrictConfig):
         return self
 
     def _objections(self) -> Iterator[Objection]:
-        """What no servo of this model and gear can do, and rules that could never fire."""
+        """Yield values that a servo of this model and gear cannot reach, and abort rules that could never fire."""
         model, gear, limits, error = MODELS[self.model], self.gear, self.limits, self.following_error
         position = limits.position_deg
         speed = model.no_load_speed * HIGHEST_SUPPLY / RATED_SUPPLY / gear
         stall = model.stall_torque * HIGHEST_SUPPLY / RATED_SUPPLY * gear
         in_position_mode = self.mode == "position"
         if in_position_mode and position is None:
-            yield "limits", "a servo in position mode needs limits.position_deg: [lowest, highest]"
+            yield "limits", "mode: position requires limits.position_deg; add it as [lowest, highest]"
         if position is not None and not position[0] < position[1]:
-            yield "limits.position_deg", f"{position[0]} is not below {position[1]}"
+            yield "limits.position_deg", f"{position[0]} must be below {position[1]}"
         if limits.velocity > speed:
-            yield "limits.velocity", f"a {model.name} turns this joint at {speed:.3g} rad/s at most"
+            yield (
+                "limits.velocity",
+                f"the maximum of a {model.name} at this joint is {speed:.3g} rad/s; use that or less",
+            )
         if limits.torque > stall:
-            yield "limits.torque", f"a {model.name} stalls at {stall:.3g} N m here: the rule would never fire"
+            yield "limits.torque", f"a {model.name} stalls at {stall:.3g} N m at this joint; use that or less"
         if limits.torque < (least := model.torque(1) * gear):
-            text = f"is below what a {model.name} can tell from none; use {rounded_up(least):g} N m or more"
+            text = f"is below the torque resolution of a {model.name}; use {rounded_up(least):g} N m or more"
             yield "limits.torque", text
         unit, name = (RAD_PER_TICK, "rad") if in_position_mode else (RAD_S_PER_UNIT, "rad/s")
         if error < unit / gear:
-            yield "following_error", f"is below what the servo can tell; use {rounded_up(unit / gear):g} {name} or more"
+            yield "following_error", f"is below the servo resolution; use {rounded_up(unit / gear):g} {name} or more"
         if not in_position_mode and position is not None:
-            text = "a servo in velocity mode is not held to angles; leave it out, or use mode: position"
+            text = "conflicts with mode: velocity, which has no angle limits; remove it or use mode: position"
             yield "limits.position_deg", text
         if in_position_mode and position is not None:
             if (position[1] - position[0]) * gear > 360.0:
-                text = f"position mode knows one turn of the servo, {360 / gear:.4g}° of this joint"
+                text = (
+                    f"exceeds the range of position mode, one servo turn; use {360 / gear:.4g}° of joint angle or less"
+                )
                 yield "limits.position_deg", text
-            if error > FURTHEST_OFF:
-                yield "following_error", f"is more than {FURTHEST_OFF:g} rad: the rule would watch nothing"
+            if error > MAX_FOLLOWING_ERROR:
+                yield "following_error", f"is above {MAX_FOLLOWING_ERROR:g} rad and would have no effect; use less"
         elif error > limits.velocity:
-            yield "following_error", "is more than limits.velocity: a servo that stands still would not be noticed"
+            yield "following_error", "is above limits.velocity, so a stopped servo would not be detected; use less"
 
 
 def _not_a_flag(value: Any) -> Any:
-    """``True`` equals 1, so a choice among numbers takes it."""
+    """Reject Booleans: ``True`` equals 1 and would pass as a sign."""
     if isinstance(value, bool):
         raise ValueError("must be 1 or -1")
     return value
 
 
 class ServoEntry(StrictConfig):
-    """One servo: its kind, bus ID, sense, zero, and (held joints) the angle it keeps instead of following a record."""
+    """One servo: kind, bus ID, direction of rotation, zero position, record column, and fixed angle if any."""
 
-    kind: str = Field(description="one of `kinds`")
-    id: int = Field(ge=0, le=MAX_ID, description="on the bus")
+    kind: str = Field(description="name of an entry of `kinds`")
+    id: int = Field(ge=0, le=MAX_ID, description="ID on the bus")
     sign: Annotated[Literal[1, -1], BeforeValidator(_not_a_flag)] = Field(
-        1, description="sense of the servo against that of the joint"
+        1, description="direction of rotation of the servo relative to the joint"
     )
     zero_tick: int = Field(
         2048, ge=-(1 << 20), le=1 << 20, description="servo position in the zero posture of the joint [ticks of 0.088°]"
     )
     label: str | None = Field(None, description="column of the record; default: the name of the joint")
-    hold_at_deg: float | None = Field(
-        None, description="angle that the joint keeps instead of following the record [°]"
-    )
+    hold_at_deg: float | None = Field(None, description="fixed joint angle, instead of following the record [°]")
 
 
 def _is_a_file_name(robot: str) -> str:
     if file_name(robot) != robot:
-        raise ValueError(
-            f"names the folder of results; use a name without / and the like, such as {file_name(robot)!r}"
-        )
+        raise ValueError(f"must be a valid folder name, because results are saved there; use {file_name(robot)!r}")
     return robot
 
 
 class _MapFile(StrictConfig):
-    """A servo map: which servo follows which column of a record, and what that joint may do."""
+    """Servo map: the column of a record that each servo follows, and the limits of its joint."""
 
     model_config = ConfigDict(title="ServoMap")
 
     robot: Annotated[str, AfterValidator(_is_a_file_name)] = Field(
-        description="name of the robot, also in that of its folder of results"
+        description="name of the robot; also part of the name of the results folder"
     )
     bus: BusSettings = Field(BusSettings(), description="the serial line")
-    safety: Safety = Field(Safety(), description="when to abort, and how to stop")
-    lifts: Lifts | None = Field(None, description="how a snake's wheel pairs are lifted")
-    kinds: dict[str, Kind] = Field(description="what several servos have in common")
+    safety: Safety = Field(Safety(), description="conditions of an abort, and how to stop")
+    lifts: Lifts | None = Field(None, description="lifting of the wheel pairs of a snake robot")
+    kinds: dict[str, Kind] = Field(description="settings shared by several servos")
     servos: dict[str, ServoEntry] = Field(
-        json_schema_extra={"minProperties": 1}, description="the servo of each joint, by the joint's name"
+        json_schema_extra={"minProperties": 1}, description="servo of each joint; the key is the name of the joint"
     )
 
     @model_validator(mode="after")
@@ -387,49 +402,49 @@ class _MapFile(StrictConfig):
         return self
 
     def _in_names(self) -> Iterator[Objection]:
-        """IDs and columns that are used twice, kinds and joints that do not exist."""
+        """Yield IDs and columns that are used twice, and kinds and joints that do not exist."""
         if not self.servos:
-            yield "servos", "the map names none"
+            yield "servos", "must list at least one servo"
         owner: dict[int, str] = {}
         follower: dict[tuple[str, str], str] = {}
         for joint, entry in self.servos.items():
             if entry.kind not in self.kinds:
                 like = suggest(entry.kind, self.kinds)
-                yield f"servos.{joint}.kind", f"is not one of {', '.join(self.kinds)}{like}"
+                yield f"servos.{joint}.kind", f"must be one of {', '.join(self.kinds)}{like}"
             if entry.id in owner:
                 yield f"servos.{joint}.id", f"is also the ID of {owner[entry.id]}"
             owner[entry.id] = joint
             column = (self.kinds[entry.kind].follows.position, entry.label or joint)
             if entry.hold_at_deg is None and (other := follower.setdefault(column, joint)) != joint:
-                yield f"servos.{joint}.label", f"{other} already follows {column[1]!r} of {column[0]!r}"
+                yield f"servos.{joint}.label", f"{other} already follows column {column[1]!r} of signal {column[0]!r}"
         for joint in self.lifts.joints if self.lifts else ():
             if joint not in self.servos:
-                yield "lifts.joints", f"{joint} is none of the servos"
+                yield "lifts.joints", f"{joint} is not in servos"
             entry = self.servos[joint]
             if self.kinds[entry.kind].mode != "position" or entry.hold_at_deg not in (None, 0):
-                yield "lifts.joints", f"{joint} must be in position mode and follow the record or be held at 0"
+                yield "lifts.joints", f"{joint} must be in position mode, without hold_at_deg or with hold_at_deg: 0"
 
     def _in_safety(self) -> Iterator[Objection]:
-        """What the kinds that are used, or their servos' models, cannot do of what ``safety`` asks for.
+        """Yield settings of ``safety`` that the kinds in use or their servo models cannot satisfy.
 
-        Among it are thresholds at which the servos have long protected themselves, by going limp.
+        These include thresholds beyond the point where a servo switches its own torque off.
         """
         safety, hottest, supply = self.safety, self.safety.temperature_max, self.safety.supply
         kinds = {name: self.kinds[name] for name in dict.fromkeys(entry.kind for entry in self.servos.values())}
         if supply.lowest >= supply.highest:
-            yield "safety.supply.lowest", "is not below supply.highest"
+            yield "safety.supply.lowest", "must be below supply.highest"
         if hottest <= ROOM:
-            text = f"is no more than the {ROOM:g} °C of a room: every run would abort; use 65 or so"
+            text = f"must be above room temperature ({ROOM:g} °C), or every run would abort; use about 65"
             yield "safety.temperature_max", text
         for model in (MODELS[kind.model] for kind in kinds.values()):
             limp = model.fields["temperature_limit"].default
             low, high = model.fields["min_voltage"].low, model.fields["max_voltage"].high
             if hottest > limp:
-                yield "safety.temperature_max", f"a {model.name} goes limp at {limp} °C"
+                yield "safety.temperature_max", f"a {model.name} switches its torque off at {limp} °C; use that or less"
             if low is not None and supply.lowest < low * VOLT_PER_UNIT:
-                yield "safety.supply.lowest", f"a {model.name} does not work below {low * VOLT_PER_UNIT:g} V"
+                yield "safety.supply.lowest", f"a {model.name} requires at least {low * VOLT_PER_UNIT:g} V"
             if high is not None and supply.highest > high * VOLT_PER_UNIT:
-                yield "safety.supply.highest", f"a {model.name} does not work above {high * VOLT_PER_UNIT:g} V"
+                yield "safety.supply.highest", f"a {model.name} allows at most {high * VOLT_PER_UNIT:g} V"
         for name, kind in kinds.items():
             limits = kind.limits
             if kind.mode == "position" and safety.approach_velocity > limits.velocity:
@@ -437,33 +452,33 @@ class _MapFile(StrictConfig):
                 yield "safety.approach_velocity", text
             if (needed := limits.velocity / safety.stop_time) > limits.acceleration:
                 least = rounded_up(limits.velocity / limits.acceleration)
-                text = f"stops kinds.{name} with {needed:.4g} rad/s², above its limit; use {least:g} or more"
+                text = f"stops kinds.{name} at {needed:.4g} rad/s², above its limit; use {least:g} or more"
                 yield "safety.stop_time", text
             if safety.run_up > limits.acceleration:
                 text = f"is above kinds.{name}.limits.acceleration, {limits.acceleration:g} rad/s²; use that or less"
                 yield "safety.run_up", text
 
     def _in_zeros(self) -> Iterator[Objection]:
-        """Servos in position mode that are to be held where they must not be, or have nowhere to go."""
+        """Yield servos in position mode with a fixed angle beyond their limits, or without any allowed position."""
         for joint, entry in self.servos.items():
             kind = self.kinds[entry.kind]
             limits = kind.limits.position_deg
             if kind.mode != "position" or limits is None:
                 continue
             if entry.hold_at_deg is not None and not limits[0] <= entry.hold_at_deg <= limits[1]:
-                text = f"is beyond limits.position_deg; use {limits[0]:g} to {limits[1]:g}"
+                text = f"is outside limits.position_deg; use {limits[0]:g} to {limits[1]:g}"
                 yield f"servos.{joint}.hold_at_deg", text
             lowest, highest = MappedServo(joint, entry, kind).tick_limits
             if lowest > highest:
                 text = (
-                    f"leaves no tick of 0 to {TICKS_PER_TURN - 1}, the turn of position mode, within "
-                    "limits.position_deg; use that of the zero posture (`dynsim hw calibrate`)"
+                    f"puts limits.position_deg outside ticks 0 to {TICKS_PER_TURN - 1}, the range of position mode; "
+                    "measure it with `dynsim hw calibrate`"
                 )
                 yield f"servos.{joint}.zero_tick", text
 
 
 class MappedServo:
-    """One servo of the map, with its conversions.
+    """One servo of the map, with conversions between joint and servo units.
 
     Attributes
     ----------
@@ -473,9 +488,9 @@ class MappedServo:
     model : ServoModel
     kind : Kind
     position_limits : tuple of float
-        Lowest and highest joint angle [rad]; infinite for a wheel.
+        Minimum and maximum joint angle [rad]; infinite for a wheel.
     entry : str
-        File, line and key of the entry, or of its ``label``: for errors.
+        File, line and key of the entry or of its ``label``, for error messages.
     """
 
     def __init__(self, joint: str, entry: ServoEntry, kind: Kind, origin: Origin | None = None) -> None:
@@ -502,32 +517,32 @@ class MappedServo:
 
     @property
     def operating_mode(self) -> OperatingMode:
-        """Value of address 11 this servo must have."""
+        """Value that address 11 of this servo must have."""
         return OperatingMode.POSITION if self.in_position_mode else OperatingMode.VELOCITY
 
     def to_ticks(self, angle: float) -> int:
-        """Servo position for a joint angle [rad]."""
+        """Return the servo position [ticks] for a joint angle [rad]."""
         return self.zero_tick + round(self.sign * self.gear * angle / RAD_PER_TICK)
 
     def to_angle(self, ticks: int) -> float:
-        """Joint angle [rad] for a servo position."""
+        """Return the joint angle [rad] for a servo position [ticks]."""
         return self.sign * (ticks - self.zero_tick) * RAD_PER_TICK / self.gear
 
     def to_velocity_units(self, velocity: float) -> int:
-        """Servo velocity register for a joint velocity [rad/s]."""
+        """Return the servo velocity register for a joint velocity [rad/s]."""
         return round(self.sign * self.gear * velocity / RAD_S_PER_UNIT)
 
     def to_velocity(self, units: int) -> float:
-        """Joint velocity [rad/s] for a servo velocity register."""
+        """Return the joint velocity [rad/s] for a servo velocity register."""
         return self.sign * units * RAD_S_PER_UNIT / self.gear
 
     def to_torque(self, effort: int) -> float:
-        """Estimated joint torque [N·m] for the register at address 126."""
+        """Return the estimated joint torque [N·m] for the register at address 126."""
         return self.sign * self.gear * self.model.torque(effort)
 
     @property
     def tick_limits(self) -> tuple[int, int]:
-        """Lowest and highest goal position this joint may ever be sent."""
+        """Lowest and highest goal position that this servo may receive [ticks]."""
         if not self.in_position_mode:
             return (0, TICKS_PER_TURN - 1)
         ends = [self.to_ticks(angle) for angle in self.position_limits]
@@ -567,7 +582,7 @@ class ServoMap:
 
     @property
     def lifting(self) -> dict[str, Any]:
-        """The entry ``lifts``, if there is one, with the columns of a record instead of the joints: for provenance."""
+        """Entry ``lifts`` with record columns in place of joint names, for the provenance; empty without ``lifts``."""
         if self.lifts is None:
             return {}
         label = {servo.joint: servo.label for servo in self.servos}
@@ -575,16 +590,21 @@ class ServoMap:
 
 
 def load_servo_map(path: str | Path) -> ServoMap:
-    """Read and validate a servo map: the file of that path, or the one of that name that comes with dynsim ("arm").
+    """Read and validate a servo map.
+
+    Parameters
+    ----------
+    path : str or Path
+        Path of a file, or the name of a shipped map ("arm", "snake").
 
     Raises
     ------
     ServoMapError
-        The file is missing, is not YAML, or an entry is wrong; with file and line.
+        If the file is missing, is not YAML or has an invalid entry; the message has file and line.
     """
     if not isinstance(path, (str, Path)):
         raise ServoMapError(
-            f"a servo map is named by its file, or by its name when it is shipped, not by {brief(path)}"
+            f"expected the file of a servo map or the name of a shipped map (arm, snake), got {brief(path)}"
         )
     path = Path(path)
     shipped = SHIPPED / f"{path.stem}.yaml"
@@ -595,30 +615,30 @@ def load_servo_map(path: str | Path) -> ServoMap:
 
 
 def json_schema() -> dict[str, Any]:
-    """JSON schema of servo maps, for editors.
+    """Return the JSON schema of servo maps, for editors.
 
-    It cannot say what ties entries together: that ``kind`` names one of ``kinds``, that IDs differ, and that the lower
-    limit is below the upper one. Loading checks these.
+    The schema cannot express relations between entries: ``kind`` is a key of ``kinds``, IDs differ, the lower limit is
+    below the upper limit. These are checked when a map is loaded.
     """
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **_MapFile.model_json_schema()}
 
 
-# Calibration of a servo map: zero ticks read in a zero posture set by hand; zero ticks or signs written to the map.
+# Calibration of a servo map: read the zero ticks in a posture set by hand, and write zero ticks or signs to the map.
 
 
 Key = Literal["zero_tick", "sign"]
 READS = 20
 STILL = 3
-"""Largest spread over the reads of a servo at rest [ticks]."""
+"""Maximum spread over the reads of a servo at rest [ticks]."""
 
 
 def read_zero_ticks(bus: Bus, servos: Iterable[MappedServo]) -> dict[str, int]:
-    """Median servo position of each joint, torque being off.
+    """Return the median servo position of each joint [ticks], read with the torque off.
 
     Raises
     ------
     VerificationFailed
-        Torque is on, a servo does not answer, or moves.
+        If the torque of a servo is on, or a servo does not answer or moves.
     """
     chosen = list(servos)
     refuse_torque(bus, chosen)
@@ -631,31 +651,41 @@ def read_zero_ticks(bus: Bus, servos: Iterable[MappedServo]) -> dict[str, int]:
     for servo in chosen:
         seen = ticks[servo.joint]
         if len(seen) < READS // 2:
-            raise VerificationFailed(f"{servo}: {len(seen)} of {READS} reads answered")
+            raise VerificationFailed(f"{servo}: answered only {len(seen)} of {READS} reads; check cable and power")
         if max(seen) - min(seen) > STILL:
             raise VerificationFailed(f"{servo.joint} moves (ticks {min(seen)} to {max(seen)}); hold it still")
     return {joint: int(np.median(seen)) for joint, seen in ticks.items()}
 
 
 def refuse_torque(bus: Bus, servos: Iterable[MappedServo]) -> None:
-    """Raises VerificationFailed where a servo has its torque on, or does not answer."""
+    """Raise VerificationFailed if a servo has its torque on or does not answer."""
     for servo in servos:
         try:
             torque = bus.read(servo.id, MX_106.fields["torque_enable"])
         except (NoAnswer, RequestRefused) as error:
             raise VerificationFailed(f"{servo.joint}: {error}; check power, cable, ID and baud rate") from error
         if torque:
-            raise VerificationFailed(f"{servo}: torque is on; `dynsim hw stop` releases it")
+            raise VerificationFailed(f"{servo}: torque is on; switch it off with `dynsim hw stop`")
 
 
 def write_into_map(servo_map: ServoMap, key: Key, values: Mapping[str, int], path: Path) -> None:
-    """Write the map with new zero ticks or senses, by joint, to ``path``; all else, comments too, stays as it is.
+    """Write a copy of the map with new zero ticks or signs; all other entries and comments are kept.
+
+    Parameters
+    ----------
+    servo_map : ServoMap
+        Map to copy.
+    key : {"zero_tick", "sign"}
+        Key to change.
+    values : mapping of str to int
+        New value for each joint.
+    path : Path
+        Output file.
 
     Raises
     ------
     ServoMapError
-        With the new value a joint's limits would leave the single turn position mode knows, or the file cannot be
-        written.
+        If the limits of a joint would exceed the single turn of position mode, or the file cannot be written.
     """
     yaml = YAML(typ="rt")
     yaml.preserve_quotes = True
@@ -674,8 +704,8 @@ def write_into_map(servo_map: ServoMap, key: Key, values: Mapping[str, int], pat
             )
             if servo.joint in values and (ends[0] < 0 or ends[1] > 4095):
                 raise ServoMapError(
-                    f"{servo.joint}: with sign {servo.sign} and zero at tick {servo.zero_tick} its limits reach ticks "
-                    f"{ends[0]} to {ends[1]}, position mode ends at 0 and 4095; turn the horn or narrow the limits"
+                    f"{servo.joint}: with sign {servo.sign} and zero_tick {servo.zero_tick} its limits are ticks "
+                    f"{ends[0]} to {ends[1]}, outside position mode (0 to 4095); turn the horn or narrow the limits"
                 )
     try:
         write_text(path, text.getvalue())

@@ -145,7 +145,7 @@ def _take_turns(outputs: Outputs, patch: pytest.MonkeyPatch) -> None:
     turns: dict[Background, int] = {}
     make, each = Background.__init__, Background._each
     enter, exchange = Journal.enter, Loop.exchange
-    tell_end, run = Replay._tell_end, Replay.run
+    log_end, run = Replay._log_end, Replay.run
 
     def made(self: Background, *arguments: Any) -> None:
         turns[self] = 0
@@ -183,7 +183,7 @@ def _take_turns(outputs: Outputs, patch: pytest.MonkeyPatch) -> None:
     def left(self: Replay) -> None:
         wait()
         outputs.state = LEFT
-        tell_end(self)
+        log_end(self)
         wait()
 
     def finished(self: Replay) -> Any:
@@ -197,5 +197,5 @@ def _take_turns(outputs: Outputs, patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Background, "_each", counted)
     patch.setattr(Journal, "enter", entered)
     patch.setattr(Loop, "exchange", exchanged)
-    patch.setattr(Replay, "_tell_end", left)
+    patch.setattr(Replay, "_log_end", left)
     patch.setattr(Replay, "run", finished)

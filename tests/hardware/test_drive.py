@@ -93,7 +93,7 @@ class Simulated:
                 self._due = now + seconds
         return self._due <= now and (self.sent + 1) * self.step <= self.told[-1] + self.ahead
 
-    def tell(self, time: float) -> None:
+    def report_time(self, time: float) -> None:
         self.told.append(time)
 
 
@@ -166,15 +166,15 @@ def test_the_servos_follow_the_drive_to_its_end(rig: Rig) -> None:
 def test_the_servos_are_so_far_behind_that_a_stop_is_known(rig: Rig, stalls: list[tuple[float, float]]) -> None:
     run = prepared(rig, stalls=stalls)
     feed, stop_time = feed_of(run), rig.map.safety.stop_time
-    tell, behind, needed = feed.tell, [], []
+    report_time, behind, needed = feed.report_time, [], []
 
     def note(time: float) -> None:
-        tell(time)
+        report_time(time)
         if run.replay.loop.course is not None and time > 0.0:
             behind.append(feed.sent * STEP - time)
             needed.append(0.5 * run.replay.loop.course.speed**2 * stop_time)
 
-    feed.tell = note  # type: ignore[method-assign]
+    feed.report_time = note  # type: ignore[method-assign]
     run.replay.run()
     assert np.all(np.array(behind) >= np.array(needed) - 1e-9)
     assert max(behind) <= lead(rig.map) + 1e-9

@@ -79,8 +79,8 @@ class SimulatedSnake:
             self._due = max(self._due + step, now - 1.0 / RATE) + lost
         return list(self._feed.take(most))
 
-    def tell(self, time: float) -> None:
-        self._feed.tell(time)
+    def report_time(self, time: float) -> None:
+        self._feed.report_time(time)
         self.behind.append(self.session.time - time)
 
     def _tick(self) -> None:

@@ -12,7 +12,7 @@ import pytest
 
 from dynsim.hardware.bus.packet import Instruction, Packet
 from dynsim.hardware.errors import ReplayAborted
-from dynsim.hardware.replay.output import ReplayState, ServoEnd, StopRequest, of_the_whole
+from dynsim.hardware.replay.output import ReplayState, ServoEnd, StopRequest, robot_state
 from dynsim.hardware.replay.rules import Cause
 from dynsim.hardware.replay.session import run_replay
 from dynsim.hardware.servo_map import load_servo_map
@@ -344,7 +344,7 @@ def test_log_error_and_summary_say_what_each_servo_does(rig, tmp_path) -> None:
 
 def test_what_the_whole_does() -> None:
     def whole(*doings: str) -> str:
-        return of_the_whole([ServoEnd(f"j{k}", k, doing=doing) for k, doing in enumerate(doings)])
+        return robot_state([ServoEnd(f"j{k}", k, doing=doing) for k, doing in enumerate(doings)])
 
     assert whole("holding", "holding") == "holding"
     assert whole("limp: off", "limp: off") == "off"

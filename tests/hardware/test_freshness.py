@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dynsim.hardware.bus.control_table import MX_106, RAD_PER_TICK, STATE_BLOCK
-from dynsim.hardware.bus.dynamixel_bus import MARKS, DynamixelBus
+from dynsim.hardware.bus.dynamixel_bus import LATE_READS, DynamixelBus
 from dynsim.hardware.bus.packet import Instruction
 from dynsim.hardware.bus.protocol import NoAnswer, VirtualClock
 from dynsim.hardware.replay.output import ReplayState
@@ -95,10 +95,10 @@ def test_requests_grow_after_a_miss_and_shrink_again(rig) -> None:
 
     assert read(3) == [LENGTH] * 3
     line.servos.dead.add(2)
-    assert read(MARKS + 1) == [LENGTH + k % MARKS for k in range(MARKS + 1)]
+    assert read(LATE_READS + 1) == [LENGTH + k % LATE_READS for k in range(LATE_READS + 1)]
     line.servos.dead.clear()
     # The shortest that nobody owes an answer to.
-    assert read(MARKS + 1) == [LENGTH + 1] * (MARKS - 1) + [LENGTH] * 2
+    assert read(LATE_READS + 1) == [LENGTH + 1] * (LATE_READS - 1) + [LENGTH] * 2
 
 
 @pytest.mark.parametrize("seed", range(20))

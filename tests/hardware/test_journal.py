@@ -44,8 +44,8 @@ def test_a_log_that_raises_loses_nothing_but_itself(journal: Journal, monkeypatc
         raise ValueError("I/O operation on closed file")
 
     monkeypatch.setattr(journal.log, "write", closed)
-    journal.say("one")
-    journal.say("two")
+    journal.add_line("one")
+    journal.add_line("two")
     assert set(journal.failures) == {"log"}
 
 
@@ -63,10 +63,10 @@ def test_an_observer_that_fails_does_not_stop_the_motion(rig) -> None:
 
 
 def test_what_is_held_back_is_written_afterwards_with_its_own_time(journal: Journal) -> None:
-    with journal.held_back():
-        journal.say("first")
+    with journal.buffered():
+        journal.add_line("first")
         journal._clock.sleep_until(2.0)
-        journal.say("second")
+        journal.add_line("second")
         assert not journal.log.lines
     assert [line.split() for line in journal.log.lines] == [
         ["0.0000", "CONNECT", "first"],

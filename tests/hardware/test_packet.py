@@ -15,9 +15,9 @@ from dynsim.hardware.bus.packet import (
     STATUS,
     Decoder,
     Packet,
+    contains_bare_header,
     crc16,
     encode,
-    holds_bare_header,
     stuff,
     unstuff,
 )
@@ -52,7 +52,7 @@ def test_checksum_is_that_of_the_client_library(data: bytes) -> None:
 def test_stuffing_is_undone_and_leaves_no_header(body: bytes) -> None:
     stuffed = stuff(body)
     assert unstuff(stuffed) == body
-    assert not holds_bare_header(stuffed)
+    assert not contains_bare_header(stuffed)
 
 
 @given(st.lists(packets, max_size=8), st.integers(1, 17))

@@ -1,1 +1,1 @@
-"""The servo bus: interface, packets, control tables, clocks, scan, and the bus behind a serial port."""
+"""The servo bus: interface, packets, control tables, clocks, scan, and the bus on a serial port."""

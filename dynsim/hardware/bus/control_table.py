@@ -1,8 +1,8 @@
-"""Control tables and specifications of MX(2.0), XL430, XM430 and XH540 servos, Protocol 2.0, as data.
+"""Control tables and specifications of MX(2.0), XL430, XM430 and XH540 servos, Protocol 2.0.
 
-Source: ROBOTIS e-Manual, the page of each model, chapters Specifications and Control Table. Limits stored in a servo
-changed between firmware versions: the replay reads them from the servo; the defaults given here only fill the virtual
-servos.
+Source: ROBOTIS e-Manual, the page of each model, chapters Specifications and Control Table. The limits stored in a
+servo depend on its firmware version: the replay reads them from the servo; the defaults in this module are used by the
+virtual servos only.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ RETURN_DELAY_SECONDS_PER_UNIT = 2e-6
 BROADCAST_ID = 254
 MAX_ID = 252
 EEPROM_END = 64
-"""Registers at lower addresses keep their values without power."""
+"""Registers below this address keep their values without power."""
 
 BAUD_RATES = (9_600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)
-"""Bits per second by the code stored at address 8. The Python client library refuses 4.5 Mbit/s."""
+"""Bit rates [bit/s], indexed by the code stored at address 8. The Python client library rejects 4.5 Mbit/s."""
 
 
 class OperatingMode(IntEnum):
-    """Values of address 11."""
+    """Operating modes: values of address 11."""
 
     CURRENT = 0
     VELOCITY = 1
@@ -43,7 +43,7 @@ HARDWARE_ERRORS = {0: "input voltage", 2: "overheating", 3: "encoder", 4: "elect
 
 
 def describe_hardware_error(register: int) -> str:
-    """Names of the bits set in the hardware error register (address 70)."""
+    """Return the names of the bits that are set in the hardware error register (address 70)."""
     names = [name for bit, name in HARDWARE_ERRORS.items() if register >> bit & 1]
     return ", ".join(names) or f"no known bit (0x{register:02x})"
 
@@ -59,7 +59,7 @@ class Field:
     default : int
         Value after power-on (RAM) or as delivered (EEPROM).
     low, high : int | None
-        What a write may hold; None where the type's own range is all there is.
+        Range of values that may be written; None if only the range of the type applies.
     writable, signed : bool
     """
 
@@ -73,34 +73,34 @@ class Field:
 
     @property
     def in_eeprom(self) -> bool:
-        """Kept without power, and writable only with torque off."""
+        """True if the value is kept without power and can be written only with torque off."""
         return self.address < EEPROM_END
 
     def decode(self, data: bytes) -> int:
-        """Integer in ``data``, with the field's own sign (the client library's getData knows only unsigned ones)."""
+        """Return the integer in ``data``, signed if the field is (getData of the client library is always unsigned)."""
         return int.from_bytes(data, "little", signed=self.signed)
 
     def encode(self, value: int) -> bytes:
-        """Bytes of ``value``; a negative number in an unsigned field is an OverflowError."""
+        """Return the bytes of ``value``; raises OverflowError for a negative value of an unsigned field."""
         return int(value).to_bytes(self.size, "little", signed=self.signed)
 
 
 @dataclass(frozen=True)
 class ServoModel:
-    """What the data sheet says about one model.
+    """Specifications of one servo model from its data sheet.
 
     Attributes
     ----------
     number : int
         Model number at address 0.
     no_load_speed : float
-        At 12 V [rad/s].
+        Speed without load at 12 V [rad/s].
     stall_torque, stall_current : float
-        At 12 V [N·m], [A].
+        Torque [N·m] and current [A] of the stalled servo at 12 V.
     ampere_per_unit : float
-        Of present and goal current, where there are such registers [A].
+        Unit of the registers of present and goal current, if the model has them [A].
     fields : dict[str, Field]
-        Control table by name.
+        Control table; the keys are names of registers.
     """
 
     name: str
@@ -113,11 +113,11 @@ class ServoModel:
 
     @property
     def measures_current(self) -> bool:
-        """True when address 126 is a current, False when it is a load in 0.1 % of stall torque."""
+        """True if address 126 is a current, False if it is a load in 0.1 % of the stall torque."""
         return "present_current" in self.fields
 
     def registers_in(self, start: int, data: bytes) -> dict[str, int]:
-        """Registers by name of which all bytes are in ``data``, the table from address ``start`` on."""
+        """Decode the registers whose bytes are all in ``data``, which starts at address ``start`` of the table."""
         return {
             name: item.decode(data[item.address - start : item.address - start + item.size])
             for name, item in self.fields.items()
@@ -126,17 +126,17 @@ class ServoModel:
 
     @property
     def torque_constant(self) -> float:
-        """Output torque per ampere [N·m/A], from the stall point (unverified away from it)."""
+        """Output torque per ampere [N·m/A], from the stall point (unverified for other loads)."""
         return self.stall_torque / self.stall_current
 
     def torque(self, effort: int) -> float:
-        """Estimated output torque [N·m] from the signed register at address 126."""
+        """Return the estimated output torque [N·m] for the signed register at address 126."""
         if self.measures_current:
             return effort * self.ampere_per_unit * self.torque_constant
         return effort * 1e-3 * self.stall_torque
 
     def effort(self, torque: float) -> int:
-        """Register at address 126 for an output torque [N·m]."""
+        """Return the value of the register at address 126 for an output torque [N·m]."""
         if self.measures_current:
             return round(torque / self.torque_constant / self.ampere_per_unit)
         return round(torque / self.stall_torque * 1e3)
@@ -203,7 +203,7 @@ _RAD_S_PER_RPM = 2 * math.pi / 60
 
 
 def _current(limit: int) -> dict[str, Field]:
-    """Registers of a servo with a current sensor; ``limit`` is the factory's current limit, and the highest one."""
+    """Return the registers of a servo with a current sensor; ``limit`` is the default and maximum current limit."""
     return {
         "current_limit": Field(38, 2, limit, 0, limit),
         "goal_current": Field(102, 2, 0, signed=True),
@@ -212,14 +212,14 @@ def _current(limit: int) -> dict[str, Field]:
 
 
 def _delivered(fields: dict[str, Field], **defaults: int) -> dict[str, Field]:
-    """The same registers, some with other factory values."""
+    """Return the same registers with other factory defaults for some."""
     return fields | {name: replace(fields[name], default=value) for name, value in defaults.items()}
 
 
 def _geared(
     servo: ServoModel, name: str, number: int, *, rpm: float, stall_torque: float, velocity_limit: int
 ) -> ServoModel:
-    """The same motor and table behind another gear; ``rpm`` without load."""
+    """Return a model with the same motor and control table but another gear; ``rpm`` is the no-load speed."""
     return replace(
         servo,
         name=name,
@@ -288,9 +288,9 @@ MODELS = {model.name: model for model in (MX_106, MX_28, XL430_W250, XM430_W210,
 MODEL_BY_NUMBER = {model.number: model for model in MODELS.values()}
 
 INDIRECT_BLOCKS = ((168, 224, 28), (578, 634, 28))
-"""(address of the first two-byte pointer, address of the first data byte, number of pointers)."""
+"""Blocks of indirect addresses: address of the first two-byte pointer, address of the first data byte, pointers."""
 TABLE_SIZE = 662
 STATE_BLOCK = (126, 10)
-"""Address and length of effort (2), velocity (4), position (4): what the loop reads from every servo each cycle."""
+"""Address and length of the block read from every servo in each cycle: effort (2), velocity (4) and position (4)."""
 HEALTH_BLOCK = (64, 83)
-"""Torque enable … temperature: read from one servo per cycle in turn."""
+"""Address and length of the block read from one servo per cycle in turn: torque enable to temperature."""

@@ -1,20 +1,21 @@
-"""Dynamixel servos through the unmodified client library (dynamixel-sdk 4.1.0), on real and virtual ports alike.
+"""Dynamixel servos through the unmodified client library (dynamixel-sdk 4.1.0), on real and virtual ports.
 
-Defects of the library, and their workarounds here (tests/hardware/test_sdk_defects.py tests those that can be shown:
-when one of its tests fails, the library was repaired and the workaround can be removed):
+Defects of the library and workarounds in this module (tests/hardware/test_sdk_defects.py reproduces the defects; if one
+of its tests fails, the library has been repaired and the workaround can be removed):
 
 - An interrupted read leaves ``port.is_using`` set, and every later write is dropped: the flag is cleared before each
-  transaction, and signal handlers only set a flag of their own.
-- One lost status packet costs a time-out and the answers of all later servos: the sync read here takes the bytes
-  itself, decodes all packets, and assigns them by ID. The library also drops the packet after a truncated one.
+  transaction, and signal handlers only set a flag.
+- One lost status packet costs a time-out and the answers of all later servos: the sync read of this module receives the
+  bytes, decodes all packets, and assigns them by ID. The library also drops the packet after a truncated packet.
 - Group reads drop the error byte: the decoder keeps it.
-- Byte stuffing of requests is lost, some stuffed answers are mangled: a request whose body holds FF FF FD is rejected
-  here, answers of a wrong length count as garbled, and Fast Sync Read is never used.
-- Its read of one servo accepts any status of that servo as the answer, whatever its length, and its reads and writes
-  of one servo wait 34 ms for an answer, whatever the adapter needs: those answers, too, are received and checked here.
-- ``getData`` returns no negative numbers: fields are decoded here.
-- A dead port raises termios.error or OSError beside SerialException; a stalled one blocks: all become PortError, and
-  writes wait here. pyserial's write time-out also counts time in which this process was suspended.
+- Byte stuffing of requests is lost, and some stuffed answers are mangled: this module rejects a request whose body
+  contains FF FF FD, treats an answer of a wrong length as garbled, and never uses Fast Sync Read.
+- Reads of one servo accept any status of that servo as the answer, whatever its length, and reads and writes of one
+  servo wait 34 ms for an answer, whatever the adapter needs: this module receives and checks these answers, too.
+- ``getData`` never returns a negative number: fields are decoded here.
+- A dead port raises termios.error or OSError in addition to SerialException; a stalled port blocks: all become
+  PortError, and this module waits for writes. The write time-out of pyserial includes time in which this process was
+  suspended.
 """
 
 from __future__ import annotations
@@ -37,24 +38,24 @@ from dynsim.hardware.bus.protocol import BlockRead, NoAnswer, RequestRefused, Se
 from dynsim.hardware.errors import PortError
 
 WRITE_TIMEOUT = 0.25
-"""Longest wait for a port that takes no byte [s]."""
+"""Maximum wait for a port that does not accept bytes [s]."""
 READ_WAIT = 5e-4
-"""Longest wait for a byte before time-outs are checked [s]."""
+"""Maximum wait for a byte before time-outs are checked [s]."""
 NOTHING_TO_READ = "returned no data"
-"""Part of pyserial's message for a read without data from a port that was ready."""
-MARKS = 16
+"""Part of the message of pyserial if a port was ready but a read returned nothing."""
+LATE_READS = 16
 """Number of reads after which a missed answer is no longer expected."""
 RETRIES = 2
-"""Further attempts of a single read or write; the timed loop makes none."""
+"""Further attempts of a single read or write; the timed loop does not use these requests."""
 SINGLE_LATENCY = 0.034
-"""Least latency that a single read or write allows, as in the library: the timed loop makes none of them [s]."""
+"""Minimum latency allowed for a single read or write, as in the library [s]."""
 STATUS_BYTES = 11
-"""Bytes of an answer beside its parameters."""
+"""Number of bytes of an answer without its parameters."""
 TORQUE_ENABLE = 64
 
 
 class SerialPort(PortHandler):
-    """The library's port, opened with a write time-out and (by default) for this process alone.
+    """Port of the client library, with a write time-out and (by default) exclusive to this process.
 
     Attributes
     ----------
@@ -84,20 +85,20 @@ class SerialPort(PortHandler):
         return True
 
     def readPort(self, length: int) -> bytes:
-        # A short wait instead of the library's busy loop: it leaves the processor to others.
+        # A short wait instead of the busy loop of the library leaves the processor to other processes.
         began = time.monotonic()
         select.select([self.ser.fileno()], [], [], READ_WAIT)
         self.longest_pause = max(self.longest_pause, time.monotonic() - began - READ_WAIT)
         try:
             return self.ser.read(length)
         except serial.SerialException as error:
-            # Beside another process that took the bytes; on a port of one's own it is the adapter that is gone.
+            # On a shared port another process may have read the bytes; on an exclusive port the adapter is gone.
             if self.exclusive or NOTHING_TO_READ not in str(error):
                 raise
             return b""
 
     def writePort(self, packet: Iterable[int]) -> int:
-        # pyserial counts the time in which this process was stopped: a write that was done counted as one that blocked.
+        # The time-out of pyserial includes time in which this process was suspended: a finished write could time out.
         left = data = bytes(packet)
         while left:
             try:
@@ -111,11 +112,20 @@ class SerialPort(PortHandler):
 def open_serial_port(name: str, baud: int, *, exclusive: bool = True) -> SerialPort:
     """Open a serial port.
 
+    Parameters
+    ----------
+    name : str
+        Serial device.
+    baud : int
+        Bit rate [bit/s].
+    exclusive : bool, optional
+        If True (default), other processes cannot use the port.
+
     Raises
     ------
     PortError
-        No such port, no permission, held by another process, a baud rate the library refuses, or a system without
-        POSIX.
+        If the port does not exist, needs permission, or is in use by another process, the library does not support the
+        bit rate, or the system is not POSIX.
     """
     require_posix(name)
     port = SerialPort(name, exclusive=exclusive)
@@ -124,7 +134,7 @@ def open_serial_port(name: str, baud: int, *, exclusive: bool = True) -> SerialP
     except (OSError, TerminalError, ValueError) as error:
         raise PortError(f"{name}: {_why_not_opened(error)}") from error
     if not opened:
-        raise PortError(f"{name}: the client library refuses {baud} bit/s")
+        raise PortError(f"{name}: the client library does not support {baud} bit/s")
     return port
 
 
@@ -132,16 +142,16 @@ def _why_not_opened(error: Exception) -> str:
     text = str(error).lower()
     number = getattr(error, "errno", None)
     if "exclusively lock" in text or number == errno.EAGAIN:
-        return "in use by another process (a replay? `dynsim hw stop` works beside it)"
+        return "in use by another process (a replay? `dynsim hw stop` works even then)"
     if number == errno.ENOENT or "no such file" in text:
         return "no such port; is the adapter plugged in?"
     if number == errno.EACCES or "permission denied" in text:
-        return "permission denied; on Linux join the group dialout"
+        return "permission denied; on Linux, add your user to the group dialout"
     return f"cannot be opened ({error})"
 
 
 def latency_timer(port_name: str) -> int | None:
-    """Latency timer of a USB serial adapter [ms], None where the system does not say (Linux FTDI driver only)."""
+    """Return the latency timer of a USB serial adapter [ms]; None if it is unknown (Linux FTDI driver only)."""
     entry = Path("/sys/bus/usb-serial/devices") / Path(port_name).resolve().name / "latency_timer"
     try:
         return int(entry.read_text())
@@ -149,12 +159,12 @@ def latency_timer(port_name: str) -> int | None:
         return None
 
 
-class Marks:
-    """How many bytes the next read asks for: more than needed, where answers to earlier ones could pass for its own.
+class RequestLengths:
+    """Choose the number of bytes of each read so that a late answer to an earlier read can be recognised.
 
-    A status says whose it is, not what it answers: a servo that is two periods late would pass for one that is up to
-    date. Where all have answered nothing can come late, and nothing is longer; a request that somebody missed keeps its
-    length to itself for the next MARKS - 1 requests.
+    A status packet has the ID of its servo but not of its request, so the answer of a servo that is two periods late
+    would look current. If a servo misses a request, the next ``LATE_READS - 1`` requests avoid the length of that
+    request and ask for more bytes than needed. If all servos answer, no request is longer.
     """
 
     def __init__(self) -> None:
@@ -162,15 +172,15 @@ class Marks:
         self._missed: dict[int, int] = {}  # number of the request by its length
 
     def choose(self, length: int) -> int:
-        """For a request to be sent now, of which ``length`` bytes are needed."""
+        """Return the number of bytes to request now if ``length`` bytes are needed."""
         self._number += 1
         if not self._missed:
             return length
-        self._missed = {asked: number for asked, number in self._missed.items() if self._number - number < MARKS}
-        return next(asked for asked in range(length, length + MARKS) if asked not in self._missed)
+        self._missed = {asked: number for asked, number in self._missed.items() if self._number - number < LATE_READS}
+        return next(asked for asked in range(length, length + LATE_READS) if asked not in self._missed)
 
     def miss(self, asked: int) -> None:
-        """Somebody has not answered the request sent last, which was for ``asked`` bytes."""
+        """Report that a servo did not answer the last request, which was for ``asked`` bytes."""
         self._missed[asked] = self._number
 
 
@@ -180,11 +190,11 @@ class DynamixelBus:
     Parameters
     ----------
     port : dynamixel_sdk.PortHandler
-        Open; a :class:`SerialPort` or a virtual one.
+        Open port: a :class:`SerialPort` or a virtual port.
     latency : float
-        What adapter and operating system may add to an answer [s].
+        Maximum delay of an answer by adapter and operating system [s].
     return_delay : float
-        Longest return delay of a servo [s].
+        Maximum return delay time of a servo [s].
     """
 
     def __init__(self, port: Any, *, latency: float = 2e-3, return_delay: float = 508e-6) -> None:
@@ -192,7 +202,8 @@ class DynamixelBus:
         self.latency = latency
         self.return_delay = return_delay
         self._library = Protocol2PacketHandler()
-        self._marks: dict[tuple[str, int], Marks] = {}  # of sync reads by address, of single reads by ID
+        # For sync reads by address, for single reads by ID.
+        self._lengths: dict[tuple[str, int], RequestLengths] = {}
 
     @property
     def longest_pause(self) -> float:
@@ -211,9 +222,9 @@ class DynamixelBus:
         return field.decode(self.read_block(id_, field.address, field.size).data)
 
     def read_block(self, id_: int, address: int, length: int) -> ServoReply:
-        marks = self._marks.setdefault(("id", id_), Marks())
+        lengths = self._lengths.setdefault(("id", id_), RequestLengths())
         for _ in range(RETRIES + 1):
-            asked = marks.choose(length)
+            asked = lengths.choose(length)
             with self._transaction():
                 result = self._library.readTx(self.port, id_, address, asked)
                 self._raise_unsent(result)
@@ -225,7 +236,7 @@ class DynamixelBus:
                 return ServoReply(packet.parameters[:length], bool(packet.error & ALERT))
             if id_ in others and not others[id_].parameters:
                 self._raise_refusal(id_, others[id_].error)
-            marks.miss(asked)
+            lengths.miss(asked)
         raise NoAnswer(id_, garbled=bool(others) or garbage > 0)
 
     def write(self, id_: int, field: Field, value: int) -> None:
@@ -250,8 +261,8 @@ class DynamixelBus:
         self._raise_unsent(result)
 
     def sync_read(self, ids: Sequence[int], address: int, length: int) -> BlockRead:
-        marks = self._marks.setdefault(("address", address), Marks())
-        asked = marks.choose(length)
+        lengths = self._lengths.setdefault(("address", address), RequestLengths())
+        asked = lengths.choose(length)
         with self._transaction():
             stray = self.port.getBytesAvailable()
             result = self._library.syncReadTx(self.port, address, asked, list(ids), len(ids), False)
@@ -259,11 +270,11 @@ class DynamixelBus:
             self._wait_at_most(len(ids), asked, self.latency)
             answers, others, garbage = self._receive(ids, asked)
         if len(answers) < len(ids):
-            marks.miss(asked)
+            lengths.miss(asked)
         replies = {
             id_: ServoReply(packet.parameters[:length], bool(packet.error & ALERT)) for id_, packet in answers.items()
         }
-        outdated = (id_ for id_, packet in others.items() if length <= len(packet.parameters) < length + MARKS)
+        outdated = (id_ for id_, packet in others.items() if length <= len(packet.parameters) < length + LATE_READS)
         return BlockRead(replies, stray + garbage, frozenset(outdated))
 
     def _raise_unsent(self, result: int) -> None:
@@ -271,15 +282,22 @@ class DynamixelBus:
             raise PortError(f"{self.name}: {self._library.getTxRxResult(result)}")
 
     def _wait_at_most(self, servos: int, length: int, latency: float) -> None:
-        """Set the time-out for answers of so many servos, each with parameters of ``length`` bytes."""
+        """Set the time-out for the answers of ``servos`` servos with ``length`` bytes of parameters each."""
         milliseconds = self.port.tx_time_per_byte * (servos * (STATUS_BYTES + length) + 14 + servos)
         milliseconds += 1e3 * (servos * (self.return_delay + 50e-6) + latency)
         self.port.setPacketTimeoutMillis(milliseconds)
 
     def _receive(self, ids: Sequence[int], asked: int) -> tuple[dict[int, Packet], dict[int, Packet], int]:
-        """Until all have answered, or the time-out: status packets by ID, and bytes of garbage.
+        """Receive until all servos have answered or the time-out.
 
-        The first ones bring the bytes ``asked`` for; the second ones, the last of every servo, another number of them.
+        Returns
+        -------
+        answers : dict
+            Status packets with ``asked`` bytes of parameters, by ID.
+        others : dict
+            Last status packet with another number of bytes, by ID.
+        garbage : int
+            Number of bytes outside packets.
         """
         answers: dict[int, Packet] = {}
         others: dict[int, Packet] = {}
@@ -287,13 +305,13 @@ class DynamixelBus:
 
         def sort_in(packets: Iterable[Packet]) -> None:
             for packet in packets:
-                # Requests echoed by the adapter are no status.
+                # Skip requests echoed by the adapter.
                 if packet.instruction == STATUS and packet.id in asked_of:
                     (answers if len(packet.parameters) == asked else others)[packet.id] = packet
 
         while len(answers) < len(ids) and not self.port.isPacketTimeout():
             sort_in(decoder.feed(self.port.readPort(total)))
-        # What came while this process was not running is here, however late it is.
+        # Also read the bytes that arrived while this process was suspended, even after the time-out.
         late = self.port.getBytesAvailable()
         if late:
             sort_in(decoder.feed(self.port.readPort(late)))
@@ -309,7 +327,7 @@ class DynamixelBus:
         try:
             self.port.closePort()
         except (OSError, TerminalError):
-            # A port that is gone needs no closing.
+            # The port is gone and need not be closed.
             return
 
     @contextmanager
@@ -318,7 +336,7 @@ class DynamixelBus:
         try:
             yield
         except (serial.SerialException, OSError, TerminalError, TypeError) as error:
-            # pyserial raises TypeError where its descriptor was closed under it.
+            # pyserial raises TypeError if its descriptor was closed meanwhile.
             raise PortError(f"{self.name}: the port died ({error})") from error
         finally:
             self.port.is_using = False
@@ -332,5 +350,5 @@ class DynamixelBus:
     def _reject_header(body: bytes) -> None:
         if HEADER in body:
             raise ValueError(
-                f"a request must not hold FF FF FD, the client library would send it unstuffed: {body.hex(' ')}"
+                f"a request must not contain FF FF FD (not stuffed by the client library), got {body.hex(' ')}"
             )

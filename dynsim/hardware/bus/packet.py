@@ -1,7 +1,7 @@
 """Dynamixel Protocol 2.0 packets: checksum, byte stuffing, encoder, and a decoder that resynchronises after noise.
 
-FF FF FD 00 | ID | length (2) | instruction | parameters | CRC-16 (2), the length counting instruction, parameters and
-checksum. Wherever FF FF FD turns up between the length and the checksum the sender inserts another FD.
+A packet is FF FF FD 00 | ID | length (2) | instruction | parameters | CRC-16 (2). The length counts instruction,
+parameters and checksum. If FF FF FD occurs between length and checksum, the sender inserts another FD after it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from dynsim.hardware.bus.control_table import BROADCAST_ID
 HEADER = b"\xff\xff\xfd"
 STATUS = 0x55
 MAX_LENGTH = 1024
-"""Largest length field that is accepted; a larger one is noise."""
+"""Largest length field that is accepted; a larger value is noise."""
 
 
 class Instruction(IntEnum):
@@ -42,7 +42,7 @@ class Instruction(IntEnum):
 
 
 class StatusError(IntEnum):
-    """Lower seven bits of a status packet's error byte; bit 7 (ALERT): the hardware error register is set."""
+    """Lower seven bits of the error byte of a status packet; bit 7 (ALERT) means that a hardware error is set."""
 
     NONE = 0
     RESULT_FAIL = 1
@@ -58,7 +58,7 @@ ALERT = 0x80
 
 
 def _crc_table() -> array[int]:
-    """Checksum of every two bytes."""
+    """Return the checksums of all pairs of bytes."""
     value = np.arange(0x10000, dtype=np.uint16)
     for _ in range(16):
         top = value >> 15
@@ -71,9 +71,9 @@ _CRC_TABLE = _crc_table()
 
 
 def crc16(data: bytes | bytearray) -> int:
-    """CRC-16, polynomial 0x8005, initial value 0, no reflection."""
+    """Return the CRC-16 with polynomial 0x8005, initial value 0, no reflection."""
     crc = 0
-    # A zero in front changes nothing, and there are only whole pairs of bytes then.
+    # A leading zero does not change the checksum and makes the number of bytes even.
     even = b"\0" + data if len(data) % 2 else data
     for two in struct.unpack(f">{len(even) // 2}H", even):
         crc = _CRC_TABLE[crc ^ two]
@@ -85,10 +85,10 @@ def stuff(body: bytes) -> bytes:
     return body.replace(HEADER, HEADER + b"\xfd")
 
 
-def holds_bare_header(stuffed: bytes) -> bool:
-    """True where FF FF FD is not followed by FD: no sender makes such a body.
+def contains_bare_header(stuffed: bytes) -> bool:
+    """Return True if FF FF FD occurs without a following FD, which no sender produces.
 
-    It tells a cut packet that swallowed the next one, which the checksum alone would miss once in 65536 times.
+    This detects a cut packet merged with the next packet, which the checksum alone would miss once in 65536 times.
     """
     return HEADER in stuffed and HEADER in stuffed.replace(HEADER + b"\xfd", b"\0")
 
@@ -99,17 +99,17 @@ def unstuff(body: bytes) -> bytes:
 
 
 class Packet(NamedTuple):
-    """One packet of either direction.
+    """One packet, in either direction.
 
     Attributes
     ----------
     id : int
     instruction : int
-        ``STATUS`` for a reply.
+        Instruction code; ``STATUS`` for a reply.
     error : int
         Error byte of a reply, 0 otherwise.
     parameters : bytes
-        Unstuffed.
+        Parameters without byte stuffing.
     """
 
     id: int
@@ -119,7 +119,7 @@ class Packet(NamedTuple):
 
 
 def encode(packet: Packet) -> bytes:
-    """Bytes on the wire."""
+    """Return the bytes of a packet on the wire."""
     first = bytes([packet.instruction, packet.error]) if packet.instruction == STATUS else bytes([packet.instruction])
     body = stuff(first + packet.parameters)
     frame = HEADER + b"\0" + bytes([packet.id]) + (len(body) + 2).to_bytes(2, "little") + body
@@ -127,10 +127,10 @@ def encode(packet: Packet) -> bytes:
 
 
 def encode_fast(replies: Sequence[Packet], sizes: Sequence[int]) -> list[bytes]:
-    """What each servo puts on the wire in answer to a fast read: together one status packet of the broadcast ID.
+    """Return the bytes that each servo sends in answer to a fast read; together they are one broadcast status packet.
 
-    Every part is error, ID, data and the checksum of all bytes so far; header and length, which counts the bytes of
-    all that were asked for (``sizes``), come with the first. There is no byte stuffing in it.
+    Each part is error, ID, data and the checksum of all bytes so far; the first part starts with header and length.
+    The length counts the requested bytes of all servos (``sizes``). There is no byte stuffing.
     """
     bodies = [bytes([reply.error, reply.id]) + reply.parameters for reply in replies]
     length = 1 + sum(size + 4 for size in sizes)
@@ -145,17 +145,17 @@ def encode_fast(replies: Sequence[Packet], sizes: Sequence[int]) -> list[bytes]:
 
 
 class Decoder:
-    """Packets out of a stream of bytes that may hold noise, cut packets and wrong checksums.
+    """Extract packets from a stream of bytes that may contain noise, cut packets and wrong checksums.
 
-    A candidate whose checksum fails costs its header only: the search goes on one byte later, so that a good packet
-    swallowed by a wrong length is still found. Call :meth:`flush` when no more bytes will come.
+    After a wrong checksum the search continues one byte later, so that a good packet inside a candidate of wrong length
+    is still detected. Call :meth:`flush` after the last bytes.
 
     Attributes
     ----------
     rejected : int
-        Candidates with a wrong checksum so far.
+        Number of candidates with a wrong checksum so far.
     garbage : int
-        Bytes skipped so far.
+        Number of bytes skipped so far.
     """
 
     def __init__(self) -> None:
@@ -164,17 +164,17 @@ class Decoder:
         self.garbage = 0
 
     def feed(self, data: bytes | bytearray) -> Iterator[Packet]:
-        """Take bytes, give every packet that is complete."""
+        """Add bytes and yield all complete packets."""
         self._buffer += data
         return self._packets(final=False)
 
     def flush(self) -> Iterator[Packet]:
-        """Give the packets behind an incomplete candidate, then forget all."""
+        """Yield the packets after an incomplete candidate, then discard all bytes."""
         return self._packets(final=True)
 
     @property
     def pending(self) -> int:
-        """Bytes of an incomplete packet."""
+        """Number of buffered bytes of an incomplete packet."""
         return len(self._buffer)
 
     def _packets(self, *, final: bool) -> Iterator[Packet]:
@@ -200,11 +200,11 @@ class Decoder:
                 self._skip(1)
                 continue
             frame = bytes(buffer[:end])
-            if holds_bare_header(frame[7:-2]) or crc16(frame[:-2]) != int.from_bytes(frame[-2:], "little"):
+            if contains_bare_header(frame[7:-2]) or crc16(frame[:-2]) != int.from_bytes(frame[-2:], "little"):
                 self.rejected += 1
                 self._skip(1)
                 continue
-            # Unstuffing must see the body only: FF FF FD may also arise across length field and instruction.
+            # Unstuff the body only: FF FF FD may also occur across length field and instruction.
             body = unstuff(frame[7:-2])
             del buffer[:end]
             if body[0] == STATUS:
@@ -221,7 +221,7 @@ class Decoder:
 
 
 def _header_prefix(buffer: bytearray) -> int:
-    """Length of the longest end of ``buffer`` that could begin a header."""
+    """Return the length of the longest end of ``buffer`` that could be the start of a header."""
     for length in (2, 1):
         if buffer.endswith(HEADER[:length]):
             return length

@@ -1,4 +1,4 @@
-"""Interface of a servo bus: the calls that the replay makes, and the answers of a servo."""
+"""Interface of a servo bus and its answers, clocks of a replay, and the POSIX modules for serial ports."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class ServoReply(NamedTuple):
     ----------
     data : bytes
     alert : bool
-        The servo's hardware error register is not zero.
+        True if the hardware error register of the servo is not zero.
     """
 
     data: bytes
@@ -32,11 +32,11 @@ class BlockRead:
     Attributes
     ----------
     replies : dict[int, ServoReply]
-        By ID; a servo that did not answer in time is absent.
+        Answers by servo ID; a servo that did not answer in time is absent.
     stray_bytes : int
-        Bytes that were already waiting before the request, and garbage between the answers.
+        Number of bytes received before the request, plus garbage between the answers.
     outdated : frozenset of int
-        Who answered an earlier request while the answer to this one was awaited.
+        IDs of servos that answered an earlier request while this one was pending.
     """
 
     replies: dict[int, ServoReply]
@@ -51,7 +51,7 @@ class NoAnswer(Exception):
     ----------
     id : int
     garbled : bool
-        Something came, but no valid packet: two servos with one ID look like this.
+        True if bytes arrived but no valid packet; two servos with the same ID cause this.
     """
 
     def __init__(self, id_: int, *, garbled: bool) -> None:
@@ -61,16 +61,16 @@ class NoAnswer(Exception):
 
 
 BUSY = 0.02
-"""A process that is run later than this while it waits is on a computer that is too busy [s]."""
+"""Delay of this process by the operating system above which the computer counts as too busy [s]."""
 
 
 def too_busy(bus: Bus) -> str:
-    """What else than a servo may be the reason for a missing answer; empty where nothing shows it."""
+    """Return a message if a busy computer may be the cause of a missing answer, otherwise an empty string."""
     if bus.longest_pause < BUSY:
         return ""
     return (
-        f"this program was run {bus.longest_pause * 1e3:.0f} ms too late while it waited for answers: the computer is "
-        "too slow or too busy; close other programs, or give the map a longer bus.latency"
+        f"the operating system delayed this program by {bus.longest_pause * 1e3:.0f} ms while it waited for answers; "
+        "close other programs or increase bus.latency in the servo map"
     )
 
 
@@ -84,65 +84,65 @@ class RequestRefused(Exception):
 
 
 class Bus(Protocol):
-    """A line with servos. Every method may raise PortError when the port itself is gone.
+    """Interface of a bus with servos. Every method may raise PortError if the port fails.
 
     Attributes
     ----------
     longest_pause : float
-        By which the system has run this process too late while it waited for answers [s].
+        Longest delay of this process by the operating system while it waited for answers [s].
     """
 
     @property
     def longest_pause(self) -> float: ...
 
     def ping_all(self) -> dict[int, tuple[int, int]]:
-        """Model number and firmware by ID of everything that answers a broadcast ping."""
+        """Return model number and firmware version of all servos that answer a broadcast ping, by ID."""
         ...
 
     def read(self, id_: int, field: Field) -> int:
-        """One item. Raises NoAnswer or RequestRefused."""
+        """Read one register. Raises NoAnswer or RequestRefused."""
         ...
 
     def read_block(self, id_: int, address: int, length: int) -> ServoReply:
-        """Consecutive bytes. Raises NoAnswer or RequestRefused."""
+        """Read consecutive bytes. Raises NoAnswer or RequestRefused."""
         ...
 
     def write(self, id_: int, field: Field, value: int) -> None:
-        """Write one item and wait for the acknowledgement. Raises NoAnswer or RequestRefused."""
+        """Write one register and wait for the acknowledgement. Raises NoAnswer or RequestRefused."""
         ...
 
     def sync_write(self, field: Field, values: dict[int, int]) -> None:
-        """Write one item of many servos at once; nobody acknowledges."""
+        """Write one register of many servos at once; the servos do not acknowledge it."""
         ...
 
     def sync_read(self, ids: Sequence[int], address: int, length: int) -> BlockRead:
-        """Read the same bytes of many servos; whoever does not answer this very request in time is absent."""
+        """Read the same bytes of many servos; a servo that does not answer this request in time is absent."""
         ...
 
     def torque_off_all(self) -> None:
-        """Broadcast torque off, three times, whatever the state of the port."""
+        """Broadcast torque off three times, whatever the state of the port."""
         ...
 
     def close(self) -> None: ...
 
 
-# Clocks of a replay: their interface, wall time for serial ports, virtual time for servos in memory.
+# Clocks of a replay: interface, wall time for serial ports, and virtual time for virtual servos in this process.
 
 
 class Clock(Protocol):
-    """Monotonic time."""
+    """Interface of a monotonic clock."""
 
     def now(self) -> float:
-        """Seconds since an arbitrary origin [s]."""
+        """Return the time since an arbitrary origin [s]."""
         ...
 
     def sleep_until(self, deadline: float) -> None:
-        """Return at ``deadline`` [s], at once if it has passed."""
+        """Return at ``deadline`` [s], or immediately if it has passed."""
         ...
 
 
 class WallClock:
-    """The computer's monotonic clock, from an ``origin`` of it on [s]."""
+    """Monotonic clock of the computer, relative to ``origin`` [s]."""
 
     def __init__(self, origin: float = 0.0) -> None:
         self._origin = origin
@@ -157,7 +157,7 @@ class WallClock:
 
 
 class VirtualClock:
-    """Time that passes only when somebody waits: a replay on it is deterministic and as fast as the computer allows."""
+    """Clock that advances only in `sleep_until`, so a replay is deterministic and runs as fast as possible."""
 
     def __init__(self) -> None:
         self._now = 0.0
@@ -169,7 +169,7 @@ class VirtualClock:
         self._now = max(self._now, deadline)
 
 
-# POSIX modules for serial ports and pseudo-terminals; None where the system lacks them, as on Windows.
+# POSIX modules for serial ports and pseudo-terminals; None on systems without them, such as Windows.
 
 
 try:
@@ -180,16 +180,21 @@ except ImportError:
     fcntl = termios = tty = None  # type: ignore[assignment]
 
 TerminalError: type[Exception] = OSError if termios is None else termios.error
-"""Exception that a serial port raises beside OSError."""
+"""Exception that a serial port raises in addition to OSError."""
 
 
 def require_posix(user: str) -> None:
-    """Refuse an operation that needs POSIX, named ``user`` in the message.
+    """Check that this is a POSIX system.
+
+    Parameters
+    ----------
+    user : str
+        Operation that needs POSIX, for the message.
 
     Raises
     ------
     PortError
-        This system is another one.
+        If this is not a POSIX system.
     """
     if termios is None:
-        raise PortError(f"{user}: needs a POSIX system such as Linux or macOS, which this is not")
+        raise PortError(f"{user}: needs a POSIX system, such as Linux or macOS")

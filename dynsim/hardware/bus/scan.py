@@ -1,4 +1,4 @@
-"""Scan of a port for servos at all bit rates, and torque off for all of them."""
+"""Scan a port for servos at all bit rates, and switch the torque of all servos off."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from dynsim.hardware.errors import PortError
 
 SCAN_BAUD_RATES = (57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000)
 STOP_BAUD_RATES = (3_000_000, 1_000_000, 57_600, 115_200, 2_000_000, 4_000_000)
-"""The most common rates come first."""
+"""Bit rates at which torque off is sent; the most common rates come first."""
 
 
-SHOWN = (
+SCANNED_REGISTERS = (
     "operating_mode",
     "return_delay",
     "present_voltage",
@@ -23,18 +23,18 @@ SHOWN = (
     "torque_enable",
     "hardware_error",
 )
-"""Registers that are read of every servo."""
+"""Registers that are read from every servo."""
 
 
 @dataclass(frozen=True)
-class Found:
+class ScannedServo:
     """A servo that answered a scan.
 
     Attributes
     ----------
     id, model, firmware, baud : int
     registers : dict
-        Of ``SHOWN``, by name; -1 where the servo did not tell it.
+        Values of ``SCANNED_REGISTERS``; -1 if the servo did not return the register.
     """
 
     id: int
@@ -48,21 +48,21 @@ class Found:
         return MODEL_BY_NUMBER[self.model].name if self.model in MODEL_BY_NUMBER else f"model {self.model}"
 
 
-def scan(port: str, bauds: tuple[int, ...] = SCAN_BAUD_RATES) -> list[Found]:
-    """Every servo that answers a broadcast ping at one of the bit rates. Reads only.
+def scan(port: str, bauds: tuple[int, ...] = SCAN_BAUD_RATES) -> list[ScannedServo]:
+    """Return all servos that answer a broadcast ping at one of the bit rates [bit/s]. Does not write to servos.
 
     Raises
     ------
     PortError
-        The port cannot be opened or died.
+        If the port cannot be opened or fails.
     """
     servos = []
     for baud in bauds:
         bus = DynamixelBus(open_serial_port(port, baud))
         try:
             for id_, (model, firmware) in sorted(bus.ping_all().items()):
-                registers = {name: _register(bus, id_, name) for name in SHOWN}
-                servos.append(Found(id_, model, firmware, baud, registers))
+                registers = {name: _register(bus, id_, name) for name in SCANNED_REGISTERS}
+                servos.append(ScannedServo(id_, model, firmware, baud, registers))
         finally:
             bus.close()
     return servos
@@ -76,35 +76,39 @@ def _register(bus: DynamixelBus, id_: int, name: str) -> int:
 
 
 @dataclass(frozen=True)
-class Asked:
-    """Who obeyed a broadcast torque off.
+class StopResult:
+    """Torque of the servos after a broadcast torque off.
 
     Attributes
     ----------
     torque : dict
-        Still on, by ID; True also for a servo that does not answer.
+        True for each ID whose torque is still on or that does not answer.
     trouble : tuple of str
-        Where the port failed, so that not everybody may have heard it or been asked.
+        Errors of the port; if there are any, some servos may not have received the command or not have been read.
     """
 
     torque: dict[int, bool]
     trouble: tuple[str, ...]
 
 
-def stop_all(port: str, bauds: tuple[int, ...] = STOP_BAUD_RATES, ids: tuple[int, ...] = ()) -> Asked:
-    """Broadcast torque off at every bit rate first, and only then ask who obeyed.
+def stop_all(port: str, bauds: tuple[int, ...] = STOP_BAUD_RATES, ids: tuple[int, ...] = ()) -> StopResult:
+    """Broadcast torque off at every bit rate, then read the torque of the servos.
 
-    Works beside a running replay: the port is not locked. Once it was sent nothing is raised any more.
+    Works during a running replay, because the port is not locked. Once torque off was sent, no error is raised.
 
     Parameters
     ----------
+    port : str
+        Serial device.
+    bauds : tuple of int
+        Bit rates [bit/s].
     ids : tuple of int
-        Whom to ask; everybody who answers a ping if empty.
+        IDs to read; if empty, all servos that answer a ping.
 
     Raises
     ------
     PortError
-        The port cannot be opened or died, and torque off was not sent.
+        If the port cannot be opened or fails before torque off was sent.
     """
     trouble: list[PortError] = []
     for baud in bauds:
@@ -117,17 +121,17 @@ def stop_all(port: str, bauds: tuple[int, ...] = STOP_BAUD_RATES, ids: tuple[int
     torque = dict.fromkeys(ids, True)
     for baud in bauds:
         try:
-            _ask_for_torque(port, baud, ids, torque)
+            _read_torque(port, baud, ids, torque)
         except PortError as error:
             trouble.append(error)
-    return Asked(torque, tuple(dict.fromkeys(map(str, trouble))))
+    return StopResult(torque, tuple(dict.fromkeys(map(str, trouble))))
 
 
 def _torque_off(port: str, baud: int) -> None:
     bus = DynamixelBus(open_serial_port(port, baud, exclusive=False))
     try:
         bus.torque_off_all()
-        # Closing throws away what the driver has not sent yet.
+        # Closing discards bytes that the driver has not sent yet.
         bus.port.ser.flush()
     except (OSError, TerminalError) as error:
         raise PortError(f"{port}: the port died ({error})") from error
@@ -135,7 +139,7 @@ def _torque_off(port: str, baud: int) -> None:
         bus.close()
 
 
-def _ask_for_torque(port: str, baud: int, ids: tuple[int, ...], torque: dict[int, bool]) -> None:
+def _read_torque(port: str, baud: int, ids: tuple[int, ...], torque: dict[int, bool]) -> None:
     bus = DynamixelBus(open_serial_port(port, baud, exclusive=False))
     try:
         for id_ in ids or bus.ping_all():

@@ -1,7 +1,7 @@
-"""The offline check of a motion before it is sent: limits of joints and servos at the given speed and rate.
+"""Offline check of a motion against the limits of joints, servos and bus, at the requested speed and rate.
 
-Every interval between samples is examined for the extremes of its interpolant. Nothing is clamped: a motion beyond a
-limit is refused as a whole, before a port is opened. Also here: the plan of a cycle of the bus.
+The check evaluates the extremes of the interpolant in every interval between samples. Nothing is clamped: a motion that
+exceeds a limit is rejected as a whole, before a port is opened. This module also plans the cycle of the bus.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from dynsim.errors import CheckRefused
 from dynsim.hardware.bus.control_table import HEALTH_BLOCK, STATE_BLOCK, TICKS_PER_TURN
 from dynsim.hardware.replay.measured import unmeasured
 from dynsim.hardware.replay.trajectory import (
-    COMMON,
     JERK_WINDOW,
-    LONG,
+    LONG_FACTOR,
+    LONG_QUANTILE,
     SHAKING_WINDOW,
     Array,
     CyclePlan,
@@ -38,13 +38,13 @@ from dynsim.record import Record
 
 BITS_PER_BYTE = 10
 TURNAROUND = 50e-6
-"""Planned time per status beyond its bytes and return delay [s] (unverified; servos and adapter both contribute)."""
+"""Planned time per status in addition to its bytes and return delay [s] (unverified; from servos and adapter)."""
 USB_TRANSACTION = 1e-3
-"""Planned cost of waiting for an answer through a USB adapter with its latency timer at 1 ms [s]."""
+"""Planned wait for an answer through a USB adapter with a latency timer of 1 ms [s]."""
 WATCHDOG_CYCLES = 3
-"""Least time of the servos' watchdogs, in cycles."""
+"""Minimum time of the servo watchdogs, in cycles."""
 BUS_SHARE = 0.97
-"""Largest part of the period in which the bus may be busy."""
+"""Maximum fraction of the period in which the bus may be busy."""
 
 Quantity = Literal["position", "velocity", "acceleration", "jerk", "shaking", "torque"]
 UNITS: dict[Quantity, str] = {
@@ -56,30 +56,31 @@ UNITS: dict[Quantity, str] = {
     "torque": "N m",
 }
 SLOWED: dict[Quantity, int] = {"velocity": 1, "acceleration": 2, "jerk": 2, "shaking": 1}
-"""Exponent n: at the speed s of the path the quantity is proportional to s^n, or decreases faster (jerk and shaking,
-whose time window covers less of a slower path)."""
+"""Exponent n: at path speed s the quantity is proportional to s^n or decreases faster (the time windows of jerk and
+shaking cover less of a slower path)."""
 
 SLOWEST, FASTEST = 0.01, 10.0
 """Range of speeds of the path, in path seconds per second."""
 LONGEST = 24 * 3600.0
-"""Longest motion [s]; longer times are refused as a mistake."""
+"""Maximum duration of a motion [s]; a longer duration is rejected as a mistake."""
 STILL = 1e-6
-"""A joint of a record that turns less than this [rad] counts as unmoved."""
+"""A joint of a record that turns less than this [rad] counts as stationary."""
 ROUNDING = 1e-9
-"""A joint of a record that rests at its very limit may be off by rounding of this size; a tick is 1.5e-3 rad."""
+"""Tolerance for rounding errors of a joint that rests at its limit; a tick is 1.5e-3 rad."""
 
 
 @dataclass(frozen=True)
 class Margin:
-    """The tightest place of one joint against one limit.
+    """Smallest margin of one joint to one limit.
 
     Attributes
     ----------
+    joint : str
     quantity : "position", "velocity", "acceleration", "jerk", "shaking" or "torque"
     value, limit, margin : float
-        SI; a negative margin is a violation.
+        Values in SI units; a negative margin is a violation.
     time : float
-        Where [s of record time].
+        Time of the value [s of record time].
     """
 
     joint: str
@@ -95,7 +96,7 @@ class Margin:
 
     @property
     def holds(self) -> bool:
-        # What overflows to no number at all is no motion either.
+        # False for NaN, the result of an overflow.
         return self.margin >= -ROUNDING
 
     def __str__(self) -> str:
@@ -108,13 +109,13 @@ class Margin:
 
 @dataclass(frozen=True, kw_only=True)
 class CheckedMotion(MotionTask):
-    """A motion that passed: what the replay runs on.
+    """Motion that passed the offline check; input of the replay.
 
     Attributes
     ----------
     path : Path
     margins : tuple of Margin
-        Tightest place per joint and limit.
+        Smallest margin for each joint and limit.
     warnings : tuple of str
     """
 
@@ -123,7 +124,7 @@ class CheckedMotion(MotionTask):
     warnings: tuple[str, ...] = ()
 
     def tightest(self, servo_map: ServoMap) -> tuple[Margin, float] | None:
-        """The margin that is the least part of its limit, of a position the half of its range, and that part."""
+        """Return the smallest relative margin and its value; position margins are relative to half of the range."""
         ranges = {servo.joint: servo.position_limits[1] - servo.position_limits[0] for servo in servo_map.servos}
         parts = [
             (
@@ -137,54 +138,54 @@ class CheckedMotion(MotionTask):
 
     @property
     def start(self) -> Array:
-        """Posture in which it begins [rad], shape (N,)."""
+        """Posture at the start [rad], shape (N,)."""
         return self.path.position[0]
 
     @property
     def duration(self) -> float:
-        """[s]."""
+        """Duration of the motion [s]."""
         return (self.path.end - self.path.start) / self.speed
 
     def needs(self) -> list[Needs]:
-        """What it asks of every joint, in the order of the map."""
+        """Return the demands on all joints, in the order of the map."""
         extremes = self.path.extremes()
         low, high = extremes.position.min(axis=(0, 1)), extremes.position.max(axis=(0, 1))
         fastest = self.speed * np.abs(extremes.velocity).max(axis=(0, 1))
         return [Needs(float(a), float(b), float(v)) for a, b, v in zip(low, high, fastest, strict=True)]
 
     def course(self) -> GoalCourse:
-        """How to go along the path, from its beginning."""
+        """Return the course along the path, from its start."""
         return PlannedCourse(self.path, self.path.start, self.path.end, speed=self.speed)
 
 
 def check_motion(
     record: Record, servo_map: ServoMap, *, rate: float | None = None, speed: float = 1.0
 ) -> CheckedMotion:
-    """Examine a whole record against the limits of the map, the servos' data sheets and the bus.
+    """Check a whole record against the limits of the map, the data sheets of the servos, and the bus.
 
     Parameters
     ----------
     record : Record
     servo_map : ServoMap
     rate : float, optional
-        Goal rate [Hz]; the map's if not given.
+        Command rate [Hz]; default: the rate in the map.
     speed : float
-        1 replays in the record's own time, 0.5 takes twice as long.
+        Playback speed; 1 is real time, 0.5 is half speed.
 
     Raises
     ------
     CheckRefused
-        With every violated limit: joint, value, time and margin.
+        If a limit is violated; the message lists all violations with joint, value, time and margin.
     """
     if not SLOWEST <= speed <= FASTEST:
-        raise CheckRefused(f"--speed must be from {SLOWEST:g} to {FASTEST:g}, not {speed:g}")
+        raise CheckRefused(f"--speed must be from {SLOWEST:g} to {FASTEST:g}, got {speed:g}")
     plan = plan_cycle(servo_map, rate if rate is not None else servo_map.bus.rate)
     _check_duration(record, speed)
     path = path_of_record(record, servo_map)
     margins = [*MotionLimits(servo_map).margins(path, speed), *_torque_margins(record, servo_map)]
     violations = [margin for margin in margins if not margin.holds]
     if violations:
-        lines = [f"{len(violations)} limit(s) violated, nothing was sent:", *(f"  {entry}" for entry in violations)]
+        lines = [f"{len(violations)} limit(s) violated; nothing was sent:", *(f"  {entry}" for entry in violations)]
         if all(entry.quantity in SLOWED for entry in violations):
             slower = speed * min(
                 (entry.limit / abs(entry.value)) ** (1 / SLOWED[entry.quantity]) for entry in violations
@@ -192,12 +193,12 @@ def check_motion(
             if slower >= SLOWEST:
                 lines.append(f"  --speed {math.floor(100 * slower) / 100:g} would pass")
         raise CheckRefused("\n".join(lines))
-    warnings = [] if record.complete else ["the record is marked incomplete: it ends before its scenario does"]
-    if limp := without_servo(record, servo_map):
+    warnings = [] if record.complete else ["the record is marked incomplete: it ends before its scenario"]
+    if limp := uncovered_joints(record, servo_map):
         warnings.append(f"joints of the record without a servo, limp on the robot: {'; '.join(limp)}")
-    if missing := long_steps(record, LONG, COMMON):
+    if missing := long_steps(record, LONG_FACTOR, LONG_QUANTILE):
         warnings.append(
-            f"{len(missing)} of {len(record) - 1} steps are long, samples of the record may be missing: {missing[0]}"
+            f"{len(missing)} of {len(record) - 1} time steps are long, samples may be missing: {missing[0]}"
         )
     return CheckedMotion(
         path=path,
@@ -210,10 +211,10 @@ def check_motion(
     )
 
 
-def without_servo(record: Record, servo_map: ServoMap) -> list[str]:
-    """Joints in the signals that the servos follow that are no servo's, each with how far it moves.
+def uncovered_joints(record: Record, servo_map: ServoMap) -> list[str]:
+    """Return the joints of the record that no servo of the map follows, each with its range of motion.
 
-    They have a column of positions and one of rates: the place of a mobile base in the plane is no joint.
+    Only columns with both position and rate count as joints, so the pose of a mobile base in the plane is ignored.
     """
     follows = dict.fromkeys((servo.kind.follows.position, servo.kind.follows.velocity) for servo in servo_map.servos)
     served = {(servo.kind.follows.position, servo.label) for servo in servo_map.servos}
@@ -233,28 +234,28 @@ def without_servo(record: Record, servo_map: ServoMap) -> list[str]:
 def _check_duration(record: Record, speed: float) -> None:
     with np.errstate(over="ignore", invalid="ignore"):
         duration = np.ptp(record.time) / speed if len(record) else 0.0
-    # Times that are no number at all are refused by their sample.
+    # Times that are not finite are rejected later, with the number of the sample.
     if LONGEST < duration < math.inf:
         raise CheckRefused(
-            f"the motion would take {duration:.3g} s at --speed {speed:g}, more than {LONGEST / 3600:g} h. "
-            "Is the record's time in seconds? Cut the record, or replay it faster"
+            f"the motion would take {duration:.3g} s at --speed {speed:g} (limit {LONGEST / 3600:g} h); "
+            "check that the time of the record is in seconds, cut the record, or increase --speed"
         )
 
 
 def plan_cycle(servo_map: ServoMap, rate: float) -> CyclePlan:
-    """Time budget of one cycle.
+    """Plan the time budget of one cycle at a command rate [Hz].
 
     Raises
     ------
     CheckRefused
-        The bus cannot carry that rate.
+        If the rate is too high for the bus or too low for the watchdogs.
     """
     if not (math.isfinite(rate) and rate > 0):
-        raise CheckRefused(f"--rate must be positive, not {rate}")
+        raise CheckRefused(f"--rate must be positive, got {rate}")
     if rate * servo_map.safety.watchdog < WATCHDOG_CYCLES:
         raise CheckRefused(
-            f"at {rate:g} Hz the servos' watchdogs of {servo_map.safety.watchdog:g} s would trip within "
-            f"{WATCHDOG_CYCLES} cycles. Use --rate {math.ceil(WATCHDOG_CYCLES / servo_map.safety.watchdog)} or more"
+            f"--rate {rate:g} is too low: safety.watchdog = {servo_map.safety.watchdog:g} s would trip within "
+            f"{WATCHDOG_CYCLES} cycles; use {math.ceil(WATCHDOG_CYCLES / servo_map.safety.watchdog)} or more"
         )
     count = len(servo_map.servos)
     groups = [sum(servo.in_position_mode is mode for servo in servo_map.servos) for mode in (True, False)]
@@ -268,14 +269,14 @@ def plan_cycle(servo_map: ServoMap, rate: float) -> CyclePlan:
     if available <= 0:
         highest = math.floor(BUS_SHARE / (cycle_time + 0.1 * health_time))
         raise CheckRefused(
-            f"{count} servos at {servo_map.bus.baud / 1e6:g} Mbit/s need {cycle_time * 1e3:.2f} ms a cycle; "
-            f"{rate:g} Hz leaves {1e3 / rate:.2f} ms. Use --rate {highest} or less, or a higher baud rate"
+            f"{count} servos at {servo_map.bus.baud / 1e6:g} Mbit/s need {cycle_time * 1e3:.2f} ms per cycle, but "
+            f"{rate:g} Hz leaves {1e3 / rate:.2f} ms; use --rate {highest} or less, or a higher baud rate"
         )
     return CyclePlan(rate, cycle_time, health_time, max(1, math.ceil(health_time / available)))
 
 
 class MotionLimits:
-    """Limits of the joints of a map for the paths that they may go along, of whole records and of single intervals."""
+    """Motion limits of the joints of a map, checked for whole paths or single intervals."""
 
     def __init__(self, servo_map: ServoMap) -> None:
         self._servos = servo_map.servos
@@ -292,11 +293,20 @@ class MotionLimits:
     def margins(
         self, path: Path, speed: float = 1.0, since: float = -math.inf, *, broken: bool = False
     ) -> Iterator[Margin]:
-        """The tightest place of every joint against each limit of its motion, in intervals and windows that end after
-        ``since`` [s]; only those where a limit is ``broken``.
+        """Yield the smallest margin of each joint to each motion limit.
+
+        Parameters
+        ----------
+        path : Path
+        speed : float
+            Playback speed.
+        since : float
+            Only intervals and windows that end after this path time [s] are checked.
+        broken : bool
+            If True, yield only violated limits.
         """
         extremes = path.extremes(since)
-        # The windows are of the robot's time, of which `speed` seconds of the path pass in a second.
+        # The windows are in robot time: `speed` seconds of the path pass in one second.
         jerk, jerk_time = path.jerk(JERK_WINDOW * speed, since)
         shaking, shaking_time = path.shaking(SHAKING_WINDOW * speed, since)
         with np.errstate(over="ignore"):
@@ -310,7 +320,7 @@ class MotionLimits:
         places = [self._tightest_position(position, at)]
         for quantity, (value, time) in values.items():
             limit = self._highest[quantity]
-            worst, when = _of_each(value, time, np.abs(value.reshape(-1, len(limit))).argmax(axis=0))
+            worst, when = _values_and_times(value, time, np.abs(value.reshape(-1, len(limit))).argmax(axis=0))
             places.append((worst, limit, limit - np.abs(worst), when))
         table = np.array(places).transpose(2, 0, 1)  # (N, quantities, 4)
         wanted = ~(table[..., 2] >= -ROUNDING) if broken else np.ones(table.shape[:2], dtype=bool)
@@ -319,8 +329,8 @@ class MotionLimits:
         for joint, quantity in np.argwhere(wanted):
             yield Margin(self._servos[joint].joint, quantities[quantity], *table[joint, quantity].tolist())
 
-    def surely_hold(self, path: Path) -> bool:
-        """Whether simple bounds say that the last interval, and the windows that end in it, break no limit."""
+    def within_bounds(self, path: Path) -> bool:
+        """Return True if simple bounds prove that the last interval and the windows that end in it break no limit."""
         position, velocity, acceleration, jerk, shaking = path.bounds_of_last(JERK_WINDOW, SHAKING_WINDOW)
         highest = self._highest
         return bool(
@@ -332,8 +342,8 @@ class MotionLimits:
         )
 
     def _tightest_position(self, position: Array, time: Array) -> tuple[Array, Array, Array, Array]:
-        lowest, lowest_time = _of_each(position, time, position.argmin(axis=0))
-        highest, highest_time = _of_each(position, time, position.argmax(axis=0))
+        lowest, lowest_time = _values_and_times(position, time, position.argmin(axis=0))
+        highest, highest_time = _values_and_times(position, time, position.argmax(axis=0))
         below = lowest - self._low < self._high - highest
         return (
             np.where(below, lowest, highest),
@@ -343,20 +353,20 @@ class MotionLimits:
         )
 
 
-def _of_each(values: Array, times: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]:
-    """Of each joint the value in one of the rows, and its time; shape (N,)."""
+def _values_and_times(values: Array, times: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]:
+    """Return the value of each joint in its entry of ``rows``, and the time of that value; shape (N,)."""
     columns = np.arange(len(rows))
     return values.reshape(-1, len(rows))[rows, columns], times.reshape(-1, len(rows))[rows, columns]
 
 
 def position_bounds(servo: MappedServo) -> tuple[float, float]:
-    """Limits of the map, narrowed to the single turn position mode knows [rad]."""
+    """Return the position limits of the map, restricted to the single turn of position mode [rad]."""
     turn = sorted((servo.to_angle(0), servo.to_angle(TICKS_PER_TURN - 1)))
     return max(servo.position_limits[0], turn[0]), min(servo.position_limits[1], turn[1])
 
 
 def velocity_limit(servo: MappedServo) -> float:
-    """Joint speed limit [rad/s]: the map's, or the model's no-load speed where that is lower."""
+    """Return the joint speed limit [rad/s]: the lower of the limit in the map and the no-load speed of the model."""
     return min(servo.kind.limits.velocity, servo.model.no_load_speed / servo.gear)
 
 

@@ -1,4 +1,4 @@
-"""Comparison of a measured run with the simulated one, per joint: delay, errors with and without it, gate, figure."""
+"""Compare a measured run with the simulated run: delay, errors with and without delay, gate and figure."""
 
 from __future__ import annotations
 
@@ -23,25 +23,27 @@ from dynsim.snake.lifting import Lifts, lifted
 
 Array = NDArray[np.float64]
 MAX_DELAY = 0.5
-"""Largest delay that is considered [s]."""
+"""Maximum delay that is considered [s]."""
 MOVING = 3 * RAD_PER_TICK
-"""The delay is not determined from a joint that moves less than this [rad], three steps of a servo's encoder."""
+"""Minimum motion of a joint for an estimate of its delay [rad]: three steps of the servo encoder."""
 WHEEL_ANGLE, WHEEL_RATE = "rho", "rho_dot"
-"""Signals of wheels, which turn without end: compared are angles turned since the start and rates, not positions."""
+"""Signals of wheels. Wheels turn without limit, so rates and angles turned since the start are compared."""
 
 
 class Gate(StrictConfig):
-    """Largest errors that a comparison may have.
+    """Error bounds of a comparison.
 
     Attributes
     ----------
     rms_rad, max_rad : float or None
-        Error of the worst joint, delay not taken out [rad].
+        Error of the worst joint, including the delay [rad].
     rms_delay_removed_rad : float or None
-        The same with the common delay taken out [rad].
+        Rms error of the worst joint with the common delay removed [rad].
     delay_s : float or None
+        Common delay [s].
     wheel_rate_rms_rad_s, wheel_angle_max_rad : float or None
-        Rate, and angle turned since the start, of the worst wheel; a comparison without wheels fails.
+        Errors of the rate [rad/s] and of the angle turned since the start [rad] of the worst wheel; a comparison
+        without wheels fails.
     """
 
     rms_rad: Positive | None = None
@@ -54,10 +56,19 @@ class Gate(StrictConfig):
 
 @dataclass(frozen=True)
 class JointError:
-    """Measured minus simulated angle of one joint [rad].
+    """Error of one joint: measured minus simulated angle.
 
-    ``delay`` is its own [s], NaN where none explains the error. ``rms_delay_removed`` is without the common one; where
-    there is none, it is ``rms``.
+    Attributes
+    ----------
+    joint : str
+    rms, max : float
+        Rms and maximum error [rad].
+    time_of_max : float
+        Time of ``max`` [s of record time].
+    rms_delay_removed : float
+        Rms error with the common delay removed [rad]; equal to ``rms`` without a common delay.
+    delay : float
+        Delay of this joint [s]; NaN if no delay explains the error.
     """
 
     joint: str
@@ -76,13 +87,13 @@ class WheelError:
     ----------
     wheel : str
     rate_rms, rate_max : float
-        Of its rate [rad/s].
+        Rms and maximum error of the rate [rad/s].
     time_of_max : float
-        Of ``rate_max`` [s of record time].
+        Time of ``rate_max`` [s of record time].
     turned : float
-        How far it turned in the simulation, first to last sample compared [rad].
+        Angle turned in the simulation between the first and the last compared sample [rad].
     angle_max, angle_end : float
-        Of the angle turned since the start of the motion: the largest, and that at its end with its sign [rad].
+        Error of the angle turned since the start: maximum magnitude, and signed error at the end [rad].
     """
 
     wheel: str
@@ -96,21 +107,21 @@ class WheelError:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Simulated and measured angles on the measured run's times.
+    """Simulated and measured angles at the times of the measured run.
 
     Attributes
     ----------
     delay : float
-        By which the measured run lags, common to all joints [s]; NaN where no delay explains half of their error.
+        Common delay of all joints of the measured run [s]; NaN if no delay explains half of the error.
     joints : tuple of JointError
     wheels : tuple of WheelError
-        Empty where the records share none.
+        Empty if the records have no wheels in common.
     time : array, shape (T,)
         Record time [s].
     simulated, measured : array, shape (T, N)
-        [rad].
+        Joint angles [rad].
     wheel_rates : array, shape (2, T, number of wheels)
-        Simulated and measured [rad/s].
+        Simulated and measured wheel rates [rad/s].
     """
 
     delay: float
@@ -123,16 +134,16 @@ class Comparison:
 
     @property
     def worst(self) -> JointError:
-        """The joint with the largest rms."""
+        """Joint with the largest rms error."""
         return max(self.joints, key=lambda joint: joint.rms)
 
     @property
     def delay_text(self) -> str:
-        """The common delay in words."""
+        """Text with the common delay."""
         return "no common delay" if np.isnan(self.delay) else f"common delay {self.delay * 1e3:.1f} ms"
 
     def summary(self) -> dict[str, Any]:
-        """Numbers for JSON; units in the names."""
+        """Return the results as a dictionary for JSON, with units in the keys."""
         joints = {
             joint.joint: {
                 "rms_rad": joint.rms,
@@ -166,35 +177,42 @@ class Comparison:
 
 
 def compare_records(simulated: Record, measured: Record) -> Comparison:
-    """Compare every joint angle the two records share.
+    """Compare all joint angles that two records have in common.
 
-    ``measured`` may be a measured run (its ``record_time`` ties it to the simulated one) or any other record. What
-    lifts wheels is compared with the angles that the record's lifted pairs ask for. Of wheels the rates are compared,
-    and how far they turned since the start of the motion.
+    Joints that lift wheels are compared with the angles required by the lifted wheel pairs of the simulated record. For
+    wheels, the rates and the angles turned since the start of the motion are compared.
+
+    Parameters
+    ----------
+    simulated : Record
+        Simulated run.
+    measured : Record
+        Measured run, which is aligned with the simulation by its ``record_time``, or any other record.
 
     Raises
     ------
     RecordError
-        No common angles, no sample of the replayed motion, or a measured run that is not as a replay makes them.
+        If there are no common angles or no samples of the replayed motion, or the measured run is not the result of a
+        replay.
     CheckRefused
-        The measured run lifted wheels, and the simulated record is none of which they can be lifted.
+        If the measured run lifted wheels but the lifting cannot be computed for the simulated record.
     """
     for name in ("state", "record_time"):
         if name in measured and measured[name].shape != measured.time.shape:
             raise RecordError(
-                f"signal {name!r} of the measured run has shape {measured[name].shape}; it has one column"
+                f"signal {name!r} of the measured run must have one column, got shape {measured[name].shape}"
             )
     speed = measured.provenance.get("speed", 1.0)
     if not isinstance(speed, (int, float)) or not 0.0 < speed < np.inf:
-        raise RecordError(f"the provenance of the measured run says speed {brief(speed)}; a replay has a positive one")
+        raise RecordError(f"speed in the provenance of the measured run must be positive, got {brief(speed)}")
     rows = measured["state"] == ReplayState.REPLAY if "state" in measured else np.ones(len(measured), dtype=bool)
     time = measured["record_time"] if "record_time" in measured else measured.time  # noqa: SIM401
     rows &= np.isfinite(time) & (time >= 0) & (time <= simulated.time[-1] - simulated.time[0])
     if rows.sum() < 2:
-        raise RecordError("the measured record holds no sample of the replayed motion")
+        raise RecordError("the measured record does not contain the replayed motion; use a completed replay")
     pairs = _common_angles(simulated, measured)
     if not pairs:
-        raise RecordError("the records share no joint angles: signals in rad with the same name and column labels")
+        raise RecordError("the records have no joint angles in common (signals in rad with equal name and labels)")
     labels = tuple(label for label, _, _ in pairs)
     actual = np.column_stack([data[rows] for _, _, data in pairs])
     reference = np.column_stack([data for _, data, _ in pairs])
@@ -228,12 +246,12 @@ def compare_records(simulated: Record, measured: Record) -> Comparison:
 
 
 def _rms(error: Array) -> float:
-    """Of an error that is NaN where an answer was missed."""
+    """Return the rms of an error that is NaN at missed answers."""
     return float(np.sqrt(np.nanmean(error**2)))
 
 
 def _largest(error: Array, time: Array) -> tuple[float, float]:
-    """Magnitude of the largest of these errors, and when it was; NaN where an answer was missed."""
+    """Return magnitude and time of the largest error; the errors are NaN at missed answers."""
     worst = int(np.nanargmax(np.abs(error)))
     return float(abs(error[worst])), float(time[worst])
 
@@ -241,7 +259,7 @@ def _largest(error: Array, time: Array) -> tuple[float, float]:
 def _wheel_errors(
     simulated: Record, measured: Record, rows: NDArray[np.bool_], time: Array, speed: float
 ) -> tuple[tuple[WheelError, ...], Array]:
-    """Errors of the wheels, and their rates as :class:`Comparison` has them."""
+    """Return the errors of the wheels, and their rates as in :class:`Comparison`."""
     angles = {label: (ours, theirs) for label, ours, theirs in _columns(simulated, measured, WHEEL_ANGLE)}
     own_time = simulated.time - simulated.time[0]
     errors, rates = [], np.zeros((2, len(time), 0))
@@ -253,7 +271,7 @@ def _wheel_errors(
         rate = pair[1] - pair[0]
         asked = np.interp(time, own_time, angles[label][0])
         turned = angles[label][1][rows]
-        seen = np.flatnonzero(np.isfinite(turned))  # not NaN, as where an answer was missed
+        seen = np.flatnonzero(np.isfinite(turned))  # without missed answers
         angle = (turned - turned[seen[0]]) - (asked - asked[seen[0]])
         rate_max, time_of_max = _largest(rate, time)
         errors.append(
@@ -271,7 +289,7 @@ def _wheel_errors(
 
 
 def _columns(simulated: Record, measured: Record, name: str) -> list[tuple[str, Array, Array]]:
-    """Label, simulated and measured column of all that the records share of a signal with columns."""
+    """Return label, simulated column and measured column for each column of a signal that both records have."""
     if name not in simulated or name not in measured or simulated[name].ndim != 2 or measured[name].ndim != 2:
         return []
     ours, theirs = simulated.labels[name], measured.labels[name]
@@ -284,7 +302,10 @@ def _columns(simulated: Record, measured: Record, name: str) -> list[tuple[str, 
 
 
 def _common_angles(simulated: Record, measured: Record) -> list[tuple[str, Array, Array]]:
-    """All angles but those of wheels; what lifts wheels follows the record and the lifting, or the lifting alone."""
+    """Return all common angles except wheel angles.
+
+    A joint that lifts wheels follows the sum of the record and the lifting, or the lifting alone.
+    """
     offsets = _lifting(simulated, measured)
     pairs = []
     for name, signal in simulated.signals.items():
@@ -300,28 +321,28 @@ def _common_angles(simulated: Record, measured: Record) -> list[tuple[str, Array
 
 
 def _lifting(simulated: Record, measured: Record) -> dict[str, Array]:
-    """What the measured run's servo map added to joints for lifting wheels, by column [rad]."""
+    """Return the angles that the servo map of the measured run added to lift wheels, by column [rad]."""
     entry = measured.provenance.get("lifts")
     if entry is None:
         return {}
     try:
         lifts = Lifts.model_validate(entry)
     except ValidationError:
-        raise RecordError(f"the provenance of the measured run says lifts {brief(entry)}") from None
+        raise RecordError(f"invalid lifts in the provenance of the measured run: {brief(entry)}") from None
     return dict(zip(lifts.joints, lifted(simulated, lifts).hinge.T, strict=True))
 
 
 def _delay(at: Any, time: Array, actual: Array, columns: NDArray[np.bool_]) -> float:
-    """Shift of the simulated angles that fits the measured ones best [s of record time].
+    """Return the shift of the simulated angles that best fits the measured angles [s of record time].
 
-    NaN where none in the range explains half of the mean square error: then the error is sag or play, not delay.
+    NaN if no shift in the range explains half of the mean square error: then the error is sag or backlash, not delay.
     """
     if not columns.any():
         return float("nan")
 
     def misfit(delay: float) -> float:
         error = (actual - at(time - delay))[:, columns]
-        # A joint that sags under its load is off by a constant; that is no delay.
+        # Remove the mean: a joint that sags under its load has a constant error, which is not a delay.
         return float(np.nanmean((error - np.nanmean(error, axis=0)) ** 2))
 
     grid = np.linspace(-0.1, MAX_DELAY, 61)
@@ -339,23 +360,23 @@ def load_gate(path: str | Path) -> Gate:
     Raises
     ------
     ServoMapError
-        Missing file, bad YAML or bad entry, with file and line.
+        If the file is missing, is not YAML or has an invalid entry; the message has file and line.
     """
     return read_yaml(Path(path), Gate)
 
 
 def check_gate(comparison: Comparison, gate: Gate) -> None:
-    """Hold a comparison against a gate.
+    """Check a comparison against the bounds of a gate.
 
     Raises
     ------
     ComparisonGateFailed
-        With every bound exceeded.
+        If a bound is exceeded; the message lists all of them.
     """
     summary = comparison.summary()
     bounds = {name: bound for name, bound in gate.model_dump().items() if bound is not None}
     if summary["delay_s"] is None:
-        # An error that no delay explains is left to the other bounds.
+        # Without a common delay the other bounds apply.
         bounds.pop("delay_s", None)
     exceeded = [f"{name}: no wheels to compare" for name in bounds if summary[name] is None]
     exceeded += [
@@ -368,16 +389,20 @@ def check_gate(comparison: Comparison, gate: Gate) -> None:
 
 
 def draw_comparison(comparison: Comparison, path: Path, joints: Sequence[str] = ()) -> Path:
-    """Figure: angles of some joints, measured over simulated, and every joint's error over time; the same of wheels.
+    """Draw measured and simulated angles of some joints, and the errors of all joints over time; likewise for wheels.
 
     Parameters
     ----------
-    joints : names of those drawn in colour, wheels among them; the worst of either if none are given
+    comparison : Comparison
+    path : Path
+        Output file.
+    joints : sequence of str
+        Joints and wheels to draw in colour; default: the worst of each.
 
     Raises
     ------
     RecordError
-        A joint is not among those compared, or the file cannot be written.
+        If a joint was not compared, or the file cannot be written.
     """
     from dynsim.draw.figures.measured import Compared as Followed
     from dynsim.draw.figures.measured import draw_errors
@@ -386,9 +411,9 @@ def draw_comparison(comparison: Comparison, path: Path, joints: Sequence[str] = 
     wheels = [wheel.wheel for wheel in comparison.wheels]
     for name in joints:
         if name not in names + wheels:
-            raise RecordError(f"no joint {brief(name)} was compared; there are: {', '.join(names + wheels)}")
+            raise RecordError(f"unknown joint {brief(name)}; compared joints: {', '.join(names + wheels)}")
     texts = [
-        f"{joint.joint}: rms {1e3 * joint.rms:.3g} mrad, at most {1e3 * joint.max:.3g}" for joint in comparison.joints
+        f"{joint.joint}: rms {1e3 * joint.rms:.3g} mrad, max. {1e3 * joint.max:.3g}" for joint in comparison.joints
     ]
     rms, both = [joint.rms for joint in comparison.joints], np.stack([comparison.simulated, comparison.measured])
     quantities = [
@@ -396,7 +421,7 @@ def draw_comparison(comparison: Comparison, path: Path, joints: Sequence[str] = 
     ]
     if wheels:
         texts = [
-            f"{wheel.wheel}: rms {wheel.rate_rms:.3g} rad/s, angle at most {wheel.angle_max:.3g} rad"
+            f"{wheel.wheel}: rms {wheel.rate_rms:.3g} rad/s, max. angle error {wheel.angle_max:.3g} rad"
             for wheel in comparison.wheels
         ]
         rms, both = [wheel.rate_rms for wheel in comparison.wheels], comparison.wheel_rates

@@ -1,13 +1,15 @@
-"""Live drive of servos: postures of a running simulation are checked and followed as they arrive.
+"""Live drive of servos: check and follow the postures of a running simulation as they arrive.
 
-The servos stay behind the simulation by at least half of ``safety.stop_time``. So enough of the path ahead of the last
-goal is known and checked that the servos can stop along it within that time. With b the length of known path ahead [s],
-T the stop time and h the period, a cycle advances by s h along the path, where s is the largest speed with
+The servos lag the simulation by at least half of ``safety.stop_time``, so that enough of the path ahead of the last
+goal is known and checked for a stop along the path within that time. With b the length of known path ahead [s], T the
+stop time and h the period, a cycle advances by s h along the path, where s is the largest speed with
 
     s² T/2 ≤ b − s h,     s ≤ 1,     s ≤ s_before + h/T
 
-So a simulation that is late slows the robot down along its path, to rest where the path ends; the robot speeds up again
-at the same rate. Lost time is not made up for: the simulation waits for the servos (:meth:`Feed.tell`).
+If the simulation is late, the robot slows down along its path and stops at the end of the path; it speeds up again at
+the same rate. Lost time is not made up: the simulation waits for the servos (:meth:`Feed.report_time`).
+
+If a snake robot lifts wheel pairs, postures are delayed until the joint angles of the lifting are known.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ from dynsim.errors import CheckRefused
 from dynsim.hardware.replay.check import ROUNDING, MotionLimits, plan_cycle
 from dynsim.hardware.replay.output import Stopped
 from dynsim.hardware.replay.rules import Cause, Fault
-from dynsim.hardware.replay.trajectory import HOLE, SHAKING_WINDOW, Array, GoalCourse, MotionTask, Needs, Path
+from dynsim.hardware.replay.trajectory import GAP_FACTOR, SHAKING_WINDOW, Array, GoalCourse, MotionTask, Needs, Path
 from dynsim.hardware.replay.verify import needs_of_map
 from dynsim.hardware.servo_map import ServoMap
 from dynsim.record import Record
@@ -39,14 +41,20 @@ from dynsim.snake.lifting import (
     refuse_what_cannot_stand,
 )
 
-# A servo path that grows knot by knot; each knot must keep the motion limits before it is sent to servos.
+# A path that grows knot by knot; each knot is checked against the motion limits before it is sent to the servos.
 
 
 class Sample(NamedTuple):
-    """One sample of the motion: time [s], joint angles [rad] and rates [rad/s], (N,), in the order of the servo map.
+    """One sample of the motion, in the order of the servo map.
 
-    ``lift`` and ``lift_rate`` are added to them where a snake lifts wheel pairs, as in
-    :func:`~dynsim.hardware.replay.trajectory.path_of_record`.
+    Attributes
+    ----------
+    time : float
+        Simulation time [s].
+    position, velocity : array, shape (N,)
+        Joint angles [rad] and rates [rad/s].
+    lift, lift_rate : array, shape (N,), or float
+        Angles [rad] and rates [rad/s] that are added to lift the wheel pairs of a snake robot.
     """
 
     time: float
@@ -57,17 +65,17 @@ class Sample(NamedTuple):
 
     @property
     def posture(self) -> Array:
-        """Where the joints are to be [rad], shape (N,)."""
+        """Commanded joint angles including the lifting [rad], shape (N,)."""
         return self.position + self.lift
 
 
 class IncrementalPath:
-    """Knots of a path as they come, as far back as goals and limits need them.
+    """Path that grows at its end and drops the knots that goals and limits no longer need.
 
     Parameters
     ----------
     first : Sample
-        Where it rests.
+        Start of the path, at rest.
     servo_map : ServoMap
     """
 
@@ -84,29 +92,30 @@ class IncrementalPath:
         return self._path.end
 
     def at(self, time: float) -> tuple[Array, Array]:
-        """Joint angles [rad] and rates [rad/s] at a time [s]."""
+        """Return joint angles [rad] and rates [rad/s] at a time [s]."""
         return self._path.at(time)
 
     def append(self, sample: Sample, *, keep: float) -> list[str]:
-        """One more knot, unless it breaks limits; which ones, in words. Of jerk and shaking as if the path ended there.
+        """Add a knot if it does not break a limit, and return the texts of the broken limits.
 
-        What is before ``keep`` [s], and before the windows of the limits, is dropped.
+        Jerk and shaking are evaluated as if the path ended at this knot. Knots before ``keep`` [s] and before the
+        windows of the limits are dropped.
         """
         path, last = self._path, self._last
-        with np.errstate(all="ignore"):  # what is no number holds no bound
+        with np.errstate(all="ignore"):  # NaN fails every bound
             h = sample.time - last.time
             held_rate = (sample.position - last.position) / h
-            # Before the first posture nothing is known: there the rate of the lift is that of the first interval.
+            # At the first posture the rate of the lift is the rate in the first interval.
             lift_rate = (sample.lift - last.lift) / h if len(path.time) == 1 else last.lift_rate
             after = np.where(self._held, held_rate, last.velocity) + lift_rate
             before = np.where(self._held, held_rate, sample.velocity) + sample.lift_rate
             longer = path.since(min(keep, path.end - SHAKING_WINDOW), 2).longer(
                 sample.time, sample.posture, after, before
             )
-            # Windows are looked at that end after the last knot. Knots before these have a part in their acceleration.
+            # Check the windows that end after the last knot; their accelerations also depend on two earlier knots.
             windows = longer.since(path.end - SHAKING_WINDOW, 2)
-            # A pilot's robot is well within its limits most of the time, and a cycle is short.
-            sure = self._limits.surely_hold(windows)
+            # Simple bounds save time in the cycle, because the robot is usually far from its limits.
+            sure = self._limits.within_bounds(windows)
             margins = [] if sure else self._limits.margins(windows, since=path.end, broken=True)
             broken = [str(margin) for margin in margins]
         if not broken:
@@ -115,24 +124,24 @@ class IncrementalPath:
 
 
 SLACK = 0.1
-"""Largest lead of the simulation over the servos, beyond the path that a stop takes [s]."""
+"""Lead of the simulation over the servos in addition to the path needed for a stop [s]."""
 SILENCE = 5.0
-"""Time without a posture after which the drive ends [s]; the robot is at rest for most of it."""
+"""Time without a posture after which the drive ends [s]; the robot is at rest for most of this time."""
 MOST_BROKEN = 4
-"""Largest number of violations that a fault names."""
+"""Maximum number of violations listed in the message of a fault."""
 REST = 1e-9
-"""A path whose end is closer than this [s] is finished."""
+"""Remaining path time below which the path is finished [s]."""
 
 
 class Feed(Protocol):
-    """Source of the postures. Its methods do not wait, write files, or raise.
+    """Interface of a source of postures. Its methods do not wait, write files or raise.
 
     Attributes
     ----------
     over : bool
-        The drive has ended as it should, and all its samples have been taken.
+        True if the drive ended normally and all samples were taken.
     fault : str
-        Why no more postures will come although the drive has not ended; empty without a fault.
+        Reason why no more postures will arrive although the drive has not ended; empty without a fault.
     """
 
     @property
@@ -142,36 +151,36 @@ class Feed(Protocol):
     def fault(self) -> str: ...
 
     def take(self, most: int) -> Sequence[Sample]:
-        """Samples that have come since, the oldest first."""
+        """Return at most ``most`` samples that arrived since the last call, the oldest first."""
         ...
 
-    def tell(self, time: float) -> None:
-        """The servos are at this time of the simulation [s]; it may go on to :func:`lead` beyond.
+    def report_time(self, time: float) -> None:
+        """Report the simulation time that the servos have reached [s].
 
-        By more where its postures are held back (:mod:`dynsim.hardware.replay.drive`).
+        The simulation may advance to :func:`lead` beyond this time, and further by the delay of :class:`LiftLookahead`.
         """
         ...
 
 
 def lead(servo_map: ServoMap) -> float:
-    """By how much the simulation may be ahead of the servos [s]."""
+    """Return the time by which the simulation may be ahead of the servos [s]."""
     return 0.5 * servo_map.safety.stop_time + SLACK
 
 
 @dataclass(frozen=True, kw_only=True)
 class DrivenMotion(MotionTask):
-    """What a pilot will ask for. Of the simulation that it follows nothing is known yet but its beginning.
+    """Motion commanded live by a pilot; only its start is known in advance.
 
     Attributes
     ----------
     servo_map : ServoMap
     feed : Feed
     first : Sample
-        Where it begins.
+        Start of the motion.
     step : float
-        Between two samples [s].
+        Time between two samples [s].
     longest : float
-        Drive [s].
+        Maximum duration of the drive [s].
     """
 
     servo_map: ServoMap
@@ -182,20 +191,20 @@ class DrivenMotion(MotionTask):
 
     @property
     def start(self) -> Array:
-        """Posture in which it begins [rad], shape (N,)."""
+        """Posture at the start [rad], shape (N,)."""
         return self.first.posture
 
     @property
     def duration(self) -> float:
-        """Longest drive [s]."""
+        """Maximum duration of the drive [s]."""
         return self.longest
 
     def needs(self) -> list[Needs]:
-        """Where it will go is not known: all that the map allows."""
+        """Return the full range allowed by the map, because the motion is not known."""
         return [needs_of_map(servo) for servo in self.servo_map.servos]
 
     def course(self) -> GoalCourse:
-        """Along what comes."""
+        """Return the course along the samples of the feed."""
         return DrivenCourse(self)
 
 
@@ -209,11 +218,28 @@ def check_drive(
     rate: float | None = None,
     scene: Scene | None = None,
 ) -> DrivenMotion:
-    """What can be known before a drive: its start is within the limits and at rest, and the bus carries the rate.
+    """Check a drive before its start: the first posture is within the limits and at rest, and the bus allows the rate.
+
+    Parameters
+    ----------
+    first : Sample
+        Start of the motion.
+    servo_map : ServoMap
+    feed : Feed
+        Source of the samples.
+    step : float
+        Time between two samples [s].
+    longest : float
+        Maximum duration of the drive [s].
+    rate : float, optional
+        Command rate [Hz]; default: the rate in the map.
+    scene : Scene, optional
+        Scene for the measured record.
 
     Raises
     ------
     CheckRefused
+        If a limit is violated, the simulation starts in motion, or the bus does not allow the rate.
     """
     plan = plan_cycle(servo_map, rate if rate is not None else servo_map.bus.rate)
     still = np.zeros((1, len(first.position)))
@@ -221,21 +247,21 @@ def check_drive(
     broken = list(MotionLimits(servo_map).margins(start, broken=True))
     if broken:
         lines = "\n".join(f"  {margin}" for margin in broken)
-        raise CheckRefused(f"the drive would begin beyond {len(broken)} limit(s), nothing was sent:\n{lines}")
+        raise CheckRefused(f"the drive would start beyond {len(broken)} limit(s); nothing was sent:\n{lines}")
     moving = np.flatnonzero(~(np.abs(first.velocity) <= ROUNDING))
     if len(moving):
         names = ", ".join(servo_map.joints[k] for k in moving)
         raise CheckRefused(
-            f"the simulation begins in motion ({names}); servos begin at rest: let its rates begin at zero"
+            f"the simulation starts in motion ({names}), but servos start at rest; use zero initial rates"
         )
     return DrivenMotion(servo_map=servo_map, feed=feed, first=first, step=step, longest=longest, plan=plan, scene=scene)
 
 
 class DrivenCourse:
-    """Along the samples of a feed, each checked when it comes, which is before any goal of its stretch is sent.
+    """Course along the samples of a feed; each sample is checked before any goal of its interval is sent.
 
-    The limits are those of the offline check. A sample beyond one is never followed, nor brought back to the limit:
-    :class:`Stopped` ends the drive, and the fault policy has the way to a stop that has been checked.
+    The limits are the same as in the offline check. A sample that exceeds a limit is neither followed nor clamped:
+    :class:`Stopped` ends the drive, and the fault policy stops along the path that has been checked.
     """
 
     def __init__(self, motion: DrivenMotion) -> None:
@@ -262,7 +288,7 @@ class DrivenCourse:
         return self._path.at(time)
 
     def braking_time(self, stop_time: float) -> float:
-        # At less than full speed a stop in this time may be longer than what is known of the path.
+        # At reduced speed a stop in this time may need more path than is known.
         ahead = self.end - self.time
         return stop_time if 0.5 * self.speed * stop_time <= ahead else 2.0 * ahead / self.speed
 
@@ -272,42 +298,45 @@ class DrivenCourse:
         most = (math.sqrt(period * period + 2.0 * stop_time * ahead) - period) / stop_time
         self.speed = min(1.0, most, self.speed + period / stop_time)
         self.time = min(self.end, self.time + self.speed * period)
-        self._feed.tell(self.time)
+        self._feed.report_time(self.time)
         position, rate = self._path.at(self.time)
         return position, self.speed * rate
 
     def _take(self, period: float) -> None:
-        """Samples that have come; never so many at once that the cycle would be late for it."""
+        """Append the samples that have arrived, limited in number so that the cycle is not late."""
         samples = self._feed.take(math.ceil(period / self._motion.step) + 1)
         self._silent = 0.0 if samples else self._silent + period
         for sample in samples:
             step = sample.time - self._path.end
-            if not 0.0 < step <= HOLE * self._motion.step:
-                text = f"its time goes from {self._path.end:g} to {sample.time:g} s in steps of {self._motion.step:g} s"
+            if not 0.0 < step <= GAP_FACTOR * self._motion.step:
+                text = f"time jumps from {self._path.end:g} to {sample.time:g} s (step {self._motion.step:g} s)"
                 raise Stopped(Fault(Cause.SIMULATION, text))
             if broken := self._path.append(sample, keep=self.time):
                 text = "; ".join(broken[:MOST_BROKEN])
                 more = f"; and {len(broken) - MOST_BROKEN} more" if len(broken) > MOST_BROKEN else ""
-                raise Stopped(Fault(Cause.LIMIT, f"the pilot's robot goes beyond what the map allows: {text}{more}"))
+                raise Stopped(Fault(Cause.LIMIT, f"the driven motion exceeds limits of the servo map: {text}{more}"))
         if self._feed.fault:
             raise Stopped(Fault(Cause.SIMULATION, self._feed.fault))
         if self._silent > SILENCE and not self._feed.over:
-            raise Stopped(Fault(Cause.SIMULATION, f"no posture came for {SILENCE:g} s"))
+            raise Stopped(Fault(Cause.SIMULATION, f"no posture received for {SILENCE:g} s"))
 
 
-# Lifted wheel pairs in a live drive: postures are held back until the joint angles that lifting adds are known.
+# Lifted wheel pairs in a live drive: delay postures until the joint angles of the lifting are known.
 
 
 @dataclass
-class _Held:
-    """A posture without the angles that lifting adds, kept until these are known.
+class _PendingPosture:
+    """Posture whose lifting angles are not known yet.
 
     Attributes
     ----------
     sample : Sample
-    yaw : shape (pairs - 1,) [rad]
-    up, down : when each pair is lifted and put down [s], shape (pairs,): infinite where it always was, or is for all
-        that is known; ``up`` is NaN for a pair on the ground
+        Sample without the lifting.
+    yaw : array, shape (pairs - 1,)
+        Yaw angles of the base part [rad].
+    up, down : array, shape (pairs,)
+        Times at which each pair is lifted and put down [s]. ``up`` is -inf for a pair that is lifted from the start and
+        NaN for a pair on the ground; ``down`` is inf if the time is not known yet.
     """
 
     sample: Sample
@@ -317,21 +346,26 @@ class _Held:
 
 
 class LiftLookahead:
-    """Postures of a simulation from its start on, and as :class:`Sample` with what lifting adds.
+    """Add the angles of lifted wheel pairs to the postures of a simulation, with a delay.
 
     Parameters
     ----------
     still : Record
-        Of the robot at its start, with its scene.
+        Record of the robot at its start, with its scene.
     servo_map : ServoMap
-        With an entry ``lifts``.
+        Map with an entry ``lifts``.
     step : float
-        Between two postures [s].
+        Time between two postures [s].
+
+    Attributes
+    ----------
+    delay : float
+        Delay of the samples [s].
 
     Raises
     ------
     CheckRefused
-        The map's entry does not fit the robot.
+        If ``lifts`` does not match the robot.
     """
 
     def __init__(self, still: Record, servo_map: ServoMap, step: float) -> None:
@@ -345,8 +379,8 @@ class LiftLookahead:
         self._columns = [still.labels[self._part.signal].index(name) for name in self._part.yaw]
         self._joints = [servo_map.joints.index(joint) for joint in lifts.joints]
         self.delay = lifts.blend_s + 2.0 * step
-        self._held: list[_Held] = []
-        # The last two that were folded: the rate of the last one is not known yet.
+        self._pending: list[_PendingPosture] = []
+        # The last folded postures; the rate of the newest is not known yet.
         self._folded: list[Sample] = []
         self._changed = -np.inf
 
@@ -356,80 +390,89 @@ class LiftLookahead:
         return self._part.signal, self._columns
 
     def steady(self, time: float) -> bool:
-        """Pairs may be lifted and put down at a time [s]: what was lifted last has had the time for both."""
+        """Return True if pairs may be lifted or put down at a time [s]: the last change has been completed."""
         blend = self._lifts.blend_s
         return time >= blend - TIME_ROUNDING and time - self._changed >= 2.0 * blend - TIME_ROUNDING
 
     def begin(self, sample: Sample, yaw: Array, grounded: Array) -> Sample:
-        """The posture in which the simulation rests, with what lifting adds.
+        """Return the initial posture, at rest, with its lifting angles.
 
         Parameters
         ----------
-        yaw : (pairs - 1,) [rad]
-        grounded : (pairs,) 1 where a pair is on the ground
+        sample : Sample
+            Posture without lifting angles.
+        yaw : array, shape (pairs - 1,)
+            Yaw angles of the base part [rad].
+        grounded : array, shape (pairs,)
+            1 for a pair on the ground, 0 for a lifted pair.
 
         Raises
         ------
         CheckRefused
-            A pair is lifted that cannot be.
+            If a lifted pair cannot be lifted.
         """
         refuse_what_cannot_stand(grounded[None], self._pairs, np.array([sample.time]))
         self._grounded = grounded.copy()
         self._up, self._down = np.where(grounded == 0, -np.inf, np.nan), np.full(len(grounded), np.inf)
-        self._hold(sample, yaw)
-        first = self._fold(self._held[0])
+        self._enqueue(sample, yaw)
+        first = self._fold(self._pending[0])
         self._folded = [first]
         return first
 
     def add(self, sample: Sample, yaw: Array, grounded: Array) -> list[Sample]:
-        """One more posture; those that are whole now, the oldest first, without the one of :meth:`begin`.
+        """Add a posture and return the completed samples, the oldest first, without the sample of :meth:`begin`.
 
         Parameters
         ----------
-        grounded : (pairs,) 1 where a pair was on the ground since the posture before
+        sample : Sample
+            Posture without lifting angles.
+        yaw : array, shape (pairs - 1,)
+            Yaw angles of the base part [rad].
+        grounded : array, shape (pairs,)
+            1 for a pair on the ground since the previous posture, 0 for a lifted pair.
 
         Raises
         ------
         CheckRefused
-            A pair is lifted that cannot be, or not for so short a time.
+            If a lifted pair cannot be lifted, or not for so short a time.
         """
-        since = self._held[-1]
+        since = self._pending[-1]
         time = since.sample.time
         if (grounded != self._grounded).any():
             self._change(since, grounded)
-        self._hold(sample, yaw)
-        return self._whole(time - self._lifts.blend_s + TIME_ROUNDING)
+        self._enqueue(sample, yaw)
+        return self._completed(time - self._lifts.blend_s + TIME_ROUNDING)
 
     def remaining(self) -> list[Sample]:
-        """All that are still held back: there are no more. What is lifted stays so."""
-        return [*self._whole(np.inf), *self._last()]
+        """Return all pending samples after the last posture; lifted pairs stay lifted."""
+        return [*self._completed(np.inf), *self._last()]
 
-    def _hold(self, sample: Sample, yaw: Array) -> None:
+    def _enqueue(self, sample: Sample, yaw: Array) -> None:
         copy = Sample(sample.time, sample.position.copy(), sample.velocity.copy())
-        self._held.append(_Held(copy, yaw.copy(), self._up.copy(), self._down.copy()))
+        self._pending.append(_PendingPosture(copy, yaw.copy(), self._up.copy(), self._down.copy()))
 
-    def _change(self, since: _Held, grounded: Array) -> None:
-        """Other pairs are on the ground since a posture."""
+    def _change(self, since: _PendingPosture, grounded: Array) -> None:
+        """Record that the set of grounded pairs has changed at a posture."""
         time = since.sample.time
         refuse_what_cannot_stand(grounded[None], self._pairs, np.array([time]))
         for pair in np.flatnonzero((grounded == 1) & (self._grounded == 0)):
             up = float(self._up[pair])
             always = not np.isfinite(up)
             refuse_short_lift(self._lifts, self._pairs[pair], max(up, 0.0), time, 1 if always else 2)
-            for entry in self._held:
+            for entry in self._pending:
                 if entry.up[pair] == up:
                     entry.down[pair] = time
         self._up = np.where(grounded == 1, np.nan, np.where(self._grounded == 1, time, self._up))
         self._grounded, self._changed = grounded.copy(), time
         since.up = self._up.copy()
 
-    def _whole(self, until: float) -> list[Sample]:
-        """What is known up to a time [s], folded; each leaves when the one after it is."""
+    def _completed(self, until: float) -> list[Sample]:
+        """Fold the postures up to a time [s] and return the samples whose successor is folded too."""
         samples: list[Sample] = []
-        # The first of those held is the last one folded.
-        while len(self._held) > 1 and self._held[1].sample.time <= until:
-            del self._held[0]
-            self._folded.append(self._fold(self._held[0]))
+        # The first pending posture is the last that was folded.
+        while len(self._pending) > 1 and self._pending[1].sample.time <= until:
+            del self._pending[0]
+            self._folded.append(self._fold(self._pending[0]))
             if len(self._folded) == 3:
                 samples.append(self._with_rate(1))
                 del self._folded[0]
@@ -440,7 +483,7 @@ class LiftLookahead:
             return []
         return [self._with_rate(len(self._folded) - 1)]
 
-    def _fold(self, entry: _Held) -> Sample:
+    def _fold(self, entry: _PendingPosture) -> Sample:
         sample = entry.sample
         time = np.array([sample.time])
         height = np.where(np.isnan(entry.up), 0.0, height_of(time, entry.up, entry.down, self._lifts))[None]

@@ -1,4 +1,4 @@
-"""State machine of a replay: a checked motion carried out by the servos of a bus.
+"""State machine of a replay, with its control loop and the commands at its end: servos execute a checked motion.
 
 CONNECT → VERIFY → ARM → MOVE_TO_START → SETTLE → REPLAY → SETTLE → DISARM, and from each state → FAULT. A motion must
 have passed the offline check (:mod:`dynsim.hardware.replay.check`). After a fault only the commands of the fault policy
@@ -52,7 +52,7 @@ from dynsim.hardware.replay.output import (
     ServoEnd,
     Stopped,
     StopRequest,
-    of_the_whole,
+    robot_state,
 )
 from dynsim.hardware.replay.rules import AbortRules, Cause, Cycle, Fault, decode_health, watchdog_units
 from dynsim.hardware.replay.trajectory import QUINTIC_PEAK, Approach, GoalCourse, MotionTask, PlannedCourse
@@ -60,25 +60,25 @@ from dynsim.hardware.replay.verify import Registers, all_registers, configure, d
 from dynsim.hardware.servo_map import FaultPolicy, MappedServo, ServoMap
 from dynsim.system.files import write_json
 
-# The control loop of a replay: at each deadline it writes goals, reads states, records and checks them.
+# Control loop of a replay: at each deadline it writes goals, reads states, records and checks them.
 
 
 Array = NDArray[np.float64]
 
 FIELDS = MX_106.fields
-"""Registers that all models share have the same address in all of them."""
+"""Registers that all models have in common have the same address in all models."""
 STATE = struct.Struct("<hii")
 """Effort, velocity and position in a block of :data:`~dynsim.hardware.bus.control_table.STATE_BLOCK`."""
 
 
 GoalRegisters = dict[str, dict[int, int]]
-"""By the name of the register and the ID of the servo."""
+"""Goals by the name of the register and the ID of the servo."""
 
 
 def goal_registers(
     servos: Iterable[MappedServo], position: Iterable[float], velocity: Iterable[float]
 ) -> GoalRegisters:
-    """Of servos in position mode the ticks of their angles [rad], of the others units of their rates [rad/s]."""
+    """Return ticks for joint angles [rad] in position mode, and register units for rates [rad/s] in velocity mode."""
     goals: GoalRegisters = {"goal_position": {}, "goal_velocity": {}}
     for servo, angle, rate in zip(servos, position, velocity, strict=True):
         if servo.in_position_mode:
@@ -89,7 +89,7 @@ def goal_registers(
 
 
 class Loop:
-    """Goals out, measurements in, cycle by cycle.
+    """Control loop: write goals and read measurements in each cycle.
 
     Attributes
     ----------
@@ -98,19 +98,21 @@ class Loop:
     stop : StopRequest
     rules : AbortRules
     period : float
-        [s].
+        Cycle time [s].
     goal, goal_rate : array, shape (N,)
-        Commanded last [rad], [rad/s].
+        Last commands [rad], [rad/s].
     measured : array, shape (N,)
-        Where every joint was seen last [rad].
-    origin, tick :
-        Clock time [s] of the first deadline, and the number of the last one.
+        Last measured joint angles [rad].
+    origin : float
+        Clock time of deadline 0 [s].
+    tick : int
+        Number of the last deadline.
     course : GoalCourse or None
-        What is followed, or was last.
+        Current or last course.
     path_started : float or None
-        Clock time [s] of path time 0, once the replay of the path began.
+        Clock time of path time 0 [s]; None before the replay of the path.
     policy_goals : list
-        (clock time, ID, register value) of every goal sent after a fault.
+        (clock time, ID, register value) of each goal that was sent after a fault.
     """
 
     def __init__(
@@ -140,7 +142,7 @@ class Loop:
         self._recorder = recorder
         self._journal = journal
         self._in_position_mode = np.array([servo.in_position_mode for servo in servo_map.servos])
-        # What may be sent: lowest and highest tick and the longest step from goal to goal, or the highest speed.
+        # Limits of goals: lowest and highest tick and maximum step from goal to goal, or maximum speed.
         self._tick_bounds = [
             (*servo.tick_limits, velocity_limit(servo) * servo.gear * 2 * self.period / RAD_PER_TICK + 2)
             for servo in servo_map.servos
@@ -149,39 +151,39 @@ class Loop:
         self._health_every = motion.plan.health_every
         self._cycles = 0
         self._sent: dict[int, int] = {}
-        self._heard_at = math.inf
+        self._last_contact = math.inf
 
-    def take_over(self, index: int, register: int, angle: float) -> None:
-        """A servo was armed where it is: at the goal ``register``, at a joint angle [rad]."""
+    def servo_armed(self, index: int, register: int, angle: float) -> None:
+        """Set goal and measurement of a servo that was armed at the goal ``register`` and joint angle [rad]."""
         self._sent[self.map.servos[index].id] = register
         self.goal[index] = self.measured[index] = angle
 
-    def all_taken_over(self) -> None:
-        """All are armed; from now on silence makes their watchdogs trip."""
-        self._heard_at = self._clock.now()
+    def all_armed(self) -> None:
+        """Start to measure the time without packets, because the watchdogs are switched on from now on."""
+        self._last_contact = self._clock.now()
 
     def stall(self) -> Fault | None:
-        """The fault of having been silent for longer than the servos' watchdogs allow, until now."""
-        silence = self._clock.now() - self._heard_at
+        """Return a fault if no packet was sent for longer than the watchdog time of the servos, otherwise None."""
+        silence = self._clock.now() - self._last_contact
         return self.rules.stall(silence) if self.rules.stalled(silence) else None
 
     def now(self) -> float:
-        """[s]."""
+        """Return the clock time [s]."""
         return self._clock.now()
 
     def pause(self, duration: float) -> None:
-        """Let a time pass [s]."""
+        """Wait for a duration [s]."""
         self._clock.sleep_until(self._clock.now() + duration)
 
     def begin(self) -> None:
-        """Deadlines count from now."""
+        """Start counting deadlines from now."""
         self.origin, self.tick = self._clock.now(), 0
 
     def deadline_of(self, tick: int) -> float:
         return self.origin + tick * self.period
 
     def wait_for_deadline(self) -> tuple[float, int]:
-        """Sleep until the next cycle is due; its lateness [s] and the number of cycles skipped."""
+        """Sleep until the next cycle is due; return its lateness [s] and the number of skipped cycles."""
         self.tick += 1
         behind = math.floor((self._clock.now() - self.deadline_of(self.tick)) / self.period)
         skipped = max(0, behind)
@@ -190,10 +192,10 @@ class Loop:
         return self._clock.now() - self.deadline_of(self.tick) + skipped * self.period, skipped
 
     def follow(self, course: GoalCourse) -> None:
-        """Go along a course to its end.
+        """Follow a course to its end.
 
-        From goal to goal one period of it passes, also where cycles in between were skipped: made up for at once they
-        would be one great step.
+        The course advances by one period per goal even if cycles were skipped, because making up for them at once would
+        be one large step.
         """
         self.course = course
         while not course.over:
@@ -203,13 +205,13 @@ class Loop:
             self._cycle(position, velocity, lateness, skipped)
 
     def stay(self, position: Array) -> Cycle:
-        """One cycle at rest."""
+        """Execute one cycle at rest."""
         lateness, skipped = self.wait_for_deadline()
         self.stop.check()
         return self._cycle(position, np.zeros_like(position), lateness, skipped)
 
-    def look(self) -> None:
-        """One cycle that only reads."""
+    def read_only_cycle(self) -> None:
+        """Execute one cycle that does not write goals."""
         lateness, skipped = self.wait_for_deadline()
         self.stop.check()
         self.exchange(lateness, skipped, write=False)
@@ -217,7 +219,7 @@ class Loop:
     def _cycle(self, position: Array, velocity: Array, lateness: float, skipped: int) -> Cycle:
         stall = self.stall()
         if stall:
-            # Servos that stopped by themselves must not be sent to where they would be by now.
+            # Servos that were stopped by their watchdogs must not jump to the current goal.
             raise Stopped(stall)
         self.goal, self.goal_rate = position, velocity
         cycle = self.exchange(lateness, skipped, write=True)
@@ -227,7 +229,7 @@ class Loop:
         return cycle
 
     def exchange(self, lateness: float, skipped: int, *, write: bool) -> Cycle:
-        """Write all goals, read all states (and one servo's health in turn), record."""
+        """Write all goals, read all states and the health of one servo in turn, and record them."""
         began = self._clock.now()
         if write:
             self._send(self.goal, self.goal_rate)
@@ -264,13 +266,13 @@ class Loop:
         self._cycles += 1
         if self._cycles % self._health_every == 0:
             servo = servos[self._cycles // self._health_every % count]
-            # Like a sync read of one: a servo that is silent costs one time-out and no retry.
+            # A sync read of one servo: a silent servo costs one time-out and no retry.
             answer = self.bus.sync_read((servo.id,), *HEALTH_BLOCK).replies.get(servo.id)
             if answer is not None:
                 cycle.health[servo.id] = decode_health(servo, answer.data)
         now = self._clock.now()
-        if self._heard_at < math.inf:
-            cycle.silence, self._heard_at = max(began - self._heard_at, now - began), now
+        if self._last_contact < math.inf:
+            cycle.silence, self._last_contact = max(began - self._last_contact, now - began), now
         origin = math.nan if self.path_started is None else self.path_started
         path_time = self.course.time if self.course and self.path_started is not None else math.nan
         self._journal.guard("record", self._recorder.add, cycle, self._journal.state, path_time, origin)
@@ -283,7 +285,7 @@ class Loop:
         self._journal.report(worst, self.course.fraction if self.course else 0.0)
 
     def _send(self, position: Array, velocity: Array) -> None:
-        """The only place goals of a motion leave through. Refuses what no checked motion can ask for."""
+        """Send the goals of a motion; raise Stopped for a goal that no checked motion can contain."""
         servos = self.map.servos
         goals = goal_registers(servos, position, velocity)
         for servo, (low, high, step), fastest in zip(servos, self._tick_bounds, self._unit_bounds, strict=True):
@@ -298,7 +300,7 @@ class Loop:
         self.write_goals(goals)
 
     def write_goals(self, goals: GoalRegisters) -> None:
-        """Goal registers by name and ID, as they are."""
+        """Write goal registers without a check."""
         for name, values in goals.items():
             if not values:
                 continue
@@ -309,27 +311,27 @@ class Loop:
                 self.policy_goals += [(now, id_, value) for id_, value in values.items()]
 
 
-# End of a replay: stops the robot and leaves torque on, or switches torque off, then reads the state of the servos.
+# End of a replay: stop the robot, leave torque on or switch it off, and read the state of the servos.
 
 
 REST_TIME = 1.0
-"""Longest wait for the servos to stand still, and for silent ones to come back (a restart takes 0.3 s) [s]."""
+"""Maximum wait until the servos are at rest and silent servos answer again (a restart takes 0.3 s) [s]."""
 REST_CYCLES = 10
 AT_REST = 0.1
-"""Joints and wheels slower than this are at rest [rad/s]; a few units of the velocity register."""
+"""Speed below which joints and wheels are at rest [rad/s]; a few units of the velocity register."""
 READS = 3
-"""Reads after which a servo that has not answered counts as silent."""
+"""Number of reads after which a servo without answer counts as silent."""
 
 
 class Ending:
-    """Brings the robot to one of the end states.
+    """Bring the robot to one of the end states.
 
     Parameters
     ----------
     loop : Loop
     journal : Journal
     result : ReplayResult
-        Gets further faults, what every servo does in the end, and the IDs that did not confirm torque off.
+        Receives further faults, the end state of each servo, and the IDs that did not confirm torque off.
     policy : "hold", "decelerate" or "off"
     """
 
@@ -339,26 +341,26 @@ class Ending:
         self._result = result
         self._policy = policy
         self._servos = loop.map.servos
-        self._troubled: set[int] = set()
-        self._held = self._released = False
+        self._faulty: set[int] = set()
+        self._frozen = self._released = False
         self._at_rest = False
 
     def regular(self) -> None:
-        """What the map says about the end of a motion. Raises PortError."""
+        """End a motion as ``safety.at_end`` of the map specifies. Raises PortError."""
         if self._loop.map.safety.at_end == "hold":
             self._leave_holding()
         else:
             self._release()
 
     def after_fault(self, struck: ReplayState, *, found_holding: bool) -> None:
-        """Carry out the fault policy for the faults of the result; raises nothing.
+        """Apply the fault policy to the faults of the result; never raises.
 
         Parameters
         ----------
         struck : ReplayState
-            In which the fault happened.
+            State in which the fault occurred.
         found_holding : bool
-            Torque was on before the robot was armed.
+            True if torque was on before the robot was armed.
         """
         self._at_rest = struck == ReplayState.SETTLE
         interrupted = self._result.faults[0].cause == Cause.INTERRUPTED
@@ -369,20 +371,20 @@ class Ending:
         elif struck == ReplayState.DISARM:
             self._try(self.regular)
         elif struck == ReplayState.ARM:
-            # Nothing has moved yet: back to how the robot was found, unless somebody else took its torque meanwhile.
+            # Nothing has moved yet: restore the initial torque, unless another program has switched it off meanwhile.
             taken = any(fault.cause == Cause.TORQUE_LOST for fault in self._result.faults)
             self._try(self._leave_holding if found_holding and not taken else self._release)
         elif self._policy == "off" and not interrupted:
             self._try(self._release)
         else:
-            # A dead port needs no policy, but the attempt costs nothing and finds out whether it is really dead.
-            if not self._try(self._hold if self._policy == "hold" and not interrupted else self._decelerate):
-                self._try(self._hold)
+            # With a dead port this has no effect, but the attempt shows whether the port is really dead.
+            if not self._try(self._freeze if self._policy == "hold" and not interrupted else self._decelerate):
+                self._try(self._freeze)
             self._try(self._come_to_rest)
             self._try(self._release if self._policy == "off" else self._leave_holding)
 
     def release_at_last(self) -> bool:
-        """Torque off if the user has asked for it since the policy was carried out; raises nothing."""
+        """Switch torque off if the user has requested it since the policy was applied; never raises."""
         if self._released or not self._loop.stop.for_release:
             return False
         self._try(self._release)
@@ -390,18 +392,18 @@ class Ending:
         return True
 
     def read_back(self, *, armed: bool) -> None:
-        """Ask every servo what it does, and derive from it what the robot does; raises nothing."""
+        """Read the state of all servos and derive the end state of the robot; never raises."""
         self._result.servos = tuple(ServoEnd(servo.joint, servo.id) for servo in self._servos)
-        self._try(self._ask)
-        self._result.end_state = of_the_whole(self._result.servos) if armed else NOT_ARMED
+        self._try(self._read_servos)
+        self._result.end_state = robot_state(self._result.servos) if armed else NOT_ARMED
 
-    def _ask(self) -> None:
+    def _read_servos(self) -> None:
         self._result.servos = read_back(self._loop.bus, self._servos)
 
-    # -- what goes wrong on the way -----------------------------------------------------------------------------------
+    # -- faults during the policy -------------------------------------------------------------------------------------
 
     def _try(self, step: Callable[[], None]) -> bool:
-        """Whether a step went through; why not becomes a fault of the result."""
+        """Execute a step and return True if it succeeded; an error becomes a fault of the result."""
         try:
             step()
         except PortError as error:
@@ -410,7 +412,7 @@ class Ending:
         except Exception as error:
             self._declare(Fault(Cause.PROGRAM, repr(error)))
         except BaseException as error:
-            # Somebody wants out, and gets out when the robot has been seen to.
+            # A request to exit, which is delayed until the robot has been stopped.
             self._loop.stop()
             self._declare(Fault(Cause.PROGRAM, repr(error)))
         else:
@@ -419,45 +421,45 @@ class Ending:
 
     def _declare(self, fault: Fault) -> None:
         self._result.declare(replace(fault, time=self._loop.now()))
-        self._journal.say(f"{fault.cause}: {fault.text}")
+        self._journal.add_line(f"{fault.cause}: {fault.text}")
 
     def _watch(self, lateness: float, skipped: int) -> Cycle:
-        """Read; the rules go on, and who gets into trouble stops where it is."""
+        """Read and apply the abort rules; a servo with a new fault stops at its present position."""
         loop = self._loop
         cycle = loop.exchange(lateness, skipped, write=False)
-        # The goals that follow do not depend on when they are sent.
+        # Late cycles do not matter, because the remaining goals do not depend on the time at which they are sent.
         for fault in loop.rules.examine(cycle):
             if fault.cause != Cause.DEADLINE:
                 self._declare(fault)
-                self._stop_where_they_are(fault)
+                self._stop_faulty(fault)
         return cycle
 
-    def _stop_where_they_are(self, fault: Fault) -> None:
-        if self._held:
+    def _stop_faulty(self, fault: Fault) -> None:
+        if self._frozen:
             return
         if fault.cause == Cause.STALL:
-            self._hold()
+            self._freeze()
         else:
-            self._hold_measured(self._known_as(fault.ids))
+            self._hold_measured(self._newly_faulty(fault.ids))
 
-    def _known_as(self, ids: Collection[int]) -> list[int]:
-        """Numbers of servos in the map, of which none was in trouble before."""
-        indices = [index for index, servo in enumerate(self._servos) if servo.id in ids and index not in self._troubled]
-        self._troubled.update(indices)
+    def _newly_faulty(self, ids: Collection[int]) -> list[int]:
+        """Mark servos as faulty and return the map indices of newly faulty servos."""
+        indices = [index for index, servo in enumerate(self._servos) if servo.id in ids and index not in self._faulty]
+        self._faulty.update(indices)
         return indices
 
     # -- ways of stopping ---------------------------------------------------------------------------------------------
 
-    def _hold(self) -> None:
-        """Goals of all servos := where they are."""
-        self._held = True
+    def _freeze(self) -> None:
+        """Set the goals of all servos to their present positions."""
+        self._frozen = True
         if any(fault.cause == Cause.STALL for fault in self._result.faults):
-            # What was read last is from before.
+            # The last measurement is from before the stall.
             self._loop.exchange(0.0, 0, write=False)
         self._hold_measured(range(len(self._servos)))
 
     def _hold_measured(self, indices: Iterable[int]) -> None:
-        """Goals of the given servos := where they are."""
+        """Set the goals of some servos to their measured positions."""
         loop = self._loop
         goals: GoalRegisters = {"goal_position": {}, "goal_velocity": {}}
         for index in indices:
@@ -471,16 +473,16 @@ class Ending:
             if low <= ticks <= high:
                 goals["goal_position"][servo.id] = ticks
                 loop.goal[index] = loop.measured[index]
-            # A reading outside of the joint's limits is not to be trusted: that servo keeps its last goal.
+            # A measurement outside the limits of the joint is unreliable: the servo keeps its last goal.
         loop.write_goals(goals)
 
     def _decelerate(self) -> None:
-        """Slow down along the path to rest, so that all joints keep step; servos in trouble stop where they are."""
+        """Slow down along the path to rest, all joints synchronously; faulty servos stop at their present positions."""
         loop, faults = self._loop, self._result.faults
         if any(fault.cause == Cause.STALL for fault in faults):
-            # They have stopped by themselves, and take no goals.
-            return self._hold()
-        self._hold_measured(self._known_as([id_ for fault in faults for id_ in fault.ids]))
+            # The servos were stopped by their watchdogs and do not accept goals.
+            return self._freeze()
+        self._hold_measured(self._newly_faulty([id_ for fault in faults for id_ in fault.ids]))
         course = loop.course
         if course is None:
             return None
@@ -488,12 +490,12 @@ class Ending:
         speed = 0.0 if self._at_rest else course.speed
         stop_time = course.braking_time(loop.map.safety.stop_time)
         elapsed, goals = 0.0, 0
-        while elapsed < stop_time and not loop.stop.for_release and not self._held:
+        while elapsed < stop_time and not loop.stop.for_release and not self._frozen:
             lateness, skipped = loop.wait_for_deadline()
             stall = loop.stall()
             if stall:
                 self._declare(stall)
-                return self._hold()
+                return self._freeze()
             goals += 1
             elapsed = min(stop_time, goals * loop.period)
             course.time = min(end, start + speed * (elapsed - elapsed**2 / (2 * stop_time)))
@@ -504,26 +506,26 @@ class Ending:
         return None
 
     def _send(self, position: Array, velocity: Array) -> None:
-        """Goals [rad], [rad/s] of the servos that are not in trouble."""
+        """Send goals [rad], [rad/s] to the servos without a fault."""
         loop = self._loop
-        well = [index for index in range(len(self._servos)) if index not in self._troubled]
-        loop.goal[well], loop.goal_rate[well] = position[well], velocity[well]
-        loop.write_goals(goal_registers([self._servos[index] for index in well], position[well], velocity[well]))
+        sound = [index for index in range(len(self._servos)) if index not in self._faulty]
+        loop.goal[sound], loop.goal_rate[sound] = position[sound], velocity[sound]
+        loop.write_goals(goal_registers([self._servos[index] for index in sound], position[sound], velocity[sound]))
 
     def _come_to_rest(self) -> None:
-        """Wait until everybody answers and stands still, for REST_TIME at most."""
+        """Wait until all servos answer and are at rest, for REST_TIME at most."""
         quiet = 0
         for _ in range(math.ceil(REST_TIME / self._loop.period)):
             if self._loop.stop.for_release:
                 return
             cycle = self._watch(*self._loop.wait_for_deadline())
-            # A servo that is silent is not at rest: it may be restarting.
+            # A silent servo does not count as at rest, because it may be restarting.
             quiet = quiet + 1 if np.all(np.abs(cycle.velocity) < AT_REST) else 0
             if quiet == REST_CYCLES:
                 return
 
     def _leave_holding(self) -> None:
-        """Watchdogs off, so that the robot keeps holding when this program has gone. Raises PortError."""
+        """Switch the watchdogs off, so that the robot keeps its posture after this program ends. Raises PortError."""
         loop = self._loop
         health = read_health(loop.bus, self._servos)
         unconfirmed = []
@@ -536,17 +538,20 @@ class Ending:
                 unconfirmed.append(f"{servo.joint}: {error}")
             registers = health.get(servo.id)
             if registers and registers["bus_watchdog"] == -1:
-                # It stopped by itself, and took no goal until now.
+                # The watchdog has stopped this servo, so it did not accept a goal until now.
                 loop.measured[index] = servo.to_angle(registers["present_position"])
                 self._hold_measured([index])
         if unconfirmed:
-            self._journal.say(
+            self._journal.add_line(
                 f"watchdogs not confirmed to be off, they may stop these servos: {'; '.join(unconfirmed)}"
             )
-        return self._journal.say("servos that are on stay ON; `dynsim hw stop` releases them")
+        return self._journal.add_line("servos with torque on stay ON; switch them off with `dynsim hw stop`")
 
     def _release(self) -> None:
-        """Torque off by broadcast, until all confirm or REST_TIME is over; then watchdogs off. Raises PortError."""
+        """Broadcast torque off until all servos confirm or REST_TIME is over; then switch watchdogs off.
+
+        Raises PortError.
+        """
         loop, until = self._loop, self._loop.now() + REST_TIME
         self._released = True
         while True:
@@ -557,22 +562,17 @@ class Ending:
             if not still_on or loop.now() >= until:
                 break
             loop.pause(REST_TIME / 10)
-        # Of those that are off: a watchdog that trips later would leave goals read-only for whoever comes next.
+        # Also switch watchdogs off, because a watchdog that trips later makes the goals read-only for the next program.
         for id_ in loop.map.ids:
             if id_ not in still_on and health[id_]["bus_watchdog"]:
                 with suppress(NoAnswer, RequestRefused):
                     loop.bus.write(id_, FIELDS["bus_watchdog"], 0)
         confirmed = f"; NOT confirmed by ID {', '.join(map(str, still_on))}" if still_on else ""
-        self._journal.say(f"torque off{confirmed}")
+        self._journal.add_line(f"torque off{confirmed}")
 
 
 def read_health(bus: Bus, servos: Sequence[MappedServo]) -> dict[int, dict[str, int]]:
-    """Registers 64 to 146 of every servo that answers, by ID and name.
-
-    Raises
-    ------
-    PortError
-    """
+    """Read registers 64 to 146 of all servos that answer, by ID and name. Raises PortError."""
     health: dict[int, dict[str, int]] = {}
     for _ in range(READS):
         silent = [servo for servo in servos if servo.id not in health]
@@ -584,7 +584,7 @@ def read_health(bus: Bus, servos: Sequence[MappedServo]) -> dict[int, dict[str, 
 
 
 def read_back(bus: Bus, servos: Sequence[MappedServo]) -> tuple[ServoEnd, ...]:
-    """What every servo is doing now. Raises PortError."""
+    """Read the present state of all servos. Raises PortError."""
     health = read_health(bus, servos)
     return tuple(
         _end(servo, health[servo.id]) if servo.id in health else ServoEnd(servo.joint, servo.id) for servo in servos
@@ -604,18 +604,18 @@ def _end(servo: MappedServo, registers: dict[str, int]) -> ServoEnd:
 
 
 APPROACH_ACCELERATION = 10.0
-"""Profile acceleration written to the servos for the move to the start [rad/s²]."""
+"""Profile acceleration of the servos for the move to the start [rad/s²]."""
 SETTLE_CYCLES = 10
 SETTLE_TIME = 3.0
-"""Longest wait for the servos to come to rest [s]."""
+"""Maximum wait for the servos to come to rest [s]."""
 RECORD = "measured record"
 """Name of the measured record in the list of outputs that failed."""
 DRY_RUN_TIME = 1.0
-"""Duration of a dry run, which reads without moving, to measure the timing of the bus [s]."""
+"""Duration of a dry run, which measures the timing of the bus without moving [s]."""
 
 
 class Replay:
-    """One run of one motion.
+    """One run of a motion on servos.
 
     Parameters
     ----------
@@ -623,26 +623,26 @@ class Replay:
     servo_map : ServoMap
     bus : Bus
     clock : Clock
-    policy : "hold", "decelerate" or "off"
-        Instead of the map's.
+    policy : "hold", "decelerate" or "off", optional
+        Fault policy; default: the policy in the map.
     live : bool
-        False: verify and time the bus, move nothing.
+        If False, verify the servos and measure the timing of the bus without moving.
     write_eeprom : bool
-        Configure servos that are set up differently.
-    stop : StopRequest
-    log : RunLog
+        If True, write EEPROM settings that differ from the map.
+    stop : StopRequest, optional
+    log : RunLog, optional
     dump_folder : path, optional
-        Where register dumps go.
+        Folder for register dumps.
     observer : callable, optional
-        Called with a Progress after every cycle and on every change of state.
-    provenance : dict
-        Kept in the measured record.
+        Called with a ReplayProgress after each cycle and at each change of state.
+    provenance : dict, optional
+        Entries that are added to the provenance of the measured record.
 
     Attributes
     ----------
     recorder : Recorder
     layout : Layout
-        Of the record made of its rows.
+        Layout of the measured record.
     """
 
     def __init__(
@@ -682,10 +682,10 @@ class Replay:
         self._ending = Ending(self.loop, self.journal, self.result, self.policy)
 
     def run(self) -> ReplayResult:
-        """Carry the replay through, to its end or to a fault; never raises for trouble on the bus or with outputs.
+        """Execute the replay to its end or to a fault; problems of bus and outputs are part of the result.
 
-        An exception of another kind (a KeyboardInterrupt without :class:`StopRequest`) is raised again after the fault
-        policy was carried out.
+        Other exceptions (for example a KeyboardInterrupt without :class:`StopRequest`) are raised again after the fault
+        policy was applied.
         """
         try:
             self._verify()
@@ -705,9 +705,9 @@ class Replay:
             busy = too_busy(self.bus) if isinstance(error, NoAnswer) else ""
             self._fault(Fault(cause, f"{error}{busy and '; '}{busy}", (error.id,)))
         except SimulationStopped as error:
-            self._fault(Fault(Cause.SIMULATION, f"the robot behind the virtual servos (--plant) {error}"))
+            self._fault(Fault(Cause.SIMULATION, f"the simulated robot of the virtual servos (--plant) {error}"))
         except BaseException as error:
-            # A robot with its torque on must not be left to itself, whatever went wrong.
+            # Never leave a robot with its torque on without applying the fault policy.
             self._fault(Fault(Cause.PROGRAM, repr(error)))
             self._finish()
             raise
@@ -719,23 +719,23 @@ class Replay:
         self.stop.check()
         self.journal.enter(ReplayState.VERIFY)
         if self.write_eeprom:
-            configure(self.bus, self.map, self.journal.say)
+            configure(self.bus, self.map, self.journal.add_line)
         problems, limits = verify(self.bus, self.map, self.motion, poll=self.stop.check)
         self.result.limits = tuple(limits)
         for line in difference_lines(limits):
-            self.journal.say(line)
+            self.journal.add_line(line)
         self._dump(self._read_registers(), REGISTERS)
         if problems:
             raise Stopped(Fault(Cause.VERIFICATION, "\n  ".join([f"{len(problems)} problem(s):", *problems])))
-        self.journal.say(f"{len(self._servos)} servos as the map says")
+        self.journal.add_line(f"{len(self._servos)} servos match the map")
 
     def _dry_run(self) -> None:
         self.journal.enter(ReplayState.DRY_RUN)
         self.loop.goal = self.loop.goal_rate = np.full(len(self._servos), np.nan)
         self.loop.begin()
         for _ in range(math.ceil(DRY_RUN_TIME / self.loop.period)):
-            self.loop.look()
-        self.journal.say("dry run: nothing was moved (--live moves)")
+            self.loop.read_only_cycle()
+        self.journal.add_line("dry run: nothing was moved; use --live to move the robot")
 
     def _arm(self) -> None:
         self.journal.enter(ReplayState.ARM)
@@ -751,23 +751,23 @@ class Replay:
                 self.bus.write(servo.id, FIELDS[item], value)
             self.bus.write(servo.id, FIELDS[name], goal)
             if self.bus.read(servo.id, FIELDS[name]) != goal:
-                raise Stopped(Fault(Cause.ARMING, f"{servo} did not take its goal", (servo.id,)))
+                raise Stopped(Fault(Cause.ARMING, f"{servo} did not accept its goal", (servo.id,)))
             if servo.id in on:
                 self._check_still_on([servo])
             self.bus.write(servo.id, FIELDS["torque_enable"], 1)
             if not self.bus.read(servo.id, FIELDS["torque_enable"]):
                 raise Stopped(Fault(Cause.ARMING, f"{servo}: torque stays off", (servo.id,)))
-            self.loop.take_over(index, goal, servo.to_angle(present))
-        # Who stopped the robot meanwhile has not reached the servos that were armed after that.
+            self.loop.servo_armed(index, goal, servo.to_angle(present))
+        # If another program switched torque off meanwhile, servos that were armed after that are still on.
         self._check_still_on(self._servos)
         units = watchdog_units(self.map.safety)
-        self.loop.all_taken_over()
+        self.loop.all_armed()
         for servo in self._servos:
             self.bus.write(servo.id, FIELDS["bus_watchdog"], units)
-        self.journal.say(f"torque on, bus watchdogs at {units * WATCHDOG_SECONDS_PER_UNIT * 1e3:.0f} ms")
+        self.journal.add_line(f"torque on, bus watchdogs at {units * WATCHDOG_SECONDS_PER_UNIT * 1e3:.0f} ms")
 
     def _check_still_on(self, servos: Sequence[MappedServo]) -> None:
-        """Raises Stopped where one has lost its torque, NoAnswer where one is silent."""
+        """Raise Stopped if a servo has lost its torque, and NoAnswer if a servo does not answer."""
         health = read_health(self.bus, servos)
         for servo in servos:
             if servo.id not in health:
@@ -785,7 +785,7 @@ class Replay:
         distance = float(np.abs(goal - here).max())
         duration = max(QUINTIC_PEAK * distance / self.map.safety.approach_velocity, self.loop.period)
         self.journal.enter(ReplayState.MOVE_TO_START)
-        self.journal.say(f"{distance:.3f} rad in {duration:.1f} s")
+        self.journal.add_line(f"{distance:.3f} rad in {duration:.1f} s")
         self.loop.begin()
         self.loop.follow(PlannedCourse(Approach(here, goal, duration), 0.0, duration, speed=1.0))
         self._settle()
@@ -825,12 +825,12 @@ class Replay:
         if self.result.end_state != asked:
             cause = Cause.INTERRUPTED if self.stop.for_release else Cause.END_STATE
             raise Stopped(Fault(cause, f"should be {asked}, but is {self.result.end_state}"))
-        self._tell_end()
+        self._log_end()
 
     def _profile(self, servo: MappedServo, *, approaching: bool) -> dict[str, int]:
-        """The firmware's own limits: slow towards the start, the joint's speed limit during the replay.
+        """Return the profile limits of the firmware: slow on the approach, the speed limit of the joint in the replay.
 
-        0 would mean "no limit" and is never written as a velocity; as an acceleration it leaves shaping to the path.
+        0 means "no limit": it is never used as a velocity; as an acceleration it lets the path determine the motion.
         """
         velocity = (
             min(2 * self.map.safety.approach_velocity, velocity_limit(servo)) if approaching else velocity_limit(servo)
@@ -843,37 +843,37 @@ class Replay:
 
     def _fault(self, *faults: Fault) -> None:
         struck, result = self.journal.state, self.result
-        # The robot first: whatever writes, is told afterwards.
-        with self.journal.held_back():
+        # Stop the robot first and write the log afterwards.
+        with self.journal.buffered():
             result.fault_state, result.fault_time = struck, self.clock.now()
             self.journal.enter(ReplayState.FAULT)
             for fault in faults:
                 result.declare(replace(fault, time=result.fault_time))
-                self.journal.say(f"in {struck.name}: {fault.cause}: {fault.text}")
+                self.journal.add_line(f"in {struck.name}: {fault.cause}: {fault.text}")
             self._ending.after_fault(struck, found_holding=self._found_holding)
             armed = struck not in UNARMED or self.stop.for_release
             if armed or faults[0].cause != Cause.PORT:
                 self._ending.read_back(armed=armed)
-        self._tell_end()
+        self._log_end()
         if armed and result.end_state != "unreachable":
             registers = self._read_registers()
             if self._ending.release_at_last():
-                self._tell_end()
+                self._log_end()
             self._dump(registers, REGISTERS_AFTER_FAULT)
 
-    def _tell_end(self) -> None:
-        self.journal.say(f"end state: {self.result.end_state}")
+    def _log_end(self) -> None:
+        self.journal.add_line(f"end state: {self.result.end_state}")
         for servo in self.result.servos:
-            self.journal.say(str(servo))
+            self.journal.add_line(str(servo))
 
     def _read_registers(self) -> dict[str, Registers | str] | None:
-        """Of all servos, for a dump; None where the port died after a fault."""
+        """Read the registers of all servos for a dump; None if the port fails after a fault."""
         try:
             return all_registers(self.bus, self.map)
         except PortError as error:
             if self.result.fault is None:
                 raise
-            self.journal.say(f"no register dump: {error}")
+            self.journal.add_line(f"no register dump: {error}")
             return None
 
     def _dump(self, registers: dict[str, Registers | str] | None, name: str) -> None:
@@ -884,10 +884,12 @@ class Replay:
         self.journal.guard(RECORD, self._sum_up)
         timing = self.result.timing
         if timing:
-            self.journal.say(f"timing: {', '.join(f'{name} {value:.6g}' for name, value in timing.as_dict().items())}")
+            self.journal.add_line(
+                f"timing: {', '.join(f'{name} {value:.6g}' for name, value in timing.as_dict().items())}"
+            )
 
     def _sum_up(self) -> None:
-        """Record and timing of the run."""
+        """Build record and timing of the run."""
         result, rows = self.result, self.recorder.all()
         result.timing = timing_of(rows, self.layout)
         started = self.loop.path_started if self.loop.path_started is not None else self.loop.origin

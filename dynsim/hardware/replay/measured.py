@@ -1,6 +1,6 @@
-"""The measured record of a replay, also of one whose process died before its end.
+"""Measured record of a replay, including a replay whose process died.
 
-Scene and events are those of the record that was followed; body poses follow from the measured joint angles.
+The scene is copied from the replayed record; body poses are computed from the measured joint angles.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from dynsim.hardware.replay.output import (
     ReplayState,
     Rows,
     TimingStatistics,
-    is_held,
+    is_locked,
     row_type,
 )
 from dynsim.hardware.replay.trajectory import GROUNDED, wheel_offsets
@@ -36,16 +36,16 @@ from dynsim.system.files import json_text, replace_together
 
 Array = NDArray[np.float64]
 LIFTING = "lifting"
-FOLLOWED = "of the record that was followed, at record_time: no servo measures it"
-END_STATE = "not known: the program died"
+FOLLOWED = "copied from the replayed record at record_time; not measured by a servo"
+END_STATE = "unknown: the program died"
 
 
 def timing_of(rows: Rows, layout: Layout) -> TimingStatistics | None:
-    """Timing statistics of the recorded cycles; None before the second cycle."""
+    """Return timing statistics of the recorded cycles; None before the second cycle."""
     if len(rows) < 2:
         return None
     path_time = rows["path_time"]
-    # Cycles in which the path went on; of the first there is no time before.
+    # Cycles in which the path advanced; the first cycle has no earlier time to compare with.
     followed = np.isfinite(path_time) & (np.diff(path_time, prepend=np.nan) != 0)
     periods, lateness, exchange = np.diff(rows["time"]), rows["lateness"], rows["exchange"]
     return TimingStatistics(
@@ -65,11 +65,21 @@ def timing_of(rows: Rows, layout: Layout) -> TimingStatistics | None:
 
 
 def measured_record(rows: Rows, layout: Layout, origin: float) -> Record:
-    """The measured run; time 0 is ``origin`` on the clock of the rows [s], the start of the replayed motion."""
+    """Build the record of the measured run.
+
+    Parameters
+    ----------
+    rows : Rows
+        Data of the cycles.
+    layout : Layout
+        Joints and signals of the rows.
+    origin : float
+        Start of the replayed motion on the clock of the rows [s]; time 0 of the record.
+    """
     record = Record(rows["time"] - origin, provenance=layout.provenance)
     joints = tuple(layout.joints)
     record.add("record_time", rows["path_time"], "s", description="time in the replayed record")
-    record.add("state", rows["state"].astype(np.int64), "1", description="see replay.State")
+    record.add("state", rows["state"].astype(np.int64), "1", description="state of the replay, a number of ReplayState")
     units = {"position": "rad", "velocity": "rad/s"}
     for (name, source, columns), suffix in itertools.product(layout.groups(), ("", "_goal")):
         labels = tuple(layout.labels[column] for column in columns)
@@ -81,19 +91,19 @@ def measured_record(rows: Rows, layout: Layout, origin: float) -> Record:
     missed = np.isnan(rows["position"])
     record.add("missed", missed, "1", labels=joints, description="no valid status in this cycle")
     record.add("alert", rows["alert"], "1", labels=joints, description="alert bit of the status")
-    record.add("lateness", rows["lateness"], "s", description="cycle start after its deadline")
-    record.add("exchange", rows["exchange"], "s", description="duration of the cycle's bus traffic")
+    record.add("lateness", rows["lateness"], "s", description="delay of the cycle start after its deadline")
+    record.add("exchange", rows["exchange"], "s", description="duration of the bus traffic of the cycle")
     timing = timing_of(rows, layout)
     record.summary["timing"] = timing.as_dict() if timing else {}
     return record
 
 
 def unmeasured(record: Record, servo_map: ServoMap) -> Record | None:
-    """What a record says of the robot's place and no servo of a map will: the base of a snake, wheels of a mobile base.
+    """Return the signals for the pose of the robot that no servo measures, such as the base of a snake robot.
 
-    Columns of the joints of its scene that the map does not have, over the time of the motion; ``grounded``; and as
-    ``lifting`` what the map adds to joints of the scene to lift wheels, of which the scene knows nothing. None for a
-    record without scene, or one that does not have those columns either.
+    The result contains, over the time of the motion, the columns of scene joints without a servo (for example the
+    wheels of a mobile base); ``grounded``; and as ``lifting`` the angles that the map adds to joints to lift wheels,
+    which are not part of the scene. None if the record has no scene or lacks one of these columns.
     """
     if record.scene is None:
         return None
@@ -120,12 +130,20 @@ def unmeasured(record: Record, servo_map: ServoMap) -> Record | None:
 
 
 def describe(record: Record, scene: Scene | None, followed: Record | None = None) -> Record:
-    """Add to a measured run what it is drawn from; the record itself is changed and given back.
+    """Add events, body poses and hand positions to a measured record, for drawing.
 
-    Every change of the signal ``state`` becomes an event. With a scene (that of the record that was followed) the poses
-    of its bodies follow from the measured positions of its joints, and so does ``hand_position``;
-    ``hand_position_goal`` is where the goals have the hand. What no servo measures is taken from the record that was
-    ``followed``, see :func:`unmeasured`, and so says its description; a joint that is in neither leaves all poses out.
+    The record is changed in place and returned. Each change of the signal ``state`` becomes an event. Poses and
+    ``hand_position`` are computed from the measured joint positions, ``hand_position_goal`` from the goals.
+
+    Parameters
+    ----------
+    record : Record
+        Measured record.
+    scene : Scene or None
+        Scene of the replayed record; without it only events are added.
+    followed : Record, optional
+        Signals of the replayed record that no servo measures (see :func:`unmeasured`). If a joint is in neither record,
+        all poses are omitted.
     """
     if len(record):
         for row in np.flatnonzero(np.diff(record["state"], prepend=-1)):
@@ -134,33 +152,33 @@ def describe(record: Record, scene: Scene | None, followed: Record | None = None
     if scene is None or not len(record):
         return record
     at, followed = _path_time(record), Record([0.0]) if followed is None else followed
-    actual = _placed(record, scene, followed, at, "")
+    actual = _with_poses(record, scene, followed, at, "")
     if actual is None:
         return record
-    on = " on the base of the record that was followed" if followed.signals else ""
+    on = " on the base of the replayed record" if followed.signals else ""
     for name in (POSITION, ORIENTATION):
         pose = actual.signals[name]
         record.add(name, pose.data, pose.unit, labels=pose.labels, description=f"from measured joints{on}")
     for name in followed.signals:
-        # Columns beside measured ones stay out: the record says of them only that they were measured.
+        # Skip signals with measured columns: their description would not apply to columns that are copied.
         if name != LIFTING and name not in record:
             data = _at(followed, name, at)
-            # A wheel is up or down.
+            # A wheel pair is either lifted or on the ground.
             data = np.rint(data) if name == GROUNDED else data
             record.add(name, data, followed.units[name], labels=followed.labels[name], description=FOLLOWED)
     if scene.hand is None:
         return record
     axes = ("x", "y", "z")
     position = point_positions(actual, scene.hand)
-    record.add("hand_position", position, "m", labels=axes, description=f"from joints{on}")
-    if (goals := _placed(record, scene, followed, at, "_goal")) is not None:
+    record.add("hand_position", position, "m", labels=axes, description=f"from measured joints{on}")
+    if (goals := _with_poses(record, scene, followed, at, "_goal")) is not None:
         where = point_positions(goals, scene.hand)
-        record.add("hand_position_goal", where, "m", labels=axes, description=f"from the goals of the joints{on}")
+        record.add("hand_position_goal", where, "m", labels=axes, description=f"from joint goals{on}")
     return record
 
 
 def _path_time(record: Record) -> Array:
-    """Time in the record that was followed: its first instant before the motion began, the last one since it ended."""
+    """Return the time in the replayed record; constant before the start and after the end of the motion."""
     time = np.asarray(record["record_time"], dtype=np.float64) if "record_time" in record else record.time
     known = np.flatnonzero(np.isfinite(time))
     return np.interp(record.time, record.time[known], time[known]) if len(known) else np.zeros(len(record))
@@ -171,8 +189,8 @@ def _at(followed: Record, name: str, at: Array) -> Array:
     return np.column_stack([np.interp(at, followed.time, column) for column in data.T])
 
 
-def _placed(record: Record, scene: Scene, followed: Record, at: Array, suffix: str) -> Record | None:
-    """A record of the poses of all bodies, by measured joints or their goals (``suffix``); None where some lack."""
+def _with_poses(record: Record, scene: Scene, followed: Record, at: Array, suffix: str) -> Record | None:
+    """Return a record with the poses of all bodies from measured joints or goals (``suffix``); None if some lack."""
     poses = Record(record.time)
     poses.scene = scene
     added: dict[str, Array] = {}
@@ -193,36 +211,39 @@ def _placed(record: Record, scene: Scene, followed: Record, at: Array, suffix: s
 
 
 def recover(folder: Path, out: Path | None = None) -> Record:
-    """Make ``measured.h5`` and ``summary.json`` of a ``measured.part`` that was left over, and remove that.
+    """Build ``measured.h5`` and ``summary.json`` from the ``measured.part`` of a replay that died, and remove the part.
 
-    The record is marked incomplete. A summary that is there is of the same replay, which ended, and could not write its
-    record: what it says of the end is kept. A measured record that is already there is of the same replay too (what an
-    earlier one left is moved away before), and whole: it stays, and is all there is to do.
+    The record is marked incomplete. An existing summary belongs to the same replay, which ended but could not write its
+    record: its end state is kept. An existing complete ``measured.h5`` also belongs to the same replay, because files
+    of earlier replays are moved away before, and is kept.
 
     Parameters
     ----------
-    out : folder for record and summary, where there is none yet; ``folder`` then stays as it is, and may be read-only
+    folder : Path
+        Folder of the replay.
+    out : Path, optional
+        Folder for record and summary, without such files yet; ``folder`` then stays unchanged and may be read-only.
 
     Raises
     ------
     RecordError
-        There is neither a streamed nor a whole record, it is empty or cannot be read, or its replay is still running;
-        the record cannot be written, or ``out`` has one.
+        If there is neither a partial nor a complete record, it is empty or cannot be read, its replay is still running,
+        the record cannot be written, or ``out`` already has one.
     """
     part = folder / PART
     try:
-        if part.is_file() and is_held(part):
-            raise RecordError(f"{part}: the replay that writes it is still running")
-        record = whole = _kept(folder / MEASURED)
+        if part.is_file() and is_locked(part):
+            raise RecordError(f"{part}: the replay is still running; wait until it has ended")
+        record = whole = _load_if_valid(folder / MEASURED)
         if not part.is_file() and not (whole and whole.complete):
-            raise RecordError(f"{folder}: no {PART} there: nothing to recover")
+            raise RecordError(f"{folder}: nothing to recover (no {PART})")
         if record is None:
             record = _read(part)
             record.summary |= {"end_state": END_STATE} | _summary(folder / SUMMARY) | {"recovered": True}
         if out is not None:
             out.mkdir(parents=True, exist_ok=True)
             if there := [name for name in (MEASURED, SUMMARY, PART) if (out / name).exists()]:
-                raise RecordError(f"{out}: has {', '.join(there)} already; give another folder (--out)")
+                raise RecordError(f"{out}: already contains {', '.join(there)}; choose another --out")
             write_measured(record, record.summary, out)
             return record
         if whole is None:
@@ -234,20 +255,20 @@ def recover(folder: Path, out: Path | None = None) -> Record:
 
 
 def write_measured(record: Record, summary: dict[str, Any], folder: Path) -> None:
-    """Record and summary, both or none."""
+    """Write record and summary; if one fails, neither is written."""
     contents: dict[str, bytes | memoryview] = {MEASURED: record.to_hdf5(), SUMMARY: json_text(summary).encode("utf-8")}
     replace_together(folder, contents)
 
 
-def _kept(measured: Path) -> Record | None:
-    """The record beside a streamed one, if it is whole."""
+def _load_if_valid(measured: Path) -> Record | None:
+    """Return the record at a path, or None if it does not exist or is damaged."""
     with suppress(RecordError):
         return Record.load(measured)
     return None
 
 
 def _summary(path: Path) -> dict[str, Any]:
-    """What a replay that came to its end has said of it; empty where there is nothing, or nothing whole."""
+    """Return the summary of a replay that ended; empty if the file does not exist or is damaged."""
     with suppress(FileNotFoundError, ValueError):
         summary = json.loads(path.read_bytes())
         return summary if isinstance(summary, dict) else {}
@@ -257,19 +278,19 @@ def _summary(path: Path) -> dict[str, Any]:
 def _read(part: Path) -> Record:
     content = part.read_bytes()
     if not content:
-        raise RecordError(f"{part}: is empty, the replay died before its first cycle: nothing to recover, remove it")
+        raise RecordError(f"{part}: is empty, because the replay died before its first cycle; remove it")
     line, _, data = content.partition(b"\n")
     try:
         header: dict[str, Any] = json.loads(line)
         layout = Layout(**header["layout"])
         kind = row_type(len(layout.joints))
         if header["format"] != PART_FORMAT or header["row"] != json.loads(json.dumps(kind.descr)):
-            raise ValueError("another version of dynsim wrote it")
+            raise ValueError("written by another version of dynsim")
         scene = Scene.from_json(header["scene"]) if header["scene"] else None
     except (ValueError, TypeError, KeyError) as error:
-        raise RecordError(f"{part}: is no streamed record of a replay ({error})") from error
-    # The last row may have been cut off in the middle.
-    rows = _sound(np.frombuffer(data[: len(data) // kind.itemsize * kind.itemsize], dtype=kind))
+        raise RecordError(f"{part}: is not a partial record of a replay ({error})") from error
+    # The last row may be cut off.
+    rows = _rows_in_order(np.frombuffer(data[: len(data) // kind.itemsize * kind.itemsize], dtype=kind))
     origins = rows["origin"][np.isfinite(rows["origin"])]
     origin = origins[0] if len(origins) else rows["time"][0] if len(rows) else 0.0
     record = describe(measured_record(rows, layout, float(origin)), scene)
@@ -277,8 +298,8 @@ def _read(part: Path) -> Record:
     return record
 
 
-def _sound(rows: Rows) -> Rows:
-    """The rows before the first whose time is not after the one before it: a power cut may leave zeros at the end."""
+def _rows_in_order(rows: Rows) -> Rows:
+    """Return the rows before the first whose time does not increase: a power cut may leave zeros at the end."""
     forward = np.diff(rows["time"], prepend=-np.inf) > 0
     broken = np.flatnonzero(~(forward & np.isfinite(rows["time"])))
     return rows[: broken[0]] if len(broken) else rows

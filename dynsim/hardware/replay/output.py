@@ -1,7 +1,7 @@
-"""Outputs of a running replay: log file (``tail -f``), recorded cycles, progress.
+"""States, results and outputs of a replay: stop requests, log file (``tail -f``), recorded cycles, progress bar.
 
-The loop keeps its outputs in memory and never waits; a thread writes them to files or a display. So a disk that is full
-or slow, or a terminal that accepts no output, does not delay the loop.
+The control loop keeps its outputs in memory and never waits; a thread writes them to files or a display. Therefore a
+full or slow disk, or a terminal that does not accept output, cannot delay the loop.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ from dynsim.record.scene import Scene
 from dynsim.system.files import INCOMPLETE, lock
 from dynsim.system.terminal import plain
 
-# Types of a replay: states, stop request and its signal handlers, progress, timing statistics, result.
+# Types of a replay: states, stop requests and signal handlers, progress, timing statistics, and the result.
 
 
 class ReplayState(IntEnum):
-    """Where the replay is; recorded cycle by cycle."""
+    """State of a replay; recorded in each cycle."""
 
     CONNECT = 0
     VERIFY = 1
@@ -60,12 +60,12 @@ NOT_ARMED = "not armed"
 
 HOLDING, LIMP, MOVING = "holding", "limp: off", "moving"
 SILENT, TRIPPED = "does not answer", "watchdog tripped"
-WHOLE = {HOLDING: "holding", LIMP: "off", SILENT: "unreachable"}
-"""End state of the robot where all its servos have the same one; other states keep their names."""
+ROBOT_STATES = {HOLDING: "holding", LIMP: "off", SILENT: "unreachable"}
+"""State of the robot if all servos have the same state; states that are missing here keep their names."""
 
 
 class StopRequest:
-    """Counts the user's Ctrl-C (or other signals): the first asks for a controlled stop, the second for torque off."""
+    """Count Ctrl-C and other signals: the first requests a controlled stop, the second requests torque off."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -75,45 +75,45 @@ class StopRequest:
 
     @property
     def for_release(self) -> bool:
-        """The user wants torque off, now."""
+        """True if the user requests torque off."""
         return self.count >= 2
 
     def check(self) -> None:
-        """Raises Stopped when the user has asked for a stop."""
+        """Raise Stopped if the user has requested a stop."""
         if self.count:
             raise Stopped(Fault(Cause.INTERRUPTED, "stopped by the user"))
 
 
-def _there(*names: str) -> list[signal.Signals]:
+def _available(*names: str) -> list[signal.Signals]:
     return [getattr(signal, name) for name in names if hasattr(signal, name)]
 
 
-# Of these only the first counts. When a terminal is closed both the system and the shell send SIGHUP, and `timeout`
-# sends SIGTERM to the process and to its group: nobody has asked twice, and a robot that is let go falls.
-# The others would end the process, and leave a moving robot to its watchdogs.
-_ONCE = _there(
+# Repeated signals of this group count once: if a terminal is closed, both the system and the shell send SIGHUP, and
+# `timeout` sends SIGTERM to the process and to its group, but torque off would let the robot fall.
+# By default these signals would end the process and leave a moving robot to its watchdogs.
+_STOP_SIGNALS = _available(
     "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP", "SIGUSR1", "SIGUSR2", "SIGALRM", "SIGVTALRM", "SIGPROF", "SIGXCPU",
     "SIGIO", "SIGPWR", "SIGSTKFLT",
 )  # fmt: skip
-# Of a terminal that the process may not write to or that is gone, and of a disk quota: the write fails, nothing else.
-_PASSED_OVER = _there("SIGTTOU", "SIGTTIN", "SIGPIPE", "SIGXFSZ")
+# Signals of a terminal that is gone or not writable, and of a disk quota: ignored, so that only the write fails.
+_IGNORED_SIGNALS = _available("SIGTTOU", "SIGTTIN", "SIGPIPE", "SIGXFSZ")
 
 
 @contextmanager
 def stop_on_signals(stop: StopRequest) -> Iterator[None]:
-    """Signals only count up ``stop``: an exception out of a handler would tear a bus transaction in two.
+    """Convert signals within the block to stop requests; an exception in a handler would break a bus transaction.
 
-    Ctrl-C counts every time; SIGTERM, SIGHUP, SIGQUIT (Ctrl-\\), SIGTSTP (Ctrl-Z, which would leave a moving robot
-    without goals) and all others by which a process ends ask for the controlled stop only. A SIGHUP
-    that is ignored (``nohup``) stays so.
+    Each Ctrl-C counts. SIGTERM, SIGHUP, SIGQUIT (Ctrl-\\), SIGTSTP (Ctrl-Z, which would leave a moving robot without
+    goals) and all other signals that end a process request the controlled stop only. If SIGHUP is ignored (``nohup``),
+    it stays ignored.
     """
 
-    def ask_once(*_: Any) -> None:
+    def request_stop(*_: Any) -> None:
         stop.count = max(stop.count, 1)
 
     handlers: dict[signal.Signals, Any] = {signal.SIGINT: stop}
-    handlers |= dict.fromkeys(_ONCE, ask_once) | dict.fromkeys(_PASSED_OVER, signal.SIG_IGN)
-    for number in _there("SIGHUP"):
+    handlers |= dict.fromkeys(_STOP_SIGNALS, request_stop) | dict.fromkeys(_IGNORED_SIGNALS, signal.SIG_IGN)
+    for number in _available("SIGHUP"):
         if signal.getsignal(number) == signal.SIG_IGN:
             del handlers[number]
     before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
@@ -121,30 +121,30 @@ def stop_on_signals(stop: StopRequest) -> Iterator[None]:
         yield
     finally:
         for number, handler in before.items():
-            # None: set by C code, which Python cannot give back.
+            # None means that C code had set the handler, which Python cannot restore.
             if handler is not None:
                 signal.signal(number, handler)
 
 
 def ignore_stops() -> None:
-    """Of a process that ends when another one says so: the signals that ask that one for a stop mean nothing here."""
-    for number in (signal.SIGINT, *_ONCE):
+    """Ignore stop signals, in a process that is ended by its parent process."""
+    for number in (signal.SIGINT, *_STOP_SIGNALS):
         signal.signal(number, signal.SIG_IGN)
 
 
 @dataclass(frozen=True)
 class ReplayProgress:
-    """What a display may show after every cycle.
+    """Progress of a replay after a cycle, for a display.
 
     Attributes
     ----------
     state : ReplayState
     fraction : float
-        Of the current motion, 0 to 1.
+        Completed fraction of the current motion, 0 to 1.
     following_error : float
-        Worst of all joints [rad].
+        Largest following error of all joints [rad].
     temperature : float
-        Hottest servo [°C], NaN before it is known.
+        Temperature of the hottest servo [°C]; NaN before it is known.
     """
 
     state: ReplayState
@@ -155,18 +155,18 @@ class ReplayProgress:
 
 @dataclass(frozen=True)
 class ServoEnd:
-    """One servo at the end.
+    """State of one servo at the end of a replay.
 
     Attributes
     ----------
     joint : str
     id : int
     torque : bool or None
-        Whether it is on; None, as all that follows, where the servo did not answer.
+        True if the torque is on. None, like the following values, if the servo did not answer.
     error : int or None
         Hardware error register.
     position, velocity : float or None
-        Of the joint [rad], [rad/s].
+        Joint position [rad] and velocity [rad/s].
     doing : str
         "holding", "limp: off", "limp: <hardware error>", "moving", "watchdog tripped" or "does not answer".
     """
@@ -180,7 +180,7 @@ class ServoEnd:
     doing: str = SILENT
 
     def as_dict(self) -> dict[str, Any]:
-        """With units in the names, for summaries."""
+        """Return the values as a dictionary for summaries, with units in the keys."""
         values = asdict(self)
         values["position_rad"], values["velocity_rad_s"] = values.pop("position"), values.pop("velocity")
         return values
@@ -192,10 +192,10 @@ class ServoEnd:
         return text if self.position is None else f"{text}, {self.position:.4f} rad, {self.velocity:.3f} rad/s"
 
 
-def of_the_whole(servos: Sequence[ServoEnd]) -> str:
-    """One phrase for all servos: "holding", "off", "unreachable", or who does what.
+def robot_state(servos: Sequence[ServoEnd]) -> str:
+    """Return the state of the robot: "holding", "off", "unreachable", or "mixed" with the states of the servos.
 
-    The largest group is counted, the others are named, as in
+    The largest group is counted and the other servos are listed, for example
     "mixed: 16 holding; wheel1, wheel2 does not answer; elbow limp: overload".
     """
     groups: dict[str, list[str]] = {}
@@ -203,7 +203,7 @@ def of_the_whole(servos: Sequence[ServoEnd]) -> str:
         groups.setdefault(servo.doing, []).append(servo.joint)
     if len(groups) <= 1:
         doing = next(iter(groups), SILENT)
-        return WHOLE.get(doing, doing)
+        return ROBOT_STATES.get(doing, doing)
     largest = max(groups, key=lambda doing: len(groups[doing]))
     descriptions = [
         f"{len(joints)} {doing}" if doing == largest and len(joints) > 1 else f"{', '.join(joints)} {doing}"
@@ -214,15 +214,16 @@ def of_the_whole(servos: Sequence[ServoEnd]) -> str:
 
 @dataclass(frozen=True)
 class TimingStatistics:
-    """How well the loop kept its deadlines.
+    """Timing statistics of the control loop.
 
     Attributes
     ----------
     cycles, skipped_cycles, missed_statuses, stray_bytes : int
     period_mean, period_max, lateness_p50, lateness_p99, lateness_max, exchange_mean, exchange_max : float
-        Time between cycle starts, start after the deadline, writing all goals and reading all states [s].
+        Time between cycle starts, delay of the start after the deadline, and time to write all goals and read all
+        states [s].
     path_late : float
-        By how much the path ended later than planned, for the cycles that were skipped on it [s].
+        Delay of the end of the path because of skipped cycles [s].
     """
 
     cycles: int
@@ -239,36 +240,37 @@ class TimingStatistics:
     exchange_max: float
 
     def as_dict(self) -> dict[str, float | int]:
-        """With the unit in the name, for summaries."""
+        """Return the values as a dictionary for summaries, with units in the keys."""
         seconds = {f"{name}_s": value for name, value in vars(self).items() if isinstance(value, float)}
         return {name: value for name, value in vars(self).items() if isinstance(value, int)} | seconds
 
 
 @dataclass
 class ReplayResult:
-    """How a replay ended.
+    """Result of a replay.
 
     Attributes
     ----------
     end_state : str
-        What the robot was read to do at the end: "holding", "off", "mixed: ..." (who does what), "unreachable" (nobody
-        answers; armed servos stop by their own watchdogs), or "not armed" where nothing was switched on.
+        State of the robot, read at the end: "holding", "off", "mixed: ..." (states of the servos), "unreachable" (no
+        servo answers; armed servos stop by their watchdogs), or "not armed" (nothing was switched on).
     servos : tuple of ServoEnd
-        What every servo was read to do.
+        State of each servo, read at the end.
     faults : list of Fault
-        All that were declared, one of each cause; the first one stopped the motion.
+        Declared faults, one for each cause; the first fault stopped the motion.
     fault_state : ReplayState | None
-        Where the first one struck.
+        State in which the first fault occurred.
     fault_time : float
-        Of the first one, on the replay's clock [s], NaN without one.
+        Time of the first fault on the clock of the replay [s]; NaN without a fault.
     policy_goals : list
-        (clock time, ID, register value) of every goal sent after the fault.
+        (clock time, ID, register value) of each goal that was sent after the fault.
     record : Record
+        Measured record.
     timing : TimingStatistics | None
     torque_still_on : tuple of int
         IDs that did not confirm torque off.
     limits : tuple of LimitRow
-        Limits that the servos have stored, beside the map's.
+        Limits stored in the servos, next to the limits of the map.
     """
 
     end_state: str = NOT_ARMED
@@ -284,18 +286,18 @@ class ReplayResult:
 
     @property
     def fault(self) -> Fault | None:
-        """The one that stopped the motion, the gravest of its cycle."""
+        """Fault that stopped the motion, the most severe of its cycle; None without a fault."""
         return self.faults[0] if self.faults else None
 
     @property
     def fault_text(self) -> str:
-        """All faults in words, the first one with the state it struck in; empty without one."""
+        """Text with all faults, the first with the state in which it occurred; empty without a fault."""
         first = f" in {self.fault_state.name}" if self.fault_state is not None else ""
         texts = [f"{fault.cause}{'' if number else first}: {fault.text}" for number, fault in enumerate(self.faults)]
         return "; ".join(texts)
 
     def summary(self) -> dict[str, Any]:
-        """How it ended, for ``summary.json``."""
+        """Return end state and faults for ``summary.json``."""
         summary: dict[str, Any] = {
             "end_state": self.end_state,
             "servos": [servo.as_dict() for servo in self.servos],
@@ -308,7 +310,7 @@ class ReplayResult:
         return summary
 
     def declare(self, fault: Fault) -> None:
-        """Add a fault; what has the cause of an earlier one joins it."""
+        """Add a fault, or merge it into an earlier fault with the same cause."""
         for number, known in enumerate(self.faults):
             if known.cause == fault.cause:
                 ids = known.ids + tuple(id_ for id_ in fault.ids if id_ not in known.ids)
@@ -318,14 +320,14 @@ class ReplayResult:
 
 
 def _joined(first: str, second: str) -> str:
-    """Texts "who: what" of one cause; what befell several is said once."""
+    """Join two texts "servo: problem" of the same cause; an equal problem is written once."""
     who, _, text = first.partition(": ")
     other, _, the_same = second.partition(": ")
     return f"{who}, {other}: {text}" if text and text == the_same else f"{first}; {second}"
 
 
 class Stopped(Exception):
-    """The replay cannot go on: rules, the user or a servo say so."""
+    """The replay must stop because of an abort rule, the user or a servo."""
 
     def __init__(self, *faults: Fault) -> None:
         super().__init__("; ".join(fault.text for fault in faults))
@@ -333,35 +335,35 @@ class Stopped(Exception):
 
 
 INTERVAL = 0.5
-"""Between two writes [s]: a process that is killed loses the outputs of about this time."""
+"""Time between two writes [s]; a killed process loses about this much output."""
 PATIENCE = 5.0
-"""Longest wait for a blocked file or display after the run [s]."""
+"""Maximum wait for a blocked file or display after the run [s]."""
 LOG_INTERVAL = 1.0
-"""Between two lines about the following error [s]."""
+"""Time between two log lines with the following error [s]."""
 PART = "measured.part"
-"""Name of the file that grows during a run; the measured record takes its place at the end."""
+"""Name of the file that grows during a run; the measured record replaces it at the end."""
 PART_FORMAT = 1
 MEASURED, SUMMARY, LOG = "measured.h5", "summary.json", "replay.log"
 REGISTERS, REGISTERS_AFTER_FAULT = "registers.json", "registers_after_fault.json"
 FILES = (PART, MEASURED, SUMMARY, LOG, REGISTERS, REGISTERS_AFTER_FAULT, INCOMPLETE)
-MADE_OF_THEM = ("comparison.*", "figures")
-"""Files that other commands write beside a measured record."""
+DERIVED_FILES = ("comparison.*", "figures")
+"""Files that other commands write next to a measured record."""
 
 P = ParamSpec("P")
 T = TypeVar("T")
 
 
 class Journal:
-    """Keeps the state of a replay, and passes it to log and observer. Nothing here raises.
+    """State of a replay, passed to log and observer. The methods do not raise.
 
     Attributes
     ----------
     state : ReplayState
     log : RunLog
     observer : callable, optional
-        Called with a Progress after every cycle and on every change of state.
+        Called with a ReplayProgress after each cycle and at each change of state.
     failures : dict
-        The first error of every output that failed, by its name; that output is off since.
+        First error of each output that failed, by the name of the output; a failed output is disabled.
     """
 
     def __init__(
@@ -381,17 +383,23 @@ class Journal:
         self._stop = stop
         self._origin = clock.now()
         self._last_logged = -math.inf
-        self._kept: list[tuple[float, str, str]] | None = None
+        self._buffer: list[tuple[float, str, str]] | None = None
 
     def guard(self, name: str, call: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T | None:
-        """Run an output; None when it fails, and from then on without trying.
+        """Call an output; an error disables it.
 
         Parameters
         ----------
         name : str
-            Its name: what :attr:`failures` lists, and what is switched off by an error.
+            Name of the output in :attr:`failures`.
         call : callable
-            A KeyboardInterrupt or SystemExit out of it becomes a request to stop: nothing may leave a moving robot.
+            Function to call. A KeyboardInterrupt or SystemExit in it becomes a stop request, so that the program does
+            not leave a moving robot.
+
+        Returns
+        -------
+        object or None
+            Result of the call; None if it fails or the output is disabled.
         """
         if name in self.failures:
             return None
@@ -403,47 +411,47 @@ class Journal:
             self.failures[name] = error
             self._stop()
         if name != "log":
-            self.say(f"{name} failed and is off from here: {self.failures[name]!r}")
+            self.add_line(f"{name} failed and is disabled: {self.failures[name]!r}")
         return None
 
     def enter(self, state: ReplayState) -> None:
         self.state = state
-        self.say("enter")
+        self.add_line("enter")
         self._observe(0.0, 0.0)
 
-    def say(self, text: str) -> None:
+    def add_line(self, text: str) -> None:
         line = (self._clock.now() - self._origin, self.state.name, text)
-        if self._kept is None:
+        if self._buffer is None:
             self._write(*line)
         else:
-            self._kept.append(line)
+            self._buffer.append(line)
 
     def report(self, following_error: float, fraction: float) -> None:
-        """After a cycle: the worst following error [rad], and how much of the motion is done."""
-        if self._kept is not None:
+        """Report the largest following error [rad] and the completed fraction of the motion after a cycle."""
+        if self._buffer is not None:
             return
         now = self._clock.now()
         if now - self._last_logged >= LOG_INTERVAL:
             self._last_logged = now
             hottest = self._recorder.hottest
-            self.say(
+            self.add_line(
                 f"following error {following_error:.4f} rad"
                 + (f", hottest {hottest:.0f} °C" if hottest == hottest else "")
             )
         self._observe(fraction, following_error)
 
     @contextmanager
-    def held_back(self) -> Iterator[None]:
-        """Within, nothing leaves: what is said is written afterwards, and the observer hears of nothing.
+    def buffered(self) -> Iterator[None]:
+        """Buffer all log lines until the block ends; the observer is not called meanwhile.
 
-        A disk or a terminal that blocks cannot delay what happens to the robot meanwhile.
+        Therefore a blocked disk or terminal cannot delay the commands to the robot in the block.
         """
-        self._kept = []
+        self._buffer = []
         try:
             yield
         finally:
-            kept, self._kept = self._kept, None
-            for line in kept:
+            lines, self._buffer = self._buffer, None
+            for line in lines:
                 self._write(*line)
 
     def _write(self, time: float, state: str, text: str) -> None:
@@ -452,22 +460,22 @@ class Journal:
             self.failures.setdefault("log", self.log.failure)
 
     def _observe(self, fraction: float, following_error: float) -> None:
-        if self.observer and self._kept is None:
+        if self.observer and self._buffer is None:
             progress = ReplayProgress(self.state, fraction, following_error, self._recorder.hottest)
             self.guard("progress", self.observer, progress)
 
 
 Rows = NDArray[np.void]
 SCALARS = struct.Struct("=5d3i")
-"""Of a row."""
+"""Scalars of a row."""
 
 
 def row_type(servos: int) -> np.dtype[np.void]:
-    """One cycle of so many servos, as it lies in memory: without gaps, in the byte order of the machine.
+    """Return the data type of one cycle of ``servos`` servos: packed, in the byte order of the machine.
 
-    ``time``, ``origin`` (the clock when the path began, NaN before), ``path_time``, ``lateness`` and ``exchange`` in
-    [s]; positions [rad], velocities [rad/s] and torques [N·m] of joints, NaN where a status was missed; supply [V],
-    temperature [°C].
+    ``time``, ``origin`` (clock time of the start of the path, NaN before), ``path_time``, ``lateness`` and ``exchange``
+    are in [s]. Positions [rad], velocities [rad/s] and torques [N·m] of joints are NaN if a status was missed. Supply
+    is in [V], temperature in [°C].
     """
     seconds = ["time", "origin", "path_time", "lateness", "exchange"]
     numbers = ["state", "stray", "skipped"]
@@ -481,14 +489,14 @@ def row_type(servos: int) -> np.dtype[np.void]:
 
 
 class Recorder:
-    """Collects the timed cycles of a replay, as rows that never change: another thread may take them meanwhile.
+    """Collect the timed cycles of a replay as immutable rows, which another thread may read meanwhile.
 
     Attributes
     ----------
     type : dtype
-        Of a row.
+        Data type of a row.
     hottest : float
-        Servo [°C], NaN before the first health read.
+        Temperature of the hottest servo [°C]; NaN before the first health read.
     """
 
     def __init__(self, servo_map: ServoMap) -> None:
@@ -503,11 +511,14 @@ class Recorder:
         return len(self._rows)
 
     def add(self, cycle: Cycle, state: ReplayState, path_time: float, origin: float) -> None:
-        """Keep one cycle.
+        """Add one cycle.
 
         Parameters
         ----------
-        path_time, origin : time along the path, and of its beginning on the clock [s]; NaN before it has begun
+        cycle : Cycle
+        state : ReplayState
+        path_time, origin : float
+            Time along the path, and clock time of its start [s]; NaN before the start.
         """
         if cycle.health:
             for id_, registers in cycle.health.items():
@@ -517,7 +528,7 @@ class Recorder:
         scalars = SCALARS.pack(
             cycle.time, origin, path_time, cycle.lateness, cycle.exchange, state, cycle.stray, cycle.skipped
         )
-        # Some microseconds faster than to assign them field by field, and this is done in every cycle.
+        # Some microseconds faster than an assignment field by field, in every cycle.
         arrays: tuple[Any, ...] = (
             cycle.goal_position,
             cycle.goal_velocity,
@@ -531,7 +542,7 @@ class Recorder:
         self._rows.append(b"".join((scalars, *arrays)))
 
     def since(self, first: int) -> bytes:
-        """Rows from number ``first`` on."""
+        """Return the rows from number ``first`` on."""
         return b"".join(self._rows[first:])
 
     def all(self) -> Rows:
@@ -540,17 +551,17 @@ class Recorder:
 
 @dataclass(frozen=True)
 class Layout:
-    """What the columns of rows are called in a record.
+    """Names of the columns of rows in a record.
 
-    Signals measured carry the names and labels of the signals followed; ``<name>_goal`` is what was commanded.
+    Measured signals have the names and labels of the signals that the servos follow; ``<name>_goal`` is the command.
 
     Attributes
     ----------
     joints : list of str
     labels : list of str
-        Of the columns of the signals that the joints follow.
+        Labels of the columns that the joints follow.
     positions, velocities : list of str
-        The signal that each joint follows; held joints are among those of their kind.
+        Signals that each joint follows; a joint with a fixed angle uses the signals of its kind.
     provenance : dict
     """
 
@@ -572,14 +583,14 @@ class Layout:
         )
 
     def groups(self) -> Iterator[tuple[str, str, list[int]]]:
-        """(signal, "position" or "velocity", columns)."""
+        """Yield the name of each signal, "position" or "velocity", and its columns."""
         for source, names in (("position", self.positions), ("velocity", self.velocities)):
             for name in dict.fromkeys(names):
                 yield name, source, [column for column, other in enumerate(names) if other == name]
 
 
 class GrowingFile:
-    """A file that can be read while it grows; nobody else's, and held until it is closed.
+    """New file that can be read while it grows; it is locked until it is closed.
 
     See :func:`dynsim.system.files.lock`.
 
@@ -590,11 +601,11 @@ class GrowingFile:
     Raises
     ------
     OSError
-        It cannot be made, or is there already.
+        If the file cannot be created or exists already.
     """
 
     def __init__(self, path: Path) -> None:
-        # Not buffered: what a buffer still holds would be tried again, and fail again, when it is closed.
+        # Unbuffered: closing would try to write the content of a buffer again after an error, and fail again.
         self.path = path
         self._stream = path.open("xb", buffering=0)
         try:
@@ -604,21 +615,21 @@ class GrowingFile:
             raise
 
     def append(self, data: bytes) -> None:
-        """Raises OSError."""
+        """Write data at the end of the file. Raises OSError."""
         left = memoryview(data)
         while left:
             left = left[self._stream.write(left) or 0 :]
 
     def sync(self) -> None:
-        """Wait until the disk has it. Raises OSError."""
+        """Wait until all data are on the disk. Raises OSError."""
         os.fsync(self._stream.fileno())
 
     def close(self) -> None:
-        """Raises OSError."""
+        """Close the file. Raises OSError."""
         self._stream.close()
 
     def discard(self) -> None:
-        """Close and remove it: the run that it was made for does not begin."""
+        """Close and remove the file, if its run does not start."""
         with suppress(OSError):
             self._stream.close()
         with suppress(OSError):
@@ -626,25 +637,25 @@ class GrowingFile:
 
 
 class RunLog:
-    """Lines "time [s]  state  text". They reach the file by :meth:`pump`, which another thread calls.
+    """Log with lines "time [s]  state  text". Another thread writes them to the file by :meth:`pump`.
 
     Parameters
     ----------
     path : path or None
-        None: the lines are only in ``lines``.
+        Log file; None keeps the lines in memory only.
 
     Attributes
     ----------
     lines : list of str
     failure : Exception or None
-        Why the file ends before the run did.
+        Error after which no more lines were written to the file.
     wake : callable
-        Called after every line: the thread that pumps may be asleep.
+        Called after each line, to wake the thread that calls :meth:`pump`.
 
     Raises
     ------
     OSError
-        The file cannot be made.
+        If the file cannot be created.
     """
 
     name = "log"
@@ -677,20 +688,22 @@ class RunLog:
 
 
 class RowStream:
-    """The rows of a replay on their way to ``measured.part``: one line of JSON, then rows as they lie in memory.
+    """Stream the rows of a replay to ``measured.part``: one line of JSON, then binary rows.
 
     Parameters
     ----------
     path : path
+        File to create.
     recorder : Recorder
+        Source of the rows.
     layout : Layout
     scene : Scene or None
-        Of the replayed record.
+        Scene of the replayed record.
 
     Raises
     ------
     OSError
-        The file cannot be made, or its first line not be written.
+        If the file cannot be created or its first line cannot be written.
     """
 
     name = "streamed record"
@@ -727,27 +740,27 @@ class RowStream:
 
 
 class Outlet(Protocol):
-    """Something that takes what the loop has left in memory to where it can be seen."""
+    """Interface of an output that writes data of the control loop from memory to a file or display."""
 
     name: str
     failure: Exception | None
 
     def pump(self) -> None:
-        """Take what has come since the last call. May raise: then it is not called again."""
+        """Write the data since the last call. After an exception it is not called again."""
         ...
 
     def close(self) -> None:
-        """After the last call of ``pump``, also after one that failed."""
+        """Close the output after the last call of ``pump``, even if that failed."""
         ...
 
 
 class Background:
-    """A thread that pumps outlets, at least every ``interval`` [s] and whenever it is woken.
+    """Thread that pumps outlets every ``interval`` [s] and whenever it is woken.
 
     Raises
     ------
     RuntimeError
-        The system gives no thread; the outlets are closed.
+        If the thread cannot be started; the outlets are closed.
     """
 
     def __init__(self, outlets: Sequence[Outlet], interval: float) -> None:
@@ -756,7 +769,7 @@ class Background:
         self._woken = threading.Event()
         self._ending = False
         self._at_work: Outlet | None = None
-        # Not waited for when Python ends: a terminal may be held for ever.
+        # A daemon thread, so that Python can exit even if a terminal blocks indefinitely.
         self._thread = threading.Thread(target=self._run, name="dynsim outlets", daemon=True)
         try:
             self._thread.start()
@@ -768,11 +781,12 @@ class Background:
         self._woken.set()
 
     def close(self, patience: float = PATIENCE) -> dict[str, Exception]:
-        """Pump once more and end; the first error of every outlet that failed, by name.
+        """Pump a last time, end the thread, and return failed outlets with their first errors.
 
         Parameters
         ----------
-        patience : longest wait [s]; an outlet that does not come back in this time has failed with a TimeoutError
+        patience : float
+            Maximum wait [s]; an outlet that takes longer has failed with a TimeoutError.
         """
         self._ending = True
         self.wake()
@@ -780,7 +794,7 @@ class Background:
         failures = {outlet.name: outlet.failure for outlet in self._outlets if outlet.failure is not None}
         stuck = self._at_work
         if self._thread.is_alive() and stuck is not None:
-            failures.setdefault(stuck.name, TimeoutError(f"does not answer for {patience:g} s"))
+            failures.setdefault(stuck.name, TimeoutError(f"no response for {patience:g} s"))
         return failures
 
     def _run(self) -> None:
@@ -811,30 +825,35 @@ class Background:
 
 
 def move_away(folder: Path) -> Path | None:
-    """Move what an earlier replay left to a folder ``previous_1``, ``previous_2``, … within; None if there is nothing.
+    """Move the files of an earlier replay to a new subfolder ``previous_1``, ``previous_2``, …
+
+    Returns
+    -------
+    Path or None
+        The subfolder; None if there are no such files.
 
     Raises
     ------
     PortError
-        Another replay is writing there.
+        If another replay is writing to the folder.
     OSError
-        Something cannot be moved.
+        If a file cannot be moved.
     """
     paths = [folder / name for name in FILES if os.path.lexists(folder / name)]
     if not paths:
         return None
-    if is_held(folder / PART):
-        raise PortError(f"{folder}: another replay is writing there; give this one another folder (--out)")
+    if is_locked(folder / PART):
+        raise PortError(f"{folder}: another replay is writing to it; choose another --out")
     if folder / PART in paths or folder / MEASURED in paths:
-        paths += [path for pattern in MADE_OF_THEM for path in folder.glob(pattern)]
+        paths += [path for pattern in DERIVED_FILES for path in folder.glob(pattern)]
     target = _new_folder(folder)
     for path in paths:
         path.rename(target / path.name)
     return target
 
 
-def is_held(part: Path) -> bool:
-    """Whether the process that writes a streamed record is alive. Raises OSError."""
+def is_locked(part: Path) -> bool:
+    """Return True if the process that writes a streamed record is alive. Raises OSError."""
     try:
         descriptor = os.open(part, os.O_RDONLY)
     except FileNotFoundError:
@@ -856,22 +875,22 @@ def _new_folder(folder: Path) -> Path:
     raise AssertionError
 
 
-# The progress bar of a replay, drawn in its own thread so that a blocked terminal cannot delay the motion.
+# Progress bar of a replay, drawn in a separate thread so that a blocked terminal cannot delay the motion.
 
 
 DRAWING_INTERVAL = 0.1
-"""Between two drawings [s]."""
+"""Time between two drawings [s]."""
 DISPLAY_PATIENCE = 1.0
-"""Longest wait for a terminal that accepts no output, after the run [s]."""
+"""Maximum wait for a blocked terminal after the run [s]."""
 
 
 class Display:
-    """A bar with state, following error and temperature; called with a Progress, it shows the last one.
+    """Progress bar with state, following error and temperature; an observer that shows the latest ReplayProgress.
 
     Attributes
     ----------
     failure : Exception or None
-        Why nothing is drawn any more.
+        Error after which nothing is drawn.
     """
 
     name = "progress bar"
@@ -888,7 +907,7 @@ class Display:
             console=console,
             transient=True,
             auto_refresh=False,
-            # What other threads print must not wait for this one.
+            # Output of other threads must not wait for this thread.
             redirect_stdout=False,
             redirect_stderr=False,
         )
@@ -918,9 +937,9 @@ class Display:
 
 @contextmanager
 def displayed(console: Console, failures: dict[str, BaseException]) -> Iterator[Display | None]:
-    """A display that draws itself within the block; None where the system gives no thread for it.
+    """Show a progress bar within the block; yields None if its thread cannot be started.
 
-    Why it did not, or did so no more, joins ``failures`` at the end of the block.
+    An error of the display is added to ``failures`` at the end of the block.
     """
     display = Display(console)
     try:

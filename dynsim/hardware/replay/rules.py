@@ -1,8 +1,8 @@
-"""The abort rules: conditions on the answers of one cycle under which a replay stops.
+"""Abort rules of a replay: conditions on the answers of a cycle that stop the motion.
 
-Every rule has a bound on its reaction: the number of cycles from the first one whose answers show the trouble to the
-one in which the fault is declared. The bounds are those of the map's ``safety``; one cycle for an alert; for troubles
-that only health reads show, the cycles in which the health of all servos is read in turn.
+Each rule has a bounded reaction time: the number of cycles from the first cycle whose answers show the fault to the
+cycle that declares it. The bound is set in ``safety`` of the map; it is one cycle for an alert, and one round of health
+reads of all servos for faults that only health reads can detect.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from dynsim.hardware.servo_map import MappedServo, Safety, ServoMap
 
 
 class Cause(StrEnum):
-    """Why a replay stopped."""
+    """Cause of the end of a replay."""
 
     INTERRUPTED = "interrupted"
     PORT = "port"
@@ -57,11 +57,11 @@ class Fault:
     ----------
     cause : Cause
     text : str
-        For the log and the user.
+        Message for the log and the user.
     ids : tuple of int
-        Servos that are in trouble; empty when none is singled out.
+        IDs of the faulty servos; empty if the fault is not specific to some servos.
     time : float
-        When it was declared, on the replay's clock [s].
+        Time of the declaration, on the clock of the replay [s].
     """
 
     cause: Cause
@@ -72,31 +72,32 @@ class Fault:
 
 @dataclass
 class Cycle:
-    """What one cycle commanded and measured; arrays of shape (N,) in the order of the map, joint coordinates.
+    """Commands and measurements of one cycle; arrays have shape (N,), in joint coordinates and the order of the map.
 
     Attributes
     ----------
     time : float
-        When it began, on the replay's clock [s].
+        Start of the cycle, on the clock of the replay [s].
     goal_position, goal_velocity : array
-        [rad], [rad/s].
+        Goals [rad], [rad/s].
     position, velocity, torque : array
-        Measured; NaN where the status was missed. [rad], [rad/s], [N·m].
+        Measured values [rad], [rad/s], [N·m]; NaN if the status was missed.
     alert : bool array
+        Alert bits of the statuses.
     lateness : float
-        Start after the deadline [s].
+        Delay of the start after the deadline [s].
     skipped : int
-        Cycles that were left out before it.
+        Number of cycles skipped before this one.
     exchange : float
-        Duration of its bus traffic, but for the health of a servo [s].
+        Duration of the bus traffic without the health read [s].
     stray : int
-        Bytes that were no answer.
+        Number of bytes outside answers.
     silence : float
-        Longest time in which the servos heard nothing, from the cycle before to the end of this one [s].
+        Longest time without a packet to the servos, from the previous cycle to the end of this one [s].
     outdated : tuple of int
-        Servos that answered an earlier request instead of this one.
+        IDs of servos that answered an earlier request instead of this one.
     health : dict
-        Registers of the servo whose health was read, by ID; empty when none was.
+        Registers of the servo whose health was read, by ID; empty if none was read.
     """
 
     time: float
@@ -120,14 +121,14 @@ class Cycle:
 
 
 def watchdog_units(safety: Safety) -> int:
-    """The map's watchdog time in units of the servos' register (20 ms), rounded up."""
+    """Return the watchdog time of the map in units of the servo register (20 ms), rounded up."""
     return math.ceil(safety.watchdog / WATCHDOG_SECONDS_PER_UNIT)
 
 
 class AbortRules:
-    """Watches a replay cycle by cycle, from arming to the end of the fault policy.
+    """Check the cycles of a replay, from arming to the end of the fault policy.
 
-    A fault is declared once for every servo; what follows from a servo's earlier fault is none.
+    A fault is declared once per servo. Consequences of an earlier fault of a servo are not declared.
     """
 
     def __init__(self, servo_map: ServoMap, plan: CyclePlan) -> None:
@@ -147,17 +148,17 @@ class AbortRules:
         self._declared: set[tuple[Cause, int | None]] = set()
 
     def following_error(self, cycle: Cycle) -> NDArray[np.float64]:
-        """Commanded minus measured, shape (N,): [rad] in position mode, [rad/s] in velocity mode."""
+        """Return commanded minus measured, shape (N,): [rad] in position mode, [rad/s] in velocity mode."""
         return np.where(
             self._in_position_mode, cycle.goal_position - cycle.position, cycle.goal_velocity - cycle.velocity
         )
 
     def examine(self, cycle: Cycle) -> list[Fault]:
-        """The faults this cycle shows for the first time, the gravest first."""
+        """Return the faults that this cycle shows for the first time, the most severe first."""
         missed = cycle.missed
         error = np.abs(self.following_error(cycle))
         self._missed = np.where(missed, self._missed + 1, 0)
-        # A missed status says nothing about error and torque: their counters neither grow nor start anew.
+        # A missed status has no error and torque: their counters neither grow nor restart.
         self._following = _count(self._following, error > self._following_limit, missed)
         self._torque = _count(self._torque, np.abs(cycle.torque) > self._torque_limit, missed)
         self._late = self._late + 1 if cycle.lateness > self._late_after else 0
@@ -179,20 +180,20 @@ class AbortRules:
         ]  # fmt: skip
 
     def stalled(self, silence: float) -> bool:
-        """True where the servos heard nothing for so long [s] that their watchdogs have tripped."""
+        """Return True if a time without packets [s] is long enough for the watchdogs of the servos to trip."""
         return silence > self._watchdog
 
     def stall(self, silence: float) -> Fault:
-        """Nobody spoke to the servos for ``silence`` [s]."""
+        """Declare a stall: no packet was sent to the servos for ``silence`` [s]."""
         self._new(Cause.STALL)
         text = (
-            f"stalled for {silence:.2f} s: the servos' bus watchdogs ({self._watchdog:.2f} s) have tripped; "
-            "keep other work off this machine, or lower --rate"
+            f"stalled for {silence:.2f} s, so the bus watchdogs of the servos ({self._watchdog:.2f} s) have tripped; "
+            "close other programs, or lower --rate"
         )
         return Fault(Cause.STALL, text)
 
     def _new(self, cause: Cause, id_: int | None = None) -> bool:
-        """Whether this was not declared before; from now on it was."""
+        """Mark a fault as declared and return True if it was not declared before."""
         known = (cause, id_) in self._declared
         self._declared.add((cause, id_))
         return not known
@@ -229,7 +230,7 @@ class AbortRules:
             add(Cause.TEMPERATURE, f"{celsius} °C, limit {self._safety.temperature_max:g} °C")
         supply = self._safety.supply
         if not supply.lowest <= volts <= supply.highest and self._new(Cause.VOLTAGE):
-            # One supply feeds all: no servo is singled out, they keep step.
+            # One supply feeds all servos, so the fault has no IDs and all servos stop synchronously.
             text = f"{servo}: {volts:.1f} V, allowed {supply.lowest:g} to {supply.highest:g} V"
             faults.append(Fault(Cause.VOLTAGE, text))
         return faults
@@ -243,13 +244,13 @@ class AbortRules:
         if outdated:
             text += f"; answers to earlier requests come from {', '.join(map(str, outdated))}"
         if len(indices) == len(self._servos) > 1:
-            text += "; nobody answers: is the supply or the line lost?"
+            text += "; no servo answers: is the supply or the line lost?"
         return [Fault(Cause.MISSED_STATUS, text, tuple(servo.id for servo in hit))]
 
     def _beyond(self, cause: Cause, over: NDArray[np.bool_], values: NDArray[np.float64], quantity: str) -> list[Fault]:
         if not over.any():
             return []
-        # A servo that is limp or silent is off its goal too: that is no news.
+        # Ignore servos with an earlier fault: a servo without torque or answer is off its goal, too.
         in_trouble = {id_ for _, id_ in self._declared}
         hit = [k for k in np.flatnonzero(over) if self._servos[k].id not in in_trouble]
         if not hit:
@@ -265,7 +266,7 @@ class AbortRules:
             return []
         text = (
             f"{self._late} cycles in a row started late, the last by {cycle.lateness * 1e3:.1f} ms: "
-            "the computer is too slow or too busy; close other programs, or give it more time by a lower --rate"
+            "the computer is too slow or too busy; close other programs, or lower --rate"
         )
         return [Fault(Cause.DEADLINE, text)]
 
@@ -275,5 +276,5 @@ def _count(counters: NDArray[np.int64], hit: NDArray[np.bool_], unknown: NDArray
 
 
 def decode_health(servo: MappedServo, data: bytes) -> dict[str, int]:
-    """Registers in a health block, by name."""
+    """Decode the registers of a health block; the keys are names of registers."""
     return servo.model.registers_in(HEALTH_BLOCK[0], data)

@@ -1,4 +1,4 @@
-"""A replay session: opens the port, runs the replay, writes its files, and raises its failures as exceptions."""
+"""Replay session: open the port, run the replay, write its files, and raise its failures as exceptions."""
 
 from __future__ import annotations
 
@@ -44,25 +44,35 @@ def run_replay(
     live: bool = False,
     **options: Any,
 ) -> ReplayResult:
-    """Replay a checked motion; ``measured.h5``, ``summary.json``, ``replay.log`` and register dumps go to ``folder``.
+    """Replay a checked motion; write ``measured.h5``, ``summary.json``, ``replay.log`` and register dumps.
 
-    What an earlier replay left there is moved away first. While the replay runs its log and its cycles are written by a
-    thread of their own, the cycles to ``measured.part``: when this process dies
-    :func:`dynsim.hardware.replay.measured.recover` makes a record of it.
+    Files of an earlier replay are moved to a subfolder first. During the replay a separate thread writes the log, and
+    the cycles to ``measured.part``: if this process dies, :func:`dynsim.hardware.replay.measured.recover` builds a
+    record from it.
 
-    ``connection`` gives bus and clock (:func:`dynsim.hardware.ports.bus_on`); the options are those of
-    :class:`dynsim.hardware.replay.machine.Replay`.
+    Parameters
+    ----------
+    motion : MotionTask
+    servo_map : ServoMap
+    connection : context manager
+        Yields bus and clock, see :func:`dynsim.hardware.ports.bus_on`.
+    folder : Path
+        Output folder.
+    live : bool
+        If False, the robot does not move.
+    **options
+        Further options of :class:`dynsim.hardware.replay.machine.Replay`.
 
     Raises
     ------
     PortError, VerificationFailed
-        Nothing was armed.
+        If nothing was armed.
     ReplayInterrupted
-        A signal stopped the run.
+        If a signal stopped the run.
     ReplayAborted
-        An abort rule did.
+        If an abort rule stopped the run.
     OutputsFailed
-        The motion went well, but something could not be written.
+        If the motion succeeded but an output could not be written.
     """
     failures: Failures = {}
     result: ReplayResult | None = None
@@ -73,7 +83,7 @@ def run_replay(
             background = _stream(replay, log, folder)
             try:
                 if moved:
-                    replay.journal.say(f"the result of an earlier replay is now in {moved}")
+                    replay.journal.add_line(f"files of an earlier replay were moved to {moved}")
                 result = replay.run()
             finally:
                 failures |= background.close()
@@ -81,7 +91,7 @@ def run_replay(
     except Exception as error:
         if result is None:
             raise
-        # The robot has been left as the result says; only closing the port has failed.
+        # The end state of the result is valid; only closing the port has failed.
         failures["port"] = error
     _save(result, folder, failures)
     raise_for(result, folder, failures)
@@ -90,15 +100,26 @@ def run_replay(
 
 @contextmanager
 def shown_by(outputs: Mapping[str, Any], folder: Path) -> Iterator[Failures]:
-    """Within the block a replay is shown; what failed of that is told like the files that could not be written.
+    """Report failures to display a replay in the block in the same way as files that could not be written.
 
-    It joins ``outputs_failed`` in the summary, which was written before. The block leaves failures in the dictionary
-    that it is given; those of ``outputs``, streams by name that keep their ``failure``, join them.
+    The failures are added to ``outputs_failed`` in the summary, which has been written before.
+
+    Parameters
+    ----------
+    outputs : mapping of str to stream
+        Names and streams; an error in the attribute ``failure`` is reported.
+    folder : Path
+        Folder with the summary.
+
+    Yields
+    ------
+    failures : dict
+        The block adds other failures to it.
 
     Raises
     ------
     OutputsFailed
-        Where nothing else was raised in the block; else it is a warning.
+        If there are failures and the block has raised nothing; otherwise they are a warning.
     """
     failures: Failures = {}
     try:
@@ -106,15 +127,15 @@ def shown_by(outputs: Mapping[str, Any], folder: Path) -> Iterator[Failures]:
     except DynsimError as error:
         _flush(outputs, failures)
         if failures:
-            warnings.warn(_lost(failures), stacklevel=3)
-            # With other errors the summary may be that of an earlier replay.
+            warnings.warn(_failure_text(failures), stacklevel=3)
+            # With other errors the summary may belong to an earlier replay.
             if isinstance(error, ReplayAborted | OutputsFailed):
                 _add_to_summary(folder, failures)
         raise
     _flush(outputs, failures)
     if failures:
         _add_to_summary(folder, failures)
-        raise OutputsFailed(f"the replay went well; {_lost(failures)}; see {folder / LOG}")
+        raise OutputsFailed(f"the replay succeeded, but {_failure_text(failures)}; see {folder / LOG}")
 
 
 def _flush(outputs: Mapping[str, Any], failures: Failures) -> None:
@@ -122,16 +143,16 @@ def _flush(outputs: Mapping[str, Any], failures: Failures) -> None:
         if stream is not None:
             stream.flush()
         failure = getattr(stream, "failure", None)
-        # A reader that wants no more (``| head``) is no failure.
+        # A reader that closes the pipe early (``| head``) is not a failure.
         if failure is not None and failure.errno != errno.EPIPE:
             failures[name] = failure
 
 
 def _add_to_summary(folder: Path, failures: Failures) -> None:
-    # Where it cannot be added it is still told on standard error.
+    # If the summary cannot be changed, the failure is still reported on standard error.
     with suppress(OSError, ValueError, DynsimError):
         summary = json.loads((folder / SUMMARY).read_bytes())
-        write_json(folder / SUMMARY, summary | {"outputs_failed": summary["outputs_failed"] | _named(failures)})
+        write_json(folder / SUMMARY, summary | {"outputs_failed": summary["outputs_failed"] | _messages(failures)})
 
 
 def _open_log(folder: Path) -> tuple[RunLog, Path | None]:
@@ -150,7 +171,7 @@ def _stream(replay: Replay, log: RunLog, folder: Path) -> Background:
         stream = RowStream(folder / PART, replay.recorder, replay.layout, replay.motion.scene)
         background = Background([log, stream], INTERVAL)
     except (OSError, RuntimeError) as error:
-        # What holds nothing would pass for a replay that died.
+        # Remove the empty files, which would look like a replay that died.
         for outlet in (log, stream):
             if outlet is not None:
                 outlet.discard()
@@ -160,57 +181,57 @@ def _stream(replay: Replay, log: RunLog, folder: Path) -> Background:
 
 
 def _save(result: ReplayResult, folder: Path, failures: Failures) -> None:
-    """Write record and summary, and remove the streamed record that they replace; errors join ``failures``."""
+    """Write record and summary, and remove the streamed record that they replace; add errors to ``failures``."""
     try:
         if RECORD not in failures:
-            summary = result.record.summary | {"outputs_failed": _named(failures)}
+            summary = result.record.summary | {"outputs_failed": _messages(failures)}
             write_measured(result.record, summary, folder)
     except Exception as error:
         failures[RECORD] = error
     if RECORD not in failures:
-        # The record is whole, whatever becomes of what it replaces.
+        # The record is complete, even if the streamed record cannot be removed.
         try:
             (folder / PART).unlink()
         except OSError as error:
             failures[f"removal of {PART}"] = error
             _add_to_summary(folder, failures)
         return
-    # What happened to the robot is told even where there is no room for its record.
+    # Write the end state of the robot even if there is no space for its record.
     try:
-        write_json(folder / SUMMARY, result.summary() | {"outputs_failed": _named(failures)})
+        write_json(folder / SUMMARY, result.summary() | {"outputs_failed": _messages(failures)})
     except Exception as error:
         failures["summary"] = error
 
 
-def _named(failures: Failures) -> dict[str, str]:
+def _messages(failures: Failures) -> dict[str, str]:
     return {name: str(error) or type(error).__name__ for name, error in failures.items()}
 
 
-def _lost(failures: Failures) -> str:
-    return "; ".join(f"{name} failed: {text}" for name, text in _named(failures).items())
+def _failure_text(failures: Failures) -> str:
+    return "; ".join(f"{name} failed: {text}" for name, text in _messages(failures).items())
 
 
 def raise_for(result: ReplayResult, folder: Path, failures: Failures) -> None:
-    """Turn a fault, or else a failure of outputs, into the exception that carries its exit code.
+    """Raise the exception of a fault or of failed outputs, with its exit code.
 
     Raises
     ------
     VerificationFailed, PortError, ReplayInterrupted, ReplayAborted, OutputsFailed
     """
-    lost = _lost(failures)
+    lost = _failure_text(failures)
     if failures and RECORD not in failures:
         lost += f"; {folder / MEASURED} is complete"
     elif (folder / PART).exists():
-        lost += f"; `dynsim hw recover {folder}` makes a record of what reached the disk"
+        lost += f"; `dynsim hw recover {folder}` builds a record from the saved cycles"
     fault, state = result.fault, result.fault_state
     if fault is None or state is None:
         if failures:
-            raise OutputsFailed(f"the motion went well, robot left {result.end_state}; {lost}")
+            raise OutputsFailed(f"the motion succeeded (end state: {result.end_state}), but {lost}")
         return
     unconfirmed = ""
     if result.torque_still_on:
         unconfirmed = f"; torque off NOT confirmed by ID {', '.join(map(str, result.torque_still_on))}"
-    left = f"robot left {result.end_state}{unconfirmed}; see {folder / LOG}{'; ' + lost if lost else ''}"
+    left = f"end state: {result.end_state}{unconfirmed}; see {folder / LOG}{'; ' + lost if lost else ''}"
     if fault.cause == Cause.INTERRUPTED:
         raise ReplayInterrupted(f"{result.fault_text}; {left}", result=result)
     if fault.cause == Cause.VERIFICATION:

@@ -1,9 +1,9 @@
-"""Trajectory of servo goals from a record: continuous in time, at rest at both ends.
+"""Motions of servos as functions of time, and the trajectory of servo goals from a record.
 
-Between the samples of a record joint angles are the cubic Hermite interpolant of (q, v), or linear where the record's
-rates are held from sample to sample (a sampled controller). Where the record begins or ends in motion, an interval of
-constant acceleration is added (a parabola, which the same interpolant represents exactly), so that the robot starts and
-ends at rest without a jump in velocity.
+The trajectory is continuous in time and starts and ends at rest. Between the samples of a record, joint angles are the
+cubic Hermite interpolant of (q, v), or linear if the record holds its rates from sample to sample (a sampled
+controller). If the record starts or ends in motion, an interval of constant acceleration is added (a parabola, which
+the interpolant represents exactly), so that the robot starts and ends at rest without a jump in velocity.
 """
 
 from __future__ import annotations
@@ -26,64 +26,64 @@ from dynsim.snake.lifting import grounded_pairs, lifted
 if TYPE_CHECKING:
     from dynsim.record.scene import Scene
 
-# Motions for servos: postures as functions of time, advance of the loop along them, and demands on the servos.
+# Motions of servos: postures as functions of time, the advance of the loop along them, and demands on the servos.
 
 
 Array = NDArray[np.float64]
 
 QUINTIC_PEAK = 1.875
-"""Largest rate of :func:`quintic`, times its duration."""
+"""Maximum rate of :func:`quintic`, multiplied by its duration."""
 
 
 class Motion(Protocol):
-    """A posture as a function of the motion's own time."""
+    """Posture as a function of motion time."""
 
     def at(self, time: float) -> tuple[Array, Array]:
-        """Joint angles [rad] and their derivatives with respect to ``time``, shape (N,)."""
+        """Return joint angles [rad] and their derivatives with respect to ``time``, shape (N,)."""
         ...
 
 
 class GoalCourse(Motion, Protocol):
-    """Advance of the loop along a motion: one period from goal to goal, whatever the clock reads.
+    """Advance of the loop along a motion, by one period from goal to goal, independent of the clock.
 
     Attributes
     ----------
     time : float
-        Of the motion, reached [s].
+        Motion time of the last goal [s].
     """
 
     time: float
 
     @property
     def speed(self) -> float:
-        """How much of the motion passes per second."""
+        """Motion time per second."""
 
     @property
     def end(self) -> float:
-        """How far the motion is known [s]."""
+        """Motion time up to which the motion is known [s]."""
 
     @property
     def over(self) -> bool:
-        """There are no more goals."""
+        """True if there are no more goals."""
 
     @property
     def fraction(self) -> float:
-        """How much of it is done, 0 to 1."""
+        """Completed fraction of the motion, 0 to 1."""
 
     def advance(self, period: float) -> tuple[Array, Array]:
-        """The goal after a period [s]: joint angles [rad] and their rates [rad/s], shape (N,).
+        """Return the goal after one more period [s]: joint angles [rad] and their rates [rad/s], shape (N,).
 
         May raise :class:`~dynsim.hardware.replay.output.Stopped`.
         """
         ...
 
     def braking_time(self, stop_time: float) -> float:
-        """Of a stop along the motion at constant deceleration that should take ``stop_time`` [s]."""
+        """Return the time [s] of a stop along the motion at constant deceleration; ``stop_time`` [s] is desired."""
         ...
 
 
 class PlannedCourse:
-    """A motion that is known from its time ``start`` to ``end`` [s], ``speed`` of it per second."""
+    """Course along a motion that is known from time ``start`` to ``end`` [s], at ``speed`` seconds of it per second."""
 
     def __init__(self, motion: Motion, start: float, end: float, *, speed: float) -> None:
         self.motion, self.start, self.end, self.speed = motion, start, end, speed
@@ -103,19 +103,19 @@ class PlannedCourse:
 
     def advance(self, period: float) -> tuple[Array, Array]:
         self._goals += 1
-        # Scheduled, not actual time: jitter of the loop must not enter the goals.
+        # Use the scheduled time: jitter of the loop must not affect the goals.
         self.time = min(self.end, self.start + self.speed * period * self._goals)
         position, rate = self.motion.at(self.time)
         return position, self.speed * rate
 
     def braking_time(self, stop_time: float) -> float:
-        # Where the motion ends before, it ends at rest.
+        # If the motion ends earlier, it ends at rest.
         return stop_time
 
 
 @dataclass(frozen=True)
 class Needs:
-    """What a motion asks of one joint: lowest and highest angle [rad], highest speed [rad/s]."""
+    """Demands of a motion on one joint: lowest and highest angle [rad], maximum speed [rad/s]."""
 
     low: float
     high: float
@@ -124,7 +124,7 @@ class Needs:
 
 @dataclass(frozen=True)
 class CyclePlan:
-    """How the bus's time is spent.
+    """Time budget of the bus.
 
     Attributes
     ----------
@@ -135,7 +135,7 @@ class CyclePlan:
     health_time : float
         Planned duration of one health read [s].
     health_every : int
-        One servo's health is read every so many cycles.
+        Number of cycles per health read of one servo.
     """
 
     rate: float
@@ -146,17 +146,17 @@ class CyclePlan:
 
 @dataclass(frozen=True, kw_only=True)
 class MotionTask(ABC):
-    """What a replay is to do: a checked record, or what a pilot will ask for.
+    """Motion that a replay executes: a checked record, or the commands of a pilot.
 
     Attributes
     ----------
     plan : CyclePlan
     speed : float
-        Seconds of the motion per second.
+        Motion time per second.
     scene : Scene or None
-        What is known of the robot's looks; the measured record takes it over.
+        Scene of the robot, which is copied into the measured record.
     unmeasured : Record or None
-        What is known of its place that no servo says; the measured record takes that over too.
+        Signals that the servos do not measure, such as the pose of the base; also copied into the measured record.
     """
 
     plan: CyclePlan
@@ -167,32 +167,32 @@ class MotionTask(ABC):
     @property
     @abstractmethod
     def start(self) -> Array:
-        """Posture in which the motion begins [rad], shape (N,)."""
+        """Posture at the start of the motion [rad], shape (N,)."""
 
     @property
     @abstractmethod
     def duration(self) -> float:
-        """Longest time that it takes [s]."""
+        """Maximum duration [s]."""
 
     @abstractmethod
     def needs(self) -> list[Needs]:
-        """What it may ask of every joint, in the order of the map."""
+        """Return the possible demands on all joints, in the order of the map."""
 
     @abstractmethod
     def course(self) -> GoalCourse:
-        """How to go along it, from its beginning."""
+        """Return the course along the motion, from its start."""
 
 
 @dataclass(frozen=True)
 class Approach:
-    """Rest-to-rest move between two postures on a quintic, all joints in step.
+    """Synchronous rest-to-rest move of all joints between two postures on a quintic.
 
     Attributes
     ----------
     start, goal : array, shape (N,)
-        [rad].
+        Joint angles [rad].
     duration : float
-        [s].
+        Duration [s].
     """
 
     start: Array
@@ -205,7 +205,7 @@ class Approach:
 
 
 def quintic(duration: float, time: float) -> tuple[float, float]:
-    """Fraction of a rest-to-rest move and its rate [1/s] at ``time`` [s]: s = 10u³ − 15u⁴ + 6u⁵, u = time/duration."""
+    """Return the fraction s of a rest-to-rest move and its rate [1/s]: s = 10u³ − 15u⁴ + 6u⁵, u = time/duration."""
     if duration <= 0:
         return 1.0, 0.0
     u = min(max(time / duration, 0.0), 1.0)
@@ -214,17 +214,17 @@ def quintic(duration: float, time: float) -> tuple[float, float]:
 
 REST = 1e-6
 """Joint speed [rad/s] below which a record counts as at rest."""
-HOLE, LONG = 2.5, 1.5
-"""A step of more than HOLE times the median step is a gap in which the motion is not known. A step of more than LONG
-times the 10 % quantile of all steps lacks samples; the median may itself be such a step."""
-COMMON = 0.1
+GAP_FACTOR, LONG_FACTOR = 2.5, 1.5
+"""A time step of more than GAP_FACTOR times the median is a gap, in which the motion is unknown. A step of more than
+LONG_FACTOR times the quantile LONG_QUANTILE probably lacks samples (the median step may itself lack samples)."""
+LONG_QUANTILE = 0.1
 JERK_WINDOW = 0.1
-"""Time over which the change of acceleration is averaged [s]: twice the lag of these servos (43.5 ms). A single jump in
-the velocity of a record is bounded by the limit on acceleration; repeated jumps wear the gears."""
+"""Time over which the jerk is averaged [s]: about twice the lag of these servos (43.5 ms). The limit on acceleration
+bounds a single jump in velocity; repeated jumps wear the gears."""
 GROUNDED = "grounded"
-"""Signal of dynsim's records with the wheel pairs on the ground; read where the map has no ``lifts``."""
+"""Signal of dynsim records with the wheel pairs on the ground; used if the map has no ``lifts``."""
 SHAKING_WINDOW = 0.3
-"""In which velocity that is gained and lost again counts as shaking [s]."""
+"""Time within which a change of velocity that is reversed counts as shaking [s]."""
 
 
 @dataclass(frozen=True)
@@ -236,9 +236,9 @@ class Path:
     time : array, shape (T,)
         Knots [s]; 0 is the first sample of the record, negative knots are the run-up.
     position : array, shape (T, N)
-        At the knots [rad], in the order of the servo map.
+        Joint angles at the knots [rad], in the order of the servo map.
     rate_after, rate_before : array, shape (T-1, N)
-        Joint rates at the beginning and the end of every interval [rad/s].
+        Joint rates at the start and the end of each interval [rad/s].
     """
 
     time: Array
@@ -255,7 +255,7 @@ class Path:
         return float(self.time[-1])
 
     def at(self, time: float) -> tuple[Array, Array]:
-        """Position [rad] and velocity [rad/s], shape (N,), at a path time [s]; at rest outside of the path."""
+        """Return position [rad] and velocity [rad/s], shape (N,), at a path time [s]; at rest outside the path."""
         if time <= self.time[0]:
             return self.position[0].copy(), np.zeros(self.position.shape[1])
         if time >= self.time[-1]:
@@ -266,12 +266,12 @@ class Path:
         return q0 + s * (m0 + s * (b + s * a)), (m0 + s * (2 * b + 3 * s * a)) / h
 
     def since(self, time: float, more: int) -> Path:
-        """From the knot at or before a time on [s], and ``more`` knots before that."""
+        """Return the part of the path from ``more`` knots before the last knot that is not after ``time`` [s]."""
         first = max(0, int(np.searchsorted(self.time, time, side="right")) - 1 - more)
         return Path(self.time[first:], self.position[first:], self.rate_after[first:], self.rate_before[first:])
 
     def longer(self, time: float, position: Array, rate_after: Array, rate_before: Array) -> Path:
-        """The same with one more knot, and rates at the beginning and the end of the interval before it."""
+        """Return the path with one more knot; the rates are at the start and the end of the new interval."""
         return Path(
             np.append(self.time, time),
             np.concatenate([self.position, position[None]]),
@@ -280,23 +280,23 @@ class Path:
         )
 
     def _cubics(self, k: int | slice) -> tuple[Array, ...]:
-        """Of intervals: h [s], q0, m0, b, a, so that q = q0 + m0 s + b s² + a s³ with s from 0 to 1."""
+        """Return h [s], q0, m0, b, a of intervals, where q = q0 + m0 s + b s² + a s³ with s from 0 to 1."""
         h = (self.time[1:][k] - self.time[:-1][k])[..., None]
         q0, q1 = self.position[:-1][k], self.position[1:][k]
         m0, m1 = h * self.rate_after[k], h * self.rate_before[k]
         return h, q0, m0, -3 * q0 + 3 * q1 - 2 * m0 - m1, 2 * q0 - 2 * q1 + m0 + m1
 
     def extremes(self, since: float = -math.inf) -> Extremes:
-        """Every interval's extreme positions, velocities and accelerations, between the knots too.
+        """Return candidates for the extreme positions, velocities and accelerations of each interval.
 
-        Acceleration q'' = (2b + 6a s)/h² is straight within an interval of length h, s = (t − t_k)/h: its extremes are
-        the two ends. Where the rate itself steps, the step over the time it stands for is the third candidate. Only
-        intervals that end after ``since`` [s] count.
+        The acceleration q'' = (2b + 6a s)/h² is linear in an interval of length h, s = (t − t_k)/h, so its extremes are
+        at the two ends. If the rate has a step, the step divided by its time is the third candidate. Only intervals
+        that end after ``since`` [s] are included.
         """
         late = slice(max(0, int(np.searchsorted(self.time, since, side="right")) - 1), None)
         h, q0, m0, b, a = self._cubics(late)
-        # Position is extreme where 3a s² + 2b s + m0 = 0, velocity where 6a s + 2b = 0. The root is taken in the form
-        # that does not cancel; where an interval has none, its ends stand in.
+        # Position is extreme at 3a s² + 2b s + m0 = 0, velocity at 6a s + 2b = 0. The root has the form without
+        # cancellation; an interval without a root uses its start instead.
         with np.errstate(divide="ignore", invalid="ignore"):
             root = b + np.where(b < 0, -1.0, 1.0) * np.sqrt(b * b - 3 * a * m0)
             at_position = np.stack([np.zeros_like(a), np.ones_like(a), -root / (3 * a), -m0 / root])  # (4, T-1, N)
@@ -307,16 +307,16 @@ class Path:
         velocity = (m0 + at_velocity * (2 * b + 3 * at_velocity * a)) / h
         left = self.time[:-1][late, None]
         ends = np.stack([left, left + h, left]) + np.zeros_like(a)
-        with np.errstate(over="ignore"):  # an infinite one is beyond any limit
+        with np.errstate(over="ignore"):  # an infinite value exceeds any limit
             acceleration = np.stack([*(table[late] for table in self._accelerations), self._steps[late]])
         return Extremes(left + h * at_position, position, left + h * at_velocity, velocity, ends, acceleration)
 
     @cached_property
     def _steps(self) -> Array:
-        """Acceleration for the step in rate at the beginning of every interval [rad/s²], shape (T-1, N).
+        """Acceleration of the step in rate at the start of each interval [rad/s²], shape (T-1, N).
 
-        A rate that is held from sample to sample stands for the middle of its interval, so that the step between two
-        of them takes half the one interval and half the other. There is none before the first interval.
+        A rate that is held from sample to sample is assigned to the middle of its interval, so the step between two
+        rates takes half of each interval. The first interval has no step.
         """
         h = np.diff(self.time)[:, None]
         steps = np.zeros_like(self.rate_after)
@@ -324,19 +324,19 @@ class Path:
         return steps
 
     def jerk(self, window: float, since: float = -math.inf) -> tuple[Array, Array]:
-        """Change of acceleration per time, averaged in magnitude over ``window`` [s] of path time.
+        """Return the maximum of the mean magnitude of the jerk over ``window`` [s] of path time.
 
-        j(t) = (1/window) Σ |a_{k+1} − a_k| over the knots between t − window and t, in which a_k is the mean of what
-        the interpolant has on both sides of knot k, plus the step in rate there. It is the mean of |d³q/dt³| for a
-        smooth path, 4 |a| f for one that is thrown to and fro f times a second, whatever the window, and Δa/window for
-        a single jump. Between knots a is taken as straight. Only windows that end after ``since`` [s] count.
+        j(t) = (1/window) Σ |a_{k+1} − a_k| over the knots between t − window and t, where a_k is the mean acceleration
+        of the interpolant on both sides of knot k, plus the step in rate there. It is the mean of |d³q/dt³| for a
+        smooth path, 4 |a| f for an oscillation at f [Hz], whatever the window, and Δa/window for a single jump. Between
+        knots, a is linear. Only windows that end after ``since`` [s] are included.
 
         Returns
         -------
         jerk : array, shape (N,)
-            Largest of each joint [rad/s³].
+            Maximum for each joint [rad/s³].
         time : array, shape (N,)
-            Where the window of that value ends [s].
+            End of the window with this value [s].
         """
         variation = np.zeros_like(self.position)
         self._changes.cumsum(axis=0, out=variation[1:])
@@ -345,28 +345,28 @@ class Path:
         return jerk / window, where
 
     def shaking(self, window: float, since: float = -math.inf) -> tuple[Array, Array]:
-        """Velocity that is gained and lost again, or lost and gained again, within ``window`` [s] of path time.
+        """Return the maximum change of velocity that is reversed within ``window`` [s] of path time.
 
-        min(P, N), in which P = ∫ max(q'', 0) dt and N = ∫ max(−q'', 0) dt over the window, steps in rate included. It
-        does not depend on a velocity the joint has besides. A zigzag of d every h has d · window/h² where the window
-        holds many teeth, a spike of d within 2h (out in h, back in h) 2d/h with held rates; a move that goes one way
-        gains and loses its top speed once, which counts where it takes no longer than the window. Only windows that end
-        after ``since`` [s] count.
+        It is min(P, N) with P = ∫ max(q'', 0) dt and N = ∫ max(−q'', 0) dt over the window, including steps in rate. It
+        does not depend on a constant velocity of the joint. A zigzag of d every h has d · window/h² if the window
+        contains many teeth; a spike of d within 2h (out in h, back in h) has 2d/h with held rates. A single move gains
+        and loses its maximum speed once, which counts if the move is not longer than the window. Only windows that end
+        after ``since`` [s] are included.
 
         Returns
         -------
         shaking : array, shape (N,)
-            Largest of each joint [rad/s].
+            Maximum for each joint [rad/s].
         time : array, shape (N,)
-            Where the window of that value ends [s].
+            End of the window with this value [s].
         """
         h, count = np.diff(self.time)[:, None], self.position.shape[1]
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             first, last = self._accelerations
-            # q'' is straight in an interval: where it changes sign the rate turns on the way.
+            # q'' is linear in an interval; if it changes sign, the rate has an extreme inside the interval.
             turning = self.rate_after + 0.5 * h * first * (first / (first - last))
             turning = np.where(first * last < 0, turning, self.rate_before)
-            # Until the rate turns and from there on, and the step at the end of the interval.
+            # Gain before and after the extreme of the rate, and in the step at the end of the interval.
             gained = np.maximum(turning - self.rate_after, 0.0) + np.maximum(self.rate_before - turning, 0.0)
             change, step = self.rate_before - self.rate_after, self.rate_after[1:] - self.rate_before[:-1]
             gained[:-1] += np.maximum(step, 0.0)
@@ -378,30 +378,30 @@ class Path:
 
     @cached_property
     def _accelerations(self) -> tuple[Array, Array]:
-        """Acceleration of the interpolant at the beginning and the end of every interval [rad/s²], shape (T-1, N)."""
+        """Acceleration of the interpolant at the start and the end of each interval [rad/s²], shape (T-1, N)."""
         h, _, _, b, a = self._cubics(slice(None))
         return 2 * b / h / h, (2 * b + 6 * a) / h / h
 
     @cached_property
     def _changes(self) -> Array:
-        """Change of acceleration from knot to knot in magnitude [rad/s²], shape (T-1, N)."""
+        """Magnitude of the change of acceleration from knot to knot [rad/s²], shape (T-1, N)."""
         first, last = self._accelerations
         with np.errstate(over="ignore", invalid="ignore"):
             at_knots = np.concatenate([first[:1], 0.5 * (last[:-1] + first[1:]) + self._steps[1:], last[-1:]])
             return np.abs(at_knots[1:] - at_knots[:-1])
 
     def bounds_of_last(self, jerk_window: float, shaking_window: float) -> tuple[Array, Array, Array, Array, Array]:
-        """What does not fall short of the extremes of the last interval, at a third of their cost.
+        """Return upper bounds of the extremes of the last interval, at a third of the cost of the extremes.
 
-        A cubic is between its control points, and so is its rate; of its windows all intervals count that they touch.
-        What is gained and lost again in one is half of all that the rate changes by, or less.
+        A cubic lies between its control points, and so does its rate. A window includes all intervals that it touches.
+        The reversed change of velocity in a window is at most half of the total change of the rate.
 
         Returns
         -------
         position : array, shape (3, N)
-            Control points [rad], but for the first.
+            Control points without the first [rad].
         velocity, acceleration, jerk, shaking : array, shape (N,)
-            In magnitude; times a window that of its jerk [rad/s²].
+            Bounds of the magnitudes; the jerk is multiplied by its window [rad/s²].
         """
         h, q0, q1 = float(self.time[-1] - self.time[-2]), self.position[-2], self.position[-1]
         v0, v1 = self.rate_after[-1], self.rate_before[-1]
@@ -423,10 +423,10 @@ class Path:
         )
 
     def _within(self, total: Array, window: float, since: float) -> tuple[Array, Array]:
-        """What ``total``, a running sum at the knots, grows by within windows: their ends (M,) [s], growth (M, N).
+        """Return the ends of windows (M,) [s] and the growth of ``total``, a running sum at the knots, in them (M, N).
 
-        The growth is straight between windows that begin or end at a knot, and no larger in one that reaches beyond the
-        path.
+        The growth is linear between windows that start or end at a knot, and not larger for a window that extends
+        beyond the path.
         """
         ends = np.concatenate([self.time, self.time + window])
         ends = ends[(ends > since) & (ends <= self.end)]
@@ -434,19 +434,19 @@ class Path:
             return ends, self._interpolated(total, ends) - self._interpolated(total, ends - window)
 
     def _interpolated(self, values: Array, times: Array) -> Array:
-        """Values at the knots (T, N), straight between them and the first one before, at other times: (M, N)."""
+        """Interpolate values at the knots (T, N) linearly to other times (M, N); before the path the first is used."""
         left = np.maximum(np.searchsorted(self.time[:-1], times, side="right") - 1, 0)
         fraction = np.maximum((times - self.time[left]) / (self.time[left + 1] - self.time[left]), 0.0)[:, None]
         return values[left] + fraction * (values[left + 1] - values[left])
 
     def _worst(self, ends: Array, values: Array) -> tuple[Array, Array]:
-        """Of each joint the largest value, and the end of its window."""
+        """Return the largest value of each joint and the end of its window."""
         worst = values.argmax(axis=0)
         return values[worst, np.arange(values.shape[1])], ends[worst]
 
 
 class Extremes(NamedTuple):
-    """Candidates for extreme values, each with its path time; all of shape (candidates, T-1, N)."""
+    """Candidates for extreme values and their path times, each of shape (candidates, T-1, N)."""
 
     position_time: Array
     position: Array
@@ -457,13 +457,13 @@ class Extremes(NamedTuple):
 
 
 def path_of_record(record: Record, servo_map: ServoMap) -> Path:
-    """Collect the columns the servos follow and bring both ends to rest.
+    """Build the path from the columns that the servos follow, with both ends at rest.
 
     Raises
     ------
     CheckRefused
-        A signal or column is missing, time does not increase or has holes, a value is not finite, or the record is too
-        short.
+        If a signal or column is missing, time does not increase or has gaps, a value is not finite, or the record is
+        too short.
     """
     _check_time(record)
     time = record.time - record.time[0]
@@ -490,65 +490,63 @@ def path_of_record(record: Record, servo_map: ServoMap) -> Path:
 
 def _check_time(record: Record) -> None:
     if len(record) < 2:
-        raise CheckRefused(f"the record has {len(record)} samples; a motion needs two")
+        raise CheckRefused(f"the record has {len(record)} samples; a motion needs at least two")
     known = np.isfinite(record.time)
     if not known.all():
         bad = int(np.flatnonzero(~known)[0])
-        raise CheckRefused(f"the record's time is {record.time[bad]} at sample {bad}, of {len(record)} samples")
+        raise CheckRefused(f"the time of the record is {record.time[bad]} at sample {bad} of {len(record)}")
     with np.errstate(over="ignore"):
         steps = np.diff(record.time)
     later = np.isfinite(steps) & (steps > 0)
     if not later.all():
         bad = int(np.flatnonzero(~later)[0]) + 1
-        raise CheckRefused(f"the record's time does not increase at sample {bad} (t = {record.time[bad]:g} s)")
-    if holes := long_steps(record, HOLE, 0.5):
+        raise CheckRefused(f"the time of the record does not increase at sample {bad} (t = {record.time[bad]:g} s)")
+    if gaps := long_steps(record, GAP_FACTOR, 0.5):
         raise CheckRefused(
-            f"the record has {len(holes)} hole(s): {holes[0]}; what the robot did there is not known. "
-            "Simulate with an even step, or cut the record"
+            f"the record has {len(gaps)} gap(s) in which the motion is unknown: {gaps[0]}; "
+            "simulate with an even step, or cut the record"
         )
 
 
 def long_steps(record: Record, factor: float, share: float) -> list[str]:
-    """Steps of the record's time longer than ``factor`` times the usual one, each in words.
+    """Return a description of each time step that is longer than ``factor`` times the usual step.
 
-    The usual step is the one that ``share`` of all steps do not exceed: 0.5 for their median.
+    The usual step is the quantile ``share`` of all steps; 0.5 is the median.
     """
     steps = np.diff(record.time)
     usual = float(np.quantile(steps, share, method="lower"))
     return [
-        f"no sample between t = {record.time[k]:g} and {record.time[k + 1]:g} s, {steps[k] / usual:.3g} of the usual "
-        f"steps of {usual * 1e3:g} ms"
+        f"no sample between t = {record.time[k]:g} and {record.time[k + 1]:g} s, {steps[k] / usual:.3g} times the "
+        f"usual step of {usual * 1e3:g} ms"
         for k in np.flatnonzero(steps > factor * usual)
     ]
 
 
 def column_of(record: Record, signal: str, servo: MappedServo, unit: str) -> Array:
-    """The column of ``signal`` that ``servo`` follows, shape (T,).
+    """Return the column of ``signal`` that ``servo`` follows, shape (T,).
 
     Raises
     ------
     CheckRefused
-        No such signal or column, another unit, or a value that is not finite.
+        If the signal or column does not exist or has another unit, or a value is not finite.
     """
     if signal not in record:
         raise CheckRefused(
-            f"{servo.entry}: follows the signal {signal!r}; the record has {', '.join(record)}{suggest(signal, record)}"
+            f"{servo.entry}: unknown signal {signal!r}; the record has {', '.join(record)}{suggest(signal, record)}"
         )
     labels = record.labels[signal]
     if servo.label not in labels:
         raise CheckRefused(
-            f"{servo.entry}: follows column {servo.label!r} of {signal!r}; "
-            f"its columns are {', '.join(labels)}{suggest(servo.label, labels)}"
+            f"{servo.entry}: unknown column {servo.label!r} of {signal!r}; "
+            f"columns: {', '.join(labels)}{suggest(servo.label, labels)}"
         )
     if record.units[signal] != unit:
-        raise CheckRefused(f"signal {signal!r} is in {record.units[signal]!r}; {servo.joint} needs {unit!r}")
+        raise CheckRefused(f"signal {signal!r} has unit {record.units[signal]!r}; {servo.joint} requires {unit!r}")
     if record[signal].ndim != 2:
-        raise CheckRefused(
-            f"signal {signal!r} must have one column for each joint, not the shape {record[signal].shape}"
-        )
+        raise CheckRefused(f"signal {signal!r} must have one column per joint, got shape {record[signal].shape}")
     if record.signals[signal].axis != TIME:
         raise CheckRefused(
-            f"signal {signal!r} is on time axis {record.signals[signal].axis!r}, not on the record's own"
+            f"signal {signal!r} must use the time axis of the record, got {record.signals[signal].axis!r}"
         )
     data = np.asarray(record[signal][:, labels.index(servo.label)], dtype=np.float64)
     if not np.all(np.isfinite(data)):
@@ -558,12 +556,14 @@ def column_of(record: Record, signal: str, servo: MappedServo, unit: str) -> Arr
 
 
 def wheel_offsets(record: Record, servo_map: ServoMap) -> dict[str, Array]:
-    """What lifting adds to the joints that the map names for it, shape (T,) each [rad]; none where nothing is lifted.
+    """Return the angles that lifting adds to the joints in ``lifts`` of the map, shape (T,) each [rad].
+
+    The result is empty if the map has no ``lifts``.
 
     Raises
     ------
     CheckRefused
-        The record lifts wheels and the map does not say how, or it lifts what cannot be lifted.
+        If the record lifts wheels and the map has no ``lifts``, or it lifts wheels that cannot be lifted.
     """
     lifts = servo_map.lifts
     if lifts is None:
@@ -579,8 +579,8 @@ def _refuse_lifted_wheels(record: Record) -> None:
     if len(up):
         names = ", ".join(record.labels[GROUNDED][k] for k in up)
         raise CheckRefused(
-            f"the record lifts wheel pairs ({names}) and the servo map does not say how: without it they would drag "
-            "over the floor. Add to the map, for example:\n"
+            f"the record lifts wheel pairs ({names}) but the servo map has no 'lifts', so they would drag over the "
+            "floor; add to the map, for example:\n"
             "  lifts: {joints: [psi3, psi4, psi5, psi6, psi7, psi8], clearance_mm: 5, blend_s: 0.3}"
         )
 

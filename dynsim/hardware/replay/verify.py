@@ -1,7 +1,7 @@
-"""Verification before torque on: servos match the map, are configured, healthy, and near the start posture.
+"""Verification before torque on: servos match the map, are configured and healthy, and are within their limits.
 
-Limits stored in a servo are shown beside those of the map: the servo ignores goals beyond them without an answer, and
-switches torque off at its own thresholds. A difference that contradicts the map prevents arming.
+The limits stored in a servo are compared with the limits of the map, because the servo silently ignores goals beyond
+its limits and switches its torque off at its own thresholds. A limit that contradicts the map prevents arming.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ from dynsim.hardware.servo_map import MappedServo, Safety, ServoMap
 EEPROM_BLOCK = (0, 64)
 TRIAL_READS = 10
 TRIAL_MISSES = 2
-"""Largest number of TRIAL_READS that a servo may miss."""
+"""Maximum number of TRIAL_READS that a servo may miss."""
 NEEDED_SHUTDOWN = 0b0010_0100  # overheating, overload
 STATUS_TO_ALL = 2
-ACKNOWLEDGE = (
+NO_ANSWER_HINT = (
     "check power, cable, ID and baud rate (`dynsim hw scan`); a servo with Protocol 1 firmware does not answer"
 )
 
@@ -47,14 +47,14 @@ Registers = dict[str, int]
 
 
 def snapshot(bus: Bus, servo: MappedServo) -> Registers:
-    """All registers of a servo, by name. Raises NoAnswer or RequestRefused."""
+    """Read all registers of a servo; the keys are names of registers. Raises NoAnswer or RequestRefused."""
     eeprom = bus.read_block(servo.id, *EEPROM_BLOCK).data
     ram = bus.read_block(servo.id, *HEALTH_BLOCK).data
     return servo.model.registers_in(EEPROM_BLOCK[0], eeprom + ram)
 
 
 def all_registers(bus: Bus, servo_map: ServoMap) -> dict[str, Registers | str]:
-    """Registers of every servo by joint, or why it did not answer. Raises PortError."""
+    """Read the registers of all servos, by joint; a servo without answer has an error text. Raises PortError."""
     contents: dict[str, Registers | str] = {}
     for servo in servo_map.servos:
         try:
@@ -65,12 +65,12 @@ def all_registers(bus: Bus, servo_map: ServoMap) -> dict[str, Registers | str]:
 
 
 def configure(bus: Bus, servo_map: ServoMap, report: Callable[[str], None]) -> None:
-    """Write operating mode, return delay and drive mode where they differ from what the replay needs (EEPROM).
+    """Write operating mode, return delay and drive mode (EEPROM) if they differ from the values the replay needs.
 
     Raises
     ------
     NoAnswer, RequestRefused
-        Also when torque is on: the EEPROM is locked then.
+        If a servo does not answer or refuses a write, for example because its torque is on, which locks the EEPROM.
     """
     for servo in servo_map.servos:
         now = snapshot(bus, servo)
@@ -91,14 +91,23 @@ def _wanted_eeprom(servo: MappedServo, servo_map: ServoMap) -> Registers:
 def verify(
     bus: Bus, servo_map: ServoMap, motion: MotionTask, *, poll: Callable[[], None]
 ) -> tuple[list[str], list[LimitRow]]:
-    """Everything that is wrong with the servos on the bus, one line each; empty when the robot may move.
-
-    With it the limits that the servos have stored, beside the map's.
+    """Verify the servos on the bus before a motion.
 
     Parameters
     ----------
+    bus : Bus
+    servo_map : ServoMap
+    motion : MotionTask
+        Motion whose demands the servos must satisfy.
     poll : callable
-        Called between servos; may raise to break off.
+        Called between servos; may raise an exception to cancel.
+
+    Returns
+    -------
+    problems : list of str
+        One line per problem; empty if the robot may move.
+    rows : list of LimitRow
+        Limits stored in the servos next to the limits of the map.
     """
     problems: list[str] = []
     rows: list[LimitRow] = []
@@ -115,7 +124,7 @@ def verify(
             registers = snapshot(bus, servo)
         except NoAnswer as missing:
             silent = True
-            hint = "two servos with this ID?" if missing.garbled or servo.id in present else ACKNOWLEDGE
+            hint = "check for two servos with this ID" if missing.garbled or servo.id in present else NO_ANSWER_HINT
             problems.append(f"{servo.joint}: {missing}; {hint}")
             continue
         except RequestRefused as refused:
@@ -124,7 +133,7 @@ def verify(
         unfit = _unfit(servo, registers, servo_map)
         if registers["model_number"] == servo.model.number:
             rows.append(compare_limits(servo, registers, servo_map.safety, needs))
-            unfit += [*rows[-1].refused, *_out_of_place(servo, registers)]
+            unfit += [*rows[-1].refused, *_position_problem(servo, registers)]
         problems += [f"{servo}: {text}" for text in unfit]
     missed = [] if problems else _trial_reads(bus, servo_map, poll)
     if (silent or missed) and (busy := too_busy(bus)):
@@ -135,55 +144,55 @@ def verify(
 def _unfit(servo: MappedServo, registers: Registers, servo_map: ServoMap) -> list[str]:
     problems = []
     if registers["model_number"] != servo.model.number:
-        return [f"is model {registers['model_number']}, the map says {servo.model.name} ({servo.model.number})"]
+        return [f"is model {registers['model_number']}, the map has {servo.model.name} ({servo.model.number})"]
     if registers["firmware"] < servo.kind.firmware_min:
-        problems.append(f"firmware {registers['firmware']} is older than {servo.kind.firmware_min}")
+        problems.append(f"firmware {registers['firmware']} is older than firmware_min {servo.kind.firmware_min}")
     if registers["operating_mode"] != servo.operating_mode:
         mode = registers["operating_mode"]
         name = OperatingMode(mode).name.lower() if mode in list(OperatingMode) else str(mode)
         problems.append(f"is in mode {name}, must be {servo.kind.mode} (--configure sets it)")
     if registers["drive_mode"]:
         problems.append(
-            f"drive mode is {registers['drive_mode']}, must be 0: the sense belongs into the map (--configure sets it)"
+            f"drive mode is {registers['drive_mode']}, must be 0 (--configure sets it); use sign in the map instead"
         )
     delay = registers["return_delay"] * RETURN_DELAY_SECONDS_PER_UNIT
     if delay > servo_map.bus.return_delay + 1e-9:
         problems.append(
-            f"return delay is {delay * 1e6:.0f} µs, planned {servo_map.bus.return_delay * 1e6:.0f} µs "
+            f"return delay is {delay * 1e6:.0f} µs, the map has {servo_map.bus.return_delay * 1e6:.0f} µs "
             "(--configure sets it)"
         )
     if registers["status_return_level"] != STATUS_TO_ALL:
         problems.append(f"status return level is {registers['status_return_level']}, must be {STATUS_TO_ALL}")
     if registers["shutdown"] & NEEDED_SHUTDOWN != NEEDED_SHUTDOWN:
         problems.append(
-            f"shutdown is 0x{registers['shutdown']:02x}: overheating and overload must switch the torque off"
+            f"shutdown is 0x{registers['shutdown']:02x}, must switch the torque off at overheating and overload"
         )
     if registers["hardware_error"]:
         problems.append(
-            f"hardware error: {describe_hardware_error(registers['hardware_error'])}; only a restart clears it"
+            f"hardware error: {describe_hardware_error(registers['hardware_error'])}; restart the servo to clear it"
         )
     volts, supply = registers["present_voltage"] * VOLT_PER_UNIT, servo_map.safety.supply
     if not supply.lowest <= volts <= supply.highest:
         problems.append(f"supply is {volts:.1f} V, allowed {supply.lowest:g} to {supply.highest:g} V")
     if registers["present_temperature"] > servo_map.safety.temperature_max:
-        problems.append(f"{registers['present_temperature']} °C is above {servo_map.safety.temperature_max:g} °C")
+        problems.append(f"{registers['present_temperature']} °C, limit {servo_map.safety.temperature_max:g} °C")
     return problems
 
 
-def _out_of_place(servo: MappedServo, registers: Registers) -> list[str]:
-    """A posture the robot must not start from."""
+def _position_problem(servo: MappedServo, registers: Registers) -> list[str]:
+    """Return a problem if the servo is outside its limits, from where the robot must not start."""
     tick = registers["present_position"]
     low, high = servo.tick_limits
     if not servo.in_position_mode or low <= tick <= high:
         return []
     return [
-        f"stands at {servo.to_angle(tick):.3f} rad (tick {tick}), outside of its limits "
+        f"is at {servo.to_angle(tick):.3f} rad (tick {tick}), outside its limits "
         f"{servo.position_limits[0]:.3f} to {servo.position_limits[1]:.3f} rad; move it by hand"
     ]
 
 
 def _trial_reads(bus: Bus, servo_map: ServoMap, poll: Callable[[], None]) -> list[str]:
-    """Two servos with one ID may answer a ping alike; their measured values differ sooner or later."""
+    """Detect two servos with the same ID: their answers to a ping may be equal, but their measured values differ."""
     missed = dict.fromkeys(servo_map.ids, 0)
     for _ in range(TRIAL_READS):
         poll()
@@ -191,10 +200,10 @@ def _trial_reads(bus: Bus, servo_map: ServoMap, poll: Callable[[], None]) -> lis
         for id_ in servo_map.ids:
             missed[id_] += id_ not in replies
     if all(count == TRIAL_READS for count in missed.values()):
-        return ["nobody answers a sync read: is the adapter's latency timer at 1 ms?"]
+        return ["no servo answers a sync read; set the latency timer of the adapter to 1 ms"]
     return [
         f"{servo}: {missed[servo.id]} of {TRIAL_READS} answers were missing or garbled; "
-        "two servos with this ID, or a bad cable?"
+        "check the cable, and for two servos with this ID"
         for servo in servo_map.servos
         if missed[servo.id] > TRIAL_MISSES
     ]
@@ -202,18 +211,18 @@ def _trial_reads(bus: Bus, servo_map: ServoMap, poll: Callable[[], None]) -> lis
 
 @dataclass(frozen=True)
 class LimitRow:
-    """One servo's limits beside the map's.
+    """Limits of one servo next to the limits of the map.
 
     Attributes
     ----------
     joint : str
     id : int
     cells : tuple of (str, str)
-        What the servo has stored and what the map says, for each of QUANTITIES.
+        Limit stored in the servo and limit of the map, for each of QUANTITIES.
     refused : tuple of str
-        Differences with which the robot must not be armed.
+        Differences that prevent arming.
     differs : tuple of str
-        Other differences worth knowing.
+        Other differences, shown as notes.
     """
 
     joint: str
@@ -224,16 +233,16 @@ class LimitRow:
 
 
 def needs_of_map(servo: MappedServo) -> Needs:
-    """All that the map allows."""
+    """Return the full range that the map allows."""
     low, high = servo.position_limits
     return Needs(low, high, servo.kind.limits.velocity)
 
 
 def compare_limits(servo: MappedServo, registers: Registers, safety: Safety, needs: Needs) -> LimitRow:
-    """The limits in a servo's EEPROM, beside those of the map.
+    """Compare the limits in the EEPROM of a servo with the limits of the map.
 
-    Refused are limits within which the servo would ignore goals of the motion or fall behind it, and thresholds with
-    which it goes limp before the replay's own rule can stop it, or protects itself later than its data sheet says.
+    A limit is refused if the servo would ignore goals of the motion or lag behind it. A threshold is refused if the
+    servo would switch its torque off before the rule of the replay stops it, or later than its data sheet specifies.
     """
     compared = (
         _position(servo, registers, needs),
@@ -267,9 +276,9 @@ def _position(servo: MappedServo, registers: Registers, needs: Needs) -> _Compar
     goals, allowed = sorted((servo.to_ticks(needs.low), servo.to_ticks(needs.high))), servo.tick_limits
     refused = differs = ""
     if goals[0] < low or goals[1] > high:
-        refused = f"the motion needs ticks {goals[0]} to {goals[1]}, its own limits are {low} to {high}"
+        refused = f"the motion needs ticks {goals[0]} to {goals[1]}, the servo allows {low} to {high}"
     elif allowed[0] < low or allowed[1] > high:
-        differs = f"its own position limits are narrower than the map's: ticks {low} to {high}"
+        differs = f"position limits of the servo are narrower than in the map: ticks {low} to {high}"
     return _Compared(f"{own[0]:.0f} to {own[1]:.0f}", f"{bounds[0]:.0f} to {bounds[1]:.0f}", refused, differs)
 
 
@@ -279,11 +288,11 @@ def _velocity(servo: MappedServo, registers: Registers, needs: Needs) -> _Compar
     refused = differs = ""
     below = units < abs(servo.to_velocity_units(allowed))
     if below and not servo.in_position_mode:
-        refused = f"its velocity limit is {own:.2f} rad/s, below the map's; faster goals would be ignored silently"
+        refused = f"velocity limit of the servo is {own:.2f} rad/s, below the map; it would ignore faster goals"
     elif units < abs(servo.to_velocity_units(needs.fastest)):
-        refused = f"the motion needs {needs.fastest:.2f} rad/s, its velocity limit is {own:.2f}: it would lag"
+        refused = f"the motion needs {needs.fastest:.2f} rad/s, the servo allows {own:.2f} and would lag"
     elif below:
-        differs = f"its velocity limit of {own:.2f} rad/s is below the map's"
+        differs = f"velocity limit of the servo is {own:.2f} rad/s, below the map"
     return _Compared(f"{own:.2f}", f"{allowed:.2f}", refused, differs)
 
 
@@ -291,9 +300,9 @@ def _torque(servo: MappedServo, registers: Registers) -> _Compared:
     allowed = servo.kind.limits.torque
     if "current_limit" not in registers:
         return _Compared(map=f"{allowed:.1f}")
-    # It bounds the goals of the modes that control current; neither of those that a map can name is one.
+    # The limit applies to modes that control current, which a map cannot select.
     own = servo.gear * servo.model.torque(registers["current_limit"])
-    below = f"its current limit is worth {own:.1f} N m, below the map's" if own < allowed else ""
+    below = f"current limit of the servo corresponds to {own:.1f} N m, below the map" if own < allowed else ""
     return _Compared(f"{own:.1f}", f"{allowed:.1f}", differs=below)
 
 
@@ -301,9 +310,9 @@ def _temperature(servo: MappedServo, registers: Registers, safety: Safety) -> _C
     own, allowed = registers["temperature_limit"], safety.temperature_max
     refused = ""
     if own <= allowed:
-        refused = f"goes limp at {own} °C, before the map's temperature_max of {allowed:g} °C stops the robot"
+        refused = f"switches its torque off at {own} °C, before temperature_max ({allowed:g} °C) stops the robot"
     elif own > (highest := servo.model.fields["temperature_limit"].default):
-        refused = f"its temperature limit is {own} °C, a {servo.model.name} is to shut down at {highest} °C"
+        refused = f"temperature limit is {own} °C, a {servo.model.name} must shut down at {highest} °C"
     return _Compared(f"{own}", f"{allowed:g}", refused)
 
 
@@ -312,32 +321,32 @@ def _supply(registers: Registers, safety: Safety) -> _Compared:
     allowed = safety.supply
     refused = differs = ""
     if not (low <= allowed.lowest and allowed.highest <= high):
-        outside = f"outside of {low:g} to {high:g} V, within the map's supply range"
+        outside = f"outside {low:g} to {high:g} V, a narrower range than safety.supply"
         if registers["shutdown"] & VOLTAGE_SHUTDOWN:
-            refused = f"goes limp {outside}"
+            refused = f"switches its torque off {outside}"
         else:
-            differs = f"raises its alert {outside}"
+            differs = f"raises an alert {outside}"
     return _Compared(f"{low:g} to {high:g}", f"{allowed.lowest:g} to {allowed.highest:g}", refused, differs)
 
 
 def difference_lines(rows: Sequence[LimitRow]) -> list[str]:
-    """The rows as a table of text, every cell "servo | map", with the differences below."""
+    """Return the lines of a text table with cells "servo | map", followed by the differences."""
     table = [["joint", "ID", *QUANTITIES]]
     table += [[row.joint, str(row.id), *(" | ".join(cell) for cell in row.cells)] for row in rows]
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in table]
-    return ["limits, stored in the servo | of the map:", *lines, *differences(rows)]
+    return ["limits (stored in the servo | in the map):", *lines, *differences(rows)]
 
 
 def differences(rows: Sequence[LimitRow]) -> list[str]:
-    """Differences worth knowing, one line each, refused ones first."""
+    """Return one line per difference, the refused limits first."""
     refused = [f"{row.joint} (ID {row.id}): {text}" for row in rows for text in row.refused]
     return refused + [f"note: {row.joint} (ID {row.id}): {text}" for row in rows for text in row.differs]
 
 
 @dataclass(frozen=True)
 class Distance:
-    """Where one joint stands, and where the motion begins [rad]."""
+    """Present angle of one joint, and its angle at the start of the motion [rad]."""
 
     joint: str
     now: float
@@ -349,16 +358,16 @@ class Distance:
 
 @dataclass(frozen=True)
 class WayToStart:
-    """The move before a replay.
+    """Move to the start posture before a replay.
 
     Attributes
     ----------
     distances : tuple of Distance
-        Of the joints in position mode, the furthest first.
+        Distances of the joints in position mode, the largest first.
     duration : float
-        [s].
+        Duration of the move [s].
     far : tuple of Distance
-        Those beyond ``safety.start_distance``.
+        Distances larger than ``safety.start_distance``.
     """
 
     distances: tuple[Distance, ...]
@@ -367,12 +376,19 @@ class WayToStart:
 
 
 def way_to_start(bus: Bus, servo_map: ServoMap, start: NDArray[np.float64]) -> WayToStart:
-    """Read where the joints stand; ``start`` is the posture to go to [rad], shape (N,).
+    """Read the present posture and plan the move to the start.
+
+    Parameters
+    ----------
+    bus : Bus
+    servo_map : ServoMap
+    start : array, shape (N,)
+        Posture at the start of the motion [rad].
 
     Raises
     ------
     VerificationFailed
-        A servo does not answer.
+        If a servo does not answer.
     """
     ticks = read_ticks(bus, [servo for servo in servo_map.servos if servo.in_position_mode])
     distances = [
@@ -388,7 +404,7 @@ def way_to_start(bus: Bus, servo_map: ServoMap, start: NDArray[np.float64]) -> W
 
 
 def read_ticks(bus: Bus, servos: list[MappedServo]) -> dict[int, int]:
-    """Servo position by ID. Raises VerificationFailed where one does not answer."""
+    """Return the position of each servo [ticks], by ID. Raises VerificationFailed if a servo does not answer."""
     ticks: dict[int, int] = {}
     for _ in range(ATTEMPTS):
         missing = [servo.id for servo in servos if servo.id not in ticks]
@@ -400,6 +416,6 @@ def read_ticks(bus: Bus, servos: list[MappedServo]) -> dict[int, int]:
     if silent:
         busy = too_busy(bus)
         raise VerificationFailed(
-            f"no answer from {', '.join(silent)}: check power, cable, ID and baud rate{busy and '; '}{busy}"
+            f"no answer from {', '.join(silent)}; check power, cable, ID and baud rate{busy and '; '}{busy}"
         )
     return ticks

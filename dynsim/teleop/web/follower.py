@@ -358,7 +358,7 @@ class PipeFeed:
             self.fault = "the process of the simulation is gone"
         return samples
 
-    def tell(self, time: float) -> None:
+    def report_time(self, time: float) -> None:
         self._heard[0] = time
 
     def close(self) -> None:
