@@ -1,4 +1,4 @@
-"""Contents of a record: signals on time axes, events, scene; and the checks for invalid values."""
+"""Contents of a record (signals on time axes, events, scene) and the checks that reject invalid values."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from dynsim.errors import RecordError
 from dynsim.record.scene import Scene
 
 FORMAT = "dynsim-record-2"
-"""The only format of files that is written and read."""
+"""The only file format that dynsim writes and reads."""
 TIME = "time"
-"""Name of the time axis of signals that name no other."""
+"""Name of the default time axis of signals."""
 
 
 @dataclass(frozen=True)
@@ -24,14 +24,16 @@ class Signal:
 
     Attributes
     ----------
-    data : array, shape (T,) or (T, k) or (T, k, m)
+    data : ndarray, shape (T,), (T, k) or (T, k, m)
+        Samples.
     unit : str
-        SI unit as text, "1" for pure numbers.
+        SI unit as text; "1" for dimensionless numbers.
     labels : tuple of str
-        Names of the k columns, empty for a scalar signal.
+        Names of the k columns; empty for a scalar signal.
     description : str
+        Short description.
     axis : str
-        Name of its time axis, which has T instants.
+        Name of its time axis, which has T times.
     """
 
     data: NDArray[Any]
@@ -43,19 +45,20 @@ class Signal:
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happened at an instant.
+    """Event at one time of a run.
 
     Attributes
     ----------
     time : float
-        [s]
+        Time [s].
     kind : str
-        What kind of thing, such as "contact opens"; the same word for all of its kind.
+        Kind of the event, such as "contact opens"; all events of a kind share this text.
     name : str
-        What it happened to: a contact, a joint, …; empty for the whole run.
+        Name of the contact, joint, … concerned; empty for the whole run.
     value : float or None
-        A number that belongs to it, in SI units.
+        Associated number in SI units.
     description : str
+        Short description.
     """
 
     time: float
@@ -67,7 +70,7 @@ class Event:
 
 @dataclass(frozen=True)
 class Content:
-    """All that a file holds."""
+    """Complete content of a record file."""
 
     time: NDArray[np.float64]
     signals: Mapping[str, Signal] = field(default_factory=dict)
@@ -80,26 +83,27 @@ class Content:
 
 
 def check_name(kind: str, name: str) -> None:
-    """Refuse a name that HDF5 would take for something else.
+    """Raise if a name cannot be used in HDF5.
 
     Raises
     ------
     RecordError
+        If ``name`` is empty or a dot, or contains a slash or a null character.
     """
     if name in ("", ".") or "/" in name or "\0" in name:
-        raise RecordError(f"{kind} {name!r}: a name must not be empty, a dot, or hold a slash")
+        raise RecordError(f"{kind} {name!r}: a name must not be empty or a dot, or contain a slash")
 
 
 def check_time(time: NDArray[Any], axis: str = TIME) -> None:
-    """Refuse a time axis that is none.
+    """Raise if a time axis is invalid.
 
     Raises
     ------
     RecordError
-        Not one-dimensional, not finite, or running backwards.
+        If ``time`` is not one-dimensional, not finite, or runs backwards.
     """
     if time.ndim != 1:
-        raise RecordError(f"{axis} has the shape {time.shape}; it must have one axis")
+        raise RecordError(f"{axis} must be one-dimensional, but has shape {time.shape}")
     if not np.isfinite(time).all():
         raise RecordError(f"{axis} is not finite at sample {int(np.flatnonzero(~np.isfinite(time))[0])}")
     if (backwards := np.flatnonzero(np.diff(time) < 0.0)).size:
@@ -107,34 +111,39 @@ def check_time(time: NDArray[Any], axis: str = TIME) -> None:
 
 
 def check_signal(name: str, signal: Signal, samples: Mapping[str, int]) -> None:
-    """Refuse a signal that no record can hold.
+    """Raise if a signal is invalid.
 
     Parameters
     ----------
-    samples : number of instants of every time axis
+    name : str
+        Name of the signal.
+    signal : Signal
+        Signal to check.
+    samples : mapping of str to int
+        Number of times of every time axis.
 
     Raises
     ------
     RecordError
-        Its name, type, shape, labels or axis.
+        If its name, type, shape, labels or axis is invalid.
     """
     data = signal.data
     check_name("signal", name)
     if not is_numeric(data.dtype):
-        raise RecordError(f"signal {name!r} holds {data.dtype}, not real numbers")
+        raise RecordError(f"signal {name!r} contains {data.dtype}, not real numbers")
     if not 1 <= data.ndim <= 3:
-        raise RecordError(f"signal {name!r} has {data.ndim} axes; one to three can be kept")
+        raise RecordError(f"signal {name!r} has {data.ndim} dimensions; it must have 1 to 3")
     if signal.axis not in samples:
-        raise RecordError(f"signal {name!r} is on time axis {signal.axis!r}; this record has: {', '.join(samples)}")
+        raise RecordError(f"signal {name!r}: unknown time axis {signal.axis!r}; this record has: {', '.join(samples)}")
     if data.shape[0] != samples[signal.axis]:
         where = "the record" if signal.axis == TIME else f"its time axis {signal.axis!r}"
         raise RecordError(f"signal {name!r} has {data.shape[0]} samples, {where} has {samples[signal.axis]}")
     if data.ndim > 1 and len(signal.labels) != data.shape[1]:
-        raise RecordError(f"signal {name!r} has {data.shape[1]} columns and {len(signal.labels)} labels")
+        raise RecordError(f"signal {name!r} has {data.shape[1]} columns but {len(signal.labels)} labels")
     if data.ndim == 1 and signal.labels:
-        raise RecordError(f"signal {name!r} has no columns and {len(signal.labels)} labels")
+        raise RecordError(f"signal {name!r} has no columns but {len(signal.labels)} labels")
 
 
 def is_numeric(dtype: Any) -> bool:
-    """Whether arrays of this type hold real numbers that a record can keep."""
+    """Return whether a record can store arrays of this type: real numbers of at most 8 bytes."""
     return bool(dtype.kind in "biuf" and dtype.itemsize <= 8)

@@ -1,4 +1,4 @@
-"""Strict reading of tables and grids of numbers from CSV files; errors name file, line and reason."""
+"""Strict reading of numeric tables and grids from CSV files; errors name file, line and reason."""
 
 from __future__ import annotations
 
@@ -10,28 +10,40 @@ from pathlib import Path
 from dynsim.errors import DynsimError
 from dynsim.system.inputs import read_text
 
-# Largest size of a file [bytes]: some million rows.
+# Maximum file size [bytes], a few million rows.
 SIZE_LIMIT = 100_000_000
 # float() also accepts "1_0" and digits of other scripts, which other programs would not read as numbers.
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", re.ASCII | re.IGNORECASE)
 
 
 def read_rows(file: str, *headers: Sequence[str], kind: str) -> list[list[float]]:
-    """The rows of :func:`read_table`, for headers of different numbers of columns."""
+    """Return the rows of :func:`read_table`; their number of columns shows which header the file has."""
     return read_table(file, *headers, kind=kind)[1]
 
 
 def read_table(file: str, *headers: Sequence[str], kind: str) -> tuple[tuple[str, ...], list[list[float]]]:
-    """Two or more rows of a file whose first line is one of ``headers``, which comes first; first column increasing.
+    """Read a header and at least two rows; the first column must increase.
 
     Parameters
     ----------
-    kind : name of the object that the rows describe, for the message
+    file : str
+        Path of the file.
+    *headers : sequence of str
+        Accepted headers; the first line of the file must be one of them.
+    kind : str
+        Name of the object that the rows describe, for error messages.
+
+    Returns
+    -------
+    columns : tuple of str
+        Header of the file.
+    rows : list of list of float
+        Numbers of each row.
 
     Raises
     ------
     ValueError
-        With file, line and reason: for validators of a scenario.
+        If the file is invalid; with file, line and reason, for validators of scenarios.
     """
     first, *lines = _lines(file)
     columns = tuple(name.strip() for name in first.split(","))
@@ -52,12 +64,12 @@ def read_table(file: str, *headers: Sequence[str], kind: str) -> tuple[tuple[str
 
 
 def read_grid(file: str) -> list[list[float]]:
-    """The rows of a file of numbers without a header, all of one length.
+    """Read the rows of a file of numbers without a header; all rows must have the same length.
 
     Raises
     ------
     ValueError
-        With file, line and reason: for validators of a scenario.
+        If the file is invalid; with file, line and reason, for validators of scenarios.
     """
     rows: list[list[float]] = []
     columns: Sequence[str] = ()
@@ -78,7 +90,7 @@ def _lines(file: str) -> list[str]:
 
 
 def _contents(lines: Iterable[str], first: int) -> Iterator[tuple[int, str]]:
-    """Lines that hold more than a comment, with their numbers."""
+    """Yield the lines that contain more than a comment, with their line numbers."""
     for number, line in enumerate(lines, first):
         if content := line.partition("#")[0].strip(" \t"):
             yield number, content
@@ -90,10 +102,10 @@ def _row(line: str, columns: Sequence[str], location: str) -> list[float]:
         names = f": {','.join(columns)}" if columns[0] != "1" else ", as in the first row"
         raise ValueError(f"{location}: {len(cells)} values; there must be {len(columns)}{names}")
     if not all(_NUMBER.fullmatch(cell) and math.isfinite(float(cell)) for cell in cells):
-        raise ValueError(f"{location}: {_shown(line)} is not {len(columns)} numbers, finite and in digits 0 to 9")
+        raise ValueError(f"{location}: {_shown(line)} must be {len(columns)} finite numbers in digits 0 to 9")
     return [float(cell) for cell in cells]
 
 
 def _shown(line: str) -> str:
-    """A line of the file for a message: one line, no control characters, not a page long."""
+    """Quote a line of the file for a message, without control characters and shortened to 80 characters."""
     return repr(line if len(line) <= 80 else line[:79] + "…")

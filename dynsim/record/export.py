@@ -18,17 +18,27 @@ if TYPE_CHECKING:
 
 
 def to_dataframe(record: Content, axis: str) -> pandas.DataFrame:
-    """A pandas DataFrame: time [s] is the index, every column of every signal on the time axis ``axis`` a column.
+    """Convert the signals on one time axis to a pandas DataFrame.
 
-    Columns are called ``signal``, ``signal.label`` or, of vectors, ``signal.label.x``; their units are in
-    ``attrs["units"]``.
+    Parameters
+    ----------
+    record : Content
+        Content of a record.
+    axis : str
+        Name of the time axis.
+
+    Returns
+    -------
+    pandas.DataFrame
+        Time [s] is the index. Columns are named ``signal``, ``signal.label`` or, for vectors, ``signal.label.x``;
+        their units are in ``attrs["units"]``.
 
     Raises
     ------
     RecordError
-        pandas is not installed.
+        If pandas is not installed.
     MissingEntry
-        No such time axis.
+        If the record has no such time axis.
     """
     pandas = _optional("pandas")
     axes = {TIME: record.time, **record.axes}
@@ -56,16 +66,20 @@ def to_dataframe(record: Content, axis: str) -> pandas.DataFrame:
 
 
 def to_xarray(record: Content) -> xarray.Dataset:
-    """An xarray Dataset: signals over ``time`` or their own time axes, with ``units`` and ``long_name`` as attributes.
+    """Convert a record to an xarray Dataset.
 
-    Signals with the same labels share a dimension, which is called after the first of them (``q_label``); the third
-    axis of vectors is ``axis`` (x, y, z), of quaternions ``axis_4`` (w, x, y, z). Summary, provenance, events and scene
-    are attributes, as JSON.
+    Returns
+    -------
+    xarray.Dataset
+        Signals over ``time`` or their other time axes, with the attributes ``units`` and ``long_name``. Signals with
+        the same labels share a dimension, which is named after the first of them (``q_label``). The third axis of
+        vectors is ``axis`` (x, y, z), that of quaternions ``axis_4`` (w, x, y, z). Summary, provenance, events and
+        scene are attributes, as JSON.
 
     Raises
     ------
     RecordError
-        xarray is not installed.
+        If xarray is not installed.
     """
     xarray = _optional("xarray")
     dimensions: dict[tuple[str, ...], str] = {}
@@ -96,7 +110,7 @@ def to_xarray(record: Content) -> xarray.Dataset:
 
 
 def _components(count: int) -> Sequence[str]:
-    """Names of the components of a vector or quaternion."""
+    """Return the names of the components of a vector or quaternion."""
     return {3: "xyz", 4: "wxyz"}.get(count) or [str(k) for k in range(count)]
 
 

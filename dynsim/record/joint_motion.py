@@ -1,4 +1,4 @@
-"""Export of joint positions and rates of a record: CSV, ROS joint trajectory, or log for URDF joints."""
+"""Export of the joint positions and rates of a record: CSV, ROS joint trajectory, or log for URDF joints."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 Format = Literal["csv", "joint-trajectory", "urdf-log"]
 SUFFIX: dict[str, str] = {"csv": ".csv", "joint-trajectory": ".trajectory.yaml", "urdf-log": ".jsonl"}
 RATES = {"q": "v", "phi": "phi_dot", "rho": "rho_dot"}
-"""Position signals of the records, and the signals that hold their rates."""
+"""Position signals of records, and the signals of their rates."""
 _YAML_WORDS = {"y", "n", "yes", "no", "on", "off", "true", "false", "null"}
 
 
@@ -30,14 +30,26 @@ def export_record(record: Record, path: Path, format_: Format, *, rate: float | 
     """Write the joint positions and rates of a record.
 
     ``csv``: one row per sample, columns "time [s]", "<joint> [rad]", "<joint> [rad/s]", with the units of the record
-    ("rad or m" where it has joints of both kinds). ``joint-trajectory``: the fields of a ROS
+    ("rad or m" if it has both kinds of joints). ``joint-trajectory``: the fields of a ROS
     trajectory_msgs/JointTrajectory as YAML, for a joint trajectory controller. ``urdf-log``: one JSON object per line,
     {"time", "position": {joint: rad or m}, "velocity": {joint: rad/s or m/s}}, with the joint names of the URDF.
 
     Parameters
     ----------
+    record : Record
+        Record with joint positions and rates.
+    path : Path
+        File to write.
+    format_ : {"csv", "joint-trajectory", "urdf-log"}
+        File format.
     rate : float, optional
-        Resample to this rate [Hz] (cubic Hermite), with a last row at the end of the record; its samples if not given.
+        Resample to this rate [Hz] (cubic Hermite), with a last row at the end of the record; default: the samples of
+        the record.
+
+    Returns
+    -------
+    Path
+        The written file.
 
     Raises
     ------
@@ -50,12 +62,12 @@ def export_record(record: Record, path: Path, format_: Format, *, rate: float | 
     if rate is not None:
         if not 0 < rate < np.inf:
             raise RecordError(f"--rate must be positive, not {rate}")
-        # A heavy library, which is imported only when it is needed.
+        # Imported here because it is slow to import.
         from scipy.interpolate import CubicHermiteSpline
 
         between = CubicHermiteSpline(time, position, velocity)
         end = float(time[-1])
-        # A motion ends where the record ends, be it within a period.
+        # The last row is at the end of the record, even if that is not a multiple of the period.
         time = np.arange(np.ceil(end * rate * (1.0 - 1e-9))) / rate
         time = np.append(time, end)
         position, velocity = between(time), between(time, 1)
@@ -68,7 +80,7 @@ def export_record(record: Record, path: Path, format_: Format, *, rate: float | 
         text = io.TextIOWrapper(stream, encoding="utf-8", newline="")
         writers[format_](text, joints, time, position, velocity)
         text.flush()
-        text.detach()  # closed with it, the stream could not be published
+        text.detach()  # otherwise the wrapper closes the stream before `replacing` publishes it
     return path
 
 
@@ -92,7 +104,7 @@ def joint_motion(
             rates.append(record[rate][:, [record.labels[rate].index(joint) for joint in shared]])
     if not joints:
         pairs = ", ".join(f"{name} with {rate}" for name, rate in RATES.items())
-        raise RecordError(f"the record holds no joint motion ({pairs}); it has {', '.join(record)}")
+        raise RecordError(f"the record has no joint motion ({pairs}); it has {', '.join(record)}")
     if not len(record):
         raise RecordError("the record has no samples")
     position, velocity = np.hstack(angles), np.hstack(rates)

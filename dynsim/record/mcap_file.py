@@ -1,9 +1,9 @@
 """Export of a record to an MCAP file of ROS 2 messages, for rosbag2, Foxglove, PlotJuggler and RViz; needs no ROS.
 
-Topics: ``/joint_states``, ``/tf`` and ``/tf_static`` (each body in the frame of the one that carries it, the root is
-``world``), ``/robot_description`` (see :mod:`dynsim.record.urdf_text`), and ``/contacts/NAME`` for each contact point:
-the force of its surface on it, in a frame ``contact_NAME`` at the place where the force acts, so that it has no torque
-there; of a sphere or capsule that is where it touches. The frame keeps the axes of the world.
+Topics: ``/joint_states``, ``/tf`` and ``/tf_static`` (each body relative to its parent; the root is ``world``),
+``/robot_description`` (see :mod:`dynsim.record.urdf_text`), and ``/contacts/NAME`` for each contact point: the force of
+its surface on it. The frame ``contact_NAME`` of this force has the axes of the world. Its origin is the point where the
+force acts (for a sphere or capsule the point of contact), so that the torque is zero.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from numpy.typing import NDArray
 from dynsim._version import __version__
 from dynsim.errors import RecordError
 from dynsim.record.joint_motion import joint_motion
-from dynsim.record.poses import relative_pose, touching_positions
+from dynsim.record.poses import contact_positions, relative_pose
 from dynsim.record.record import Record
 from dynsim.record.scene import WORLD
 from dynsim.record.urdf_text import WORLD_LINK, scene_urdf
 from dynsim.system.files import replacing
 
 Array = NDArray[np.float64]
-# Later subscribers get the last message too, as is usual in ROS 2 for descriptions and static frames.
+# Late subscribers receive the last message too, as is usual in ROS 2 for descriptions and static frames.
 _LATCHED = (
     "- history: 1\n  depth: 1\n  reliability: 1\n  durability: 1\n  deadline: {sec: 2147483647, nsec: 4294967295}\n"
     "  lifespan: {sec: 2147483647, nsec: 4294967295}\n  liveliness: 1\n"
@@ -35,16 +35,28 @@ _LATCHED = (
 
 
 def write_mcap(record: Record, path: Path) -> Path:
-    """Write joint states, frames, contact forces and the robot's description at all samples of a record.
+    """Write joint states, frames, contact forces and the robot description at all samples of a record.
 
-    Time zero is the record's first sample. ``effort`` is the torque at the joint, NaN where there is no motor.
+    Time zero is the first sample. ``effort`` is the joint torque, NaN for joints without a motor.
+
+    Parameters
+    ----------
+    record : Record
+        Record with joint positions and rates.
+    path : Path
+        File to write.
+
+    Returns
+    -------
+    Path
+        The written file.
 
     Raises
     ------
     RecordError
-        The packages for it are not installed, no joint motion in the record, or the file cannot be written.
+        If the required packages are not installed, the record has no joint motion, or the file cannot be written.
     """
-    # Optional, and a second to import.
+    # Optional packages, which take a second to import.
     try:
         writer_module = importlib.import_module("mcap.writer")
         typesys = importlib.import_module("rosbags.typesys")
@@ -60,7 +72,7 @@ def write_mcap(record: Record, path: Path) -> Path:
 
 
 class _Bag:
-    """Messages by the names of their types, and the channels that they were written to."""
+    """Create messages by type name, and write each to the channel of its topic."""
 
     def __init__(self, writer: Any, types: Any) -> None:
         self.writer, self._types = writer, types
@@ -89,7 +101,7 @@ class _Bag:
 
 
 def _messages(record: Record, bag: _Bag) -> list[tuple[int, str, str, Any]]:
-    """All messages: time [ns], topic, type, content."""
+    """Return all messages: time [ns], topic, type, content."""
     joints, time, position, velocity = joint_motion(record)
     stamps = np.rint(time * 1e9).astype(np.int64).tolist()
     effort = np.zeros((len(time), 0))
@@ -113,7 +125,7 @@ def _messages(record: Record, bag: _Bag) -> list[tuple[int, str, str, Any]]:
 
 
 def _frames(record: Record, bag: _Bag, stamps: list[int]) -> list[tuple[int, str, str, Any]]:
-    """The description, and frames of bodies and contact points; nothing without a scene."""
+    """Return the robot description and the frames of bodies and contact points; nothing without a scene."""
     scene = record.scene
     if scene is None or not scene.bodies:
         return []
@@ -133,7 +145,7 @@ def _frames(record: Record, bag: _Bag, stamps: list[int]) -> list[tuple[int, str
             moving.append((parent, body.name, p, q))
     unturned = np.array([1.0, 0.0, 0.0, 0.0])
     for point in scene.contacts if "body_position" in record else ():
-        at = touching_positions(record, point).T
+        at = contact_positions(record, point).T
         turn = np.broadcast_to(unturned[:, None], (4, len(stamps)))
         moving.append((WORLD_LINK, f"contact_{point.name}", at, turn))
     if fixed:
@@ -160,7 +172,7 @@ def _transform(bag: _Bag, stamp: int, parent: str, child: str, p: Array, q: Arra
 
 
 def _forces(record: Record, bag: _Bag, stamps: list[int]) -> list[tuple[int, str, str, Any]]:
-    """Contact forces as wrenches."""
+    """Return the contact forces as wrenches."""
     if "contact_force" not in record:
         return []
     kind, vector = "geometry_msgs/msg/WrenchStamped", "geometry_msgs/msg/Vector3"

@@ -10,39 +10,39 @@ from numpy.typing import NDArray
 
 from dynsim.record import Record
 
-# Where the electrical energy goes, in the order in which it is drawn and printed.
+# Sinks of the electrical energy, in the order in which they are drawn and printed.
 SINKS = ("heat_joule", "loss_gear", "loss_joint", "heat_friction")
-# Further sinks, under the unilateral law or by time stepping. Elastic energy is that gained since the start.
+# Further sinks, under the unilateral law or with time stepping. Elastic energy counts from the start of the run.
 MORE_SINKS = ("loss_impact", "loss_stop", "loss_damper", "energy_elastic", "loss_scheme")
 STORES = ("energy_kinetic", "energy_potential", "energy_magnetic")
 
-# Largest residual of the energy ledger without a warning, as a share of the turnover.
+# Largest residual of the energy ledger without a warning, as a fraction of the turnover.
 RESIDUAL_LIMIT = 1e-6
-# A share of a run that would read 0.0 %.
+# Smallest fraction of a run that is not printed as 0.0 %.
 SHORT = 5e-4
-# A share of a run's time below this is rounding error.
+# Smaller fractions of the duration of a run are rounding errors.
 ROUNDED = 1e-9
 
-# States of a gripper by the numbers of the signal ``gripper_state``.
+# States of a gripper, indexed by the signal ``gripper_state``.
 GRIPPER_STATES = ("soft", "hardening", "hardened", "softening")
-# Kind of the event of a mobile base that tips; found between samples, where the margin is zero.
+# Kind of the event at which a mobile base tips: its margin passes zero, located between samples.
 TIP_OVER = "tip_over"
 
 
 def sinks(record: Record) -> tuple[str, ...]:
-    """The sinks of energy that a record has."""
+    """Return the energy sinks that a record contains."""
     return SINKS + tuple(name for name in MORE_SINKS if name in record)
 
 
 def percent(share: float) -> str:
-    """A share of a run with one decimal, and more where it takes them to tell it from none or all of it."""
+    """Format a fraction of a run with one decimal, or with enough decimals to distinguish it from 0 % and 100 %."""
     least = min(share, 1.0 - share)
     decimals = 1 if least < ROUNDED else max(1, -math.floor(math.log10(100.0 * least)))
     return f"{100.0 * share:.{decimals}f} %"
 
 
 def energy_turnover(record: Record) -> float:
-    """Energy that changed hands: the largest over time of half the sum of all terms' sizes [J]."""
+    """Return the energy turnover [J]: the maximum over time of half the sum of the absolute values of all terms."""
     total = np.abs(record["energy_electrical"]) + np.abs(record["work_constraint"])
     if "work_loads" in record:
         total = total + np.abs(record["work_loads"]).sum(axis=1)
@@ -54,14 +54,14 @@ def energy_turnover(record: Record) -> float:
 
 
 def hand_target(record: Record) -> NDArray[np.float64] | None:
-    """Where the hand should be, (T, 3) [m]: the target of the path or, of a measured run, where the goals have it."""
+    """Return the target of the hand, (T, 3) [m], or None: on the path or, for a measured run, at the joint goals."""
     return next((record[name] for name in ("target_position", "hand_position_goal") if name in record), None)
 
 
 def hand_error(record: Record, settle: float) -> dict[str, float | None]:
-    """Root mean square, maximum and vertical root mean square of the hand's distance from its target [m].
+    """Return the rms, maximum and vertical rms distance of the hand from its target [m].
 
-    Counted from t = ``settle`` on; None without a target or when the run is shorter.
+    Samples before t = ``settle`` are ignored. The values are None without a target or if the run is shorter.
     """
     names = ("hand_error_rms_m", "hand_error_max_m", "hand_error_z_rms_m")
     first = int(np.searchsorted(record.time, settle))
@@ -76,9 +76,10 @@ def hand_error(record: Record, settle: float) -> dict[str, float | None]:
 
 
 def hand_turn_error(record: Record, settle: float) -> dict[str, float | None]:
-    """Root mean square and maximum of the angle between the hand's orientation and its target [rad].
+    """Return the rms and maximum angle between the orientation of the hand and its target [rad].
 
-    Counted from t = ``settle`` on; None when the run is shorter, nothing where no orientation is asked for.
+    Samples before t = ``settle`` are ignored. The values are None if the run is shorter; the result is empty without a
+    target orientation.
     """
     if "hand_turn_error" not in record:
         return {}
@@ -90,7 +91,10 @@ def hand_turn_error(record: Record, settle: float) -> dict[str, float | None]:
 
 
 def least_loads(record: Record, steps: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Least loads of wheels and caster, (3,) [N], over the samples and over all steps (``steps``, empty: unknown)."""
+    """Return the minimum loads of wheels and caster, (3,) [N], over all samples and over all steps.
+
+    ``steps`` is the array of :func:`base_summary`; if it is empty, only the samples count.
+    """
     loads = record["wheel_load"].min(axis=0, initial=np.inf)
     return np.minimum(loads, steps[:3]) if len(steps) else loads
 
@@ -98,13 +102,19 @@ def least_loads(record: Record, steps: NDArray[np.float64]) -> NDArray[np.float6
 def base_summary(
     record: Record, settle: float, steps: NDArray[np.float64], travel: NDArray[np.float64]
 ) -> dict[str, Any]:
-    """How a mobile base has driven and stood; None where there is nothing to say.
+    """Summarise motion and stability of a mobile base; a value that is not defined is None.
 
     Parameters
     ----------
-    settle : time from which ``tip_margin_min_settled`` and ``overturns_settled_at_s`` count [s]
-    travel : way of the axle's middle along the heading, backwards negative, (T,) [m]
-    steps : (4,) least loads and least margin over all steps, which are closer together than the samples; or empty
+    record : Record
+        Record of a mobile base.
+    settle : float
+        Time from which ``tip_margin_min_settled`` and ``overturns_settled_at_s`` count [s].
+    steps : ndarray, shape (4,) or (0,)
+        Minimum loads [N] and minimum tip margin over all integration steps, which are closer together than the samples;
+        empty if unknown.
+    travel : ndarray, shape (T,)
+        Distance travelled by the midpoint of the axle along the heading, backwards negative [m].
     """
     pose, load, margin = record["base_pose"], record["wheel_load"], record["tip_margin"]
     tips = [event.time for event in record.events if event.kind == TIP_OVER]
@@ -133,7 +143,7 @@ def base_summary(
 
 
 def overturns_settled(record: Record, settle: float) -> float | None:
-    """First time from ``settle`` on at which a mobile base tips, or lies beyond tipping [s]; None: never."""
+    """Return the first time from ``settle`` on at which a mobile base tips or has tipped [s], or None."""
     time, margin = record.time, record["tip_margin"]
     late = [event.time for event in record.events if event.kind == TIP_OVER and event.time >= settle]
     late += time[(time >= settle) & (margin < 0.0)][:1].tolist()
@@ -141,5 +151,5 @@ def overturns_settled(record: Record, settle: float) -> float | None:
 
 
 def _mean(values: NDArray[np.float64], time: NDArray[np.float64]) -> float:
-    """Mean over time, by trapezoids."""
+    """Return the mean over time (trapezoidal rule)."""
     return float(np.trapezoid(values, time) / (time[-1] - time[0]))

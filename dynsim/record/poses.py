@@ -1,4 +1,4 @@
-"""Poses of bodies and points over time, from the scene of a record and its joint positions."""
+"""Poses of bodies and points over time, computed from the scene and the joint positions of a record."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ POSITION, ORIENTATION, TOUCHING = "body_position", "body_orientation", "contact_
 
 
 def add_body_poses(record: Record) -> bool:
-    """Add the poses of all bodies of the scene over time as signals; False where a joint was not recorded.
+    """Add the poses of all bodies over time as signals; return False if the positions of a joint were not recorded.
 
-    ``body_position`` (T, bodies, 3) [m], ``body_orientation`` (T, bodies, 4): quaternions w, x, y, z whose signs do not
-    jump. In single precision, a tenth of a micrometre at a metre: they serve to draw; the scene and the joint positions
-    give them in full precision.
+    ``body_position`` (T, bodies, 3) [m] and ``body_orientation`` (T, bodies, 4), quaternions w, x, y, z without sign
+    jumps. Both are in single precision (0.1 µm at 1 m), which is enough for drawing; scene and joint positions give
+    them in double precision.
     """
     scene = record.scene
     if scene is None or not scene.bodies or not all(_recorded(record, body.joint) for body in scene.bodies):
@@ -29,10 +29,10 @@ def add_body_poses(record: Record) -> bool:
     names = tuple(body.name for body in scene.bodies)
     position = np.empty((len(names), 3, len(record)), dtype=np.float32)
     orientation = np.empty((len(names), 4, len(record)), dtype=np.float32)
-    # Poses of bodies that carry others which are still to be placed.
+    # Poses of bodies whose children are still to be computed.
     known: dict[int, tuple[Array, Array]] = {}
     left = np.bincount([body.parent for body in scene.bodies if body.parent != WORLD], minlength=len(names))
-    # The last samples of a run that diverged may be beyond all bounds.
+    # The last samples of a diverging run may overflow.
     with np.errstate(over="ignore", invalid="ignore"):
         for k, body in enumerate(scene.bodies):
             moved = np.array([columns[body.joint.signal][label] for label in body.joint.labels])
@@ -51,9 +51,14 @@ def add_body_poses(record: Record) -> bool:
 
 
 def poses_at(scene: Scene, positions: Mapping[str, Mapping[str, float]]) -> Array:
-    """Poses of all bodies at one instant, (bodies, 7) [m, 1]: position, quaternion w, x, y, z.
+    """Return the poses of all bodies at one time, (bodies, 7) [m, 1]: position, quaternion w, x, y, z.
 
-    ``positions`` are those of the joints [rad or m], by signal and label.
+    Parameters
+    ----------
+    scene : Scene
+        Scene with the bodies.
+    positions : mapping
+        Joint positions [rad or m] by signal and label.
     """
     poses: list[tuple[Array, Array]] = []
     for body in scene.bodies:
@@ -63,12 +68,12 @@ def poses_at(scene: Scene, positions: Mapping[str, Mapping[str, float]]) -> Arra
 
 
 def relative_pose(record: Record, body: Body) -> tuple[Array, Array]:
-    """Origin, (3, T) [m], and quaternion, (4, T), of a body in the frame of the body that carries it.
+    """Return the pose of a body relative to its parent: origin, (3, T) [m], and quaternion, (4, T).
 
     Raises
     ------
     MissingEntry
-        The record does not have the positions of its joint.
+        If the record does not contain the positions of its joint.
     """
     columns = _columns(record, body.joint.signal) if body.joint.labels else {}
     moved = np.array([columns[label] for label in body.joint.labels])
@@ -76,17 +81,26 @@ def relative_pose(record: Record, body: Body) -> tuple[Array, Array]:
 
 
 def pose_columns(bodies: int) -> int:
-    """How many columns of 8 bytes the poses of so many bodies take: seven numbers of 4 bytes each."""
+    """Return the number of 8-byte columns that the poses of ``bodies`` bodies need (seven 4-byte numbers each)."""
     return -(-7 * bodies // 2)
 
 
 def point_positions(record: Record, point: Point, rows: slice | int | NDArray[np.intp] = slice(None)) -> Array:
-    """World positions of a point on a body at samples of a record with body poses, (…, 3) [m].
+    """Return the world positions of a point on a body, (…, 3) [m].
+
+    Parameters
+    ----------
+    record : Record
+        Record with body poses.
+    point : Point
+        Point of its scene.
+    rows : slice, int or ndarray of int, optional
+        Samples; default: all.
 
     Raises
     ------
     MissingEntry
-        The record has no body poses.
+        If the record has no body poses.
     """
     where = np.array(point.position)
     origin, turn = record[POSITION][rows], record[ORIENTATION][rows]
@@ -96,15 +110,16 @@ def point_positions(record: Record, point: Point, rows: slice | int | NDArray[np
     return np.asarray(origin[..., point.body, :] + np.moveaxis(rotated(np.moveaxis(q, -1, 0), where), 0, -1))
 
 
-def touching_positions(record: Record, point: Point, rows: slice | int | NDArray[np.intp] = slice(None)) -> Array:
-    """Where forces act on a contact point, (…, 3) [m]: of a sphere or capsule where it is nearest to its surface.
+def contact_positions(record: Record, point: Point, rows: slice | int | NDArray[np.intp] = slice(None)) -> Array:
+    """Return the positions where the contact force acts on a contact point, (…, 3) [m].
 
-    Records of before know only the centre of a sphere, and one end of a capsule.
+    For a sphere or capsule this is its point nearest to the surface. Records of older versions contain only the centre
+    of a sphere and one end of a capsule.
 
     Raises
     ------
     MissingEntry
-        The record has no body poses.
+        If the record has no body poses.
     """
     if TOUCHING in record and point.name in record.labels[TOUCHING]:
         return np.asarray(record[TOUCHING][rows, record.labels[TOUCHING].index(point.name)], dtype=np.float64)
@@ -121,11 +136,14 @@ def _columns(record: Record, name: str) -> dict[str, Array]:
 
 
 def _pose(body: Body, moved: Array, parent: tuple[Array, Array] | None, shape: tuple[int, ...]) -> tuple[Array, Array]:
-    """Position, (3, …), and orientation, (4, …), of a body at instants of a ``shape`` from those of its parent.
+    """Return position, (3, …), and orientation, (4, …), of a body from the pose of its parent.
 
     Parameters
     ----------
-    moved : (k, …) positions of its joint [rad or m]
+    moved : (k, …) ndarray
+        Positions of its joint [rad or m].
+    shape : tuple of int
+        Shape of the times: () for one time, (T,) for all samples.
     """
     joint = body.joint
     p, q = parent or (np.zeros((3, *shape)), np.array([np.ones(shape), *np.zeros((3, *shape))]))

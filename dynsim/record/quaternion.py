@@ -1,4 +1,4 @@
-"""Operations on unit quaternions (w, x, y, z), arrays of shape (4,) or, for many instants, (4, T)."""
+"""Operations on unit quaternions (w, x, y, z): arrays of shape (4,), or (4, T) for T times."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ Array = NDArray[np.float64]
 
 
 def of_turn(axis: ArrayLike, angle: ArrayLike) -> Array:
-    """Turn by an angle q, () or (T,) [rad], about a unit axis a, (3,): (cos q/2, a sin q/2)."""
+    """Return the rotation by an angle q, () or (T,) [rad], about a unit axis a, (3,): (cos q/2, a sin q/2)."""
     half = 0.5 * np.asarray(angle, dtype=np.float64)
     s = np.sin(half)
     x, y, z = np.asarray(axis, dtype=np.float64)
@@ -17,9 +17,9 @@ def of_turn(axis: ArrayLike, angle: ArrayLike) -> Array:
 
 
 def of_matrix(R: ArrayLike) -> Array:
-    """The quaternion with w ≥ 0 of a rotation matrix, (3, 3) → (4,)."""
+    """Return the quaternion with w ≥ 0 of a rotation matrix, (3, 3) → (4,)."""
     R = np.asarray(R, dtype=np.float64)
-    # 4 q_k q of the largest component q_k: to divide by a small one would cost digits.
+    # 4 q_k q for the largest component q_k; dividing by a small one would lose precision.
     trace = float(np.trace(R))
     squares = np.array([1.0 + trace, *(1.0 - trace + 2.0 * np.diag(R))])
     k = int(squares.argmax())
@@ -30,7 +30,7 @@ def of_matrix(R: ArrayLike) -> Array:
 
 
 def product(a: Array, b: Array) -> Array:
-    """The turn b, then the turn a."""
+    """Return the rotation a b: first b, then a."""
     aw, ax, ay, az = a
     bw, bx, by, bz = b
     return np.array(
@@ -44,7 +44,7 @@ def product(a: Array, b: Array) -> Array:
 
 
 def rotated(q: Array, vector: Array) -> Array:
-    """A vector, (3,) or (3, T), turned: v + 2 w u × v + 2 u × (u × v) of q = (w, u)."""
+    """Rotate a vector, (3,) or (3, T), by q = (w, u): v + 2 w u × v + 2 u × (u × v)."""
     w, u = q[0], q[1:]
     twice = 2.0 * _cross(u, vector)
     along = w * twice + _cross(u, twice)
@@ -56,7 +56,7 @@ def _cross(a: Array, b: Array) -> Array:
 
 
 def continuous(q: Array) -> Array:
-    """The same turns, (4, T), each with the sign that is nearest to the one before; the first has w ≥ 0."""
+    """Return the same rotations, (4, T), with signs that make successive quaternions close; the first has w ≥ 0."""
     flips = np.where((q[:, 1:] * q[:, :-1]).sum(axis=0) < 0.0, -1.0, 1.0)
     first = -1.0 if q.shape[1] and q[0, 0] < 0.0 else 1.0
     return q * np.concatenate([[first], first * np.cumprod(flips)])[: q.shape[1]]

@@ -1,9 +1,9 @@
-"""Reading of records from HDF5 files.
+"""Reading and writing of records as HDF5 files.
 
 A file is HDF5 data followed by one line with the SHA-256 of all bytes before it, which HDF5 ignores. The digest reveals
 damage before the HDF5 library is called, which may crash or hang on a damaged file. A file without that line, or with
 another digest, is read only with ``trust=True`` (``--trust``). In both cases sizes are checked before data are
-decompressed. A file is refused if it may belong to another run than the files beside it.
+decompressed. A file is rejected if it may belong to another run than the files next to it.
 """
 
 from __future__ import annotations
@@ -27,22 +27,19 @@ from dynsim.record.scene import Scene
 from dynsim.system.files import check_complete
 from dynsim.system.inputs import is_file
 
-# Writing of records to HDF5 files, with a digest of all bytes at the end.
-
-
 EVENT_COLUMNS = {"time": float, "kind": str, "name": str, "value": float, "description": str}
-"""Attributes of events; each is a data set of the group ``events``."""
+"""Attributes of events; each is a data set in the group ``events``."""
 _LABELS_IN_ATTRIBUTE = 1000
-"""More labels than this become a data set: HDF5 attributes have at most 64 kB, which is 4090 labels."""
+"""More labels than this are stored as a data set: an HDF5 attribute holds at most 64 kB, which is 4090 labels."""
 
 
 def encode(content: Content) -> memoryview:
-    """The bytes of a file.
+    """Return the bytes of a record file.
 
     Raises
     ------
     RecordError
-        A time axis is invalid, or a text cannot be stored in HDF5.
+        If a time axis is invalid, or a text cannot be stored in HDF5.
     """
     import h5py
 
@@ -52,12 +49,12 @@ def encode(content: Content) -> memoryview:
         check_time(times, f"time axis {name!r}")
     summary, provenance = json.dumps(content.summary), json.dumps(content.provenance, default=str)
     scene = "" if content.scene is None else content.scene.to_json()
-    # Made in memory: HDF5 crashes the process when the disk is full while it closes a file.
+    # Written in memory: HDF5 crashes the process if the disk is full when it closes a file.
     image = io.BytesIO()
     with h5py.File(image, "w") as file:
         file.attrs["format"] = FORMAT
         file.attrs["complete"] = content.complete
-        # Long texts as data sets: HDF5 attributes end at 64 kB.
+        # Long texts are data sets: an HDF5 attribute holds at most 64 kB.
         file["summary"] = summary
         file["provenance"] = provenance
         if scene:
@@ -79,7 +76,7 @@ def encode(content: Content) -> memoryview:
 
 
 def _write(file: Any, name: str, signal: Signal) -> None:
-    # gzip only where it pays: it costs time on every run, and short records are small anyway.
+    # gzip only for large signals: it costs time in every run, and short records are small anyway.
     options = {"compression": "gzip", "compression_opts": 1} if signal.data.nbytes > 1 << 22 else {}
     data = file.create_dataset(name, data=signal.data, **options)
     data.attrs["unit"] = signal.unit
@@ -91,7 +88,7 @@ def _write(file: Any, name: str, signal: Signal) -> None:
 
 
 def _write_events(file: Any, events: Sequence[Event]) -> None:
-    """A column for each attribute; a file without events has no group of them."""
+    """Write one column per attribute; a file without events has no such group."""
     import h5py
 
     if not events:
@@ -105,29 +102,32 @@ def _write_events(file: Any, events: Sequence[Event]) -> None:
 
 _FORMATS = "dynsim-record-"
 SIZE_LIMIT = 2 << 30
-"""A file may unpack to this many bytes, or to ``RATIO_LIMIT`` times its own size if that is more."""
+"""A file may expand to this many bytes, or to ``RATIO_LIMIT`` times its size if that is more."""
 RATIO_LIMIT = 100
 _LAST_LINE = re.compile(rb"\ndynsim-sha256:([0-9a-f]{64})\n")
 _LAST_LINE_SIZE = 80
 
 
 def read(path: Path, *, trust: bool = False) -> Content:
-    """Read a file.
+    """Read a record file.
 
     Parameters
     ----------
-    trust : also read a file whose digest is missing or wrong: one that another program has written or changed
+    path : Path
+        File to read.
+    trust : bool, optional
+        Accept a file whose digest is missing or wrong (written or changed by another program).
 
     Raises
     ------
     RecordError
-        No such file; damaged, or no record; its digest is missing or wrong and it is not trusted; or it may be of
-        another run than the files beside it.
+        If the file does not exist, is damaged or is not a record; if its digest is missing or wrong and ``trust`` is
+        False; or if it may belong to another run than the files next to it.
     """
     try:
         if not is_file(path, RecordError):
             part = path.with_suffix(".part")
-            hint = f"; the replay that made {part} died: dynsim hw recover {path.parent}" if part.is_file() else ""
+            hint = f"; the replay crashed and left {part}: dynsim hw recover {path.parent}" if part.is_file() else ""
             raise RecordError(f"{path}: no such record{hint}")
         check_complete(path)
         with path.open("rb") as stream:
@@ -139,47 +139,49 @@ def read(path: Path, *, trust: bool = False) -> Content:
     return decode(path, path)
 
 
-_TRUST = "if you know where it comes from, --trust reads it (in Python: Record.load(path, trust=True))"
+_TRUST = "if you trust its source, read it with --trust (in Python: Record.load(path, trust=True))"
 
 
 def _doubt(path: Path, stream: BinaryIO) -> str:
-    """Why the bytes may not be those that dynsim wrote, "" when they are.
+    """Return why the file may not be as dynsim wrote it, or "" if it is.
 
     Raises
     ------
     RecordError
-        It is no HDF5 file.
+        If it is not an HDF5 file.
     """
     size = stream.seek(0, os.SEEK_END)
     stream.seek(max(size - _LAST_LINE_SIZE, 0))
     match = _LAST_LINE.fullmatch(stream.read())
     stream.seek(0)
     if not stream.read(8).startswith(b"\x89HDF\r\n\x1a\n"):
-        raise RecordError(f"{path}: not a readable HDF5 file (it does not begin like one)")
+        raise RecordError(f"{path}: not a readable HDF5 file (wrong signature)")
     if match is None:
-        return "it has no digest (SHA-256) at its end: it was cut short, or written by another program"
+        return "no digest (SHA-256) at the end: it was truncated, or written by another program"
     stream.seek(0)
     actual, left = hashlib.sha256(), size - _LAST_LINE_SIZE
     while left and (block := stream.read(min(left, 1 << 20))):
         actual.update(block)
         left -= len(block)
     if actual.hexdigest().encode("ascii") != match[1]:
-        return "damaged, or changed since dynsim wrote it: its bytes do not agree with its digest (SHA-256)"
+        return "its content does not match its digest (SHA-256): it was damaged, or changed after dynsim wrote it"
     return ""
 
 
 def decode(path: Path, source: Path | BinaryIO) -> Content:
-    """What an HDF5 file holds, checked part by part.
+    """Read and check the content of an HDF5 file.
 
     Parameters
     ----------
-    path : its name, for messages
-    source : the file, or its bytes
+    path : Path
+        Name of the file, for messages.
+    source : Path or binary file
+        The file, or its bytes.
 
     Raises
     ------
     RecordError
-        With file and reason.
+        If the content is invalid; with file and reason.
     """
     import h5py
 
@@ -190,29 +192,29 @@ def decode(path: Path, source: Path | BinaryIO) -> Content:
     except RecordError as error:
         raise RecordError(f"{path}: {error}") from error
     except MemoryError as error:
-        raise RecordError(f"{path}: too large for the memory") from error
-    # Damaged files make h5py raise almost anything.
+        raise RecordError(f"{path}: not enough memory to read it") from error
+    # With damaged files h5py raises exceptions of almost any type.
     except Exception as error:
         text = str(error).strip("'\"").splitlines() or [type(error).__name__]
         raise RecordError(f"{path}: not a readable HDF5 file ({text[0]})") from error
 
 
 def _allowed(size: int) -> int:
-    """How many bytes a file of this size may unpack to."""
+    """Return the number of bytes that a file of this size may expand to."""
     return max(SIZE_LIMIT, RATIO_LIMIT * size)
 
 
-# Groups of data sets, and what messages call these.
+# Groups of data sets, and how messages name their data sets.
 _GROUPS = {"signals": "signal {!r}", "axes": "time axis {!r}", "events": "{} of the events", "labels": "labels of {!r}"}
 
 
-def _named(path: str) -> str:
+def _describe(path: str) -> str:
     group, _, name = path.rpartition("/")
     return _GROUPS[group].format(name) if group else name
 
 
 class _Reader:
-    """Reads an open file; its errors do not name it."""
+    """Reader of an open file; its errors do not name the file."""
 
     def __init__(self, file: Any, size: int) -> None:
         self._file = file
@@ -224,16 +226,16 @@ class _Reader:
         if not isinstance(version, str) or not version.startswith(_FORMATS):
             raise RecordError(f"an HDF5 file, but not a dynsim record ({FORMAT})")
         if version != FORMAT:
-            raise RecordError(f"a record of another format, {brief(version)}; this version of dynsim reads {FORMAT}")
+            raise RecordError(f"unsupported record format {brief(version)}; this version of dynsim reads {FORMAT}")
         complete = self._attribute(self._file, "complete")
         if complete is None:
-            raise RecordError("a dynsim record that lacks parts: no attribute complete")
+            raise RecordError("incomplete dynsim record: no attribute complete")
         if not isinstance(complete, (bool, np.bool_)):
-            raise RecordError("attribute complete is neither true nor false")
+            raise RecordError("attribute complete must be true or false")
         axes = {TIME: self._times(TIME)}
         for name in self._names("axes"):
             if name == TIME:
-                raise RecordError(f"{TIME} is the name of the record's own axis")
+                raise RecordError(f"the name {TIME} is reserved for the default time axis")
             axes[name] = self._times(f"axes/{name}")
         samples = {name: len(times) for name, times in axes.items()}
         scene = self._text("scene") if "scene" in self._file else ""
@@ -251,7 +253,7 @@ class _Reader:
 
     def _times(self, path: str) -> NDArray[np.float64]:
         times = self._numbers(path)
-        check_time(times, _named(path))
+        check_time(times, _describe(path))
         return times.astype(np.float64, copy=False)
 
     def _signal(self, name: str, samples: Mapping[str, int]) -> Signal:
@@ -260,9 +262,9 @@ class _Reader:
         kept = "labels" in attributes or "labels" not in self._file
         labels = self._attribute(self._file[path], "labels") if kept else self._column(f"labels/{name}")
         if labels is None:
-            raise RecordError(f"a dynsim record that lacks parts: no labels of {_named(path)}")
+            raise RecordError(f"incomplete dynsim record: no labels of {_describe(path)}")
         axis = self._string(path, "axis") if "axis" in attributes else TIME
-        texts = _texts(labels, f"{_named(path)} has labels")
+        texts = _texts(labels, f"{_describe(path)} has labels")
         signal = Signal(data, self._string(path, "unit"), texts, self._string(path, "description"), axis)
         check_signal(name, signal, samples)
         return signal
@@ -277,9 +279,9 @@ class _Reader:
             columns[name] = _texts(self._column(path), f"events has {name}") if texts else self._numbers(path).tolist()
             if len(columns[name]) != len(columns["time"]):
                 counts = len(columns[name]), len(columns["time"])
-                raise RecordError(f"{_named(path)} has {counts[0]} entries, their times {counts[1]}")
+                raise RecordError(f"{_describe(path)} has {counts[0]} entries, but there are {counts[1]} times")
         if not all(map(math.isfinite, columns["time"])):
-            raise RecordError("time of the events is not finite")
+            raise RecordError("the time of an event is not finite")
         columns["value"] = [None if math.isnan(value) else value for value in columns["value"]]
         return [Event(*entries) for entries in zip(*(columns[name] for name in EVENT_COLUMNS), strict=True)]
 
@@ -287,65 +289,63 @@ class _Reader:
         return list(self._child(group, group=True)) if group in self._file else []
 
     def _child(self, path: str, *, group: bool = False) -> Any:
-        """A data set, or a group of them, that lies in the file itself."""
+        """Return a data set or group that is stored in the file itself."""
         import h5py
 
-        name = f"group {path}" if group else _named(path)
+        name = f"group {path}" if group else _describe(path)
         link = self._file.get(path, getlink=True)
         if link is None:
-            raise RecordError(f"a dynsim record that lacks parts: no {name}")
+            raise RecordError(f"incomplete dynsim record: no {name}")
         if not isinstance(link, h5py.HardLink):
-            raise RecordError(f"{name} is a link to somewhere else; links are not followed")
+            raise RecordError(f"{name} is a link; links are not followed")
         item = self._file[path]
         if not isinstance(item, h5py.Group if group else h5py.Dataset):
-            raise RecordError(f"{name} is no {'group' if group else 'data set'}")
+            raise RecordError(f"{name} is not a {'group' if group else 'data set'}")
         return item
 
     def _numbers(self, path: str) -> NDArray[Any]:
-        """An array of real numbers."""
+        """Return an array of real numbers."""
         data = self._child(path)
         if not is_numeric(data.dtype):
-            raise RecordError(f"{_named(path)} holds {data.dtype}, not real numbers")
+            raise RecordError(f"{_describe(path)} contains {data.dtype}, not real numbers")
         return np.asarray(self._values(data, path))
 
     def _column(self, path: str) -> NDArray[Any]:
-        """Texts, kept as a data set."""
+        """Return texts that are stored as a data set."""
         return np.asarray(self._values(self._child(path), path))
 
     def _text(self, name: str) -> str:
-        """A long text, kept as a data set."""
+        """Return a long text that is stored as a data set."""
         text = self._values(self._child(name), name)
         if not isinstance(text, bytes):
             raise RecordError(f"{name} is not a text")
         return text.decode("utf-8")
 
     def _values(self, data: Any, path: str) -> Any:
-        """The content of a data set; none that lies outside of the file, is not there, or is beyond the limit."""
+        """Return the content of a data set; reject data that are external, missing or too large."""
         import h5py
 
-        name, properties = _named(path), data.id.get_create_plist()
+        name, properties = _describe(path), data.id.get_create_plist()
         if properties.get_external_count() or data.is_virtual:
-            raise RecordError(f"{name} lies in other files, which are not opened")
+            raise RecordError(f"{name} is stored in other files, which are not opened")
         if data.shape is None:
             raise RecordError(f"{name} is empty")
         filters = [properties.get_filter(k)[0] for k in range(properties.get_nfilters())]
         if filters not in ([], [h5py.h5z.FILTER_DEFLATE]):
-            raise RecordError(
-                f"{name} is packed in a way (HDF5 filters {filters}) that dynsim does not read; gzip it does"
-            )
+            raise RecordError(f"{name} uses HDF5 filters {filters}, which dynsim does not read; use gzip only")
         size, stored = math.prod(data.shape) * data.dtype.itemsize, data.id.get_storage_size()
         if stored > self._size or (size > stored and not filters):
-            raise RecordError(f"{name} claims {size} bytes, but the file ({self._size} bytes) holds {stored} of them")
+            raise RecordError(f"{name} claims {size} bytes, but the file ({self._size} bytes) contains {stored}")
         self._left -= size
         if self._left < 0:
             raise RecordError(
-                f"{name} would unpack to {size} bytes; a file of {self._size} bytes may unpack to "
-                f"{_allowed(self._size)} in all"
+                f"{name} would expand to {size} bytes; the limit for a file of {self._size} bytes is "
+                f"{_allowed(self._size)} in total"
             )
         return data[()]
 
     def _attribute(self, owner: Any, name: str) -> Any:
-        """An attribute of a size that fits the file, None if there is none."""
+        """Return an attribute, or None if it is missing; reject one that is larger than the file."""
         if name not in owner.attrs:
             return None
         identifier = owner.attrs.get_id(name)
@@ -356,7 +356,7 @@ class _Reader:
     def _string(self, path: str, name: str) -> str:
         value = self._attribute(self._file[path], name)
         if not isinstance(value, str):
-            raise RecordError(f"{_named(path)} has no text as {name}")
+            raise RecordError(f"{name} of {_describe(path)} is not a text")
         return value
 
 
@@ -371,10 +371,10 @@ def _mapping(name: str, text: str) -> dict[str, Any]:
 
 
 def _texts(values: Any, name: str) -> tuple[str, ...]:
-    """Texts of an attribute or a data set, which h5py reads as str or as bytes."""
+    """Return the texts of an attribute or a data set, which h5py reads as str or bytes."""
     if np.ndim(values) != 1:
-        raise RecordError(f"{name} that are no list")
+        raise RecordError(f"{name} that are not a list")
     texts = tuple(text.decode("utf-8") if isinstance(text, bytes) else text for text in np.asarray(values).tolist())
     if not all(isinstance(text, str) for text in texts):
-        raise RecordError(f"{name} that are no texts")
+        raise RecordError(f"{name} that are not texts")
     return texts

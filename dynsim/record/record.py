@@ -1,4 +1,4 @@
-"""The record: signals over time with units, events, scene, summary and provenance; loaded from and saved as HDF5.
+"""Record of a run: signals over time with units, events, scene, summary and provenance; loaded from and saved as HDF5.
 
 A record does not depend on the engine that made it: simulated and measured runs have the same form.
 """
@@ -28,11 +28,19 @@ if TYPE_CHECKING:
     import pandas
     import xarray
 
-# HTML tables by which notebooks display objects.
-
 
 def table(title: str, rows: Iterable[tuple[object, ...]], more: str = "") -> str:
-    """HTML of a table with its title; the first cell of a row names it. ``more`` follows as it is."""
+    """Return an HTML table with a title, for display in notebooks.
+
+    Parameters
+    ----------
+    title : str
+        Title of the table.
+    rows : iterable of tuple
+        Rows; the first cell is the heading of its row.
+    more : str, optional
+        HTML to append unchanged.
+    """
     lines = "".join(
         f'<tr><th style="text-align:left">{html.escape(str(first))}</th>'
         + "".join(f'<td style="text-align:left">{html.escape(str(cell))}</td>' for cell in cells)
@@ -42,30 +50,63 @@ def table(title: str, rows: Iterable[tuple[object, ...]], more: str = "") -> str
     return f"<div><b>{html.escape(title)}</b><table>{lines}</table>{more}</div>"
 
 
-# Number of signals that the repr names.
+# Maximum number of signals listed in the repr.
 _SHOWN = 6
 
 
 class Entries(dict[str, Any]):
-    """A mapping whose error for a missing entry names it and those that it has."""
+    """Mapping whose error for a missing key lists the existing keys."""
 
     def __init__(self, kind: str, entries: Mapping[str, Any]) -> None:
         super().__init__(entries)
-        self._what = kind
+        self._kind = kind
 
     def __missing__(self, key: object) -> Any:
-        raise MissingEntry(f"no {self._what} {brief(key)}; this record has: {', '.join(self) or 'none'}")
+        raise MissingEntry(f"no {self._kind} {brief(key)}; this record has: {', '.join(self) or 'none'}")
 
 
 class Record:
-    """Signals of one run, what happened in it, and what it looked like.
+    """Results of one run: signals with units, events, scene and provenance.
 
-    ``record["q"]`` is the array, ``record.units["q"]`` its unit, ``record.labels["q"]`` its column names,
-    ``record.times("q")`` its instants: those of ``time``, or of one of the further time axes ``axes``. ``events`` are
-    in the order of their times; ``scene`` (None: not known) is what figures and viewers draw.
+    ``record["q"]`` is the array of a signal, ``record.times("q")`` its sample times; iteration yields the signal names,
+    and ``len(record)`` is the number of samples on the main time axis.
 
-    ``summary`` holds the numbers of ``summary.json``; ``provenance`` says what made the record (resolved scenario,
-    version, commit, libraries). ``complete`` is False when the run was interrupted or stopped.
+    Parameters
+    ----------
+    time : array_like, shape (T,)
+        Times of the samples [s].
+    provenance : mapping, optional
+        Origin of the record: resolved scenario, version, commit, libraries.
+
+    Attributes
+    ----------
+    time : (T,) ndarray
+        Main time axis [s].
+    axes : dict of str to (K,) ndarray
+        Further time axes [s], for signals that are sampled at other times.
+    signals : dict of str to Signal
+        Signals by name.
+    events : list of Event
+        Events, sorted by time.
+    scene : Scene or None
+        Geometry for figures and viewers, if known.
+    complete : bool
+        False if the run was interrupted or stopped early.
+
+    Raises
+    ------
+    RecordError
+        If ``provenance`` is not a mapping.
+
+    Examples
+    --------
+    >>> import dynsim
+    >>> scenario = dynsim.load_scenario("elbow_comparison", variant="two_elbows", overrides={"duration_s": 0.1})
+    >>> record = dynsim.simulate(scenario)
+    >>> record["q"].shape, record.units["q"], record.labels["q"][0]
+    ((21, 10), 'rad', 'joint_1')
+    >>> record.complete, record.title
+    (True, 'elbow_comparison / two_elbows')
     """
 
     def __init__(self, time: ArrayLike, *, provenance: Mapping[str, Any] | None = None) -> None:
@@ -88,14 +129,36 @@ class Record:
         description: str = "",
         axis: str = TIME,
     ) -> None:
-        """Add a signal; its first axis is time, its second (if any) is named by ``labels``.
+        """Add a signal.
 
-        ``axis`` is the name of its time axis: that of the record, or one that :meth:`add_axis` has added.
+        Parameters
+        ----------
+        name : str
+            Name of the signal; an existing signal of this name is replaced.
+        data : array_like, shape (T,), (T, k) or (T, k, m)
+            Real numbers; the first axis is time.
+        unit : str
+            SI unit, "1" for dimensionless numbers.
+        labels : tuple of str, optional
+            Names of the k columns.
+        description : str, optional
+            Short description.
+        axis : str, optional
+            Name of the time axis; default: the main one. :meth:`add_axis` adds others.
 
         Raises
         ------
         RecordError
-            No real numbers, no such time axis, another number of samples than that has, or of labels than columns.
+            If the name is taken by a time axis, the time axis does not exist, the data are not real numbers, or the
+            number of samples or labels is wrong.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> record = dynsim.Record([0.0, 0.5, 1.0])
+        >>> record.add("q", [[0.1, 0.2], [0.1, 0.3], [0.1, 0.4]], "rad", labels=("shoulder", "elbow"))
+        >>> record["q"].shape
+        (3, 2)
         """
         if name in self.axes:
             raise RecordError(f"signal {name!r}: a time axis has that name")
@@ -105,12 +168,26 @@ class Record:
         self.signals[name] = signal
 
     def add_axis(self, name: str, times: ArrayLike) -> None:
-        """Add a further time axis [s], for signals that have instants of their own.
+        """Add a time axis for signals that are sampled at other times.
+
+        Parameters
+        ----------
+        name : str
+            Name of the time axis.
+        times : array_like, shape (K,)
+            Times [s], not decreasing.
 
         Raises
         ------
         RecordError
-            The name is taken, or the times are not finite or run backwards.
+            If the name is taken, or the times are not finite or run backwards.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> record = dynsim.Record([0.0, 0.5, 1.0])
+        >>> record.add_axis("camera", [0.2, 0.7])
+        >>> record.add("marker", [1.0, 1.1], "m", axis="camera")
         """
         check_name("time axis", name)
         if name == TIME or name in self.axes or name in self.signals:
@@ -120,12 +197,30 @@ class Record:
         self.axes[name] = axis
 
     def times(self, name: str) -> NDArray[np.float64]:
-        """Instants of a signal's samples, (T,) [s].
+        """Return the sample times of a signal.
+
+        Parameters
+        ----------
+        name : str
+            Name of the signal.
+
+        Returns
+        -------
+        (T,) ndarray
+            Times [s].
 
         Raises
         ------
         MissingEntry
-            No such signal.
+            If the record has no such signal.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> record = dynsim.Record([0.0, 0.5, 1.0])
+        >>> record.add("voltage", [12.0, 11.9, 11.8], "V")
+        >>> record.times("voltage")
+        array([0. , 0.5, 1. ])
         """
         axis = self._signal(name).axis
         return self.time if axis == TIME else self.axes[axis]
@@ -133,12 +228,33 @@ class Record:
     def add_event(
         self, time: float, kind: str, name: str = "", *, value: float | None = None, description: str = ""
     ) -> None:
-        """Add what happened at an instant [s], see :class:`Event`; events stay in the order of their times.
+        """Add an event; events are kept sorted by time.
+
+        Parameters
+        ----------
+        time : float
+            Time [s].
+        kind : str
+            Kind of the event, such as "contact opens".
+        name : str, optional
+            Name of the contact, joint, … concerned; default: the whole run.
+        value : float, optional
+            Associated number in SI units; NaN counts as None.
+        description : str, optional
+            Short description.
 
         Raises
         ------
         RecordError
-            The time is not finite.
+            If the time is not finite.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> record = dynsim.Record([0.0, 1.0])
+        >>> record.add_event(0.4, "contact opens", "elbow_4")
+        >>> record.events[0].name
+        'elbow_4'
         """
         if not math.isfinite(time):
             raise RecordError(f"event {kind!r} at {time} s: the time must be finite")
@@ -174,20 +290,34 @@ class Record:
         return table(repr(self)[1:-1], rows, hint)
 
     def view(self, *others: Record, ghost: bool = False, height: int = 640) -> Any:
-        """A page that shows the run in 3D, with plots over time; notebooks show it inline.
+        """Show the run in 3D, with plots over time; notebooks display the page inline.
 
         Parameters
         ----------
-        others : records that are shown beside this one, or laid over it
-        ghost : others are laid over this one
-        height : of the frame in a notebook [pixel]
+        *others : Record
+            Records to show next to this one.
+        ghost : bool, optional
+            Overlay the other records on this one instead.
+        height : int, optional
+            Height of the frame in a notebook [pixel].
+
+        Returns
+        -------
+        dynsim.draw.page.Inline
+            The page, as an object that notebooks display.
 
         Raises
         ------
         RecordError
-            See :func:`dynsim.view.page`.
+            If a record cannot be shown; see :func:`dynsim.view.page`.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> scenario = dynsim.load_scenario("elbow_comparison", overrides={"duration_s": 0.1})
+        >>> page = dynsim.simulate(scenario).view(height=400)
         """
-        # By name: pictures know records, not the other way round.
+        # By name, because dynsim.draw imports records, not vice versa.
         page = importlib.import_module("dynsim.draw.page")
         named: dict[str, Record] = {}
         for record in (self, *others):
@@ -196,7 +326,16 @@ class Record:
         return page.Inline(page.page(named, ghost=ghost), height)
 
     def keys(self) -> KeysView[str]:
-        """Names of the signals."""
+        """Return the names of the signals.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> record = dynsim.Record([0.0, 1.0])
+        >>> record.add("voltage", [12.0, 11.9], "V")
+        >>> list(record.keys())
+        ['voltage']
+        """
         return self.signals.keys()
 
     def __contains__(self, name: object) -> bool:
@@ -210,7 +349,7 @@ class Record:
 
     @property
     def title(self) -> str:
-        """Scenario and variant, or the robot of a measured run; "" where neither is known."""
+        """Scenario and variant, or the robot of a measured run; "" if neither is known."""
         scenario, robot = self.provenance.get("scenario"), self.provenance.get("robot")
         names = [scenario.get("name"), scenario.get("variant")] if isinstance(scenario, Mapping) else []
         return " / ".join(str(name) for name in names if name) or (f"{robot}, measured" if robot else "")
@@ -227,7 +366,7 @@ class Record:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """The numbers of ``summary.json``."""
+        """Numbers of ``summary.json``."""
         return self._summary
 
     @summary.setter
@@ -236,7 +375,7 @@ class Record:
 
     @property
     def provenance(self) -> dict[str, Any]:
-        """What made the record: resolved scenario, version, commit, libraries."""
+        """Origin of the record: resolved scenario, version, commit, libraries."""
         return self._provenance
 
     @provenance.setter
@@ -244,13 +383,32 @@ class Record:
         self._provenance = _entries("provenance", entries)
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write HDF5 to ``path``: complete or not at all (see :func:`dynsim.system.files.replacing`).
+        """Write the record to an HDF5 file atomically.
+
+        Parameters
+        ----------
+        path : str or path-like
+            File to write; an existing file is replaced.
+
+        Returns
+        -------
+        Path
+            The written file.
 
         Raises
         ------
         RecordError
-            The file cannot be written (no space, no permission); an older file at ``path`` is left as it was. Or the
-            time axis runs backwards or is not finite.
+            If the file cannot be written (no space, no permission); an existing file is then unchanged. Also if a time
+            axis is not finite or runs backwards.
+
+        Examples
+        --------
+        >>> import dynsim, pathlib, tempfile
+        >>> record = dynsim.Record([0.0, 1.0])
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = record.save(pathlib.Path(folder) / "record.h5")
+        >>> path.name
+        'record.h5'
         """
         path = Path(path)
         content = self.to_hdf5()
@@ -259,7 +417,24 @@ class Record:
         return path
 
     def to_hdf5(self) -> memoryview:
-        """The bytes of the file that :meth:`save` writes."""
+        """Return the bytes of the file that :meth:`save` writes.
+
+        Returns
+        -------
+        memoryview
+            Content of the file.
+
+        Raises
+        ------
+        RecordError
+            If a time axis is not finite or runs backwards, or a text cannot be stored in HDF5.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> bytes(dynsim.Record([0.0, 1.0]).to_hdf5()[1:4])
+        b'HDF'
+        """
         return reader.encode(self._content())
 
     def _content(self) -> Content:
@@ -280,14 +455,32 @@ class Record:
 
         Parameters
         ----------
-        trust : also read a file whose digest is missing or wrong: one that another program has written or changed.
-            Its types, sizes and times are checked as ever.
+        path : str or path-like
+            File to read.
+        trust : bool, optional
+            Accept a file whose digest is missing or wrong (written or changed by another program). Types, sizes and
+            times are checked in any case.
+
+        Returns
+        -------
+        Record
+            The record.
 
         Raises
         ------
         RecordError
-            No such file, damaged, not a dynsim record, or its digest is missing or wrong and it is not trusted; or it
-            lies beside the file ``INCOMPLETE`` of a run that died while it was saved. The message has file and reason.
+            If the file does not exist, is damaged or is not a record; if its digest is missing or wrong and ``trust``
+            is False; or if the file ``INCOMPLETE`` next to it shows that a run crashed while saving. The message names
+            file and reason.
+
+        Examples
+        --------
+        >>> import dynsim, pathlib, tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = dynsim.Record([0.0, 1.0]).save(pathlib.Path(folder) / "record.h5")
+        ...     record = dynsim.Record.load(path)
+        >>> len(record)
+        2
         """
         content = reader.read(Path(path), trust=trust)
         record = cls(content.time, provenance=content.provenance)
@@ -300,15 +493,62 @@ class Record:
         return record
 
     def to_dataframe(self, axis: str = TIME) -> pandas.DataFrame:
-        """A pandas DataFrame of the signals on one time axis, see :func:`dynsim.record.export.to_dataframe`."""
+        """Convert the signals on one time axis to a pandas DataFrame.
+
+        Parameters
+        ----------
+        axis : str, optional
+            Name of the time axis; default: the main one.
+
+        Returns
+        -------
+        pandas.DataFrame
+            Time [s] is the index. Columns are named ``signal``, ``signal.label`` or, for vectors, ``signal.label.x``;
+            their units are in ``attrs["units"]``.
+
+        Raises
+        ------
+        RecordError
+            If pandas is not installed.
+        MissingEntry
+            If the record has no such time axis.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> record = dynsim.Record([0.0, 1.0])
+        >>> record.add("q", [[0.1, 0.2], [0.1, 0.3]], "rad", labels=("shoulder", "elbow"))
+        >>> list(record.to_dataframe().columns)
+        ['q.shoulder', 'q.elbow']
+        """
         return export.to_dataframe(self._content(), axis)
 
     def to_xarray(self) -> xarray.Dataset:
-        """An xarray Dataset of all signals, see :func:`dynsim.record.export.to_xarray`."""
+        """Convert all signals to an xarray Dataset.
+
+        Returns
+        -------
+        xarray.Dataset
+            Signals over their time axes, with units and descriptions as attributes; signals with the same labels share
+            a dimension. See :func:`dynsim.record.export.to_xarray`.
+
+        Raises
+        ------
+        RecordError
+            If xarray is not installed.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> record = dynsim.Record([0.0, 1.0])
+        >>> record.add("q", [[0.1, 0.2], [0.1, 0.3]], "rad", labels=("shoulder", "elbow"))
+        >>> dict(record.to_xarray().sizes)
+        {'time': 2, 'q_label': 2}
+        """
         return export.to_xarray(self._content())
 
 
 def _entries(kind: str, entries: Mapping[str, Any]) -> Entries:
     if not isinstance(entries, Mapping):
-        raise RecordError(f"the {kind} of a record is a mapping of names to values, not {brief(entries)}")
+        raise RecordError(f"the {kind} of a record must be a mapping of names to values, got {brief(entries)}")
     return Entries(f"entry of the {kind}", entries)

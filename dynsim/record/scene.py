@@ -1,7 +1,7 @@
-"""The scene of a record: shapes and places of robot and surfaces, as plain data for figures and viewers.
+"""Scene of a record: shapes and poses of robot and surfaces, as plain data for figures and viewers.
 
-Placements are a position [m] and an orientation, a unit quaternion (w, x, y, z). A body's frame moves with its joint;
-at joint position zero it is the joint's frame, which is placed in the parent's frame.
+A pose is a position [m] and an orientation, a unit quaternion (w, x, y, z). The frame of a body moves with its joint;
+at joint position zero it coincides with the frame of the joint, whose pose is relative to the parent.
 """
 
 from __future__ import annotations
@@ -28,30 +28,33 @@ Matrix3 = tuple[Vector3, Vector3, Vector3]
 
 WORLD = -1
 """Index of the world among the bodies."""
-# A depth below a surface of less than this counts as zero [m]: contacts and single precision of poses leave so much.
+# Smaller depths below a surface count as zero [m]: contact errors and single precision of poses can reach this size.
 NOT_BELOW = 1e-4
 HERE: Quaternion = (1.0, 0.0, 0.0, 0.0)
-"""The orientation without rotation."""
+"""Identity orientation."""
 _FIELD = ("position", "spacing", "heights")
-"""Attributes of a height field."""
+"""Attributes that a height field requires."""
 _CHECKS: Any = {"allow_inf_nan": False}
-"""Configuration of pydantic for reading each class."""
+"""Pydantic configuration of each class."""
 
 
 @dataclass(frozen=True)
 class Shape:
-    """A solid on a body, for the eye; it has no part in the mechanics.
+    """Solid on a body, for drawing only; it does not affect the mechanics.
 
     Attributes
     ----------
     kind : "cylinder", "capsule", "box", "sphere" or "mesh"
-        Cylinders and capsules lie along z, all kinds about the origin of their placement.
+        Kind of the solid, which is centred on its frame; cylinders and capsules extend along z.
     size : tuple of float
-        Cylinder and capsule: radius and length [m], that of a capsule between the centres of its ends. Box: edges along
-        x, y and z. Sphere: radius. Mesh: scale along x, y and z.
-    position, orientation : placement in the body's frame
-    file : of a mesh, as the robot's file names it
-    colour : red, green, blue and opacity from 0 to 1, None: not stated
+        Cylinder and capsule: radius and length [m]; the length of a capsule is the distance between the centres of its
+        ends. Box: edge lengths along x, y and z. Sphere: radius. Mesh: scale along x, y and z.
+    position, orientation : tuple of float
+        Pose in the frame of the body.
+    file : str
+        Mesh file, as named in the robot file.
+    colour : tuple of float or None
+        Red, green, blue and opacity from 0 to 1, if specified.
     """
 
     __pydantic_config__: ClassVar[Any] = _CHECKS
@@ -65,10 +68,16 @@ class Shape:
     def __post_init__(self) -> None:
         count = {"cylinder": 2, "capsule": 2, "box": 3, "sphere": 1, "mesh": 3}[self.kind]
         if len(self.size) != count:
-            raise RecordError(f"a {self.kind} has {count} numbers as its size, not {len(self.size)}")
+            raise RecordError(f"the size of a {self.kind} must be {count} numbers, got {len(self.size)}")
 
     def placed(self, position: ArrayLike, orientation: ArrayLike) -> Shape:
-        """The same shape seen from a frame in which the body's has a position [m] and an orientation."""
+        """Return the shape with its pose in another frame.
+
+        Parameters
+        ----------
+        position, orientation : array_like
+            Pose of the frame of the body in the other frame.
+        """
         turn = np.asarray(orientation, dtype=np.float64)
         where = np.asarray(position) + rotated(turn, np.array(self.position))
         return replace(self, position=vector3(where), orientation=_four(product(turn, np.array(self.orientation))))
@@ -76,19 +85,26 @@ class Shape:
 
 @dataclass(frozen=True)
 class Joint:
-    """How a body moves against its parent.
+    """Joint between a body and its parent.
 
     Attributes
     ----------
+    name : str
+        Name of the joint.
     kind : "revolute", "prismatic", "planar", "ball" or "fixed"
-        Planar: along x and y of the joint's frame, then about z. Ball: the body's orientation in the joint's frame.
-    axis : unit vector in the joint's frame (and the body's)
-    position, orientation : placement of the joint in the parent's frame
+        Planar: translation along x and y of the joint frame, then rotation about z. Ball: orientation of the body in
+        the joint frame.
+    axis : tuple of float
+        Unit vector, with the same components in the frames of the joint and of the body.
+    position, orientation : tuple of float
+        Pose of the joint in the frame of the parent.
     signal, labels : str, tuple of str
-        Where the record has the joint's position: columns of a signal, one [rad or m], of a planar joint three [m, m,
-        rad], of a ball joint the four of a quaternion w, x, y, z of any length; none of what is fixed.
-    lower, upper : limits [rad or m], None for none
-    part_of : name of the joint with several rates that this is one of, "" for a joint of its own
+        Signal of the record with the joint position, and its columns: one [rad or m], for a planar joint three [m, m,
+        rad], for a ball joint the four of a quaternion w, x, y, z of any length, for a fixed joint none.
+    lower, upper : float or None
+        Limits [rad or m].
+    part_of : str
+        Name of the joint with several rates to which this joint belongs; "" for an independent joint.
     """
 
     __pydantic_config__: ClassVar[Any] = _CHECKS
@@ -105,12 +121,12 @@ class Joint:
 
     def __post_init__(self) -> None:
         if len(self.labels) != {"planar": 3, "ball": 4, "fixed": 0}.get(self.kind, 1):
-            raise RecordError(f"joint {self.name!r} is {self.kind} and has {len(self.labels)} columns")
+            raise RecordError(f"joint {self.name!r} is {self.kind} but has {len(self.labels)} columns")
 
 
 @dataclass(frozen=True)
 class Body:
-    """A rigid body; ``parent`` is the index of the body that carries it, ``WORLD`` for none."""
+    """Rigid body; ``parent`` is the index of its parent body, or ``WORLD``."""
 
     __pydantic_config__: ClassVar[Any] = _CHECKS
     name: str
@@ -120,25 +136,38 @@ class Body:
 
     @property
     def radius(self) -> float:
-        """Of its thickest cylinder or capsule [m]; 0 where it has none. So far its axis may reach below a surface."""
+        """Radius of its thickest cylinder or capsule [m], 0 without one.
+
+        The axis of the body may be this far below a surface.
+        """
         round_ones = (shape for shape in self.shapes if shape.kind in ("cylinder", "capsule"))
         return max((float(shape.size[0]) for shape in round_ones), default=0.0)
 
 
 @dataclass(frozen=True)
 class SceneSurface:
-    """A surface C(r) = 0 in the world; C > 0 is the free side, where ∇C points.
+    """Surface C(r) = 0 in the world; C > 0 is the free side, into which ∇C points.
 
     Attributes
     ----------
-    Q, b, c : C = r·Q r/2 + b·r + c of a quadric; zero of a box (C is the distance) and a height field (C = z − h)
+    name : str
+        Name of the surface.
+    Q, b, c : tuple of tuple of float, tuple of float, float
+        Coefficients of a quadric, C = r·Q r/2 + b·r + c; zero for a box (C is the distance) and a height field
+        (C = z − h).
     kind : "plane", "sphere", "cylinder", "quadric", "box" or "height_field"
-    position : on a plane, next to the world's origin; centre of a sphere or box; on the axis of a cylinder; of the
-        first height of a field, whose z is zero [m]
-    direction : normal of a plane, axis of a cylinder
-    radius : of a sphere or cylinder [m], negative where the free side is inside; of the edges of a box
-    orientation, edges : of a box
-    spacing, heights : of a field along x and y, a row for each y [m]; no more than are drawn
+        Kind of the surface.
+    position : tuple of float or None
+        Plane: point closest to the origin of the world. Sphere and box: centre. Cylinder: point on the axis. Height
+        field: first grid point, with z the zero of the heights [m].
+    direction : tuple of float or None
+        Normal of a plane, or axis of a cylinder.
+    radius : float or None
+        Radius of a sphere or cylinder [m], negative if the free side is inside; radius of the edges of a box.
+    orientation, edges : tuple of float or None
+        Orientation and edge lengths [m] of a box.
+    spacing, heights : tuple or None
+        Grid spacing of a height field along x and y, and its heights, one row per y [m], only as many as are drawn.
     """
 
     __pydantic_config__: ClassVar[Any] = _CHECKS
@@ -162,7 +191,7 @@ class SceneSurface:
 
     @classmethod
     def of_quadric(cls, name: str, Q: ArrayLike, b: ArrayLike, c: float) -> SceneSurface:
-        """A surface by its coefficients, with the parameters of the simple kind that it is of, if any."""
+        """Create a surface from its coefficients; planes, spheres and cylinders are recognised."""
         Q, b = np.asarray(Q, dtype=np.float64), np.asarray(b, dtype=np.float64)
         with np.errstate(all="ignore"):
             kind, parameters = _simple_kind(Q, b, float(c))
@@ -171,7 +200,7 @@ class SceneSurface:
         return cls(name, (vector3(Q[0]), vector3(Q[1]), vector3(Q[2])), vector3(b), float(c), kind, **parameters)
 
     def value(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """C at points, (…, 3) → (…)."""
+        """Return C at points, (…, 3) → (…)."""
         if self.kind == "box":
             core = 0.5 * np.array(self.edges) - (self.radius or 0.0)
             beyond = np.abs((points - np.array(self.position)) @ rotated(np.array(self.orientation), np.eye(3))) - core
@@ -183,7 +212,7 @@ class SceneSurface:
         return np.asarray(0.5 * bent + points @ np.array(self.b) + self.c)
 
     def gradient(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """∇C at points, (…, 3) → (…, 3)."""
+        """Return ∇C at points, (…, 3) → (…, 3)."""
         if self.kind in ("box", "height_field"):
             step = 1e-6
             ends = [(points + step * axis, points - step * axis) for axis in np.eye(3)]
@@ -191,13 +220,13 @@ class SceneSurface:
         return np.asarray(points @ np.array(self.Q) + np.array(self.b))
 
     def normal(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Unit normals into the free side at points, (…, 3) → (…, 3); zero where ∇C is."""
+        """Return unit normals into the free side at points, (…, 3) → (…, 3); zero if ∇C is zero."""
         slope = self.gradient(points)
         size = np.linalg.norm(slope, axis=-1, keepdims=True)
         return np.asarray(slope / np.where(size > 0.0, size, 1.0))
 
     def gap(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Signed distances [m] of points along ∇C, (…, 3) → (…), exact for plane, sphere and cylinder."""
+        """Return signed distances [m] of points along ∇C, (…, 3) → (…); exact for plane, sphere and cylinder."""
         value, size, n = self.value(points), np.linalg.norm(self.gradient(points), axis=-1), self.normal(points)
         inner = size * size - 2.0 * value * np.einsum("...i,ij,...j", n, np.array(self.Q), n)
         with np.errstate(all="ignore"):
@@ -205,32 +234,38 @@ class SceneSurface:
 
     @property
     def grid(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """x, (nx,), and y, (ny,), of the heights of a field [m]."""
+        """Grid coordinates x, (nx,), and y, (ny,), of a height field [m]."""
         start, heights = np.array(self.position), np.array(self.heights)
         x, y = (start[s] + np.array(self.spacing)[s] * np.arange(heights.shape[1 - s]) for s in (0, 1))
         return x, y
 
     def _height(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Between the heights of the grid in straight lines; beyond it as at its edge."""
-        from scipy.ndimage import map_coordinates  # height fields are rare
+        """Return heights by bilinear interpolation; outside the grid, the height at its edge."""
+        from scipy.ndimage import map_coordinates  # imported here because height fields are rare
 
         start, spacing = np.array(self.position), np.array(self.spacing)
         cells = np.stack([(y - start[1]) / spacing[1], (x - start[0]) / spacing[0]])
-        # A single point is an array of no dimension, which map_coordinates does not take.
+        # For a single point the arrays have no axis, which map_coordinates does not accept.
         heights = map_coordinates(np.array(self.heights), cells.reshape(2, -1), order=1, mode="nearest")
         return np.asarray(heights).reshape(cells.shape[1:])
 
 
 @dataclass(frozen=True)
 class Point:
-    """A named point on a body.
+    """Named point on a body.
 
     Attributes
     ----------
-    role : "hand", "contact" or "support", where a mobile base stands on the ground
-    body : index, ``WORLD`` for a point in the world
-    position : in the body's frame [m]
-    surface : name of the surface that holds a contact point
+    name : str
+        Name of the point.
+    role : "hand", "contact" or "support"
+        A support is a ground contact of a mobile base.
+    body : int
+        Index of the body, or ``WORLD``.
+    position : tuple of float
+        Position in the frame of the body [m].
+    surface : str
+        Name of the surface that a contact point touches.
     """
 
     __pydantic_config__: ClassVar[Any] = _CHECKS
@@ -243,18 +278,26 @@ class Point:
 
 @dataclass(frozen=True)
 class Scene:
-    """Bodies, each after the one that carries it, surfaces, named points, and what stands still in the world.
+    """Bodies (parents first), surfaces, named points and fixed shapes.
 
     Attributes
     ----------
-    points : the hand and the contact points
-    supports : where a mobile base touches the ground: left wheel, right wheel, caster. Not among the points, so that
-        earlier versions, which do not know their role, pass them over
+    bodies : tuple of Body
+        Bodies; each follows its parent.
+    surfaces : tuple of SceneSurface
+        Surfaces.
+    points : tuple of Point
+        The hand and the contact points.
+    fixed : tuple of Shape
+        Shapes fixed in the world.
+    supports : tuple of Point
+        Ground contacts of a mobile base: left wheel, right wheel, caster. They are not in ``points``, so that older
+        versions, which do not know their role, skip them.
 
     Raises
     ------
     RecordError
-        A body comes before its parent, or a point is on none.
+        If a body precedes its parent, or a point is on a body that does not exist.
     """
 
     __pydantic_config__: ClassVar[Any] = _CHECKS
@@ -267,28 +310,28 @@ class Scene:
     def __post_init__(self) -> None:
         for k, body in enumerate(self.bodies):
             if not WORLD <= body.parent < k:
-                raise RecordError(f"body {body.name!r} ({k}) does not come after its parent ({body.parent})")
+                raise RecordError(f"body {body.name!r} ({k}) must come after its parent ({body.parent})")
         for point in (*self.points, *self.supports):
             if not WORLD <= point.body < len(self.bodies):
-                raise RecordError(f"point {point.name!r} is on body {point.body}, there are {len(self.bodies)}")
+                raise RecordError(f"point {point.name!r} is on body {point.body} of {len(self.bodies)} bodies")
 
     @property
     def hand(self) -> Point | None:
-        """The controlled point."""
+        """Controlled point."""
         return next((point for point in self.points if point.role == "hand"), None)
 
     @property
     def contacts(self) -> tuple[Point, ...]:
-        """The contact points."""
+        """Contact points."""
         return tuple(point for point in self.points if point.role == "contact")
 
     @property
     def base(self) -> tuple[int, ...]:
-        """Indices of the bodies of a mobile base: the one that stands on the supports, then its wheels."""
+        """Indices of the bodies of a mobile base: the body with the supports, then its wheels."""
         if not self.supports or self.supports[0].body == WORLD:
             return ()
         base = self.supports[0].body
-        # The joint of the base has the angles of its wheels among its coordinates.
+        # The coordinates of the joint of the base include the angles of its wheels.
         joint = self.bodies[base].joint.part_of
         own = {body.joint.name for body in self.bodies if joint and body.joint.part_of == joint}
         wheels = [k for k, body in enumerate(self.bodies) if body.parent == base and own & set(body.joint.labels)]
@@ -296,28 +339,28 @@ class Scene:
 
     @property
     def wheel_names(self) -> dict[str, str]:
-        """What pictures call the motors of a mobile base's wheels, by their labels: "base.left" is the left wheel."""
+        """Display names of the wheel motors of a mobile base, by label: "base.left" is the left wheel."""
         labels = [label for k in self.base[1:] for label in self.bodies[k].joint.labels]
         return {label: f"{label.rpartition('.')[2]} wheel" for label in labels}
 
     def surface(self, name: str) -> SceneSurface | None:
-        """The surface of a name."""
+        """Return the surface with this name, or None."""
         return next((surface for surface in self.surfaces if surface.name == name), None)
 
     def to_json(self) -> str:
-        """The scene as a text of JSON; :meth:`from_json` reads it."""
+        """Return the scene as JSON text, which :meth:`from_json` reads."""
         return json.dumps(self, default=vars)
 
     @classmethod
     def from_json(cls, text: str) -> Scene:
-        """Read :meth:`to_json`; every part is checked. Keys of later versions are passed over.
+        """Read the text of :meth:`to_json` and check every part; keys of later versions are ignored.
 
         Raises
         ------
         RecordError
-            The text describes no scene.
+            If the text does not describe a scene.
         """
-        # Imported here: only who reads a scene needs it.
+        # Imported here because it is needed only for reading.
         from pydantic import ValidationError
 
         try:
@@ -336,13 +379,13 @@ def _adapter() -> TypeAdapter[Scene]:
 
 
 def vector3(values: ArrayLike) -> Vector3:
-    """Three numbers as plain floats."""
+    """Return three numbers as floats."""
     x, y, z = np.asarray(values, dtype=np.float64).tolist()
     return x, y, z
 
 
 def quaternion(R: ArrayLike) -> Quaternion:
-    """Unit quaternion, w ≥ 0, of a rotation matrix, as plain floats."""
+    """Return the unit quaternion, w ≥ 0, of a rotation matrix, as floats."""
     return _four(of_matrix(R))
 
 
@@ -352,7 +395,7 @@ def _four(values: ArrayLike) -> Quaternion:
 
 
 def _simple_kind(Q: NDArray[np.float64], b: NDArray[np.float64], c: float) -> tuple[Any, dict[str, Any]]:
-    """Plane, sphere or cylinder, and its parameters."""
+    """Return the kind (plane, sphere, cylinder or quadric) of a quadric and its parameters."""
     if not Q.any():
         slope = np.linalg.norm(b)
         return "plane", {"position": vector3(-c / slope**2 * b), "direction": vector3(b / slope)}

@@ -1,4 +1,4 @@
-"""Statistics of many runs: mean with interval, spread, and sensitivity to each sampled parameter."""
+"""Statistics of many runs: mean with confidence interval, spread, and sensitivity to each sampled parameter."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# Confidence level of the mean's interval, and probability of the samples' interval.
+# Confidence level of the interval of the mean, and probability of the interval of the samples.
 LEVEL = 0.95
 
 
@@ -19,10 +19,16 @@ class Spread:
 
     Attributes
     ----------
-    count : samples
-    mean : of them; ``mean_low``, ``mean_high``: its interval at ``LEVEL``, by Student's t
-    deviation : standard deviation of the samples
-    low, high : the samples' own interval at ``LEVEL``, by their quantiles
+    count : int
+        Number of samples.
+    mean : float
+        Mean of the samples.
+    mean_low, mean_high : float
+        Confidence interval of the mean at ``LEVEL``, by Student's t.
+    deviation : float
+        Standard deviation of the samples.
+    low, high : float
+        Interval of the samples at ``LEVEL``, by their quantiles.
     """
 
     count: int
@@ -35,14 +41,20 @@ class Spread:
 
 
 def student(freedom: int) -> float:
-    """Half width of the interval at ``LEVEL`` of Student's t."""
-    from scipy.special import stdtrit  # here: it takes as long to import as ten runs of a sweep
+    """Return the half-width of the interval at ``LEVEL`` of Student's t.
+
+    Parameters
+    ----------
+    freedom : int
+        Degrees of freedom.
+    """
+    from scipy.special import stdtrit  # imported here because it takes as long as ten runs of a sweep
 
     return float(stdtrit(freedom, 0.5 + 0.5 * LEVEL))
 
 
 def spread(values: Array) -> Spread:
-    """Mean and spread of samples, (N,) with N ≥ 2: x̄ ± t(N − 1) s/√N."""
+    """Return mean and spread of samples, (N,) with N ≥ 2: x̄ ± t(N − 1) s/√N."""
     count, mean, deviation = len(values), float(values.mean()), float(values.std(ddof=1))
     half = student(count - 1) * deviation / np.sqrt(count)
     low, high = np.quantile(values, [0.5 - 0.5 * LEVEL, 0.5 + 0.5 * LEVEL])
@@ -51,13 +63,16 @@ def spread(values: Array) -> Spread:
 
 @dataclass(frozen=True)
 class Sensitivities:
-    """The linear model y = b_0 + Σ b_j (x_j − x̄_j)/s_j of a number, by least squares.
+    """Linear model y = b_0 + Σ b_j (x_j − x̄_j)/s_j of a number, fitted by least squares.
 
     Attributes
     ----------
-    effect : (k,) b_j, what one standard deviation s_j of each parameter does to the number
-    half_width : (k,) of the intervals at ``LEVEL`` about them, by Student's t
-    explained : share of the number's variance that the model has, R²
+    effect : (k,) ndarray
+        b_j: change of the number per standard deviation s_j of each parameter.
+    half_width : (k,) ndarray
+        Half-widths of the confidence intervals of ``effect`` at ``LEVEL``, by Student's t.
+    explained : float
+        Fraction of the variance of the number that the model explains, R².
     """
 
     effect: Array
@@ -66,10 +81,10 @@ class Sensitivities:
 
 
 def sensitivities(parameters: Array, values: Array) -> Sensitivities | None:
-    """Fit parameters (N, k) to values (N,).
+    """Fit parameters, (N, k), to values, (N,).
 
-    None where that has no answer: no more samples than coefficients, a parameter or a value that does not vary, or
-    parameters that depend on each other.
+    Returns None if the fit is not determined: too few samples, a parameter or value that does not vary, or linearly
+    dependent parameters.
     """
     count, size = parameters.shape
     free, deviations = count - size - 1, parameters.std(axis=0, ddof=1) if count > 1 else np.zeros(size)

@@ -1,4 +1,4 @@
-"""URDF text of a scene (links, joints, shapes), and XML elements shared by all URDF writers."""
+"""URDF text of a scene (links, joints, shapes), and XML helpers shared by all URDF writers."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from dynsim.record.scene import WORLD, Scene, Shape
 Array = NDArray[np.float64]
 Element = ElementTree.Element
 WORLD_LINK = "world"
-# URDF has no ball joint; viewers place such bodies by their frames.
+# URDF has no ball joint; viewers position such bodies by their frames.
 _KINDS = {"ball": "floating"}
-# Written for a joint without a limit, as URDF demands numbers [rad or m, N m or N, rad/s or m/s].
+# Written for a joint without a limit, because URDF requires numbers [rad or m, N m or N, rad/s or m/s].
 _UNLIMITED = 1e9
 
 
 def scene_urdf(scene: Scene, name: str) -> str:
-    """Write the bodies of a scene as URDF text: joints, limits and shapes, without masses.
+    """Return the URDF text of the bodies of a scene: joints, limits and shapes, without masses.
 
-    Link names are those of the bodies, the root is ``world``. It is what a viewer of ROS draws
-    (``robot_description``); ``dynsim export SCENARIO --format urdf`` writes masses too.
+    Links have the names of the bodies; the root is ``world``. ROS viewers draw this text (``robot_description``);
+    ``dynsim export SCENARIO --format urdf`` writes masses too.
     """
     root = Element("robot", name=name)
     names = [body.name for body in scene.bodies]
@@ -54,7 +54,7 @@ def scene_urdf(scene: Scene, name: str) -> str:
 
 
 def add_shapes(link: Element, shapes: Sequence[Shape]) -> None:
-    """Add the ``visual`` elements of shapes to a link; a capsule is a cylinder and two spheres, as URDF has none."""
+    """Add the ``visual`` elements of shapes to a link; a capsule becomes a cylinder and two spheres."""
     for shape in _simple(shapes):
         visual = ElementTree.SubElement(link, "visual")
         R = rotation(shape.orientation)
@@ -76,7 +76,7 @@ def add_shapes(link: Element, shapes: Sequence[Shape]) -> None:
 
 
 def _simple(shapes: Sequence[Shape]) -> list[Shape]:
-    """Shapes with capsules taken apart."""
+    """Return the shapes with each capsule split into a cylinder and two spheres."""
     simple: list[Shape] = []
     for shape in shapes:
         if shape.kind != "capsule":
@@ -92,21 +92,21 @@ def _simple(shapes: Sequence[Shape]) -> list[Shape]:
 
 
 def connect(joint: Element, parent: str, child: str, position: Any, rotation: Array) -> None:
-    """Add parent, child and placement to a joint."""
+    """Add parent, child and origin to a joint."""
     ElementTree.SubElement(joint, "parent", link=parent)
     ElementTree.SubElement(joint, "child", link=child)
     ElementTree.SubElement(joint, "origin", xyz=numbers(position), rpy=numbers(roll_pitch_yaw(rotation)))
 
 
 def rotation(orientation: Any) -> Array:
-    """The matrix of a unit quaternion, (3, 3)."""
+    """Return the rotation matrix of a unit quaternion, (3, 3)."""
     return rotated(np.array(orientation, dtype=np.float64), np.eye(3))
 
 
 def roll_pitch_yaw(R: Array) -> Array:
-    """Angles of R = Rz(yaw) Ry(pitch) Rx(roll) [rad], accurate at pitch = ±90° too.
+    """Return the angles of R = Rz(yaw) Ry(pitch) Rx(roll) [rad], accurate at pitch = ±90° too.
 
-    There roll and yaw are not unique: whatever yaw rounding gives, roll is taken from what is left after undoing it.
+    At pitch = ±90° roll and yaw are not unique: yaw is determined by rounding, and roll is computed from Rz(yaw)ᵀ R.
     """
     yaw = math.atan2(R[1, 0], R[0, 0])
     c, s = math.cos(yaw), math.sin(yaw)
@@ -116,11 +116,11 @@ def roll_pitch_yaw(R: Array) -> Array:
 
 
 def numbers(values: Any) -> str:
-    """Numbers in their shortest form that reads back to the same double."""
+    """Format numbers in the shortest form that reads back to the same double."""
     return " ".join(repr(float(x)) for x in np.atleast_1d(values))
 
 
 def xml_text(root: Element) -> str:
-    """The document of an element, indented."""
+    """Return the indented XML document of an element."""
     ElementTree.indent(root)
     return '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"

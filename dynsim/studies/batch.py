@@ -1,4 +1,4 @@
-"""Batch of independent runs, in processes or on a cluster: each yields a summary, or the reason for its failure."""
+"""Batch of independent runs, in processes or on a cluster; each returns a summary or the reason for its failure."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from dynsim.system.memo import Memo, remembering
 Keep = Literal["none", "failed", "all"]
 Task = TypeVar("Task")
 
-# Attempts of a run whose process is lost: the first may have been ended because another run used up the memory.
+# Attempts at a run whose process is lost: the process may have been killed because another run used up the memory.
 ATTEMPTS = 2
 
 
@@ -30,29 +30,49 @@ def simulate_batch(
     scheduler: str | None = None,
     finished: Callable[[int, RunResult], None] | None = None,
 ) -> list[RunResult]:
-    """Simulate many scenarios; one that fails does not keep the others from running.
+    """Simulate many scenarios in parallel and return one result each; a failed run does not stop the others.
 
-    Every run is that of :func:`dynsim.simulate` to the bit, whatever ``jobs`` and whichever runs are beside it.
+    Each run is bit-identical to :func:`dynsim.simulate`, for any ``jobs`` and any other runs in the batch.
 
     Parameters
     ----------
-    scenarios : of any plants
-    jobs : processes; one simulates here, one after the other
-    keep_records : which results hold their records: none, those of runs that stopped, or all
-    scheduler : address of a Dask scheduler, such as ``tcp://host:8786``, whose workers simulate instead
-    finished : called with the number of a run and its result, as soon as it is there
+    scenarios : iterable of Scenario
+        Scenarios with any plants.
+    jobs : int, optional
+        Number of worker processes; 1 (default) simulates in this process.
+    keep_records : {"none", "failed", "all"}, optional
+        Results that keep their record: none (default), those of runs that stopped early, or all.
+    scheduler : str, optional
+        Address of a Dask scheduler, such as ``tcp://host:8786``, whose workers simulate instead.
+    finished : callable, optional
+        Called with the index of a run and its result, as soon as it is available.
 
     Returns
     -------
     list of RunResult
-        In the order of ``scenarios``.
+        Results in the order of ``scenarios``; each has ``ok``, ``summary``, ``reason`` and ``record``.
 
     Raises
     ------
     ScenarioError
-        No scenarios, no such ``jobs`` or ``keep_records``, or no such scheduler.
+        If an entry is not a Scenario, or ``jobs`` or ``keep_records`` is invalid.
+    ClusterError
+        If no scheduler answers at the address, or a worker cannot run dynsim.
+    WorkerError
+        If a worker process cannot start.
     SimulationInterrupted
-        Ctrl-C; ``finished`` has had what was done until then.
+        On Ctrl-C; ``finished`` has been called for all runs completed until then.
+
+    Examples
+    --------
+    >>> import dynsim
+    >>> names, short = ("two_elbows", "no_elbow"), {"duration_s": 0.1}
+    >>> scenarios = [dynsim.load_scenario("elbow_comparison", name, short) for name in names]
+    >>> results = dynsim.simulate_batch(scenarios)
+    >>> [result.ok for result in results]
+    [True, True]
+    >>> results[0].summary["variant"], results[0].summary["duration_s"]
+    ('two_elbows', 0.1)
     """
     runs = list(scenarios)
     for scenario in runs:
@@ -67,29 +87,31 @@ def simulate_batch(
             finished(task[0], result)
 
     if run_all(BatchWork(itemgetter(1), keep_records), list(enumerate(runs)), take, jobs=jobs, scheduler=scheduler):
-        raise SimulationInterrupted(f"interrupted when {len(results)} of {len(runs)} runs were done")
+        raise SimulationInterrupted(f"interrupted after {len(results)} of {len(runs)} runs")
     return [results[k] for k in range(len(runs))]
 
 
 class BatchWork(Generic[Task]):
-    """What is done for tasks, in a process of its own too: what their runs have in common stays there with it.
+    """Work for the tasks of a batch; each process has one memo for the results that its runs share.
 
     Parameters
     ----------
-    load : a task's scenario; of a module, or bound to what can be sent to processes
-    keep : whose records are kept, see :func:`simulate_batch`
+    load : callable
+        Returns the scenario of a task. It must be picklable: a function of a module, or a method of a picklable object.
+    keep : {"none", "failed", "all"}
+        Runs whose records are kept, see :func:`simulate_batch`.
     """
 
     def __init__(self, load: Callable[[Task], Scenario], keep: Keep) -> None:
         self._load, self._keep, self._memo = load, keep, Memo()
 
     def __call__(self, task: Task, look: Progress | None) -> RunResult:
-        """Load and simulate a task, whatever becomes of it.
+        """Load and simulate a task, and return a failure as a result.
 
         Raises
         ------
         SimulationInterrupted
-            ``look`` raised KeyboardInterrupt.
+            If ``look`` raises KeyboardInterrupt.
         """
         started, record, reason = clock.perf_counter(), None, ""
         try:
@@ -98,7 +120,7 @@ class BatchWork(Generic[Task]):
         except SimulationInterrupted:
             raise
         except Exception as error:
-            # Hours of other runs must not go for a fault of dynsim in one, which is told by its kind.
+            # A bug of dynsim in one run must not cost hours of other runs; its reason starts with the error type.
             kind = "" if isinstance(error, DynsimError) else f"{type(error).__name__}: "
             reason = " ".join(f"{kind}{error}".split())
             record = error.record if isinstance(error, SimulationStopped) else None
@@ -122,20 +144,33 @@ def run_all(
     jobs: int = 1,
     scheduler: str | None = None,
 ) -> bool:
-    """Do ``work`` for all tasks here, in processes or on a cluster, and hand every result to ``take`` as it comes.
+    """Do ``work`` for all tasks here, in processes or on a cluster, and pass each result to ``take`` when it arrives.
+
+    Parameters
+    ----------
+    work : callable
+        Called with a task and its progress function; returns its result.
+    tasks : sequence
+        Tasks, picklable for ``jobs`` > 1 or a scheduler.
+    take : callable
+        Called in this process with a task and its result.
+    jobs, scheduler
+        See :func:`simulate_batch`.
 
     Returns
     -------
     bool
-        True if Ctrl-C came before all were done.
+        True if Ctrl-C came before all tasks were done.
 
     Raises
     ------
     ScenarioError
-        No such ``jobs``, or no such scheduler.
+        If ``jobs`` is invalid.
+    ClusterError
+        If no scheduler answers at the address, or a worker cannot run dynsim.
     """
     if not isinstance(jobs, int) or jobs < 1:
-        raise ScenarioError(f"jobs = {brief(jobs)}: must be a whole number of processes, 1 or more")
+        raise ScenarioError(f"jobs = {brief(jobs)}: must be an integer of at least 1")
     if scheduler is not None:
         from dynsim.studies.cluster import run_on_cluster
 

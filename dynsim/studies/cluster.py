@@ -1,4 +1,4 @@
-"""Batch of runs on a Dask cluster: tasks are sent to its workers, results are received as they come.
+"""Batch of runs on a Dask cluster: tasks are sent to its workers, and results are received in the order of completion.
 
 Start of the cluster, retries after the loss of a worker, and adaptive scaling are left to Dask.
 """
@@ -21,21 +21,21 @@ from dynsim.system import interruption
 
 Task = TypeVar("Task")
 
-# Longest wait for the scheduler's answer [s].
+# Longest wait for an answer of the scheduler [s].
 _CONNECT_S = 10.0
-# Duration of one piece of work [s]: short, to balance the load of the cluster, but so long that scheduler and client,
-# which need some milliseconds for each (docs/sweeps.md), handle those of all threads in that time.
-_PIECE_S, _PIECE_S_EACH = 1.0, 0.015
-_PIECE_MOST = 2048
-# Pieces submitted at a time: some for each thread, and enough for adaptive scaling to add workers.
-_OUT_EACH, _OUT_LEAST = 3, 64
+# Duration of one piece of work [s]: short, to balance the load of the cluster, but long enough for scheduler and
+# client to handle one piece for each thread in that time; they need some milliseconds per piece (docs/sweeps.md).
+_PIECE_S, _PIECE_S_PER_THREAD = 1.0, 0.015
+_PIECE_MAX_TASKS = 2048
+# Number of pending pieces: several per thread, and enough for adaptive scaling to add workers.
+_PENDING_PER_THREAD, _PENDING_MIN = 3, 64
 
-# One run at a time in a process: threads of a worker would only wait for the interpreter's lock.
+# One run at a time in a process: other threads of a worker would only wait for the global interpreter lock.
 _one_at_a_time = threading.Lock()
 
 
 class ClusterError(DynsimError):
-    """No Dask, no scheduler, or workers that cannot do the work."""
+    """Dask is missing, no scheduler answers, or a worker cannot do the work."""
 
 
 def run_on_cluster(
@@ -46,22 +46,22 @@ def run_on_cluster(
 ) -> bool:
     """Do ``work`` for all tasks on the workers of a scheduler, see :func:`dynsim.studies.batch.run_all`.
 
-    Tasks go in pieces of about a second, measured as they come back. A piece whose workers died again and again is
-    taken apart, and what is left of it in the end is lost.
+    Tasks are sent in pieces of about a second, according to the measured durations. A piece whose workers die
+    repeatedly is split into its tasks; a task whose workers die again is lost.
 
     Raises
     ------
     ClusterError
-        Dask is not installed, no scheduler answers at the address (any more), or a worker has no dynsim or another
-        version.
+        If Dask is not installed, no scheduler answers at the address (any more), or a worker has no dynsim or another
+        version of it.
     """
     try:
         from distributed import CancelledError, Client, KilledWorker, as_completed
         from distributed.comm import resolve_address
     except ImportError as error:
-        raise ClusterError("a scheduler needs Dask: pip install 'dynsim[cluster]'") from error
+        raise ClusterError("a scheduler requires Dask: pip install 'dynsim[cluster]'") from error
     try:
-        # A client that cannot even try would tell of itself when it is forgotten.
+        # A client with an invalid address would print an error when it is garbage-collected.
         resolve_address(address)
         client: Any = Client(address, timeout=_CONNECT_S, set_as_default=False)
     except (OSError, ValueError, RuntimeError) as error:
@@ -70,17 +70,17 @@ def run_on_cluster(
     wall = _PIECE_S
 
     def submit(piece: list[Task]) -> Any:
-        future = client.submit(_work_through, work, piece, __version__, pure=False)
+        future = client.submit(_run_piece, work, piece, __version__, pure=False)
         out[future] = piece
         return future
 
     def hand_out() -> list[Any]:
         threads = sum(worker["nthreads"] for worker in client.scheduler_info(n_workers=-1)["workers"].values())
-        size = min(max(round(max(_PIECE_S, _PIECE_S_EACH * threads) / max(wall, 1e-9)), 1), _PIECE_MOST)
-        # The last ones are smaller, for all to end together.
+        size = min(max(round(max(_PIECE_S, _PIECE_S_PER_THREAD * threads) / max(wall, 1e-9)), 1), _PIECE_MAX_TASKS)
+        # The last pieces are smaller, so that all workers finish at about the same time.
         size = min(size, max(len(waiting) // (2 * max(threads, 1)), 1))
         futures = []
-        while waiting and len(out) < max(_OUT_LEAST, _OUT_EACH * threads):
+        while waiting and len(out) < max(_PENDING_MIN, _PENDING_PER_THREAD * threads):
             futures.append(submit([waiting.popleft() for _ in range(min(size, len(waiting)))]))
         return futures
 
@@ -95,12 +95,13 @@ def run_on_cluster(
                 except KilledWorker:
                     if len(piece) == 1:
                         take(
-                            piece[0], RunResult({}, "its process was ended from outside, on several workers", lost=True)
+                            piece[0],
+                            RunResult({}, "its process was killed from outside on several workers", lost=True),
                         )
                     else:
                         queue.update([submit([task]) for task in piece])
                 except CancelledError as error:
-                    raise ClusterError(f"the Dask scheduler at {address} answers no more") from error
+                    raise ClusterError(f"the Dask scheduler at {address} no longer answers") from error
                 except ImportError as error:
                     raise ClusterError(
                         f"a worker of {address} cannot load dynsim ({error}); install it there"
@@ -122,8 +123,8 @@ def run_on_cluster(
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """What goes wrong is one error here: Dask does not log it as well; afterwards it logs as before."""
-    # Those to which Dask gives a level of their own.
+    """Suppress the log of Dask in the block; its problems are reported once, as errors."""
+    # Loggers whose level Dask sets separately.
     before = {logger: logger.level for logger in map(logging.getLogger, ("distributed", "distributed.client"))}
     for logger in before:
         logger.setLevel(logging.CRITICAL + 1)
@@ -134,12 +135,12 @@ def _quiet() -> Iterator[None]:
             logger.setLevel(level)
 
 
-def _work_through(
+def _run_piece(
     work: Callable[[Task, Progress | None], RunResult], tasks: Sequence[Task], version: str
 ) -> list[RunResult]:
-    """On a worker: what there is to do for each task."""
+    """Do the work for each task, on a worker."""
     if version != __version__:
-        raise ClusterError(f"a worker has dynsim {__version__}, this is {version}; install the same on all")
+        raise ClusterError(f"a worker has dynsim {__version__}, but this is {version}; install the same version")
     keep_memory()
     with _one_at_a_time:
         return [work(task, None) for task in tasks]

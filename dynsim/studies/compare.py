@@ -17,7 +17,7 @@ from dynsim.system.files import json_text, replace_together
 
 
 class VariantProgress(Protocol):
-    """A :class:`dynsim.engine.Progress` that also gets the variant's name."""
+    """A :class:`dynsim.engine.Progress` that also receives the name of the variant."""
 
     def __call__(self, variant: str, time: float, stage: str = SIMULATION) -> None: ...
 
@@ -31,31 +31,48 @@ def compare(
     finished: Callable[[str, Record], None] | None = None,
     stopped: Callable[[str, SimulationStopped], None] | None = None,
 ) -> dict[str, Record]:
-    """Simulate every variant of a scenario. A variant that stops does not keep the others from running; Ctrl-C does.
+    """Simulate every variant of a scenario. A failed variant does not stop the others.
 
     Parameters
     ----------
-    path : scenario file or name of a shipped one
-    overrides : values by dotted key, for all variants
-    jobs : processes; one runs the variants here, one after the other
-    progress : see :class:`VariantProgress` (with several processes it is called only at a variant's end)
-    finished : called with variant and record as soon as a variant is done, so that it can be saved
-    stopped : called with variant and exception as soon as a variant stops or is interrupted
+    path : str or Path
+        Scenario file, or the name of a shipped scenario.
+    overrides : mapping, optional
+        Values by dotted key, for all variants.
+    jobs : int, optional
+        Number of worker processes; 1 (default) simulates in this process.
+    progress : callable, optional
+        See :class:`VariantProgress`. With several processes it is called only at the end of a variant.
+    finished : callable, optional
+        Called with variant and record as soon as a variant is done, for example to save it.
+    stopped : callable, optional
+        Called with variant and exception as soon as a variant stops or is interrupted.
 
     Returns
     -------
-    dict of Record by variant, in the order of the file
+    dict of str to Record
+        Records by variant, in the order of the file.
 
     Raises
     ------
     ScenarioError
-        The file has no variants, one of them is not valid (all are checked before the first runs), or no such ``jobs``.
-    SimulationStopped, SimulationInterrupted
-        A variant stopped (after the others have run) or Ctrl-C. Names all that stopped and, after Ctrl-C, all that were
-        not started; holds the record of the first.
+        If the file has no variants, a variant is invalid (all are checked before the first runs), or ``jobs`` is
+        invalid.
+    SimulationStopped
+        If a variant stopped, after all others have run. The message lists all stopped variants; ``record`` is the
+        record of the first.
+    SimulationInterrupted
+        On Ctrl-C. The message also lists the variants that were not started.
+
+    Examples
+    --------
+    >>> import dynsim
+    >>> records = dynsim.compare("elbow_comparison", overrides={"duration_s": 0.1})
+    >>> list(records)
+    ['two_elbows', 'elbow_7', 'elbow_4', 'no_elbow']
     """
     if not isinstance(jobs, int) or jobs < 1:
-        raise ScenarioError(f"jobs = {brief(jobs)}: must be a whole number of processes, 1 or more")
+        raise ScenarioError(f"jobs = {brief(jobs)}: must be an integer of at least 1")
     names = variant_names(path)
     if not names:
         raise ScenarioError(f"{path}: has no variants to compare; use `dynsim run`")
@@ -68,7 +85,7 @@ def compare(
             record = result()
         except WorkerInterrupted:
             location = scenarios[name].location(variant=f" ({name})")
-            stops[name] = SimulationInterrupted(f"{location}: interrupted before there was anything to save")
+            stops[name] = SimulationInterrupted(f"{location}: interrupted before there were results to save")
             return
         except WorkerLost as lost:
             stops[name] = SimulationStopped(f"{name}: {lost}")
@@ -102,25 +119,25 @@ def compare(
                 break
     if stops or interrupted:
         left = [name for name in names if name not in records and name not in stops]
-        raise _summed_up({name: stops[name] for name in names if name in stops}, left, interrupted)
+        raise _combined_stop({name: stops[name] for name in names if name in stops}, left, interrupted)
     return {name: records[name] for name in names}
 
 
-def _summed_up(stops: Mapping[str, SimulationStopped], left: list[str], interrupted: bool) -> SimulationStopped:
-    """One exception for all variants that stopped, and those that were left when the user stopped it all."""
-    # Without a record the message names the variant already.
+def _combined_stop(stops: Mapping[str, SimulationStopped], left: list[str], interrupted: bool) -> SimulationStopped:
+    """Combine the exceptions of all stopped variants, and list those that Ctrl-C prevented from starting."""
+    # If there is no record, the message already names the variant.
     texts = [str(stop) if stop.record is None else f"{name}: {stop}" for name, stop in stops.items()]
     if left:
         texts.append(f"interrupted before {', '.join(left)} {'was' if len(left) == 1 else 'were'} started")
     first = next(iter(stops.values()), SimulationStopped(""))
     kind = SimulationInterrupted if interrupted else SimulationStopped
-    summed_up = kind("; ".join(texts), time=first.time, state=first.state)
-    summed_up.record = next((stop.record for stop in stops.values() if stop.record is not None), None)
-    return summed_up
+    combined = kind("; ".join(texts), time=first.time, state=first.state)
+    combined.record = next((stop.record for stop in stops.values() if stop.record is not None), None)
+    return combined
 
 
 def _simulate(scenario: Scenario, look: Progress) -> Record:
-    """In a worker process."""
+    """Simulate in a worker process."""
     return simulate(scenario, look)
 
 
@@ -128,7 +145,7 @@ def save_comparison(records: Mapping[str, Record], folder: Path) -> None:
     """Write ``comparison.json`` and ``comparison.csv``."""
     summaries = {name: record.summary for name, record in records.items()}
     runs = [flat(summary) for summary in summaries.values()]
-    # A number that one variant lacks, another may have; of contacts those of the unilateral law.
+    # Variants may differ in their numbers; numbers of contacts depend on the contact law.
     names = dict.fromkeys(["variant", *(key for run in runs for key, value in run.items() if is_scalar(value))])
     contacts = dict.fromkeys(c["name"] for run in runs for c in run.get("contacts", ()))
     keys = dict.fromkeys(k for run in runs for c in run.get("contacts", ()) for k, v in c.items() if not is_text(v))

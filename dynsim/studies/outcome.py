@@ -1,4 +1,4 @@
-"""Outcome of one run of a batch: summary, or error."""
+"""Outcome of one run of a batch: a summary or an error."""
 
 from __future__ import annotations
 
@@ -14,11 +14,16 @@ class RunResult:
 
     Attributes
     ----------
-    summary : numbers of the run, of a stopped one those until its stop; empty when nothing was simulated
-    reason : why it failed, "" when it did not
-    lost : whether its process was lost, so that another attempt may succeed
-    record : if requested
-    wall_s : total computing time [s]
+    summary : dict
+        Summary of the run, up to the stop if it stopped early; empty if nothing was simulated.
+    reason : str
+        Reason for the failure, "" for a successful run.
+    lost : bool
+        True if its worker process was lost; another attempt may succeed.
+    record : Record or None
+        Record of the run, if requested.
+    wall_s : float
+        Total computing time [s].
     """
 
     summary: dict[str, Any] = field(default_factory=dict)
@@ -29,5 +34,5 @@ class RunResult:
 
     @property
     def ok(self) -> bool:
-        """True for a run that came to its end."""
+        """True if the run completed."""
         return not self.reason

@@ -1,7 +1,7 @@
 """Parallel work in worker processes: results in the order of completion, interruption, and loss of workers.
 
-On Ctrl-C the workers return the results that they have. If a worker is killed or sends no sign of life, only the task
-that it was doing is lost.
+On Ctrl-C the workers return the results that they have. If a worker is killed or stops responding, only its current
+task is lost.
 """
 
 from __future__ import annotations
@@ -29,84 +29,94 @@ from dynsim.system import interruption
 from dynsim.system.interruption import STOP_SIGNALS
 
 if TYPE_CHECKING:
-    from dynsim.engine import Progress  # numba, which not every work needs
+    from dynsim.engine import Progress  # imports numba, which not all work needs
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
-# Longest time between signs of life of a worker, and until its first one [s]. A thread of the worker sends them, so
+# Longest time between heartbeats of a worker, and until its first one [s]. A thread of the worker sends them, so that
 # they do not depend on the duration of its work; they end if the process is stopped, or if compiled code never releases
-# the interpreter's lock.
+# the global interpreter lock.
 SILENT_S, START_S = 60.0, 600.0
-# Longest time until a worker confirms Ctrl-C [s]; then it may take any time to return its results. Its signs of life
-# measure that time, so that no result is lost if the machine is busy; the second value is the limit without signs.
+# Longest time until a worker confirms Ctrl-C [s]; then it may take any time to return its results. Its heartbeats
+# measure that time, so that no result is lost if the machine is busy; the second value is the limit without heartbeats.
 _PATIENCE_S, _STALLED_S = 0.7, 10.0
 # Interval of the checks for signals [s].
 _SIGNAL_S = 0.1
-# Longest task that is sent to a worker still busy [s]: for longer ones another worker may be free sooner.
+# Longest task that is sent to a worker while it is busy [s]: for longer tasks another worker may be free sooner.
 _QUICK_S = 0.5
 # Lines of a worker's stderr that are reported when it cannot start.
 _LAST_LINES = 12
 
 
 def cores() -> int:
-    """Number of cores that this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class WorkerLost(Exception):
-    """The worker process of a task has ended; the message is a clause that begins with ``its process``."""
+    """The worker process of a task ended; the message is a clause that begins with ``its process``."""
 
-    def __init__(self, how: str = "its process was ended from outside; is memory short for so many jobs?") -> None:
+    def __init__(self, how: str = "its process was killed from outside; if memory is short, use fewer jobs") -> None:
         super().__init__(how)
 
 
 class WorkerSilent(WorkerLost):
-    """The parent ended the worker process because it sent no more signs of life."""
+    """The parent killed the worker process because its heartbeats stopped."""
 
     def __init__(self) -> None:
-        super().__init__(f"its process gave no sign of life for {SILENT_S:g} s and was ended")
+        super().__init__(f"its process did not respond for {SILENT_S:g} s and was killed")
 
 
 class WorkerInterrupted(WorkerLost):
-    """The parent ended the worker process because it did not react to Ctrl-C while it was starting its work."""
+    """The parent killed the worker process because it did not react to Ctrl-C while it was starting its work."""
 
 
 @dataclass(eq=False)
 class _Worker:
-    """A worker process and the threads that use its pipes, so that the main thread never waits for a pipe.
+    """Worker process and the threads that use its pipes, so that the main thread never waits for a pipe.
 
     Attributes
     ----------
-    process : the process, with pipes to all three of its standard streams
-    outbox : messages to the worker; None allows it to end
-    tasks : tasks sent to it, each with the number of processes that have lost it: the first is being done, the rest
-        wait in the pipe
-    ready : whether it has sent its first sign of life
-    heard : whether it has confirmed Ctrl-C
-    signs : number of signs of life that arrived after Ctrl-C and did not confirm it
-    since : time at which it began the first task [s]
-    took : duration of its last task [s]
-    silent : time since its last message [s]
-    said : the last lines of its stderr
+    process : Popen
+        The process, with pipes to its three standard streams.
+    outbox : SimpleQueue
+        Messages to the worker; None allows it to end.
+    tasks : deque
+        Tasks sent to it, each with the number of processes that have lost it. The first is in progress, the others wait
+        in the pipe.
+    ready : bool
+        Whether it has sent its first heartbeat.
+    confirmed : bool
+        Whether it has confirmed Ctrl-C.
+    heartbeats : int
+        Number of heartbeats that arrived after Ctrl-C without a confirmation.
+    since : float
+        Time at which it began the first task [s].
+    last_duration : float
+        Duration of its last task [s].
+    silent : float
+        Time since its last message [s].
+    stderr_lines : deque of str
+        The last lines of its stderr.
     """
 
     process: subprocess.Popen[bytes]
     outbox: SimpleQueue[bytes | None] = field(default_factory=SimpleQueue)
     tasks: deque[tuple[Any, int]] = field(default_factory=deque)
     ready: bool = False
-    heard: bool = False
-    signs: int = 0
+    confirmed: bool = False
+    heartbeats: int = 0
     since: float = 0.0
-    took: float = math.inf
+    last_duration: float = math.inf
     silent: float = 0.0
-    said: deque[str] = field(default_factory=lambda: deque(maxlen=_LAST_LINES))
+    stderr_lines: deque[str] = field(default_factory=lambda: deque(maxlen=_LAST_LINES))
     threads: list[threading.Thread] = field(default_factory=list)
     printing: threading.Lock = field(default_factory=threading.Lock)
 
     def begin(self, inbox: SimpleQueue[tuple[_Worker, tuple[Any, ...] | None]]) -> None:
-        """Start the threads; they put the worker's messages into the inbox, and None at its end."""
-        for talk, *arguments in ((self._send,), (self._receive, inbox), (self._hear,)):
+        """Start the threads; they put the messages of the worker into the inbox, and None at their end."""
+        for talk, *arguments in ((self._send,), (self._receive, inbox), (self._forward_stderr,)):
             self.threads.append(threading.Thread(target=talk, args=arguments, name="worker", daemon=True))
             self.threads[-1].start()
 
@@ -126,30 +136,30 @@ class _Worker:
                 inbox.put((self, pickle.load(stream)))
         inbox.put((self, None))
 
-    def _hear(self) -> None:
-        """Forward the worker's stderr; before it is ready, only keep the lines for the error of a failed start."""
+    def _forward_stderr(self) -> None:
+        """Forward the stderr of the worker; before it is ready, only keep the lines for the error of a failed start."""
         assert self.process.stderr is not None
         with suppress(OSError, ValueError), self.process.stderr as stream:
             for line in stream:
                 with self.printing:
-                    self.said.append(line.decode("utf-8", "replace").rstrip())
+                    self.stderr_lines.append(line.decode("utf-8", "replace").rstrip())
                     if self.ready:
-                        _print(self.said[-1])
+                        _print(self.stderr_lines[-1])
 
     def is_ready(self) -> None:
-        """Mark the worker as ready after its first sign of life, and print the stderr lines kept until then."""
+        """Mark the worker as ready after its first heartbeat, and print the stderr lines kept until then."""
         with self.printing:
             self.ready = True
-            for line in self.said:
+            for line in self.stderr_lines:
                 _print(line)
 
     @property
     def room(self) -> int:
         """Number of further tasks to send; a quick task is sent early, so that the worker need not wait for it."""
-        return (2 if self.took < _QUICK_S else 1) - len(self.tasks)
+        return (2 if self.last_duration < _QUICK_S else 1) - len(self.tasks)
 
     def leave(self) -> None:
-        """End the process, which has nothing more to do or has already ended."""
+        """End the process, which has no more tasks or has already ended."""
         self.outbox.put(None)
         try:
             self.process.wait(_PATIENCE_S)
@@ -174,17 +184,23 @@ def run_in_processes(
     *,
     attempts: int = 1,
 ) -> bool:
-    """Do ``work(task, look)`` for every task, each in one of several processes.
+    """Do ``work(task, look)`` for every task, in several processes.
 
     Parameters
     ----------
-    work : function of an importable module; it calls ``look`` often, which raises KeyboardInterrupt when it must stop
-    tasks : sent to the processes one by one, as these become free; a quick task is sent one ahead
-    jobs : number of processes
-    take : called in this process with every task and a function that returns the result, or raises the exception of the
-        work or :class:`WorkerLost`; the result is None if Ctrl-C came before the task began. Tasks that no process had
-        at Ctrl-C get no call. A task whose process was silent is given up immediately
-    attempts : number of processes that a task may lose before it is given up
+    work : callable
+        Function of an importable module. It must call ``look`` often, which raises KeyboardInterrupt to stop it.
+    tasks : iterable
+        Tasks; they are sent to the processes one at a time as these become free, or one ahead if tasks are quick.
+    jobs : int
+        Number of processes.
+    take : callable
+        Called in this process with each task and a function that returns its result, or raises the exception of the
+        work or :class:`WorkerLost`. The result is None if Ctrl-C came before the task began. ``take`` is not called for
+        tasks that had not been sent to a process at Ctrl-C.
+    attempts : int, optional
+        Number of processes that a task may lose before it is given up; a task whose process stopped responding is given
+        up immediately.
 
     Returns
     -------
@@ -239,7 +255,7 @@ class _Pool:
             worker.outbox.put(pickle.dumps((messages.STOP,)))
 
     def collect(self) -> None:
-        """Hand out tasks and take results until no more are expected; signals wait while this process works."""
+        """Send tasks and take results until no more are expected; signals are deferred while this process works."""
         looked = clock.monotonic()
         while True:
             interruption.keep()
@@ -252,10 +268,10 @@ class _Pool:
                 worker, message = self._inbox.get(timeout=_SIGNAL_S)
                 # A worker that this process has ended may have left messages.
                 if worker in self.workers:
-                    self._heed(worker, message)
+                    self._handle(worker, message)
             # If this process was stopped for a while, for example by Ctrl-Z, it has not looked for messages either.
             passed, looked = min(clock.monotonic() - looked, 2.0 * LOOK_S), clock.monotonic()
-            self._give_up(passed)
+            self._end_unresponsive(passed)
             interruption.heed()
             interruption.check()
 
@@ -277,21 +293,21 @@ class _Pool:
             worker.tasks.append(task)
             worker.outbox.put(pickle.dumps((messages.TASK, content)))
 
-    def _heed(self, worker: _Worker, message: tuple[Any, ...] | None) -> None:
+    def _handle(self, worker: _Worker, message: tuple[Any, ...] | None) -> None:
         """Handle a message of a worker; None at the end of its output."""
         worker.silent = 0.0
         match message:
             case (messages.READY,):
                 worker.is_ready()
-            case (messages.HEARD,):
-                worker.heard = True
+            case (messages.CONFIRMED,):
+                worker.confirmed = True
             case (messages.ALIVE,):
-                worker.signs += self._stopped is not None
+                worker.heartbeats += self._stopped is not None
             case (messages.LOG, name, level, text):
                 logging.getLogger(name).log(level, "%s", text)
             case (messages.ANSWER, good, content, leaves):
                 now = clock.monotonic()
-                worker.since, worker.took = now, now - worker.since
+                worker.since, worker.last_duration = now, now - worker.since
                 task, _ = worker.tasks.popleft()
                 if leaves:
                     self._dismiss(worker)
@@ -313,19 +329,22 @@ class _Pool:
             self._take(task, partial(_raise, WorkerLost if worker.ready else WorkerInterrupted))
 
     def _dismiss(self, worker: _Worker) -> None:
-        """Remove a worker that has ended or will end, and send the tasks that wait in its pipe again."""
+        """Remove a worker that has ended or will end, and return the tasks that wait in its pipe to the queue."""
         self.workers.remove(worker)
         worker.leave()
         self._again.extend(worker.tasks)
         worker.tasks.clear()
 
-    def _give_up(self, passed: float) -> None:
-        """End workers that are silent or do not confirm Ctrl-C in time; ``passed`` : time since the last look [s]."""
+    def _end_unresponsive(self, passed: float) -> None:
+        """End workers that stopped responding or do not confirm Ctrl-C in time.
+
+        ``passed`` is the time since the last call [s].
+        """
         for worker in [worker for worker in self.workers if worker.tasks]:
             worker.silent += passed
             if worker.silent > (SILENT_S if worker.ready else START_S):
                 kind: type[WorkerLost] = WorkerSilent
-            elif self._stopped is not None and not worker.heard and self._is_deaf(worker, self._stopped):
+            elif self._stopped is not None and not worker.confirmed and self._is_unresponsive(worker, self._stopped):
                 kind = WorkerInterrupted
             else:
                 continue
@@ -335,12 +354,12 @@ class _Pool:
             self._take(task, partial(_raise, kind))
 
     @staticmethod
-    def _is_deaf(worker: _Worker, stopped: float) -> bool:
-        """Whether a worker has had enough time to confirm Ctrl-C, which came at ``stopped`` [s]."""
+    def _is_unresponsive(worker: _Worker, stopped: float) -> bool:
+        """Return whether a worker had enough time to confirm Ctrl-C, which came at ``stopped`` [s]."""
         waited = clock.monotonic() - stopped
         if not worker.ready:
             return waited > _PATIENCE_S
-        return worker.signs * STOP_LOOK_S > _PATIENCE_S or waited > _STALLED_S
+        return worker.heartbeats * STOP_LOOK_S > _PATIENCE_S or waited > _STALLED_S
 
 
 def _raise(kind: type[WorkerLost]) -> NoReturn:
@@ -357,17 +376,18 @@ def _result(good: bool, content: bytes) -> Any:
 def _beginning(work: Any) -> bytes:
     """Return the first messages to a worker, see :func:`dynsim.studies.worker.serve`.
 
-    The worker searches for dynsim in the working directory last, so that a ``json.py`` there does not replace Python's.
+    The worker searches for dynsim in the working directory last, so that a ``json.py`` there does not replace the
+    standard module.
     """
     here = ("", os.curdir, os.getcwd() if os.path.isdir(os.curdir) else "")
     path = [folder for folder in sys.path if isinstance(folder, str)]
     safe = sorted(path, key=lambda folder: folder in here)
-    return pickle.dumps(safe) + pickle.dumps((path, _heard_from(), packed(work)))
+    return pickle.dumps(safe) + pickle.dumps((path, _log_level(), packed(work)))
 
 
 def _start(beginning: bytes, inbox: SimpleQueue[tuple[_Worker, tuple[Any, ...] | None]]) -> _Worker:
     if not sys.executable:
-        raise WorkerError("no Python is known that processes could be started with; take one job")
+        raise WorkerError("no Python interpreter found to start worker processes; use jobs=1")
     try:
         with signals_held():
             process = subprocess.Popen(
@@ -375,7 +395,7 @@ def _start(beginning: bytes, inbox: SimpleQueue[tuple[_Worker, tuple[Any, ...] |
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
             )  # fmt: skip
     except OSError as error:
-        raise WorkerError(f"no process can be started ({error}); take fewer jobs") from error
+        raise WorkerError(f"cannot start a worker process ({error}); use fewer jobs") from error
     worker = _Worker(process)
     worker.outbox.put(beginning)
     worker.begin(inbox)
@@ -385,27 +405,26 @@ def _start(beginning: bytes, inbox: SimpleQueue[tuple[_Worker, tuple[Any, ...] |
 def _no_start(worker: _Worker) -> str:
     code = worker.process.returncode
     how = f"was ended by signal {-code}" if code < 0 else f"ended with exit code {code}"
-    said = "".join(f"\n  {line}" for line in worker.said) or " nothing"
-    return f"a process that was started for the jobs {how} before it could work; is memory short? It said:{said}"
+    output = "".join(f"\n  {line}" for line in worker.stderr_lines) or " nothing"
+    return f"a worker process {how} while starting; if memory is short, use fewer jobs; its output:{output}"
 
 
-def _heard_from() -> int:
+def _log_level() -> int:
     """Return the lowest log level for which a handler exists; workers need not create messages below it."""
     library = logging.getLogger("dynsim")
-    asked: logging.Logger | None = library
-    while asked is not None:
-        if any(not isinstance(handler, logging.NullHandler) for handler in asked.handlers):
+    logger: logging.Logger | None = library
+    while logger is not None:
+        if any(not isinstance(handler, logging.NullHandler) for handler in logger.handlers):
             return library.getEffectiveLevel()
-        asked = asked.parent if asked.propagate else None
+        logger = logger.parent if logger.propagate else None
     return logging.CRITICAL + 1
 
 
 @contextmanager
 def signals_held() -> Iterator[None]:
-    """Shield processes that start in the block from the terminal's Ctrl-C; this process gets it after the block.
+    """Shield processes that start in the block from Ctrl-C in the terminal; this process receives it after the block.
 
-    Only the parent reacts to Ctrl-C, wherever it was sent, and informs the workers; the same applies to the other
-    ``STOP_SIGNALS``.
+    Only the parent reacts to Ctrl-C and informs the workers; the same applies to the other ``STOP_SIGNALS``.
     """
     if not hasattr(signal, "pthread_sigmask"):
         yield

@@ -1,4 +1,4 @@
-"""A sweep: carries out its runs, continues from its journal, writes the table of results and statistics."""
+"""Sweeps: run the runs of a plan, resume from the journal, and write the table of results and its statistics."""
 
 from __future__ import annotations
 
@@ -26,15 +26,12 @@ from dynsim.studies.sweep_plan import Plan, SweepPoint
 from dynsim.studies.worker import WorkerError
 from dynsim.system.files import check_writable, held_folder, json_text, replacing, write_text
 
-# Columns of a table of runs: flat numbers of a summary, kinds of values, CSV text.
-
-
-# Excluded: names, which have columns of their own, and computing times, which are not reproducible.
-_NOT_OF_THE_RUN = ("scenario", "variant", "dynsim_version", "integration_wall_s", "real_time_factor")
+# Not among the numbers of a run: names, which have separate columns, and computing times, which are not reproducible.
+_EXCLUDED = ("scenario", "variant", "dynsim_version", "integration_wall_s", "real_time_factor")
 
 
 def flat(summary: dict[str, Any]) -> dict[str, Any]:
-    """A summary whose numbers of a mobile base and of motors stand beside the others, as ``base.…`` and ``JOINT.…``."""
+    """Return a summary with the numbers of mobile base and motors at the top level, as ``base.…`` and ``JOINT.…``."""
     base = dict(summary.get("base", {}))
     for key in [key for key, value in base.items() if isinstance(value, dict)]:
         base.update({f"{key}.{name}": value for name, value in base.pop(key).items()})
@@ -48,33 +45,33 @@ def flat(summary: dict[str, Any]) -> dict[str, Any]:
 
 
 def is_text(value: Any) -> bool:
-    """True for a text, which has no place in a column of numbers."""
+    """Return whether a value is text, which cannot be in a column of numbers."""
     return isinstance(value, str)
 
 
 def is_scalar(value: Any) -> bool:
-    """True for a number, a text or nothing."""
+    """Return whether a value is a number, text or None."""
     return value is None or isinstance(value, (int, float, str))
 
 
 def is_finite(value: Any) -> bool:
-    """True for a finite number of double precision."""
+    """Return whether a value is a number that is finite in double precision."""
     return isinstance(value, (int, float)) and abs(value) <= sys.float_info.max
 
 
 def numbers(summary: dict[str, Any]) -> dict[str, Any]:
-    """All finite numbers of a summary that do not depend on the machine; those of contacts under ``CONTACT.…``."""
+    """Return all finite numbers of a summary that do not depend on the machine; contacts under ``CONTACT.…``."""
     values = flat(summary)
     for key, value in summary.items():
         if isinstance(value, dict) and key != "base":
             values |= {f"{key}.{name}": entry for name, entry in value.items()}
     for contact in summary.get("contacts", ()):
         values |= {f"{contact['name']}.{key}": value for key, value in contact.items()}
-    return {key: value for key, value in values.items() if is_finite(value) and key not in _NOT_OF_THE_RUN}
+    return {key: value for key, value in values.items() if is_finite(value) and key not in _EXCLUDED}
 
 
 def csv_table(names: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
-    """CSV of rows by column: all digits, an empty field for nothing."""
+    """Return rows as CSV text, with all digits and empty fields for missing values."""
     stream = io.StringIO()
     writer = csv.DictWriter(stream, names, lineterminator="\n")
     writer.writeheader()
@@ -82,9 +79,7 @@ def csv_table(names: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
     return stream.getvalue()
 
 
-# The journal of a sweep: one line per finished run, from which an interrupted sweep is continued.
-
-
+# The journal of a sweep has one line per completed run; an interrupted sweep is resumed from it.
 PLAN, JOURNAL = "sweep.json", "runs.jsonl"
 OK, FAILED, LOST = "ok", "failed", "lost"
 
@@ -95,11 +90,16 @@ class SweepRow:
 
     Attributes
     ----------
-    run, variant, values : see :class:`dynsim.studies.sweep_plan.SweepPoint`
-    status : ``ok``, ``failed`` (and would again) or ``lost`` with its process
-    reason : why it failed
-    numbers : of its summary, see :func:`dynsim.studies.sweep.numbers`
-    warnings : of its summary, in a line
+    run, variant, values
+        See :class:`dynsim.studies.sweep_plan.SweepPoint`.
+    status : str
+        ``ok``, ``failed`` (reproducibly) or ``lost`` (with its process).
+    reason : str
+        Reason for the failure.
+    numbers : mapping of str to float
+        Numbers of its summary, see :func:`dynsim.studies.sweep.numbers`.
+    warnings : str
+        Warnings of its summary, in one line.
     """
 
     run: int
@@ -112,24 +112,24 @@ class SweepRow:
 
     @classmethod
     def of(cls, point: SweepPoint, result: RunResult) -> SweepRow:
-        """A result as a row."""
+        """Create the row of a result."""
         status = OK if result.ok else LOST if result.lost else FAILED
         warnings = "; ".join(result.summary.get("warnings", ()))
         return cls(point.run, point.variant, point.values, status, result.reason, numbers(result.summary), warnings)
 
     @classmethod
     def read(cls, line: str) -> SweepRow:
-        """A line of a journal as a row.
+        """Parse a line of a journal.
 
         Raises
         ------
         ValueError
-            It is none.
+            If the line is not a valid row.
         """
         data = json.loads(line)
         names = [field.name for field in fields(cls)]
         if not isinstance(data, dict) or set(data) != set(names):
-            raise ValueError(f"is no run with {', '.join(names)}")
+            raise ValueError(f"expected the keys {', '.join(names)}")
         row = cls(**data)
         fits = {
             "run": type(row.run) is int and row.run >= 0,
@@ -142,11 +142,11 @@ class SweepRow:
         }
         for name in names:
             if not fits[name]:
-                raise ValueError(f"{name} = {brief(data[name])} is nothing that dynsim has written")
+                raise ValueError(f"invalid {name} = {brief(data[name])}")
         return row
 
     def placed(self, point: SweepPoint) -> SweepRow:
-        """This row, in the place that another plan has for it."""
+        """Return this row with number, variant and values of a point of another plan."""
         return SweepRow(point.run, point.variant, point.values, self.status, self.reason, self.numbers, self.warnings)
 
     @property
@@ -155,25 +155,25 @@ class SweepRow:
         return SweepPoint(self.run, self.variant, self.values).identity
 
     def cells(self) -> dict[str, Any]:
-        """By column."""
+        """Return the cells of the row by column."""
         variant = {} if self.variant is None else {"variant": self.variant}
         ended = {"status": self.status, "reason": self.reason}
         return {"run": self.run, **variant, **self.values, **ended, **self.numbers, "warnings": self.warnings}
 
 
 class SweepJournal:
-    """The file, with rows that are known written anew, open for those that come.
+    """Journal file of a sweep: written again with the known rows, then open for further rows.
 
     Raises
     ------
     RecordError
-        It cannot be written.
+        If it cannot be written.
     """
 
     def __init__(self, folder: Path, rows: Iterable[SweepRow]) -> None:
         self._path = folder / JOURNAL
         write_text(self._path, "".join(map(_line, rows)))
-        # Without a buffer, which would be written once more at the end of a disk that is full.
+        # Unbuffered: closing the file on a full disk would try to write a buffer again.
         self._stream = self._path.open("ab", buffering=0)
 
     def __enter__(self) -> SweepJournal:
@@ -183,12 +183,12 @@ class SweepJournal:
         self._stream.close()
 
     def add(self, row: SweepRow) -> None:
-        """Write a row.
+        """Append a row.
 
         Raises
         ------
         RecordError
-            It cannot be written; a part of its line may be there, which is not read again.
+            If it cannot be written; a part of its line may remain, which is ignored when the journal is read.
         """
         content = _line(row).encode("utf-8")
         try:
@@ -203,28 +203,40 @@ def _line(row: SweepRow) -> str:
 
 
 def earlier_rows(folder: Path, header: Mapping[str, Any], resume: bool, tables: Iterable[str]) -> dict[str, SweepRow]:
-    """Rows of a folder's journal by their identity, but for lost ones; ``header`` is what they must be of.
+    """Return the rows of the journal in a folder by identity, except lost ones.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the sweep.
+    header : mapping
+        Header of the new sweep, which the existing one must match.
+    resume : bool
+        Whether an existing sweep may be resumed.
+    tables : iterable of str
+        Names of the tables of a sweep.
 
     Raises
     ------
     ScenarioError
-        There is a sweep and ``resume`` is not asked for, or one of another scenario, other overrides or another dynsim.
+        If the folder contains a sweep and ``resume`` is False, or a sweep with another scenario, other overrides or
+        another version of dynsim.
     RecordError
-        A file is damaged or missing.
+        If a file is damaged or missing.
     """
     journal = folder / JOURNAL
     if not journal.exists():
         left = [name for name in tables if (folder / name).exists()]
         if resume and left:
             raise RecordError(
-                f"{journal}: is missing, though {left[0]} beside it is of a sweep; put it back, or remove {left[0]} "
-                "to run everything again, or give another --out"
+                f"{journal} is missing, although {left[0]} next to it belongs to a sweep; restore it, delete {left[0]} "
+                "to run everything again, or choose another --out"
             )
         return {}
     if not resume:
-        raise ScenarioError(f"{folder} holds a sweep: --resume goes on with it; or give another --out, or remove it")
+        raise ScenarioError(f"{folder} already contains a sweep; add --resume, choose another --out, or delete it")
     _check_header(folder / PLAN, header)
-    # What is no text is found with its line; only a line that has an end was written to it.
+    # Decoded line by line so that an error names its line; a line without an end was not written completely.
     *lines, _ = _content(journal).split(b"\n")
     rows = {}
     for number, line in enumerate(lines, start=1):
@@ -232,7 +244,7 @@ def earlier_rows(folder: Path, header: Mapping[str, Any], resume: bool, tables: 
             row = SweepRow.read(line.decode("utf-8"))
         except (ValueError, RecursionError) as error:
             raise RecordError(
-                f"{journal}, line {number}: is damaged ({error}); remove that line, and --resume does its run again"
+                f"{journal}, line {number}: damaged ({error}); delete this line, and --resume repeats its run"
             ) from error
         if row.status != LOST:
             rows[row.identity] = row
@@ -240,24 +252,24 @@ def earlier_rows(folder: Path, header: Mapping[str, Any], resume: bool, tables: 
 
 
 def _check_header(path: Path, header: Mapping[str, Any]) -> None:
-    """Refuse a sweep of anything else."""
-    fix = f"put it back, or remove {path.parent}, or give another --out"
+    """Raise if the folder contains a different sweep."""
+    fix = f"restore it, delete {path.parent}, or choose another --out"
     if not path.exists():
-        raise RecordError(f"{path}: is missing, so that nobody knows what the runs beside it are of; {fix}")
+        raise RecordError(f"{path} is missing, so the runs next to it cannot be identified; {fix}")
     try:
         before = json.loads(_content(path))
     except (ValueError, RecursionError) as error:
-        raise RecordError(f"{path}: is damaged ({error}); {fix}") from error
+        raise RecordError(f"{path}: damaged ({error}); {fix}") from error
     now = json.loads(json_text(header))
     keys = ("scenario", "overrides", "dynsim_version", "commit")
     if not isinstance(before, dict) or not before.keys() >= set(keys):
-        raise RecordError(f"{path}: is damaged, or not of a sweep (it has not all of {', '.join(keys)}); {fix}")
+        raise RecordError(f"{path}: damaged, or not from a sweep (it must have {', '.join(keys)}); {fix}")
     for key in keys:
         if type(before[key]) is not type(now[key]) and None not in (before[key], now[key]):
-            raise RecordError(f"{path}: is damaged ({key} = {brief(before[key])}); {fix}")
+            raise RecordError(f"{path}: damaged ({key} = {brief(before[key])}); {fix}")
         if before[key] != now[key]:
             raise ScenarioError(
-                f"{path.parent} holds a sweep of another {key}, which cannot be gone on with: give another --out"
+                f"the sweep in {path.parent} differs in {key} and cannot be resumed; choose another --out"
             )
 
 
@@ -265,7 +277,9 @@ def _content(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        raise RecordError(f"{path}: cannot be read ({error.strerror}); change that, or give another --out") from error
+        raise RecordError(
+            f"{path}: cannot be read ({error.strerror}); fix permissions or choose another --out"
+        ) from error
 
 
 TABLES = ("sweep.csv", "sweep.parquet")
@@ -283,38 +297,46 @@ def run_sweep(
     progress: Callable[[int, int], None] | None = None,
     ended: Callable[[SweepRow], None] | None = None,
 ) -> list[SweepRow]:
-    """Carry out the runs of a plan; write plan, journal, records, tables and statistics of samples to a folder.
+    """Run a plan; write plan, journal, records, tables and statistics of the samples to a folder.
 
     Parameters
     ----------
-    folder : for the files; the journal ``runs.jsonl`` has a line for every run that is done, as soon as it is
-    jobs, keep_records, scheduler : see :func:`dynsim.studies.batch.simulate_batch`
-    resume : take over what the folder's journal has of the same scenario; only lost runs and those not there are run
-    progress : called with how many runs are done and how many of them have failed
-    ended : called with every run that is done, also with those taken over
+    plan : Plan
+        Runs of the sweep.
+    folder : Path
+        Output folder; each run is appended to the journal ``runs.jsonl`` as soon as it is done.
+    jobs, keep_records, scheduler
+        See :func:`dynsim.studies.batch.simulate_batch`.
+    resume : bool, optional
+        Take completed runs of the same scenario from the journal in the folder; only missing and lost runs are
+        simulated.
+    progress : callable, optional
+        Called with the numbers of completed and of failed runs.
+    ended : callable, optional
+        Called with the row of every completed run, including those taken from the journal.
 
     Returns
     -------
     list of SweepRow
-        In the order of the plan, the same whatever the jobs and the order in which they ended.
+        Rows in the order of the plan, independent of the number of jobs and the order of completion.
 
     Raises
     ------
     ScenarioError
-        The folder holds a sweep and ``resume`` is not asked for, or one of another scenario; the first run of a
-        variant is none (a key is misspelt), so that nothing is run.
+        If the folder contains a sweep and ``resume`` is False, or a sweep of another scenario; or if the first run of a
+        variant is invalid (for example a misspelt key), before anything is simulated.
     SimulationInterrupted
-        Ctrl-C; tables of what was done are written.
+        On Ctrl-C; tables of the completed runs are written.
     RecordError
-        A file cannot be written, or one of the sweep that is gone on with is damaged; another process is at work there.
+        If a file cannot be written, a file of the resumed sweep is damaged, or another process is using the folder.
     WorkerError, ClusterError
-        No process can be started; see :func:`dynsim.studies.cluster.run_on_cluster`.
+        If no process can be started; see :func:`dynsim.studies.cluster.run_on_cluster`.
     """
     points = list(plan.points())
     check_writable(folder, (PLAN, JOURNAL, *TABLES, STATISTICS))
     if keep_records != "none":
         check_writable(folder / RECORDS)
-    # A key that no scenario has would fail in every run: the first of each variant tells.
+    # A misspelt key would fail in every run, so the first run of each variant is checked in advance.
     for point in {point.variant: point for point in reversed(points)}.values():
         plan.scenario(point)
     header = _header(plan)
@@ -323,13 +345,13 @@ def run_sweep(
         rows = {point.run: earlier[point.identity].placed(point) for point in points if point.identity in earlier}
         left = [point for point in points if point.run not in rows]
         failed = sum(row.status != OK for row in rows.values())
-        with _goes_on(folder):
+        with _resumable(folder):
             write_text(folder / PLAN, json_text(header))
             with SweepJournal(folder, rows.values()) as journal:
 
                 def take(point: SweepPoint, result: RunResult) -> None:
                     nonlocal failed
-                    # Before its row: a run that has one is not run again.
+                    # The record is saved before the row, because a run with a row is not repeated.
                     if result.record is not None:
                         save_run(result.record, folder / RECORDS / f"{point.run:06d}")
                     row = rows[point.run] = SweepRow.of(point, result)
@@ -352,21 +374,21 @@ def run_sweep(
             if plan.laws:
                 write_text(folder / STATISTICS, json_text(statistics(done, plan)))
     if interrupted:
-        raise SimulationInterrupted(f"interrupted when {len(done)} of {len(points)} runs were done; --resume goes on")
+        raise SimulationInterrupted(f"interrupted after {len(done)} of {len(points)} runs; continue with --resume")
     return done
 
 
 @contextmanager
-def _goes_on(folder: Path) -> Iterator[None]:
-    """A full disk, no process or no cluster costs none of the runs that are done."""
+def _resumable(folder: Path) -> Iterator[None]:
+    """Add to errors that completed runs are kept: a full disk, no process or no cluster only stops the sweep."""
     try:
         yield
     except (RecordError, WorkerError, ClusterError) as error:
-        raise type(error)(f"{error}; --resume goes on with the runs that are in {folder / JOURNAL}") from error
+        raise type(error)(f"{error}; completed runs are in {folder / JOURNAL}; continue with --resume") from error
 
 
 def _header(plan: Plan) -> dict[str, Any]:
-    """What rows must share to stand in one table, and how these came about."""
+    """Return the data that rows of one table must share, and the plan of the sweep."""
     return {
         "dynsim_version": __version__,
         "commit": commit(),
@@ -384,19 +406,19 @@ def _header(plan: Plan) -> dict[str, Any]:
 
 
 def columns(rows: Sequence[SweepRow]) -> list[str]:
-    """Columns of the table: of all rows, in the order in which the first that has one has it."""
+    """Return the columns of the table: those of all rows, in order of first occurrence."""
     names = dict.fromkeys(name for row in rows for name in row.cells())
     # Failed runs have no numbers.
     return [*(name for name in names if name != "warnings"), "warnings"]
 
 
 def write_tables(rows: Sequence[SweepRow], plan: Plan, folder: Path) -> None:
-    """Write ``sweep.csv`` and, with pyarrow, ``sweep.parquet``: all digits, an empty field or null for no number.
+    """Write ``sweep.csv`` and, with pyarrow, ``sweep.parquet``, with all digits; missing numbers are empty or null.
 
     Raises
     ------
     RecordError
-        A file cannot be written.
+        If a file cannot be written.
     """
     names = columns(rows)
     write_text(folder / TABLES[0], csv_table(names, [row.cells() for row in rows]))
@@ -405,7 +427,7 @@ def write_tables(rows: Sequence[SweepRow], plan: Plan, folder: Path) -> None:
 
 
 def has_parquet() -> bool:
-    """Whether pyarrow is there."""
+    """Return whether pyarrow is installed."""
     try:
         import pyarrow.parquet  # noqa: F401
     except ImportError:
@@ -426,7 +448,7 @@ def _write_parquet(rows: Sequence[SweepRow], names: Sequence[str], path: Path, p
         try:
             arrays.append(pyarrow.array(column))
         except (pyarrow.ArrowInvalid, pyarrow.ArrowTypeError, OverflowError):
-            # A grid of numbers and texts.
+            # A grid with numbers and texts.
             arrays.append(pyarrow.array([None if value is None else json.dumps(value) for value in column]))
     table = pyarrow.table(arrays, names=list(names))
     described = {"dynsim": json.dumps(json.loads(json_text(_header(plan))))}
@@ -437,10 +459,12 @@ def _write_parquet(rows: Sequence[SweepRow], names: Sequence[str], path: Path, p
 
 
 def statistics(rows: Sequence[SweepRow], plan: Plan) -> list[dict[str, Any]]:
-    """For each variant and place of the grid: runs, those without numbers, and of each number that all others have
+    """Return statistics for each variant and grid point.
 
-    its :class:`dynsim.record.sensitivity.Spread` and, where a line fits, what one standard deviation of each drawn key
-    does to it (``effect``, with the half width of its interval) and how much of the variance the line explains.
+    Each entry has the number of runs, the number of failed runs, and for every number that all successful runs have its
+    :class:`dynsim.record.sensitivity.Spread`. If a linear model can be fitted, it also has the change of the number per
+    standard deviation of each sampled key (``effect``, with the half-width of its confidence interval) and the fraction
+    of the variance that the model explains.
     """
     groups: dict[str, list[SweepRow]] = {}
     for row in rows:

@@ -17,58 +17,56 @@ from dynsim.errors import ScenarioError
 from dynsim.scenario import Scenario, ScenarioFile, SetOptions
 from dynsim.system.inputs import parse_yaml
 
-# More runs than this are refused as a mistake.
-RUNS_MOST = 10_000_000
+# More runs than this are rejected as a mistake.
+MAX_RUNS = 10_000_000
 ANY = "*"
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _RANGE = re.compile(rf"({_NUMBER}):({_NUMBER}):(\d+)")
-# A range without its count, or with one that is no whole number.
+# A range whose count is missing or not an integer.
 _HALF_RANGE = re.compile(rf"({_NUMBER}):({_NUMBER})(:.*)?")
 _LAW = re.compile(rf"(\w+)\(\s*({_NUMBER})\s*,\s*({_NUMBER})\s*\)")
-# Distributions of samples, and the meanings of their two numbers.
-LAWS = {"normal": "mean, standard deviation", "uniform": "least, greatest"}
+# Distributions of samples, and their two parameters.
+LAWS = {"normal": "mean, standard deviation", "uniform": "minimum, maximum"}
 
 
 @dataclass(frozen=True)
 class Axis:
-    """A key of the scenario and the values that it takes one after the other."""
+    """Scenario key and its values, one after the other."""
 
     key: str
     values: tuple[Any, ...]
 
     @classmethod
     def parse(cls, text: str) -> Axis:
-        """``KEY=start:stop:count``, both ends included, or ``KEY=a,b,…``.
+        """Parse ``KEY=start:stop:count``, both ends included, or ``KEY=a,b,…``.
 
         Raises
         ------
         ScenarioError
-            Neither of them.
+            If the text has neither form, or its values are invalid.
         """
         key, value = _split(text, "--grid", "contacts.friction=0:1:5 or contacts.friction=0,0.1")
         if match := _RANGE.fullmatch(value):
             start, stop, count = float(match[1]), float(match[2]), int(match[3])
-            if not 2 <= count <= RUNS_MOST:
-                raise ScenarioError(
-                    f"--grid {text}: the count must be 2 or more, as both ends are included, and at most {RUNS_MOST}"
-                )
-            # Twelve digits: 0.3 and not 0.30000000000000004.
+            if not 2 <= count <= MAX_RUNS:
+                raise ScenarioError(f"--grid {text}: count must be between 2 (both ends are included) and {MAX_RUNS}")
+            # Twelve digits: 0.3 instead of 0.30000000000000004.
             return cls(key, tuple(float(f"{x:.12g}") for x in np.linspace(start, stop, count)))
         if match := _HALF_RANGE.fullmatch(value):
             example = f"{key}={match[1]}:{match[2]}:5"
-            raise ScenarioError(f"--grid {text}: must be start:stop:count with a whole count, such as {example}")
+            raise ScenarioError(f"--grid {text}: must be start:stop:count with an integer count, such as {example}")
         values = parse_yaml(f"[{value}]", ScenarioError, f"--grid {key}", line_numbers=False)
         if not values:
             raise ScenarioError(f"--grid {text}: has no values")
         if len(set(map(json.dumps, values))) < len(values):
-            raise ScenarioError(f"--grid {text}: has a value twice")
+            raise ScenarioError(f"--grid {text}: repeats a value")
         return cls(key, tuple(values))
 
 
 @dataclass(frozen=True)
 class Law:
-    """A key of the scenario and the law that its values are drawn by: see ``LAWS`` for what the two numbers are."""
+    """Scenario key and the distribution of its values; ``LAWS`` lists the two numbers of each distribution."""
 
     key: str
     name: str
@@ -76,27 +74,27 @@ class Law:
 
     @classmethod
     def parse(cls, text: str) -> Law:
-        """``KEY=normal(mean,deviation)`` or ``KEY=uniform(least,greatest)``.
+        """Parse ``KEY=normal(mean,deviation)`` or ``KEY=uniform(minimum,maximum)``.
 
         Raises
         ------
         ScenarioError
-            None of them, or a spread that is not positive.
+            If the text has neither form, or the spread is not positive.
         """
         key, value = _split(text, "--sample", "plant.link.mass_kg=normal(0.1,0.005)")
         match = _LAW.fullmatch(value)
         if not match or match[1] not in LAWS:
             known = ", ".join(f"{name}({numbers})" for name, numbers in LAWS.items())
-            raise ScenarioError(f"--sample {text}: no law of that form; laws: {known}")
+            raise ScenarioError(f"--sample {text}: unknown distribution; choices: {known}")
         a, b = float(match[2]), float(match[3])
         if not (b > 0.0 if match[1] == "normal" else b > a):
-            raise ScenarioError(f"--sample {text}: {match[1]}({LAWS[match[1]]}) needs a spread that is positive")
+            raise ScenarioError(f"--sample {text}: {match[1]}({LAWS[match[1]]}) requires a positive spread")
         if not (math.isfinite(a) and math.isfinite(b) and math.isfinite(b - a)):
-            raise ScenarioError(f"--sample {text}: numbers of that size cannot be drawn")
+            raise ScenarioError(f"--sample {text}: parameters must be finite, and so must their difference")
         return cls(key, match[1], (a, b))
 
     def draw(self, key: str, seed: int, count: int) -> list[float]:
-        """Values for one key, the same whatever else is drawn; a longer draw begins like a shorter one."""
+        """Draw values for one key, independently of other keys; a longer draw begins with those of a shorter one."""
         generator = np.random.default_rng([seed, zlib.crc32(key.encode())])
         a, b = self.numbers
         values = generator.normal(a, b, count) if self.name == "normal" else generator.uniform(a, b, count)
@@ -105,7 +103,7 @@ class Law:
 
 @dataclass(frozen=True)
 class SweepPoint:
-    """One run: its number, its variant, and what it changes by dotted key."""
+    """One run of a sweep: its number, its variant, and the values that it changes, by dotted key."""
 
     run: int
     variant: str | None
@@ -113,7 +111,7 @@ class SweepPoint:
 
     @property
     def identity(self) -> str:
-        """The same for the same run of another sweep of the same scenario."""
+        """Text that is equal for equal runs of two sweeps of the same scenario."""
         return json.dumps([self.variant, self.values], sort_keys=True)
 
 
@@ -123,13 +121,21 @@ class Plan:
 
     Attributes
     ----------
-    file : the scenario
-    variants : to run; None for the only one of a file without any
-    overrides : for all runs
-    grid : every value of one with every value of the others; ``*`` in a key stands for all entries, which share it
-    laws : samples, the same at each place of the grid; ``*`` in a key stands for all entries, each drawn by itself
-    count : samples of each place; 1 without laws
-    seed : of the samples
+    file : ScenarioFile
+        The scenario.
+    variants : tuple of str or None
+        Variants to run; (None,) for a file without variants.
+    overrides : mapping
+        Overrides of all runs.
+    grid : tuple of Axis
+        Keys whose values are combined with each other; ``*`` in a key matches all entries, which get the same value.
+    laws : tuple of Law
+        Sampled keys, with the same samples at each grid point; ``*`` in a key matches all entries, which are sampled
+        independently.
+    count : int
+        Number of samples at each grid point; 1 without laws.
+    seed : int
+        Seed of the samples.
     """
 
     file: ScenarioFile
@@ -142,36 +148,36 @@ class Plan:
 
     def __post_init__(self) -> None:
         if not self.grid and not self.laws and len(self.variants) < 2:
-            raise ScenarioError("nothing to sweep: give --grid, --sample or --variants")
+            raise ScenarioError("nothing to sweep; add --grid, --sample or --variants")
         self._check_overlap()
         if self.count < 1:
             raise ScenarioError(f"--count {self.count}: must be 1 or more")
         if self.count > 1 and not self.laws:
-            raise ScenarioError("--count is how often --sample draws; without one all runs would be the same")
-        if self.runs > RUNS_MOST:
-            raise ScenarioError(f"{self.runs} runs: more than {RUNS_MOST}; take fewer values")
+            raise ScenarioError("--count requires --sample; without it all runs would be identical")
+        if self.runs > MAX_RUNS:
+            raise ScenarioError(f"too many runs ({self.runs}, limit {MAX_RUNS}); use fewer values")
 
     def _check_overlap(self) -> None:
-        """Refuse a key that replaces in every run what an earlier one gave, the same or a part of it.
+        """Reject a key that in every run replaces the value of an earlier key: the same key, or one that contains it.
 
-        A part of what an earlier key gave may well be varied: ``plant.link`` by a grid, one of its numbers by a sample.
+        A key may vary a part of an earlier one: ``plant.link`` in a grid, one of its numbers as a sample.
         """
-        # In Python they are a base, of values that may well be varied; who writes --set wants that value.
+        # Overrides from Python are a base whose values may be varied; a value of --set is meant to stay.
         overrides = self.overrides if isinstance(self.overrides, SetOptions) else {}
         options = [("--set", key, [key]) for key in overrides]
         options += [("--grid", axis.key, self._entries(axis.key)) for axis in self.grid]
         options += [("--sample", law.key, self._entries(law.key)) for law in self.laws]
-        # What was given, by itself and by all that it is a part of.
+        # The option that set each key, also for all keys that contain it.
         inside: dict[str, str] = {}
         for option, key, entries in options:
             # Later overrides replace earlier ones, as in every command.
             for entry in entries if option != "--set" else []:
                 if (key_path := _plain(entry)) in inside:
                     other = inside[key_path]
-                    fix = f", or write out the entries of {ANY} that the other leaves" if ANY in key + other else ""
+                    fix = f", or replace {ANY} by the entries that are set only once" if ANY in key + other else ""
                     raise ScenarioError(
-                        f"{option} {key}: replaces what {other} gives {entry}, in every run; "
-                        f"take one of the two away{fix}"
+                        f"{option} {key}: replaces the value of {entry} from {other} in every run; "
+                        f"remove one of the two{fix}"
                     )
             for key_path in map(_plain, entries):
                 parts = key_path.split(".")
@@ -179,45 +185,45 @@ class Plan:
 
     @property
     def runs(self) -> int:
-        """How many there are."""
+        """Number of runs."""
         return len(self.variants) * math.prod(len(axis.values) for axis in self.grid) * self.count
 
     @property
     def sampled(self) -> list[str]:
-        """Keys that are drawn, ``*`` written out."""
+        """Keys that are sampled, with ``*`` expanded."""
         return [key for law in self.laws for key in self._entries(law.key)]
 
     @property
     def parameters(self) -> list[str]:
-        """All keys that are varied, those of the grid first, as the columns of the table have them."""
+        """All keys that are varied, in the order of the table columns: first the grid, then the samples."""
         return [axis.key for axis in self.grid] + self.sampled
 
     def points(self) -> Iterator[SweepPoint]:
-        """All runs: variants outermost, samples innermost."""
+        """Yield all runs; variants are the outer loop, samples the inner loop."""
         drawn = {key: law.draw(key, self.seed, self.count) for law in self.laws for key in self._entries(law.key)}
-        places = itertools.product(self.variants, *(axis.values for axis in self.grid), range(self.count))
-        for run, (variant, *values, k) in enumerate(places):
+        combinations = itertools.product(self.variants, *(axis.values for axis in self.grid), range(self.count))
+        for run, (variant, *values, k) in enumerate(combinations):
             chosen = {axis.key: value for axis, value in zip(self.grid, values, strict=True)}
             yield SweepPoint(run, variant, chosen | {key: draws[k] for key, draws in drawn.items()})
 
     def scenario(self, point: SweepPoint) -> Scenario:
-        """What one run simulates.
+        """Return the scenario of a run.
 
         Raises
         ------
         ScenarioError
-            Its values do not make a scenario.
+            If its values do not make a valid scenario.
         """
         values = {entry: value for key, value in point.values.items() for entry in self._entries(key)}
         return self.file.load(point.variant, {**self.overrides, **values})
 
     def _entries(self, key: str) -> list[str]:
-        """Keys that one with ``*`` stands for, by what the file has before its variants; the key itself without.
+        """Return the keys that match a key with ``*`` in the part of the file before its variants, or the key itself.
 
         Raises
         ------
         ScenarioError
-            The file has no entries there.
+            If ``*`` matches no entries.
         """
         parts = key.split(".")
         if ANY not in parts:
@@ -231,12 +237,12 @@ class Plan:
                 inner += [([*before, name], entries.get(name)) for name in names]
             nodes = inner
         if not nodes:
-            raise ScenarioError(f"{key}: {self.file.path} has no entries that {ANY} could stand for")
+            raise ScenarioError(f"{key}: {self.file.path} has no entries that match {ANY}")
         return [".".join(names) for names, _ in nodes]
 
 
 def _plain(key: str) -> str:
-    """A key with numbers of entries as they are counted: 5 for 05."""
+    """Return a key with entry numbers in plain form: 5 for 05."""
     return ".".join(part.lstrip("0") or "0" if part.isdecimal() else part for part in key.split("."))
 
 

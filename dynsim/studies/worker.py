@@ -1,8 +1,8 @@
 """Worker process for :mod:`dynsim.studies.processes`: it carries out tasks until no more arrive.
 
-Messages are pickles in sequence: tasks on the worker's standard input, answers on its standard output.
-Python's own multiprocessing would run the caller's script again in every worker, and before the script a ``signal.py``
-of the working directory.
+Messages are a sequence of pickles: tasks on the standard input of the worker, answers on its standard output.
+The multiprocessing module of Python would run the script of the caller again in every worker, and before it a
+``signal.py`` in the working directory.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from typing import Any, BinaryIO, NoReturn
 from dynsim.errors import DynsimError
 from dynsim.system import interruption
 
-# Program of a new process. Only the worker uses the pipes: output of its tasks goes to stderr. The first message lists
-# the folders in which Python searches for dynsim.
+# Program of a new process. Only the worker itself uses the pipes; output of its tasks goes to stderr. The first message
+# lists the folders in which Python searches for dynsim.
 START = """
 import os, pickle, sys
 tasks, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
@@ -39,11 +39,11 @@ from dynsim.studies.worker import serve
 serve(tasks, answers)
 """
 
-# Kinds of messages to a worker and from it.
+# Kinds of messages to and from a worker.
 TASK, STOP = "task", "stop"
-READY, ALIVE, HEARD, LOG, ANSWER = "ready", "alive", "heard", "log", "answer"
+READY, ALIVE, CONFIRMED, LOG, ANSWER = "ready", "alive", "confirmed", "log", "answer"
 
-# Interval of a worker's signs of life, and their shorter interval after it was asked to stop [s].
+# Interval of the heartbeats of a worker, and their shorter interval after a stop request [s].
 LOOK_S, STOP_LOOK_S = 0.5, 0.05
 
 
@@ -63,7 +63,7 @@ def packed(value: Any) -> bytes:
     try:
         _Pickler(stream, pickle.HIGHEST_PROTOCOL).dump(value)
     except (pickle.PicklingError, TypeError, AttributeError, RecursionError) as error:
-        raise WorkerError(f"cannot be sent to or from another process: {error}; jobs=1 does without") from error
+        raise WorkerError(f"cannot be sent to another process: {error}; use jobs=1") from error
     return stream.getvalue()
 
 
@@ -80,14 +80,14 @@ class _Pickler(pickle.Pickler):
     def reducer_override(self, value: Any) -> Any:
         if callable(value) and getattr(value, "__module__", None) == "__main__" and hasattr(value, "__qualname__"):
             raise WorkerError(
-                f"{value.__qualname__} is defined in the script or notebook itself, which other processes do not run: "
-                "put it into a module beside it and import it from there; or take jobs=1"
+                f"{value.__qualname__} is defined in the script or notebook itself, which other processes do not run; "
+                "move it to a module and import it, or use jobs=1"
             )
         return NotImplemented
 
 
 class _Answers:
-    """Messages to the parent, each written in one piece, whichever thread sends it."""
+    """Messages to the parent; each is written in one piece, from any thread."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream, self._lock = stream, threading.Lock()
@@ -113,10 +113,9 @@ class _Log(logging.Handler):
 
 @cache
 def keep_memory() -> None:
-    """Let this process keep the memory of a run for the next one: fresh pages would cost a tenth of each run.
+    """Let this process reuse the memory of one run for the next; new pages would cost a tenth of each run.
 
-    This uses glibc's ``mallopt`` with M_MMAP_THRESHOLD and M_TRIM_THRESHOLD, see its manual. Without glibc it has no
-    effect.
+    Sets M_MMAP_THRESHOLD and M_TRIM_THRESHOLD with the ``mallopt`` of glibc, see its manual; no effect without glibc.
     """
     if platform.libc_ver()[0] == "glibc":
         library = ctypes.CDLL(None)
@@ -132,7 +131,7 @@ def serve(source: BinaryIO, sink: BinaryIO) -> None:
     answers, stop, tasks = _Answers(sink), threading.Event(), SimpleQueue[bytes]()
     path, level, content = pickle.load(source)
     work: Callable[[Any, Any], Any] = pickle.loads(content)
-    # Tasks may need modules from the script's folder. Imports of dynsim and of the work do not use it: see above.
+    # Tasks may need modules from the folder of the script. Imports of dynsim and of the work do not use it, see above.
     sys.path[:] = path
     keep_memory()
     library = logging.getLogger("dynsim")
@@ -140,12 +139,12 @@ def serve(source: BinaryIO, sink: BinaryIO) -> None:
     library.addHandler(_Log(answers))
     answers.send(READY)
     threading.Thread(target=_listen, args=(source, tasks, stop), daemon=True).start()
-    threading.Thread(target=_give_signs, args=(answers, stop), daemon=True).start()
+    threading.Thread(target=_send_heartbeats, args=(answers, stop), daemon=True).start()
 
     def look(time: float, stage: str = "") -> None:
-        # Ctrl-C would stop the work here if it ran in the parent, with a partial result.
+        # In the parent, Ctrl-C would stop the work here, with a partial result.
         if stop.is_set():
-            answers.send(HEARD)
+            answers.send(CONFIRMED)
             raise KeyboardInterrupt
 
     while True:
@@ -159,7 +158,7 @@ def serve(source: BinaryIO, sink: BinaryIO) -> None:
             leaves = interruption.is_left()
         answers.send(ANSWER, good, content, leaves)
         if leaves:
-            # End the process: it cannot end the thread in any other way, and the thread would slow other tasks down.
+            # End the process: there is no other way to end the remaining thread, which would slow down other tasks.
             _end()
 
 
@@ -185,10 +184,10 @@ def _listen(source: BinaryIO, tasks: SimpleQueue[bytes], stop: threading.Event) 
         _end()
 
 
-def _give_signs(answers: _Answers, stop: threading.Event) -> None:
-    """Send signs of life as long as the process runs; confirm a stop also while a result is being made."""
+def _send_heartbeats(answers: _Answers, stop: threading.Event) -> None:
+    """Send heartbeats as long as the process runs; confirm a stop also while a result is being computed."""
     while True:
-        answers.send(HEARD if stop.is_set() and interruption.is_kept() else ALIVE)
+        answers.send(CONFIRMED if stop.is_set() and interruption.is_kept() else ALIVE)
         if stop.is_set():
             clock.sleep(STOP_LOOK_S)
         else:

@@ -22,7 +22,7 @@ from dynsim.draw.geometry.robot import penetrations, placed
 from dynsim.draw.geometry.shapes import Faces, box_about, corners_of, grid_faces, outline, round_patch, surface_grids
 from dynsim.record import Record
 from dynsim.record.measures import hand_target
-from dynsim.record.poses import POSITION, point_positions, touching_positions
+from dynsim.record.poses import POSITION, contact_positions, point_positions
 from dynsim.record.scene import WORLD, Joint, Point, Scene, SceneSurface
 
 # Lines and points of an arm from the scene and body poses of its record, and their extent.
@@ -107,7 +107,7 @@ class Skeleton:
             surface = self.scene.surface(point.surface)
             if surface is None or point.name in untouched:
                 continue
-            position, force = touching_positions(record, point, len(record) - 1), float(forces.get(point.name, np.nan))
+            position, force = contact_positions(record, point, len(record) - 1), float(forces.get(point.name, np.nan))
             if abs(force) > 0.0:
                 position = position - surface.gap(position) * surface.normal(position)
             contacts.append((point, surface, position, force))

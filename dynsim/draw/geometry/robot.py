@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dynsim.errors import RecordError
 from dynsim.record import Record
 from dynsim.record.measures import hand_target
-from dynsim.record.poses import ORIENTATION, POSITION, TOUCHING, point_positions, touching_positions
+from dynsim.record.poses import ORIENTATION, POSITION, TOUCHING, contact_positions, point_positions
 from dynsim.record.scene import NOT_BELOW, WORLD, Point, Scene, Vector3
 
 Array = NDArray[np.float64]
@@ -211,7 +211,7 @@ def contacts(robot: DrawnRobot, rows: NDArray[np.intp] | slice = slice(None)) ->
         mode = record["contact_mode"][rows, k] if "contact_mode" in record else None
         if mode is not None and not mode.any():
             continue
-        at = np.asarray(touching_positions(record, point, rows), dtype=np.float64)
+        at = np.asarray(contact_positions(record, point, rows), dtype=np.float64)
         normal = surface.normal(at)
         force = np.asarray(record["contact_normal_force"][rows, k], dtype=np.float64)
         tangent = None
