@@ -1,4 +1,4 @@
-"""Scenarios: reading from YAML (``reading``), validation (``schema``), and building of their objects (``build``)."""
+"""Scenarios: reading YAML files (``reading``), validation (``schema``), and building the objects (``build``)."""
 
 from dynsim.scenario.build import build_model, require_scenario
 from dynsim.scenario.reading import (

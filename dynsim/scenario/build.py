@@ -1,4 +1,4 @@
-"""Construction of a scenario's objects: plant in its initial posture, controller, surfaces, contacts and loads."""
+"""Build the objects of a scenario: plant in its initial posture, controller, surfaces, contacts and loads."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ from dynsim.system.memo import recall
 if TYPE_CHECKING:
     from dynsim.snake.description import SnakeDescription, TaskSpaceController
 
-# A contact point must start this close to its surface [m].
+# Maximum distance of a contact point from its surface at the start [m].
 START_TOLERANCE = 1e-6
-# A compliant contact point may start at this depth below its surface [m].
+# Maximum initial depth of a compliant contact point below its surface [m].
 PRESSED = 5e-3
 
 
 def machine(scenario: Scenario) -> Robot | SnakeDescription:
-    """The plant of the scenario: a tree of bodies, or the description of a snake."""
+    """Build the plant of the scenario: a tree of bodies, or the description of a snake."""
     if scenario.engine == "kinematic":
-        # Imported here and below: an arm needs nothing of a snake.
+        # Imported here and below because an arm does not need the snake modules.
         from dynsim.snake.description import SnakeDescription
 
         return families.build("plant", scenario.plant, BuildContext(scenario.duration_s), SnakeDescription)
@@ -46,20 +46,20 @@ def machine(scenario: Scenario) -> Robot | SnakeDescription:
 
 
 def robot(scenario: Scenario) -> Robot:
-    """The tree of bodies with its motors and payloads, in its initial posture.
+    """Build the tree of bodies with motors and payloads, in its initial posture.
 
     Raises
     ------
     ModelError
-        The plant is none or cannot be built, a payload is on a body that it does not have, or contact points do not
-        reach the surfaces that ``initial`` puts them on.
+        If the plant has no rigid-body model or cannot be built, a payload is on an unknown body, or contact points
+        cannot reach the surfaces that ``initial`` requires.
     """
     built = _loaded(scenario)
     return built if scenario.config.initial is None else _posed(scenario, built, _nameable(scenario, built))
 
 
 def robot_and_contacts(scenario: Scenario) -> tuple[Robot, list[Contact]]:
-    """:func:`robot` and all enabled contacts, each built once."""
+    """Return :func:`robot` and all enabled contacts, building each only once."""
     config, built = scenario.config, unposed(scenario)
     touching = contacts(scenario, built)
     if config.initial is None:
@@ -70,7 +70,7 @@ def robot_and_contacts(scenario: Scenario) -> tuple[Robot, list[Contact]]:
 
 
 def unposed(scenario: Scenario) -> Robot:
-    """The robot in the posture of its plant, before ``initial``."""
+    """Build the robot in the posture of its plant, before ``initial`` is applied."""
     config = scenario.config
     beside = (config.objects, config.surfaces, config.contacts) if config.objects else ()
     known = config.plant, config.duration_s, config.loads, config.ties, *beside
@@ -78,15 +78,15 @@ def unposed(scenario: Scenario) -> Robot:
 
 
 def _loaded(scenario: Scenario) -> Robot:
-    """The tree of bodies as its plant says, with payloads."""
+    """Build the plant's tree of bodies with payloads, objects and ties."""
     if scenario.engine == "kinematic":
-        raise ModelError(f"plant {scenario.plant.type!r} is kinematic: it has no rigid-body model")
+        raise ModelError(f"plant {scenario.plant.type!r} is kinematic and has no rigid-body model")
     bare = families.build("plant", scenario.plant, BuildContext(scenario.duration_s), Robot)
     inertias: dict[int, list[Inertia]] = {}
     for name, config in scenario.config.loads.items():
         if isinstance(config, Payload):
             body, point, axes = _attached(bare, name, config)
-            # One of no mass leaves its link as it is, to the bit.
+            # A massless payload leaves its link bit-identical.
             if config.mass_kg > 0.0:
                 inertias.setdefault(body, [bare.links[body].inertia]).append(_payload(name, config, point, axes))
     links = list(bare.links)
@@ -98,16 +98,16 @@ def _loaded(scenario: Scenario) -> Robot:
 
 
 def _with_objects(scenario: Scenario, built: Robot) -> Robot:
-    """The robot and the objects beside it, each a tree of its own."""
+    """Return the robot with the objects, each a separate tree."""
     objects, surfaces = scenario.config.objects, list(scenario.config.surfaces)
     taken = {*(link.name for link in built.links), *built.joint_names, *(frame.name for frame in built.frames)}
     for name in objects:
         if not name or name == WORLD:
             raise ModelError(
-                f"objects: {name!r} cannot be the name of an object; choose another", keys=("objects", name)
+                f"objects: {name!r} is not a valid name for an object; choose another", keys=("objects", name)
             )
         if name in taken:
-            text = f"objects.{name}: the robot has a body, joint or frame of that name"
+            text = f"objects.{name}: the robot has a body, joint or frame with this name; choose another"
             raise ModelError(text, keys=("objects", name))
     context = BuildContext(scenario.duration_s)
     ties = [tie for name, body in objects.items() for tie in body.ties(name)]
@@ -125,12 +125,12 @@ def _with_objects(scenario: Scenario, built: Robot) -> Robot:
 
 
 def _tied(scenario: Scenario, built: Robot) -> Robot:
-    """The robot and objects with the ties between them."""
+    """Return the robot and objects with the ties between them."""
     ties = {name: config.tie(name) for name, config in scenario.config.ties.items()}
     taken = {tie.name for tie in built.ties}
     for name, tie in ties.items():
         if name in taken:
-            text = f"ties.{name}: an object has a tie of that name, its spring or that of a gripper; choose another"
+            text = f"ties.{name}: the spring or the gripper of an object uses this name; choose another"
             raise ModelError(text, keys=("ties", name))
         for key, body in (("body", tie.body), ("other", tie.other)):
             if key == "other" and body == WORLD:
@@ -144,7 +144,10 @@ def _tied(scenario: Scenario, built: Robot) -> Robot:
 
 
 def _nameable(scenario: Scenario, built: Robot) -> list[Contact]:
-    """What ``initial`` may name: all contacts, and disabled points, so that braced and free start in one posture."""
+    """Return the contacts that ``initial`` may list.
+
+    Disabled points are included, so that variants with and without a brace can start in the same posture.
+    """
     initial = scenario.config.initial
     if initial is None or not initial.on_surface:
         return []
@@ -152,9 +155,10 @@ def _nameable(scenario: Scenario, built: Robot) -> list[Contact]:
 
 
 def disabled_points(scenario: Scenario, described: Robot) -> list[Contact]:
-    """Disabled contact points. They touch nothing, but a start or a path may keep them on their surfaces.
+    """Return the disabled contact points.
 
-    So the same motion can be simulated with and without a brace.
+    They have no contact, but a start or a path may keep them on their surfaces, so that the same motion can be
+    simulated with and without a brace.
     """
     options = scenario.config.contacts
     known = surfaces(scenario)
@@ -171,7 +175,7 @@ def disabled_points(scenario: Scenario, described: Robot) -> list[Contact]:
 
 
 def _posed(scenario: Scenario, built: Robot, touching: Sequence[Contact]) -> Robot:
-    """The robot in the posture that ``initial`` asks for."""
+    """Return the robot in the posture that ``initial`` requires."""
     initial = scenario.config.initial
     first = _first_references(scenario, built)
     if first is not None:
@@ -189,22 +193,22 @@ def _posed(scenario: Scenario, built: Robot, touching: Sequence[Contact]) -> Rob
 
 
 def _first_references(scenario: Scenario, built: Robot) -> Array | None:
-    """Coordinates where waypoints of joints begin, (nq,); None if that is not requested.
+    """Return the coordinates at the first waypoints of the joints, shape (nq,); None if not requested.
 
-    Followers of these joints are where their leaders have them, the other joints where the plant has them.
+    Coupled joints follow their leaders; all other joints keep the plant's posture.
     """
     initial = scenario.config.initial
     if initial is None or not initial.on_references:
         return None
     waypoints = getattr(scenario.controller, "joints", None)
     if not waypoints:
-        raise ModelError("initial.on_references: no joint has waypoints; give controller.joints", keys=("initial",))
+        raise ModelError("initial.on_references: no joint has waypoints; set controller.joints", keys=("initial",))
     q = built.initial.copy()
     for name, path in waypoints.items():
         if name in built.joint_names:
             q[built.position_index[built.joint_names.index(name)]] = path.values[0]
     places, placed = dict(zip(built.joint_names, built.position_index, strict=True)), {*waypoints}
-    # A follower may lead another joint, and couplings have no order.
+    # A follower may lead another joint, and couplings are not ordered.
     for _ in built.couplings:
         for coupling in built.couplings:
             if coupling.leader in placed and coupling.joint not in waypoints:
@@ -214,14 +218,31 @@ def _first_references(scenario: Scenario, built: Robot) -> Array | None:
 
 
 def build_model(scenario: Scenario) -> Model:
-    """The rigid-body model of a scenario's plant.
+    """Build the rigid-body model of a scenario's plant.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Validated scenario, see :func:`load_scenario`.
+
+    Returns
+    -------
+    Model
+        Rigid-body model of the plant with its payloads, objects and ties, in its initial posture.
 
     Raises
     ------
     ModelError
-        The plant has none, or is not physical.
+        If the plant is kinematic, or its masses and joints are not physical.
     ScenarioError
-        Not a scenario.
+        If ``scenario`` is not a Scenario.
+
+    Examples
+    --------
+    >>> import dynsim
+    >>> model = dynsim.build_model(dynsim.load_scenario("elbow_comparison"))
+    >>> model.robot.initial.shape
+    (10,)
     """
     require_scenario(scenario)
     return Model(robot(scenario))
@@ -244,77 +265,92 @@ def controller(
     progress: Callable[[float], None] | None = None,
     touching: Sequence[Contact] | None = None,
 ) -> JointControl | TaskSpaceController:
-    """The controller for a machine.
+    """Build the controller for a machine.
 
     Parameters
     ----------
-    progress : called with the time [s] that the references have come to
-    touching : the contacts of the scenario, when they are built already
+    scenario : Scenario
+        Validated scenario.
+    machine : Model or SnakeDescription
+        Machine that the controller drives.
+    progress : callable, optional
+        Called with the time [s] up to which the references are computed.
+    touching : sequence of Contact, optional
+        Contacts of the scenario, if they are built already.
 
     Raises
     ------
     ModelError
-        The scenario has none, it is for other machines, or does not fit this one.
+        If the scenario has no controller, or the controller does not fit the machine.
     UnreachableReference
-        The hand cannot follow its path.
+        If the hand cannot follow its path.
     """
     config = scenario.controller
     if config is None:
         raise ModelError("the scenario has no controller; its motors are short-circuited")
-    # Of a snake at whatever level.
+    # ENGINE of the modules, not of the scenario: a snake's controller drives a snake at both levels.
     if families.member("plant", scenario.plant.type).ENGINE != families.member("controller", config.type).ENGINE:
         raise ModelError(f"controller {config.type!r} cannot drive a {scenario.plant.type!r}")
-    believed = scenario
+    nominal = scenario
     if isinstance(machine, Model) and scenario.config.surface_error is not None:
-        # What it plans with is not what is there.
-        believed = replace(scenario, config=scenario.config.model_copy(update={"surface_error": None}))
-        touching = contacts(believed, machine.robot)
+        # The controller plans with the nominal surfaces, not with the simulated ones.
+        nominal = replace(scenario, config=scenario.config.model_copy(update={"surface_error": None}))
+        touching = contacts(nominal, machine.robot)
     elif touching is None:
         touching = contacts(scenario, machine.robot) if isinstance(machine, Model) else ()
     points = {contact.name: contact for contact in touching}
     declared = [
         name for name, contact in points.items() if name in scenario.config.contacts.points and not contact.left_out
     ]
-    unused = disabled_points(believed, machine.robot) if isinstance(machine, Model) else []
+    unused = disabled_points(nominal, machine.robot) if isinstance(machine, Model) else []
     disabled = [contact.name for contact in unused]
-    looked = _Looked({**points, **{contact.name: contact for contact in unused}})
+    tracked = _TrackedContacts({**points, **{contact.name: contact for contact in unused}})
     context = BuildContext(
-        scenario.duration_s, machine, progress=progress, contacts=looked, declared=declared, disabled=disabled
+        scenario.duration_s, machine, progress=progress, contacts=tracked, declared=declared, disabled=disabled
     )
     if isinstance(machine, Model):
 
         def built() -> JointControl:
             return families.build("controller", config, context, JointControl)
 
-        def blind() -> JointControl | None:
-            # One that looks at no contact is that of all runs of the same machine and section.
+        def independent_of_contacts() -> JointControl | None:
+            # A controller that reads no contact is the same for all runs with this machine and section.
             made.append(built())
-            return None if looked.at else made[0]
+            return None if tracked.accessed else made[0]
 
         made: list[JointControl] = []
-        known = recall("controller", blind, config, scenario.duration_s, machine, [*points], declared, disabled)
+        known = recall(
+            "controller",
+            independent_of_contacts,
+            config,
+            scenario.duration_s,
+            machine,
+            [*points],
+            declared,
+            disabled,
+        )
         control = known or (made[0] if made else built())
-        # The kernels would follow the last polynomial on.
+        # The kernels would extrapolate the last polynomial.
         if control.end < scenario.duration_s * (1.0 - 1e-6):
             ends = f"end at {control.end:g} s, the run at {scenario.duration_s:g} s"
-            raise ModelError(f"controller {config.type!r}: its references {ends}")
+            raise ModelError(f"controller {config.type!r}: the references {ends}; extend the references")
         return control
     from dynsim.snake.description import TaskSpaceController
 
     return families.build("controller", config, context, TaskSpaceController)
 
 
-class _Looked(Mapping[str, Contact]):
-    """Contacts by name, and whether anyone has looked at one."""
+class _TrackedContacts(Mapping[str, Contact]):
+    """Mapping of names to contacts that records whether a contact was read."""
 
     def __init__(self, contacts: Mapping[str, Contact]) -> None:
-        self._contacts, self.at = contacts, False
+        self._contacts, self.accessed = contacts, False
 
     def __getitem__(self, name: str) -> Contact:
-        self.at = True
+        self.accessed = True
         return self._contacts[name]
 
-    # Names are known without a look at what they name.
+    # Reading a name does not count as reading its contact.
     def __contains__(self, name: object) -> bool:
         return name in self._contacts
 
@@ -326,7 +362,7 @@ class _Looked(Mapping[str, Contact]):
 
 
 def surfaces(scenario: Scenario) -> dict[str, Surface]:
-    """All surfaces by name, where they are, whether anything touches them or not."""
+    """Return the named surfaces, in use or not, at their simulated positions."""
     context, configs = BuildContext(scenario.duration_s), scenario.config.surfaces
     error = scenario.config.surface_error
 
@@ -342,14 +378,19 @@ def surfaces(scenario: Scenario) -> dict[str, Surface]:
 
 
 def contacts(scenario: Scenario, described: Robot | None = None) -> list[Contact]:
-    """All enabled contact points with their surfaces, then the other candidates.
+    """Return all enabled contact points with their surfaces, then the other candidates.
 
-    ``described`` : the robot of the scenario, when it is known already; candidates that are not points are its parts
+    Parameters
+    ----------
+    scenario : Scenario
+        Validated scenario.
+    described : Robot, optional
+        Robot of the scenario, if it is built already.
 
     Raises
     ------
     ModelError
-        A point on a surface that the scenario does not have.
+        If a point is on a surface that does not exist.
     """
     options = scenario.config.contacts
     known = surfaces(scenario)
@@ -361,7 +402,7 @@ def contacts(scenario: Scenario, described: Robot | None = None) -> list[Contact
         if point.surface not in known:
             keys = ("contacts", "points", name, "surface")
             raise ModelError(
-                f"{dotted(keys)} = {point.surface!r}: no such surface{suggest(point.surface, known)}; "
+                f"{dotted(keys)} = {point.surface!r}: unknown surface{suggest(point.surface, known)}; "
                 f"surfaces: {', '.join(known) or 'none'}",
                 keys=keys,
             )
@@ -382,18 +423,18 @@ def contacts(scenario: Scenario, described: Robot | None = None) -> list[Contact
         result = [replace(contact, left_out=left_out) for contact, left_out in zip(result, still, strict=True)]
     if options.candidates != "points":
         law = _law(options, ContactPoint(body=""))
-        # Objects touch with what they are made of, not with their origins.
+        # Objects touch with their solids, not with their origins.
         beside = {link.name for name, body in scenario.config.objects.items() for link in body.links(name)}
         own = (entry for entry in candidates(options.candidates, described, known, result) if entry.body not in beside)
         result += [replace(contact, **law) for contact in own]
     error = scenario.config.surface_error
-    return result if error is None else [_rubbed(contact, error.friction_factor) for contact in result]
+    return result if error is None else [_scaled_friction(contact, error.friction_factor) for contact in result]
 
 
 def _foot(foot: Foot, known: Mapping[str, Surface], options: Contacts) -> Contact:
-    """The contact of what a robot is made to touch with."""
+    """Return the contact of a foot: a part that the robot is built to touch with."""
     if foot.surface not in known:
-        raise ModelError(f"surfaces: {foot.name} stands on surface {foot.surface!r}, which there is not")
+        raise ModelError(f"surfaces: surface {foot.surface!r} does not exist (used by {foot.name})")
     law = _law(options, ContactPoint(body=foot.body))
     if foot.grip_axis is not None:
         law |= {"grip": 0.0, "grip_axis": foot.grip_axis}
@@ -402,15 +443,15 @@ def _foot(foot: Foot, known: Mapping[str, Surface], options: Contacts) -> Contac
     )
 
 
-def _rubbed(contact: Contact, factor: float) -> Contact:
-    """The contact with its coefficients of friction times a factor."""
+def _scaled_friction(contact: Contact, factor: float) -> Contact:
+    """Return the contact with all coefficients of friction multiplied by a factor."""
     static = None if contact.static_friction is None else factor * contact.static_friction
     viscous = factor * contact.viscous_friction
     return replace(contact, friction=factor * contact.friction, static_friction=static, viscous_friction=viscous)
 
 
 def _law(options: Contacts, point: ContactPoint) -> dict[str, Any]:
-    """What the law of the contacts says of one of them."""
+    """Return the contact-law parameters of a point, as keyword arguments of `Contact`."""
     friction, static = options.coefficients(point)
     stiffness, damping = options.compliance(point)
     if options.law == "bilateral":
@@ -430,12 +471,12 @@ def _law(options: Contacts, point: ContactPoint) -> dict[str, Any]:
 
 
 def loads(scenario: Scenario, robot: Robot) -> list[Load]:
-    """Forces and torques from outside on the links of a robot; payloads are part of the links already.
+    """Return the external forces and torques on the links of a robot; payloads are already part of the links.
 
     Raises
     ------
     ModelError
-        A load on a body that the robot does not have.
+        If a load is on a body that does not exist.
     """
     result = []
     for name, config in scenario.config.loads.items():
@@ -445,14 +486,14 @@ def loads(scenario: Scenario, robot: Robot) -> list[Load]:
         knots, coefficients = config.pieces(scenario.duration_s)
         in_body = config.frame == "body"
         if in_body:
-            # The axes of a frame fixed on a link are not the link's.
+            # Convert from the axes of a frame to the axes of its link.
             coefficients = np.einsum("ab,kwbp->kwap", axes, coefficients.reshape(-1, 2, 3, 4)).reshape(-1, 6, 4)
         result.append(Load(name, robot.links[body].name, point, in_body, knots, coefficients, config.hold))
     return result
 
 
 def _attached(robot: Robot, name: str, config: BodyPoint) -> tuple[int, Array, Array]:
-    """Index of the link that a load is on, its point in the link's frame [m], and the axes that it is given in."""
+    """Return a load's link index, its point in the link's frame [m], and the axes of its components, shape (3, 3)."""
     keys = ("loads", name, "body")
     try:
         index, point = robot.attach(config.body, np.array(config.point_m))
@@ -462,7 +503,7 @@ def _attached(robot: Robot, name: str, config: BodyPoint) -> tuple[int, Array, A
 
 
 def _payload(name: str, config: Payload, point: Array, axes: Array) -> Inertia:
-    """Mass properties of a payload in its link's frame."""
+    """Return the mass properties of a payload in its link's frame."""
     if config.inertia_kg_m2 is None:
         return Inertia.solid_sphere(config.mass_kg, config.radius_m, point)
     keys = ("loads", name, "inertia_kg_m2")
@@ -481,11 +522,26 @@ def check_start(
     q: NDArray[np.float64] | None = None,
     depth: float = START_TOLERANCE,
 ) -> None:
-    """Raise :class:`ModelError` unless every contact is on a body of the robot and starts on its surface.
+    """Check that every contact is on a body of the robot and starts on its surface.
 
-    One error for all that do not: about the first, and with the names and gaps of the others.
-    ``q`` : coordinates at the start, (nq,) [rad or m]; default: the robot's initial ones
-    ``depth`` : that a point may have below its surface [m]
+    Parameters
+    ----------
+    scenario : Scenario
+        Validated scenario.
+    model : Model
+        Model of the robot.
+    touching : sequence of Contact
+        Contacts to check.
+    q : (nq,) ndarray, optional
+        Coordinates at the start [rad or m]; default: the robot's initial coordinates.
+    depth : float, optional
+        Maximum depth of a point below its surface [m].
+
+    Raises
+    ------
+    ModelError
+        If a contact does not start on its surface. The message is about the first such contact and lists the names
+        and gaps of the others.
     """
     own = q is None
     q = model.robot.initial if q is None else q
@@ -501,14 +557,14 @@ def check_start(
     if off:
         contact, declared, keys, gap = off[0]
         position = model.point_position(contact.body, contact.point, q)
-        remedy = "take another posture to start from; or change the surface"
+        remedy = "start from another posture; or change the surface"
         if own and scenario.plant.type == "snake":  # `initial` does not place its joints
             remedy = "move the surface or change plant.initial_joints_rad"
         elif own:
             named = [other for other, by_name, *_ in off if by_name and not other.left_out]
             remedy = f"{_remedy(scenario, named)}change the initial configuration or the surface"
         if contact.left_out:
-            remedy = "no joint moves it along the normal: move the surface"
+            remedy = "no joint moves it along the normal; move the surface"
         others = ", ".join(f"{other.name} {its:+.4g} m from {other.surface_name!r}" for other, _, _, its in off[1:])
         limit = START_TOLERANCE if gap > 0.0 else depth
         raise ModelError(
@@ -521,13 +577,13 @@ def check_start(
 
 
 def _keys_of(scenario: Scenario, contact: Contact) -> tuple[bool, tuple[str, ...]]:
-    """Whether the scenario declares a contact point by name, and the keys that it comes from."""
+    """Return whether the contact is a declared contact point, and the keys that define it."""
     declared = contact.name in scenario.config.contacts.points
     return declared, ("contacts", "points", contact.name) if declared else ("contacts", "candidates")
 
 
 def _check_body(scenario: Scenario, robot: Robot, contact: Contact) -> None:
-    """Refuse a contact on a body that the robot does not have, or that does not move."""
+    """Raise ModelError if a contact is on a body that does not exist or does not move."""
     try:
         robot.attach(contact.body, contact.point)
     except ModelError as error:
@@ -538,9 +594,16 @@ def _check_body(scenario: Scenario, robot: Robot, contact: Contact) -> None:
 def left_out_warnings(
     scenario: Scenario, contacts: Sequence[Contact], behind_brakes: Mapping[str, float] = MappingProxyType({})
 ) -> list[str]:
-    """Return a sentence for each contact that no joint moves along the normal of its surface.
+    """Return a warning for each contact that no joint moves along the normal of its surface.
 
-    behind_brakes : those that only joints with a closed brake would move, by name, and since when [s]
+    Parameters
+    ----------
+    scenario : Scenario
+        Validated scenario.
+    contacts : sequence of Contact
+        Contacts of the run.
+    behind_brakes : mapping of str to float, optional
+        Contacts that only braked joints would move, with the time at which the brakes closed [s].
     """
     sentences = []
     for contact in contacts:
@@ -548,20 +611,20 @@ def left_out_warnings(
         name, surface = dotted(keys) if declared else contact.name, contact.surface_name
         if contact.left_out:
             sentences.append(
-                f"{name}: no joint moves this point along the normal of {surface}, so its force changes no motion; "
-                "it is left out of the contacts, with a force of zero"
+                f"{name}: no joint moves this point along the normal of {surface}, so its force has no effect; "
+                "the contact is omitted, with a force of zero"
             )
         elif contact.name in behind_brakes:
             sentences.append(
-                f"{name}: from t = {behind_brakes[contact.name]:.4g} s on, no joint without a closed brake moves this "
-                f"point along the normal of {surface}, so its force changes no motion; it is left out of the contacts, "
-                "with a force of zero, while these brakes are closed"
+                f"{name}: from t = {behind_brakes[contact.name]:.4g} s only braked joints move this point along the "
+                f"normal of {surface}, so its force has no effect; the contact is omitted, with a force of zero, while "
+                "these brakes are closed"
             )
     return sentences
 
 
 def _remedy(scenario: Scenario, off: Sequence[Contact]) -> str:
-    """What puts declared points on their surfaces, for the end of an error; nothing where that was asked for."""
+    """Return the remedy that puts declared points on their surfaces; empty if the scenario already requests it."""
     initial = scenario.config.initial
     already = [] if initial is None else initial.on_surface
     names = [contact.name for contact in off if contact.name not in already]
@@ -569,12 +632,12 @@ def _remedy(scenario: Scenario, off: Sequence[Contact]) -> str:
 
 
 def on_surface_key(scenario: Scenario, names: Sequence[str]) -> str:
-    """The line of a scenario that puts these points on their surfaces, beside those that are there."""
+    """Return the scenario line that puts these points on their surfaces, in addition to those already listed."""
     initial = scenario.config.initial
     return f"initial: {{on_surface: [{', '.join([*(initial.on_surface if initial else ()), *names])}]}}"
 
 
 def require_scenario(scenario: object) -> None:
-    """Raise :class:`ScenarioError` for what is none, such as the name of one."""
+    """Raise :class:`ScenarioError` if the argument is not a Scenario, e.g. the name of a scenario."""
     if not isinstance(scenario, Scenario):
-        raise ScenarioError(f"needs a Scenario, not {brief(scenario)}; load_scenario(name or file) gives one")
+        raise ScenarioError(f"expected a Scenario, got {brief(scenario)}; load one with load_scenario(name or file)")

@@ -1,4 +1,4 @@
-"""Contact candidates where a scenario names no points: all joints as points, or links as capsules."""
+"""Contact candidates that a scenario does not list: all joints as points, or all links as capsules."""
 
 from __future__ import annotations
 
@@ -17,22 +17,23 @@ from dynsim.model.surfaces import Array, Surface
 
 log = logging.getLogger(__name__)
 
-# The radius of a capsule between its ends is smaller by this [m]: where an end is nearest, or the axis lies along a
-# face, only the ends touch, and the rows are independent.
+# Reduction of a capsule's radius between its ends [m]. If an end is nearest, or the axis is parallel to a face, only
+# the ends touch, so the constraint rows are independent.
 THINNER = 1e-6
 
 
 def candidates(kind: str, robot: Robot, surfaces: Mapping[str, Surface], declared: Iterable[Contact]) -> list[Contact]:
-    """Candidates of a robot against all surfaces, without friction, beside those that are declared.
+    """Return the frictionless contact candidates of a robot on all surfaces, in addition to the declared contacts.
 
-    ``joints``: the origins of all joints, and the hand, as points. ``links``: the axes of all links, with their radii.
-    A capsule is nearest to a flat or hollow surface, and to a height field, with one of the spheres at its ends; those
-    that neighbours share count once, on the link whose joint it is, with the larger radius. Spheres, cylinders and
-    boxes are touched from outside by these, and by the nearest point of the axis; that is :data:`THINNER`.
+    The kind ``joints`` makes points of the origins of all joints and of the hand; ``links`` makes capsules of the axes
+    and radii of all links. On a flat or hollow surface, or a height field, a capsule touches with one of its end
+    spheres. Neighbouring links share an end sphere; it is listed once, on the link that starts at the joint, with the
+    larger radius. Spheres, cylinders and boxes can also touch the capsule between its ends; this part is thinner by
+    :data:`THINNER`.
 
-    Left out are points that are declared or the same as others, spheres about points that are declared (a warning
-    names them), and what cannot move along the normal (a log line names it): it would have a row of zeros. A link
-    without mass and extent, such as a carriage, has no sphere.
+    Omitted are points that are declared or coincide with another candidate, spheres around declared points (with a
+    warning), and candidates that no joint moves along the normal (with a log line), because their constraint row would
+    be zero. A link without mass and length, such as a carriage, has no sphere.
     """
     model = Model(robot)
     configurations = random_configurations(robot)
@@ -69,16 +70,16 @@ def candidates(kind: str, robot: Robot, surfaces: Mapping[str, Surface], declare
                 still.append(name)
     if replaced:
         log.warning(
-            "contacts.candidates: declared at a joint, a point of less radius touches there instead of the link: %s",
+            "contacts.candidates: a declared point at a joint replaces the larger sphere of the link: %s",
             ", ".join(dict.fromkeys(replaced)),
         )
     if still:
-        log.info("contacts.candidates: left out, because nothing moves them along the normal: %s", ", ".join(still))
+        log.info("contacts.candidates: omitted, because no joint moves them along the normal: %s", ", ".join(still))
     return contacts
 
 
 def _joints(robot: Robot, surface: Surface, name: str) -> list[Contact]:
-    """Origins of all joints, and the hand."""
+    """Return the origins of all joints, and the hand, as points."""
     carriers = robot.carriers
     joints = [
         Contact(link.joint_of_rows or link.joint, link.name, np.zeros(3), surface, name)
@@ -89,12 +90,12 @@ def _joints(robot: Robot, surface: Surface, name: str) -> list[Contact]:
 
 
 def _links(robot: Robot, surface: Surface, on: str) -> list[Contact]:
-    """Axes of all links against a surface: spheres at their beginnings, then at their ends, and capsules between."""
+    """Return the links as spheres at their starts, spheres at their ends, and capsules in between."""
     starts, ends, capsules = [], [], []
     tips, carriers = axis_ends(robot), robot.carriers
     for link in robot.links:
         axes = [tip for tip in tips[link.name] if np.linalg.norm(tip) > SAME]
-        # What has neither extent nor mass, such as a carriage, is no body of its own.
+        # A link without length and mass, such as a carriage, is not a physical body.
         if link.name in carriers or not (axes or link.inertia.mass):
             continue
         joint = link.joint_of_rows or link.joint
@@ -108,7 +109,7 @@ def _links(robot: Robot, surface: Surface, on: str) -> list[Contact]:
 
 
 def _places(model: Model, contact: Contact, configurations: Iterable[Array]) -> Array:
-    """Positions of the point of a contact [m]."""
+    """Return the positions of a contact's point in each configuration [m]."""
     return np.array([model.point_position(contact.body, contact.point, q) for q in configurations])
 
 
@@ -117,7 +118,7 @@ def _same(a: Array, b: Array) -> bool:
 
 
 def _unused(name: str, names: set[str]) -> str:
-    """The name, with a number if another candidate has it; it is taken from then on."""
+    """Return the name, with a number if it is in use, and add it to ``names``."""
     unused, count = name, 1
     while unused in names:
         count += 1

@@ -1,7 +1,7 @@
-"""Features that a contact law or an integration method does not support: one table.
+"""Table of features that a contact law or an integration method does not support.
 
-Validation of a scenario refuses the combinations that its keys show, preparation of a run those that its robot shows (a
-URDF file, say, that has dry friction), and docs/limits.md prints the table.
+Validation of a scenario rejects unsupported combinations of keys; preparation of a run rejects features of the robot,
+such as dry friction from a URDF file. docs/limits.md prints the table.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ METHODS = ("auto", *methods.METHODS)
 TIME_STEPPING = tuple(method.name for method in methods.METHODS.values() if not method.adaptive)
 EVENT_DRIVEN = tuple(name for name in METHODS if name not in TIME_STEPPING)
 
-# Keys of contacts and of their points that only one law reads.
+# Keys of contacts and contact points that only one contact law uses.
 BILATERAL_KEYS = ("slip_smoothing_m_s", "pulling_friction")
 UNILATERAL_KEYS = (
     "static_friction",
@@ -33,23 +33,30 @@ UNILATERAL_KEYS = (
     "stiffness_N_per_m",
     "damping_N_s_per_m",
 )
-# The trapezoidal rule of time stepping.
+# Default of integrator.theta: the trapezoidal rule.
 THETA = 0.5
 
 
 @dataclass(frozen=True)
 class Restriction:
-    """A feature that not every contact law and integration method supports.
+    """Feature that only some contact laws and integration methods support.
 
     Attributes
     ----------
-    feature : in words, for the table
-    reason : why the others do not support it
-    laws, methods : that support it
-    fix : what to do instead of changing law or method
-    keys : the scenario's keys that use it, dotted, read from its ScenarioConfig
-    parts : names of the robot's joints, ties or bases that use it
-    at : the key that an error about the robot names
+    feature : str
+        Description for the table.
+    reason : str
+        Why the other laws and methods do not support it.
+    laws, methods : tuple of str
+        Contact laws and integration methods that support it.
+    fix : str
+        Remedy other than changing the law or the method.
+    keys : callable, optional
+        Yields the dotted keys of a ScenarioConfig that use the feature.
+    parts : callable, optional
+        Returns the names of the robot's joints, ties or bases that use the feature.
+    at : tuple of str
+        Key that an error about the robot refers to.
     """
 
     feature: str
@@ -62,7 +69,7 @@ class Restriction:
     at: tuple[str, ...] = ("plant",)
 
     def conflict(self, config: Any) -> str:
-        """The law or method that the feature requires and the scenario does not have; "" if it has them."""
+        """Return the requirement on law or method that the scenario does not meet; "" if it meets both."""
         law, method = config.contacts.law, config.integrator.method
         if law not in self.laws:
             return f"requires contacts.law: {_either(self.laws)} (here: {law})"
@@ -71,7 +78,7 @@ class Restriction:
         return ""
 
     def message(self, conflict: str) -> str:
-        """The sentence of an error."""
+        """Return the text of an error."""
         change = "the law" if "contacts.law" in conflict else "the method"
         return f"{conflict}, because {self.reason}; {self.fix}, or change {change}"
 
@@ -81,7 +88,7 @@ def _either(names: tuple[str, ...]) -> str:
 
 
 def _contact_keys(*names: str) -> Callable[[Any], Iterator[str]]:
-    """Keys of that name, of contacts and of their points, that the scenario sets."""
+    """Return a function that yields the keys with these names that contacts and contact points set."""
 
     def used(config: Any) -> Iterator[str]:
         sections = {"contacts": config.contacts}
@@ -95,7 +102,7 @@ def _contact_keys(*names: str) -> Callable[[Any], Iterator[str]]:
 
 
 def _compliance(config: Any) -> Iterator[str]:
-    # Resolved scenarios write out the default damping of 0.
+    # Resolved scenarios contain the default damping of 0, which is not a use of the feature.
     yield from _contact_keys("stiffness_N_per_m")(config)
     if config.contacts.damping_N_s_per_m:
         yield "contacts.damping_N_s_per_m"
@@ -128,7 +135,7 @@ def _theta(config: Any) -> Iterator[str]:
         yield "integrator.theta"
 
 
-def _rubbing(robot: Robot) -> list[str]:
+def _joints_with_dry_friction(robot: Robot) -> list[str]:
     joints = [link.joint for link in robot.links if link.friction > 0.0]
     return joints + [m.joint for m in robot.motors if isinstance(m, Motor) and m.dry_friction > 0.0]
 
@@ -200,7 +207,7 @@ RESTRICTIONS = (
         "dry friction of joints",
         "friction that holds a joint at rest is a unilateral law",
         laws=LAWS[1:],
-        parts=_rubbing,
+        parts=_joints_with_dry_friction,
         fix="set the friction to 0 and use damping",
     ),
     Restriction(
@@ -229,7 +236,7 @@ RESTRICTIONS = (
 
 
 def check_keys(config: Any) -> None:
-    """Raise the error of the first restriction that the keys of a ScenarioConfig break, for a validator."""
+    """Raise an error, for a pydantic validator, if the keys of a ScenarioConfig violate a restriction."""
     for restriction in RESTRICTIONS:
         if restriction.keys is None or not (conflict := restriction.conflict(config)):
             continue
@@ -238,7 +245,7 @@ def check_keys(config: Any) -> None:
 
 
 def check_robot(config: Any, robot: Robot) -> None:
-    """Raise ModelError for the first restriction that the parts of a robot break."""
+    """Raise ModelError if the parts of a robot violate a restriction."""
     for restriction in RESTRICTIONS:
         if restriction.parts is None or not (conflict := restriction.conflict(config)):
             continue

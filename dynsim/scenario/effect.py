@@ -1,4 +1,4 @@
-"""Warnings for keys that are accepted but have no effect in a scenario."""
+"""Warnings about keys that a scenario sets although they have no effect."""
 
 from __future__ import annotations
 
@@ -12,16 +12,21 @@ from dynsim.library.families import engine
 
 Keys = tuple[int | str, ...]
 
-# Sections that only the dynamics engine reads.
+# Sections that only the dynamics engine uses.
 OF_DYNAMICS = ("contacts", "initial", "integrator", "metrics")
-# Sections of joint_pd that move a reference, or plan voltages along one.
+# Sections of joint_pd that define a moving reference or plan voltages along it.
 MOVING = ("hand", "base", "joints", "torques", "brace")
 
 
 def without_effect(scenario: Any, motors: bool = True) -> list[str]:
-    """A line for each key that the scenario sets and that changes nothing, with its place and the reason.
+    """Return a warning for each key that the scenario sets without effect, with its location and the reason.
 
-    ``scenario`` : a :class:`~dynsim.scenario.schema.Scenario`; ``motors`` : whether the plant has any
+    Parameters
+    ----------
+    scenario : Scenario
+        Validated scenario.
+    motors : bool, optional
+        Whether the plant has motors.
     """
     config = scenario.config
     texts: dict[Keys, str] = {}
@@ -38,7 +43,7 @@ def without_effect(scenario: Any, motors: bool = True) -> list[str]:
 
 
 def idle_keys(config: Any) -> dict[Keys, str]:
-    """Keys that change nothing, whether they are set or not, and why."""
+    """Return the keys without effect, set or not, with the reason for each."""
     kinematic = engine(config.plant) == "kinematic"
     rules = (
         [_of_kinematics(config)] if kinematic else [_of_integrator(config), _of_contacts(config), _of_sensors(config)]
@@ -47,7 +52,7 @@ def idle_keys(config: Any) -> dict[Keys, str]:
 
 
 def is_set(config: BaseModel, keys: Keys) -> bool:
-    """Whether file, variant or an override says the key."""
+    """Return whether the file, the variant or an override sets the key."""
     node: Any = config
     for key in keys:
         if isinstance(node, BaseModel):
@@ -60,7 +65,7 @@ def is_set(config: BaseModel, keys: Keys) -> bool:
 
 
 def _of_kinematics(config: Any) -> Iterator[tuple[Keys, str]]:
-    """What has forces and steps is not for a kinematic plant; ``duration_s`` and the controller say all."""
+    """A kinematic plant ignores forces and integration; only ``duration_s`` and the controller matter."""
     for section in OF_DYNAMICS:
         part = getattr(config, section)
         for key in () if part is None else type(part).model_fields:
@@ -77,26 +82,26 @@ def _of_integrator(config: Any) -> Iterator[tuple[Keys, str]]:
     why = "time_stepping takes steps of integrator.step_s"
     yield ("integrator", "rtol"), why
     yield ("integrator", "step_max_s"), why
-    if config.contacts.law != "unilateral":  # there it says below which speed slip has no direction
+    if config.contacts.law != "unilateral":  # under this law atol is the speed below which slip has no direction
         yield ("integrator", "atol"), why
 
 
 def _of_contacts(config: Any) -> Iterator[tuple[Keys, str]]:
     contacts = config.contacts
     if contacts.law == "unilateral":
-        yield ("contacts", "reference_tolerance_m"), "it is of law: bilateral; real braces may leave their surfaces"
+        yield ("contacts", "reference_tolerance_m"), "it requires law: bilateral; unilateral braces may lift off"
     has_feet = getattr(config.plant, "level", "") == "dynamic"
-    # Free objects touch with their corners and wheels.
+    # Free objects have contacts at their corners and wheels.
     touches = contacts.law == "unilateral" and any(body.joint is None for body in config.objects.values())
     if not contacts.points and contacts.candidates == "points" and not has_feet and not touches:
         for key in type(contacts).model_fields:
             if key not in ("law", "candidates", "points", "reference_tolerance_m"):
-                yield ("contacts", key), "there are no contacts.points, and contacts.candidates are points alone"
+                yield ("contacts", key), "contacts.points is empty, and contacts.candidates is points"
     if contacts.candidates != "points" and not config.surfaces:
-        yield ("contacts", "candidates"), "there are no surfaces to touch"
+        yield ("contacts", "candidates"), "the scenario has no surfaces"
     for name, point in contacts.points.items():
         if point.grip is not None and point.grip.ratio == 1.0:
-            yield ("contacts", "points", name, "grip"), "ratio 1 is the same friction in all directions"
+            yield ("contacts", "points", name, "grip"), "ratio 1 means equal friction in all directions"
 
 
 def _of_controller(config: Any) -> Iterator[tuple[Keys, str]]:
@@ -109,7 +114,7 @@ def _of_controller(config: Any) -> Iterator[tuple[Keys, str]]:
 
 
 def _of_sensors(config: Any) -> Iterator[tuple[Keys, str]]:
-    """A snake's controller reads one sensor at most."""
+    """A snake controller uses at most one sensor."""
     state = getattr(config.controller, "state", None)
     if config.sensors is None or state is None:
         return
@@ -120,18 +125,18 @@ def _of_sensors(config: Any) -> Iterator[tuple[Keys, str]]:
 
 
 def _of_time(config: Any) -> Iterator[tuple[Keys, str]]:
-    """What begins when the run has ended."""
+    """References, loads and commands that start after the end of the run."""
     end = config.duration_s
     ends = f"the run ends at {end:g} s"
     settle = config.metrics.settle_s
     if settle >= end and settle != type(config.metrics).model_fields["settle_s"].default:
-        yield ("metrics", "settle_s"), f"{ends}, so that no tracking error counts"
+        yield ("metrics", "settle_s"), f"{ends}, so no tracking error is evaluated"
     for name, load in config.loads.items():
         first = getattr(load, "times_s", None)
         if first is None and load.type == "csv":
             first = load.pieces(end)[0]
         if first is not None and first[0] >= end and not getattr(load, "hold", False):
-            yield ("loads", name), f"it begins at {first[0]:g} s, {ends}"
+            yield ("loads", name), f"it begins at {first[0]:g} s, but {ends}"
     controller = config.controller
     if controller is None:
         return
@@ -151,11 +156,11 @@ def _of_time(config: Any) -> Iterator[tuple[Keys, str]]:
     for keys, part in timed:
         begins = _begins(part)
         if begins is not None and begins >= end:
-            yield keys, f"it begins at {begins:g} s, {ends}"
+            yield keys, f"it begins at {begins:g} s, but {ends}"
 
 
 def _begins(part: Any) -> float | None:
-    """When a path, waypoints or a command begin [s]; None where that is not said."""
+    """Return the start time of a path, waypoints or a command [s]; None if unknown."""
     for name in ("start_s", "at_s"):
         if isinstance(value := getattr(part, name, None), int | float):
             return float(value)

@@ -1,7 +1,7 @@
-"""Reading of scenario files: search, merging of variant and overrides, validation, and writing of resolved scenarios.
+"""Scenario files: search, merging of variants and overrides, validation, YAML output, and the JSON schema for editors.
 
-Errors name file, line, key and fix. A scenario file is one mapping; ``variants`` holds the differences of each variant
-by its name (mappings merge, lists and values replace, null removes). Overrides are applied last.
+Errors contain file, line, key and fix. A scenario file is one mapping; its key ``variants`` maps the name of each
+variant to its differences (mappings merge, lists and values replace, null removes). Overrides are applied last.
 """
 
 from __future__ import annotations
@@ -24,26 +24,26 @@ from dynsim.system.files import check_complete
 from dynsim.system.inputs import DEPTH_LIMIT, YamlMapping, is_file, parse_yaml, read_text
 from dynsim.system.shipped import shipped_scenario, shipped_scenarios
 
-# Keys of a file that are not part of one variant.
+# Keys of a file that are not part of a single variant.
 TOP = ("variants",)
-# Largest magnitude of a number in a scenario, in any unit.
+# Maximum magnitude of a number in a scenario, in any unit.
 SIZE_MAX = 1e30
-# Variants that are searched for further unknown keys once one was found.
+# Maximum number of other variants that are searched for unknown keys after an error.
 VARIANTS_SEARCHED = 100
 
 
 def find_scenario(name: str | Path) -> Path:
-    """The file of that path, or the shipped scenario of that name.
+    """Return the path of a scenario file, given its path or the name of a shipped scenario.
 
     Raises
     ------
     ScenarioError
-        Neither exists, with near names in the message; or a folder.
+        If neither exists (the message suggests similar names), or if the path is a folder.
     RecordError
-        The scenario of a run that died while it was saved.
+        If the file belongs to a run that was killed while its results were saved.
     """
     if not isinstance(name, (str, Path)):
-        raise ScenarioError(f"a scenario is named by its file, or by its name when it is shipped, not by {brief(name)}")
+        raise ScenarioError(f"expected a scenario file or the name of a shipped scenario, got {brief(name)}")
     path = Path(name)
     shipped = shipped_scenario(path)
     try:
@@ -60,34 +60,51 @@ def find_scenario(name: str | Path) -> Path:
 
 
 def variant_names(path: str | Path) -> list[str]:
-    """Names of the variants in a scenario file, in its order; empty without variants."""
+    """Return the names of the variants in a scenario file, in file order; empty without variants."""
     return read_scenario(path).variants
 
 
 def load_scenario(path: str | Path, variant: str | None = None, overrides: Mapping[str, Any] | None = None) -> Scenario:
-    """Read, merge and validate one variant of a scenario.
+    """Load and validate one variant of a scenario.
 
     Parameters
     ----------
-    path : file, or the name of a shipped scenario
-    variant : name; default the first variant of the file
-    overrides : values by dotted key, e.g. ``{"integrator.rtol": 1e-8, "plant.chain.0.mass_kg": 0.2}``
+    path : str or Path
+        Path of a scenario file, or the name of a shipped scenario (see ``dynsim list``).
+    variant : str, optional
+        Name of the variant; default: the first variant in the file.
+    overrides : mapping, optional
+        Values by dotted key, in the units of the keys, e.g.
+        ``{"integrator.rtol": 1e-8, "plant.chain.0.mass_kg": 0.2}``. They are applied after the variant.
+
+    Returns
+    -------
+    Scenario
+        Validated scenario with all defaults.
 
     Raises
     ------
     ScenarioError
-        The message names file, line, key, value and the fix.
+        If the file, the variant or a key does not exist, or a value is invalid. The message contains file, line, key,
+        value and fix.
+
+    Examples
+    --------
+    >>> import dynsim
+    >>> scenario = dynsim.load_scenario("elbow_comparison", variant="elbow_4", overrides={"duration_s": 2.0})
+    >>> scenario.variant, scenario.duration_s
+    ('elbow_4', 2.0)
     """
     return read_scenario(path).load(variant, overrides)
 
 
 def read_scenario(path: str | Path) -> ScenarioFile:
-    """Read a scenario file, or the shipped scenario of that name, without validating it.
+    """Read a scenario file, or a shipped scenario, without validating it.
 
     Raises
     ------
     ScenarioError
-        It cannot be read, or is no mapping.
+        If the file cannot be read or is not a mapping.
     """
     path = find_scenario(path)
     return ScenarioFile(path, _read(path))
@@ -95,12 +112,14 @@ def read_scenario(path: str | Path) -> ScenarioFile:
 
 @dataclass(frozen=True)
 class ScenarioFile:
-    """A scenario file as it was read: many scenarios can be loaded from it, also in processes that do not have it.
+    """Content of a scenario file, from which scenarios can be loaded without reading the file again.
 
     Attributes
     ----------
-    path : where it was read from; files that it names are relative to its folder
-    data : its content
+    path : Path
+        Path of the file; paths in the scenario are relative to its folder.
+    data : YamlMapping
+        Content with line numbers.
     """
 
     path: Path
@@ -108,17 +127,17 @@ class ScenarioFile:
 
     @property
     def variants(self) -> list[str]:
-        """Names of the variants, in the order of the file; empty without variants."""
+        """Names of the variants, in file order; empty without variants."""
         variants = self.data.get("variants")
         return list(variants) if isinstance(variants, Mapping) else []
 
     def load(self, variant: str | None = None, overrides: Mapping[str, Any] | None = None) -> Scenario:
-        """See :func:`load_scenario`."""
+        """Load and validate one variant; see :func:`load_scenario`."""
         variants, variant = self.chosen(variant)
         overrides = {} if overrides is None else overrides
         if not (isinstance(overrides, Mapping) and all(isinstance(key, str) for key in overrides)):
             raise ScenarioError(
-                f"overrides must map dotted keys to values, as {{'integrator.rtol': 1e-8}} does, not {brief(overrides)}"
+                f"overrides must map dotted keys to values, e.g. {{'integrator.rtol': 1e-8}}, got {brief(overrides)}"
             )
         merged, origin = self._merged(variant, overrides)
         try:
@@ -132,27 +151,33 @@ class ScenarioFile:
         return Scenario(config.name, config.variant, config, self.path, origin)
 
     def chosen(self, variant: str | None) -> tuple[Mapping[str, Any], str | None]:
-        """All variants, and the name of the one that is meant, None without any; ScenarioError if there is no such."""
+        """Return all variants and the name of the chosen variant (None without variants).
+
+        Raises
+        ------
+        ScenarioError
+            If the variant does not exist.
+        """
         path, data = self.path, self.data
         variants = data.get("variants")
         if variants is None:
             variants = {}
         if not isinstance(variants, Mapping):
-            raise ScenarioError(f"{path}:{data.lines['variants']}: variants must be a mapping of names to what differs")
+            raise ScenarioError(f"{path}:{data.lines['variants']}: variants must be a mapping of names to differences")
         if variant is None and variants:
             variant = next(iter(variants))
-        # A list of the names: what is no name need not be hashable.
+        # Compare with a list: an invalid name need not be hashable.
         if variant is not None and variants and variant not in list(variants):
             raise ScenarioError(
                 f"{path}: no variant {variant!r}{suggest(str(variant), variants)}; "
                 f"variants: {', '.join(map(key_text, variants))}"
             )
         if variant is not None and not variants and variant != data.get("variant"):
-            raise ScenarioError(f"{path}: has no variants, so there is no {variant!r}")
+            raise ScenarioError(f"{path}: has no variants; remove the variant {variant!r}")
         return variants, variant
 
     def _merged(self, variant: str | None, overrides: Mapping[str, Any]) -> tuple[dict[str, Any], Origin]:
-        """One variant of a file with overrides on top, and where its values come from."""
+        """Return one variant with overrides applied, and the origin of its values."""
         shared = YamlMapping()
         shared.update({key: value for key, value in self.data.items() if key != "variants"})
         shared.lines = {key: line for key, line in self.data.lines.items() if key in shared}
@@ -162,7 +187,7 @@ class ScenarioFile:
             difference = {}
         if not isinstance(difference, Mapping):
             line = f":{variants.lines[variant]}" if isinstance(variants, YamlMapping) and variant is not None else ""
-            raise ScenarioError(f"{self.path}{line}: variant {value_text(variant)} must be a mapping of what differs")
+            raise ScenarioError(f"{self.path}{line}: variant {value_text(variant)} must be a mapping of differences")
         overriding = "--set" if isinstance(overrides, SetOptions) else "overrides"
         origin = Origin(self.path, (difference, shared), tuple(overrides), overriding)
         merged = _plain(_merge(shared, difference))
@@ -177,7 +202,7 @@ class ScenarioFile:
         return merged, origin
 
     def _unknown_keys(self, variant: str, overrides: Mapping[str, Any]) -> list[str]:
-        """Unknown keys of a variant; nothing when it has other faults."""
+        """Return the unknown keys of a variant; an empty list if it has other errors."""
         try:
             merged, origin = self._merged(variant, overrides)
             ScenarioConfig.model_validate(merged)
@@ -189,35 +214,35 @@ class ScenarioFile:
 
 
 def scenario_from_resolved(resolved: Mapping[str, Any]) -> Scenario:
-    """The scenario that a record's provenance holds.
+    """Return the scenario in a record's provenance.
 
     Raises
     ------
     ScenarioError
-        It was written by a version of dynsim with other keys.
+        If it was written by a version of dynsim with different keys.
     """
     if not isinstance(resolved, Mapping):
-        raise ScenarioError(f"the scenario in this record must be a mapping of keys to values, not {brief(resolved)}")
+        raise ScenarioError(f"the scenario in this record must be a mapping of keys to values, got {brief(resolved)}")
     try:
         config = ScenarioConfig.model_validate(resolved)
     except ValidationError as error:
         origin = Origin("the scenario in this record")
         problem = explain(error, resolved, origin, unknown_keys(error, resolved, origin, ScenarioConfig, TOP))
-        raise ScenarioError(f"{problem}; it was written by another version of dynsim") from None
+        raise ScenarioError(f"{problem}; the record was written by another version of dynsim") from None
     return Scenario(config.name, config.variant, config)
 
 
 class SetOptions(dict[str, Any]):
-    """Overrides that were given as ``--set`` on the command line: errors call them so."""
+    """Overrides from ``--set`` on the command line; errors refer to them as ``--set``."""
 
 
 def parse_override(text: str) -> tuple[str, Any]:
-    """``a.b.c=VALUE`` as key and YAML value.
+    """Split ``a.b.c=VALUE`` into the key and the YAML value.
 
     Raises
     ------
     ScenarioError
-        No ``=`` in the text, or a value that is not YAML.
+        If the text has no ``=``, or the value is not valid YAML.
     """
     key, separator, value = text.partition("=")
     key = key.strip()
@@ -229,7 +254,7 @@ def parse_override(text: str) -> tuple[str, Any]:
 def _read(path: Path) -> YamlMapping:
     data = parse_yaml(read_text(path, ScenarioError), ScenarioError, str(path))
     if data is None:
-        raise ScenarioError(f"{path}: is empty; a scenario needs at least duration_s and plant")
+        raise ScenarioError(f"{path}: is empty; a scenario requires at least duration_s and plant")
     if not isinstance(data, YamlMapping):
         kind = "list" if isinstance(data, list) else "single value"
         raise ScenarioError(f"{path}: must be a mapping of keys to values, not a {kind}")
@@ -237,7 +262,7 @@ def _read(path: Path) -> YamlMapping:
 
 
 def _plain(value: Any) -> Any:
-    """A copy of a value in plain Python types; arrays, which overrides may be, as lists."""
+    """Return a copy in plain Python types; arrays, which overrides may contain, become lists."""
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, (np.ndarray, np.generic)):
@@ -253,7 +278,7 @@ def _plain(value: Any) -> Any:
 
 
 def _merge(base: Any, difference: Any) -> Any:
-    """``difference`` laid over ``base``: mappings merge, null removes, anything else replaces."""
+    """Merge ``difference`` into ``base``: mappings merge, null removes, other values replace."""
     if not (isinstance(base, Mapping) and isinstance(difference, Mapping)):
         return difference
     merged = {key: _merge(value, {}) if isinstance(value, Mapping) else value for key, value in base.items()}
@@ -270,16 +295,16 @@ def _override(data: Any, key: str, value: Any, overriding: str, variant: str | N
     node, parts = data, str(key).split(".")
     location = f"{overriding} {key_text(key)}"
     if "" in parts:
-        raise ScenarioError(f"{location}: a part of the key is empty; it must look like integrator.rtol")
+        raise ScenarioError(f"{location}: part of the key is empty; write it like integrator.rtol")
     if len(parts) > DEPTH_LIMIT:
-        raise ScenarioError(f"{location}: has {len(parts)} parts; no key of a scenario has more than {DEPTH_LIMIT}")
+        raise ScenarioError(f"{location}: has {len(parts)} parts; keys have at most {DEPTH_LIMIT}")
     if parts[0] == "variants" or (parts[0] == "variant" and variant is not None):
-        raise ScenarioError(f"{location}: which variant runs is chosen by its name (dynsim run --variant), not set")
+        raise ScenarioError(f"{location}: the variant cannot be set here; use dynsim run --variant")
     for depth, part in enumerate(parts):
         last = depth == len(parts) - 1
         if isinstance(node, list):
             if not INDEX.fullmatch(part) or int(part) >= len(node):
-                raise ScenarioError(f"{location}: {value_text(part)} is no index of a list of {len(node)}")
+                raise ScenarioError(f"{location}: {value_text(part)} is not an index of a list of {len(node)} entries")
             index: Any = int(part)
         elif isinstance(node, Mapping):
             index = part
@@ -294,11 +319,11 @@ def _override(data: Any, key: str, value: Any, overriding: str, variant: str | N
 
 
 def _make_absolute(data: Any, folder: Path) -> None:
-    """Paths in keys named ``file`` are relative to the scenario."""
+    """Resolve the paths in keys named ``file`` relative to the scenario's folder."""
     if isinstance(data, dict):
         for key, value in data.items():
             if key == "file" and isinstance(value, str):
-                # A name that no file can have is left for its reader to refuse.
+                # The reader of the file reports invalid file names.
                 with suppress(OSError, ValueError, RuntimeError):
                     data[key] = str((folder / value).resolve())
             else:
@@ -309,19 +334,19 @@ def _make_absolute(data: Any, folder: Path) -> None:
 
 
 def _check_sizes(value: Any, keys: tuple[int | str, ...], origin: Origin) -> None:
-    """Refuse numbers whose powers and products leave the range of a float; other checks see to NaN and infinity."""
+    """Reject numbers whose powers and products could overflow a float; other checks reject NaN and infinity."""
     if isinstance(value, dict | list):
         for key, item in value.items() if isinstance(value, dict) else enumerate(value):
             _check_sizes(item, (*keys, key), origin)
     elif isinstance(value, int | float) and (SIZE_MAX < abs(value) < np.inf or 0 < abs(value) < 1.0 / SIZE_MAX):
         raise ScenarioError(
-            f"{origin.location(keys)}: {dotted(keys)} = {value_text(value)}: its size must be between "
+            f"{origin.location(keys)}: {dotted(keys)} = {value_text(value)}: the magnitude must be between "
             f"{1.0 / SIZE_MAX:g} and {SIZE_MAX:g}, or zero"
         )
 
 
 def to_yaml(resolved: Mapping[str, Any]) -> str:
-    """YAML text of a resolved scenario."""
+    """Return a resolved scenario as YAML text."""
     from ruamel.yaml import YAML
 
     stream = io.StringIO()
@@ -332,23 +357,20 @@ def to_yaml(resolved: Mapping[str, Any]) -> str:
     return stream.getvalue()
 
 
-# The JSON schema of scenario files, for editors.
-
-
 def json_schema() -> dict[str, Any]:
-    """JSON schema of scenario files, for editors; it constrains ``variants`` only to be mappings."""
+    """Return the JSON schema of scenario files for editors; the content of ``variants`` is not checked."""
     schema = _by_type(ScenarioConfig.model_json_schema())
     schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
     schema["properties"]["variants"] = {
         "type": "object",
-        "description": "by name: what differs (mappings merge, lists and values replace, null removes)",
+        "description": "differences by variant name (mappings merge, lists and values replace, null removes)",
         "additionalProperties": {"type": ["object", "null"]},
     }
     return schema
 
 
 def _by_type(schema: Any) -> Any:
-    """Choices as conditions on ``type`` and on null: for ``oneOf`` and ``anyOf`` editors report only "no match"."""
+    """Rewrite choices as conditions on ``type`` and null; editors report ``oneOf`` and ``anyOf`` only as "no match"."""
     if isinstance(schema, list):
         return [_by_type(item) for item in schema]
     if not isinstance(schema, dict):

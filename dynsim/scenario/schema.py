@@ -1,4 +1,7 @@
-"""Schema of a scenario: its keys with types, units, limits and defaults, as frozen data; the validated scenario."""
+"""Schema of a scenario file: keys with types, units, limits and defaults as frozen pydantic models, and `Scenario`.
+
+One section of this file for each section of a scenario: sensors, ties, loads, objects, contacts, start, integrator.
+"""
 
 from __future__ import annotations
 
@@ -27,78 +30,81 @@ from dynsim.record.scene import HERE, Shape, quaternion
 from dynsim.scenario.combinations import BILATERAL_KEYS, METHODS, THETA, UNILATERAL_KEYS, check_keys
 from dynsim.scenario.effect import idle_keys, is_set
 
-# The ``sensors:`` section of a scenario: rate, delay, resolution and noise of a sampled controller's inputs.
+# Section `sensors`: sampling rate, delay, resolution and noise of the controller's inputs.
 
-
-# Rate of a sensor [Hz]; limited because each sample is a call of Python.
+# Rate of a sensor [Hz]; limited because each sample is a Python call.
 Rate = Annotated[float, Field(gt=0.0, le=1e5)]
 # Resolution of the MX series [deg]: 4096 positions in a turn (data sheet).
 MX_RESOLUTION = math.degrees(2.0 * math.pi / 4096)
 
 
 class Sensor(StrictConfig):
-    """What all sensors have: the last sample that has arrived is held."""
+    """Sampled sensor; the controller reads the last sample that has arrived."""
 
-    rate_hz: Rate | None = Field(None, description="of its samples; default: one at every tick of the controller")
-    delay_s: NonNegative = Field(0.0, description="from a sample to its arrival")
+    rate_hz: Rate | None = Field(None, description="sampling rate; default: one sample per controller tick")
+    delay_s: NonNegative = Field(0.0, description="delay between a sample and its arrival")
 
 
 class Encoders(Sensor):
-    """Positions of joints; their rates are differences of samples."""
+    """Joint encoders; joint rates are differences of samples."""
 
     resolution_deg: NonNegative = Field(
-        MX_RESOLUTION, description="angles are rounded to it; default: 4096 positions in a turn, as MX servos have"
+        MX_RESOLUTION, description="resolution of joint angles; default: 4096 positions per turn, as in MX servos"
     )
-    noise_deg: NonNegative = Field(0.0, description="standard deviation, before rounding")
-    resolution_m: NonNegative = Field(0.0, description="the same of prismatic joints")
-    noise_m: NonNegative = Field(0.0, description="the same of prismatic joints")
+    noise_deg: NonNegative = Field(0.0, description="standard deviation of the noise of joint angles, before rounding")
+    resolution_m: NonNegative = Field(0.0, description="resolution of prismatic joints")
+    noise_m: NonNegative = Field(
+        0.0, description="standard deviation of the noise of prismatic joints, before rounding"
+    )
 
 
 class MotionCapture(Sensor):
-    """Position and attitude of the controlled point of a snake ([T] V.A)."""
+    """Motion capture of the position and attitude of a snake's controlled point ([T] V.A)."""
 
-    rate_hz: Rate | None = Field(100.0, description="of its samples (assumed)")
-    delay_s: NonNegative = Field(0.01, description="from a sample to its arrival (assumed)")
-    position_noise_m: NonNegative = Field(2e-4, description="standard deviation of each coordinate (assumed)")
-    attitude_noise_rad: NonNegative = Field(5e-4, description="standard deviation of each angle (assumed)")
+    rate_hz: Rate | None = Field(100.0, description="sampling rate (assumed)")
+    delay_s: NonNegative = Field(0.01, description="delay between a sample and its arrival (assumed)")
+    position_noise_m: NonNegative = Field(
+        2e-4, description="standard deviation of the noise of each coordinate (assumed)"
+    )
+    attitude_noise_rad: NonNegative = Field(5e-4, description="standard deviation of the noise of each angle (assumed)")
 
 
 class Sensors(StrictConfig):
-    """Sensors of the robot; one that is not there tells the truth at once."""
+    """Sensors of the robot; without a sensor the controller reads the exact state without delay."""
 
-    seed: StrictInt = Field(0, ge=0, description="of all noise: the same seed, the same noise")
+    seed: StrictInt = Field(0, ge=0, description="seed of the noise of all sensors; equal seeds give equal noise")
     encoders: Encoders | None = None
     motion_capture: MotionCapture | None = None
 
 
-# The ``ties:`` section of a scenario: springs, dampers and bounds between two bodies, of the robot or of objects.
+# Section `ties`: bounded springs and dampers between two bodies of the robot or of objects.
 
 
 class TieConfig(StrictConfig):
-    """What it ties, and in which direction; the keys of ``LAW`` name stiffness, damping and bound with their units."""
+    """Ends and direction of a tie; `LAW` names the keys of its stiffness, damping and bound."""
 
     LAW: ClassVar[tuple[str, str, str]]
 
-    body: str = Field(description="name of a body, or of a frame fixed on one")
-    other: str = Field(description="the same, of the other end, or `world`")
-    axis: Vector3 = Field(description="in the axes of body")
-    pushes: bool = Field(default=False, description="it only pushes body along the axis, away from other")
-    holds: bool = Field(default=True, description="from the start on; `Simulation.set_tie` changes it")
+    body: str = Field(description="first end: a body, or a frame fixed on a body")
+    other: str = Field(description="second end: a body, a frame fixed on a body, or `world`")
+    axis: Vector3 = Field(description="direction of the tie, in the axes of `body`")
+    pushes: bool = Field(default=False, description="only push `body` along the axis, away from `other`")
+    holds: bool = Field(default=True, description="active at the start; `Simulation.set_tie` changes it")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         unit_vector(self.axis, "axis")
         if self.body == self.other:
-            raise error_at("other", f"is {self.body!r}, as body is; a tie has two ends")
+            raise error_at("other", f"must differ from body ({self.body!r}); a tie connects two bodies")
         stiffness, damping, bound = self.LAW
         if not getattr(self, stiffness) + getattr(self, damping) > 0.0:
-            raise error_at(stiffness, f"is needed, or {damping}")
+            raise error_at(stiffness, f"must be positive if {damping} is 0; set one of the two")
         if self.pushes and getattr(self, bound) is not None:
-            raise error_at(bound, "is none of a tie that only pushes; remove it")
+            raise error_at(bound, "is not available for a tie that only pushes; remove it")
         return self
 
     def tie(self, name: str) -> Tie:
-        """The tie of that name."""
+        """Return the tie."""
         stiffness, damping, bound = (getattr(self, key) for key in self.LAW)
         bound = math.inf if bound is None else bound
         ends = self.body, self.other, np.array(self.axis)
@@ -106,20 +112,20 @@ class TieConfig(StrictConfig):
 
 
 class Linear(TieConfig):
-    """Along the axis: f = −k (x − x_0) − c dx/dt on body, x = axis · (point − other point)."""
+    """Linear tie along the axis: f = −k (x − x_0) − c dx/dt on `body`, with x = axis · (point − other point)."""
 
     LAW = "stiffness_N_per_m", "damping_N_s_per_m", "bound_N"
 
     type: Literal["linear"]
-    point_m: Vector3 = Field(default=[0.0, 0.0, 0.0], description="in body's axes, from its origin")
-    other_point_m: Vector3 = Field(default=[0.0, 0.0, 0.0], description="in those of other")
-    stiffness_N_per_m: NonNegative = 0.0
-    damping_N_s_per_m: NonNegative = 0.0
-    bound_N: Positive | None = Field(default=None, description="beyond it x_0 moves; default: none")
-    rest_m: float | None = Field(default=None, description="x_0; default: x at the start")
+    point_m: Vector3 = Field(default=[0.0, 0.0, 0.0], description="point of `body`, in its axes from its origin")
+    other_point_m: Vector3 = Field(default=[0.0, 0.0, 0.0], description="point of `other`, in its axes from its origin")
+    stiffness_N_per_m: NonNegative = Field(default=0.0, description="stiffness k")
+    damping_N_s_per_m: NonNegative = Field(default=0.0, description="damping c")
+    bound_N: Positive | None = Field(default=None, description="force limit, beyond which x_0 moves; default: no limit")
+    rest_m: float | None = Field(default=None, description="rest length x_0; default: x at the start")
 
     def tie(self, name: str) -> Tie:
-        """The tie of that name."""
+        """Return the tie."""
         start = math.nan if self.rest_m is None else self.rest_m
         return replace(
             super().tie(name), point=np.array(self.point_m), other_point=np.array(self.other_point_m), rest=start
@@ -127,74 +133,78 @@ class Linear(TieConfig):
 
 
 class Torsion(TieConfig):
-    """About the axis: the same of the rotation of body against other."""
+    """Torsional tie about the axis: the law of a linear tie for the rotation of `body` relative to `other`."""
 
     LAW = "stiffness_N_m_per_rad", "damping_N_m_s_per_rad", "bound_N_m"
 
     type: Literal["torsion"]
-    stiffness_N_m_per_rad: NonNegative = 0.0
-    damping_N_m_s_per_rad: NonNegative = 0.0
-    bound_N_m: Positive | None = Field(default=None, description="beyond it x_0 moves; default: none")
+    stiffness_N_m_per_rad: NonNegative = Field(default=0.0, description="stiffness k")
+    damping_N_m_s_per_rad: NonNegative = Field(default=0.0, description="damping c")
+    bound_N_m: Positive | None = Field(
+        default=None, description="torque limit, beyond which x_0 moves; default: no limit"
+    )
 
     def tie(self, name: str) -> Tie:
-        """The tie of that name."""
+        """Return the tie."""
         return replace(super().tie(name), turns=True)
 
 
 TieChoice = Annotated[Linear | Torsion, Field(discriminator="type")]
 
 
-# The ``loads:`` section of a scenario: forces and torques on bodies, and payloads fixed to them.
-
+# Section `loads`: forces and torques on bodies, and payloads fixed to bodies.
 
 FORCE_COLUMNS = ("t_s", "fx_N", "fy_N", "fz_N")
 TORQUE_COLUMNS = ("mx_N_m", "my_N_m", "mz_N_m")
 
-# Times, (K + 1,) [s], and coefficients of cubic polynomials of the six components between them, (K, 6, 4).
+# Times, shape (K + 1,) [s], and coefficients of the cubic polynomials of the six components in between, (K, 6, 4).
 Pieces = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 class WrenchConfig(BodyPoint):
-    """Where a wrench acts, and in which axes it is given."""
+    """Point of application of a wrench, and the axes of its components."""
 
-    frame: Literal["world", "body"] = Field(default="world", description="axes of force and torque")
+    frame: Literal["world", "body"] = Field(default="world", description="axes of the force and torque components")
 
 
 class Constant(WrenchConfig):
-    """A constant force and torque."""
+    """Constant force and torque."""
 
     type: Literal["constant"]
-    force_N: Vector3 = [0.0, 0.0, 0.0]
-    torque_N_m: Vector3 = Field(default=[0.0, 0.0, 0.0], description="about the point")
+    force_N: Vector3 = Field(default=[0.0, 0.0, 0.0], description="force at the point")
+    torque_N_m: Vector3 = Field(default=[0.0, 0.0, 0.0], description="torque about the point")
 
     @property
     def hold(self) -> bool:
-        """It has no end."""
+        """True: the wrench lasts until the end of the run."""
         return True
 
     def pieces(self, duration: float) -> Pieces:
-        """One constant piece from 0 to ``duration`` [s]."""
+        """Return one constant piece from 0 to ``duration`` [s]."""
         coefficients = np.zeros((1, 6, 4))
         coefficients[0, :, 0] = [*self.force_N, *self.torque_N_m]
         return np.array([0.0, duration]), coefficients
 
 
 class Sampled(WrenchConfig):
-    """A force and a torque through samples."""
+    """Force and torque interpolated between samples."""
 
     interpolation: Literal["spline", "linear"] = Field(
-        default="spline", description="spline: cubic, not-a-knot (of two samples a line, of three a parabola)"
+        default="spline",
+        description="`spline`: cubic, not-a-knot (a line for two samples, a parabola for three); or `linear`",
     )
-    hold: bool = Field(default=False, description="first and last sample go on beyond the times, else it is zero there")
-    # Of all columns, made once: an edit of a file does not change a scenario that is already loaded.
+    hold: bool = Field(
+        default=False, description="hold the first and last sample outside the sampled times; default: zero there"
+    )
+    # Computed at load time: a later edit of the file does not change a loaded scenario.
     _pieces: Pieces = PrivateAttr()
 
     def pieces(self, duration: float) -> Pieces:
-        """Times and polynomials through the samples."""
+        """Return the sample times and the polynomials between them."""
         return self._pieces
 
     def _interpolate(self, times: list[float], values: NDArray[np.float64]) -> Pieces:
-        """Polynomials through ``values``, (T, 6); ValueError where rounding leaves them not finite or off these."""
+        """Interpolate ``values``, shape (T, 6); raise ValueError if rounding makes the curve inaccurate or infinite."""
         knots = np.array(times)
         try:
             with np.errstate(all="ignore"):
@@ -204,12 +214,12 @@ class Sampled(WrenchConfig):
         except ValueError:  # slopes that overflow
             met = False
         if not (met and np.isfinite(coefficients).all()):
-            raise ValueError("numbers too large, or samples too close in time, for a curve through them")
+            raise ValueError("cannot be interpolated: numbers too large, or samples too close in time")
         return knots, coefficients
 
     def _coefficients(self, knots: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
         if self.interpolation == "spline":
-            from scipy.interpolate import CubicSpline  # takes 0.3 s
+            from scipy.interpolate import CubicSpline  # the import takes 0.3 s
 
             return np.ascontiguousarray(CubicSpline(knots, values).c[::-1].transpose(1, 2, 0))
         coefficients = np.zeros((len(knots) - 1, 6, 4))
@@ -219,12 +229,14 @@ class Sampled(WrenchConfig):
 
 
 class Samples(Sampled):
-    """Force and torque at ``times_s``."""
+    """Force and torque sampled at `times_s`."""
 
     type: Literal["samples"]
-    times_s: list[float] = Field(min_length=2)
-    force_N: list[Vector3] | None = Field(default=None, description="one vector for each time; default: no force")
-    torque_N_m: list[Vector3] | None = Field(default=None, description="about the point, likewise")
+    times_s: list[float] = Field(min_length=2, description="sample times, increasing")
+    force_N: list[Vector3] | None = Field(default=None, description="force at each time; default: no force")
+    torque_N_m: list[Vector3] | None = Field(
+        default=None, description="torque about the point at each time; default: no torque"
+    )
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -233,9 +245,9 @@ class Samples(Sampled):
         values = {"force_N": self.force_N, "torque_N_m": self.torque_N_m}
         for key, vectors in values.items():
             if vectors is not None and len(vectors) != len(self.times_s):
-                raise error_at(key, f"{len(vectors)} vectors and {len(self.times_s)} times_s: there must be as many")
+                raise error_at(key, f"has {len(vectors)} vectors for {len(self.times_s)} times_s; make them equal")
         if self.force_N is None and self.torque_N_m is None:
-            raise ValueError("has neither force_N nor torque_N_m")
+            raise ValueError("requires force_N or torque_N_m; add one of them")
         nothing = np.zeros((len(self.times_s), 3))
         columns = [nothing if vectors is None else np.array(vectors) for vectors in values.values()]
         self._pieces = self._interpolate(self.times_s, np.hstack(columns))
@@ -247,8 +259,8 @@ class Table(Sampled):
 
     type: Literal["csv"]
     file: str = Field(
-        description=f"CSV file, relative to the scenario file, with a header {','.join(FORCE_COLUMNS)}, "
-        f"or that and {','.join(TORQUE_COLUMNS)}"
+        description="path of a CSV file, relative to the scenario file, with the header "
+        f"{','.join(FORCE_COLUMNS)}, optionally followed by {','.join(TORQUE_COLUMNS)}"
     )
 
     @model_validator(mode="after")
@@ -264,31 +276,33 @@ class Table(Sampled):
 
 
 class Payload(BodyPoint):
-    """A body that is fixed to one of the robot's; its centre of mass is at ``point_m``; without mass it is none."""
+    """Mass fixed to a body of the robot, with its centre of mass at `point_m`; a payload of 0 kg has no effect."""
 
     type: Literal["payload"]
-    mass_kg: NonNegative
-    radius_m: NonNegative = Field(default=0.0, description="of a solid sphere; zero: a point mass")
+    mass_kg: NonNegative = Field(description="mass")
+    radius_m: NonNegative = Field(default=0.0, description="radius of a solid sphere; 0: a point mass")
     inertia_kg_m2: Annotated[list[NonNegative], Field(min_length=3, max_length=3)] | None = Field(
-        default=None, description="xx yy zz about the centre of mass, in the axes of body; default: the sphere's"
+        default=None,
+        description="moments of inertia xx, yy, zz about the centre of mass, in the axes of `body`; "
+        "default: solid sphere of `radius_m`",
     )
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         if self.inertia_kg_m2 is not None and self.radius_m > 0.0:
-            raise error_at("inertia_kg_m2", "cannot be given together with radius_m; remove one of the two")
+            raise error_at("inertia_kg_m2", "conflicts with radius_m; remove one of the two")
         if self.inertia_kg_m2 is not None and self.mass_kg == 0.0:
-            raise error_at("inertia_kg_m2", "cannot be that of mass_kg = 0; remove it, or give radius_m instead")
+            raise error_at("inertia_kg_m2", "requires a positive mass_kg; remove it, or use radius_m instead")
         return self
 
 
 LoadConfig = Annotated[Constant | Samples | Table | Payload, Field(discriminator="type")]
 
 
-# The ``objects:`` section of a scenario: bodies in addition to the robot, each a separate tree rooted in the world.
+# Section `objects`: bodies in addition to the robot, each a separate tree rooted in the world.
 
 
-# Of wood, so that no object is taken for a part of the robot.
+# The colour of wood, so that objects differ from the robot.
 COLOUR = (0.91, 0.81, 0.65, 1.0)
 Edges = Annotated[list[Positive], Field(min_length=3, max_length=3)]
 
@@ -297,11 +311,11 @@ Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
 
 
 class Guide(StrictConfig):
-    """What lets an object move in one way; ``KIND`` is that of its joint."""
+    """Joint with one degree of freedom between an object and the world; `KIND` is its type."""
 
     KIND: ClassVar[str]
 
-    axis: Vector3 = Field([0.0, 0.0, 1.0], description="in the object's own axes")
+    axis: Vector3 = Field([0.0, 0.0, 1.0], description="axis of the joint, in the object's axes")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -309,25 +323,25 @@ class Guide(StrictConfig):
         return self
 
     def _joint(self, link: Link, damping: float, friction: float, limits: list[float] | None) -> Link:
-        """The link on this joint, with limits [rad or m]."""
+        """Return the link on this joint, with limits [rad or m]."""
         lower, upper = limits or (-math.inf, math.inf)
         axis = unit_vector(self.axis, "axis")
         return replace(link, kind=self.KIND, axis=axis, damping=damping, friction=friction, lower=lower, upper=upper)
 
 
 class Hinge(Guide):
-    """An axis about which an object turns."""
+    """Hinge of an object, such as a door."""
 
     KIND = "revolute"
 
     point_m: Vector3 = Field(
-        [0.0, 0.0, 0.0], description="a point of the axis, from the object's centre; it is the origin of the body"
+        [0.0, 0.0, 0.0], description="point on the axis, from the object's centre; it becomes the origin of the body"
     )
-    friction_N_m: NonNegative = Field(0.0, description="that holds it at rest; unilateral law")
-    damping_N_m_s_per_rad: NonNegative = 0.0
-    limits_deg: Pair | None = Field(None, description="lower and upper; default: none")
-    spring_N_m_per_rad: NonNegative = Field(0.0, description="stiffness of a closer; time stepping only")
-    rest_deg: float = Field(0.0, gt=-180.0, lt=180.0, description="angle at which the spring has no torque")
+    friction_N_m: NonNegative = Field(0.0, description="dry friction torque; unilateral law")
+    damping_N_m_s_per_rad: NonNegative = Field(0.0, description="viscous damping")
+    limits_deg: Pair | None = Field(None, description="lower and upper limit; default: no limits")
+    spring_N_m_per_rad: NonNegative = Field(0.0, description="stiffness of a return spring; time_stepping only")
+    rest_deg: float = Field(0.0, gt=-180.0, lt=180.0, description="angle at which the spring torque is zero")
 
     @model_validator(mode="after")
     def _check_limits(self) -> Self:
@@ -335,32 +349,32 @@ class Hinge(Guide):
         return self
 
     def joint(self, link: Link) -> Link:
-        """The link on this joint."""
+        """Return the link on this joint."""
         limits = None if self.limits_deg is None else np.deg2rad(self.limits_deg).tolist()
         return self._joint(link, self.damping_N_m_s_per_rad, self.friction_N_m, limits)
 
     def spring(self, name: str, link: Link) -> Tie | None:
-        """Its closer, between the link and the world."""
+        """Return the return spring between the link and the world; None without stiffness."""
         angle, law = math.radians(self.rest_deg), (self.spring_N_m_per_rad, 0.0)
         tie = Tie(f"{name}.spring", link.name, WORLD, link.axis, *law, turns=True, rest=angle, attitude=link.R_PJ.T)
         return tie if self.spring_N_m_per_rad > 0.0 else None
 
 
 class Slide(Guide):
-    """Rails on which an object moves along a straight line, as a drawer does."""
+    """Straight rails of an object, such as a drawer."""
 
     KIND = "prismatic"
 
-    axis: Vector3 = Field([1.0, 0.0, 0.0], description="in the object's own axes")
-    friction_N: NonNegative = Field(0.0, description="that holds it at rest; unilateral law")
-    damping_N_s_per_m: NonNegative = 0.0
-    limits_m: Pair | None = Field(None, description="lower and upper; default: none")
-    spring_N_per_m: NonNegative = Field(0.0, description="time stepping only")
-    rest_m: float = Field(0.0, description="displacement at which the spring has no force")
+    axis: Vector3 = Field([1.0, 0.0, 0.0], description="direction of the rails, in the object's axes")
+    friction_N: NonNegative = Field(0.0, description="dry friction force; unilateral law")
+    damping_N_s_per_m: NonNegative = Field(0.0, description="viscous damping")
+    limits_m: Pair | None = Field(None, description="lower and upper limit; default: no limits")
+    spring_N_per_m: NonNegative = Field(0.0, description="stiffness of a return spring; time_stepping only")
+    rest_m: float = Field(0.0, description="displacement at which the spring force is zero")
 
     @property
     def point_m(self) -> list[float]:
-        """The joint is at the centre."""
+        """Position of the joint: the object's centre."""
         return [0.0, 0.0, 0.0]
 
     @model_validator(mode="after")
@@ -369,11 +383,11 @@ class Slide(Guide):
         return self
 
     def joint(self, link: Link) -> Link:
-        """The link on this joint."""
+        """Return the link on this joint."""
         return self._joint(link, self.damping_N_s_per_m, self.friction_N, self.limits_m)
 
     def spring(self, name: str, link: Link) -> Tie | None:
-        """Its spring, between the link and the world."""
+        """Return the spring between the link and the world; None without stiffness."""
         law, at = (self.spring_N_per_m, 0.0), link.p_PJ
         tie = Tie(f"{name}.spring", link.name, WORLD, link.axis, *law, other_point=at, rest=self.rest_m)
         return tie if self.spring_N_per_m > 0.0 else None
@@ -381,17 +395,17 @@ class Slide(Guide):
 
 def _ordered(limits: list[float] | None, key: str) -> None:
     if limits is not None and not limits[0] < limits[1]:
-        raise error_at(key, "the lower limit must be below the upper one")
+        raise error_at(key, "the lower limit must be below the upper limit")
 
 
 class Solid(StrictConfig):
-    """A shape with mass: a box, a sphere, or a cylinder along its own z axis."""
+    """Homogeneous solid: a box, a sphere, or a cylinder along its z axis."""
 
-    mass_kg: Positive
-    shape: Literal["box", "sphere", "cylinder"] = "box"
-    size_m: Edges | None = Field(None, description="edges of a box along its axes")
-    radius_m: Positive | None = Field(None, description="of a sphere or a cylinder")
-    length_m: Positive | None = Field(None, description="of a cylinder, along its z axis")
+    mass_kg: Positive = Field(description="mass")
+    shape: Literal["box", "sphere", "cylinder"] = Field("box", description="shape")
+    size_m: Edges | None = Field(None, description="edge lengths of a box along its axes")
+    radius_m: Positive | None = Field(None, description="radius of a sphere or cylinder")
+    length_m: Positive | None = Field(None, description="length of a cylinder along its z axis")
 
     @model_validator(mode="after")
     def _check_size(self) -> Self:
@@ -400,7 +414,7 @@ class Solid(StrictConfig):
 
     @property
     def inertia(self) -> Inertia:
-        """Inertia about the centre: box I_x = m (b² + c²)/12, sphere I = 2 m r²/5, cylinder I_z = m r²/2."""
+        """Inertia about the centre: I_x = m (b² + c²)/12 (box), I = 2 m r²/5 (sphere), I_z = m r²/2 (cylinder)."""
         if self.size_m is not None:
             squares = np.array(self.size_m) ** 2
             return Inertia(self.mass_kg, np.zeros(3), np.diag(self.mass_kg * (squares.sum() - squares) / 12.0))
@@ -411,7 +425,7 @@ class Solid(StrictConfig):
 
     @property
     def solid(self) -> Shape:
-        """What it looks like."""
+        """Shape for display."""
         if self.size_m is not None:
             return Shape("box", tuple(self.size_m), colour=COLOUR)
         radius = float(self.radius_m or 0.0)
@@ -421,10 +435,10 @@ class Solid(StrictConfig):
 
     @property
     def spheres(self) -> tuple[Array, float]:
-        """Centres (k, 3) and radius of spheres that touch surfaces [m]: corners, the sphere, or ends of a cylinder.
+        """Centres, shape (k, 3), and radius of the spheres that can touch surfaces [m].
 
-        Ends of a cylinder are spheres within it: a pipe that lies touches as it should, one that stands stands on a
-        sphere.
+        A box touches with its corners, a cylinder with a sphere inside each end: contact is exact for a lying pipe;
+        an upright pipe stands on a sphere.
         """
         if self.size_m is not None:
             signs = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
@@ -440,32 +454,30 @@ SIZES = {"box": ("size_m",), "sphere": ("radius_m",), "cylinder": ("radius_m", "
 
 
 def _check_sizes(solid: Solid | SceneObject) -> None:
-    """Raise an error for a size that the shape needs and has not, or has and does not need."""
+    """Raise an error if a size that the shape requires is missing, or a size does not apply to it."""
     needed = SIZES[solid.shape]
     for key in ("size_m", "radius_m", "length_m"):
         if (getattr(solid, key) is None) == (key in needed):
             text = (
-                f"is needed for a {solid.shape}" if key in needed else f"does not apply to a {solid.shape}; remove it"
+                f"is required for a {solid.shape}" if key in needed else f"does not apply to a {solid.shape}; remove it"
             )
             raise error_at(key, text)
 
 
 class Part(Solid):
-    """One of several solids of which an object is made."""
+    """Solid that is part of an object."""
 
-    position_m: Vector3 = Field([0.0, 0.0, 0.0], description="position of its centre, in the object's axes")
+    position_m: Vector3 = Field([0.0, 0.0, 0.0], description="position of the part's centre, in the object's axes")
     rpy_deg: Vector3 = Field([0.0, 0.0, 0.0], description="attitude in the object's axes, Rz(yaw) Ry(pitch) Rx(roll)")
 
 
 class Grasp(StrictConfig):
-    """Where and from where a gripper can hold an object."""
+    """Pose of a gripper that holds an object."""
 
     position_m: Vector3 = Field(
-        [0.0, 0.0, 0.0], description="where the tip of the gripper is then, in the object's axes from its centre"
+        [0.0, 0.0, 0.0], description="position of the gripper's tip, in the object's axes from its centre"
     )
-    axis: Vector3 = Field(
-        [1.0, 0.0, 0.0], description="direction in which the gripper points then, in the object's axes"
-    )
+    axis: Vector3 = Field([1.0, 0.0, 0.0], description="pointing direction of the gripper, in the object's axes")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -474,15 +486,15 @@ class Grasp(StrictConfig):
 
 
 class ObjectWheel(StrictConfig):
-    """A body that turns on an object and rolls on surfaces: a sphere where it touches, with the inertia of a disc."""
+    """Wheel of an object: it touches surfaces as a sphere and has the inertia of a disc."""
 
-    position_m: Vector3 = Field(description="of its centre, in the object's axes from its centre")
-    axis: Vector3 = Field([0.0, 1.0, 0.0], description="in the object's axes")
-    radius_m: Positive
-    mass_kg: Positive
-    friction_N_m: NonNegative = Field(0.0, description="of its bearing, that holds it at rest; unilateral law")
-    damping_N_m_s_per_rad: NonNegative = 0.0
-    motor: union("motor") | None = Field(None, description="default: it turns freely")  # type: ignore[valid-type]
+    position_m: Vector3 = Field(description="position of the wheel's centre, in the object's axes from its centre")
+    axis: Vector3 = Field([0.0, 1.0, 0.0], description="axle, in the object's axes")
+    radius_m: Positive = Field(description="radius")
+    mass_kg: Positive = Field(description="mass")
+    friction_N_m: NonNegative = Field(0.0, description="dry friction torque of the bearing; unilateral law")
+    damping_N_m_s_per_rad: NonNegative = Field(0.0, description="viscous damping")
+    motor: union("motor") | None = Field(None, description="motor; default: no motor")  # type: ignore[valid-type]
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -490,7 +502,7 @@ class ObjectWheel(StrictConfig):
         return self
 
     def link(self, name: str, carrier: str) -> Link:
-        """Its body and joint, on the object's body; the disc has I = m r²/2 about its axis, half of that across."""
+        """Return the wheel's link on the body `carrier`; I = m r²/2 about the axle, m r²/4 across it."""
         axis, across = unit_vector(self.axis, "axis"), 0.25 * self.mass_kg * self.radius_m**2
         inertia = Inertia(self.mass_kg, np.zeros(3), across * (np.eye(3) + np.outer(axis, axis)))
         width = (self.radius_m, WHEEL_WIDTH * self.radius_m)
@@ -509,52 +521,54 @@ class ObjectWheel(StrictConfig):
 
 
 class SceneObject(StrictConfig):
-    """A solid box, sphere or cylinder, or a body of several parts."""
+    """Object: a solid box, sphere or cylinder, or a rigid body of several parts."""
 
-    mass_kg: Positive | None = Field(None, description="default: the sum of those of its parts")
-    shape: Literal["box", "sphere", "cylinder", "parts"] = "box"
-    size_m: Edges | None = Field(None, description="edges of a box along its axes")
-    radius_m: Positive | None = Field(None, description="of a sphere or a cylinder")
-    length_m: Positive | None = Field(None, description="of a cylinder, along its z axis")
+    mass_kg: Positive | None = Field(None, description="mass; with `shape: parts` the sum of the masses of the parts")
+    shape: Literal["box", "sphere", "cylinder", "parts"] = Field("box", description="shape")
+    size_m: Edges | None = Field(None, description="edge lengths of a box along its axes")
+    radius_m: Positive | None = Field(None, description="radius of a sphere or cylinder")
+    length_m: Positive | None = Field(None, description="length of a cylinder along its z axis")
     parts: Annotated[dict[str, Part], Field(min_length=1)] | None = Field(
-        None, description="solids by name, fixed to each other, of `shape: parts`"
+        None, description="named solids, fixed to each other, for `shape: parts`"
     )
-    position_m: Vector3 = Field(description="of its centre at the start, in the world; of parts: of their origin")
-    rpy_deg: Vector3 = Field([0.0, 0.0, 0.0], description="attitude at the start, Rz(yaw) Ry(pitch) Rx(roll)")
-    hinge: Hinge | None = Field(None, description="default: it is free")
-    slide: Slide | None = Field(None, description="default: it is free")
-    wheels: dict[str, ObjectWheel] = Field({}, description="wheels of a free one, by name")
-    grasp: Grasp | None = Field(None, description="where a gripper can hold it; default: nowhere")
+    position_m: Vector3 = Field(
+        description="initial position of the centre in the world; for `shape: parts`, of the origin of the parts"
+    )
+    rpy_deg: Vector3 = Field([0.0, 0.0, 0.0], description="initial attitude, Rz(yaw) Ry(pitch) Rx(roll)")
+    hinge: Hinge | None = Field(None, description="hinge to the world; default: the object is free")
+    slide: Slide | None = Field(None, description="rails in the world; default: the object is free")
+    wheels: dict[str, ObjectWheel] = Field({}, description="named wheels of a free object")
+    grasp: Grasp | None = Field(None, description="grasp pose for a gripper; default: it cannot be gripped")
 
     @model_validator(mode="after")
     def _check_size(self) -> Self:
         if self.hinge is not None and self.slide is not None:
-            raise error_at("slide", "this object is on a hinge already; remove one of the two")
+            raise error_at("slide", "conflicts with hinge; remove one of the two")
         if self.joint is not None and self.wheels:
             on = "hinge" if self.hinge is not None else "slide"
-            raise error_at("wheels", f"are of free objects, this one is on a {on}; remove one of the two")
+            raise error_at("wheels", f"requires a free object, but this object has a {on}; remove one of the two")
         if self.shape == "parts":
             for key in ("mass_kg", "size_m", "radius_m", "length_m"):
                 if getattr(self, key) is not None:
-                    raise error_at(key, "does not apply to an object of parts, each of which has its own; remove it")
+                    raise error_at(key, "does not apply to shape: parts; set it for each part and remove it here")
             if self.parts is None:
-                raise error_at("parts", "is needed for shape: parts")
+                raise error_at("parts", "is required for shape: parts")
             return self
         if self.parts is not None:
             raise error_at("parts", f"does not apply to a {self.shape}; remove it, or set shape: parts")
         if self.mass_kg is None:
-            raise error_at("mass_kg", f"is needed for a {self.shape}")
+            raise error_at("mass_kg", f"is required for a {self.shape}")
         _check_sizes(self)
         return self
 
     @property
     def joint(self) -> Hinge | Slide | None:
-        """The joint between the object and the world; None: it is free."""
+        """Joint between the object and the world; None if the object is free."""
         return self.hinge if self.hinge is not None else self.slide
 
     @property
     def solids(self) -> dict[str, Part]:
-        """Its parts; a single solid is one part."""
+        """Parts of the object; a single solid counts as one part."""
         if self.parts is not None:
             return self.parts
         keys = ("mass_kg", "shape", "size_m", "radius_m", "length_m")
@@ -568,17 +582,17 @@ class SceneObject(StrictConfig):
 
     @property
     def shapes(self) -> tuple[Shape, ...]:
-        """What it looks like, in its axes from its centre."""
+        """Shapes for display, in the object's axes from its centre."""
         parts = self.solids.values()
         return tuple(part.solid.placed(part.position_m, quaternion(_turn(part.rpy_deg))) for part in parts)
 
     @property
     def _origin(self) -> Array:
-        """Origin of its body, in its axes from its centre: on its hinge [m]."""
+        """Origin of the body, in the object's axes from its centre [m]; on the hinge if there is a hinge."""
         return np.zeros(3) if self.joint is None else np.array(self.joint.point_m)
 
     def links(self, name: str) -> tuple[Link, ...]:
-        """Its tree; joint and body have the name of the object."""
+        """Return the tree of links; joint and body have the name of the object."""
         back = -self._origin
         shapes = tuple(shape.placed(back, HERE) for shape in self.shapes)
         inertia = self.inertia.placed(np.eye(3), back)
@@ -589,30 +603,30 @@ class SceneObject(StrictConfig):
         return (replace(self.joint.joint(link), R_PJ=R, p_PJ=np.array(self.position_m) + R @ self._origin),)
 
     def ties(self, name: str) -> list[Tie]:
-        """The spring of its hinge or rails."""
+        """Return the spring of the hinge or rails, if any."""
         spring = None if self.joint is None else self.joint.spring(name, self.links(name)[0])
         return [] if spring is None else [spring]
 
     def frames(self, name: str) -> list[Frame]:
-        """Its grasp frame, whose x axis is the direction in which a gripper points."""
+        """Return the grasp frame, if any; its x axis is the pointing direction of the gripper."""
         if self.grasp is None:
             return []
         R = frame_along(unit_vector(self.grasp.axis, "axis"))
         return [Frame(grasp_frame(name), name, R, np.array(self.grasp.position_m) - self._origin)]
 
     def start(self) -> list[float]:
-        """Its coordinates at the start."""
+        """Return the initial coordinates [m, quaternion or rad]."""
         if self.joint is not None:
             return [0.0]
         return [*self.position_m, *quaternion(_turn(self.rpy_deg)), *(0.0 for _ in self.wheels)]
 
     def motors(self, name: str, context: BuildContext) -> list[Drive]:
-        """Those of its wheels."""
+        """Return the motors of the wheels."""
         joints = {f"{name}.{own}": wheel.motor for own, wheel in self.wheels.items() if wheel.motor is not None}
         return [build("motor", motor, context.at_joint(joint), Drive) for joint, motor in joints.items()]
 
     def feet(self, name: str, surfaces: list[str]) -> list[Foot]:
-        """With what it can touch each of these surfaces."""
+        """Return the points and spheres that can touch each of these surfaces."""
         if self.joint is not None:
             return []
         touching: list[tuple[str, Array, float]] = []
@@ -634,7 +648,7 @@ class SceneObject(StrictConfig):
 
 
 def _turn(rpy_deg: list[float]) -> Array:
-    # Imported here: the reader of URDF takes long to load.
+    # Imported here because the URDF reader takes long to load.
     if not any(rpy_deg):
         return np.eye(3)
     from dynsim.model.urdf.reader import rotation
@@ -643,7 +657,7 @@ def _turn(rpy_deg: list[float]) -> Array:
 
 
 def frame_along(axis: Array) -> Array:
-    """Rotation (3, 3) whose x axis is a unit vector, with its y axis level if it can be."""
+    """Return a rotation, shape (3, 3), with the unit vector ``axis`` as x axis and, if possible, a level y axis."""
     side = np.cross([0.0, 0.0, 1.0], axis)
     if np.linalg.norm(side) < 1e-9:
         side = np.array([0.0, 1.0, 0.0])
@@ -651,13 +665,20 @@ def frame_along(axis: Array) -> Array:
     return np.column_stack([axis, side, np.cross(axis, side)])
 
 
-# Nulls of a resolved scenario: those in whose place a default would come where they were left out.
+# Nulls of a resolved scenario: without them a default would replace the None.
 
 
 def write_nulls(config: BaseModel, written: dict[str, Any], defaults: Any = None) -> None:
-    """Write ``null`` where a configuration has it and its member, or the plant, has another default.
+    """Write ``null`` for each key that is None although the key or the plant has another default.
 
-    ``written`` : the configuration as it was dumped without nulls; ``defaults`` : those of the plant, of the same form
+    Parameters
+    ----------
+    config : BaseModel
+        Validated configuration.
+    written : dict
+        Dump of ``config`` without nulls; changed in place.
+    defaults : mapping, optional
+        Defaults of the plant, in the form of ``written``.
     """
     for key, member in type(config).model_fields.items():
         value, of_plant = getattr(config, key), _entry(defaults, key)
@@ -668,7 +689,7 @@ def write_nulls(config: BaseModel, written: dict[str, Any], defaults: Any = None
 
 
 def _write_within(value: Any, written: Any, defaults: Any) -> None:
-    """The same for a value: a configuration, or several of them in a mapping or list."""
+    """Apply `write_nulls` to a value: a configuration, or a mapping or list of configurations."""
     if isinstance(value, BaseModel):
         if isinstance(written, dict):
             write_nulls(value, written, defaults)
@@ -684,82 +705,109 @@ def _entry(mapping: Any, key: Any) -> Any:
     return mapping.get(key) if isinstance(mapping, Mapping) else None
 
 
-# Most bytes in the name of a folder on common file systems.
+# Maximum length of a folder name on common file systems [bytes].
 NAME_LIMIT = 255
 
 Share = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
 
 
 class Grip(StrictConfig):
-    """Friction that differs along and across an axis of the body, as that of a wheel."""
+    """Friction that differs along and across an axis of the body, like the friction of a wheel."""
 
-    axis: Vector3 = Field(description="in the axes of the body or frame: along it, as far as it lies in the surface")
-    ratio: Share = Field(description="friction along the axis as a fraction of that across; 0: it rolls freely")
+    axis: Vector3 = Field(
+        description="direction of the reduced friction in the axes of the body or frame, projected onto the surface"
+    )
+    ratio: Share = Field(
+        description="friction along the axis as a fraction of the friction across it; 0: it rolls freely"
+    )
 
     @field_validator("axis")
     @classmethod
     def _check_axis(cls, value: list[float]) -> list[float]:
         if not any(value):
-            raise ValueError("has no direction")
+            raise ValueError("must not be the zero vector")
         return value
 
 
 class ContactPoint(BodyPoint):
-    """A point fixed on a body, or a sphere about it, held to a surface."""
+    """Contact of a point fixed on a body, or of a sphere around it, with a surface."""
 
-    surface: str = "floor"
-    radius_m: NonNegative = Field(default=0.0, description="of a sphere about the point, which touches instead of it")
-    friction: NonNegative | None = Field(default=None, description="kinetic coefficient; default: that of contacts")
-    static_friction: NonNegative | None = Field(default=None, description="default: that of contacts; unilateral law")
-    restitution: Share | None = Field(default=None, description="default: that of contacts; unilateral law")
-    grip: Grip | None = Field(default=None, description="anisotropic friction; only of integrator.method time_stepping")
-    stiffness_N_per_m: Positive | None = Field(
-        default=None, description="default: that of contacts; time_stepping only"
+    surface: str = Field(default="floor", description="name of a surface")
+    radius_m: NonNegative = Field(default=0.0, description="radius of a sphere around the point; 0: the point touches")
+    friction: NonNegative | None = Field(
+        default=None, description="kinetic coefficient μ; default: `contacts.friction`"
     )
-    damping_N_s_per_m: NonNegative | None = Field(default=None, description="default: that of contacts")
-    enabled: bool = True
+    static_friction: NonNegative | None = Field(
+        default=None, description="static coefficient μ_s; default: `contacts.static_friction`; unilateral law"
+    )
+    restitution: Share | None = Field(
+        default=None, description="coefficient of restitution; default: `contacts.restitution`; unilateral law"
+    )
+    grip: Grip | None = Field(default=None, description="anisotropic friction; default: isotropic; time_stepping only")
+    stiffness_N_per_m: Positive | None = Field(
+        default=None,
+        description="stiffness along the normal; default: `contacts.stiffness_N_per_m`; time_stepping only",
+    )
+    damping_N_s_per_m: NonNegative | None = Field(
+        default=None, description="damping along the normal; default: `contacts.damping_N_s_per_m`; time_stepping only"
+    )
+    enabled: bool = Field(default=True, description="whether the point can touch")
 
 
 class Contacts(StrictConfig):
-    """Contact law and contact points."""
+    """Contact law, friction and contact points."""
 
     law: Literal["bilateral", "unilateral"] = Field(
         default="bilateral",
-        description="points stay on their surfaces, f_n of any sign; or they are pushed only, stick, slip and lift off",
+        description="`bilateral`: points stay on their surfaces, with normal forces of any sign; "
+        "`unilateral`: surfaces only push, and points stick, slip and lift off",
     )
     friction: NonNegative = Field(default=0.1, description="kinetic coefficient μ")
     static_friction: NonNegative | None = Field(
-        default=None, description="coefficient that holds at rest, at least friction (the default); unilateral law"
+        default=None, description="static coefficient μ_s, at least `friction`; default: `friction`; unilateral law"
     )
     stribeck_m_s: Positive | None = Field(
         default=None,
-        description="v_s of μ + (μ_s − μ) exp(−(v/v_s)²); default: μ from the first slip on; unilateral law",
+        description="Stribeck speed v_s of μ + (μ_s − μ) exp(−(v/v_s)²); "
+        "default: μ as soon as the point slips; unilateral law",
     )
     viscous_friction_s_per_m: NonNegative = Field(
-        default=0.0, description="what each m/s of slip adds to the coefficient; unilateral law"
+        default=0.0, description="increase of the coefficient per m/s of slip; unilateral law"
     )
     restitution: Share = Field(
-        default=0.0, description="share of the normal speed that an impact turns round; unilateral law"
+        default=0.0, description="coefficient of restitution for the normal speed; unilateral law"
     )
     stiffness_N_per_m: Positive | None = Field(
-        default=None, description="of body and surface along the normal; default: rigid; time_stepping only"
+        default=None, description="contact stiffness along the normal; default: rigid; time_stepping only"
     )
-    damping_N_s_per_m: NonNegative = Field(default=0.0, description="along the normal, beside the stiffness")
-    slip_smoothing_m_s: Positive = Field(default=1e-3, description="v_s of the slip direction v_t/√(v_t² + v_s²)")
+    damping_N_s_per_m: NonNegative = Field(
+        default=0.0, description="damping of compliant contacts along the normal; time_stepping only"
+    )
+    slip_smoothing_m_s: Positive = Field(
+        default=1e-3, description="v_s of the smoothed slip direction v_t/√(v_t² + v_s²); bilateral law"
+    )
     pulling_friction: Literal["signed", "dissipative"] = Field(
-        default="dissipative", description="f_t = μ f_n as printed in the paper, or μ |f_n|"
+        default="dissipative",
+        description="friction of a pulling contact: `signed` f_t = μ f_n as printed in the paper, "
+        "`dissipative` f_t = μ |f_n|; bilateral law",
     )
     reference_tolerance_m: Positive = Field(
-        default=2e-3, description="references that take a contact point further off its surface than this are refused"
+        default=2e-3,
+        description="maximum distance of a contact point from its surface along the references; "
+        "an error if exceeded; bilateral law",
     )
     candidates: Literal["points", "joints", "links"] = Field(
         default="points",
-        description="what can touch beside the points: nothing, all joints and the hand, or the links as capsules",
+        description="contacts in addition to `points`: none (`points`), all joints and the hand (`joints`), "
+        "or the links as capsules (`links`)",
     )
-    points: dict[str, ContactPoint] = {}
+    points: dict[str, ContactPoint] = Field(default={}, description="named contact points")
 
     def coefficients(self, point: ContactPoint | None = None) -> tuple[float, float]:
-        """Kinetic and static coefficient of a point: its own, else those of contacts; static defaults to kinetic."""
+        """Return the kinetic and static coefficient of a point, or of all contacts.
+
+        Keys of the point take precedence over keys of `contacts`; the static coefficient defaults to the kinetic one.
+        """
         kinetic, static = (
             getattr(self, key) if point is None or getattr(point, key) is None else getattr(point, key)
             for key in ("friction", "static_friction")
@@ -767,7 +815,7 @@ class Contacts(StrictConfig):
         return kinetic, kinetic if static is None else static
 
     def compliance(self, point: ContactPoint | None = None) -> tuple[float, float]:
-        """Stiffness [N/m], 0 of a rigid one, and damping [N s/m] of a point: its own, else those of contacts."""
+        """Return stiffness [N/m] (0: rigid) and damping [N s/m] of a point, or of all contacts."""
         stiffness, damping = (
             getattr(self, key) if point is None or getattr(point, key) is None else getattr(point, key)
             for key in ("stiffness_N_per_m", "damping_N_s_per_m")
@@ -776,7 +824,7 @@ class Contacts(StrictConfig):
 
     @property
     def other_keys(self) -> tuple[str, ...]:
-        """Keys that only the other law reads."""
+        """Keys that only the other contact law uses."""
         return BILATERAL_KEYS if self.law == "unilateral" else UNILATERAL_KEYS
 
     @model_validator(mode="after")
@@ -784,41 +832,48 @@ class Contacts(StrictConfig):
         self._check_compliance()
         kinetic, static = self.coefficients()
         if static < kinetic:
-            raise error_at("static_friction", f"is less than friction {self.friction:g}; it must hold as much or more")
+            raise error_at(
+                "static_friction", f"must not be less than friction ({self.friction:g}); raise it or lower friction"
+            )
         for name, point in self.points.items():
             kinetic, static = self.coefficients(point)
             if static < kinetic:
                 key = "friction" if point.static_friction is None else "static_friction"
                 raise error_at(
                     f"points.{name}.{key}",
-                    f"static_friction {static:g} is less than friction {kinetic:g}; it must hold as much or more",
+                    f"static_friction ({static:g}) must not be less than friction ({kinetic:g}); change one of them",
                 )
         return self
 
     def _check_compliance(self) -> None:
-        """Refuse damping where nothing gives way, and restitution where something does."""
+        """Raise an error for damping of a rigid contact and for restitution of a compliant contact."""
         for where, point in {"": None, **{f"points.{name}.": point for name, point in self.points.items()}}.items():
             config = self if point is None else point
             soft = self.compliance(point)[0] > 0.0
             anywhere = soft or (point is None and not all(p.stiffness_N_per_m is None for p in self.points.values()))
             if config.damping_N_s_per_m and not anywhere:
-                raise error_at(f"{where}damping_N_s_per_m", "is that of what gives way: give stiffness_N_per_m too")
+                raise error_at(f"{where}damping_N_s_per_m", "requires stiffness_N_per_m; add it or remove this key")
             restitution = self.restitution if point is None or point.restitution is None else point.restitution
             if soft and restitution > 0.0:
                 key = "restitution" if config.restitution else "stiffness_N_per_m"
-                raise error_at(f"{where}{key}", f"what gives way has no restitution ({restitution:g}), but a damping")
+                raise error_at(
+                    f"{where}{key}",
+                    f"compliant contacts have no restitution (here {restitution:g}); use damping_N_s_per_m instead",
+                )
 
 
 class Initial(StrictConfig):
-    """The start: what the initial posture is changed by, as little as possible, and what holds it."""
+    """Start of a run: smallest change of the plant's initial posture, and initial motor currents."""
 
     on_surface: list[str] = Field(
-        default=[], description="contact points, also disabled ones, that start exactly on their surfaces"
+        default=[], description="contact points, enabled or disabled, that start exactly on their surfaces"
     )
-    keep: list[str] = Field(default=[], description="joints that do not move for it, and `hand` for the hand's place")
-    on_references: bool = Field(default=False, description="joints with waypoints start where those begin")
+    keep: list[str] = Field(
+        default=[], description="joints that `on_surface` must not move; `hand` keeps the position of the hand"
+    )
+    on_references: bool = Field(default=False, description="start joints with waypoints at their first waypoint")
     equilibrium: bool = Field(
-        default=False, description="currents that hold posture, weight, loads and braces at rest, with the least heat"
+        default=False, description="start with the motor currents of least heat that hold the robot at rest"
     )
 
     @model_validator(mode="after")
@@ -826,18 +881,19 @@ class Initial(StrictConfig):
         if not self.on_surface and not self.equilibrium and not self.on_references:
             raise error_at(
                 "on_surface",
-                "names no contact point; name some, set equilibrium or on_references: true, or leave initial out",
+                "must list at least one contact point; add one, set equilibrium or on_references: true, "
+                "or remove initial",
             )
         if self.keep and not self.on_surface:
-            raise error_at("keep", "has no effect without on_surface, for which joints move; remove it")
+            raise error_at("keep", "has no effect without on_surface; remove it")
         return self
 
 
 class SurfaceError(StrictConfig):
-    """By what surfaces differ from those that the controller plans with: how well a plan bears it."""
+    """Difference between the simulated surfaces and the surfaces that the controller assumes."""
 
-    shift_m: Vector3 = Field(default=[0.0, 0.0, 0.0], description="of all surfaces, in the world")
-    friction_factor: NonNegative = Field(default=1.0, description="times every coefficient of friction")
+    shift_m: Vector3 = Field(default=[0.0, 0.0, 0.0], description="displacement of all surfaces in the world")
+    friction_factor: NonNegative = Field(default=1.0, description="factor on all coefficients of friction")
 
 
 class Integrator(StrictConfig):
@@ -845,80 +901,94 @@ class Integrator(StrictConfig):
 
     method: Literal[METHODS] = Field(  # type: ignore[valid-type]
         default="auto",
-        description="auto: one of the adaptive ones, by the system; adaptive 5(4), adaptive implicit (where motors "
-        "hold the steps of the other), or fixed step with contacts that open and close",
+        description="integration method; `auto`: `dopri5` or `radau5`, depending on the system; `dopri5`: adaptive, "
+        "explicit 5(4); `radau5`: adaptive, implicit (for stiff motors); `time_stepping`: fixed step, with contacts "
+        "that open and close",
     )
-    solver: Literal["articulated", "m_star"] = Field(default="articulated", description="O(n) sweeps or the dense M*")
-    rtol: float = Field(default=1e-6, ge=1e-13, le=1e-1)
+    solver: Literal["articulated", "m_star"] = Field(
+        default="articulated",
+        description="equations of motion by O(n) sweeps (`articulated`) or the dense matrix M* (`m_star`)",
+    )
+    rtol: float = Field(default=1e-6, ge=1e-13, le=1e-1, description="relative tolerance of adaptive methods")
     atol: float | None = Field(
         default=None,
         ge=1e-16,
         le=1e-1,
-        description="default: rtol/100, at most 1e-8, so that a smaller rtol has its effect",
+        description="absolute tolerance; default: rtol/100, at most 1e-8",
     )
     step_s: Positive | None = Field(
-        default=None, description="fixed step of time_stepping (default 0.001), else the first step"
+        default=None,
+        description="fixed step of time_stepping, default: 0.001; first step of adaptive methods, default: automatic",
     )
     theta: float = Field(
-        default=THETA, ge=0.5, le=1.0, description="time_stepping: 0.5 is second order between events, 1 damps"
+        default=THETA,
+        ge=0.5,
+        le=1.0,
+        description="implicitness of time_stepping: 0.5 is second order between events, 1 adds numerical damping",
     )
-    step_max_s: Positive | None = None
+    step_max_s: Positive | None = Field(default=None, description="maximum step of adaptive methods; default: no limit")
     wall_limit_s: Positive | None = Field(
-        default=None, description="wall time that the integration may take; ten times as much by estimate is refused"
+        default=None,
+        description="maximum wall-clock time of the integration; default: no limit; "
+        "an error if the estimate exceeds ten times the limit",
     )
 
     @field_validator("method", mode="before")
     @classmethod
     def _replaced(cls, value: object) -> object:
         if value in ("rk4", "rk43"):
-            raise ValueError("is no longer there; take dopri5, or time_stepping where steps are to be fixed")
+            raise ValueError("unknown method (removed); use dopri5, or time_stepping for fixed steps")
         return value
 
     @property
     def absolute_tolerance(self) -> float:
-        """``atol``, or its default: a fixed one would limit the accuracy at small ``rtol``."""
+        """``atol`` or its default, which follows ``rtol``: a fixed default would limit the accuracy."""
         return min(1e-8, 1e-2 * self.rtol) if self.atol is None else self.atol
 
 
 class RecordOptions(StrictConfig):
-    """What is recorded."""
+    """Sampling rate and size limit of the record."""
 
-    rate_hz: Positive = 200.0
-    size_limit_GB: Positive = 2.0
+    rate_hz: Positive = Field(default=200.0, description="sampling rate of the record")
+    size_limit_GB: Positive = Field(default=2.0, description="maximum size of the record; a larger record is an error")
 
 
 class Metrics(StrictConfig):
-    """How the summary is computed."""
+    """Options of the summary."""
 
-    settle_s: NonNegative = Field(default=2.0, description="tracking errors count from this time on")
+    settle_s: NonNegative = Field(default=2.0, description="time from which tracking errors are evaluated")
 
 
-def laid_under(defaults: Any, said: Any) -> Any:
-    """``said`` with ``defaults`` where it says nothing; mappings merge."""
-    if not (isinstance(defaults, Mapping) and isinstance(said, Mapping)):
-        return said
-    return {**defaults, **{key: laid_under(defaults.get(key), value) for key, value in said.items()}}
+def merge_defaults(defaults: Any, values: Any) -> Any:
+    """Return ``values`` with missing keys filled in from ``defaults``, recursively for mappings."""
+    if not (isinstance(defaults, Mapping) and isinstance(values, Mapping)):
+        return values
+    return {**defaults, **{key: merge_defaults(defaults.get(key), value) for key, value in values.items()}}
 
 
 class ScenarioConfig(StrictConfig):
-    """A dynsim scenario."""
+    """Scenario file of dynsim."""
 
-    name: str = Field(default="", description="default: the name of the file")
-    variant: str = Field(default="", description="written into resolved scenarios")
-    description: str = ""
-    duration_s: Positive
+    name: str = Field(default="", description="name of the scenario; default: the file name without extension")
+    variant: str = Field(default="", description="name of the variant; written into resolved scenarios")
+    description: str = Field(default="", description="text about the scenario")
+    duration_s: Positive = Field(description="simulated time")
     plant: union("plant")  # type: ignore[valid-type]
     controller: union("controller") | None = None  # type: ignore[valid-type]
     surfaces: dict[str, union("surface")] = {}  # type: ignore[valid-type]
     contacts: Contacts = Contacts()
     surface_error: SurfaceError | None = Field(
-        default=None, description="by what surfaces and friction differ from those that the controller plans with"
+        default=None, description="difference between the surfaces and the controller's assumptions; default: none"
     )
-    initial: Initial | None = Field(default=None, description="posture and currents of the start")
-    loads: dict[str, LoadConfig] = Field(default={}, description="forces, torques and payloads by name")
-    objects: dict[str, SceneObject] = Field(default={}, description="bodies beside the robot, by name")
-    ties: dict[str, TieChoice] = Field(default={}, description="springs and dampers between two bodies, by name")
-    sensors: Sensors | None = Field(default=None, description="what a sampled controller is told of the robot")
+    initial: Initial | None = Field(
+        default=None, description="changes to the initial posture and motor currents; default: as in the plant"
+    )
+    loads: dict[str, LoadConfig] = Field(default={}, description="named forces, torques and payloads")
+    objects: dict[str, SceneObject] = Field(default={}, description="named bodies in addition to the robot")
+    ties: dict[str, TieChoice] = Field(default={}, description="named springs and dampers between two bodies")
+    sensors: Sensors | None = Field(
+        default=None, description="sensors of a sampled controller; default: the exact state without delay"
+    )
     integrator: Integrator = Integrator()
     record: RecordOptions = RecordOptions()
     metrics: Metrics = Metrics()
@@ -926,10 +996,10 @@ class ScenarioConfig(StrictConfig):
     @model_validator(mode="before")
     @classmethod
     def _of_plant(cls, data: Any) -> Any:
-        """Some plants want other defaults in other sections."""
+        """Apply the plant's defaults for other sections."""
         if not isinstance(data, Mapping):
             return data
-        return laid_under(section_defaults(data.get("plant"), data), data)
+        return merge_defaults(section_defaults(data.get("plant"), data), data)
 
     @model_validator(mode="after")
     def _check_combinations(self) -> Self:
@@ -939,29 +1009,43 @@ class ScenarioConfig(StrictConfig):
     @field_validator("name", "variant")
     @classmethod
     def _check_folder(cls, value: str) -> str:
-        """Both name folders of the results: neither may lead out of them."""
+        """Both become folder names: they must not lead out of the results folder."""
         if value in (".", "..") or any(sign in value for sign in "/\\\0"):
-            raise ValueError("names a folder of the results, so it must not have slashes or be dots")
+            raise ValueError("becomes a folder name, so it must not contain slashes or be dots")
         if not value.isprintable():
-            raise ValueError("names a folder of the results, so it must be printable in one line")
+            raise ValueError("becomes a folder name, so it must be printable and on one line")
         if len(value.encode()) > NAME_LIMIT:
-            raise ValueError(f"names a folder of the results, so it must not be longer than {NAME_LIMIT} bytes")
+            raise ValueError(f"becomes a folder name, so it must not be longer than {NAME_LIMIT} bytes")
         return value
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """One validated simulation.
+    """Validated scenario: plant, controller, contacts, integrator and recording.
+
+    Scenarios are immutable; :func:`load_scenario` reads them from files.
 
     Attributes
     ----------
-    name, variant : str
-        The variant is "" for a scenario without variants.
+    name : str
+        Name of the scenario; default: the name of its file.
+    variant : str
+        Name of the variant; empty for a scenario without variants.
     config : ScenarioConfig
+        All keys of the scenario, with defaults; numbers have the units in their keys.
     source : Path or None
-        The file it came from.
+        Scenario file; None if the scenario was not read from a file.
     origin : Origin or None
-        Lines of its keys in that file.
+        Lines of the keys in that file.
+
+    Examples
+    --------
+    >>> import dynsim
+    >>> scenario = dynsim.load_scenario("elbow_comparison", variant="two_elbows")
+    >>> scenario.title
+    'elbow_comparison (two_elbows)'
+    >>> scenario.duration_s, scenario.plant.type, scenario.config.contacts.law
+    (10.0, 'serial_arm', 'bilateral')
     """
 
     name: str
@@ -996,7 +1080,7 @@ class Scenario:
 
     @property
     def title(self) -> str:
-        """Name and variant, for a line of text."""
+        """Name and variant as one line of text."""
         return f"{self.name} ({self.variant})" if self.variant else self.name
 
     @property
@@ -1006,39 +1090,51 @@ class Scenario:
 
     @property
     def plant(self) -> Any:
-        """Configuration of the machine, the ``Config`` of its module."""
+        """Configuration of the plant: the ``Config`` of its module in `dynsim.library.plants`."""
         return self.config.plant
 
     @property
     def controller(self) -> Any:
-        """Configuration of the controller, None without one."""
+        """Configuration of the controller; None without a controller."""
         return self.config.controller
 
     @property
     def integrator(self) -> Integrator:
-        """Method, solver and tolerances."""
+        """Integration method, solver and tolerances."""
         return self.config.integrator
 
     @property
     def record(self) -> RecordOptions:
-        """Rate [Hz] and size limit [GB] of the record."""
+        """Sampling rate [Hz] and size limit [GB] of the record."""
         return self.config.record
 
     @property
     def metrics(self) -> Metrics:
-        """How the summary is computed."""
+        """Options of the summary."""
         return self.config.metrics
 
     @property
     def engine(self) -> str:
-        """What simulates the plant."""
+        """Engine that simulates the plant: ``"dynamics"`` or ``"kinematic"``."""
         return engine(self.plant)
 
     @property
     def resolved(self) -> dict[str, Any]:
-        """The scenario with defaults and overrides written out; reading it again gives the same simulation.
+        """Scenario with defaults and overrides written out; loading it gives the same simulation.
 
-        Defaults that change nothing are left out.
+        Defaults without effect are omitted.
+
+        Returns
+        -------
+        dict
+            Plain values by key, as in a scenario file.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> resolved = dynsim.load_scenario("elbow_comparison", overrides={"integrator.rtol": 1e-8}).resolved
+        >>> resolved["integrator"]["rtol"]
+        1e-08
         """
         resolved = self.config.model_dump(mode="json", exclude_none=True)
         write_nulls(self.config, resolved, section_defaults(resolved["plant"], resolved))
@@ -1049,7 +1145,7 @@ class Scenario:
         for part in (resolved["contacts"], *resolved["contacts"]["points"].values()):
             for key in contacts.other_keys:
                 part.pop(key, None)
-        # What changes nothing is not there, unless it was said.
+        # Omit keys without effect, unless the scenario sets them.
         for keys in idle_keys(self.config):
             section, *inner = map(str, keys)
             if len(inner) == 1 and not is_set(self.config, keys) and isinstance(resolved.get(section), dict):
@@ -1059,7 +1155,28 @@ class Scenario:
         return resolved
 
     def location(self, keys: Sequence[int | str] = (), variant: str = "") -> str:
-        """``file:line`` of a key, the text for ``variant``, and how the key was overridden."""
+        """Return where a key was set, for messages.
+
+        Parameters
+        ----------
+        keys : sequence of str or int, optional
+            Path to the key, e.g. ``("contacts", "friction")``; default: the scenario as a whole.
+        variant : str, optional
+            Text to insert after the file and line.
+
+        Returns
+        -------
+        str
+            ``file:line``; without a line if the key is not in the file. For an overridden key ``file: --set`` or
+            ``file: overrides``.
+
+        Examples
+        --------
+        >>> import dynsim
+        >>> scenario = dynsim.load_scenario("elbow_comparison", overrides={"duration_s": 2.0})
+        >>> scenario.location(("duration_s",)).endswith("elbow_comparison.yaml: overrides")
+        True
+        """
         line, overridden = 0, ""
         if keys and self.origin is not None:
             overridden = f": {self.origin.overriding}" if self.origin.sets(keys) else ""
