@@ -43,7 +43,7 @@ def combine(y, h, row, stages, k, y_new):
 
 @inline_kernel
 def explicit_error(system: System, ws: Workspace, run: Run, row):
-    """Return the error norm of an explicit step with error coefficients ``row`` (7,); leave the estimate in stage[7]."""
+    """Return the error norm of an explicit step with error coefficients ``row`` (7,); the estimate is in stage[7]."""
     h, y, k = run.clock[ki.STEP], run.y, run.stage
     for j in range(y.shape[0]):
         k[7, j] = 0.0
