@@ -27,7 +27,7 @@ from dynsim.hardware.virtual.simulated_plant import (
     InertialLoad,
     MotorLaw,
     SimulatedArm,
-    _bare,
+    _plant_only,
     simulated_arm,
 )
 from dynsim.model.drives import Servo
@@ -128,9 +128,9 @@ def test_the_plant_of_a_plan_starts_where_its_servos_are(tmp_path, monkeypatch, 
 @pytest.mark.parametrize(("asked_for", "step"), [(None, 1e-3), (2e-4, 2e-4), (0.01, PHYSICS_STEP)])
 def test_time_stepping_of_the_scenario_is_that_of_the_plant(asked_for: float | None, step: float) -> None:
     options = {"integrator": {"method": "time_stepping", "step_s": asked_for}, "contacts.law": "unilateral"}
-    integrator = _bare(dynsim.load_scenario("single_pendulum", overrides=options)).integrator
+    integrator = _plant_only(dynsim.load_scenario("single_pendulum", overrides=options)).integrator
     assert (integrator.method, integrator.step_s) == ("time_stepping", step)
-    assert _bare(dynsim.load_scenario(ARM, "no_elbow")).integrator.method == "dopri5"
+    assert _plant_only(dynsim.load_scenario(ARM, "no_elbow")).integrator.method == "dopri5"
 
 
 def test_a_limp_arm_falls_and_stays_above_the_floor_with_its_elbows() -> None:

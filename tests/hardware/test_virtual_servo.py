@@ -72,7 +72,7 @@ def test_the_watchdog_stops_the_servo_and_makes_goals_read_only(line) -> None:
     write(line, 1, "torque_enable", 1)
     write(line, 1, "bus_watchdog", 5)
     write(line, 1, "goal_position", 3000)
-    line.servos.heard[:] = line.time
+    line.servos.last_packet[:] = line.time
     line.advance(line.time + 0.11)
     stopped_at = line.servos.registers[1]["goal_position"]
     line.advance(line.time + 1.0)
@@ -250,12 +250,12 @@ def test_servos_die_below_six_volts_and_start_anew_above(drop: float, dies: bool
     line = scripted_line({"kind": "voltage_sag", "drop": drop, "at": 0.5, "duration": 0.5})
     write(line, 1, "torque_enable", 1)
     line.advance(0.7)
-    assert line.servos.listens(1) != dies
+    assert line.servos.receives(1) != dies
     assert line.servos.registers[1]["torque_enable"] == (not dies)
     line.advance(0.9)
-    assert line.servos.listens(1) != dies, "a start cannot come to its end without volts"
+    assert line.servos.receives(1) != dies, "a start cannot come to its end without volts"
     line.advance(1.1 + BOOT_TIME)
-    assert line.servos.listens(1)
+    assert line.servos.receives(1)
     assert line.servos.registers[1]["torque_enable"] == (not dies)
     line.servos.measure(0)
     assert line.servos.registers[1]["present_voltage"] == 120
@@ -269,7 +269,7 @@ def test_a_fault_in_a_long_silence_is_not_slept_over() -> None:
     write(line, 1, "profile_velocity", 40)
     line.advance(60.0)
     assert line.servos.registers[1]["profile_velocity"] == 0
-    assert line.servos.listens(1)
+    assert line.servos.receives(1)
 
 
 @pytest.mark.parametrize("periods", [1, 2, 3])

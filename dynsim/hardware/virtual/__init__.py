@@ -1,1 +1,1 @@
-"""Virtual servos: registers and motion, serial line, scripted faults, and the mechanics they move."""
+"""Virtual servos: registers and motion, serial line, scripted faults, and the plant that they drive."""

@@ -1,4 +1,4 @@
-"""Fault scripts of virtual servos: kind, servo, time and probability of each fault; reproducible by seed."""
+"""Fault scripts of virtual servos: kind, servo, time and probability of each fault, reproducible by a seed."""
 
 from __future__ import annotations
 
@@ -16,26 +16,29 @@ Probability = Annotated[float, Field(ge=0, le=1)]
 
 
 class _Timed(StrictConfig):
-    """Active from ``at`` [s after the first torque enable] for ``duration`` [s]; absent: always, for good."""
+    """Fault that is active from ``at`` [s after the first torque enable] for ``duration`` [s].
+
+    Without ``at`` it is always active; without ``duration`` it does not end.
+    """
 
     at: Annotated[float, Field(ge=0)] | None = None
     duration: Annotated[float, Field(gt=0)] | None = None
 
     def active(self, since_torque: float) -> bool:
-        """True at ``since_torque`` [s] after the first torque enable (−∞ before it)."""
+        """Return True if the fault is active ``since_torque`` [s] after the first torque enable (−∞ before it)."""
         start, end = self.span
         return start <= since_torque < end
 
     @property
     def span(self) -> tuple[float, float]:
-        """When it begins and ends [s after the first torque enable]; −∞ and ∞ for one that is always there."""
+        """Start and end of the fault [s after the first torque enable]; −∞ and ∞ if it is always active."""
         if self.at is None:
             return -math.inf, math.inf
         return self.at, self.at + (self.duration or math.inf)
 
 
 class LineFault(_Timed):
-    """Trouble with status packets, of one servo or (no ``id``) of all."""
+    """Damage to the status packets of one servo, or of all servos without ``id``."""
 
     kind: Literal["lost_status", "truncated_status", "bad_crc", "noise"]
     id: int | None = None
@@ -43,7 +46,7 @@ class LineFault(_Timed):
 
 
 class LateStatus(_Timed):
-    """Status packets come later by ``delay`` [s]: by n periods, and cycle k + n gets the answer of cycle k."""
+    """Status packets that are delayed by ``delay`` [s]; with n periods, cycle k + n receives the answer of cycle k."""
 
     kind: Literal["late_status"]
     id: int | None = None
@@ -52,20 +55,20 @@ class LateStatus(_Timed):
 
 
 class PortFault(_Timed):
-    """The adapter echoes what is sent, or is pulled out."""
+    """An adapter that echoes all sent bytes, or is unplugged."""
 
     kind: Literal["echo", "unplug"]
 
 
 class ServoFault(_Timed):
-    """A second servo with the same ID; power or cable lost; a restart; an error shutdown; a tripped watchdog; a jam."""
+    """Duplicate ID, loss of power or cable, restart, shutdown after an error, tripped watchdog, or jam of a servo."""
 
     kind: Literal["duplicate_id", "drop_off", "reboot", "overload", "overheat", "watchdog_trip", "stuck"]
     id: int
 
 
 class WrongRegister(_Timed):
-    """A servo that is not the one of the map: ``value`` stands in its register."""
+    """A servo that does not match the map: its register contains ``value``."""
 
     kind: Literal["wrong_model", "wrong_firmware", "wrong_mode"]
     id: int
@@ -73,7 +76,7 @@ class WrongRegister(_Timed):
 
 
 class AngleFault(_Timed):
-    """Play of the shaft, or a jump of the measured position, of ``angle`` [rad]."""
+    """Backlash of the shaft, or a jump of the measured position, by ``angle`` [rad]."""
 
     kind: Literal["backlash", "offset_jump"]
     id: int
@@ -81,14 +84,14 @@ class AngleFault(_Timed):
 
 
 class VoltageSag(_Timed):
-    """The supply drops by ``drop`` [V]."""
+    """A drop of the supply voltage by ``drop`` [V]."""
 
     kind: Literal["voltage_sag"]
     drop: Annotated[float, Field(gt=0)]
 
 
 class SupplyLoss(_Timed):
-    """No volts for ``duration`` [s]: every servo is limp and silent, then starts anew with what its EEPROM holds."""
+    """Loss of supply for ``duration`` [s]: all servos lose torque and do not answer, then restart from their EEPROM."""
 
     kind: Literal["supply_loss"]
     at: Annotated[float, Field(ge=0)]
@@ -96,7 +99,7 @@ class SupplyLoss(_Timed):
 
 
 class TemperatureRamp(_Timed):
-    """A servo warms by ``heating_rate`` [K/s] on top of its own losses."""
+    """A servo that warms by ``heating_rate`` [K/s] in addition to its losses."""
 
     kind: Literal["temperature_ramp"]
     id: int
@@ -123,7 +126,7 @@ class FaultScript(StrictConfig):
     Attributes
     ----------
     seed : int
-        Of every random choice the faults make.
+        Seed of all random choices.
     faults : list
     """
 
@@ -132,22 +135,28 @@ class FaultScript(StrictConfig):
 
     @model_validator(mode="after")
     def _servos_are_there(self, info: ValidationInfo) -> FaultScript:
-        """Validated with the context ``{"ids": ...}`` a fault of a servo that is not among them is an error."""
+        """Reject faults of unknown servos, if the IDs are in the validation context ``{"ids": ...}``."""
         ids = info.context["ids"] if info.context else None
         for number, fault in enumerate(self.faults):
             id_ = getattr(fault, "id", None)
             if ids is not None and id_ is not None and id_ not in ids:
                 there = ", ".join(map(str, sorted(ids)))
-                raise error_at(f"faults.{number}.id", f"no servo has this ID; there are {there}")
+                raise error_at(f"faults.{number}.id", f"unknown servo ID; IDs: {there}")
         return self
 
 
 def load_fault_script(path: str | Path, ids: Collection[int] | None = None) -> FaultScript:
-    """Read a fault script for servos with these IDs, of which it may name no others (any if not given).
+    """Read a fault script.
+
+    Parameters
+    ----------
+    path : str or Path
+    ids : collection of int, optional
+        Allowed servo IDs; default: any.
 
     Raises
     ------
     ServoMapError
-        Missing file, bad YAML or bad entry, with file and line.
+        If the file is missing, is not YAML or has an invalid entry; the message has file and line.
     """
     return read_yaml(Path(path), FaultScript, {"ids": ids})

@@ -1,4 +1,4 @@
-"""Injection of scripted faults: failing servos, dying ports, corrupted or delayed status packets."""
+"""Injection of scripted faults: failing servos, a dead port, corrupted or delayed status packets."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from dynsim.hardware.virtual.servos import OVERHEATING, OVERLOAD, VirtualServos
 
 
 class Injection:
-    """Applies those faults of a script that are not part of the servo model.
+    """Apply the faults of a script that are not part of the servo model.
 
     Attributes
     ----------
     unplugged : bool
-        The adapter was pulled out.
+        True if the adapter was unplugged.
     """
 
     def __init__(self, servos: VirtualServos, script: FaultScript) -> None:
@@ -28,11 +28,11 @@ class Injection:
 
     @property
     def echo(self) -> bool:
-        """The adapter gives back what is sent."""
+        """True if the adapter echoes all sent bytes."""
         return any(fault.kind == "echo" for fault in self._servos.active_faults())
 
     def apply(self) -> None:
-        """Faults that change a servo: once when they become active, the jam at every step."""
+        """Apply the faults that change a servo: once when they become active, a jam at every step."""
         servos = self._servos
         servos.set_power(on=not any(fault.kind == "supply_loss" for fault in servos.active_faults()))
         for number, fault in enumerate(self._script.faults):
@@ -46,9 +46,9 @@ class Injection:
             if fault.kind == "unplug":
                 self.unplugged = True
             if getattr(fault, "id", None) in servos.registers:
-                self._strike(fault)
+                self._apply_to_servo(fault)
 
-    def _strike(self, fault: Any) -> None:
+    def _apply_to_servo(self, fault: Any) -> None:
         servos, id_ = self._servos, fault.id
         index = servos.ids.index(id_)
         registers = servos.registers[id_]
@@ -76,7 +76,7 @@ class Injection:
                 servos.play[index] = servos.plant.position[index]
 
     def disturb(self, id_: int, frame: bytes, arrival: float) -> list[tuple[float, bytes]]:
-        """What the scripted faults leave of a status packet."""
+        """Return the arrival time and the bytes of a status packet after the scripted faults; empty if it is lost."""
         chance = self._random.random
         for fault in self._servos.active_faults():
             if getattr(fault, "id", None) not in (None, id_):
@@ -94,11 +94,11 @@ class Injection:
                 case "late_status" if chance() < fault.probability:
                     arrival += fault.delay
                 case "duplicate_id":
-                    # Both drive the line; a zero bit wins. Only measured values differ between the two.
-                    frame = bytes(a & b for a, b in zip(frame, self._frame_of_the_other(frame), strict=True))
+                    # Both servos drive the line and a zero bit wins. The frames differ in the measured values only.
+                    frame = bytes(a & b for a, b in zip(frame, self._duplicate_frame(frame), strict=True))
         return [(arrival, frame)]
 
-    def _frame_of_the_other(self, frame: bytes) -> bytes:
+    def _duplicate_frame(self, frame: bytes) -> bytes:
         if len(frame) < 15:
             return frame
         body = bytearray(frame[:-2])

@@ -1,7 +1,7 @@
-"""A virtual half-duplex line with servos: takes the bytes of requests, returns those of answers with arrival times.
+"""A virtual half-duplex line with servos, a port of the client library on it, and a pseudo-terminal for other programs.
 
-:class:`dynsim.hardware.virtual.line.VirtualPort` puts a line under the client library on a virtual clock,
-:mod:`dynsim.hardware.virtual.line` behind a serial device.
+The line accepts the bytes of requests and returns the bytes of answers with their arrival times. :class:`VirtualPort`
+connects it to the client library, and :class:`PseudoTerminal` to a serial device.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from dynsim.hardware.virtual.servos import PHYSICS_STEP, Firmware, ServoRegister
 from dynsim.hardware.virtual.simulated_plant import ServoPlant
 
 BYTE_TIMEOUT = 5e-3
-"""Longest pause within a packet [s] (unverified)."""
+"""Maximum pause within a packet [s] (unverified)."""
 TURNAROUND = 20e-6
-"""Time a servo takes beyond its return delay before it answers [s] (unverified)."""
+"""Time before the answer of a servo in addition to its return delay [s] (unverified)."""
 ADAPTER_LATENCY = 1e-3
-"""From the wire to the reader: a USB adapter with its latency timer at 1 ms [s]."""
+"""Delay from the line to the reader: a USB adapter with a latency timer of 1 ms [s]."""
 
 Listener = Callable[[float, Packet], None]
 
@@ -45,14 +45,15 @@ class VirtualLine:
     Parameters
     ----------
     servos : mapping of int to ServoRegisters
-        By ID.
+        Registers of the servos, by ID.
     positions : sequence of float
         Initial servo angles [rad], 0 at tick 0.
     plant : ServoPlant, optional
-        What the servos move; every one its own inertia if not given.
-    script : FaultScript
+        Plant that the servos drive; default: a separate inertia for each servo.
+    script : FaultScript, optional
+        Scripted faults.
     listener : callable, optional
-        Called with (time, packet) for every valid packet that a servo can hear.
+        Called with (time, packet) for each valid packet that a servo can receive.
     """
 
     def __init__(
@@ -70,37 +71,50 @@ class VirtualLine:
         self._faults = Injection(self.servos, script)
         self._firmware = Firmware(self.servos)
         self._decoders: dict[int, Decoder] = {}
-        self._heard = 0.0
+        self._last_byte = 0.0
         self._faults.apply()
 
     @property
     def time(self) -> float:
-        """[s]."""
+        """Time of the servos [s]."""
         return self.servos.time
 
     @property
     def unplugged(self) -> bool:
-        """The adapter was pulled out."""
+        """True if the adapter was unplugged."""
         return self._faults.unplugged
 
     def advance(self, now: float) -> None:
-        """Let time pass until ``now`` [s]."""
+        """Advance the servos to the time ``now`` [s]."""
         while now - self.servos.time >= PHYSICS_STEP:
             self.servos.step(now)
             self._faults.apply()
 
     @property
     def baud(self) -> int:
-        """What the first servo is set to [bit/s]."""
+        """Bit rate of the first servo [bit/s]."""
         return next(iter(self.servos.registers.values())).baud
 
     def transmit(self, data: bytes, start: float, baud: int) -> list[tuple[float, bytes]]:
-        """Put bytes on the line at ``start`` [s]; the answers, each with the time its last byte reaches the reader.
+        """Send bytes on the line.
+
+        Parameters
+        ----------
+        data : bytes
+        start : float
+            Time of the first byte [s].
+        baud : int
+            Bit rate [bit/s].
+
+        Returns
+        -------
+        list of (float, bytes)
+            Arrival time of the last byte at the reader [s], and bytes of each answer.
 
         Raises
         ------
         OSError
-            The adapter was pulled out.
+            If the adapter was unplugged.
         """
         end = start + len(data) * 10 / baud
         self.advance(end)
@@ -109,25 +123,25 @@ class VirtualLine:
         arrivals: list[tuple[float, bytes]] = []
         if self._faults.echo:
             arrivals.append((end + ADAPTER_LATENCY, data))
-        # A packet that stopped half-way is given up after a while.
-        given_up = start - self._heard > BYTE_TIMEOUT
-        self._heard = end
-        # To servos at another bit rate this is noise.
-        if baud in self.servos.hearing:
+        # An incomplete packet is discarded after a pause.
+        expired = start - self._last_byte > BYTE_TIMEOUT
+        self._last_byte = end
+        # The bytes are noise for servos with another bit rate.
+        if baud in self.servos.baud_groups:
             decoder = self._decoders.setdefault(baud, Decoder())
-            packets = [*decoder.flush()] if given_up else []
+            packets = [*decoder.flush()] if expired else []
             for packet in [*packets, *decoder.feed(data)]:
-                if packet.instruction != STATUS and baud in self.servos.hearing:
+                if packet.instruction != STATUS and baud in self.servos.baud_groups:
                     arrivals += self._execute(packet, end, baud)
         return arrivals
 
     def _execute(self, packet: Packet, now: float, baud: int) -> list[tuple[float, bytes]]:
-        hearing = self.servos.hearing[baud]
-        self.servos.hear(hearing, now)
+        group = self.servos.baud_groups[baud]
+        self.servos.reset_watchdogs(group, now)
         if self.listener:
             self.listener(now, packet)
         arrivals: list[tuple[float, bytes]] = []
-        for answer in self._firmware.answers(packet, hearing):
+        for answer in self._firmware.answers(packet, group):
             first = answer.servos[0]
             if not answer.chained:
                 now += self.servos.registers[first]["return_delay"] * RETURN_DELAY_SECONDS_PER_UNIT + TURNAROUND
@@ -137,9 +151,14 @@ class VirtualLine:
 
 
 def line_for_map(servo_map: ServoMap, **options: Any) -> VirtualLine:
-    """The servos of a map as they should be configured, every joint at its zero.
+    """Build a line with the servos of a map, configured as the map requires.
 
-    Keyword arguments are those of :class:`VirtualLine`; ``posture`` [rad by joint] starts joints elsewhere.
+    Parameters
+    ----------
+    servo_map : ServoMap
+    **options
+        ``posture``: initial angles by joint [rad], default: zero or the fixed angle in the map; other options are
+        passed to :class:`VirtualLine`.
     """
     posture = options.pop("posture", {})
     angles = []
@@ -156,14 +175,14 @@ def line_for_map(servo_map: ServoMap, **options: Any) -> VirtualLine:
     return VirtualLine(servos, positions=angles, **options)
 
 
-# A port of virtual servos for the client library, on a virtual clock.
+# Port of virtual servos for the client library.
 
 
 class VirtualPort(PortHandler):
-    """The client library's port on a :class:`VirtualLine` and a clock that begins at 0.
+    """Port of the client library on a :class:`VirtualLine`, with a clock that starts at 0.
 
-    On a virtual clock nothing here waits: a read without waiting bytes advances the clock to the next byte or the
-    time-out.
+    With a virtual clock the port never waits: a read without available bytes advances the clock to the next byte or to
+    the time-out.
     """
 
     POLL = 1e-5
@@ -232,26 +251,25 @@ class VirtualPort(PortHandler):
             self._input += self._arriving.popleft()[1]
 
 
-# Virtual servos behind a pseudo-terminal, which programs open as a serial device.
+# Virtual servos on a pseudo-terminal, which other programs open as a serial device.
 
 
 _BAUD_BY_CODE = {
     getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()
 }
 _TCGETS2 = 0x802C542A
-"""Linux request for the settings of a terminal with the bit rate as a number: clients set rates that have no code."""
+"""Linux request for terminal settings with a numeric bit rate, because clients may use rates without a code."""
 _OUTPUT_SPEED = slice(40, 44)
 IDLE = 1e-3
-"""Longest wait for bytes before the motion of the servos is computed further [s]; short, so that a request needs little
-of it."""
+"""Maximum wait for bytes before the servos are advanced [s]; short, so that little is left to compute at a request."""
 
 
 STALL = 10e-3
-"""Longest pause of this process that the servos take into account; of longer ones this part [s]."""
+"""Maximum pause of this process that counts as time of the servos [s]; the rest of a longer pause is ignored."""
 
 
 class PseudoTerminal:
-    """Serves a :class:`VirtualLine` in wall time.
+    """Serve a :class:`VirtualLine` on a pseudo-terminal in wall time.
 
     Attributes
     ----------
@@ -260,18 +278,18 @@ class PseudoTerminal:
     """
 
     def __init__(self, line: VirtualLine, link: Path | None = None) -> None:
-        """Open the terminal, and name it by the symbolic link ``link`` if given.
+        """Open the terminal and create the symbolic link ``link`` to it, if set.
 
         Raises
         ------
         PortError
-            The link exists as something else, leads to a device that is there, or cannot be made; or a system without
+            If the link cannot be created, is another kind of file, or leads to an existing device, or the system has no
             pseudo-terminals.
         """
-        require_posix("virtual servos behind a pseudo-terminal")
+        require_posix("virtual servos on a pseudo-terminal")
         self.line = line
         self._master, self._slave = os.openpty()
-        # Kept open: without a holder of the slave end the master reads end-of-file between two clients.
+        # Keep the slave end open, otherwise the master reads end-of-file between two clients.
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
         self.device = os.ttyname(self._slave)
@@ -284,25 +302,25 @@ class PseudoTerminal:
                 link.symlink_to(self.device)
             except OSError as error:
                 self.close()
-                raise PortError(f"{link}: cannot be made a link to {self.device} ({error.strerror})") from error
+                raise PortError(f"{link}: cannot be linked to {self.device} ({error.strerror})") from error
 
     def _refuse_device_in_use(self, link: Path) -> None:
-        """What a process that was killed has left leads nowhere, or by chance to the own device."""
+        """Raise PortError unless the link is left over from a killed process: broken, or leading to this device."""
         if link.exists() and os.readlink(link) != self.device:
             there = os.readlink(link)
             self._link = None
             self.close()
-            raise PortError(f"{link}: leads to {there}, which is in use (other virtual servos?); give another link")
+            raise PortError(f"{link}: leads to {there}, which is in use (other virtual servos?); choose another link")
 
     def serve(self, keep_on: Callable[[], bool]) -> None:
-        """Answer until ``keep_on`` says no, or the scripted adapter is pulled out."""
+        """Answer requests until ``keep_on`` returns False or a scripted fault unplugs the adapter."""
         origin = last = time.monotonic()
         outgoing: deque[tuple[float, bytes]] = deque()
         while keep_on() and not self.line.unplugged:
             now = time.monotonic() - origin
             wait = min(IDLE, max(0.0, outgoing[0][0] - now)) if outgoing else IDLE
             readable, _, _ = select.select([self._master], [], [], wait)
-            # When the computer did not run this process the servos stood still too: real ones would not have been late.
+            # Stop the time of the servos while this process was suspended, because real servos would not be late.
             origin += max(0.0, time.monotonic() - last - STALL)
             last = time.monotonic()
             now = last - origin
@@ -316,26 +334,26 @@ class PseudoTerminal:
                 self._send(outgoing.popleft()[1])
 
     def _answer(self, data: bytes, now: float) -> list[tuple[float, bytes]]:
-        # The client's own write time has passed already when the bytes are here; the USB adapter's has too.
+        # When the bytes arrive, the write time of the client and of the USB adapter has already passed.
         baud = self.baud
         arrivals = self.line.transmit(data, now - len(data) * 10 / baud, baud)
         return [(arrival - ADAPTER_LATENCY, frame) for arrival, frame in arrivals]
 
     @property
     def baud(self) -> int:
-        """What the client has set [bit/s]; what the servos have where the system does not say."""
+        """Bit rate set by the client [bit/s]; the rate of the servos if the system does not report it."""
         with contextlib.suppress(OSError):
             settings = fcntl.ioctl(self._slave, _TCGETS2, bytes(44))
             return int.from_bytes(settings[_OUTPUT_SPEED], sys.byteorder)
         return _BAUD_BY_CODE.get(termios.tcgetattr(self._slave)[5], self.line.baud)
 
     def _send(self, data: bytes) -> None:
-        # A client that does not read loses bytes, as with a real adapter.
+        # As with a real adapter, a client that does not read loses bytes.
         with contextlib.suppress(BlockingIOError):
             os.write(self._master, data)
 
     def close(self) -> None:
-        """Hang up and remove the link, where it is still the own one."""
+        """Close the terminal, and remove the link if it still leads to this device."""
         if self._link is not None and self._link.is_symlink() and os.readlink(self._link) == self.device:
             self._link.unlink()
         for descriptor in (self._master, self._slave):

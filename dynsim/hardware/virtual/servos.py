@@ -1,4 +1,4 @@
-"""The servos of a virtual line: registers, motion, heat, supply and watchdogs."""
+"""Servos of a virtual line: registers, motion, heat, supply, watchdogs, and the firmware that answers requests."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from dynsim.hardware.bus.packet import ALERT, STATUS, Instruction, Packet, Statu
 from dynsim.hardware.virtual.faults import AngleFault, Fault, FaultScript, TemperatureRamp, VoltageSag
 from dynsim.hardware.virtual.simulated_plant import Drive, InertialLoad, ServoPlant
 
-# Registers of one virtual servo, with the access rules of the real one.
+# Registers of one virtual servo, with the access rules of a real servo.
 
 
 GOAL_FIELDS = ("goal_pwm", "goal_current", "goal_velocity", "goal_position")
@@ -53,8 +53,8 @@ class ServoRegisters:
         self.model = model
         self._table = bytearray(TABLE_SIZE)
         self._field_at = {item.address: name for name, item in model.fields.items()}
-        # Each read of a state needs a dozen registers: their addresses are looked up once.
-        self._places = {
+        # Each read of a state needs a dozen registers: look up their addresses once.
+        self._spans = {
             name: (slice(item.address, item.address + item.size), item.size, item.signed)
             for name, item in model.fields.items()
         }
@@ -62,20 +62,20 @@ class ServoRegisters:
         self["id"], self["baud"] = id_, baud_code
 
     def __getitem__(self, name: str) -> int:
-        span, _, signed = self._places[name]
+        span, _, signed = self._spans[name]
         return int.from_bytes(self._table[span], "little", signed=signed)
 
     def __setitem__(self, name: str, value: int) -> None:
-        span, size, signed = self._places[name]
+        span, size, signed = self._spans[name]
         self._table[span] = value.to_bytes(size, "little", signed=signed)
 
     @property
     def baud(self) -> int:
-        """[bit/s]."""
+        """Bit rate [bit/s]."""
         return BAUD_RATES[self["baud"]]
 
     def reset(self, keep: Collection[str] = ()) -> None:
-        """All as delivered, but for the registers named in ``keep``."""
+        """Reset all registers except ``keep`` to factory defaults, and restart."""
         kept = {name: self[name] for name in keep}
         for name, item in self.model.fields.items():
             self[name] = kept.get(name, item.default)
@@ -83,7 +83,7 @@ class ServoRegisters:
         self.restart()
 
     def restart(self) -> None:
-        """RAM as after power-on."""
+        """Reset the RAM to its state after power-on."""
         for name, item in self.model.fields.items():
             if not item.in_eeprom:
                 self[name] = item.default
@@ -96,7 +96,7 @@ class ServoRegisters:
         self["goal_pwm"] = self["pwm_limit"]
 
     def read(self, address: int, length: int) -> bytes | None:
-        """Bytes, indirect ones resolved; None outside of the table."""
+        """Return bytes with indirect addresses resolved; None outside the table."""
         if length < 1 or address + length > TABLE_SIZE:
             return None
         if address + length <= INDIRECT_BLOCKS[0][1]:
@@ -104,7 +104,7 @@ class ServoRegisters:
         return bytes(self._table[self._resolve(a)] for a in range(address, address + length))
 
     def write(self, address: int, data: bytes) -> StatusError:
-        """Write consecutive items, all or none."""
+        """Write consecutive registers; after an error, none is written."""
         if not data or address + len(data) > TABLE_SIZE:
             return StatusError.ACCESS
         end = address + len(data)
@@ -164,7 +164,7 @@ class ServoRegisters:
         if name == "goal_position":
             if self["operating_mode"] == OperatingMode.POSITION:
                 return self["min_position"], self["max_position"]
-            # Multi-turn modes know no position limits.
+            # Multi-turn modes have no position limits.
             return -1_048_575, 1_048_575
         limit = self[
             {"goal_pwm": "pwm_limit", "goal_current": "current_limit", "goal_velocity": "velocity_limit"}[name]
@@ -176,7 +176,7 @@ class ServoRegisters:
             if data <= address < data + count:
                 at = pointers + 2 * (address - data)
                 target = int.from_bytes(self._table[at : at + 2], "little")
-                # A pointer to another indirect byte would be followed only once by the real servo.
+                # A real servo follows a pointer to another indirect byte only once.
                 return target if target < TABLE_SIZE else address
         return address
 
@@ -190,18 +190,18 @@ class ServoRegisters:
 
 
 PROTOCOL = 2
-"""Protocol of the line. A servo set to another one never answers."""
+"""Protocol of the line. A servo with another protocol never answers."""
 PHYSICS_STEP = 2e-3
 COMMUNICATION_END = 14
-"""Settings of communication (IDs, bit rate, protocol) have lower addresses than this."""
+"""Communication settings (IDs, bit rate, protocol) have addresses below this."""
 GOALS = range(100, 120)
-"""Addresses of goals and profile: a write to nothing else changes neither torque nor mode."""
+"""Addresses of goals and profile; a write to these addresses changes neither torque nor mode."""
 TRAJECTORY = 136, 144
-"""Addresses of the profile's speed and position, which are updated only when they are read."""
+"""Addresses of speed and position of the profile, which are updated only when they are read."""
 STATE = range(124, 136)
-"""Addresses of load, speed and position, which are read in each cycle, without voltage, temperature and clock."""
+"""Addresses of load, speed and position, which are read in each cycle without voltage, temperature and clock."""
 BOOT_TIME = 0.3
-"""Silence after a reboot [s] (unverified)."""
+"""Time after a reboot in which a servo does not answer [s] (unverified)."""
 AMBIENT = 25.0  # °C
 THERMAL_RESISTANCE = 2.0  # K/W (unverified)
 THERMAL_TIME = 300.0  # s (unverified)
@@ -209,22 +209,22 @@ OVERLOAD_FRACTION = 0.9  # of stall torque (unverified)
 OVERLOAD_TIME = 1.0  # s (unverified)
 SUPPLY, SUPPLY_RESISTANCE = 12.0, 0.05  # V, Ω
 BROWN_OUT = 6.0
-"""Supply below which the servos' electronics stop; they restart above it [V] (unverified)."""
+"""Supply below which the electronics of the servos stop; they restart above it [V] (unverified)."""
 OVERHEATING, OVERLOAD, INPUT_VOLTAGE = 1 << 2, 1 << 5, 1 << 0
 
 
 @dataclass
-class Hearing:
-    """Servos of one bit rate, named by the ID they had at first.
+class BaudGroup:
+    """Servos with the same bit rate, identified by their initial IDs.
 
     Attributes
     ----------
     by_id : dict of int to list of int
-        By the ID they have now; more than one where they share it.
+        Servos by present ID; several servos may have the same ID.
     by_shadow : dict of int to list of int
-        By their secondary ID: they carry out writes to it, and do not answer.
+        Servos by secondary ID: they execute writes to this ID but do not answer.
     members : int array
-        Their places in the order of the line.
+        Indices of the servos in the order of the line.
     """
 
     by_id: dict[int, list[int]] = field(default_factory=dict)
@@ -232,54 +232,57 @@ class Hearing:
     members: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
 
-def by_bit_rate(servos: Mapping[int, ServoRegisters]) -> dict[int, Hearing]:
-    """Who understands a packet, by its bit rate [bit/s]; as the registers say now."""
-    hearings: dict[int, Hearing] = {}
+def group_by_baud(servos: Mapping[int, ServoRegisters]) -> dict[int, BaudGroup]:
+    """Return the servos that receive packets at each bit rate [bit/s], from their present registers."""
+    groups: dict[int, BaudGroup] = {}
     for index, (first_id, registers) in enumerate(servos.items()):
         if registers["protocol"] != PROTOCOL:
             continue
-        hearing = hearings.setdefault(registers.baud, Hearing())
-        hearing.members = np.append(hearing.members, index)
-        hearing.by_id.setdefault(registers["id"], []).append(first_id)
+        group = groups.setdefault(registers.baud, BaudGroup())
+        group.members = np.append(group.members, index)
+        group.by_id.setdefault(registers["id"], []).append(first_id)
         if registers["shadow_id"] <= MAX_ID and registers["shadow_id"] != registers["id"]:
-            hearing.by_shadow.setdefault(registers["shadow_id"], []).append(first_id)
-    return hearings
+            group.by_shadow.setdefault(registers["shadow_id"], []).append(first_id)
+    return groups
 
 
 class VirtualServos:
-    """N servos and what they move.
+    """N servos and the plant that they drive.
 
     Parameters
     ----------
     registers : mapping of int to ServoRegisters
-        By ID. A servo that is given another one keeps its place here, and its name in fault scripts.
+        Registers by ID. If a servo gets another ID later, this key and the ID in fault scripts stay the same.
     positions : iterable of float
         Initial servo angles [rad], 0 at tick 0.
     plant : ServoPlant or None
-        What the servos move; every one its own inertia if None.
+        Plant that the servos drive; if None, a separate inertia for each servo.
     script : FaultScript
-        Its sags, ramps and angle faults act here; :class:`~dynsim.hardware.virtual.injection.Injection` does the rest.
+        Source of voltage sags, temperature ramps and angle faults;
+        :class:`~dynsim.hardware.virtual.injection.Injection` applies the other faults.
 
     Attributes
     ----------
     supply : float
         Voltage of the supply without load [V].
     registers : dict
-        ServoRegisters by the ID that a servo had at first.
+        ServoRegisters by initial ID.
     ids : list of int
-        Those IDs.
-    hearing : dict of int to Hearing
-        Who hears what, by bit rate.
+        Initial IDs.
+    baud_groups : dict of int to BaudGroup
+        Servos that receive packets at each bit rate.
     time : float
-        [s].
+        Time of the servos [s].
     torque_since : float
-        When torque was first switched on [s]; infinite before.
-    heard : array, shape (N,)
-        Time of the last packet that each servo could understand, for the watchdogs [s].
+        Time at which torque was first switched on [s]; infinite before.
+    last_packet : array, shape (N,)
+        Time of the last packet that each servo could receive, for the watchdogs [s].
     dead : set of int
         IDs without power or cable.
-    temperature, play : array, shape (N,)
-        Of the windings [°C]; the angle behind the backlash [rad].
+    temperature : array, shape (N,)
+        Temperature of the windings [°C].
+    play : array, shape (N,)
+        Angle after the backlash [rad].
     """
 
     def __init__(
@@ -292,7 +295,7 @@ class VirtualServos:
     ) -> None:
         self.registers = dict(registers)
         self.ids = list(registers)
-        self.hearing = by_bit_rate(self.registers)
+        self.baud_groups = group_by_baud(self.registers)
         self._models = [table.model for table in registers.values()]
         self.plant: ServoPlant = plant or InertialLoad(self._models, np.array(list(positions), dtype=np.float64))
         self.supply = SUPPLY
@@ -302,7 +305,7 @@ class VirtualServos:
         self._powered = self._switched_on = True
         self._script = script
         count = len(self.ids)
-        self.heard = np.zeros(count)
+        self.last_packet = np.zeros(count)
         self._drive = Drive(
             np.zeros(count, dtype=bool), np.ones(count, dtype=bool), self.plant.position.copy(), np.zeros(count), SUPPLY
         )
@@ -322,34 +325,34 @@ class VirtualServos:
         self._ampere_per_newtonmetre = np.array([1 / model.torque_constant for model in self._models])
         for index in range(count):
             self.reload(index)
-            self.hold_here(index)
+            self.hold_position(index)
             self.reload(index)
 
     def active_faults(self) -> list[Fault]:
-        """Faults of the script that are active now."""
+        """Return the faults of the script that are active now."""
         if not self._script.faults:
             return []
         since = self.time - self.torque_since
         return [fault for fault in self._script.faults if fault.active(since)]
 
     def _next_fault(self) -> float:
-        """When the next fault begins or ends [s]."""
+        """Return the time at which the next fault starts or ends [s]."""
         changes = [self.torque_since + time for fault in self._script.faults for time in fault.span]
         return min((time for time in changes if time > self.time), default=math.inf)
 
     # -- requests -----------------------------------------------------------------------------------------------------
 
-    def hear(self, hearing: Hearing, now: float) -> None:
-        """Those who understood a packet at ``now`` [s] are content for as long as their watchdogs wait."""
-        self.heard[hearing.members] = now
+    def reset_watchdogs(self, group: BaudGroup, now: float) -> None:
+        """Restart the watchdogs of the servos that received a packet at ``now`` [s]."""
+        self.last_packet[group.members] = now
 
-    def listens(self, id_: int) -> bool:
-        """Whether a servo hears what is sent."""
+    def receives(self, id_: int) -> bool:
+        """Return True if a servo can receive packets."""
         there = self._powered and id_ in self.registers and id_ not in self.dead
         return there and self.time >= self._boot_until.get(id_, 0.0)
 
     def read(self, id_: int, address: int, length: int) -> bytes | None:
-        """Bytes of a servo's control table as they are now; None outside of it."""
+        """Return present bytes of the control table of a servo; None outside the table."""
         index = self.ids.index(id_)
         self._measure_motion(index)
         if not (STATE.start <= address and address + length <= STATE.stop):
@@ -362,12 +365,12 @@ class VirtualServos:
         return self.registers[id_].read(address, length)
 
     def write(self, id_: int, address: int, data: bytes) -> StatusError:
-        """Write to a control table, with all that follows from it."""
+        """Write to a control table, and apply the consequences."""
         registers, index = self.registers[id_], self.ids.index(id_)
         if GOALS.start <= address and address + len(data) <= GOALS.stop:
             error = registers.write(address, data)
             if not error:
-                self._take_goals(index)
+                self._load_goals(index)
             return error
         torque, mode = registers["torque_enable"], registers["operating_mode"]
         error = registers.write(address, data)
@@ -375,40 +378,40 @@ class VirtualServos:
             return error
         if registers["operating_mode"] != mode:
             self.reload(index)
-            self.forget_turns(index)
+            self.reset_turns(index)
         if registers["torque_enable"] and not torque:
-            self.hold_here(index)
+            self.hold_position(index)
             if self.torque_since == math.inf:
                 self.torque_since = self.time
         self.reload(index)
         if address < COMMUNICATION_END:
-            self.hearing = by_bit_rate(self.registers)
+            self.baud_groups = group_by_baud(self.registers)
         return StatusError.NONE
 
     def reset(self, id_: int, keep: Collection[str]) -> None:
-        """As delivered but for the registers ``keep``, then a restart."""
+        """Reset a servo to factory defaults except the registers ``keep``, and restart it."""
         self.registers[id_].reset(keep)
         self.reload(self.ids.index(id_))
-        self.hearing = by_bit_rate(self.registers)
+        self.baud_groups = group_by_baud(self.registers)
         self.reboot(id_)
 
     def reboot(self, id_: int) -> None:
-        """Power-on state; the servo is silent for a while."""
+        """Reset a servo to its power-on state; it does not answer for BOOT_TIME."""
         index = self.ids.index(id_)
         self.registers[id_].restart()
-        self.forget_turns(index)
+        self.reset_turns(index)
         self._overload[index] = 0.0
         self._boot_until[id_] = self.time + BOOT_TIME
         self.reload(index)
 
     def set_power(self, *, on: bool) -> None:
-        """Switch the supply of all servos; they start anew when it comes back."""
+        """Switch the supply of all servos; they restart when it returns."""
         if on != self._switched_on:
             self._switched_on = on
-            self._feed(0.0)
+            self._update_supply(0.0)
 
-    def _feed(self, current: float) -> None:
-        """The supply under a current [A]: below BROWN_OUT all are silent and limp, above it they start anew."""
+    def _update_supply(self, current: float) -> None:
+        """Update the supply voltage for a current [A]; servos fail below BROWN_OUT and restart above it."""
         sag = sum(fault.drop for fault in self.active_faults() if isinstance(fault, VoltageSag))
         self._drive.voltage = (self.supply - sag - SUPPLY_RESISTANCE * current) * self._switched_on
         powered = self._drive.voltage >= BROWN_OUT
@@ -417,16 +420,16 @@ class VirtualServos:
             for id_ in self.ids:
                 self.reboot(id_)
 
-    def forget_turns(self, index: int) -> None:
-        """Count turns from here."""
+    def reset_turns(self, index: int) -> None:
+        """Start counting turns from the present position."""
         self._turns[index] = self._sense[index] * round(self.plant.position[index] / RAD_PER_TICK) // TICKS_PER_TURN
 
     # -- motion, heat, supply -----------------------------------------------------------------------------------------
 
     def step(self, until: float) -> None:
-        """One physics step, or when nothing moves all that fit in before ``until`` [s]."""
+        """Execute one physics step, or, if nothing moves, all steps that fit in before ``until`` [s]."""
         if not self._drive.enabled.any() and self.plant.rests:
-            # Nothing moves: one long step for the temperatures, so that waiting for pings costs nothing.
+            # Nothing moves: one long step for the temperatures, so that a wait for pings costs no time.
             steps = max(1, int((min(until, self._next_fault()) - self.time) / PHYSICS_STEP))
             self.time += steps * PHYSICS_STEP
             self._warm(steps * PHYSICS_STEP)
@@ -438,13 +441,13 @@ class VirtualServos:
             self._watch()
 
     def _set_points(self, dt: float) -> None:
-        """Profile generator: a set point that runs to the goal with limited speed and acceleration (0: unlimited)."""
+        """Move the set points to the goals with the speed and acceleration of the profile (0: unlimited)."""
         drive = self._drive
         to_go = self._goal_position - drive.set_position
         acceleration = np.where(self._profile_acceleration > 0, self._profile_acceleration, np.inf)
         speed = np.where(self._profile_velocity > 0, self._profile_velocity, np.inf)
         distance = np.abs(to_go)
-        # The speed from which it can still brake before the goal; at the goal that is 0, whatever the acceleration.
+        # Maximum speed that allows braking before the goal; 0 at the goal, whatever the acceleration.
         braking = np.sqrt(2 * acceleration * np.maximum(distance, 1e-12))
         wanted = np.sign(to_go) * np.minimum(np.minimum(speed, braking), distance / dt)
         change = acceleration * dt
@@ -461,7 +464,7 @@ class VirtualServos:
         target = AMBIENT + THERMAL_RESISTANCE * heat
         self.temperature += (target - self.temperature) * -math.expm1(-dt / THERMAL_TIME)
         self._overload = np.where(torque > self._overload_torque, self._overload + dt, 0.0)
-        self._feed(float(current.sum()))
+        self._update_supply(float(current.sum()))
         for fault in self.active_faults():
             if isinstance(fault, TemperatureRamp) and fault.id in self.registers:
                 self.temperature[self.ids.index(fault.id)] += dt * fault.heating_rate
@@ -469,10 +472,10 @@ class VirtualServos:
     def _watch(self) -> None:
         enabled = self._drive.enabled
         low_voltage = self._drive.voltage < self._min_voltage
-        unheard = (self._watchdog > 0) & (self.time - self.heard > self._watchdog)
+        timed_out = (self._watchdog > 0) & (self.time - self.last_packet > self._watchdog)
         hot = self.temperature > self._temperature_limit
         overloaded = self._overload > OVERLOAD_TIME
-        if not (enabled & (low_voltage | unheard | hot | overloaded)).any():
+        if not (enabled & (low_voltage | timed_out | hot | overloaded)).any():
             return
         for index in map(int, np.flatnonzero(enabled)):
             if overloaded[index]:
@@ -481,11 +484,11 @@ class VirtualServos:
                 self.raise_error(index, OVERHEATING)
             if low_voltage[index]:
                 self.raise_error(index, INPUT_VOLTAGE)
-            if unheard[index]:
+            if timed_out[index]:
                 self.trip_watchdog(index)
 
     def raise_error(self, index: int, bit: int) -> None:
-        """Set a bit of the error register; torque off if the servo is to shut down for it."""
+        """Set a bit of the error register, and switch torque off if ``shutdown`` contains this bit."""
         registers = self.registers[self.ids[index]]
         registers["hardware_error"] |= bit
         if registers["hardware_error"] & registers["shutdown"]:
@@ -493,8 +496,8 @@ class VirtualServos:
             self.reload(index)
 
     def trip_watchdog(self, index: int) -> None:
-        """Stop, and take no goals until the watchdog is cleared."""
-        self.hold_here(index)
+        """Stop a servo, which then accepts no goals until its watchdog is cleared."""
+        self.hold_position(index)
         self.registers[self.ids[index]]["bus_watchdog"] = -1
         self.reload(index)
 
@@ -509,8 +512,8 @@ class VirtualServos:
         raw = ticks - registers["homing_offset"] + int(self._turns[index]) * TICKS_PER_TURN
         return self._sense[index] * raw * RAD_PER_TICK
 
-    def hold_here(self, index: int) -> None:
-        """Set point and goals := where the shaft is."""
+    def hold_position(self, index: int) -> None:
+        """Set the goals and the set point to the present position of the shaft."""
         registers = self.registers[self.ids[index]]
         registers["goal_position"] = self._present_ticks(index, self.plant.position[index])
         registers["goal_velocity"] = 0
@@ -519,19 +522,19 @@ class VirtualServos:
         self._set_rate[index] = 0.0
 
     def reload(self, index: int) -> None:
-        """Take over what the motion needs from the registers."""
+        """Load the settings that affect the motion from the registers."""
         registers = self.registers[self.ids[index]]
-        # Reverse mode turns the shaft's sense, not that of the homing offset.
+        # Reverse mode changes the direction of the shaft, but not of the homing offset.
         self._sense[index] = -1 if registers["drive_mode"] & 1 else 1
         self._drive.enabled[index] = bool(registers["torque_enable"])
         self._drive.in_position_mode[index] = registers["operating_mode"] != OperatingMode.VELOCITY
         self._temperature_limit[index] = registers["temperature_limit"]
         self._min_voltage[index] = registers["min_voltage"] * VOLT_PER_UNIT
         self._watchdog[index] = max(0, registers["bus_watchdog"]) * WATCHDOG_SECONDS_PER_UNIT
-        self._take_goals(index)
+        self._load_goals(index)
 
-    def _take_goals(self, index: int) -> None:
-        """Goals and profile as the registers have them."""
+    def _load_goals(self, index: int) -> None:
+        """Load goals and profile from the registers."""
         registers = self.registers[self.ids[index]]
         self._goal_position[index] = self._angle(index, registers["goal_position"])
         self._goal_velocity[index] = self._sense[index] * registers["goal_velocity"] * RAD_S_PER_UNIT
@@ -539,7 +542,7 @@ class VirtualServos:
         self._profile_acceleration[index] = registers["profile_acceleration"] * RAD_S2_PER_UNIT
 
     def measure(self, index: int) -> None:
-        """Bring the registers of one servo up to date."""
+        """Update the measurements in the registers of one servo."""
         self._measure_motion(index)
         self._measure_supply(index)
 
@@ -570,28 +573,28 @@ class VirtualServos:
         registers["realtime_tick"] = int(self.time * 1e3) % 32768
 
 
-# Firmware of a virtual servo: instructions of Protocol 2.0 and their answers.
+# Firmware of the virtual servos: instructions of Protocol 2.0 and their answers.
 
 
 CLEAR_TURNS = b"\x01\x44\x58\x4c\x22"
 RESET_ALL = 0xFF
 KEPT_BY_RESET: dict[int, tuple[str, ...]] = {RESET_ALL: (), 0x01: ("id",), 0x02: ("id", "baud")}
-"""Registers that a factory reset does not change, by its parameter."""
+"""Registers that a factory reset does not change, by the parameter of the reset."""
 
-SHADOWED = (Instruction.WRITE, Instruction.REG_WRITE)
-"""Instructions that a servo carries out without an answer when they are sent to its secondary ID, in RAM."""
+SHADOW_INSTRUCTIONS = (Instruction.WRITE, Instruction.REG_WRITE)
+"""Instructions to a secondary ID that a servo executes without an answer, for registers in RAM."""
 
 
 class Answer(NamedTuple):
-    """A frame that one or several servos send at one time.
+    """Frame that one or several servos send at the same time.
 
     Attributes
     ----------
     servos : tuple of int
-        The servos that send, by the IDs they had at first; more than one when they share an ID.
+        Initial IDs of the sending servos; several if they have the same present ID.
     frame : bytes
     chained : bool
-        It follows on the answer before without a pause.
+        True if the frame follows the previous answer without a pause.
     """
 
     servos: tuple[int, ...]
@@ -599,8 +602,8 @@ class Answer(NamedTuple):
     chained: bool = False
 
 
-def together(frames: Sequence[tuple[int, bytes]]) -> Answer:
-    """Servos that answer at once, each with its frame: all drive the line, and a zero bit wins (unverified)."""
+def merge_frames(frames: Sequence[tuple[int, bytes]]) -> Answer:
+    """Merge the frames of servos that answer at the same time: all drive the line, and a zero bit wins (unverified)."""
     if len(frames) == 1:
         servo, frame = frames[0]
         return Answer((servo,), frame)
@@ -612,64 +615,67 @@ def together(frames: Sequence[tuple[int, bytes]]) -> Answer:
 
 
 class Firmware:
-    """Carries out instructions on servos. These are named by the ID they had at first."""
+    """Execute instructions on servos, which are identified by their initial IDs."""
 
     def __init__(self, servos: VirtualServos) -> None:
         self._servos = servos
         self._registered: dict[int, tuple[int, bytes]] = {}
 
-    def answers(self, packet: Packet, hearing: Hearing) -> Iterator[Answer]:
-        """Carry out an instruction; what comes back, in the order of the line."""
+    def answers(self, packet: Packet, group: BaudGroup) -> Iterator[Answer]:
+        """Execute an instruction and yield the answers, in their order on the line."""
         p = packet.parameters
         match packet.instruction:
             case Instruction.SYNC_READ | Instruction.FAST_SYNC_READ if len(p) >= 5:
                 address, length = int.from_bytes(p[0:2], "little"), int.from_bytes(p[2:4], "little")
                 entries = [(id_, address, length) for id_ in p[4:]]
                 read = self._fast_read if packet.instruction == Instruction.FAST_SYNC_READ else self._read_many
-                yield from read(entries, hearing)
+                yield from read(entries, group)
             case Instruction.BULK_READ | Instruction.FAST_BULK_READ:
                 entries = [
                     (p[k], int.from_bytes(p[k + 1 : k + 3], "little"), int.from_bytes(p[k + 3 : k + 5], "little"))
                     for k in range(0, len(p) - 4, 5)
                 ]
                 read = self._fast_read if packet.instruction == Instruction.FAST_BULK_READ else self._read_many
-                yield from read(entries, hearing)
+                yield from read(entries, group)
             case Instruction.SYNC_WRITE if len(p) >= 4:
                 address, length = int.from_bytes(p[0:2], "little"), int.from_bytes(p[2:4], "little")
                 for k in range(4, len(p) - length, length + 1):
-                    # Nobody answers a sync write: a refused goal goes unnoticed, as on real servos.
-                    self._write_silently(p[k], address, p[k + 1 : k + 1 + length], hearing)
+                    # Servos do not answer a sync write: a refused goal is not reported, as on real servos.
+                    self._write_silently(p[k], address, p[k + 1 : k + 1 + length], group)
             case Instruction.BULK_WRITE:
                 k = 0
                 while k + 5 <= len(p):
                     address = int.from_bytes(p[k + 1 : k + 3], "little")
                     length = int.from_bytes(p[k + 3 : k + 5], "little")
-                    self._write_silently(p[k], address, p[k + 5 : k + 5 + length], hearing)
+                    self._write_silently(p[k], address, p[k + 5 : k + 5 + length], group)
                     k += 5 + length
             case _:
-                yield from self._answers_of_each(packet, hearing)
+                yield from self._answers_of_each(packet, group)
 
-    def _write_silently(self, id_: int, address: int, data: bytes, hearing: Hearing) -> None:
-        for servo in self._awake(hearing, id_):
+    def _write_silently(self, id_: int, address: int, data: bytes, group: BaudGroup) -> None:
+        for servo in self._awake(group, id_):
             self._servos.write(servo, address, data)
-        if hearing.by_shadow and address >= EEPROM_END:
-            for servo in self._shadows(hearing, id_):
+        if group.by_shadow and address >= EEPROM_END:
+            for servo in self._shadows(group, id_):
                 self._servos.write(servo, address, data)
 
-    def _answers_of_each(self, packet: Packet, hearing: Hearing) -> Iterator[Answer]:
+    def _answers_of_each(self, packet: Packet, group: BaudGroup) -> Iterator[Answer]:
         broadcast = packet.id == BROADCAST_ID
-        for servo in self._shadows(hearing, packet.id):
-            if packet.instruction in SHADOWED and int.from_bytes(packet.parameters[0:2], "little") >= EEPROM_END:
+        for servo in self._shadows(group, packet.id):
+            if (
+                packet.instruction in SHADOW_INSTRUCTIONS
+                and int.from_bytes(packet.parameters[0:2], "little") >= EEPROM_END
+            ):
                 self._reply(servo, packet.id, packet)
-        # A list: the instruction may give a servo another ID.
-        for id_ in sorted(hearing.by_id) if broadcast else [packet.id]:
+        # Iterate over a copy, because the instruction may change the ID of a servo.
+        for id_ in sorted(group.by_id) if broadcast else [packet.id]:
             frames = []
-            for servo in self._awake(hearing, id_):
+            for servo in self._awake(group, id_):
                 reply = self._reply(servo, id_, packet)
                 if reply and (not broadcast or packet.instruction == Instruction.PING):
                     frames.append((servo, encode(reply)))
             if frames:
-                yield together(frames)
+                yield merge_frames(frames)
 
     def _reply(self, servo: int, id_: int, packet: Packet) -> Packet | None:
         registers, p = self._servos.registers[servo], packet.parameters
@@ -687,12 +693,12 @@ class Firmware:
             case Instruction.ACTION:
                 error = self._act(servo)
             case Instruction.REBOOT | Instruction.FACTORY_RESET:
-                # The answer goes out before, as the servo was.
+                # The answer is sent first, from the state before the restart.
                 answer = self._status(servo, id_, StatusError.NONE)
                 if packet.instruction == Instruction.REBOOT:
                     self._servos.reboot(servo)
                 elif p[:1] == bytes([RESET_ALL]) and packet.id == BROADCAST_ID:
-                    return None  # it would give all of them one ID
+                    return None  # ignored, because it would assign the same ID to all servos
                 elif p and p[0] in KEPT_BY_RESET:
                     self._servos.reset(servo, KEPT_BY_RESET[p[0]])
                 else:
@@ -704,26 +710,26 @@ class Firmware:
                 error = StatusError.INSTRUCTION
         return self._status(servo, id_, error) if answers_all else None
 
-    def _read_many(self, entries: Sequence[tuple[int, int, int]], hearing: Hearing) -> Iterator[Answer]:
+    def _read_many(self, entries: Sequence[tuple[int, int, int]], group: BaudGroup) -> Iterator[Answer]:
         for id_, address, length in entries:
-            replies = [(servo, self._read(servo, id_, address, length)) for servo in self._awake(hearing, id_)]
+            replies = [(servo, self._read(servo, id_, address, length)) for servo in self._awake(group, id_)]
             if frames := [(servo, encode(reply)) for servo, reply in replies if reply]:
-                yield together(frames)
+                yield merge_frames(frames)
 
-    def _fast_read(self, entries: Sequence[tuple[int, int, int]], hearing: Hearing) -> Iterator[Answer]:
-        """One packet, of which every servo sends its part; behind one that is silent nobody speaks (unverified)."""
-        speakers, replies = [], []
+    def _fast_read(self, entries: Sequence[tuple[int, int, int]], group: BaudGroup) -> Iterator[Answer]:
+        """Yield the parts of one packet; the servos after a silent servo do not send (unverified)."""
+        senders, replies = [], []
         for id_, address, length in entries:
-            servo = next(iter(self._awake(hearing, id_)), None)
+            servo = next(iter(self._awake(group, id_)), None)
             reply = None if servo is None else self._read(servo, id_, address, length)
             if servo is None or reply is None:
                 break
             if len(reply.parameters) != length:
                 reply = Packet(id_, STATUS, bytes(length), reply.error)
-            speakers.append(servo)
+            senders.append(servo)
             replies.append(reply)
         parts = encode_fast(replies, [length for _, _, length in entries])
-        for index, (servo, part) in enumerate(zip(speakers, parts, strict=True)):
+        for index, (servo, part) in enumerate(zip(senders, parts, strict=True)):
             yield Answer((servo,), part, chained=index > 0)
 
     def _read(self, servo: int, id_: int, address: int, length: int) -> Packet | None:
@@ -738,22 +744,22 @@ class Firmware:
         alert = ALERT if self._servos.registers[servo]["hardware_error"] else 0
         return Packet(id_, STATUS, data, error | alert)
 
-    def _awake(self, hearing: Hearing, id_: int) -> list[int]:
-        """Servos that have an ID and are not dead, off or starting."""
-        return list(filter(self._servos.listens, hearing.by_id.get(id_, ())))
+    def _awake(self, group: BaudGroup, id_: int) -> list[int]:
+        """Return the servos with an ID that can receive packets."""
+        return list(filter(self._servos.receives, group.by_id.get(id_, ())))
 
-    def _shadows(self, hearing: Hearing, id_: int) -> list[int]:
-        """Servos of which it is the secondary ID."""
-        return list(filter(self._servos.listens, hearing.by_shadow.get(id_, ())))
+    def _shadows(self, group: BaudGroup, id_: int) -> list[int]:
+        """Return the servos with a secondary ID that can receive packets."""
+        return list(filter(self._servos.receives, group.by_shadow.get(id_, ())))
 
     def _register(self, servo: int, address: int, data: bytes) -> StatusError:
-        """Keep a write until :meth:`_act`."""
+        """Store a write until :meth:`_act`."""
         self._registered[servo] = (address, data)
         self._servos.registers[servo]["registered_instruction"] = 1
         return StatusError.NONE
 
     def _act(self, servo: int) -> StatusError:
-        """Carry out the registered write; a restart has forgotten it."""
+        """Execute the registered write, unless a restart has cleared it."""
         registers = self._servos.registers[servo]
         if not registers["registered_instruction"]:
             return StatusError.RESULT_FAIL
@@ -761,9 +767,9 @@ class Firmware:
         return self._servos.write(servo, *self._registered.pop(servo))
 
     def _clear_turns(self, servo: int) -> StatusError:
-        """Count turns from here; only at rest."""
+        """Start counting turns from the present position; fails if the servo moves."""
         index = self._servos.ids.index(servo)
         if abs(self._servos.plant.velocity[index]) > self._servos.registers[servo]["moving_threshold"] * RAD_S_PER_UNIT:
             return StatusError.RESULT_FAIL
-        self._servos.forget_turns(index)
+        self._servos.reset_turns(index)
         return StatusError.NONE

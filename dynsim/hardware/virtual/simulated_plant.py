@@ -1,11 +1,11 @@
-"""A simulated robot behind virtual servos: bodies, gravity, joint stops, braces and ground.
+"""Plants of virtual servos: the motor law, simple inertias, and a simulated robot with gravity, stops and contacts.
 
-A :class:`dynsim.Simulation` moves it: the scenario's robot, with servos of the map's models for motors. Contacts are
-those of the engine under the unilateral law, whatever law the scenario has: a real floor does not pull. The integrator
-is time stepping where the scenario has that, and for a snake, which stands on its wheels; else the one of events.
+The robot is a :class:`dynsim.Simulation` of the robot of a scenario, with servo models from the map as motors. Contacts
+follow the unilateral law, whatever law the scenario has, because a real floor does not pull. The integrator is time
+stepping if the scenario uses it, and for a snake robot, which stands on its wheels; otherwise it is event-driven.
 
-The angles that servos report are rounded to ticks, so a braced elbow may appear some tenths of a millimetre below its
-floor, or a joint beyond its stop. The arm then starts at the nearest admissible posture.
+Servos round their angles to ticks, so a braced elbow may appear some tenths of a millimetre below its floor, or a joint
+beyond its stop. The arm then starts in the nearest admissible posture.
 """
 
 from __future__ import annotations
@@ -29,29 +29,29 @@ if TYPE_CHECKING:
     from dynsim.model.drives import Servo
     from dynsim.scenario import Scenario
 
-# Mechanics of virtual servos: motor law, interface of plants behind servos, and inertias as the simplest plant.
+# Mechanics of virtual servos: motor law, interface of plants, and separate inertias as the simplest plant.
 
 
 STIFFNESS_PER_STALL_TORQUE = 41.0 / MX_106.stall_torque  # 1/rad
 VELOCITY_TIME_CONSTANT = 0.02
-"""Time constant of the closed velocity loop, with the servo's own inertia only [s] (unverified)."""
+"""Time constant of the closed velocity loop of a servo without load [s] (unverified)."""
 FREE_DAMPING = 0.1
 """Damping of an unpowered gear train as a fraction of the back-EMF damping (unverified)."""
 
 
 @dataclass
 class Drive:
-    """Set points of the servos' controllers for their motors; all arrays of shape (N,), in servo angles.
+    """Set points of the servo controllers; arrays of shape (N,), in servo angles.
 
     Attributes
     ----------
     enabled, in_position_mode : bool arrays
     set_position : array
-        [rad].
+        Set points of the position [rad].
     set_velocity : array
-        [rad/s].
+        Set points of the velocity [rad/s].
     voltage : float
-        Supply at the servos [V].
+        Supply voltage at the servos [V].
     """
 
     enabled: NDArray[np.bool_]
@@ -62,14 +62,14 @@ class Drive:
 
 
 class MotorLaw:
-    """Torque of N servos from their set points: the servo law of the simulation, with constants of their models.
+    """Torque of N servos from their set points: the servo law of the simulation with the constants of the models.
 
     Attributes
     ----------
     stiffness, damping, stall_torque : array, shape (N,)
         k [N·m/rad], d [N·m·s/rad], τ_stall at 12 V [N·m].
     inertia : array, shape (N,)
-        The output inertia at which the position loop is critically damped, d²/(4k) [kg·m²].
+        Output inertia for which the position loop is critically damped, d²/(4k) [kg·m²].
     """
 
     def __init__(self, models: list[ServoModel]) -> None:
@@ -77,21 +77,21 @@ class MotorLaw:
         self.damping = self.stall_torque / np.array([model.no_load_speed for model in models])
         self.stiffness = STIFFNESS_PER_STALL_TORQUE * self.stall_torque
         self.inertia = self.damping**2 / (4 * self.stiffness)
-        # Replaying on real servos imports this module and nothing of the simulation.
+        # Imported here because a replay on real servos imports this module, but not the simulation.
         from dynsim.model.drives import ServoBank
 
         self._bank = ServoBank(self.servos([model.name for model in models], np.ones(len(models))))
 
     def torque(self, position: Array, velocity: Array, drive: Drive) -> Array:
-        """Output torque [N·m], shape (N,), at an angle [rad] and speed [rad/s]."""
+        """Return the output torque [N·m], shape (N,), at an angle [rad] and speed [rad/s]."""
         self._bank.command(drive.enabled, drive.in_position_mode, drive.set_position, drive.set_velocity)
         self._bank.supply(drive.voltage)
         return self._bank.torque(position, velocity)
 
     def servos(self, joints: list[str], gears: Array) -> list[Servo]:
-        """The same servos on joints which they turn through gears, (N,) servo turns per joint turn.
+        """Return the servos as motors of joints, with gears (N,) in servo turns per joint turn.
 
-        K_m = V/ω_no_load and R = V K_m/τ_stall at 12 V, so that d = K_m²/R; a torque per volt is K_m/R.
+        K_m = V/ω_no_load and R = V K_m/τ_stall at 12 V, so that d = K_m²/R; the torque per volt is K_m/R.
         """
         from dynsim.model.drives import Servo
 
@@ -113,14 +113,14 @@ class MotorLaw:
 
 
 class ServoPlant(Protocol):
-    """Mechanics behind the servos' output shafts.
+    """Interface of the mechanics that servos drive.
 
     Attributes
     ----------
     position, velocity, torque : array, shape (N,)
         Servo angle [rad] (0 at tick 0), speed [rad/s], motor torque [N·m].
     rests : bool
-        Nothing would move as long as all servos are off, so time may pass without steps.
+        True if nothing moves while all servos are off, so that no steps are needed.
     """
 
     position: Array
@@ -135,12 +135,12 @@ class ServoPlant(Protocol):
         ...
 
     def stop(self, index: int) -> None:
-        """Bring one shaft to rest where it is, and hold it there during the next step (a jammed gear)."""
+        """Stop one shaft at its present angle and lock it during the next step (a jammed gear)."""
         ...
 
 
 class InertialLoad:
-    """Every servo turns an inertia of its own: a second-order response, critically damped."""
+    """A separate inertia for each servo, with a critically damped second-order response."""
 
     def __init__(self, models: list[ServoModel], position: Array) -> None:
         self.law = MotorLaw(models)
@@ -169,34 +169,34 @@ Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
 START_CHANGE = 5.0 * RAD_PER_TICK
-"""Largest change of a joint at the start that removes penetrations, which ticks and backlash cause [rad]."""
-GAP = 1e-10  # [m]
+"""Maximum change of a joint at the start to remove penetrations, which are caused by ticks and backlash [rad]."""
+GAP_TOLERANCE = 1e-10  # [m]
 SNAKE_STEP, ARM_STEP = 2e-3, 1e-3
-"""Time steps [s]: that of the servos' physics, which is the largest, and of an arm whose scenario has none."""
+"""Maximum time step, equal to the step of the servo physics, and default time step of an arm [s]."""
 SLOW, STEADY = 1e-4, 1e-2
-"""A robot with torque off is at rest below this rate [rad/s] and this acceleration [rad/s²]."""
+"""Rate [rad/s] and acceleration [rad/s²] below which a robot without torque is at rest."""
 
 
 class SimulatedArm:
-    """A :class:`~dynsim.hardware.virtual.simulated_plant.ServoPlant`: a robot whose every joint has a position servo.
+    """A :class:`~dynsim.hardware.virtual.simulated_plant.ServoPlant`: a robot with a position servo at each joint.
 
-    A joint rests on the robot's stand until its servo is first switched on: otherwise an arm would fall while it is
-    armed joint by joint.
+    A joint is locked by the stand of the robot until its servo is first switched on; otherwise an arm would fall while
+    its joints are armed one after another.
 
     Parameters
     ----------
     scenario : dynsim.Scenario
-        Whose robot it is, with payloads and contacts; forces that the scenario gives over time are left out.
+        Source of robot, payloads and contacts; forces over time are ignored.
     servo_map : ServoMap
     posture : array, shape (n,)
-        Where the joints are at first [rad], in the order of :func:`served_joints`; see :func:`possible`.
+        Initial joint angles [rad], in the order of :func:`served_joints`; see :func:`admissible_posture`.
 
     Raises
     ------
     ServoMapError
-        The servos of the map are not the joints of the model.
+        If the servos of the map do not match the joints of the model.
     ModelError
-        A contact point starts below its surface by more than ticks explain.
+        If a contact point starts farther below its surface than rounding to ticks explains.
     """
 
     def __init__(self, scenario: Scenario, servo_map: ServoMap, posture: Array) -> None:
@@ -207,34 +207,34 @@ class SimulatedArm:
         served, labels = served_joints(robot), [servo.label for servo in servos]
         if sorted(labels) != sorted(served):
             raise ServoMapError(
-                f"{servo_map.path} has servos for {', '.join(labels)}; the plant's joints are {', '.join(served)}"
+                f"{servo_map.path} has servos for {', '.join(labels)}, but the plant has joints {', '.join(served)}"
             )
-        # Servo k moves the joint labels[k], whose angle is q[order[k]] and whose rate is v[rows[k]].
+        # Servo k moves joint labels[k] with angle q[order[k]] and rate v[rows[k]].
         self._labels = labels = [served[label] for label in labels]
         self._rows = np.array([robot.joint_names.index(joint) for joint in labels])
         self._order = np.array(robot.position_index)[self._rows]
-        self._places = np.array(robot.position_index)[[robot.joint_names.index(joint) for joint in served.values()]]
+        self._indices = np.array(robot.position_index)[[robot.joint_names.index(joint) for joint in served.values()]]
         self._scale = np.array([servo.sign * servo.gear for servo in servos])  # servo angle per joint angle
         self._zero = np.array([servo.zero_tick * RAD_PER_TICK for servo in servos])
         self._law = MotorLaw([servo.model for servo in servos])
-        # They weigh what the motors do whose places they take.
+        # The servos have the masses of the motors that they replace.
         masses = {motor.joint: (motor.mass, motor.mass_point) for motor in robot.motors}
         motors = [
             replace(servo, mass=mass, mass_point=point)
             for servo in self._law.servos(labels, np.abs(self._scale))
             for mass, point in [masses.get(servo.joint, (0.0, None))]
         ]
-        bare = _bare(scenario)
-        q = _standing(bare, robot, dict(zip(served.values(), np.asarray(posture).tolist(), strict=True)))
+        bare = _plant_only(scenario)
+        q = _start_coordinates(bare, robot, dict(zip(served.values(), np.asarray(posture).tolist(), strict=True)))
         start = State(0.0, q, np.zeros(len(robot.links)), np.zeros(0))
         self.simulation = Simulation(bare, state=start, duration=math.inf, trace=0, motors=motors)
         self._on_stand = np.ones(len(servos), dtype=bool)
         self._jammed = np.zeros(len(servos), dtype=bool)
-        self._told = [("off", 0.0, 0.0)] * len(servos)
+        self._commands = [("off", 0.0, 0.0)] * len(servos)
         for label in labels:
             self.simulation.set_mode(label, "off")
             self.simulation.set_brake(label, True)
-        # Nothing moves yet; kernels are compiled now, not while a bus waits for an answer.
+        # Nothing moves yet: compile the kernels now, not while a bus waits for an answer.
         self.simulation.advance(1e-3)
         self.rests = True
         self.torque = np.zeros(len(servos))
@@ -243,7 +243,7 @@ class SimulatedArm:
     @property
     def joint_positions(self) -> Array:
         """Joint angles [rad], shape (n,), in the order of :func:`served_joints`."""
-        return self.simulation.state.q[self._places]
+        return self.simulation.state.q[self._indices]
 
     def step(self, dt: float, drive: Drive) -> None:
         self._on_stand &= ~drive.enabled
@@ -257,10 +257,10 @@ class SimulatedArm:
             if drive.enabled[k]:
                 in_position_mode = drive.in_position_mode[k]
                 command = ("position", positions[k], 0.0) if in_position_mode else ("velocity", 0.0, rates[k])
-            if command != self._told[k]:
+            if command != self._commands[k]:
                 simulation.set_mode(label, command[0])
                 simulation.set_reference(label, *command[1:])
-                self._told[k] = command
+                self._commands[k] = command
         self._jammed[:] = False
         simulation.advance(simulation.time + dt)
         self.position, self.velocity = self._shafts()
@@ -274,14 +274,14 @@ class SimulatedArm:
         self.position, self.velocity = self._shafts()
 
     def _shafts(self) -> tuple[Array, Array]:
-        """Angles [rad] and speeds [rad/s] of the servos."""
+        """Return angles [rad] and speeds [rad/s] of the servos."""
         state = self.simulation.state
         return self._zero + self._scale * state.q[self._order], self._scale * state.v[self._rows]
 
 
 def served_joints(robot: Robot) -> dict[str, str]:
-    """The joints that have servos, by the labels of these: all of an arm; of a snake those with motors."""
-    # Imported here and below: replaying on real servos imports this module's room and nothing of the simulation.
+    """Return the joints with servos, by servo label: all joints of an arm, the joints with motors of a snake robot."""
+    # Imported here and below because a replay on real servos imports this package, but not the simulation.
     from dynsim.compile.snake_tree import SnakeTree
 
     if not isinstance(robot, SnakeTree):
@@ -291,22 +291,22 @@ def served_joints(robot: Robot) -> dict[str, str]:
     return {joint: joint for joint in driven if joint not in wheels.values()} | wheels
 
 
-def _standing(bare: Scenario, robot: Robot, posture: dict[str, float]) -> Array:
-    """Coordinates (nq,) with the joints at these angles [rad]: an arm as near as is possible, a snake on its wheels."""
+def _start_coordinates(bare: Scenario, robot: Robot, posture: dict[str, float]) -> Array:
+    """Return coordinates (nq,) for joint angles [rad]; an arm is made admissible, a snake robot is on its wheels."""
     from dynsim.compile.snake_tree import SnakeTree, at_angles
     from dynsim.scenario import build
 
     if isinstance(robot, SnakeTree):
         return at_angles(robot, posture)
-    return possible(bare, build.build_model(bare), np.array(list(posture.values()), dtype=np.float64))
+    return admissible_posture(bare, build.build_model(bare), np.array(list(posture.values()), dtype=np.float64))
 
 
-def possible(scenario: Scenario, model: Model, posture: Array) -> Array:
-    """The posture, (n,) [rad], with joints within their stops and contact points on their surfaces or above them.
+def admissible_posture(scenario: Scenario, model: Model, posture: Array) -> Array:
+    """Return a posture with joints within their stops and contact points on or above their surfaces, (n,) [rad].
 
-    It is the nearest one to first order, Δq = −Jᵀ(J Jᵀ)⁺ gap for the points that were ever below, repeated until
-    gaps are rounding; what is moved is logged. A posture that would have to change by more than START_CHANGE is
-    returned as it is: the simulation refuses it by name.
+    It is the nearest posture to first order, Δq = −Jᵀ(J Jᵀ)⁺ gap for all points that were ever below, repeated until
+    the gaps are rounding errors; changes are logged. If a joint would have to change by more than START_CHANGE, the
+    posture is returned unchanged and the simulation rejects it with a message.
     """
     from dynsim.compile.shapes import gap_at
     from dynsim.scenario import build
@@ -321,25 +321,25 @@ def possible(scenario: Scenario, model: Model, posture: Array) -> Array:
     below = np.zeros(len(contacts), dtype=bool)
     for _ in range(20):
         depths = gaps(q)
-        below |= depths < -GAP
-        if np.abs(depths[below]).max(initial=0.0) <= GAP:
+        below |= depths < -GAP_TOLERANCE
+        if np.abs(depths[below]).max(initial=0.0) <= GAP_TOLERANCE:
             break
         q = q - np.linalg.pinv(_slopes(gaps, q)[below]) @ depths[below]
     change = np.abs(q - posture).max(initial=0.0)
     if not 0.0 < change <= START_CHANGE:
         return posture
-    log.info("a joint starts %.2g rad beside where its servo is: contact points on their surfaces, stops", change)
+    log.info("a joint starts %.2g rad away from its servo position, to satisfy contacts and stops", change)
     return q
 
 
 def _slopes(function: Callable[[Array], Array], q: Array, step: float = 1e-6) -> Array:
-    """Jacobian of a function of the joints by central differences, (c, n)."""
+    """Return the Jacobian of a function of the joints by central differences, (c, n)."""
     shifts = step * np.eye(len(q))
     return np.array([(function(q + shift) - function(q - shift)) / (2.0 * step) for shift in shifts]).T
 
 
-def _bare(scenario: Scenario) -> Scenario:
-    """The plant of a scenario, its payloads and what it can touch: no controller, no forces over time, no glue."""
+def _plant_only(scenario: Scenario) -> Scenario:
+    """Return a scenario with plant, payloads and unilateral contacts only, without controller and forces over time."""
     from dynsim.scenario.combinations import BILATERAL_KEYS
     from dynsim.scenario.schema import Contacts, Payload
 
@@ -351,7 +351,7 @@ def _bare(scenario: Scenario) -> Scenario:
         "sensors": None,
         "contacts": Contacts(**{**keys, "law": "unilateral"}),
         "loads": payloads,
-        "initial": None,  # the servos' ticks say where it stands
+        "initial": None,  # the ticks of the servos determine the posture
         "integrator": type(config.integrator)(method="dopri5"),  # set points change every 2 ms, which ends steps
     }
     if config.integrator.method == "time_stepping":
@@ -367,19 +367,24 @@ def _bare(scenario: Scenario) -> Scenario:
 def simulated_arm(
     scenario_name: str, variant: str | None, servo_map: ServoMap, posture: dict[str, float]
 ) -> SimulatedArm:
-    """The robot of a scenario behind the servos of a map.
+    """Build the robot of a scenario as the plant of the servos of a map.
 
     Parameters
     ----------
+    scenario_name : str
+        Scenario file or name of a shipped scenario.
+    variant : str or None
+        Variant of the scenario; default: the first.
+    servo_map : ServoMap
     posture : dict
-        Joint angles at first [rad], by label; the scenario's initial ones where it names none.
+        Initial joint angles [rad], by label; missing joints start as in the scenario.
 
     Raises
     ------
     ScenarioError, ModelError
-        No such scenario, or it has no rigid-body model (a kinematic plant).
+        If the scenario does not exist or has no rigid-body model (a kinematic plant).
     ServoMapError
-        The servos of the map are not its joints.
+        If the servos of the map do not match the joints of the robot.
     """
     from dynsim.scenario import build, load_scenario
 
