@@ -8,14 +8,14 @@ from dynsim.model.description import Array, Link, Robot
 
 
 def base_row(robot: Robot) -> tuple[int, Link]:
-    """Where the base's coordinates (left, right, x, y) begin in q, and its first row."""
+    """Return the index in q at which the base's coordinates (left, right, x, y) begin, and its first row."""
     assert robot.base is not None
     i = robot.joint_names.index(robot.base.wheels[0])
     return robot.position_index[i], robot.links[i]
 
 
 def base_pose(robot: Robot, q: Array) -> Array:
-    """x, y [m] and heading [rad, not wrapped] of the base in the world at coordinates q, (T, nq) → (T, 3).
+    """Return x, y [m] and heading [rad, not wrapped] of the base in the world at coordinates q, (T, nq) → (T, 3).
 
     heading = heading_0 + r (φ_r − φ_l)/T ([WM] II.E: ω_0 T = r (φ̇_r − φ̇_l)).
     """

@@ -28,7 +28,7 @@ WORLD = "world"
 
 
 def vector(x: float, y: float, z: float) -> Array:
-    """A 3-vector."""
+    """Return a 3-vector."""
     return np.array([x, y, z], dtype=np.float64)
 
 
@@ -38,9 +38,12 @@ class Inertia:
 
     Attributes
     ----------
-    mass : float [kg]
-    com : (3,) centre of mass in B [m]
-    tensor : (3, 3) inertia about the centre of mass, axes of B [kg m²]
+    mass : float
+        Mass [kg].
+    com : (3,) ndarray
+        Centre of mass in B [m].
+    tensor : (3, 3) ndarray
+        Inertia about the centre of mass, axes of B [kg m²].
     """
 
     mass: float
@@ -49,23 +52,23 @@ class Inertia:
 
     @classmethod
     def solid_sphere(cls, mass: float, radius: float, center: Array) -> Inertia:
-        """Sphere about ``center``: I = 2 m r²/5; a point mass when the radius is zero."""
+        """Return a sphere about ``center``: I = 2 m r²/5; a point mass if the radius is zero."""
         return cls(mass, center, np.eye(3) * (0.4 * mass * radius**2))
 
     @classmethod
     def solid_cylinder(cls, mass: float, radius: float, length: float) -> Inertia:
-        """Cylinder along +z from the frame's origin: I_x = I_y = m (3 r² + l²)/12, I_z = m r²/2."""
+        """Return a cylinder along +z from the frame's origin: I_x = I_y = m (3 r² + l²)/12, I_z = m r²/2."""
         side = mass * (3.0 * radius**2 + length**2) / 12.0
         return cls(mass, vector(0.0, 0.0, 0.5 * length), np.diag([side, side, 0.5 * mass * radius**2]))
 
     def placed(self, R: Array, p: Array) -> Inertia:
-        """The same body seen from a frame in which B has rotation R and origin p [m]."""
+        """Return the same inertia in a frame in which B has rotation R and origin p [m]."""
         tensor = R @ self.tensor @ R.T
         return Inertia(self.mass, p + R @ self.com, 0.5 * (tensor + tensor.T))
 
     @classmethod
     def merged(cls, parts: Iterable[Inertia]) -> Inertia:
-        """Bodies fixed to each other as one, all in one frame: I = Σ I_i + m_i (d_i² 1 − d_i d_iᵀ), d_i = c_i − c."""
+        """Return the sum of rigidly connected parts in a frame, I = Σ I_i + m_i (d_i² 1 − d_i d_iᵀ), d_i = c_i − c."""
         parts = list(parts)
         if len(parts) == 1:
             return parts[0]
@@ -80,27 +83,27 @@ class Inertia:
     def check(self, name: str) -> None:
         """Raise :class:`ModelError` unless a real body can have these mass properties.
 
-        Files have rounded moments, and rotations round them again: what is below 1e-9 of the largest moment, or below
-        that of the mass at a micrometre from its centre, counts as zero.
+        Files have rounded moments, and rotations round them again: errors count as zero if they are below 1e-9 of the
+        largest moment, or below the moment of the mass at one micrometre from its centre.
         """
         if not (np.isfinite(self.mass) and self.mass >= 0.0):
-            raise ModelError(f"{name}: mass {self.mass} kg; a mass must be zero or positive")
+            raise ModelError(f"{name}: mass {self.mass} kg must be zero or positive")
         small = 1e-12 * self.mass
-        # Not NaN either.
+        # Written so that NaN fails too.
         if not np.abs(self.tensor - self.tensor.T).max() <= 1e-9 * np.abs(self.tensor).max() + small:
-            raise ModelError(f"{name}: the inertia tensor is not symmetric")
+            raise ModelError(f"{name}: the inertia tensor must be symmetric")
         moments = np.linalg.eigvalsh(self.tensor)
         slack = 1e-9 * float(abs(moments).max()) + small
         if moments[0] < -slack or moments[0] + moments[1] < moments[2] - slack:
             raise ModelError(
-                f"{name}: principal moments of inertia {moments} kg m² are not those of a body "
+                f"{name}: principal moments of inertia {moments} kg m² are impossible for a body "
                 "(each must be positive and no larger than the sum of the other two)"
             )
 
 
 @dataclass(frozen=True)
 class Link:
-    """One joint and the body it carries.
+    """One joint and the body that it carries.
 
     Attributes
     ----------
@@ -108,21 +111,30 @@ class Link:
         Names of the body and of its joint.
     parent : str or None
         Name of the parent body, None for the world.
-    kind : "revolute", "prismatic", or another row of :func:`dynsim.model.joints.rows`
-    axis : (3,) unit joint axis in J (and B)
-    R_PJ, p_PJ : (3, 3), (3,) placement of the joint in the parent's frame [m]
+    kind : str
+        "revolute", "prismatic", or another row of :func:`dynsim.model.joints.rows`.
+    axis : (3,) ndarray
+        Unit joint axis in J (and B).
+    R_PJ, p_PJ : (3, 3) ndarray, (3,) ndarray
+        Rotation and position [m] of the joint in the parent's frame.
     damping : float
         Viscous loss D of the joint [N m s/rad or N s/m].
-    friction : of its bearing, against any motion and up to which it holds [N m or N]; under the unilateral law
+    friction : float
+        Dry friction of the bearing, which also holds it at rest [N m or N]; unilateral law only.
     lower, upper, velocity_limit, effort_limit : float
-        Limits of the joint [rad or m; rad/s or m/s; N m or N]. Nothing enforces them: a run that passes one warns.
-    parameter : what else its kind of joint needs
-    armature : inertia that only turns with the joint, beside that of its motor [kg m² or kg]
-    joint_of_rows : name of the joint with several rows that this is one of, None for a joint of its own
-    radius : of a cylinder about the body's axis [m], zero when unknown: deeper than that below a surface, a run warns
-    tip : (3,) or None
-        Other end of the axis in B [m], the first is the joint; None: the joints that the body carries, and the hand.
-    shapes : what the body looks like, in B; empty: a cylinder about its axis, if ``radius`` and ``tip`` are known
+        Limits of the joint [rad or m; rad/s or m/s; N m or N]. They are not enforced: a run that exceeds one warns.
+    parameter : float
+        Extra parameter of some kinds of joint.
+    armature : float
+        Inertia that only turns with the joint, in addition to its motor's inertia [kg m² or kg].
+    joint_of_rows : str or None
+        Name of the joint with several rows to which this row belongs; None for a joint with one row.
+    radius : float
+        Radius of a cylinder about the body's axis [m], zero if unknown; a run warns if a surface is penetrated deeper.
+    tip : (3,) ndarray or None
+        Other end of the axis in B [m], starting at the joint; None: the joints that the body carries, and the hand.
+    shapes : tuple of Shape
+        Visual shapes of the body, in B; empty: a cylinder about its axis, if ``radius`` and ``tip`` are known.
     """
 
     name: str
@@ -148,20 +160,20 @@ class Link:
 
     @property
     def row(self) -> Row:
-        """Its kind.
+        """Kind of the row.
 
         Raises
         ------
         ModelError
-            There is no such kind.
+            If the kind is unknown.
         """
         if self.kind not in rows():
-            raise ModelError(f"{self.joint}: joint kind {self.kind!r}; known: {', '.join(rows())}")
+            raise ModelError(f"{self.joint}: unknown joint kind {self.kind!r}; known: {', '.join(rows())}")
         return rows()[self.kind]
 
     @property
     def geometry(self) -> tuple[str, str | None, str, Array, Array, Array, float, Array | None]:
-        """What says where the body is and how far it reaches, without its mass."""
+        """Everything that determines position and reach of the body, without its mass."""
         return self.name, self.parent, self.kind, self.axis, self.R_PJ, self.p_PJ, self.radius, self.tip
 
     @property
@@ -171,13 +183,13 @@ class Link:
 
     @property
     def coordinates(self) -> tuple[str, ...]:
-        """Names of the coordinates that begin with this row: those of its joint, none for a later row."""
+        """Names of the coordinates that begin with this row: all coordinates of the joint; none for a later row."""
         row = self.row
         return tuple(f"{self.joint_of_rows}.{name}" for name in row.names) or (self.joint,) * len(row.neutral)
 
 
 def in_rows(link: Link, rows: Sequence[tuple[str, str, Array]]) -> tuple[Link, ...]:
-    """A joint of several rows, (suffix, kind, axis) each, the body of ``link`` on the last; the others are massless."""
+    """Return a joint of several rows, (suffix, kind, axis); the last carries the body of ``link``, others no mass."""
     made: list[Link] = []
     for suffix, kind, axis in rows:
         last, first = len(made) == len(rows) - 1, not made
@@ -203,9 +215,9 @@ def in_rows(link: Link, rows: Sequence[tuple[str, str, Array]]) -> tuple[Link, .
 
 @dataclass(frozen=True)
 class Frame:
-    """A named frame fixed on a body, such as a tool flange; its rotation and origin in the body's frame.
+    """Named frame fixed on a body, such as a tool flange: rotation and origin in the body's frame.
 
-    ``body`` is None for what is fixed to the world: it has a name, but nothing that moves can be attached to it.
+    ``body`` is None for a frame fixed to the world: it has a name, but no moving part can be attached to it.
     """
 
     name: str
@@ -216,25 +228,37 @@ class Frame:
 
 @dataclass(frozen=True)
 class Contact:
-    """A point, sphere or capsule of a body, and the surface that it can touch.
+    """Point, sphere or capsule of a body, and the surface that it can touch.
 
     Attributes
     ----------
-    point : (3,) in the body's frame [m]: the point, the centre of the sphere, or one end of the capsule's axis
-    friction : kinetic coefficient μ
-    slip_smoothing : v_s [m/s] of the direction v_t/√(v_t² + v_s²); bilateral law
-    pulling_friction : "signed" (f_t = μ f_n as [WM] prints it) or "dissipative" (f_t = μ |f_n|); bilateral law
-    static_friction : coefficient μ_s that holds at rest; None: μ. This and what follows: unilateral law
-    stribeck : speed [m/s] of μ + (μ_s − μ) exp(−(v/v_s)²); 0: μ from the first slip on
-    viscous_friction : what each m/s adds to the coefficient [s/m]
-    restitution : share of the normal speed that is left after an impact, with its sign turned
-    grip_axis : (3,) in the body's frame, or None: friction along it is ``grip`` times that across; time stepping only
-    stiffness, damping : of body and surface along the normal [N/m, N s/m], 0: rigid; time stepping only
-    radius : of sphere or capsule [m]
-    tip : (3,) or None
-        The other end of a capsule's axis, in the same frame [m]. Where the surface bends away from the free side the
-        nearest point of the axis touches, elsewhere ``point``.
-    left_out : no joint moves it along the normal in any posture, so that it never touches
+    point : (3,) ndarray
+        The point, the centre of the sphere, or one end of the capsule's axis, in the body's frame [m].
+    friction : float
+        Kinetic coefficient μ.
+    slip_smoothing : float
+        v_s [m/s] of the direction v_t/√(v_t² + v_s²); bilateral law only.
+    pulling_friction : str
+        "signed" (f_t = μ f_n as [WM] prints it) or "dissipative" (f_t = μ |f_n|); bilateral law only.
+    static_friction : float or None
+        Coefficient μ_s at rest; None: μ. This and all following attributes: unilateral law only.
+    stribeck : float
+        Speed [m/s] of μ + (μ_s − μ) exp(−(v/v_s)²); 0: μ as soon as it slips.
+    viscous_friction : float
+        Increase of the coefficient with speed [s/m].
+    restitution : float
+        Ratio of normal speeds after and before an impact.
+    grip_axis : (3,) ndarray or None
+        Axis in the body's frame along which friction is ``grip`` times the friction across; time stepping only.
+    stiffness, damping : float
+        Stiffness and damping of body and surface along the normal [N/m, N s/m], 0: rigid; time stepping only.
+    radius : float
+        Radius of sphere or capsule [m].
+    tip : (3,) ndarray or None
+        Other end of a capsule's axis, in the same frame [m]. If the surface curves away from the free side, the nearest
+        point of the axis touches, otherwise ``point``.
+    left_out : bool
+        No joint moves it along the normal in any posture, so that it never touches.
     """
 
     name: str
@@ -259,26 +283,32 @@ class Contact:
 
     @property
     def friction_at_rest(self) -> float:
-        """Static coefficient μ_s, by default the kinetic one."""
+        """Static coefficient μ_s; default: the kinetic coefficient."""
         return self.friction if self.static_friction is None else self.static_friction
 
     @property
     def geometry(self) -> tuple[str, str, Array, Surface, float, Array | None]:
-        """What says where it is and what it can touch, without its law."""
+        """Everything that determines its location and the surface that it can touch, without its law."""
         return self.name, self.body, self.point, self.surface, self.radius, self.tip
 
 
 @dataclass(frozen=True)
 class Foot:
-    """A sphere of a body that can touch one of the scenario's surfaces, whatever contact points that declares.
+    """Sphere of a body that can touch a surface of the scenario, independent of the declared contact points.
 
-    On a body that spins about its own centre it is a wheel: the point that touches is that of the sphere, so it rolls.
+    On a body that spins about the centre of the sphere it is a wheel: the touching point belongs to the sphere, so it
+    rolls.
 
     Attributes
     ----------
-    point : (3,) centre of the sphere in the body's frame [m]; radius [m]
-    surface : name of the surface in the scenario
-    grip_axis : (3,) in the body's frame, or None: no friction along it, as of a wheel without mass
+    point : (3,) ndarray
+        Centre of the sphere in the body's frame [m].
+    radius : float
+        Radius [m].
+    surface : str
+        Name of the surface in the scenario.
+    grip_axis : (3,) ndarray or None
+        Axis in the body's frame without friction along it, as for a wheel without mass.
     """
 
     name: str
@@ -291,9 +321,9 @@ class Foot:
 
 @dataclass(frozen=True)
 class Coupling:
-    """A joint that follows another one, q = ratio q_leader + offset: a gear, a belt, a URDF mimic joint.
+    """Joint that follows another one, q = ratio q_leader + offset: a gear, a belt, a URDF mimic joint.
 
-    It is a constraint without losses: it holds exactly, and takes whatever force that needs.
+    It is an exact constraint without losses, with any force that it needs.
     """
 
     joint: str
@@ -304,23 +334,32 @@ class Coupling:
 
 @dataclass(frozen=True)
 class Tie:
-    """One direction in which two bodies hold each other by a spring, a damper and a bound; time stepping only.
+    """One direction in which two bodies are connected by a spring, a damper and a bound; time stepping only.
 
     The force on ``body``, along the axis or about it, and its opposite on ``other`` is f = −k (x − x_0) − c dx/dt
-    within its bound, x = axis · (point − other point), or the part along the axis of the rotation of ``body`` against
-    ``other``. Beyond the bound x_0 moves. Bodies may be of different trees; ``other`` may be the world.
+    within its bound, x = axis · (point − other point), or the part along the axis of the rotation of ``body`` relative
+    to ``other``. Beyond the bound x_0 moves. The bodies may belong to different trees; ``other`` may be the world.
 
     Attributes
     ----------
-    point, other_point : (3,) in the frames of ``body`` and ``other`` [m]
-    axis : (3,) in the frame of ``body``
-    stiffness, damping : k, c [N/m, N s/m; N m/rad, N m s/rad]
-    bound : of the force [N or N m]
-    turns : about the axis, not along it
-    pushes : one-sided: it only pushes ``body`` along the axis, without a bound
-    rest : x_0 [m or rad]; NaN: x when the tie begins
-    attitude : (3, 3) of ``other`` in the axes of ``body`` where a torsion whose rest is a number is not turned
-    holds : from the start on
+    point, other_point : (3,) ndarray
+        Points in the frames of ``body`` and ``other`` [m].
+    axis : (3,) ndarray
+        Axis in the frame of ``body``.
+    stiffness, damping : float
+        k, c [N/m, N s/m; N m/rad, N m s/rad].
+    bound : float
+        Largest force [N or N m].
+    turns : bool
+        The tie acts about the axis, not along it.
+    pushes : bool
+        One-sided: it only pushes ``body`` along the axis, without a bound.
+    rest : float
+        x_0 [m or rad]; NaN: x when the tie begins.
+    attitude : (3, 3) ndarray
+        Rotation of ``other`` in the axes of ``body`` without deflection, for a torsion whose rest is a number.
+    holds : bool
+        Active from the start.
     """
 
     name: str
@@ -341,16 +380,22 @@ class Tie:
 
 @dataclass(frozen=True)
 class Load:
-    """A force and a torque from outside on a point of a body, as cubic polynomials of time.
+    """External force and torque on a point of a body, as cubic polynomials of time.
 
     Attributes
     ----------
-    body : name of a link
-    point : (3,) where the force acts, in the link's frame [m]
-    in_body : whether the components are in the axes of the link, else of the world
-    knots : (K + 1,) increasing times [s]
-    coefficients : (K, 6, 4) ascending powers of t - knots[k], force x, y, z [N], then torque x, y, z [N m]
-    hold : whether the values at the first and the last knot go on beyond them, else it is zero there
+    body : str
+        Name of a link.
+    point : (3,) ndarray
+        Point of application in the link's frame [m].
+    in_body : bool
+        Whether the components are in the axes of the link; otherwise in world axes.
+    knots : (K + 1,) ndarray
+        Increasing times [s].
+    coefficients : (K, 6, 4) ndarray
+        Ascending powers of t - knots[k], force x, y, z [N], then torque x, y, z [N m].
+    hold : bool
+        Whether the first and last values are held outside the knots; otherwise the load is zero there.
     """
 
     name: str
@@ -362,7 +407,7 @@ class Load:
     hold: bool
 
     def components(self, t: Array) -> Array:
-        """Force and torque at times t [s], (T,) → (T, 6) [N, N m]."""
+        """Return force and torque at times t [s], (T,) → (T, 6) [N, N m]."""
         t = np.asarray(t, dtype=np.float64)
         inside = np.clip(t, self.knots[0], self.knots[-1])
         segment = np.minimum(np.searchsorted(self.knots, inside, side="right") - 1, len(self.coefficients) - 1)
@@ -373,13 +418,36 @@ class Load:
 
 @dataclass(frozen=True)
 class Robot:
-    """A tree of links with its motors.
+    """Tree of links with its motors.
 
-    ``hand``: the controlled point (body name, point in its frame [m]); ``hand_frame``: (3, 3) axes, in those of that
-    body, of the frame that was named for the hand, whose orientation is that of the frame; ``q0``: initial
-    configuration [rad or m], zero unless given; ``frames``: further names to attach points to; ``fixed_shapes``,
-    ``fixed_inertia``: what stands still in the world; ``couplings`` of joints to joints; ``ties`` of bodies to bodies;
-    ``base``: what it drives on, None: it stands fixed or floats; ``feet``: what of it is made to touch, such as wheels.
+    Attributes
+    ----------
+    name : str
+        Name of the robot.
+    links : tuple of Link
+        Joints and bodies; parents come before their children.
+    motors : tuple of Drive
+        Motors of the joints.
+    hand : (str, (3,) ndarray)
+        Controlled point: body name and point in its frame [m].
+    gravity : (3,) ndarray
+        Gravity in W [m/s²].
+    q0 : (nq,) ndarray or None
+        Initial configuration [rad or m]; None: zero.
+    frames : tuple of Frame
+        Further names to which points can be attached.
+    fixed_shapes, fixed_inertia : tuple of Shape, Inertia
+        Shapes and mass of the parts fixed to the world.
+    couplings : tuple of Coupling
+        Couplings between joints.
+    ties : tuple of Tie
+        Ties between bodies.
+    base : MobileBase or None
+        Mobile base; None: the robot is fixed or floats.
+    feet : tuple of Foot
+        Parts designed to touch surfaces, such as wheels.
+    hand_frame : (3, 3) ndarray
+        Axes of the frame named for the hand, whose orientation is controlled, in the axes of its body.
     """
 
     name: str
@@ -398,12 +466,12 @@ class Robot:
     hand_frame: Array = field(default_factory=lambda: np.eye(3))
 
     def holding(self, name: str) -> list[Tie]:
-        """Ties by which a gripper of the robot can hold the object of that name: none."""
+        """Return the ties by which a gripper of the robot can hold the named object: none."""
         return []
 
     @property
     def hand_axes(self) -> Array:
-        """Axes of the hand in those of the body that carries it, (3, 3)."""
+        """Axes of the hand in the axes of the body that carries it, (3, 3)."""
         return np.asarray(self.attached_axes(self.hand[0]) @ self.hand_frame)
 
     @property
@@ -414,30 +482,30 @@ class Robot:
 
     @property
     def carriers(self) -> frozenset[str]:
-        """Names of the links that carry no body: of a joint with several rows all but the last."""
+        """Names of the links without a body: all rows of a joint except the last."""
         joint = {link.name: link.joint_of_rows or link.joint for link in self.links}
         return frozenset(
             link.parent for link in self.links if link.parent in joint and joint[link.parent] == link.joint_of_rows
         )
 
     def attach(self, name: str, point: Array) -> tuple[int, Array]:
-        """Index of the body that has a name, or a frame of that name, and a point of that frame in the body's [m].
+        """Return the index of a body, given its name or a frame's name, and a point of that frame in its axes [m].
 
         Raises
         ------
         ModelError
-            No such body or frame, or a frame that is fixed to the world.
+            If there is no such body or frame, or the frame is fixed to the world.
         """
         index, frame = self._find(name)
         return index, point if frame is None else frame.p + frame.R @ point
 
     def attached_axes(self, name: str) -> Array:
-        """Axes of the body or frame of that name in the body's, (3, 3); raises what :meth:`attach` does."""
+        """Return the axes of the named body or frame in the body's axes, (3, 3); errors as for :meth:`attach`."""
         _, frame = self._find(name)
         return np.eye(3) if frame is None else frame.R
 
     def tree_of(self, body: str) -> NDArray[np.bool_]:
-        """Which links belong to the tree of a link, (n,): those with the same ancestor that the world carries."""
+        """Return a mask, (n,), of the links in the tree of ``body``: the same ancestor is attached to the world."""
         roots: dict[str, str] = {}
         for link in self.links:
             roots[link.name] = link.name if link.parent is None else roots[link.parent]
@@ -465,13 +533,13 @@ class Robot:
         return self.configuration({}) if self.q0 is None else np.asarray(self.q0, dtype=np.float64)
 
     def configuration(self, positions: Mapping[str, float]) -> Array:
-        """Coordinates [rad or m], (nq,): as given by joint, followers where their leaders have them, others neutral."""
+        """Return coordinates [rad or m], (nq,): given values by joint, followers from their leaders, others neutral."""
         leads = {coupling.joint: coupling for coupling in self.couplings if coupling.joint not in positions}
         q = np.array([value for link in self.links for value in link.row.neutral])
 
         def position(joint: str) -> float:
             chain: list[Coupling] = []
-            # A cycle of couplings has no position; the compilation refuses it.
+            # A cycle of couplings has no position; compilation refuses it.
             while joint in leads and len(chain) <= len(leads):
                 chain.append(leads[joint])
                 joint = chain[-1].leader
@@ -492,7 +560,7 @@ class Robot:
 
     @property
     def position_index(self) -> tuple[int, ...]:
-        """For each link where its own coordinates begin in q."""
+        """Index in q at which the coordinates of each link begin."""
         index, first, beyond = [], 0, 0
         for link in self.links:
             if link.row.neutral:
@@ -506,7 +574,7 @@ class Robot:
         return tuple(name for link in self.links for name in link.coordinates)
 
     def with_motors_mounted(self) -> Robot:
-        """The robot whose motors weigh nothing any more: their masses are part of the links that they sit on."""
+        """Return the robot with massless motors: their masses are part of the links on which they are mounted."""
         links = {link.joint: link for link in self.links}
         inertia = {link.name: link.inertia for link in self.links}
         for motor in self.motors:
@@ -522,7 +590,7 @@ class Robot:
 
     @property
     def circuits(self) -> int:
-        """How many motors have a circuit, whose current is a state."""
+        """Number of motors with a circuit, whose current is a state."""
         return sum(isinstance(motor, Motor) for motor in self.motors)
 
     @property

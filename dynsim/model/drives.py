@@ -21,21 +21,30 @@ SMOOTHING = 1e-2
 
 @dataclass(frozen=True)
 class Motor:
-    """A DC motor on a joint ([WM] eqs 16–25).
+    """DC motor on a joint ([WM] eqs 16–25).
 
     Attributes
     ----------
     joint : str
-    torque_constant : K [N m/A = V s/rad]
-    resistance : R [Ω]; inductance : L [H]; rotor_inertia : I_m [kg m²]
-    gear_ratio : k; gear_damping : d_m on the motor side [N m s/rad]
-    dry_friction : of the gear, at the joint [N m or N]: it holds the joint at rest; under the unilateral law
-    voltage_limit : [V], inf for none
-    current_limit : [A] that its driver keeps, inf for none
-    nominal_current : [A], continuous rating; nominal_torque : at the joint [N m or N]; inf where not known
-    mass : [kg] of a point on the link before the joint; without effect where that is fixed to the world
-    mass_point : (3,) or None
-        Where, in that link's frame [m]; None: at the joint.
+        Name of the joint.
+    torque_constant : float
+        K [N m/A = V s/rad].
+    resistance, inductance, rotor_inertia : float
+        R [Ω], L [H], I_m [kg m²].
+    gear_ratio, gear_damping : float
+        k, and d_m on the motor side [N m s/rad].
+    voltage_limit : float
+        Largest voltage [V]; infinite if unlimited.
+    mass : float
+        Point mass on the link before the joint [kg]; no effect if that link is fixed to the world.
+    mass_point : (3,) ndarray or None
+        Position of the mass in that link's frame [m]; None: at the joint.
+    current_limit : float
+        Largest current of its driver [A]; infinite if unlimited.
+    nominal_current, nominal_torque : float
+        Continuous ratings [A] and at the joint [N m or N]; infinite if unknown.
+    dry_friction : float
+        Dry friction of the gear, at the joint, which also holds the joint at rest [N m or N]; unilateral law only.
     """
 
     joint: str
@@ -55,7 +64,7 @@ class Motor:
 
     @property
     def greatest_current(self) -> float:
-        """The limit of current [A], as of a servo."""
+        """Current limit [A], as for a servo."""
         return self.current_limit
 
     @property
@@ -76,22 +85,33 @@ class Motor:
 
 @dataclass(frozen=True)
 class Servo:
-    """A position servo on a revolute joint, everything at its output shaft; its law: dynsim.dynamics.drive.law.
+    """Position servo on a revolute joint, all values at its output shaft; for its law see dynsim.dynamics.drive.law.
 
     Attributes
     ----------
     joint : str
-    torque_constant : K_m [N m/A = V s/rad]; resistance : R [Ω]
-    k_p, k_d : gains of the position loop [V/rad, V s/rad]
-    k_v : gain of the velocity loop [V s/rad]
-    velocity_mode : the loop follows the rate of the reference, not its position
-    armature : J_m [kg m²]; reflected_damping : D_m [N m s/rad]
-    coulomb_friction : τ_c [N m]; coulomb_speed : v_s [rad/s], below which it fades
-        None: under the unilateral law it does not, and holds at rest; else below SMOOTHING
-    voltage_limit, current_limit : [V], [A]; torque_limit : of the current, K_m i [N m]; inf for none
-    nominal_current, nominal_torque : as of a :class:`Motor`
-    free_drag : viscous drag of the gear while the servo is off [N m s/rad]
-    mass, mass_point : as of a :class:`Motor`
+        Name of the joint.
+    torque_constant, resistance : float
+        K_m [N m/A = V s/rad], R [Ω].
+    k_p, k_d : float
+        Gains of the position loop [V/rad, V s/rad].
+    k_v : float
+        Gain of the velocity loop [V s/rad].
+    velocity_mode : bool
+        The loop follows the rate of the reference, not its position.
+    armature, reflected_damping : float
+        J_m [kg m²], D_m [N m s/rad].
+    coulomb_friction : float
+        τ_c [N m].
+    coulomb_speed : float or None
+        v_s, speed below which the friction fades [rad/s]; None: SMOOTHING, or under the unilateral law dry friction
+        that holds at rest.
+    voltage_limit, current_limit, torque_limit : float
+        Limits [V], [A], and of the current as torque K_m i [N m]; infinite if unlimited.
+    nominal_current, nominal_torque, mass, mass_point
+        As for :class:`Motor`.
+    free_drag : float
+        Viscous drag of the gear while the servo is off [N m s/rad].
     """
 
     joint: str
@@ -121,23 +141,23 @@ class Servo:
 
     @property
     def dry_friction(self) -> float:
-        """Friction of the gear that is not smoothed where the method can do without [N m]."""
+        """Gear friction that is not smoothed if the method supports dry friction [N m]."""
         return self.coulomb_friction if self.coulomb_speed is None else 0.0
 
     @property
     def greatest_current(self) -> float:
-        """The lower of the limits of current and torque [A]."""
+        """Smaller of the limits of current and torque, as a current [A]."""
         return min(self.current_limit, self.torque_limit / self.torque_constant)
 
     @property
     def stall_torque(self) -> float:
-        """Of the motor at rest, at the limit of its voltage or current, without the friction of the gear [N m]."""
+        """Torque of the motor at rest, at its voltage or current limit, without gear friction [N m]."""
         return self.torque_constant * min(self.voltage_limit / self.resistance, self.greatest_current)
 
 
 @dataclass(frozen=True)
 class TorqueSource:
-    """A torque on a joint that is its own reference, within ``torque_limit`` [N m, or N]; the rest as of a motor."""
+    """Ideal torque source: the reference is the torque, within ``torque_limit`` [N m or N]; the rest as for a motor."""
 
     joint: str
     torque_limit: float = np.inf
@@ -149,26 +169,26 @@ class TorqueSource:
 Drive = Motor | Servo | TorqueSource
 
 
-# Keys common to all motors of a scenario, and those of a geared brushed DC motor ([WM] eqs 16–25).
+# Keys common to all motors of a scenario, and keys of a geared brushed DC motor ([WM] eqs 16–25).
 
 
 def limit(value: float | None) -> float:
-    """The value of an optional limit: infinite for none."""
+    """Return the value of an optional limit: infinite for None."""
     return np.inf if value is None else value
 
 
 class DriveParameters(StrictConfig):
-    """A motor of any kind: what it weighs, and what it stands for ever."""
+    """Motor of any kind: mass and continuous rating."""
 
     mass_kg: NonNegative = Field(
-        default=0.0, description="of motor and gear, a point mass on the link before the joint"
+        default=0.0, description="mass of motor and gear, a point mass on the link before the joint"
     )
     mass_point_m: Vector3 | None = Field(
-        default=None, description="where, in that link's frame; default: at the motor's joint"
+        default=None, description="position of the mass in that link's frame; default: at the motor's joint"
     )
 
     nominal_torque_N_m: Positive | None = Field(
-        default=None, description="that motor and gear stand for ever, at the joint; N at a prismatic joint"
+        default=None, description="continuous torque rating of motor and gear, at the joint; N at a prismatic joint"
     )
 
     @model_validator(mode="after")
@@ -179,12 +199,12 @@ class DriveParameters(StrictConfig):
 
     @property
     def mass_point(self) -> NDArray[np.float64] | None:
-        """Where its mass is, (3,) [m]; None: at the joint."""
+        """Position of the mass, (3,) [m]; None: at the joint."""
         return None if self.mass_point_m is None else np.array(self.mass_point_m)
 
     @property
     def nominal_torque(self) -> float:
-        """[N m or N], infinite where it is not known."""
+        """Continuous rating [N m or N], infinite if unknown."""
         return limit(self.nominal_torque_N_m)
 
 
@@ -196,15 +216,15 @@ class MotorParameters(DriveParameters):
     inductance_H: Positive
     rotor_inertia_kg_m2: NonNegative
     gear_ratio: Positive = Field(description="motor turns per joint turn; at a prismatic joint rad of the motor per m")
-    gear_damping_N_m_s_per_rad: NonNegative = Field(default=0.0, description="on the motor side")
+    gear_damping_N_m_s_per_rad: NonNegative = Field(default=0.0, description="viscous, on the motor side")
     coulomb_friction_N_m: NonNegative = Field(
-        default=0.0, description="of the gear, at the joint: holds at rest; N at a prismatic joint; unilateral law"
+        default=0.0, description="dry friction of the gear, at the joint; N at a prismatic joint; unilateral law"
     )
     voltage_limit_V: Positive | None = None
     nominal_current_A: Positive | None = Field(
-        default=None, description="that it stands for ever: a run that needs more warns"
+        default=None, description="continuous rating: a run that exceeds it warns"
     )
-    peak_current_A: Positive | None = Field(default=None, description="limit of its driver")
+    peak_current_A: Positive | None = Field(default=None, description="current limit of its driver")
 
     @model_validator(mode="after")
     def _check_currents(self) -> Self:
@@ -215,13 +235,13 @@ class MotorParameters(DriveParameters):
     @field_validator("inductance_H", mode="before")
     @classmethod
     def _not_zero(cls, value: Any) -> Any:
-        """L = 0 is a circuit many know from textbooks: say what to take instead."""
+        """Reject L = 0, a common textbook circuit, with a hint."""
         if value == 0:
-            raise ValueError("must be positive; for none take 1e-6 with integrator.method: auto or radau5")
+            raise ValueError("must be positive; to neglect it use 1e-6 with integrator.method: auto or radau5")
         return value
 
     def motor(self, joint: str) -> Motor:
-        """The motor on the joint of that name."""
+        """Return the motor on the named joint."""
         return Motor(
             joint=joint,
             torque_constant=self.torque_constant_N_m_per_A,
@@ -248,31 +268,31 @@ GAINS = {"position": ("k_p_V_per_rad", "k_d_V_s_per_rad"), "velocity": ("k_v_V_s
 
 
 class ServoParameters(DriveParameters):
-    """Everything at the output shaft: K_m = U / ω_0 and R = U K_m / τ_stall at ``voltage_V``, which limits the voltage.
+    """Values at the output shaft: K_m = U / ω_0 and R = U K_m / τ_stall at ``voltage_V``, which limits the voltage.
 
-    The gains are the servo's own; those of the controller are for DC motors.
+    The servo has its own gains; the gains of the controller are for DC motors.
     """
 
-    voltage_V: Positive = Field(description="supply, at which stall torque and no-load speed hold")
+    voltage_V: Positive = Field(description="supply voltage of stall torque and no-load speed")
     stall_torque_N_m: Positive
     no_load_speed_rad_per_s: Positive
     mode: Literal["position", "velocity"] = Field(
-        default="position", description="what of the reference the servo follows"
+        default="position", description="part of the reference that the servo follows"
     )
     k_p_V_per_rad: NonNegative = Field(default=0.0, description="position mode")
     k_d_V_s_per_rad: NonNegative = Field(default=0.0, description="position mode")
     k_v_V_s_per_rad: NonNegative = Field(default=0.0, description="velocity mode")
-    rotor_inertia_kg_m2: NonNegative = Field(default=0.0, description="of rotor and gear, at the output shaft")
-    gear_damping_N_m_s_per_rad: NonNegative = Field(default=0.0, description="at the output shaft")
-    coulomb_friction_N_m: NonNegative = Field(default=0.0, description="of the gear, at the output shaft")
+    rotor_inertia_kg_m2: NonNegative = Field(default=0.0, description="rotor and gear, at the output shaft")
+    gear_damping_N_m_s_per_rad: NonNegative = Field(default=0.0, description="viscous, at the output shaft")
+    coulomb_friction_N_m: NonNegative = Field(default=0.0, description="friction of the gear, at the output shaft")
     coulomb_speed_rad_per_s: Positive | None = Field(
         default=None,
-        description="below it the Coulomb friction fades; default: 0.01, under the unilateral law it holds at rest",
+        description="speed below which Coulomb friction fades; default: 0.01; under the unilateral law dry friction",
     )
     current_limit_A: Positive | None = None
-    torque_limit_N_m: Positive | None = Field(default=None, description="of the current, without the gear's friction")
+    torque_limit_N_m: Positive | None = Field(default=None, description="current limit as torque without gear friction")
     nominal_current_A: Positive | None = Field(
-        default=None, description="that it stands for ever: a run that needs more warns"
+        default=None, description="continuous rating: a run that exceeds it warns"
     )
 
     @model_validator(mode="after")
@@ -303,7 +323,7 @@ class ServoParameters(DriveParameters):
         return self
 
     def servo(self, joint: str) -> Servo:
-        """The servo on the joint of that name."""
+        """Return the servo on the named joint."""
         torque_constant = self.voltage_V / self.no_load_speed_rad_per_s
         return Servo(
             joint=joint,
@@ -327,11 +347,11 @@ class ServoParameters(DriveParameters):
         )
 
 
-# Servos outside the compiled kernels: the kernels' parameter row, and the servo law for arrays of servos.
+# Servos outside the compiled kernels: parameter row of the kernels, and the servo law for arrays of servos.
 
 
 def servo_row(m: Servo) -> Array:
-    """Row of ``DriveArrays.motor`` of a servo, (MOTOR_SIZE,)."""
+    """Return the row of ``DriveArrays.motor`` of a servo, (MOTOR_SIZE,)."""
     row = np.zeros(ka.MOTOR_SIZE)
     row[ka.K_M], row[ka.RESISTANCE] = m.torque_constant, m.resistance
     row[ka.J_M], row[ka.D_M] = m.armature, m.reflected_damping
@@ -344,7 +364,7 @@ def servo_row(m: Servo) -> Array:
 
 
 class ServoBank:
-    """N servos, each on a shaft of its own."""
+    """N servos on separate shafts."""
 
     def __init__(self, servos: list[Servo]) -> None:
         self._table = np.array([servo_row(servo) for servo in servos]).reshape(-1, ka.MOTOR_SIZE)
@@ -356,16 +376,16 @@ class ServoBank:
     def command(
         self, enabled: NDArray[np.bool_], in_position_mode: NDArray[np.bool_], position: Array, velocity: Array
     ) -> None:
-        """Modes and set points [rad, rad/s] from now on, all (N,); what is not ``enabled`` is off."""
+        """Set modes and set points [rad, rad/s] from now on, all (N,); servos that are not ``enabled`` are off."""
         modes = np.where(in_position_mode, ka.POSITION_MODE, ka.VELOCITY_MODE)
         self._mode, self._position, self._velocity = np.where(enabled, modes, ka.OFF), position, velocity
 
     def supply(self, voltage: float) -> None:
-        """Limit all voltages to that of a supply [V]."""
+        """Limit all voltages to a supply voltage [V]."""
         self._table[:, ka.U_MAX] = max(voltage, 0.0)
 
     def torque(self, q: Array, v: Array) -> Array:
-        """Torques at the output shafts at positions [rad] and rates [rad/s], (N,) → (N,) [N m]."""
+        """Return the torques at the output shafts for positions [rad] and rates [rad/s], (N,) → (N,) [N m]."""
         torques = np.empty(len(self._mode))
         for a, (mode, q_ref, v_ref, at, rate) in enumerate(
             zip(self._mode, self._position, self._velocity, q, v, strict=True)

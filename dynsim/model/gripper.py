@@ -1,4 +1,4 @@
-"""A soft gripper that hardens around an object, as the omni-gripper of [T] does.
+"""Soft gripper that hardens around an object, like the omni-gripper of [T].
 
 A soft gripper holds nothing. A hardened one holds an object by six ties, each with a spring, a damper and a bound.
 Beyond a bound the object slips, and stays in its new position.
@@ -31,11 +31,18 @@ class Gripper:
 
     Attributes
     ----------
-    body : that carries it; tip : (3,) of the gripper in the frame of that body, whose x axis it points along [m]
-    capture_distance, capture_angle : from the grasp frame of an object, within which it captures that [m, rad]
-    hardening, softening : times that these take [s]
-    along, about : laws by which it holds along each axis and about it, when it is hardened
-    lost_distance, lost_angle : by which an object that it holds has slipped when it counts as lost [m, rad]
+    body : str
+        Body that carries it.
+    tip : (3,) ndarray
+        Tip in the frame of that body; the gripper points along its x axis [m].
+    capture_distance, capture_angle : float
+        Largest distances from the grasp frame of an object at which it captures it [m, rad].
+    hardening, softening : float
+        Durations [s].
+    along, about : HoldingLaw
+        Laws along each axis and about it, when hardened.
+    lost_distance, lost_angle : float
+        Slip of an object from which it counts as lost [m, rad].
     """
 
     body: str
@@ -51,11 +58,11 @@ class Gripper:
 
     @property
     def laws(self) -> dict[str, HoldingLaw]:
-        """The law in each of the :data:`DIRECTIONS`."""
+        """Law in each of the :data:`DIRECTIONS`."""
         return {direction: self.about if len(direction) > 1 else self.along for direction in DIRECTIONS}
 
     def ties(self, object_name: str) -> list[Tie]:
-        """Those by which it holds an object at its grasp frame; none of them holds at the start."""
+        """Return the ties that hold an object at its grasp frame; inactive at the start."""
         return [
             Tie(
                 tie_name(object_name, direction),
@@ -73,15 +80,15 @@ class Gripper:
 
 
 def grasp_frame(name: str) -> str:
-    """Name of the frame of an object at which a gripper holds it."""
+    """Return the name of the frame of an object at which a gripper holds it."""
     return name + _GRASP
 
 
 def graspable(robot: Robot) -> tuple[str, ...]:
-    """Names of the objects that have such a frame."""
+    """Return the names of the objects with such a frame."""
     return tuple(frame.name.removesuffix(_GRASP) for frame in robot.frames if frame.name.endswith(_GRASP))
 
 
 def tie_name(name: str, direction: str) -> str:
-    """Name of the tie in one of the :data:`DIRECTIONS`."""
+    """Return the name of the tie in one of the :data:`DIRECTIONS`."""
     return f"gripper.{name}.{direction}"

@@ -1,9 +1,9 @@
 """MJCF export: a robot as a MuJoCo file with the same mass matrix and bias forces.
 
-Written are bodies, joints with limits, viscous losses, dry friction and rotor inertia, couplings, gravity and the
-initial posture, which MuJoCo's format states exactly. Motors become torques on their joints, bounded by their current
-limits; circuits, smoothed gear friction and controllers are left out. Contact points become sites and surfaces become
-shapes without contact, because MuJoCo's contacts are soft.
+Exported are bodies, joints with limits, viscous losses, dry friction and rotor inertia, couplings, gravity and the
+initial posture, which MuJoCo's format represents exactly. Motors become torques on their joints, bounded by their
+current limits; circuits, smoothed gear friction and controllers are omitted. Contact points become sites and surfaces
+become shapes without contact, because MuJoCo's contacts are soft.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from dynsim.record.quaternion import of_matrix
 from dynsim.record.scene import HERE, SceneSurface, Shape
 from dynsim.record.urdf_text import Element, numbers, xml_text
 
-# MuJoCo refuses bodies without mass or inertia; this much is negligible in any robot [kg, kg m²].
+# MuJoCo refuses bodies without mass or inertia; these values are negligible in any robot [kg, kg m²].
 LEAST = 1e-12
 # Half the edge of the drawn part of a plane [m].
 _PLANE = 5.0
@@ -32,22 +32,26 @@ _BALL = ["ball_x", "ball_y", "ball_z"]
 def write_mjcf(
     robot: Robot, contacts: Sequence[Contact], surfaces: Sequence[SceneSurface], damping: Array, armature: Array
 ) -> str:
-    """Write the bodies, joints, torques and looks of a robot as MJCF text.
+    """Write the bodies, joints, torques and visual shapes of a robot as MJCF text.
 
     Parameters
     ----------
-    robot : with the masses of its motors on its links
-    contacts : become sites ``contact_NAME``; the hand is the site ``hand``
-    surfaces : planes, spheres, cylinders and boxes are drawn
-    damping, armature : (n,) of each row of the joints [N m s/rad, kg m²; N s/m, kg]
+    robot : Robot
+        Robot with the masses of its motors on its links.
+    contacts : sequence of Contact
+        Contact points, which become sites ``contact_NAME``; the hand is the site ``hand``.
+    surfaces : sequence of SceneSurface
+        Planes, spheres, cylinders and boxes are drawn.
+    damping, armature : (n,) ndarray
+        Values of each row of the joints [N m s/rad, kg m²; N s/m, kg].
 
     Raises
     ------
     ModelError
-        A joint of a kind that MJCF does not have, or ties between bodies.
+        If MJCF has no such kind of joint, or if there are ties between bodies.
     """
     if robot.ties:
-        raise ModelError(f"{robot.ties[0].name}: ties between bodies have no counterpart in MJCF")
+        raise ModelError(f"{robot.ties[0].name}: ties between bodies cannot be exported to MJCF")
     rubs = _dry_friction(robot)
     root = Element("mujoco", model=robot.name)
     ElementTree.SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
@@ -96,7 +100,7 @@ def write_mjcf(
 
 
 def _joints(robot: Robot) -> list[list[Link]]:
-    """The rows of each joint, checked to be of kinds that MJCF has."""
+    """Return the rows of each joint, checked to be of kinds that MJCF has."""
     groups: dict[str, list[Link]] = {}
     for link in robot.links:
         groups.setdefault(link.joint_of_rows or link.joint, []).append(link)
@@ -104,14 +108,14 @@ def _joints(robot: Robot) -> list[list[Link]]:
         kinds = [link.kind for link in group]
         if [kind for kind in kinds if kind not in (*_SIMPLE, *_BALL)]:
             raise ModelError(
-                f"{name}: is made of {', '.join(kinds)}; MJCF has no such joint, as it has no wheels that roll without "
-                "slip: export an arm on a fixed base"
+                f"{name}: is made of {', '.join(kinds)}; MJCF has no such joint, nor wheels that roll without slip: "
+                "export an arm on a fixed base"
             )
     return list(groups.values())
 
 
 def _add_joints(body: Element, group: Sequence[Link], rubs: dict[str, float], damping: Array, armature: float) -> None:
-    """Add the joints of a body; three slides and a ball of a body that is free in the world are one free joint."""
+    """Add the joints of a body; three slides and a ball of a body that is free in the world become one free joint."""
     kinds = [link.kind for link in group]
     first = group[0]
     loose = kinds == ["prismatic"] * 3 + _BALL and not damping.any() and armature == 0.0
@@ -132,7 +136,7 @@ def _add_joints(body: Element, group: Sequence[Link], rubs: dict[str, float], da
 
 
 def _dry_friction(robot: Robot) -> dict[str, float]:
-    """Friction of bearings and gears that holds at rest, by joint [N m or N]."""
+    """Return the dry friction of bearings and gears for each joint [N m or N]."""
     rubs = {link.joint: link.friction for link in robot.links}
     for motor in robot.motors:
         if not isinstance(motor, TorqueSource):
@@ -152,7 +156,7 @@ def _add_inertial(body: Element, link: Link) -> None:
 
 
 def _add_shapes(body: Element, shapes: Sequence[Shape]) -> None:
-    """Add shapes as geoms; meshes are left out, whose files MuJoCo may not read."""
+    """Add shapes as geoms, without meshes, whose files MuJoCo may not be able to read."""
     for shape in shapes:
         if shape.kind == "mesh":
             continue
@@ -171,7 +175,7 @@ def _add_shapes(body: Element, shapes: Sequence[Shape]) -> None:
 
 def _add_surface(world: Element, surface: SceneSurface) -> None:
     geom = {"name": f"surface_{surface.name}", "rgba": "0.7 0.7 0.7 0.5"}
-    # What the free side is inside of would hide it.
+    # A surface around the free side would hide it.
     if surface.kind == "plane":
         geom |= {"type": "plane", "size": f"{_PLANE} {_PLANE} 0.1", "zaxis": numbers(surface.direction)}
     elif surface.kind == "sphere" and (surface.radius or 0.0) > 0.0:

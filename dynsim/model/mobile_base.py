@@ -15,17 +15,24 @@ SUPPORTS = ("left", "right", "caster")
 
 @dataclass(frozen=True)
 class MobileBase:
-    """A base on two driven wheels and a caster ([WM] II.E); its frame: on the ground below the axle, x ahead.
+    """Base on two driven wheels and a caster ([WM] II.E); its frame is on the ground below the axle, x ahead.
 
     Attributes
     ----------
-    body : name of the link that carries it
-    wheels : joints of the left and of the right wheel; a positive rate rolls ahead
-    wheel_radius : r [m]; track : T, between the wheels' contact points [m]
-    caster : (3,) where the caster touches the ground, in the base's frame [m]
-    spin_inertia : of one wheel about its axle [kg m²]
-    wheel_friction : μ between wheels and ground, for the traction demand
-    stop_on_overturn : whether a run ends when the base tips; else it continues with a base that cannot tip
+    body : str
+        Name of the link that carries it.
+    wheels : tuple of str
+        Joints of the left and of the right wheel; a positive rate rolls ahead.
+    wheel_radius, track : float
+        r [m], and T, the distance between the wheels' contact points [m].
+    caster : (3,) ndarray
+        Contact point of the caster with the ground, in the base's frame [m].
+    spin_inertia : float
+        Inertia of one wheel about its axle [kg m²].
+    wheel_friction : float
+        μ between wheels and ground, for the traction demand.
+    stop_on_overturn : bool
+        Whether a run ends when the base tips; otherwise it continues with a base that cannot tip.
     """
 
     body: str

@@ -23,27 +23,27 @@ SIMPLE = ("plane", "sphere", "cylinder")
 
 
 class Surface(Protocol):
-    """A surface; its free side is where the distance is positive."""
+    """Surface; its free side is where the distance is positive."""
 
     def gap(self, position: Array) -> float:
-        """Signed distance of a point, (3,), along the normal [m]."""
+        """Return the signed distance of a point, (3,), along the normal [m]."""
 
     def gaps(self, positions: Array) -> Array:
-        """:meth:`gap` of many points, (T, 3) → (T,) [m]."""
+        """Return :meth:`gap` of many points, (T, 3) → (T,) [m]."""
 
     def normal(self, position: Array) -> Array:
-        """Unit normal at a point, (3,), to the free side."""
+        """Return the unit normal at a point, (3,), to the free side."""
 
     def normals(self, positions: Array) -> Array:
-        """:meth:`normal` at many points, (T, 3) → (T, 3)."""
+        """Return :meth:`normal` at many points, (T, 3) → (T, 3)."""
 
     def shifted(self, by: Array) -> Surface:
-        """The same surface elsewhere, moved by a vector [m]."""
+        """Return the surface moved by a vector [m]."""
 
 
 @dataclass(frozen=True)
 class Quadric:
-    """A surface C(r) = r·Q r/2 + b·r + c = 0, Q (3, 3) symmetric, b (3,); C > 0 is outside, where ∇C points."""
+    """Surface C(r) = r·Q r/2 + b·r + c = 0, Q (3, 3) symmetric, b (3,); C > 0 is outside, where ∇C points."""
 
     Q: Array
     b: Array
@@ -52,20 +52,20 @@ class Quadric:
     def __post_init__(self) -> None:
         shapes = np.shape(self.Q), np.shape(self.b)
         if shapes != ((3, 3), (3,)):
-            raise ModelError(f"a quadric takes Q of shape (3, 3) and b of shape (3,), not {shapes[0]} and {shapes[1]}")
+            raise ModelError(f"a quadric requires Q of shape (3, 3), b of shape (3,); got {shapes[0]} and {shapes[1]}")
         rounding = 1e-9 * float(np.abs(self.Q).max())
         if not np.allclose(self.Q, np.transpose(self.Q), rtol=0.0, atol=rounding, equal_nan=True):
-            raise ModelError("Q of a quadric must be symmetric; (Q + Qᵀ)/2 is the same surface")
+            raise ModelError("Q of a quadric must be symmetric; use (Q + Qᵀ)/2 for the same surface")
 
     def gap(self, position: Array) -> float:
-        """Signed distance [m] of a point along the normal; exact for plane, sphere and cylinder."""
+        """Return the signed distance [m] of a point along the normal; exact for plane, sphere and cylinder."""
         from dynsim.dynamics.contact.rows import surface_distance
 
         gradient = self.Q @ position + self.b
         slope = float(np.linalg.norm(gradient))
         if slope == 0.0:
             raise ModelError(
-                "is at the centre, or on the axis, of its surface, where no point of that is the nearest; move it by a "
+                "is at the centre, or on the axis, of its surface, where all directions are equally near; move it by a "
                 "micrometre"
             )
         normal = gradient / slope
@@ -73,7 +73,7 @@ class Quadric:
         return float(surface_distance(value, slope, float(normal @ self.Q @ normal)))
 
     def gaps(self, positions: Array) -> Array:
-        """:meth:`gap` of many points, (T, 3) → (T,) [m]; where ∇C vanishes, as in the middle of a sphere, too."""
+        """Return :meth:`gap` of many points, (T, 3) → (T,) [m]; also if ∇C vanishes, as in a sphere's centre."""
         if not self.Q.any():
             return np.asarray((positions @ self.b + self.c) / np.linalg.norm(self.b))
         Qr = positions @ self.Q
@@ -94,24 +94,24 @@ class Quadric:
         )
 
     def shifted(self, by: Array) -> Quadric:
-        """The same surface elsewhere, moved by a vector [m]."""
+        """Return the surface moved by a vector [m]."""
         return Quadric(self.Q, self.b - self.Q @ by, float(self.c - self.b @ by + 0.5 * by @ self.Q @ by))
 
     def normal(self, position: Array) -> Array:
-        """∇C/|∇C| at a point, (3,); zero where there is none, as in the middle of a sphere."""
+        """Return ∇C/|∇C| at a point, (3,); zero if ∇C vanishes, as at the centre of a sphere."""
         gradient = self.Q @ position + self.b
         slope = float(np.linalg.norm(gradient))
         return np.asarray(gradient / slope) if slope > 0.0 else np.zeros(3)
 
     def normals(self, positions: Array) -> Array:
-        """:meth:`normal` at many points, (T, 3) → (T, 3)."""
+        """Return :meth:`normal` at many points, (T, 3) → (T, 3)."""
         gradients = positions @ self.Q + self.b
         slopes = np.linalg.norm(gradients, axis=1, keepdims=True)
         return np.divide(gradients, slopes, out=np.zeros_like(gradients), where=slopes > 0.0)
 
     @cached_property
     def drawn(self) -> SceneSurface:
-        """The surface with the parameters of the simple kind that it is of, if any; without a name."""
+        """Surface of the matching simple kind with its parameters, if there is one; without a name."""
         return SceneSurface.of_quadric("", self.Q, self.b, self.c)
 
 
@@ -120,27 +120,27 @@ class _Shaped(ABC):
 
     @abstractmethod
     def shifted(self, by: Array) -> Surface:
-        """The same surface elsewhere, moved by a vector [m]."""
+        """Return the surface moved by a vector [m]."""
 
     @property
     def shapes(self) -> ShapeArrays:
-        """Table of a point candidate on this surface."""
+        """Return the table of a point candidate on this surface."""
         return shape_arrays([(self, 0.0, np.zeros(3), False)])
 
     def gap(self, position: Array) -> float:
-        """Signed distance of a point, (3,), along the normal [m]."""
+        """Return the signed distance of a point, (3,), along the normal [m]."""
         return float(self._distances(np.asarray(position)[None])[0][0])
 
     def gaps(self, positions: Array) -> Array:
-        """:meth:`gap` of many points, (T, 3) → (T,) [m]."""
+        """Return :meth:`gap` of many points, (T, 3) → (T,) [m]."""
         return self._distances(positions)[0]
 
     def normal(self, position: Array) -> Array:
-        """Unit normal at a point, (3,), to the free side."""
+        """Return the unit normal at a point, (3,), to the free side."""
         return np.asarray(self._distances(np.asarray(position)[None])[1][0])
 
     def normals(self, positions: Array) -> Array:
-        """:meth:`normal` at many points, (T, 3) → (T, 3)."""
+        """Return :meth:`normal` at many points, (T, 3) → (T, 3)."""
         return self._distances(positions)[1]
 
     def _distances(self, positions: Array) -> tuple[Array, Array]:
@@ -154,14 +154,18 @@ class _Shaped(ABC):
 
 @dataclass(frozen=True)
 class Box(_Shaped):
-    """A box whose edges and corners are rounded by ``edge_radius``; the free side is outside.
+    """Box whose edges and corners are rounded by ``edge_radius``; the free side is outside.
 
     Attributes
     ----------
-    centre : (3,) [m]
-    axes : (3, 3), the box's axes in W as rows
-    edges : (3,) lengths along them [m]
-    edge_radius : at most half the shortest edge [m]
+    centre : (3,) ndarray
+        Centre [m].
+    axes : (3, 3) ndarray
+        Axes of the box in W, as rows.
+    edges : (3,) ndarray
+        Lengths along the axes [m].
+    edge_radius : float
+        Radius of edges and corners, at most half the shortest edge [m].
     """
 
     centre: Array
@@ -170,19 +174,22 @@ class Box(_Shaped):
     edge_radius: float
 
     def shifted(self, by: Array) -> Box:
-        """The same box elsewhere, moved by a vector [m]."""
+        """Return the box moved by a vector [m]."""
         return replace(self, centre=self.centre + by)
 
 
 @dataclass(frozen=True)
 class HeightField(_Shaped):
-    """z = h(x, y) by a bicubic C² spline through heights on a grid; the free side is above.
+    """Surface z = h(x, y), a bicubic C² spline through heights on a grid; the free side is above.
 
     Attributes
     ----------
-    origin : (2,) x and y of the first height [m]
-    spacing : (2,) of the grid along x and y [m]
-    heights : (ny, nx), four or more each way: row j is at y_j, column i at x_i [m]
+    origin : (2,) ndarray
+        x and y of the first height [m].
+    spacing : (2,) ndarray
+        Grid spacing along x and y [m].
+    heights : (ny, nx) ndarray
+        Heights [m], at least four in each direction: row j is at y_j, column i at x_i.
     """
 
     origin: Array
@@ -190,24 +197,24 @@ class HeightField(_Shaped):
     heights: Array = field(repr=False)
 
     def shifted(self, by: Array) -> HeightField:
-        """The same field elsewhere, moved by a vector [m]."""
+        """Return the field moved by a vector [m]."""
         return replace(self, origin=self.origin + by[:2], heights=self.heights + by[2])
 
     @cached_property
     def coefficients(self) -> Array:
-        """Of the uniform cubic B-splines, (ny + 2, nx + 2); the third derivative does not jump at the second lines.
+        """Coefficients of the uniform cubic B-splines, (ny + 2, nx + 2), with not-a-knot end conditions.
 
-        So cubics are kept exactly (not-a-knot).
+        The third derivative does not jump at the second grid lines, so cubics are reproduced exactly.
         """
         return _spline(_spline(self.heights).T).T
 
 
 SURFACES = Quadric | Box | HeightField
-"""What a member of the family ``surface`` may build."""
+"""Types that a member of the family ``surface`` may build."""
 
 
 def _spline(values: Array) -> Array:
-    """Coefficients of cubic B-splines along the first axis, (n, m) → (n + 2, m)."""
+    """Return coefficients of cubic B-splines along the first axis, (n, m) → (n + 2, m)."""
     from dynsim.dynamics.banded import solve_banded
 
     n, beside = len(values), 4
@@ -220,11 +227,11 @@ def _spline(values: Array) -> Array:
 
 
 def shape_arrays(entries: Sequence[tuple[Surface | None, float, Array, bool]]) -> ShapeArrays:
-    """Tables of candidates: surface, radius [m], axis in its body [m], and whether its nearest point touches.
+    """Return tables of candidates from surface, radius [m], axis in the body [m], and if its nearest point touches.
 
     The surface is None for a point on a quadric.
     """
-    # The kernels need a second to load, which configurations can do without.
+    # Imported here because the kernels take a second to load and configurations do not need them.
     from dynsim.dynamics.contact import distance as kd
     from dynsim.jit.kernel import integers, reals
 
@@ -259,5 +266,5 @@ def shape_arrays(entries: Sequence[tuple[Surface | None, float, Array, bool]]) -
                 data[k, kd.AXES : kd.AXES + 3] = drawn.direction
             data[k, kd.SIZE] = drawn.radius or 0.0
         else:
-            raise ModelError(f"a {type(surface).__name__} is no surface that the kernels know")
+            raise ModelError(f"the kernels do not support a surface of type {type(surface).__name__}")
     return kd.ShapeArrays(kind=integers(kind), data=reals(data), fields=reals(np.concatenate(fields)))

@@ -1,7 +1,7 @@
 """Kinds of joints, one module each: rows, coordinates, units, and the motion of the body in the joint's frame.
 
-A module exposes ``ROWS``, its rows by name (:attr:`dynsim.model.description.Link.kind`), and for a joint with several
-of them a function that makes its links. All modules of this package are used. The kernels' motion is a branch of
+A module defines ``ROWS``, its rows by kind (:attr:`dynsim.model.description.Link.kind`), and for a joint with several
+rows a function that makes its links. All modules of this package are used. The motion in the kernels is a branch of
 :func:`dynsim.dynamics.tree.sweep.forward_sweep` (one angle, one distance) or of
 :func:`dynsim.dynamics.tree.joints.row_motion` (everything else).
 """
@@ -31,17 +31,25 @@ class Row:
 
     Attributes
     ----------
-    code : its number in the kernels (dynsim.dynamics.tables)
-    units : of position, velocity, acceleration and force
-    neutral : coordinates of the whole joint where its frames coincide; of its later rows empty
-    names : of these coordinates, where there are several
-    offset : where the row's own coordinates begin among those of the joint
-    own_position : whether the first of these is the integral of its rate, so that a motor can control it, though the
-        joint has several rows
-    drawn : kind of joint, in the scene of a record, that moves the row's body as this row does; None: there is none,
-        and records of robots with such a joint have no scene
-    motion : (:class:`~dynsim.model.description.Link`, coordinates (k, T)) → rotation (3, 3, T) and origin (3, T) of the
-        body in the joint's frame
+    code : int
+        Number of the kind in the kernels (dynsim.dynamics.tables).
+    units : tuple of str
+        Units of position, velocity, acceleration and force.
+    neutral : tuple of float
+        Coordinates of the whole joint at which its frames coincide; empty for later rows.
+    names : tuple of str
+        Names of these coordinates, if there are several.
+    offset : int
+        Index of the row's coordinates within the coordinates of the joint.
+    own_position : bool
+        Whether the first of these is the integral of its rate, so that a motor can control it although the joint has
+        several rows.
+    drawn : str or None
+        Kind of joint, in the scene of a record, that moves the row's body in the same way; None: not available, and
+        records of robots with such a joint have no scene.
+    motion : callable
+        (:class:`~dynsim.model.description.Link`, coordinates (k, T)) → rotation (3, 3, T) and origin (3, T) of the body
+        in the joint's frame.
     """
 
     code: int
@@ -56,7 +64,7 @@ class Row:
 
 @cache
 def rows() -> dict[str, Row]:
-    """Rows of all joints by name."""
+    """Return the rows of all joints by kind."""
     table: dict[str, Row] = {}
     for info in pkgutil.iter_modules(__path__):
         table.update(importlib.import_module(f"{__name__}.{info.name}").ROWS)
@@ -64,12 +72,12 @@ def rows() -> dict[str, Row]:
 
 
 def turned(axis: Array, angle: Array) -> Array:
-    """Rotation about a unit axis by angles (T,), (3, 3, T)."""
+    """Return the rotation about a unit axis by angles (T,), (3, 3, T)."""
     x, y, z = axis
     K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return np.eye(3)[:, :, None] + np.sin(angle) * K[:, :, None] + (1.0 - np.cos(angle)) * (K @ K)[:, :, None]
 
 
 def unturned(count: int) -> Array:
-    """No rotation, (3, 3, count)."""
+    """Return identity rotations, (3, 3, count)."""
     return np.repeat(np.eye(3)[:, :, None], count, axis=2)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def motion(link: Link, q: Array) -> tuple[Array, Array]:
-    """See :class:`dynsim.model.joints.Row`."""
+    """Return rotation and origin, see :class:`dynsim.model.joints.Row`."""
     w, x, y, z = q / np.sqrt((q * q).sum(axis=0))
     R = np.array(
         [
@@ -37,9 +37,9 @@ ROWS = {
 
 
 def ball(link: Link) -> tuple[Link, ...]:
-    """Links of a ball joint that carries the body of ``link``, whose kind and axis do not matter.
+    """Return the links of a ball joint that carries the body of ``link``, whose kind and axis do not matter.
 
-    Coordinates: the quaternion w, x, y, z of the body in the joint's frame. Rates: its angular velocity in its axes.
+    Coordinates: quaternion w, x, y, z of the body in the joint's frame. Rates: its angular velocity in its axes.
     """
     from dynsim.model.description import in_rows
 
@@ -47,10 +47,10 @@ def ball(link: Link) -> tuple[Link, ...]:
 
 
 def floating(link: Link) -> tuple[Link, ...]:
-    """Links of a body that moves freely from the joint's frame.
+    """Return the links of a body that moves freely relative to the joint's frame.
 
     Coordinates: position of its origin in the joint's frame, then the quaternion. Rates: velocity of the origin in the
-    axes of the joint's frame, angular velocity in those of the body.
+    axes of the joint's frame, angular velocity in the axes of the body.
     """
     from dynsim.model.description import Inertia, in_rows
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def motion(link: Link, q: Array) -> tuple[Array, Array]:
-    """See :class:`dynsim.model.joints.Row`."""
+    """Return rotation and origin, see :class:`dynsim.model.joints.Row`."""
     return turned(np.array([0.0, 0.0, 1.0]), q[2]), np.stack([q[0], q[1], np.zeros(q.shape[1])])
 
 
@@ -25,11 +25,11 @@ ROWS = {
 
 
 def planar(link: Link) -> tuple[Link, ...]:
-    """Links of a body in the plane with normal ``link.axis`` (unit): two distances in the plane, one angle."""
+    """Return the links of a body in the plane with normal ``link.axis`` (unit): two distances and one angle."""
     from dynsim.model.description import in_rows
 
     normal = np.asarray(link.axis, dtype=np.float64)
-    # The plane's axes: those of x and y turned the shortest way to the normal, x and y themselves for +z.
+    # Axes of the plane: x and y turned the shortest way to the normal; x and y themselves for +z.
     z = np.array([0.0, 0.0, 1.0])
     cosine, v = float(normal[2]), np.cross(z, normal)
     square = float(v @ v)
@@ -37,15 +37,15 @@ def planar(link: Link) -> tuple[Link, ...]:
         R = np.diag([1.0, -1.0, -1.0])
     else:
         K = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
-        # 1 / (1 + cosine), which near -z would be a difference of equal numbers.
+        # 1 / (1 + cosine), whose denominator near -z would be a difference of equal numbers.
         R = np.eye(3) + K + K @ K * ((1.0 - cosine) / square if cosine < 0.0 else 1.0 / (1.0 + cosine))
     return in_rows(link, [("x", "prismatic", R[:, 0]), ("y", "prismatic", R[:, 1]), ("angle", "revolute", normal)])
 
 
 def rolling(link: Link) -> tuple[Link, ...]:
-    """Links of a body that rolls on the plane z = 0 of the joint's frame like a wheelset with its axle along y.
+    """Return the links of a body that rolls on the plane z = 0 of the joint's frame like a wheelset with axle along y.
 
-    Coordinates: x, y and heading of the middle of the axle. Rates: speed along the heading, rate of turning. It cannot
+    Coordinates: x, y and heading of the centre of the axle. Rates: speed along the heading, rate of turning. It cannot
     move sideways.
     """
     from dynsim.model.description import in_rows

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def motion(link: Link, q: Array) -> tuple[Array, Array]:
-    """See :class:`dynsim.model.joints.Row`."""
+    """Return rotation and origin, see :class:`dynsim.model.joints.Row`."""
     return unturned(q.shape[1]), link.axis[:, None] * q[0]
 
 

@@ -1,4 +1,4 @@
-"""Revolute joint: one angle about an axis. For axes x, y and z of the joint's frame kernels have faster codes."""
+"""Revolute joint: one angle about an axis. Kernels have faster code for axes x, y and z of the joint's frame."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def motion(link: Link, q: Array) -> tuple[Array, Array]:
-    """See :class:`dynsim.model.joints.Row`."""
+    """Return rotation and origin, see :class:`dynsim.model.joints.Row`."""
     return turned(link.axis, q[0]), np.zeros((3, q.shape[1]))
 
 

@@ -1,4 +1,4 @@
-"""Mobile base on two wheels of one axle that roll without slip; its rates are those of the wheels ([WM] II.E)."""
+"""Mobile base on two wheels of one axle that roll without slip; its rates are the wheel rates ([WM] II.E)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def motion(link: Link, q: Array) -> tuple[Array, Array]:
-    """See :class:`dynsim.model.joints.Row`."""
+    """Return rotation and origin, see :class:`dynsim.model.joints.Row`."""
     left, right, x, y = q
     return turned(np.array([0.0, 0.0, 1.0]), link.parameter * (right - left)), np.stack([x, y, np.zeros_like(x)])
 
@@ -35,11 +35,18 @@ ROWS = {
 
 
 def wheeled(link: Link, radius: float, track: float) -> tuple[Link, ...]:
-    """Links of a base that rolls on the plane z = 0 of the joint's frame on wheels of that radius, a track [m] apart.
+    """Return the links of a base that rolls on the plane z = 0 of the joint's frame on two wheels.
 
-    Coordinates: angles of the left and the right wheel, then x and y of the middle of the axle; both wheels turn
-    positively when the base rolls ahead, along its x. Rates: those of the wheels, V = r (φ̇_r + φ̇_l)/2 and
-    ω = r (φ̇_r − φ̇_l)/T; so rolling without slip, and the heading r (φ_r − φ_l)/T, are exact.
+    Coordinates: angles of the left and the right wheel, then x and y of the centre of the axle; both wheels turn
+    positively when the base rolls ahead, along its x. Rates: wheel rates, V = r (φ̇_r + φ̇_l)/2 and
+    ω = r (φ̇_r − φ̇_l)/T; rolling without slip, and the heading r (φ_r − φ_l)/T, are therefore exact.
+
+    Parameters
+    ----------
+    link : Link
+        Link whose body is carried.
+    radius, track : float
+        Wheel radius r and distance T between the wheels [m].
     """
     from dynsim.model.description import in_rows
 

@@ -1,8 +1,8 @@
-"""Strict reading of URDF text to links and joints: all numbers are checked, errors name element and line.
+"""URDF import: strict reading of links and joints, lenient reading of visual shapes, and conversion to a robot.
 
-Elements that the URDF specification makes optional have its defaults (a link without ``<inertial>`` has no mass, a
-joint without ``<axis>`` turns about x). Others that are missing, misspelt, repeated or not numbers are refused. Visuals
-are read leniently (:mod:`dynsim.model.urdf.reader`).
+All numbers are checked, and errors name element and line. Elements that the URDF specification makes optional get its
+defaults (a link without ``<inertial>`` has no mass, a joint without ``<axis>`` turns about x). Other elements that are
+missing, misspelt, repeated or not numeric are refused.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from dynsim.record.quaternion import of_turn, product
 from dynsim.record.scene import Shape, ShapeKind, quaternion
 from dynsim.system.inputs import read_bytes
 
-# XML of a URDF file: elements with line numbers, and attributes read as numbers; unknown ones are reported.
+# XML of a URDF file: elements with line numbers, and attributes as numbers; unknown attributes are reported.
 
 
 # The largest robots in use have some 100 links and 1 MB of text.
@@ -42,8 +42,8 @@ _WITHOUT_TEXT = {"mass", "inertia", "origin", "axis", "limit", "dynamics", "mimi
 
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-# Child elements that physics depends on, by parent, and their attributes. Other elements and, on limits and losses,
-# other attributes are extensions of single programs; they are ignored unless they look like one of these misspelt.
+# Child elements that physics depends on, by parent, and their attributes. Other elements, and other attributes of
+# limits and losses, are extensions of some programs; they are ignored unless they look like a misspelling of these.
 _CHILDREN = {
     "robot": ("link", "joint"),
     "link": ("inertial",),
@@ -67,7 +67,7 @@ _EXAMPLE = {1: '"0.25"', 3: '"0 0 0.25"'}
 
 @dataclass
 class Element:
-    """A tag with its attributes, the line it begins in, and what it holds."""
+    """XML tag with its attributes, start line and children."""
 
     tag: str
     attributes: dict[str, str]
@@ -75,34 +75,34 @@ class Element:
     children: list[Element] = field(default_factory=list)
 
     def child(self, tag: str) -> Element | None:
-        """The first child of that kind."""
+        """Return the first child with this tag, or None."""
         return next((child for child in self.children if child.tag == tag), None)
 
 
 class Placed(Protocol):
-    """Something of the file with a line."""
+    """Part of the file with a line number."""
 
     @property
     def line(self) -> int: ...
 
 
 class UrdfFile:
-    """One file, read by elements; all errors name it."""
+    """One URDF file, read by elements; all errors name it."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
     def error(self, line: int, text: str) -> ModelError:
-        """An error about a line of the file."""
+        """Return an error about a line of the file."""
         return ModelError(f"{self.path}:{line}: {text}")
 
     def root(self) -> Element:
-        """The outermost element, with all that it holds.
+        """Return the root element with all of its content.
 
         Raises
         ------
         ModelError
-            The file cannot be read, is no XML, or passes a limit.
+            If the file cannot be read, is not XML, or exceeds a limit.
         """
         return self._parse(self._read())
 
@@ -113,7 +113,7 @@ class UrdfFile:
         return data
 
     def _parse(self, data: bytes) -> Element:
-        """The elements of XML text in any encoding that expat knows; with their lines."""
+        """Parse XML text in any encoding that expat knows into elements with line numbers."""
         parser = expat.ParserCreate()
         open_elements: list[Element] = []
         roots: list[Element] = []
@@ -148,17 +148,17 @@ class UrdfFile:
 
         def text(content: str) -> None:
             element = open_elements[-1]
-            # Without attributes it is refused for what it lacks.
+            # An element without attributes is refused for missing attributes.
             if content.strip() and element.tag in _WITHOUT_TEXT and element.attributes:
                 tag = element.tag
                 raise self.error(
                     parser.CurrentLineNumber,
-                    f"<{tag}> holds the text {quoted(content.strip())}; URDF has values in attributes only",
+                    f"<{tag}> contains the text {quoted(content.strip())}; URDF has values in attributes only",
                 )
 
         def document_type(*_: object) -> None:
             raise self.error(
-                parser.CurrentLineNumber, "has a DOCTYPE; entities and DTDs are not read: remove it, write them out"
+                parser.CurrentLineNumber, "has a DOCTYPE; entities and DTDs are not supported: expand and remove them"
             )
 
         parser.StartElementHandler, parser.EndElementHandler, parser.CharacterDataHandler = begin, end, text
@@ -168,37 +168,39 @@ class UrdfFile:
         except expat.ExpatError as error:
             raise self.error(error.lineno, f"not XML: {expat.ErrorString(error.code)}") from None
         except (LookupError, ValueError) as error:
-            raise ModelError(f"{self.path}: its encoding is not known ({error}); save it as UTF-8") from None
+            raise ModelError(f"{self.path}: unknown encoding ({error}); save it as UTF-8") from None
         return roots[0]
 
     @property
     def _expand(self) -> str:
         return (
             f"this is a xacro file; run `xacro {self.path} > {self.path.name.split('.')[0]}_expanded.urdf` (of ROS) "
-            "and give that file"
+            "and use that file"
         )
 
     def name(self, element: Element, others: Mapping[str, Placed]) -> str:
-        """The name of a link or joint: there, printable, and the only one of its kind."""
+        """Return the name of a link or joint, checked to be printable and unique."""
         name = element.attributes.get("name", "")
         if not name:
-            raise self.error(element.line, f"<{element.tag}> has no name; give it one")
+            raise self.error(element.line, f"<{element.tag}> has no name; add the attribute name")
         self._check_expanded(element, "name", f"<{element.tag}>")
         if not name.isprintable():
             raise self.error(
                 element.line, f"{element.tag} {quoted(name)}: the name has control characters; remove them"
             )
         if len(name) > NAME_LENGTH_MAX:
-            raise self.error(element.line, f"{element.tag} {quoted(name)}: a name has at most {NAME_LENGTH_MAX} signs")
+            raise self.error(
+                element.line, f"{element.tag} {quoted(name)}: a name has at most {NAME_LENGTH_MAX} characters"
+            )
         if name in others:
             raise self.error(
                 element.line,
-                f"{element.tag} {quoted(name)} is there twice (also in line {others[name].line}); rename one of them",
+                f"{element.tag} {quoted(name)} is defined twice (also in line {others[name].line}); rename one of them",
             )
         return name
 
     def check_children(self, element: Element, who: str) -> None:
-        """Refuse what is there twice, belongs elsewhere or looks misspelt: other readers pass over it in silence."""
+        """Refuse repeated, misplaced or misspelt elements, which other readers ignore silently."""
         known, seen = _CHILDREN[element.tag], set()
         for child in element.children:
             if child.tag in known:
@@ -222,7 +224,7 @@ class UrdfFile:
                 raise self.error(element.line, f"{who}: unknown attribute {cut(key)} of <{element.tag}>; {hint}")
 
     def required(self, element: Element, tag: str, who: str, fix: str) -> Element:
-        """The child of that kind; without it ``fix`` says what to do."""
+        """Return the child with this tag; without it, raise an error with the advice ``fix``."""
         child = element.child(tag)
         if child is None:
             where = f"{who}: <{element.tag}>" if element.tag == "inertial" else who
@@ -230,42 +232,42 @@ class UrdfFile:
         return child
 
     def text(self, element: Element, key: str, who: str) -> str:
-        """An attribute that must be there and not empty."""
+        """Return a required, non-empty attribute."""
         if not element.attributes.get(key):
             raise self.error(element.line, f"{who}: <{element.tag}> has no {key}; add it")
         self._check_expanded(element, key, who)
         return element.attributes[key]
 
     def number(self, element: Element, key: str, who: str, default: float | None = None) -> float:
-        """The one number of an attribute."""
+        """Return the single number of an attribute."""
         return float(self.numbers(element, key, 1, who, None if default is None else (default,))[0])
 
     def numbers(
         self, element: Element, key: str, count: int, who: str, default: tuple[float, ...] | None = None
     ) -> Array:
-        """The numbers of an attribute: plain ASCII decimals, as many as there must be, finite."""
+        """Return the ``count`` numbers of an attribute: plain ASCII decimals, finite."""
         text = element.attributes.get(key)
         if text is None:
             if default is not None:
                 return np.array(default)
-            raise self.error(element.line, f"{who}: <{element.tag}> has no {key}; add it, like {key}={_EXAMPLE[count]}")
+            raise self.error(element.line, f"{who}: <{element.tag}> has no {key}; add it, e.g. {key}={_EXAMPLE[count]}")
         self._check_expanded(element, key, who)
         words = _words(text)
         stated = f"{who}: <{element.tag} {key}={quoted(text)}>"
         if len(words) != count:
             raise self.error(
-                element.line, f"{stated} has {len(words)} entries, {count} are needed, like {_EXAMPLE[count]}"
+                element.line, f"{stated} has {len(words)} entries, {count} are needed, e.g. {_EXAMPLE[count]}"
             )
         values = []
         for word in words:
             if len(word) > _NUMBER_LENGTH_MAX or not _NUMBER.fullmatch(word):
                 raise self.error(
                     element.line,
-                    f"{stated} is not a finite number; write it in the digits 0–9 with a point, like {_EXAMPLE[count]}",
+                    f"{stated} is not a finite number; write decimal digits 0–9 with a point, e.g. {_EXAMPLE[count]}",
                 )
             value = float(word)
             vanished = value == 0.0 and re.search("[1-9]", re.split("[eE]", word)[0])
-            # Limits may be as large as numbers go: that stands for none.
+            # Limits may be as large as numbers go, meaning no limit.
             largest = math.inf if element.tag == "limit" else _MAGNITUDE_MAX
             if vanished or not math.isfinite(value) or abs(value) > largest:
                 raise self.error(element.line, f"{stated} is out of the range of numbers; check its exponent")
@@ -280,13 +282,13 @@ class UrdfFile:
 
 
 def suggestion(word: str, known: object) -> str:
-    """``; did you mean 'x'?``, or nothing when no known word is near."""
+    """Return ``; did you mean 'x'?``, or an empty text if no known word is similar."""
     near = difflib.get_close_matches(word[:100], [str(k) for k in known], n=1, cutoff=0.6)  # type: ignore[attr-defined]
     return f"; did you mean {near[0]!r}?" if near else ""
 
 
 def _near(word: str, known: tuple[str, ...]) -> str:
-    """The known word that ``word`` looks like misspelt, empty if none. Programs have extensions of similar names."""
+    """Return the known word of which ``word`` looks like a misspelling, or "". Programs have similar extensions."""
     if word in known:
         return ""
     near = difflib.get_close_matches(word[:40].casefold(), known, n=1, cutoff=0.8)
@@ -294,17 +296,17 @@ def _near(word: str, known: tuple[str, ...]) -> str:
 
 
 def _words(text: str) -> list[str]:
-    """What stands between white space, of XML's kinds only."""
+    """Return the words between XML white space."""
     return [word for word in re.split(r"[ \t\r\n]+", text) if word]
 
 
 def quoted(text: str) -> str:
-    """A text of the file, quoted and cut to what fits in a message."""
+    """Return a text of the file, quoted and shortened for a message."""
     return repr(cut(text))
 
 
 def cut(text: str) -> str:
-    """A text of the file, no longer than fits in a message."""
+    """Return a text of the file, shortened for a message."""
     return text if len(text) <= 60 else text[:57] + "..."
 
 
@@ -312,12 +314,12 @@ def cut(text: str) -> str:
 
 
 Colour = tuple[float, float, float, float]
-# As in dynsim.model.urdf.reader: no length, scale or angle is larger.
+# No length, scale or angle is larger.
 _LARGEST = 1e15
 
 
 def materials(robot: Element) -> dict[str, Colour]:
-    """Colours that the file defines by name, outside of its links."""
+    """Return the named colours that the file defines outside of its links."""
     colours = {
         child.attributes.get("name", ""): _colour(child, {}) for child in robot.children if child.tag == "material"
     }
@@ -325,7 +327,7 @@ def materials(robot: Element) -> dict[str, Colour]:
 
 
 def visual_shapes(link: Element, named_colours: Mapping[str, Colour]) -> tuple[Shape, ...]:
-    """Shapes of a link in its frame; ``named_colours`` are colours by name."""
+    """Return the shapes of a link in its frame; ``named_colours`` maps names to colours."""
     shapes = [_shape(child, named_colours) for child in link.children if child.tag == "visual"]
     return tuple(shape for shape in shapes if shape is not None)
 
@@ -373,7 +375,7 @@ def _colour(material: Element, named_colours: Mapping[str, Colour]) -> Colour | 
 
 
 def _numbers(element: Element, key: str, count: int, default: str = "") -> tuple[float, ...]:
-    """So many numbers of an attribute; empty where there are others."""
+    """Return ``count`` numbers of an attribute; empty if they are not valid."""
     try:
         numbers = tuple(map(float, element.attributes.get(key, default).split()))
     except ValueError:
@@ -386,15 +388,15 @@ LINKS_MAX = 2000
 MOVING = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 # Joints with several rates.
 SEVERAL = ("floating", "planar")
-# A limit of at least this magnitude means "no limit" [rad, m, N m …]: URDF demands some number for most limits.
+# A limit of at least this magnitude means "no limit" [rad, m, N m …]: URDF requires a number for most limits.
 UNLIMITED = 1e9
 
 
 @dataclass(frozen=True)
 class UrdfLink:
-    """A link as the file has it; ``inertia`` is None without ``<inertial>``, ``shaped`` means visual or collision.
+    """Link as stated in the file; ``inertia`` is None without ``<inertial>``; ``shaped``: has visual or collision.
 
-    ``shapes`` are its visuals, as far as they can be drawn.
+    ``shapes`` are the visuals that can be drawn.
     """
 
     name: str
@@ -406,11 +408,11 @@ class UrdfLink:
 
 @dataclass(frozen=True)
 class UrdfJoint:
-    """A joint as the file states it: placement of the child in the parent's frame, unit axis in the child's frame.
+    """Joint as stated in the file: placement of the child in the parent's frame, unit axis in the child's frame.
 
     ``kind`` is URDF's type, ``mimics`` the name of the joint that leads this one, at ``multiplier`` times its position
-    and ``offset`` [rad or m]. Limits [rad or m, rad/s or m/s, N m
-    or N] are infinite where the file has none, ``damping`` and ``friction`` zero.
+    and ``offset`` [rad or m]. Limits [rad or m, rad/s or m/s, N m or N] are infinite if the file has none; ``damping``
+    and ``friction`` are then zero.
     """
 
     name: str
@@ -434,7 +436,7 @@ class UrdfJoint:
 
 @dataclass(frozen=True)
 class UrdfTree:
-    """Links and joints by name in the order of the file, and the root link."""
+    """Links and joints by their names, in the order of the file, and the root link."""
 
     path: Path
     name: str
@@ -443,7 +445,7 @@ class UrdfTree:
     root: str
 
     def error(self, line: int, text: str) -> ModelError:
-        """An error about a line of the file."""
+        """Return an error about a line of the file."""
         return ModelError(f"{self.path}:{line}: {text}")
 
 
@@ -453,14 +455,14 @@ def read_tree(path: Path) -> UrdfTree:
     Raises
     ------
     ModelError
-        The file cannot be read, is not URDF, or states something that is not clear: the message names file, line, link
-        or joint, attribute, value and what to do.
+        If the file cannot be read, is not URDF, or is ambiguous; the message contains file, line, link or joint,
+        attribute, value and a fix.
     """
     return _Reader(path).tree()
 
 
 class _Reader:
-    """Reads the links and joints of one file."""
+    """Reader of the links and joints of one file."""
 
     def __init__(self, path: Path) -> None:
         self.file = UrdfFile(path)
@@ -468,7 +470,7 @@ class _Reader:
     def tree(self) -> UrdfTree:
         root = self.file.root()
         if root.tag != "robot":
-            raise self.file.error(root.line, f"the outermost element is <{cut(root.tag)}>, a URDF file has <robot>")
+            raise self.file.error(root.line, f"the root element is <{cut(root.tag)}>, must be <robot>")
         self.file.check_children(root, "the robot")
         links: dict[str, UrdfLink] = {}
         joints: dict[str, UrdfJoint] = {}
@@ -504,15 +506,15 @@ class _Reader:
     def inertia(self, element: Element, who: str) -> Inertia:
         self.file.check_children(element, who)
         mass_element = self.file.required(
-            element, "mass", who, "give both, or remove <inertial> for a link without mass"
+            element, "mass", who, "add both, or remove <inertial> for a link without mass"
         )
         tensor_element = self.file.required(
-            element, "inertia", who, "give all six moments (zero for a point mass), or remove <inertial>"
+            element, "inertia", who, "add all six moments (zero for a point mass), or remove <inertial>"
         )
         R, com = self.origin(element, who)
         mass = self.file.number(mass_element, "value", who)
         if mass < 0.0:
-            raise self.file.error(mass_element.line, f"{who}: mass {mass:g} kg is negative; a mass is zero or positive")
+            raise self.file.error(mass_element.line, f"{who}: mass {mass:g} kg must not be negative")
         xx, xy, xz, yy, yz, zz = (self.file.number(tensor_element, key, who) for key in MOMENTS)
         tensor = R @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ R.T
         return Inertia(mass, com, 0.5 * (tensor + tensor.T))
@@ -528,7 +530,7 @@ class _Reader:
             raise self.file.error(element.line, f"{who} {stated}; known: {', '.join(known)}")
         ends = []
         for tag in ("parent", "child"):
-            end = self.file.required(element, tag, who, f'add it, like <{tag} link="arm"/>')
+            end = self.file.required(element, tag, who, f'add it, e.g. <{tag} link="arm"/>')
             link = self.file.text(end, "link", who)
             if link not in links:
                 raise self.file.error(
@@ -538,7 +540,7 @@ class _Reader:
         for tag in ("limit", "dynamics") if kind in SEVERAL else ():
             if (single := element.child(tag)) is not None:
                 raise self.file.error(
-                    single.line, f"{who} is {kind}: <{tag}> has one number for several rates; remove <{tag}>"
+                    single.line, f"{who} is {kind}: <{tag}> has one number but the joint several rates; remove <{tag}>"
                 )
         R, p = self.origin(element, who)
         lower, upper, velocity_limit, effort_limit = self.limits(element, kind, who)
@@ -548,9 +550,7 @@ class _Reader:
         )
         if damping < 0.0 or friction < 0.0:
             line = element.line if dynamics is None else dynamics.line
-            raise self.file.error(
-                line, f"{who}: damping {damping:g} and friction {friction:g}; a loss is zero or positive"
-            )
+            raise self.file.error(line, f"{who}: damping {damping:g} and friction {friction:g} must not be negative")
         mimics, multiplier, offset = None, 1.0, 0.0
         if mimic is not None:
             mimics = self.file.text(mimic, "joint", who)
@@ -577,7 +577,7 @@ class _Reader:
         )
 
     def limits(self, element: Element, kind: str, who: str) -> tuple[float, float, float, float]:
-        """Lower and upper position, velocity and effort; zero of the latter stands in files whose author knew none."""
+        """Return limits of position (lower, upper), velocity and effort; zero velocity or effort means unknown."""
         limit = element.child("limit")
         if limit is None:
             if kind in ("revolute", "prismatic"):
@@ -589,7 +589,7 @@ class _Reader:
         bounds = [self.file.number(limit, key, who, None if kind in MOVING else 0.0) for key in ("velocity", "effort")]
         velocity, effort = (size if 0.0 < size < UNLIMITED else math.inf for size in bounds)
         if min(bounds) < 0.0:
-            raise self.file.error(limit.line, f"{who}: a velocity or effort limit is negative; 0 stands for none")
+            raise self.file.error(limit.line, f"{who}: velocity and effort limits must not be negative; 0: unlimited")
         if kind == "continuous":
             return -math.inf, math.inf, velocity, effort
         if lower > upper:
@@ -602,7 +602,7 @@ class _Reader:
         )
 
     def origin(self, element: Element, who: str) -> tuple[Array, Array]:
-        """Rotation and position that ``<origin>`` states; none is the identity."""
+        """Return rotation and position of ``<origin>``; identity without it."""
         origin = element.child("origin")
         if origin is None:
             return np.eye(3), np.zeros(3)
@@ -610,34 +610,34 @@ class _Reader:
         return rotation(*rpy), p
 
     def axis(self, element: Element, kind: str, who: str) -> Array:
-        """Unit axis in the joint's frame; that of a joint without one is not looked at."""
+        """Return the unit axis in the joint's frame; the axis of a joint that does not use it is not checked."""
         stated = element.child("axis")
         default = (1.0, 0.0, 0.0)
         axis = np.array(default) if stated is None else self.file.numbers(stated, "xyz", 3, who)
         if kind == "planar" and stated is None:
             raise self.file.error(
                 element.line,
-                f"{who} is planar and has no <axis>, the normal of its plane: URDF then means x, and many programs z; "
-                'add it, like <axis xyz="0 0 1"/>',
+                f"{who} is planar and has no <axis>, the normal of its plane: URDF then means x, but many programs z; "
+                'add it, e.g. <axis xyz="0 0 1"/>',
             )
         if kind not in (*MOVING, "planar"):
             return np.array(default)
         length = float(np.linalg.norm(axis))
         if stated is not None and not 1e-12 < length < math.inf:
-            raise self.file.error(stated.line, f"{who}: axis {quoted(stated.attributes['xyz'])} is no direction")
+            raise self.file.error(stated.line, f"{who}: axis {quoted(stated.attributes['xyz'])} has no direction")
         # A unit axis stays as it is: dividing by 1 − 1e-16 would take it off the exact coordinate directions.
         return axis if abs(length - 1.0) < 1e-15 else axis / length
 
     def root(self, links: dict[str, UrdfLink], joints: dict[str, UrdfJoint]) -> str:
-        """The one link that hangs on no joint; every other one must be reached from it."""
+        """Return the only link that is not a child; all others must be reached from it."""
         above: dict[str, UrdfJoint] = {}
         for joint in joints.values():
             other = above.setdefault(joint.child, joint)
             if other is not joint:
                 raise self.file.error(
                     joint.line,
-                    f"joint {quoted(joint.name)}: its child {quoted(joint.child)} already hangs on joint "
-                    f"{quoted(other.name)} (line {other.line}): a kinematic loop, which URDF cannot state; "
+                    f"joint {quoted(joint.name)}: its child {quoted(joint.child)} is already the child of joint "
+                    f"{quoted(other.name)} (line {other.line}): a kinematic loop, which URDF does not support; "
                     "remove one of the two",
                 )
         roots = [name for name in links if name not in above]
@@ -656,18 +656,18 @@ class _Reader:
         if lost is not None:
             raise self.file.error(
                 lost.line,
-                f"joint {quoted(lost.name)} is part of a kinematic loop that no root link leads to; "
-                "the joints of a URDF file form a tree",
+                f"joint {quoted(lost.name)} is part of a kinematic loop without a root link; "
+                "the joints of a URDF file must form a tree",
             )
         if len(roots) != 1:
             names = ", ".join(quoted(name) for name in roots[:5]) + (", …" if len(roots) > 5 else "")
             line = links[roots[1]].line if roots else 1
-            raise self.file.error(line, f"a tree has one root link; here: {names or 'none'}; connect them with joints")
+            raise self.file.error(line, f"a tree has one root link; found: {names or 'none'}; connect them with joints")
         return roots[0]
 
 
 def rotation(roll: float, pitch: float, yaw: float) -> Array:
-    """R = Rz(yaw) Ry(pitch) Rx(roll), (3, 3); angles [rad]."""
+    """Return R = Rz(yaw) Ry(pitch) Rx(roll), (3, 3); angles [rad]."""
     (cr, cp, cy), (sr, sp, sy) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
     return np.array(
         [
@@ -678,17 +678,17 @@ def rotation(roll: float, pitch: float, yaw: float) -> Array:
     )
 
 
-# URDF import: bodies, joints, limits, viscous losses, couplings, frames and shapes of a robot.
+# Conversion to a robot: bodies, joints, limits, viscous losses, couplings, frames and shapes.
 
 
 HAND = "hand"
-# Functions that make the rows of joints with several of them.
+# Functions that make the rows of joints with several rows.
 ROWS = {"floating": floating, "planar": planar}
 
 
 @dataclass(frozen=True)
 class _Place:
-    """The moving body that carries a link (None: the world), the link's frame there, and its distance from the root."""
+    """Moving body that carries a link (None: the world), the link's frame there, and its distance from the root."""
 
     body: str | None
     R: Array
@@ -700,30 +700,31 @@ class _Place:
 def read_urdf(path: Path, lock: Mapping[str, float] | None = None) -> Robot:
     """Read the bodies and joints of a URDF file.
 
-    Joints keep their names and the order of the file (a parent still comes first); each body is named after the link
-    at its moving joint, and every other link is a frame of the body that carries it. Floating and planar joints become
-    their rows (:mod:`dynsim.model.joints`). The hand is the link named
-    ``hand``, else the tip of the chain with the most moving joints: the last link fixed to its last body, or that
-    body's origin when nothing is fixed to it. The root link is the world. A mimic joint is a coupling to its leader; a
-    locked leader locks it too.
+    Joints keep their names and the order of the file (but a parent always comes first); each body is named after the
+    link at its moving joint, and every other link is a frame of the body that carries it. Floating and planar joints
+    become their rows (:mod:`dynsim.model.joints`). The hand is the link named ``hand``, otherwise the tip of the chain
+    with the most moving joints: the last link fixed to its last body, or that body's origin if nothing is fixed to it.
+    The root link is the world. A mimic joint is a coupling to its leader; a locked leader locks it too.
 
     Parameters
     ----------
-    path : file
-    lock : positions [rad or m] of joints that are to be fixed, by name
+    path : Path
+        URDF file.
+    lock : mapping, optional
+        Positions [rad or m] of joints to fix, with the joint names as keys.
 
     Raises
     ------
     ModelError
-        No such file, not URDF, a number that is none, a mass without inertia and the like; a mimic joint whose leader
-        there is not; no joint of a name in ``lock``, or one without a single position. The message names file, line,
-        link or joint, value and what to do.
+        If the file does not exist or is not URDF, a number or an inertia is invalid, the leader of a mimic joint does
+        not exist, or ``lock`` names an unknown joint or one without a single position. The message contains file, line,
+        link or joint, value and a fix.
 
     Warns
     -----
     UserWarning
-        A link with a shape has no mass; moments of inertia of a link are not those of a body; a joint is locked beyond
-        its limits.
+        If a link with a shape has no mass, the moments of inertia of a link are impossible for a body, or a joint is
+        locked beyond its limits.
     """
     tree = read_tree(path)
     locked = _locked(tree, {**_locked_followers(tree, lock or {}), **(lock or {})})
@@ -738,7 +739,7 @@ def read_urdf(path: Path, lock: Mapping[str, float] | None = None) -> Robot:
         for name in (joint.name, joint.mimics or joint.name):
             if joint.mimics is not None and locked.joints[name].kind in SEVERAL:
                 raise tree.error(
-                    joint.line, f"joint {joint.name!r} mimics {joint.mimics!r}, and {name!r} has several positions"
+                    joint.line, f"joint {joint.name!r} mimics {joint.mimics!r}, but {name!r} has several positions"
                 )
     couplings = tuple(
         Coupling(joint.name, joint.mimics, joint.multiplier, joint.offset)
@@ -760,7 +761,7 @@ def read_urdf(path: Path, lock: Mapping[str, float] | None = None) -> Robot:
 
 
 def _fixed(tree: UrdfTree, places: Mapping[str, _Place]) -> Inertia:
-    """Mass properties of all that is fixed to the root, in its frame."""
+    """Return the mass properties of all links fixed to the root, in its frame."""
     parts = [
         inertia.placed(pose.R, pose.p)
         for name, pose in places.items()
@@ -770,7 +771,7 @@ def _fixed(tree: UrdfTree, places: Mapping[str, _Place]) -> Inertia:
 
 
 def _locked_followers(tree: UrdfTree, lock: Mapping[str, float]) -> dict[str, float]:
-    """Positions of the mimic joints whose leader is locked or fixed, directly or through others [rad or m]."""
+    """Return positions of mimic joints whose leader is locked or fixed, directly or through others [rad or m]."""
     positions: dict[str, float] = {}
     for follower in tree.joints.values():
         chain, joint = [], follower
@@ -782,7 +783,7 @@ def _locked_followers(tree: UrdfTree, lock: Mapping[str, float]) -> dict[str, fl
                     f"{suggestion(joint.mimics, tree.joints)}",
                 )
             if joint in chain:
-                raise tree.error(joint.line, f"joint {joint.name!r} mimics itself, by way of {joint.mimics!r}")
+                raise tree.error(joint.line, f"joint {joint.name!r} mimics itself through {joint.mimics!r}")
             chain.append(joint)
             joint = tree.joints[joint.mimics]
         if chain and (joint.name in lock or joint.kind == "fixed"):
@@ -794,7 +795,7 @@ def _locked_followers(tree: UrdfTree, lock: Mapping[str, float]) -> dict[str, fl
 
 
 def _locked(tree: UrdfTree, lock: Mapping[str, float]) -> UrdfTree:
-    """The tree with joints fixed at positions: T_PC = T_PJ · Rot(a, q), or T_PJ · Trans(a q) for a prismatic one."""
+    """Return the tree with joints fixed at positions: T_PC = T_PJ · Rot(a, q), or T_PJ · Trans(a q) if prismatic."""
     joints = dict(tree.joints)
     for name, value in lock.items():
         if name not in joints:
@@ -805,13 +806,13 @@ def _locked(tree: UrdfTree, lock: Mapping[str, float]) -> UrdfTree:
         if joint.kind not in MOVING:
             fix = "; make it fixed in the file" if joint.kind in SEVERAL else ""
             raise tree.error(
-                joint.line, f"lock: joint {name!r} is {joint.kind}, which has no position to lock it at{fix}"
+                joint.line, f"lock: joint {name!r} is {joint.kind} and has no single position to lock{fix}"
             )
         if not math.isfinite(value):
             raise ModelError(f"{tree.path}: lock: {name} = {value} is not a finite number")
         if not joint.lower - 1e-9 <= value <= joint.upper + 1e-9:
             warnings.warn(
-                f"{tree.path}: joint {name} is locked at {value:g}, its limits are {joint.lower:g} and {joint.upper:g}",
+                f"{tree.path}: joint {name} is locked at {value:g}, beyond its limits {joint.lower:g}, {joint.upper:g}",
                 stacklevel=3,
             )
         if joint.kind == "prismatic":
@@ -822,19 +823,19 @@ def _locked(tree: UrdfTree, lock: Mapping[str, float]) -> UrdfTree:
 
 
 def _turn(axis: Array, angle: float) -> Array:
-    """Rotation about a unit axis, R = 1 + sin q [a]× + (1 − cos q) [a]×² (Rodrigues)."""
+    """Return the rotation about a unit axis, R = 1 + sin q [a]× + (1 − cos q) [a]×² (Rodrigues)."""
     x, y, z = axis
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross
 
 
 def _places(tree: UrdfTree) -> dict[str, _Place]:
-    """Where every link is; a parent comes before its children, of those that could come next the first of the file."""
+    """Return the place of every link; parents first, otherwise in the order of the file."""
     below: dict[str, list[tuple[int, UrdfJoint]]] = {name: [] for name in tree.links}
     for order, joint in enumerate(tree.joints.values()):
         below[joint.parent].append((order, joint))
     places = {tree.root: _Place(None, np.eye(3), np.zeros(3), 0, 0)}
-    # Fixed joints first: what is behind them belongs to a body that is there, and may carry joints early in the file.
+    # Fixed joints first: links behind them belong to an existing body and may carry joints early in the file.
     pending: list[tuple[bool, int, str]] = []
     joints = tree.joints
 
@@ -856,7 +857,7 @@ def _places(tree: UrdfTree) -> dict[str, _Place]:
 
 
 def _links(tree: UrdfTree, places: Mapping[str, _Place]) -> tuple[Link, ...]:
-    """The moving bodies, with all that is fixed to them; a floating or planar joint is still one, of this kind."""
+    """Return the moving bodies with everything fixed to them; a floating or planar joint is still a single link."""
     parts: dict[str | None, list[Inertia]] = {}
     for name, pose in places.items():
         inertia = tree.links[name].inertia
@@ -894,7 +895,7 @@ def _links(tree: UrdfTree, places: Mapping[str, _Place]) -> tuple[Link, ...]:
 
 
 def _shapes(tree: UrdfTree, places: Mapping[str, _Place]) -> dict[str | None, tuple[Shape, ...]]:
-    """What each moving body, and the world (None), looks like, with all that is fixed to it."""
+    """Return the shapes of each moving body and of the world (None), with everything fixed to it."""
     drawn: dict[str | None, tuple[Shape, ...]] = {}
     for name, pose in places.items():
         turn = quaternion(pose.R)
@@ -904,7 +905,7 @@ def _shapes(tree: UrdfTree, places: Mapping[str, _Place]) -> dict[str | None, tu
 
 
 def _hand(tree: UrdfTree, places: Mapping[str, _Place]) -> _Place:
-    """The controlled point: the link ``hand`` if it moves, else the tip of the deepest chain, the first of equals."""
+    """Return the controlled point: the link ``hand`` if it moves, otherwise the tip of the first deepest chain."""
     tip = max(tree.links, key=lambda name: (places[name].moving, places[name].joints))
     if HAND in places and places[HAND].moving > 0:
         tip = HAND
@@ -912,11 +913,9 @@ def _hand(tree: UrdfTree, places: Mapping[str, _Place]) -> _Place:
 
 
 def _warn(tree: UrdfTree, places: Mapping[str, _Place], links: tuple[Link, ...]) -> None:
-    """Refuse bodies that cannot be; warn of masses that are missing."""
+    """Refuse impossible bodies; warn about missing masses."""
     for link in links:
-        link.inertia.check(
-            f"{tree.path}:{tree.links[link.name].line}: link {link.name!r}, with all that is fixed to it"
-        )
+        link.inertia.check(f"{tree.path}:{tree.links[link.name].line}: link {link.name!r}, with everything fixed to it")
     loaded: set[str | None] = set()
     for link in reversed(links):
         if link.name in loaded or link.inertia.mass > 0.0 or link.inertia.tensor.any():
@@ -938,7 +937,7 @@ def _warn(tree: UrdfTree, places: Mapping[str, _Place], links: tuple[Link, ...])
             odd.append(part.name)
     if odd:
         warnings.warn(
-            f"{tree.path}: moments of inertia that no body can have, taken as they stand because the bodies that these "
-            f"links are fixed to can have the sum ({', '.join(odd)})",
+            f"{tree.path}: impossible moments of inertia, accepted because the sum with the links fixed to them is "
+            f"possible ({', '.join(odd)})",
             stacklevel=3,
         )

@@ -17,21 +17,21 @@ from dynsim.record.urdf_text import add_shapes, connect, numbers, xml_text
 def write_urdf(robot: Robot) -> str:
     """Write the bodies, joints and shapes of a robot as URDF text.
 
-    Frames, and the hand as one of them, are links without mass. Losses of joints are those of their bearings, without
-    those of motors.
+    Frames, and the hand as one of them, become links without mass. Losses of joints are bearing losses, without motor
+    losses.
 
     Numbers are written in full, so that reading the text back gives the same dynamics to rounding.
 
     Raises
     ------
     ModelError
-        A joint of a kind that URDF does not have, or a loss of one whose losses it cannot state.
+        If URDF has no such kind of joint, or cannot represent the losses of a joint.
     """
     links = _whole_joints(robot)
     root = ElementTree.Element("robot", name=robot.name)
     frames = [frame for frame in robot.frames if frame.name != HAND]
     taken = {link.name for link in robot.links} | {frame.name for frame in frames}
-    # The root link of the file that the robot came from is its first frame.
+    # The root link of the robot's original file is its first frame.
     rooted = next((f.name for f in frames if f.body is None and not f.p.any() and np.array_equal(f.R, np.eye(3))), None)
     base = rooted or next(name for name in (WORLD, "base_link", "root_link") if name not in taken)
     add_shapes(ElementTree.SubElement(root, "link", name=base), robot.fixed_shapes)
@@ -52,7 +52,7 @@ def write_urdf(robot: Robot) -> str:
         if link.kind != "floating":
             ElementTree.SubElement(joint, "axis", xyz=numbers(link.axis))
         if link.kind in MOVING.values() and not (endless and all(map(math.isinf, limits))):
-            # A continuous joint has no lower and upper.
+            # A continuous joint has no lower and upper limits.
             texts = [numbers(min(max(limit, -UNLIMITED), UNLIMITED)) for limit in limits]
             attributes = dict(zip(("lower", "upper", "effort", "velocity"), texts, strict=True))
             ElementTree.SubElement(joint, "limit", dict(list(attributes.items())[2:]) if endless else attributes)
@@ -78,7 +78,7 @@ def write_urdf(robot: Robot) -> str:
 
 
 def _whole_joints(robot: Robot) -> list[Link]:
-    """The links of the file: rows that make a floating or planar joint as one link of that kind."""
+    """Return the links of the file: rows that make a floating or planar joint as one link of that kind."""
     rows: dict[str, list[Link]] = {}
     for link in robot.links:
         rows.setdefault(link.joint_of_rows or link.joint, []).append(link)
@@ -95,6 +95,6 @@ def _whole_joint(name: str, rows: list[Link]) -> Link:
         same = [(row.joint, row.kind) for row in made] == [(row.joint, row.kind) for row in rows]
         if same and all(np.allclose(a.axis, b.axis, rtol=0.0, atol=1e-15) for a, b in zip(made, rows, strict=True)):
             if any(row.damping or row.friction for row in rows):
-                raise ModelError(f"{name}: has losses; URDF has no unit for those of a {kind} joint")
+                raise ModelError(f"{name}: has losses; URDF has no units for losses of a {kind} joint")
             return replace(whole, kind=kind)
     raise ModelError(f"{name}: is made of {', '.join(row.kind for row in rows)}; URDF has no such joint")
