@@ -91,9 +91,11 @@ def _edit(files: dict[str, Any], old: str, new: Content) -> str:
         name = next(iter(files))
         files[name] = new
         return name
-    name = next(name for name, text in files.items() if isinstance(text, str) and old in text)
-    files[name] = files[name].replace(old, str(new), 1)
-    return name
+    for name, text in files.items():
+        if isinstance(text, str) and old in text:
+            files[name] = text.replace(old, str(new), 1)
+            return name
+    raise ValueError(f"no file has the text {old!r}")
 
 
 @dataclass(frozen=True)
@@ -181,7 +183,7 @@ class Commands:
     def cases(self) -> Iterator[Case]:
         for name, arguments in self.rows:
             words = re.split(r"[\s/=]", arguments)
-            used = tuple(dict.fromkeys(place for file in self.files if (place := file.partition("/")[0]) in words))
+            used = tuple(dict.fromkeys(top for file in self.files if (top := file.partition("/")[0]) in words))
             yield Case(
                 name, (f"dynsim {shown(arguments)}",), self.files, f"dynsim {arguments}", used if self.named else ()
             )

@@ -97,8 +97,8 @@ def _texts(value: Any) -> list[str]:
 
 
 def _command(line: str) -> list[str]:
-    """Return the lines of a command on standard error, or else its last line of output, each with its exit code."""
-    output, errors = io.StringIO(), io.StringIO()
+    """Return the lines of a command on standard error, or else on standard output, each with its exit code."""
+    output, errors, code = io.StringIO(), io.StringIO(), 0
     with ExitStack() as inside, pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", shlex.split(line))
         patch.setattr(typer.main, "get_command", _get_command)
@@ -107,12 +107,14 @@ def _command(line: str) -> list[str]:
         # The command line prints warnings itself.
         inside.enter_context(warnings.catch_warnings())
         warnings.simplefilter("default")
-        with pytest.raises(SystemExit) as ended:
+        try:
             main()
-    code = ended.value.code or 0
-    lines = [text.rstrip() for text in errors.getvalue().splitlines() if text.strip()]
-    if not lines:
-        return [f"exit {code}: {text.strip()}" for text in output.getvalue().splitlines()[-1:]]
+        except SystemExit as ended:
+            code = int(ended.code or 0)
+        except Exception as error:
+            return [f"{FOREIGN} {type(error).__name__}: {error}"]
+    printed = errors.getvalue() if errors.getvalue().strip() else output.getvalue()
+    lines = [text.rstrip() for text in printed.splitlines() if text.strip()]
     # Continuation lines begin with a blank.
     messages: list[str] = []
     for text in lines:
