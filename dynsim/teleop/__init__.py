@@ -1,1 +1,1 @@
-"""Teleoperation: sessions of arm and snake, and the web server by which a pilot commands them."""
+"""Teleoperation: sessions of arms and snake robots, and the web server for a pilot."""

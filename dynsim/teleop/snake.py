@@ -1,4 +1,7 @@
-"""Teleoperation of a snake by head or gripper: target velocities, modes and gripper ([T] IV.C)."""
+"""Teleoperation sessions: a pilot commands a simulated arm or snake robot tick by tick ([T] IV.C for the snake).
+
+A session executes the commands of the pilot and writes a script that reproduces the run.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +34,7 @@ from dynsim.scenario import Scenario, build, require_scenario, scenario_from_res
 from dynsim.snake import ticks as ss
 from dynsim.snake.description import COORDINATES, FIXING, NO_REQUEST, SWITCHING, CommandBlock, Feedback
 
-# Interface and data types of a teleoperated simulation, tick by tick, with a script of commands that reproduces it.
+# Interface and data types of a teleoperated simulation.
 
 
 Array = NDArray[np.float64]
@@ -39,12 +42,18 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PilotAxis:
-    """One component of the velocities that a pilot commands.
+    """One component of the commanded velocity.
 
     Attributes
     ----------
-    name : ``x``, ``yaw``; group : what moves, ``hand``, ``head``, ``gripper`` or ``base``
-    limit : fastest rate, in ``unit``
+    name : str
+        Name of the component, such as ``x`` or ``yaw``.
+    group : str
+        Moving part: ``hand``, ``head``, ``gripper`` or ``base``.
+    unit : str
+        Unit of the velocity.
+    limit : float
+        Maximum velocity, in ``unit``.
     """
 
     name: str
@@ -59,9 +68,12 @@ class Command:
 
     Attributes
     ----------
-    velocity : of each axis [m/s, rad/s]
-    request : a mode to go to: its number, or one of :mod:`dynsim.snake.description`; ``NO_REQUEST``: none
-    closed : the gripper
+    velocity : tuple of float
+        Velocity of each axis [m/s, rad/s].
+    request : int
+        Requested mode: its number, or a constant of :mod:`dynsim.snake.description`; ``NO_REQUEST`` for none.
+    closed : bool
+        True to close the gripper.
     """
 
     velocity: tuple[float, ...]
@@ -71,14 +83,22 @@ class Command:
 
 @dataclass(frozen=True)
 class LiveFrame:
-    """What a pilot sees after a tick.
+    """State of the robot after a tick, for the display of the pilot.
 
     Attributes
     ----------
-    time : [s]; poses : (bodies, 7) position [m], quaternion w, x, y, z; hand : (3,) [m]
-    hindrance : why not all of what was commanded is done; empty where it is
-    extra : by the names of a frame of the page: wheels, gripper; ``mode`` of a snake
-    touching : what contact points do, by their names
+    time : float
+        Simulation time [s].
+    poses : array, shape (bodies, 7)
+        Positions [m] and quaternions (w, x, y, z) of the bodies.
+    hand : array, shape (3,)
+        Target position of the hand [m].
+    hindrance : str
+        Reason why the command is not fully executed; empty if it is.
+    extra : dict
+        Further entries of a page frame: wheels and gripper; ``mode`` of a snake robot.
+    touching : mapping of str to Touch
+        Contact states; the keys are names of contact points.
     """
 
     time: float
@@ -91,11 +111,16 @@ class LiveFrame:
 
 @dataclass(frozen=True)
 class SpeedLimits:
-    """Fastest rates that a pilot can command.
+    """Maximum velocities that a pilot can command.
 
     Attributes
     ----------
-    hand : of a hand or head [m/s]; turn : of a head or base [rad/s]; base : of a mobile base [m/s]
+    hand : float
+        Speed of a hand or head [m/s].
+    turn : float
+        Turning rate of a head or base [rad/s].
+    base : float
+        Speed of a mobile base [m/s].
     """
 
     hand: float = 0.1
@@ -104,13 +129,20 @@ class SpeedLimits:
 
 
 class Session(Protocol):
-    """A simulation that a pilot commands.
+    """Interface of a simulation that a pilot commands.
 
     Attributes
     ----------
-    axes : velocities of a command; modes : numbers that it may request; has_gripper : it may close
-    period : of a tick [s]
-    still : a moment of the same robot at its start, for a page to be made of
+    axes : tuple of PilotAxis
+        Components of the commanded velocity.
+    modes : tuple of int
+        Modes that may be requested.
+    has_gripper : bool
+        True if the robot has a gripper.
+    period : float
+        Duration of a tick [s].
+    still : Record
+        Short record of the robot at its start, from which the page is built.
     """
 
     axes: tuple[PilotAxis, ...]
@@ -121,35 +153,35 @@ class Session(Protocol):
 
     @property
     def ticks(self) -> int:
-        """Periods so far."""
+        """Number of ticks so far."""
 
     @property
     def time(self) -> float:
-        """Of the simulation [s]: with its ticks, or half a tick behind them."""
+        """Simulation time [s]: the time of the last tick, or half a tick earlier."""
 
     @property
     def finished(self) -> bool:
-        """The longest time is over, or the run has ended by itself."""
+        """True if the maximum duration has passed or the simulation has ended."""
 
     def tick(self, command: Command) -> None:
-        """Advance by one period; SimulationStopped where there is no going on."""
+        """Advance by one period. Raises SimulationStopped if the simulation cannot continue."""
 
     def frame(self) -> LiveFrame:
-        """What there is to see now."""
+        """Return the present state for the display."""
 
     def joints(self) -> Mapping[str, Array]:
-        """Angles of joints [rad], rates [rad/s] unless they are held from tick to tick, and which wheels are grounded
-        (since the tick before).
+        """Return joint angles [rad], rates [rad/s] and grounded wheel pairs (since the previous tick).
 
-        By the names of the record's signals, in the order of their labels.
+        Rates are omitted if they are constant from tick to tick. The keys are names of record signals, and the values
+        are in the order of their labels.
         """
 
     def record(self) -> Record:
-        """The record of all ticks so far, with a scenario that makes it again."""
+        """Return the record of all ticks so far, with a scenario that reproduces it."""
 
 
 def with_controller(scenario: Scenario, duration: float, controller: dict[str, Any]) -> Scenario:
-    """The scenario with another duration [s] and controller."""
+    """Return the scenario with another duration [s] and controller."""
     return scenario_from_resolved({**scenario.resolved, "duration_s": duration, "controller": controller})
 
 
@@ -159,9 +191,10 @@ REQUESTS = {SWITCHING: "switching", FIXING: "fixing"}
 
 
 class SnakeSession:
-    """See :class:`dynsim.teleop.snake.Session`; ``longest`` is the time that it may take [s].
+    """Session of a kinematic snake robot; see :class:`dynsim.teleop.snake.Session`.
 
-    It is the :class:`~dynsim.snake.description.CommandSource` of its own run.
+    The session is the :class:`~dynsim.snake.description.CommandSource` of its run. ``longest`` is the maximum
+    duration [s].
     """
 
     has_gripper = True
@@ -183,7 +216,7 @@ class SnakeSession:
     _run: SnakeControl
 
     def _begin(self, scenario: Scenario) -> None:
-        """The run, its kernels loaded, and a moment of it."""
+        """Prepare the run, load its kernels, and record its start."""
         run = self._kinematic = prepare(scenario, self)
         run.load_kernels()
         self._run = run
@@ -193,28 +226,28 @@ class SnakeSession:
 
     @property
     def ticks(self) -> int:
-        """Control periods so far."""
+        """Number of control periods so far."""
         return self._run.tick
 
     @property
     def time(self) -> float:
-        """[s]."""
+        """Simulation time [s]."""
         return self._run.time
 
     @property
     def finished(self) -> bool:
-        """The longest time is over."""
+        """True if the maximum duration has passed."""
         return self.ticks >= self._run.ticks
 
     def read(self, first: int, count: int, period: float, feedback: Feedback) -> CommandBlock:
-        """The command of the moment, for one period."""
+        """Return the present command for one period."""
         command = self._command
-        # As a script has it: no negative zeros.
+        # Avoid negative zeros, as in a script.
         velocity = np.zeros((1, 6)) + np.array(command.velocity)
         return CommandBlock(velocity, np.array([command.request]), np.array([int(command.closed)]))
 
     def tick(self, command: Command) -> None:
-        """One control period."""
+        """Advance by one control period."""
         before, self._command = self._command, command
         entry: dict[str, Any] = {}
         if command.velocity != before.velocity:
@@ -226,7 +259,7 @@ class SnakeSession:
         if entry:
             self._commands.append({"at_s": self.ticks * self.period, **entry})
         if self.ticks == 0:
-            # What was known when the run was prepared is not what is commanded now.
+            # Replace the commands that were read when the run was prepared.
             self._run.read_commands(waiting=False)
         self._advance()
 
@@ -234,7 +267,7 @@ class SnakeSession:
         self._kinematic.advance()
 
     def frame(self) -> LiveFrame:
-        """The posture now."""
+        """Return the present state for the display."""
         run, state = self._run, self._run.state
         row = int(state.counts[ss.MODE])
         return LiveFrame(
@@ -252,7 +285,7 @@ class SnakeSession:
         )
 
     def _positions(self) -> Mapping[str, Mapping[str, float]]:
-        """Positions of the joints of the scene, by signal and label."""
+        """Return the joint positions of the scene, by signal and label."""
         run, state = self._run, self._run.state
         objects = (
             {}
@@ -266,7 +299,7 @@ class SnakeSession:
         }
 
     def _grip(self) -> dict[str, str]:
-        """State of the gripper in words, where there are objects that it can hold."""
+        """Return a description of the gripper state if there are objects to grip."""
         objects = self._kinematic.objects
         return {} if objects is None else {"grip": objects.state_in_words(self.ticks)}
 
@@ -274,20 +307,20 @@ class SnakeSession:
         return {}
 
     def _hindrance(self) -> str:
-        """What the target waits for."""
+        """Return the reason why the target waits."""
         run = self._run
         if run.recovering:
             return OBSTACLES[-1]
         return OBSTACLES[int(run.state.counts[ss.STILL_FOR]) - 1] if run.blocked else ""
 
     def joints(self) -> Mapping[str, Array]:
-        """Joints and wheels; rates are held from period to period, so that they are differences of these."""
+        """Return joints and wheels; rates are omitted because they are constant in a period (differences of angles)."""
         run, state = self._run, self._run.state
         grounded = run.controller.law.grounded[int(state.counts[ss.MODE])]
         return {"phi": state.phi.copy(), "rho": state.rho.copy(), "grounded": grounded}
 
     def record(self) -> Record:
-        """The record of all ticks so far; its scenario is the script."""
+        """Return the record of all ticks so far; its scenario contains the script of commands."""
         duration = max(self.ticks, 1) * self.period
         script = with_controller(self._scenario, duration, {**self._controller, "commands": self._commands})
         return self._record(script)
@@ -297,7 +330,7 @@ class SnakeSession:
 
 
 class DynamicSnakeSession(SnakeSession):
-    """The same of a snake with servos and wheels that can slip: its simulation asks the session at its ticks."""
+    """Session of a dynamic snake robot, with servos and slipping wheels; the simulation reads the commands."""
 
     def _begin(self, scenario: Scenario) -> None:
         with kernels_logged(log):
@@ -317,7 +350,7 @@ class DynamicSnakeSession(SnakeSession):
 
     @property
     def time(self) -> float:
-        """Half a tick behind the last one [s]."""
+        """Simulation time, half a tick before the time of the last tick [s]."""
         return self._simulation.time
 
     def _advance(self) -> None:
@@ -337,7 +370,7 @@ class DynamicSnakeSession(SnakeSession):
     def _record(self, script: Scenario) -> Record:
         simulation = self._simulation
         before, longest = simulation.snapshot(), self._run.ticks
-        # As a run that ends here: the command at this tick is yet to come.
+        # Record as a run that ends at this tick, whose command is not known yet.
         self._run.ticks = self.ticks
         simulation.end_samples(self.ticks * self.period)
         simulation.advance(self.ticks * self.period)
@@ -348,18 +381,19 @@ class DynamicSnakeSession(SnakeSession):
         return record
 
 
-# Teleoperation of an arm: a pilot's velocities of hand and mobile base become references at every tick.
+# Teleoperation of an arm: the commanded velocities of hand and mobile base become references at each tick.
 
 
 _NAMES = ("x", "y", "z", "ahead", "turn")
-# Velocity of the trial ticks that load the kernels [m/s].
+# Velocity in the trial ticks that load the kernels [m/s].
 _SMALL = 1e-6
 
 
 class ArmSession:
-    """See :class:`dynsim.teleop.snake.Session`; ``longest`` is the time that it may take [s].
+    """Session of an arm; see :class:`dynsim.teleop.snake.Session`.
 
-    It is the :class:`~dynsim.compile.references.teleop.VelocitySource` of its own simulation.
+    The session is the :class:`~dynsim.compile.references.teleop.VelocitySource` of its simulation. ``longest`` is the
+    maximum duration [s].
     """
 
     modes: tuple[int, ...] = ()
@@ -368,15 +402,15 @@ class ArmSession:
     def __init__(self, scenario: Scenario, limits: SpeedLimits, longest: float) -> None:
         controller = scenario.resolved["controller"]
         if "operator" not in type(scenario.controller).model_fields:
-            raise ScenarioError(f"controller {scenario.controller.type!r} follows no operator; joint_pd does")
-        operator = controller.get("operator") or _followers(scenario, controller)
+            raise ScenarioError(f"controller {scenario.controller.type!r} cannot follow an operator; use joint_pd")
+        operator = controller.get("operator") or _default_operator(scenario, controller)
         self._controller = {key: value for key, value in controller.items() if key not in PLANNED}
         self._operator = {**operator, "commands": []}
         self._scenario, self._longest = scenario, longest
         self._velocity, self._last = np.zeros(VELOCITIES), np.zeros(VELOCITIES)
         self._velocity[HAND] = _SMALL
         begun = with_controller(scenario, longest, {**self._controller, "operator": self._operator})
-        # Two ticks of another simulation, by which the kernels are loaded, or compiled.
+        # Two ticks of another simulation load or compile the kernels.
         with kernels_logged(log):
             trial = Simulation(begun, duration=math.inf, operator=self)
             trial.advance(2.0 / trial.operator.rate if trial.operator is not None else 0.0)
@@ -395,7 +429,7 @@ class ArmSession:
             self._parts += list(range(VELOCITIES))[BASE]
         if not self._parts:
             raise ScenarioError(
-                "there is nothing to drive: name joints that follow the hand, controller.operator.joints "
+                "no joint to drive; list joints in controller.operator.joints "
                 f"(joints with a motor: {', '.join(sorted(driven)) or 'none'})"
             )
         self.axes = tuple(
@@ -405,20 +439,20 @@ class ArmSession:
 
     @property
     def time(self) -> float:
-        """Half a tick behind the last one, whose command is yet to come [s]."""
+        """Simulation time, half a tick before the time of the next command [s]."""
         return self.simulation.time
 
     @property
     def finished(self) -> bool:
-        """The longest time is over, or the run ended by itself."""
+        """True if the maximum duration has passed or the simulation has ended."""
         return self.simulation.finished or self.ticks >= self._longest * self._rate
 
     def read(self, tick: int) -> Array:
-        """The command of the moment, whatever tick it is."""
+        """Return the present command; ``tick`` is ignored."""
         return self._velocity
 
     def tick(self, command: Command) -> None:
-        """Up to just before the next tick, at which the next command is read."""
+        """Advance to half a period before the next tick, which reads the next command."""
         velocity = np.zeros(VELOCITIES)
         velocity[self._parts] = command.velocity
         velocity += 0.0
@@ -433,7 +467,7 @@ class ArmSession:
         self.simulation.advance((self.ticks - 0.5) / self._rate)
 
     def frame(self) -> LiveFrame:
-        """The posture now."""
+        """Return the present state for the display."""
         simulation, scene = self.simulation, self.still.scene
         robot, operator = simulation.robot, simulation.operator
         assert isinstance(operator, Operator)
@@ -453,30 +487,33 @@ class ArmSession:
         )
 
     def joints(self) -> Mapping[str, Array]:
-        """Of all rows of the tree."""
+        """Return positions and rates of all joints of the model."""
         state = self.simulation.state
         return {"q": state.q, "v": state.v}
 
     def record(self) -> Record:
-        """The record of all ticks so far; its scenario is the script."""
+        """Return the record of all ticks so far; its scenario contains the script of commands."""
         before = self.simulation.snapshot()
         if not self.simulation.finished:
             self.simulation.end_samples(self.ticks * self.period)
             self.simulation.advance(self.ticks * self.period)
-        # As ticks are counted: a step that ends a rounding before one would not be that of a run which ends there.
+        # Compute the end from the number of ticks: a rounding error would change the last step of the repeated run.
         duration = max(self.ticks, 1) * self.period
         operator = {**self._operator, "commands": self._commands}
         record = self.simulation.record(
             with_controller(self._scenario, duration, {**self._controller, "operator": operator})
         )
-        # The command at this tick is yet to come.
+        # The command at this tick is not known yet.
         self.simulation.restore(before)
         record.complete = "stopped" not in record.provenance
         return record
 
 
-def _followers(scenario: Scenario, controller: dict[str, Any]) -> dict[str, Any]:
-    """Joints that follow the hand: those of its path, else all that follow a position, unless contacts hold them."""
+def _default_operator(scenario: Scenario, controller: dict[str, Any]) -> dict[str, Any]:
+    """Return an operator with the joints of the hand path, otherwise with all position-controlled joints.
+
+    The result is empty if the arm has bilateral contacts.
+    """
     if (hand := controller.get("hand")) is not None:
         return {key: hand[key] for key in ("joints", "braces", "tolerance_m") if key in hand}
     robot, touching = build.robot_and_contacts(scenario)
@@ -486,26 +523,29 @@ def _followers(scenario: Scenario, controller: dict[str, Any]) -> dict[str, Any]
     return {"joints": [m.joint for m in robot.motors if not isinstance(m, TorqueSource) and m.joint not in wheels]}
 
 
-# Choice of the teleoperation session for a scenario: arm or snake.
+# Choice of the session for a scenario.
 
 
 def begin(scenario: Scenario, *, limits: SpeedLimits | None = None, longest: float = 600.0) -> Session:
-    """A session of a scenario, with its plant, surfaces, contacts and loads, without the motions of its references.
+    """Start a session of a scenario with its plant, surfaces, contacts and loads; a pilot replaces its references.
 
     Parameters
     ----------
-    limits : fastest rates
-    longest : time that the session may take [s]
+    scenario : Scenario
+    limits : SpeedLimits, optional
+        Maximum velocities.
+    longest : float, optional
+        Maximum duration [s].
 
     Raises
     ------
     ScenarioError
-        The scenario has no controller that a pilot could take the place of.
+        If the scenario has no controller whose references a pilot can command.
     """
     require_scenario(scenario)
     with named(scenario):
         if scenario.controller is None:
-            raise ScenarioError("it has no controller, so there is nothing to drive: a pilot gives its references")
+            raise ScenarioError("a pilot requires a controller; add one, such as joint_pd")
         session: type[SnakeSession] | type[ArmSession] = ArmSession
         if scenario.controller.type == "task_space":
             session = SnakeSession if scenario.engine == "kinematic" else DynamicSnakeSession

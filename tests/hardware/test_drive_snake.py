@@ -18,7 +18,7 @@ from dynsim.hardware.servo_map import ServoMap
 from dynsim.record import Record
 from dynsim.snake.description import FIXING, SWITCHING
 from dynsim.teleop.snake import Command, begin
-from dynsim.teleop.web.follower import NOT_LIFTED, NOT_YET, REGULAR, Columns, PipeFeed, ServoFollower
+from dynsim.teleop.web.follower import NOT_LIFTED, NOT_STARTED, REGULAR, Columns, PipeFeed, ServoFollower
 
 from .conftest import Rig, Run, check_goals_within_limits
 from .test_lifting import BLEND, CLEARANCE, JOINTS, Oracle, settled, snake_map, with_lifts
@@ -50,7 +50,7 @@ class SimulatedSnake:
         self.requests, self.ticks, self.stall = requests, ticks, stall
         self.refused: CheckRefused | None = None
         reader, writer = get_context("spawn").Pipe(duplex=False)
-        self.heard = [NOT_YET]
+        self.heard = [NOT_STARTED]
         self.follower = ServoFollower(self.session, servo_map, writer, self.heard)
         self._feed = PipeFeed(reader, self.heard, servo_map)
         self.clock: Clock | None = None
@@ -88,7 +88,7 @@ class SimulatedSnake:
         try:
             if self.session.ticks < self.ticks:
                 self.session.tick(command(self.session.ticks, self.requests))
-                self.follower.hear()
+                self.follower.after_tick()
                 return
             self.follower.finish()
             self.follower.end(REGULAR)
@@ -246,7 +246,7 @@ def test_it_is_known_when_modes_may_change(tick: int, steady: bool) -> None:
     feed = SimulatedSnake(servo_map)
     for k in range(tick):
         feed.session.tick(command(k, {150: 4}))
-        feed.follower.hear()
+        feed.follower.after_tick()
         feed._feed.take(2)
     assert feed.follower.steady is steady
 

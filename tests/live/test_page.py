@@ -166,7 +166,7 @@ def test_the_page_says_what_is_in_the_way(teleop: Callable[..., Teleop], pilot: 
     user.space()
     user.until("document.querySelector('.state.hindered')?.textContent.includes('joint_10 would speed up')", user.space)
     # The page is too busy to say a word.
-    user.js("dynsim.drive.say = (said) => { dynsim.drive.unsaid = said; }")
+    user.js("dynsim.drive.transmit = (said) => { dynsim.drive.unsaid = said; }")
     user.until("document.querySelector('.state.silent')?.textContent.includes('let the key go once')")
     assert drive.interrupt() == 0
     user.until("document.querySelector('.state.over')?.textContent.includes('interrupted')")
@@ -178,12 +178,12 @@ def test_focus_that_is_lost_lets_everything_go(teleop: Callable[..., Teleop], pi
     keyboard = user.page.keyboard
     user.space()
     keyboard.down("ArrowUp")
-    user.until("dynsim.drive.last.state === 'driving' && dynsim.drive.wish.axes[3] === 1", user.space)
+    user.until("dynsim.drive.last.state === 'driving' && dynsim.drive.command.axes[3] === 1", user.space)
     begun = user.js("dynsim.drive.last.poses[0]")
     user.until(f"dynsim.drive.last.poses[0] > {begun} + 0.02", user.space)
     user.js("window.dispatchEvent(new Event('blur'))")
     # Keys are still down: they count only when they are pressed anew.
-    user.until("dynsim.drive.wish.held === false")
+    user.until("dynsim.drive.command.held === false")
     user.rests()
     # What is drawn is what the simulation has.
     drawn = user.js("Object.values(dynsim.state().records[0].bodies).flatMap((body) => [...body.p, ...body.q])")
@@ -233,10 +233,10 @@ def test_a_phone_has_all_axes_beside_the_scene(teleop: Callable[..., Teleop], pi
 
     turn()
     beta = user.js("dynsim.drive.names.indexOf('beta')")
-    asked = f"dynsim.drive.wish.held && dynsim.drive.wish.axes[{beta}] > 0.8"
+    asked = f"dynsim.drive.command.held && dynsim.drive.command.axes[{beta}] > 0.8"
     user.until(f"{asked} && dynsim.drive.last.state === 'driving'", anew)
     finger("touchEnd")
-    user.until("dynsim.drive.wish.held === false")
+    user.until("dynsim.drive.command.held === false")
     assert drive.interrupt() == 0
 
 
@@ -251,7 +251,7 @@ def test_a_watcher_is_told_nothing_that_the_pilot_is_to_do(
     watcher.evaluate("dynsim.ready")
     user.space()
     user.until("dynsim.drive.last.state === 'driving'", user.space)
-    user.js("dynsim.drive.say = () => {}")
+    user.js("dynsim.drive.transmit = () => {}")
     end = time.monotonic() + PATIENCE_S
     while watcher.evaluate("dynsim.drive?.last?.state") != "silent":
         assert time.monotonic() < end

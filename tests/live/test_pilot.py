@@ -10,7 +10,7 @@ import pytest
 from dynsim.snake.description import SWITCHING
 from dynsim.teleop.snake import PilotAxis
 from dynsim.teleop.web.live import RealTimeClock
-from dynsim.teleop.web.pilot import DRIVING, NOBODY, RELEASED, SILENCE, SILENT, Deadman, PilotCommand, Refused, parse
+from dynsim.teleop.web.pilot import DRIVING, NO_PILOT, RELEASED, SILENCE, SILENT, Deadman, PilotCommand, Refused, parse
 
 AXES = (PilotAxis("x", "hand", "m/s", 0.1), PilotAxis("turn", "base", "rad/s", 0.5))
 
@@ -74,13 +74,13 @@ def test_whole_numbers_beyond_all_bounds_are_full_speed() -> None:
 def test_deadman_needs_the_key_heard_released_first() -> None:
     clock = Clock()
     deadman = Deadman(AXES, clock)
-    assert deadman.command()[1] == NOBODY
-    deadman.hear(PilotCommand(1, (1.0, 1.0), held=True))
+    assert deadman.command()[1] == NO_PILOT
+    deadman.receive(PilotCommand(1, (1.0, 1.0), held=True))
     assert deadman.command()[0].velocity == (0.0, 0.0)
-    deadman.hear(PilotCommand(2, (1.0, 1.0), held=False))
+    deadman.receive(PilotCommand(2, (1.0, 1.0), held=False))
     command, state, count = deadman.command()
     assert (command.velocity, state, count) == ((0.0, 0.0), RELEASED, 2)
-    deadman.hear(PilotCommand(3, (0.5, -1.0), held=True))
+    deadman.receive(PilotCommand(3, (0.5, -1.0), held=True))
     command, state, count = deadman.command()
     assert (command.velocity, state, count) == ((0.05, -0.5), DRIVING, 3)
 
@@ -88,50 +88,50 @@ def test_deadman_needs_the_key_heard_released_first() -> None:
 def test_deadman_stops_in_silence_until_the_key_is_pressed_anew() -> None:
     clock = Clock()
     deadman = Deadman(AXES, clock)
-    deadman.hear(PilotCommand(1, (0.0, 0.0), held=False))
-    deadman.hear(PilotCommand(2, (1.0, 0.0), held=True, closed=True))
+    deadman.receive(PilotCommand(1, (0.0, 0.0), held=False))
+    deadman.receive(PilotCommand(2, (1.0, 0.0), held=True, closed=True))
     clock.now = SILENCE
     assert deadman.command()[1] == DRIVING
     clock.now = SILENCE + 1e-3
     command, state, _ = deadman.command()
     assert (command.velocity, state) == ((0.0, 0.0), SILENT)
     assert command.closed, "a gripper does not open by itself"
-    deadman.hear(PilotCommand(3, (1.0, 0.0), held=True))
+    deadman.receive(PilotCommand(3, (1.0, 0.0), held=True))
     assert deadman.command()[0].velocity == (0.0, 0.0), "nothing goes on by itself"
-    deadman.hear(PilotCommand(4, (1.0, 0.0), held=False))
-    deadman.hear(PilotCommand(5, (1.0, 0.0), held=True))
+    deadman.receive(PilotCommand(4, (1.0, 0.0), held=False))
+    deadman.receive(PilotCommand(5, (1.0, 0.0), held=True))
     assert deadman.command()[0].velocity == (0.1, 0.0)
 
 
 def test_silence_that_no_tick_has_seen_counts() -> None:
     clock = Clock()
     deadman = Deadman(AXES, clock)
-    deadman.hear(PilotCommand(1, (0.0, 0.0), held=False))
-    deadman.hear(PilotCommand(2, (1.0, 0.0), held=True))
+    deadman.receive(PilotCommand(1, (0.0, 0.0), held=False))
+    deadman.receive(PilotCommand(2, (1.0, 0.0), held=True))
     clock.now = 1.0
-    deadman.hear(PilotCommand(3, (1.0, 0.0), held=True))
+    deadman.receive(PilotCommand(3, (1.0, 0.0), held=True))
     assert deadman.command()[0].velocity == (0.0, 0.0)
 
 
 def test_deadman_drops_words_that_were_overtaken_and_takes_a_mode_once() -> None:
     deadman = Deadman(AXES, Clock())
-    deadman.hear(PilotCommand(1, (0.0, 0.0), held=False))
-    deadman.hear(PilotCommand(5, (1.0, 0.0), held=True, request=3))
-    deadman.hear(PilotCommand(4, (-1.0, 0.0), held=True))
+    deadman.receive(PilotCommand(1, (0.0, 0.0), held=False))
+    deadman.receive(PilotCommand(5, (1.0, 0.0), held=True, request=3))
+    deadman.receive(PilotCommand(4, (-1.0, 0.0), held=True))
     assert deadman.command()[0].velocity == (0.1, 0.0)
-    deadman.hear(PilotCommand(6, (0.0, 0.0), held=True, request=3))
+    deadman.receive(PilotCommand(6, (0.0, 0.0), held=True, request=3))
     assert [deadman.command()[0].request for _ in range(2)] == [3, 0]
-    deadman.hear(PilotCommand(7, (0.0, 0.0), held=False, request=2))
+    deadman.receive(PilotCommand(7, (0.0, 0.0), held=False, request=2))
     assert deadman.command()[0].request == 0, "a mode moves the robot: it wants the key too"
 
 
 def test_a_pilot_who_left_leaves_nothing_to_the_next() -> None:
     deadman = Deadman(AXES, Clock())
-    deadman.hear(PilotCommand(1, (0.0, 0.0), held=False))
-    deadman.hear(PilotCommand(900, (1.0, 0.0), held=True))
-    deadman.forget()
-    assert deadman.command()[:2] == (deadman.command()[0], NOBODY)
-    deadman.hear(PilotCommand(1, (1.0, 0.0), held=True))
+    deadman.receive(PilotCommand(1, (0.0, 0.0), held=False))
+    deadman.receive(PilotCommand(900, (1.0, 0.0), held=True))
+    deadman.reset()
+    assert deadman.command()[:2] == (deadman.command()[0], NO_PILOT)
+    deadman.receive(PilotCommand(1, (1.0, 0.0), held=True))
     assert deadman.command()[0].velocity == (0.0, 0.0)
 
 

@@ -127,7 +127,7 @@ SLACK = 0.1
 """Lead of the simulation over the servos in addition to the path needed for a stop [s]."""
 SILENCE = 5.0
 """Time without a posture after which the drive ends [s]; the robot is at rest for most of this time."""
-MOST_BROKEN = 4
+MAX_VIOLATIONS = 4
 """Maximum number of violations listed in the message of a fault."""
 REST = 1e-9
 """Remaining path time below which the path is finished [s]."""
@@ -312,8 +312,8 @@ class DrivenCourse:
                 text = f"time jumps from {self._path.end:g} to {sample.time:g} s (step {self._motion.step:g} s)"
                 raise Stopped(Fault(Cause.SIMULATION, text))
             if broken := self._path.append(sample, keep=self.time):
-                text = "; ".join(broken[:MOST_BROKEN])
-                more = f"; and {len(broken) - MOST_BROKEN} more" if len(broken) > MOST_BROKEN else ""
+                text = "; ".join(broken[:MAX_VIOLATIONS])
+                more = f"; and {len(broken) - MAX_VIOLATIONS} more" if len(broken) > MAX_VIOLATIONS else ""
                 raise Stopped(Fault(Cause.LIMIT, f"the driven motion exceeds limits of the servo map: {text}{more}"))
         if self._feed.fault:
             raise Stopped(Fault(Cause.SIMULATION, self._feed.fault))

@@ -1,4 +1,4 @@
 """Web teleoperation: a server on this machine, a pilot in a browser, and spectators.
 
-browser ─ PilotCommand at 50 Hz ─▶ Server ─▶ Deadman ─ a Command at each tick ─▶ Session ─ frames ─▶ Server ─▶ browsers
+browser ─ PilotCommand at 50 Hz ─▶ Server ─▶ Deadman ─ Command at each tick ─▶ Session ─ frames ─▶ Server ─▶ browsers
 """

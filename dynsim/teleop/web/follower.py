@@ -1,11 +1,11 @@
-"""Process of a simulation that is driven by a pilot and followed by servos.
+"""Simulation that is driven by a pilot and followed by servos, in a separate process, and its connection to the servos.
 
-    loop of the servos                                 this process
-    ------------------                                 ------------
-    writes how far its time is, shared     ──▶         ServoFollower.ready: the next tick may be simulated
-    reads a pipe without waiting           ◀──         ServoFollower.hear: writes a posture for every tick
+    process of the servos                              process of the simulation
+    ---------------------                              -------------------------
+    writes its time to shared memory       ──▶         ServoFollower.ready: the next tick may be simulated
+    reads a pipe without waiting           ◀──         ServoFollower.after_tick: writes a posture for each tick
 
-The loop of the servos has an interpreter of its own, so compilation, browsers or disks in this process do not block it.
+The control loop of the servos has a separate interpreter, so compilation, browsers or disks cannot block it.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ from dynsim.system import interruption
 from dynsim.teleop.snake import Array, Session, SpeedLimits, begin
 from dynsim.teleop.web.live import DriveReport, LiveDrive
 
-NOT_YET = -math.inf
-"""Time that the servos report before they have reached the initial posture."""
+NOT_STARTED = -math.inf
+"""Time reported by the servos before they have reached the initial posture."""
 NICENESS = 5
 REGULAR, BROKEN, NOT_LIFTED = 0.0, 1.0, 2.0
-"""Codes of the end of a drive, sent after a time that is not a number."""
+"""Codes of the end of a drive, sent after a time of NaN."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class DriveRequest:
 
 @dataclass(frozen=True)
 class Ready:
-    """What the servos must know before they move; ``step`` is that of the samples [s]."""
+    """Data for the servos before they move; ``step`` is the time between samples [s]."""
 
     address: str
     still: Record
@@ -72,7 +72,7 @@ class Ready:
 
 @dataclass(frozen=True)
 class Done:
-    """How the drive went; ``saved`` is false where there was nothing to save, ``failure`` says why it was not."""
+    """Result of a drive; ``driven`` is its duration [s], ``failure`` an error of the simulation or of saving."""
 
     report: DriveReport
     driven: float
@@ -81,39 +81,41 @@ class Done:
 
 
 def frame_of(servos: int, lifting: int) -> struct.Struct:
-    """A sample in the pipe: time, angles, rates, and what lifting adds to both at the joints that lift wheels."""
+    """Return the format of a sample in the pipe: time, angles, rates, and the lifting angles and rates."""
     return struct.Struct(f"={1 + 2 * (servos + lifting)}d")
 
 
 def lifting_columns(servo_map: ServoMap) -> list[int]:
-    """Joints that lift wheel pairs, by their place in the map."""
+    """Return the indices in the map of the joints that lift wheel pairs."""
     return [servo_map.joints.index(joint) for joint in servo_map.lifts.joints] if servo_map.lifts else []
 
 
 class Columns:
-    """Which of a simulation's joints the servos of a map follow.
+    """Joints of a simulation that the servos of a map follow.
 
     Raises
     ------
     CheckRefused
-        There is no such signal or column, a live drive does not have it, or the robot lifts wheels and the map does
-        not say how.
+        If a signal or column does not exist or is not available in a live drive, or the robot lifts wheels but the map
+        has no ``lifts``.
     """
 
     def __init__(self, session: Session, servo_map: ServoMap) -> None:
         still, known = session.still, session.joints()
         if servo_map.lifts is None and LIFTED in known:
             raise CheckRefused(
-                "the robot lifts wheel pairs and the servo map does not say how: without it they would drag over the "
-                "floor. Add an entry `lifts` to the map"
+                "the robot lifts wheel pairs but the servo map has no 'lifts', so they would drag over the floor; "
+                "add an entry 'lifts' to the map"
             )
         self._lifts = servo_map.lifts
         if self._lifts is not None and self._lifts.signal not in known:
-            raise CheckRefused(f"lifts.signal: a live drive has no {self._lifts.signal!r}; it has {', '.join(known)}")
+            raise CheckRefused(
+                f"lifts.signal: {self._lifts.signal!r} is not available in a live drive; use {', '.join(known)}"
+            )
         self._session = session
         self._position = np.array([servo.hold_at or 0.0 for servo in servo_map.servos])
         self._velocity = np.zeros(len(self._position))
-        # Index of the servo, where its angle is, and where its rate; held rates are differences of the angles.
+        # Index of the servo, signal and column of its angle and of its rate; None for held rates.
         self._sources: list[tuple[int, tuple[str, int], tuple[str, int] | None]] = []
         for index, servo in enumerate(servo_map.servos):
             if servo.hold_at is not None:
@@ -126,14 +128,14 @@ class Columns:
                 column_of(still, name, servo, unit)
             if missing := [name for name in signals if name not in known]:
                 raise CheckRefused(
-                    f"{servo.joint} follows the signal {missing[0]!r}, which a live drive does not have; it has "
-                    f"{', '.join(known)}. Rates of a sampled controller are `rates: held`"
+                    f"{servo.joint}: signal {missing[0]!r} is not available in a live drive (signals: "
+                    f"{', '.join(known)}); for a sampled controller use 'rates: held'"
                 )
             position, *rates = ((name, still.labels[name].index(servo.label)) for name in signals)
             self._sources.append((index, position, rates[0] if rates else None))
 
     def now(self) -> tuple[Array, Array]:
-        """Angles [rad] and rates [rad/s] in the order of the map, shape (N,)."""
+        """Return the present angles [rad] and rates [rad/s] in the order of the map, shape (N,)."""
         joints = self._session.joints()
         for index, (signal, column), rates in self._sources:
             self._position[index] = joints[signal][column]
@@ -142,12 +144,12 @@ class Columns:
         return self._position, self._velocity
 
     def sample(self) -> Sample:
-        """The same, at the time of the simulation."""
+        """Return the present angles and rates as a sample."""
         position, velocity = self.now()
         return Sample(self._session.time, position.copy(), velocity.copy())
 
     def base(self, yaw: tuple[str, list[int]]) -> tuple[Array, Array]:
-        """Yaw angles of the base part, from columns of a signal [rad], and which wheel pairs are on the ground."""
+        """Return the yaw angles of the base part [rad], from columns of a signal, and the grounded wheel pairs."""
         assert self._lifts is not None
         joints = self._session.joints()
         signal, columns = yaw
@@ -155,14 +157,18 @@ class Columns:
 
 
 class ServoFollower:
-    """A :class:`~dynsim.teleop.web.live.Follower` behind a pipe.
+    """A :class:`~dynsim.teleop.web.live.Follower` that sends postures to the process of the servos.
 
     Parameters
     ----------
-    session : the simulation
-    servo_map : of the servos
-    samples : the pipe
-    heard : shared memory with the time of the servos [s]
+    session : Session
+        Simulation.
+    servo_map : ServoMap
+        Map of the servos.
+    samples : Connection
+        Pipe for the postures.
+    servo_time : array
+        Shared memory with the time of the servos [s].
 
     Raises
     ------
@@ -170,12 +176,12 @@ class ServoFollower:
         See :class:`Columns`.
     """
 
-    def __init__(self, session: Session, servo_map: ServoMap, samples: Connection, heard: Any) -> None:
+    def __init__(self, session: Session, servo_map: ServoMap, samples: Connection, servo_time: Any) -> None:
         self._session, self._columns = session, Columns(session, servo_map)
         self.lookahead = LiftLookahead(session.still, servo_map, session.period) if servo_map.lifts else None
-        # By how much the simulation may be ahead of the servos [s].
+        # Time by which the simulation may be ahead of the servos [s].
         self._ahead = lead(servo_map) + (self.lookahead.delay if self.lookahead is not None else 0.0)
-        self._samples, self._heard, self._lifting = samples, heard, lifting_columns(servo_map)
+        self._samples, self._servo_time, self._lifting = samples, servo_time, lifting_columns(servo_map)
         self.first = self._columns.sample()
         self._frame = frame_of(len(self.first.position), len(self._lifting))
         if self.lookahead is not None:
@@ -183,67 +189,69 @@ class ServoFollower:
 
     @property
     def begun(self) -> bool:
-        return self._heard[0] > NOT_YET
+        return self._servo_time[0] > NOT_STARTED
 
     @property
     def ready(self) -> bool:
-        return (self._session.ticks + 1) * self._session.period <= self._heard[0] + self._ahead
+        return (self._session.ticks + 1) * self._session.period <= self._servo_time[0] + self._ahead
 
     @property
     def steady(self) -> bool:
         return self.lookahead is None or self.lookahead.steady(self._session.time)
 
-    def hear(self) -> None:
+    def after_tick(self) -> None:
         sample, lookahead = self._columns.sample(), self.lookahead
         for whole in [sample] if lookahead is None else lookahead.add(sample, *self._columns.base(lookahead.yaw)):
-            self._tell(whole)
+            self._send(whole)
 
     def finish(self) -> None:
-        """There was no tick that is not to be followed: what is held back goes on."""
+        """Send the pending samples after the last tick."""
         for sample in self.lookahead.remaining() if self.lookahead is not None else []:
-            self._tell(sample)
+            self._send(sample)
 
     def end(self, how: float) -> None:
-        """There are no more samples."""
+        """Send the code of the end of the drive, and close the pipe."""
         self._write(math.nan, how, *[0.0] * (self._frame.size // 8 - 2))
         self._samples.close()
 
-    def _tell(self, sample: Sample) -> None:
+    def _send(self, sample: Sample) -> None:
         added: list[float] = []
         for values in (sample.lift, sample.lift_rate) if self._lifting else ():
             added += np.asarray(values)[self._lifting].tolist()
         self._write(sample.time, *sample.position, *sample.velocity, *added)
 
     def _write(self, *numbers: float) -> None:
-        # Servos that are gone are told of elsewhere.
+        # A process of servos that is gone is reported elsewhere.
         with suppress(OSError):
             os.write(self._samples.fileno(), self._frame.pack(*numbers))
 
 
-def simulate(request: DriveRequest, control: Connection, samples: Connection, heard: Any) -> None:
-    """What the process does: says Ready or an error, drives, saves, and says Done.
+def simulate(request: DriveRequest, control: Connection, samples: Connection, servo_time: Any) -> None:
+    """Run the process of the simulation: send Ready or an error, drive, save, and send Done.
 
-    It ends when it is told to by any word, or when whoever would tell it is gone.
+    Any message on ``control`` ends the drive, and so does the end of the process of the servos.
     """
-    # A terminal sends these to all processes of a group; only the one with the servos heeds them.
+    # A terminal sends signals to all processes of a group; only the process of the servos handles them.
     ignore_stops()
-    # On a busy computer the servos come first.
+    # On a busy computer the servos have priority.
     with suppress(AttributeError, OSError):
         os.nice(NICENESS)
-    ending = _Ending(control)
+    listener = _EndListener(control)
     try:
         session = begin(request.scenario, limits=request.limits, longest=request.longest)
-        follower = ServoFollower(session, request.servo_map, samples, heard)
+        follower = ServoFollower(session, request.servo_map, samples, servo_time)
         drive = LiveDrive(session, request.scenario.variant or request.scenario.name, follower)
         address = drive.open(request.http_port)
     except Exception as error:
-        _say(control, error if isinstance(error, DynsimError) else DynsimError(f"the simulation failed: {error!r}"))
+        _send_message(
+            control, error if isinstance(error, DynsimError) else DynsimError(f"the simulation failed: {error!r}")
+        )
         return
     how = BROKEN
     refused: CheckRefused | None = None
     try:
-        ending.of(drive)
-        _say(control, Ready(address, session.still, follower.first, session.period))
+        listener.set_drive(drive)
+        _send_message(control, Ready(address, session.still, follower.first, session.period))
         if drive.run(until_closed=request.until_closed).stop is None:
             follower.finish()
             how = REGULAR
@@ -254,12 +262,12 @@ def simulate(request: DriveRequest, control: Connection, samples: Connection, he
     finally:
         follower.end(how)
         drive.close()
-    _say(control, _saved(session, drive.report, request.folder, refused))
+    _send_message(control, _saved(session, drive.report, request.folder, refused))
 
 
 def _saved(session: Session, report: DriveReport, folder: Path, refused: CheckRefused | None) -> Done:
     time = session.ticks * session.period
-    stop, report.stop = report.stop, None  # it holds a record, which need not go through the pipe
+    stop, report.stop = report.stop, None  # contains a record, which is not needed in the other process
     if session.ticks == 0:
         return Done(report, time, saved=False, failure=stop)
     try:
@@ -267,17 +275,17 @@ def _saved(session: Session, report: DriveReport, folder: Path, refused: CheckRe
     except DynsimError as error:
         return Done(report, time, saved=False, failure=error)
     except Exception as error:
-        return Done(report, time, saved=False, failure=RecordError(f"the drive was not saved: {error!r}"))
+        return Done(report, time, saved=False, failure=RecordError(f"the drive could not be saved: {error!r}"))
     return Done(report, time, saved=True, failure=refused if stop is None else type(stop)(str(stop)))
 
 
-def _say(control: Connection, message: Any) -> None:
+def _send_message(control: Connection, message: Any) -> None:
     with suppress(OSError):
         control.send(message)
 
 
-class _Ending:
-    """Hears in a thread of its own that the drive is to end."""
+class _EndListener:
+    """Thread that waits for the message to end the drive."""
 
     def __init__(self, control: Connection) -> None:
         self._drive: LiveDrive | None = None
@@ -286,8 +294,8 @@ class _Ending:
         self._control = control
         threading.Thread(target=self._listen, name="dynsim ending", daemon=True).start()
 
-    def of(self, drive: LiveDrive) -> None:
-        """Whose end it is."""
+    def set_drive(self, drive: LiveDrive) -> None:
+        """Set the drive to end."""
         with self._lock:
             self._drive = drive
             if self._why:
@@ -297,9 +305,9 @@ class _Ending:
         try:
             why = str(self._control.recv())
         except (EOFError, OSError):
-            why = "the process with the servos has gone"
+            why = "the process of the servos has ended"
             if self._drive is None:
-                # Nothing has begun, and nobody waits for it.
+                # The drive has not started, and no process waits for it.
                 os._exit(1)
         with self._lock:
             self._why = why
@@ -307,18 +315,18 @@ class _Ending:
                 self._drive.end(why, at_once=True)
 
 
-# The servo side of a drive: starts and ends the simulation's process, and follows its postures.
+# The servo side of a drive: start and end the process of the simulation, and follow its postures.
 
 
-PIECE = 1 << 16
+CHUNK_SIZE = 1 << 16
 FAULTS = {
-    BROKEN: "the simulation has ended by itself",
-    NOT_LIFTED: "wheel pairs cannot be lifted as the pilot's robot has them",
+    BROKEN: "the simulation stopped early",
+    NOT_LIFTED: "the servos cannot lift the wheel pairs that the simulated robot lifts",
 }
-LOOK = 0.2
-"""Interval of the checks for Ctrl-C while waiting for the simulation [s]."""
+POLL_INTERVAL = 0.2
+"""Interval between checks for Ctrl-C while waiting for the simulation [s]."""
 PATIENCE = 5.0
-"""Longest wait for the end of a process that has finished its work [s]."""
+"""Maximum wait for the end of a process that has finished its work [s]."""
 
 
 class PipeFeed:
@@ -330,11 +338,11 @@ class PipeFeed:
     fault : str
     """
 
-    def __init__(self, samples: Connection, heard: Any, servo_map: ServoMap) -> None:
+    def __init__(self, samples: Connection, servo_time: Any, servo_map: ServoMap) -> None:
         self.over, self.fault = False, ""
         self._descriptor = samples.fileno()
         os.set_blocking(self._descriptor, False)
-        self._samples, self._heard = samples, heard
+        self._samples, self._servo_time = samples, servo_time
         self._servos, self._lifting = len(servo_map.servos), lifting_columns(servo_map)
         self._frame = frame_of(self._servos, len(self._lifting))
         self._bytes = b""
@@ -355,14 +363,14 @@ class PipeFeed:
             else:
                 self.over = True
         if self._gone and len(self._bytes) < size and not self.over and not self.fault:
-            self.fault = "the process of the simulation is gone"
+            self.fault = "the process of the simulation has ended"
         return samples
 
     def report_time(self, time: float) -> None:
-        self._heard[0] = time
+        self._servo_time[0] = time
 
     def close(self) -> None:
-        """Nothing more is wanted."""
+        """Close the pipe."""
         self._samples.close()
 
     def _sample(self, time: float, values: Array) -> Sample:
@@ -377,14 +385,14 @@ class PipeFeed:
     def _read(self) -> None:
         with suppress(BlockingIOError):
             while not self._gone:
-                piece = os.read(self._descriptor, PIECE)
+                piece = os.read(self._descriptor, CHUNK_SIZE)
                 self._gone = not piece
                 self._bytes += piece
 
 
 @contextmanager
 def safe_path() -> Iterator[None]:
-    """Python that is started within does not run a ``signal.py`` of the working directory."""
+    """Prevent a Python process that is started in the block from importing modules of the working directory."""
     name = "PYTHONSAFEPATH"
     if name in os.environ:
         yield
@@ -397,7 +405,7 @@ def safe_path() -> Iterator[None]:
 
 
 class SimulationProcess:
-    """A drive in a process of its own; within its block, after which nothing of it is left.
+    """Drive in a separate process, which is ended when the block of this context manager ends.
 
     Attributes
     ----------
@@ -405,25 +413,25 @@ class SimulationProcess:
     """
 
     def __init__(self, request: DriveRequest) -> None:
-        """Start it; raises PortError on a system without POSIX's pipes."""
+        """Start the process. Raises PortError on a system without POSIX pipes."""
         require_posix("servos that follow a live drive")
         self._done = False
         context: Any = get_context("spawn")
         self._control, control = context.Pipe()
-        samples, there = context.Pipe(duplex=False)
-        # Python's own helper lets signals through again when it is started: not while they are held.
+        samples, sender = context.Pipe(duplex=False)
+        # Starting the resource tracker of Python unblocks signals, so start it before they are blocked.
         with safe_path():
             resource_tracker.ensure_running()
         with signals_held(), safe_path():
-            heard = context.RawArray("d", [NOT_YET])
+            servo_time = context.RawArray("d", [NOT_STARTED])
             self._process = context.Process(
-                target=simulate, args=(request, control, there, heard), name="dynsim simulation", daemon=True
+                target=simulate, args=(request, control, sender, servo_time), name="dynsim simulation", daemon=True
             )
             self._process.start()
-        # Their ends here would hide the end of the process.
+        # Close the ends in this process, otherwise they would hide the end of the other process.
         control.close()
-        there.close()
-        self.feed = PipeFeed(samples, heard, request.servo_map)
+        sender.close()
+        self.feed = PipeFeed(samples, servo_time, request.servo_map)
 
     def __enter__(self) -> SimulationProcess:
         return self
@@ -438,24 +446,24 @@ class SimulationProcess:
 
     @property
     def pid(self) -> int:
-        """Of the process."""
+        """ID of the process."""
         return int(self._process.pid)
 
     def ready(self) -> Ready:
-        """Wait until it can be driven; kernels may have to be compiled for that.
+        """Wait until the simulation can be driven, which may include the compilation of kernels.
 
         Raises
         ------
         DynsimError
-            It cannot.
+            If the simulation fails to start.
         """
-        while not self._control.poll(LOOK):
+        while not self._control.poll(POLL_INTERVAL):
             interruption.check()
-        said = self._hear()
-        if isinstance(said, DynsimError):
-            raise said
-        assert isinstance(said, Ready)
-        return said
+        message = self._receive()
+        if isinstance(message, DynsimError):
+            raise message
+        assert isinstance(message, Ready)
+        return message
 
     def finish(self, why: str) -> Done:
         """End the drive, unless it has ended, and wait until it is saved.
@@ -463,19 +471,19 @@ class SimulationProcess:
         Raises
         ------
         DynsimError
-            The process was gone before.
+            If the process has ended before.
         """
         with suppress(OSError):
             self._control.send(why)
-        said = self._hear()
-        assert isinstance(said, Done)
+        message = self._receive()
+        assert isinstance(message, Done)
         self._done = True
-        return said
+        return message
 
-    def _hear(self) -> Any:
+    def _receive(self) -> Any:
         try:
             return self._control.recv()
         except (EOFError, OSError):
             self._process.join(PATIENCE)
             text = f"the process of the simulation ended with code {self._process.exitcode}"
-            raise DynsimError(f"{text}; what was driven is not saved") from None
+            raise DynsimError(f"{text}; the drive is not saved") from None

@@ -1,4 +1,4 @@
-"""A live drive: simulation in real time in the calling thread, server in another, and the report of the drive."""
+"""A live drive: the simulation runs in real time in the calling thread, the server in another thread."""
 
 from __future__ import annotations
 
@@ -23,20 +23,32 @@ from dynsim.teleop.web.pilot import DRIVING, Deadman
 from dynsim.teleop.web.server import FRAMES, Server
 
 WAIT = 1e-3
-"""Interval of the checks whether a follower is ready [s]."""
+"""Interval between checks whether a follower is ready [s]."""
 NOT_READY = "the robot is not ready yet"
 
 
 class RealTimeClock:
-    """Computes when the next tick is due.
+    """Clock that waits for the next tick.
 
-    After a late tick at most one tick follows without a pause; a larger delay is not made up for, and simulated time
-    falls behind wall time. So motions are not faster than commanded over more than a tick, and commands do not act in
-    bursts.
+    After a late tick at most one tick follows without a pause. A larger delay is not made up, so simulated time falls
+    behind wall time. Therefore motions exceed the commanded speed for at most one tick, and commands do not take effect
+    in bursts.
+
+    Parameters
+    ----------
+    period : float
+        Time between ticks [s].
+    now : callable
+        Monotonic clock [s].
+    wait : callable
+        Function that waits for a time [s].
 
     Attributes
     ----------
-    late : of the tick that has begun last [s]; lost : wall time that the simulation did not follow [s]
+    late : float
+        Lateness of the last tick [s].
+    lost : float
+        Wall time by which the simulation has fallen behind [s].
     """
 
     def __init__(self, period: float, now: Callable[[], float], wait: Callable[[float], object]) -> None:
@@ -60,13 +72,18 @@ class RealTimeClock:
 
 @dataclass
 class DriveReport:
-    """How a drive went.
+    """Report of a drive.
 
     Attributes
     ----------
-    late : lateness of each tick [s]; lost : wall time that the simulation did not follow [s]
-    ended : why it ended
-    stop : what ended the simulation by itself, None otherwise
+    late : list of float
+        Lateness of each tick [s].
+    lost : float
+        Wall time by which the simulation has fallen behind [s].
+    ended : str
+        Reason of the end.
+    stop : SimulationStopped or None
+        Error that ended the simulation.
     """
 
     late: list[float] = field(default_factory=list)
@@ -76,32 +93,35 @@ class DriveReport:
 
 
 class Follower(Protocol):
-    """What goes where the simulation does; the simulation waits for it."""
+    """Interface of a robot that follows the simulation; the simulation waits for it."""
 
     @property
     def begun(self) -> bool:
-        """It is where the simulation begins."""
+        """True if the follower has reached the initial posture of the simulation."""
 
     @property
     def ready(self) -> bool:
-        """It is near enough for another tick."""
+        """True if the follower is close enough for another tick."""
 
     @property
     def steady(self) -> bool:
-        """The robot may change its mode now, and the drive may end."""
+        """True if the robot may change its mode now, and the drive may end."""
 
-    def hear(self) -> None:
-        """There was a tick."""
+    def after_tick(self) -> None:
+        """Send the state of the simulation after a tick."""
 
 
 class LiveDrive:
-    """A session that is open to browsers from :meth:`open` to :meth:`close`.
+    """Session that browsers can access from :meth:`open` to :meth:`close`.
 
     Parameters
     ----------
-    session : the simulation
-    name : shown in the page
-    follower : for whom it waits before each tick; what is lost by that counts as behind real time
+    session : Session
+        Simulation to drive.
+    name : str
+        Name shown in the page.
+    follower : Follower, optional
+        Robot for which the simulation waits before each tick; the wait counts as time behind real time.
     """
 
     def __init__(self, session: Session, name: str, follower: Follower | None = None) -> None:
@@ -123,18 +143,19 @@ class LiveDrive:
         self.report = DriveReport()
 
     def open(self, port: int = 0) -> str:
-        """Listen, and give the address to open in a browser."""
+        """Start the server and return the address to open in a browser."""
         self.server.start(port)
         return self.server.address
 
     def close(self) -> None:
-        """Tell the browsers why it is over, and stop listening; nothing is left running."""
+        """Send the reason of the end to the browsers, and stop the server and its thread."""
         self.server.stop(self.report.ended)
 
     def run(self, *, until_closed: bool = False) -> DriveReport:
-        """Drive until the pilot ends it, Ctrl-C, the longest time, or with ``until_closed`` nobody is left.
+        """Drive until the pilot ends the drive, Ctrl-C, or the maximum duration.
 
-        Signals are handled between ticks only, so that each one is driven and written down, or neither.
+        With ``until_closed`` the drive also ends when the last browser leaves.
+        Signals are handled between ticks only, so that each tick is either executed and recorded, or neither.
         """
         session, report = self.session, self.report
         try:
@@ -149,7 +170,7 @@ class LiveDrive:
                 command, state, count = self.deadman.command()
                 session.tick(self._followed(command, state))
                 if self._follower is not None:
-                    self._follower.hear()
+                    self._follower.after_tick()
                 report.late.append(self._clock.late)
                 report.lost = self._clock.lost
                 self._show(state, count)
@@ -162,13 +183,13 @@ class LiveDrive:
         return report
 
     def end(self, why: str = "ended by the pilot", *, at_once: bool = False) -> None:
-        """Let the drive be over before its next tick, or once its follower is steady; from any thread."""
+        """End the drive before its next tick (``at_once``) or when its follower is steady; thread-safe."""
         self._ended = self._ended or why
         self._at_once = self._at_once or at_once
         self._over.set()
 
     def _followed(self, command: Command, state: str) -> Command:
-        """A command of which the follower can do all: a request waits for it, for as long as the key is held."""
+        """Return a command that the follower can execute; a mode request waits while the dead-man switch is held."""
         if self._follower is None:
             return command
         if self._over.is_set() or state != DRIVING:
@@ -181,25 +202,25 @@ class LiveDrive:
         return replace(command, request=request)
 
     def _is_over(self, until_closed: bool) -> bool:
-        if until_closed and self.server.came and not self.server.clients:
+        if until_closed and self.server.had_clients and not self.server.clients:
             self.end("the last browser was closed")
         may_end = self._at_once or self._follower is None or self._follower.steady or self.session.ticks == 0
         if self.session.finished or (self._over.is_set() and may_end):
-            self.report.ended = self._ended or "the longest time is over"
+            self.report.ended = self._ended or "the maximum duration has passed"
         elif self.server.failure is not None:
-            raise DynsimError(f"the server ended: {self.server.failure!r}")
+            raise DynsimError(f"the server failed: {self.server.failure!r}")
         else:
             return False
         return True
 
     def _wait_for_follower(self, until_closed: bool) -> None:
-        """Whoever holds the key when a robot has come to its start must let it go first."""
+        """Wait until the follower is ready; a switch that is held before its start must be released first."""
         follower = self._follower
         while follower is not None and not follower.ready and not self._is_over(until_closed):
             if not follower.begun:
                 self.deadman.disarm()
                 self._show(NOT_READY, self.deadman.command()[2])
-            # Not on the event: it is set where a drive goes on until its follower is steady.
+            # Do not wait for the event: it is already set if the drive continues until its follower is steady.
             clock.sleep(WAIT)
 
     def _show(self, state: str, count: int) -> None:
@@ -224,7 +245,7 @@ class LiveDrive:
         }
 
     def _contacts(self, frame: LiveFrame) -> dict[str, Any]:
-        """Forces as the page takes them: the normal, and what is left beside it."""
+        """Return the contact forces for the page: normal force, normal and tangential force."""
         scene, forces = self.session.still.scene, dict[str, Any]()
         if scene is None:
             return forces

@@ -1,4 +1,4 @@
-"""Parsing of a pilot's messages: small JSON texts with known keys; others are refused with a reason."""
+"""Messages of a pilot: validation of small JSON texts with known keys, and the dead-man switch."""
 
 from __future__ import annotations
 
@@ -12,29 +12,36 @@ from typing import Any, NoReturn
 from dynsim.snake.description import FIXING, NO_REQUEST, SWITCHING
 from dynsim.teleop.snake import Command, PilotAxis
 
-MOST_BYTES = 4096
-"""Largest size of a message [bytes]; a longer one closes the connection."""
-MOST_COUNT = 2**53
+MAX_BYTES = 4096
+"""Maximum size of a message [bytes]; a longer message closes the connection."""
+MAX_COUNT = 2**53
 """Largest integer that a browser represents exactly."""
 STEPS = 100
-"""Steps of the speeds up to full speed, so that noise of a joystick does not add entries to the script."""
+"""Number of speed steps up to full speed, so that noise of a joystick does not add entries to the script."""
 REQUESTS = {"switching": SWITCHING, "fixing": FIXING}
 ACTIONS = ("take", "leave", "end")
 
 
 class Refused(ValueError):
-    """A message that is not valid; the text gives the reason."""
+    """Invalid message of a client; the text is the reason."""
 
 
 @dataclass(frozen=True)
 class PilotCommand:
-    """The present command of the pilot.
+    """Command of the pilot.
 
     Attributes
     ----------
-    count : of the browser's messages, rising; axes : in parts of full speed, −1 to 1
-    held : the dead-man's key is held
-    request : a mode to go to, ``NO_REQUEST`` for none; closed : the gripper
+    count : int
+        Increasing number of the message.
+    axes : tuple of float
+        Velocities as fractions of full speed, −1 to 1.
+    held : bool
+        True if the dead-man switch is held.
+    request : int
+        Requested mode; ``NO_REQUEST`` for none.
+    closed : bool
+        True to close the gripper.
     """
 
     count: int
@@ -45,26 +52,35 @@ class PilotCommand:
 
 
 def parse(text: str | bytes, axes: int, modes: tuple[int, ...]) -> PilotCommand | str:
-    """A command, or one of ``ACTIONS``.
+    """Parse a message of a client into a command, or one of ``ACTIONS``.
+
+    Parameters
+    ----------
+    text : str or bytes
+        Message.
+    axes : int
+        Number of axes.
+    modes : tuple of int
+        Modes that may be requested.
 
     Raises
     ------
     Refused
-        With what is wrong.
+        If the message is not valid.
     """
     if not isinstance(text, str):
-        raise Refused("a binary message; texts are understood")
+        raise Refused("binary message; send text")
     try:
-        message = json.loads(text, parse_constant=_no_number)
+        message = json.loads(text, parse_constant=_reject_constant)
     except Refused:
         raise
     except (ValueError, RecursionError):
-        raise Refused("no JSON") from None
+        raise Refused("not valid JSON") from None
     if not isinstance(message, dict):
-        raise Refused("no JSON object")
+        raise Refused("not a JSON object")
     if set(message) == {"do"}:
         if message["do"] not in ACTIONS:
-            raise Refused(f"do: one of {', '.join(ACTIONS)}")
+            raise Refused(f"do: must be one of {', '.join(ACTIONS)}")
         return str(message["do"])
     if unknown := set(message) - {"n", "axes", "held", "mode", "closed"}:
         raise Refused(f"unknown key {sorted(unknown)[0][:40]!r}")
@@ -77,23 +93,23 @@ def parse(text: str | bytes, axes: int, modes: tuple[int, ...]) -> PilotCommand 
     )
 
 
-def _no_number(name: str) -> NoReturn:
-    raise Refused(f"{name} is no number")
+def _reject_constant(name: str) -> NoReturn:
+    raise Refused(f"{name} is not a finite number")
 
 
 def _count(value: Any) -> int:
-    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= MOST_COUNT:
-        raise Refused("n: must count the messages")
+    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= MAX_COUNT:
+        raise Refused("n: must be the number of the message")
     return value
 
 
 def _axes(values: Any, count: int) -> tuple[float, ...]:
-    """As many as there are, finite; what is beyond full speed is full speed."""
+    """Return ``count`` finite values, limited to full speed and rounded to its steps."""
     if not isinstance(values, list) or len(values) != count:
         raise Refused(f"axes: must be a list of {count} numbers")
     axes = []
     for value in values:
-        # Whole numbers may have thousands of digits, and decimals overflow to infinity.
+        # An integer may have thousands of digits; a float may overflow to infinity.
         if (
             isinstance(value, bool)
             or not isinstance(value, int | float)
@@ -118,67 +134,70 @@ def _request(value: Any, modes: tuple[int, ...]) -> int:
         return REQUESTS[value]
     if isinstance(value, int) and not isinstance(value, bool) and value in modes:
         return value
-    known = ", ".join([*REQUESTS, *map(str, modes)]) if modes else "none here"
-    raise Refused(f"mode: no such mode; known: {known}")
+    known = ", ".join([*REQUESTS, *map(str, modes)]) if modes else "none"
+    raise Refused(f"mode: unknown mode; modes: {known}")
 
 
-# The dead-man's key: set by the server's thread, read by the simulation at every tick.
+# Dead-man switch: set by the thread of the server, read by the simulation at each tick.
 
 
 SILENCE = 0.25
 """Time without a message from the pilot after which velocities are zero [s]."""
 
-NOBODY, RELEASED, DRIVING, SILENT = "nobody drives", "key released", "driving", "silent"
+NO_PILOT, RELEASED, DRIVING, SILENT = "no pilot", "key released", "driving", "silent"
 
 
 class Deadman:
-    """The newest command of the pilot; safe to use from two threads.
+    """Dead-man switch with the newest command of the pilot; thread-safe.
 
-    Velocities are zero unless the dead-man's key is held and the last message is not older than ``SILENCE``. After
-    silence, and for a new pilot, the key has an effect only after a message that it is released.
+    Velocities are zero unless the switch is held and the last message is not older than ``SILENCE``. After a silence,
+    and for a new pilot, the switch has an effect only after a message that it is released.
 
     Parameters
     ----------
-    axes : velocities of the robot; clock : seconds that only rise
+    axes : sequence of PilotAxis
+        Velocities of the robot.
+    clock : callable
+        Monotonic clock [s].
     """
 
     def __init__(self, axes: Sequence[PilotAxis], clock: Callable[[], float]) -> None:
         self._limits = [axis.limit for axis in axes]
         self._clock, self._lock = clock, threading.Lock()
         self._newest: PilotCommand | None = None
-        self._heard, self._armed, self._request, self._closed = 0.0, False, NO_REQUEST, False
+        self._received_at, self._armed, self._request, self._closed = 0.0, False, NO_REQUEST, False
         self._silent = False
 
-    def hear(self, command: PilotCommand) -> None:
-        """Take a message of the pilot; it is dropped if a later one was received before."""
+    def receive(self, command: PilotCommand) -> None:
+        """Store a command of the pilot; it is ignored if a newer command was received before."""
         with self._lock:
             now = self._clock()
             if self._newest is not None and command.count <= self._newest.count:
                 return
-            self._note_silence(now)
+            self._check_silence(now)
             if not command.held:
                 self._armed, self._silent = True, False
             if command.request != NO_REQUEST and command.held and self._armed:
                 self._request = command.request
-            self._newest, self._heard, self._closed = command, now, command.closed
+            self._newest, self._received_at, self._closed = command, now, command.closed
 
-    def forget(self) -> None:
-        """The pilot has left."""
+    def reset(self) -> None:
+        """Discard the command, when the pilot leaves."""
         with self._lock:
             self._newest, self._armed, self._request, self._silent = None, False, NO_REQUEST, False
 
     def disarm(self) -> None:
-        """The key must be let go once before it counts."""
+        """Require that the switch is released once before it has an effect."""
         with self._lock:
             self._armed, self._request = False, NO_REQUEST
 
     def command(self) -> tuple[Command, str, int]:
-        """What the simulation is to do from now on, why, and the count of the pilot's command that it comes from."""
+        """Return the command for the simulation, the state of the pilot, and the count of the pilot command."""
         with self._lock:
             newest, still = self._newest, Command((0.0,) * len(self._limits), closed=self._closed)
             if newest is None:
-                return still, NOBODY, -1
-            self._note_silence(self._clock())
+                return still, NO_PILOT, -1
+            self._check_silence(self._clock())
             if self._silent or not (newest.held and self._armed):
                 self._request = NO_REQUEST
                 return still, SILENT if self._silent else RELEASED, newest.count
@@ -186,6 +205,6 @@ class Deadman:
             request, self._request = self._request, NO_REQUEST
             return Command(velocity, request, self._closed), DRIVING, newest.count
 
-    def _note_silence(self, now: float) -> None:
-        if self._newest is not None and now - self._heard > SILENCE:
+    def _check_silence(self, now: float) -> None:
+        if self._newest is not None and now - self._received_at > SILENCE:
             self._silent, self._armed = True, False

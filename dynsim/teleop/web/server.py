@@ -1,7 +1,8 @@
-"""The server of a drive: page by HTTP, commands and frames by web socket, on this machine only.
+"""Server of a drive: page by HTTP, commands and frames by web socket, on this machine only.
 
-Every user of the machine, and every web page in a browser on it, can reach the loopback address. So the path contains a
-token, ``Host`` must be this server (against DNS rebinding), and the ``Origin`` of a web socket must be its own page.
+All users of the machine, and all web pages in a browser on it, can reach the loopback address. Therefore the path
+contains a token, ``Host`` must be this server (against DNS rebinding), and the ``Origin`` of a web socket must be the
+page of this server.
 """
 
 from __future__ import annotations
@@ -24,18 +25,18 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from dynsim.errors import DynsimError
-from dynsim.teleop.web.pilot import MOST_BYTES, Deadman, PilotCommand, Refused, parse
+from dynsim.teleop.web.pilot import MAX_BYTES, Deadman, PilotCommand, Refused, parse
 
-HERE = "127.0.0.1"
+LOOPBACK = "127.0.0.1"
 FRAMES = 60.0
-"""Most frames that a client gets [1/s]."""
-MOST_CLIENTS = 16
-MOST_WORDS = 400
-"""Most messages of a client in a second; a browser sends 50."""
-MOST_REFUSED = 20
-"""Messages of a client that are none, after which it is closed."""
-GOODBYE = 1.0
-"""For a last word to all clients [s]."""
+"""Maximum frame rate of a client [1/s]."""
+MAX_CLIENTS = 16
+MAX_MESSAGES = 400
+"""Maximum number of messages of a client per second; a browser sends 50."""
+MAX_REFUSED = 20
+"""Number of invalid messages after which the connection of a client is closed."""
+LAST_MESSAGE_TIME = 1.0
+"""Maximum time for the last message to all clients [s]."""
 _HEADERS = {
     "Cache-Control": "no-store",
     "Referrer-Policy": "no-referrer",
@@ -50,22 +51,29 @@ _HEADERS = {
 @dataclass(eq=False)
 class _Client:
     socket: ServerConnection
-    news: asyncio.Event = field(default_factory=asyncio.Event)
+    new_frame: asyncio.Event = field(default_factory=asyncio.Event)
     refused: int = 0
     begun: float = 0.0
-    words: int = 0
+    messages: int = 0
 
 
 class Server:
-    """Runs in a thread of its own from :meth:`start` to :meth:`stop`.
+    """Server that runs in a separate thread from :meth:`start` to :meth:`stop`.
 
     Parameters
     ----------
-    deadman : hears the pilot
-    hello : said to every client at first
-    axes, modes : of the robot
-    page : the page, of the address of the socket
-    end : called when the pilot ends the drive
+    deadman : Deadman
+        Receives the commands of the pilot.
+    hello : mapping
+        First message to each client.
+    axes : int
+        Number of axes of the robot.
+    modes : tuple of int
+        Modes of the robot.
+    page : callable
+        Returns the page for the address of the web socket.
+    end : callable
+        Called when the pilot ends the drive.
     """
 
     def __init__(
@@ -91,40 +99,40 @@ class Server:
         self.failure: BaseException | None = None
         self.port = 0
         self._page = b""
-        self.came = False
+        self.had_clients = False
 
     @property
     def address(self) -> str:
-        """Of the page."""
-        return f"http://{HERE}:{self.port}/{self.token}/"
+        """Address of the page."""
+        return f"http://{LOOPBACK}:{self.port}/{self.token}/"
 
     @property
     def socket(self) -> str:
-        """Of the web socket."""
-        return f"ws://{HERE}:{self.port}/{self.token}/drive"
+        """Address of the web socket."""
+        return f"ws://{LOOPBACK}:{self.port}/{self.token}/drive"
 
     @property
     def clients(self) -> int:
-        """Browsers that are connected."""
+        """Number of connected browsers."""
         return len(self._clients)
 
     def start(self, port: int = 0) -> None:
-        """Listen; 0 takes a free port.
+        """Start the server; port 0 selects a free port.
 
         Raises
         ------
         DynsimError
-            The port is taken.
+            If the port is in use.
         """
         self._thread = threading.Thread(target=self._run, args=(port,), name="dynsim live server", daemon=True)
         self._thread.start()
         self._ready.wait()
         if self.failure is not None:
             self._thread.join()
-            raise DynsimError(f"cannot listen on {HERE}, port {port}: {self.failure}; choose another --http-port")
+            raise DynsimError(f"cannot listen on {LOOPBACK}, port {port}: {self.failure}; choose another --http-port")
 
     def stop(self, why: str = "") -> None:
-        """Tell all clients why the drive is over, say goodbye and end the thread."""
+        """Send the reason of the end to all clients, close the connections and end the thread."""
         self._why = why
         if self._loop is not None and self._quit is not None and not self._loop.is_closed():
             self._loop.call_soon_threadsafe(self._quit.set)
@@ -132,14 +140,14 @@ class Server:
             self._thread.join()
 
     def show(self, frame: Mapping[str, Any]) -> None:
-        """Give every client a new frame; from any thread. One that is still busy gets only the newest."""
+        """Send a new frame to all clients; thread-safe. A busy client receives the newest frame only."""
         if self._loop is not None and not self._loop.is_closed():
-            self._loop.call_soon_threadsafe(self._announce, json.dumps(frame, separators=(",", ":")))
+            self._loop.call_soon_threadsafe(self._set_frame, json.dumps(frame, separators=(",", ":")))
 
-    def _announce(self, text: str) -> None:
+    def _set_frame(self, text: str) -> None:
         self._frame = text
         for client in self._clients.values():
-            client.news.set()
+            client.new_frame.set()
 
     def _run(self, port: int) -> None:
         try:
@@ -152,11 +160,11 @@ class Server:
     async def _serve(self, port: int) -> None:
         self._loop, self._quit = asyncio.get_running_loop(), asyncio.Event()
         async with serve(
-            self._meet,
-            HERE,
+            self._serve_client,
+            LOOPBACK,
             port,
             process_request=self._guard,
-            max_size=MOST_BYTES,
+            max_size=MAX_BYTES,
             max_queue=8,
             compression=None,
             close_timeout=1.0,
@@ -167,14 +175,14 @@ class Server:
             self._ready.set()
             await self._quit.wait()
             messages = (client.socket.send(json.dumps({"over": self._why})) for client in self._clients.values())
-            # A browser that takes nothing more is not waited for.
+            # Do not wait for a browser that no longer reads.
             with suppress(TimeoutError):
-                await asyncio.wait_for(asyncio.gather(*messages, return_exceptions=True), GOODBYE)
+                await asyncio.wait_for(asyncio.gather(*messages, return_exceptions=True), LAST_MESSAGE_TIME)
 
     def _guard(self, connection: ServerConnection, request: Request) -> Response | None:
-        """None for the pilot's own socket; the page, or a refusal that says nothing."""
+        """Return the page or a rejection without details; None for a valid web socket of the page."""
         hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
-        own = {f"{name}:{self.port}" for name in (HERE, "localhost")}
+        own = {f"{name}:{self.port}" for name in (LOOPBACK, "localhost")}
         if len(hosts) != 1 or hosts[0] not in own:
             return _answer(http.HTTPStatus.FORBIDDEN)
         if request.path == "/favicon.ico":
@@ -188,25 +196,25 @@ class Server:
             return _answer(http.HTTPStatus.FORBIDDEN)
         if len(origins) != 1 or origins[0] not in {f"http://{name}" for name in own}:
             return _answer(http.HTTPStatus.FORBIDDEN)
-        if len(self._clients) >= MOST_CLIENTS:
+        if len(self._clients) >= MAX_CLIENTS:
             return _answer(http.HTTPStatus.SERVICE_UNAVAILABLE)
         return None
 
-    async def _meet(self, socket: ServerConnection) -> None:
-        """One client, from its first message to its last."""
+    async def _serve_client(self, socket: ServerConnection) -> None:
+        """Serve one client until its connection ends."""
         client = _Client(socket)
         self._clients[socket] = client
-        self.came = True
+        self.had_clients = True
         sender: asyncio.Task[None] | None = None
         try:
             await socket.send(json.dumps({"hello": dict(self._hello)}))
-            await self._tell_roles()
+            await self._send_roles()
             sender = asyncio.create_task(self._send(client))
             async for message in socket:
                 if not self._count(client):
                     await socket.close(1008, "too many messages")
                     break
-                await self._hear(client, message)
+                await self._handle(client, message)
         except ConnectionClosed:
             pass
         finally:
@@ -215,43 +223,43 @@ class Server:
                 sender.cancel()
             if self._pilot is client:
                 self._release()
-                await self._tell_roles()
+                await self._send_roles()
 
     def _count(self, client: _Client) -> bool:
         assert self._loop is not None
         now = self._loop.time()
         if now - client.begun >= 1.0:
-            client.begun, client.words = now, 0
-        client.words += 1
-        return client.words <= MOST_WORDS
+            client.begun, client.messages = now, 0
+        client.messages += 1
+        return client.messages <= MAX_MESSAGES
 
-    async def _hear(self, client: _Client, message: str | bytes) -> None:
+    async def _handle(self, client: _Client, message: str | bytes) -> None:
         try:
-            heard = parse(message, self._axes, self._modes)
+            parsed = parse(message, self._axes, self._modes)
         except Refused as reason:
             client.refused += 1
             await client.socket.send(json.dumps({"refused": str(reason)}))
-            if client.refused >= MOST_REFUSED:
-                await client.socket.close(1008, "messages that are none")
+            if client.refused >= MAX_REFUSED:
+                await client.socket.close(1008, "too many invalid messages")
             return
-        if heard == "take" and self._pilot is None:
+        if parsed == "take" and self._pilot is None:
             self._pilot = client
-            await self._tell_roles()
+            await self._send_roles()
         elif client is not self._pilot:
             return
-        elif isinstance(heard, PilotCommand):
-            self._deadman.hear(heard)
-        elif heard == "leave":
+        elif isinstance(parsed, PilotCommand):
+            self._deadman.receive(parsed)
+        elif parsed == "leave":
             self._release()
-            await self._tell_roles()
-        elif heard == "end":
+            await self._send_roles()
+        elif parsed == "end":
             self._end()
 
     def _release(self) -> None:
         self._pilot = None
-        self._deadman.forget()
+        self._deadman.reset()
 
-    async def _tell_roles(self) -> None:
+    async def _send_roles(self) -> None:
         for client in list(self._clients.values()):
             role = "pilot" if client is self._pilot else "watching"
             try:
@@ -260,11 +268,11 @@ class Server:
                 continue
 
     async def _send(self, client: _Client) -> None:
-        """Frames as they come, the newest only."""
+        """Send frames as they arrive, the newest only."""
         try:
             while True:
-                await client.news.wait()
-                client.news.clear()
+                await client.new_frame.wait()
+                client.new_frame.clear()
                 await client.socket.send(self._frame)
                 await asyncio.sleep(1.0 / FRAMES)
         except ConnectionClosed:
