@@ -1,4 +1,4 @@
-"""The braced arm of docs/quickstart.md and the tutorials: its plant, for scenarios of tests."""
+"""Plant of the braced arm in docs/quickstart.md and the tutorials, for scenarios of tests."""
 
 PLANT = """plant:
   type: serial_arm
@@ -13,5 +13,5 @@ PLANT = """plant:
 
 
 def plant(motor: str) -> str:
-    """The section ``plant`` with motors of a type."""
+    """Return the section ``plant`` with motors of a type."""
     return PLANT.replace("MOTOR", motor)
