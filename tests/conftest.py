@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 from hypothesis import settings
 
-# Each worker has a core: threads of numpy's libraries would wait for each other, for longer than small matrices take.
-# Before anything loads numpy, and for the workers and what they start.
+# Each worker has a core: threads of numpy's libraries would wait for each other, longer than small matrices take.
+# Set before anything loads numpy, and for the workers and their child processes.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from support import programs
@@ -60,7 +60,7 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture
 def hang_ups() -> Iterator[None]:
-    """SIGHUP as a shell leaves it, here and for child processes: under ``nohup`` all inherit that it is ignored."""
+    """Restore the default SIGHUP handling, also for child processes: ``nohup`` would let them ignore it."""
     inherited = signal.signal(signal.SIGHUP, signal.SIG_DFL)
     yield
     signal.signal(signal.SIGHUP, inherited)

@@ -15,7 +15,7 @@ from dynsim.dynamics.contact.distance import ShapeArrays
 from dynsim.dynamics.contact.m_star import solve_m_star
 from dynsim.dynamics.contact.rows import contact_rows, set_modes, shaped_rows, sign_changed
 from dynsim.dynamics.contact.shares import solve_rows
-from dynsim.dynamics.contact.unilateral import UnilateralArrays, rub
+from dynsim.dynamics.contact.unilateral import UnilateralArrays, apply_dry_friction
 from dynsim.dynamics.drive.law import drive
 from dynsim.dynamics.ledger import dry_losses, ledger_rates
 from dynsim.dynamics.state import StateLayout
@@ -125,7 +125,7 @@ def derivative(system: System, t, y, ws: Workspace, dy):
         joints[i, ka.QDD] = 0.0
         joints[i, ka.APPLIED] = -(model.body[i, ka.DAMPING] + model.body[i, ka.GEAR_DAMPING]) * joints[i, ka.QD]
     drive(drives, system.reference, t, y, layout, ws)
-    rub(system.unilateral, ws)
+    apply_dry_friction(system.unilateral, ws)
 
     forward_sweep(model, ws, 1.0, 0.0, 1.0)
     if system.loads.table.shape[0] > 0:

@@ -79,7 +79,7 @@ def follow_path(
             for j in range(moving):
                 q[path.place[j]] = 3.0 * result[k - 1, j] - 3.0 * result[k - 2, j] + result[k - 3, j]
         if limited:
-            cut_off(path, q)
+            clip_to_limits(path, q)
         best = math.inf
         for _ in range(ITERATIONS):
             left = errors(model, ws, path, targets[k], q)
@@ -88,10 +88,10 @@ def follow_path(
             if left < 1e-4 * tolerance:
                 break
             if limited:
-                leave_out(path, q)
+                exclude_limited(path, q)
             step(path, 1e-12 + 0.1 * left * left, q)
             if limited:
-                cut_off(path, q)
+                clip_to_limits(path, q)
         if not best <= tolerance:
             return k, best
         for j in range(moving):
@@ -109,7 +109,7 @@ def is_limited(path: PathArrays):
 
 
 @internal_kernel
-def leave_out(path: PathArrays, q):
+def exclude_limited(path: PathArrays, q):
     """Zero the rates of joints at limits that a step downhill would move beyond them."""
     for j in range(path.column.shape[0]):
         pull = 0.0
@@ -122,7 +122,7 @@ def leave_out(path: PathArrays, q):
 
 
 @internal_kernel
-def cut_off(path: PathArrays, q):
+def clip_to_limits(path: PathArrays, q):
     """Put joints beyond a limit on it."""
     for j in range(path.column.shape[0]):
         at = q[path.place[j]]

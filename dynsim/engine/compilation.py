@@ -17,7 +17,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from dynsim.jit.kernel import cache_folder, told_of_compilation
+from dynsim.jit.kernel import cache_folder, on_compilation
 
 # File beside the folders of kernels: duration of the last compilation of each kind [s].
 LAST = "compiled_in_s.json"
@@ -77,7 +77,7 @@ def kernels_logged(log: logging.Logger, kind: str = "", loads: bool = True) -> I
         if on_terminal:
             print(f"dynsim: {compilation.text}", file=sys.stderr, flush=True)
 
-    with marks, told_of_compilation(begin):
+    with marks, on_compilation(begin):
         yield
     taken = clock.perf_counter() - started
     if compiling:

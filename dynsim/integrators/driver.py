@@ -34,7 +34,7 @@ from dynsim.integrators.dopri5 import step_dopri5
 from dynsim.integrators.events import arm_events, cut_step, fire_events, take_ticks
 from dynsim.integrators.methods import compiled
 from dynsim.integrators.radau5.step import after_step, end_accepted, end_workspace, step_radau5
-from dynsim.integrators.radau5.tables import forget
+from dynsim.integrators.radau5.tables import discard_history
 from dynsim.integrators.run import Run, forces_unique, rewrite_sample, sample_step, settle, watch, write_waiting
 from dynsim.integrators.steps import choose_step, finished, finite, first_step, next_step, rejected, stalled
 from dynsim.jit.kernel import FixedSignature, free_kernel, inline_kernel, internal_kernel, noinline_kernel
@@ -51,7 +51,7 @@ def start(system: System, ws: Workspace, run: Run):
         watch(ws, run, 0.0)
         if run.clock[ki.STEP] <= 0.0:
             first_step(system, ws, run)
-    forget(run.newton, run.count[ki.STEPS])
+    discard_history(run.newton, run.count[ki.STEPS])
     run.count[ki.STARTED] = 1
 
 
@@ -64,7 +64,7 @@ def start_contacts(unilateral: UnilateralArrays | None, system: System, ws: Work
     if due:
         run.count[ki.MODES_DUE] = 0
         read_positions(system.model, run.y, system.layout.q, ws)
-        hold_here(unilateral, ws)
+        hold_all_joints(unilateral, ws)
         solve_modes(system, ws, run, first)
     if run.count[ki.STATUS] != ki.RUNNING or not settle(system, run.clock[ki.TIME], run.y, ws, run.stage[0], run):
         return False
@@ -75,7 +75,7 @@ def start_contacts(unilateral: UnilateralArrays | None, system: System, ws: Work
 
 
 @internal_kernel
-def hold_here(unilateral: UnilateralArrays, ws: Workspace):
+def hold_all_joints(unilateral: UnilateralArrays, ws: Workspace):
     """Let dry friction hold joints in position: an impact precedes the modes that select the joints it holds."""
     for k in range(unilateral.dry_table.shape[0]):
         unilateral.dry[k, ku.DRY_AT] = ws.joints[unilateral.dry_table[k, ku.DRY_JOINT], ka.Q]
@@ -103,7 +103,7 @@ def accept(system: System, ws: Workspace, run: Run):
 
 
 @inline_kernel
-def take_step(system: System, ws: Workspace, run: Run, error):
+def accepts_step(system: System, ws: Workspace, run: Run, error):
     """True if error control, events and HOLD accept the step just taken."""
     clock, count = run.clock, run.count
     if run.event.shape[0] > 0 and cut_step(system, end_workspace(run.newton, system, ws, run), run):
@@ -124,7 +124,7 @@ def propose(run: Run):
 
 
 @internal_kernel
-def go_on(run: Run, order, beta):
+def adapt_step_size(run: Run, order, beta):
     """Set the step size after an accepted step."""
     clock, count = run.clock, run.count
     if count[ki.FIRED] == 1:
@@ -169,7 +169,7 @@ def ready(system: System, ws: Workspace, run: Run):
 
 
 @inline_kernel
-def waiting(system: System, ws: Workspace, run: Run):
+def can_step(system: System, ws: Workspace, run: Run):
     """True if a step can be taken; False if control must return to the caller first."""
     # Most runs have nothing to do between two steps.
     idle = run.count[ki.STARTED] == 1 and run.tick.shape[0] + run.breaks.shape[0] == 0
@@ -184,11 +184,11 @@ def conclude(system: System, ws: Workspace, run: Run, error, order):
         if rejected(ws, run, error, order):
             count[ki.SEARCHING] = 0
             return False
-        if not take_step(system, ws, run, error):
+        if not accepts_step(system, ws, run, error):
             return count[ki.PENDING] == 1
     count[ki.PENDING] = 0
     accept(system, ws, run)
-    go_on(run, order, 0.04)
+    adapt_step_size(run, order, 0.04)
     if count[ki.FIRED] == 1 and count[ki.STATUS] == ki.RUNNING:
         switch_contacts(system.unilateral, system, ws, run)
     return run.event.shape[0] > 0 and fire_events(run)
@@ -200,7 +200,7 @@ def advance_dopri5(system: System, ws: Workspace, run: Run, limit):
     taken, error = 0, 0.0
     if limit < 0:
         return
-    while waiting(system, ws, run):
+    while can_step(system, ws, run):
         if taken >= limit or finished(run) or stalled(run):
             return
         taken += 1
@@ -212,7 +212,7 @@ def advance_dopri5(system: System, ws: Workspace, run: Run, limit):
 
 
 @noinline_kernel
-def conclude_apart(system: System, ws: Workspace, run: Run, error, order):
+def conclude_separately(system: System, ws: Workspace, run: Run, error, order):
     """Call :func:`conclude`, compiled separately.
 
     The callees of a RADAU5 step compile slowly, and functions as small as this one compile in less than half the time
@@ -231,7 +231,7 @@ def advance_radau5(system: System, ws: Workspace, run: Run, limit):
     taken, error = 0, 0.0
     if limit < 0:
         return
-    while waiting(system, ws, run) and not finished(run):
+    while can_step(system, ws, run) and not finished(run):
         if taken >= limit:
             return
         if stalled(run):
@@ -241,7 +241,7 @@ def advance_radau5(system: System, ws: Workspace, run: Run, limit):
             propose(run)
             error = step_radau5(system, ws, run)
         steps, h = run.count[ki.STEPS], run.clock[ki.STEP]
-        done = conclude_apart(system, ws, run, error, 4.0)
+        done = conclude_separately(system, ws, run, error, 4.0)
         if run.count[ki.STEPS] > steps:
             after_step(run, h)
         if done:

@@ -310,7 +310,7 @@ def parts_of(context: Any, builder: Any, kind: Any, value: Any) -> list[Any]:
     return [model.part(builder, value, k) for k in range(len(kind))]
 
 
-def made(context: Any, builder: Any, kind: Tables, values: Sequence[Any]) -> Any:
+def build_tuple(context: Any, builder: Any, kind: Tables, values: Sequence[Any]) -> Any:
     """Build a named tuple of these parts in the frame of the function."""
     model = context.data_model_manager[kind]
     block = model.room(builder)
@@ -323,7 +323,7 @@ def made(context: Any, builder: Any, kind: Tables, values: Sequence[Any]) -> Any
 def _constructed(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     kind = sig.return_type
     values = [context.cast(builder, *conversion) for conversion in zip(args, sig.args, kind, strict=True)]
-    return impl_ret_borrowed(context, builder, kind, made(context, builder, kind, values))
+    return impl_ret_borrowed(context, builder, kind, build_tuple(context, builder, kind, values))
 
 
 class _Lower(Lower):  # type: ignore[misc]
@@ -335,7 +335,7 @@ class _Lower(Lower):  # type: ignore[misc]
         return super()._lower_call_normal(fnty, expr, signature)
 
     @cached_property
-    def _again(self) -> set[str]:
+    def _reassigned(self) -> set[str]:
         """Names of variables of type :class:`Tables` that are assigned more than once."""
         assigned = (store.target.name for block in self.blocks.values() for store in block.find_insts(ir.Assign))
         return {
@@ -351,7 +351,7 @@ class _Lower(Lower):  # type: ignore[misc]
         super().storevar(self._copied(value, name), name, argidx)
 
     def _copied(self, value: Any, name: str) -> Any:
-        if name not in self._again:
+        if name not in self._reassigned:
             return value
         return self.context.data_model_manager[self.typeof(name)].copied(self.builder, value)
 

@@ -61,8 +61,8 @@ class _KernelCache(_Cache):
         try:
             content = path.read_bytes()
         except FileNotFoundError:
-            for tell in list(_listeners):
-                tell()
+            for report in list(_listeners):
+                report()
             return None
         except OSError as error:
             _warn(f"{path}: cannot be read ({error.strerror}); recompiling")
@@ -204,12 +204,12 @@ def _of_this_process() -> tempfile.TemporaryDirectory[str]:
 
 
 @contextmanager
-def told_of_compilation(tell: Callable[[], None]) -> Iterator[None]:
-    """Call ``tell`` once before a kernel that is not on disk is compiled in this process, which takes long."""
+def on_compilation(report: Callable[[], None]) -> Iterator[None]:
+    """Call ``report`` once before a kernel that is not on disk is compiled in this process, which takes long."""
 
     def once() -> None:
         _listeners.remove(once)
-        tell()
+        report()
 
     _listeners.append(once)
     try:

@@ -219,7 +219,7 @@ def four(typingctx: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
 
 
 @intrinsic
-def turned(typingctx: Any, value: Any) -> Any:
+def swap_middle(typingctx: Any, value: Any) -> Any:
     """Return four lanes with the middle two exchanged."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:

@@ -217,12 +217,12 @@ def _spline(values: Array) -> Array:
     """Return coefficients of cubic B-splines along the first axis, (n, m) → (n + 2, m)."""
     from dynsim.dynamics.banded import solve_banded
 
-    n, beside = len(values), 4
-    band, right = np.zeros((n + 2, 3 * beside + 1)), np.zeros((n + 2, values.shape[1]))
-    band[1:-1, beside - 1 : beside + 2] = 1.0 / 6.0, 2.0 / 3.0, 1.0 / 6.0
-    band[0, beside : beside + 5] = band[-1, beside - 4 : beside + 1] = 1.0, -4.0, 6.0, -4.0, 1.0
+    n, reach = len(values), 4
+    band, right = np.zeros((n + 2, 3 * reach + 1)), np.zeros((n + 2, values.shape[1]))
+    band[1:-1, reach - 1 : reach + 2] = 1.0 / 6.0, 2.0 / 3.0, 1.0 / 6.0
+    band[0, reach : reach + 5] = band[-1, reach - 4 : reach + 1] = 1.0, -4.0, 6.0, -4.0, 1.0
     right[1:-1] = values
-    solve_banded(band, beside, beside, right)
+    solve_banded(band, reach, reach, right)
     return right
 
 

@@ -41,7 +41,7 @@ def handled() -> Iterator[list[int]]:
     global _pending, _kept
     received: list[int] = []
 
-    def hear(number: int, frame: FrameType | None) -> None:
+    def on_signal(number: int, frame: FrameType | None) -> None:
         global _pending
         received.append(number)
         _pending = True
@@ -51,7 +51,7 @@ def handled() -> Iterator[list[int]]:
     before = {}
     for number in STOP_SIGNALS:
         if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
-            before[number] = signal.signal(number, hear)
+            before[number] = signal.signal(number, on_signal)
     try:
         yield received
     finally:

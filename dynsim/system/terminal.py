@@ -124,7 +124,7 @@ class LenientStream:
         return getattr(self._stream, name)
 
 
-def hold_descriptors() -> None:
+def reserve_descriptors() -> None:
     """Redirect the descriptors of closed standard streams to the null device.
 
     Otherwise the next files opened would get them, and the output of a library would go to a record, or to the servos.
@@ -140,7 +140,7 @@ def hold_descriptors() -> None:
 @contextmanager
 def lenient_streams() -> Iterator[LenientStream | None]:
     """Make standard output and error lenient within the block; yield standard output, or None if it is closed."""
-    hold_descriptors()
+    reserve_descriptors()
     before = sys.stdout, sys.stderr
     with _encodable(sys.stdout), _encodable(sys.stderr):
         output = LenientStream(sys.stdout) if sys.stdout is not None else None

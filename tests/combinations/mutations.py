@@ -53,7 +53,7 @@ FAULTS = (
     ),
     Fault(
         "force_of_spheres",
-        (("integrators/stepping/step.py", "        put_directions_back(s, ws)\n", ""),),
+        (("integrators/stepping/step.py", "        restore_directions(s, ws)\n", ""),),
     ),
     Fault(
         "jam",

@@ -1,4 +1,4 @@
-"""Command line of the fuzzer: all cases of a seed, or one of them again."""
+"""Command line of the fuzzer: all cases of a seed, or one of them."""
 
 from __future__ import annotations
 

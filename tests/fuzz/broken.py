@@ -1,6 +1,6 @@
-"""Deliberately broken loaders, one per kind of failure: the fuzzer must find each of them.
+"""Deliberately broken loaders, one per kind of failure: the fuzzer must detect each of them.
 
-Before a record is loaded, the entry of :data:`WAYS` for the number of the case is called. Every link of a serial arm
+Before a record is loaded, the entry of :data:`WAYS` with the number of the case is called. Every link of a serial arm
 has 1 % more mass.
 """
 
@@ -21,7 +21,7 @@ def install() -> None:
     sound_load, sound_inertia = Record.load.__func__, LinkConfig.inertia  # type: ignore[attr-defined]
 
     def load(cls: type[Record], path: Any, *, trust: bool = False) -> Record:
-        # A case runs in a folder of its name and number.
+        # A case runs in a folder with its name and number.
         number = int(Path.cwd().name.rpartition("-")[2])
         list(WAYS.values())[number % len(WAYS)]()
         return sound_load(cls, path, trust=trust)

@@ -20,15 +20,15 @@ from fuzz.case import KINDS, draw
 from fuzz.worker import CRASH, FAILURES, HANG, INTERRUPTED, LOSS, OK, READY, REFUSED, Outcome
 
 SEED = 8
-# Time after which a command counts as hung [s]: well above the limit of dynsim for reading a damaged record, on a busy
-# machine too.
+# Time after which a command counts as hung [s]: well above dynsim's limit for reading a damaged record, even on a busy
+# machine.
 LIMIT = 90.0
 ROOT = Path(__file__).resolve().parents[2]
 
 
 @dataclass(frozen=True)
 class Result:
-    """How one case ended."""
+    """Outcome of one case."""
 
     kind: str
     seed: int
@@ -43,7 +43,7 @@ class Result:
 
     @property
     def cause(self) -> tuple[str, str, str, str]:
-        """Equal for failures of one cause, as far as can be told."""
+        """Key that is equal for failures with the same cause, as far as this can be determined."""
         return self.kind, self.ended.outcome, self.ended.what, self.ended.place
 
     def __str__(self) -> str:
@@ -56,7 +56,7 @@ class Result:
 
 
 class Worker:
-    """One child process and the case it is at."""
+    """A child process and its current case."""
 
     def __init__(self, records: Path, folder: Path, limit: float, broken: bool) -> None:
         self._records = records
@@ -66,7 +66,7 @@ class Worker:
         self._process: subprocess.Popen[str] | None = None
 
     def run(self, kind: str, seed: int, index: int) -> Result:
-        """The outcome of one case; the child is started anew where needed."""
+        """Run one case and return its outcome; restart the child if needed."""
         process = self._process or self._start()
         started = time.monotonic()
         line = ""
@@ -86,7 +86,7 @@ class Worker:
         return Result(kind, seed, index, case, Outcome(**answer), seconds)
 
     def close(self) -> None:
-        """End the child, whatever it does."""
+        """End the child, whatever its state."""
         if self._process is not None:
             self._process.kill()
             self._process.communicate()
@@ -116,7 +116,7 @@ class Worker:
         process.communicate()
         self._process = None
         log = self._read_log()
-        # Of all threads that are told the main one, which began first, is the last.
+        # The main thread, which started first, is the last in the list of threads.
         main_thread = log.rpartition("(most recent call first)")[2]
         places = [line.strip() for line in main_thread.splitlines() if line.lstrip().startswith("File ")]
         ours = next((line for line in places if f"{os.sep}dynsim{os.sep}" in line and "site-packages" not in line), "")
@@ -130,7 +130,7 @@ class Worker:
             return Outcome(HANG, "heeds no Ctrl-C", location, log[-1500:])
         code = process.returncode
         if code == 130:
-            # Ctrl-C in the compiler, which cannot be ended but with its process.
+            # Ctrl-C in the compiler, which can only be ended with its process.
             return Outcome(INTERRUPTED, detail=log[-1500:])
         end = signal.Signals(-code).name if code < 0 else f"exit code {code}"
         return Outcome(CRASH, f"the process ended: {end}", location, log[-1500:])
@@ -150,7 +150,7 @@ def run(
     broken: bool = False,
     report: Callable[[Result], None] = lambda result: None,
 ) -> list[Result]:
-    """Run cases (kind, index) in ``jobs`` workers; ``report`` gets each result as it comes."""
+    """Run cases (kind, index) in ``jobs`` workers; ``report`` receives each result as it arrives."""
     todo: queue.SimpleQueue[tuple[str, int]] = queue.SimpleQueue()
     for case in cases:
         todo.put(case)
@@ -174,12 +174,12 @@ def run(
 
 
 def spread(count: int) -> list[tuple[str, int]]:
-    """``count`` cases in turn over all kinds."""
+    """Return ``count`` cases that alternate between all kinds."""
     return [(KINDS[k % len(KINDS)], k // len(KINDS)) for k in range(count)]
 
 
 def table(results: list[Result]) -> str:
-    """Kind × outcome with counts; and for how many the second reading was held against what was taken."""
+    """Return a table of kinds and outcomes, with the number of inputs compared with the second reading."""
     columns = (OK, REFUSED, INTERRUPTED, *FAILURES)
     counts = Counter((result.kind, result.ended.outcome) for result in results)
     compared = Counter(result.kind for result in results if result.ended.compared or result.ended.outcome == LOSS)
@@ -195,7 +195,7 @@ def table(results: list[Result]) -> str:
 
 
 def failures(results: list[Result]) -> str:
-    """Failures by cause: how many, and the first of each."""
+    """Return failures grouped by cause: their number, and the first of each group."""
     causes: dict[tuple[str, str, str, str], list[Result]] = {}
     for result in results:
         if result.failed:

@@ -10,13 +10,13 @@ from pathlib import Path
 from random import Random
 
 KINDS = ("scenario", "override", "servo_map", "urdf", "csv_path", "record", "terrain", "sweep", "faults")
-# The file that is damaged, by kind.
+# The damaged file, by kind.
 MAIN = {
     "scenario": "scenario.yaml", "override": "scenario.yaml", "servo_map": "map.yaml", "urdf": "robot.urdf",
     "csv_path": "path.csv", "record": "record.h5", "terrain": "heights.csv", "sweep": "out/runs.jsonl",
     "faults": "faults.yaml",
 }  # fmt: skip
-# Substitutes for that file, and the share of cases with one: no input may block or never end.
+# Substitutes for that file, and the fraction of cases with one: no input may block or never end.
 NO_FILES = ("pipe", "folder", "nothing", "link to /dev/zero", "link to /dev/null", "link to itself", "unreadable")
 NO_FILE_SHARE = 0.02
 SHIPPED = Path(__file__).resolve().parents[2] / "scenarios"
@@ -24,19 +24,19 @@ SHIPPED = Path(__file__).resolve().parents[2] / "scenarios"
 
 @dataclass
 class Draft:
-    """What the module of a kind draws.
+    """Case drawn by the module of a kind.
 
     Attributes
     ----------
     what : str
-        How the input was broken, for the report.
+        Description of the damage, for the report.
     files : dict[str, bytes or str]
-        By name; written to an empty folder, in which the commands run. A text is one of ``NO_FILES``.
+        Content by file name; written to an empty folder, in which the commands run. A text is one of ``NO_FILES``.
     commands : list of list of str
-        Arguments of ``dynsim``; each runs only when the one before went well.
+        Arguments of ``dynsim``; each runs only if the preceding one succeeded.
     losses : callable, optional
-        Called in that folder whatever the commands said: what dynsim took without a word although it does not say what
-        the input says. It must let the errors through with which dynsim refuses the input.
+        Called in that folder whatever the commands printed: returns values of the input that dynsim silently changed.
+        Errors with which dynsim refuses the input must pass through.
     """
 
     what: str
@@ -46,7 +46,7 @@ class Draft:
 
 
 def draw(kind: str, seed: int, index: int, records: Path) -> Draft:
-    """The case of this number: the same ones for ever, in any order. ``records`` is the folder of sound records."""
+    """Return the case with this number: always the same, in any order. ``records`` is the folder of valid records."""
     rng = Random(f"{seed}/{kind}/{index}")
     case: Draft = importlib.import_module(f"fuzz.inputs.{kind}").draw(rng, records)
     if rng.random() < NO_FILE_SHARE:
@@ -56,7 +56,7 @@ def draw(kind: str, seed: int, index: int, records: Path) -> Draft:
 
 
 def put(path: Path, content: bytes | str) -> None:
-    """Write a file of a case, or what stands in its place."""
+    """Write a file of a case, or its substitute."""
     path.parent.mkdir(parents=True, exist_ok=True)
     if isinstance(content, bytes):
         path.write_bytes(content)

@@ -11,7 +11,7 @@ from fuzz.inputs.record import make_records
 
 @pytest.fixture(scope="session")
 def records(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of the sound records that are broken."""
+    """Folder of the valid records that the fuzzer damages."""
     folder = tmp_path_factory.mktemp("records")
     make_records(folder)
     return folder

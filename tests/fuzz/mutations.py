@@ -10,7 +10,7 @@ from typing import Any
 
 
 class Raw(str):
-    """A value written into a YAML text as it stands."""
+    """Value written verbatim into a YAML text."""
 
     __slots__ = ()
 
@@ -43,7 +43,7 @@ RAW = tuple(
             "|", ">", "|+9\n  x", "'", '"', '"\\x"', '"\\ud800"', '"\\uD83D"', '"\\0"', '"\\x00"', '"\\x1b[31m"',
             "# comment", "---", "...", "? x", ": x", "- x", "a: b: c", "~", "Null", "yes", "on", "[" * 50 + "]" * 50,
             "[" * 3000, "[" * 3000 + "]" * 3000, "{a: " * 1500 + "1" + "}" * 1500, "- " * 400 + "1",
-            # Ten to the ninth values when its aliases are written out; and one that is just long.
+            # A billion values with aliases expanded; and a text that is merely long.
             "{a0: &a0 [1], " + ", ".join(f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 10)}]" for k in range(1, 10)) + "}",
             "[" + "0.5, " * 300_000 + "]",
         ),
@@ -53,7 +53,7 @@ SPECIAL_BYTES = b'\x00\t\n\r\x1b "&*-.:<[_{\x7f\x80\xc3\xff'
 
 
 def value(rng: Random, old: Any = None) -> Any:
-    """Something else in the place of ``old``: often close to it, sometimes of another kind altogether."""
+    """Return a replacement for ``old``: often similar, sometimes of a different kind."""
     if is_number(old) and rng.random() < 0.35:
         return near(rng, old)
     choice = rng.random()
@@ -85,12 +85,12 @@ def value(rng: Random, old: Any = None) -> Any:
 
 
 def is_number(old: Any) -> bool:
-    """A number, not a flag."""
+    """True for a number that is not a flag."""
     return isinstance(old, (int, float)) and not isinstance(old, bool)
 
 
 def near(rng: Random, number: float) -> Any:
-    """Another number, or the same one as text."""
+    """Return a different number, or the same number as text."""
     ways = (
         lambda x: x * 1.01, lambda x: x * 1.5, lambda x: x + 1, lambda x: -x, lambda x: x * 1e6, lambda x: x * 1e-6,
         str,
@@ -99,7 +99,7 @@ def near(rng: Random, number: float) -> Any:
 
 
 def places(tree: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """Paths of everything in a tree of mappings and lists, from the top down."""
+    """Return the paths of all nodes in a tree of mappings and lists, from the top down."""
     below: list[tuple[Any, ...]] = []
     items = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
     for key, item in items:
@@ -108,14 +108,14 @@ def places(tree: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
 
 
 def at(tree: Any, path: tuple[Any, ...]) -> Any:
-    """What stands at a path."""
+    """Return the node at a path."""
     for key in path:
         tree = tree[key]
     return tree
 
 
 def mutate_tree(rng: Random, tree: Any) -> str:
-    """Break one place of a tree; the answer says where and how."""
+    """Damage one place of a tree; return a description."""
     if not (candidates := places(tree)):
         return "nothing left"
     if rng.random() < 0.25:
@@ -151,7 +151,7 @@ def mutate_tree(rng: Random, tree: Any) -> str:
             owner.insert(key, copy.deepcopy(owner[key]))
         elif change == "much longer":
             owner.extend(copy.deepcopy(owner) * rng.choice((10, 100, 1000)))
-            # Trees of more than some ten thousand values only cost time.
+            # Trees of more than some ten thousand values only take time.
             del owner[20_000:]
         elif change == "shorter":
             del owner[key:]
@@ -164,7 +164,7 @@ def mutate_tree(rng: Random, tree: Any) -> str:
 
 
 def yaml_text(tree: Any, indent: str = "") -> str:
-    """Block YAML of a tree, a key per line; :class:`Raw` as it stands."""
+    """Return block YAML of a tree, one key per line, with :class:`Raw` verbatim."""
     if isinstance(tree, dict) and tree:
         return "".join(
             f"{indent}{_flow(key)}:"
@@ -191,7 +191,7 @@ def _flow(tree: Any) -> str:
 
 
 def mutate_bytes(rng: Random, data: bytes) -> tuple[bytes, str]:
-    """Break a file without knowing its format."""
+    """Damage a file without knowledge of its format."""
     out = bytearray(data)
     where = rng.randrange(len(out)) if out else 0
     ways: dict[str, Callable[[], None]] = {
@@ -213,7 +213,7 @@ def mutate_bytes(rng: Random, data: bytes) -> tuple[bytes, str]:
 
 
 def mutate_text(rng: Random, text: str) -> tuple[bytes, str]:
-    """Break a text file: its lines, its words, its encoding."""
+    """Damage a text file: its lines, its words or its encoding."""
     lines = text.splitlines(keepends=True) or [""]
     row = rng.randrange(len(lines))
     line = lines[row]

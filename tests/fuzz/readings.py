@@ -1,7 +1,7 @@
-"""Inputs parsed without dynsim, compared with the objects that dynsim made of them.
+"""Inputs parsed without dynsim and compared with dynsim's objects.
 
-Every function returns the losses as lines of text, none where nothing is lost. An input that the second reader cannot
-read counts as no loss.
+Every function returns the losses as lines of text, an empty list if there are none. An input that the second reader
+cannot read counts as no loss.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from xml.parsers import expat
 
 import numpy as np
 
-# Digits 0 to 9 only, no underscores: what float() takes beyond that is not a number to other programs.
+# ASCII digits only, no underscores: other texts that float() accepts are not numbers in other programs.
 DECIMAL = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
-# Keys whose values dynsim rewrites: paths absolute, names of folders from the file's name.
+# Keys whose values dynsim rewrites: absolute paths, and folder names derived from the name of the file.
 _REWRITTEN = frozenset({"file", "name", "variant"})
 # Texts that are certainly true or false as a flag.
 _TRUE, _FALSE = ("true", "1", "1.0", "yes", "on", "y", "t"), ("false", "0", "0.0", "-0.0", "no", "off", "n", "f")
@@ -26,23 +26,23 @@ ROUNDING = 1e-9
 
 
 class Unreadable(Exception):
-    """The second reading cannot tell."""
+    """Raised if the second reading gives no answer."""
 
 
 def yaml_tree(text: str) -> Any:
-    """A YAML text as plain values, by ruamel's safe reader; dynsim uses the one that keeps lines."""
+    """Return a YAML text as plain values, by ruamel's safe reader; dynsim uses the reader that keeps lines."""
     from ruamel.yaml import YAML
 
     if len(text) > 200_000:
         raise Unreadable("too long for that reader, which takes a minute for a megabyte")
     try:
         return YAML(typ="safe", pure=True).load(io.StringIO(text))
-    except Exception as error:  # whatever it is, that reader cannot tell
+    except Exception as error:  # any error means that this reader gives no answer
         raise Unreadable(str(error)) from error
 
 
 def merged(base: Any, difference: Any) -> Any:
-    """``difference`` over ``base`` as docs/scenarios say: mappings merge, lists and values replace, null removes."""
+    """Merge ``difference`` over ``base`` as in docs: mappings merge, lists and values replace, null removes."""
     if not isinstance(difference, Mapping):
         return difference
     out = dict(base) if isinstance(base, Mapping) else {}
@@ -55,7 +55,7 @@ def merged(base: Any, difference: Any) -> Any:
 
 
 def set_dotted(tree: Any, dotted: str, item: Any) -> None:
-    """Set ``a.b.0.c`` in a tree; :class:`Unreadable` where it leads nowhere."""
+    """Set ``a.b.0.c`` in a tree; raise :class:`Unreadable` if the path does not exist."""
     *path, last = dotted.split(".")
     node = tree
     try:
@@ -74,7 +74,7 @@ def set_dotted(tree: Any, dotted: str, item: Any) -> None:
 
 
 def missing(said: Any, taken: Any, where: str = "") -> list[str]:
-    """Values of ``said`` that ``taken`` does not hold; ``taken`` may hold more (defaults)."""
+    """Return values of ``said`` that are not in ``taken``; ``taken`` may contain more (defaults)."""
     if isinstance(said, Mapping):
         if not said:
             return []
@@ -82,7 +82,7 @@ def missing(said: Any, taken: Any, where: str = "") -> list[str]:
             return [f"{where}: a mapping became {taken!r}"]
         lost = []
         for key, item in said.items():
-            # Keys are text as written; this reader may have made a number or a date of it.
+            # Keys are text as written; this reader may have converted it to a number or a date.
             if item is None or key in _REWRITTEN or not isinstance(key, str):
                 continue
             inner = f"{where}.{key}".lstrip(".")
@@ -112,20 +112,20 @@ def _same(said: Any, taken: Any) -> bool:
     if isinstance(taken, (int, float)):
         if isinstance(said, str):
             return DECIMAL.fullmatch(said.strip()) is not None and float(said) == taken
-        # Digits beyond those of a double are rounded, in an integer as in a decimal number.
+        # Digits beyond the precision of a double are rounded, in integers as in decimal numbers.
         return said == taken or (isinstance(said, int) and isinstance(taken, float) and float(said) == taken)
-    # What this reader makes of dates, sets and the like is text as written to dynsim.
+    # This reader converts dates, sets etc., which are text as written in dynsim.
     return said == taken or (isinstance(taken, str) and not isinstance(said, str))
 
 
 def scenario_losses(said: Mapping[str, Any], scenario: Any) -> list[str]:
-    """Values of a merged scenario that are not in the validated one, and masses and friction not in the model."""
+    """Return values of a merged scenario that the validated one lacks, and masses and friction that the model lacks."""
     said = {key: item for key, item in said.items() if key not in ("variants", *_REWRITTEN)}
     taken = scenario.resolved
     plant = dict(said["plant"]) if isinstance(said.get("plant"), Mapping) else {}
     chain = plant.get("chain")
     if plant.get("type") == "serial_arm" and isinstance(chain, list):
-        # The shared link is not in the resolved scenario: every entry of the chain has its keys.
+        # The resolved scenario has no shared link: every entry of the chain has its keys.
         shared = plant.pop("link", None) or {}
         plant["chain"] = [_with_shared(shared, entry) for entry in chain]
         said["plant"] = plant
@@ -168,7 +168,7 @@ def _model_losses(said: Mapping[str, Any], plant: Mapping[str, Any], scenario: A
 
 
 def servo_map_losses(said: Mapping[str, Any], servo_map: Any) -> list[str]:
-    """Entries of a servo map that its servos, bus and safety rules do not have."""
+    """Return entries of a servo map that its servos, bus and safety rules lack."""
     lost = missing(said.get("bus") or {}, servo_map.bus.model_dump(), "bus")
     lost += missing(said.get("safety") or {}, servo_map.safety.model_dump(), "safety")
     entries = list(said["servos"].items())
@@ -176,7 +176,7 @@ def servo_map_losses(said: Mapping[str, Any], servo_map: Any) -> list[str]:
     if len(entries) != len(servo_map.servos):
         return [*lost, f"{len(entries)} servos became {len(servo_map.servos)}"]
     for servo, (joint, entry) in zip(servo_map.servos, entries, strict=True):
-        # A key is text as written; this reader may have made a number or a date of it.
+        # A key is text as written; this reader may have converted it to a number or a date.
         if isinstance(joint, str) and joint != servo.joint:
             lost.append(f"servos.{joint} became {servo.joint}")
         taken = {"id": servo.id, "sign": servo.sign, "zero_tick": servo.zero_tick, "label": servo.label}
@@ -189,7 +189,7 @@ def servo_map_losses(said: Mapping[str, Any], servo_map: Any) -> list[str]:
 
 
 def csv_rows(data: bytes) -> list[list[float]]:
-    """Rows of a path table, each number in decimal digits; :class:`Unreadable` otherwise."""
+    """Return the rows of a path table, each number in decimal digits; otherwise raise :class:`Unreadable`."""
     try:
         lines = data.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n").split("\n")
     except UnicodeDecodeError as error:
@@ -205,8 +205,8 @@ def csv_rows(data: bytes) -> list[list[float]]:
 
 
 def urdf_losses(data: bytes, robot: Any) -> list[str]:
-    """Masses, inertias, joints and damping of a URDF file that a robot does not have; links are composed as fixed."""
-    # Without namespaces, which readers of URDF do not know: files in use have prefixes that they do not bind.
+    """Return masses, inertias, joints and damping of a URDF file that a robot lacks; fixed links are combined."""
+    # Without namespaces, which URDF readers ignore: existing files have prefixes that they do not bind.
     tree, parser = ElementTree.TreeBuilder(), expat.ParserCreate()
     parser.StartElementHandler, parser.EndElementHandler, parser.CharacterDataHandler = tree.start, tree.end, tree.data
     try:
@@ -270,7 +270,7 @@ def _numbers(text: str) -> np.ndarray:
 
 
 def _body(link: ElementTree.Element) -> np.ndarray:
-    """Pseudo-inertia of a link about its own frame, (4, 4); zero for one without <inertial>."""
+    """Return the pseudo-inertia of a link about its own frame, (4, 4); zero without <inertial>."""
     name = link.get("name")
     inertials = link.findall("inertial")
     if not inertials:
@@ -286,7 +286,7 @@ def _body(link: ElementTree.Element) -> np.ndarray:
 
 
 def _pseudo_inertia(mass: float, com: np.ndarray, tensor: np.ndarray) -> np.ndarray:
-    """[[Σ, m c], [m cᵀ, m]] with Σ = ∫ r rᵀ dm = ½ tr(I) 1 − I about the frame; it moves as T J Tᵀ."""
+    """Return [[Σ, m c], [m cᵀ, m]], Σ = ∫ r rᵀ dm = ½ tr(I) 1 − I about the frame; it transforms as T J Tᵀ."""
     J = np.empty((4, 4))
     J[:3, :3] = 0.5 * np.trace(tensor) * np.eye(3) - tensor + mass * np.outer(com, com)
     J[:3, 3] = J[3, :3] = mass * np.asarray(com)
@@ -295,7 +295,7 @@ def _pseudo_inertia(mass: float, com: np.ndarray, tensor: np.ndarray) -> np.ndar
 
 
 def _moved(J: np.ndarray, origin: ElementTree.Element | None) -> np.ndarray:
-    """A pseudo-inertia seen from the frame in which ``origin`` places it."""
+    """Return a pseudo-inertia in the frame in which ``origin`` places it."""
     if origin is None:
         return J
     T = np.eye(4)
@@ -313,7 +313,7 @@ def _moved(J: np.ndarray, origin: ElementTree.Element | None) -> np.ndarray:
 
 
 def record_losses(sound: Any, loaded: Any) -> list[str]:
-    """Signals, units, labels, summary and provenance of a sound record that a loaded one does not have."""
+    """Return signals, units, labels, summary and provenance of a valid record that a loaded record lacks."""
     lost = []
     if not np.array_equal(sound.time, loaded.time):
         lost.append("time changed")

@@ -1,4 +1,4 @@
-"""Broken inputs of every kind: each ends well or with one clear error, and nothing is lost."""
+"""Damaged inputs of every kind: each succeeds or ends with one clear error, and nothing is lost."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from fuzz.case import KINDS, draw
 
 pytestmark = pytest.mark.long
 
-# Damaged records are slower to read than the rest.
+# Damaged records are slower to read than other inputs.
 QUICK = {**dict.fromkeys(KINDS, 30), "record": 10}
 ALL = 6000
-# Cases that have found a defect: seed, kind, number.
+# Cases that have detected a defect: seed, kind, number.
 ONCE = (
     (7_700_000, "record", 793),
     (7_700_000, "sweep", 1443),
@@ -43,7 +43,7 @@ def test_a_case_that_was_found_once(seed: int, kind: str, index: int, records: P
 
 @pytest.mark.slow
 def test_all_broken_inputs(records: Path) -> None:
-    """Seen with ``-s``: the table of kinds and outcomes."""
+    """Print the table of kinds and outcomes (visible with ``-s``)."""
     check(campaign.run(campaign.spread(ALL), records=records, jobs=os.cpu_count() or 1), ALL)
 
 

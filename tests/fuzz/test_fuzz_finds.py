@@ -1,4 +1,4 @@
-"""Deliberately broken loaders, which the fuzzer must find and name, and losses that its readings must find."""
+"""Deliberately broken loaders that the fuzzer must detect and name, and losses that its readings must detect."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def results(records: Path) -> list[campaign.Result]:
 
 @pytest.mark.parametrize(("number", "defect"), list(enumerate(WAYS)))
 def test_a_broken_loader_is_found(number: int, defect: str, results: list[campaign.Result]) -> None:
-    """Also those after one that ended its worker: "refuses" is the last and ran in a new one."""
+    """Also detected after a defect that ended its worker: "refuses" is the last and ran in a new worker."""
     result = next(result for result in results if (result.kind, result.index) == ("servo_map", number))
     outcome, message, location = FOUND[defect]
     assert result.ended.outcome == outcome, result
@@ -115,7 +115,7 @@ def test_what_a_urdf_file_says_and_the_robot_does_not_is_a_loss(
 
 
 def test_masses_behind_fixed_joints_are_composed_as_they_are_merged(tmp_path: Path) -> None:
-    """Two bodies fixed to one another, turned and moved: one composite, whatever Pinocchio does to get there."""
+    """Combine two bodies fixed to each other, rotated and translated, independently of Pinocchio's algorithm."""
     turned = '<origin xyz="0.1 -0.2 0.3" rpy="0.4 -0.5 0.6"/>'
     tensor = '<inertia ixx="3" ixy="0.1" ixz="0.2" iyy="4" iyz="0.3" izz="5"/>'
     body = f'<inertial>{turned}<mass value="2"/>{tensor}</inertial>'

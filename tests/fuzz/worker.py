@@ -1,13 +1,13 @@
 """A child process that runs fuzz cases and judges how each ends.
 
-A case is damaged inputs and the dynsim commands that read them. The parent (:mod:`fuzz.campaign`) notices when the
-child crashes. The child reads lines ``kind seed index`` and answers each with one line of JSON. Commands run in the
+A case consists of damaged inputs and the dynsim commands that read them. The parent (:mod:`fuzz.campaign`) notices when
+the child crashes. The child reads lines ``kind seed index`` and answers each with one line of JSON. Commands run in the
 child, through the entry point of the console script.
 
-A command must succeed, or refuse with one line that begins with ``error:`` (continued by indented ones), exit code 2 or
-3 and all files unchanged. Exceptions: ``hw replay`` may end with 1 to 4 and may write files however it ends; a command
-may save a part that it marks incomplete; a run beyond its time limit must stop on Ctrl-C. ``check`` and other ``hw``
-commands must change no file, even where they succeed. No temporary file is left; no signal of a run is infinite.
+A command must succeed, or refuse with one line that begins with ``error:`` (and indented continuation lines), exit code
+2 or 3 and all files unchanged. Exceptions: ``hw replay`` may end with 1 to 4 and may write files in any case; a command
+may save a partial result that it marks incomplete; a run beyond its time limit must stop on Ctrl-C. ``check`` and other
+``hw`` commands must not change files even if they succeed. No temporary file remains; no signal of a run is infinite.
 """
 
 from __future__ import annotations
@@ -47,23 +47,23 @@ TRACEBACK, HANG, CRASH, LOSS, MESSAGE, FILES, NUMBERS = (
 )
 FAILURES = (TRACEBACK, HANG, CRASH, LOSS, MESSAGE, FILES, NUMBERS)
 READY = "ready"
-# Memory of a worker beyond that after all imports [bytes].
+# Memory of a worker in addition to its memory after all imports [bytes].
 MEMORY = 4 << 30
-# A simulation may take long because its input asks for it (stiff motors, say). It must then heed Ctrl-C [s].
+# A simulation may take long because of its input (stiff motors, for example). It must then stop on Ctrl-C [s].
 SIMULATION_LIMIT = 20.0
-# Stderr as the parent gave it: file descriptor 2 is another one while a case runs.
+# Original stderr: file descriptor 2 is redirected while a case runs.
 LOG = os.dup(2)
 
 
 @dataclass
 class Outcome:
-    """How a case ended: one of the words above; for failures what and where, equal for equal causes."""
+    """Outcome of a case: one of the words above; for failures description and place, equal for equal causes."""
 
     outcome: str
     what: str = ""
     place: str = ""
     detail: str = ""
-    # What the input says was held against what was taken.
+    # The content of the input was compared with dynsim's objects.
     compared: bool = False
 
 
@@ -71,7 +71,7 @@ def run_case(case: Draft, folder: Path, limit: float) -> Outcome:
     """Run all commands of a case in ``folder``; the first failure counts."""
     for name, data in case.files.items():
         put(folder / name, data)
-    # Some scenarios name it.
+    # Some scenarios refer to it.
     shutil.copytree(SHIPPED / "robots", folder / "robots")
     ended = Outcome(OK)
     for command in case.commands:
@@ -104,7 +104,7 @@ def run_case(case: Draft, folder: Path, limit: float) -> Outcome:
 
 
 def _not_finite(path: Path) -> str:
-    """The first signal of a run that went well with a value that is no number, but for those that have none."""
+    """Return the first signal of a successful run with a value that is not finite, except signals that may have one."""
     import numpy as np
 
     from dynsim.record import Record
@@ -138,7 +138,7 @@ def _run_command(command: list[str], folder: Path, limit: float) -> Outcome:
 
 
 def _judge(command: list[str], code: Any, out: str, err: str) -> Outcome:
-    """Exit code and output of a command against the rules."""
+    """Check exit code and output of a command against the rules."""
     lines = err.splitlines()
     errors = [line for line in lines if line.startswith("error:")]
     verdict = Outcome(OK if code == 0 else REFUSED, detail=err[-2000:])
@@ -159,7 +159,7 @@ def _judge(command: list[str], code: Any, out: str, err: str) -> Outcome:
         wrong = "an error that says nothing"
     if not wrong:
         return verdict
-    # What stands in quotes differs from case to case; the cause does not.
+    # Quoted text differs from case to case; the cause does not.
     return Outcome(
         MESSAGE,
         wrong.partition(":")[0] if wrong.startswith("the error") else wrong,
@@ -173,7 +173,7 @@ def _is_control(sign: str) -> bool:
 
 
 def _loose(lines: list[str], after: str) -> list[str]:
-    """Lines beside the error that are neither its continuation nor a warning nor the note of a saved part."""
+    """Return lines other than the error, its continuation, warnings and the note about a saved part."""
     loose = []
     warned = False
     for line in lines:
@@ -208,7 +208,7 @@ def _late(said: _Said, limit: float) -> Outcome:
 
 
 def _class_of(loss: str) -> str:
-    """The loss without its numbers and names, so that equal ones count together."""
+    """Return the loss without its numbers and names, so that equal losses are counted together."""
     words = [word for word in loss.split() if not any(sign.isdigit() or sign in "'\".,:=/" for sign in word)]
     return " ".join(words)[:70] or loss[:70]
 
@@ -220,7 +220,7 @@ def _traceback(error: BaseException) -> Outcome:
 
 
 def _place(stack: traceback.StackSummary) -> str:
-    """The innermost function of dynsim on a stack, and where it ended if elsewhere."""
+    """Return the innermost function of dynsim on a stack, and where it ended if elsewhere."""
     ours = [
         frame
         for frame in stack
@@ -248,7 +248,7 @@ def _snapshot(folder: Path) -> dict[str, bytes]:
 
 @dataclass
 class _Said:
-    """What was printed, by Python and by compiled libraries; and the stack when the time was up."""
+    """Output of Python and of compiled libraries, and the stack when the time was up."""
 
     output: str = ""
     errors: str = ""
@@ -257,7 +257,7 @@ class _Said:
 
 @contextlib.contextmanager
 def _quiet(folder: Path, limit: float) -> Iterator[_Said]:
-    """Work in ``folder`` with everything printed caught, and Ctrl-C after ``limit`` [s]."""
+    """Work in ``folder``, capture all output, and raise Ctrl-C after ``limit`` [s]."""
     said, out, err = _Said(), io.StringIO(), io.StringIO()
     before = Path.cwd()
     os.chdir(folder)
@@ -281,7 +281,7 @@ def _quiet(folder: Path, limit: float) -> Iterator[_Said]:
 
 @contextlib.contextmanager
 def _into(target: int) -> Iterator[None]:
-    """File descriptors 1 and 2, to which compiled libraries print past Python, lead to ``target``."""
+    """Redirect file descriptors 1 and 2, which compiled libraries use directly, to ``target``."""
     kept = {number: os.dup(number) for number in (1, 2)}
     for number in kept:
         os.dup2(target, number)
@@ -295,14 +295,14 @@ def _into(target: int) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _alarm(limit: float, said: _Said) -> Iterator[None]:
-    """Ctrl-C after ``limit`` [s]; where not even that is handled, the stack into the log and the end of the process."""
+    """Raise Ctrl-C after ``limit`` [s]; if even that is not handled, log the stack and end the process."""
 
     def ring(number: int, frame: Any) -> None:
         said.rang_at = said.rang_at or traceback.extract_stack(frame)
         raise KeyboardInterrupt
 
     signal.signal(signal.SIGALRM, ring)
-    # Again every two seconds: somebody may have swallowed the first.
+    # Repeat every two seconds, in case the first signal was swallowed.
     signal.setitimer(signal.ITIMER_REAL, limit, 2.0)
     faulthandler.dump_traceback_later(1.5 * limit + 1.0, exit=True, file=LOG)
     try:
@@ -313,7 +313,7 @@ def _alarm(limit: float, said: _Said) -> Iterator[None]:
 
 
 def _load_everything(records: Path) -> None:
-    """What every case needs, before memory is bounded and the clock runs: libraries and compiled kernels."""
+    """Load libraries and compiled kernels for all cases, before memory is limited and the clock runs."""
     import pinocchio  # noqa: F401
 
     from dynsim.engine import simulate
@@ -325,7 +325,7 @@ def _load_everything(records: Path) -> None:
 
 
 def bound_memory() -> None:
-    """No input may take the machine's memory."""
+    """Limit memory, so that no input can exhaust the machine."""
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
     limit = pages * resource.getpagesize() + MEMORY
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
@@ -339,7 +339,7 @@ def main() -> None:
     parser.add_argument("--limit", type=float, required=True, help="of a command [s]")
     parser.add_argument("--broken", action="store_true", help="break the loaders first, see fuzz.broken")
     options = parser.parse_args()
-    # Answers go to a copy of stdout: nothing that a case prints can stand between them.
+    # Answers go to a copy of stdout, so that the output of a case cannot come between them.
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     faulthandler.enable(LOG)
     _load_everything(options.records)
@@ -351,7 +351,7 @@ def main() -> None:
         for line in sys.stdin:
             kind, seed, index = line.split()
             case = draw(kind, int(seed), int(index), options.records)
-            # A name of its own for every case: nothing read before can be taken for it.
+            # A separate name for every case, so that nothing read before can be mistaken for it.
             folder = options.folder / f"{kind}-{index}"
             folder.mkdir(parents=True)
             ended = run_case(case, folder, options.limit)

@@ -1,4 +1,4 @@
-"""Study: the published arm with its elbows glued to the floor, on a real floor, and with all links as candidates.
+"""Study: the published arm with its elbows held on the floor, on a real floor, and with all links as candidates.
 
 ``PYTHONPATH=tests python -m support.contact`` writes results/contact/, which README.md and docs/validation.md quote, in
 about ten seconds once the kernels are compiled.
@@ -19,7 +19,7 @@ from dynsim.system.files import write_json
 FOLDER = Path("results/contact")
 GLUED, REAL, LINKS = "elbow_comparison", "elbow_comparison_floor", "elbow_comparison_links"
 SCENARIOS = (GLUED, REAL, LINKS)
-# Of a summary: what is quoted of a run, and of each of its contacts that touched.
+# Keys of a summary that are quoted for a run, and for each of its contacts that touched.
 RUN = (
     "electrical_energy_J", "mechanical_work_J", "joule_heat_J", "friction_heat_J", "impact_loss_J", "hand_error_rms_m",
     "hand_error_z_rms_m", "energy_residual_relative", "constraint_drift_max_m", "rhs_evaluations",
@@ -31,7 +31,7 @@ CONTACT = (
 
 
 def numbers(record: Record) -> dict[str, Any]:
-    """What is quoted of a run: energies, errors, contacts, and the events of contacts as [time, kind, contact]."""
+    """Return the quoted numbers of a run: energies, errors, contacts, and contact events as [time, kind, contact]."""
     summary = record.summary
     row: dict[str, Any] = {key: summary[key] for key in RUN if key in summary}
     row["deepest_below_the_floor_m"] = max((sunk["depth_m"] for sunk in summary["sinking"]), default=0.0)
@@ -45,7 +45,7 @@ def numbers(record: Record) -> dict[str, Any]:
 
 
 def side_by_side(glued: dict[str, Record], real: dict[str, Record]) -> dict[str, Record]:
-    """Every variant on both floors, one after the other."""
+    """Return every variant on both floors, one after the other."""
     return {
         f"{variant}, {floor}": records[variant]
         for variant in glued
@@ -54,7 +54,7 @@ def side_by_side(glued: dict[str, Record], real: dict[str, Record]) -> dict[str,
 
 
 def table(numbers_of: dict[str, dict[str, Any]]) -> str:
-    """Numbers of all runs, for the terminal."""
+    """Return the numbers of all runs, for the terminal."""
     lines = [f"{'':40}{'energy [J]':>11}{'error [mm]':>11}{'residual':>10}  contacts: mean N, closed %, sticking %"]
     for scenario, variants in numbers_of.items():
         for variant, row in variants.items():

@@ -1,6 +1,6 @@
 """The diagrams of docs/physics.md: ``PYTHONPATH=tests python -m support.diagrams`` writes docs/images/*.svg.
 
-Poses, axes and forces are those of a model and of the laws, not drawn by hand.
+Poses, axes and forces come from a model and from the laws; they are not drawn by hand.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ AXES = (PULLING, GREEN, BLUE)
 """Colours of x, y and z."""
 MU = 0.5
 MOUNT = np.array([0.3, 0.1, 0.3])
-"""Of the arm, in the world [m]."""
+"""Position of the arm in the world [m]."""
 
 
 def arm() -> Model:
-    """Yaw at the base, three pitch joints; the third joint is an elbow on the floor."""
+    """Return an arm with a yaw joint at the base and three pitch joints; the third joint is an elbow on the floor."""
     body = Inertia(1.0, np.zeros(3), np.eye(3))
     lengths = (0.0, 0.5, 0.5, 0.4)
     axes = [np.array([0.0, 0.0, 1.0]), *[np.array([0.0, 1.0, 0.0])] * 3]
@@ -40,7 +40,7 @@ def arm() -> Model:
 
 
 def frames() -> Figure:
-    """World, bodies and joint axes of an arm in a posture, and what turns one joint."""
+    """Draw world, bodies and joint axes of an arm in a posture, and the rotation of one joint."""
     figure = Figure(figsize=(9.0, 3.4))
     _posture(figure.add_axes((-0.06, -0.3, 0.72, 1.6), projection="3d", proj_type="ortho", computed_zorder=False))
     _one_joint(figure.add_axes((0.62, 0.02, 0.37, 0.96)))
@@ -88,7 +88,7 @@ def _frame(ax: Axes, p: Array, R: Array, size: float, name: str) -> None:
 
 
 def _one_joint(ax: Axes) -> None:
-    """Parent's frame P, the joint's frame J in it, and the body's frame B after a turn by q about the axis a."""
+    """Draw the parent's frame P, the joint's frame J in it, and the body's frame B after a turn by q about axis a."""
     turn, q = math.radians(20.0), math.radians(50.0)
     P, J = np.array([0.0, 0.0]), np.array([1.5, 0.9])
     _flat_frame(ax, P, 0.0, "P", 0.62)
@@ -107,7 +107,7 @@ def _one_joint(ax: Axes) -> None:
 
 
 def _flat_frame(ax: Axes, p: Array, angle: float, name: str, size: float, faint: bool = False) -> None:
-    """A frame whose third axis points at the reader: x and z of the arm's links."""
+    """Draw a frame whose third axis points at the reader: x and z of the arm's links."""
     for k, letter in enumerate("xy"):
         tip = p + size * np.array([math.cos(angle + k * math.pi / 2), math.sin(angle + k * math.pi / 2)])
         look = {"arrowstyle": "-|>", "color": AXES[k], "linewidth": 1.8, "shrinkA": 0, "shrinkB": 0}
@@ -116,7 +116,7 @@ def _flat_frame(ax: Axes, p: Array, angle: float, name: str, size: float, faint:
 
 
 def contact_modes() -> Figure:
-    """What a contact does, and the force that it has."""
+    """Draw the modes of a contact with their forces."""
     figure = Figure(figsize=(9.0, 5.2), layout="constrained")
     grid = figure.subplots(2, 3)
     panels = (
@@ -156,7 +156,7 @@ def _contact(ax: Axes, gap: float, force: tuple[float, float] | None, velocity: 
     ax.text(1.33, 0.6, "n", fontsize=10)
     if force is not None and any(force):
         _arrow(ax, p, force, PULLING, "P" if cone and velocity is not None and velocity[1] < 0.0 else "f")
-    if velocity is not None and cone and velocity[1] < 0.0:  # what it came with
+    if velocity is not None and cone and velocity[1] < 0.0:  # velocity before the impact
         _arrow(ax, p - np.asarray(velocity) * 1.6, np.asarray(velocity) * 1.5, GREEN, "")
         ax.text(*(p - np.asarray(velocity) * 1.6 + [-0.05, 0.15]), r"$\dot r$", color=GREEN, fontsize=11, ha="center")
     elif velocity is not None:
@@ -177,7 +177,7 @@ def _arrow(ax: Axes, p: Array, vector: Array, colour: str, name: str) -> None:
 
 
 def mobile_base() -> Figure:
-    """The base from above: what its coordinates, its rates and its margin are."""
+    """Draw the base from above, with its coordinates, rates and margin."""
     figure = Figure(figsize=(6.4, 4.2), layout="constrained")
     ax = figure.add_subplot()
     psi, track, radius, caster = math.radians(25.0), 1.2, 0.3, 1.1
@@ -219,7 +219,7 @@ def mobile_base() -> Figure:
 
 
 def main() -> None:
-    # Texts as outlines, so that they look alike everywhere; the same bytes each time.
+    # Texts as outlines, so that they look the same everywhere; identical bytes in each run.
     with matplotlib.rc_context({"svg.hashsalt": "dynsim", "svg.fonttype": "path"}):
         for draw in (frames, contact_modes, mobile_base):
             draw().savefig(FOLDER / f"{draw.__name__}.svg", facecolor="white", metadata={"Date": None})

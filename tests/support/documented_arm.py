@@ -13,5 +13,5 @@ PLANT = """plant:
 
 
 def plant(motor: str) -> str:
-    """The section ``plant`` with motors of a type."""
+    """Return the section ``plant`` with motors of a type."""
     return PLANT.replace("MOTOR", motor)

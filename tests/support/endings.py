@@ -1,13 +1,13 @@
 """Study: thousands of random braced arms; each run must reach its end or a named stop.
 
-Arms of 3 to 12 joints with DC motors lean on planes, pipes, spheres, boxes and terrain: points that are declared, all
-joints or all links may touch, with friction that holds more or as much at rest, payloads, pushes, soft and stiff gains,
-hand paths.
+Arms of 3 to 12 joints with DC motors lean on planes, pipes, spheres, boxes and terrain. Declared points, all joints or
+all links may touch, with static friction equal to kinetic friction or larger, payloads, pushes, soft and stiff gains,
+and hand paths.
 
     PYTHONPATH=tests python -m support.endings --count 10000 --jobs 2
 
-writes results/endings/endings.json, which docs/validation.md quotes, in about half an hour; ``--journal FILE`` keeps
-what is done, and goes on with it.
+writes results/endings/endings.json, which docs/validation.md quotes, in about half an hour; ``--journal FILE`` stores
+completed scenes and resumes from them.
 """
 
 from __future__ import annotations
@@ -39,27 +39,32 @@ Array = NDArray[np.float64]
 
 FILE = Path("results/endings/endings.json")
 SEED = 27
-# Wall time after which a run counts as cut off [s]: a hundred times that of the longest.
+# Wall time after which a run counts as cut off [s]: a hundred times the longest run.
 WALL_LIMIT_S = 60.0
 METHODS = ("radau5", "radau5", "dopri5", "time_stepping")
 SURFACES = ("plane", "cylinder", "sphere", "box", "height_field")
 FINISHED, REFUSED = "finished", "refused"
 TERRAINS = 4
-# Heights of the grid that a terrain has along each side, and their distance [m].
+# Number of grid points of a terrain along each side, and their spacing [m].
 GRID, SPACING = 24, 0.15
 
 
 @dataclass(frozen=True)
 class Ending:
-    """How one scene ended.
+    """Ending of one scene.
 
     Attributes
     ----------
-    scene : its number
-    status : ``finished``, ``refused`` before the first step, or the kind of the stop
-    reason : of a stop or refusal
-    time_s : that was simulated [s]
-    wall_s : of its integration [s]
+    scene : int
+        Number of the scene.
+    status : str
+        ``finished``, ``refused`` before the first step, or the kind of the stop.
+    reason : str
+        Reason of a stop or refusal.
+    time_s : float
+        Simulated time [s].
+    wall_s : float
+        Wall time of the integration [s].
     """
 
     scene: int
@@ -72,7 +77,7 @@ class Ending:
 
 
 def scene(number: int, terrains: Sequence[str]) -> dict[str, Any]:
-    """A scene by its number, as a scenario file would have it; ``terrains``: files of :func:`write_terrains`."""
+    """Return a scene by its number, as in a scenario file; ``terrains``: files of :func:`write_terrains`."""
     random = np.random.default_rng([SEED, number])
     method, surface = str(random.choice(METHODS)), str(random.choice(SURFACES))
     duration = float(random.uniform(0.3, 1.0))
@@ -80,7 +85,7 @@ def scene(number: int, terrains: Sequence[str]) -> dict[str, Any]:
     joints = _places(chain)
     radius = float(random.uniform(0.01, 0.04))
     candidates = str(random.choice(("points", "joints", "links"), p=(0.5, 0.3, 0.2)))
-    # On the surface, or as high above it as it falls in a tenth of a second.
+    # On the surface, or above it by the distance of a fall of 0.1 s.
     braced = bool(random.random() < 0.6)
     thick = 1.02 * radius if candidates == "links" else 0.0
     below = joints[elbow] - [0.0, 0.0, thick + (0.0 if braced else float(random.uniform(0.0, 0.05)))]
@@ -120,19 +125,19 @@ def scene(number: int, terrains: Sequence[str]) -> dict[str, Any]:
 
 
 def _chain(random: Generator) -> tuple[list[dict[str, Any]], int]:
-    """An arm that comes down to its elbow and goes up behind it; and the number of the joint that is its elbow."""
+    """Return an arm that descends to its elbow and rises behind it, and the number of the elbow's joint."""
     n = int(random.integers(3, 13))
     yaw = bool(n > 3 and random.random() < 0.6)
     elbow = int(random.integers(2 if yaw else 1, n))
     chain: list[dict[str, Any]] = []
     before = 0.0
     for k in range(n):
-        # About its own axis a link turns only what comes behind it.
+        # Rotation of a link about its own axis turns only the following links.
         axis, angle, length = "z", float(random.uniform(-20, 20)), float(random.uniform(0.15, 0.4))
         if k == 0 and yaw:
             length = 0.0
         elif k in (int(yaw), elbow) or random.random() < 0.8:
-            # The link's angle to the vertical: down before the elbow, up behind it.
+            # Angle of the link to the vertical: down before the elbow, up behind it.
             pitch = float(random.uniform(95, 130) if k < elbow else random.uniform(30, 85))
             axis, angle, before = "y", pitch - before, pitch
         mass = float(random.uniform(0.1, 1.0))
@@ -141,7 +146,7 @@ def _chain(random: Generator) -> tuple[list[dict[str, Any]], int]:
 
 
 def _places(chain: Sequence[Mapping[str, Any]]) -> Array:
-    """Where joints and hand are at the start, (n + 1, 3) [m]."""
+    """Return the positions of joints and hand at the start, (n + 1, 3) [m]."""
     rotation, position, positions = np.eye(3), np.zeros(3), []
     for link in chain:
         positions.append(position)
@@ -154,7 +159,7 @@ def _places(chain: Sequence[Mapping[str, Any]]) -> Array:
 
 
 def _link(random: Generator, radius: float) -> dict[str, Any]:
-    """What all links have: a published motor, or one of the size of Maxon's RE 40 with a gear of 113:1."""
+    """Return the keys of all links: a published motor, or one of the size of Maxon's RE 40 with a gear of 113:1."""
     motor: dict[str, Any] = {"type": "wang_minami"}
     if random.random() < 0.5:
         motor = {
@@ -175,7 +180,7 @@ def _link(random: Generator, radius: float) -> dict[str, Any]:
 def _controller(
     random: Generator, chain: Sequence[Mapping[str, Any]], joints: Array, duration: float
 ) -> dict[str, Any]:
-    """Gains from soft to stiff; the arm holds, or moves some joints, or its hand."""
+    """Return gains from soft to stiff for an arm that holds its posture, or moves some joints, or its hand."""
     gain = float(10.0 ** random.uniform(1.0, 3.3))
     settings: dict[str, Any] = {"type": "joint_pd", "k_p_V_per_rad": gain, "k_d_V_s_per_rad": gain * 0.04}
     moves = random.random()
@@ -195,7 +200,7 @@ def _controller(
 
 
 def _surface(random: Generator, kind: str, below: Array, terrains: Sequence[str]) -> dict[str, Any]:
-    """A surface whose top is at a place, (3,) [m]."""
+    """Return a surface whose top is at a position, (3,) [m]."""
     size = float(random.uniform(0.05, 0.3))
     x, y, z = below.tolist()
     if kind == "plane":
@@ -210,14 +215,14 @@ def _surface(random: Generator, kind: str, below: Array, terrains: Sequence[str]
         edges = random.uniform(0.1, 0.5, size=3).tolist()
         turn = [0.0, 0.0, float(random.uniform(-90, 90))]
         return {"type": kind, "center_m": [x, y, z - 0.5 * edges[2]], "edges_m": edges, "rpy_deg": turn}
-    # Where the arm is above the middle of it, it is nowhere higher than there.
+    # The terrain is highest in its middle, below the arm.
     corner = -0.5 * SPACING * (GRID - 1)
     file = str(random.choice(list(terrains)))
     return {"type": kind, "file": file, "spacing_m": [SPACING] * 2, "origin_m": [x + corner, y + corner, z]}
 
 
 def _loads(random: Generator, chain: Sequence[Mapping[str, Any]], duration: float) -> dict[str, Any]:
-    """A payload, a steady force, a push."""
+    """Return a payload, a steady force or a push."""
     last, loads = f"link_{len(chain)}", dict[str, Any]()
     if random.random() < 0.3:
         tip = [0.0, 0.0, chain[-1]["length_m"]]
@@ -233,7 +238,7 @@ def _loads(random: Generator, chain: Sequence[Mapping[str, Any]], duration: floa
 
 
 def write_terrains(folder: Path) -> list[str]:
-    """Height fields of hills, highest in the middle, where they are zero; their files."""
+    """Write height fields of hills, highest in the middle, where they are zero; return their files."""
     files = []
     for k in range(TERRAINS):
         random = np.random.default_rng([SEED, 1_000_000 + k])
@@ -251,12 +256,12 @@ def write_terrains(folder: Path) -> list[str]:
 
 
 def end(number: int, terrains: Sequence[str], look: Progress | None = None) -> Ending:
-    """Simulate a scene, however that ends.
+    """Simulate a scene and return its ending.
 
     Raises
     ------
     SimulationInterrupted
-        ``look`` raised KeyboardInterrupt, or Ctrl-C.
+        If ``look`` raises KeyboardInterrupt, or on Ctrl-C.
     """
     drawn, record = scene(number, terrains), None
     status, reason, time = FINISHED, "", drawn["duration_s"]
@@ -276,7 +281,7 @@ def end(number: int, terrains: Sequence[str], look: Progress | None = None) -> E
 def endings(
     numbers: Iterable[int], jobs: int, terrains: Sequence[str], take: Callable[[Ending], None]
 ) -> tuple[list[Ending], bool]:
-    """How scenes end, in the order of their numbers, and whether Ctrl-C came before all had; ``take`` gets each."""
+    """Return the endings in the order of the scenes, and whether Ctrl-C came before all ended; ``take`` gets each."""
     ended: list[Ending] = []
 
     def take_late(number: int, result: Callable[[], Ending | None]) -> None:
@@ -297,7 +302,7 @@ def endings(
 
 
 class _Work:
-    """:func:`end` for processes."""
+    """:func:`end` as a task for processes."""
 
     def __init__(self, terrains: Sequence[str]) -> None:
         self._terrains = list(terrains)
@@ -307,7 +312,7 @@ class _Work:
 
 
 def account(ended: Sequence[Ending]) -> dict[str, Any]:
-    """How many ended how, by method and surface; wall times; the first scene of each kind of stop or refusal."""
+    """Return numbers of endings by method and surface, wall times, and the first scene of each kind of ending."""
     kinds = sorted({ending.status for ending in ended})
     walls = {
         method: [ending.wall_s for ending in ended if ending.method == method and ending.status != REFUSED]
@@ -342,7 +347,7 @@ def _short(reason: str) -> str:
 
 
 def _why(reason: str) -> str:
-    """A refusal without its names and numbers."""
+    """Return a refusal without its names and numbers."""
     words = ["…" if any(c.isdigit() or c in "'_" for c in word) else word for word in reason.split()[1:]]
     return " ".join(word for k, word in enumerate(words) if word != "…" or words[k - 1] != "…")
 
@@ -364,7 +369,7 @@ def note(journal: Path, ending: Ending) -> None:
 
 
 def noted(journal: Path | None) -> list[Ending]:
-    """What a journal has; a process that was killed may have left a line unfinished."""
+    """Return the entries of a journal; a killed process may have left an unfinished line."""
     ended: list[Ending] = []
     if journal is not None and journal.exists():
         for line in journal.read_text("utf-8").splitlines():
@@ -374,7 +379,7 @@ def noted(journal: Path | None) -> list[Ending]:
 
 
 def main() -> None:
-    """Run the scenes, print what became of them, and keep it."""
+    """Run the scenes, print their endings, and save them."""
     options = _options()
     wanted = range(options.first, options.first + options.count)
     earlier = [ended_scene for ended_scene in noted(options.journal) if ended_scene.scene in wanted]
@@ -392,7 +397,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    # By its name: other processes find it by that.
+    # Imported by name, because other processes look it up by this name.
     from support import endings as module
 
     module.main()

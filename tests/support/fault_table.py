@@ -1,11 +1,11 @@
-"""Study: the end of every fault under every policy in every state of a replay, on virtual servos.
+"""Study: final state after every fault under every policy in every state of a replay, on virtual servos.
 
     PYTHONPATH=tests python -m support.fault_table --runs 100 --out results/reference/bridge_faults.json
 
 prints the table of docs/hardware.md. A cell is a fault, the state of the replay in which it strikes, and a policy; its
-runs differ in their seed: servo, instant, and what the fault does at random. Each run is checked against the bytes on
-the line and the registers: after the fault only the policy sends goals, no torque is switched on, and the servos are in
-the state that is reported.
+runs differ in their seed: servo, time, and random parts of the fault. Each run is checked against the bytes on the line
+and the registers: after the fault only the policy sends goals, no torque is switched on, and the servos are in the
+reported state.
 """
 
 from __future__ import annotations
@@ -75,12 +75,12 @@ POLICIES: tuple[FaultPolicy, ...] = get_args(FaultPolicy)
 
 @dataclass(frozen=True)
 class Case:
-    """One fault: its script entry, whom it may strike, and by which rules it is noticed (none: it goes well).
+    """One fault: its script entry, the servos that it may strike, and the rules that detect it (none: no effect).
 
     Attributes
     ----------
     visible_after : float
-        From its onset until a rule can see it [s].
+        Time from its onset until a rule can detect it [s].
     """
 
     name: str
@@ -91,7 +91,7 @@ class Case:
 
     @property
     def scripted_onset(self) -> bool:
-        """False for what is wrong from the beginning, and found before anything moves."""
+        """False for a fault that exists from the start and is detected before anything moves."""
         return self.causes != (Cause.VERIFICATION,)
 
 
@@ -114,7 +114,7 @@ CASES = (
     Case("overload", {"kind": "overload"}, ANY, (Cause.ALERT,)),
     Case("overheat", {"kind": "overheat"}, ANY, (Cause.ALERT,)),
     Case("watchdog_trip", {"kind": "watchdog_trip"}, ANY, (Cause.WATCHDOG, Cause.FOLLOWING_ERROR)),
-    # A joint that sticks with little error left to grow pushes until its torque rule fires instead.
+    # A joint that sticks with a small error pushes until its torque rule fires instead.
     Case("stuck", {"kind": "stuck"}, ANY, (Cause.FOLLOWING_ERROR, Cause.TORQUE)),
     Case("backlash", {"kind": "backlash", "angle": 0.02}, JOINTS),
     Case("offset_jump", {"kind": "offset_jump", "angle": 0.5}, JOINTS, (Cause.FOLLOWING_ERROR,)),
@@ -125,7 +125,7 @@ CASES = (
 
 
 def swing(duration: float = 1.2, rate: float = 200.0, amplitude: float = 0.6) -> Record:
-    """A swing that never stands still for long: angle 0.6 sin 4t, wheel at up to 3 rad/s."""
+    """Return a swing that is never stationary for long: angle 0.6 sin 4t, wheel at up to 3 rad/s."""
     time = np.arange(0.0, duration, 1 / rate)
     record = Record(time)
     angles = amplitude * np.stack([np.sin(4 * time), np.sin(4 * time + 0.5)], axis=1)
@@ -139,7 +139,7 @@ def swing(duration: float = 1.2, rate: float = 200.0, amplitude: float = 0.6) ->
 
 @dataclass
 class Run:
-    """One replay on the rig, with all that was sent."""
+    """One replay on the rig, with all packets sent."""
 
     replay: Replay
     result: ReplayResult
@@ -152,11 +152,11 @@ class Run:
         return self.replay.map
 
     def goals(self) -> list[tuple[float, int, int]]:
-        """(time, ID, value) of every goal on the wire."""
+        """Return (time, ID, value) of every goal on the wire."""
         return [entry for time, packet in self.sent for entry in goals_in(time, packet)]
 
     def writes_of(self, address: int) -> list[tuple[float, int, int]]:
-        """(time, ID, value) of every byte written there to one servo."""
+        """Return (time, ID, value) of every byte written at ``address`` to one servo."""
         return [
             (time, packet.id, packet.parameters[2])
             for time, packet in self.sent
@@ -170,7 +170,7 @@ class Run:
 
 
 def goals_in(time: float, packet: Packet) -> list[tuple[float, int, int]]:
-    """(time, ID, value) of the goals in a packet."""
+    """Return (time, ID, value) of the goals in a packet."""
     p = packet.parameters
     if packet.instruction == Instruction.SYNC_WRITE and int.from_bytes(p[:2], "little") in GOAL_ADDRESSES:
         return [(time, p[k], int.from_bytes(p[k + 1 : k + 5], "little", signed=True)) for k in range(4, len(p), 5)]
@@ -181,7 +181,7 @@ def goals_in(time: float, packet: Packet) -> list[tuple[float, int, int]]:
 
 @dataclass
 class Rig:
-    """Runs replays on virtual servos."""
+    """Runner of replays on virtual servos."""
 
     map: ServoMap
     record: Record = field(default_factory=swing)
@@ -199,7 +199,7 @@ class Rig:
         plant: Any = None,
         **options: Any,
     ) -> Run:
-        """A replay that has not begun, on servos of their own."""
+        """Return a replay that has not begun, on separate servos."""
         sent: list[tuple[float, Packet]] = []
         clock = VirtualClock()
         line = line_for_map(
@@ -215,7 +215,7 @@ class Rig:
         return Run(replay, replay.result, line, clock, sent)
 
     def run(self, *faults: dict[str, Any], **options: Any) -> Run:
-        """A whole replay."""
+        """Run a complete replay."""
         run = self.prepare(*faults, **options)
         run.result = run.replay.run()
         return run
@@ -223,7 +223,7 @@ class Rig:
 
 @lru_cache(maxsize=1)
 def rig() -> Rig:
-    """The small robot, on a short way and at half its rate: ten thousands of runs are many."""
+    """Return the rig with the small robot, on a short path and at half rate, because there are thousands of runs."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "rig.yaml")
         path.write_text(MAP.replace("rate: 100", "rate: 50"), encoding="utf-8")
@@ -234,20 +234,20 @@ def rig() -> Rig:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How one run ended.
+    """Ending of one run.
 
     Attributes
     ----------
     end : str
-        What the servos were read to do: those that were struck, then the others.
+        Final behaviour read from the servos: first the struck ones, then the others.
     cycles : int or None
-        From the onset of the fault to the rule that declared it; None where none did.
+        Cycles from the onset of the fault to the rule that declared it; None if no rule did.
     goals, packets : int
-        Packets with goals, and all others that were sent after it was declared.
+        Packets with goals, and all others, sent after it was declared.
     text : str
-        What the user reads.
+        Message to the user.
     broken : tuple of str
-        What must hold and did not.
+        Violated requirements.
     """
 
     end: str
@@ -260,7 +260,7 @@ class Outcome:
 
 @lru_cache(maxsize=1)
 def spans() -> dict[str, tuple[float, float]]:
-    """When each state begins and ends without a fault [s after the first torque enable]."""
+    """Return begin and end of each state without a fault [s after the first torque enable]."""
     run = rig().run()
     since = run.result.record.time + run.started() - run.line.servos.torque_since
     states = run.result.record["state"]
@@ -272,7 +272,7 @@ def spans() -> dict[str, tuple[float, float]]:
 
 
 def strike(case: Case, state: str, policy: FaultPolicy, seed: int) -> Outcome:
-    """One run: a fault strikes somebody at some time within a state, all drawn from the seed."""
+    """Run once: a fault strikes some servos at some time within a state, all drawn from the seed."""
     draw = random.Random(f"{case.name}/{state}/{policy}/{seed}")
     entry, stop = dict(case.entry), StopRequest()
     if case.ids:
@@ -295,7 +295,7 @@ def strike(case: Case, state: str, policy: FaultPolicy, seed: int) -> Outcome:
 
 
 def judge(run: Run, case: Case, entry: dict[str, Any]) -> Outcome:
-    """What a run shows of itself, on the wire and in the servos."""
+    """Evaluate a run from its result, the wire and the servos."""
     result = run.result
     fault = next((fault for fault in result.faults if fault.cause in case.causes), None)
     cycles = None
@@ -315,7 +315,7 @@ def judge(run: Run, case: Case, entry: dict[str, Any]) -> Outcome:
 
 
 def end_of(result: ReplayResult, entry: dict[str, Any]) -> str:
-    """What was read, without names: "struck: limp: overload, others: holding", or what all do."""
+    """Return the final behaviour without names: "struck: limp: overload, others: holding", or one for all."""
     if len({servo.doing for servo in result.servos}) <= 1 or "id" not in entry:
         return result.end_state
     struck = {servo.doing for servo in result.servos if servo.id == entry["id"]}
@@ -324,11 +324,11 @@ def end_of(result: ReplayResult, entry: dict[str, Any]) -> str:
 
 
 def broken_promises(run: Run) -> Iterator[str]:
-    """What was sent or reported and should not have been."""
+    """Yield packets and reports that should not have been sent."""
     result, servos = run.result, run.line.servos
     on_the_wire = [(id_, value) for time, id_, value in run.goals() if time > result.fault_time]
     declared = [(id_, value) for _, id_, value in result.policy_goals]
-    # What was declared last may not have reached the wire when the port died under it.
+    # The last declarations may not have reached the wire if the port failed meanwhile.
     if on_the_wire != declared[: len(on_the_wire)]:
         yield "a goal after the fault that was not the policy's"
     if [value for time, _, value in run.writes_of(TORQUE_ADDRESS) if time > result.fault_time and value]:
@@ -343,7 +343,7 @@ def broken_promises(run: Run) -> Iterator[str]:
 
 @dataclass
 class Cell:
-    """The runs of one fault in one state under one policy."""
+    """Runs of one fault in one state under one policy."""
 
     case: str
     state: str
@@ -351,7 +351,7 @@ class Cell:
     outcomes: list[Outcome] = field(default_factory=list)
 
     def as_dict(self) -> dict[str, Any]:
-        """Numbers for the reference; the text is that of the first run."""
+        """Return the numbers for the reference; the text is from the first run."""
         seen = [outcome.cycles for outcome in self.outcomes if outcome.cycles is not None]
         return {
             "fault": self.case,
@@ -368,7 +368,7 @@ class Cell:
 
 
 def cells(runs: int, cases: Iterable[Case] = CASES, first: int = 0) -> Iterator[Cell]:
-    """All cells of these faults, with so many runs each, of the seeds from ``first`` on."""
+    """Yield all cells of these faults, with ``runs`` runs each, for the seeds from ``first`` on."""
     for case in cases:
         for state in STATES if case.scripted_onset else (ReplayState.VERIFY.name,):
             for policy in POLICIES:
@@ -382,7 +382,7 @@ def _cells_of(job: tuple[Case, int]) -> list[dict[str, Any]]:
 
 
 def markdown(table: list[dict[str, Any]]) -> str:
-    """The table for the docs: states with the same ends in one row."""
+    """Return the table for the docs, with states of equal endings in one row."""
     lines = ["| fault | state | end: hold | end: decelerate | end: off | cycles | goals after it | the user reads |"]
     lines.append("|" + "---|" * 8)
     for case in dict.fromkeys(cell["fault"] for cell in table):
@@ -413,7 +413,7 @@ def _ends(cell: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    """Run the table, print it, and keep it."""
+    """Run the table, print it, and save it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=int, default=100, help="of each cell [100]")
     parser.add_argument("--out", type=Path, help="keep the numbers there (JSON)")

@@ -31,13 +31,13 @@ from support.random_robots import (
 
 @dataclass
 class Case:
-    """A system, a state y and a time t about which the states of the lanes are drawn."""
+    """A system, and a state y and a time t around which the states of the lanes are drawn."""
 
     compiled: CompiledSystem
     y: np.ndarray
-    spread: float  # of the lanes about y
+    spread: float  # spread of the lanes about y
     t: float = 0.0
-    t_step: float = 0.0  # of time from lane to lane; 0: one time for all
+    t_step: float = 0.0  # time difference between lanes; 0: the same time for all
 
 
 def random_plane(rng: np.random.Generator, body: str, law: str = "signed", friction: float = 0.2) -> Contact:
@@ -68,7 +68,7 @@ def on_planes(
     twice: bool = False,
     m_star: bool = False,
 ) -> Case:
-    """A tree with points of its last bodies on planes, the first of them ``twice``."""
+    """Return a tree with points of its last bodies on planes, the first of them ``twice``."""
     rng = np.random.default_rng(seed)
     contacts = [random_plane(rng, f"body_{n - 1 - k % n}", law, friction) for k in range(count)]
     if twice:
@@ -91,21 +91,21 @@ def every_joint() -> Case:
 
 
 def held(modes: list[int]) -> Case:
-    """Points that stick, slide and are off their planes."""
+    """Return points that stick, slide and are off their planes."""
     case = on_planes(7, len(modes), seed=2, spread=1e-3)
     stick(case, modes)
     return case
 
 
 def stick(case: Case, modes: list[int]) -> None:
-    """Give the contacts modes; those that stick do so where they are."""
+    """Set the modes of the contacts; sticking points stick at their present positions."""
     b = case.compiled
     _, b.ws = run(case, [case.y], 0.0)
     lanes.plain(set_modes)(b.system.contacts, b.system.couplings, None, b.ws, integers(modes))
 
 
 def curved() -> Case:
-    """A sphere, a cylinder, and a level set that is nowhere zero."""
+    """Return a sphere, a cylinder, and a level set that is nowhere zero."""
     rng = np.random.default_rng(3)
     surfaces = [
         surface_through(rng, "sphere", rng.normal(size=3)),
@@ -119,14 +119,14 @@ def curved() -> Case:
 
 
 def saddle() -> Case:
-    """A surface that bends both ways, of which some lanes are too far for a distance along its normal."""
+    """Return a saddle surface, too far from some lanes for a distance along its normal."""
     rng = np.random.default_rng(9)
     contact = replace(random_plane(rng, "body_5"), surface=Quadric(np.diag([1.0, 0.5, -2.0]), np.zeros(3), -0.5))
     return random_case(rng, assemble(random_robot(rng, 6, branches=False), [contact]), 1.0)
 
 
 def coupled(m_star: bool = False) -> Case:
-    """Joints that follow others up and down the tree, and a point that sticks to a body that moves."""
+    """Return joints that follow others up and down the tree, and a point that sticks to a moving body."""
     rng = np.random.default_rng(4)
     robot = random_robot(rng, 8)
     couplings = (Coupling("joint_6", "joint_2", 0.7, 0.1), Coupling("joint_1", "joint_7", -1.3))
@@ -139,7 +139,7 @@ def coupled(m_star: bool = False) -> Case:
 
 
 def driven(t: float, t_step: float = 0.0) -> Case:
-    """References by splines, held and rewritten; wrenches that are constant, end, and are held."""
+    """Return references by splines, held and rewritten; wrenches that are constant, end, and are held."""
     rng = np.random.default_rng(5)
     robot = replace(
         random_robot(rng, 5, motors=False),
@@ -165,7 +165,7 @@ def driven(t: float, t_step: float = 0.0) -> Case:
 
 
 def limited() -> Case:
-    """Motors of which some lanes are at their limits."""
+    """Return motors of which some lanes are at their limits."""
     rng = np.random.default_rng(6)
     robot = random_robot(rng, 6)
     motors = [replace(motor, voltage_limit=15.0) for motor in robot.motors]
@@ -174,7 +174,7 @@ def limited() -> Case:
 
 
 def servos() -> Case:
-    """Every kind of drive and mode of a servo."""
+    """Return every kind of drive and mode of a servo."""
     rng = np.random.default_rng(7)
     robot = random_robot_of(rng, ["revolute"] * 6)
     common: dict[str, Any] = {"torque_constant": 1.9, "resistance": 2.3, "coulomb_friction": 0.3, "free_drag": 0.1}
@@ -194,7 +194,7 @@ def servos() -> Case:
 
 
 def rubbing() -> Case:
-    """Joints and gears with dry friction that slide."""
+    """Return sliding joints and gears with dry friction."""
     rng = np.random.default_rng(9)
     robot = random_robot_of(rng, ["revolute"] * 4)
     links = tuple(replace(link, friction=0.1 * k) for k, link in enumerate(robot.links))
@@ -209,14 +209,14 @@ def rubbing() -> Case:
 
 
 def unmoved() -> Case:
-    """A point of a slide along x on a floor: a system of one row that is zero."""
+    """Return a point of a slide along x on a floor: a system of one zero row."""
     x, z = np.eye(3)[0], np.eye(3)[2]
     robot = Robot("slide", (Link("body", "joint", None, "prismatic", x, Inertia(1.0)),), (), ("body", np.zeros(3)))
     b = assemble(robot, [Contact("foot", "body", np.zeros(3), Quadric(np.zeros((3, 3)), z, 0.0))])
     return random_case(np.random.default_rng(8), b, 1.0)
 
 
-# Name → states. Spread widely; by little where lanes must agree; not at all where rounding decides on pivots.
+# Name → states. The spread is wide, small if lanes must agree, and zero if rounding decides on pivots.
 CASES: dict[str, Callable[[], Case]] = {
     "free arm": free,
     "every joint": every_joint,
@@ -249,7 +249,7 @@ TIMED = {
 
 
 def run(case: Case, states: list[np.ndarray], t: Any, **forms: Callable[..., Any]) -> tuple[np.ndarray, ka.Workspace]:
-    """Derivative and workspace of states as lanes, or of one state as it is; kernels replaced by their ``forms``."""
+    """Return derivative and workspace of states as lanes, or of one state; ``forms`` replace kernels."""
     b, count = case.compiled, len(states)
     parts, ws, dense = b.system, lanes.copies(b.ws), lanes.copies(b.system.dense)
     y, dy = states[0], np.zeros_like(states[0])

@@ -2,8 +2,8 @@
 
 ``Lanes`` are N doubles, one for each of N states; N is 4 in the compiled kernels. A comparison gives N booleans. An
 ``if`` on such a comparison is recorded with its line, since SIMD code has no such branch; lanes that disagree raise
-``Divergent``. Constants of the model become ``Constant``, which records where a real is taken for an integer; integers
-stay integers.
+``Divergent``. Constants of the model become ``Constant``, which records uses of a real as an integer; integers remain
+integers.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ KERNELS = str(Path(dynsim.dynamics.__file__).parent)
 
 
 class Place(NamedTuple):
-    """A line of the kernels by its text."""
+    """Line of the kernels, identified by its text."""
 
     file: str
     function: str
@@ -37,20 +37,20 @@ class Place(NamedTuple):
 
 
 class Line(NamedTuple):
-    """A line of the kernels by its number."""
+    """Line of the kernels, identified by its number."""
 
     path: str
     function: str
     number: int
 
     def location(self) -> Place:
-        """Its text, which stays when lines before it come and go."""
+        """Text of the line, which is unchanged when preceding lines are added or removed."""
         text = linecache.getline(self.path, self.number).strip()
         return Place(Path(self.path).relative_to(KERNELS).as_posix(), self.function, text)
 
 
 class Divergent(Exception):
-    """Lanes took different branches."""
+    """Raised if lanes take different branches."""
 
     def __init__(self, location: Place) -> None:
         super().__init__(str(location))
@@ -58,7 +58,7 @@ class Divergent(Exception):
 
 
 class Notes:
-    """What runs have noted: places that asked lanes, and that took a constant real for an integer; lines that ran."""
+    """Notes of runs: places that branch on lanes, or use a constant real as an integer, and executed lines."""
 
     def __init__(self) -> None:
         self.asked: set[Place] = set()
@@ -71,7 +71,7 @@ _notes = Notes()
 
 @contextmanager
 def noted() -> Iterator[Notes]:
-    """Notes of what runs inside."""
+    """Yield the notes of runs inside the block."""
     global _notes
     before, tracer = _notes, sys.gettrace()
     _notes = notes = Notes()
@@ -105,7 +105,7 @@ def _line(frame: FrameType) -> Line:
 
 
 def _agreed(values: tuple) -> Any:
-    """The value of all lanes, for a place that can do with one only."""
+    """Return the common value of all lanes, for a place that can use only one."""
     location = _place()
     _notes.asked.add(location)
     if any(value != values[0] for value in values):
@@ -114,7 +114,7 @@ def _agreed(values: tuple) -> Any:
 
 
 class Mask:
-    """One truth for each lane."""
+    """One boolean for each lane."""
 
     def __init__(self, values: tuple) -> None:
         self.values = values
@@ -141,9 +141,9 @@ def _operator(function: Callable[..., Any], result: type, turned: bool = False) 
 
 
 class Lanes:
-    """N doubles. No index, no dictionary key, no float: those would need one number."""
+    """N doubles; not an index, a dictionary key or a float, because these would need one number."""
 
-    __array_ufunc__ = None  # numpy's numbers leave operators to this class
+    __array_ufunc__ = None  # numpy's scalars leave operators to this class
     __hash__ = None  # type: ignore[assignment]
 
     def __init__(self, values: Any) -> None:
@@ -174,7 +174,7 @@ for _name in ("lt", "le", "gt", "ge", "eq", "ne"):
 
 
 def select(mask: Any, a: Any, b: Any) -> Any:
-    """Lanes of a where the mask is true, of b elsewhere."""
+    """Return lanes of a where the mask is true, of b elsewhere."""
     if not isinstance(mask, Mask):
         return a if mask else b
     count = len(mask.values)
@@ -182,7 +182,7 @@ def select(mask: Any, a: Any, b: Any) -> Any:
 
 
 class Constant(np.float64):
-    """A real of the model; compared with an integer, or made one, it is taken for what it is not."""
+    """Real of the model; a comparison with an integer, or a conversion to one, is recorded as misuse."""
 
     __hash__ = np.float64.__hash__
 
@@ -205,7 +205,7 @@ class Constant(np.float64):
 
 
 def _spread(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function for lanes and for numbers."""
+    """Return the function for lanes and for numbers."""
 
     def apply(*arguments: Any) -> Any:
         if any(isinstance(x, Lanes) for x in arguments):
@@ -215,18 +215,18 @@ def _spread(function: Callable[..., Any]) -> Callable[..., Any]:
     return apply
 
 
-# All that the right-hand side may take from its libraries. Roots of numbers are numpy's: NaN, not an error.
+# All library functions that the right-hand side may use. Roots of numbers are numpy's: NaN, not an error.
 MATH = SimpleNamespace(sqrt=_spread(np.sqrt), nan=np.nan, inf=np.inf, pi=np.pi)
 NUMPY = SimpleNamespace(rint=_spread(np.rint), floor=_spread(np.floor))
 
 
 def plain(function: Any) -> FunctionType:
-    """The source of a kernel, compiled or not."""
+    """Return the source of a kernel, compiled or not."""
     return getattr(function, "py_func", function)
 
 
 def reached(root: Any, without: Sequence[Any] = ()) -> list[FunctionType]:
-    """The function and all kernels that it calls, directly or not, and not through one of ``without`` alone."""
+    """Return the function and all kernels that it calls, directly or not, other than only through ``without``."""
     left_out = {plain(function).__code__ for function in without}
     functions: dict[CodeType, FunctionType] = {}
     waiting = [plain(root)]
@@ -243,7 +243,7 @@ def reached(root: Any, without: Sequence[Any] = ()) -> list[FunctionType]:
 
 
 def lines(function: FunctionType) -> set[Line]:
-    """Lines that can run, without the head of the function."""
+    """Return the lines that can run, without the head of the function."""
     code = function.__code__
     numbers = {number for _, _, number in code.co_lines() if number is not None}
     source = linecache.getlines(code.co_filename)
@@ -252,7 +252,7 @@ def lines(function: FunctionType) -> set[Line]:
 
 
 def patch(monkeypatch: pytest.MonkeyPatch, root: Any, **replaced: Callable[..., Any]) -> None:
-    """Let the modules of all that ``root`` reaches run as Python, with lanes; ``replaced``: kernels by name."""
+    """Let the modules of all functions that ``root`` reaches run as Python with lanes; ``replaced``: kernels."""
     for name in sorted({function.__module__ for function in reached(root)}):
         module = importlib.import_module(name)
         for key, value in list(vars(module).items()):
@@ -268,7 +268,7 @@ def patch(monkeypatch: pytest.MonkeyPatch, root: Any, **replaced: Callable[..., 
 
 
 def mapped(value: Any, real: Callable[[np.ndarray], Any], integer: Callable[[np.ndarray], Any]) -> Any:
-    """The tables of a named tuple, however nested, by their kind."""
+    """Convert the tables of a named tuple, however nested, by their kind."""
     if isinstance(value, tuple):
         return type(value)(*(mapped(part, real, integer) for part in value))
     if isinstance(value, np.ndarray):
@@ -277,7 +277,7 @@ def mapped(value: Any, real: Callable[[np.ndarray], Any], integer: Callable[[np.
 
 
 def objects(table: np.ndarray, make: Callable[[Any], Any]) -> np.ndarray:
-    """A table of objects, made of each number."""
+    """Return a table of objects, one made from each number."""
     result = np.empty(table.shape, dtype=object)
     for index in np.ndindex(table.shape):
         result[index] = make(table[index])
@@ -285,24 +285,24 @@ def objects(table: np.ndarray, make: Callable[[Any], Any]) -> np.ndarray:
 
 
 def constants(tables: Any) -> Any:
-    """A named tuple of the model, for runs with lanes."""
+    """Convert a named tuple of the model for runs with lanes."""
     return mapped(tables, lambda table: objects(table, Constant), lambda table: objects(table, int))
 
 
 def copies(tables: Any) -> Any:
-    """A named tuple of tables of its own."""
+    """Return a named tuple with copies of its tables."""
     return mapped(tables, np.copy, np.copy)
 
 
 def in_lanes(tables: Any, count: int) -> Any:
-    """A named tuple of what is written, all reals with so many equal lanes."""
+    """Convert a named tuple of written tables: all reals become ``count`` equal lanes."""
     return mapped(
         tables, lambda table: objects(table, lambda x: Lanes((x,) * count)), lambda table: objects(table, int)
     )
 
 
 def stacked(states: list[np.ndarray]) -> np.ndarray:
-    """Vectors as one vector of lanes."""
+    """Return vectors as one vector of lanes."""
     result = np.empty(states[0].shape, dtype=object)
     for k in range(len(result)):
         result[k] = Lanes(state[k] for state in states)
@@ -310,5 +310,5 @@ def stacked(states: list[np.ndarray]) -> np.ndarray:
 
 
 def lane(table: np.ndarray, k: int) -> np.ndarray:
-    """Lane k of a table."""
+    """Return lane k of a table."""
     return np.array([x.values[k] if isinstance(x, Lanes) else x for x in table.flat], dtype=float).reshape(table.shape)

@@ -1,8 +1,7 @@
 """Wheel pairs of a snake on servos, posed in Pinocchio, and the study of their heights and directions.
 
 ``PYTHONPATH=tests python -m support.lifted_wheels`` writes results/snake/lifted_wheels.json, which docs/hardware.md
-quotes. The robot gets the pose of the head that the record holds and the angles that the servos are sent, and nothing
-of the base.
+quotes. The robot gets the recorded head pose and the angles sent to the servos, but no data of the base.
 """
 
 from __future__ import annotations
@@ -26,18 +25,18 @@ from dynsim.snake.lifting import Lifts, lifted
 from dynsim.system.files import write_json
 
 FILE = Path("results/snake/lifted_wheels.json")
-# Records from a base that is nearly straight to one that is bent in a zigzag.
+# Records with bases from nearly straight to bent in a zigzag.
 RECORDS = (("snake_operator", None), ("snake_positioning", "y"), ("snake_joint_limits", "cyclic"))
 
 LINK, RADIUS, GRIPPER = 0.0905, 0.05, 0.09  # [T] Table I, IV.B
 HALF_TRACK = np.array([0.075, 0.06, 0.075, 0.06, 0.075, 0.06, 0.06])
-CLEARANCE, BLEND = 5e-3, 0.3  # the shipped map's
+CLEARANCE, BLEND = 5e-3, 0.3  # values of the shipped map
 JOINTS = [f"{kind}{k}" for k in range(1, 10) for kind in ("theta", "psi")][:-1]  # theta1, psi1 ... psi8, theta9
 PITCH = tuple(f"psi{k}" for k in range(3, 9))
 
 
 class Oracle:
-    """The chain of all 18 joints, a revolute one in each, neighbours one link apart."""
+    """Chain of all 18 joints, one revolute joint each, neighbours one link apart."""
 
     def __init__(self) -> None:
         self.model = pin.Model()
@@ -51,12 +50,12 @@ class Oracle:
         self.tail = pin.SE3(np.eye(3), np.array([-LINK, 0.0, 0.0]))
 
     def from_head(self, w: np.ndarray, offset: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Axle middles (7, 3), axle directions (7, 3) and heights of the wheels' lowest points (7, 2) [m]."""
+        """Return axle centres (7, 3), axle directions (7, 3) and heights of the wheels' lowest points (7, 2) [m]."""
         head = pin.SE3(pin.rpy.rpyToMatrix(*w[3:]), w[:3]) * pin.SE3(np.eye(3), np.array([-offset, 0.0, 0.0]))
         return self._seen(head, q)
 
     def from_pair_1(self, psi_3: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The same with pair 1 flat on the floor at the origin; ``psi_3`` is the record's angle, without lifting."""
+        """Return the same with pair 1 flat on the floor at the origin; ``psi_3`` is the recorded angle, without lift."""
         pin.forwardKinematics(self.model, self.data, q)
         lifting = pin.SE3(pin.rpy.rpyToMatrix(0.0, q[JOINTS.index("psi3")] - psi_3, 0.0), np.zeros(3))
         floor = self.data.oMi[self.axle[0]] * lifting.inverse()
@@ -75,7 +74,7 @@ class Oracle:
 
 @dataclass
 class Posed:
-    """A record on the oracle at all its samples."""
+    """A record posed on the oracle at all its samples."""
 
     record: Record
     middle: np.ndarray  # (T, 7, 3)
@@ -92,24 +91,24 @@ class Posed:
 
 
 def snake_map() -> ServoMap:
-    """The shipped map of the snake."""
+    """Return the shipped map of the snake."""
     return load_servo_map(SHIPPED / "snake.yaml")
 
 
 def head_offset(record: Record) -> float:
-    """From the first joint to the controlled point, less one link [m]."""
+    """Return the distance from the first joint to the controlled point, minus one link [m]."""
     return record.scene.hand.position[0] - LINK
 
 
 def posed(record: Record, servo_map: ServoMap) -> Posed:
-    """The robot at all samples of a record, with its head as recorded and the angles that the map has sent."""
+    """Pose the robot at all samples of a record, with the recorded head pose and the angles sent by the map."""
     oracle, angles = Oracle(), angles_sent(record, servo_map)
     poses = [oracle.from_head(w, head_offset(record), q) for w, q in zip(record["w"], angles, strict=True)]
     return Posed(record, *(np.array(part) for part in zip(*poses, strict=True)))
 
 
 def settled(record: Record) -> np.ndarray:
-    """Where a pair has been lifted for the blend time, and stays so for as long."""
+    """Return a mask of samples at which a pair was lifted for the blend time before and after."""
     away, time = record["grounded"] == 0, record.time
     angles = np.zeros_like(away)
     for pair in range(away.shape[1]):
@@ -120,16 +119,16 @@ def settled(record: Record) -> np.ndarray:
 
 
 def with_lifts(servo_map: ServoMap, **changes: object) -> ServoMap:
-    """The map with other settings of `lifts`."""
+    """Return the map with different settings of `lifts`."""
     servo_map.lifts = Lifts.model_validate(servo_map.lifts.model_dump() | changes)
     return servo_map
 
 
 def best_deviation(yaw: np.ndarray, away: set[int]) -> float:
-    """Smallest possible largest distance of a grounded wheel from the floor [m], to first order, over all pitch angles.
+    """Return the least possible maximum height error of grounded wheels [m], to first order, over all pitch angles.
 
-    A linear programme: pitch joint j lifts what is behind it by its distance from axle j; lifted wheels are at the
-    clearance or above, pair 1 is flat.
+    A linear programme: pitch joint j lifts the links behind it in proportion to their distance from axle j; lifted
+    wheels are at the clearance or above, pair 1 is flat.
     """
     middle, axle, heading = [np.zeros(2)], [np.array([0.0, 1.0])], 0.0
     for angle in yaw:
@@ -154,7 +153,7 @@ def best_deviation(yaw: np.ndarray, away: set[int]) -> float:
 
 
 def angles_sent(record: Record, servo_map: ServoMap) -> np.ndarray:
-    """Angles of all 18 joints at the samples of the record (T, 18), as the servos are sent them [rad]."""
+    """Return the angles of all 18 joints sent to the servos at the samples of the record, (T, 18) [rad]."""
     path = path_of_record(record, servo_map)
     columns = [servo_map.joints.index(name) for name in JOINTS]
     first = int(np.searchsorted(path.time, 0.0))
@@ -162,7 +161,7 @@ def angles_sent(record: Record, servo_map: ServoMap) -> np.ndarray:
 
 
 def second_order(poses: Posed) -> tuple[float, float]:
-    """How far axles on the ground are from the record's flat base at most: along the floor [m], in heading [rad]."""
+    """Return the largest deviation of grounded axles from the recorded base: along the floor [m], heading [rad]."""
     record = poses.record
     flat = record["posture"][:, 6::2, :2]  # after the controlled point and five joints
     off = np.linalg.norm(poses.middle[..., :2] - flat, axis=2)[poses.grounded].max()
@@ -172,14 +171,14 @@ def second_order(poses: Posed) -> tuple[float, float]:
 
 
 def other_wheel(record: Record) -> dict[str, float]:
-    """Of a bent base: the greatest yaw angle [deg], and how high the other wheel of a grounded pair is at most [mm]."""
+    """Return for a bent base: largest yaw angle [deg], largest height of the other wheel of a grounded pair [mm]."""
     fold = lifted(record, Lifts(joints=PITCH, tilt_mm=1e3))
     yaw = np.degrees(np.abs(record["phi"][:, 6:]).max())
     return {"yaw_deg": float(yaw), "other_wheel_mm": float(1e3 * fold.tilt[record["grounded"] == 1].max())}
 
 
 def in_ticks(record: Record) -> dict[str, float]:
-    """Wheels of the robot whose angles are rounded to ticks of the servos, with pair 1 flat on the floor [mm]."""
+    """Return wheel heights with angles rounded to servo ticks, with pair 1 flat on the floor [mm]."""
     oracle, exact = Oracle(), posed(record, snake_map())
     psi_3 = _to_ticks(record["phi"][:, record.labels["phi"].index("psi3")])
     angles = _to_ticks(angles_sent(record, snake_map()))
@@ -197,7 +196,7 @@ def _to_ticks(angles: np.ndarray) -> np.ndarray:
 
 
 def study() -> dict[str, Any]:
-    """Numbers of docs/hardware.md."""
+    """Return the numbers quoted in docs/hardware.md."""
     records = {name: simulate(load_scenario(name, variant)) for name, variant in RECORDS}
     operator = records["snake_operator"]
     poses = posed(operator, snake_map())

@@ -25,7 +25,7 @@ controller: {type: joint_pd, k_p_V_per_rad: 2000, k_d_V_s_per_rad: 20}
 
 
 def meshed_robot(folder: Path) -> Path:
-    """Write files of a robot of four links to a folder; returns the scenario."""
+    """Write the files of a robot of four links to a folder; return the scenario."""
     meshes = folder / "wedges" / "meshes"
     meshes.mkdir(parents=True)
     (meshes / "wedge.stl").write_bytes(stl())
@@ -56,13 +56,13 @@ def meshed_robot(folder: Path) -> Path:
 
 
 def stl() -> bytes:
-    """The wedge in binary STL."""
+    """Return the wedge in binary STL."""
     faces = b"".join(struct.pack("<12fH", 0, 0, 0, *CORNERS[face].ravel(), 0) for face in FACES)
     return bytes(80) + struct.pack("<I", len(FACES)) + faces
 
 
 def stl_text() -> str:
-    """The wedge in STL as text."""
+    """Return the wedge in ASCII STL."""
     loops = "".join(
         "facet normal 0 0 0\nouter loop\n"
         + "".join(f"vertex {x:g} {y:g} {z:g}\n" for x, y, z in CORNERS[face])
@@ -73,7 +73,7 @@ def stl_text() -> str:
 
 
 def obj() -> str:
-    """The wedge as OBJ, with indices from either end."""
+    """Return the wedge as OBJ, with indices from either end."""
     corners = "".join(f"v {x:g} {y:g} {z:g}\n" for x, y, z in CORNERS)
     first, *others = FACES
     faces = "f " + " ".join(f"{k - len(CORNERS)}" for k in first) + "\n"
@@ -81,7 +81,7 @@ def obj() -> str:
 
 
 def dae() -> str:
-    """The wedge as COLLADA: in centimetres, turned and moved by its node, with normals between the indices."""
+    """Return the wedge as COLLADA: in centimetres, rotated and translated by its node, with normals between indices."""
     numbers = " ".join(f"{x:g}" for x in (100.0 * (CORNERS @ np.diag([-1.0, -1.0, 1.0]) - [0.0, 0.0, 0.05])).ravel())
     index = " ".join(f"{k} 0" for face in FACES for k in face)
     parts = "".join(f'<param name="{name}" type="float"/>' for name in "XYZ")

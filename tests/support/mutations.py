@@ -1,8 +1,8 @@
-"""Mutation study: small mistakes put into kernel lines one at a time, and the share that tests notice.
+"""Mutation study: small errors put into kernel lines one at a time, and the fraction that tests detect.
 
 ``NUMBA_DISABLE_JIT=1 PYTHONPATH=tests python -m support.mutations OUT.json`` draws lines of the kernels at random,
-writes which tests reach each of them, then what became of each mistake. Kernels run as Python, so that a mistake is a
-code object that is exchanged in a process forked for it, and nothing is compiled. Numbers: docs/dev/tests.md.
+writes which tests reach each of them, then the result for each error. Kernels run as Python: an error is a code object
+exchanged in a forked process, and nothing is compiled. Numbers: docs/dev/tests.md.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ import pytest
 from _pytest.runner import runtestprotocol
 
 FACTOR = 1.0 + 1e-4
-# Processor time of a test with kernels as Python [s]; those that take longer only tell which lines they reach.
+# Processor time of a test with kernels as Python [s]; longer tests only show which lines they reach.
 TEST_S = 2.5
-# Time for all tests of one mistake [s]. A test that does not end is stopped after SLOWER times its usual time + MORE_S.
+# Time for all tests of one error [s]. A test that does not end is stopped after SLOWER times its usual time + MORE_S.
 MISTAKE_S, SLOWER, MORE_S = 30.0, 8.0, 4.0
-# Mistakes that no quick test notices: number of slower tests that are tried, and time for each [s].
+# Errors that no quick test detects: number of slower tests that are tried, and time for each [s].
 LATE, LATE_S = 4, 25.0
 # Largest number of parametrised examples of a test that are tried.
 EXAMPLES = 3
@@ -51,7 +51,7 @@ def kernels(tree: ast.Module) -> Iterator[ast.FunctionDef]:
 
 
 def mistakes(function: ast.FunctionDef) -> Iterator[tuple[str, ast.AST, Callable[[], None]]]:
-    """Kind, node and how to make it, of every mistake that can be made in a function."""
+    """Yield kind, node and modification of every possible error in a function."""
     indices = set()
     for node in ast.walk(function):
         if isinstance(node, ast.Subscript):
@@ -75,7 +75,7 @@ def mistakes(function: ast.FunctionDef) -> Iterator[tuple[str, ast.AST, Callable
 
 
 def drawn(package: Path, rooms: list[str], lines: int, seed: int) -> list[dict[str, Any]]:
-    """Lines of kernels, and one mistake for each: by its number among those of its function."""
+    """Draw lines of kernels, and one error for each, identified by its number within its function."""
     population: dict[tuple[str, str, int], dict[str, list[int]]] = {}
     for path in sorted(file for room in rooms for file in (package / room).rglob("*.py")):
         module = ".".join(path.relative_to(package.parent).with_suffix("").parts)
@@ -100,14 +100,14 @@ def parsed(module: str) -> tuple[ast.Module, str]:
 
 
 def exchange(module: str, tree: ast.Module, path: str, name: str) -> None:
-    """Let a kernel, in all places that have imported it, run as it is written in ``tree``."""
+    """Replace a kernel, wherever it is imported, by its version in ``tree``."""
     code = compile(ast.fix_missing_locations(tree), path, "exec", dont_inherit=True)
     new = next(part for part in code.co_consts if isinstance(part, CodeType) and part.co_name == name)
     vars(importlib.import_module(module))[name].__code__ = new
 
 
 def make(mistake: dict[str, Any]) -> None:
-    """Make the mistake in this process; notes in it what was there and what is now."""
+    """Make the error in this process; record the original and the changed text in it."""
     tree, path = parsed(mistake["module"])
     function = next(f for f in kernels(tree) if f.name == mistake["function"])
     _, node, change = list(mistakes(function))[mistake["number"]]
@@ -118,7 +118,7 @@ def make(mistake: dict[str, Any]) -> None:
 
 
 def watch(sample: list[dict[str, Any]]) -> set[int]:
-    """Numbers of the lines of the sample that are reached from now on."""
+    """Return the set of lines of the sample that are reached from now on, by number."""
     seen: set[int] = set()
     setattr(builtins, PROBE, seen.add)
     for module, name in sorted({(m["module"], m["function"]) for m in sample}):
@@ -148,7 +148,7 @@ def watch(sample: list[dict[str, Any]]) -> set[int]:
 
 
 def in_a_child(work: Callable[[Callable[[Any], None]], None]) -> list[Any]:
-    """What ``work`` tells in a process of its own, which may end anywhere."""
+    """Run ``work`` in a forked process, which may end at any point, and return its messages."""
     receive, send = os.pipe()
     child = os.fork()
     if child == 0:
@@ -168,7 +168,7 @@ def in_a_child(work: Callable[[Callable[[Any], None]], None]) -> list[Any]:
 
 
 def limit(seconds: float, tell: Callable[[], None]) -> None:
-    """End this process after so much processor time, or twenty times that of waiting, and tell so."""
+    """End this process after ``seconds`` of processor time or 20 times as much wall time; call ``tell`` before."""
 
     def end(*_: Any) -> None:
         tell()
@@ -186,7 +186,7 @@ def used_s() -> float:
 
 
 def outcome(item: pytest.Item, following: pytest.Item | None) -> str:
-    """passed, failed, skipped or xfailed."""
+    """Return passed, failed or skipped."""
     reports = runtestprotocol(item, log=False, nextitem=following)
     if any(report.failed for report in reports):
         return "failed"
@@ -194,7 +194,7 @@ def outcome(item: pytest.Item, following: pytest.Item | None) -> str:
 
 
 class Study:
-    """Takes the place of pytest's loop over the tests."""
+    """Plugin that replaces pytest's loop over the tests."""
 
     def __init__(self, out: Path, sample: list[dict[str, Any]]) -> None:
         self.out, self.drawn = out, sample
@@ -223,7 +223,7 @@ class Study:
         print(f"{time.strftime('%H:%M:%S')} {len(results)} mistakes, {noticed} noticed", flush=True)
 
     def look_longer(self, result: dict[str, Any], items: dict[str, Any]) -> list[str]:
-        """What became of some late tests, those first whose names have words of the kernel's in them."""
+        """Run some late tests, first those whose names share words with the kernel, and return their outcomes."""
         words = {word for word in re.split("[._]", f"{result['module']}_{result['function']}") if len(word) > 3}
         families: dict[str, str] = {}
         for name in result["late"]:
@@ -238,20 +238,20 @@ class Study:
                 tell(outcome(items[name], None))
 
             messages.append((in_a_child(work) or ["broken"])[-1])
-            # Some fail as Python anyway.
+            # Some fail as Python even without the error.
             if messages[-1] == "failed" and in_a_child(partial(work, mistaken=False)) == ["passed"]:
                 result["noticed"] = [name, "fails"]
                 break
         return messages
 
     def reach(self, items: list[pytest.Item]) -> dict[str, dict[str, Any]]:
-        """Of each test the lines of the sample that it reaches, its processor time [s] and outcome."""
+        """Return for each test the lines of the sample that it reaches, its processor time [s] and outcome."""
         reach: dict[str, dict[str, Any]] = {}
         late: dict[str, int] = {}
         families: dict[str, list[pytest.Item]] = {}
         for item in items:
             families.setdefault(item.nodeid.split("[")[0], []).append(item)
-        # The first, the last and others between.
+        # The first, the last and some in between.
         items = [
             examples[k]
             for examples in families.values()
@@ -280,7 +280,7 @@ class Study:
         return reach
 
     def judge(self, k: int, mistake: dict[str, Any], reach: dict[str, Any], items: dict[str, Any]) -> dict[str, Any]:
-        """The mistake with what became of it: the test that noticed, or none of so many."""
+        """Return the error with its result: the test that detected it, or the number of tests that did not."""
         tests = sorted(
             (test["s"], name) for name, test in reach.items() if test["outcome"] == "passed" and k in test["lines"]
         )

@@ -35,12 +35,12 @@ SCENARIO = "mobile_elbow_comparison"
 SCENARIOS = (SCENARIO, f"{SCENARIO}_driving")
 FOLDER = Path("results/overturning")
 
-# The hand starts beside its circle, so voltages jump; the reaction of the base lasts milliseconds.
+# The hand starts next to its circle, so voltages jump; the reaction of the base lasts milliseconds.
 START: dict[str, Any] = {"duration_s": 0.5, "record.rate_hz": 20_000}
-# Without a path the arm holds, and nothing jumps.
+# Without a path the arm keeps its posture, and nothing jumps.
 HELD: dict[str, Any] = {"controller.hand": None}
 
-# What of the base is varied, two at a time; the shipped values are among them.
+# Varied parameters of the base, two at a time; the shipped values are among them.
 MASSES_KG = (0.5, 1.0, 2.0, 4.0, 6.0, 8.0, 10.0, 12.0)
 TRACKS_M = (0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6)
 CASTERS_M = (0.06, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4)
@@ -57,19 +57,19 @@ COLUMNS = (
 )  # fmt: skip
 
 SHADE = "#E4EEF6"
-# On the side of a zero line where values are below it.
+# Marks on the side of a zero line where values are negative.
 _TICKS = withTickedStroke(spacing=7, length=0.7, angle=-135)
 
 
 def below_zero(time: Array, margin: Array) -> list[tuple[float, float | None]]:
-    """From when to when the margin is below zero in the samples [s]; None: to the end."""
+    """Return the intervals in which the margin is below zero in the samples [s]; None: to the end."""
     edges = np.diff(np.concatenate([[0], margin < 0.0, [0]]).astype(int))
     first, last = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
     return [(float(time[a]), float(time[b]) if b < len(time) else None) for a, b in zip(first, last, strict=True)]
 
 
 def configuration(scenario: str, variant: str) -> Row:
-    """How one configuration stands: its start on a fine grid of samples, then the whole run, and the arm held."""
+    """Evaluate one configuration: its start on a fine grid of samples, then the whole run, and with the arm at rest."""
     loaded = load_scenario(scenario, variant)
     whole, start = simulate(loaded), simulate(load_scenario(scenario, variant, START))
     held = simulate(load_scenario(scenario, variant, HELD)).summary["base"]
@@ -98,13 +98,13 @@ def configuration(scenario: str, variant: str) -> Row:
 
 
 def shipped_base() -> dict[str, Any]:
-    """``plant.base`` of the scenario that is varied."""
+    """Return ``plant.base`` of the varied scenario."""
     base: dict[str, Any] = load_scenario(SCENARIO).resolved["plant"]["base"]
     return base
 
 
 def overrides(base: Mapping[str, Any], mass: float, track: float, caster: float) -> dict[str, Any]:
-    """Another base in the same place: heavier with the same shape, so that its inertia grows with its mass."""
+    """Return overrides for a base of the same shape with another mass, so that inertia grows with mass."""
     return {
         "plant.base.mass_kg": mass,
         "plant.base.inertia_kg_m2": [mass / base["mass_kg"] * moment for moment in base["inertia_kg_m2"]],
@@ -114,7 +114,7 @@ def overrides(base: Mapping[str, Any], mass: float, track: float, caster: float)
 
 
 def point(mass: float, track: float, caster: float, variant: str) -> Row:
-    """One run of the sweep: it stands if its margin stays above zero from the settled time on."""
+    """Run one point of the sweep: it stands if its margin stays above zero from the settled time on."""
     row: Row = {"mass_kg": mass, "track_m": track, "caster_m": caster, "variant": variant, "stands": None}
     row["dynsim_version"] = __version__
     try:
@@ -128,7 +128,7 @@ def point(mass: float, track: float, caster: float, variant: str) -> Row:
 
 
 def points() -> list[tuple[float, float, float]]:
-    """Mass, track and caster: every pair of them against each other, the third as shipped."""
+    """Return mass, track and caster for every pair of them, with the third as shipped."""
     base = shipped_base()
     shipped = (base["mass_kg"], base["track_m"], base["caster_m"][0])
     grid = product(MASSES_KG, TRACKS_M, CASTERS_M)
@@ -136,7 +136,7 @@ def points() -> list[tuple[float, float, float]]:
 
 
 def sweep(progress: Callable[[int, int], None]) -> list[Row]:
-    """All points with all variants; calls ``progress`` with how many runs of how many are done."""
+    """Run all points with all variants; call ``progress`` with the numbers of completed and total runs."""
     cases = [(*at, variant) for at in points() for variant in variant_names(SCENARIO)]
     rows = []
     for case in cases:
@@ -146,7 +146,7 @@ def sweep(progress: Callable[[int, int], None]) -> list[Row]:
 
 
 def picture(rows: Sequence[Row]) -> Figure:
-    """Two of mass, track and caster against each other: where each variant begins to tip, and what bracing decides."""
+    """Plot pairs of mass, track and caster: where each variant begins to tip, and where bracing matters."""
     base = shipped_base()
     shipped = {"mass_kg": base["mass_kg"], "track_m": base["track_m"], "caster_m": base["caster_m"][0]}
     styles = variant_styles(variant_names(SCENARIO))
@@ -177,7 +177,7 @@ def picture(rows: Sequence[Row]) -> Figure:
 
 
 def _panel(axes: Axes, rows: Sequence[Row], x: str, y: str, styles: Mapping[str, Mapping[str, Any]]) -> None:
-    """The margin of every variant over x and y, by its zero line; what failed is crossed out."""
+    """Plot the zero line of every variant's margin over x and y; failed runs are crossed out."""
     xs, ys = np.array(AXES[x][1]), np.array(AXES[y][1])
     margins = {name: np.full((len(ys), len(xs)), np.nan) for name in styles}
     for row in rows:
@@ -196,7 +196,7 @@ def _panel(axes: Axes, rows: Sequence[Row], x: str, y: str, styles: Mapping[str,
 
 
 def table(configurations: Mapping[str, Row]) -> str:
-    """The configurations of one scenario, for the terminal."""
+    """Return the configurations of one scenario, for the terminal."""
     lines = [
         f"{'':12}{'margin min':>11}{'settled':>9}{'overturns at':>14} settled loads left, right, caster [N]; under zero"
     ]

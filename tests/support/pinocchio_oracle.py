@@ -35,11 +35,11 @@ class Oracle:
         self.data = self.model.createData()
 
     def to(self, x: np.ndarray) -> np.ndarray:
-        """Joint vector of dynsim in Pinocchio's order."""
+        """Return a joint vector of dynsim in Pinocchio's order."""
         return x[self.order]
 
     def back(self, x: np.ndarray) -> np.ndarray:
-        """Joint vector of Pinocchio in dynsim's order, along the last axis."""
+        """Return a joint vector of Pinocchio in dynsim's order, along the last axis."""
         out = np.empty_like(x)
         out[..., self.order] = x
         return out
@@ -50,7 +50,7 @@ class Oracle:
         return self.back(self.back(M).T)
 
     def point(self, body: int, point: np.ndarray, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Position, Jacobian (3, n), velocity and drift acceleration of a body-fixed point."""
+        """Return position, Jacobian (3, n), velocity and drift acceleration of a body-fixed point."""
         pin.forwardKinematics(self.model, self.data, self.to(q), self.to(v), np.zeros(len(q)))
         pin.computeJointJacobians(self.model, self.data, self.to(q))
         M, j = self.data.oMi[self.joint[body]], self.joint[body]

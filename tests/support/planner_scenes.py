@@ -5,12 +5,12 @@
     PYTHONPATH=tests python -m support.planner_scenes --study gains --out results/planner
     PYTHONPATH=tests python -m support.planner_scenes --study posture --out results/planner
 
-The first plans each scene. The second searches each scene with ``--effort`` times the usual rounds, for the best known
-answer; rows of other scenes in its file are kept. The third runs the best plans, and those of the published arm, on
-surfaces displaced by 5 mm, with stiff to soft gains. The fourth gives the least heat of the published arm at the
-postures of its scenario, which no plan has chosen, over all forces at its elbows of at least 0.5 N.
+The first command plans each scene. The second searches each scene with ``--effort`` times the usual rounds, for the
+best known answer; rows of other scenes in its file are kept. The third runs the best plans, and those of the published
+arm, on surfaces displaced by 5 mm, with stiff to soft gains. The fourth computes the least heat of the published arm at
+the postures of its scenario, which no plan has chosen, over all forces at its elbows of at least 0.5 N.
 
-Arms of 7 to 10 joints whose hand goes there and back along a short way, over a floor, a pipe, a box, or with a joint
+Arms of 7 to 10 joints whose hand moves back and forth along a short path, over a floor, a pipe, a box, or with a joint
 about a third axis. The seed of a scene is its number; the constants of the search were chosen on the first twenty.
 """
 
@@ -56,17 +56,17 @@ MOTOR = {
 
 
 def kind_of(seed: int) -> str:
-    """What a scene has beside its arm."""
+    """Return what a scene has in addition to its arm."""
     return KINDS[seed % 4]
 
 
 def along_of(seed: int) -> tuple[float, ...]:
-    """Shares along links that are candidates too: the middle, in every third scene."""
+    """Return fractions along links that are also candidates: the middle, in every third scene."""
     return (0.5,) if seed % 3 == 0 else ()
 
 
 def scene(seed: int) -> dict[str, Any]:
-    """The scenario of a scene as plain data."""
+    """Return the scenario of a scene as plain data."""
     rng = np.random.default_rng(seed)
 
     def drawn(low: float, high: float, digits: int = 3) -> float:
@@ -134,12 +134,12 @@ def _link(axis: str, length: float, mass: float, gear: float, limit: list[float]
 
 
 def scene_scenario(seed: int) -> Scenario:
-    """The scene as a scenario."""
+    """Return the scene as a scenario."""
     return scenario_from_resolved(scene(seed))
 
 
 def planned(seed: int, jobs: int) -> dict[str, Any]:
-    """The plan of a scene in numbers: heat, sets, corners, and what it cost."""
+    """Return the plan of a scene in numbers: heat, sets, corners, and cost of the search."""
     scenario, started = scene_scenario(seed), clock.perf_counter()
     cpu = clock.process_time()
     searched: list[tuple[float, float]] = []
@@ -184,12 +184,12 @@ def planned(seed: int, jobs: int) -> dict[str, Any]:
 
 
 def _rounded(value: Any) -> Any:
-    """Numbers to five decimals; those that are none as nothing."""
+    """Round numbers to five decimals; None for values that are not finite."""
     return value if not isinstance(value, float) else round(value, 5) if math.isfinite(value) else None
 
 
 def best_known(seed: int, effort: int) -> dict[str, Any]:
-    """Least heat of each number of braces by a search of so many times the rounds, from other random postures."""
+    """Return the least heat of each number of braces by a search with ``effort`` times the rounds and another seed."""
     options = Options(along=along_of(seed), starts=effort * Options.starts, seed=OTHER_SEED)
     search, cpu = Search(task(scene_scenario(seed), options)), clock.process_time()
     search.kept = 3 * search.kept
@@ -213,9 +213,9 @@ def best_known(seed: int, effort: int) -> dict[str, Any]:
 
 
 def least_of(row: dict[str, Any], before: dict[str, Any]) -> dict[str, Any]:
-    """A reference with the lesser heat of each number of braces, its own or that of one before.
+    """Return a reference with the lesser heat of each number of braces, from this row or the previous one.
 
-    Both are of dense references on hand path and surfaces, whatever search led to them; ``searched_W`` is its own.
+    Both heats are for dense references on hand path and surfaces, from whichever search; ``searched_W`` is its own.
     """
     known = {size["count"]: size for size in before["sizes"] if size["heat_W"] is not None}
     sizes = [
@@ -231,9 +231,9 @@ def least_of(row: dict[str, Any], before: dict[str, Any]) -> dict[str, Any]:
 
 
 def stiffness(scenario: Scenario, counts: Sequence[int], along: tuple[float, ...] = ()) -> list[dict[str, Any]]:
-    """What plans cost on surfaces that are 5 mm off, by the gain k_p of all joints that press braces.
+    """Return the cost of plans on surfaces displaced by 5 mm, by the gain k_p of all joints that press braces.
 
-    Of each number of braces, or of the best of them where there are none, the plan of least heat.
+    For each number of braces, or for the best if ``counts`` is empty, the plan of least heat.
     """
     plan = plan_braces(scenario, along=along, count=(min(counts, default=1), max(counts, default=3)), verify=False)
     sizes = [size for size in plan.sizes if size.planned is not None]
@@ -261,14 +261,14 @@ def stiffness(scenario: Scenario, counts: Sequence[int], along: tuple[float, ...
 
 
 def published(friction: float) -> Scenario:
-    """The published arm on its real floor."""
+    """Return the published arm on its real floor."""
     return load_scenario("pressing", overrides={"contacts.friction": friction})
 
 
 def posture_heat(friction: float, instants: int = 200) -> dict[str, Any]:
-    """Least heat of the published posture, which stands still at instants of its circle: the mean over them.
+    """Return the least heat of the published posture, stationary at instants of its circle: the mean over them.
 
-    Of all forces at both elbows that press at least 0.5 N: ``Model.brace_statics``.
+    The minimum is over all forces at both elbows of at least 0.5 N: ``Model.brace_statics``.
     """
     prepared = prepare(published(friction))
     model, up = prepared.model, np.array([0.0, 0.0, 1.0])
@@ -297,7 +297,7 @@ def main() -> None:
     former = chosen.out / "reference.json"
     before = {row["seed"]: row for row in json.loads(former.read_text(encoding="utf-8"))} if former.exists() else {}
     if chosen.study == "scenes":
-        # What is compiled, or loaded, is no part of a scene's time.
+        # Compilation and loading do not count as time of a scene.
         planned(first, 1)
     for seed in range(first, last + 1) if chosen.study != "posture" else ():
         if chosen.study == "gains":

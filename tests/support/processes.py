@@ -21,7 +21,7 @@ def wait_for(condition: Callable[[], bool], timeout: float = 120.0, failure: str
 
 
 class Child:
-    """A child in a process group of its own, with its stderr in a file that can be read while it runs."""
+    """Child in a separate process group, with its stderr in a file that can be read while it runs."""
 
     def __init__(self, command: Sequence[str], stderr: Path, **options: Any) -> None:
         self._stderr = stderr
@@ -35,7 +35,7 @@ class Child:
         return self._stderr.read_text()
 
     def wait_for(self, text: str, count: int = 1) -> None:
-        """Until the child has written ``text`` to stderr so many times; fails if it ends before."""
+        """Wait until the child has written ``text`` to stderr ``count`` times; fail if it ends before."""
 
         def written() -> bool:
             ended = self.process.poll() is not None
@@ -47,13 +47,13 @@ class Child:
         wait_for(written, failure=f"no {text!r} in {self.stderr!r}")
 
     def end(self, timeout: float = 120.0) -> int:
-        """Exit code of a child that ends by itself."""
+        """Wait for the child to end and return its exit code."""
         return self.process.wait(timeout)
 
 
 @contextmanager
 def started(command: Sequence[str], stderr: Path, **options: Any) -> Iterator[Child]:
-    """A running child; when the block ends, nothing of its group is left."""
+    """Provide a running child; when the block ends, its whole group is ended."""
     child = Child(command, stderr, **options)
     try:
         yield child

@@ -1,6 +1,6 @@
-"""The programs that the default tests share, compiled before them: half of them by each of two workers.
+"""Programs that the default tests share, compiled in advance: half of them by each of two workers.
 
-Each worker would compile most of them otherwise, at the same time as the other.
+Otherwise each worker would compile most of them, at the same time as the other worker.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from contextlib import suppress
 from dynsim.engine import simulate
 from dynsim.scenario import load_scenario
 
-# Scenarios and variants with the programs of docs/dev/tests.md. What a worker compiles has most of its parts in common.
+# Scenarios and variants with the programs of docs/dev/tests.md. The programs of a worker have most parts in common.
 SHARES: tuple[tuple[tuple[str, str | None], ...], ...] = (
     (("block_on_slope", None), ("elbow_comparison_links", None), ("elbow_comparison", "no_elbow")),
     (("falling_arm", None), ("snake_positioning_dynamic", "x"), ("single_pendulum", None)),

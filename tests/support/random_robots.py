@@ -1,4 +1,4 @@
-"""Random robots of every joint kind, with states and contacts; ``CompiledSystem``, to evaluate and integrate them."""
+"""Random robots of every joint kind, states and contacts, and ``CompiledSystem`` to evaluate and integrate them."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from dynsim.model.joints.planar import planar, rolling
 from dynsim.model.joints.wheels import wheeled
 
 SURFACES = ("plane", "sphere", "cylinder")
-# Methods that integrate the right-hand side, whose contacts hold both ways: time stepping has tests of its own.
+# Methods that integrate the right-hand side with bilateral contacts; time stepping has separate tests.
 ADAPTIVE = tuple(name for name, method in METHODS.items() if method.adaptive)
 SEVERAL_ROWS = {
     "ball": ball,
@@ -53,19 +53,19 @@ SEVERAL_ROWS = {
 
 
 def random_unit(rng: np.random.Generator) -> np.ndarray:
-    """Direction, uniform on the sphere, (3,)."""
+    """Return a direction, uniform on the sphere, (3,)."""
     u = rng.normal(size=3)
     return u / np.linalg.norm(u)
 
 
 def random_rotation(rng: np.random.Generator) -> np.ndarray:
-    """Rotation matrix, (3, 3)."""
+    """Return a rotation matrix, (3, 3)."""
     Q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     return Q * np.sign(np.linalg.det(Q))
 
 
 def random_inertia(rng: np.random.Generator) -> Inertia:
-    """A solid box of random edges, mass, place and attitude: a full tensor that a real body can have."""
+    """Return a solid box of random edges, mass, position and attitude: a full tensor that a real body can have."""
     mass = rng.uniform(0.1, 2.0)
     square = rng.uniform(0.05, 0.4, size=3) ** 2
     R = random_rotation(rng)
@@ -74,7 +74,7 @@ def random_inertia(rng: np.random.Generator) -> Inertia:
 
 
 def random_robot(rng: np.random.Generator, n: int, *, branches: bool = True, motors: bool = True) -> Robot:
-    """n links: revolute about x, y, z or any axis, prismatic along any; about every third link starts a branch."""
+    """Return n links: revolute about x, y, z or any axis, or prismatic; about every third link starts a branch."""
     links, axes = [], np.eye(3)
     for i in range(n):
         kind = rng.integers(5)
@@ -116,9 +116,9 @@ def random_robot(rng: np.random.Generator, n: int, *, branches: bool = True, mot
 
 
 def random_robot_of(rng: np.random.Generator, kinds: Sequence[str], *, branches: bool = True) -> Robot:
-    """A body for each joint kind, in this order: single rows as in :func:`random_robot`, and :data:`SEVERAL_ROWS`.
+    """Return a body for each joint kind, in this order: single rows as in `random_robot`, and :data:`SEVERAL_ROWS`.
 
-    All placements are turned; the names of the bodies are those of :func:`random_robot`.
+    All placements are rotated; the bodies have the names of :func:`random_robot`.
     """
     links: list[Link] = []
     for i, kind in enumerate(kinds):
@@ -141,12 +141,12 @@ def random_robot_of(rng: np.random.Generator, kinds: Sequence[str], *, branches:
 
 
 def without_losses(robot: Robot) -> Robot:
-    """The robot with frictionless joints."""
+    """Return the robot with frictionless joints."""
     return replace(robot, links=tuple(replace(link, damping=0.0) for link in robot.links))
 
 
 def random_positions(rng: np.random.Generator, robot: Robot) -> np.ndarray:
-    """Coordinates of all joints, (nq,): quaternions uniform on the rotations."""
+    """Return coordinates of all joints, (nq,): quaternions uniform on the rotations."""
     q = rng.normal(scale=2.0, size=robot.nq)
     for link, k in zip(robot.links, robot.position_index, strict=True):
         if link.kind == "ball_x":
@@ -155,7 +155,7 @@ def random_positions(rng: np.random.Generator, robot: Robot) -> np.ndarray:
 
 
 def surface_through(rng: np.random.Generator, kind: str, position: np.ndarray) -> Quadric:
-    """A plane, sphere or cylinder of random attitude and size that passes through a point."""
+    """Return a plane, sphere or cylinder of random attitude and size that passes through a point."""
     normal, radius = random_unit(rng), rng.uniform(0.3, 2.0)
     if kind == "plane":
         return Quadric(np.zeros((3, 3)), normal, -float(normal @ position))
@@ -169,9 +169,9 @@ def surface_through(rng: np.random.Generator, kind: str, position: np.ndarray) -
 
 
 def random_contacts(rng: np.random.Generator, robot: Robot, q: np.ndarray, count: int) -> list[Contact]:
-    """Contacts at points of random bodies that lie on their surfaces at q, with both friction laws."""
+    """Return contacts at points of random bodies that are on their surfaces at q, with both friction laws."""
     model, contacts = Model(robot), []
-    # The rows of a joint but the last carry no body.
+    # Only the last row of a joint carries a body.
     bodies = [link.name for link in robot.links if link.inertia.mass > 0.0]
     for k in range(count):
         body, point = bodies[int(rng.integers(len(bodies)))], rng.normal(scale=0.3, size=3)
@@ -191,7 +191,7 @@ def random_contacts(rng: np.random.Generator, robot: Robot, q: np.ndarray, count
 
 
 def held_reference(angles: np.ndarray) -> ka.ReferenceArrays:
-    """References that hold the given angles, (na,)."""
+    """Return references that hold the given angles, (na,)."""
     return ka.ReferenceArrays(
         spline=integers(np.full(len(angles), -1)),
         held=reals(angles),
@@ -202,12 +202,12 @@ def held_reference(angles: np.ndarray) -> ka.ReferenceArrays:
 
 @dataclass
 class CompiledSystem:
-    """A system with its workspace: what a test needs to evaluate one right-hand side."""
+    """System with its workspace: everything that a test needs to evaluate one right-hand side."""
 
     robot: Robot
     system: System
     ws: ka.Workspace
-    contacts: tuple[Contact, ...] = ()  # under the unilateral law
+    contacts: tuple[Contact, ...] = ()  # unilateral law
     stops: tuple[JointStop, ...] = ()
 
     @property
@@ -216,7 +216,7 @@ class CompiledSystem:
         return len(self.robot.links), len(self.robot.motors), len(self.system.contacts.link)
 
     def state(self, q: np.ndarray, v: np.ndarray, current: np.ndarray | None = None) -> np.ndarray:
-        """State vector whose integrals are zero, (layout.size,)."""
+        """Return a state vector with zero integrals, (layout.size,)."""
         y = np.zeros(self.system.layout.size)
         self.part(y, "q")[:], self.part(y, "v")[:] = q, v
         if current is not None:
@@ -224,11 +224,11 @@ class CompiledSystem:
         return y
 
     def part(self, y: np.ndarray, name: str) -> np.ndarray:
-        """A block of a state vector or of its derivative, by its name (a view)."""
+        """Return the block ``name`` of a state vector or of its derivative (a view)."""
         return y[block(self.system.layout, name)]
 
     def derivative(self, y: np.ndarray, t: float = 0.0) -> np.ndarray:
-        """dy/dt."""
+        """Return dy/dt."""
         dy = np.zeros_like(y)
         derivative(self.system, t, reals(y), self.ws, dy)
         return dy
@@ -245,10 +245,10 @@ class CompiledSystem:
         atol: float | None = None,
         theta: float = 0.5,
     ) -> Run:
-        """A run from y to the last of ``times``, recorded there, that has not begun.
+        """Return a run from y to the last of ``times``, recorded there, that has not begun.
 
-        ``step`` 0 leaves the first step to the method; ``fixed`` holds adaptive methods at ``step`` too.
-        Time stepping has arrays of its own, with ``theta``, and goes by the unilateral law.
+        ``step`` 0 leaves the first step to the method; ``fixed`` keeps the ``step`` of adaptive methods constant.
+        Time stepping has additional arrays, with ``theta``, and uses the unilateral law.
         """
         n, na, c = self.sizes
         system, stepping = self.system, None
@@ -275,7 +275,7 @@ class CompiledSystem:
             lanes=has_forms(system),
             step_max=step if fixed else np.inf,
             rtol=rtol,
-            # With an absolute tolerance out of reach every step is accepted and the next one is as long as allowed.
+            # With a huge absolute tolerance every step is accepted and the next one is as long as allowed.
             atol=1e12 if fixed else rtol * 1e-2 if atol is None else atol,
         )
         if fixed and run.newton is not None:
@@ -288,11 +288,11 @@ class CompiledSystem:
         return run
 
     def with_shapes(self) -> CompiledSystem:
-        """As scenarios are that are stepped in time: all run one program."""
+        """Return the system with shapes, like scenarios with time stepping, which all run one program."""
         return replace(self, system=with_shapes(self.system))
 
     def simulate(self, y: np.ndarray, times: np.ndarray, method: str = "dopri5", **options: Any) -> Run:
-        """Integrate to the last of ``times``, which must be reached; ``options`` are those of :meth:`new_run`."""
+        """Integrate to the last of ``times``, which must be reached; ``options`` as for :meth:`new_run`."""
         b = self.with_shapes() if METHODS[method].number == TIME_STEPPING else self
         return b.finish(b.new_run(y, times, method, **options))
 
@@ -318,8 +318,8 @@ def assemble(
 ) -> CompiledSystem:
     """Compile a robot and its contacts, with a voltage PD that holds ``held`` (zero by default).
 
-    ``real``: under the unilateral law, with the robot's joint stops; slip below ``slow`` [m/s] keeps its direction.
-    ``dry``: with friction that holds joints at rest, not smoothed.
+    ``real``: unilateral law, with the robot's joint stops; slip below ``slow`` [m/s] keeps its direction.
+    ``dry``: friction that holds joints at rest, not smoothed.
     """
     na = len(robot.motors)
     contact_arrays = compile_contacts(robot, contacts or [])
@@ -344,7 +344,7 @@ def assemble(
 
 
 def braced(rng: np.random.Generator) -> tuple[CompiledSystem, np.ndarray]:
-    """A tree with gentle motors and two points on their surfaces: what is fast and chatters amplifies rounding."""
+    """Return a tree with gentle motors and two points on surfaces: fast or chattering motion amplifies rounding."""
     robot = random_robot(rng, 7)
     q = random_positions(rng, robot)
     return assemble(robot, random_contacts(rng, robot, q, 2), k_p=0.3, k_d=0.01), q

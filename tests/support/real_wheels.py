@@ -1,8 +1,8 @@
 """Independent model of a mobile arm in Pinocchio: planar base, two spinning wheels, rolling by multipliers.
 
-The base slides along the world's x and y and turns about z; each wheel is a disc of its own that turns on its axle; the
+The base slides along the world's x and y and turns about z; each wheel is a separate disc that turns on its axle; the
 arm stands on the base. The axle does not slip sideways and no wheel slips along: rows A v = 0, whose forces are solved
-for together with the accelerations. Nothing here knows the coordinates, rows or merged inertias of dynsim's joint.
+for together with the accelerations. It does not use the coordinates, rows or merged inertias of dynsim's joint.
 """
 
 from __future__ import annotations
@@ -31,24 +31,24 @@ MOTOR = {
 
 
 def six(tensor: Array) -> list[float]:
-    """xx xy xz yy yz zz."""
+    """Return xx xy xz yy yz zz."""
     return [float(tensor[i, j]) for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))]
 
 
 def symmetric(values: list[float]) -> Array:
-    """The tensor of xx xy xz yy yz zz."""
+    """Return the tensor of xx xy xz yy yz zz."""
     xx, xy, xz, yy, yz, zz = values
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
 def about_z(angle: float) -> Array:
-    """Rotation matrix."""
+    """Return the rotation matrix about z."""
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def random_motor(rng: np.random.Generator) -> dict[str, Any]:
-    """Keys of a DC motor; half of them have a mass."""
+    """Return the keys of a DC motor; half of them have a mass."""
     return {
         "mass_kg": float(rng.uniform(0.1, 0.8)) if rng.random() < 0.5 else 0.0,
         "type": "dc",
@@ -62,7 +62,7 @@ def random_motor(rng: np.random.Generator) -> dict[str, Any]:
 
 
 def random_base(rng: np.random.Generator) -> dict[str, Any]:
-    """A body of any centre of mass and inertia, wheels that are no ideal discs, and an arm turned anywhere on it."""
+    """Return a body of any centre of mass and inertia, wheels that are not ideal discs, and an arm in any attitude."""
     body = random_inertia(rng)
     mass = float(rng.uniform(0.05, 0.5))
     radius = float(rng.uniform(0.03, 0.12))
@@ -87,7 +87,7 @@ def random_base(rng: np.random.Generator) -> dict[str, Any]:
 
 
 def random_serial(rng: np.random.Generator, n: int) -> dict[str, Any]:
-    """A chain about any axes, sliding joints among them, whose links have full inertia tensors."""
+    """Return a chain about any axes, with sliding joints, whose links have full inertia tensors."""
     chain = []
     for _ in range(n):
         inertia, slides = random_inertia(rng), rng.random() < 0.2
@@ -106,7 +106,7 @@ def random_serial(rng: np.random.Generator, n: int) -> dict[str, Any]:
 
 
 def random_urdf(rng: np.random.Generator, n: int, file: Path) -> dict[str, Any]:
-    """A tree with branches as a URDF file, whose root has mass, and a bracket fixed to it that has mass too."""
+    """Write a tree with branches as a URDF file, whose root has mass, and a bracket fixed to it with mass."""
     root = ElementTree.fromstring(write_urdf(random_robot(rng, n, motors=False)))
     first = next(link for link in root.iter("link") if link.find("inertial") is None)
     bracket = ElementTree.SubElement(root, "link", name="bracket")
@@ -130,14 +130,15 @@ def random_urdf(rng: np.random.Generator, n: int, file: Path) -> dict[str, Any]:
 
 
 class RealWheels:
-    """The plant of a scenario, given by its keys.
+    """Plant of a scenario, given by its keys.
 
     Coordinates X, Y, heading in the world, angles of the left and the right wheel, joints of the arm. Rates likewise;
     forces of motors and losses are generalised forces on them, rotors an armature on the diagonal of M.
 
     Attributes
     ----------
-    joints : names of dynsim's rates
+    joints : list of str
+        Names of dynsim's rates.
     """
 
     def __init__(self, plant: dict[str, Any]) -> None:
@@ -155,7 +156,7 @@ class RealWheels:
         across = wheel.get("inertia_across_kg_m2", 0.5 * disc)
         for name, side in zip(WHEELS, (0.5, -0.5), strict=True):
             placement = pin.SE3(np.eye(3), np.array([0.0, side * self.track, self.r]))
-            # About +y: its top goes ahead.
+            # About +y: its top moves ahead.
             turning = self.model.addJoint(joint, pin.JointModelRY(), placement, name)
             rotor = pin.Inertia(float(wheel["mass_kg"]), np.zeros(3), np.diag([across, axle, across]))
             self.model.appendBodyToJoint(turning, rotor, here)
@@ -167,7 +168,7 @@ class RealWheels:
         self.joints = (*WHEELS, *names)
         for name in self.joints:
             if (motor := self.motor[name]) is not None and motor.get("mass_kg", 0.0) > 0.0:
-                # A point on what comes before its joint.
+                # A point on the body before its joint.
                 here = self.model.getJointId(name)
                 point = np.array(motor.get("mass_point_m", self.model.jointPlacements[here].translation))
                 body = pin.Inertia(motor["mass_kg"], point, np.zeros((3, 3)))
@@ -209,10 +210,10 @@ class RealWheels:
         return names
 
     def _urdf(self, arm: dict[str, Any], placement: pin.SE3) -> list[str]:
-        """Pinocchio reads the file itself, but lets go of what is fixed to the root."""
+        """Read the file with Pinocchio, which drops links fixed to the root."""
         read = pin.buildModelFromUrdf(arm["file"])
         joints = {joint.attrib["name"]: joint for joint in ElementTree.parse(arm["file"]).getroot().iter("joint")}
-        # A fixed base as a floating one: then the root's inertia is that of its first joint.
+        # With a floating base the root's inertia is the inertia of its first joint.
         floating = pin.buildModelFromUrdf(arm["file"], pin.JointModelFreeFlyer())
         self.model.appendBodyToJoint(self.body, floating.inertias[1], placement)
         universe = read.inertias[0]
@@ -229,10 +230,10 @@ class RealWheels:
             self.motor[name] = arm["motors"].get(name)
         return names
 
-    # ---- from dynsim's coordinates (left, right, x, y in the axes of the start, arm) and rates
+    # ---- conversion of dynsim's coordinates (left, right, x, y in the axes of the start, arm) and rates
 
     def configuration(self, q: Array) -> Array:
-        """The coordinates of this class, (nv,)."""
+        """Return the coordinates of this class, (nv,)."""
         left, right, x, y = q[:4]
         start, out = np.deg2rad(self.base["heading_deg"]), np.zeros(self.model.nv)
         out[[self.x, self.y]] = (np.array([*self.base["position_m"], 0.0]) + about_z(start) @ [x, y, 0.0])[:2]
@@ -241,7 +242,7 @@ class RealWheels:
         return out
 
     def rates(self, q: Array, v: Array) -> Array:
-        """Their rates, of a base that rolls."""
+        """Return their rates for a rolling base."""
         heading, out = self.configuration(q)[self.heading], np.zeros(self.model.nv)
         speed = 0.5 * self.r * (v[0] + v[1])
         out[[self.x, self.y]] = speed * np.cos(heading), speed * np.sin(heading)
@@ -250,7 +251,7 @@ class RealWheels:
         return out
 
     def _coordinates(self, q: Array) -> Array:
-        """As Pinocchio has them: cosine and sine of joints without limits."""
+        """Return Pinocchio's coordinates: cosine and sine for joints without limits."""
         out = np.zeros(self.model.nq)
         for joint in self.model.joints[1:]:
             angle = q[joint.idx_v]
@@ -261,30 +262,30 @@ class RealWheels:
     # ---- mechanics
 
     def rows(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """A, (3, nv), and A v̇ = drift of: no side slip, left wheel rolls, right wheel rolls."""
+        """Return A, (3, nv), and the drift A v̇ of: no side slip, left wheel rolls, right wheel rolls."""
         c, s, w = np.cos(q[self.heading]), np.sin(q[self.heading]), v[self.heading]
         A, drift = np.zeros((3, self.model.nv)), np.zeros(3)
         A[0, [self.x, self.y]] = -s, c
         drift[0] = (c * v[self.x] + s * v[self.y]) * w
         for k, side in ((1, 0.5), (2, -0.5)):
-            # The hub goes at V − ω (side T) ahead; its wheel takes r φ̇ from that.
+            # The hub moves at V − ω (side T) ahead; the wheel subtracts r φ̇.
             A[k, [self.x, self.y]], A[k, self.heading], A[k, self.index[k - 1]] = (c, s), -side * self.track, -self.r
             drift[k] = (s * v[self.x] - c * v[self.y]) * w
         return A, drift
 
     def mass_matrix(self, q: Array) -> Array:
-        """With rotors."""
+        """Return the mass matrix with rotors."""
         M = pin.crba(self.model, self.data, self._coordinates(q))
         return np.triu(M) + np.triu(M, 1).T + np.diag(self.armature)
 
     def bias_forces(self, q: Array, v: Array) -> Array:
-        """What v̇ = 0 needs, losses included."""
+        """Return the forces that v̇ = 0 requires, including losses."""
         return np.asarray(pin.nonLinearEffects(self.model, self.data, self._coordinates(q), v)) + self.loss * v
 
     def accelerations(
         self, q: Array, v: Array, tau: Array, J: Array | None = None, target: Array | None = None
     ) -> tuple[Array, Array, Array]:
-        """v̇, (nv,), the three multipliers, then those of rows J v̇ = target, and the matrix of the system."""
+        """Return v̇, (nv,), the three multipliers, those of rows J v̇ = target, and the matrix of the system."""
         A, drift = self.rows(q, v)
         if J is not None and target is not None:
             A, drift = np.vstack([A, J]), np.concatenate([drift, target])
@@ -293,7 +294,7 @@ class RealWheels:
         return x[: self.model.nv], x[self.model.nv :], K
 
     def point(self, body: str, point: Array, q: Array, v: Array) -> tuple[Array, Array, Array]:
-        """Jacobian (3, nv), velocity and drift acceleration of a point on the base or on the link of a joint."""
+        """Return Jacobian (3, nv), velocity and drift acceleration of a point on the base or on the link of a joint."""
         joint, coordinates = self.model.getJointId(body), self._coordinates(q)
         pin.forwardKinematics(self.model, self.data, coordinates, v, np.zeros(self.model.nv))
         pin.computeJointJacobians(self.model, self.data, coordinates)
@@ -309,9 +310,9 @@ class RealWheels:
         )
 
     def forces(self, q: Array, v: Array, vdot: Array) -> Array:
-        """Forces of the motors at :attr:`joints` that these accelerations of them need, losses paid, multipliers free.
+        """Return the motor forces at :attr:`joints` for these accelerations, including losses, with free multipliers.
 
-        Unknown: accelerations of the base, the multipliers and the forces.
+        Unknowns: accelerations of the base, the multipliers and the forces.
         """
         A, drift = self.rows(q, v)
         nv, n = self.model.nv, len(self.index)

@@ -1,8 +1,8 @@
-"""Study: rotors as armature at their joints, against rotors that are bodies of their own.
+"""Study: rotors as armature at their joints, compared with rotors as separate bodies.
 
 dynsim gives a rotor the inertia J_m = I_m k² at its joint ([WM] eq 25), as if its axis did not turn. In fact the link
-before the joint carries it: with ω the angular velocity of that link and a the axis of the joint, the rotor has the
-speed k v + a·ω about its axis and the energy ½ I_m (k v + a·ω)². Here that is computed without dynsim's right-hand
+before the joint carries it: with the angular velocity ω of that link and the axis a of the joint, the rotor has the
+speed k v + a·ω about its axis and the energy ½ I_m (k v + a·ω)². This study computes that without dynsim's right-hand
 side: rotors are bodies of a larger tree, tied to their joints by θ = k q (θ: angle of the rotor on that link), and the
 dense equations are integrated by the classical Runge–Kutta method.
 """
@@ -20,7 +20,7 @@ from dynsim.model.description import Array, Contact, Inertia, Link, Quadric
 from dynsim.model.drives import Motor
 from dynsim.scenario import Scenario, build, build_model
 
-# Step, and the shorter step of the first START_S, while the motors take up the weight [s].
+# Step, and the shorter step of the first START_S, while the motors build up torque against the weight [s].
 STEP, START_STEP, START_S = 5e-4, 1.25e-4, 0.5
 
 
@@ -29,7 +29,8 @@ class RotorModel:
 
     Parameters
     ----------
-    spinning : every rotor is a thin disc on the link before its joint; else J_m = I_m k² on the diagonal, as in dynsim
+    spinning : bool
+        Every rotor is a thin disc on the link before its joint; otherwise J_m = I_m k² on the diagonal, as in dynsim.
     """
 
     def __init__(
@@ -64,11 +65,11 @@ class RotorModel:
             np.add.at(self.armature, self.joint, [k**2 * motor.rotor_inertia for k, motor in of])
 
     def mass_matrix(self, q: Array) -> Array:
-        """M of bodies and rotors in the joints alone, (n, n)."""
+        """Return M of bodies and rotors in the joint coordinates, (n, n)."""
         return self.gears.T @ self.tree.mass_matrix(self.gears @ q) @ self.gears + np.diag(self.armature)
 
     def voltage(self, t: float, q: Array, v: Array) -> Array:
-        """[WM] eq 56, (na,) [V]."""
+        """Return the voltages of [WM] eq 56, (na,) [V]."""
         control, reference = self.control, self.control.reference
         begin, spacing = reference.grid
         segment = int(np.clip((t - begin) // spacing, 0, len(reference.coefficients) - 1))
@@ -82,7 +83,7 @@ class RotorModel:
         return np.asarray(control.k_p * (wanted - q[self.joint]) + control.k_d * (rate - v[self.joint]))
 
     def derivative(self, t: float, y: Array) -> Array:
-        """dy/dt of y = (q, v, i, ∫ Σ u i dt) by one dense solve, as [WM] eq 35."""
+        """Return dy/dt of y = (q, v, i, ∫ Σ u i dt) by one dense solve, as [WM] eq 35."""
         n, p = self.model.n, len(self.contacts)
         q, v, current = y[:n], y[n : 2 * n], y[2 * n : -1]
         u = self.voltage(t, q, v)
@@ -108,7 +109,7 @@ class RotorModel:
         return np.concatenate([v, vdot, rise, [u @ current]])
 
     def _point(self, contact: Contact, q: Array, v: Array) -> tuple[Array, Array]:
-        """Jacobian of a contact point, and J̇ v by a central difference along v."""
+        """Return the Jacobian of a contact point, and J̇ v by a central difference along v."""
         step = 1e-6 / max(1.0, float(np.abs(v).max()))
         J, ahead, behind = (
             self.model.point_jacobian(contact.body, contact.point, q + s * v) for s in (0.0, step, -step)
@@ -116,7 +117,7 @@ class RotorModel:
         return J, (ahead - behind) @ v / (2.0 * step)
 
     def energy(self) -> float:
-        """∫ Σ u i dt over the run [J], by the classical Runge–Kutta method from rest."""
+        """Return ∫ Σ u i dt over the run [J], by the classical Runge–Kutta method from rest."""
         y = np.concatenate([self.model.robot.initial, np.zeros(self.model.n + len(self.joint) + 1)])
         start = min(START_S, self.duration)
         t = 0.0
@@ -135,7 +136,7 @@ class RotorModel:
 
 
 def _rotor(link: Link, inertia: float) -> Link:
-    """A disc without mass on the link before a joint, turning about the joint's axis: I_m, and half of it across."""
+    """Return a disc without mass on the link before a joint, about the joint's axis: I_m, and half of it across."""
     across = 0.5 * inertia * (np.eye(3) - np.outer(link.axis, link.axis))
     disc = Inertia(0.0, np.zeros(3), inertia * np.outer(link.axis, link.axis) + across)
     return Link(
@@ -151,14 +152,14 @@ def _rotor(link: Link, inertia: float) -> Link:
 
 
 def rotor_model(scenario: Scenario, *, spinning: bool) -> RotorModel:
-    """The :class:`RotorModel` of a scenario with a joint controller, revolute joints and signed friction."""
+    """Return the :class:`RotorModel` of a scenario with a joint controller, revolute joints and signed friction."""
     model = build_model(scenario)
     control = build.controller(scenario, model)
     return RotorModel(model, build.contacts(scenario), control, scenario.duration_s, spinning=spinning)
 
 
 def rotor_energies(scenario: Scenario) -> dict[str, float]:
-    """Electrical energy [J] with rotors as armature and as spinning bodies, both by this module's own integration."""
+    """Return electrical energy [J] with rotors as armature and as spinning bodies, both integrated by this module."""
     return {
         name: rotor_model(scenario, spinning=spinning).energy()
         for name, spinning in (("armature", False), ("spinning", True))

@@ -49,19 +49,19 @@ KEPT = (
 )
 # The circle backward with less time, or with a larger least margin: duration of the path [s], margin [m].
 CIRCLES = ((400.0, 0.02), (200.0, 0.01), (200.0, 0.02))
-# Of a servo map: height of a wheel on the ground that is allowed [mm], acceleration up to a motion's start [rad/s²].
+# Servo map: allowed height of a wheel on the ground [mm], acceleration up to a motion's start [rad/s²].
 TILT_MM, RUN_UP = 18.0, 10.0
-# Of the redundancy, for the order in which the joints of the base become straight.
+# Gains of the redundancy, for the order in which the joints of the base become straight.
 NULL_GAINS = (0.1, 0.3, 1.0)
 
 
 def simulated(name: str, variant: str | None, overrides: Mapping[str, Any] | None = None) -> Record:
-    """The record of a shipped scenario with other settings."""
+    """Return the record of a shipped scenario with overrides."""
     return simulate(load_scenario(name, variant, overrides))
 
 
 def outcome(record: Record) -> dict[str, Any]:
-    """A run in numbers."""
+    """Return the numbers of a run."""
     rise = np.diff(record["cost"])
     same = np.diff(record["mode"]) == 0
     return {
@@ -74,7 +74,7 @@ def outcome(record: Record) -> dict[str, Any]:
 
 
 def wider_map() -> ServoMap:
-    """The shipped servo map, for a robot whose grounded wheels may rise and whose joints may start fast."""
+    """Return the shipped servo map for a robot whose grounded wheels may rise and whose joints may start fast."""
     content = yaml.safe_load((SHIPPED / "snake.yaml").read_text(encoding="utf-8"))
     content["lifts"]["tilt_mm"], content["safety"]["run_up"] = TILT_MM, RUN_UP
     with tempfile.TemporaryDirectory() as folder:
@@ -84,7 +84,7 @@ def wider_map() -> ServoMap:
 
 
 def verdict(record: Record, servo_map: ServoMap) -> str:
-    """What ``dynsim hw check`` says of a record at its own speed: its first reason to refuse it, or nothing."""
+    """Return the first reason of ``dynsim hw check`` to refuse a record at its own speed, or an empty text."""
     try:
         check_motion(record, servo_map)
     except CheckRefused as refused:
@@ -93,7 +93,7 @@ def verdict(record: Record, servo_map: ServoMap) -> str:
 
 
 def halved(record: Record) -> dict[str, float | None]:
-    """When joints of the base part come below half of their first angle for good [s]; None: not within the run."""
+    """Return when joints of the base finally fall below half of their initial angle [s]; None: not within the run."""
     times: dict[str, float | None] = {}
     names = record.labels["phi"]
     for j in range(6, record["phi"].shape[1]):
@@ -103,7 +103,7 @@ def halved(record: Record) -> dict[str, float | None]:
 
 
 def circle(duration: float, margin: float) -> dict[str, Any]:
-    """The circle backward, with another duration of its path and another least margin."""
+    """Return the circle backward with a different path duration and least margin."""
     path = load_scenario("snake_circle_backward").resolved["controller"]["paths"][0]
     settings = {
         "controller.paths": [path | {"duration_s": duration}],
@@ -114,14 +114,14 @@ def circle(duration: float, margin: float) -> dict[str, Any]:
 
 
 def order(null_gain: float) -> dict[str, Any]:
-    """When the joints of the base become straight, with modes in turn and a gain of the redundancy."""
+    """Return when the joints of the base become straight, with modes in turn and a gain of the redundancy."""
     record = simulated("snake_joint_limits", "cyclic", {"controller.null_gain": null_gain})
     reduced = record.summary["null_space_reduced_s"]
     return {"null_gain": null_gain, "halved_s": halved(record), "null_space_reduced_s": reduced}
 
 
 def study() -> dict[str, Any]:
-    """All of it."""
+    """Return all results."""
     maps = {"shipped": load_servo_map("snake"), "wider": wider_map()}
     runs: dict[str, dict[str, Any]] = {}
     servos: dict[str, dict[str, Any]] = {}

@@ -1,7 +1,7 @@
 """Study: tracking with measured feedback, motion of the head during mode changes, and heights of lifted wheels.
 
 ``PYTHONPATH=tests python -m support.snake_observations`` writes results/snake/observations.json, which docs/snake.md
-quotes, in a minute. All runs are those of the dynamic snake.
+quotes, in a minute. All runs use the dynamic snake.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ WHEELS, PAIRS = 14, 7
 
 
 def switching_run(duration_s: float = 22.0) -> Record:
-    """Modes 1 to 6 of the paper's Table II, one after the other ([T] V.B)."""
+    """Run modes 1 to 6 of the paper's Table II, one after the other ([T] V.B)."""
     settings = {"plant.level": "dynamic", "duration_s": duration_s}
     return simulate(load_scenario("snake_joint_limits", "cyclic", settings))
 
 
 def converged(variant: str) -> dict[str, float]:
-    """Largest error of the head in the last second, its state measured by motion capture with 10 ms delay."""
+    """Return the largest error of the head in the last second, measured by motion capture with 10 ms delay."""
     settings = {"controller.state": "measured", "sensors.motion_capture.delay_s": 0.01}
     record = simulate(load_scenario("snake_positioning_dynamic", variant, settings))
     off = np.abs(record["w"] - record["w_target"])[record.time >= record.time[-1] - 1.0]
@@ -39,7 +39,7 @@ def converged(variant: str) -> dict[str, float]:
 
 
 def head_motion(record: Record) -> dict[str, float]:
-    """Largest distance and turn of the head from its pose at the first mode change, and its largest error."""
+    """Return the largest distance and rotation of the head from its pose at the first mode change, and its error."""
     switching = record.time >= 2.0
     w, target = record["w"][switching], record["w_target"][switching]
     moved, off = w - w[0], w - target
@@ -54,24 +54,24 @@ def head_motion(record: Record) -> dict[str, float]:
 
 
 def settled(record: Record) -> np.ndarray:
-    """Samples at which the wheels have come to the heights of their mode, (T,)."""
+    """Return a mask of samples at which the wheels have reached the heights of their mode, (T,)."""
     mode = record["mode"]
     begun = np.maximum.accumulate(np.where(np.diff(mode, prepend=mode[0]) != 0.0, record.time, 0.0))
     return record.time - begun > LIFTING_S
 
 
 def lifted(record: Record) -> np.ndarray:
-    """Samples at which a pair has come to its lifted height, (T, 7)."""
+    """Return a mask of samples at which a pair has reached its lifted height, (T, 7)."""
     return (record["grounded"] == 0.0) & settled(record)[:, None]
 
 
 def by_wheel(record: Record, signal: str) -> np.ndarray:
-    """A signal of contacts, of the wheels of each pair, (T, 7, 2)."""
+    """Return a contact signal for the wheels of each pair, (T, 7, 2)."""
     return record[signal][:, :WHEELS].reshape(-1, PAIRS, 2)
 
 
 def wheel_heights(record: Record) -> dict[str, list[float]]:
-    """By mode and lifted pair: mean heights of the lower and the higher wheel [mm]."""
+    """Return mean heights of the lower and the higher wheel, by mode and lifted pair [mm]."""
     up, gaps = lifted(record), by_wheel(record, "contact_gap")
     heights = {}
     for mode in sorted(set(record["mode"])):
@@ -83,7 +83,7 @@ def wheel_heights(record: Record) -> dict[str, list[float]]:
 
 
 def study() -> dict[str, Any]:
-    """All of it."""
+    """Return all results."""
     record = switching_run()
     return {
         "dynsim_version": __version__,

@@ -19,17 +19,17 @@ from dynsim.system.files import write_json
 
 SCENARIO, FILE = "snake_positioning_dynamic", Path("results/snake/steps.json")
 STEPS_MS = (1.0, 2.5, 5.0)
-# Fall of the head after its release: steps, of which the last is the reference for the others, and duration.
+# Fall of the head after its release: steps, the last of which is the reference, and duration.
 FALL_MS, FALL_S = (5.0, 2.5, 1.25, 0.3125), 0.15
 
 
 def end_values(moved: str, step_ms: float) -> np.ndarray:
-    """Displacement of the head as Table III takes it, (6,) [m, rad]."""
+    """Return the displacement of the head as defined in Table III, (6,) [m, rad]."""
     return displacement(simulate(load_scenario(SCENARIO, moved, {"integrator.step_s": 1e-3 * step_ms})))
 
 
 def fall_errors(theta: float) -> list[float]:
-    """Largest error of the head's place while it falls, by step [m]."""
+    """Return the largest position error of the head while it falls, by step [m]."""
     settings = {"plant.dynamics.start": "released", "duration_s": FALL_S, "integrator.theta": theta}
     falls = [
         simulate(load_scenario(SCENARIO, "x", {**settings, "integrator.step_s": 1e-3 * step}))["w"] for step in FALL_MS
@@ -38,7 +38,7 @@ def fall_errors(theta: float) -> list[float]:
 
 
 def study() -> dict[str, Any]:
-    """All of it."""
+    """Return all results."""
     ends = {moved: [end_values(moved, step).tolist() for step in STEPS_MS] for moved in TABLE_III}
     spread = np.array([np.ptp(values, axis=0) for values in ends.values()])
     return {

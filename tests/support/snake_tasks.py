@@ -1,6 +1,6 @@
 """Study: the snake's tasks on both levels, each with the variants that fail.
 
-``PYTHONPATH=tests python -m support.snake_tasks`` writes results/snake/tasks.json, whose table docs/snake.md has, in
+``PYTHONPATH=tests python -m support.snake_tasks`` writes results/snake/tasks.json, whose table is in docs/snake.md, in
 two minutes.
 """
 
@@ -19,7 +19,7 @@ from dynsim.scenario import load_scenario, variant_names
 from dynsim.system.files import write_json
 
 FILE = Path("results/snake/tasks.json")
-# Of each task: the coordinate of its object, its factor and unit.
+# For each task: coordinate of its object, factor and unit.
 TASKS = {
     "snake_pick_up": ("pipe.z", 1e3, "mm"),
     "snake_valve": ("valve", 180.0 / np.pi, "°"),
@@ -28,7 +28,7 @@ TASKS = {
 
 
 def run(name: str, variant: str, level: str) -> tuple[Record, str]:
-    """The record of a run, and the reason and time of its early end; empty where it came to its end."""
+    """Return the record of a run, and the reason and time of an early end; empty if it was completed."""
     try:
         return simulate(load_scenario(name, variant, {"plant.level": level})), ""
     except SimulationStopped as stop:
@@ -38,7 +38,7 @@ def run(name: str, variant: str, level: str) -> tuple[Record, str]:
 
 
 def outcome(name: str, variant: str, level: str) -> dict[str, Any]:
-    """How far the object was moved, what the gripper carried, and how well the ledger closes."""
+    """Return how far the object was moved, what the gripper carried, and how well the ledger closes."""
     record, end = run(name, variant, level)
     coordinate, factor, unit = TASKS[name]
     moved = factor * record["q"][:, record.labels["q"].index(coordinate)]
@@ -59,7 +59,7 @@ def outcome(name: str, variant: str, level: str) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Run all and write the file."""
+    """Run all tasks and write the file."""
     runs = [
         {"scenario": name, "variant": variant, "level": level, **outcome(name, variant, level)}
         for name in TASKS
@@ -67,7 +67,7 @@ def main() -> None:
         for level in ("kinematic", "dynamic")
     ]
     for entry in runs:
-        entry.pop("real_time", None)  # of this machine
+        entry.pop("real_time", None)  # depends on the machine
     write_json(FILE, {"dynsim_version": __version__, "runs": runs})
 
 

@@ -1,7 +1,7 @@
 """Study: duration of the very first run, which compiles the kernels, and of a later one.
 
-``PYTHONPATH=tests python -m support.start_up`` writes results/reference/start_up.json in two minutes: on a machine that
-does nothing else, the one of results/reference/bench.json.
+``PYTHONPATH=tests python -m support.start_up`` writes results/reference/start_up.json in two minutes, on an otherwise
+idle machine, the machine of results/reference/bench.json.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ METHODS = ("radau5", "dopri5")
 
 
 def measure(method: str) -> dict[str, dict[str, float]]:
-    """A run with an empty kernel cache and the next one; a comparison of all variants with figures and page, twice.
+    """Time a run with an empty kernel cache and the next one; also a comparison of all variants with figures and page.
 
-    The first one makes matplotlib's list of fonts.
+    The first run creates matplotlib's list of fonts.
     """
     run = ["run", SCENARIO, "--no-figures", "--set", f"integrator.method={method}"]
     compare = ["compare", SCENARIO, "--set", f"integrator.method={method}"]
@@ -39,7 +39,7 @@ def measure(method: str) -> dict[str, dict[str, float]]:
 
 
 def _timed(arguments: list[str], folder: Path) -> dict[str, float]:
-    """Wall time and processor time of all processes [s]."""
+    """Return wall time and processor time of all processes [s]."""
     command = [sys.executable, "-m", "dynsim", *arguments, "--quiet", "--out", str(folder / arguments[0])]
     before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
     subprocess.run(command, check=True, env={**os.environ, "XDG_CACHE_HOME": str(folder / "cache")})
@@ -48,8 +48,8 @@ def _timed(arguments: list[str], folder: Path) -> dict[str, float]:
 
 
 def start_up() -> dict[str, Any]:
-    """By method, with machine and versions."""
-    # Of other programs wall times tell as much.
+    """Return the times by method, with machine and versions."""
+    # The load before shows whether other programs affect the wall times.
     where = {"machine": machine() | {"load_before": os.getloadavg()[0]}, "versions": versions()}
     return where | {method: measure(method) for method in METHODS}
 

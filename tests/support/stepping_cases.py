@@ -23,7 +23,7 @@ X, Y, Z = np.eye(3)
 
 
 class Case(NamedTuple):
-    """A system with its start, duration and required end."""
+    """A system with its start, duration and required final state."""
 
     compiled: CompiledSystem
     q: np.ndarray
@@ -31,26 +31,26 @@ class Case(NamedTuple):
     until: float
     end: np.ndarray
     law: dict[int, float] = {}
-    read: Callable[[np.ndarray], np.ndarray] = np.asarray  # from the positions to the form of ``end``
+    read: Callable[[np.ndarray], np.ndarray] = np.asarray  # converts positions to the form of ``end``
 
     def run(self, step: float, theta: float = 0.5, until: float | None = None) -> Run:
-        """Its run with this step, sampled at every step."""
+        """Run it with this step, sampled at every step."""
         until = self.until if until is None else until
         times = np.arange(round(until / step) + 1) * step
         return stepped(self.compiled, self.compiled.state(self.q, self.v), times, step, theta, self.law)
 
     def error(self, step: float, theta: float = 0.5) -> float:
-        """Largest error at the end [m or rad]."""
+        """Return the largest error at the end [m or rad]."""
         return float(np.abs(self.read(self.run(step, theta).states("q")[-1]) - self.end).max())
 
 
 def solved(law: Callable[..., object], until: float, start: np.ndarray, *more: object) -> np.ndarray:
-    """End of an ordinary differential equation, far beyond what steps resolve."""
+    """Solve an ordinary differential equation far more accurately than steps resolve, and return the end."""
     return solve_ivp(law, (0.0, until), start, "DOP853", rtol=1e-12, atol=1e-13, args=more)["y"][:, -1]
 
 
 def point(contact: Contact, mass: float, *, gravity: float = G) -> CompiledSystem:
-    """A body that does not turn, free along x, y and z, with one contact at its origin."""
+    """Return a body that does not turn, free along x, y and z, with one contact at its origin."""
     links = [
         Link(a, f"j{a}", "xy"[k - 1] if k else None, "prismatic", np.eye(3)[k], Inertia(mass if k == 2 else 0.0))
         for k, a in enumerate("xyz")
@@ -60,19 +60,19 @@ def point(contact: Contact, mass: float, *, gravity: float = G) -> CompiledSyste
 
 
 def sphere(centre: np.ndarray, radius: float, side: float) -> Quadric:
-    """A sphere with its free side within (−1) or without (1)."""
+    """Return a sphere with its free side inside (−1) or outside (1)."""
     Q = side * np.eye(3) / radius
     return Quadric(Q, -Q @ centre, 0.5 * side * (float(centre @ centre) / radius - radius))
 
 
 def bowl(friction: float, *, radius: float = 0.4, mass: float = 0.3, gravity: float = G) -> CompiledSystem:
-    """A bead in a sphere whose lowest point is the origin."""
+    """Return a bead in a sphere whose lowest point is the origin."""
     surface = sphere(radius * Z, radius, -1.0)
     return point(Contact("bead", "z", np.zeros(3), surface, friction=friction), mass, gravity=gravity)
 
 
 def bead(friction: float = 0.0) -> Case:
-    """Around a great circle without weight; with friction the speed falls as v₀/(1 + μ v₀ t/R)."""
+    """Move around a great circle without weight; with friction the speed falls as v₀/(1 + μ v₀ t/R)."""
     radius, speed, until = 0.4, 1.7, 1.0
     rate = friction / radius
     distance = speed * until if friction == 0.0 else np.log(1.0 + rate * speed * until) / rate
@@ -81,7 +81,7 @@ def bead(friction: float = 0.0) -> Case:
 
 
 def spherical_bowl(friction: float) -> Case:
-    """With weight, across: the direction of slip turns."""
+    """Move across with weight, so that the slip direction turns."""
     radius = 0.4
     start = np.array([0.3, 0.0, radius - np.sqrt(radius**2 - 0.09)])
 
@@ -96,7 +96,7 @@ def spherical_bowl(friction: float) -> Case:
 
 
 def hump() -> Case:
-    """A bead slides over a sphere and leaves it; then it falls."""
+    """Slide a bead over a sphere, which it leaves; then it falls."""
     radius, speed, until = 0.4, 0.8, 0.35
 
     def leaves(_: float, y: np.ndarray) -> float:
@@ -116,7 +116,7 @@ def hump() -> Case:
 
 
 def knife_edge() -> Case:
-    """A sleigh on one blade, its weight a little ahead of it: friction across the blade alone."""
+    """Return a sleigh on one blade, with its weight slightly ahead: friction acts only across the blade."""
     mass, inertia, ahead, until = 2.0, 0.05, 0.1, 3.0
     inertias = [Inertia(0.0)] * 3 + [Inertia(mass, ahead * X, inertia * np.eye(3))]
     links = [
@@ -137,13 +137,13 @@ def knife_edge() -> Case:
         ]
 
     end = solved(law, until, np.array([0.3, 4.0, 0.0, 0.0, 0.0]))
-    # Across the blade μ, along it none: the axis of the grip is the blade's.
+    # Friction across the blade is μ, along it zero: the grip axis is along the blade.
     grip = {ka.GRIP: 0.0, ka.GRIP_AXIS: 1.0, ka.GRIP_AXIS + 1: 0.0, ka.GRIP_AXIS + 2: 0.0}
     return Case(b, np.zeros(4), np.array([0.3, 0.0, 0.0, 4.0]), until, np.array([end[3], end[4], 0.0, end[2]]), grip)
 
 
 def incline(until: float = 0.6) -> Case:
-    """A block slides down a slope, sideways at first: its direction turns. After 1.5 s it has come to rest."""
+    """Slide a block down a slope, sideways at first, so that its direction turns. After 1.5 s it is at rest."""
     friction, slope, start = 0.5, 0.4, np.array([1.5, 1.0])
     held = friction * G * np.cos(slope)
 
@@ -156,19 +156,19 @@ def incline(until: float = 0.6) -> Case:
 
     rests.terminal = True  # type: ignore[attr-defined]
     solution = solve_ivp(law, (0.0, until), np.r_[0.0, 0.0, start], "DOP853", rtol=1e-12, atol=1e-13, events=rests)
-    # The plane is level here and gravity leans.
+    # The plane is level here and gravity is inclined.
     b = point(Contact("foot", "z", np.zeros(3), plane(Z), friction=friction), 1.0)
     b.system.model.gravity[:] = G * np.array([0.0, -np.sin(slope), -np.cos(slope)])
     return Case(b, np.zeros(3), np.r_[start, 0.0], until, np.r_[solution["y"][:2, -1], 0.0])
 
 
 LENGTH, MASS, FLOOR = np.array([0.3, 0.25, 0.2]), np.array([0.5, 0.4, 0.3]), -0.1
-BEND = np.eye(3) - np.eye(3, k=-1)  # joint angles of absolute ones
+BEND = np.eye(3) - np.eye(3, k=-1)  # joint angles from absolute angles
 STIFF, DRAG = 200.0, 2.0
 
 
 class Chain:
-    """Three rods in a vertical plane, by their absolute angles: an independent arm, its tip on a floor or not."""
+    """Three rods in a vertical plane, by absolute angles: an independent arm, with its tip on a floor or free."""
 
     def __init__(self) -> None:
         self.inertia, self.weight = np.zeros((3, 3)), np.zeros(3)
@@ -180,13 +180,13 @@ class Chain:
             self.weight += MASS[k] * arm
 
     def rows(self, q: np.ndarray) -> np.ndarray:
-        """Of the tip, normal and along the floor, (2, 3)."""
+        """Return the rows of the tip, normal and along the floor, (2, 3)."""
         return np.array([LENGTH * np.cos(q), -LENGTH * np.sin(q)])
 
     def law(
         self, t: float, y: np.ndarray, motion: str, friction: float = 0.0, reference: Callable | None = None
     ) -> np.ndarray:
-        """(v, v̇) with a tip that is free along the floor, slides on it ahead, or sticks."""
+        """Return (v, v̇) with a tip that is free along the floor, slides on it, or sticks."""
         q, v = y[:3], y[3:]
         M = self.inertia * np.cos(q[:, None] - q[None])
         force = -(self.inertia * np.sin(q[:, None] - q[None])) @ (v * v) - G * self.weight * np.cos(q)
@@ -200,7 +200,7 @@ class Chain:
 
 
 def reach(last: float, x: float, z: float = FLOOR) -> np.ndarray:
-    """Absolute angles with the tip at (x, z) and the last rod at an angle; the elbow up."""
+    """Return absolute angles with the tip at (x, z) and the last rod at an angle; the elbow is up."""
     px, pz = x - LENGTH[2] * np.cos(last), z - LENGTH[2] * np.sin(last)
     bend = -np.arccos((px**2 + pz**2 - LENGTH[0] ** 2 - LENGTH[1] ** 2) / (2 * LENGTH[0] * LENGTH[1]))
     first = np.arctan2(pz, px) - np.arctan2(LENGTH[1] * np.sin(bend), LENGTH[0] + LENGTH[1] * np.cos(bend))
@@ -208,7 +208,7 @@ def reach(last: float, x: float, z: float = FLOOR) -> np.ndarray:
 
 
 def arm(friction: float, reference: Callable | None = None, until: float = 0.0) -> CompiledSystem:
-    """The same arm in dynsim, its joints held to a reference of absolute angles by springs and dampers."""
+    """Return the same arm in dynsim, with joints held to a reference of absolute angles by springs and dampers."""
     links = []
     for k in range(3):
         rod = Inertia(MASS[k], 0.5 * LENGTH[k] * X, MASS[k] * LENGTH[k] ** 2 / 12.0 * np.eye(3))
@@ -223,7 +223,7 @@ def arm(friction: float, reference: Callable | None = None, until: float = 0.0) 
         return b
     knots = np.linspace(0.0, until, 1001)
     spline = make_interp_spline(knots, np.array([BEND @ reference(t) for t in knots]), k=5)
-    # Taylor's at the left end of each piece.
+    # Taylor coefficients at the left end of each piece.
     powers = [spline.derivative(m)(knots[:-1]) / math.factorial(m) for m in range(6)]
     coefficients = np.stack(powers, axis=-1)
     follows = ka.ReferenceArrays(
@@ -235,7 +235,7 @@ def arm(friction: float, reference: Callable | None = None, until: float = 0.0) 
 
 
 def tip(motion: str) -> Case:
-    """The arm moves with its tip on the floor, which is free along it, slides, or sticks."""
+    """Move the arm with its tip on the floor: free along it, sliding, or sticking."""
     chain, start = Chain(), reach(-1.2, 0.42)
     J = chain.rows(start)
     if motion == "free":

@@ -1,4 +1,4 @@
-"""Systems for tests of time stepping: runs with a contact law of their own, and a scene of the snake's size."""
+"""Systems for tests of time stepping: runs with a special contact law, and a scene of the snake's size."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from support.random_robots import CompiledSystem, assemble
 def stepped(
     b: CompiledSystem, y: np.ndarray, times: np.ndarray, step: float, theta: float, law: dict | None = None
 ) -> Run:
-    """A run by time stepping; law: columns of the contacts' law."""
+    """Return a run with time stepping; law: columns of the contacts' law."""
     b = b.with_shapes()
     run = b.new_run(y, times, "time_stepping", step=step, theta=theta)
     for column, value in (law or {}).items():
@@ -27,7 +27,7 @@ def plane(normal: np.ndarray) -> Quadric:
 
 
 def snake(joints: int = 12, wheels: int = 14) -> tuple[CompiledSystem, np.ndarray]:
-    """A chain of yaw and pitch joints in turn that lies on a plane on wheels, two at each end and one at each joint."""
+    """Return a chain of alternating yaw and pitch joints on wheels on a plane, two at each end and one per joint."""
     length, inertia = 0.1, Inertia(0.3, np.zeros(3), np.diag([2e-4, 4e-4, 4e-4]))
     links = list(floating(Link("link_0", "root", None, "floating", np.eye(3)[0], inertia)))
     for k in range(joints):

@@ -1,4 +1,4 @@
-"""Live drives in processes of their own, and raw clients of their servers."""
+"""Live drives in separate processes, and raw clients of their servers."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ PATIENCE_S = 180.0
 
 
 def prepare_child() -> None:
-    """Where the tests run in the background, SIGINT is ignored and would be in their children too."""
+    """Restore SIGINT: if the tests run in the background it is ignored, and child processes would inherit that."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 class Teleop:
-    """A process of ``dynsim teleop``, or of another command with its page, and the address that it prints."""
+    """Process of ``dynsim teleop``, or of another command with its page, and the address that it prints."""
 
     def __init__(self, folder: Path, *arguments: str, command: Sequence[str] = ("teleop",)) -> None:
         self.folder = folder
@@ -51,18 +51,18 @@ class Teleop:
         self.port, self.path = int(parts.port or 0), parts.path
 
     def finish(self) -> int:
-        """Wait for the end; the exit code."""
+        """Wait for the end and return the exit code."""
         out, _ = self.process.communicate(timeout=PATIENCE_S)
         self.said += out
         return self.process.returncode
 
     def interrupt(self) -> int:
-        """Ctrl-C, and what comes of it."""
+        """Send Ctrl-C and return the exit code."""
         self.process.send_signal(signal.SIGINT)
         return self.finish()
 
     def group_is_gone(self) -> bool:
-        """No process of its session is left."""
+        """Return whether all processes of its session have ended."""
         try:
             os.killpg(self.process.pid, 0)
         except ProcessLookupError:
@@ -70,11 +70,11 @@ class Teleop:
         return False
 
     def connect(self) -> Client:
-        """A pilot's socket, as the page opens it."""
+        """Return a pilot's socket, opened as by the page."""
         return Client(self)
 
     def ask(self, path: str, headers: Mapping[str, str | None]) -> tuple[int, bytes]:
-        """Status and rest of the answer to a request with these headers."""
+        """Return status and body of the answer to a request with these headers."""
         lines = [f"GET {path} HTTP/1.1", *(f"{name}: {value}" for name, value in headers.items() if value is not None)]
         with socket.create_connection(("127.0.0.1", self.port), timeout=30) as raw:
             raw.sendall(("\r\n".join(lines) + "\r\n\r\n").encode())
@@ -87,7 +87,7 @@ class Teleop:
         return int(head.split()[1]), body
 
     def upgrade(self, **changes: str | None) -> dict[str, str | None]:
-        """Headers of a web socket from the page."""
+        """Return the headers of a web socket from the page."""
         headers: dict[str, str | None] = {
             "Host": f"127.0.0.1:{self.port}",
             "Origin": f"http://127.0.0.1:{self.port}",
@@ -100,7 +100,7 @@ class Teleop:
 
 
 class Client:
-    """A raw client: says and hears JSON."""
+    """Raw client that sends and receives JSON."""
 
     def __init__(self, teleop: Teleop) -> None:
         from websockets.sync.client import connect
@@ -113,27 +113,27 @@ class Client:
         self.hello: dict[str, Any] = self.until("hello")["hello"]
 
     def close(self) -> None:
-        """Leave."""
+        """Close the connection."""
         self._open.close()
 
     def say(self, **message: Any) -> None:
-        """One message."""
+        """Send one message."""
         self.socket.send(json.dumps(message))
 
     def wish(self, axes: Mapping[str, float], held: bool = True, **more: Any) -> None:
-        """What is wanted of each axis by name, others zero."""
+        """Send the wanted value of each named axis, zero for others."""
         self.count += 1
         names = [axis["name"] for axis in self.hello["axes"]]
         self.say(n=self.count, axes=[axes.get(name, 0.0) for name in names], held=held, **more)
 
     def hear(self) -> dict[str, Any]:
-        """The next message."""
+        """Return the next message."""
         message = dict(json.loads(self.socket.recv(timeout=60)))
         self.over = message.get("over", self.over)
         return message
 
     def until(self, key: str, test: Callable[[Any], bool] = lambda value: True) -> dict[str, Any]:
-        """The next message with a key, and a value that passes a test."""
+        """Return the next message with a key whose value passes a test."""
         end = time.monotonic() + 60
         while time.monotonic() < end:
             message = self.hear()

@@ -29,7 +29,7 @@ from support.random_robots import CompiledSystem, assemble, random_contacts, ran
 
 
 def raised(contact: Contact, height: float) -> Contact:
-    """The contact with its surface moved away from its point by a height [m], along the normal there."""
+    """Return the contact with its surface moved away from its point by a height [m], along the normal there."""
     surface = contact.surface
     assert isinstance(surface, Quadric)
     if not surface.Q.any():
@@ -41,7 +41,7 @@ def raised(contact: Contact, height: float) -> Contact:
 
 
 def random_touch(seed: int) -> tuple[CompiledSystem, np.ndarray]:
-    """A random robot with two to six contacts, on their surfaces or some centimetres off, and a state."""
+    """Return a random robot with two to six contacts, on their surfaces or some centimetres off, and a state."""
     rng = np.random.default_rng(seed)
     n = int(rng.integers(3, 9))
     robot = random_robot(rng, n, branches=bool(rng.random() < 0.5), motors=bool(rng.random() < 0.5))
@@ -65,18 +65,18 @@ def random_touch(seed: int) -> tuple[CompiledSystem, np.ndarray]:
 
 
 def ledger_residual(run: ki.Run) -> np.ndarray:
-    """What the ledger does not explain at each sample, relative to what has been turned over [1]."""
+    """Return the unexplained part of the ledger at each sample, relative to the turnover [1]."""
     stored, ledger, loss = run.outputs("energy").sum(axis=1), run.states("ledger"), run.states("loss").sum(axis=1)
     spent = ledger[:, [JOULE, GEAR, JOINT, FRICTION]].sum(axis=1) + loss
-    # An impact at the start comes before the first sample.
+    # An impact at the start precedes the first sample.
     off = stored - stored[0] + spent - spent[0] - ledger[:, ELECTRICAL] - ledger[:, CONSTRAINT]
     return off / (1.0 + np.abs(stored).max() + spent.max() + np.abs(ledger[:, ELECTRICAL]).max())
 
 
 def violations(b: CompiledSystem, run: ki.Run) -> dict[str, float]:
-    """The worst breach of each rule of the law over all samples: forces per the largest of a sample, plus 1 N [1, m].
+    """Return the worst violation of each rule over all samples; forces relative to the largest of a sample plus 1 N.
 
-    Rules: f_n ≥ 0; gap ≥ 0; f_n gap = 0; |f_t| ≤ μ f_n; sliding friction is μ f_n against slip.
+    Units: 1, m. Rules: f_n ≥ 0; gap ≥ 0; f_n gap = 0; |f_t| ≤ μ f_n; sliding friction is μ f_n against slip.
     """
     touch = run.outputs("contact")
     mode, f, gap = touch[:, :, OUT_MODE], touch[:, :, OUT_FORCE], touch[:, :, OUT_GAP]
@@ -99,7 +99,7 @@ def violations(b: CompiledSystem, run: ki.Run) -> dict[str, float]:
             force, slip = touch[s, k, OUT_VECTOR : OUT_VECTOR + 3], touch[s, k, OUT_SLIP : OUT_SLIP + 3]
             q = run.states("q")[s]
             normal = _normal(b, contact, q)
-            # A frozen direction of slip is tangential at the ends of steps; a curved surface turns under it within one.
+            # A frozen slip direction is tangential at the ends of steps; within a step a curved surface turns.
             assert abs(force @ normal - f[s, k]) <= 1e-5 * scale[s, 0]
             tangential, speed = force - f[s, k] * normal, float(np.linalg.norm(slip))
             if mode[s, k] == ka.STICKING:
@@ -122,7 +122,7 @@ def _normal(b: CompiledSystem, contact: Contact, q: np.ndarray) -> np.ndarray:
 
 
 def events(run: ki.Run) -> list[tuple[float, int, int]]:
-    """Time, contact and kind of the logged events of contacts."""
+    """Return time, contact and kind of the logged contact events."""
     events_seen = []
     for t, code in zip(run.log_time, run.log_event[: run.count[ki.LOGGED]], strict=False):
         k, kind = divmod(int(code) - ki.CONTACT_LOG, ke.LOG_KINDS)

@@ -25,14 +25,14 @@ from dynsim.model.urdf.reader import (
     read_tree,
 )
 
-# Two readers of the same decimals differ by roundings: of the sines of angles, and of sums over merged bodies.
+# Two readers of the same decimals differ by rounding, in sines of angles and in sums over merged bodies.
 AGREEMENT = 1e-9
 
 
 def plain_text(root: Element, name: str) -> str:
-    """What physics depends on, with the numbers as the file has them, in UTF-8 without anything else.
+    """Return the elements that physics depends on, with the numbers of the file, as minimal UTF-8 text.
 
-    For Pinocchio, whose parser knows no other encoding and drops the whole inertia over a space beside a number.
+    Needed because Pinocchio's parser knows no other encoding and drops the whole inertia over a space next to a number.
     """
 
     def written(element: Element, tags: tuple[str, ...]) -> str:
@@ -55,7 +55,7 @@ def plain_text(root: Element, name: str) -> str:
 
 
 def assert_pinocchio_reads_the_same(path: Path, text: str | None = None) -> None:
-    """AssertionError unless Pinocchio finds the same joints and bodies in the file, or in another ``text``."""
+    """Raise AssertionError unless Pinocchio reads the same joints and bodies from the file, or from ``text``."""
     tree = read_tree(path)
     model = pinocchio.buildModelFromXML(plain_text(UrdfFile(path).root(), tree.name) if text is None else text)
     neutral = pinocchio.neutral(model)
@@ -83,10 +83,10 @@ def assert_pinocchio_reads_the_same(path: Path, text: str | None = None) -> None
         pairs.append(("inertia", link.inertia.tensor, inertia.inertia, size))
         pairs.append(("damping", link.damping, model.damping[model.joints[j].idx_v], link.damping))
         if link.kind in SEVERAL:
-            # Of a plane Pinocchio does not read the normal: it takes z.
+            # Pinocchio does not read the normal of a plane: it uses z.
             pairs.append(("number of rates", len(ROWS[link.kind](link)), model.joints[j].nv, 0.0))
         else:
-            # Motion of the body per unit rate in its own frame: (0, a) of a revolute joint, (a, 0) of a prismatic one.
+            # Motion of the body per unit rate in its own frame: (0, a) for a revolute, (a, 0) for a prismatic joint.
             in_joint = model.joints[j].createData()
             model.joints[j].calc(in_joint, neutral)
             zero, revolute = np.zeros(3), link.kind == "revolute"

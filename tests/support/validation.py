@@ -1,4 +1,4 @@
-"""Study: energies, errors, forces and residuals of scenarios that README.md and docs/ quote, simulated anew.
+"""Study: energies, errors, forces and residuals of scenarios quoted in README.md and docs/, simulated again.
 
 ``PYTHONPATH=tests python -m support.validation`` writes results/reference/validation.json in about four minutes;
 ``python .ci/pages.py`` writes them into the pages.
@@ -27,11 +27,11 @@ from support.wang_minami import ELBOWS, elbow_forces, elbow_numbers
 FILE = Path("results/reference/validation.json")
 # Keys of a summary that depend on the machine.
 OF_THE_MACHINE = ("integration_wall_s", "real_time_factor")
-# Fine enough for the first tenth of a second.
+# Sufficient resolution for the first tenth of a second.
 RATE_HZ = 2000.0
 
 _FLOOR: dict[str, Any] = {"floor": {"type": "plane"}}
-# Scenarios without motors and with no loss but friction: errors of the steps accumulate, as no motor corrects them.
+# Scenarios without motors and with friction as only loss: step errors accumulate, as no motor corrects them.
 FREE: dict[str, dict[str, Any]] = {
     "undamped fall of ten links, 5 s": {
         "duration_s": 5,
@@ -73,12 +73,12 @@ FREE: dict[str, dict[str, Any]] = {
 
 
 def free_scenario(name: str) -> Scenario:
-    """One of :data:`FREE`."""
+    """Return one of :data:`FREE`."""
     return scenario_from_resolved({"name": name, **FREE[name]})
 
 
 def arms() -> dict[str, Scenario]:
-    """Variants of the shipped scenarios that are integrated, by "scenario variant"."""
+    """Return the integrated variants of the shipped scenarios, by "scenario variant"."""
     scenarios = {
         f"{path.stem} {variant or ''}".strip(): load_scenario(path, variant)
         for path in shipped_scenarios()
@@ -92,7 +92,7 @@ def arms() -> dict[str, Scenario]:
 
 
 def ended(scenario: Scenario) -> Record:
-    """The record of a run, also of one that is to stop where its base tips over."""
+    """Return the record of a run, even if it is designed to stop when its base tips."""
     try:
         return simulate(scenario)
     except SimulationStopped as stop:
@@ -102,7 +102,7 @@ def ended(scenario: Scenario) -> Record:
 
 
 def row(record: Record) -> dict[str, Any]:
-    """What is quoted of any run: energy, error, ledger, work, contacts and how often what happened."""
+    """Return the quoted numbers of a run: energy, error, ledger, work, contacts and event counts."""
     summary = record.summary
     keys = ("method", "electrical_energy_J", "hand_error_rms_m", "energy_residual_relative", "rhs_evaluations")
     numbers = {key: summary[key] for key in keys}
@@ -121,7 +121,7 @@ def row(record: Record) -> dict[str, Any]:
 
 
 def time_stepping() -> dict[str, dict[str, float]]:
-    """The balance of the discrete equations by time stepping, what the steps take, and how deep points sink."""
+    """Return balance and losses of the discrete equations in time stepping, and the depths of points."""
     cases: dict[str, tuple[str, str | None, dict[str, Any]]] = {
         "elbow_comparison_floor two_elbows, 2 s": ("elbow_comparison_floor", "two_elbows", {"duration_s": 2}),
         "wall_push weak_hold": ("wall_push", "weak_hold", {}),
@@ -142,7 +142,7 @@ def time_stepping() -> dict[str, dict[str, float]]:
 
 
 def knock() -> dict[str, float]:
-    """The largest that the check of the bridge sees in the record of two elbows: acceleration, jerk, shaking."""
+    """Return the largest acceleration, jerk and shaking that the bridge check finds in the record of two elbows."""
     motion = check_motion(_elbows(), load_servo_map("arm"))
     keys = ("acceleration", "jerk", "shaking")
     return {key: max(abs(margin.value) for margin in motion.margins if margin.quantity == key) for key in keys}
@@ -154,7 +154,7 @@ def _elbows(variant: str = "two_elbows", **integrator: Any) -> Record:
 
 
 def residuals_by_tolerance() -> dict[str, float]:
-    """Ledger residual over turnover of two elbows, by method, tolerance and duration."""
+    """Return the ledger residual over turnover of two elbows, by method, tolerance and duration."""
     cases: dict[str, dict[str, Any]] = {
         "dopri5, rtol 1e-6, 1 s": {"duration_s": 1, "method": "dopri5"},
         "dopri5, rtol 1e-8, 1 s": {"duration_s": 1, "method": "dopri5", "rtol": 1e-8, "atol": 1e-10},
@@ -167,7 +167,7 @@ def residuals_by_tolerance() -> dict[str, float]:
 
 
 def differences() -> dict[str, dict[str, float]]:
-    """What other tolerances, methods and solvers change in the run with two elbows, and half the tolerance in all."""
+    """Return the effects of tolerances, methods and solvers on the run with two elbows, and of half the tolerance."""
     reference = _elbows(method="dopri5", rtol=1e-11, atol=1e-13)
     results: dict[str, dict[str, float]] = {}
     cases: dict[str, dict[str, Any]] = {
@@ -193,7 +193,7 @@ def differences() -> dict[str, dict[str, float]]:
 
 
 def validation() -> dict[str, Any]:
-    """All of it, by topic."""
+    """Return all results, by topic."""
     fine = compare(ELBOWS, overrides={"record.rate_hz": RATE_HZ})
     results = {name: ended(scenario) for name, scenario in arms().items()}
     free = {name: simulate(free_scenario(name)) for name in FREE}

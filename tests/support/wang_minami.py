@@ -17,7 +17,7 @@ from dynsim.studies.compare import compare
 ELBOWS = "elbow_comparison"
 PATH = "controller.hand.path"
 
-# What is changed → overrides.
+# Changed assumption → overrides.
 CASES: dict[str, dict[str, Any]] = {
     "as shipped": {},
     "circle vertical, in the heading's plane": {f"{PATH}.normal": [1, -1, 0], f"{PATH}.start": [1, 1, 0]},
@@ -34,7 +34,7 @@ CASES: dict[str, dict[str, Any]] = {
 
 
 def elbow_numbers(record: Record, scenario: Scenario) -> dict[str, float]:
-    """Energies, works and the depth of the lowest joint of one variant."""
+    """Return energies, works and the depth of the lowest joint of one variant."""
     summary, time = record.summary, record.time
     keys = ("electrical_energy_J", "electrical_energy_supply_J", "electrical_energy_drawn_J", "mechanical_work_J")
     more = ("joule_heat_J", "friction_heat_J", "hand_error_rms_m", "hand_error_z_rms_m")
@@ -42,7 +42,7 @@ def elbow_numbers(record: Record, scenario: Scenario) -> dict[str, float]:
     row["sum_of_absolute_power_J"] = float(np.trapezoid(np.abs(record["torque"] * record["v"]).sum(axis=1), time))
     lowest = np.min([p[2] for _, _, p in poses(build.robot(scenario), record["q"])], axis=0)
     row["joint_depth_max_m"] = float(-lowest.min())
-    # Not −0.0 where a joint lies on the floor.
+    # Not −0.0 if a joint is exactly on the floor.
     row["joint_depth_from_2_s_min_m"] = float(0.0 - lowest[time >= 2.0].max())
     row["joint_depth_from_2_s_max_m"] = float(-lowest[time >= 2.0].min())
     row["joint_depth_end_m"] = float(-lowest[-1])
@@ -50,7 +50,7 @@ def elbow_numbers(record: Record, scenario: Scenario) -> dict[str, float]:
 
 
 def elbow_forces(record: Record) -> dict[str, float]:
-    """How the floor pushes and then pulls at elbow 4, and when it pulls at elbow 7, with both elbows held."""
+    """Return how the floor pushes and then pulls at elbow 4, and when it pulls at elbow 7, with both elbows held."""
     time, names = record.time, record.labels["contact_normal_force"]
     force, other = (record["contact_normal_force"][:, names.index(name)] for name in ("elbow_4", "elbow_7"))
     pulled = time[other < 0.0]
@@ -70,7 +70,7 @@ def elbow_forces(record: Record) -> dict[str, float]:
 
 
 def changed_assumptions() -> dict[str, dict[str, dict[str, float]]]:
-    """Case → variant → electrical energy [J], hand error rms [m], pulling fraction of elbow 4."""
+    """Return case → variant → electrical energy [J], hand error rms [m], pulling fraction of elbow 4."""
     result: dict[str, dict[str, dict[str, float]]] = {}
     for case, overrides in CASES.items():
         result[case] = {}

@@ -153,10 +153,10 @@ def test_damaged_machine_code_is_compiled_anew(kernel_files: Path, damage: str) 
 
 def test_who_asks_is_told_once_that_a_kernel_is_compiled(kernel_files: Path) -> None:
     messages: list[str] = []
-    with jit.told_of_compilation(lambda: messages.append("before")):
+    with jit.on_compilation(lambda: messages.append("before")):
         _double()
     assert messages == ["before"]
-    with jit.told_of_compilation(lambda: messages.append("from the cache")):
+    with jit.on_compilation(lambda: messages.append("from the cache")):
         _double()
     assert messages == ["before"]
     (file,) = kernel_files.iterdir()

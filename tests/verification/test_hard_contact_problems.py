@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from support.cone_checks import violation
 
-from dynsim.dynamics.contact.cone.steps import CONE, CONE_ROOM, approach_or_draw_near, solve_cones
+from dynsim.dynamics.contact.cone.steps import CONE, CONE_ROOM, approach_or_proximal_point, solve_cones
 from dynsim.integrators.stepping import contacts
 from dynsim.integrators.stepping import tables as kt
 from dynsim.jit.kernel import kernel
@@ -49,7 +49,7 @@ def read() -> Iterator[Problem]:
 @kernel
 def as_a_step_does(W, b, kind, mu, p, f, room):
     """The residual after all searches of a step of time stepping."""
-    return approach_or_draw_near(W, b, kind, mu, p, f, room, kt.GOOD, kt.LAST_ROUNDS)
+    return approach_or_proximal_point(W, b, kind, mu, p, f, room, kt.GOOD, kt.LAST_ROUNDS)
 
 
 @kernel
@@ -141,7 +141,7 @@ def test_impulses_that_solve_nothing_take_energy_and_stay_in_their_cones():
         for impulses in (solved(problem)[1], problem.start, 1e6 * problem.start):
             f, w = impulses.copy(), problem.W @ impulses + problem.b
             s = SimpleNamespace(f=f, right=problem.b, w=w)
-            contacts.hold_energy(s, problem.W, len(f))
+            contacts.limit_energy(s, problem.W, len(f))
             taken = f @ problem.b + 0.5 * f @ problem.W @ f
             assert taken <= 1e-12 * np.abs(f * problem.b).sum()
             # One factor for all, from 0 to 1.

@@ -355,11 +355,11 @@ def admissible_forces(model: ModelArrays, contacts: ContactArrays, unilateral: U
         return
     # Small, because it is inlined into the right-hand side.
     if unilateral.number[ku.REDUNDANT] == 1.0 or unilateral.stop.shape[0] + unilateral.dry.shape[0] > 0:
-        look_at_forces(model, contacts, unilateral, ws)
+        check_forces(model, contacts, unilateral, ws)
 
 
 @noinline_kernel
-def look_at_forces(model: ModelArrays, contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace):
+def check_forces(model: ModelArrays, contacts: ContactArrays, unilateral: UnilateralArrays, ws: Workspace):
     """Do the work of :func:`admissible_forces` if there are dependent rows, stops or dry friction."""
     unilateral.number[ku.SPLIT] = 0.0
     if unilateral.number[ku.REDUNDANT] == 1.0 and beyond_bounds(contacts, unilateral, ws):

@@ -15,7 +15,7 @@ IMMOBILE = 1e-12
 # A larger rate is not rounding for any robot [m/rad or m/m].
 CLEARLY = 1e-9
 # A joint that would have to move further than this does not bring a point onto its surface [rad or m].
-WAY = 0.1
+MAX_TRAVEL = 0.1
 
 
 @noinline_kernel
@@ -30,7 +30,7 @@ def moves_along_normal(model: ModelArrays, contacts: ContactArrays, ws: Workspac
     links, state = ws.links, ws.contacts
     at, last = vector(state, k, ka.POSITION), contacts.link[k, ka.LINK]
     row = wrench_at(at, vector(state, k, ka.NORMAL), ZERO_VECTOR)
-    square, i, least = dot_vector(at, at), last, abs(gap) / WAY
+    square, i, least = dot_vector(at, at), last, abs(gap) / MAX_TRAVEL
     while i >= 0:
         if abs(dot(six(links, i, ka.S), row)) > max(CLEARLY, least):
             return True

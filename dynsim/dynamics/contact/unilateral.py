@@ -107,7 +107,7 @@ TIE_TURNED = 29  # torsion: its rotation vector along the axis at the last step 
 TIE_SIZE = 30
 # UnilateralArrays.mode, int: columns
 WANTED, BEFORE, TOUCHING, STRUCK = 0, 1, 2, 3
-GIVES_WAY = 4  # 1: it has reached its static cone, and the kinetic coefficient applies from now on
+KINETIC_ONLY = 4  # 1: it has reached its static cone, and the kinetic coefficient applies from now on
 LEAVES = 5  # 1: nothing presses it, and the next choice of modes excludes it
 TOUCHED = 6  # TOUCHING before a choice of modes
 OVERLOADED = 7  # 1: at rest it would exceed its friction, however small its acceleration
@@ -267,7 +267,7 @@ def dry_rests(unilateral: UnilateralArrays, k):
 
 
 @internal_kernel
-def rub(unilateral: UnilateralArrays | None, ws: Workspace):
+def apply_dry_friction(unilateral: UnilateralArrays | None, ws: Workspace):
     """Add the dry friction of joints without a row to the applied forces; it is constant within a step."""
     if unilateral is None:  # resolved at compile time
         return

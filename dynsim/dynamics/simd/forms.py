@@ -19,8 +19,8 @@ from dynsim.dynamics.contact import delassus as kq
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.delassus import (
     admissible_forces,
+    check_forces,
     clearly_unique,
-    look_at_forces,
     solve_dependent,
     solve_small,
 )
@@ -31,7 +31,7 @@ from dynsim.dynamics.derivative import System, derivative
 from dynsim.dynamics.drive.law import clipped, evaluate_reference, fed_forward, servo_circuit
 from dynsim.dynamics.tables import Workspace
 from dynsim.dynamics.tree.loads import add_loads
-from dynsim.jit.compiler import Tables, form_of, made, parts_of
+from dynsim.jit.compiler import Tables, build_tuple, form_of, parts_of
 from dynsim.jit.kernel import internal_kernel, noinline_kernel
 from dynsim.jit.simd import INT32, Lanes, every, lanes_of, select
 
@@ -104,7 +104,7 @@ def _lane(context: Any, builder: Any, value: Any, kind: Any, index: Any) -> Any:
     if isinstance(kind, Tables):
         parts = parts_of(context, builder, kind, value)
         lanes = [_lane(context, builder, x, part, index) for x, part in zip(parts, kind, strict=True)]
-        return made(context, builder, result, lanes)
+        return build_tuple(context, builder, result, lanes)
     source, view = make_array(kind)(context, builder, value), make_array(result)(context, builder)
     start = builder.gep(builder.bitcast(source.data, view.data.type), [index])
     return _viewed(context, builder, view, start, source.shape, source.strides, 8)
@@ -167,7 +167,7 @@ def tables_as_lanes(typingctx: Any, ws: Any) -> Any:
             value if seen == kind else _as_lanes(context, builder, value, kind, seen)
             for value, kind, seen in zip(parts_of(context, builder, ws, args[0]), ws, result, strict=True)
         ]
-        return made(context, builder, result, values)
+        return build_tuple(context, builder, result, values)
 
     return result(ws), codegen
 
@@ -290,7 +290,7 @@ def admissible_forces_lanes(model, contacts, unilateral, ws):
         return
     if unilateral.number[ku.REDUNDANT] == 1.0 or unilateral.stop.shape[0] + unilateral.dry.shape[0] > 0:
         for k in range(lane_count(ws)):
-            look_at_forces(model, contacts, unilateral, lane(ws, k))
+            check_forces(model, contacts, unilateral, lane(ws, k))
 
 
 @form_of(sign_changed, any_lanes)

@@ -43,10 +43,10 @@ from dynsim.integrators.contacts.impacts import (
     IMMOBILE,
     approach_without_force,
     evaluate,
-    keep,
     largest_right_side,
+    restore_modes,
+    save_modes,
     slip_speed,
-    take_back,
     watch_unpressed,
 )
 from dynsim.integrators.contacts.modes import (
@@ -57,13 +57,13 @@ from dynsim.integrators.contacts.modes import (
     acceleration_left,
     aim,
     begin_slip,
-    drops,
     force_slack,
+    friction_drops,
     note_headway,
     resolve,
     slip_on,
 )
-from dynsim.integrators.contacts.resting import hold_free_joints, leave_least, some_rest_without_row
+from dynsim.integrators.contacts.resting import hold_free_joints, projection_residual, some_rest_without_row
 from dynsim.integrators.run import GAP_TOLERANCE, RATE_TOLERANCE, Run, project_level
 from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
@@ -76,7 +76,7 @@ MOST_LEFT, LITTLE_LEFT = 0.5, 0.25
 
 
 @internal_kernel
-def note_left(unilateral: UnilateralArrays, ws: Workspace):
+def record_residual(unilateral: UnilateralArrays, ws: Workspace):
     """Record the error that projection leaves right after a choice of modes; it does not grow if nothing moves."""
     left = 0.0
     if unilateral.number[ku.REDUNDANT] == 1.0:
@@ -85,19 +85,19 @@ def note_left(unilateral: UnilateralArrays, ws: Workspace):
 
 
 @internal_kernel
-def most_left(unilateral: UnilateralArrays):
+def release_limit(unilateral: UnilateralArrays):
     """Return the fraction of the tolerances at which a joint is released: half of the remaining tolerance."""
     return unilateral.number[ku.LEFT] + MOST_LEFT * (1.0 - unilateral.number[ku.LEFT])
 
 
 @internal_kernel
-def left_margin(unilateral: UnilateralArrays, ws: Workspace, k):
+def agreement_margin(unilateral: UnilateralArrays, ws: Workspace, k):
     """Return 1 if the rows agree, below 0 if a joint must be released; the guard of the first held joint checks all."""
     for j in range(k):
         if unilateral.dry_table[j, ku.DRY_HOLDS] == 1:
             return 1.0
     left, _ = contradiction(unilateral, ws)
-    return 1.0 - left / most_left(unilateral)
+    return 1.0 - left / release_limit(unilateral)
 
 
 @noinline_kernel
@@ -125,12 +125,12 @@ def contradiction(unilateral: UnilateralArrays, ws: Workspace):
     for r in range(p):
         force[r], right[r] = rows[r, ka.FORCE], rows[r, ka.RHS]
     for level in range(2):
-        leave_least(ws, small, ka.ROW_GAP if level == 0 else ka.ROW_RATE, errors)
+        projection_residual(ws, small, ka.ROW_GAP if level == 0 else ka.ROW_RATE, errors)
         norm = 0.0
         for r in range(p):
             norm += errors[r] * errors[r]
         norm = math.sqrt(norm)
-        left, joint = norm / (GAP_TOLERANCE if level == 0 else RATE_TOLERANCE), first_to_yield(unilateral, errors, norm)
+        left, joint = norm / (GAP_TOLERANCE if level == 0 else RATE_TOLERANCE), first_to_slip(unilateral, errors, norm)
         if left > most and joint >= 0:
             most, gives = left, joint
     for r in range(p):
@@ -139,7 +139,7 @@ def contradiction(unilateral: UnilateralArrays, ws: Workspace):
 
 
 @internal_kernel
-def first_to_yield(unilateral: UnilateralArrays, errors, norm):
+def first_to_slip(unilateral: UnilateralArrays, errors, norm):
     """Return the held joint that slips first as forces against these errors grow; −1 if none is involved.
 
     The errors lie along the only combination w of rows with wᵀ J = 0, so forces can change along w without changing the
@@ -156,7 +156,7 @@ def first_to_yield(unilateral: UnilateralArrays, errors, norm):
 
 
 @noinline_kernel
-def let_joint_go(system: System, ws: Workspace, run: Run):
+def release_joint(system: System, ws: Workspace, run: Run):
     """Release a held joint that contradicts other rows, so that these rows can turn it; True if there was one.
 
     Call right after :func:`evaluate`, then choose all modes. If the rate of the joint is only rounding, it is held
@@ -167,7 +167,7 @@ def let_joint_go(system: System, ws: Workspace, run: Run):
         return False
     left, k = contradiction(unilateral, ws)
     # Half of the growth suffices: rounding changes the value at which the event was located.
-    if k < 0 or left < 0.5 * (unilateral.number[ku.LEFT] + most_left(unilateral)):
+    if k < 0 or left < 0.5 * (unilateral.number[ku.LEFT] + release_limit(unilateral)):
         return False
     unilateral.dry_table[k, ku.DRY_HOLDS] = 0
     for j in range(mode.shape[0]):
@@ -260,7 +260,7 @@ def rest_margin(unilateral: UnilateralArrays, ws: Workspace, k):
     if unilateral.number[ku.REDUNDANT] == 0.0:
         return 1.0
     limit = max(SLIP_TOLERANCE * max(largest_right_side(ws), IMMOBILE), 2.0 * unilateral.dry[k, ku.DRY_LEFT])
-    return min(1.0 - acceleration_left(unilateral, ws, k) / limit, left_margin(unilateral, ws, k))
+    return min(1.0 - acceleration_left(unilateral, ws, k) / limit, agreement_margin(unilateral, ws, k))
 
 
 @internal_kernel
@@ -271,7 +271,7 @@ def force_margin(unilateral: UnilateralArrays, ws: Workspace, k):
 
 
 @internal_kernel
-def moves_held(unilateral: UnilateralArrays, ws: Workspace, k):
+def held_joint_accelerates(unilateral: UnilateralArrays, ws: Workspace, k):
     """True if the event of held dry-friction joint k is that it accelerates, not that its force is at the bound."""
     return dry_bound(unilateral, k) * rest_margin(unilateral, ws, k) < force_margin(unilateral, ws, k)
 
@@ -541,12 +541,12 @@ def solve_modes(system: System, ws: Workspace, run: Run, first):
     """Choose all modes again and log the changes; if ``first``, nothing is logged."""
     before = ws.counts[ka.DEPENDENT]
     resolve(system, ws, run, TOUCH)
-    note_left(system.unilateral, ws)
+    record_residual(system.unilateral, ws)
     # Do not count dependent rows that were held together only on trial.
     ws.counts[ka.DEPENDENT] = before
     if not first:
         log_changes(system, ws, run)
-    tell_joints(system.unilateral, run)
+    log_joints(system.unilateral, run)
     rearm(run)
     count_changes(system, run)
 
@@ -577,7 +577,7 @@ def split_ends(system: System, ws: Workspace, run: Run):
         if kind == STOP_GUARD and unilateral.stop_table[k, ku.STOP_CLOSED] == 1 and stops > 0:
             return True
         # A point at the apex of its cone leaves; if its friction drops, modes are chosen at full friction.
-        if kind == SLIP_GUARD and ws.active[k, ka.MODE] == ka.STICKING and not drops(system, k):
+        if kind == SLIP_GUARD and ws.active[k, ka.MODE] == ka.STICKING and not friction_drops(system, k):
             pressed = ws.rows[ws.active[k, ka.FIRST_ROW], ka.FORCE] > NO_FORCE * strongest
             if pressed and point_shares(unilateral, ws, k) and at_limit(system.contacts, unilateral, ws, k):
                 return True
@@ -592,7 +592,7 @@ def solve_reduced(system: System, ws: Workspace, run: Run):
     """
     number, clock = system.unilateral.number, run.clock
     before, not_unique, reduction = ws.counts[ka.DEPENDENT], clock[ki.NOT_UNIQUE], FIRST_REDUCTION
-    keep(system.unilateral, ws, run)
+    save_modes(system.unilateral, ws, run)
     agrees = False
     while not agrees and reduction <= MOST_REDUCTION:
         number[ku.HOLDING] = 1.0 - reduction
@@ -600,13 +600,13 @@ def solve_reduced(system: System, ws: Workspace, run: Run):
         # At full friction, modes in which too much sticks would agree.
         agrees = run.count[ki.STATUS] == ki.RUNNING and consistent(system, ws)
         if not agrees:
-            take_back(system, ws, run)
+            restore_modes(system, ws, run)
         reduction *= 10.0
     number[ku.HOLDING], ws.counts[ka.DEPENDENT] = 1.0, before
     if agrees:
-        note_left(system.unilateral, ws)
+        record_residual(system.unilateral, ws)
         log_changes(system, ws, run)
-        tell_joints(system.unilateral, run)
+        log_joints(system.unilateral, run)
         rearm(run)
         count_changes(system, run)
     else:
@@ -642,7 +642,7 @@ def log(run: Run, code):
 
 
 @internal_kernel
-def tell(system: System, run: Run, k, kind):
+def log_contact(system: System, run: Run, k, kind):
     """Log and count an event of candidate k, and check for chatter."""
     tally = system.unilateral.tally
     log(run, ki.CONTACT_LOG + LOG_KINDS * k + kind)
@@ -658,7 +658,7 @@ def tell(system: System, run: Run, k, kind):
 
 
 @internal_kernel
-def tell_stop(system: System, run: Run, k, kind):
+def log_stop(system: System, run: Run, k, kind):
     """Log that a joint hits or leaves stop k, count hits, and check for chatter."""
     stop = system.unilateral.stop
     log(run, ki.STOP_LOG + LOG_KINDS * k + kind)
@@ -696,36 +696,36 @@ def log_changes(system: System, ws: Workspace, run: Run):
         before, now = unilateral.mode[k, ku.BEFORE], ws.active[k, ka.MODE]
         if before == ka.OPEN:
             if now != ka.OPEN:
-                tell(system, run, k, LANDING)
+                log_contact(system, run, k, LANDING)
             elif unilateral.mode[k, ku.STRUCK] == 1:
                 # It leaves from where it landed, below its surface: it must not land there again at once.
                 unilateral.slide[k, ku.LANDS_AT] = ku.AT_ROOT + max(0.0, -ws.contacts[k, ka.GAP])
-                tell(system, run, k, BOUNCE)
+                log_contact(system, run, k, BOUNCE)
         elif now == ka.OPEN:
-            tell(system, run, k, LIFT_OFF)
+            log_contact(system, run, k, LIFT_OFF)
         elif before == ka.STICKING and now == ka.SLIDING:
-            tell(system, run, k, SLIP_START)
+            log_contact(system, run, k, SLIP_START)
         elif before == ka.SLIDING and now == ka.STICKING:
-            tell(system, run, k, SLIP_STOP)
+            log_contact(system, run, k, SLIP_STOP)
     for k in range(table.shape[0]):
         before, closed = table[k, ku.STOP_BEFORE] == 1, table[k, ku.STOP_CLOSED] == 1
         # A joint may be driven away from its stop in the instant of its hit.
         struck = table[k, ku.STOP_STRUCK] == 1
         if not before and (closed or struck):
-            tell_stop(system, run, k, STOP_HIT)
+            log_stop(system, run, k, STOP_HIT)
         if not closed and (before or struck):
-            tell_stop(system, run, k, STOP_LEFT)
+            log_stop(system, run, k, STOP_LEFT)
 
 
 @internal_kernel
-def tell_joints(unilateral: UnilateralArrays, run: Run):
+def log_joints(unilateral: UnilateralArrays, run: Run):
     """Log joints that dry friction has begun or ceased to hold since their state in DRY_TOLD."""
     for k in range(unilateral.dry_table.shape[0]):
-        tell_joint(unilateral, run, k, 1 if dry_rests(unilateral, k) else 0)
+        log_joint(unilateral, run, k, 1 if dry_rests(unilateral, k) else 0)
 
 
 @internal_kernel
-def tell_joint(unilateral: UnilateralArrays, run: Run, k, holds):
+def log_joint(unilateral: UnilateralArrays, run: Run, k, holds):
     """Log if dry-friction joint k begins or stops slipping; its state at the start is not an event."""
     before = unilateral.dry_table[k, ku.DRY_TOLD]
     unilateral.dry_table[k, ku.DRY_TOLD] = holds
@@ -752,7 +752,7 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
     if unilateral is None:
         return
     mode, table = unilateral.mode, unilateral.stop_table
-    happened, by_hand, leaves, begins = 0, True, False, False
+    happened, directly, leaves, begins = 0, True, False, False
     for e in range(run.event.shape[0]):
         if run.event_table[e, ki.EVENT_KIND] >= NORMAL_GUARD and run.event[e, ki.VALUE] <= 0.0:
             happened += 1
@@ -760,7 +760,7 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
         return
     # Samples may have left another state in the workspace.
     evaluate(system, ws, run)
-    if let_joint_go(system, ws, run):
+    if release_joint(system, ws, run):
         solve_modes(system, ws, run, False)
         run.count[ki.STARTED] = 0
         return
@@ -780,24 +780,24 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
                 if split and unilateral.stop[k, ku.STOP_FORCE] > unilateral.number[ku.BEST_MARGIN] + split_slack(ws):
                     continue
                 table[k, ku.STOP_CLOSED] = 0
-                tell_stop(system, run, k, STOP_LEFT)
+                log_stop(system, run, k, STOP_LEFT)
             else:
-                by_hand = False
+                directly = False
         elif kind == DRY_GUARD:
             before = unilateral.dry_table[k, ku.DRY_HOLDS]
-            if before == 1 and moves_held(unilateral, ws, k):
-                by_hand = False
+            if before == 1 and held_joint_accelerates(unilateral, ws, k):
+                directly = False
                 continue
-            by_hand = break_loose(unilateral, ws, k) and by_hand
+            directly = break_loose(unilateral, ws, k) and directly
             begins = begins or unilateral.dry_table[k, ku.DRY_HOLDS] < before
         elif ws.active[k, ka.MODE] == ka.OPEN:
-            by_hand = False
+            directly = False
         elif kind == NORMAL_GUARD and mode[k, ku.WANTED] == ka.STICKING and unilateral.number[ku.SPLIT] == 1.0:
             # The others may start to slip as it leaves.
-            mode[k, ku.LEAVES], by_hand, leaves = 1, False, True
+            mode[k, ku.LEAVES], directly, leaves = 1, False, True
         elif kind == NORMAL_GUARD:
             mode[k, ku.WANTED] = ka.OPEN
-            tell(system, run, k, LIFT_OFF)
+            log_contact(system, run, k, LIFT_OFF)
         elif mode[k, ku.WANTED] == ka.STICKING:
             if mode[k, ku.LEAVES] == 1 or not at_limit(system.contacts, unilateral, ws, k):
                 continue
@@ -805,25 +805,25 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
             if ws.rows[r, ka.FORCE] <= NO_FORCE * strongest:
                 # At the apex of its cone it leaves; there is no direction in which it could slip.
                 mode[k, ku.WANTED] = ka.OPEN
-                tell(system, run, k, LIFT_OFF)
+                log_contact(system, run, k, LIFT_OFF)
                 continue
-            if drops(system, k):
+            if friction_drops(system, k):
                 # Forces jump, and the slip direction with them.
-                mode[k, ku.GIVES_WAY], by_hand = 1, False
+                mode[k, ku.KINETIC_ONLY], directly = 1, False
                 continue
             begin_slip(system, ws, k, ws.rows[r + 1, ka.FORCE], ws.rows[r + 2, ka.FORCE])
             aim(unilateral, ws, k)
             mode[k, ku.WANTED], begins = ka.SLIDING, True
-            tell(system, run, k, SLIP_START)
+            log_contact(system, run, k, SLIP_START)
         elif mode[k, ku.WANTED] == ka.SLIDING:
             # Either slip has only turned, or all modes must be chosen.
-            by_hand = slip_on(unilateral, ws, k, 10.0 * unilateral.number[ku.SLOW]) and by_hand
-    if by_hand:
+            directly = slip_on(unilateral, ws, k, 10.0 * unilateral.number[ku.SLOW]) and directly
+    if directly:
         keep_shares(unilateral, ws, mode[:, ku.WANTED])
         set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
         if some_rest_without_row(unilateral):
             hold_free_joints(system, ws, run, begins)
-        tell_joints(unilateral, run)
+        log_joints(unilateral, run)
         rearm(run)
         count_changes(system, run)
     # When one leaves, points that start to slip hardly accelerate yet: with full friction they would seem at rest.

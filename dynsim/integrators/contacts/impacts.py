@@ -11,7 +11,7 @@ from dynsim.dynamics import state as kst
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.cone import steps as kc
-from dynsim.dynamics.contact.cone.steps import approach, approach_or_draw_near, solve_cones
+from dynsim.dynamics.contact.cone.steps import approach, approach_or_proximal_point, solve_cones
 from dynsim.dynamics.contact.delassus import find_splits, normal_is_open
 from dynsim.dynamics.contact.mobility import moves_along_normal
 from dynsim.dynamics.contact.rows import row_errors, set_modes
@@ -136,7 +136,7 @@ def keep_touching(unilateral: UnilateralArrays, ws: Workspace):
 
 
 @internal_kernel
-def come_down(system: System, ws: Workspace, run: Run):
+def close_touching(system: System, ws: Workspace, run: Run):
     """Bring touching points and joints onto their surfaces and stops, to rounding, before they are held in position.
 
     A point lands slightly below its surface. If rows depend on each other, like the rows of a point on a body with one
@@ -214,7 +214,7 @@ def gather(system: System, ws: Workspace, run: Run):
     """
     unilateral = system.unilateral
     mode, index = unilateral.mode, unilateral.index
-    come_down(system, ws, run)
+    close_touching(system, ws, run)
     for k in range(mode.shape[0]):
         mode[k, ku.WANTED] = ka.STICKING if mode[k, ku.TOUCHING] == 1 else ka.OPEN
     set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
@@ -244,7 +244,7 @@ def solve_problem(unilateral: UnilateralArrays, W, size, largest, starts):
     b, mu, f, good = vector[ku.OFFSET], vector[ku.CONE_FRICTION], vector[ku.SOLUTION], 1e-2 * CONE_TOLERANCE
     good *= max(largest, IMMOBILE)
     if starts > 0:
-        residual = approach_or_draw_near(W, b, kind, mu, size, f, room, good, starts)
+        residual = approach_or_proximal_point(W, b, kind, mu, size, f, room, good, starts)
     else:
         residual = solve_cones(W, b, kind, mu, size, f, room, good)
     return 0.0 <= residual <= CONE_TOLERANCE * (1.0 + largest)
@@ -253,7 +253,7 @@ def solve_problem(unilateral: UnilateralArrays, W, size, largest, starts):
 @internal_kernel
 def friction_at_rest(system: System, k):
     """Return the coefficient of the friction cone of candidate k, which is at rest along its surface."""
-    if system.unilateral.mode[k, ku.GIVES_WAY] == 1:
+    if system.unilateral.mode[k, ku.KINETIC_ONLY] == 1:
         return system.contacts.law[k, ka.MU]
     return system.unilateral.number[ku.HOLDING] * system.contacts.law[k, ka.STATIC]
 
@@ -424,7 +424,7 @@ def impact(system: System, ws: Workspace, run: Run):
 
 
 @noinline_kernel
-def keep(unilateral: UnilateralArrays, ws: Workspace, run: Run):
+def save_modes(unilateral: UnilateralArrays, ws: Workspace, run: Run):
     """Save modes, their tables and the state between two steps, when ``y_new`` is free."""
     kept, mode = unilateral.kept, unilateral.mode
     for k in range(mode.shape[0]):
@@ -443,8 +443,8 @@ def keep(unilateral: UnilateralArrays, ws: Workspace, run: Run):
 
 
 @noinline_kernel
-def take_back(system: System, ws: Workspace, run: Run):
-    """Restore modes, tables and state as saved by :func:`keep`, and evaluate the right-hand side there."""
+def restore_modes(system: System, ws: Workspace, run: Run):
+    """Restore modes, tables and state as saved by :func:`save_modes`, and evaluate the right-hand side there."""
     unilateral = system.unilateral
     kept, mode = unilateral.kept, unilateral.mode
     at = read(kept, 0, mode)

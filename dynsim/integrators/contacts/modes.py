@@ -51,7 +51,7 @@ from dynsim.integrators.contacts.impacts import (
     solve_problem,
     strike_limit,
 )
-from dynsim.integrators.contacts.resting import leave_least, release_dependent_joints
+from dynsim.integrators.contacts.resting import projection_residual, release_dependent_joints
 from dynsim.integrators.run import RATE_TOLERANCE, Run, project_level
 from dynsim.jit.kernel import internal_kernel, noinline_kernel
 
@@ -119,15 +119,15 @@ def choose(system: System, ws: Workspace, run: Run):
         dry[k, ku.DRY_OVERLOADED] = 0
     choose_joints(system, ws, run)
     # Settling after an impact may reverse light joints; their friction then opposes the new direction.
-    if run.count[ki.STATUS] == ki.RUNNING and some_turned_round(system, ws):
-        touch_again(system.unilateral)
+    if run.count[ki.STATUS] == ki.RUNNING and some_reversed(system, ws):
+        restore_touching(system.unilateral)
         choose_joints(system, ws, run)
     # Each pass finds at least one more.
     while run.count[ki.STATUS] == ki.RUNNING and note_overloaded(system, ws):
-        touch_again(system.unilateral)
+        restore_touching(system.unilateral)
         choose_joints(system, ws, run)
     for k in range(mode.shape[0]):
-        mode[k, ku.GIVES_WAY], mode[k, ku.LEAVES] = 0, 0
+        mode[k, ku.KINETIC_ONLY], mode[k, ku.LEAVES] = 0, 0
 
 
 @internal_kernel
@@ -150,7 +150,7 @@ def note_overloaded(system: System, ws: Workspace):
             left = margin(system.contacts, unilateral, ws, k)
             # A point past its static friction is held by kinetic friction; shared forces may be split differently.
             alone = number[ku.REDUNDANT] == 0.0 or not point_shares(unilateral, ws, k)
-            if mode[k, ku.GIVES_WAY] == 1 and alone:
+            if mode[k, ku.KINETIC_ONLY] == 1 and alone:
                 law = system.contacts.law
                 left += (law[k, ka.MU] - number[ku.HOLDING] * law[k, ka.STATIC]) * ws.contacts[k, ka.NORMAL_FORCE]
             if left < -slack:
@@ -172,7 +172,7 @@ def force_slack(ws: Workspace):
 
 
 @internal_kernel
-def some_turned_round(system: System, ws: Workspace):
+def some_reversed(system: System, ws: Workspace):
     """True if a joint or point slides, not slowly, against the direction for which its friction was chosen."""
     unilateral, turned = system.unilateral, False
     slow = 2.0 * unilateral.number[ku.SLOW]
@@ -197,7 +197,7 @@ def choose_joints(system: System, ws: Workspace, run: Run):
     choose_rule(system, ws, run)
     if run.count[ki.STATUS] != ki.RUNNING and release_leaving(system, ws):
         run.count[ki.STATUS], run.clock[ki.NOT_UNIQUE] = ki.RUNNING, not_unique
-        touch_again(system.unilateral)
+        restore_touching(system.unilateral)
         choose_rule(system, ws, run)
 
 
@@ -221,11 +221,11 @@ def choose_rule(system: System, ws: Workspace, run: Run):
     if search_modes(system, ws, run, HOLD_COMPATIBLE):
         return
     # A joint that moves, however slowly, because a contact or stop moves it, is not at rest.
-    touch_again(system.unilateral)
+    restore_touching(system.unilateral)
     search_modes(system, ws, run, HOLD_RESTING)
     if run.count[ki.STATUS] != ki.RUNNING:
         run.count[ki.STATUS] = ki.RUNNING
-        touch_again(system.unilateral)
+        restore_touching(system.unilateral)
         search_modes(system, ws, run, HOLD_SLOW)
 
 
@@ -245,7 +245,7 @@ def search_modes(system: System, ws: Workspace, run: Run, rule):
         if number[ku.CORNER] == 0.0 and (search != ku.NEAR or run.count[ki.STATUS] == ki.RUNNING):
             break
         run.count[ki.STATUS], run.clock[ki.NOT_UNIQUE] = ki.RUNNING, not_unique
-        touch_again(system.unilateral)
+        restore_touching(system.unilateral)
         search += 1.0
     return chosen
 
@@ -289,7 +289,7 @@ def sliding_parts(system: System, ws: Workspace, k):
 
 
 @internal_kernel
-def touch_again(unilateral: UnilateralArrays):
+def restore_touching(unilateral: UnilateralArrays):
     """Restore which candidates and stops touched before a rejected choice."""
     mode, stops = unilateral.mode, unilateral.stop_table
     for k in range(mode.shape[0]):
@@ -412,7 +412,7 @@ def solve_accelerations(system: System, ws: Workspace, run: Run, p, largest, lea
         if mode[k, ku.TOUCHING] == 1:
             slides = (slides_on and keeps_sliding(unilateral, ws, k)) or begins_sliding(system, ws, k, least)
             mode[k, ku.WANTED] = ka.SLIDING if slides else ka.STICKING
-            mode[k, ku.GIVES_WAY] = 1 if mode[k, ku.GIVES_WAY] == 1 and drops(system, k) else 0
+            mode[k, ku.KINETIC_ONLY] = 1 if mode[k, ku.KINETIC_ONLY] == 1 and friction_drops(system, k) else 0
     # If static friction drops to a smaller kinetic value, the forces of the other contacts change.
     for _ in range(1 + mode.shape[0]):
         size = reduce_rows(system, ws, run, p)
@@ -452,7 +452,7 @@ def release_moving_joints(unilateral: UnilateralArrays, ws: Workspace):
 def rates_contradict(unilateral: UnilateralArrays, ws: Workspace):
     """True if no change of joint rates brings the rates of all active rows to zero, right after :func:`evaluate`."""
     left = unilateral.vector[2]
-    leave_least(ws, ws.small, ka.ROW_RATE, left)
+    projection_residual(ws, ws.small, ka.ROW_RATE, left)
     for r in range(ws.counts[ka.ROWS]):
         fast = 0.0 if ws.active[r, ka.ROW_KIND] == ka.JOINT_ROW else slip_speed(ws, ws.active[r, ka.OWNER])
         if abs(left[r]) > RATE_TOLERANCE * (1.0 + fast):
@@ -693,7 +693,7 @@ def aim(unilateral: UnilateralArrays, ws: Workspace, k):
 
 
 @internal_kernel
-def drops(system: System, k):
+def friction_drops(system: System, k):
     """True if the friction of candidate k drops from a static to a smaller kinetic coefficient when it slips."""
     law = system.contacts.law
     return law[k, ka.STRIBECK] == 0.0 and law[k, ka.STATIC] > law[k, ka.MU]
@@ -714,9 +714,9 @@ def give_way(system: System, ws: Workspace, size, largest):
             continue
         while index[ku.TABLE_ROW, i] != ws.active[k, ka.FIRST_ROW]:
             i += 1
-        holds = mode[k, ku.WANTED] == ka.STICKING and mode[k, ku.GIVES_WAY] == 0 and f[i] > 0.0
-        if holds and drops(system, k) and slips(system, k, i, size, largest):
-            mode[k, ku.GIVES_WAY] = 1
+        holds = mode[k, ku.WANTED] == ka.STICKING and mode[k, ku.KINETIC_ONLY] == 0 and f[i] > 0.0
+        if holds and friction_drops(system, k) and slips(system, k, i, size, largest):
+            mode[k, ku.KINETIC_ONLY] = 1
             changed = True
     return changed
 

@@ -301,7 +301,7 @@ def mobility(ws: Workspace, r, s):
 
 
 @internal_kernel
-def leave_least(ws: Workspace, small, column, errors):
+def projection_residual(ws: Workspace, small, column, errors):
     """Write the residual that projection leaves in a column of the rows (gaps or rates), right after ``derivative``.
 
     RHS and FORCE of the rows, and ``small``, serve as scratch.

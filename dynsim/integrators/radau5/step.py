@@ -61,7 +61,7 @@ from dynsim.integrators.run import (
 from dynsim.integrators.steps import energy_norm, error_norm
 from dynsim.jit.compiler import form_of
 from dynsim.jit.kernel import internal_kernel, noinline_kernel
-from dynsim.jit.simd import four, turned
+from dynsim.jit.simd import four, swap_middle
 
 # Linear systems of RADAU5's Newton method, reduced to the rates: a real and a complex system, solved together.
 
@@ -206,7 +206,7 @@ def multiply_on_lanes(system, ws, y, r, h):
         rates_across(system.model, y, q, x, angle)
     for i in range(n):
         e = angle[i] if layout.extra > 0 else x[q + i]
-        angle[i] = e * op + turned(e) * om
+        angle[i] = e * op + swap_middle(e) * om
         u[i] = x[v + i]
     for j in range(n):
         e = angle[j]
@@ -216,11 +216,11 @@ def multiply_on_lanes(system, ws, y, r, h):
         j, k = table[a, ka.DRIVEN], table[a, ka.CIRCUIT]
         if k >= 0:
             free = x[current + k] + block[a, ka.RATE_Q] * angle[j]
-            free = free * circuit[a, 0] + turned(free) * circuit[a, 1]
+            free = free * circuit[a, 0] + swap_middle(free) * circuit[a, 1]
             for i in range(n):
                 u[i] += along[first + k, i] * free
     for i in range(n):
-        across[i] = turned(u[i])
+        across[i] = swap_middle(u[i])
     for i in range(n):
         total, other = x[v + i] * 0.0, x[v + i] * 0.0
         for j in range(n):
@@ -231,20 +231,20 @@ def multiply_on_lanes(system, ws, y, r, h):
         j, k = table[a, ka.DRIVEN], table[a, ka.CIRCUIT]
         if k >= 0:
             rate = x[v + j]
-            moved = angle[j] + rate * op + turned(rate) * om
+            moved = angle[j] + rate * op + swap_middle(rate) * om
             free = x[current + k] + block[a, ka.RATE_Q] * moved + block[a, ka.RATE_V] * rate
-            x[current + k] = free * circuit[a, 0] + turned(free) * circuit[a, 1]
+            x[current + k] = free * circuit[a, 0] + swap_middle(free) * circuit[a, 1]
     if layout.extra == 0:
         for i in range(n):
             rate = x[v + i]
-            x[q + i] = angle[i] + rate * op + turned(rate) * om
+            x[q + i] = angle[i] + rate * op + swap_middle(rate) * om
     else:
         for i in range(n):
             u[i] = x[v + i]
         positions_along(system.model, y, q, u, x)
         for j in range(q, q + n + layout.extra):
             e = x[j]
-            x[j] = e * op + turned(e) * om
+            x[j] = e * op + swap_middle(e) * om
     for j in range(x.shape[0]):
         e = x[j]
         r.one[j], r.two[j] = lane(e, 0), complex(lane(e, 1), lane(e, 2))
@@ -594,7 +594,7 @@ def keep_stages(run: Run):
 
 
 @internal_kernel
-def missed(x):
+def collocation_error(x):
     """Return P(x) = ∫ Π (s − c_i) ds from 0 to x; c_3 = 1 is a double root."""
     return x * (x - 1.0) * (x - 1.0) * (0.25 * x - 0.1)
 
@@ -611,7 +611,7 @@ def guess_stages(run: Run, h):
     ahead = h / r.clock[kn.KEPT] if r.count[kn.EXTRAPOLATES] == 1 else 0.0
     for s in range(3):
         x = NODE_RADAU[s] * ahead
-        more = -10.0 * GAMMA_RADAU * (missed(1.0 + x) - ahead**4 * missed(NODE_RADAU[s]))
+        more = -10.0 * GAMMA_RADAU * (collocation_error(1.0 + x) - ahead**4 * collocation_error(NODE_RADAU[s]))
         for j in range(r.kept.shape[1]):
             r.z[s, j] = x * (r.kept[0, j] + (x - (c1 - 1.0)) * (r.kept[1, j] + (x - (c0 - 1.0)) * r.kept[2, j]))
             r.z[s, j] += more * r.kept[3, j]

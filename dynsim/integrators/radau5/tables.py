@@ -113,7 +113,7 @@ def newton_arrays(n: int, na: int, circuits: int, tracked: int, m: int) -> Newto
 
 
 @internal_kernel
-def forget(newton: NewtonArrays | None, steps):
+def discard_history(newton: NewtonArrays | None, steps):
     """Discard data about the right-hand side as of ``steps`` accepted steps, because it has jumped."""
     if newton is None:  # resolved at compile time
         return

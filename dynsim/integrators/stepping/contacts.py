@@ -25,7 +25,7 @@ from dynsim.dynamics.contact import distance as kd
 from dynsim.dynamics.contact import unilateral as ku
 from dynsim.dynamics.contact.cone import steps as kc
 from dynsim.dynamics.contact.cone.program import select_least_norm
-from dynsim.dynamics.contact.cone.steps import approach, draw_near, motion
+from dynsim.dynamics.contact.cone.steps import approach, motion, proximal_point
 from dynsim.dynamics.contact.mobility import moves_along_normal
 from dynsim.dynamics.contact.rows import point_row, set_modes
 from dynsim.dynamics.contact.unilateral import UnilateralArrays, dry_bound, sliding_friction, stop_gap
@@ -70,7 +70,7 @@ MOST_LOADED = 30
 
 
 @internal_kernel
-def give_way(k, c, w, x, u, h, theta):
+def compliant_row(k, c, w, x, u, h, theta):
     """Return φ, compliance ε and addition a to the end rate of a row with mobility w that is at x with rate u."""
     resolved = 1.0 / max(1.0, h * h * k * w)
     phi = 1.0 - (1.0 - theta) * resolved
@@ -91,7 +91,7 @@ def soften_contact(law, s: SteppingArrays, ws: Workspace, k, h):
     r, turn, W = ws.active[k, ka.FIRST_ROW], s.turn[k], ws.small[0]
     turn[kt.PRESSED_IN] = ws.contacts[k, ka.GAP] - 0.5 * h * s.rate[0, r]
     s.statistics[kt.STIFFEST] = max(s.statistics[kt.STIFFEST], stiffness * W[r, r])
-    phi, more, added = give_way(stiffness, damping, W[r, r], turn[kt.PRESSED_IN], s.rate[0, r], h, s.theta)
+    phi, more, added = compliant_row(stiffness, damping, W[r, r], turn[kt.PRESSED_IN], s.rate[0, r], h, s.theta)
     W[r, r] += more
     turn[kt.IMPLICIT], turn[kt.ADDED] = phi, added
     for i in range(r + 1, r + ka.MOST_ROWS):
@@ -298,7 +298,7 @@ def soften_ties(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, 
         s.mu[r], s.f[r] = h * tie[k, ku.TIE_BOUND], h * tie[k, ku.TIE_FORCE]
         tie[k, ku.TIE_AT] -= 0.5 * h * s.rate[0, r]
         s.statistics[kt.STIFFEST] = max(s.statistics[kt.STIFFEST], tie[k, ku.TIE_STIFFNESS] * W[r, r])
-        tie[k, ku.TIE_IMPLICIT], more, added = give_way(
+        tie[k, ku.TIE_IMPLICIT], more, added = compliant_row(
             tie[k, ku.TIE_STIFFNESS], tie[k, ku.TIE_DAMPING], W[r, r], tie[k, ku.TIE_AT], s.rate[0, r], h, s.theta
         )
         W[r, r] += more
@@ -365,7 +365,7 @@ SWAY = 2.0
 
 
 @internal_kernel
-def recall(system, s: SteppingArrays, ws: Workspace, y):
+def restart_memory(system, s: SteppingArrays, ws: Workspace, y):
     """Restart with the contacts touching at y if the rates of y are not the rates at the end of the last step.
 
     Their rows at y, half a step before the midpoint, replace the rows of the last step, with h/(h + 0) of the change of
@@ -441,7 +441,7 @@ def list_contacts(system, s: SteppingArrays, ws: Workspace, h):
     changed = stops or ties
     for k in range(ws.contacts.shape[0]):
         last = s.memory[kt.LAST, k]
-        known = last[kt.LISTED] == 1.0 and goes_on(system, last, ws, k, h)
+        known = last[kt.LISTED] == 1.0 and is_same_contact(system, last, ws, k, h)
         s.turn[k, kt.KNOWN] = 1.0 if known else 0.0
         listed = ws.contacts[k, ka.GAP] <= kt.MARGIN or (known and last[kt.CLOSED] == 1.0)
         listed = listed and not at_axis_end(system, ws, k)
@@ -477,18 +477,18 @@ def at_axis_end(system, ws: Workspace, k):
 
 
 @internal_kernel
-def goes_on(system, last, ws: Workspace, k, h):
+def is_same_contact(system, last, ws: Workspace, k, h):
     """True if the normal of candidate k has turned little and its contact point has moved about as far as its body."""
     state, turned = ws.contacts[k], 0.0
     for m in range(3):
         turned += state[ka.NORMAL + m] * last[kt.NORMAL_THEN + m]
     if turned <= SAME_ROW:
         return False
-    return place_goes_on(system.shapes, last, state, six(ws.links, system.contacts.link[k, ka.LINK], ka.V), k, h)
+    return is_same_point(system.shapes, last, state, six(ws.links, system.contacts.link[k, ka.LINK], ka.V), k, h)
 
 
 @internal_kernel
-def place_goes_on(shapes, last, state, V, k, h):
+def is_same_point(shapes, last, state, V, k, h):
     """True unless the contact point of candidate k has jumped, e.g. from one end of a capsule to the other."""
     if shapes is None:  # resolved at compile time
         return True
@@ -701,7 +701,7 @@ def solve_contacts(law, unilateral: UnilateralArrays, s: SteppingArrays, ws: Wor
         s.statistics[kt.WORST] = max(s.statistics[kt.WORST], residual)
         if not residual <= kt.BAD:
             s.statistics[kt.CAPPED] += 1.0
-            hold_energy(s, ws.small[0], p)
+            limit_energy(s, ws.small[0], p)
         if elastic and gains_energy(law, unilateral, s, ws):
             elastic = False
             drop_restitution(law, s, ws)
@@ -749,7 +749,7 @@ def solve_problem(s: SteppingArrays, W, p, rigid):
     s.statistics[kt.SOLVES] += 1.0
     if not residual <= kt.FAIR:
         s.statistics[kt.LONG_SOLVES] += 1.0
-        residual = draw_near(W, s.right, s.kind, s.mu, p, s.f, s.room, kt.GOOD)
+        residual = proximal_point(W, s.right, s.kind, s.mu, p, s.f, s.room, kt.GOOD)
     if not residual <= kt.FAIR:
         residual = approach(W, s.right, s.kind, s.mu, p, s.f, s.room, kt.GOOD, kt.LAST_ROUNDS)
     motion(W, s.right, p, s.f, s.w)
@@ -828,7 +828,7 @@ def drop_restitution(law, s: SteppingArrays, ws: Workspace):
 
 
 @internal_kernel
-def hold_energy(s: SteppingArrays, W, p):
+def limit_energy(s: SteppingArrays, W, p):
     """Scale impulses that do not solve their problem by the factor in [0, 1] that minimises ½ fᵀ W f + f·b.
 
     This is the energy that they add. A scaled f stays in its cones and takes energy, whatever f is.

@@ -26,8 +26,8 @@ from dynsim.integrators.stepping.contacts import (
     list_contacts,
     note_contacts,
     rates_jumped,
-    recall,
     remember,
+    restart_memory,
     slip_of_rates,
     solve_contacts,
     strikes,
@@ -209,7 +209,7 @@ def step_moreau(system: System, ws: Workspace, run: Run):
     v0, v_bias, last = s.before[kt.V_START], s.before[kt.V_BIAS], s.before[kt.ACCELERATION]
     model = ModelArrays(system.model.tree, s.body, system.model.gravity)
     begin_energy(system, ws, run)
-    recall(system, s, ws, y)
+    restart_memory(system, s, ws, y)
     # The mean acceleration of an impact does not predict the next step; the last step without an impact does.
     known = s.before[kt.SMOOTH] if s.grid[kt.IMPACT_LAST] == 1.0 else last
     for i in range(ws.joints.shape[0]):
@@ -462,15 +462,15 @@ def keep_torques(system: System, ws: Workspace, run: Run):
 
 
 @internal_kernel
-def tell_changes(unilateral: UnilateralArrays, s: SteppingArrays, run: Run):
+def log_step_changes(unilateral: UnilateralArrays, s: SteppingArrays, run: Run):
     """Log and count the changes of the accepted step, at its end; True if the caller must empty the log.
 
     The initial state of a contact is not an event.
     """
     tally, table, stop = unilateral.tally, unilateral.stop_table, unilateral.stop
-    for k in range(s.told.shape[0]):
-        before, now = s.told[k], s.motion[k]
-        s.told[k] = now
+    for k in range(s.logged_motion.shape[0]):
+        before, now = s.logged_motion[k], s.motion[k]
+        s.logged_motion[k] = now
         if before < 0 or before == now:
             continue
         if now == ka.OPEN:
@@ -493,13 +493,13 @@ def tell_changes(unilateral: UnilateralArrays, s: SteppingArrays, run: Run):
         table[k, ku.STOP_BEFORE] = table[k, ku.STOP_CLOSED]
     rubbing = unilateral.dry_table
     for k in range(rubbing.shape[0]):
-        ke.tell_joint(unilateral, run, k, 0 if abs(s.w[rubbing[k, ku.DRY_ROW]]) > kt.BAD else 1)
-    most = s.told.shape[0] + table.shape[0] + rubbing.shape[0]
+        ke.log_joint(unilateral, run, k, 0 if abs(s.w[rubbing[k, ku.DRY_ROW]]) > kt.BAD else 1)
+    most = s.logged_motion.shape[0] + table.shape[0] + rubbing.shape[0]
     return run.count[ki.LOGGED] + most > run.log_time.shape[0]
 
 
 @internal_kernel
-def keep_directions(s: SteppingArrays, ws: Workspace):
+def save_directions(s: SteppingArrays, ws: Workspace):
     """Copy the wrenches of unit forces of all active rows, with which the step was solved."""
     for r in range(ws.counts[ka.ROWS]):
         for j in range(6):
@@ -507,7 +507,7 @@ def keep_directions(s: SteppingArrays, ws: Workspace):
 
 
 @internal_kernel
-def put_directions_back(s: SteppingArrays, ws: Workspace):
+def restore_directions(s: SteppingArrays, ws: Workspace):
     """Undo changes of the directions by ``geometry``: the forces of the step belong to its own rows only.
 
     ``geometry`` gives the rows of sticking contacts different tangents, without the factor of the grip.
@@ -538,9 +538,9 @@ def sample_moreau(system: System, ws: Workspace, run: Run):
         for i in range(ws.joints.shape[0]):
             ws.joints[i, ka.QD], ws.joints[i, ka.APPLIED] = row[system.layout.v + i], 0.0
         drive(system.drives, system.reference, run.sample_time[last], row, system.layout, ws)
-        keep_directions(s, ws)
+        save_directions(s, ws)
         geometry(system, system.model, ws)
-        put_directions_back(s, ws)
+        restore_directions(s, ws)
         write_output(system, ws, run, last)
         # Between the ends of a step the state is linear, but energy is not.
         between = -(1.0 - x) * (s.energy[kt.START, kt.MECHANICAL] + s.energy[kt.START, kt.MAGNETIC])
@@ -650,5 +650,5 @@ def advance_moreau(system: System, ws: Workspace, run: Run, limit):
         remember(system.unilateral, run.stepping, run.y, system.layout.v, clock[ki.STEP])
         advance_time(run.stepping, clock)
         count[ki.STEPS] += 1
-        if tell_changes(system.unilateral, run.stepping, run):
+        if log_step_changes(system.unilateral, run.stepping, run):
             return

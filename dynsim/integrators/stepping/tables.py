@@ -109,7 +109,7 @@ class SteppingArrays(NamedTuple):
     kind: np.ndarray  # (p,) int
     modes: np.ndarray  # (c,) int: OPEN, or STICKING for three rows
     motion: np.ndarray  # (c,) int: OPEN, SLIDING or STICKING at the end of the step
-    told: np.ndarray  # (c,) int: motion in the last accepted step; −1 before the first
+    logged_motion: np.ndarray  # (c,) int: motion in the last accepted step; −1 before the first
     memory: np.ndarray  # (2, c, MEMORY_SIZE) LAST and NOW
     turn: np.ndarray  # (c, TURN_SIZE)
     room: np.ndarray  # (CONE_ROOM, p, p)
@@ -147,7 +147,7 @@ def stepping_arrays(
         kind=integers(np.zeros(p)),
         modes=integers(np.full(c, -1)),
         motion=integers(np.full(c, ka.OPEN)),
-        told=integers(np.full(c, -1)),
+        logged_motion=integers(np.full(c, -1)),
         memory=np.zeros((2, c, MEMORY_SIZE)),
         turn=np.zeros((c, TURN_SIZE)),
         room=np.zeros((kc.CONE_ROOM, p, p)),

@@ -1,4 +1,4 @@
-"""Tables of hand paths, broken by cells, rows, text and bytes."""
+"""Tables of hand paths with damaged cells, rows, text and bytes."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def draw(rng: Random, records: Path) -> Draft:
 
 
 def losses() -> list[str]:
-    """Rows of path.csv through which the path does not go."""
+    """Return rows of path.csv that are not on the path."""
     from dynsim.scenario import load_scenario
 
     path = load_scenario("scenario.yaml").controller.hand.path

@@ -1,4 +1,4 @@
-"""Fault scripts of the virtual servos, broken, in a short replay."""
+"""Damaged fault scripts of the virtual servos, in a short replay."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ faults:
 
 
 def make_motion(folder: Path) -> None:
-    """A short record of the small robot of ``support.fault_table``, and its map."""
+    """Make a short record of the small robot of ``support.fault_table``, and its map."""
     from support.fault_table import MAP, swing
 
     swing(0.1).save(folder / "rig.h5")
@@ -47,7 +47,7 @@ def draw(rng: Random, records: Path) -> Draft:
 
 
 def losses() -> list[str]:
-    """Faults that the script says and are not taken."""
+    """Return faults of the script that dynsim did not load."""
     from dynsim.hardware.virtual.faults import load_fault_script
 
     script = load_fault_script("faults.yaml")

@@ -1,4 +1,4 @@
-"""Overrides: ``--set`` with real and nonsense keys and values."""
+"""Overrides: ``--set`` with valid and nonsense keys and values."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def draw(rng: Random, records: Path) -> Draft:
         tree["variants"] = variants = {kept: variants[kept]}
     overrides = []
     if rng.random() < 0.3:
-        # One that is likely to be taken, so that there is something to lose.
+        # A key that dynsim probably accepts, so that losses can be detected.
         key = rng.choice([key for key in _real_keys(name) if is_number(at(tree, _path(key)))])
         overrides.append(f"{key}={near(rng, at(tree, _path(key)))}")
     for _ in range(rng.choice((1, 1, 1, 2, 3)) if not overrides else 0):
@@ -56,9 +56,9 @@ def draw(rng: Random, records: Path) -> Draft:
         except (LookupError, TypeError, ValueError):
             old = None
         item = value(rng, old)
-        # As somebody types it: quoted only now and then.
+        # As a user types it: rarely quoted.
         text = item if isinstance(item, str) and rng.random() < 0.7 else yaml_text(item).strip()
-        # No NUL: the system hands none to a program.
+        # No NUL: the system cannot pass it to a program.
         overrides.append(
             rng.choice((f"{key}={text}",) * 9 + (key, f"{key}=", f"={text}", f"{key}=={text}")).replace("\x00", "")
         )
@@ -73,7 +73,7 @@ def draw(rng: Random, records: Path) -> Draft:
 
 
 def losses(overrides: list[str]) -> list[str]:
-    """What of the file and the overrides is not in the scenario."""
+    """Return values of the file and the overrides that the scenario lacks."""
     from dynsim.scenario import SetOptions, load_scenario, parse_override, variant_names
 
     name = next(iter(variant_names("scenario.yaml")), None)

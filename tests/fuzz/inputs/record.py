@@ -1,4 +1,4 @@
-"""Records: valid ones with broken HDF5 structure or broken bytes."""
+"""Records: valid files with damaged HDF5 structure or bytes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ FORMATS = ("csv", "joint-trajectory", "urdf-log")
 
 
 def make_records(folder: Path) -> None:
-    """Short, sound records, the same ones in every campaign on a machine: nothing in them tells the time; a sweep."""
+    """Make short, valid records, identical in every campaign on a machine because they contain no time; and a sweep."""
     from dynsim.engine import simulate
     from dynsim.scenario import load_scenario
 
@@ -53,7 +53,7 @@ def draw(rng: Random, records: Path) -> Draft:
             mutation = "; ".join(_changed(rng, file) for _ in range(rng.choice((1, 1, 1, 2))))
         data = image.getvalue()
         if rng.random() < 0.7:
-            # Without the digest in its last line, as another program leaves it.
+            # Without the digest in its last line, as written by another program.
             data = re.sub(rb"\n[\w-]+:[0-9a-f]{64}\n\Z", b"", data)
     else:
         data, mutation = sound, ""
@@ -81,13 +81,13 @@ def draw(rng: Random, records: Path) -> Draft:
     if structural:
         command.append("--trust")
     else:
-        # Damage on the way: what is not refused must be what was saved.
+        # Accidental damage: an accepted record must equal the saved one.
         files["sound.h5"] = sound
     return Draft(f"{name}: {mutation}", files, [command], losses)
 
 
 def losses() -> list[str]:
-    """What a damaged record lost without a word; one that was changed on purpose must only be readable to the end."""
+    """Return silent losses of a damaged record; a deliberately changed record must only be readable to the end."""
     from dynsim.record import Record
 
     with warnings.catch_warnings(record=True) as said:
@@ -124,7 +124,7 @@ def read(record: Any) -> None:
 
 
 def _changed(rng: Random, file: Any) -> str:
-    """A change, and what it is; the first of two may leave a file in which HDF5 makes no second one."""
+    """Make a change and return its description; after a first change HDF5 may refuse the second one."""
     try:
         return _mutate(rng, file)
     except (OSError, ValueError, RuntimeError) as error:
@@ -132,7 +132,7 @@ def _changed(rng: Random, file: Any) -> str:
 
 
 def _mutate(rng: Random, file: h5py.File) -> str:
-    """Break one object of the file; the answer says how."""
+    """Damage one object of the file; return a description."""
     names: list[str] = []
     file.visit(names.append)
     path = rng.choice([*names, "time", "signals", "summary", "provenance", "scene", "events", "axes", "signals/q"])

@@ -1,4 +1,4 @@
-"""Scenario files: the shipped ones with keys, values, words and bytes broken."""
+"""Scenario files: shipped files with damaged keys, values, words and bytes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NAMES = (
     "snake_joint_limits",
 )
 WEIGHTS = (6, 6, 1, 2, 1, 2, 1)
-# What a short run sets, so that its work does not depend on what was drawn.
+# Settings of a short run, so that its work does not depend on the draw.
 SHORT = (
     "duration_s=0.01",
     "record.rate_hz=1000",
@@ -53,7 +53,7 @@ def draw(rng: Random, records: Path) -> Draft:
 
 
 def reading(mutation: str, data: bytes, run: bool, overrides: tuple[str, ...] = ()) -> Draft:
-    """A case of one scenario file: check it, and if ``run`` also simulate a hundredth of a second over older files."""
+    """Return a case of one scenario file: check it, and if ``run`` also simulate 0.01 s over existing files."""
     arguments = [word for text in overrides for word in ("--set", text)]
     commands = [["check", "scenario.yaml", *arguments]]
     if run:
@@ -63,7 +63,7 @@ def reading(mutation: str, data: bytes, run: bool, overrides: tuple[str, ...] = 
 
 
 def losses() -> list[str]:
-    """What every variant of scenario.yaml lost."""
+    """Return losses of every variant of scenario.yaml."""
     from dynsim.scenario import load_scenario, variant_names
 
     names: list[Any] = variant_names("scenario.yaml") or [None]

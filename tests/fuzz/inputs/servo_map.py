@@ -1,4 +1,4 @@
-"""Servo maps: the shipped ones, broken, checked against a valid record."""
+"""Servo maps: shipped files, damaged, checked against a valid record."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def draw(rng: Random, records: Path) -> Draft:
 
 
 def losses() -> list[str]:
-    """What the map lost."""
+    """Return losses of the map."""
     from dynsim.hardware.servo_map import load_servo_map
 
     servo_map = load_servo_map("map.yaml")

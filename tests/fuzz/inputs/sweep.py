@@ -22,7 +22,7 @@ TEXTS = ("variant", "status", "reason", "warnings")
 
 
 def make_sweep(folder: Path) -> None:
-    """A valid sweep of four runs in ``folder``, without a commit: an edited tree would refuse to resume one with it."""
+    """Make a valid sweep of four runs in ``folder``, without a commit, because an edited tree refuses to resume it."""
     from dynsim.scenario import read_scenario
     from dynsim.studies.sweep import run_sweep
     from dynsim.studies.sweep_plan import Axis, Plan
@@ -66,7 +66,7 @@ def draw(rng: Random, records: Path) -> Draft:
 
 
 def losses() -> list[str]:
-    """Runs of the table that are missing, or have a number that is none."""
+    """Return runs that are missing in the table or have an invalid number."""
     from dynsim.errors import RecordError
 
     table = Path("out/sweep.csv")

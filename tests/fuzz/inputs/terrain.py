@@ -1,4 +1,4 @@
-"""Height-field files, broken by cells, rows, text and bytes, under an arm that may touch them."""
+"""Height-field files with damaged cells, rows, text and bytes, under an arm that may touch them."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def draw(rng: Random, records: Path) -> Draft:
 
 
 def losses() -> list[str]:
-    """Heights of heights.csv that the surface does not have."""
+    """Return heights of heights.csv that the surface lacks."""
     from dynsim.scenario import load_scenario
 
     taken = np.array(load_scenario("scenario.yaml").config.surfaces["ground"]._heights)

@@ -1,4 +1,4 @@
-"""URDF files: the shipped arm with elements, attributes, numbers and bytes broken."""
+"""URDF files: the shipped arm with damaged elements, attributes, numbers and bytes."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def draw(rng: Random, records: Path) -> Draft:
 
 
 def _mutate(rng: Random, root: ElementTree.Element) -> str:
-    """Break one element; mostly one that physics depends on."""
+    """Damage one element, usually one that physics depends on."""
     parents = {child: parent for parent in root.iter() for child in parent}
     physical = [
         element
@@ -149,7 +149,7 @@ def _near(rng: Random, word: str) -> str:
 
 
 def losses() -> list[str]:
-    """What robot.urdf lost on the way to the model."""
+    """Return losses between robot.urdf and the model."""
     from dynsim.scenario import build_model, load_scenario
 
     model = build_model(load_scenario("scenario.yaml"))

@@ -453,7 +453,7 @@ def contradiction(braces: BraceArrays, equations, cones, relaxed):
 def extreme_force(braces: BraceArrays, unknowns, equations, cones, j, end, scale):
     """Return the smallest (end 0) or largest (end 1) possible normal force of brace j [N]; x must start inside."""
     program, k, x = braces.program, braces.first[j], braces.program.x
-    if end == 0 and equations == 0 and holds_with_least(braces, j):
+    if end == 0 and equations == 0 and possible_with_least(braces, j):
         return braces.table[j, LEAST]
     rows, first = program.first[cones], program.first
     clear_objective(program, unknowns)
@@ -468,7 +468,7 @@ def extreme_force(braces: BraceArrays, unknowns, equations, cones, j, end, scale
 
 
 @internal_kernel
-def holds_with_least(braces: BraceArrays, j):
+def possible_with_least(braces: BraceArrays, j):
     """Return whether the forces remain possible when the force of brace j is reduced to its minimum."""
     results, k, least = braces.results, braces.first[j], braces.table[j, LEAST]
     shorter = results[j, FORCES] - least

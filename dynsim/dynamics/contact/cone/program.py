@@ -69,16 +69,16 @@ LAMBDA, RESIDUAL, TARGET, DS, DZ, SCALED_DS, SCALED_DZ = 0, 1, 2, 3, 4, 5, 6
 def cone_program(n: int, m: int, cones: int, rows: int) -> ConeProgram:
     """Allocate a :class:`ConeProgram` for n unknowns, m equations and ``cones`` cones with ``rows`` rows in total."""
     flat, first = reals(np.zeros(program_size(n, m, cones, rows))), integers(np.zeros(cones + 1))
-    return laid_out(flat, first, n, m, cones, rows)
+    return program_in(flat, first, n, m, cones, rows)
 
 
 def program_size(n: int, m: int, cones: int, rows: int) -> int:
-    """Return the number of floats that :func:`laid_out` needs for a program."""
+    """Return the number of floats that :func:`program_in` needs for a program."""
     return n * n + n + m * n + m + 3 * rows + n + m + (n + m) ** 2 + n + m + 2 * rows * n + 10 * rows + cones + n + m
 
 
 @internal_kernel
-def laid_out(flat, first, n, m, cones, rows):
+def program_in(flat, first, n, m, cones, rows):
     """Return a :class:`ConeProgram` in one array: a table of many arrays would be passed through every function.
 
     Parameters
@@ -420,13 +420,13 @@ def longest_step(program: ConeProgram, cones):
     """Return the longest step, at most 1, that keeps s and z in their cones."""
     first, reach = program.first, 1.0
     for c in range(cones):
-        reach = min(reach, way_out(program.s, program.work[DS], first[c], first[c + 1]))
-        reach = min(reach, way_out(program.z, program.work[DZ], first[c], first[c + 1]))
+        reach = min(reach, exit_distance(program.s, program.work[DS], first[c], first[c + 1]))
+        reach = min(reach, exit_distance(program.z, program.work[DZ], first[c], first[c + 1]))
     return reach
 
 
 @internal_kernel
-def way_out(u, du, a, end):
+def exit_distance(u, du, a, end):
     """Return the smallest α > 0 at which u + α du leaves the cone; infinite if it never does."""
     # At most to the height of the apex: on a line through the apex itself, rounding hides the double root below.
     apex = -u[a] / du[a] if du[a] < 0.0 else math.inf
@@ -473,7 +473,7 @@ def split_sizes(r: int, count: int) -> tuple[int, int, int, int]:
 @internal_kernel
 def split_room_in(flat, first, r, count):
     """Return :func:`split_room` in given arrays, (split_size(r, count),) and (count + 2,) int."""
-    return laid_out(flat, first, r + 1, 2 * count, count + 1, ka.MOST_ROWS * count + 1)
+    return program_in(flat, first, r + 1, 2 * count, count + 1, ka.MOST_ROWS * count + 1)
 
 
 @kernel

@@ -286,12 +286,12 @@ def solve_block(W, k, n, x, y, mu, f, least):
     c = W[k + 1, k + 2] - wx * W[k + 2, k]
     d = W[k + 2, k + 2] - wy * W[k + 2, k] + least
     gx, gy = wx * n - x, wy * n - y
-    fn, fx, fy, excess = slid(a, c, d, gx, gy, wx, wy, n / normal, mu, 0.0)
+    fn, fx, fy, excess = sliding_force(a, c, d, gx, gy, wx, wy, n / normal, mu, 0.0)
     if excess > 0.0:
         low, high, at_low = 0.0, a + d, excess
         at_high = at_low
         for _ in range(200):
-            fn, fx, fy, at_high = slid(a, c, d, gx, gy, wx, wy, n / normal, mu, high)
+            fn, fx, fy, at_high = sliding_force(a, c, d, gx, gy, wx, wy, n / normal, mu, high)
             if at_high <= 0.0:
                 break
             low, at_low = high, at_high
@@ -303,7 +303,7 @@ def solve_block(W, k, n, x, y, mu, f, least):
             middle = low + (high - low) * at_low / (at_low - at_high)
             if not (middle > low and middle < high):
                 middle = 0.5 * (low + high)
-            fn, fx, fy, excess = slid(a, c, d, gx, gy, wx, wy, n / normal, mu, middle)
+            fn, fx, fy, excess = sliding_force(a, c, d, gx, gy, wx, wy, n / normal, mu, middle)
             if abs(excess) <= 1e-15 * mu * abs(fn):
                 break
             if excess > 0.0:
@@ -318,7 +318,7 @@ def solve_block(W, k, n, x, y, mu, f, least):
 
 
 @internal_kernel
-def slid(a, c, d, gx, gy, wx, wy, n, mu, alpha):
+def sliding_force(a, c, d, gx, gy, wx, wy, n, mu, alpha):
     """Return (f_n, f_t, |f_t| − μ f_n) of ((a, c), (c, d)) + α."""
     determinant = (a + alpha) * (d + alpha) - c * c
     fx = ((d + alpha) * gx - c * gy) / determinant
@@ -339,8 +339,8 @@ __all__ = [
     "ONE_WAY",
     "TANGENT",
     "approach",
-    "approach_or_draw_near",
-    "draw_near",
+    "approach_or_proximal_point",
+    "proximal_point",
     "solve_cones",
 ]
 
@@ -386,7 +386,7 @@ def solve_cones(W, b, kind, mu, p, f, room, tolerance):
     """
     if p == 0:  # without possible contacts there is no scratch either
         return 0.0
-    residual = approach_or_draw_near(W, b, kind, mu, p, f, room, tolerance, FEW_ROUNDS)
+    residual = approach_or_proximal_point(W, b, kind, mu, p, f, room, tolerance, FEW_ROUNDS)
     if residual <= tolerance:
         return residual
     if impossible(W, b, kind, mu, p, room):
@@ -395,11 +395,11 @@ def solve_cones(W, b, kind, mu, p, f, room, tolerance):
 
 
 @internal_kernel
-def approach_or_draw_near(W, b, kind, mu, p, f, room, tolerance, rounds):
-    """Do :func:`solve_cones` without a proof: one start, then :func:`draw_near`, then up to ``rounds`` starts."""
+def approach_or_proximal_point(W, b, kind, mu, p, f, room, tolerance, rounds):
+    """Do :func:`solve_cones` without a proof: one start, then :func:`proximal_point`, then up to ``rounds`` starts."""
     residual = approach(W, b, kind, mu, p, f, room, tolerance, 1)
     if not residual <= tolerance:
-        residual = draw_near(W, b, kind, mu, p, f, room, tolerance)
+        residual = proximal_point(W, b, kind, mu, p, f, room, tolerance)
     if not residual <= tolerance:
         residual = approach(W, b, kind, mu, p, f, room, tolerance, rounds)
     return residual
@@ -499,7 +499,7 @@ def shift(W, b, p, room, epsilon):
 
 
 @internal_kernel
-def draw_near(W, b, kind, mu, p, f, room, tolerance):
+def proximal_point(W, b, kind, mu, p, f, room, tolerance):
     """Solve (W + ε w) f' + b − ε w f = 0, with the same cones, repeatedly (proximal point); return the residual.
 
     A fixed point solves the problem itself for any ε; if forces are not unique, they stay near the start f. As W + ε w
