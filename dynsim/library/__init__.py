@@ -1,1 +1,1 @@
-"""Types that a scenario chooses by name: plants, motors, surfaces, controllers, paths."""
+"""Types that a scenario selects with `type`: plants, motors, surfaces, controllers, paths."""

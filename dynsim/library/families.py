@@ -1,9 +1,9 @@
-"""Families of types that a scenario chooses by ``type``: modules of the package or of plug-ins.
+"""Families of types that a scenario selects with ``type``: modules of dynsim or of plug-ins.
 
-``type: snake`` of a plant is the module ``dynsim.library.plants.snake``, else the entry point ``snake`` of the group
-``dynsim.plants`` of an installed package. There is no other list. Entry points are looked for only when the package
-has no member of that name (looking takes milliseconds with few packages installed, more with many), and no plug-in is
-imported before a scenario names it; ``dynsim list``, ``dynsim schema`` and ``dynsim check`` look at all of them.
+``type: snake`` of a plant is the module ``dynsim.library.plants.snake``, or else the entry point ``snake`` in the group
+``dynsim.plants`` of an installed package. No other registry exists. Entry points are searched only if dynsim has no
+member with that name (a search takes milliseconds with few packages installed, more with many), and a plug-in is
+imported only when a scenario uses it; ``dynsim list``, ``dynsim schema`` and ``dynsim check`` import all plug-ins.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Family:
-    """Where the members of a family are, and the texts that a module must have beside ``Config`` and ``build``."""
+    """Location of a family's members, and the text constants a module needs in addition to ``Config`` and ``build``."""
 
     package: str
     group: str
@@ -54,20 +54,20 @@ FAMILIES = {
 
 @dataclass(frozen=True)
 class Plugin:
-    """A member outside the package."""
+    """Member from an installed plug-in."""
 
     module: ModuleType
     library: tuple[str, str]
     validator: SchemaValidator
 
 
-# Those that were imported, by family and name.
+# Imported plug-ins by family and name.
 _imported: dict[tuple[str, str], Plugin] = {}
 
 
 @cache
 def _modules(family: str) -> tuple[str, ...]:
-    """Names of the modules in the package of a family."""
+    """Return the names of the modules in the package of a family."""
     package = importlib.import_module(FAMILIES[family].package)
     return tuple(sorted(info.name for info in pkgutil.iter_modules(package.__path__) if not info.ispkg))
 
@@ -78,19 +78,19 @@ def _module(family: str, name: str) -> ModuleType:
 
 @cache
 def shipped(family: str) -> tuple[str, ...]:
-    """Members in the package: the modules that expose ``Config``. Imports all of them."""
+    """Return the members shipped with dynsim: the modules with a ``Config``. Imports all modules of the family."""
     return tuple(name for name in _modules(family) if is_shipped(family, name))
 
 
 def is_shipped(family: str, name: str) -> bool:
-    """Whether a name is one of :func:`shipped`; imports that module at most."""
+    """Return whether a name is in :func:`shipped`; imports at most that module."""
     return name in _modules(family) and hasattr(_module(family, name), "Config")
 
 
 @cache
 def _entry_points(family: str) -> Mapping[str, list[EntryPoint]]:
-    """Entry points of a family by name."""
-    # Imported here: most scenarios need none.
+    """Return the entry points of a family by name."""
+    # Imported here because most scenarios use no plug-in.
     from importlib.metadata import entry_points
 
     points: dict[str, list[EntryPoint]] = {}
@@ -100,12 +100,12 @@ def _entry_points(family: str) -> Mapping[str, list[EntryPoint]]:
 
 
 def names(family: str) -> tuple[str, ...]:
-    """Names of all members, in the package and in plug-ins, whether these work or not."""
+    """Return the names of all members, shipped or from plug-ins, including plug-ins that fail to import."""
     return tuple(sorted({*shipped(family), *_entry_points(family)}))
 
 
 def members(family: str) -> tuple[str, ...]:
-    """Names of the members that work; imports every plug-in of the family."""
+    """Return the names of all usable members; imports every plug-in of the family."""
     usable = list(shipped(family))
     for name in _entry_points(family):
         try:
@@ -116,13 +116,13 @@ def members(family: str) -> tuple[str, ...]:
 
 
 def faults() -> list[str]:
-    """What is wrong with the plug-ins that are installed, a line for each; imports all of them."""
+    """Return one message per faulty plug-in; imports all plug-ins."""
     texts = []
     for family in FAMILIES:
         for name, points in _entry_points(family).items():
             if name in shipped(family):
                 owners = " and ".join(map(_title, points))
-                texts.append(f"{family} {name!r} of {owners} is not used: dynsim has its own of that name")
+                texts.append(f"{family} {name!r} of {owners} is not used: dynsim ships a {family} with this name")
                 continue
             try:
                 _plugin(family, name)
@@ -132,28 +132,39 @@ def faults() -> list[str]:
 
 
 def libraries() -> dict[str, str]:
-    """Distributions whose plug-ins were imported, and their versions."""
+    """Return the distributions of the imported plug-ins with their versions."""
     return dict(sorted({plugin.library for plugin in _imported.values()}))
 
 
 def member(family: str, name: str) -> ModuleType:
-    """The module of one member.
+    """Return the module of a member.
 
     Raises
     ------
     PluginError
-        There is none of that name, or it is a plug-in that does not work.
+        If no member has this name, or its plug-in is faulty.
     """
     return _module(family, name) if is_shipped(family, name) else _plugin(family, name).module
 
 
 def build(family: str, config: Any, context: BuildContext, expected: type[T] | UnionType) -> T:
-    """What the member that a configuration belongs to makes of it, checked to be what the family gives.
+    """Build the object of a configuration with its member's ``build``, and check the type of the result.
+
+    Parameters
+    ----------
+    family : str
+        Key of `FAMILIES`.
+    config : StrictConfig
+        Validated ``Config`` of a member.
+    context : BuildContext
+        Context for ``build``.
+    expected : type
+        Required type of the result.
 
     Raises
     ------
     ModelError
-        The member says so, or gives something else; the build of a plug-in fails.
+        If the member rejects the configuration or returns another type, or the ``build`` of a plug-in fails.
     """
     module = member(family, config.type)
     try:
@@ -167,25 +178,25 @@ def build(family: str, config: Any, context: BuildContext, expected: type[T] | U
         raise ModelError(f"{family} {config.type!r}: its build fails with {text}{_line(error, module)}") from error
     if not isinstance(result, expected):
         wanted = " or ".join(kind.__name__ for kind in typing.get_args(expected) or (expected,))
-        raise ModelError(f"{family} {config.type!r}: its build must return a {wanted}, not {brief(result)}")
+        raise ModelError(f"{family} {config.type!r}: its build must return a {wanted}, got {brief(result)}")
     return cast(T, result)
 
 
 def _line(error: Exception, module: ModuleType) -> str:
-    """Where in a module an exception comes from, " (file:line)"; "" when not from there."""
+    """Return " (file:line)" if the exception comes from the module, else ""."""
     lines = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename == module.__file__]
     return f" ({Path(lines[-1].filename).name}:{lines[-1].lineno})" if lines else ""
 
 
 def engine(plant: Any) -> str:
-    """What simulates the plant of a configuration: the ``engine(config)`` of its module, or its ``ENGINE``."""
+    """Return the engine of a plant: the result of its module's ``engine(config)``, or the module's ``ENGINE``."""
     module = member("plant", plant.type)
     chosen = getattr(module, "engine", None)
     return str(module.ENGINE if chosen is None else chosen(plant))
 
 
 def section_defaults(plant: Any, sections: Mapping[str, Any]) -> dict[str, Any]:
-    """What a plant that was read, not validated, wants other sections to say where they do not say otherwise."""
+    """Return the plant's defaults for other sections of a scenario; both arguments are unvalidated."""
     name = plant.get("type") if isinstance(plant, Mapping) else None
     if not isinstance(name, str) or not is_shipped("plant", name):
         return {}
@@ -198,17 +209,17 @@ def _plugin(family: str, name: str) -> Plugin:
         return _imported[family, name]
     points = _entry_points(family).get(name, [])
     if not points:
-        raise PluginError(f"no {family} {name!r}; known: {', '.join(names(family))}")
+        raise PluginError(f"unknown {family} {name!r} (choices: {', '.join(names(family))})")
     point, *others = points
     if others:
-        raise PluginError(f"{family} {name!r} is in {' and '.join(map(_title, points))}: uninstall all but one of them")
+        raise PluginError(f"{family} {name!r} is in {' and '.join(map(_title, points))}; uninstall all but one of them")
     try:
         module = point.load()
     except (Exception, SystemExit) as error:
         reason = f"importing {point.value!r} fails with {type(error).__name__}: {' '.join(str(error).split())[:200]}"
         raise PluginError(_unusable(family, point, reason)) from error
-    if lack := _lack(module, FAMILIES[family], name):
-        raise PluginError(_unusable(family, point, f"{point.value!r} {lack}"))
+    if defect := _defect(module, FAMILIES[family], name):
+        raise PluginError(_unusable(family, point, f"{point.value!r} {defect}"))
     library = (point.dist.name, point.dist.version) if point.dist else (point.value, "unknown")
     _imported[family, name] = Plugin(module, library, SchemaValidator(_tagged({name: module.Config})))
     return _imported[family, name]
@@ -219,48 +230,53 @@ def _unusable(family: str, point: EntryPoint, reason: str) -> str:
 
 
 def _title(point: EntryPoint) -> str:
-    """The distribution of an entry point."""
+    """Return name and version of an entry point's distribution."""
     return f"{point.dist.name} {point.dist.version}" if point.dist else point.value
 
 
-def _lack(module: Any, family: Family, name: str) -> str:
-    """What keeps a module from being a member of that name, "" when nothing does."""
+def _defect(module: Any, family: Family, name: str) -> str:
+    """Return why a module cannot be a member with this name, or "" if it can."""
     if not isinstance(module, ModuleType):
-        return "is no module; an entry point names one"
+        return "is not a module; the entry point must refer to a module"
     config, build_ = getattr(module, "Config", None), getattr(module, "build", None)
     if not (isinstance(config, type) and issubclass(config, StrictConfig)):
         return "has no class Config derived from dynsim.config.base.StrictConfig"
     field = config.model_fields.get("type")
     if field is None or typing.get_args(field.annotation) != (name,):
-        return f'has a Config whose type is not Literal["{name}"], the name of its entry point'
+        return f'has a Config whose type must be Literal["{name}"], the name of its entry point'
     if not callable(build_):
         return "has no function build(config, context)"
     try:
         inspect.signature(build_).bind(None, None)
     except (TypeError, ValueError):
-        return "has a build that does not take (config, context)"
+        return "has a build that does not accept (config, context)"
     for text in family.texts:
         if not isinstance(getattr(module, text, None), str):
-            return f'has no text {text}, such as "dynamics"'
+            return f'has no string {text}, such as "dynamics"'
     return ""
 
 
 def union(family: str, only: tuple[str, ...] = ()) -> Any:
-    """A pydantic field type: the ``Config`` of whichever member of the family the key ``type`` names.
+    """Return a pydantic field type: the ``Config`` of the member that the key ``type`` selects.
 
-    ``only`` : these of the package's members and no others; default: all, and plug-ins
+    Parameters
+    ----------
+    family : str
+        Key of `FAMILIES`.
+    only : tuple of str, optional
+        Names of the shipped members to accept; default: all members, including plug-ins.
     """
     return Annotated[Any, MemberField(family, only)]
 
 
 class MemberField:
-    """Pydantic's side of :func:`union`: the member that ``type`` names, and no other is imported to validate it."""
+    """Pydantic annotation of :func:`union`; validation imports only the member that ``type`` selects."""
 
     def __init__(self, family: str, only: tuple[str, ...] = ()) -> None:
         self.family, self.only = family, only
 
     def models(self) -> list[type[BaseModel]]:
-        """Configurations of the package's members and of the plug-ins in use."""
+        """Return the ``Config`` classes of the shipped members and of the imported plug-ins."""
         if self.only:
             return [member(self.family, name).Config for name in self.only]
         plugins = [plugin.module.Config for (family, _), plugin in _imported.items() if family == self.family]
@@ -269,7 +285,7 @@ class MemberField:
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
         return core_schema.no_info_plain_validator_function(
             self._validate,
-            # Each by its own class: that of a plug-in is not in the schema.
+            # Serialize each value by its class: the schema does not contain the classes of plug-ins.
             serialization=core_schema.wrap_serializer_function_ser_schema(_dump, schema=core_schema.any_schema()),
         )
 
@@ -295,13 +311,13 @@ class MemberField:
 
 @cache
 def _validator(family: str, names: tuple[str, ...]) -> SchemaValidator:
-    """Of a choice among these members of the package."""
+    """Return a validator that chooses among these shipped members."""
     return SchemaValidator(_tagged({name: member(family, name).Config for name in names}))
 
 
 def _tagged(configs: Mapping[str, type[StrictConfig]]) -> core_schema.CoreSchema:
     for config in configs.values():
-        config.model_rebuild()  # the schema of a configuration is made when it is first asked for
+        config.model_rebuild()  # schemas are built on first use
     choices = {name: config.__pydantic_core_schema__ for name, config in configs.items()}
     return core_schema.tagged_union_schema(choices, discriminator="type", from_attributes=True)
 

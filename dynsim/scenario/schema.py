@@ -73,8 +73,10 @@ class Sensors(StrictConfig):
     """Sensors of the robot; without a sensor the controller reads the exact state without delay."""
 
     seed: StrictInt = Field(0, ge=0, description="seed of the noise of all sensors; equal seeds give equal noise")
-    encoders: Encoders | None = None
-    motion_capture: MotionCapture | None = None
+    encoders: Encoders | None = Field(None, description="joint encoders; default: exact joint angles and rates")
+    motion_capture: MotionCapture | None = Field(
+        None, description="motion capture of a snake's controlled point; default: the exact pose"
+    )
 
 
 # Section `ties`: bounded springs and dampers between two bodies of the robot or of objects.
@@ -973,10 +975,14 @@ class ScenarioConfig(StrictConfig):
     variant: str = Field(default="", description="name of the variant; written into resolved scenarios")
     description: str = Field(default="", description="text about the scenario")
     duration_s: Positive = Field(description="simulated time")
-    plant: union("plant")  # type: ignore[valid-type]
-    controller: union("controller") | None = None  # type: ignore[valid-type]
-    surfaces: dict[str, union("surface")] = {}  # type: ignore[valid-type]
-    contacts: Contacts = Contacts()
+    plant: union("plant") = Field(description="robot")  # type: ignore[valid-type]
+    controller: union("controller") | None = Field(  # type: ignore[valid-type]
+        default=None, description="controller; default: none, with the motors short-circuited"
+    )
+    surfaces: dict[str, union("surface")] = Field(  # type: ignore[valid-type]
+        default={}, description="named surfaces"
+    )
+    contacts: Contacts = Field(default=Contacts(), description="contact law, friction and contact points")
     surface_error: SurfaceError | None = Field(
         default=None, description="difference between the surfaces and the controller's assumptions; default: none"
     )
@@ -989,9 +995,9 @@ class ScenarioConfig(StrictConfig):
     sensors: Sensors | None = Field(
         default=None, description="sensors of a sampled controller; default: the exact state without delay"
     )
-    integrator: Integrator = Integrator()
-    record: RecordOptions = RecordOptions()
-    metrics: Metrics = Metrics()
+    integrator: Integrator = Field(default=Integrator(), description="time integration")
+    record: RecordOptions = Field(default=RecordOptions(), description="sampling rate and size limit of the record")
+    metrics: Metrics = Field(default=Metrics(), description="options of the summary")
 
     @model_validator(mode="before")
     @classmethod

@@ -1,1 +1,1 @@
-"""Compiled functions of the kinematic snake: chain, controller, support, plant, ticks."""
+"""Kinematic snake robot: compiled kinematics, controller, support polygon and tick loop, and data of [T]."""

@@ -1,9 +1,9 @@
-"""The snake's task-space control law, compiled: weighted redundancy resolution ([T] eqs 9-17).
+"""Compiled task-space control law of the snake: weighted redundancy resolution ([T] eqs 9-17).
 
-The commanded motion fixes B~ u, u the joint and wheel rates; W weights u. With M = B~ W^(-1/2) and its factorisation
-M = L Q^T (Householder reflections of the rows, one row at a time), the weighted pseudo-inverse is
-B~^(W+) v = W^(-1/2) Q L^-1 v, and I - Q Q^T projects on the null space. Rows can be added one by one, which is how a
-joint is taken out of the allocation while it is at its limit.
+The commanded motion determines B~ u, where u are the joint and wheel rates with weights W. With M = B~ W^(-1/2) and its
+factorisation M = L Q^T (Householder reflections of the rows, one row at a time), the weighted pseudo-inverse is
+B~^(W+) v = W^(-1/2) Q L^-1 v, and I - Q Q^T projects onto the null space. A row can be appended at any time; such a row
+excludes a joint from the allocation while it is at its limit.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from dynsim.snake.kinematics import (
 )
 from dynsim.snake.support import Cost, Support, cost_gradient, new_support
 
-# Joint limits: ignored, clamped in the tick loop, or also kept by taking joints at a limit out of the allocation.
+# Joint limits: ignored, clamped in the tick loop, or clamped with joints at a limit excluded from the allocation.
 LIMITS_NONE, LIMITS_SATURATE, LIMITS_ALLOCATE = 0, 1, 2
-# Null-space term: as printed in [T] eq 14, or in the form that never raises the cost, see control_input.
+# Null-space term: as printed in [T] eq 14, or in a form that never increases the cost, see control_input.
 NULL_PAPER, NULL_SAFE = 0, 1
 
 
@@ -41,12 +41,12 @@ class ControlLaw(NamedTuple):
     root_weight_inverse: np.ndarray  # (n_phi + n_w,) diagonal of W^(-1/2)
     shape_joints: np.ndarray  # (m,) joints of the shape controllable points, rows of S
     shape_target: np.ndarray  # (m,) [rad]
-    grounded: np.ndarray  # (modes, n_b + 1) 1 where a pair is on the ground
+    grounded: np.ndarray  # (modes, n_b + 1) 1 for pairs on the ground
     limit_policy: int
-    rate_limit: float  # fastest joint rate [rad/s]; a command that asks for more is not carried out
-    limit_rate: float  # a joint approaches its limit no faster than this rate times the remaining angle
-    damping_sigma: float  # damp when the smallest singular value of M falls below it
-    damping_factor: float  # at sigma = 0, in the same unit as sigma
+    rate_limit: float  # maximum joint rate [rad/s]; a command that needs a higher rate is not executed
+    limit_rate: float  # maximum rate towards a joint limit, per remaining angle [1/s]
+    damping_sigma: float  # smallest singular value of M below which the solution is damped
+    damping_factor: float  # damping at sigma = 0, in the unit of sigma
     cost: Cost
 
 
@@ -71,12 +71,12 @@ class ControlWork(NamedTuple):
     gradient: np.ndarray  # (n_u,) eta
     null_part: np.ndarray  # (n_u,) Q^T of the scaled gradient
     u: np.ndarray  # (n_u,) result: joint rates, wheel rates [rad/s]
-    withheld: np.ndarray  # (1,) part of the command that damping has taken away [m/s, rad/s]
-    at_limit: np.ndarray  # (n_phi,) 1 where a joint was taken out of the allocation, 2 where it could not be
+    withheld: np.ndarray  # (1,) part of the command removed by damping [m/s, rad/s]
+    at_limit: np.ndarray  # (n_phi,) 1: joint excluded from the allocation, 2: joint that could not be excluded
 
 
 def new_work(model: SnakeModel) -> ControlWork:
-    """Empty workspace of :func:`control_input`."""
+    """Allocate the workspace of :func:`control_input`."""
     joints = model.head_joints + model.base_joints
     rows, inputs = model.base_joints + 4 + model.wheels, joints + model.wheels
     return ControlWork(
@@ -105,10 +105,10 @@ def new_work(model: SnakeModel) -> ControlWork:
 
 @internal_kernel
 def append_row(k, row, tolerance, lower, reflector, beta):
-    """Extend M = L Q^T by one row (destroyed); row k of L and reflector k are written.
+    """Extend M = L Q^T by ``row``, which is overwritten; write row k of L and reflector k.
 
-    Returns False, and leaves k rows, when the part of ``row`` outside the space of the earlier rows is shorter than
-    ``tolerance``. With tolerance 0 even a dependent row is taken: its pivot is tiny and damping has to deal with it.
+    Returns False and keeps k rows if the part of ``row`` that is independent of the earlier rows is shorter than
+    ``tolerance``. With tolerance 0 even a dependent row is accepted; its pivot is tiny, and damping must handle it.
     """
     n = row.shape[0]
     for j in range(k):
@@ -141,7 +141,7 @@ def append_row(k, row, tolerance, lower, reflector, beta):
 
 @internal_kernel
 def reflect(j, reflector, beta, vector):
-    """Apply reflection j to a vector in place."""
+    """Apply reflection j to a vector, in place."""
     s = 0.0
     for i in range(j, vector.shape[0]):
         s += reflector[j, i] * vector[i]
@@ -152,14 +152,14 @@ def reflect(j, reflector, beta, vector):
 
 @internal_kernel
 def smallest_singular_value(count, tolerance, lower, u, y):
-    """Smallest singular value of L (count x count, lower triangular) by inverse iteration.
+    """Compute the smallest singular value of L (count x count, lower triangular) by inverse iteration.
 
-    ``u`` becomes the left singular vector, ``y`` is workspace, ``tolerance`` the relative change that ends the
-    iteration. The first vector has entries of one size; their signs are chosen one by one such that y grows (Cline,
-    Moler, Stewart, Wilkinson 1979). A fixed one is orthogonal to the wanted vector at some postures, and the iteration
-    then ends at the second smallest value. It converges by the square of the ratio of the two smallest singular
-    values: near a singularity, where value and vector matter, in two or three steps; and when the two are close, any
-    mixture of their vectors will do.
+    ``u`` receives the left singular vector, ``y`` is workspace, and ``tolerance`` is the relative change that ends the
+    iteration. The entries of the first vector have equal magnitude; their signs are chosen one by one to make y large
+    (Cline, Moler, Stewart, Wilkinson 1979). A fixed vector is orthogonal to the singular vector in some postures, and
+    the iteration then ends at the second smallest value. The convergence factor is the square of the ratio of the two
+    smallest singular values: near a singularity, where value and vector matter, two or three steps suffice; if the two
+    values are close, any combination of their vectors is adequate.
     """
     sigma = math.inf
     for iteration in range(60):
@@ -190,7 +190,7 @@ def smallest_singular_value(count, tolerance, lower, u, y):
 
 @internal_kernel
 def factor_rows(B, rows, count, shape_joints, scale, row, lower, reflector, beta):
-    """L Q^T = B~ diag(scale) of a mode: rows ``rows[:count]`` of B, then S; returns the number of rows."""
+    """Factorise B~ diag(scale) = L Q^T of a mode: rows ``rows[:count]`` of B, then S; return the number of rows."""
     total = count + shape_joints.shape[0]
     for k in range(total):
         for i in range(row.shape[0]):
@@ -203,7 +203,7 @@ def factor_rows(B, rows, count, shape_joints, scale, row, lower, reflector, beta
 
 @kernel
 def sigma_min(model, law, work, grounded):
-    """Smallest singular value of the unweighted B~ of a mode; needs ``work.B`` of the present state."""
+    """Return the smallest singular value of the unweighted B~ of a mode; ``work.B`` must be up to date."""
     lower = work.lower
     count = active_rows(model, grounded, work.rows)
     k = factor_rows(work.B, work.rows, count, law.shape_joints, work.ones, work.row, lower, work.reflector, work.beta)
@@ -212,7 +212,7 @@ def sigma_min(model, law, work, grounded):
 
 @internal_kernel
 def solve_input(law, work, rows, null_gain):
-    """u = W^(-1/2) (Q L^-1 rhs - k_eta (I - Q Q^T) W^(1/2) n), n = eta (eq 14) or W^-1 eta (safe form)."""
+    """Solve u = W^(-1/2) (Q L^-1 rhs - k_eta (I - Q Q^T) W^(1/2) n), n = eta (eq 14) or W^-1 eta (safe form)."""
     y, u, g, rhs = work.solution, work.u, work.null_part, work.rhs
     lower, reflector, beta, root = work.lower, work.reflector, work.beta, law.root_weight_inverse
     n = u.shape[0]
@@ -239,7 +239,7 @@ def solve_input(law, work, rows, null_gain):
 
 @internal_kernel
 def worst_limit_violation(model, law, work, phi):
-    """Joint whose rate breaks its bound most, and that bound; (-1, 0) when all rates are allowed."""
+    """Return the joint whose rate exceeds its bound most, and that bound; (-1, 0) if no rate exceeds its bound."""
     u, at_limit, upper, lower, rate = work.u, work.at_limit, model.upper, model.lower, law.limit_rate
     worst, joint, bound = 1e-12, -1, 0.0
     for j in range(phi.shape[0]):
@@ -253,19 +253,31 @@ def worst_limit_violation(model, law, work, phi):
 
 @kernel
 def control_input(model, law, work, w, phi, w_target, velocity, mode, null_gain):
-    """One evaluation of the controller: joint and wheel rates u of [T] eqs 12-14, in ``work.u``.
+    """Evaluate the control law once: joint and wheel rates u of [T] eqs 12-14, written to ``work.u``.
 
     u = B~^(W+) A~ (w~_d' - K (w~ - w~_d)) - k_eta (I - B~^(W+) B~) n, with n = eta (the paper's eq 14) or W^-1 eta
-    (safe: eta . u_ker <= 0 for every W). Near a singular B~ the part of the command along its weakest direction alone
-    is scaled by sigma^2 / (sigma^2 + lambda^2), lambda^2 = (1 - (sigma/damping_sigma)^2) damping_factor^2; the
-    null-space part is an exact projection even there.
+    (safe: eta . u_ker <= 0 for every W). Near a singular B~ only the part of the command along the weakest direction is
+    scaled, by sigma^2 / (sigma^2 + lambda^2) with lambda^2 = (1 - (sigma/damping_sigma)^2) damping_factor^2; the
+    null-space part remains an exact projection.
 
     Parameters
     ----------
-    w, phi : (6,), (n_phi,) pose of the controlled point and joints as the controller believes them.
-    w_target, velocity : (6,), (6,) target pose and its rate.
-    mode : int, row of ``law.grounded``.
-    null_gain : float, k_eta or 0 to switch the null-space term off.
+    model : SnakeModel
+        Parameters of the robot.
+    law : ControlLaw
+        Constants of the controller.
+    work : ControlWork
+        Workspace and results.
+    w : (6,) ndarray
+        Estimated pose of the controlled point [m, rad].
+    phi : (n_phi,) ndarray
+        Estimated joint angles [rad].
+    w_target, velocity : (6,) ndarray
+        Target pose [m, rad] and its rate [m/s, rad/s].
+    mode : int
+        Row of ``law.grounded``.
+    null_gain : float
+        k_eta, or 0 to disable the null-space term.
 
     Returns
     -------
@@ -320,7 +332,7 @@ def control_input(model, law, work, w, phi, w_target, velocity, mode, null_gain)
             for i in range(row.shape[0]):
                 row[i] = 0.0
             row[joint] = root[joint]
-            # A joint that the task fixes almost alone would throw its share onto others at 1/tolerance its rate.
+            # If the task determines this joint almost alone, the other joints would need 1/tolerance times its rate.
             if append_row(rows, row, 1e-3 * root[joint], lower, reflector, beta):
                 rhs[rows] = bound
                 rows += 1
@@ -333,9 +345,9 @@ def control_input(model, law, work, w, phi, w_target, velocity, mode, null_gain)
 
 @internal_kernel
 def estimate_from_joints(model, phi, frame, base, w_hat, w):
-    """[T] IV.C.1: z, alpha, beta from the joints of the head part with the base level; x, y, gamma as integrated.
+    """Estimate z, alpha, beta from the head joints with a level base ([T] IV.C.1); x, y, gamma remain as integrated.
 
-    ``base`` and ``w`` are workspace; ``w_hat`` (6,) keeps its x, y, gamma.
+    ``w_hat``, shape (6,), keeps its x, y, gamma; ``base`` and ``w`` are workspace.
     """
     base[0], base[1], base[2] = 0.0, 0.0, 0.0
     pose_of_point(model, base, phi, frame, w)

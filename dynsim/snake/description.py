@@ -1,4 +1,4 @@
-"""Description of an articulated mobile robot, its modes, commands and task-space controller, and its conditioning."""
+"""Description of an articulated mobile robot: geometry, modes, commands, task-space controller and conditioning."""
 
 from __future__ import annotations
 
@@ -19,27 +19,42 @@ Policy = Literal["fixed", "cyclic", "predictive"]
 
 COORDINATES = ("x", "y", "z", "alpha", "beta", "gamma")
 
-# Mode requests of an operator; a positive one is the number of a mode.
+# Mode requests of an operator; a positive request is the number of a mode.
 NO_REQUEST, SWITCHING, FIXING = 0, -1, -2
-# A singular value below this part of the largest one is a lost rank, not just a small value.
+# Fraction of the largest singular value below which a singular value counts as zero.
 SINGULAR = 1e-9
 
 
 @dataclass(frozen=True)
 class SnakeDescription:
-    """An articulated mobile robot in SI units; n_phi = head_joints + base_joints joints, base_joints + 1 wheel pairs.
+    """Articulated mobile robot with n_phi = head_joints + base_joints joints and base_joints + 1 wheel pairs.
 
     Attributes
     ----------
-    joint_names : theta1, psi1, ..., then theta of the base part.
-    pitch : (n_phi,) bool
-    lower, upper : (n_phi,) joint limits [rad]
-    half_track : (pairs,) axle middle to wheel [m]
-    driven_side : (pairs,) +1 left, -1 right, 0 passive pair
-    link_mass : (head_joints + 2 base_joints,) [kg]
-    point_offset : controlled point ahead of the head point [m]
-    initial_joints : (n_phi,) [rad]
-    initial_base_pose : (3,) x [m], y [m], yaw [rad]
+    head_joints, base_joints : int
+        Number of joints of the head part and of the base part.
+    link_length, wheel_radius : float
+        Distance between neighbouring joint axes and radius of the wheels [m].
+    point_offset : float
+        Distance of the controlled point ahead of the head point [m].
+    reference_joints : (n_phi,) ndarray
+        Joint angles with raised head and straight base, the reference for damping [rad].
+    joint_names : tuple of str
+        theta1, psi1, ..., then theta of the base part.
+    pitch : (n_phi,) ndarray of bool
+        True for pitch joints.
+    lower, upper : (n_phi,) ndarray
+        Joint limits [rad].
+    half_track : (pairs,) ndarray
+        Distance from the middle of the axle to a wheel [m].
+    driven_side : (pairs,) ndarray of int
+        Side of the active wheel: +1 left, -1 right, 0 passive pair.
+    link_mass : (head_joints + 2 base_joints,) ndarray
+        Masses of the links [kg].
+    initial_joints : (n_phi,) ndarray
+        Initial joint angles [rad].
+    initial_base_pose : (3,) ndarray
+        Initial x [m], y [m] and yaw [rad] of the base part.
     """
 
     head_joints: int
@@ -47,7 +62,7 @@ class SnakeDescription:
     link_length: float
     wheel_radius: float
     point_offset: float
-    reference_joints: NDArray[np.float64]  # (n_phi,) head raised, base straight: where damping takes its scale
+    reference_joints: NDArray[np.float64]
     joint_names: tuple[str, ...]
     pitch: NDArray[np.bool_]
     lower: NDArray[np.float64]
@@ -60,21 +75,21 @@ class SnakeDescription:
 
     @property
     def pairs(self) -> int:
-        """Wheel pairs of the base part."""
+        """Number of wheel pairs of the base part."""
         return self.base_joints + 1
 
     @property
     def active_wheels(self) -> int:
-        """n_w."""
+        """Number n_w of active wheels."""
         return int(np.count_nonzero(self.driven_side))
 
     @property
     def wheel_names(self) -> tuple[str, ...]:
-        """rho1, rho2, ... numbered like the active wheels."""
+        """Names of the active wheels: rho1, rho2, ..."""
         return tuple(f"rho{i + 1}" for i in range(self.active_wheels))
 
     def arrays(self) -> SnakeModel:
-        """The description as the kernels want it."""
+        """Return the parameters for the kernels."""
         driven = self.driven_side != 0
         return SnakeModel(
             head_joints=self.head_joints,
@@ -95,12 +110,14 @@ class SnakeDescription:
 
 @dataclass(frozen=True)
 class ModeTable:
-    """Modes by number; row i of ``grounded`` is mode ``numbers[i]``.
+    """Modes of the robot; row i of ``grounded`` is mode ``numbers[i]``.
 
     Attributes
     ----------
-    numbers : (modes,) mode numbers as written in the scenario
-    grounded : (modes, pairs) 1 where a wheel pair is on the ground
+    numbers : tuple of int
+        Mode numbers in the scenario.
+    grounded : (modes, pairs) ndarray of int
+        1 for wheel pairs on the ground.
     """
 
     numbers: tuple[int, ...]
@@ -108,38 +125,43 @@ class ModeTable:
 
     @classmethod
     def from_lifted(cls, lifted: Mapping[int, tuple[int, ...] | list[int]], pairs: int) -> ModeTable:
-        """Table from the lifted pairs (counted from 1) of each mode.
+        """Build the table from the lifted pairs (numbered from 1) of each mode.
 
         Raises
         ------
         ModelError
-            No modes, a mode number below 1, or a pair that the robot does not have.
+            If there is no mode, a mode number is below 1, or a pair does not exist.
         """
         if not lifted:
-            raise ModelError("controller.modes is empty: give at least one mode, e.g. {1: [3, 6]}")
+            raise ModelError("controller.modes must have at least one mode, e.g. {1: [3, 6]}")
         grounded = np.ones((len(lifted), pairs), dtype=np.int64)
         for row, (number, away) in enumerate(lifted.items()):
             if number < 1:
-                raise ModelError(f"controller.modes: mode number {number}; modes are numbered 1, 2, ...")
+                raise ModelError(f"controller.modes: mode numbers must be positive, got {number}")
             for pair in away:
                 if not 1 <= pair <= pairs:
-                    raise ModelError(f"controller.modes: mode {number} lifts pair {pair}; the pairs are 1 to {pairs}")
+                    raise ModelError(f"controller.modes: mode {number} lifts unknown pair {pair} (pairs: 1 to {pairs})")
                 grounded[row, pair - 1] = 0
         return cls(tuple(lifted), grounded)
 
     def row(self, number: int, key: str) -> int:
-        """Row of a mode number; ``key`` is the scenario key to blame when there is none."""
+        """Return the row of a mode number; ``key`` is the scenario key that an error refers to."""
         if number not in self.numbers:
-            raise ModelError(f"{key}: no mode {number}; the table has {', '.join(map(str, self.numbers))}")
+            raise ModelError(f"{key}: unknown mode {number} (modes: {', '.join(map(str, self.numbers))})")
         return self.numbers.index(number)
 
 
 class CommandBlock(NamedTuple):
     """Commands of T control periods.
 
-    velocity : (T, 6) mean rate of the target x, y, z [m/s], alpha, beta, gamma [rad/s] in each period
-    request : (T,) mode request at its beginning: NO_REQUEST, SWITCHING, FIXING, or a mode number
-    gripper : (T,) 1 closed (hardened), 0 open (soft)
+    Attributes
+    ----------
+    velocity : (T, 6) ndarray
+        Mean rates of the target x, y, z [m/s], alpha, beta, gamma [rad/s] in each period.
+    request : (T,) ndarray of int
+        Mode request at the beginning of each period: NO_REQUEST, SWITCHING, FIXING, or a mode number.
+    gripper : (T,) ndarray of int
+        1: closed (hardened), 0: open (soft).
     """
 
     velocity: NDArray[np.float64]
@@ -148,14 +170,22 @@ class CommandBlock(NamedTuple):
 
 
 class Feedback(NamedTuple):
-    """What an operator sees of the robot at the beginning of a control period.
+    """State of the robot for an operator at the beginning of a control period.
 
-    time : [s]
-    w, w_target : (6,) pose of the controlled point, and its target [m, rad]
-    base_pose : (3,) x [m], y [m], yaw [rad]
-    phi : (n_phi,) [rad]
-    mode : number of the present mode
-    waiting : the last command was not carried out, the target waits
+    Attributes
+    ----------
+    time : float
+        Time [s].
+    w, w_target : (6,) ndarray
+        Pose of the controlled point and its target [m, rad].
+    base_pose : (3,) ndarray
+        x [m], y [m] and yaw [rad] of the base part.
+    phi : (n_phi,) ndarray
+        Joint angles [rad].
+    mode : int
+        Number of the current mode.
+    waiting : bool
+        Whether the target waits because the last command was not executed.
     """
 
     time: float
@@ -168,18 +198,23 @@ class Feedback(NamedTuple):
 
 
 class CommandSource(Protocol):
-    """What a scripted list and a joystick have in common."""
+    """Source of commands, such as a script or a joystick."""
 
     def read(self, first: int, count: int, period: float, feedback: Feedback) -> CommandBlock:
-        """Commands from control period ``first`` on, as far as they are known now: of 1 to ``count`` periods.
+        """Return the commands of 1 to ``count`` control periods from period ``first``.
 
-        The engine asks again when they are used up. A script answers with ``count``, a joystick with one.
+        The engine calls again when these commands are used up. A script returns ``count`` periods, a joystick one.
 
         Parameters
         ----------
-        first, count : the present period (from 0) and how many are left
-        period : their length [s]
-        feedback : state at the beginning of period ``first``
+        first : int
+            Current period, from 0.
+        count : int
+            Number of remaining periods.
+        period : float
+            Length of a period [s].
+        feedback : Feedback
+            State at the beginning of period ``first``.
         """
         ...
 
@@ -188,9 +223,9 @@ class Conditioning(NamedTuple):
     """Ranks of the model of one mode at one posture ([T] eqs 9-11)."""
 
     rows: int
-    rank_A: int  # of A~, full: 6 + m
-    rank_B: int  # of B~, full: rows
-    redundancy: int  # inputs - rank of B~
+    rank_A: int  # rank of A~; full rank: 6 + m
+    rank_B: int  # rank of B~; full rank: rows
+    redundancy: int  # number of inputs - rank of B~
     sigma_min_A: float
     sigma_min_B: float
     condition_B: float
@@ -198,9 +233,9 @@ class Conditioning(NamedTuple):
 
 @dataclass(frozen=True)
 class TaskSpaceController:
-    """Everything that the tick loop and the mode switcher need.
+    """Parameters of the tick loop and the mode switcher.
 
-    ``prediction`` is the schedule of a predicted period: coarser steps, ``prediction_ticks`` of them.
+    ``prediction`` is the schedule of a predicted switching period with ``prediction_ticks`` coarser steps.
     """
 
     law: ControlLaw
@@ -221,7 +256,7 @@ class TaskSpaceController:
 def conditioning(
     model: SnakeModel, law: ControlLaw, row: int, base: NDArray[np.float64], phi: NDArray[np.float64]
 ) -> Conditioning:
-    """Ranks and singular values of A~ and B~ ([T] eqs 10, 11) of one mode at a posture on the ground."""
+    """Compute ranks and singular values of A~ and B~ ([T] eqs 10, 11) of one mode at a posture on the ground."""
     chain, w, frame = new_chain(model), np.zeros(6), np.zeros((3, 3))
     pose_of_point(model, reals(base), reals(phi), frame, w)
     walk_chain(model, w, reals(phi), frame, chain)

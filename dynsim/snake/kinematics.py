@@ -1,13 +1,13 @@
-"""Kinematics of the head-raising articulated mobile robot and its velocity constraints ([T] section III.A).
+"""Kinematics and velocity constraints of an articulated mobile robot with a raised head ([T] section III.A).
 
 Source [T]: M. Tanaka, K. Tadakuma, M. Nakajima, M. Fujita, "Task-Space Control of Articulated Mobile Robots With a
 Soft Gripper for Operations", IEEE Transactions on Robotics 35(1), 2019.
 
-The chain is walked from the controlled point E tailward: E, head point, theta_1, psi_1, ..., theta_(n_h/2),
+The chain is traversed from the controlled point E to the tail: E, head point, theta_1, psi_1, ..., theta_(n_h/2),
 psi_(n_h/2) (wheel pair 1), then theta, wheel pair 2, theta, wheel pair 3, ... to the tail axle. Neighbours are one
-link length apart, E and the head point ``point_offset``. A body tailward of a joint is turned by Rz(theta) or Ry(psi)
-against the body headward of it, so psi > 0 raises the head. Pitch joints of the base part only lift wheels ([T] II.A)
-and stay at zero here.
+link length apart; E and the head point are ``point_offset`` apart. The body behind a joint is rotated by Rz(theta) or
+Ry(psi) relative to the body in front of it, so psi > 0 raises the head. Pitch joints of the base part only lift wheels
+([T] II.A) and are zero here.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from dynsim.jit.kernel import internal_kernel, kernel
 
 
 class SnakeModel(NamedTuple):
-    """Parameters of a robot for the kernels; lengths [m], angles [rad], masses [kg].
+    """Parameters of a robot for the kernels: lengths [m], angles [rad], masses [kg].
 
     n_phi = head_joints + base_joints joints, base_joints + 1 wheel pairs, head_joints + 2 base_joints links.
     """
@@ -31,18 +31,18 @@ class SnakeModel(NamedTuple):
     wheels: int  # n_w, active wheels of the base part
     link_length: float
     wheel_radius: float
-    point_offset: float  # controlled point ahead of the head point: 0, or the gripper's length
-    pitch: np.ndarray  # (n_phi,) 1 where the joint is a pitch joint
+    point_offset: float  # distance of the controlled point ahead of the head point: 0, or the length of the gripper
+    pitch: np.ndarray  # (n_phi,) 1 for pitch joints
     lower: np.ndarray  # (n_phi,) joint limits
     upper: np.ndarray  # (n_phi,)
     half_track: np.ndarray  # (n_b + 1,)
-    wheel: np.ndarray  # (n_b + 1,) index of the pair's active wheel, -1 if the pair has none
-    side: np.ndarray  # (n_b + 1,) +1 active wheel on the left (along +Y of the pair), -1 on the right
+    wheel: np.ndarray  # (n_b + 1,) index of the pair's active wheel, -1 for passive pairs
+    side: np.ndarray  # (n_b + 1,) +1: active wheel on the left (along +Y of the pair), -1: on the right
     link_mass: np.ndarray  # (n_h + 2 n_b,)
 
 
 class Chain(NamedTuple):
-    """Frames of one posture in world coordinates; filled by :func:`walk_chain`."""
+    """Frames of one posture in world coordinates, written by :func:`walk_chain`."""
 
     rate_axis: np.ndarray  # (3, 3) row k: angular velocity of the head per unit rate of alpha, beta, gamma
     joint_position: np.ndarray  # (n_phi, 3)
@@ -55,7 +55,7 @@ class Chain(NamedTuple):
 
 
 def new_chain(model: SnakeModel) -> Chain:
-    """Empty workspace of :func:`walk_chain`."""
+    """Allocate the workspace of :func:`walk_chain`."""
     joints, pairs = model.head_joints + model.base_joints, model.base_joints + 1
     links = model.head_joints + 2 * model.base_joints
     return Chain(
@@ -72,13 +72,13 @@ def new_chain(model: SnakeModel) -> Chain:
 
 @internal_kernel
 def wrap_angle(angle):
-    """Angle in [-pi, pi)."""
+    """Return the angle wrapped to [-pi, pi)."""
     return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
 
 
 @internal_kernel
 def turn(axis_is_pitch, angle, R):
-    """R := R Ry(angle) or R Rz(angle), in place; R is (3, 3) with rows = frame axes x, y, z in the world."""
+    """Compute R := R Ry(angle) or R Rz(angle) in place; the rows of R, (3, 3), are the frame axes in the world."""
     c, s = math.cos(angle), math.sin(angle)
     for i in range(3):
         x = R[0, i]
@@ -94,7 +94,7 @@ def turn(axis_is_pitch, angle, R):
 
 @internal_kernel
 def head_frame(w, R):
-    """Frame axes (rows of R) of attitude Rz(gamma) Ry(beta) Rx(alpha); w = (x, y, z, alpha, beta, gamma)."""
+    """Write the frame axes of Rz(gamma) Ry(beta) Rx(alpha) to the rows of R; w = (x, y, z, alpha, beta, gamma)."""
     ca, sa = math.cos(w[3]), math.sin(w[3])
     cb, sb = math.cos(w[4]), math.sin(w[4])
     cg, sg = math.cos(w[5]), math.sin(w[5])
@@ -105,14 +105,20 @@ def head_frame(w, R):
 
 @kernel
 def pose_of_point(model, base, phi, R, w):
-    """Pose w of the controlled point from the base pose: the base part lies level on its wheels.
+    """Compute the pose w of the controlled point for a base part that is level on its wheels.
 
     Parameters
     ----------
-    base : (3,) x, y of wheel pair 1 [m] and its yaw [rad].
-    phi : (n_phi,) joint angles [rad].
-    R : (3, 3) workspace.
-    w : (6,) output, x, y, z [m], alpha, beta, gamma [rad] of R = Rz(gamma) Ry(beta) Rx(alpha).
+    model : SnakeModel
+        Parameters of the robot.
+    base : (3,) ndarray
+        x, y [m] and yaw [rad] of wheel pair 1.
+    phi : (n_phi,) ndarray
+        Joint angles [rad].
+    R : (3, 3) ndarray
+        Workspace.
+    w : (6,) ndarray
+        Output: x, y, z [m], alpha, beta, gamma [rad] of R = Rz(gamma) Ry(beta) Rx(alpha).
     """
     R[0, 0], R[0, 1], R[0, 2] = math.cos(base[2]), math.sin(base[2]), 0.0
     R[1, 0], R[1, 1], R[1, 2] = -R[0, 1], R[0, 0], 0.0
@@ -131,7 +137,7 @@ def pose_of_point(model, base, phi, R, w):
 
 @kernel
 def walk_chain(model, w, phi, R, chain):
-    """Positions and axes of joints, wheel pairs and links for any pose w and joints phi (level or not)."""
+    """Compute positions and axes of joints, wheel pairs and links for any pose w and joint angles phi, level or not."""
     half = 0.5 * model.link_length
     head_frame(w, R)
     cb, sb = math.cos(w[4]), math.sin(w[4])
@@ -171,7 +177,7 @@ def walk_chain(model, w, phi, R, chain):
 
 @internal_kernel
 def velocity_row(model, chain, w, pair, a, A, B, row):
-    """Rows a . v_pair = A w' - B u of the velocity of an axle's middle along the direction a."""
+    """Write the row a . v_pair = A w' - B u for the velocity of an axle's midpoint along the direction a."""
     p = chain.pair_position[pair]
     ax, ay, az = a[0], a[1], a[2]
     dx, dy, dz = p[0] - w[0], p[1] - w[1], p[2] - w[2]
@@ -192,7 +198,7 @@ def velocity_row(model, chain, w, pair, a, A, B, row):
 
 @internal_kernel
 def add_rotation(model, chain, pair, factor, a, A, B, row):
-    """Add factor a . omega_pair = A w' - B u of the body that carries a wheel pair to a row."""
+    """Add factor a . omega_pair = A w' - B u, the rotation of the body of a wheel pair, to a row."""
     ax, ay, az = factor * a[0], factor * a[1], factor * a[2]
     for k in range(3):
         e = chain.rate_axis[k]
@@ -204,22 +210,30 @@ def add_rotation(model, chain, pair, factor, a, A, B, row):
 
 @kernel
 def constraint_matrices(model, chain, w, A, B):
-    """A(q) w' = B(q) u with every wheel on the ground ([T] eqs 2-6).
+    """Compute A(q) and B(q) of A w' = B u with all wheels on the ground, u = (phi', rho') ([T] eqs 2-6).
 
-    Rows: n_b + 1 times no side slip, Y_i . v_i = 0; three times contact with the ground, e_z . v_1 = 0 and
-    X_1 . omega_tail = Y_1 . omega_tail = 0; n_w times rolling of the active wheels,
-    X_i . v_i - side_i b_i (Z_i . omega_i) = r rho_i'. u = (phi', rho').
+    Rows: n_b + 1 rows without side slip, Y_i . v_i = 0; three rows of ground contact, e_z . v_1 = 0 and
+    X_1 . omega_tail = Y_1 . omega_tail = 0; n_w rows of rolling active wheels,
+    X_i . v_i - side_i b_i (Z_i . omega_i) = r rho_i'.
 
     Parameters
     ----------
-    A : (n_b + 4 + n_w, 6) output
-    B : (n_b + 4 + n_w, n_phi + n_w) output
+    model : SnakeModel
+        Parameters of the robot.
+    chain : Chain
+        Frames of the posture, from :func:`walk_chain`.
+    w : (6,) ndarray
+        Pose of the controlled point [m, rad].
+    A : (n_b + 4 + n_w, 6) ndarray
+        Output.
+    B : (n_b + 4 + n_w, n_phi + n_w) ndarray
+        Output.
     """
     pairs = model.base_joints + 1
     joints = model.head_joints + model.base_joints
     for i in range(pairs):
         velocity_row(model, chain, w, i, chain.pair_y[i], A, B, i)
-    first = pairs - pairs  # a variable, not the literal 0: one compiled signature
+    first = pairs - pairs  # a variable instead of the literal 0, so that only one signature is compiled
     velocity_row(model, chain, w, first, chain.rate_axis[2], A, B, pairs)  # rate axis of gamma: e_z
     for row in range(pairs + 1, pairs + 3):
         a = chain.pair_x[0] if row == pairs + 1 else chain.pair_y[0]
@@ -238,12 +252,21 @@ def constraint_matrices(model, chain, w, A, B):
 
 @kernel
 def active_rows(model, grounded, rows):
-    """Rows of A and B that a mode keeps ([T] eqs 7, 8): both rows of every lifted pair are deleted.
+    """Find the rows of A and B that are active in a mode ([T] eqs 7, 8); both rows of a lifted pair are removed.
 
     Parameters
     ----------
-    grounded : (n_b + 1,) 1 where the pair is on the ground.
-    rows : (n_b + 4 + n_w,) output; the first returned count are valid.
+    model : SnakeModel
+        Parameters of the robot.
+    grounded : (n_b + 1,) ndarray
+        1 for pairs on the ground.
+    rows : (n_b + 4 + n_w,) ndarray
+        Output: row indices; entries beyond the returned count are undefined.
+
+    Returns
+    -------
+    int
+        Number of active rows.
     """
     pairs = model.base_joints + 1
     count = 0
@@ -263,12 +286,20 @@ def active_rows(model, grounded, rows):
 
 @kernel
 def posture_points(model, bases, phis, R, chain, w, points):
-    """Polyline of the robot for many states: controlled point, joints of the head part, joints and axles of the base.
+    """Compute the polyline of the robot for many states: controlled point, head joints, base joints and axles.
 
     Parameters
     ----------
-    bases, phis : (T, 3), (T, n_phi)
-    points : (T, 1 + n_h + 2 n_b, 3) output; entry n_h is wheel pair 1, every second one after it the next pair.
+    model : SnakeModel
+        Parameters of the robot.
+    bases : (T, 3) ndarray
+        x, y [m] and yaw [rad] of wheel pair 1.
+    phis : (T, n_phi) ndarray
+        Joint angles [rad].
+    R, chain, w
+        Workspaces.
+    points : (T, 1 + n_h + 2 n_b, 3) ndarray
+        Output [m]; entry n_h is wheel pair 1, every second entry after it is the next pair.
     """
     for t in range(bases.shape[0]):
         pose_of_point(model, bases[t], phis[t], R, w)

@@ -1,12 +1,12 @@
-"""Lifted wheel pairs of a record as angles of the pitch joints on their axles.
+"""Lifting of wheel pairs: geometry of a snake from its record, and pitch angles that lift the pairs.
 
-The record has each pair on the ground or off it, 1 or 0; a lift takes time. The height of a pair follows
+A record has 1 for each pair on the ground and 0 for each lifted pair; lifting takes time. The height of a pair is
 
     eta(t) = clearance s((t - t_up)/blend) s((t_down - t)/blend),   s(u) = 10 u^3 - 15 u^4 + 6 u^5
 
-from the first sample t_up at which it is lifted; it is zero again at t_down, the first at which it is grounded. So a
-pair is in the air only while the record has it off the ground. Pitch angles are computed from the heights and the yaw
-angles of every sample (:mod:`dynsim.snake.lifting`), before anything moves.
+from the first sample t_up at which it is lifted to the first sample t_down at which it is grounded again. So a pair is
+in the air only while it is lifted in the record. The pitch angles follow from the heights and yaw angles of each sample
+and are computed before any motion starts.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from dynsim.errors import CheckRefused, MissingEntry
 from dynsim.record import TIME, Record
 from dynsim.record.scene import Scene
 
-# Geometry of a snake (joint axes and limits, head joints, wheels) from the scene of its record.
+# Geometry from the scene of a record.
 
 
 @dataclass(frozen=True)
@@ -33,11 +33,16 @@ class SnakeGeometry:
 
     Attributes
     ----------
-    head_joints : number of joints in the head part; they are the first columns of ``phi``, the joint angles
-    pitch : (n_phi,) true where a joint turns about y (pitch), false about z (yaw)
-    lower, upper : (n_phi,) limits of the joints [rad]
-    wheel_radius : of the first pair [m]
-    half_track : (number of wheel pairs,) distance from the middle of an axle to its wheels [m]
+    head_joints : int
+        Number of joints of the head part, the first columns of the joint angles ``phi``.
+    pitch : (n_phi,) ndarray of bool
+        True for pitch joints (about y), False for yaw joints (about z).
+    lower, upper : (n_phi,) ndarray
+        Joint limits [rad].
+    wheel_radius : float
+        Wheel radius of the first pair [m].
+    half_track : (pairs,) ndarray
+        Distance from the middle of an axle to its wheels [m].
     """
 
     head_joints: int
@@ -49,15 +54,15 @@ class SnakeGeometry:
 
 
 def snake_geometry(record: Record) -> SnakeGeometry:
-    """Geometry of the snake of a record.
+    """Return the geometry of the snake in a record.
 
     Raises
     ------
     MissingEntry
-        The record has no scene.
+        If the record has no scene.
     """
     if record.scene is None:
-        raise MissingEntry("the record has no scene, which says what the snake is like")
+        raise MissingEntry("the record has no scene with the geometry of the snake; simulate again")
     names = record.labels["phi"]
     joints = {body.joint.name: body.joint for body in record.scene.bodies}
     lower, upper = np.array([[joints[name].lower, joints[name].upper] for name in names], dtype=np.float64).T
@@ -73,7 +78,7 @@ def snake_geometry(record: Record) -> SnakeGeometry:
 
 
 class WheelOfPair(NamedTuple):
-    """Of a wheel pair: where along its body the axle is, how far beside the middle of the body it is, radius [m]."""
+    """Position of a wheel along its body, its distance to the side of the body's middle, and its radius [m]."""
 
     along: float
     beside: float
@@ -81,7 +86,7 @@ class WheelOfPair(NamedTuple):
 
 
 def wheels_of(scene: Scene, pair: str) -> list[WheelOfPair]:
-    """Wheels on a body: shapes of its own, and bodies that turn on it."""
+    """Return the wheels of a wheel pair's body: its own shapes, and bodies that turn on it."""
     index = {body.name: k for k, body in enumerate(scene.bodies)}[pair]
     places = [(shape.position, shape) for shape in scene.bodies[index].shapes]
     places += [(body.joint.position, body.shapes[0]) for body in scene.bodies if body.parent == index and body.shapes]
@@ -90,27 +95,29 @@ def wheels_of(scene: Scene, pair: str) -> list[WheelOfPair]:
     ]
 
 
-# Kinematics of a snake's base part with lifted wheel pairs: pitch angles of plates that are hinged at the axles.
+# Kinematics of the base part with lifted wheel pairs: pitch angles of the plates hinged at the axles.
 
 
 Coefficients = tuple[float, float, float]
 NEWTON_STEPS = 12
+# Minimum change of the height per pitch angle [m/rad]; with less the height is out of reach.
 FLAT = 1e-12
-"""A height that changes by less with a pitch angle cannot be reached by it [m]."""
+# Last Newton step of a pitch angle [rad]; the height of the wheel is then accurate to 2e-10 m.
 CONVERGED = 1e-9
-"""Last Newton step of a pitch angle [rad]; a wheel is then at its height to 2e-10 m."""
 
 
 @dataclass(frozen=True)
 class Fold:
-    """A folded base part at T instants.
+    """Folded base part at T instants.
 
     Attributes
     ----------
-    hinge : array, shape (T, pairs - 1)
+    hinge : (T, pairs - 1) ndarray
         Angles of the pitch joints on the axles of pair 1, 2, ... [rad].
-    lower, tilt : array, shape (T, pairs)
-        Height of the lower wheel of every pair above the floor, and of the other above it [m].
+    lower : (T, pairs) ndarray
+        Height of the lower wheel of each pair above the floor [m].
+    tilt : (T, pairs) ndarray
+        Height of the other wheel above the lower wheel [m].
     """
 
     hinge: Array
@@ -120,20 +127,22 @@ class Fold:
 
 @dataclass(frozen=True)
 class BasePart:
-    """Lengths of the base part [m] and the columns of the joint angles that bend it.
+    """Lengths of the base part and the record's columns of its yaw angles.
 
     Attributes
     ----------
     pairs : tuple of str
-        Names of the wheel pairs, from the head tailward.
-    before, behind : array, shape (pairs - 1,)
-        Axle to yaw joint, and yaw joint to the next axle.
-    half_track : array, shape (pairs,)
-        Middle of the axle to either wheel.
+        Names of the wheel pairs, from head to tail.
+    before, behind : (pairs - 1,) ndarray
+        Distance from an axle to the yaw joint behind it, and from this joint to the next axle [m].
+    half_track : (pairs,) ndarray
+        Distance from the middle of the axle to a wheel [m].
     radius : float
-        Of the wheels.
-    signal, yaw : str, tuple of str
-        Signal of the record and its columns with the yaw angles between the axles.
+        Radius of the wheels [m].
+    signal : str
+        Signal of the record with the yaw angles between the axles.
+    yaw : tuple of str
+        Columns of this signal.
     """
 
     pairs: tuple[str, ...]
@@ -145,22 +154,24 @@ class BasePart:
     yaw: tuple[str, ...]
 
     def yaw_angles(self, record: Record) -> Array:
-        """Shape (T, pairs - 1) [rad]."""
+        """Return the yaw angles between the axles, shape (T, pairs - 1) [rad]."""
         columns = [record.labels[self.signal].index(name) for name in self.yaw]
         return np.asarray(record[self.signal][:, columns], dtype=np.float64)
 
     def fold(self, yaw: Array, height: Array) -> Fold:
-        """Pitch angles with the lower wheel of every pair at a height above the floor.
+        """Compute the pitch angles that put the lower wheel of each pair at its height above the floor.
 
         Parameters
         ----------
-        yaw : (T, pairs - 1) [rad]
-        height : (T, pairs) [m], 0 for pair 1
+        yaw : (T, pairs - 1) ndarray
+            Yaw angles [rad].
+        height : (T, pairs) ndarray
+            Heights [m]; 0 for pair 1.
 
         Raises
         ------
         ArithmeticError
-            No angle brings a pair to its height; the arguments are the instant's index and the pair's.
+            If a height is out of reach; the arguments are the indices of the instant and of the pair.
         """
         hinge, lower, tilt = np.zeros_like(yaw), np.zeros_like(height), np.zeros_like(height)
         before, behind, half_track = self.before.tolist(), self.behind.tolist(), self.half_track.tolist()
@@ -170,7 +181,8 @@ class BasePart:
             for j, (angle, above) in enumerate(zip(yaw[row].tolist(), height[row, 1:].tolist(), strict=True)):
                 cos, sin, half = math.cos(angle), math.sin(angle), half_track[j + 1]
                 x, y = -before[j] - behind[j] * cos, -behind[j] * sin
-                # Coefficients of 1, cos psi, sin psi in up . Ry(psi) vector: the way to the next axle, and that axle.
+                # Coefficients of 1, cos psi, sin psi in up . Ry(psi) vector, for the vector to the next axle and for
+                # the axle's direction.
                 rise, slope = (uy * y, ux * x, -uz * x), (uy * cos, -ux * sin, uz * sin)
                 needed = [self._angle(z - above, rise, slope, lever) for lever in (half, -half)]
                 if any(map(math.isnan, needed)):
@@ -186,7 +198,7 @@ class BasePart:
         return Fold(hinge, lower, tilt)
 
     def _angle(self, above: float, rise: Coefficients, slope: Coefficients, lever: float) -> float:
-        """psi where above + rise + lever slope - r sqrt(1 - slope^2) = 0, by Newton's method; NaN where it is lost."""
+        """Solve above + rise + lever slope - r sqrt(1 - slope^2) = 0 for psi by Newton's method; NaN if it fails."""
         psi = 0.0
         for _ in range(NEWTON_STEPS):
             c, s = math.cos(psi), math.sin(psi)
@@ -199,36 +211,38 @@ class BasePart:
                 break
             step = (above + rise[0] + rise[1] * c + rise[2] * s + lever * incline - self.radius * disc) / change
             psi -= step
-            # The next one would be of its square.
+            # Quadratic convergence: the next step would be of the order of the square.
             if abs(step) < CONVERGED:
                 return psi
         return math.nan
 
 
 def base_part(record: Record, pairs: tuple[str, ...]) -> BasePart:
-    """The base part of the snake of a record, from its scene.
+    """Return the base part of the snake in a record, from its scene.
 
     Raises
     ------
     CheckRefused
-        There is no scene, or it is not that of a chain of wheel pairs on yaw joints.
+        If the record has no scene, or its robot is not a chain of wheel pairs on yaw joints.
     """
     scene = record.scene
     if scene is None:
-        raise CheckRefused("the record has no scene to take the robot's lengths from: simulate again")
+        raise CheckRefused("the record has no scene with the lengths of the robot; simulate again")
     index = {body.name: k for k, body in enumerate(scene.bodies)}
     missing = [name for name in pairs if name not in index]
     if missing or len(pairs) < 2:
-        raise CheckRefused(f"the record's scene has no wheel pair {', '.join(missing)}; {len(pairs)} are in the record")
+        raise CheckRefused(
+            f"the record's scene has no wheel pair {', '.join(missing)} (wheel pairs in the record: {len(pairs)})"
+        )
     bodies = [scene.bodies[index[name]] for name in pairs]
-    # Between a pair and the yaw joint behind it there may be a pitch joint on the axle, with a body of its own.
+    # A pitch joint on the axle may carry a separate body between a pair and the yaw joint behind it.
     plates = [scene.bodies[body.parent] for body in bodies[1:]]
     plates = [plate if plate.joint.axis == (0.0, 1.0, 0.0) else None for plate in plates]
     for ahead, body, plate in zip(pairs, bodies[1:], plates, strict=False):
         joint = body.joint
         parent = body.parent if plate is None else plate.parent
         if joint.kind != "revolute" or joint.axis != (0.0, 0.0, 1.0) or parent != index[ahead]:
-            raise CheckRefused(f"{body.name} is not behind {ahead} on a yaw joint: its wheels cannot be lifted")
+            raise CheckRefused(f"{body.name} is not behind {ahead} on a yaw joint, so its wheels cannot be lifted")
     wheels = [wheels_of(scene, name) for name in pairs]
     if bare := [name for name, on_body in zip(pairs, wheels, strict=True) if not on_body]:
         raise CheckRefused(f"the record's scene has no wheels on {bare[0]}")
@@ -246,38 +260,44 @@ def base_part(record: Record, pairs: tuple[str, ...]) -> BasePart:
     )
 
 
+# Heights and pitch angles of a record.
+
+
 Array = NDArray[np.float64]
+# Minimum number of samples per blend; with fewer the path between two samples deviates from their heights.
 SAMPLES_PER_BLEND = 20
-"""Fewer of them, and the path between two samples is no longer at the heights of the samples."""
+# Tolerance of comparisons between times [s].
 TIME_ROUNDING = 1e-9
-"""By so much less a time may be than it must [s]."""
 
 
 class Lifts(StrictConfig):
-    """How wheel pairs that the record lifts are lifted.
+    """Lifting of the wheel pairs that are lifted in a record.
 
-    Every pair but the last has a pitch joint on its axle. Lifting is added to what these do otherwise; the first, on
-    the axle that carries the head, follows the record and keeps the head where it is.
+    All pairs except the last have a pitch joint on the axle. Lifting adds to the angles of these joints; the first
+    joint, on the axle that carries the head, follows the record and keeps the head in place.
     """
 
     signal: str = Field(
-        "grounded", description="of the record, with 1 where a wheel pair is on the ground, 0 where it is lifted"
+        "grounded", description="signal of the record with 1 for wheel pairs on the ground and 0 for lifted pairs"
     )
     joints: tuple[str, ...] = Field(min_length=1, description="pitch joints on the axles of the first, second, … pair")
     clearance_mm: Positive = Field(5.0, description="height of the lower wheel of a lifted pair above the floor")
-    blend_s: Positive = Field(0.3, description="time to lift a pair, and to put it down, in record time")
+    blend_s: Positive = Field(0.3, description="time to lift or lower a pair, in record time")
     tilt_mm: Positive = Field(
-        2.5, description="a record is refused where one wheel of a grounded pair would be higher: a bent base twists"
+        2.5,
+        description="maximum height difference between the wheels of a grounded pair, caused by the twist of a bent "
+        "base; an error if exceeded",
     )
 
 
 def lifted(record: Record, lifts: Lifts) -> Fold:
-    """How the base part of a record is folded at every sample.
+    """Compute how the base part of a record is folded at each sample.
 
     Raises
     ------
     CheckRefused
-        No such signal, or it lifts pairs that cannot be lifted, or not for so short a time; with pair and time.
+        If the signal does not exist, a pair cannot be lifted, or a lift is too short. The message contains pair and
+        time.
     """
     grounded = grounded_pairs(record, lifts.signal)
     pairs = record.labels[lifts.signal]
@@ -295,25 +315,32 @@ def lifted(record: Record, lifts: Lifts) -> Fold:
 
 
 def fold_to_heights(part: BasePart, yaw: Array, height: Array, lifts: Lifts, time: Array) -> Fold:
-    """The base part with its pairs at heights above the floor.
+    """Fold the base part so that its pairs are at heights above the floor.
 
     Parameters
     ----------
-    yaw : (T, pairs - 1) [rad]
-    height : (T, pairs) [m]
-    time : (T,) [s], for what is refused
+    part : BasePart
+        Lengths of the base part.
+    yaw : (T, pairs - 1) ndarray
+        Yaw angles between the axles [rad].
+    height : (T, pairs) ndarray
+        Heights of the pairs [m].
+    lifts : Lifts
+        Options of lifting.
+    time : (T,) ndarray
+        Times [s], for error messages.
 
     Raises
     ------
     CheckRefused
-        No pitch angles do that, or a pair would stand on one wheel; with pair and time.
+        If a height is out of reach, or a pair would stand on one wheel. The message contains pair and time.
     """
     try:
         fold = part.fold(yaw, height)
     except ArithmeticError as lost:
         row, pair = lost.args
         raise CheckRefused(
-            f"no pitch angle brings {part.pairs[pair]} to {1e3 * height[row, pair]:g} mm above the floor at "
+            f"{part.pairs[pair]} cannot reach {1e3 * height[row, pair]:g} mm above the floor with any pitch angle at "
             f"t = {time[row]:.3f} s"
         ) from None
     _refuse_twist(np.where(height == 0.0, fold.tilt, 0.0), lifts, part.pairs, time)
@@ -321,53 +348,53 @@ def fold_to_heights(part: BasePart, yaw: Array, height: Array, lifts: Lifts, tim
 
 
 def refuse_other_joints(lifts: Lifts, pairs: tuple[str, ...]) -> None:
-    """CheckRefused unless every pair but the last has its pitch joint."""
+    """Raise CheckRefused unless every pair except the last has a pitch joint."""
     if len(lifts.joints) != len(pairs) - 1:
         raise CheckRefused(
-            f"lifts.joints names {len(lifts.joints)} pitch joints; the record has {len(pairs)} wheel pairs, with one "
-            "on the axle of each but the last"
+            f"lifts.joints must list {len(pairs) - 1} pitch joints, one for each of the record's {len(pairs)} wheel "
+            f"pairs except the last; got {len(lifts.joints)}"
         )
 
 
 def refuse_long_steps(lifts: Lifts, step: float) -> None:
-    """CheckRefused where samples are too far apart [s] for the path between them."""
+    """Raise CheckRefused if the sampling interval [s] is too long for the path between two samples."""
     if step * SAMPLES_PER_BLEND > lifts.blend_s:
         raise CheckRefused(
-            f"wheels are lifted in blend_s = {lifts.blend_s:g} s, and the record has a sample every {step:g} s: record "
-            f"at {SAMPLES_PER_BLEND / lifts.blend_s:.0f} Hz or more, or lift them slower"
+            f"wheels are lifted within blend_s = {lifts.blend_s:g} s, but the record has one sample per {step:g} s; "
+            f"record at {SAMPLES_PER_BLEND / lifts.blend_s:.0f} Hz or more, or raise blend_s"
         )
 
 
 def grounded_pairs(record: Record, name: str) -> Array:
-    """1 where a pair is on the ground, shape (T, pairs)."""
+    """Return 1 for pairs on the ground and 0 for lifted pairs, shape (T, pairs)."""
     if name not in record:
-        raise CheckRefused(f"lifts.signal: the record has no {name!r}; it has {', '.join(record)}")
+        raise CheckRefused(f"lifts.signal: unknown signal {name!r} (signals of the record: {', '.join(record)})")
     data = np.asarray(record[name])
     if data.ndim != 2 or record.signals[name].axis != TIME or not np.isin(data, (0, 1)).all():
-        raise CheckRefused(f"signal {name!r} must be 0 or 1 for each wheel pair, at the times of the record")
+        raise CheckRefused(f"signal {name!r} must be 0 or 1 for each wheel pair at each time of the record")
     return data.astype(np.float64)
 
 
 def refuse_what_cannot_stand(grounded: Array, pairs: tuple[str, ...], time: Array) -> None:
-    """CheckRefused where pair 1 is lifted, or all others are; ``grounded`` has the shape (T, pairs)."""
+    """Raise CheckRefused if pair 1, or every other pair, is lifted; ``grounded`` has shape (T, pairs)."""
     if not (grounded[:, 0] == 1).all():
         row = int(np.argmin(grounded[:, 0]))
         raise CheckRefused(
-            f"{pairs[0]} is lifted at t = {time[row]:.3f} s: it carries the raised head, which would move with it"
+            f"{pairs[0]} is lifted at t = {time[row]:.3f} s, but it carries the raised head, which would move with it"
         )
     standing = grounded.sum(axis=1)
     if standing.min() < 2:
         row = int(np.argmin(standing))
-        raise CheckRefused(f"only {pairs[0]} is on the ground at t = {time[row]:.3f} s: the robot does not stand on it")
+        raise CheckRefused(f"only {pairs[0]} is on the ground at t = {time[row]:.3f} s; the robot would tip over")
 
 
 def _height(grounded: Array, time: Array, lifts: Lifts, name: str) -> Array:
-    """Height of one pair over time, shape (T,) [m]."""
+    """Return the height of one pair over time, shape (T,) [m]."""
     height = np.zeros_like(time)
     edges = np.flatnonzero(np.diff(grounded, prepend=1.0, append=1.0))
     for first, end in edges.reshape(-1, 2):
         up, down = time[first], time[min(end, len(time) - 1)]
-        # What is lifted from the beginning is lifted in the start posture, what is at the end stays so.
+        # A pair lifted in the first sample starts in the air; a pair lifted in the last sample stays in the air.
         blends = int(first > 0) + int(end < len(time))
         refuse_short_lift(lifts, name, up, down, blends)
         height[first:end] = height_of(
@@ -377,16 +404,16 @@ def _height(grounded: Array, time: Array, lifts: Lifts, name: str) -> Array:
 
 
 def refuse_short_lift(lifts: Lifts, name: str, up: float, down: float, blends: int) -> None:
-    """CheckRefused where a pair is not lifted for as long as so many blends take; times in [s]."""
+    """Raise CheckRefused if a lift from ``up`` to ``down`` [s] is shorter than ``blends`` blends."""
     if down - up < blends * lifts.blend_s - TIME_ROUNDING:
         raise CheckRefused(
-            f"{name} is lifted for {down - up:.3f} s only, from t = {up:.3f} s on; up and down take "
-            f"{blends * lifts.blend_s:g} s (lifts.blend_s)"
+            f"{name} is lifted for {down - up:.3f} s from t = {up:.3f} s; raising and lowering takes "
+            f"{blends * lifts.blend_s:g} s (lifts.blend_s): lift longer or lower blend_s"
         )
 
 
 def height_of(time: Array, up: Array | float, down: Array | float, lifts: Lifts) -> Array:
-    """Height [m] at a time of what is lifted from ``up`` to ``down`` [s]; infinite ones are for ever."""
+    """Return the height [m] at ``time`` of a pair that is lifted from ``up`` to ``down`` [s], which may be infinite."""
     since, until = (time - up) / lifts.blend_s, (down - time) / lifts.blend_s
     return 1e-3 * lifts.clearance_mm * _smooth(since) * _smooth(until)
 
@@ -397,12 +424,12 @@ def _smooth(u: Array) -> Array:
 
 
 def _refuse_twist(tilt: Array, lifts: Lifts, pairs: tuple[str, ...], time: Array) -> None:
-    """A grounded pair whose other wheel is high in the air does not roll as the record's kinematics has it."""
+    """Raise CheckRefused if a wheel of a grounded pair is too high to roll as in the record's kinematics."""
     row, pair = np.unravel_index(int(tilt.argmax()), tilt.shape)
     if tilt[row, pair] > 1e-3 * lifts.tilt_mm:
         raise CheckRefused(
-            f"{pairs[pair]} would stand on one wheel at t = {time[row]:.3f} s, the other "
-            f"{1e3 * tilt[row, pair]:.1f} mm above the floor (lifts.tilt_mm: {lifts.tilt_mm:g}): the axles before it "
-            "do not meet in one point, so that one between them cannot be lifted without a twist. Less clearance, or a "
-            "base that is bent less"
+            f"{pairs[pair]} would stand on one wheel at t = {time[row]:.3f} s, with the other wheel "
+            f"{1e3 * tilt[row, pair]:.1f} mm above the floor (lifts.tilt_mm: {lifts.tilt_mm:g}): the axles in front of "
+            "it do not meet in one point, so a pair between them cannot be lifted without twisting the base; reduce "
+            "the clearance, or bend the base less"
         )

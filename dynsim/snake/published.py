@@ -1,4 +1,4 @@
-"""Measured values and statements of [T], and tables that compare them with records of simulations.
+"""Measured values and statements of [T], and tables that compare them with simulated records.
 
 [T]: M. Tanaka et al., "Task-Space Control of Articulated Mobile Robots With a Soft Gripper for Operations", IEEE
 Transactions on Robotics 35(1), 2019.
@@ -16,7 +16,7 @@ from dynsim.snake.description import COORDINATES, SnakeDescription
 from dynsim.snake.kinematics import pose_of_point
 from dynsim.snake.lifting import snake_geometry
 
-Table = list[list[str]]  # headings first
+Table = list[list[str]]  # the first row has the headings
 
 
 class Displacement(NamedTuple):
@@ -24,10 +24,10 @@ class Displacement(NamedTuple):
 
     target: tuple[float, ...]
     mean: tuple[float, ...]
-    deviation: tuple[float, ...]  # standard deviation of five runs
+    deviation: tuple[float, ...]  # standard deviation over five runs
 
 
-# [T] Table III, by the coordinate that is moved.
+# [T] Table III, by moved coordinate.
 TABLE_III: dict[str, Displacement] = {
     "x": Displacement(
         (0.20, 0, 0, 0, 0, 0),
@@ -63,16 +63,16 @@ TABLE_III: dict[str, Displacement] = {
 
 
 def displacement(record: Record) -> np.ndarray:
-    """Relative displacement of the controlled point as [T] V.A takes it, (6,).
+    """Return the relative displacement of the controlled point as defined in [T] V.A, shape (6,) [m, rad].
 
-    Mean over the last second of the run minus mean over its first.
+    It is the mean over the last second of the run minus the mean over the first second.
     """
     first, last = record.time <= 1.0, record.time >= record.time[-1] - 1.0
     return record["w"][last].mean(axis=0) - record["w"][first].mean(axis=0)
 
 
 def table_iii(records: Mapping[str, Record]) -> Table:
-    """Table III: target, measured in [T], simulated. Only manoeuvres that were run."""
+    """Return Table III with targets, measurements of [T] and simulations, for the simulated manoeuvres."""
     rows = [["moved", "what", *COORDINATES]]
     for moved, published in TABLE_III.items():
         if moved in records:
@@ -84,12 +84,15 @@ def table_iii(records: Mapping[str, Record]) -> Table:
 
 
 UNITS = ("m", "m", "m", "rad", "rad", "rad")
-# Variants of `snake_positioning_dynamic`: what is appended to the moved coordinate, by the column of the table.
+# Column of the table → ending that follows the moved coordinate in the variants of `snake_positioning_dynamic`.
 SOURCES = {"kinematic": "_kinematic", "dynamic": "", "measured": "_measured"}
 
 
 def table_iii_dynamic(records: Mapping[str, Record]) -> Table:
-    """Table III beside what was simulated without forces, with them, and with the head measured; a line a number."""
+    """Return Table III next to kinematic and dynamic simulations, and simulations with a measured head pose.
+
+    Each row has one number of the paper.
+    """
     rows = [["variant", "quantity", "paper_mean", "paper_sd", *SOURCES]]
     for moved, published in TABLE_III.items():
         names = {source: moved + ending for source, ending in SOURCES.items()}
@@ -106,11 +109,16 @@ def table_iii_dynamic(records: Mapping[str, Record]) -> Table:
 
 
 class Push(NamedTuple):
-    """Posture of a push test, and the contact forces f_x, f_y, f_z that the head exerted on a plate.
+    """Posture of a push test, and the measured contact forces f_x, f_y, f_z of the head on a plate.
 
-    height, beside : z_h, y_h, of the head point [m]
-    l_shape : the base part is bent by 90 degrees, not straight
-    mean, deviation : of five runs [N]
+    Attributes
+    ----------
+    height, beside : float
+        Coordinates z_h and y_h of the head point [m].
+    l_shape : bool
+        Whether the base part is bent by 90 degrees instead of straight.
+    mean, deviation : tuple of float
+        Mean and standard deviation over five runs [N].
     """
 
     height: float
@@ -120,7 +128,7 @@ class Push(NamedTuple):
     deviation: tuple[float, float, float]
 
 
-# [T] Table IV, heights z_h differ.
+# [T] Table IV, with different heights z_h.
 TABLE_IV: dict[str, Push] = {
     "i": Push(0.40, 0.0, False, (16.9, 5.71, 15.7), (0.3, 0.22, 0.3)),
     "ii": Push(0.35, 0.0, False, (24.0, 8.60, 12.1), (1.1, 0.20, 0.1)),
@@ -129,7 +137,7 @@ TABLE_IV: dict[str, Push] = {
     "v": Push(0.35, 0.0, True, (21.4, 7.1, 11.3), (0.5, 0.5, 0.2)),
     "vi": Push(0.30, 0.0, True, (26.3, 9.94, 10.3), (1.1, 0.35, 0.2)),
 }
-# [T] Table V, y_h differ; it gives f_y of posture (v) with a digit more.
+# [T] Table V, with different y_h; f_y of posture (v) has one more digit.
 TABLE_V: dict[str, Push] = {
     "ii": TABLE_IV["ii"],
     "vii": Push(0.35, 0.1, False, (20.4, 11.1, 13.2), (0.4, 0.5, 0.2)),
@@ -138,26 +146,27 @@ TABLE_V: dict[str, Push] = {
     "ix": Push(0.35, 0.1, True, (19.2, 12.7, 13.5), (1.1, 0.6, 0.4)),
     "x": Push(0.35, 0.2, True, (13.5, 14.9, 16.1), (0.5, 1.1, 0.2)),
 }
-# By the coordinate of a variant's name: the way in which the head pushes.
+# Coordinate in the name of a variant → pushing direction of the head.
 PUSHES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, -1.0)}
 # Name of the contact point that touches the plate.
 PLATE = "plate"
-# f_z is taken where the target is this far within the plate; the paper does not say how far it was [m].
+# Depth of the target in the plate at which f_z is evaluated [m]; the paper does not specify it.
 DEPTH_Z = 0.07
 # Target of the last pitch joint of the head part, [T] IV.C.3 [rad].
 LAST_PITCH = np.deg2rad(110.0)
-# Starts of the search for a posture; twenty find all that 300 find.
+# Number of starts of the search for a posture; 20 starts find all solutions that 300 starts find.
 STARTS = 60
 
 
 def push_posture(d: SnakeDescription, push: Push) -> np.ndarray | None:
-    """Joint angles (n_phi,) [rad] of a posture of the push tests, or None if none was found.
+    """Return the joint angles of a push-test posture, shape (n_phi,) [rad], or None without a solution.
 
-    The paper gives z_h, y_h and the form of the base part only. The head is level and looks along x, psi3 is at its
-    target, and the bend is shared by the two joints in the middle of the base part (assumed). Five head joints are
-    left for five coordinates. Of several solutions within the limits the one with the smallest angles is taken.
+    The paper specifies only z_h, y_h and the shape of the base part. The head is level and points along x, psi3 is at
+    its target, and the two joints in the middle of the base part share the bend (assumed). The other five head joints
+    determine five coordinates. Among several solutions within the limits, the solution with the smallest angles is
+    used.
     """
-    from scipy.optimize import least_squares  # here, because it takes long to load
+    from scipy.optimize import least_squares  # imported here because it takes long to load
 
     model, base = d.arrays(), np.zeros(d.base_joints)
     if push.l_shape:
@@ -184,11 +193,16 @@ def push_posture(d: SnakeDescription, push: Push) -> np.ndarray | None:
 
 
 class Pushed(NamedTuple):
-    """What a push test has given.
+    """Result of a simulated push test.
 
-    force : of the plate against the push [N]
-    depth : of the target within the plate when it was taken [m]
-    stop_acted : a mechanical stop of a joint carried force while the head pushed
+    Attributes
+    ----------
+    force : float
+        Force of the plate against the push [N].
+    depth : float
+        Depth of the target in the plate at this force [m].
+    stop_acted : bool
+        Whether a mechanical stop carried force while the head pushed.
     """
 
     force: float
@@ -197,7 +211,7 @@ class Pushed(NamedTuple):
 
 
 def pushed(record: Record, coordinate: str) -> Pushed:
-    """f_x and f_y, largest of the run; f_z where the target is :data:`DEPTH_Z` within the plate, or at its deepest."""
+    """Evaluate f_x and f_y at their maximum, and f_z at the depth :data:`DEPTH_Z` or else at the maximum depth."""
     plate = record.labels["contact_normal_force"].index(PLATE)
     force, gap = record["contact_normal_force"][:, plate], record["contact_gap"][0, plate]
     target = record["w_target"][:, :3]
@@ -208,7 +222,7 @@ def pushed(record: Record, coordinate: str) -> Pushed:
 
 
 def push_table(published: Mapping[str, Push], records: Mapping[str, Record]) -> Table:
-    """Table IV or V beside what was simulated; only pushes that were run."""
+    """Return Table IV or V next to the simulated pushes."""
     rows = [["posture", "direction", "paper_mean", "paper_sd", "simulated", "depth_m", "start", "stop_acted"]]
     for posture, push in published.items():
         for k, coordinate in enumerate(PUSHES):
@@ -224,7 +238,7 @@ def push_table(published: Mapping[str, Push], records: Mapping[str, Record]) -> 
 
 
 def wheel_table(records: Mapping[str, Record]) -> Table:
-    """What each wheel has carried, how far it has slipped, and what its friction has taken, by variant."""
+    """Return load, slip distance and friction energy of each wheel and variant."""
     rows = [["variant", "wheel", "mean_load_N", "largest_load_N", "slip_m", "friction_J"]]
     for variant, record in records.items():
         if "contact_slip_velocity" not in record:
@@ -241,15 +255,15 @@ def wheel_table(records: Mapping[str, Record]) -> Table:
 
 # [T] Table I: battery life [min].
 BATTERY_LIFE = 80.0
-# Stall current of the MX-106 at 12 V: data sheet, and that of the model, U / R [A].
+# Stall current of the MX-106 at 12 V: from the data sheet, and of the model, U / R [A].
 STALL_CURRENT = (5.2, 3.3)
 
 
 def energy_table(records: Mapping[str, Record]) -> Table:
-    """Energy of a run, where it went, and what a battery would need to hold for the 80 min of [T] Table I.
+    """Return the energy of a run by destination, and the battery capacity for the 80 min of [T] Table I.
 
-    The motor of the model stalls at less current than the data sheet says; with the data sheet's, all electrical
-    numbers are as many times more.
+    The motor of the model has a lower stall current than the data sheet; with the current of the data sheet all
+    electrical energies are larger by this ratio.
     """
     more = STALL_CURRENT[0] / STALL_CURRENT[1]
     names = ("supply_J", "joule_J", "gear_J", "wheel_friction_J", "tyre_J", "mean_power_W")
@@ -267,10 +281,10 @@ def energy_table(records: Mapping[str, Record]) -> Table:
 
 
 class Statement(NamedTuple):
-    """What [T] says, and how to take the same from a record."""
+    """Statement of [T], and the function that evaluates the same quantity from a record."""
 
-    where: str
-    what: str
+    section: str
+    quantity: str
     published: str
     variant: str
     simulated: Callable[[Record], str]
@@ -281,26 +295,29 @@ HEAD_ERROR = (0.030, 0.1)  # [m], [rad]
 
 
 def base_joints(record: Record) -> np.ndarray:
-    """Joint angles of the base part, (T, n_b) [rad]."""
+    """Return the joint angles of the base part, shape (T, n_b) [rad]."""
     return record["phi"][:, snake_geometry(record).head_joints :]
 
 
 def mode_sequence(record: Record) -> list[tuple[float, int]]:
-    """(time [s], mode number) at the start and at every change."""
+    """Return (time [s], mode number) at the start and at each change of mode."""
     mode = record["mode"]
     starts = np.flatnonzero(np.diff(mode, prepend=mode[0] - 1))
     return [(float(record.time[i]), int(mode[i])) for i in starts]
 
 
 def used_limit(record: Record) -> np.ndarray:
-    """Largest yaw angle of each sample in parts of its limit, (T,); pitch is mostly set by the shape point."""
+    """Return the largest yaw angle of each sample as a fraction of its limit, shape (T,).
+
+    Pitch angles are excluded: the shape point determines most of them.
+    """
     geometry = snake_geometry(record)
     yaw = ~geometry.pitch
     return np.asarray(np.abs(record["phi"][:, yaw] / geometry.upper[yaw]).max(axis=1))
 
 
 def opening(record: Record) -> np.ndarray:
-    """How far the door is open, (T,) [°]: without one in the record, how far the head has turned."""
+    """Return the opening angle of the door, or the turn of the head in a record without door, shape (T,) [°]."""
     has_door = "door" in record.labels.get("q", ())
     angle = record["q"][:, record.labels["q"].index("door")] if has_door else record["w"][:, 5]
     return np.asarray(np.abs(np.rad2deg(angle - angle[0])))
@@ -312,14 +329,14 @@ def _largest_base_angle(record: Record) -> str:
 
 
 def _straightening(record: Record) -> str:
-    """Base joints in the order in which they fall below half of their first angle for good, with the time [s]."""
+    """Return the base joints in the order in which they stay below half of their first angle, with the time [s]."""
     angle, names = np.abs(base_joints(record)), record.labels["phi"][-base_joints(record).shape[1] :]
-    rows, said = len(angle), []
-    # first row of the rest of the run in which the joint stays below; the number of rows: none
+    rows, texts = len(angle), []
+    # first row from which the joint stays below; the number of rows if it never does
     below = [int(np.append(-1, np.flatnonzero(column > 0.5 * column[0]))[-1]) + 1 for column in angle.T]
     for j in np.argsort(below, kind="stable"):
-        said.append(f"{names[j]} " + (f"{record.time[below[j]]:.1f}" if below[j] < rows else "never"))
-    return ", ".join(said)
+        texts.append(f"{names[j]} " + (f"{record.time[below[j]]:.1f}" if below[j] < rows else "never"))
+    return ", ".join(texts)
 
 
 def _same_wheels(record: Record) -> str:
@@ -330,11 +347,11 @@ def _same_wheels(record: Record) -> str:
 
 
 def _cost(record: Record) -> str:
-    return f"{record['cost'][0]:.2f} -> {record['cost'][-1]:.2f}; largest rise in a sample {_rise(record):.1e}"
+    return f"{record['cost'][0]:.2f} -> {record['cost'][-1]:.2f}; largest increase per sample {_rise(record):.1e}"
 
 
 def _rise(record: Record) -> float:
-    """Largest rise of V from sample to sample within a mode; below zero: it always falls."""
+    """Return the largest increase of V per sample within a mode; negative if V always decreases."""
     return float(np.diff(record["cost"])[np.diff(record["mode"]) == 0].max())
 
 
@@ -352,34 +369,34 @@ def _rms_base_angle(record: Record) -> str:
 
 # [T] V.B (Figs 8 to 10), IV.C.5 (Table II) and V.E (Fig 16), sentence by sentence.
 JOINT_LIMITS: tuple[Statement, ...] = (
-    Statement("V.B", "largest |theta| of the base part, start -> end [rad]",
+    Statement("V.B", "maximum base joint angle, start -> end [rad]",
               "near the limit (1.1), decreased with time", "cyclic", _largest_base_angle),
     Statement("V.B", "fixing state for t < 2 s, then the switching state: t [s] (mode)",
               "mode 1; at t >= 2: 2, 3, ..., 6, 2, 3, ... every 1 s", "cyclic",
               lambda r: ", ".join(f"{t:.0f} ({m})" for t, m in mode_sequence(r))),
-    Statement("IV.C.5, Table II", "lifted pairs of every mode that was used",
+    Statement("IV.C.5, Table II", "lifted pairs of each mode in use",
               "mode 1: 3, 6; 2: 6, 7; 3: 5, 6; 4: 4, 5; 5: 3, 4; 6: 2, 3", "cyclic", _same_wheels),
-    Statement("IV.C.5, Table II", "wheel pairs on the ground, fewest and most", "5 of 7", "cyclic",
+    Statement("IV.C.5, Table II", "wheel pairs on the ground, minimum and maximum", "5 of 7", "cyclic",
               lambda r: f"{r['grounded'].sum(axis=1).min()} and {r['grounded'].sum(axis=1).max()}"),
     Statement("V.B, Fig 9", "cost V", "decreased with time", "cyclic", _cost),
-    Statement("V.B, Fig 9", "position error of the head, largest [mm]", f"about {1e3 * HEAD_ERROR[0]:.0f}", "cyclic",
+    Statement("V.B, Fig 9", "maximum position error of the head [mm]", f"about {1e3 * HEAD_ERROR[0]:.0f}", "cyclic",
               _error("position_error", 1e3)),
-    Statement("V.B, Fig 9", "attitude error of the head, largest [rad]", f"about {HEAD_ERROR[1]}", "cyclic",
+    Statement("V.B, Fig 9", "maximum attitude error of the head [rad]", f"about {HEAD_ERROR[1]}", "cyclic",
               _error("attitude_error", 1.0)),
-    Statement("V.B, Fig 10", "largest yaw angle in parts of its limit", "the joint limit was avoided", "cyclic",
+    Statement("V.B, Fig 10", "maximum yaw angle, fraction of its limit", "the joint limit was avoided", "cyclic",
               lambda r: f"{used_limit(r).max():.6f}"),
-    Statement("V.B, Fig 10", "below half the first angle for good, t [s]", "in order from the tail to the head",
+    Statement("V.B, Fig 10", "joints stay below half the first angle from t [s]", "in order from the tail to the head",
               "cyclic", _straightening),
     Statement("IV.C.5", "the same without switching", "switching makes the robot operable again", "fixed",
               _straightening),
     Statement("IV.C.5, V.E", "V at the end, predictive switching", "better than the prescribed order", "predictive",
               _cost),
-    Statement("V.E, Fig 15", "smallest support margin [mm]", "hardly falls", "cyclic",
+    Statement("V.E, Fig 15", "minimum support margin [mm]", "hardly falls", "cyclic",
               lambda r: f"{1e3 * r['support_margin'].min():.1f}"),
     *(
-        Statement("V.E, Fig 16", f"{quantity}, end", published, variant, take)
+        Statement("V.E, Fig 16", f"{quantity}, at the end", published, variant, take)
         for quantity, reference, published_20, take in (
-            ("rms |theta| of the base part [rad]", "straight (Fig 8)", "not straight", _rms_base_angle),
+            ("rms base joint angle [rad]", "straight (Fig 8)", "not straight", _rms_base_angle),
             ("area of the support polygon [m^2]", "(Fig 8)", "greater than in Fig 8",
              _summary("support_area_final_m2", ".4f")),
             ("support margin [mm]", "", "", lambda r: f"{1e3 * r['support_margin'][-1]:.1f}"),
@@ -388,20 +405,20 @@ JOINT_LIMITS: tuple[Statement, ...] = (
     ),
 )  # fmt: skip
 
-# Scenarios of [T] V.D.3, Fig 14: the arc alone, and with a door.
+# Scenarios of [T] V.D.3, Fig 14: the arc without and with a door.
 DOORS = ("snake_door_arc", "snake_door")
 DOOR: tuple[Statement, ...] = tuple(
     Statement("V.D.3, Fig 14", quantity, published, variant, take)
     for quantity, take, texts in (
         ("opened to [deg]", lambda r: f"{opening(r)[-1]:.2f}",
          ("(d), (f): the robot could not move backward", "(e), (g): able to resume moving backward", "")),
-        ("largest yaw angle in parts of its limit", lambda r: f"{used_limit(r).max():.4f}",
+        ("maximum yaw angle, fraction of its limit", lambda r: f"{used_limit(r).max():.4f}",
          ("(d), (f): the joint reached the limit angle", "changed posture", "")),
         ("target waited [s]", _summary("waiting_s", ".2f"), ("", "", "")),
         ("mode switches", _summary("mode_switches"), ("fixing state", "mode switching", "")),
-        ("gripper off its target, largest [mm]", _error("position_error", 1e3),
+        ("maximum position error of the gripper [mm]", _error("position_error", 1e3),
          ("", "maintaining the position and attitude", "")),
-        ("gripper off its target, largest [rad]", _error("attitude_error", 1.0),
+        ("maximum attitude error of the gripper [rad]", _error("attitude_error", 1.0),
          ("", "maintaining the position and attitude", "")),
     )
     for variant, published in zip(("pull", "pull_switching", "pull_predictive", "push"),
@@ -410,7 +427,7 @@ DOOR: tuple[Statement, ...] = tuple(
 
 
 def statements(listed: tuple[Statement, ...], records: Mapping[str, Record]) -> Table:
-    """What [T] says beside what was simulated; only variants that were run."""
+    """Return a table of statements next to the simulated values, for the simulated variants."""
     rows = [["[T]", "what", "published", "variant", "simulated"]]
     rows += [[*s[:4], s.simulated(records[s.variant])] for s in listed if s.variant in records]
     return rows
@@ -420,20 +437,20 @@ POLICIES = ("fixed", "cyclic", "predictive")
 
 
 def policies(records: Mapping[str, Record]) -> Table:
-    """The mode switching policies side by side, one column each."""
+    """Return a table of the mode switching policies, with one column per policy."""
     shown = {name: records[name] for name in POLICIES if name in records}
     lines: tuple[tuple[str, Callable[[Record], str]], ...] = (
         ("V, start -> end", lambda r: f"{r['cost'][0]:.2f} -> {r['cost'][-1]:.2f}"),
         ("V at half time", lambda r: f"{r['cost'][len(r.time) // 2]:.2f}"),
-        ("largest |theta| of the base part, start -> end [rad]", _largest_base_angle),
-        ("joints that were taken out at their limits", lambda r: " ".join(r.summary["joints_taken_out"]) or "none"),
-        ("largest yaw angle in parts of its limit", lambda r: f"{used_limit(r).max():.6f}"),
-        ("position error of the head, largest [mm]", _error("position_error", 1e3)),
-        ("attitude error of the head, largest [rad]", _error("attitude_error", 1.0)),
-        ("smallest support margin [mm]", lambda r: f"{1e3 * r['support_margin'].min():.1f}"),
-        ("support area, end [m^2]", _summary("support_area_final_m2", ".4f")),
+        ("maximum base joint angle, start -> end [rad]", _largest_base_angle),
+        ("joints excluded at their limits", lambda r: " ".join(r.summary["joints_taken_out"]) or "none"),
+        ("maximum yaw angle, fraction of its limit", lambda r: f"{used_limit(r).max():.6f}"),
+        ("maximum position error of the head [mm]", _error("position_error", 1e3)),
+        ("maximum attitude error of the head [rad]", _error("attitude_error", 1.0)),
+        ("minimum support margin [mm]", lambda r: f"{1e3 * r['support_margin'].min():.1f}"),
+        ("support area at the end [m^2]", _summary("support_area_final_m2", ".4f")),
         ("mode switches", _summary("mode_switches")),
-        ("modes refused", _summary("modes_refused")),
+        ("rejected modes", _summary("modes_refused")),
         ("modes", lambda r: " ".join(str(m) for _, m in mode_sequence(r))),
         ("wall time [s]", _summary("integration_wall_s", ".3f")),
     )
@@ -441,7 +458,7 @@ def policies(records: Mapping[str, Record]) -> Table:
 
 
 def tables(scenario: str, records: Mapping[str, Record]) -> dict[str, Table]:
-    """Tables beside [T] for the variants of a shipped scenario, by file name; empty where [T] has nothing to say."""
+    """Return tables by file name that compare a shipped scenario with [T]; empty for scenarios that are not in [T]."""
     if scenario == "snake_positioning":
         results = {"table_iii": table_iii(records)}
     elif scenario == "snake_positioning_dynamic":
@@ -458,5 +475,5 @@ def tables(scenario: str, records: Mapping[str, Record]) -> dict[str, Table]:
         results = {"door": statements(DOOR, records)}
     else:
         results = {}
-    # a head line alone: none of its variants was run
+    # a table with only a heading has no simulated variant
     return {name: rows for name, rows in results.items() if len(rows) > 1 and len(rows[0]) > 1}

@@ -1,7 +1,6 @@
-"""Support polygon, static stability and the cost functions of the redundancy ([T] eqs 19 and 20).
+"""Support polygon, static stability and cost functions of the redundancy resolution ([T] eqs 19 and 20).
 
-These are functions of the joint angles and of which wheel pairs are grounded: distances between points of the robot do
-not change when the whole robot moves on the plane.
+All of them depend only on the joint angles and the grounded wheel pairs, not on the robot's pose on the plane.
 """
 
 from __future__ import annotations
@@ -16,37 +15,37 @@ from dynsim.snake.kinematics import SnakeModel
 
 COST_ANGLES = 0  # eq 19
 COST_SUPPORT_NORM = 1  # eq 20 as printed: 1 / norm of the distances to all sides
-COST_SUPPORT_MIN = 2  # eq 20 with the distance to the nearest side, smoothed
+COST_SUPPORT_MIN = 2  # eq 20 with the smoothed distance to the nearest side
 
 
 class Cost(NamedTuple):
-    """Cost V; kind is one of COST_*."""
+    """Parameters of the cost V; ``kind`` is one of COST_*."""
 
     kind: int
     diagonal: np.ndarray  # (n_phi,) K_V
     angle_weight: float  # a_1
     support_weight: float  # a_2 [m]
-    distance_floor: float  # [m] distances below it count as it, so that V stays finite when the robot tips
-    smoothing: float  # [m] sides whose distances differ by less than about this count together as the nearest
+    distance_floor: float  # [m] lower bound of the distances in V, so that V stays finite if the robot tips
+    smoothing: float  # [m] sides whose distances differ by less than about this are averaged as the nearest side
 
 
 class Support(NamedTuple):
     """Workspace and result of :func:`support_polygon`."""
 
-    contact: np.ndarray  # (2 (n_b + 1), 2) ground points of the wheels [m]
+    contact: np.ndarray  # (2 (n_b + 1), 2) contact points of the wheels with the ground [m]
     owner: np.ndarray  # (2 (n_b + 1),) wheel pair of each contact
     order: np.ndarray  # (2 (n_b + 1),) sorting workspace
     hull: np.ndarray  # (2 (n_b + 1) + 1,) contacts on the hull, counter-clockwise
     distance: np.ndarray  # (2 (n_b + 1),) signed distance of the centre of mass from each side, inside > 0 [m]
-    length: np.ndarray  # (2 (n_b + 1),) of each side [m]
+    length: np.ndarray  # (2 (n_b + 1),) length of each side [m]
     centre: np.ndarray  # (3,) centre of mass [m]
-    centre_slope: np.ndarray  # (n_phi, 2) of its projection, body of wheel pair 1 held [m/rad]
-    slope: np.ndarray  # (n_phi,) of one distance [m/rad]
-    length_slope: np.ndarray  # (n_phi,) of the length of that side [m/rad]
+    centre_slope: np.ndarray  # (n_phi, 2) derivative of its projection with the body of wheel pair 1 fixed [m/rad]
+    slope: np.ndarray  # (n_phi,) derivative of one distance [m/rad]
+    length_slope: np.ndarray  # (n_phi,) derivative of the length of that side [m/rad]
 
 
 def new_support(model: SnakeModel) -> Support:
-    """Empty workspace of :func:`support_polygon`, :func:`cost_value` and :func:`cost_gradient`."""
+    """Allocate the workspace of :func:`support_polygon`, :func:`cost_value` and :func:`cost_gradient`."""
     contacts, joints = 2 * (model.base_joints + 1), model.head_joints + model.base_joints
     return Support(
         np.zeros((contacts, 2)),
@@ -64,13 +63,13 @@ def new_support(model: SnakeModel) -> Support:
 
 @internal_kernel
 def cross(ox, oy, ax, ay, bx, by):
-    """(a - o) x (b - o), positive when o, a, b turn left."""
+    """Return (a - o) x (b - o), which is positive if o, a, b turn left."""
     return (ax - ox) * (by - oy) - (ay - oy) * (bx - ox)
 
 
 @internal_kernel
 def convex_hull(points, count, order, hull):
-    """Counter-clockwise hull of the first ``count`` points (monotone chain); returns its number of corners."""
+    """Find the counter-clockwise hull of the first ``count`` points (monotone chain); return its number of corners."""
     for i in range(count):
         j = i
         while j > 0 and (
@@ -92,21 +91,22 @@ def convex_hull(points, count, order, hull):
                 size -= 1
             hull[size] = p
             size += 1
-        size -= 1  # the last point of a sweep is the first of the next
+        size -= 1  # the last point of a sweep is the first point of the next
     return size
 
 
 @kernel
 def support_polygon(model, chain, grounded, support):
-    """Support polygon of the grounded wheels and signed distances d_i of the centre of mass from its sides.
+    """Compute the support polygon of the grounded wheels and the signed distances d_i of the centre of mass.
 
-    The projection of the centre of mass is inside (statically stable, [T] V.E) while every d_i > 0.
+    The robot is statically stable ([T] V.E) as long as all d_i > 0: the projected centre of mass is inside.
 
     Returns
     -------
     sides : int
+        Number of sides; 0 without a polygon.
     margin : float
-        Smallest d_i [m]; -inf when fewer than three corners are left.
+        Smallest d_i [m]; -inf for fewer than three corners.
     """
     mass = 0.0
     for i in range(3):
@@ -144,7 +144,7 @@ def support_polygon(model, chain, grounded, support):
 
 @kernel
 def polygon_area(support, sides):
-    """Area of the support polygon [m^2]."""
+    """Return the area of the support polygon [m^2]."""
     area = 0.0
     for s in range(sides):
         a, b = support.contact[support.hull[s]], support.contact[support.hull[(s + 1) % sides]]
@@ -154,12 +154,12 @@ def polygon_area(support, sides):
 
 @internal_kernel
 def centre_slopes(model, chain, support):
-    """Derivative of the projected centre of mass by each joint angle, the body of wheel pair 1 held still."""
+    """Compute the derivatives of the projected centre of mass by the joint angles; wheel pair 1 is fixed."""
     total = 0.0
     for k in range(model.link_mass.shape[0]):
         total += model.link_mass[k]
     mass, mx, my, mz = 0.0, 0.0, 0.0, 0.0
-    for j in range(model.head_joints):  # a head joint moves everything headward of it, backwards
+    for j in range(model.head_joints):  # a head joint moves all links in front of it, in the negative direction
         m, c = model.link_mass[j], chain.link_centre[j]
         mass, mx, my, mz = mass + m, mx + m * c[0], my + m * c[1], mz + m * c[2]
         p, e = chain.joint_position[j], chain.joint_axis[j]
@@ -169,7 +169,7 @@ def centre_slopes(model, chain, support):
     mass, mx, my, mz = 0.0, 0.0, 0.0, 0.0
     link = model.link_mass.shape[0]
     for j in range(model.head_joints + model.base_joints - 1, model.head_joints - 1, -1):
-        # a base joint moves everything tailward of it; the link headward of it is summed afterwards
+        # a base joint moves all links behind it; the link in front of it is added afterwards
         for k in range(2):
             link -= 1
             if k == 1:
@@ -183,8 +183,10 @@ def centre_slopes(model, chain, support):
 
 @internal_kernel
 def distance_slope(model, chain, support, side, sides):
-    """Derivatives of one distance d_side and of that side's length by every joint angle, into ``support.slope`` and
-    ``support.length_slope`` [m/rad]."""
+    """Compute the derivatives of a distance d_side and of the side's length by the joint angles [m/rad].
+
+    The results are in ``support.slope`` and ``support.length_slope``.
+    """
     ia, ib = support.hull[side], support.hull[(side + 1) % sides]
     a, b = support.contact[ia], support.contact[ib]
     ex, ey = b[0] - a[0], b[1] - a[1]
@@ -208,21 +210,21 @@ def distance_slope(model, chain, support, side, sides):
 
 @internal_kernel
 def nearness(support, side, smoothing, margin):
-    """exp(-(d_side - margin) / s): one for the nearest side, next to nothing for sides that are s and more farther."""
+    """Return exp(-(d_side - margin) / s): 1 for the nearest side, near 0 for sides that are several s farther."""
     return math.exp(-(support.distance[side] - margin) / smoothing)
 
 
 @kernel
 def smooth_margin(support, sides, smoothing, margin):
-    """Smoothed smallest distance: margin - s ln sum_i (L_i / L) exp(-(d_i - margin) / s), L = sum of the lengths L_i.
+    """Smooth the smallest distance: margin - s ln sum_i (L_i / L) exp(-(d_i - margin) / s), L = sum of the lengths L_i.
 
-    The gradient of the minimum itself jumps where two sides are equally near, and a robot that follows it is thrown
-    to and fro between them. Weighted by length, a side that is split by a new corner of the hull counts as before.
+    The gradient of the exact minimum jumps if two sides are equally near, and a robot that follows it oscillates
+    between them. With weights by length, a side that a new corner of the hull splits has the same effect as before.
 
     Returns
     -------
     distance : float
-        Not below ``margin`` [m].
+        Smoothed distance, at least ``margin`` [m].
     total : float
         sum_i L_i exp(...) [m].
     perimeter : float
@@ -237,7 +239,7 @@ def smooth_margin(support, sides, smoothing, margin):
 
 @kernel
 def cost_value(cost, phi, sides, support, margin):
-    """V of eq 19 or eq 20; ``sides``, ``support``, ``margin`` from :func:`support_polygon`."""
+    """Return V of eq 19 or eq 20, with ``sides``, ``support`` and ``margin`` from :func:`support_polygon`."""
     V = 0.0
     for j in range(phi.shape[0]):
         V += cost.diagonal[j] * phi[j] * phi[j]
@@ -256,12 +258,7 @@ def cost_value(cost, phi, sides, support, margin):
 
 @kernel
 def cost_gradient(model, cost, chain, phi, grounded, support, gradient):
-    """eta = dV/d(phi, rho) ([T] eq 17), analytic; the wheels' part is zero.
-
-    Parameters
-    ----------
-    gradient : (n_phi + n_w,) output
-    """
+    """Write eta = dV/d(phi, rho) ([T] eq 17), shape (n_phi + n_w,), to ``gradient``; its wheel part is zero."""
     angle_weight = 1.0 if cost.kind == COST_ANGLES else cost.angle_weight
     for j in range(gradient.shape[0]):
         gradient[j] = 2.0 * angle_weight * cost.diagonal[j] * phi[j] if j < phi.shape[0] else 0.0

@@ -1,4 +1,4 @@
-"""The compiled tick loop: state estimate, limits on the target's speed, control, plant and recording."""
+"""Compiled tick loop of the kinematic snake: state estimate, target speed limits, control, plant and recording."""
 
 from __future__ import annotations
 
@@ -15,48 +15,47 @@ from dynsim.snake.support import cost_value, polygon_area, support_polygon
 
 # Data of the tick loop: schedule, state of plant and controller, workspace, recorded rows.
 
-
-# Source of the state that the controller believes; GIVEN: the caller that moves the robot writes it.
+# Source of the controller's state estimate; GIVEN: written by the caller that moves the robot.
 MEASURED, ESTIMATED, FEEDFORWARD, GIVEN = 0, 1, 2, 3
-# Why a command cannot be carried out.
+# Reasons why a command cannot be executed.
 NO_OBSTACLE, JOINT_LIMIT, RATE_LIMIT, SINGULAR, ATTITUDE = 0, 1, 2, 3, 4
-# State.counts
+# Indices of SnakeState.counts
 MODE = 0  # row of the mode in ControlLaw.grounded
-TICKS = 1  # run
+TICKS = 1  # ticks simulated
 CLAMPED = 2  # joint-ticks clamped at a limit
-CARRIED_OUT = 3  # commands carried out of the present block
-WAITED = 4  # ticks in which the command could not be carried out and the target waited
-SLOWED = 5  # ticks slowed down
-NULL_REDUCED = 6  # ticks with less null-space motion
-WAITED_FOR = 6  # + JOINT_LIMIT … ATTITUDE: ticks that waited for it
+CARRIED_OUT = 3  # executed commands of the current block
+WAITED = 4  # ticks in which the command could not be executed and the target waited
+SLOWED = 5  # ticks with rates scaled down
+NULL_REDUCED = 6  # ticks with reduced null-space motion
+WAITED_FOR = 6  # + JOINT_LIMIT … ATTITUDE: ticks in which the target waited for this reason
 PATH_SLOWED = WAITED_FOR + ATTITUDE + 1  # ticks in which the target moved slower than commanded
-STILL = PATH_SLOWED + 1  # ticks for which the target has now waited without a break
-STILL_FOR = STILL + 1  # what it waited for last
+STILL = PATH_SLOWED + 1  # ticks since the target started to wait
+STILL_FOR = STILL + 1  # reason of the last wait
 COUNTS_SIZE = STILL_FOR + 1
-# State.progress
-DONE = 0  # part of the present row of commands that is carried out, 0 to 1
-LATE = 1  # control periods that a slower target has lost
+# Indices of SnakeState.progress
+DONE = 0  # executed part of the current row of commands, 0 to 1
+LATE = 1  # delay of a slowed target [control periods]
 
 
 class Schedule(NamedTuple):
     """Sampling of the controller."""
 
     period: float  # control period [s]
-    midpoint: int  # 1: the held rates are those of the predicted middle of the period; 0: those of its beginning
-    substeps: int  # integration steps of the plant in one control period
+    midpoint: int  # 1: rates are computed for the predicted middle of the period; 0: for its beginning
+    substeps: int  # integration steps of the plant per control period
     state_source: int  # MEASURED, ESTIMATED, FEEDFORWARD or GIVEN
     null_start_tick: int
 
 
 class SnakeState(NamedTuple):
-    """Everything that changes from tick to tick."""
+    """State of plant and controller."""
 
     base: np.ndarray  # (3,) x, y, yaw at wheel pair 1
     phi: np.ndarray  # (n_phi,)
     rho: np.ndarray  # (n_w,)
     w_target: np.ndarray  # (6,) w_d, integrated from the commanded velocity
-    w_hat: np.ndarray  # (6,) what the controller believes of w
-    phi_hat: np.ndarray  # (n_phi,) what the controller believes of phi
+    w_hat: np.ndarray  # (6,) estimate of w
+    phi_hat: np.ndarray  # (n_phi,) estimate of phi
     counts: np.ndarray  # (COUNTS_SIZE,) int
     progress: np.ndarray  # (2,)
 
@@ -74,12 +73,12 @@ class TickWorkspace(NamedTuple):
     py: np.ndarray
     pose: np.ndarray  # (6,)
     target: np.ndarray  # (6,)
-    rate: np.ndarray  # (6,) rate of the target that is carried out
+    rate: np.ndarray  # (6,) executed rate of the target
     origin: np.ndarray  # (3,)
 
 
 class SnakeTrace(NamedTuple):
-    """Recorded rows; row r belongs to tick r * stride."""
+    """Recorded rows; row r is tick r * stride."""
 
     base: np.ndarray  # (R, 3)
     phi: np.ndarray  # (R, n_phi)
@@ -92,14 +91,14 @@ class SnakeTrace(NamedTuple):
     cost: np.ndarray  # (R,)
     sigma: np.ndarray  # (R,)
     margin: np.ndarray  # (R,)
-    area: np.ndarray  # (R,) of the support polygon
+    area: np.ndarray  # (R,) area of the support polygon
     slip: np.ndarray  # (R,)
     at_limit: np.ndarray  # (R, n_phi)
     centre: np.ndarray  # (R, 3)
 
 
 def new_state(model: SnakeModel) -> SnakeState:
-    """Zero state."""
+    """Return a zero state."""
     joints = model.head_joints + model.base_joints
     return SnakeState(
         base=np.zeros(3),
@@ -114,7 +113,7 @@ def new_state(model: SnakeModel) -> SnakeState:
 
 
 def new_tick_workspace(model: SnakeModel) -> TickWorkspace:
-    """Empty workspace of :func:`run_ticks`."""
+    """Allocate the workspace of :func:`run_ticks`."""
     joints = model.head_joints + model.base_joints
     return TickWorkspace(
         work=new_work(model),
@@ -133,7 +132,7 @@ def new_tick_workspace(model: SnakeModel) -> TickWorkspace:
 
 
 def new_trace(model: SnakeModel, rows: int) -> SnakeTrace:
-    """Empty recording of ``rows`` samples."""
+    """Allocate a recording of ``rows`` samples."""
     joints = model.head_joints + model.base_joints
     return SnakeTrace(
         base=np.zeros((rows, 3)),
@@ -159,12 +158,12 @@ def new_trace(model: SnakeModel, rows: int) -> SnakeTrace:
 
 @internal_kernel
 def base_velocity(model, grounded, yaw, phi, u, ws):
-    """Velocity of the base part that the grounded wheels allow, into ``ws.base_rate``.
+    """Compute the velocity of the base part from the grounded wheels, written to ``ws.base_rate``.
 
-    Joint and wheel rates are given, so the rows (no side slip of every grounded pair, rolling of every grounded active
-    wheel) are more than the three unknowns. Their least-squares solution is the motion of least dissipation when all
-    wheels slip against equal viscous friction; between control ticks, when held rates fit the rows only to first order,
-    it shares the misfit evenly. A consistent u gives the exact motion.
+    Joint and wheel rates are known, so the rows (no side slip of grounded pairs, rolling of grounded active wheels)
+    overdetermine the three unknowns. The least-squares solution is the motion of least dissipation if all wheels slip
+    with equal viscous friction. Between control ticks the held rates satisfy the rows only to first order, and the
+    solution distributes the residual evenly. A consistent u gives the exact motion.
 
     Returns
     -------
@@ -229,9 +228,9 @@ def base_velocity(model, grounded, yaw, phi, u, ws):
 
 @internal_kernel
 def advance_plant(model, grounded, period, substeps, state, u, ws):
-    """Hold u for one control period: joints and wheels exactly, base pose by classical Runge-Kutta 4.
+    """Hold u for one control period: exact joints and wheels, base pose by the classical Runge-Kutta method.
 
-    Returns the largest slip met [m/s].
+    Returns the largest slip [m/s].
     """
     h, slip = period / substeps, 0.0
     for _ in range(substeps):
@@ -257,33 +256,34 @@ def advance_plant(model, grounded, period, substeps, state, u, ws):
     return slip
 
 
-# Part of a command that damping may withhold [m/s, rad/s]; with gain K the head error is WITHHELD / K.
+# Maximum part of a command that damping may remove [m/s, rad/s]; with gain K the head error is WITHHELD / K.
 WITHHELD = 1e-5
-# A target is not turned further than this towards beta = +-90 deg [rad].
+# Limit of |beta|: a target is not rotated closer to +-90 deg [rad].
 BETA_LIMIT = 0.5 * math.pi - 0.02
-# Steps in which a null-space motion that is too fast is reduced, the last of them to nothing.
+# Steps in which a null-space motion that is too fast is reduced; the last step removes it.
 NULL_REDUCTIONS = 4
-# Most trials for a target speed that keeps the limits. Each takes the share ROOM of the speed that the last one allows,
-# but at least LEAST_PART of the last speed, as the prediction at a speed far too high is inaccurate.
+# Maximum number of trials for a target speed within the limits. Each trial uses the fraction ROOM of the speed that the
+# last trial allows, but at least LEAST_PART of the last speed: far above the limits the prediction is inaccurate.
 SLOW_DOWNS = 8
 ROOM = 0.98
 LEAST_PART = 0.25
-# The target waits if it would have to be slower than this share of its commanded speed.
+# Minimum target speed as a fraction of the commanded speed; below it the target waits.
 LEAST_SPEED = 0.01
-# A joint nearer to its limit than this [rad] is at it; a joint further off that blocks a command was too fast.
+# Distance to a joint limit below which the joint is at the limit [rad]; a joint farther away that blocks a command was
+# too fast.
 AT_LIMIT = 0.05
 
 
 @internal_kernel
 def copy(source, target):
-    """target[:] = source; numba's slice assignment would compile its whole error formatting."""
+    """Copy source to target; numba's slice assignment would also compile its error formatting."""
     for i in range(source.shape[0]):
         target[i] = source[i]
 
 
 @internal_kernel
-def believe(model, schedule, state, ws):
-    """What the controller takes for w and phi ([T] IV.C.1 and IV.C.2), into ``state.w_hat`` and ``state.phi_hat``."""
+def update_estimate(model, schedule, state, ws):
+    """Update the controller's estimates of w and phi, ``state.w_hat`` and ``state.phi_hat`` ([T] IV.C.1, IV.C.2)."""
     if schedule.state_source == GIVEN:
         return
     if schedule.state_source != FEEDFORWARD:
@@ -297,7 +297,7 @@ def believe(model, schedule, state, ws):
 
 @internal_kernel
 def obstacle(law, work, joints):
-    """Why ``work.u`` cannot be carried out: SINGULAR, JOINT_LIMIT, RATE_LIMIT or NO_OBSTACLE."""
+    """Return why ``work.u`` cannot be executed: SINGULAR, JOINT_LIMIT, RATE_LIMIT or NO_OBSTACLE."""
     if work.withheld[0] > WITHHELD:
         return SINGULAR
     reason = NO_OBSTACLE
@@ -311,14 +311,15 @@ def obstacle(law, work, joints):
 
 @internal_kernel
 def slow_down(model, law, u, phi):
-    """Scale all rates alike such that no joint passes its rate or comes too fast to its limit.
+    """Scale all rates by one factor so that no joint exceeds its rate limit or approaches its limit too fast.
 
-    The constraints are homogeneous in the rates, so the wheels still roll without slip. Returns True when it had to.
+    The constraints are homogeneous in the rates, so the wheels still roll without slip. Returns True if the factor is
+    less than 1.
     """
     factor = 1.0
     for j in range(phi.shape[0]):
         room = law.limit_rate * max(model.upper[j] - phi[j] if u[j] > 0.0 else phi[j] - model.lower[j], 0.0)
-        # what allocation has put on its bound is there to rounding
+        # allocation puts rates on their bounds only to rounding
         allowed = min(law.rate_limit, room + 1e-9)
         if abs(u[j]) > allowed:
             factor = min(factor, allowed / abs(u[j]))
@@ -329,7 +330,7 @@ def slow_down(model, law, u, phi):
 
 @internal_kernel
 def is_too_fast(model, law, work, reason, phi):
-    """A slower target would pass: joints are too fast, and what comes too fast to a limit is not at it yet."""
+    """Return whether a slower target would help: joints are too fast, and none that blocks is already at its limit."""
     for j in range(phi.shape[0]):
         if work.at_limit[j] == 2:
             left = model.upper[j] - phi[j] if work.u[j] > 0.0 else phi[j] - model.lower[j]
@@ -340,7 +341,7 @@ def is_too_fast(model, law, work, reason, phi):
 
 @internal_kernel
 def fitting_part(model, law, work, phi):
-    """Part of the rates ``work.u`` that keeps the rate limit and comes to no limit too fast, by a step at a time."""
+    """Return the factor on the target speed for the next trial, from the rate limits and the joint limits."""
     part = 1.0
     for j in range(phi.shape[0]):
         allowed, rate = law.rate_limit, abs(work.u[j])
@@ -354,10 +355,10 @@ def fitting_part(model, law, work, phi):
 
 @internal_kernel
 def commanded_rate(velocity, row, done, speed, rate):
-    """Mean rate of the target in a period in which ``speed`` rows of the commands are carried out, 0 to 1.
+    """Compute the mean rate of the target in a period that executes ``speed`` rows of the commands, 0 to 1.
 
-    The first ``done`` of row ``place`` is carried out already; after the last row the rate is zero. The path is that of
-    the rows, whatever the speeds: every row is carried out as a whole, in one period or in several.
+    The fraction ``done`` of row ``row`` is executed already; after the last row the rate is zero. The path does not
+    depend on the speed: every row is executed completely, in one period or several.
     """
     rows = velocity.shape[0]
     first = min(speed, 1.0 - done)
@@ -370,32 +371,45 @@ def commanded_rate(velocity, row, done, speed, rate):
 
 @internal_kernel
 def command(model, law, schedule, state, velocity, moving, slows, ws):
-    """What the controller asks for in one control period: rates of joints and wheels, into ``ws.work.u``.
+    """Compute the joint and wheel rates of one control period, written to ``ws.work.u``.
 
-    Rates of the beginning of the period, held, miss the constraints by O(period) at its end and leave a head error of
-    that order. Those of its predicted middle (``schedule.midpoint``) make it O(period^2). The prediction is the closed
-    loop itself, w~' = w~_d' - K (w~ - w~_d) ([T] eq 15).
+    Rates computed for the beginning of the period and held miss the constraints by O(period) at its end, with a head
+    error of the same order. Rates for the predicted middle (``schedule.midpoint``) reduce it to O(period^2). The
+    prediction uses the closed loop, w~' = w~_d' - K (w~ - w~_d) ([T] eq 15).
 
-    With the allocating limit policy a command is carried out with all six coordinates in step, every joint within its
-    limits and rate. When a joint would be too fast, first the null-space motion is reduced, then (``slows``) the target
-    goes along its path with less speed. Otherwise the target waits where it is, and what is left to do (errors, shape
-    points) is slowed down until it fits. A target that would turn over beta = +-90 deg, where the rates of alpha and
-    gamma have no bound, waits too.
+    With the limit policy "allocate" all six coordinates of a command are executed together, with every joint within
+    its limits and rate. If a joint would be too fast, the null-space motion is reduced first; then, if ``slows``, the
+    target moves along its path at a lower speed. Otherwise the target waits, and the remaining motion (errors, shape
+    points) is slowed down until it is within the limits. A target that would pass beta = +-90 deg, where the rates of
+    alpha and gamma are unbounded, also waits.
 
     Parameters
     ----------
-    velocity : (T, 6) see :func:`run_ticks`.
-    moving : int, 0: the target waits, whatever the commands.
-    slows : int, 1: the target may be slower than commanded.
+    model : SnakeModel
+        Parameters of the robot.
+    law : ControlLaw
+        Constants of the controller.
+    schedule : Schedule
+        Sampling of the controller.
+    state : SnakeState
+        State of plant and controller.
+    velocity : (T, 6) ndarray
+        Commanded rates, see :func:`run_ticks`.
+    moving : int
+        0: the target waits and the commands are ignored.
+    slows : int
+        1: the target may be slower than commanded.
+    ws : TickWorkspace
+        Workspace.
 
     Returns
     -------
     reason : int
-        Why the target waits, see :mod:`dynsim.snake.ticks`; NO_OBSTACLE where it does not.
+        Why the target waits, see :mod:`dynsim.snake.ticks`; NO_OBSTACLE if it does not wait.
     commanded : bool
-        There was something to carry out.
+        Whether the command was not zero.
     speed : float
-        Rows of the commands that are carried out, 0 to 1.
+        Executed rows of the commands, 0 to 1.
     """
     work, period, mode = ws.work, schedule.period, state.counts[MODE]
     phi, phi_hat, w_hat, w_target = state.phi, state.phi_hat, state.w_hat, state.w_target
@@ -404,7 +418,7 @@ def command(model, law, schedule, state, velocity, moving, slows, ws):
     full_gain = law.null_gain if state.counts[TICKS] >= schedule.null_start_tick else 0.0
     null_gain = full_gain
     allocate = law.limit_policy == controller.LIMITS_ALLOCATE
-    believe(model, schedule, state, ws)
+    update_estimate(model, schedule, state, ws)
     reason, waits, reductions, slowed = NO_OBSTACLE, False, 0, False
     row, done, speed, tries = state.counts[CARRIED_OUT], state.progress[DONE], 1.0, 0
     commanded = False
@@ -460,12 +474,12 @@ def command(model, law, schedule, state, velocity, moving, slows, ws):
             break
     state.counts[SLOWED] += int(slowed)
     state.counts[NULL_REDUCED] += int(reductions > 0)
-    if law.limit_policy != controller.LIMITS_NONE:  # the mechanical stop, and what is left when no allocation helps
+    if law.limit_policy != controller.LIMITS_NONE:  # mechanical stops, and rates that allocation could not reduce
         for j in range(joints):
             up = max(model.upper[j] - phi[j], 0.0) / period
             down = min(model.lower[j] - phi[j], 0.0) / period
             if u[j] > up or u[j] < down:
-                # rounding of an allocated bound is no event
+                # do not count rounding of an allocated bound
                 if u[j] > up + 1e-9 or u[j] < down - 1e-9:
                     state.counts[CLAMPED] += 1
                 u[j] = up if u[j] > up else down
@@ -474,16 +488,16 @@ def command(model, law, schedule, state, velocity, moving, slows, ws):
 
 @internal_kernel
 def settle(schedule, state, moving, reason, commanded, speed, ws):
-    """End a control period: beliefs, target, and the place in the commands, after :func:`command` and the plant.
+    """End a control period after :func:`command` and the plant: update estimates, target and command position.
 
-    Returns True when the command was not carried out.
+    Returns True if the command was not executed.
     """
     period, u, rate, done = schedule.period, ws.work.u, ws.rate, state.progress[DONE]
     for j in range(state.phi.shape[0]):
-        state.phi_hat[j] += period * u[j]  # feedforward; overwritten when the joints are read
+        state.phi_hat[j] += period * u[j]  # feedforward; overwritten if the joints are measured
     for i in range(6):
         state.w_target[i] += period * rate[i]
-        state.w_hat[i] += period * rate[i]  # x, y, gamma of the estimated state; the rest is overwritten
+        state.w_hat[i] += period * rate[i]  # x, y, gamma of the estimate; the other coordinates are overwritten
     state.counts[TICKS] += 1
     blocked = reason != NO_OBSTACLE and commanded
     if blocked:
@@ -506,9 +520,10 @@ def settle(schedule, state, moving, reason, commanded, speed, ws):
 
 @internal_kernel
 def tick(model, law, schedule, state, velocity, moving, slows, ws):
-    """One control period of the kinematic robot: evaluate the controller, hold its rates, move the plant.
+    """Run one control period of the kinematic robot: evaluate the controller, hold its rates, move the plant.
 
-    Parameters as of :func:`command`. Returns the slip of the plant [m/s], and whether the command was not carried out.
+    For the parameters see :func:`command`. Returns the slip of the plant [m/s], and whether the command was not
+    executed.
     """
     mode = state.counts[MODE]
     reason, commanded, speed = command(model, law, schedule, state, velocity, moving, slows, ws)
@@ -518,23 +533,22 @@ def tick(model, law, schedule, state, velocity, moving, slows, ws):
 
 @internal_kernel
 def record_command(schedule, state, ws, r, trace):
-    """Write to row r of the trace what the controller has asked for in the period that has just ended."""
+    """Write the commands of the period that has just ended to row r of the trace."""
     copy(ws.work.u, trace.u[r])
     copy(state.w_hat, trace.w_hat[r])
     for j in range(state.phi.shape[0]):
         trace.at_limit[r, j] = ws.work.at_limit[j]
-    # beliefs at the beginning of the period: take back the step that it has added
+    # estimate at the beginning of the period: subtract the step added by settle
     for i in range(6):
         trace.w_hat[r, i] -= schedule.period * ws.rate[i]
 
 
 @kernel
 def command_tick(model, law, schedule, state, velocity, moving, slows, ws, r, trace):
-    """One control period of a robot that something else moves: joints and wheels of ``state`` are what they are told.
+    """Run one control period of an externally simulated robot; joints and wheels of ``state`` are commanded positions.
 
-    Parameters as of :func:`command`. What was told and believed at its beginning goes to row r of the trace, if it is
-    not -1.
-    Returns True when the command was not carried out.
+    For the parameters see :func:`command`. Commands and estimates at the beginning of the period are written to
+    row r of the trace unless r is -1. Returns True if the command was not executed.
     """
     if r >= 0:
         trace.mode[r] = state.counts[MODE]
@@ -554,7 +568,7 @@ def command_tick(model, law, schedule, state, velocity, moving, slows, ws, r, tr
 
 @kernel
 def record_row(model, law, state, ws, r, trace):
-    """Write the state, and what follows from it, to row r of the trace."""
+    """Write the state and derived quantities to row r of the trace."""
     work, chain, support, pose, mode = ws.work, ws.work.chain, ws.work.support, ws.pose, state.counts[MODE]
     phi, rho, grounded = state.phi, state.rho, law.grounded[mode]
     pose_of_point(model, state.base, phi, work.frame, pose)
@@ -576,24 +590,41 @@ def record_row(model, law, state, ws, r, trace):
 
 @kernel
 def run_ticks(model, law, schedule, state, velocity, count, moving, stop, stride, ws, trace):
-    """Run control periods in the present mode.
+    """Run control periods in the current mode.
 
     Parameters
     ----------
-    velocity : (T, 6) commanded rates of the target, a block of one row per period; zero after its end. The next row is
-        taken only when the last one was carried out (``state.counts[CARRIED_OUT]`` is its row, ``state.progress[DONE]``
-        the part of that row that is carried out already).
-    count : int, control periods to run.
-    moving : int, 1: follow the script; 0: the target waits.
-    stop : int, 1: return after a period that was blocked; 0: a target that is too fast is slowed down instead.
-    stride : int, ticks 0, stride, 2 stride, ... of the run are recorded.
+    model : SnakeModel
+        Parameters of the robot.
+    law : ControlLaw
+        Constants of the controller.
+    schedule : Schedule
+        Sampling of the controller.
+    state : SnakeState
+        State of plant and controller.
+    velocity : (T, 6) ndarray
+        Commanded rates of the target [m/s, rad/s], one row per period; zero after the end. A row is executed completely
+        before the next row starts: ``state.counts[CARRIED_OUT]`` is the current row, ``state.progress[DONE]`` its
+        executed fraction.
+    count : int
+        Number of control periods.
+    moving : int
+        1: follow the commands; 0: the target waits.
+    stop : int
+        1: return after a blocked period; 0: slow down a target that is too fast.
+    stride : int
+        Interval between recorded ticks; the first recorded tick of the run is 0.
+    ws : TickWorkspace
+        Workspace.
+    trace : SnakeTrace
+        Recorded rows.
 
     Returns
     -------
     done : int
-        Periods simulated; -1 when the state is no longer finite.
+        Number of simulated periods; -1 if the state is no longer finite.
     blocked : bool
-        The last period was blocked.
+        Whether the last period was blocked.
     """
     base, phi, counts = state.base, state.phi, state.counts
     blocked, slows = False, 0 if stop else 1

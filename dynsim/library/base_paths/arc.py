@@ -1,4 +1,4 @@
-"""Along a circle by an angle, from rest to rest with minimum jerk."""
+"""Circular arc of a mobile base, from rest to rest with minimum jerk."""
 
 from __future__ import annotations
 
@@ -15,20 +15,24 @@ from dynsim.config.base import NonNegative, Positive, StrictConfig
 
 
 class Config(StrictConfig):
-    """The heading turns by ``angle_deg``; the middle of the axle stays ``radius_m`` from the centre of the circle."""
+    """Arc about a centre at distance `radius_m` from the middle of the axle; the heading turns by `angle_deg`."""
 
     type: Literal["arc"]
-    radius_m: float = Field(description="positive: the centre is on the left; negative: on the right; 0: on the spot")
-    angle_deg: float = Field(description="turn of the heading, positive to the left; against the radius: driving back")
-    duration_s: Positive
-    start_s: NonNegative = 0.0
+    radius_m: float = Field(
+        description="radius; positive: centre on the left, negative: centre on the right, 0: turn on the spot"
+    )
+    angle_deg: float = Field(
+        description="turn of the heading, positive to the left; with the sign opposite to radius_m the base reverses"
+    )
+    duration_s: Positive = Field(description="duration of the motion")
+    start_s: NonNegative = Field(default=0.0, description="start time of the motion")
 
     def motion(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Distance R ψ [m] and turn ψ = α s(x) [rad] at times t [s], (T, 2)."""
+        """Return distance R ψ [m] and turn ψ = α s(x) [rad] at times t [s], shape (T, 2)."""
         turn = np.deg2rad(self.angle_deg) * minimum_jerk(t, self.start_s, self.duration_s)
         return np.stack([self.radius_m * turn, turn], axis=1)
 
 
 def build(config: Config, context: BuildContext) -> BasePath:
-    """The path, which its configuration is."""
+    """Return the configuration, which implements the path."""
     return config

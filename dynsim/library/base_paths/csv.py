@@ -1,4 +1,4 @@
-"""A base motion from a CSV file with columns t_s, x_m, y_m, or rates t_s, V_m_s, omega_rad_s."""
+"""Motion of a mobile base from a CSV file with columns t_s, x_m, y_m, or rates t_s, V_m_s, omega_rad_s."""
 
 from __future__ import annotations
 
@@ -20,23 +20,25 @@ from dynsim.record.csv_rows import read_table
 
 PLACES = ("t_s", "x_m", "y_m")
 RATES = ("t_s", "V_m_s", "omega_rad_s")
-# Rows nearer than this to the last point of the curve determine the speed along it, not its shape [m].
+# Rows closer than this to the last point of the curve determine the speed along it, not its shape [m].
 SPACING = 1e-3
-# Turns between such rows that exceed this are corners; rows of a smooth path turn less [rad].
+# Maximum turn between rows of a smooth path; larger turns are corners [rad].
 TURN_LIMIT = np.deg2rad(15.0)
 
 
 class Config(StrictConfig):
-    """Along the places, or with the rates, of ``file``; at rest beyond its ends."""
+    """Motion through the positions, or with the rates, in `file`; at rest before the first and after the last row."""
 
     type: Literal["csv"]
     file: str = Field(
-        description="CSV file, relative to the scenario file, with a header t_s,x_m,y_m or t_s,V_m_s,omega_rad_s"
+        description="path of a CSV file, relative to the scenario file, with the header t_s,x_m,y_m or "
+        "t_s,V_m_s,omega_rad_s"
     )
     frame: Literal["world", "start"] | None = Field(
-        default=None, description="of x_m and y_m (default: world); start: that of the base at its start, x ahead"
+        default=None,
+        description="frame of x_m and y_m: `world`, or `start` (the base at its start, x ahead); default: world",
     )
-    # Read once: an edit of the file does not change a scenario that is already loaded, only the next one.
+    # Read once: an edit of the file does not change a loaded scenario.
     _rows: NDArray[np.float64] = PrivateAttr()
     _are_rates: bool = PrivateAttr()
 
@@ -45,32 +47,32 @@ class Config(StrictConfig):
         columns, rows = read_table(self.file, PLACES, RATES, kind="a path")
         self._rows, self._are_rates = np.array(rows), columns == RATES
         if self._rows[0, 0] < 0.0:
-            raise ValueError(f"{self.file}: begins at {self._rows[0, 0]:g} s, before the run")
+            raise ValueError(f"{self.file}: begins at {self._rows[0, 0]:g} s; times must not be negative")
         if not np.abs(self._rows).max() < 1e9 or np.diff(self._rows[:, 0]).min() < 1e-9:
-            raise ValueError(f"{self.file}: numbers too large, or rows too close in time, for a curve through them")
+            raise ValueError(f"{self.file}: cannot be interpolated: numbers too large, or rows too close in time")
         if self._are_rates and self.frame is not None:
-            raise error_at("frame", "has no effect on rates")
+            raise error_at("frame", "has no effect on rates; remove it")
         return self
 
 
 @dataclass(frozen=True)
 class Rates:
-    """V and ω, shape-preserving cubics of time."""
+    """Motion with the rates V and ω as shape-preserving cubics of time."""
 
     rates: PchipInterpolator
 
     def motion(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Their integrals, distance [m] and turn [rad], at times t [s], (T, 2)."""
+        """Return the integrals of V and ω, distance [m] and turn [rad], at times t [s], shape (T, 2)."""
         return np.asarray(self.rates.antiderivative()(np.clip(t, *self.rates.x[[0, -1]])))
 
 
 def build(config: Config, context: BuildContext) -> BasePath:
-    """The motion that the rows describe.
+    """Build the motion from the rows of the file.
 
     Raises
     ------
     ModelError
-        The places start elsewhere or sideways, or have a corner: with the row.
+        If the positions start away from the base or sideways, or have a corner; the message names the row.
     """
     times, rows = config._rows[:, 0], config._rows[:, 1:]
     if config._are_rates:
@@ -78,7 +80,9 @@ def build(config: Config, context: BuildContext) -> BasePath:
     points = seen_from_start(context.model.robot, rows, config.frame or "world")
     kept, distance = _along(points)
     if len(kept) < 2:
-        raise ModelError(f"{config.file}: no row is {SPACING:g} m from the first; for a base that stands take hold")
+        raise ModelError(
+            f"{config.file}: all rows are within {SPACING:g} m of the first; use type: hold for a stationary base"
+        )
     names = [f"row {k + 1} ({rows[k, 0]:g}, {rows[k, 1]:g}) m, t = {times[k]:g} s" for k in kept]
     try:
         curve = PlaneCurve(points[kept], names, start_limit=TURN_LIMIT, turn_limit=TURN_LIMIT, samples=8)
@@ -88,14 +92,14 @@ def build(config: Config, context: BuildContext) -> BasePath:
 
 
 def _along(points: NDArray[np.float64]) -> tuple[list[int], NDArray[np.float64]]:
-    """Rows that the curve goes through, and the way along their chords at every row [m]; it never goes back."""
+    """Return the rows that define the curve, and the chord length at every row [m], which never decreases."""
     kept = [0]
     begin, *others = points.tolist()
     for k, point in enumerate(others, 1):
         if math.dist(begin, point) >= SPACING:
             begin = point
             kept.append(k)
-    # It ends at the last row, however near.
+    # The curve ends at the last row, even if that row is close.
     kept[1:] = [*kept[1:-1], len(points) - 1] if len(kept) > 1 else []
     chords = np.append(np.hypot(*np.diff(points[kept], axis=0).T), 0.0)
     last = np.searchsorted(kept, np.arange(len(points)), side="right") - 1

@@ -1,4 +1,4 @@
-"""The base stays where it stands."""
+"""Stationary mobile base."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from dynsim.config.base import StrictConfig
 
 
 class Config(StrictConfig):
-    """The wheels hold, as they do without a path."""
+    """Wheels that hold their position, as without a path."""
 
     type: Literal["hold"]
 
     def motion(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
-        """No distance and no turn, (T, 2)."""
+        """Return zero distance and turn at times t [s], shape (T, 2)."""
         return np.zeros((len(t), 2))
 
 
 def build(config: Config, context: BuildContext) -> BasePath:
-    """The path, which its configuration is."""
+    """Return the configuration, which implements the path."""
     return config

@@ -1,4 +1,4 @@
-"""Straight ahead or back by a distance, from rest to rest with minimum jerk."""
+"""Straight line of a mobile base, forward or backward, from rest to rest with minimum jerk."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from dynsim.config.base import NonNegative, Positive, StrictConfig
 
 
 class Config(StrictConfig):
-    """By ``distance_m`` along the heading in ``duration_s``."""
+    """Motion by `distance_m` along the heading within `duration_s`."""
 
     type: Literal["straight"]
-    distance_m: float = Field(description="negative: back")
-    duration_s: Positive
-    start_s: NonNegative = 0.0
+    distance_m: float = Field(description="distance along the heading; negative: backward")
+    duration_s: Positive = Field(description="duration of the motion")
+    start_s: NonNegative = Field(default=0.0, description="start time of the motion")
 
     def motion(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Distance d s(x) [m] and no turn at times t [s], (T, 2)."""
+        """Return distance d s(x) [m] and zero turn at times t [s], shape (T, 2)."""
         distance = self.distance_m * minimum_jerk(t, self.start_s, self.duration_s)
         return np.stack([distance, np.zeros_like(distance)], axis=1)
 
 
 def build(config: Config, context: BuildContext) -> BasePath:
-    """The path, which its configuration is."""
+    """Return the configuration, which implements the path."""
     return config

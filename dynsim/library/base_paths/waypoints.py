@@ -1,4 +1,4 @@
-"""A smooth curve through points on the ground at given times."""
+"""Smooth curve of a mobile base through points on the ground at specified times."""
 
 from __future__ import annotations
 
@@ -17,33 +17,33 @@ Point = Annotated[list[float], Field(min_length=2, max_length=2)]
 
 
 class Config(StrictConfig):
-    """From rest to rest through ``points_m`` at ``times_s``, the heading along the curve; held beyond them."""
+    """Motion from rest to rest through `points_m` at `times_s`, with the heading along the curve."""
 
     type: Literal["waypoints"]
-    times_s: list[NonNegative] = Field(min_length=2)
-    points_m: list[Point] = Field(min_length=2, description="x and y; the first is where the base starts")
+    times_s: list[NonNegative] = Field(min_length=2, description="times of the points, increasing")
+    points_m: list[Point] = Field(min_length=2, description="x and y of the points; the base starts at the first")
     frame: Literal["world", "start"] = Field(
-        default="world", description="of the points; start: that of the base at its start, x ahead"
+        default="world", description="frame of the points: `world`, or `start` (the base at its start, x ahead)"
     )
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         check_waypoints(self.times_s, self.points_m, "points_m")
         if not np.hypot(*np.diff(self.points_m, axis=0).T).min() > 0.0:
-            raise ValueError("two neighbouring points_m are the same; a base that waits takes csv with V_m_s")
+            raise ValueError("points_m has two equal neighbouring points; for a base that waits use csv with V_m_s")
         return self
 
 
 def build(config: Config, context: BuildContext) -> BasePath:
-    """Cubic spline r(u) over the chords, from the heading at the start on, and u(t) quintic between two points.
+    """Build the curve: a cubic spline r(u) over the chords that starts along the heading, and quintics u(t).
 
-    At the points u has no acceleration, and the harmonic mean of the mean speeds before and after; so it never goes
-    back, and between two points alone it is minimum jerk.
+    At the points u(t) has zero acceleration, and its rate is the harmonic mean of the mean speeds before and after.
+    So the base never reverses, and with only two points the motion is minimum jerk.
 
     Raises
     ------
     ModelError
-        The path starts elsewhere or sideways, or has a corner: with the point.
+        If the path starts away from the base or sideways, or has a corner; the message names the point.
     """
     points = seen_from_start(context.model.robot, config.points_m, config.frame)
     entries = enumerate(zip(config.points_m, config.times_s, strict=True))

@@ -1,4 +1,4 @@
-"""Voltage PD on joint references, continuous or sampled (Wang and Minami, eq 56): u = k_p (q_d − q) + k_d (v_d − v)."""
+"""Joint PD control by voltage, continuous or sampled (Wang and Minami, eq 56): u = k_p (q_d − q) + k_d (v_d − v)."""
 
 from __future__ import annotations
 
@@ -32,56 +32,63 @@ ENGINE = "dynamics"
 PathChoice: Any = families.union("path")
 BasePathChoice: Any = families.union("base_path")
 
-# Maximum number of segments of the reference splines: half a gigabyte for each joint.
+# Maximum number of segments of the reference splines: half a gigabyte per joint.
 SEGMENTS_MAX = 10_000_000
 # Minimum number of knots from one waypoint to the next; maximum factor by which they are finer than ``knot_spacing_s``.
 KNOTS_BETWEEN, MOST_FINER = 5.0, 100.0
-# Largest turn of a base between two knots [rad]; with more the spline would deviate from the path.
+# Maximum turn of a base between two knots [rad]; beyond it the spline would deviate from the path.
 TURN_MAX = 0.2
 
 
 class Orientation(StrictConfig):
-    """A rotation of a body in the world."""
+    """Attitude of a body in the world."""
 
-    rpy_deg: Vector3 = Field(description="about x, y, z of the world, in this order")
+    rpy_deg: Vector3 = Field(description="rotation about x, y, z of the world, in this order")
 
     def matrix(self) -> NDArray[np.float64]:
-        """Axes of the body as columns, (3, 3)."""
+        """Return the axes of the body as columns, shape (3, 3)."""
         from dynsim.model.urdf.reader import rotation
 
         return np.asarray(rotation(*np.deg2rad(self.rpy_deg).tolist()))
 
 
 class HandReference(StrictConfig):
-    """A path of the hand, turned into references of ``joints`` by inverse kinematics."""
+    """Hand path that inverse kinematics converts to references of `joints`."""
 
-    path: PathChoice
-    orientation: Orientation | None = Field(default=None, description="of the hand's body or frame all the way")
-    joints: list[str] = Field(
-        description="joints that follow the path, the others hold; none: controller.joints lead the hand along it"
+    path: PathChoice = Field(description="path of the hand")
+    orientation: Orientation | None = Field(
+        default=None, description="constant attitude of the hand's body or frame; default: free"
     )
-    braces: list[str] = Field(default=[], description="contact points that the joints keep on their surfaces meanwhile")
-    tolerance_m: Positive = Field(default=1e-6, description="a target further off than this is unreachable")
+    joints: list[str] = Field(
+        description="joints that follow the path, while the other joints hold; an empty list if `controller.joints` "
+        "moves the hand along the path"
+    )
+    braces: list[str] = Field(default=[], description="contact points that the joints keep on their surfaces")
+    tolerance_m: Positive = Field(
+        default=1e-6, description="maximum position error; a larger error means that the path is out of reach"
+    )
 
 
 class BaseReference(StrictConfig):
-    """A path of the mobile base, turned into references of its wheels."""
+    """Path of the mobile base, converted to references of its wheels."""
 
-    path: BasePathChoice
+    path: BasePathChoice = Field(description="path of the base")
 
 
 class JointPath(StrictConfig):
     """Waypoints of one joint: a cubic spline with zero rate at both ends, constant beyond them."""
 
-    times_s: list[float] = Field(min_length=2)
-    angles_deg: list[float] | None = Field(default=None, min_length=2, description="of a revolute joint")
-    positions_m: list[float] | None = Field(default=None, min_length=2, description="of a prismatic joint")
-    ends: Literal["rest", "free"] = Field(default="rest", description="free: the spline is not bent at its ends")
+    times_s: list[float] = Field(min_length=2, description="times of the waypoints, increasing")
+    angles_deg: list[float] | None = Field(default=None, min_length=2, description="angles of a revolute joint")
+    positions_m: list[float] | None = Field(default=None, min_length=2, description="positions of a prismatic joint")
+    ends: Literal["rest", "free"] = Field(
+        default="rest", description="ends of the spline: `rest` (zero rate) or `free` (zero curvature)"
+    )
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         if (self.angles_deg is None) == (self.positions_m is None):
-            raise error_at("angles_deg", "give either angles_deg or, of a prismatic joint, positions_m")
+            raise error_at("angles_deg", "requires either angles_deg or, for a prismatic joint, positions_m")
         if self.angles_deg is not None:
             check_waypoints(self.times_s, self.angles_deg, "angles_deg")
         elif self.positions_m is not None:
@@ -94,15 +101,15 @@ class JointPath(StrictConfig):
         return np.array(self.positions_m) if self.angles_deg is None else np.deg2rad(self.angles_deg)
 
     def positions(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The spline at times [s] [rad or m]."""
+        """Return the spline [rad or m] at times [s]."""
         return clamped_cubic(self.times_s, self.values, times, self.ends == "rest")
 
 
 class TorquePath(StrictConfig):
     """Waypoints of one torque: a cubic spline with zero slope at both ends, constant beyond them."""
 
-    times_s: list[float] = Field(min_length=2)
-    torques_N_m: list[float] = Field(min_length=2, description="N at a prismatic joint")
+    times_s: list[float] = Field(min_length=2, description="times of the waypoints, increasing")
+    torques_N_m: list[float] = Field(min_length=2, description="torques; N at a prismatic joint")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -111,78 +118,85 @@ class TorquePath(StrictConfig):
 
 
 class Config(StrictConfig):
-    """Gains for all DC motors or one per DC motor; joints without a reference hold their initial position.
+    """PD controller of the joints; joints without a reference hold their initial position.
 
-    Servos follow the same references with the gains of their motors; torque sources follow ``torques``.
+    The gains are for DC motors. Servos follow the references with their own gains; torque sources follow `torques`.
     """
 
     type: Literal["joint_pd"]
     k_p_V_per_rad: NonNegative | list[NonNegative] | None = Field(
-        default=None, description="default: 500; V/m at a prismatic joint"
+        default=None,
+        description="position gain, one value or one per DC motor; V/m at a prismatic joint; default: 500",
     )
     k_d_V_s_per_rad: NonNegative | list[NonNegative] | None = Field(
-        default=None, description="default: 20; V s/m at a prismatic joint"
+        default=None,
+        description="rate gain, one value or one per DC motor; V s/m at a prismatic joint; default: 20",
     )
-    hand: HandReference | None = Field(default=None, description="a path for the hand")
-    base: BaseReference | None = Field(default=None, description="a path for the mobile base; none: it holds")
+    hand: HandReference | None = Field(default=None, description="path of the hand; default: no path")
+    base: BaseReference | None = Field(default=None, description="path of the mobile base; default: it holds")
     operator: OperatorConfig | None = Field(
-        default=None, description="velocities for hand and mobile base, instead of paths"
+        default=None, description="velocities of hand and mobile base, instead of paths; default: no operator"
     )
-    joints: dict[str, JointPath] = Field(default={}, description="waypoints by joint name")
-    torques: dict[str, TorquePath] = Field(default={}, description="torques of motors of type torque by joint name")
+    joints: dict[str, JointPath] = Field(default={}, description="waypoints of the named joints")
+    torques: dict[str, TorquePath] = Field(
+        default={}, description="torques of the named joints with motors of type torque"
+    )
     feed_forward: Literal["none", "gravity", "dynamics"] = Field(
-        default="none", description="planned voltages of DC motors along the references, beside the PD"
+        default="none",
+        description="planned voltages of DC motors along the references, added to the PD: none, for gravity, or for "
+        "the full dynamics",
     )
     brace: Literal["optimal"] | dict[str, Positive] | None = Field(
         default=None,
-        description="normal forces [N] by contact, or `optimal`: planned as `dynamics`, with these braces pressing",
+        description="normal forces [N] of the named contacts, or `optimal` for forces of least heat; voltages are "
+        "then planned for the full dynamics with these forces; default: no planned forces",
     )
-    min_N: NonNegative = Field(default=MIN_N, description="least normal force of every brace under brace: optimal")
+    min_N: NonNegative = Field(default=MIN_N, description="minimum normal force of each brace with `brace: optimal`")
     sample_time_s: Positive | None = Field(
-        default=None, description="commands are taken at this period and held in between; default: continuous"
+        default=None, description="sampling period of the commands, held in between; default: continuous"
     )
-    knot_spacing_s: Positive = Field(default=0.02, description="distance of the knots of the reference splines")
+    knot_spacing_s: Positive = Field(default=0.02, description="knot spacing of the reference splines")
 
     @field_validator("brace", mode="before")
     @classmethod
     def _check_brace(cls, value: Any) -> Any:
-        """Raise one error for a value of neither type, and another that names the invalid force."""
+        """Raise one error for a value of an invalid type, and another that names the invalid force."""
         if isinstance(value, Mapping) and value:
             for name, force in value.items():
                 if isinstance(force, bool) or not isinstance(force, int | float) or not 0.0 < force < np.inf:
-                    raise error_at(
-                        str(name), "must be a normal force above 0 N; leave out a contact that shall not press"
-                    )
+                    raise error_at(str(name), "must be a normal force above 0 N; remove contacts that must not press")
         elif value not in (None, "optimal"):
-            raise ValueError("must be `optimal`, or normal forces [N] by contact, such as {elbow_4: 3.0}")
+            raise ValueError("must be `optimal`, or a mapping of contacts to normal forces [N], e.g. {elbow_4: 3.0}")
         return value
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         both = [name for name in self.joints if self.hand is not None and name in self.hand.joints]
         if both:
-            raise ValueError(f"{both[0]} cannot follow both the hand path and waypoints of its own")
+            raise ValueError(f"{both[0]} cannot follow both the hand path and waypoints in joints; remove one of them")
         if self.hand is not None and not self.hand.joints and not self.joints:
-            raise error_at("hand.joints", "names no joint that follows the path; name some, or give controller.joints")
+            raise error_at("hand.joints", "must list at least one joint; add joints here, or set controller.joints")
         if self.operator is not None:
             planned = [name for name in PLANNED if name in self.model_fields_set and getattr(self, name)]
             planned = [name for name in planned if getattr(self, name) != "none"]
             if planned:
-                raise error_at(planned[0], f"an operator rewrites references on the way; remove {planned[0]}")
+                raise error_at(
+                    planned[0], f"conflicts with operator, which changes the references; remove {planned[0]}"
+                )
         if self.brace is not None and self.feed_forward != "none":
-            raise error_at("feed_forward", "brace plans the whole dynamics; leave feed_forward away")
+            raise error_at("feed_forward", "conflicts with brace, which plans the full dynamics; remove feed_forward")
         if self.min_N != MIN_N and self.brace != "optimal":
-            raise error_at("min_N", "min_N is for brace: optimal; commanded forces are what they are; remove it")
+            raise error_at("min_N", "requires brace: optimal; remove min_N")
         return self
 
 
 def build(config: Config, context: BuildContext) -> JointControl:
-    """Resolve gains and references for the model of the context; long inverse kinematics report to its ``progress``.
+    """Resolve gains and references for the model of the context; inverse kinematics report to its ``progress``.
 
     Raises
     ------
     ModelError
-        If a named joint does not exist or has no motor, or if the number of gains differs from the number of motors.
+        If a joint does not exist or has no motor, or if the number of gains differs from the number of motors.
     UnreachableReference
         If the hand cannot follow its path.
     """
@@ -266,7 +280,7 @@ def _planned(
 def _contact(context: BuildContext, name: str, key: str) -> Contact:
     if name not in context.contacts:
         known = ", ".join(context.contacts) or "none"
-        raise ModelError(f"controller.{key}: no contact {name!r}; those are: {known}", keys=("controller",))
+        raise ModelError(f"controller.{key}: unknown contact {name!r} (contacts: {known})", keys=("controller",))
     return context.contacts[name]
 
 
@@ -280,50 +294,52 @@ def _check_names(config: Config, model: Model) -> None:
         for name in names:
             if name not in driven:
                 raise ModelError(
-                    f"controller.{'.'.join(keys)}: {name!r} is no joint with a motor{suggest(name, driven)}; "
-                    f"those are: {', '.join(driven) or 'none'}",
+                    f"controller.{'.'.join(keys)}: {name!r} is not a joint with a motor{suggest(name, driven)}; "
+                    f"joints with a motor: {', '.join(driven) or 'none'}",
                     keys=("controller", *keys),
                 )
     sources = {motor.joint for motor in robot.motors if isinstance(motor, TorqueSource)}
     for name in [*config.joints, *in_hand]:
         if name in sources:
-            raise ModelError(f"controller: {name!r} has a motor of type torque; give it controller.torques.{name}")
+            raise ModelError(f"controller: {name!r} has a motor of type torque; use controller.torques.{name}")
     for name in config.torques:
         if name not in sources:
-            raise ModelError(f"controller: torques.{name}: only motors of type torque take torques")
+            raise ModelError(f"controller: torques.{name}: requires a motor of type torque; remove it")
     for name in config.joints:
         revolute = robot.links[model.joint_names.index(name)].units[0] == "rad"
         if revolute != (config.joints[name].positions_m is None):
             kind, key = ("revolute", "angles_deg") if revolute else ("prismatic", "positions_m")
-            raise ModelError(f"controller: {name!r} is {kind}; give its waypoints in {key}")
+            raise ModelError(f"controller: {name!r} is {kind}; use {key} for its waypoints")
     wheels = () if robot.base is None else robot.base.wheels
     for wheel in wheels:
         if wheel in in_hand:
-            raise ModelError(f"controller: {wheel!r} is a wheel; the hand's path is for joints of the arm")
+            raise ModelError(f"controller: {wheel!r} is a wheel; only joints of the arm can follow the hand path")
     if config.base is None:
         return
     _check_base(robot, ("controller", "base"))
     for wheel in wheels:
         if wheel in config.joints:
-            raise ModelError(f"controller: {wheel!r} cannot follow both the base's path and waypoints of its own")
+            raise ModelError(
+                f"controller: {wheel!r} cannot follow both the base path and waypoints; remove one of them"
+            )
 
 
 def _check_base(robot: Robot, keys: tuple[str, ...]) -> None:
-    """Raise ModelError if the plant has no base to move, or if the wheels of the base cannot follow references."""
+    """Raise ModelError if the plant has no mobile base, or if its wheels cannot follow references."""
     key, motors = ".".join(keys), {motor.joint: motor for motor in robot.motors}
     if robot.base is None:
-        raise ModelError(f"{key}: the plant has no mobile base; pws_arm has one", keys=keys)
+        raise ModelError(f"{key}: requires a plant with a mobile base, such as pws_arm", keys=keys)
     for wheel in robot.base.wheels:
         if wheel not in motors:
             raise ModelError(f"{key}: {wheel!r} has no motor; set plant.base.wheel.motor", keys=keys)
         if isinstance(motors[wheel], TorqueSource):
-            raise ModelError(f"{key}: {wheel!r} has a motor of type torque, which follows no path", keys=keys)
+            raise ModelError(f"{key}: {wheel!r} has a motor of type torque, which cannot follow a path", keys=keys)
 
 
 def _spacing(config: Config) -> float:
-    """Return the knot spacing [s]: ``knot_spacing_s``, or less if waypoints are too close together to be followed.
+    """Return the knot spacing [s]: ``knot_spacing_s``, or less if waypoints are closer together.
 
-    Splines whose knots are as far apart as the waypoints miss the waypoints by up to half of their change.
+    A spline with knots as far apart as the waypoints misses the waypoints by up to half of the change between them.
     """
     waypoints = [path.times_s for path in config.joints.values()] + [path.times_s for path in config.torques.values()]
     nearest = min((float(np.diff(times).min()) for times in waypoints if len(times) > 1), default=np.inf)
@@ -335,8 +351,8 @@ def _knots(spacing: float, duration: float) -> NDArray[np.float64]:
     segments = duration / spacing
     if segments > SEGMENTS_MAX:
         raise ModelError(
-            f"controller.knot_spacing_s = {spacing:g}: {segments:.3g} knots in {duration:g} s, "
-            f"at most {SEGMENTS_MAX:g} are made; {duration / SEGMENTS_MAX:.3g} would fit"
+            f"controller.knot_spacing_s = {spacing:g}: needs {segments:.3g} knots for {duration:g} s "
+            f"(limit {SEGMENTS_MAX:g}); use at least {duration / SEGMENTS_MAX:.3g}"
         )
     # A quintic spline needs six knots.
     return np.linspace(0.0, duration, max(int(np.ceil(segments)), 6) + 1)
@@ -355,15 +371,15 @@ def _wheel_angles(robot: Robot, path: BasePath, times: NDArray[np.float64]) -> d
     keys = ("controller", "base", "path")
     motion = np.asarray(path.motion(times), dtype=np.float64)
     if motion.shape != (len(times), 2) or not np.isfinite(motion).all():
-        raise ModelError(f"controller.base.path: needs {len(times)} finite distances and turns", keys=keys)
+        raise ModelError(f"controller.base.path: must return {len(times)} finite distances and turns", keys=keys)
     if not motion.any():
         return {}
     turns = np.abs(np.diff(motion[:, 1]))
     if turns.max() > TURN_MAX:
         raise ModelError(
             f"controller.base.path: at t = {times[turns.argmax()]:.3f} s the heading turns by {turns.max():.3g} rad "
-            f"from one knot of the references to the next, {times[1]:.3g} s later (limit {TURN_MAX:g} rad); go slower, "
-            "round it off, or lower controller.knot_spacing_s",
+            f"between two knots of the references, {times[1]:.3g} s apart (limit {TURN_MAX:g} rad); slow down, "
+            "round the path off, or lower controller.knot_spacing_s",
             keys=keys,
         )
     first, _ = base_row(robot)
@@ -374,7 +390,7 @@ def _wheel_angles(robot: Robot, path: BasePath, times: NDArray[np.float64]) -> d
 def _base_coordinates(
     robot: Robot, positions: dict[str, NDArray[np.float64]], times: NDArray[np.float64]
 ) -> NDArray[np.float64] | None:
-    """Return wheel angles [rad], x and y [m] of the base at its reference times, (T, 4); None if the base holds."""
+    """Return wheel angles [rad], x and y [m] of the base at the reference times, (T, 4); None if the base holds."""
     if robot.base is None or not any(wheel in positions for wheel in robot.base.wheels):
         return None
     first, _ = base_row(robot)
@@ -387,21 +403,21 @@ def _base_coordinates(
     return np.hstack([angles, np.vstack([start[2:], ways[:, -1]])])
 
 
-# Keys of the gains, and their defaults. A default is not in the scenario: for servos the key would be an error.
+# Keys and defaults of the gains. The schema has no default because for servos the key would be an error.
 _GAINS = {"k_p": ("k_p_V_per_rad", 500.0), "k_d": ("k_d_V_s_per_rad", 20.0)}
 
 
 def _gains(config: Config, robot: Robot, name: str) -> NDArray[np.float64]:
-    """Return one gain of every motor, (na,): from the controller for DC motors, from a servo, 0 for a torque source."""
+    """Return one gain per motor, shape (na,): from the controller for DC motors, from a servo, 0 for torque sources."""
     (key, default), motors = _GAINS[name], robot.motors
     gain, circuits = getattr(config, key), [isinstance(motor, Motor) for motor in motors]
     if gain is None:
         gain = default
     elif motors and not any(circuits):
-        raise ModelError(f"controller: {key} has no effect: it is for DC motors, servos have gains of their own")
+        raise ModelError(f"controller: {key} requires DC motors (servos use the gains of their motors); remove it")
     if isinstance(gain, list) and len(gain) != sum(circuits):
         kind = "motors" if all(circuits) else "DC motors"
-        raise ModelError(f"controller: {key} has {len(gain)} values, there are {sum(circuits)} {kind}")
+        raise ModelError(f"controller: {key} has {len(gain)} values for {sum(circuits)} {kind}; use one per motor")
     gains = np.array([getattr(motor, name) if isinstance(motor, Servo) else 0.0 for motor in motors])
     gains[np.array(circuits, dtype=bool)] = gain
     return gains

@@ -1,4 +1,4 @@
-"""Configuration of an operator: timed velocities of the hand and of the mobile base, ticks, rate limits, braces."""
+"""Configuration of an operator: timed velocities of the hand and mobile base, tick rate, rate limits and braces."""
 
 from __future__ import annotations
 
@@ -15,44 +15,54 @@ BaseVelocity = Annotated[list[float], Field(min_length=2, max_length=2)]
 
 
 class Velocity(StrictConfig):
-    """One entry of the operator's list; what it does not name stays as it was."""
+    """Velocity command of an operator; omitted velocities do not change."""
 
-    at_s: NonNegative
+    at_s: NonNegative = Field(description="time of the command")
     hand: Vector3 | None = Field(
-        default=None, description="x, y, z [m/s], in axes of the world; on a mobile base in those of the base"
+        default=None,
+        description="hand velocity x, y, z [m/s] in world axes, or on a mobile base in the axes of the base; "
+        "default: unchanged",
     )
-    base: BaseVelocity | None = Field(default=None, description="ahead [m/s], to the left [rad/s]")
+    base: BaseVelocity | None = Field(
+        default=None, description="base velocity: forward [m/s] and turning to the left [rad/s]; default: unchanged"
+    )
 
 
 class OperatorConfig(StrictConfig):
-    """References that follow velocities, rewritten at every tick; the commands may come from a live operator."""
+    """References that follow commanded velocities, from a scenario or a live operator, updated at every tick."""
 
-    rate_hz: Positive = Field(default=100.0, description="ticks, at which references are rewritten")
-    joints: list[str] = Field(default=[], description="joints that follow the hand's velocity; the others hold")
-    braces: list[str] = Field(default=[], description="contact points that the joints keep on their surfaces meanwhile")
+    rate_hz: Positive = Field(default=100.0, description="tick rate, at which the references are updated")
+    joints: list[str] = Field(default=[], description="joints that follow the hand velocity; the other joints hold")
+    braces: list[str] = Field(default=[], description="contact points that the joints keep on their surfaces")
     rate_limit_rad_s: Positive = Field(
-        default=2.0, description="fastest joint rate, m/s of a prismatic joint: a hand that needs more is slower"
+        default=2.0, description="maximum joint rate (m/s at a prismatic joint); it slows the hand down if necessary"
     )
     acceleration_limit_rad_s2: Positive = Field(
-        default=10.0, description="in which joint rates change, m/s² of a prismatic joint: it ends a way to the edge"
+        default=10.0,
+        description="maximum joint acceleration (m/s² at a prismatic joint); limits how fast a joint stops at the "
+        "edge of the workspace",
     )
-    hand_acceleration_m_s2: Positive = Field(default=0.5, description="in which velocities of the hand change")
-    base_acceleration_m_s2: Positive = Field(default=0.5, description="of the base ahead; more may tip it")
-    base_acceleration_rad_s2: Positive = Field(default=2.0, description="of its turns")
-    tolerance_m: Positive = Field(default=1e-6, description="a target further off than this is unreachable: it waits")
-    commands: list[Velocity] = Field(default=[], description="held until the next one")
+    hand_acceleration_m_s2: Positive = Field(default=0.5, description="acceleration of the hand")
+    base_acceleration_m_s2: Positive = Field(
+        default=0.5, description="forward acceleration of the base; larger values may tip it"
+    )
+    base_acceleration_rad_s2: Positive = Field(default=2.0, description="angular acceleration of the base")
+    tolerance_m: Positive = Field(
+        default=1e-6, description="maximum position error; the target waits if it would be exceeded"
+    )
+    commands: list[Velocity] = Field(default=[], description="velocity commands, each held until the next")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         times = [command.at_s for command in self.commands]
         if times != sorted(times):
-            raise ValueError("commands must be in the order of their at_s")
+            raise ValueError("commands must be sorted by at_s")
         if not self.joints and any(command.hand is not None for command in self.commands):
-            raise ValueError("commands of the hand need joints that follow them")
+            raise ValueError("commands for the hand require joints; list the joints that follow")
         return self
 
     def script(self) -> VelocityScript:
-        """The commands; each takes effect at the first tick at or after its time."""
+        """Return the commands; each takes effect at the first tick at or after its time."""
         velocity, current = np.zeros((len(self.commands), VELOCITIES)), np.zeros(VELOCITIES)
         for row, command in zip(velocity, self.commands, strict=True):
             for part, values in ((HAND, command.hand), (BASE, command.base)):

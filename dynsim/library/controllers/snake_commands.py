@@ -1,7 +1,7 @@
-"""Target motion of the snake: the operator's velocity commands and generated paths ([T] IV.C).
+"""Target motion of the snake: an operator's velocity commands and generated paths ([T] IV.C).
 
-A script is a :class:`dynsim.snake.description.CommandSource` whose later commands are known, unlike those of a
-joystick. The script of a live operator is replayed tick by tick as it was recorded.
+A script is a :class:`dynsim.snake.description.CommandSource` with all commands known in advance, unlike a joystick.
+The script of a live operator is replayed tick by tick, as recorded.
 """
 
 from __future__ import annotations
@@ -25,58 +25,69 @@ STATES = {"switching": SWITCHING, "fixing": FIXING}
 
 
 class SnakeCommand(StrictConfig):
-    """One entry of the operator's list; values that it does not name stay as they were."""
+    """Command of an operator; omitted values do not change."""
 
-    at_s: NonNegative
+    at_s: NonNegative = Field(description="time of the command")
     velocity: Coordinates | None = Field(
-        None, description="rates of x, y, z [m/s], alpha, beta, gamma [rad/s]; held until the next command"
+        None,
+        description="rates of x, y, z [m/s] and alpha, beta, gamma [rad/s], held until the next command; "
+        "default: unchanged",
     )
     mode: int | Literal["switching", "fixing"] | None = Field(
-        None, description="fix a mode by its number, or enter the switching or the fixing state"
+        None,
+        description="number of a mode to fix, or `switching` or `fixing` to enter that state; default: unchanged",
     )
-    gripper: Literal["open", "closed"] | None = None
+    gripper: Literal["open", "closed"] | None = Field(None, description="gripper command; default: unchanged")
 
     @field_validator("mode", mode="before")
     @classmethod
     def _state_or_number(cls, value: Any) -> Any:
-        """A state or a whole number; whether the table has the number is for the controller to say."""
+        """Accept a state or an integer; the controller checks that its table has the mode."""
         text = value if isinstance(value, str) else ""
         if value is None or text in STATES or (isinstance(value, int) and not isinstance(value, bool)):
             return value
         near = difflib.get_close_matches(text, STATES, n=1)
         hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise ValueError(f"no such mode{hint}; known: {', '.join(STATES)}, or the number of a mode")
+        raise ValueError(f"unknown mode{hint} (choices: {', '.join(STATES)}, or the number of a mode)")
 
 
 class Ramp(StrictConfig):
-    """Displacement of the target in a straight line of the six coordinates."""
+    """Straight displacement of the target in its six coordinates."""
 
     type: Literal["ramp"]
-    start_s: NonNegative = 0.0
-    duration_s: Positive
-    displacement: Coordinates
-    profile: Profile = "linear"
+    start_s: NonNegative = Field(0.0, description="start time of the motion")
+    duration_s: Positive = Field(description="duration of the motion")
+    displacement: Coordinates = Field(description="displacement in x, y, z [m] and alpha, beta, gamma [rad]")
+    profile: Profile = Field(
+        "linear", description="progress in time: `linear`, or `smooth` (minimum jerk, from rest to rest)"
+    )
 
     def offset(self, s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Displacement at progress s in [0, 1], shape (T, 6)."""
+        """Return the displacement at progress s in [0, 1], shape (T, 6)."""
         return s[:, None] * np.array(self.displacement)
 
 
 class Circle(StrictConfig):
-    """Circle of the target in world axes: on the floor plan, starting along +x, or in the vertical yz plane."""
+    """Circle of the target in world axes: in the horizontal plane, starting along +x, or in the vertical yz plane."""
 
     type: Literal["circle"]
-    start_s: NonNegative = 0.0
-    duration_s: Positive
-    radius_m: Positive
-    turns: float = Field(1.0, description="plane xy: > 0 to the left; plane yz: from the top, > 0 first to the left")
-    plane: Literal["xy", "yz"] = "xy"
-    backward: bool = Field(False, description="plane xy: leave the start point tail first")
-    turn_head: bool = Field(True, description="plane xy: the yaw follows the tangent")
-    profile: Profile = "smooth"
+    start_s: NonNegative = Field(0.0, description="start time of the motion")
+    duration_s: Positive = Field(description="duration of the motion")
+    radius_m: Positive = Field(description="radius")
+    turns: float = Field(
+        1.0,
+        description="number of turns; plane xy: positive to the left; plane yz: starts at the top, positive first "
+        "to the left",
+    )
+    plane: Literal["xy", "yz"] = Field("xy", description="plane of the circle")
+    backward: bool = Field(False, description="plane xy: move backward from the start point")
+    turn_head: bool = Field(True, description="plane xy: the yaw angle follows the tangent")
+    profile: Profile = Field(
+        "smooth", description="progress in time: `linear`, or `smooth` (minimum jerk, from rest to rest)"
+    )
 
     def offset(self, s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Displacement at progress s in [0, 1], shape (T, 6)."""
+        """Return the displacement at progress s in [0, 1], shape (T, 6)."""
         angle = 2.0 * np.pi * self.turns * s
         out = np.zeros((len(s), 6))
         if self.plane == "yz":
@@ -92,22 +103,24 @@ class Circle(StrictConfig):
 
 
 class DoorArc(StrictConfig):
-    """Arc of a door's knob about its hinge, the yaw kept perpendicular to the door ([T] V.D.3).
+    """Arc of a door knob about the hinge, with the yaw perpendicular to the door ([T] V.D.3).
 
-    The robot faces the door along +x; the hinge is ``radius_m`` to the left or right of the target's start.
+    The robot faces the door along +x; the hinge is `radius_m` to the left or right of the target's start.
     """
 
     type: Literal["door_arc"]
-    start_s: NonNegative = 0.0
-    duration_s: Positive
-    radius_m: Positive = Field(description="hinge to knob [m]")
-    angle_deg: Annotated[float, Field(gt=0, le=180)] = 60.0
-    hinge: Literal["left", "right"] = "left"
-    opening: Literal["pull", "push"] = "pull"
-    profile: Profile = "smooth"
+    start_s: NonNegative = Field(0.0, description="start time of the motion")
+    duration_s: Positive = Field(description="duration of the motion")
+    radius_m: Positive = Field(description="distance from hinge to knob")
+    angle_deg: Annotated[float, Field(gt=0, le=180)] = Field(60.0, description="opening angle of the door")
+    hinge: Literal["left", "right"] = Field("left", description="side of the hinge")
+    opening: Literal["pull", "push"] = Field("pull", description="direction in which the door opens")
+    profile: Profile = Field(
+        "smooth", description="progress in time: `linear`, or `smooth` (minimum jerk, from rest to rest)"
+    )
 
     def offset(self, s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Displacement at progress s in [0, 1], shape (T, 6)."""
+        """Return the displacement at progress s in [0, 1], shape (T, 6)."""
         angle = np.deg2rad(self.angle_deg) * s
         left = 1.0 if self.hinge == "left" else -1.0
         away = 1.0 if self.opening == "push" else -1.0
@@ -122,28 +135,28 @@ Path = Annotated[Ramp | Circle | DoorArc, Field(discriminator="type")]
 
 
 class Script(StrictConfig):
-    """Operator's list and target paths of a scenario; their velocities add."""
+    """Operator commands and target paths of a scenario; their velocities add."""
 
-    commands: list[SnakeCommand] = Field(default_factory=list)
-    paths: list[Path] = Field(default_factory=list)
+    commands: list[SnakeCommand] = Field(default_factory=list, description="operator commands, sorted by time")
+    paths: list[Path] = Field(default_factory=list, description="target paths, added to the commands")
 
     @model_validator(mode="after")
     def _in_order(self) -> Script:
         times = [command.at_s for command in self.commands]
         if times != sorted(times):
-            raise ValueError("commands must be in the order of their at_s")
+            raise ValueError("commands must be sorted by at_s")
         return self
 
 
 @dataclass(frozen=True)
 class ScriptedSource:
-    """A command source that knows its future."""
+    """Command source with all commands known in advance."""
 
     commands: Sequence[SnakeCommand]
     paths: Sequence[Ramp | Circle | DoorArc]
 
     def read(self, first: int, count: int, period: float, feedback: Feedback | None = None) -> CommandBlock:
-        """Commands of periods ``first`` to ``first + count - 1``; a script does not look at the robot.
+        """Return the commands of periods ``first`` to ``first + count - 1``; ``feedback`` is ignored.
 
         A command takes effect at the first period that begins at or after its time.
         """
@@ -174,13 +187,13 @@ class ScriptedSource:
 
 @dataclass
 class TimedScript:
-    """A script whose commands keep their times: told period by period, as a live operator tells them."""
+    """Script whose commands keep their times: read one period at a time, as from a live operator."""
 
     script: ScriptedSource
     _all: CommandBlock | None = None
 
     def read(self, first: int, count: int, period: float, feedback: Feedback | None = None) -> CommandBlock:
-        """The commands of one period."""
+        """Return the commands of period ``first``."""
         if self._all is None:
             self._all = self.script.read(0, first + count, period)
         here = slice(first, first + 1)

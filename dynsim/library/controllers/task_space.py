@@ -1,6 +1,6 @@
 """Task-space controller of the articulated mobile robot (Tanaka et al. 2019, III.B, IV.C).
 
-Keys and defaults; the control law is in :mod:`dynsim.snake.controller`.
+This module has the keys and defaults; the control law is in :mod:`dynsim.snake.controller`.
 
 [T]: M. Tanaka et al., "Task-Space Control of Articulated Mobile Robots With a Soft Gripper for Operations", IEEE
 Transactions on Robotics 35(1), 2019. Values that [T] does not give are marked "assumed".
@@ -41,87 +41,115 @@ STATES = {"measured": ss.MEASURED, "estimated": ss.ESTIMATED, "feedforward": ss.
 FORMS = {"paper": controller.NULL_PAPER, "safe": controller.NULL_SAFE}
 
 
-# [T] Table II: mode number -> lifted wheel pairs of the base part (pair 1 at its head).
+# [T] Table II: mode number -> lifted wheel pairs of the base part (pair 1 is next to the head part).
 TABLE_II: dict[int, list[int]] = {1: [3, 6], 2: [6, 7], 3: [5, 6], 4: [4, 5], 5: [3, 4], 6: [2, 3]}
 
 
 class Switching(StrictConfig):
-    """Switching state ([T] IV.C.5); it is entered by a command ``mode: switching``."""
+    """Switching state ([T] IV.C.5), entered by a command with `mode: switching`."""
 
-    policy: Policy = Field("cyclic", description="fixed: never switch; cyclic: [T]'s order; predictive: lowest cost")
-    order: list[StrictInt] = Field(
-        [2, 3, 4, 5, 6], min_length=1, description="mode numbers, also the predictive candidates"
+    policy: Policy = Field(
+        "cyclic",
+        description="choice of the next mode; `fixed`: never switch, `cyclic`: in the order of [T], `predictive`: "
+        "lowest predicted cost",
     )
-    period_s: Positive = Field(1.0, description="Delta T [s]")
-    least_margin_m: float = Field(0.0, description="a mode whose support margin is not above it counts as tipping")
+    order: list[StrictInt] = Field(
+        [2, 3, 4, 5, 6],
+        min_length=1,
+        description="mode numbers: the order of `cyclic` and the candidates of `predictive`",
+    )
+    period_s: Positive = Field(1.0, description="switching period Delta T")
+    least_margin_m: float = Field(
+        0.0, description="minimum support margin; a mode with a smaller or equal margin counts as tipping"
+    )
     when_blocked: bool = Field(
         False,
-        description="enter the switching state by itself when a command cannot be carried out, the target waiting",
+        description="enter the switching state automatically when a command cannot be executed; the target waits",
     )
     release_fraction: Annotated[float, Field(gt=0, lt=1)] = Field(
-        0.6, description="when_blocked: go on when every base joint is within this part of its limit (assumed)"
+        0.6,
+        description="when_blocked: leave the switching state once every base joint is within this fraction of its "
+        "limit (assumed)",
     )
-    prediction_step_s: Positive = Field(0.02, description="step of the predicted period (assumed)")
+    prediction_step_s: Positive = Field(0.02, description="time step of the prediction (assumed)")
 
 
 class Config(Script):
-    """The ``controller:`` section of a scenario; SI units where the key names no other."""
+    """Task-space controller of the snake; SI units unless the key has another unit."""
 
     type: Literal["task_space"] = "task_space"
     period_s: Positive = Field(0.005, description="control period (assumed)")
     rates_at: Literal["middle", "start"] = Field(
-        "middle", description="which point of the period the held rates are computed for (assumed)"
+        "middle", description="instant of the period for which the held rates are computed (assumed)"
     )
-    plant_substeps: int = Field(1, ge=1, le=100)
-    state: Literal["measured", "estimated", "feedforward"] = "measured"
+    plant_substeps: int = Field(1, ge=1, le=100, description="integration steps of the kinematic plant per period")
+    state: Literal["measured", "estimated", "feedforward"] = Field(
+        "measured",
+        description="state for the control law: `measured` pose, pose `estimated` from measured joint angles, or "
+        "`feedforward` from commanded joint angles",
+    )
     gain: Positive | list[Positive] = Field(
-        2.0, description="K [1/s]: one for all, or one per controlled variable (six, then shape points)"
+        2.0, description="gain K [1/s]: one value, or one per controlled variable (six, then the shape points)"
     )
-    null_gain: NonNegative = Field(0.1, description="k_eta")
+    null_gain: NonNegative = Field(0.1, description="null-space gain k_eta")
     null_form: Literal["safe", "paper"] = Field(
-        "safe", description="paper: eq 14; safe: eq 14 with W^-1 eta, which cannot raise the cost whatever the weights"
+        "safe",
+        description="null-space motion; `paper`: eq 14, `safe`: eq 14 with W^-1 eta, which never increases the cost",
     )
-    null_start_s: NonNegative = 0.0
-    weight_joint: Positive | list[Positive] = Field(1.0, description="W: one for all joints, or one per joint")
-    weight_wheel: Positive = Field(0.01, description="W of the active wheels; small, or the joint rates chatter")
+    null_start_s: NonNegative = Field(0.0, description="start time of the null-space motion")
+    weight_joint: Positive | list[Positive] = Field(
+        1.0, description="weight W of the joint rates: one value, or one per joint"
+    )
+    weight_wheel: Positive = Field(
+        0.01, description="weight W of the active wheels; with large values the joint rates chatter"
+    )
     cost: Literal["eq19", "eq20", "eq20_min"] = Field(
-        "eq19", description="eq20: 1/norm of the signed distances, as printed; eq20_min: 1/smallest distance, smoothed"
+        "eq19",
+        description="null-space cost; `eq19`: joint angles, `eq20`: adds 1/norm of the signed support distances, as "
+        "printed, `eq20_min`: adds 1/smallest support distance, smoothed",
     )
     cost_matrix: list[NonNegative] | None = Field(
-        None, description="diagonal of K_V; default [T] V.B: head yaw 15, head pitch 0.015, base 9.6, 4.8, 2.4, ..."
+        None,
+        description="diagonal of K_V; default: [T] V.B (head yaw 15, head pitch 0.015, base 9.6, 4.8, 2.4, ...)",
     )
-    cost_angle_weight: NonNegative = Field(1.0, description="a_1 of eq 20 (assumed)")
-    cost_support_weight_m: NonNegative = Field(1.0, description="a_2 of eq 20 [m] (assumed)")
+    cost_angle_weight: NonNegative = Field(1.0, description="weight a_1 of the joint angles in eq 20 (assumed)")
+    cost_support_weight_m: NonNegative = Field(
+        1.0, description="weight a_2 of the support distances in eq 20 (assumed)"
+    )
     limit_policy: Literal["none", "saturate", "allocate"] = Field(
         "allocate",
-        description="allocate: a joint at its limit leaves the allocation, and when that is impossible the target "
-        "waits; saturate: joints are clamped; none: limits are ignored",
+        description="treatment of joint limits; `allocate`: a joint at its limit is excluded from the allocation, and "
+        "the target waits if no solution is left, `saturate`: joints are clamped, `none`: limits are ignored",
     )
     rate_limit_rad_s: Positive = Field(
-        4.7, description="fastest joint rate [rad/s]: no-load speed of the MX-106 at 12 V, 45 rpm (data sheet)"
+        4.7, description="maximum joint rate: no-load speed of the MX-106 at 12 V, 45 rpm (data sheet)"
     )
     limit_rate_per_s: Positive = Field(
-        20.0, description="a joint approaches its limit no faster than this [1/s] times the angle left (assumed)"
+        20.0, description="maximum joint rate towards a limit, per angle left to the limit [1/s] (assumed)"
     )
     damping_sigma: NonNegative = Field(
         0.2,
-        description="part of the smallest singular value of B W^-1/2 in the reference posture (head raised, base "
-        "straight) below which the weakest direction is damped (assumed)",
+        description="singular value below which the weakest direction is damped, as a fraction of the smallest "
+        "singular value of B W^-1/2 in the reference posture (head raised, base straight) (assumed)",
     )
     damping_factor: NonNegative = Field(
-        0.4, description="its damping at the singularity, in parts of the same singular value (assumed)"
+        0.4, description="damping at the singularity, as a fraction of the same singular value (assumed)"
     )
     shape_points_rad: dict[str, float] | None = Field(
-        None, description="shape controllable points: joint name -> target [rad]; default the last head joint, 110 deg"
+        None,
+        description="shape controllable points: target angle [rad] for each named joint; default: 110 deg for the "
+        "last head joint",
     )
-    modes: dict[int, list[int]] | None = Field(None, description="mode number -> lifted wheel pairs; default Table II")
-    fixing_mode: StrictInt = 1
+    modes: dict[int, list[int]] | None = Field(
+        None, description="lifted wheel pairs for each mode number; default: [T] Table II"
+    )
+    fixing_mode: StrictInt = Field(1, description="mode of the fixing state, also the mode at the start")
     commands_wait: bool = Field(
         True,
-        description="commands wait while the target waits; false: they keep their times, and what the target cannot "
-        "follow is lost, as of a live operator",
+        description="commands are delayed while the target waits; false: commands keep their times, and motion that "
+        "the target cannot follow is lost, as with a live operator",
     )
-    switching: Switching = Field(default_factory=Switching)
+    switching: Switching = Field(default_factory=Switching, description="switching state")
 
     @field_validator("cost", mode="before")
     @classmethod
@@ -130,22 +158,22 @@ class Config(Script):
 
     @model_validator(mode="after")
     def _known_modes(self) -> Config:
-        """Every mode that a command asks for is in the table, also after the end of the run."""
+        """Check that all commanded modes are in the table, even after the end of the run."""
         table = TABLE_II if self.modes is None else self.modes
         for i, command in enumerate(self.commands):
             if isinstance(command.mode, int) and command.mode not in table:
                 known = ", ".join(map(str, [*MODE_STATES, *table]))
-                raise error_at(f"commands.{i}.mode", f"no mode {command.mode}; known: {known}")
+                raise error_at(f"commands.{i}.mode", f"unknown mode {command.mode} (choices: {known})")
         return self
 
 
 def build(config: Config, context: BuildContext) -> TaskSpaceController:
-    """Controller for the snake of the context.
+    """Build the controller for the snake of the context.
 
     Raises
     ------
     ModelError
-        Lists or names that do not fit the robot, or a mode in which the robot cannot be controlled (see
+        If lists or names do not fit the robot, or the robot is not controllable in a mode (see
         :func:`check_controllable`).
     """
     plant = context.snake
@@ -155,9 +183,8 @@ def build(config: Config, context: BuildContext) -> TaskSpaceController:
     needed = max(pair for lifted in TABLE_II.values() for pair in lifted)
     if config.modes is None and plant.pairs < needed:
         raise ModelError(
-            f"controller.modes is not given, and the default table ([T] Table II) needs {needed} wheel pairs; this "
-            f"robot has {plant.pairs}: write its own controller.modes, e.g. {{1: []}}, and controller.switching.order, "
-            "e.g. [1]"
+            f"controller.modes: the default table ([T] Table II) needs {needed} wheel pairs, but this robot has "
+            f"{plant.pairs}; set controller.modes, e.g. {{1: []}}, and controller.switching.order, e.g. [1]"
         )
     modes = ModeTable.from_lifted(TABLE_II if config.modes is None else config.modes, plant.pairs)
     fixing_row = modes.row(config.fixing_mode, "controller.fixing_mode")
@@ -223,9 +250,9 @@ def build(config: Config, context: BuildContext) -> TaskSpaceController:
 
 
 def reference_sigma(model: SnakeModel, law: ControlLaw, row: int, plant: SnakeDescription) -> float:
-    """Smallest singular value of B~ W^(-1/2) with the head raised and the base straight.
+    """Return the smallest singular value of B~ W^(-1/2) with the head raised and the base straight.
 
-    It falls with the length of the chain, the links and the weights; damping is measured by it, not in metres.
+    It depends on the number and length of the links and on the weights, so it is the unit of the damping parameters.
     """
     work, pose, joints = new_work(model), np.zeros(6), reals(plant.reference_joints)
     pose_of_point(model, np.zeros(3), joints, work.frame, pose)
@@ -235,17 +262,17 @@ def reference_sigma(model: SnakeModel, law: ControlLaw, row: int, plant: SnakeDe
 def check_controllable(
     model: SnakeModel, law: ControlLaw, modes: ModeTable, fixing_row: int, plant: SnakeDescription
 ) -> None:
-    """Refuse a table with a mode in which A~ w~' = B~ u ([T] eq 9) has no solution for every w~'.
+    """Check for every mode that A~ w~' = B~ u ([T] eq 9) has a solution for all w~'.
 
     The side-slip row of wheel pair 1 and the three ground-contact rows contain head joints only. Every shape
-    controllable point of the head part takes one of these joints away, so n_h >= 4 ([T] eq 1) becomes
-    n_h - m_h >= 4 (3 in a mode that lifts pair 1). Every other loss of rank is found numerically, at seeded random
-    postures: a rank that is low at all of them is low everywhere.
+    controllable point of the head part fixes one of these joints, so n_h >= 4 ([T] eq 1) becomes n_h - m_h >= 4
+    (3 in a mode that lifts pair 1). Any other loss of rank is detected numerically at seeded random postures: a rank
+    that is low at all of them is low everywhere.
 
     Raises
     ------
     ModelError
-        With mode, equation and numbers.
+        If a mode fails the check. The message contains the mode, the equation and the numbers.
     """
     n_h, n_b, names = model.head_joints, model.base_joints, plant.joint_names
     head_shape = [names[j] for j in law.shape_joints if j < n_h]
@@ -257,20 +284,20 @@ def check_controllable(
         if n_b - lifted + model.wheels - lifted_active < 2:
             raise ModelError(
                 f"{mode}: n_b - lifted pairs + n_w - lifted active wheels = {n_b} - {lifted} + {model.wheels} - "
-                f"{lifted_active} < 2: A loses its full column rank ([T] eq 16); lift fewer wheels"
+                f"{lifted_active} < 2: A does not have full column rank ([T] eq 16); lift fewer wheels"
             )
         needed = 4 if down[0] else 3
         if n_h - len(head_shape) < needed:
             raise ModelError(
                 f"{mode}: with shape controllable points {', '.join(head_shape)} only {n_h - len(head_shape)} of the "
-                f"n_h = {n_h} head joints are free, but the ground-contact and side-slip rows that contain head joints "
-                f"only need {needed} (more than [T] eq 1 asks); raise head_joints or drop shape points"
+                f"n_h = {n_h} head joints are free, but the ground-contact and side-slip rows that contain only head "
+                f"joints need {needed} (more than [T] eq 1 requires); raise head_joints or remove shape points"
             )
         redundancy = n_h + lifted + lifted_active - 4 - len(law.shape_joints)
         if redundancy < 0:
             raise ModelError(
                 f"{mode}: {-redundancy} more rows than inputs (n_h + lifted pairs + lifted active wheels - 4 - shape "
-                f"points = {redundancy}): no joint and wheel rates satisfy every row; lift wheels or drop shape points"
+                f"points = {redundancy}): no joint and wheel rates satisfy all rows; lift wheels or remove shape points"
             )
         postures = [random.uniform(0.4 * model.lower, 0.4 * model.upper) for _ in range(4)]
         samples = [conditioning(model, law, row, np.zeros(3), phi) for phi in postures]
@@ -278,13 +305,14 @@ def check_controllable(
         if rank_a < 6 + len(law.shape_joints) or rank_b < samples[0].rows:
             raise ModelError(
                 f"{mode}: rank of A is {rank_a} of {6 + len(law.shape_joints)}, rank of B is {rank_b} of "
-                f"{samples[0].rows} at random postures: the controlled variables are not independent"
+                f"{samples[0].rows} at random postures: the controlled variables are not independent; change the mode "
+                "or remove shape points"
             )
     start = conditioning(model, law, fixing_row, plant.initial_base_pose, plant.initial_joints)
     if start.rank_B < start.rows or start.rank_A < 6 + len(law.shape_joints):
         raise ModelError(
             f"mode {modes.numbers[fixing_row]}: the initial posture is singular (rank of A {start.rank_A}, rank of B "
-            f"{start.rank_B} of {start.rows}): change plant.initial_joints_rad or the shape points"
+            f"{start.rank_B} of {start.rows}); change plant.initial_joints_rad or the shape points"
         )
 
 
@@ -295,16 +323,16 @@ def _shape_points(config: Config, plant: SnakeDescription, model: SnakeModel) ->
         points = {names[model.head_joints - 1]: float(np.deg2rad(110.0))}  # [T] IV.C.3
     for name, target in points.items():
         if name not in names:
-            raise ModelError(f"controller.shape_points_rad: no joint {name!r}; the joints are {', '.join(names)}")
+            raise ModelError(f"controller.shape_points_rad: unknown joint {name!r} (joints: {', '.join(names)})")
         j = names.index(name)
         if not model.lower[j] <= target <= model.upper[j]:
             raise ModelError(
-                f"controller.shape_points_rad: {name} = {target:.4f} is beyond its limit of {model.upper[j]:.4f} rad"
+                f"controller.shape_points_rad: {name} = {target:.4f} rad exceeds its limit of {model.upper[j]:.4f} rad"
             )
     return [names.index(name) for name in points], list(points.values())
 
 
 def _per_entry(key: str, value: float | list[float], count: int) -> NDArray[np.float64]:
     if isinstance(value, list) and len(value) != count:
-        raise ModelError(f"controller.{key} has {len(value)} entries, {count} are needed")
+        raise ModelError(f"controller.{key} must have {count} entries, got {len(value)}")
     return np.ones(count) * np.asarray(value)

@@ -1,1 +1,1 @@
-"""Motors, one file per parameter set or kind: a ``Config`` with the defaults of its source, and ``build``."""
+"""Motors, one file per kind or parameter set: a ``Config`` with defaults from its source, and ``build``."""

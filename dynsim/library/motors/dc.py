@@ -1,4 +1,4 @@
-"""A brushed DC motor of which the scenario gives every parameter."""
+"""Brushed DC motor with all parameters from the scenario."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from dynsim.model.drives import Motor, MotorParameters
 
 
 class Config(MotorParameters):
-    """All parameters of the motor, none assumed."""
+    """Brushed DC motor; no parameter is assumed."""
 
     type: Literal["dc"]
 
 
 def build(config: Config, context: BuildContext) -> Motor:
-    """The motor on ``context.joint``."""
+    """Return the motor of ``context.joint``."""
     return config.motor(context.joint)

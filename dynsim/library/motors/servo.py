@@ -1,4 +1,4 @@
-"""A position servo from its data sheet: voltage loop, limits of voltage, current and torque, friction of the gear."""
+"""Position servo from its data sheet: voltage loop, limits of voltage, current and torque, and gear friction."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from dynsim.model.drives import Servo, ServoParameters
 
 
 class Config(ServoParameters):
-    """Everything at the output shaft: K_m = U / ω_0 and R = U K_m / τ_stall at ``voltage_V``, which limits the voltage.
+    """Servo with all values at the output shaft: K_m = U / ω_0 and R = U K_m / τ_stall at `voltage_V`.
 
-    The gains are the servo's own; those of the controller are for DC motors.
+    `voltage_V` also limits the voltage. A servo uses its own gains; the gains of the controller are for DC motors.
     """
 
     type: Literal["servo"]
 
 
 def build(config: Config, context: BuildContext) -> Servo:
-    """The servo on ``context.joint``."""
+    """Return the servo of ``context.joint``."""
     return config.servo(context.joint)

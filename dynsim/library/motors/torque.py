@@ -1,4 +1,4 @@
-"""An ideal torque source commanded by the controller: no circuit, no gear; its power is τ v."""
+"""Ideal torque source commanded by the controller, without circuit or gear; its power is τ v."""
 
 from __future__ import annotations
 
@@ -12,13 +12,15 @@ from dynsim.model.drives import DriveParameters, TorqueSource, limit
 
 
 class Config(DriveParameters):
-    """The torque is the reference of the motor (``controller.torques``), within the limit."""
+    """Torque source that follows `controller.torques` within its limit."""
 
     type: Literal["torque"]
-    limit_N_m: Positive | None = Field(default=None, description="N at a prismatic joint")
+    limit_N_m: Positive | None = Field(
+        default=None, description="torque limit; N at a prismatic joint; default: no limit"
+    )
 
 
 def build(config: Config, context: BuildContext) -> TorqueSource:
-    """The torque on ``context.joint``."""
+    """Return the torque source of ``context.joint``."""
     torque_limit, nominal = limit(config.limit_N_m), config.nominal_torque
     return TorqueSource(context.joint, torque_limit, config.mass_kg, config.mass_point, nominal)

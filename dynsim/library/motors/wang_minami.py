@@ -1,8 +1,10 @@
-"""The joint motors of Wang and Minami's arm (their section IV, "actual motor's specifications"); no voltage limit."""
+"""Joint motor of Wang and Minami's arm (their section IV, "actual motor's specifications"); no voltage limit."""
 
 from __future__ import annotations
 
 from typing import Literal
+
+from pydantic import Field
 
 from dynsim.compile.protocols import BuildContext
 from dynsim.config.base import NonNegative, Positive
@@ -10,17 +12,19 @@ from dynsim.model.drives import Motor, MotorParameters
 
 
 class Config(MotorParameters):
-    """K = 0.203 N m/A, R = 1.1 Ω, L = 1.7 mH, I_m = 1.64e-4 kg m², k = 3, d_m = 0.01 N m s/rad."""
+    """DC motor: K = 0.203 N m/A, R = 1.1 Ω, L = 1.7 mH, I_m = 1.64e-4 kg m², k = 3, d_m = 0.01 N m s/rad."""
 
     type: Literal["wang_minami"]
-    torque_constant_N_m_per_A: Positive = 0.203
-    resistance_ohm: Positive = 1.1
-    inductance_H: Positive = 0.0017
-    rotor_inertia_kg_m2: NonNegative = 1.64e-4
-    gear_ratio: Positive = 3.0
-    gear_damping_N_m_s_per_rad: NonNegative = 0.01
+    torque_constant_N_m_per_A: Positive = Field(default=0.203, description="torque constant K")
+    resistance_ohm: Positive = Field(default=1.1, description="armature resistance R")
+    inductance_H: Positive = Field(default=0.0017, description="armature inductance L")
+    rotor_inertia_kg_m2: NonNegative = Field(default=1.64e-4, description="rotor inertia I_m, on the motor side")
+    gear_ratio: Positive = Field(default=3.0, description="gear ratio k: motor turns per joint turn")
+    gear_damping_N_m_s_per_rad: NonNegative = Field(
+        default=0.01, description="viscous damping d_m of the gear, on the motor side"
+    )
 
 
 def build(config: Config, context: BuildContext) -> Motor:
-    """The motor on ``context.joint``."""
+    """Return the motor of ``context.joint``."""
     return config.motor(context.joint)

@@ -1,4 +1,4 @@
-"""A circle about a centre in a plane of any normal."""
+"""Circle of the hand in a plane with any normal."""
 
 from __future__ import annotations
 
@@ -14,15 +14,18 @@ from dynsim.config.base import Positive, StrictConfig, Vector3, unit_vector
 
 
 class Config(StrictConfig):
-    """Counter-clockwise about ``normal``, beginning at the centre plus ``radius_m`` along ``start``."""
+    """Circle about `center_m`, counter-clockwise about `normal`, that starts in the direction `start`."""
 
     type: Literal["circle"]
-    center_m: Vector3
-    radius_m: Positive
-    normal: Vector3 = [0.0, 0.0, 1.0]
-    start: Vector3 = Field(default=[1.0, 0.0, 0.0], description="direction from the centre; its part in the plane")
-    period_s: Positive = 10.0
-    clockwise: bool = False
+    center_m: Vector3 = Field(description="centre in the world")
+    radius_m: Positive = Field(description="radius")
+    normal: Vector3 = Field(default=[0.0, 0.0, 1.0], description="normal of the plane")
+    start: Vector3 = Field(
+        default=[1.0, 0.0, 0.0],
+        description="direction from the centre to the first point, projected onto the plane",
+    )
+    period_s: Positive = Field(default=10.0, description="duration of one turn")
+    clockwise: bool = Field(default=False, description="clockwise about the normal")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -36,7 +39,7 @@ class Config(StrictConfig):
         return first, np.cross(normal, first)
 
     def position(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
-        """c + R (e₁ cos ωt ± e₂ sin ωt) at times t [s], shape (T, 3) [m]."""
+        """Return c + R (e₁ cos ωt ± e₂ sin ωt) at times t [s], shape (T, 3) [m]."""
         first, second = self._directions()
         angle = 2.0 * np.pi / self.period_s * np.asarray(t) * (-1.0 if self.clockwise else 1.0)
         return np.array(self.center_m) + self.radius_m * (
@@ -45,5 +48,5 @@ class Config(StrictConfig):
 
 
 def build(config: Config, context: BuildContext) -> HandPath:
-    """The path, which its configuration is."""
+    """Return the configuration, which implements the path."""
     return config

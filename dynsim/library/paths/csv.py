@@ -1,4 +1,4 @@
-"""A hand path from a CSV file with the columns t_s, x_m, y_m, z_m."""
+"""Hand path from a CSV file with the columns t_s, x_m, y_m, z_m."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ COLUMNS = ("t_s", "x_m", "y_m", "z_m")
 
 
 class Config(StrictConfig):
-    """Shape-preserving cubic through the rows of ``file``, held beyond its ends."""
+    """Shape-preserving cubic through the rows of `file`, constant before the first and after the last row."""
 
     type: Literal["csv"]
-    file: str = Field(description="CSV file, relative to the scenario file, with a header t_s,x_m,y_m,z_m")
-    # Read once: an edit of the file does not change a scenario that is already loaded, only the next one.
+    file: str = Field(description="path of a CSV file, relative to the scenario file, with the header t_s,x_m,y_m,z_m")
+    # Read once: an edit of the file does not change a loaded scenario.
     _rows: list[list[float]] = PrivateAttr()
 
     @model_validator(mode="after")
@@ -32,13 +32,13 @@ class Config(StrictConfig):
         return self
 
     def position(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The curve at times t [s], shape (T, 3) [m]."""
+        """Return the positions at times t [s], shape (T, 3) [m]."""
         curve = _curve(self._rows)
         return curve(np.clip(t, curve.x[0], curve.x[-1]))
 
 
 def build(config: Config, context: BuildContext) -> HandPath:
-    """The path, which its configuration is."""
+    """Return the configuration, which implements the path."""
     return config
 
 
@@ -48,7 +48,7 @@ def _curve(rows: list[list[float]]) -> PchipInterpolator:
 
 
 def _check_curve(rows: list[list[float]], file: str) -> None:
-    """ValueError unless rounding leaves the curve finite and on its rows."""
+    """Raise ValueError if rounding makes the curve infinite or miss its rows."""
     table = np.array(rows)
     try:
         with np.errstate(all="ignore"):
@@ -57,4 +57,4 @@ def _check_curve(rows: list[list[float]], file: str) -> None:
     except ValueError:  # slopes that overflow
         met = False
     if not (met and np.isfinite(curve.c).all()):
-        raise ValueError(f"{file}: numbers too large, or rows too close in time, for a curve through them")
+        raise ValueError(f"{file}: cannot be interpolated: numbers too large, or rows too close in time")

@@ -1,4 +1,4 @@
-"""A straight line from one point to another, at rest at both ends."""
+"""Straight line of the hand between two points, from rest to rest."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from dynsim.compile.control import HandPath
 from dynsim.compile.protocols import BuildContext
@@ -14,20 +15,20 @@ from dynsim.config.base import NonNegative, Positive, StrictConfig, Vector3
 
 
 class Config(StrictConfig):
-    """From ``from_m`` to ``to_m`` in ``duration_s``, along a quintic (no velocity or acceleration at the ends)."""
+    """Line from `from_m` to `to_m` within `duration_s`: a quintic with zero velocity and acceleration at the ends."""
 
     type: Literal["line"]
-    from_m: Vector3
-    to_m: Vector3
-    start_s: NonNegative = 0.0
-    duration_s: Positive
+    from_m: Vector3 = Field(description="first point in the world")
+    to_m: Vector3 = Field(description="last point in the world")
+    start_s: NonNegative = Field(default=0.0, description="start time of the motion")
+    duration_s: Positive = Field(description="duration of the motion")
 
     def position(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
-        """a + (b − a) s(x) with s = 10x³ − 15x⁴ + 6x⁵ at times t [s], shape (T, 3) [m]."""
+        """Return a + (b − a) s(x) with s = 10x³ − 15x⁴ + 6x⁵ at times t [s], shape (T, 3) [m]."""
         a, b = np.array(self.from_m), np.array(self.to_m)
         return a + np.outer(minimum_jerk(t, self.start_s, self.duration_s), b - a)
 
 
 def build(config: Config, context: BuildContext) -> HandPath:
-    """The path, which its configuration is."""
+    """Return the configuration, which implements the path."""
     return config

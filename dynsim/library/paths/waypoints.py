@@ -1,4 +1,4 @@
-"""A smooth curve through points at given times."""
+"""Smooth curve of the hand through points at specified times."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from dynsim.config.base import StrictConfig, Vector3, check_waypoints
 
 
 class Config(StrictConfig):
-    """Cubic spline through ``points_m`` at ``times_s``, at rest at both ends and held beyond them."""
+    """Cubic spline through `points_m` at `times_s`, at rest at both ends and constant beyond them."""
 
     type: Literal["waypoints"]
-    times_s: list[float] = Field(min_length=2)
-    points_m: list[Vector3] = Field(min_length=2)
+    times_s: list[float] = Field(min_length=2, description="times of the points, increasing")
+    points_m: list[Vector3] = Field(min_length=2, description="points in the world")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -27,10 +27,10 @@ class Config(StrictConfig):
         return self
 
     def position(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The spline at times t [s], shape (T, 3) [m]."""
+        """Return the positions at times t [s], shape (T, 3) [m]."""
         return clamped_cubic(self.times_s, np.array(self.points_m), t)
 
 
 def build(config: Config, context: BuildContext) -> HandPath:
-    """The path, which its configuration is."""
+    """Return the configuration, which implements the path."""
     return config

@@ -1,4 +1,4 @@
-"""An arm on a wheeled base with power wheeled steering (PWS): two wheels, each may be driven, and a caster.
+"""Arm on a wheeled base with power wheeled steering (PWS): two wheels with optional motors, and a caster.
 
 The wheels roll without slip ([WM] II.E, eqs 36–50).
 """
@@ -32,97 +32,114 @@ ArmChoice: Any = families.union("plant", only=("serial_arm", "urdf_arm"))
 
 
 class WheelConfig(StrictConfig):
-    """Both wheels: solid discs at axle height r, each on its own motor."""
+    """Both wheels: solid discs with separate motors, at axle height r."""
 
-    mass_kg: NonNegative = 0.25
-    radius_m: Positive = 0.05
-    inertia_axle_kg_m2: NonNegative | None = Field(default=None, description="about the axle; default: m r²/2")
-    inertia_across_kg_m2: NonNegative | None = Field(default=None, description="across it; default: m r²/4")
-    damping_N_m_s_per_rad: NonNegative = Field(default=0.0, description="viscous loss of each wheel's joint")
-    motor: MotorChoice | None = Field(default=None, description="of each wheel; none: it rolls free")
+    mass_kg: NonNegative = Field(default=0.25, description="mass of each wheel")
+    radius_m: Positive = Field(default=0.05, description="radius r of each wheel")
+    inertia_axle_kg_m2: NonNegative | None = Field(
+        default=None, description="moment of inertia about the axle; default: m r²/2"
+    )
+    inertia_across_kg_m2: NonNegative | None = Field(
+        default=None, description="moment of inertia across the axle; default: m r²/4"
+    )
+    damping_N_m_s_per_rad: NonNegative = Field(default=0.0, description="viscous damping of each wheel")
+    motor: MotorChoice | None = Field(default=None, description="motor of each wheel; default: no motor")
 
     @model_validator(mode="after")
     def _check_moments(self) -> Self:
         axle, across = self.moments
         if axle > 2.0 * across * (1.0 + 1e-9):
             key = "inertia_axle_kg_m2" if self.inertia_axle_kg_m2 is not None else "inertia_across_kg_m2"
-            raise error_at(key, f"{axle:g} about the axle is more than twice {across:g} across it, as of no real wheel")
+            raise error_at(
+                key, f"{axle:g} about the axle must not exceed twice the moment across it ({across:g}); change one"
+            )
         return self
 
     @property
     def moments(self) -> tuple[float, float]:
-        """Moments of inertia about the axle and across it [kg m²]."""
+        """Moments of inertia about and across the axle [kg m²]."""
         square = self.mass_kg * self.radius_m**2
         axle, across = self.inertia_axle_kg_m2, self.inertia_across_kg_m2
         return 0.5 * square if axle is None else axle, 0.25 * square if across is None else across
 
 
 class Mount(StrictConfig):
-    """Where the arm stands on the base, in the base's frame."""
+    """Mounting pose of the arm in the frame of the base."""
 
-    position_m: Vector3 = [0.0, 0.0, 0.1]
-    yaw_deg: float = 0.0
+    position_m: Vector3 = Field(default=[0.0, 0.0, 0.1], description="position of the arm's base")
+    yaw_deg: float = Field(default=0.0, description="rotation about the vertical axis")
 
 
 class Base(StrictConfig):
-    """The base; its frame lies on the floor below the middle of the axle, x ahead, z up."""
+    """Mobile base; its frame is on the floor below the middle of the axle, with x forward and z up."""
 
-    position_m: list[float] = Field(default=[0.0, 0.0], min_length=2, max_length=2, description="where it starts")
-    heading_deg: float = Field(default=0.0, description="heading at the start")
-    mass_kg: NonNegative = Field(default=4.0, description="of the body, without wheels")
-    com_m: Vector3 = [0.05, 0.0, 0.08]
+    position_m: list[float] = Field(
+        default=[0.0, 0.0], min_length=2, max_length=2, description="initial x and y in the world"
+    )
+    heading_deg: float = Field(default=0.0, description="initial heading")
+    mass_kg: NonNegative = Field(default=4.0, description="mass of the body without wheels")
+    com_m: Vector3 = Field(default=[0.05, 0.0, 0.08], description="centre of mass of the body without wheels")
     inertia_kg_m2: list[float] = Field(
         default=[0.03, 0.0, 0.0, 0.05, 0.0, 0.06],
         min_length=6,
         max_length=6,
-        description="xx xy xz yy yz zz of the body about its com",
+        description="inertia tensor xx, xy, xz, yy, yz, zz of the body without wheels, about its centre of mass",
     )
-    wheel: WheelConfig = WheelConfig()
-    track_m: Positive = Field(default=0.3, description="distance of the wheels")
-    caster_m: Vector3 = Field(default=[0.15, 0.0, 0.0], description="where the caster touches the floor: no friction")
-    wheel_friction: Positive = Field(default=0.8, description="between wheels and floor, for the traction demand")
+    wheel: WheelConfig = Field(default=WheelConfig(), description="both wheels")
+    track_m: Positive = Field(default=0.3, description="distance between the wheels")
+    caster_m: Vector3 = Field(
+        default=[0.15, 0.0, 0.0], description="contact point of the caster with the floor, without friction"
+    )
+    wheel_friction: Positive = Field(
+        default=0.8, description="coefficient of friction between wheels and floor, for the traction demand"
+    )
     on_overturn: Literal["warn", "stop"] = Field(
-        default="warn", description="go on as if held down, and say so, or stop the run there (exit code 3)"
+        default="warn",
+        description="reaction to overturning: `warn` and continue as if the base were held down, or `stop` the run "
+        "(exit code 3)",
     )
-    mount: Mount = Mount()
+    mount: Mount = Field(default=Mount(), description="mounting pose of the arm")
 
     @field_validator("caster_m")
     @classmethod
     def _check_caster(cls, caster: list[float]) -> list[float]:
         if caster[2] != 0.0:
-            raise ValueError(f"it touches the floor: its third coordinate must be 0, not {caster[2]:g}")
+            raise ValueError(f"the third coordinate must be 0 (the caster touches the floor), got {caster[2]:g}")
         if abs(caster[0]) < 1e-9:
-            raise ValueError("it lies on the axle's line, so that the base has no triangle to stand on")
+            raise ValueError(
+                "must not be on the axle, or the base has no support triangle; change the first coordinate"
+            )
         return caster
 
 
 class Config(StrictConfig):
-    """The base, and an arm with keys of its own."""
+    """Mobile base with an arm."""
 
     type: Literal["pws_arm"]
-    base: Base = Base()
-    arm: ArmChoice
+    base: Base = Field(default=Base(), description="mobile base")
+    arm: ArmChoice = Field(description="arm on the base: a `serial_arm` or `urdf_arm`")
 
     @model_validator(mode="after")
     def _check_arm(self) -> Self:
-        # Resolved scenarios have it all; the place of an arm that was given none is no other than that of its mount.
+        # Accept the default pose, because resolved scenarios contain it.
         own = getattr(self.arm, "base", None)
         if own is not None and own != type(own)():
-            raise error_at("arm.base", "on a mobile base the arm stands at plant.base.mount; remove arm.base")
+            raise error_at("arm.base", "conflicts with plant.base.mount, the pose of the arm; remove arm.base")
         return self
 
 
 def build(config: Config, context: BuildContext) -> Robot:
-    """The base as a joint with the rates of its wheels, and the arm's bodies on it.
+    """Build the base as a joint whose rates are the wheel rates, with the arm's bodies on it.
 
-    The wheels' masses, and their moments across the axle, are part of the base; their spin is inertia of their joints:
-    on flat ground that is the energy of real wheels, T = ½ I_a φ̇² + ½ I_t ω² + ½ m v². Their motors sit on the base.
+    Mass and transverse inertia of the wheels belong to the base, and the inertia about the axle belongs to the wheel
+    joints. On flat ground this is the energy of real wheels, T = ½ I_a φ̇² + ½ I_t ω² + ½ m v². The motors of the
+    wheels are fixed on the base.
 
     Raises
     ------
     ModelError
-        The arm says so, one of its bodies has the name of the base or of a part of it, or no real body or wheel can
-        have such an inertia.
+        If the arm is invalid, a body of the arm has the name of the base or of a part of it, or an inertia is not
+        physical.
     """
     arm = families.build("plant", config.arm, context, Robot)
     base, wheel = config.base, config.base.wheel
@@ -134,7 +151,7 @@ def build(config: Config, context: BuildContext) -> Robot:
         parts.append(Inertia(wheel.mass_kg, hub, np.diag([across, axle, across])))
         if wheel.motor is not None:
             motor: Drive = families.build("motor", wheel.motor, context.at_joint(joint), Drive)
-            # The rows of the base carry no body: what the motor weighs cannot be left to its joint.
+            # The rows of the base carry no body, so the mass of the motor is added to the base.
             parts.append(Inertia(motor.mass, hub if motor.mass_point is None else motor.mass_point))
             motors.append(replace(motor, mass=0.0, mass_point=None))
     body = Link(
@@ -155,7 +172,7 @@ def build(config: Config, context: BuildContext) -> Robot:
     for name in (name for link in arm.links for name in (link.name, link.joint)):
         if name in taken:
             raise ModelError(
-                f"plant.arm: {name!r} is a name of the mobile base too; rename it in the arm", keys=("plant", "arm")
+                f"plant.arm: {name!r} is also a name of the mobile base; rename it in the arm", keys=("plant", "arm")
             )
     return replace(
         arm,
@@ -199,10 +216,10 @@ def _quaternion(base: Base) -> Any:
 
 
 def _mounted(link: Link, R: Array, p: Array) -> Link:
-    """A link of the arm, standing on the base where it stood on the ground."""
+    """Return a link of the arm, moved from the ground to the base."""
     if link.parent is not None:
         return link
-    # R_PJ stays the identity, known to the kernels, where the mount is not turned.
+    # Without rotation of the mount R_PJ stays the exact identity, which the kernels exploit.
     return replace(link, parent=BASE, R_PJ=R @ link.R_PJ, p_PJ=p + R @ link.p_PJ)
 
 
@@ -211,7 +228,7 @@ def _framed(frame: Frame, R: Array, p: Array) -> Frame:
 
 
 def _shapes(base: Base) -> tuple[Shape, ...]:
-    """A plate from axle to caster, between the wheels, and the caster's ball; wheels are bodies of the scene."""
+    """Return a plate from axle to caster and the caster's ball for display; the wheels are bodies of the scene."""
     r, x, y = base.wheel.radius_m, base.caster_m[0], base.caster_m[1]
     front, back = max(x, 0.0) + 0.5 * r, min(x, 0.0) - r
     low, high = 0.6 * r, max(base.mount.position_m[2], 1.6 * r)

@@ -1,8 +1,8 @@
-"""Articulated mobile robot that raises its head: T2 Snake-3 by default (Tanaka et al. 2019, Table I).
+"""Articulated mobile robot with a raised head: T2 Snake-3 by default (Tanaka et al. 2019, Table I).
 
 [T]: M. Tanaka et al., "Task-Space Control of Articulated Mobile Robots With a Soft Gripper for Operations", IEEE
 Transactions on Robotics 35(1), 2019. Values that [T] does not give are marked "assumed".
-Kinematic by default; ``level: dynamic`` gives a tree of bodies with masses, servos and tyres.
+Kinematic by default; ``level: dynamic`` builds a tree of bodies with masses, servos and tyres.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from dynsim.snake.description import SnakeDescription
 from dynsim.snake.lifting import Lifts
 
 ENGINE = "kinematic"
-# The controller whose keys `section_defaults` knows.
+# Controller for which `section_defaults` has defaults.
 TASK_SPACE = "task_space"
 
-# Compliant tyres (assumed): with rigid ones the loads of the left and right wheel of a pair are not determined.
+# Compliant tyres (assumed): with rigid tyres the loads of the left and right wheel of a pair are not determined.
 TYRES = {"stiffness_N_per_m": 1e5, "damping_N_s_per_m": 200.0}
 MotorChoice: Any = families.union("motor")
 DrivenSide = Literal["left", "right", "none"]
@@ -36,62 +36,70 @@ DrivenSide = Literal["left", "right", "none"]
 class JointLimits(StrictConfig):
     """Joint limits, symmetric about zero ([T] Table I)."""
 
-    yaw: Positive = Field(65.0, lt=180, description="[deg]")
-    pitch: Positive = Field(113.0, lt=180, description="[deg]")
+    yaw: Positive = Field(65.0, lt=180, description="limit of yaw joints [deg]")
+    pitch: Positive = Field(113.0, lt=180, description="limit of pitch joints [deg]")
 
 
 class JointStops(StrictConfig):
-    """Mechanical stops of the joints, symmetric about zero; default: at the limits of the command."""
+    """Mechanical stops of the joints, symmetric about zero."""
 
-    yaw: Positive | None = Field(None, lt=180, description="[deg]")
-    pitch: Positive | None = Field(None, lt=180, description="[deg]")
+    yaw: Positive | None = Field(None, lt=180, description="stop of yaw joints [deg]; default: `limits_deg.yaw`")
+    pitch: Positive | None = Field(None, lt=180, description="stop of pitch joints [deg]; default: `limits_deg.pitch`")
 
 
 class Lifting(StrictConfig):
-    """How wheel pairs are lifted."""
+    """Lifting of wheel pairs."""
 
-    clearance_m: Positive = Field(0.010, description="of the lower wheel above the ground (assumed)")
-    blend_s: Positive = Field(0.25, description="time to lift a pair, and to put it down (assumed)")
-    sag_compensation: bool = Field(True, description="pitch joints are told by so much more as their servos give way")
+    clearance_m: Positive = Field(0.010, description="height of the lower wheel above the ground (assumed)")
+    blend_s: Positive = Field(0.25, description="time to lift or lower a pair (assumed)")
+    sag_compensation: bool = Field(
+        True, description="add the predicted deflection of the servos to the commands of pitch joints"
+    )
 
 
 class Dynamics(StrictConfig):
-    """What the plant is beside its lengths where it has forces: ``level: dynamic``."""
+    """Additional parameters of the plant for `level: dynamic`."""
 
-    joint_servo: MotorChoice = Field({"type": "mx_106"}, description="of every joint ([T] IV.A)")
-    wheel_servo: MotorChoice = Field({"type": "mx_28"}, description="of every driven wheel ([T] IV.A)")
-    wheel_inertia_kg_m2: Positive = Field(4e-5, description="about its axle, of each wheel without its servo (assumed)")
-    bearing_drag_N_m_s_per_rad: NonNegative = Field(1e-4, description="of each wheel (assumed)")
+    joint_servo: MotorChoice = Field({"type": "mx_106"}, description="servo of each joint ([T] IV.A)")
+    wheel_servo: MotorChoice = Field({"type": "mx_28"}, description="servo of each driven wheel ([T] IV.A)")
+    wheel_inertia_kg_m2: Positive = Field(
+        4e-5, description="moment of inertia of each wheel about its axle, without servo (assumed)"
+    )
+    bearing_drag_N_m_s_per_rad: NonNegative = Field(1e-4, description="viscous friction of each wheel (assumed)")
     passive_wheels: Literal["bodies", "massless"] = Field(
-        "bodies", description="massless: no friction along their way, instead of bodies that turn"
+        "bodies",
+        description="model of passive wheels: rotating `bodies`, or `massless` points without rolling friction",
     )
     stops_deg: JointStops = Field(
-        default_factory=JointStops, description="mechanical stops, no narrower than limits_deg, which are the command's"
+        default_factory=JointStops,
+        description="mechanical stops, not narrower than `limits_deg`, which limits the commands",
     )
-    lifting: Lifting = Field(default_factory=Lifting)
+    lifting: Lifting = Field(default_factory=Lifting, description="lifting of wheel pairs")
     start: Literal["soft", "released"] = Field(
-        "soft", description="soft: the head has been raised from below and has settled; released: it is let go at t = 0"
+        "soft",
+        description="initial state: `soft`, with the head raised from below and settled, or `released`, dropped at "
+        "t = 0",
     )
 
 
 class GripperConfig(StrictConfig):
-    """The soft gripper that hardens around an object; all values are assumed, see docs/snake.md."""
+    """Soft gripper that hardens around an object; all values are assumed, see docs/snake.md."""
 
-    capture_m: Positive = Field(0.015, description="it captures an object whose grasp frame is within this")
-    capture_deg: Positive = Field(23.0, lt=180, description="and whose axis is within this of its own")
-    hardening_s: Positive = 1.0
-    softening_s: Positive = 0.5
-    stiffness_N_per_m: Positive = Field(5e3, description="hardened, along each axis")
-    damping_N_s_per_m: Positive = 20.0
-    bound_N: Positive = Field(20.0, description="beyond it the object slips")
-    turning_stiffness_N_m_per_rad: Positive = Field(5.0, description="hardened, about each axis")
-    turning_damping_N_m_s_per_rad: Positive = 0.05
-    turning_bound_N_m: Positive = Field(0.8, description="beyond it the object slips")
-    lost_m: Positive = Field(0.015, description="an object that has slipped further is lost")
-    lost_deg: Positive = Field(29.0, lt=180)
+    capture_m: Positive = Field(0.015, description="maximum distance from an object's grasp frame to capture it")
+    capture_deg: Positive = Field(23.0, lt=180, description="maximum angle to an object's grasp axis to capture it")
+    hardening_s: Positive = Field(1.0, description="time to harden")
+    softening_s: Positive = Field(0.5, description="time to soften")
+    stiffness_N_per_m: Positive = Field(5e3, description="stiffness along each axis when hardened")
+    damping_N_s_per_m: Positive = Field(20.0, description="damping along each axis when hardened")
+    bound_N: Positive = Field(20.0, description="force along an axis beyond which the object slips")
+    turning_stiffness_N_m_per_rad: Positive = Field(5.0, description="stiffness about each axis when hardened")
+    turning_damping_N_m_s_per_rad: Positive = Field(0.05, description="damping about each axis when hardened")
+    turning_bound_N_m: Positive = Field(0.8, description="torque about an axis beyond which the object slips")
+    lost_m: Positive = Field(0.015, description="slip beyond which the object is lost")
+    lost_deg: Positive = Field(29.0, lt=180, description="rotation beyond which the object is lost")
 
     def gripper(self, length: float) -> Gripper:
-        """The gripper, its tip that far ahead of the head point [m]."""
+        """Return the gripper with its tip at ``length`` ahead of the head point [m]."""
         turning = self.turning_stiffness_N_m_per_rad, self.turning_damping_N_m_s_per_rad, self.turning_bound_N_m
         return Gripper(
             body="head",
@@ -108,49 +116,57 @@ class GripperConfig(StrictConfig):
 
 
 class Config(StrictConfig):
-    """The ``plant:`` section of a scenario; SI units where the key names no other."""
+    """Snake robot; SI units unless the key has another unit."""
 
     type: Literal["snake"] = "snake"
     level: Literal["kinematic", "dynamic"] = Field(
-        "kinematic", description="kinematic: wheels do not slip and joints follow exactly; dynamic: a tree of bodies"
+        "kinematic",
+        description="model; `kinematic`: no wheel slip and exact joints, `dynamic`: a tree of bodies with forces",
     )
-    dynamics: Dynamics = Field(default_factory=Dynamics, description="level: dynamic only")
-    yaw_joints: int = Field(9, ge=2, le=200, description="n: yaw joints of the whole robot")
-    head_joints: int = Field(6, ge=0, description="n_h: joints of the raised head part, yaw, pitch, yaw, ..., even")
-    link_length_m: Positive = Field(0.0905, description="l [m], between neighbouring joint axes")
-    wheel_radius_m: Positive = Field(0.05, description="r [m]")
+    dynamics: Dynamics = Field(default_factory=Dynamics, description="parameters of `level: dynamic`")
+    yaw_joints: int = Field(9, ge=2, le=200, description="number n of yaw joints of the whole robot")
+    head_joints: int = Field(
+        6, ge=0, description="number n_h of joints of the raised head part (yaw, pitch, yaw, ...), even"
+    )
+    link_length_m: Positive = Field(0.0905, description="distance l between neighbouring joint axes")
+    wheel_radius_m: Positive = Field(0.05, description="wheel radius r")
     wheel_gap_m: Positive | list[Positive] | None = Field(
         None,
-        description="distance between the wheels of a pair [m]: one for all, or one per pair of the base part. "
-        "Default (assumed): 0.15 m for pairs 1, 3, 5, which carry batteries, and 0.12 m for the others",
+        description="distance between the wheels of a pair: one value, or one per pair of the base part; "
+        "default (assumed): 0.15 m for pairs 1, 3, 5, which carry batteries, and 0.12 m for the other pairs",
     )
     driven_side: DrivenSide | list[DrivenSide] | None = Field(
-        None, description="side of the active wheel of each pair. Default (assumed): left, right, left, ..."
+        None,
+        description="side of the active wheel: one value, or one per pair; default (assumed): left, right, left, ...",
     )
-    limits_deg: JointLimits = Field(default_factory=JointLimits, description="of the command; see dynamics.stops_deg")
-    gripper_length_m: NonNegative = Field(0.09, description="gripper tip ahead of the head point [m] ([T] IV.B)")
-    gripper: GripperConfig = Field(default_factory=GripperConfig, description="how it holds objects")
-    mass_kg: Positive = Field(10.0, description="of the whole robot [kg], spread evenly over its links (assumed)")
+    limits_deg: JointLimits = Field(
+        default_factory=JointLimits, description="limits of the commanded joint angles; see `dynamics.stops_deg`"
+    )
+    gripper_length_m: NonNegative = Field(
+        0.09, description="distance of the gripper tip ahead of the head point ([T] IV.B)"
+    )
+    gripper: GripperConfig = Field(default_factory=GripperConfig, description="parameters of the gripper")
+    mass_kg: Positive = Field(10.0, description="mass of the whole robot, distributed evenly over its links (assumed)")
     controlled_point: Literal["head", "gripper"] = Field(
-        "head", description="head point ([T] V.A) or gripper tip ([T] V.D)"
+        "head", description="controlled point: head point ([T] V.A) or gripper tip ([T] V.D)"
     )
     initial_joints_rad: list[float] | None = Field(
         None,
-        description="theta_1, psi_1, ... [rad] at t = 0, the base's yaw joints may be left out when zero. Default: "
-        "[T] V.A, where it fits",
+        description="initial joint angles theta_1, psi_1, ...; zero yaw angles of the base part may be omitted; "
+        "default: [T] V.A, or a similar posture for other head parts",
     )
     initial_base_pose: tuple[float, float, float] = Field(
-        (0.0, 0.0, 0.0), description="x [m], y [m] of wheel pair 1 and yaw [rad] of the base part"
+        (0.0, 0.0, 0.0), description="initial x [m] and y [m] of wheel pair 1, and yaw [rad] of the base part"
     )
 
 
 def engine(config: Config) -> str:
-    """What simulates the plant of a configuration."""
+    """Return the engine that simulates the configured plant."""
     return "dynamics" if config.level == "dynamic" else ENGINE
 
 
 def section_defaults(plant: Mapping[str, Any], sections: Mapping[str, Any]) -> dict[str, Any]:
-    """What other sections of a scenario say where they do not say otherwise; both as they were read."""
+    """Return the plant's defaults for other sections of a scenario; both arguments are unvalidated."""
     if plant.get("level") != "dynamic":
         return {}
     defaults: dict[str, Any] = {
@@ -163,7 +179,7 @@ def section_defaults(plant: Mapping[str, Any], sections: Mapping[str, Any]) -> d
         if not isinstance(contacts, Mapping) or contacts.get("stiffness_N_per_m", TYRES) is not None:
             defaults["contacts"] |= TYRES
     controller = sections.get("controller")
-    # Another controller is refused as such, not for a key that the user did not write.
+    # Another controller gets no defaults: its error must not be about a key that the user did not write.
     if isinstance(controller, Mapping) and controller.get("type") == TASK_SPACE:
         defaults["controller"] = {"state": "feedforward"}  # [T] IV.C.2
         sensor = {"measured": "motion_capture", "estimated": "encoders"}.get(str(controller.get("state")))
@@ -173,12 +189,12 @@ def section_defaults(plant: Mapping[str, Any], sections: Mapping[str, Any]) -> d
 
 
 def build(config: Config, context: BuildContext) -> SnakeDescription | SnakeTree:
-    """The configured robot: its description, or the tree of its bodies.
+    """Build the configured robot: a description, or a tree of bodies for ``level: dynamic``.
 
     Raises
     ------
     ModelError
-        What :func:`describe` raises; stops that are narrower than the limits of the command.
+        If :func:`describe` fails, or the stops are narrower than the limits of the commands.
     """
     description = describe(config)
     if config.level == "kinematic":
@@ -208,35 +224,35 @@ def build(config: Config, context: BuildContext) -> SnakeDescription | SnakeTree
 
 
 def _stop(kind: str, stop_deg: float | None, limit_deg: float) -> float:
-    """Angle [rad] at which joints of a kind stop mechanically; ModelError if that is within the command's limit."""
+    """Return the mechanical stop of joints of a kind [rad]; raise ModelError if it is within the command limit."""
     if stop_deg is None:
         return float(np.deg2rad(limit_deg))
     if stop_deg < limit_deg:
         raise ModelError(
-            f"plant.dynamics.stops_deg.{kind} = {stop_deg:g} is narrower than plant.limits_deg.{kind} = {limit_deg:g}: "
-            "the command would go beyond the stop",
+            f"plant.dynamics.stops_deg.{kind} = {stop_deg:g}: must not be less than plant.limits_deg.{kind} = "
+            f"{limit_deg:g}, or commands would exceed the stop",
             keys=("plant", "dynamics", "stops_deg", kind),
         )
     return float(np.deg2rad(stop_deg))
 
 
 def describe(config: Config) -> SnakeDescription:
-    """Description of the configured robot.
+    """Build the description of the configured robot.
 
     Raises
     ------
     ModelError
-        The head part cannot be controlled in six coordinates (n_h odd or n_h < 4, [T] eq 1), too few wheel rows
-        (n_b + n_w >= 2, [T] eq 16 with every wheel on the ground), or lists that do not fit the number of joints or
-        wheel pairs. What depends on the wheels lifted and on shape controllable points is checked by the controller.
+        If the head part is not controllable in six coordinates (n_h odd or n_h < 4, [T] eq 1), there are too few wheel
+        rows (n_b + n_w >= 2 is required, [T] eq 16 with all wheels on the ground), or lists do not fit the number of
+        joints or wheel pairs. The controller checks conditions on lifted wheels and shape controllable points.
     """
     n, n_h = config.yaw_joints, config.head_joints
     if n_h % 2:
-        raise ModelError(f"plant.head_joints = {n_h}: yaw and pitch joints alternate, n_h must be even")
+        raise ModelError(f"plant.head_joints = {n_h}: must be even, because yaw and pitch joints alternate")
     if n_h < 4:
         raise ModelError(
-            f"plant.head_joints = {n_h}: six coordinates of the head need n_h >= 4 ([T] eq 1), because the three "
-            "ground-contact rows and the side-slip row of wheel pair 1 contain no other joints"
+            f"plant.head_joints = {n_h}: must be at least 4 ([T] eq 1), because the three ground-contact rows and the "
+            "side-slip row of wheel pair 1 contain head joints only"
         )
     n_b = n - n_h // 2
     if n_b < 1:
@@ -254,8 +270,8 @@ def describe(config: Config) -> SnakeDescription:
     n_w = int(np.count_nonzero(driven_side))
     if n_b + n_w < 2:
         raise ModelError(
-            f"plant: n_b + n_w = {n_b} + {n_w} < 2: with so few wheel rows A loses its full column rank and the head "
-            "cannot be tracked ([T] eq 16)"
+            f"plant: n_b + n_w = {n_b} + {n_w} must be at least 2, or A does not have full column rank and the head "
+            "cannot be tracked ([T] eq 16); add yaw joints or driven wheels"
         )
 
     pitch = np.array([j < n_h and j % 2 == 1 for j in range(joints)])
@@ -263,19 +279,19 @@ def describe(config: Config) -> SnakeDescription:
     names = tuple(f"{'psi' if j % 2 else 'theta'}{j // 2 + 1}" for j in range(n_h))
     names += tuple(f"theta{n_h // 2 + i + 1}" for i in range(n_b))
 
-    # [T] V.A; a head part of another length starts with a similar S that keeps the head level
+    # [T] V.A; for other lengths of the head part a similar S shape that keeps the head level
     raised = [0.0, -0.8, 0.0, -1.1, 0.0, 1.9] if n_h == 6 else [0.0, 0.0] * (n_h // 2 - 2) + [0.0, -0.8, 0.0, 0.8]
     angles = raised if config.initial_joints_rad is None else config.initial_joints_rad
     if len(angles) not in (n_h, joints):
         raise ModelError(
-            f"plant.initial_joints_rad has {len(angles)} angles; give n_h = {n_h} (base straight) or all {joints}: "
-            f"{', '.join(names)}"
+            f"plant.initial_joints_rad has {len(angles)} angles; set n_h = {n_h} angles (base straight) or all "
+            f"{joints}: {', '.join(names)}"
         )
     initial = np.concatenate([angles, np.zeros(joints - len(angles))])
     for name, angle, limit in zip(names, initial, upper, strict=True):
         if abs(angle) > limit:
             raise ModelError(
-                f"plant.initial_joints_rad: {name} = {angle:.4f} rad is beyond its limit of {limit:.4f} rad "
+                f"plant.initial_joints_rad: {name} = {angle:.4f} rad exceeds its limit of {limit:.4f} rad "
                 f"({np.rad2deg(limit):g} deg, plant.limits_deg)"
             )
     links = n_h + 2 * n_b
@@ -302,5 +318,5 @@ def _per_pair(key: str, value: object, pairs: int) -> list:
     if not isinstance(value, list):
         return [value] * pairs
     if len(value) != pairs:
-        raise ModelError(f"plant.{key} has {len(value)} entries, the base part has {pairs} wheel pairs")
+        raise ModelError(f"plant.{key} has {len(value)} entries for {pairs} wheel pairs; use one per pair")
     return value

@@ -1,4 +1,4 @@
-"""An arm on a fixed base whose bodies and joints come from a URDF file; motors are added by the scenario."""
+"""Arm on a fixed base with bodies and joints from a URDF file and motors from the scenario."""
 
 from __future__ import annotations
 
@@ -23,55 +23,60 @@ MotorChoice: Any = families.union("motor")
 
 
 class PoseConfig(StrictConfig):
-    """Place and attitude of a body in the frame of its joint, R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    """Pose of a body in the frame of its joint, R = Rz(yaw) Ry(pitch) Rx(roll)."""
 
-    position_m: Vector3 = [0.0, 0.0, 0.0]
-    rpy_deg: Vector3 = [0.0, 0.0, 0.0]
+    position_m: Vector3 = Field(default=[0.0, 0.0, 0.0], description="position of the body")
+    rpy_deg: Vector3 = Field(default=[0.0, 0.0, 0.0], description="attitude of the body: roll, pitch, yaw")
 
 
 class Config(StrictConfig):
-    """A robot from ``file`` (relative to the scenario), one motor model for all joints or one per joint."""
+    """Robot from a URDF file, with one motor model for all joints or one per joint."""
 
     type: Literal["urdf_arm"]
-    file: str = Field(description="URDF file, relative to the scenario file")
-    gravity_m_s2: Vector3 = [0.0, 0.0, -9.81]
+    file: str = Field(description="path of a URDF file, relative to the scenario file")
+    gravity_m_s2: Vector3 = Field(default=[0.0, 0.0, -9.81], description="gravitational acceleration")
     motor: MotorChoice | None = Field(
-        default=None, description="motor of every joint that `motors` does not name and that follows no other"
+        default=None,
+        description="motor of all joints that are not in `motors` and not coupled to a leader; default: no motor",
     )
-    motors: dict[str, MotorChoice] = Field(default={}, description="motors by joint name")
+    motors: dict[str, MotorChoice] = Field(default={}, description="motors of the named joints")
     damping_N_m_s_per_rad: NonNegative | None = Field(
-        default=None, description="loss of every revolute joint; default: the URDF's"
+        default=None, description="viscous damping of all revolute joints; default: from the URDF"
     )
     damping_N_s_per_m: NonNegative | None = Field(
-        default=None, description="loss of every prismatic joint; default: the URDF's"
+        default=None, description="viscous damping of all prismatic joints; default: from the URDF"
     )
     friction_N_m: NonNegative | None = Field(
-        default=None, description="dry friction of every revolute joint; default: the URDF's"
+        default=None, description="dry friction of all revolute joints; default: from the URDF"
     )
     friction_N: NonNegative | None = Field(
-        default=None, description="dry friction of every prismatic joint; default: the URDF's"
+        default=None, description="dry friction of all prismatic joints; default: from the URDF"
     )
     initial_deg: dict[str, float] = Field(
-        default={}, description="initial angles of revolute joints by name; others 0, or where a leader has them"
+        default={},
+        description="initial angles of the named revolute joints; default: 0, or the value of the coupling",
     )
-    initial_m: dict[str, float] = Field(default={}, description="initial positions of prismatic joints; others 0")
+    initial_m: dict[str, float] = Field(
+        default={},
+        description="initial positions of the named prismatic joints; default: 0, or the value of the coupling",
+    )
     initial_pose: dict[str, PoseConfig] = Field(
-        default={}, description="initial poses of the bodies of floating and planar joints, by joint name"
+        default={}, description="initial poses of the bodies of the named floating and planar joints"
     )
-    lock_deg: dict[str, float] = Field(default={}, description="revolute joints that are fixed, at these angles")
-    lock_m: dict[str, float] = Field(default={}, description="prismatic joints that are fixed, at these positions")
+    lock_deg: dict[str, float] = Field(default={}, description="angles of the named revolute joints that are locked")
+    lock_m: dict[str, float] = Field(default={}, description="positions of the named prismatic joints that are locked")
     hand: BodyPoint | None = Field(
         default=None, description="controlled point on a body or in a frame; default: the tip of the longest chain"
     )
 
     @model_validator(mode="after")
     def _check_joints(self) -> Self:
-        """Names and kinds of joints: here, where an error knows its line. Other errors of the file come from build."""
+        """Check names and kinds of joints here, so that errors have a line; ``build`` reports all other errors."""
         from dynsim.model.urdf.reader import MOVING, SEVERAL, read_tree, suggestion
 
         try:
             if not is_file(self.file, ModelError):
-                raise error_at("file", "no such file")
+                raise error_at("file", "file not found")
             joints = read_tree(Path(self.file)).joints
         except ModelError:
             return self
@@ -82,33 +87,35 @@ class Config(StrictConfig):
                 path = f"{key}.{name}"
                 if name not in joints:
                     moving = ", ".join(joint.name for joint in joints.values() if joint.kind != "fixed")
-                    raise error_at(path, f"no joint {name!r}{suggestion(name, joints)}; joints of the file: {moving}")
+                    raise error_at(
+                        path, f"unknown joint {name!r}{suggestion(name, joints)}; joints in the file: {moving}"
+                    )
                 kind = MOVING.get(joints[name].kind, joints[name].kind)
                 if kind in SEVERAL:
                     if key == "initial_pose":
                         continue
-                    start = "" if key == "motors" else f"; it starts where plant.initial_pose.{name} says"
-                    raise error_at(path, f"{name!r} is {kind}: it has no motor, angle or distance{start}")
+                    start = "" if key == "motors" else f"; set its start in plant.initial_pose.{name}"
+                    raise error_at(path, f"{name!r} is {kind} and cannot have a motor, angle or distance{start}")
                 if kind not in units:
-                    raise error_at(path, f"{name!r} is {kind}: it has no motor and no position")
+                    raise error_at(path, f"{name!r} is {kind} and cannot have a motor or position; remove it")
                 if key == "initial_pose":
-                    raise error_at(path, f"{name!r} is {kind}; give it in plant.initial_{units[kind]}")
+                    raise error_at(path, f"{name!r} is {kind}; use plant.initial_{units[kind]}")
                 family, _, unit = key.partition("_")
                 if unit and unit != units[kind]:
-                    raise error_at(path, f"{name!r} is {kind}; give it in plant.{family}_{units[kind]}")
+                    raise error_at(path, f"{name!r} is {kind}; use plant.{family}_{units[kind]}")
                 if name in locked and family != "lock":
                     raise error_at(path, f"{name!r} is locked by plant.lock_{units[kind]}; remove one of the two")
         return self
 
 
 def build(config: Config, context: BuildContext) -> Robot:
-    """The robot of the file with the scenario's motors.
+    """Build the robot of the file with the scenario's motors.
 
     Raises
     ------
     ModelError
-        A file that is refused (see :func:`dynsim.model.urdf.reader.read_urdf`), or a hand on a body that it
-        does not have.
+        If the file is invalid (see :func:`dynsim.model.urdf.reader.read_urdf`), or the hand is on a body that does not
+        exist.
     """
     from dynsim.model.urdf.reader import read_urdf
 
@@ -119,7 +126,7 @@ def build(config: Config, context: BuildContext) -> Robot:
         "revolute": {"damping": config.damping_N_m_s_per_rad, "friction": config.friction_N_m},
         "prismatic": {"damping": config.damping_N_s_per_m, "friction": config.friction_N},
     }
-    # Joints with several rates have neither losses nor motors.
+    # Joints with several rates have no damping, friction or motors.
     single = [link for link in robot.links if link.joint_of_rows is None]
     links = tuple(
         dataclasses.replace(link, **{key: loss for key, loss in stated[link.kind].items() if loss is not None})
@@ -154,7 +161,7 @@ def build(config: Config, context: BuildContext) -> Robot:
 
 
 def _initial(robot: Robot, positions: dict[str, float], poses: dict[str, PoseConfig]) -> Array:
-    """Coordinates of all joints, (nq,); those of floating and planar joints from the poses of their bodies."""
+    """Return the coordinates of all joints, (nq,); floating and planar joints use the poses of their bodies."""
     from dynsim.model.urdf.reader import rotation
     from dynsim.record.scene import quaternion
 
@@ -169,6 +176,6 @@ def _initial(robot: Robot, positions: dict[str, float], poses: dict[str, PoseCon
         path = f"plant.initial_pose.{name}"
         for key, off in (("position_m", abs(normal @ p)), ("rpy_deg", float(np.abs(R @ normal - normal).max()))):
             if off > 1e-9:
-                raise ModelError(f"{path}.{key}: leaves the plane of the joint, whose normal is {normal.tolist()}")
+                raise ModelError(f"{path}.{key}: must be in the plane of the joint (normal {normal.tolist()})")
         q[index[rows[0]] : index[rows[0]] + 3] = x @ p, y @ p, np.arctan2(y @ R @ x, x @ R @ x)
     return q

@@ -1,1 +1,1 @@
-"""Contact surfaces, one file each: ``Config``, and ``build``, which gives a ``Quadric``, ``Box`` or ``HeightField``."""
+"""Contact surfaces, one file each: ``Config``, and ``build``, which returns a `Quadric`, `Box` or `HeightField`."""

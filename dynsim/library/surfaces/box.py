@@ -1,4 +1,4 @@
-"""A box with rounded edges: its signed distance is C¹, flat on the faces, round over edges and corners."""
+"""Box with rounded edges; the signed distance is C¹, flat on the faces and round over edges and corners."""
 
 from __future__ import annotations
 
@@ -14,13 +14,15 @@ from dynsim.model.urdf.reader import rotation
 
 
 class Config(StrictConfig):
-    """Box about ``center_m``, turned by ``rpy_deg``; the free side is outside."""
+    """Box about `center_m`, rotated by `rpy_deg`; the robot is outside."""
 
     type: Literal["box"]
-    center_m: Vector3
-    edges_m: Annotated[list[Positive], Field(min_length=3, max_length=3)]
-    rpy_deg: Vector3 = Field(default=[0.0, 0.0, 0.0], description="about x, y, z of the world, in this order")
-    edge_radius_m: Positive = Field(default=0.005, description="of the rounded edges, within the box")
+    center_m: Vector3 = Field(description="centre in the world")
+    edges_m: Annotated[list[Positive], Field(min_length=3, max_length=3)] = Field(
+        description="edge lengths along x, y, z of the box"
+    )
+    rpy_deg: Vector3 = Field(default=[0.0, 0.0, 0.0], description="rotation about x, y, z of the world, in this order")
+    edge_radius_m: Positive = Field(default=0.005, description="radius of the rounded edges, within the box")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -28,12 +30,12 @@ class Config(StrictConfig):
         if self.edge_radius_m > most:
             raise error_at(
                 "edge_radius_m",
-                f"{self.edge_radius_m:g} m; it must not be more than half the shortest edge, {most:g} m",
+                f"{self.edge_radius_m:g} m; must not exceed half the shortest edge ({most:g} m)",
             )
         return self
 
 
 def build(config: Config, context: BuildContext) -> Box:
-    """The box with the edges of its core and its rounding."""
+    """Return the box."""
     axes = rotation(*np.deg2rad(config.rpy_deg).tolist()).T
     return Box(np.array(config.center_m), axes, np.array(config.edges_m), config.edge_radius_m)

@@ -1,11 +1,11 @@
-"""An infinite circular cylinder: C(r) = (|P (r − c)|² − R²)/(2R) with P = 1 − a aᵀ."""
+"""Infinite circular cylinder: C(r) = (|P (r − c)|² − R²)/(2R) with P = 1 − a aᵀ."""
 
 from __future__ import annotations
 
 from typing import Literal, Self
 
 import numpy as np
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
 from dynsim.compile.protocols import BuildContext
 from dynsim.config.base import Positive, StrictConfig, Vector3, unit_vector
@@ -13,13 +13,13 @@ from dynsim.model.description import Quadric
 
 
 class Config(StrictConfig):
-    """Cylinder about the line through ``point_m`` along ``axis``; ``inside: true`` makes it a pipe."""
+    """Cylinder about the line through `point_m` along `axis`; with `inside: true` the robot is in a pipe."""
 
     type: Literal["cylinder"]
-    point_m: Vector3
-    axis: Vector3
-    radius_m: Positive
-    inside: bool = False
+    point_m: Vector3 = Field(description="point on the axis, in the world")
+    axis: Vector3 = Field(description="direction of the axis")
+    radius_m: Positive = Field(description="radius")
+    inside: bool = Field(default=False, description="whether the robot is inside")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -28,7 +28,7 @@ class Config(StrictConfig):
 
 
 def build(config: Config, context: BuildContext) -> Quadric:
-    """The cylinder as a quadric with |∇C| = 1 on it."""
+    """Return the cylinder as a quadric with |∇C| = 1 on the surface."""
     sign = -1.0 if config.inside else 1.0
     axis, point, radius = unit_vector(config.axis, "axis"), np.array(config.point_m), config.radius_m
     Q = sign / radius * (np.eye(3) - np.outer(axis, axis))

@@ -1,11 +1,11 @@
-"""A plane: C(r) = n·(r − r_0)."""
+"""Plane: C(r) = n·(r − r_0)."""
 
 from __future__ import annotations
 
 from typing import Literal, Self
 
 import numpy as np
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
 from dynsim.compile.protocols import BuildContext
 from dynsim.config.base import StrictConfig, Vector3, unit_vector
@@ -13,11 +13,11 @@ from dynsim.model.description import Quadric
 
 
 class Config(StrictConfig):
-    """Plane through ``point_m``; the free side is where ``normal`` points."""
+    """Plane through `point_m`; the robot is on the side of `normal`."""
 
     type: Literal["plane"]
-    point_m: Vector3 = [0.0, 0.0, 0.0]
-    normal: Vector3 = [0.0, 0.0, 1.0]
+    point_m: Vector3 = Field(default=[0.0, 0.0, 0.0], description="point on the plane, in the world")
+    normal: Vector3 = Field(default=[0.0, 0.0, 1.0], description="normal towards the robot")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -26,6 +26,6 @@ class Config(StrictConfig):
 
 
 def build(config: Config, context: BuildContext) -> Quadric:
-    """The plane as a quadric with Q = 0."""
+    """Return the plane as a quadric with Q = 0."""
     normal = unit_vector(config.normal, "normal")
     return Quadric(np.zeros((3, 3)), normal, -float(normal @ config.point_m))

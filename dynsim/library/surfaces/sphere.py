@@ -1,10 +1,11 @@
-"""A sphere: C(r) = (|r − c|² − R²)/(2R)."""
+"""Sphere: C(r) = (|r − c|² − R²)/(2R)."""
 
 from __future__ import annotations
 
 from typing import Literal
 
 import numpy as np
+from pydantic import Field
 
 from dynsim.compile.protocols import BuildContext
 from dynsim.config.base import Positive, StrictConfig, Vector3
@@ -12,16 +13,16 @@ from dynsim.model.description import Quadric
 
 
 class Config(StrictConfig):
-    """Sphere about ``center_m``; ``inside: true`` makes it a bowl (the free side is within)."""
+    """Sphere about `center_m`; with `inside: true` the robot is in a bowl."""
 
     type: Literal["sphere"]
-    center_m: Vector3
-    radius_m: Positive
-    inside: bool = False
+    center_m: Vector3 = Field(description="centre in the world")
+    radius_m: Positive = Field(description="radius")
+    inside: bool = Field(default=False, description="whether the robot is inside")
 
 
 def build(config: Config, context: BuildContext) -> Quadric:
-    """The sphere as a quadric with |∇C| = 1 on it."""
+    """Return the sphere as a quadric with |∇C| = 1 on the surface."""
     sign = -1.0 if config.inside else 1.0
     center, radius = np.array(config.center_m), config.radius_m
     scale = sign / radius
