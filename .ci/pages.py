@@ -550,7 +550,7 @@ def comparison() -> str:
         "───",
     )  # fmt: skip
     text = [line[1:].rstrip() for line in output.getvalue().split("warning: ")[0].splitlines()]
-    rows = [row for row in text if any(label in row for label in kept) and "times the least" not in row]
+    rows = [row for row in text if any(label in row for label in kept) and "times the minimum" not in row]
     # Of two elbows the first one's share of pulling.
     shown = rows[: next(k for k, row in enumerate(rows) if "pulling" in row) + 1]
     warned = {name: summary["warnings"] for name, summary in summaries.items()}
